@@ -1,0 +1,85 @@
+"""Every error that tsgt raises on purpose.
+
+::
+
+    TsgtError
+    ├── ConfigError            a configuration or set-up file cannot be used
+    ├── InputFileError         a data file from outside cannot be used
+    ├── OutputFileError        a result cannot be written
+    ├── RecordingError         a recording or journal cannot be read or written
+    │   ├── CorruptLineError   one of its lines cannot be read
+    │   └── RecordingVersionError  it was written in another version of the format
+    ├── GeometryError          numbers that no geometry can be computed from
+    │   └── DegenerateGeometryError  points that coincide or lie in a line
+    └── StreamError            the pose socket cannot be opened or reached
+
+A message says what happened, where, and what to do; the same data is kept in attributes.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+class TsgtError(Exception):
+    """Base of all errors that tsgt raises on purpose; its text is one line for the user."""
+
+
+class ConfigError(TsgtError):
+    """A configuration or set-up file cannot be used: unknown key, bad value, missing file."""
+
+    def __init__(self, message: str, *, path: Path | None = None, key: str | None = None) -> None:
+        super().__init__(message)
+        self.path = path
+        self.key = key
+
+
+class InputFileError(TsgtError):
+    """A data file from outside cannot be used: empty, wrong columns, NaN, time running backwards."""
+
+    def __init__(self, message: str, *, path: Path, line: int | None = None) -> None:
+        where = str(path) if line is None else f"{path}, line {line}"
+        super().__init__(f"{where}: {message}")
+        self.path = path
+        self.line = line
+
+
+class OutputFileError(TsgtError):
+    """A result cannot be written: no room on the disk, no such folder, no permission."""
+
+    def __init__(self, message: str, *, path: Path) -> None:
+        super().__init__(f"{path}: {message}")
+        self.path = path
+
+
+class RecordingError(TsgtError):
+    """A recording cannot be read or written: no header, no room on the disk, no such station."""
+
+    def __init__(self, message: str, *, path: Path, line: int | None = None) -> None:
+        where = str(path) if line is None else f"{path}, line {line}"
+        super().__init__(f"{where}: {message}")
+        self.path = path
+        self.line = line
+
+
+class CorruptLineError(RecordingError):
+    """A line in the middle of a recording is not what its writer can have written."""
+
+
+class RecordingVersionError(RecordingError):
+    """The recording was written in a version of the format that this program does not read."""
+
+
+class GeometryError(TsgtError, ValueError):
+    """Numbers that no geometry can be computed from: wrong shape, NaN, a distance below zero."""
+
+
+class DegenerateGeometryError(GeometryError):
+    """Points that coincide or lie in a line where a plane or a volume is needed."""
+
+
+class StreamError(TsgtError, OSError):
+    """The pose socket cannot be opened or reached: it is in use, or nobody serves it."""

@@ -1,0 +1,295 @@
+"""The records that all parts share: measurements, and the parameters that turn them into poses.
+
+Plain frozen data classes, SI units and radians, times as integers in nanoseconds. What stands on disk and on the
+stream is exactly these fields under exactly these names; units, frames and signs are those of
+docs/explanation/conventions.md.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import ClassVar, Literal
+
+Vector3 = tuple[float, float, float]
+Row4 = tuple[float, float, float, float]
+Matrix4 = tuple[Row4, Row4, Row4, Row4]
+
+IDENTITY4: Matrix4 = (
+    (1.0, 0.0, 0.0, 0.0),
+    (0.0, 1.0, 0.0, 0.0),
+    (0.0, 0.0, 1.0, 0.0),
+    (0.0, 0.0, 0.0, 1.0),
+)
+
+WORLD_FRAME = "station1"
+ROBOT_FRAME = "robot"
+
+ARCSECOND_RAD = math.pi / 648_000
+
+
+class Status(StrEnum):
+    """What the instrument said of a measurement, in one vocabulary for all makes."""
+
+    OK = "ok"
+    LOW_ACCURACY = "low_accuracy"
+    ANGLE_ONLY = "angle_only"
+    NO_TARGET = "no_target"
+    TILT = "tilt"
+    WRONG_DISTANCE = "wrong_distance"
+    ERROR = "error"
+
+    @property
+    def usable(self) -> bool:
+        """Whether angles and distance may enter a pose; ``LOW_ACCURACY`` is normal in motion."""
+        return self in (Status.OK, Status.LOW_ACCURACY)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PolarMeasurement:
+    """One measurement of a prism, raw as the total station gave it.
+
+    Attributes
+    ----------
+    type
+        Always ``measurement``.
+    station
+        Number of the station that measured, from 1.
+    prism
+        Number of the prism that it tracked, from 1.
+    sequence
+        Running number of this station's measurements, from 0.
+    stamp_ns
+        Time of the measurement on the master's Unix clock in ns: the host stamp put on that clock. The
+        station's latency is not taken off; whoever computes with it does that.
+    stamp_sigma_ns
+        One sigma of ``stamp_ns`` in ns, without the instrument's latency.
+    received_ns
+        When the master had it, on the master's Unix clock, in ns.
+    horizontal_angle_rad
+        Horizontal circle, clockwise from the circle's zero, in rad.
+    zenith_angle_rad
+        Angle from straight up in rad; above pi in the second face.
+    slope_distance_m
+        Slope distance in m as the instrument gave it, without prism constant and atmospheric correction
+        beyond what the instrument applies itself; null where it gave none.
+    status
+        The instrument's verdict: ``ok``, ``low_accuracy``, ``angle_only``, ``no_target``, ``tilt``,
+        ``wrong_distance`` or ``error``. The first two are usable.
+    raw_status
+        The number that the instrument itself gave for it.
+    host_time_ns
+        The station computer's stamp in ns, on its own clock.
+    instrument_time_ns
+        The instrument's own stamp in ns, on the instrument's clock; null where it has none.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
+
+    type: Literal["measurement"] = "measurement"
+    station: int
+    prism: int
+    sequence: int
+    stamp_ns: int
+    stamp_sigma_ns: int = 0
+    received_ns: int
+    horizontal_angle_rad: float
+    zenith_angle_rad: float
+    slope_distance_m: float | None
+    status: Status = Status.OK
+    raw_status: int = 0
+    host_time_ns: int
+    instrument_time_ns: int | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PointMeasurement:
+    """One prism position that came as Cartesian coordinates; the polar raw values are not known.
+
+    Attributes
+    ----------
+    type
+        Always ``point``.
+    station
+        Number of the station that measured, from 1.
+    prism
+        Number of the prism, from 1.
+    sequence
+        Running number of this station's points, from 0.
+    stamp_ns
+        Time of the measurement on the master's Unix clock in ns.
+    received_ns
+        When it came, on the same clock, in ns.
+    position_m
+        Position of the prism in the frame ``station1``, [x, y, z] in m, all corrections applied.
+    status
+        As in ``measurement``.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
+
+    type: Literal["point"] = "point"
+    station: int
+    prism: int
+    sequence: int
+    stamp_ns: int
+    received_ns: int
+    position_m: Vector3
+    status: Status = Status.OK
+
+
+Measurement = PolarMeasurement | PointMeasurement
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InstrumentNoise:
+    """One-sigma noise of a total station's single measurement, in the form of its data sheet.
+
+    Attributes
+    ----------
+    range_sigma_m
+        Constant part of the slope distance's noise in m.
+    range_sigma_ppm
+        Part that grows with the distance, in 1e-6 of it; both parts add as variances.
+    angle_sigma_rad
+        Noise of the horizontal and of the zenith angle in rad, on the sphere: the horizontal angle's own
+        noise is this over sin(zenith angle).
+    pointing_sigma_m
+        What pointing adds across and along the line of sight, per axis, in m: tracking jitter and the
+        prism's centring, or aiming by hand at a foil target.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
+
+    range_sigma_m: float
+    range_sigma_ppm: float
+    angle_sigma_rad: float
+    pointing_sigma_m: float
+
+
+TRACKING_NOISE = InstrumentNoise(
+    # Trimble S7 data sheet, tracking mode: 4 mm + 2 ppm and 1 arcsecond. The 4 mm are read as two sigma, the rest is
+    # kept whole, which errs on the safe side by 0.1 mm at 100 m. 1 mm of tracking jitter per axis.
+    range_sigma_m=0.002,
+    range_sigma_ppm=2.0,
+    angle_sigma_rad=1.0 * ARCSECOND_RAD,
+    pointing_sigma_m=0.001,
+)
+
+TARGET_NOISE = InstrumentNoise(
+    # Single measurements on reflective foil: Trimble S7 data sheet, 2 mm + 2 ppm read as two sigma and 1
+    # arcsecond; half a millimetre of aiming by hand.
+    range_sigma_m=0.001,
+    range_sigma_ppm=1.0,
+    angle_sigma_rad=1.0 * ARCSECOND_RAD,
+    pointing_sigma_m=0.0005,
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StationParameters:
+    """What is needed to turn one station's raw measurements into positions in the frame ``station1``.
+
+    Attributes
+    ----------
+    station
+        Number of the station, from 1.
+    prism
+        Number of the prism that the station tracks by default.
+    T_station1_station
+        Rigid transform, 4x4, that takes coordinates in the station's frame to frame ``station1``, in m.
+    prism_constant_m
+        Added to every raw slope distance, in m.
+    atmospheric_ppm
+        Scale correction of the slope distance in 1e-6, only what the instrument did not apply itself.
+    latency_ns
+        From the measurement to its host stamp, in ns; taken off the stamp. Positive: the stamp is late.
+    noise
+        Noise of one measurement.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
+
+    station: int
+    prism: int
+    T_station1_station: Matrix4 = IDENTITY4
+    prism_constant_m: float = 0.0
+    atmospheric_ppm: float = 0.0
+    latency_ns: int = 0
+    noise: InstrumentNoise = TRACKING_NOISE
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PipelineParameters:
+    """How measurements become poses.
+
+    Attributes
+    ----------
+    estimator
+        Name of the estimator: ``linear``.
+    period_ns
+        Step of the pose epochs in ns; epochs are the whole multiples of it in Unix time.
+    outage_limit_ns
+        Two measurements of one prism further apart than this leave the time between them invalid, in ns.
+    transport_limit_ns
+        A measurement that has not arrived this long after it was made is not waited for, in ns.
+    residual_limit_m
+        A pose whose prisms miss the layout by more than this (root mean square over the prisms) is invalid.
+    tilt_limit_rad
+        A pose whose robot z axis leans further than this from straight up is invalid: the prism layout is
+        mirrored, or two stations have swapped prisms.
+    acceleration_sigma_mps2
+        One sigma, per axis, of a prism's acceleration between two measurements: what straight-line
+        interpolation does not see, and the covariance therefore has to carry.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
+
+    estimator: Literal["linear"] = "linear"
+    period_ns: int = 50_000_000
+    outage_limit_ns: int = 1_000_000_000
+    transport_limit_ns: int = 2_000_000_000
+    residual_limit_m: float = 0.05
+    tilt_limit_rad: float = math.pi / 2
+    acceleration_sigma_mps2: float = 0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PrismPosition:
+    """Where a prism sits on the robot.
+
+    Attributes
+    ----------
+    prism
+        Number of the prism, from 1.
+    position_m
+        Its centre in the frame ``robot``, [x, y, z] in m.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
+
+    prism: int
+    position_m: Vector3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Parameters:
+    """Every parameter in force: what a recording must hold to be processed again.
+
+    Attributes
+    ----------
+    type
+        Always ``parameters``.
+    stations
+        One entry per station.
+    prisms
+        One entry per prism.
+    pipeline
+        How measurements become poses.
+    """
+
+    type: Literal["parameters"] = "parameters"
+    stations: tuple[StationParameters, ...]
+    prisms: tuple[PrismPosition, ...]
+    pipeline: PipelineParameters = PipelineParameters()

@@ -1,0 +1,132 @@
+"""Polar coordinates: axes, both faces, corrections, Jacobians against differences, noise against Monte Carlo."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tsgt.errors import GeometryError
+from tsgt.geometry import (
+    cartesian_jacobian,
+    cartesian_to_polar,
+    corrected_distance,
+    measurement_covariance,
+    polar_jacobian,
+    polar_to_cartesian,
+    raw_distance,
+)
+from tsgt.model import TRACKING_NOISE, InstrumentNoise
+
+QUARTER = np.pi / 2
+
+
+@pytest.mark.parametrize(
+    ("horizontal_rad", "zenith_rad", "expected"),
+    [
+        (0.0, QUARTER, (2, 0, 0)),
+        (QUARTER, QUARTER, (0, -2, 0)),
+        (3 * QUARTER, QUARTER, (0, 2, 0)),
+        (1.0, 0.0, (0, 0, 2)),
+        (1.0, np.pi, (0, 0, -2)),
+    ],
+)
+def test_axes(horizontal_rad: float, zenith_rad: float, expected: tuple[float, ...]) -> None:
+    """Horizontal angles run clockwise from x seen from above, zenith angles from straight up."""
+    np.testing.assert_allclose(polar_to_cartesian(horizontal_rad, zenith_rad, 2.0), expected, atol=1e-15)
+
+
+def test_both_faces_give_the_same_point() -> None:
+    """The instrument turned over (zenith above pi, horizontal angle turned by pi) sees the same point."""
+    np.testing.assert_allclose(
+        polar_to_cartesian(0.7 + np.pi, 2 * np.pi - 1.2, 30.0), polar_to_cartesian(0.7, 1.2, 30.0), atol=1e-13
+    )
+
+
+def test_field_data_formula(field_data: object) -> None:
+    """The authors' markers come out as in the formula beside their data, written with elevations."""
+    table = np.loadtxt(f"{field_data}/20220314/GCP.txt", delimiter=",", skiprows=1)
+    el, az, d = table[:, 3], table[:, 4], table[:, 5]
+    up = np.pi / 2 - el
+    expected = np.column_stack([d * np.cos(-az) * np.cos(up), d * np.sin(-az) * np.cos(up), d * np.sin(up)])
+    np.testing.assert_allclose(polar_to_cartesian(az, el, d), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "point", [(0, 0, 0), (0.0, -0.0, 3), (0, 0, -3), (-1, 0, 0), (-1, -0.0, 0), (1, 1e-20, 0)]
+)
+def test_cartesian_to_polar_at_the_seams(point: tuple[float, ...]) -> None:
+    """At the station, on the vertical and at the circle's zero the angles stay in their ranges and map back."""
+    h, z, d = cartesian_to_polar(point)
+    assert 0 <= h < 2 * np.pi
+    assert 0 <= z <= np.pi
+    np.testing.assert_allclose(polar_to_cartesian(h, z, d), point, atol=1e-15)
+
+
+def test_constant_is_not_scaled_by_ppm() -> None:
+    """100 ppm of 1000 m are 0.1 m; the constant is added as it is."""
+    assert corrected_distance(1000.0, constant_m=0.01, ppm=100.0) == pytest.approx(1000.11, abs=1e-12)
+
+
+def test_raw_distance_is_what_the_instrument_gave() -> None:
+    """raw_distance takes constant and scale off again."""
+    raw_m = np.array([0.0, 1.5, 812.3])
+    corrected_m = corrected_distance(raw_m, constant_m=-0.0344, ppm=-12.0)
+    np.testing.assert_allclose(raw_distance(corrected_m, constant_m=-0.0344, ppm=-12.0), raw_m, atol=1e-12)
+
+
+def test_polar_jacobian_agrees_with_differences() -> None:
+    """Each column is what central differences of polar_to_cartesian give."""
+    polar = np.random.default_rng(1).uniform((0, 0.1, 1), (6.2, 3.0, 100), size=(50, 3))
+    step = 1e-6
+    for column in range(3):
+        shift = step * np.eye(3)[column]
+        numeric = (polar_to_cartesian(*(polar + shift).T) - polar_to_cartesian(*(polar - shift).T)) / (
+            2 * step
+        )
+        # Truncation d step^2 / 6 and rounding d eps / step: below 2e-8 at 100 m.
+        np.testing.assert_allclose(polar_jacobian(*polar.T)[:, :, column], numeric, atol=5e-8)
+
+
+def test_cartesian_jacobian_inverts_polar_jacobian() -> None:
+    """The two Jacobians are each other's inverse, away from the vertical."""
+    polar = np.random.default_rng(2).uniform((0, 0.1, 1), (6.2, 3.0, 100), size=(50, 3))
+    product = cartesian_jacobian(polar_to_cartesian(*polar.T)) @ polar_jacobian(*polar.T)
+    np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), (50, 3, 3)), atol=1e-11)
+
+
+def test_cartesian_jacobian_refuses_the_vertical() -> None:
+    """Straight up there is no horizontal angle to differentiate."""
+    with pytest.raises(GeometryError, match="horizontal angle"):
+        cartesian_jacobian([(1.0, 0.0, 0.0), (0.0, 0.0, 5.0)])
+
+
+def test_covariance_is_the_angles_and_ranges_propagated() -> None:
+    """J diag(sigma^2) J' with the horizontal sigma over sin z, plus pointing, gives the same matrix."""
+    noise = InstrumentNoise(
+        range_sigma_m=0.002, range_sigma_ppm=20.0, angle_sigma_rad=1e-4, pointing_sigma_m=0.001
+    )
+    polar = np.random.default_rng(3).uniform((0, 0.1, 1), (6.2, 3.0, 500), size=(50, 3))
+    h, z, d = polar.T
+    J = polar_jacobian(h, z, d)
+    variances = np.stack(
+        [(1e-4 / np.sin(z)) ** 2, np.full(50, 1e-4**2), 0.002**2 + (20e-6 * d) ** 2], axis=-1
+    )
+    expected = (J * variances[:, None, :]) @ np.swapaxes(J, 1, 2) + 0.001**2 * np.eye(3)
+    np.testing.assert_allclose(measurement_covariance(h, z, d, noise), expected, rtol=1e-9, atol=1e-15)
+
+
+def test_covariance_straight_up_is_finite() -> None:
+    """At zenith 0 the noise across is distance x angle sigma in both directions, and the range noise is vertical."""
+    noise = InstrumentNoise(
+        range_sigma_m=0.002, range_sigma_ppm=0.0, angle_sigma_rad=1e-5, pointing_sigma_m=0.0
+    )
+    np.testing.assert_allclose(
+        measurement_covariance(0.3, 0.0, 100.0, noise), np.diag([1e-6, 1e-6, 4e-6]), atol=1e-18
+    )
+
+
+def test_noise_model_broadcasts_to_one_matrix_per_measurement() -> None:
+    """Arrays of angles and distances give a stack of matrices, each that of its measurement."""
+    h, z, d = np.array([[0.1, 2.0], [1.4, 1.6], [5.0, 70.0]])
+    together = measurement_covariance(h, z, d, TRACKING_NOISE)
+    np.testing.assert_array_equal(together[1], measurement_covariance(2.0, 1.6, 70.0, TRACKING_NOISE))

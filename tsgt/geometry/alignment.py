@@ -1,0 +1,372 @@
+"""Rigid alignment: the rotation and translation that bring one set of points closest to another.
+
+:func:`align` serves calibration: one set of any size, weighted, with covariance. :func:`align_triplets` and
+:func:`align_many` serve poses: one layout against very many measured sets, unweighted. For three points the
+optimum has a closed form, which :func:`align_triplets` evaluates; :func:`align_many` takes any number of points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.errors import DegenerateGeometryError, GeometryError
+from tsgt.geometry.rigid import rotate, skew, transform_from
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    from tsgt.geometry.rigid import FloatArray
+
+COLLINEAR_RATIO = 1e-6
+"""Points whose spread across their best line is less than this part of the spread along it lie in a line."""
+
+ROUNDING = 1e-12
+"""Spread below this part of the coordinates themselves is rounding, not geometry."""
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """The rigid transform that brings source points closest to target points.
+
+    Attributes
+    ----------
+    rotation
+        R, shape (3, 3): ``target = R source + t``. Always proper.
+    translation_m
+        t in m, shape (3,).
+    residuals_m
+        Target less transformed source in m, shape (n, 3).
+    rms_m
+        Root mean square of the lengths of the residuals in m, unweighted.
+    covariance
+        6x6 of (translation x, y, z in m; rotation about the target frame's fixed axes x, y, z in rad): the true
+        transform is ``[exp(dtheta) R | t + dt]``.
+    """
+
+    rotation: FloatArray
+    translation_m: FloatArray
+    residuals_m: FloatArray
+    rms_m: float
+    covariance: FloatArray
+
+    @property
+    def T(self) -> FloatArray:  # noqa: N802 (the field's name for a transform)
+        """4x4 transform ``T_target_source``."""
+        return transform_from(self.rotation, self.translation_m)
+
+
+@dataclass(frozen=True, slots=True)
+class BatchAlignment:
+    """The rigid transforms that bring one layout closest to each of N measured sets of its P points.
+
+    Attributes
+    ----------
+    rotation
+        Shape (N, 3, 3): ``point = R layout + t``. The identity where degenerate.
+    translation_m
+        In m, shape (N, 3).
+    residuals_m
+        Measured less transformed layout in m, shape (N, P, 3).
+    degenerate
+        The measured points coincide or lie in a line (beside the layout: to :data:`COLLINEAR_RATIO`), so that no
+        rotation follows from them. Shape (N,).
+    """
+
+    rotation: FloatArray
+    translation_m: FloatArray
+    residuals_m: FloatArray
+    degenerate: NDArray[np.bool_]
+
+
+def align(
+    source: ArrayLike,
+    target: ArrayLike,
+    *,
+    weights: ArrayLike | None = None,
+    covariances: ArrayLike | None = None,
+) -> Alignment:
+    """Weighted least-squares rigid alignment of two point sets (Arun et al. 1987; Umeyama 1991 for the sign).
+
+    Parameters
+    ----------
+    source
+        Points in the source frame in m, shape (n, 3), n >= 3.
+    target
+        The same points in the target frame in m, shape (n, 3).
+    weights
+        Positive weights of the points, shape (n,); equal when not given. Only their ratios count.
+    covariances
+        Covariance of each residual (of both points together) in the axes of the target frame in m^2, shape
+        (n, 3, 3). When not given, the noise is taken as isotropic with variances inverse to the weights, and its
+        size is estimated from the residuals, of which 3n - 6 are free.
+
+    Returns
+    -------
+    Alignment
+        The transform, its residuals and its covariance, which is of first order in the noise.
+
+    Raises
+    ------
+    DegenerateGeometryError
+        Fewer than three points, points that coincide or lie in a line, or a mirror image that fits equally well
+        in more than one way.
+    GeometryError
+        Shapes that do not match, numbers that are not finite, weights that are not positive.
+    """
+    source, target = _points(source, "source"), _points(target, "target")
+    n = len(source)
+    if len(target) != n:
+        raise GeometryError(f"alignment needs as many target as source points, got {len(target)} and {n}")
+    w = np.ones(n) if weights is None else np.asarray(weights, dtype=np.float64)
+    if w.shape != (n,) or not np.all((w > 0) & np.isfinite(w)):
+        raise GeometryError(f"alignment needs {n} positive weights, got {w.tolist()}")
+    check_spread(source, "source points")
+    check_spread(target, "target points")
+
+    w = w / w.sum()
+    source_mean, target_mean = w @ source, w @ target
+    cross_covariance = (w[:, None] * (source - source_mean)).T @ (target - target_mean)
+    u, s, vt = np.linalg.svd(cross_covariance)
+    sign = np.sign(np.linalg.det(u) * np.linalg.det(vt))
+    if s[1] + sign * s[2] <= ROUNDING * s[1]:
+        raise DegenerateGeometryError(
+            "the target points are a mirror image of the source points: no rotation fits best"
+        )
+    R = (vt.T * (1.0, 1.0, sign)) @ u.T
+    t = target_mean - R @ source_mean
+    residuals = target - (source @ R.T + t)
+
+    if covariances is None:
+        variance = float(w @ (residuals**2).sum(axis=1)) / (3 * n - 6)
+        point_covariances = (variance / w)[:, None, None] * np.eye(3)
+    else:
+        point_covariances = np.asarray(covariances, dtype=np.float64)
+        if point_covariances.shape != (n, 3, 3) or not np.isfinite(point_covariances).all():
+            raise GeometryError(
+                f"alignment needs {n} finite 3x3 covariances, got shape {point_covariances.shape}"
+            )
+    gain = fit_gain(source @ R.T, w)
+    return Alignment(
+        rotation=R,
+        translation_m=t,
+        residuals_m=residuals,
+        rms_m=float(np.sqrt((residuals**2).sum(axis=1).mean())),
+        covariance=(gain @ point_covariances @ np.swapaxes(gain, 1, 2)).sum(axis=0),
+    )
+
+
+def fit_gain(points: FloatArray, weights: FloatArray) -> FloatArray:
+    """How a small displacement of each point moves the rigid transform fitted to all of them.
+
+    Parameters
+    ----------
+    points
+        The points from the origin of the moved frame, in axes of one's choice, in m, shape (n, 3).
+    weights
+        Their weights in the fit, shape (n,).
+
+    Returns
+    -------
+    FloatArray
+        Shape (n, 6, 3). Summed over the points, gain times displacement is (translation of the moved frame's
+        origin, small rotation), in the same axes: the pseudo-inverse of ``[I, -skew(point)]``, in blocks.
+    """
+    w = weights / weights.sum()
+    mean = w @ points
+    arms = skew(points - mean)
+    # About the weighted mean, translation and rotation part; from the origin their normal matrix is badly
+    # conditioned as soon as the points are far away.
+    inertia = np.linalg.inv((w[:, None, None] * (np.swapaxes(arms, 1, 2) @ arms)).sum(axis=0))
+    rotation = inertia @ (w[:, None, None] * arms)
+    translation = w[:, None, None] * np.eye(3) + skew(mean) @ rotation
+    return np.concatenate([translation, rotation], axis=1)
+
+
+def align_triplets(layout: ArrayLike, points: ArrayLike) -> BatchAlignment:
+    """Closed-form alignment of three layout points with N measured triplets.
+
+    Parameters
+    ----------
+    layout
+        The three points in the body frame in m, shape (3, 3).
+    points
+        Measured triplets in the world frame in m, shape (N, 3, 3): item, point, coordinate.
+
+    Returns
+    -------
+    BatchAlignment
+        The same optimum as :func:`align_many`, to rounding.
+
+    Raises
+    ------
+    DegenerateGeometryError
+        The layout's points coincide or lie in a line. A degenerate measured triplet is marked instead.
+    GeometryError
+        Wrong shapes or numbers that are not finite.
+
+    Notes
+    -----
+    The optimum lays centroid on centroid and plane on plane, each triangle being seen in the same sense; what
+    remains is one angle in the plane. Let b1, b2, b3 be axes of the layout with b3 its normal, (u_i, v_i) its
+    points on b1, b2 from their centroid, and n the measured normal. With U = sum u_i p_i and V = sum v_i p_i, the
+    image r1 of b1 maximises U·r1 + V·(n x r1) = r1·(U - n x V), so r1 is the direction of U - n x V: neither
+    trigonometry nor a decomposition is needed.
+    """
+    layout = _points(layout, "layout")
+    if len(layout) != 3:
+        raise GeometryError(f"the closed form is for 3 points, the layout has {len(layout)}")
+    batch = _batch(points, 3)
+    check_spread(layout, "layout points")
+
+    layout_mean = (layout[0] + layout[1] + layout[2]) / 3
+    layout_normal = np.cross(layout[1] - layout[0], layout[2] - layout[0])
+    double_area = float(np.linalg.norm(layout_normal))
+    b3 = layout_normal / double_area
+    # b1 along the edge 0-1, so that both ends have the same v.
+    b1 = layout[1] - layout[0]
+    b1 = b1 / np.linalg.norm(b1)
+    b2 = np.cross(b3, b1)
+    u, v = (layout - layout_mean) @ b1, (layout - layout_mean) @ b2
+
+    # Coordinates first and items last: each step below is a few passes over contiguous rows.
+    p = np.ascontiguousarray(batch.transpose(1, 2, 0))
+    mean = (p[0] + p[1] + p[2]) / 3
+    edge_1, edge_2 = p[1] - p[0], p[2] - p[0]
+    normal = _cross(edge_1, edge_2)
+    normal_length = _norm(normal)
+    degenerate = normal_length <= COLLINEAR_RATIO * double_area
+    normal /= np.where(degenerate, 1.0, normal_length)
+    # The u_i and the v_i sum to zero, so that U and V follow from the edges.
+    U = u[1] * edge_1 + u[2] * edge_2
+    V = v[1] * edge_1 + v[2] * edge_2
+    r1 = U - _cross(normal, V)
+    r1 /= np.where(degenerate, 1.0, _norm(r1))
+    r2 = _cross(normal, r1)
+    if degenerate.any():
+        for axis, body_axis in ((r1, b1), (r2, b2), (normal, b3)):
+            axis[:, degenerate] = body_axis[:, None]
+
+    R = np.empty((3, 3, len(batch)))
+    for column in range(3):
+        R[:, column] = b1[column] * r1 + b2[column] * r2 + b3[column] * normal
+    residuals = np.empty_like(p)
+    for point in range(3):
+        residuals[point] = p[point] - mean - (u[point] * r1 + v[point] * r2)
+    translation = mean - (layout_mean[0] * R[:, 0] + layout_mean[1] * R[:, 1] + layout_mean[2] * R[:, 2])
+    # Contiguous, as a matrix product may round otherwise for another layout in memory, which depends on N here.
+    return BatchAlignment(
+        rotation=np.ascontiguousarray(R.transpose(2, 0, 1)),
+        translation_m=np.ascontiguousarray(translation.T),
+        residuals_m=np.ascontiguousarray(residuals.transpose(2, 0, 1)),
+        degenerate=degenerate,
+    )
+
+
+def align_many(layout: ArrayLike, points: ArrayLike) -> BatchAlignment:
+    """Alignment of a layout of any size with N measured sets, by one singular value decomposition each.
+
+    Parameters
+    ----------
+    layout
+        Points in the body frame in m, shape (P, 3), P >= 3.
+    points
+        Measured sets in the world frame in m, shape (N, P, 3).
+
+    Returns
+    -------
+    BatchAlignment
+        Least-squares transforms (Arun et al. 1987), equal weights.
+
+    Raises
+    ------
+    DegenerateGeometryError, GeometryError
+        As :func:`align_triplets`.
+    """
+    layout = _points(layout, "layout")
+    batch = _batch(points, len(layout))
+    check_spread(layout, "layout points")
+
+    body = layout - layout.mean(axis=0)
+    # One by one, as a sum over an axis may group its terms differently for one item than for many.
+    mean = sum((batch[:, i] for i in range(1, len(layout))), start=batch[:, 0]) / len(layout)
+    u, s, vt = np.linalg.svd(body.T @ (batch - mean[:, None]))
+    u_t, v = np.swapaxes(u, 1, 2), np.swapaxes(vt, 1, 2).copy()
+    sign = np.sign(np.linalg.det(u) * np.linalg.det(vt))
+    v[:, :, 2] *= sign[:, None]
+    degenerate = s[:, 1] + sign * s[:, 2] <= COLLINEAR_RATIO * len(layout) * spread_m(layout)[1] ** 2
+    R = np.where(degenerate[:, None, None], np.eye(3), v @ u_t)
+    translation = mean - rotate(R, layout.mean(axis=0))
+    residuals = batch - rotate(R[:, None], layout) - translation[:, None]
+    return BatchAlignment(rotation=R, translation_m=translation, residuals_m=residuals, degenerate=degenerate)
+
+
+def spread_m(points: FloatArray) -> FloatArray:
+    """Root mean square of points about their mean along their principal axes in m, largest first; shape (3,)."""
+    spread: FloatArray = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / np.sqrt(len(points))
+    return spread
+
+
+def check_spread(points: FloatArray, what: str) -> None:
+    """Refuse points that coincide or lie in a line.
+
+    Parameters
+    ----------
+    points
+        Finite points in m, shape (n, 3), n >= 3.
+    what
+        What they are, in the plural, for the message.
+
+    Raises
+    ------
+    DegenerateGeometryError
+        With the spread along and across their best line.
+    """
+    along_m, across_m, _ = spread_m(points)
+    rounding_m = ROUNDING * float(np.abs(points).max())
+    if along_m <= rounding_m:
+        raise DegenerateGeometryError(
+            f"the {len(points)} {what} coincide: expected at least three that span a triangle"
+        )
+    if across_m <= max(COLLINEAR_RATIO * along_m, rounding_m):
+        raise DegenerateGeometryError(
+            f"the {len(points)} {what} lie in a line: they spread {across_m:.2g} m across it over {along_m:.2g} m along "
+            f"it, a ratio of {across_m / along_m:.1g}, expected more than {COLLINEAR_RATIO:g}"
+        )
+
+
+def _points(points: ArrayLike, what: str) -> FloatArray:
+    """Point set of shape (n, 3), n >= 3, checked."""
+    array = np.asarray(points, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise GeometryError(f"{what} points have shape (n, 3), got {array.shape}")
+    if len(array) < 3:
+        raise DegenerateGeometryError(f"alignment needs at least 3 {what} points, got {len(array)}")
+    if not np.isfinite(array).all():
+        raise GeometryError(f"{what} points are finite numbers, got NaN or infinity")
+    return array
+
+
+def _batch(points: ArrayLike, count: int) -> FloatArray:
+    """Measured sets of shape (N, count, 3), checked."""
+    array = np.ascontiguousarray(points, dtype=np.float64)
+    if array.ndim != 3 or array.shape[1:] != (count, 3):
+        raise GeometryError(
+            f"measured points have shape (N, {count}, 3) as the layout has, got {array.shape}"
+        )
+    if not np.isfinite(array).all():
+        raise GeometryError("measured points are finite numbers, got NaN or infinity")
+    return array
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Cross products of vectors along the first axis."""
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def _norm(a: FloatArray) -> FloatArray:
+    """Lengths of vectors along the first axis."""
+    length: FloatArray = np.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
+    return length

@@ -1,0 +1,139 @@
+"""A prism's position between two of its measurements: a straight line in time, unless they are too far apart.
+
+Paper section III-C: linear interpolation of each prism to common epochs, invalid across an outage.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.errors import GeometryError
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    from tsgt.geometry.rigid import FloatArray
+
+NO_GAP_NS = -1
+"""``gap_ns`` of an epoch that has no sample before it or none after it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Interpolated:
+    """One prism at N epochs.
+
+    Attributes
+    ----------
+    points
+        Positions in m, shape (N, 3); 0 where invalid.
+    velocities_mps
+        Velocities along the straight lines in m/s, shape (N, 3); 0 where invalid.
+    after
+        Index of the first sample at or after the epoch, shape (N,); the number of samples where there is none. The
+        sample before is the one before it.
+    fraction
+        Where the epoch lies between the two, 0 exclusive to 1 inclusive, shape (N,); 0 where one of them is missing.
+    gap_ns
+        Time between the two in ns, shape (N,); :data:`NO_GAP_NS` where one of them is missing.
+    valid
+        Both samples are there, and not further apart than the outage limit; shape (N,).
+    """
+
+    points: FloatArray
+    velocities_mps: FloatArray
+    after: NDArray[np.int64]
+    fraction: FloatArray
+    gap_ns: NDArray[np.int64]
+    valid: NDArray[np.bool_]
+
+
+def interpolate(
+    times_ns: NDArray[np.int64], points: ArrayLike, epochs_ns: NDArray[np.int64], outage_limit_ns: int
+) -> Interpolated:
+    """Interpolate a prism's samples linearly to epochs.
+
+    Parameters
+    ----------
+    times_ns
+        Times of the samples in ns, strictly increasing, shape (M,). M may be 0.
+    points
+        Positions of the samples in m, shape (M, 3).
+    epochs_ns
+        Times to interpolate to in ns, shape (N,), in any order.
+    outage_limit_ns
+        Two samples further apart than this leave the time between them invalid; exactly as far is valid.
+
+    Returns
+    -------
+    Interpolated
+        One row per epoch. An epoch on a sample belongs to the interval that ends there, so that it is decided as
+        soon as that sample is known.
+
+    Raises
+    ------
+    GeometryError
+        Shapes that do not match, times that do not increase, positions that are not finite.
+    """
+    times_ns, epochs_ns = np.asarray(times_ns, dtype=np.int64), np.asarray(epochs_ns, dtype=np.int64)
+    points = np.asarray(points, dtype=np.float64)
+    if points.shape != (len(times_ns), 3):
+        raise GeometryError(
+            f"{len(times_ns)} sample times need positions of shape ({len(times_ns)}, 3), got {points.shape}"
+        )
+    if not np.isfinite(points).all():
+        raise GeometryError("sample positions are finite numbers, got NaN or infinity")
+    if np.any(np.diff(times_ns) <= 0):
+        raise GeometryError("sample times increase strictly: sort the samples and drop repeats first")
+
+    after = np.searchsorted(times_ns, epochs_ns, side="left")
+    bracketed = (after > 0) & (after < len(times_ns))
+    end = after[bracketed]
+    start = end - 1
+    gap_ns = np.full(len(epochs_ns), NO_GAP_NS)
+    gap_ns[bracketed] = times_ns[end] - times_ns[start]
+    # Differences of integers first: a Unix time in ns is beyond what a float64 resolves.
+    fraction = np.zeros(len(epochs_ns))
+    fraction[bracketed] = (epochs_ns[bracketed] - times_ns[start]) / gap_ns[bracketed]
+    valid = bracketed & (gap_ns <= outage_limit_ns)
+
+    end, before = after[valid], points[after[valid] - 1]
+    steps = points[end] - before
+    at_epochs, velocities_mps = np.zeros((2, len(epochs_ns), 3))
+    at_epochs[valid] = before + fraction[valid, None] * steps
+    velocities_mps[valid] = steps / (gap_ns[valid, None] * 1e-9)
+    return Interpolated(at_epochs, velocities_mps, after, fraction, gap_ns, valid)
+
+
+def interpolated_covariance(
+    cov_before: FloatArray,
+    cov_after: FloatArray,
+    fraction: FloatArray,
+    gap_ns: NDArray[np.int64],
+    acceleration_sigma_mps2: float,
+) -> FloatArray:
+    """Propagate the noise of two samples, and the curve that a straight line does not see, to an epoch.
+
+    Parameters
+    ----------
+    cov_before, cov_after
+        Covariances of the two samples in m^2, shape (N, 3, 3).
+    fraction
+        Where the epoch lies between them, 0 to 1, shape (N,).
+    gap_ns
+        Time between them in ns, shape (N,).
+    acceleration_sigma_mps2
+        One sigma per axis of the prism's acceleration, taken as constant between them: the line misses the curve by
+        a t_before t_after / 2.
+
+    Returns
+    -------
+    FloatArray
+        Shape (N, 3, 3), in m^2.
+    """
+    gap_s = np.asarray(gap_ns) * 1e-9
+    missed_m = acceleration_sigma_mps2 / 2 * (fraction * gap_s) * ((1 - fraction) * gap_s)
+    f = fraction[:, None, None]
+    return (1 - f) ** 2 * cov_before + f**2 * cov_after + (missed_m**2)[:, None, None] * np.eye(3)

@@ -1,0 +1,201 @@
+"""What a total station measures, as coordinates: polar to Cartesian and back, corrections, noise.
+
+The station frame is right-handed with z up. Horizontal angles run clockwise, seen from above, from the x axis;
+zenith angles run from straight up. All functions work element by element and broadcast; NaN passes through.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.errors import GeometryError
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from tsgt.geometry.rigid import FloatArray
+    from tsgt.model import InstrumentNoise
+
+
+def polar_to_cartesian(
+    horizontal_angle_rad: ArrayLike, zenith_angle_rad: ArrayLike, distance_m: ArrayLike
+) -> FloatArray:
+    """Point in the station frame of a polar measurement.
+
+    Parameters
+    ----------
+    horizontal_angle_rad
+        Horizontal angle in rad, clockwise.
+    zenith_angle_rad
+        Zenith angle in rad; above pi in the second face, where the horizontal angle is turned by pi: both faces
+        give the same point.
+    distance_m
+        Slope distance in m, corrected.
+
+    Returns
+    -------
+    FloatArray
+        x, y, z in m, shape (..., 3).
+    """
+    return np.asarray(distance_m)[..., None] * _direction(horizontal_angle_rad, zenith_angle_rad)
+
+
+def cartesian_to_polar(points: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """First-face polar coordinates of points in the station frame; inverse of :func:`polar_to_cartesian`.
+
+    Parameters
+    ----------
+    points
+        x, y, z in m, shape (..., 3).
+
+    Returns
+    -------
+    tuple of FloatArray
+        Horizontal angle in rad in [0, 2 pi), zenith angle in rad in [0, pi], distance in m, each of shape (...).
+        An angle that does not exist is 0: the horizontal angle straight up and down, both at the station itself.
+    """
+    x, y, z = np.moveaxis(np.asarray(points, dtype=np.float64), -1, 0)
+    horizontal_m = np.hypot(x, y)
+    around = np.where(horizontal_m == 0, 0.0, np.mod(np.arctan2(-y, x), 2 * np.pi))
+    # The remainder of a tiny negative angle rounds up to the full circle itself.
+    around = np.where(around >= 2 * np.pi, 0.0, around)
+    zenith_angle_rad = np.where((horizontal_m == 0) & (z == 0), 0.0, np.arctan2(horizontal_m, z))
+    return around, zenith_angle_rad, np.hypot(horizontal_m, z)
+
+
+def corrected_distance(slope_distance_m: ArrayLike, *, constant_m: float, ppm: float) -> FloatArray:
+    """Slope distance with atmospheric scale and prism constant applied.
+
+    Parameters
+    ----------
+    slope_distance_m
+        Raw slope distance in m.
+    constant_m
+        Prism or target constant in m, added. It is not scaled: it is a length of glass, not of air.
+    ppm
+        Atmospheric correction in 1e-6 of the raw distance.
+
+    Returns
+    -------
+    FloatArray
+        Corrected slope distance in m.
+    """
+    return np.asarray(slope_distance_m, dtype=np.float64) * (1 + ppm * 1e-6) + constant_m
+
+
+def raw_distance(distance_m: ArrayLike, *, constant_m: float, ppm: float) -> FloatArray:
+    """Raw slope distance in m that :func:`corrected_distance` turns into ``distance_m``."""
+    return (np.asarray(distance_m, dtype=np.float64) - constant_m) / (1 + ppm * 1e-6)
+
+
+def polar_jacobian(
+    horizontal_angle_rad: ArrayLike, zenith_angle_rad: ArrayLike, distance_m: ArrayLike
+) -> FloatArray:
+    """Differentiate :func:`polar_to_cartesian`.
+
+    Parameters
+    ----------
+    horizontal_angle_rad, zenith_angle_rad, distance_m
+        As there.
+
+    Returns
+    -------
+    FloatArray
+        Shape (..., 3, 3): rows x, y, z; columns horizontal angle, zenith angle, distance (m/rad, m/rad, 1).
+    """
+    h, z, d = np.broadcast_arrays(
+        *(np.asarray(a, dtype=np.float64) for a in (horizontal_angle_rad, zenith_angle_rad, distance_m))
+    )
+    sin_h, cos_h, sin_z, cos_z = np.sin(h), np.cos(h), np.sin(z), np.cos(z)
+    return np.stack(
+        [
+            np.stack([-d * sin_z * sin_h, -d * sin_z * cos_h, np.zeros_like(d)], axis=-1),
+            np.stack([d * cos_z * cos_h, -d * cos_z * sin_h, -d * sin_z], axis=-1),
+            np.stack([sin_z * cos_h, -sin_z * sin_h, cos_z], axis=-1),
+        ],
+        axis=-1,
+    )
+
+
+def cartesian_jacobian(points: ArrayLike) -> FloatArray:
+    """Differentiate :func:`cartesian_to_polar`: the inverse of :func:`polar_jacobian`.
+
+    Parameters
+    ----------
+    points
+        x, y, z in m, shape (..., 3).
+
+    Returns
+    -------
+    FloatArray
+        Shape (..., 3, 3): rows horizontal angle, zenith angle, distance; columns x, y, z (rad/m, rad/m, 1).
+
+    Raises
+    ------
+    GeometryError
+        A point lies straight above or below the station or in it: its horizontal angle has no derivative.
+    """
+    x, y, z = np.moveaxis(np.asarray(points, dtype=np.float64), -1, 0)
+    horizontal_m = np.hypot(x, y)
+    if np.any(horizontal_m == 0):
+        raise GeometryError(
+            "a point straight above or below the station has no horizontal angle to differentiate"
+        )
+    distance_m = np.hypot(horizontal_m, z)
+    square = distance_m**2
+    return np.stack(
+        [
+            np.stack([y / horizontal_m**2, -x / horizontal_m**2, np.zeros_like(x)], axis=-1),
+            np.stack(
+                [x * z / (horizontal_m * square), y * z / (horizontal_m * square), -horizontal_m / square],
+                axis=-1,
+            ),
+            np.stack([x / distance_m, y / distance_m, z / distance_m], axis=-1),
+        ],
+        axis=-2,
+    )
+
+
+def measurement_covariance(
+    horizontal_angle_rad: ArrayLike,
+    zenith_angle_rad: ArrayLike,
+    distance_m: ArrayLike,
+    noise: InstrumentNoise,
+) -> FloatArray:
+    """Covariance of a measured point in the station frame.
+
+    Parameters
+    ----------
+    horizontal_angle_rad, zenith_angle_rad, distance_m
+        The measurement, as in :func:`polar_to_cartesian`.
+    noise
+        One sigma of the instrument. The range's constant and ppm parts are independent and add as variances.
+
+    Returns
+    -------
+    FloatArray
+        Shape (..., 3, 3), in m^2.
+
+    Notes
+    -----
+    The horizontal angle's own noise is the angle sigma over sin(zenith angle), and the point moves by
+    distance x sin(zenith angle) per rad of it. The sines cancel: across the line of sight the noise is
+    distance x angle sigma in all directions, straight up as well, and only the line of sight has to be known.
+    """
+    distance_m = np.asarray(distance_m, dtype=np.float64)
+    direction = _direction(horizontal_angle_rad, zenith_angle_rad)
+    along = noise.range_sigma_m**2 + (noise.range_sigma_ppm * 1e-6 * distance_m) ** 2
+    across = (noise.angle_sigma_rad * distance_m) ** 2
+    outer = direction[..., :, None] * direction[..., None, :]
+    isotropic = (across + noise.pointing_sigma_m**2)[..., None, None] * np.eye(3)
+    return isotropic + (along - across)[..., None, None] * outer
+
+
+def _direction(horizontal_angle_rad: ArrayLike, zenith_angle_rad: ArrayLike) -> FloatArray:
+    """Give the unit vector of the line of sight in the station frame, shape (..., 3)."""
+    h, z = np.broadcast_arrays(
+        np.asarray(horizontal_angle_rad, dtype=np.float64), np.asarray(zenith_angle_rad, dtype=np.float64)
+    )
+    return np.stack([np.sin(z) * np.cos(h), -np.sin(z) * np.sin(h), np.cos(z)], axis=-1)

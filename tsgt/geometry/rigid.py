@@ -1,0 +1,247 @@
+"""Rotations and rigid transforms.
+
+``T_a_b`` maps coordinates in frame b to frame a. All functions broadcast over leading dimensions, and they give
+the same bits for an item alone as for the same item in a batch: element by element, no reduction over a batch.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsgt.errors import GeometryError
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+FloatArray = NDArray[np.float64]
+
+RIGID_TOLERANCE = 1e-6
+"""How far a rotation matrix may be from orthonormal: six decimals, as people type them into a file."""
+
+
+def skew(v: FloatArray) -> FloatArray:
+    """Matrix of the cross product: ``skew(v) @ p`` is ``v`` x ``p``.
+
+    Parameters
+    ----------
+    v
+        Vectors, shape (..., 3).
+
+    Returns
+    -------
+    FloatArray
+        Skew-symmetric matrices, shape (..., 3, 3).
+    """
+    v = np.asarray(v, dtype=np.float64)
+    matrix = np.zeros((*v.shape, 3))
+    matrix[..., 0, 1], matrix[..., 0, 2], matrix[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    matrix[..., 1, 0], matrix[..., 2, 0], matrix[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return matrix
+
+
+def exp_so3(w: FloatArray) -> FloatArray:
+    """Rotation matrix of a rotation vector (Rodrigues' formula).
+
+    Parameters
+    ----------
+    w
+        Rotation vectors in rad, shape (..., 3): the axis, as long as the angle.
+
+    Returns
+    -------
+    FloatArray
+        Rotation matrices, shape (..., 3, 3).
+    """
+    w = np.asarray(w, dtype=np.float64)
+    angle_rad = np.sqrt(dot(w, w))[..., None, None]
+    # sin(a)/a and (1 - cos(a))/a^2, the latter by the half angle: smooth through zero without a branch.
+    first = np.sinc(angle_rad / np.pi)
+    second = 0.5 * np.sinc(angle_rad / (2 * np.pi)) ** 2
+    outer = w[..., :, None] * w[..., None, :]
+    return np.eye(3) + first * skew(w) + second * (outer - angle_rad**2 * np.eye(3))
+
+
+def log_so3(R: FloatArray) -> FloatArray:
+    """Rotation vector of a rotation matrix; inverse of :func:`exp_so3`.
+
+    Parameters
+    ----------
+    R
+        Rotation matrices, shape (..., 3, 3).
+
+    Returns
+    -------
+    FloatArray
+        Rotation vectors in rad, shape (..., 3), of length 0 to pi. At exactly pi the axis has two signs; either
+        may come.
+    """
+    # By way of the quaternion, which is well conditioned at every angle; the trace is not, near 0 and near pi.
+    q = quaternion_from_rotation(R)
+    sine, cosine = np.sqrt(dot(q[..., :3], q[..., :3])), q[..., 3]
+    small = sine < np.finfo(np.float64).tiny
+    scale = np.where(small, 2.0, 2.0 * np.arctan2(sine, cosine) / np.where(small, 1.0, sine))
+    return scale[..., None] * q[..., :3]
+
+
+def quaternion_from_rotation(R: FloatArray) -> FloatArray:
+    """Give the unit quaternion of a rotation matrix (Shepperd 1978: divide by the largest of the four).
+
+    Parameters
+    ----------
+    R
+        Rotation matrices, shape (..., 3, 3).
+
+    Returns
+    -------
+    FloatArray
+        Hamilton quaternions x, y, z, w with w >= 0, shape (..., 4).
+    """
+    R = np.asarray(R, dtype=np.float64)
+    xx, yy, zz = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
+    xy, xz, yz = R[..., 0, 1] + R[..., 1, 0], R[..., 0, 2] + R[..., 2, 0], R[..., 1, 2] + R[..., 2, 1]
+    xw, yw, zw = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
+    diagonal = np.stack([1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz, 1 + xx + yy + zz], axis=-1)
+    # Four times the outer product of the quaternion with itself: each row is the quaternion, scaled.
+    rows = np.stack(
+        [
+            np.stack([diagonal[..., 0], xy, xz, xw], axis=-1),
+            np.stack([xy, diagonal[..., 1], yz, yw], axis=-1),
+            np.stack([xz, yz, diagonal[..., 2], zw], axis=-1),
+            np.stack([xw, yw, zw, diagonal[..., 3]], axis=-1),
+        ],
+        axis=-2,
+    )
+    largest = np.argmax(diagonal, axis=-1)[..., None, None]
+    q: FloatArray = np.take_along_axis(rows, largest, axis=-2)[..., 0, :]
+    length = np.sqrt(q[..., 0] ** 2 + q[..., 1] ** 2 + q[..., 2] ** 2 + q[..., 3] ** 2)
+    return q / np.where(q[..., 3] < 0, -length, length)[..., None]
+
+
+def rotation_from_quaternion(q: FloatArray) -> FloatArray:
+    """Rotation matrix of a quaternion, which need not have unit length.
+
+    Parameters
+    ----------
+    q
+        Hamilton quaternions x, y, z, w, shape (..., 4).
+
+    Returns
+    -------
+    FloatArray
+        Rotation matrices, shape (..., 3, 3).
+
+    Raises
+    ------
+    GeometryError
+        A quaternion is zero or not finite.
+    """
+    q = np.asarray(q, dtype=np.float64)
+    x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    square = x * x + y * y + z * z + w * w
+    if not np.all((square > 0) & np.isfinite(square)):
+        raise GeometryError("a quaternion is zero or not finite: expected x, y, z, w of length 1")
+    s = 2 / square
+    return np.stack(
+        [
+            np.stack([1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)], axis=-1),
+            np.stack([s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w)], axis=-1),
+            np.stack([s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y)], axis=-1),
+        ],
+        axis=-2,
+    )
+
+
+def transform_from(R: FloatArray, t: FloatArray) -> FloatArray:
+    """4x4 transform of a rotation and a translation.
+
+    Parameters
+    ----------
+    R
+        Rotation matrices, shape (..., 3, 3).
+    t
+        Translations in m, shape (..., 3).
+
+    Returns
+    -------
+    FloatArray
+        Transforms, shape (..., 4, 4): ``p_a = R p_b + t``.
+    """
+    R, t = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64)
+    T = np.zeros((*np.broadcast_shapes(R.shape[:-2], t.shape[:-1]), 4, 4))
+    T[..., :3, :3] = R
+    T[..., :3, 3] = t
+    T[..., 3, 3] = 1.0
+    return T
+
+
+def invert(T: FloatArray) -> FloatArray:
+    """Inverse of rigid transforms, ``T_b_a`` of ``T_a_b``; shapes (..., 4, 4)."""
+    T = np.asarray(T, dtype=np.float64)
+    R_inverse = np.swapaxes(T[..., :3, :3], -1, -2)
+    return transform_from(R_inverse, -rotate(R_inverse, T[..., :3, 3]))
+
+
+def rotate(R: FloatArray, v: FloatArray) -> FloatArray:
+    """Rotate vectors: ``R v`` for matrices (..., 3, 3) and vectors (..., 3), broadcast over the leading dimensions."""
+    x, y, z = v[..., 0, None], v[..., 1, None], v[..., 2, None]
+    return R[..., :, 0] * x + R[..., :, 1] * y + R[..., :, 2] * z
+
+
+def transform_points(T: FloatArray, points: FloatArray) -> FloatArray:
+    """Coordinates in frame a of points given in frame b.
+
+    Parameters
+    ----------
+    T
+        Rigid transforms ``T_a_b``, shape (..., 4, 4).
+    points
+        Points in frame b in m, shape (..., 3). The leading dimensions of the two are broadcast: one transform with
+        many points, or each point with its own.
+
+    Returns
+    -------
+    FloatArray
+        Points in frame a in m, shape (..., 3).
+    """
+    T, points = np.asarray(T, dtype=np.float64), np.asarray(points, dtype=np.float64)
+    return rotate(T[..., :3, :3], points) + T[..., :3, 3]
+
+
+def check_transform(T: ArrayLike) -> None:
+    """Refuse what is not one rigid transform.
+
+    Parameters
+    ----------
+    T
+        Expected: shape (4, 4), a proper rotation, last row 0 0 0 1.
+
+    Raises
+    ------
+    GeometryError
+        Wrong shape, not finite, last row wrong, not orthonormal to :data:`RIGID_TOLERANCE`, or mirrored.
+    """
+    matrix = np.asarray(T, dtype=np.float64)
+    if matrix.shape != (4, 4):
+        raise GeometryError(f"a rigid transform has 4x4 numbers, got {'x'.join(map(str, matrix.shape))}")
+    if not np.isfinite(matrix).all():
+        raise GeometryError("a rigid transform has finite numbers only, got NaN or infinity")
+    if not np.array_equal(matrix[3], (0, 0, 0, 1)):
+        raise GeometryError(f"the last row of a rigid transform is 0 0 0 1, got {matrix[3].tolist()}")
+    R = matrix[:3, :3]
+    error = float(np.abs(R.T @ R - np.eye(3)).max())
+    if error > RIGID_TOLERANCE:
+        raise GeometryError(
+            f"the rotation of a rigid transform is orthonormal, this one is off by {error:.1e}"
+        )
+    if np.linalg.det(R) < 0:
+        raise GeometryError(
+            "the rotation of a rigid transform is right-handed, this one mirrors: is an axis negated?"
+        )
+
+
+def dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Dot products of 3-vectors along the last axis; written out, so that a batch gives the bits of one item."""
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]

@@ -29,6 +29,10 @@ ROBOT_FRAME = "robot"
 ARCSECOND_RAD = math.pi / 648_000
 
 
+LAST_INSTANT_NS = 2**63 - 1
+"""Times are kept in 64 bits; 2262 is the year that they end in."""
+
+
 class Status(StrEnum):
     """What the instrument said of a measurement, in one vocabulary for all makes."""
 
@@ -102,6 +106,10 @@ class PolarMeasurement:
     host_time_ns: int
     instrument_time_ns: int | None = None
 
+    def __post_init__(self) -> None:
+        """Refuse instants that no clock shows."""
+        _check_instants(self.stamp_ns, self.received_ns, self.host_time_ns)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PointMeasurement:
@@ -137,6 +145,10 @@ class PointMeasurement:
     received_ns: int
     position_m: Vector3
     status: Status = Status.OK
+
+    def __post_init__(self) -> None:
+        """Refuse instants that no clock shows."""
+        _check_instants(self.stamp_ns, self.received_ns)
 
 
 Measurement = PolarMeasurement | PointMeasurement
@@ -293,3 +305,9 @@ class Parameters:
     stations: tuple[StationParameters, ...]
     prisms: tuple[PrismPosition, ...]
     pipeline: PipelineParameters = PipelineParameters()
+
+
+def _check_instants(*times_ns: int) -> None:
+    for time_ns in times_ns:
+        if not 0 <= time_ns <= LAST_INSTANT_NS:
+            raise ValueError(f"a time of {time_ns} ns is outside what a clock can show")

@@ -1,0 +1,78 @@
+"""How a program ends when it is told to: real signals to real processes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PROGRAM = """
+import asyncio
+from tsgt.service import run
+
+async def main():
+    print("running", flush=True)
+    try:
+        await asyncio.sleep(60)
+    finally:
+        await asyncio.sleep(0)
+        print("cleaned up", flush=True)
+
+run(main)
+"""
+
+SUMMING_UP = """
+import asyncio
+from tsgt.service import run
+
+async def main():
+    print("running", flush=True)
+    try:
+        await asyncio.sleep(60)
+    except asyncio.CancelledError:
+        return "summary"
+
+print(run(main))
+"""
+
+
+def ended_by(number: signal.Signals, program: str) -> tuple[int, list[str]]:
+    """Run a program, send it a signal when it runs, return its exit code and its output."""
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    with subprocess.Popen(
+        [sys.executable, "-c", program],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        env=environment,
+    ) as process:
+        assert process.stdout is not None
+        lines = [process.stdout.readline()]
+        process.send_signal(number)
+        try:
+            rest, _ = process.communicate(timeout=1.0)
+        finally:
+            process.kill()
+        return process.returncode, (lines[0] + rest).splitlines()
+
+
+def test_sigterm_ends_a_service_cleanly() -> None:
+    """SIGTERM cancels the program, its clean-up runs, and the exit code is that of success, within a second."""
+    assert ended_by(signal.SIGTERM, PROGRAM) == (0, ["running", "cleaned up"])
+
+
+def test_sigint_ends_a_program_cleanly() -> None:
+    """SIGINT does the same and then counts as an interruption."""
+    code, lines = ended_by(signal.SIGINT, PROGRAM)
+    assert lines == ["running", "cleaned up"]
+    assert code == -signal.SIGINT
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM])
+def test_program_may_sum_up(number: signal.Signals) -> None:
+    """A program that catches the cancellation may return its result."""
+    assert ended_by(number, SUMMING_UP) == (0, ["running", "summary"])

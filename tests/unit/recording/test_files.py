@@ -1,0 +1,81 @@
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tsgt.errors import InputFileError, OutputFileError
+from tsgt.recording import write_atomically
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def test_result_appears_at_the_end_only(tmp_path: Path) -> None:
+    """Until the block has ended, the old file is there."""
+    path = tmp_path / "poses.tum"
+    path.write_bytes(b"old")
+    with write_atomically(path) as file:
+        file.write(b"new")
+        file.flush()
+        assert path.read_bytes() == b"old"
+    assert path.read_bytes() == b"new"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_failure_leaves_everything_as_it_was(tmp_path: Path) -> None:
+    """An error in the block, of whatever kind, passes through and leaves the old file and nothing else."""
+    path = tmp_path / "poses.tum"
+    path.write_bytes(b"old")
+    with pytest.raises(InputFileError), write_atomically(path) as file:  # noqa: PT012 (the block fails halfway)
+        file.write(b"half")
+        raise InputFileError("broken", path=tmp_path / "input.csv")
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_missing_folder_is_one_line(tmp_path: Path) -> None:
+    """A folder that does not exist is an error that names the result."""
+    path = tmp_path / "nowhere" / "poses.tum"
+    refused = pytest.raises(OutputFileError, match=rf"^{path}: cannot be written \(No such file")
+    with refused as raised, write_atomically(path):
+        pass
+    assert raised.value.path == path
+
+
+def test_full_disk_is_one_line(tmp_path: Path) -> None:
+    """A write that finds no room is an error that names the result."""
+    refused = pytest.raises(OutputFileError, match=r"poses.tum: cannot be written \(No space left")
+    with refused, write_atomically(tmp_path / "poses.tum"):
+        raise OSError(28, "No space left on device")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_error_about_another_file_is_not_ours(tmp_path: Path) -> None:
+    """An input that is missing is not reported as a result that cannot be written."""
+    with pytest.raises(FileNotFoundError, match=r"input\.csv"), write_atomically(tmp_path / "poses.tum"):
+        (tmp_path / "input.csv").open()
+
+
+def test_device_is_written_not_replaced(tmp_path: Path) -> None:
+    """A pipe (as /dev/stdout or /dev/null may be) gets the bytes and stays what it is."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    reading = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        with write_atomically(pipe) as file:
+            file.write(b"poses")
+        assert os.read(reading, 100) == b"poses"
+    finally:
+        os.close(reading)
+    assert pipe.is_fifo()
+
+
+def test_symbolic_link_stays(tmp_path: Path) -> None:
+    """A result behind a symbolic link is replaced there."""
+    (tmp_path / "link").symlink_to(tmp_path / "target")
+    with write_atomically(tmp_path / "link") as file:
+        file.write(b"poses")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "target").read_bytes() == b"poses"

@@ -1,0 +1,64 @@
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+from support.records import EVENT, HEADER, HELLO, NO_POSE, PARAMETERS, POINT, POSE, STATUS, measurement
+
+from tsgt.model import PolarMeasurement
+from tsgt.recording import decode, encode_line
+
+
+@pytest.mark.parametrize(
+    "record",
+    [HEADER, PARAMETERS, HELLO, measurement(3), POINT, POSE, NO_POSE, STATUS, EVENT],
+    ids=lambda r: r.type,
+)
+def test_record_comes_back_as_it_was(record: object) -> None:
+    """A record of any type is equal to itself after a way through bytes."""
+    assert decode(type(record), encode_line(record)) == record
+
+
+def test_line_is_one_line() -> None:
+    """An encoded record has no line end, whatever its texts hold."""
+    assert b"\n" not in encode_line(HEADER.__class__(software="a\nb", created_ns=0, source="\u2028\r\n"))
+
+
+def test_unknown_keys_are_passed_over() -> None:
+    """A newer writer may add keys."""
+    data = json.loads(encode_line(measurement(1))) | {"colour": "red"}
+    assert decode(PolarMeasurement, json.dumps(data).encode()) == measurement(1)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("station", "1"),
+        ("stamp_ns", 1.5),
+        ("slope_distance_m", math.nan),
+        ("status", "fine"),
+        ("type", "point"),
+    ],
+)
+def test_wrong_value_is_named(key: str, value: object) -> None:
+    """The error of a field with a wrong value names the field and stays on one line."""
+    data = json.loads(encode_line(measurement(1))) | {key: value}
+    with pytest.raises(ValueError, match=rf"^field {key}: [^\n]+$"):
+        decode(PolarMeasurement, json.dumps(data).encode())
+
+
+def test_missing_field_is_named() -> None:
+    """The error of a missing field names it."""
+    data = json.loads(encode_line(measurement(1)))
+    del data["zenith_angle_rad"]
+    with pytest.raises(ValueError, match=r"^field zenith_angle_rad: Field required$"):
+        decode(PolarMeasurement, json.dumps(data).encode())
+
+
+@pytest.mark.parametrize("stamp_ns", [-1, 2**63])
+def test_an_instant_that_no_clock_shows_is_refused(stamp_ns: int) -> None:
+    """Times are kept in 64 bits and begin in 1970; anything else is a broken line, not a measurement."""
+    line = b'{"type":"point","station":1,"prism":1,"sequence":0,"stamp_ns":%d,"received_ns":1,"position_m":[0,0,0]}'
+    with pytest.raises(ValueError, match="outside what a clock can show"):
+        decode(PointMeasurement, line % stamp_ns)

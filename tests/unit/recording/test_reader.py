@@ -1,0 +1,211 @@
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import pytest
+from support.records import (
+    EVENT,
+    HEADER,
+    NO_POSE,
+    PARAMETERS,
+    POINT,
+    POSE,
+    SECOND,
+    START,
+    STATUS,
+    measurement,
+    recording_bytes,
+)
+
+from tsgt.errors import CorruptLineError, RecordingError, RecordingVersionError
+from tsgt.recording import encode_line, load_recording, read_lines
+from tsgt.recording.format import MAX_LINE_BYTES
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """Where the recording is."""
+    return tmp_path / "r.jsonl"
+
+
+def test_measurements_come_in_order_of_arrival(path: Path) -> None:
+    """Loading gives header, parameters and the measurements of both kinds as they stand in the file."""
+    path.write_bytes(recording_bytes(measurement(1), POINT, POSE, measurement(0)))
+    recording = load_recording(path)
+    assert recording.header == HEADER
+    assert recording.parameters == PARAMETERS
+    assert recording.measurements == [measurement(1), POINT, measurement(0)]
+
+
+@pytest.mark.parametrize(
+    ("records", "end_ns"),
+    [
+        ([], None),
+        ([NO_POSE], None),
+        ([measurement(5), measurement(0)], START + 2_100_000_000),
+        ([measurement(0), STATUS], START + 2 * SECOND),
+        ([EVENT, measurement(0)], START + 3 * SECOND),
+        ([POINT], START + SECOND),
+    ],
+    ids=["empty", "pose", "measurements", "status", "event", "point"],
+)
+def test_end_is_the_latest_time_known(path: Path, records: list[object], end_ns: int | None) -> None:
+    """Arrivals, status and events tell how far the recording goes; poses do not."""
+    path.write_bytes(recording_bytes(*records))
+    assert load_recording(path).end_ns == end_ns
+
+
+def test_last_parameters_are_in_force(path: Path) -> None:
+    """Of several parameters lines the last one counts, of several headers the first."""
+    later = PARAMETERS.__class__(stations=PARAMETERS.stations, prisms=PARAMETERS.prisms[:2])
+    second = HEADER.__class__(software="other", created_ns=1, source="later session")
+    path.write_bytes(recording_bytes(measurement(0), second, later, measurement(1)))
+    recording = load_recording(path)
+    assert recording.parameters == later
+    assert recording.header == HEADER
+
+
+def test_unknown_types_are_passed_over(path: Path) -> None:
+    """Lines of a type that nobody knows come from read_lines and do not disturb load_recording."""
+    path.write_bytes(recording_bytes(measurement(0)) + b'{"type":"weather","wind":"strong"}\n')
+    assert [line.type for line in read_lines(path)] == ["recording", "parameters", "measurement", "weather"]
+    assert load_recording(path).measurements == [measurement(0)]
+
+
+def test_line_keeps_number_and_bytes(path: Path) -> None:
+    """A line comes as it stands in the file, with its number."""
+    path.write_bytes(recording_bytes(POSE))
+    assert list(read_lines(path))[2] == (3, "pose", encode_line(POSE))
+
+
+def test_torn_last_line_is_reported_and_skipped(path: Path) -> None:
+    """A last line without its end is no error; whoever asked is told its number."""
+    path.write_bytes(recording_bytes(measurement(0), measurement(1))[:-20])
+    problems: list[RecordingError] = []
+    assert load_recording(path, on_problem=problems.append).measurements == [measurement(0)]
+    assert [(problem.line, "torn" in str(problem)) for problem in problems] == [(4, True)]
+
+
+def test_last_line_without_newline_counts(path: Path) -> None:
+    """A last line that lacks nothing but the newline is read, and nothing is reported."""
+    path.write_bytes(recording_bytes(measurement(0)).rstrip())
+    problems: list[RecordingError] = []
+    assert load_recording(path, on_problem=problems.append).measurements == [measurement(0)]
+    assert problems == []
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        b"",
+        b"garbage",
+        b'{"type":"pose",',
+        b'["pose"]',
+        b'{"kind":"pose"}',
+        b'{"type":5}',
+        b'{"type":"weather","text":"\xff\xfe"}',
+        b"\0" * 100,
+        encode_line(measurement(1)).replace(b'"station":1', b'"station":"one"'),
+        b'{"type":"recording","version":1}',
+        b'{"type":"status"}',
+    ],
+    ids=[
+        "blank",
+        "garbage",
+        "cut",
+        "array",
+        "no-type",
+        "number-type",
+        "not-utf8",
+        "zeros",
+        "field",
+        "header",
+        "no-stamp",
+    ],
+)
+class TestCorruptLine:
+    def write(self, path: Path, bad: bytes) -> None:
+        """Put the corrupt line in the middle of good ones."""
+        path.write_bytes(recording_bytes(measurement(0)) + bad + b"\n" + encode_line(measurement(2)) + b"\n")
+
+    def test_is_an_error_with_its_number(self, path: Path, bad: bytes) -> None:
+        """A corrupt line in the middle ends the reading with one line that names file and line number."""
+        self.write(path, bad)
+        with pytest.raises(CorruptLineError, match=r"^[^\n]*r\.jsonl, line 4: [^\n]+$") as raised:
+            load_recording(path)
+        assert raised.value.line == 4
+
+    def test_is_skipped_when_asked(self, path: Path, bad: bytes) -> None:
+        """With keep_going the line is reported and the rest is read."""
+        self.write(path, bad)
+        problems: list[RecordingError] = []
+        recording = load_recording(path, keep_going=True, on_problem=problems.append)
+        assert recording.measurements == [measurement(0), measurement(2)]
+        assert [problem.line for problem in problems] == [4]
+
+
+def test_line_that_is_too_long_is_one_problem(path: Path) -> None:
+    """An overlong line is neither kept in memory nor does it shift the numbers of the lines after it."""
+    long = b'{"type":"' + b"x" * (2 * MAX_LINE_BYTES + 5) + b'"}\n'
+    path.write_bytes(recording_bytes() + long + encode_line(POSE) + b"\n")
+    problems: list[RecordingError] = []
+    lines = list(read_lines(path, keep_going=True, on_problem=problems.append))
+    assert [line.number for line in lines] == [1, 2, 4]
+    assert ["is longer than 1048576 bytes" in str(problem) for problem in problems] == [True]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"\n",
+        b"1.0 2.0 3.0 4.0\n",
+        b"\x7fELF\0\xff\xfe",
+        encode_line(POSE) + b"\n",
+        b'{"type":"recording"}\n',
+    ],
+    ids=["empty", "blank", "text", "binary", "no-header", "half-header"],
+)
+def test_file_without_header_is_refused(path: Path, content: bytes) -> None:
+    """What does not begin with a header is no recording, not even with keep_going."""
+    path.write_bytes(content)
+    with pytest.raises(RecordingError, match=r"^[^\n]*header of a recording[^\n]*$"):
+        load_recording(path, keep_going=True)
+
+
+def test_empty_file_is_refused_by_read_lines(path: Path) -> None:
+    """Reading lines from an empty file is the same error as loading it."""
+    path.touch()
+    with pytest.raises(RecordingError, match="header of a recording"):
+        list(read_lines(path))
+
+
+def test_other_version_is_refused(path: Path) -> None:
+    """A header of another version is an error that names both versions, with keep_going as well."""
+    header = json.loads(encode_line(HEADER)) | {"version": 7}
+    path.write_bytes(json.dumps(header).encode() + b"\n")
+    with pytest.raises(RecordingVersionError, match=r"version 7, this program reads version 1"):
+        load_recording(path, keep_going=True)
+
+
+def test_recording_without_parameters_is_refused(path: Path) -> None:
+    """Without parameters nothing can be computed."""
+    path.write_bytes(encode_line(HEADER) + b"\n" + encode_line(measurement(0)) + b"\n")
+    with pytest.raises(RecordingError, match="holds no parameters"):
+        load_recording(path)
+
+
+def test_missing_file_is_one_line(tmp_path: Path) -> None:
+    """A path with nothing there is an error of ours that names it."""
+    with pytest.raises(RecordingError, match=r"nowhere\.jsonl: cannot be read \(No such file"):
+        load_recording(tmp_path / "nowhere.jsonl")
+
+
+def test_folder_is_one_line(tmp_path: Path) -> None:
+    """A folder in place of the file is an error of ours."""
+    with pytest.raises(RecordingError, match=r"cannot be read \(Is a directory"):
+        load_recording(tmp_path)

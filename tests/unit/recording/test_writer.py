@@ -1,0 +1,228 @@
+from __future__ import annotations
+
+import json
+import os
+import resource
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from support.records import HEADER, PARAMETERS, measurement, recording_bytes
+
+from tsgt.errors import RecordingError, RecordingVersionError
+from tsgt.recording import RecordingWriter, encode_line, load_recording
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """Where the recording is."""
+    return tmp_path / "r.jsonl"
+
+
+@pytest.fixture
+def writer(path: Path) -> Iterator[RecordingWriter]:
+    """Open a new recording with its first two lines."""
+    with RecordingWriter(path) as opened:
+        opened.write(HEADER)
+        opened.write(PARAMETERS)
+        yield opened
+
+
+def limit_file_size(size: int | None) -> None:
+    """Let no file of this process grow beyond a size: a disk that fills up, without a disk."""
+    _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (hard if size is None else size, hard))
+
+
+@pytest.fixture
+def full_disk(path: Path, writer: RecordingWriter) -> Iterator[None]:  # noqa: ARG001 (after the writer's first lines)
+    """Room for thirty more bytes."""
+    limit_file_size(path.stat().st_size + 30)
+    yield
+    limit_file_size(None)
+
+
+def test_line_is_with_the_kernel_at_once(path: Path, writer: RecordingWriter) -> None:
+    """A written line can be read before any sync or close."""
+    writer.write(measurement(0))
+    writer.write_line(encode_line(measurement(1)))
+    assert path.read_bytes() == recording_bytes(measurement(0), measurement(1))
+
+
+def test_line_is_one_write(writer: RecordingWriter, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A line goes to the kernel in a single call, line end included."""
+    written: list[bytes] = []
+
+    def write(_: int, data: bytes) -> int:
+        written.append(bytes(data))
+        return len(data)
+
+    monkeypatch.setattr(os, "write", write)
+    writer.write(measurement(0))
+    assert written == [encode_line(measurement(0)) + b"\n"]
+
+
+def test_mode_is_0644(path: Path) -> None:
+    """A new file can be read by everyone and written by its owner."""
+    before = os.umask(0o022)
+    try:
+        RecordingWriter(path).close()
+    finally:
+        os.umask(before)
+    assert path.stat().st_mode & 0o777 == 0o644
+
+
+def test_session_is_appended(path: Path) -> None:
+    """Opening a recording again keeps what is there."""
+    path.write_bytes(recording_bytes(measurement(0)))
+    with RecordingWriter(path) as writer:
+        writer.write(measurement(1))
+        assert writer.cut_bytes == 0
+    assert load_recording(path).measurements == [measurement(0), measurement(1)]
+
+
+def test_torn_tail_is_cut_off(path: Path) -> None:
+    """A torn last line is removed when the file is opened for writing, and its length is told."""
+    path.write_bytes(recording_bytes(measurement(0)) + b'{"type":"measurem')
+    with RecordingWriter(path) as writer:
+        writer.write(measurement(1))
+        assert writer.cut_bytes == 17
+    assert path.read_bytes() == recording_bytes(measurement(0), measurement(1))
+
+
+def test_torn_tail_of_zeros_is_cut_off(path: Path) -> None:
+    """A power cut can leave a long tail of zeros; it goes as a whole, also when it is longer than any line."""
+    path.write_bytes(recording_bytes(measurement(0)) + b"\0" * 3_000_000)
+    with RecordingWriter(path) as writer:
+        assert writer.cut_bytes == 3_000_000
+    assert path.read_bytes() == recording_bytes(measurement(0))
+
+
+def test_missing_newline_is_added(path: Path) -> None:
+    """A last line that lacks nothing but its end keeps its place."""
+    path.write_bytes(recording_bytes(measurement(0)).rstrip(b"\n"))
+    with RecordingWriter(path) as writer:
+        assert writer.cut_bytes == 0
+    assert path.read_bytes() == recording_bytes(measurement(0))
+
+
+def test_torn_header_is_cut_off(path: Path) -> None:
+    """A file that holds nothing but the beginning of a header becomes an empty one."""
+    path.write_bytes(encode_line(HEADER)[:25])
+    with RecordingWriter(path) as writer:
+        assert writer.cut_bytes == 25
+    assert path.read_bytes() == b""
+
+
+@pytest.mark.parametrize(
+    "content", [b"my notes", b"my notes\n", b"1 2 3 4\n5 6", b'{"type":"pose"}\n', b"\0\0"]
+)
+def test_other_file_is_refused_and_left_alone(path: Path, content: bytes) -> None:
+    """A file that is no recording is neither appended to nor cut."""
+    path.write_bytes(content)
+    with pytest.raises(RecordingError, match="header of a recording"):
+        RecordingWriter(path)
+    assert path.read_bytes() == content
+
+
+def test_other_version_is_refused_and_left_alone(path: Path) -> None:
+    """A recording of another version is not appended to."""
+    content = json.dumps(json.loads(encode_line(HEADER)) | {"version": 2}).encode() + b'\n{"to'
+    path.write_bytes(content)
+    with pytest.raises(RecordingVersionError, match="version 2, this program reads version 1"):
+        RecordingWriter(path)
+    assert path.read_bytes() == content
+
+
+@pytest.mark.usefixtures("writer")
+def test_second_writer_is_refused(path: Path) -> None:
+    """One file has one writer; the second one is told so."""
+    with pytest.raises(RecordingError, match="another program is writing it"):
+        RecordingWriter(path)
+
+
+def test_file_is_free_after_close(path: Path, writer: RecordingWriter) -> None:
+    """Closing, also twice, lets the next writer in."""
+    writer.close()
+    writer.close()
+    RecordingWriter(path).close()
+
+
+def test_file_is_free_after_refusal(path: Path) -> None:
+    """A writer that refused a file holds neither lock nor descriptor."""
+    path.write_bytes(b"my notes\n")
+    descriptors = len(list(Path("/proc/self/fd").iterdir()))
+    with pytest.raises(RecordingError):
+        RecordingWriter(path)
+    assert len(list(Path("/proc/self/fd").iterdir())) == descriptors
+
+
+@pytest.mark.parametrize("place", ["/dev/null", "/dev", "/proc/none", "/nowhere/r.jsonl"])
+def test_impossible_place_is_one_line(place: str, tmp_path: Path) -> None:
+    """A device, a folder or a missing folder is refused in one line that names it."""
+    with pytest.raises(RecordingError, match=rf"^{place}: [^\n]+$"):
+        RecordingWriter(tmp_path / place)
+
+
+@pytest.mark.usefixtures("full_disk")
+def test_full_disk_leaves_no_half_line(path: Path, writer: RecordingWriter) -> None:
+    """A line that does not fit is an error in one line, and nothing of it stays."""
+    with pytest.raises(
+        RecordingError, match=r"^[^\n]*a line was left out \(File too large\)[^\n]*room[^\n]*$"
+    ):
+        writer.write(measurement(0))
+    assert path.read_bytes() == recording_bytes()
+
+
+@pytest.mark.usefixtures("full_disk")
+def test_writing_goes_on_when_there_is_room_again(path: Path, writer: RecordingWriter) -> None:
+    """After a line was left out the next one is written as soon as it fits."""
+    with pytest.raises(RecordingError):
+        writer.write(measurement(0))
+    limit_file_size(None)
+    writer.write(measurement(1))
+    assert path.read_bytes() == recording_bytes(measurement(1))
+
+
+@pytest.mark.usefixtures("full_disk")
+def test_half_line_that_cannot_be_cut_goes_later(
+    path: Path, writer: RecordingWriter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """When even the cutting fails, the half line is removed before the next one is written."""
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "ftruncate", failing)
+        with pytest.raises(RecordingError):
+            writer.write(measurement(0))
+    assert path.stat().st_size > len(recording_bytes())
+    limit_file_size(None)
+    writer.write(measurement(1))
+    assert path.read_bytes() == recording_bytes(measurement(1))
+
+
+def test_sync_reaches_the_disk_once(writer: RecordingWriter, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A sync is one fsync, and none when nothing was written since the last one."""
+    calls: list[int] = []
+    monkeypatch.setattr(os, "fsync", calls.append)
+    writer.write(measurement(0))
+    writer.sync()
+    writer.sync()
+    assert len(calls) == 1
+
+
+def test_failed_sync_is_tried_again(writer: RecordingWriter, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A disk error at a sync is reported, and the next sync does not pretend that all is well."""
+    writer.write(measurement(0))
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", failing)
+        for _ in range(2):
+            with pytest.raises(RecordingError, match=r"cannot be brought to the disk \(broken\)"):
+                writer.sync()
+    writer.sync()
+
+
+def failing(*_: object) -> None:
+    """Stand in for a system call on a broken disk."""
+    raise OSError(5, "broken")

@@ -1,0 +1,146 @@
+"""The form of a line in a recording: what each begins with, to bytes and back."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
+
+from pydantic import TypeAdapter, ValidationError
+
+from tsgt.errors import CorruptLineError, RecordingVersionError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+FORMAT_VERSION = 1
+
+MAX_LINE_BYTES = 1 << 20
+"""Longest line that a reader takes; it keeps a file without line ends from filling the memory."""
+
+HEADER_START = b'{"type":"recording",'
+"""How every header begins; what is left of a torn one is known by it."""
+
+NO_HEADER = "does not begin with the header of a recording; give a file that tsgt recorded or imported"
+"""What is wrong with a file whose first line is no header, and what to do."""
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordingHeader:
+    """The first line of a recording, and of each further session in the same file.
+
+    Attributes
+    ----------
+    type
+        Always ``recording``.
+    version
+        Version of the format. Readers refuse others; new types of lines and new keys do not change it.
+    software
+        Name and version of the program that wrote it.
+    created_ns
+        When the session began, on the Unix clock of the computer that wrote it, in ns.
+    source
+        Where the lines come from: a program, or the files that were imported.
+    """
+
+    type: Literal["recording"] = "recording"
+    version: int = FORMAT_VERSION
+    software: str
+    created_ns: int
+    source: str
+
+
+class Line(NamedTuple):
+    """One line of a recording that is whole and is a JSON object with a type.
+
+    Attributes
+    ----------
+    number
+        Number of the line in the file, from 1.
+    type
+        Its ``type``, of which the reader need not know anything.
+    data
+        The JSON object as it stands in the file, without the line end.
+    """
+
+    number: int
+    type: str
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Typed:
+    """What every line of a recording has."""
+
+    type: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Versioned:
+    type: Literal["recording"]
+    version: int
+
+
+_adapter: Callable[[object], TypeAdapter[Any]] = functools.cache(TypeAdapter)
+
+
+def encode_line(record: object) -> bytes:
+    """Turn a record into one JSON object, without a line end."""
+    return _adapter(type(record)).dump_json(record)
+
+
+def decode(cls: type[T], data: bytes) -> T:
+    """Build a record from one JSON object; unknown keys are ignored.
+
+    Raises
+    ------
+    ValueError
+        In one line: what is not JSON, or the first field that is missing or wrong.
+    """
+    try:
+        record: T = _adapter(cls).validate_json(data, strict=True)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        field = ".".join(str(part) for part in first["loc"])
+        raise ValueError(f"field {field}: {first['msg']}" if field else first["msg"]) from None
+    return record
+
+
+def decode_line(cls: type[T], line: Line, path: Path) -> T:
+    """Build a record from a line of a recording.
+
+    Raises
+    ------
+    CorruptLineError
+        The first field that is missing or wrong, with the number of the line.
+    """
+    try:
+        return decode(cls, line.data)
+    except ValueError as error:
+        raise CorruptLineError(
+            f"cannot be used as {line.type}: {error}", path=path, line=line.number
+        ) from error
+
+
+def check_header(data: bytes, path: Path, line: int) -> None:
+    """Make sure that a line is the header of a recording that this program can read.
+
+    Raises
+    ------
+    ValueError
+        It is no header, or a field is missing or wrong.
+    RecordingVersionError
+        It is the header of another version of the format.
+    """
+    version = decode(_Versioned, data).version
+    if version != FORMAT_VERSION:
+        raise RecordingVersionError(
+            f"the recording is of version {version}, this program reads version {FORMAT_VERSION}; "
+            "use the program that wrote it or a newer one",
+            path=path,
+            line=line,
+        )
+    decode(RecordingHeader, data)

@@ -1,0 +1,181 @@
+"""Reading a recording: torn ends are skipped, corrupt lines are errors, unknown types are passed over."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from tsgt.errors import CorruptLineError, RecordingError
+from tsgt.model import Measurement, Parameters, PointMeasurement, PolarMeasurement
+from tsgt.recording.format import (
+    MAX_LINE_BYTES,
+    NO_HEADER,
+    Line,
+    RecordingHeader,
+    Typed,
+    check_header,
+    decode,
+    decode_line,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+
+_MEASUREMENTS: dict[str, type[Measurement]] = {"measurement": PolarMeasurement, "point": PointMeasurement}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recording:
+    """What a recording holds for processing it again.
+
+    Attributes
+    ----------
+    header
+        The header of the first session.
+    parameters
+        The parameters in force at the end: the last ones in the file.
+    measurements
+        All measurements in the order of arrival.
+    end_ns
+        Latest time on the master's Unix clock that the file knows of, in ns: of an arrival, a status or an event.
+        None when it has none of these.
+    """
+
+    header: RecordingHeader
+    parameters: Parameters
+    measurements: list[Measurement]
+    end_ns: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Stamped:
+    stamp_ns: int
+
+
+def read_lines(
+    path: Path,
+    *,
+    keep_going: bool = False,
+    on_problem: Callable[[RecordingError], None] | None = None,
+) -> Iterator[Line]:
+    """Read a recording line by line. Every line is checked to be JSON with a type, also of unknown types.
+
+    Parameters
+    ----------
+    path
+        The recording.
+    keep_going
+        Skip lines that cannot be read instead of raising.
+    on_problem
+        Told of every line that is skipped: a torn last line always, others with ``keep_going``.
+
+    Yields
+    ------
+    Line
+        The lines in the order of the file, headers included.
+
+    Raises
+    ------
+    RecordingError
+        The file cannot be read or does not begin with the header of a recording.
+    RecordingVersionError
+        It was written in another version of the format.
+    CorruptLineError
+        A line is not JSON with a type, and ``keep_going`` is not set.
+    """
+    number = 0
+    for number, raw in enumerate(_raw_lines(path), start=1):
+        data = raw.removesuffix(b"\n")
+        try:
+            kind = decode(Typed, data).type
+            if kind == "recording":
+                check_header(data, path, number)
+        except ValueError as error:
+            if number == 1:
+                raise RecordingError(NO_HEADER, path=path) from error
+            problem = _unreadable(raw, str(error), path, number)
+            if not keep_going and isinstance(problem, CorruptLineError):
+                raise problem from error
+            if on_problem is not None:
+                on_problem(problem)
+            continue
+        if number == 1 and kind != "recording":
+            raise RecordingError(NO_HEADER, path=path)
+        yield Line(number, kind, data)
+    if number == 0:
+        raise RecordingError("is empty; it does not even have the header of a recording", path=path)
+
+
+def load_recording(
+    path: Path,
+    *,
+    keep_going: bool = False,
+    on_problem: Callable[[RecordingError], None] | None = None,
+) -> Recording:
+    """Read what is needed to process a recording again. Poses in it are checked to be whole, but not kept.
+
+    Parameters
+    ----------
+    path, keep_going, on_problem
+        As for :func:`read_lines`; a line whose fields are missing or wrong counts as one that cannot be read.
+
+    Raises
+    ------
+    RecordingError
+        As :func:`read_lines`; also when there are no parameters in the file.
+    """
+    header: RecordingHeader | None = None
+    parameters: Parameters | None = None
+    measurements: list[Measurement] = []
+    end_ns: int | None = None
+    for line in read_lines(path, keep_going=keep_going, on_problem=on_problem):
+        known_ns: int | None = None
+        try:
+            match line.type:
+                case "recording":
+                    header = header or decode_line(RecordingHeader, line, path)
+                case "parameters":
+                    parameters = decode_line(Parameters, line, path)
+                case "measurement" | "point":
+                    measurement: Measurement = decode_line(_MEASUREMENTS[line.type], line, path)
+                    measurements.append(measurement)
+                    known_ns = measurement.received_ns
+                case "status" | "event":
+                    known_ns = decode_line(_Stamped, line, path).stamp_ns
+        except CorruptLineError as problem:
+            if not keep_going:
+                raise
+            if on_problem is not None:
+                on_problem(problem)
+        if known_ns is not None:
+            end_ns = known_ns if end_ns is None else max(end_ns, known_ns)
+    if header is None or parameters is None:  # read_lines has made sure of the header
+        raise RecordingError("holds no parameters; the program that wrote it ended too early", path=path)
+    return Recording(header=header, parameters=parameters, measurements=measurements, end_ns=end_ns)
+
+
+def _unreadable(raw: bytes, why: str, path: Path, line: int) -> RecordingError:
+    if raw.endswith(b"\n"):
+        return CorruptLineError(f"cannot be read: {why}; --keep-going skips it", path=path, line=line)
+    if len(raw) == MAX_LINE_BYTES:
+        return CorruptLineError(
+            f"is longer than {MAX_LINE_BYTES} bytes; --keep-going skips it", path=path, line=line
+        )
+    return RecordingError("the last line is torn and is skipped", path=path, line=line)
+
+
+def _raw_lines(path: Path) -> Iterator[bytes]:
+    """Lines with their ends; of one that is too long only the beginning."""
+    try:
+        with path.open("rb") as file:
+            read_line = functools.partial(file.readline, MAX_LINE_BYTES)
+            for raw in iter(read_line, b""):
+                yield raw
+                piece = raw
+                while len(piece) == MAX_LINE_BYTES and not piece.endswith(b"\n"):
+                    piece = read_line()
+    except OSError as error:
+        raise RecordingError(f"cannot be read ({error.strerror})", path=path) from error

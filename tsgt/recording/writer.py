@@ -1,0 +1,206 @@
+"""Appending to a recording so that a killed program, a full disk or a power cut take as little as can be."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import stat
+import threading
+from contextlib import suppress
+from typing import TYPE_CHECKING, BinaryIO, Self
+
+from tsgt.errors import RecordingError
+from tsgt.recording.files import sync_folder
+from tsgt.recording.format import (
+    HEADER_START,
+    MAX_LINE_BYTES,
+    NO_HEADER,
+    Typed,
+    check_header,
+    decode,
+    encode_line,
+)
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+class RecordingWriter:
+    """Appends lines to a recording, each as a whole or not at all.
+
+    A line is in the hands of the kernel when :meth:`write` returns; it is on the disk after the next
+    :meth:`sync`. The file is locked: there is one writer at a time.
+
+    Parameters
+    ----------
+    path
+        A new file, or a recording that is to be continued. Every session begins with a header line and a
+        parameters line, which the caller writes.
+
+    Attributes
+    ----------
+    cut_bytes
+        Length of the torn line that was cut off the end of the file, 0 when it was whole.
+
+    Raises
+    ------
+    RecordingError
+        The file cannot be opened, is no recording, or another program is writing it.
+    RecordingVersionError
+        It is a recording of another version.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._sync_lock = threading.Lock()  # a sync may be under way in a thread when the owner closes
+        self._unsynced = True
+        try:
+            self._fd = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        except OSError as error:
+            raise RecordingError(f"cannot be opened for writing ({error.strerror})", path=path) from error
+        try:
+            self._lock()
+            self._torn_at: int | None = None
+            self.cut_bytes = self._repair()
+        except OSError as error:
+            os.close(self._fd)
+            raise RecordingError(f"cannot be continued ({error.strerror})", path=path) from error
+        except BaseException:
+            os.close(self._fd)
+            raise
+        sync_folder(path)
+
+    def _lock(self) -> None:
+        if not stat.S_ISREG(os.fstat(self._fd).st_mode):
+            raise RecordingError("is not a regular file; choose another", path=self._path)
+        try:
+            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise RecordingError(
+                "another program is writing it; stop that one or choose another file", path=self._path
+            ) from error
+
+    def _repair(self) -> int:
+        """Bring the file to the end of a line; return how many bytes of a torn one had to go."""
+        with open(self._fd, "rb", closefd=False) as file:
+            whole_bytes, size = _whole_lines(file)
+            file.seek(0)
+            first = file.readline(MAX_LINE_BYTES)
+            file.seek(whole_bytes)
+            tail = file.read(MAX_LINE_BYTES)
+        if size == 0:
+            return 0
+        only_newline_missing = _is_record(tail)
+        if whole_bytes or only_newline_missing:
+            try:
+                check_header(first, self._path, 1)
+            except ValueError as error:
+                raise RecordingError(NO_HEADER, path=self._path) from error
+        elif tail[: len(HEADER_START)] != HEADER_START[: len(tail)]:
+            raise RecordingError(NO_HEADER, path=self._path)
+        if only_newline_missing:
+            self._append(b"\n")
+            return 0
+        os.ftruncate(self._fd, whole_bytes)
+        return size - whole_bytes
+
+    def write(self, record: object) -> None:
+        """Append a record as one line.
+
+        Raises
+        ------
+        RecordingError
+            The line could not be written as a whole, and nothing of it was. Later lines may succeed.
+        """
+        self.write_line(encode_line(record))
+
+    def write_line(self, line: bytes) -> None:
+        """Append a line that is encoded already, without its line end; raises as :meth:`write`."""
+        try:
+            self._append(line + b"\n")
+        except OSError as error:
+            raise RecordingError(
+                f"a line was left out ({error.strerror}); make room on the disk or check it, "
+                "writing goes on as soon as it can",
+                path=self._path,
+            ) from error
+
+    def _append(self, data: bytes) -> None:
+        self._cut_torn_line()
+        size = os.fstat(self._fd).st_size
+        rest = memoryview(data)
+        try:
+            # Once round, unless the disk fills up within the line: then the second round says so.
+            while rest:
+                rest = rest[os.write(self._fd, rest) :]
+        except OSError:
+            self._torn_at = size
+            with suppress(OSError):  # a failing disk may refuse that too; the next line tries again
+                self._cut_torn_line()
+            raise
+        self._unsynced = True  # after the write, so that a sync under way cannot take it for done
+
+    def _cut_torn_line(self) -> None:
+        if self._torn_at is not None:
+            os.ftruncate(self._fd, self._torn_at)
+            self._torn_at = None
+
+    def sync(self) -> None:
+        """Return when all lines written so far are on the disk; may be called from another thread.
+
+        Raises
+        ------
+        RecordingError
+            The disk reports an error; lines since the last good sync may be lost.
+        """
+        with self._sync_lock:
+            if not self._unsynced:
+                return
+            self._unsynced = False
+            try:
+                os.fsync(self._fd)
+            except OSError as error:
+                self._unsynced = True
+                raise RecordingError(
+                    f"cannot be brought to the disk ({error.strerror}); check the disk", path=self._path
+                ) from error
+
+    def close(self) -> None:
+        """Sync and close the file; a second call does nothing."""
+        if self._fd < 0:
+            return
+        try:
+            self.sync()
+        finally:
+            with self._sync_lock:
+                os.close(self._fd)
+                self._fd = -1
+                self._unsynced = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _is_record(data: bytes) -> bool:
+    try:
+        decode(Typed, data)
+    except ValueError:
+        return False
+    return True
+
+
+def _whole_lines(file: BinaryIO) -> tuple[int, int]:
+    """How many bytes up to the last line end, and in all."""
+    size = file.seek(0, os.SEEK_END)
+    end = size
+    while end > 0:
+        start = max(0, end - MAX_LINE_BYTES)
+        file.seek(start)
+        newline = file.read(end - start).rfind(b"\n")
+        if newline >= 0:
+            return start + newline + 1, size
+        end = start
+    return 0, size

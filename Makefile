@@ -5,7 +5,7 @@ VENV ?= .venv
 DURATION ?= 30
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint types layers pytest bench format clean
+.PHONY: demo test lint types layers pytest bench generated format clean
 
 demo: $(VENV)/.runtime
 	$(BIN)/tsgt demo --duration $(DURATION)
@@ -28,6 +28,12 @@ pytest: $(VENV)/.test
 bench: $(VENV)/.test
 	$(BIN)/python benchmarks/alignment.py
 	$(BIN)/python benchmarks/process.py
+
+# Schemas, field tables and the command reference come from the code; a test fails when they are stale.
+generated: $(VENV)/.test
+	$(BIN)/python -m tsgt.master.schema
+	$(BIN)/tsgt config schema > configs/schema/config.schema.json
+	$(BIN)/python -m tsgt.cli.reference docs/reference/cli.md
 
 format: $(VENV)/.test
 	$(BIN)/ruff check --fix .

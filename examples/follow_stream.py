@@ -1,0 +1,38 @@
+"""Follow the robot's pose: a reader of the stream that needs nothing but Python's standard library.
+
+Usage: ``python follow_stream.py [/run/tsgt/poses.sock]``. What each field means stands in docs/reference/stream.md.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import sys
+
+
+def follow(path: str) -> None:
+    """Print valid poses, the reasons of invalid ones, and events, until the stream ends."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+        connection.connect(path)
+        for line in connection.makefile("r", encoding="utf-8"):
+            record = json.loads(line)
+            if record["type"] == "hello" and record["protocol"] != 1:
+                sys.exit(f"the stream speaks protocol {record['protocol']}, this program knows protocol 1")
+            if record["type"] == "event":
+                print(f"event: {record['message']}", flush=True)
+            # Whatever else comes, now or in later versions of tsgt, is passed over.
+            if record["type"] != "pose":
+                continue
+            if not record["valid"]:
+                print(f"no pose: {record['reason']}", flush=True)
+                continue
+            x, y, z = record["position_m"]
+            sigma_x_m = record["covariance"][0] ** 0.5
+            print(
+                f"{record['stamp_ns']} ns: {x:.3f} {y:.3f} {z:.3f} m, sigma of x {sigma_x_m:.4f} m",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    follow(sys.argv[1] if len(sys.argv) > 1 else "/run/tsgt/poses.sock")

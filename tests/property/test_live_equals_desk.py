@@ -1,0 +1,111 @@
+"""What was streamed, what is replayed and what is processed later are the same poses, bit for bit."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import hypothesis.strategies as st
+from hypothesis import given, settings
+from support.scene import START, driving, standing_scene
+
+from tsgt.master.feed import Feed
+from tsgt.master.pipeline import Pipeline
+from tsgt.model import Status
+from tsgt.recording import encode_line
+
+if TYPE_CHECKING:
+    from tsgt.master.stream_records import PoseRecord
+    from tsgt.model import Measurement, PolarMeasurement
+
+TRANSPORT_NS = 2_000_000_000
+SCENE = standing_scene().moving(driving)
+
+# Steps between a station's measurements: its rate with jitter, now and then a gap beyond the outage limit.
+steps = st.lists(
+    st.tuples(
+        st.one_of(st.floats(0.02, 0.6), st.floats(0.02, 4.0)),
+        st.floats(0.0, TRANSPORT_NS / 1e9 - 0.001),
+        st.sampled_from([Status.OK, Status.OK, Status.OK, Status.LOW_ACCURACY, Status.NO_TARGET]),
+    ),
+    max_size=25,
+)
+
+
+@st.composite
+def arrivals(draw: st.DrawFn) -> list[PolarMeasurement]:
+    """Measurements of three stations in order of arrival; each station's arrive in order and in time."""
+    everything = []
+    for station in (1, 2, 3):
+        time_s, arrival_s = draw(st.floats(0.0, 1.0)), 0.0
+        for step_s, delay_s, status in draw(steps):
+            # Whole microseconds: their sums round to exact nanoseconds, so that order is kept.
+            time_s = round(time_s + step_s, 6)
+            arrival_s = max(arrival_s, round(time_s + delay_s, 6))
+            everything.append(SCENE.measure(station, time_s, delay_s=arrival_s - time_s, status=status))
+    return sorted(everything, key=lambda m: m.received_ns)
+
+
+def live(measurements: list[PolarMeasurement], ticks_ns: list[int], end_ns: int) -> list[bytes]:
+    """Lines of a live run whose timer also fires at the instants given."""
+    feed = Feed(SCENE.parameters)
+    calls = [(m.received_ns, m) for m in measurements] + [(tick, None) for tick in ticks_ns if tick < end_ns]
+    records: list[Measurement | PoseRecord] = []
+    for now_ns, measurement in sorted(calls, key=lambda call: call[0]):
+        records += feed.advance(now_ns) if measurement is None else feed.measurement(measurement)
+    return [encode_line(record) for record in (*records, *feed.advance(end_ns))]
+
+
+def poses(lines: list[bytes]) -> list[bytes]:
+    """Only the lines of poses."""
+    return [line for line in lines if line.startswith(b'{"type":"pose"')]
+
+
+@settings(deadline=None, max_examples=60)
+@given(arrivals(), st.lists(st.integers(START, START + 100 * 10**9), max_size=30), st.floats(0.0, 5.0))
+def test_the_desk_gives_what_the_stream_gave(
+    measurements: list[PolarMeasurement], ticks_ns: list[int], wait_s: float
+) -> None:
+    """All measurements at once in the order of time give the poses that arrived one by one."""
+    end_ns = max((m.received_ns for m in measurements), default=START) + round(wait_s * 1e9)
+    pipeline = Pipeline(SCENE.parameters)
+    for measurement in sorted(measurements, key=lambda m: m.stamp_ns):
+        pipeline.add(measurement)
+    desk = [encode_line(pose) for pose in pipeline.advance(end_ns).records()]
+    assert desk == poses(live(measurements, ticks_ns, end_ns))
+
+
+@settings(deadline=None, max_examples=30)
+@given(arrivals(), st.lists(st.integers(START, START + 100 * 10**9), max_size=30))
+def test_the_timer_changes_no_line_and_no_order(
+    measurements: list[PolarMeasurement], ticks_ns: list[int]
+) -> None:
+    """When the timer fires, or whether at all, leaves no trace on the stream."""
+    end_ns = max((m.received_ns for m in measurements), default=START)
+    assert live(measurements, ticks_ns, end_ns) == live(measurements, [], end_ns)
+
+
+@settings(deadline=None, max_examples=30)
+@given(arrivals())
+def test_stamps_of_poses_increase_by_one_period(measurements: list[PolarMeasurement]) -> None:
+    """No epoch is left out and none is given twice."""
+    pipeline = Pipeline(SCENE.parameters)
+    stamps: list[int] = []
+    for measurement in measurements:
+        pipeline.add(measurement)
+        stamps += pipeline.advance(measurement.received_ns).stamp_ns.tolist()
+    period = SCENE.parameters.pipeline.period_ns
+    assert stamps == list(range(stamps[0], stamps[-1] + 1, period)) if stamps else True
+
+
+@settings(deadline=None, max_examples=30)
+@given(arrivals())
+def test_the_announced_deadline_is_when_the_next_pose_is_due(measurements: list[PolarMeasurement]) -> None:
+    """At the deadline there is a pose, one nanosecond before there is none."""
+    pipeline = Pipeline(SCENE.parameters)
+    for measurement in measurements:
+        pipeline.add(measurement)
+        pipeline.advance(measurement.received_ns)
+    deadline_ns = pipeline.next_deadline_ns()
+    if deadline_ns is not None:
+        assert len(pipeline.advance(deadline_ns - 1)) == 0
+        assert len(pipeline.advance(deadline_ns)) > 0

@@ -1,0 +1,51 @@
+"""The live side of the pipeline: what arrives goes in; out comes what belongs on stream and recording, in order.
+
+Pure. The order of calls and the instants handed in decide everything, and all of them stand in the recording; so a
+replay, which makes the same calls, gives the same lines bit for bit.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+from tsgt.master.pipeline import Pipeline
+
+if TYPE_CHECKING:
+    from tsgt.master.stream_records import PoseRecord
+    from tsgt.model import Measurement, Parameters
+
+
+class Feed:
+    """Turns arrivals into records: each measurement, followed by the poses that it completed.
+
+    Parameters
+    ----------
+    parameters
+        Stations, prisms and limits in force.
+    """
+
+    def __init__(self, parameters: Parameters) -> None:
+        self._pipeline = Pipeline(parameters)
+        self._now_ns = -(2**63)
+
+    def measurement(self, measurement: Measurement) -> list[Measurement | PoseRecord]:
+        """Take a measurement at its ``received_ns``; return it between the poses due before and those due with it.
+
+        An instant before that of an earlier call is moved up to it, in the record as well: the recording states
+        when the pipeline had the measurement, because a replay must hand it over at the same point.
+        """
+        if measurement.received_ns < self._now_ns:
+            measurement = dataclasses.replace(measurement, received_ns=self._now_ns)
+        due = self.advance(measurement.received_ns)
+        self._pipeline.add(measurement)
+        return [*due, measurement, *self.advance(measurement.received_ns)]
+
+    def advance(self, now_ns: int) -> list[PoseRecord]:
+        """Return the poses that are due by now. To be called before any other record is put in its place."""
+        self._now_ns = max(self._now_ns, now_ns)
+        return list(self._pipeline.advance(self._now_ns).records())
+
+    def next_deadline_ns(self) -> int | None:
+        """Return when :meth:`advance` should be called if nothing arrives before; None while nothing waits."""
+        return self._pipeline.next_deadline_ns()

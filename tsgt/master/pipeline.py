@@ -1,0 +1,233 @@
+"""Measurements in, poses with reasons out: the estimator ``linear``, the same for the live stream and the desk.
+
+Pure: no clock, no sockets. Poses are computed at epochs, the whole multiples of a period in Unix time. An epoch is
+*decided* as soon as each prism either has a measurement at or after it, or cannot get one any more that would help:
+everything that was made up to now less the transport limit has arrived, and the prism's last measurement is further
+back than the outage limit. A decided epoch gets its pose at once, so live poses wait for what they need and no
+longer; and what is decided does not depend on when the pipeline is asked, so that a replay gives the same poses.
+A measurement that arrives later than the transport limit, or out of its station's order, may come too late for the
+stream; :mod:`tsgt.analysis` hands all measurements over in the order of time and loses none.
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.geometry import (
+    check_layout,
+    interpolate,
+    interpolated_covariance,
+    pose_covariance,
+    poses_from_prisms,
+    quaternion_from_rotation,
+    twists,
+)
+from tsgt.master.pose_batch import PoseBatch, Reason
+from tsgt.master.tracks import Track, build_tracks, measured_at_ns, usable
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from tsgt.geometry import Interpolated
+    from tsgt.model import Measurement, Parameters
+
+# A measurement cannot have been made after it arrived; a clock offset that is a little off may make it seem so.
+_AHEAD_AT_MOST_NS = 1_000_000_000
+
+# The first epoch is at most this much before the first arrival: a station whose clock is years behind must not
+# make the stream begin years ago.
+_BEHIND_AT_MOST_NS = 3_600_000_000_000
+
+# Bounds the memory of a long recording's intermediate arrays; results do not depend on it.
+_EPOCHS_AT_ONCE = 8192
+
+
+class Pipeline:
+    """The estimator ``linear``: the paper's method (section III-D), with reasons, covariance and velocity.
+
+    Parameters
+    ----------
+    parameters
+        Stations, prisms and limits in force. A prism whose stations never measure keeps every pose invalid.
+
+    Raises
+    ------
+    DegenerateGeometryError
+        The prisms of the layout are fewer than three, coincide, or lie in a line.
+    """
+
+    def __init__(self, parameters: Parameters) -> None:
+        self._parameters = parameters
+        self._limits = parameters.pipeline
+        self._prisms = tuple(prism.prism for prism in parameters.prisms)
+        self._layout = np.array([prism.position_m for prism in parameters.prisms])
+        check_layout(self._layout, names=self._prisms)
+        self._stations = {station.station: station for station in parameters.stations}
+        self._home_station = {s.prism: s.station for s in reversed(parameters.stations)}
+        self._tracks = {prism: Track.empty() for prism in self._prisms}
+        self._unusable_ns: dict[int, list[int]] = {prism: [] for prism in self._prisms}
+        self._pending: list[Measurement] = []
+        self._next_epoch_ns: int | None = None
+        self._started = False
+
+    def add(self, measurement: Measurement) -> None:
+        """Take a measurement.
+
+        Passed over are those of a station or prism that the parameters do not name, and those stamped more than a
+        second after they arrived: such a stamp is wrong, and believing it would stop the stream until then.
+        """
+        station = self._stations.get(measurement.station)
+        if station is None or measurement.prism not in self._tracks:
+            return
+        time_ns = measured_at_ns(measurement, station)
+        if time_ns > measurement.received_ns + _AHEAD_AT_MOST_NS:
+            return
+        begin_ns = max(time_ns, measurement.received_ns - _BEHIND_AT_MOST_NS)
+        first_epoch = -(-begin_ns // self._limits.period_ns) * self._limits.period_ns
+        if self._next_epoch_ns is None or (not self._started and first_epoch < self._next_epoch_ns):
+            self._next_epoch_ns = first_epoch
+        if usable(measurement):
+            self._pending.append(measurement)
+        else:
+            self._unusable_ns[measurement.prism].append(time_ns)
+
+    def advance(self, now_ns: int) -> PoseBatch:
+        """Return the poses of all epochs that are decided by now and were not returned before.
+
+        Parameters
+        ----------
+        now_ns
+            The present on the master's Unix clock; measurements made more than the transport limit before it
+            are taken to have been added.
+        """
+        self._take_pending()
+        period = self._limits.period_ns
+        start = self._next_epoch_ns
+        decided = min(self._decided_until_ns(prism, now_ns) for prism in self._prisms)
+        if start is None or decided < start:
+            return PoseBatch.blank(np.empty(0, np.int64), self._prisms)
+        epochs = np.arange(start, decided + 1, period, dtype=np.int64)
+        chunks = np.split(epochs, range(_EPOCHS_AT_ONCE, len(epochs), _EPOCHS_AT_ONCE))
+        poses = PoseBatch.concatenated([self._poses(chunk) for chunk in chunks])
+        self._started = True
+        self._next_epoch_ns = int(epochs[-1]) + period
+        self._forget_before(self._next_epoch_ns)
+        return poses
+
+    def next_deadline_ns(self) -> int | None:
+        """Return when the next epoch will be decided even if nothing more arrives; None before the first one."""
+        self._take_pending()
+        epoch = self._next_epoch_ns
+        if epoch is None:
+            return None
+        deadlines = [epoch]
+        for prism in self._prisms:
+            times = self._tracks[prism].times_ns
+            if not len(times):
+                deadlines.append(epoch + self._limits.transport_limit_ns + 1)
+            elif times[-1] < epoch:
+                lost_ns = int(times[-1]) + self._limits.outage_limit_ns
+                deadlines.append(max(epoch, lost_ns) + self._limits.transport_limit_ns + 1)
+        return max(deadlines)
+
+    def _take_pending(self) -> None:
+        if self._pending:
+            for prism, track in build_tracks(self._parameters, self._pending).items():
+                if len(track):
+                    self._tracks[prism] = self._tracks[prism].merged(track)
+            self._pending.clear()
+
+    def _decided_until_ns(self, prism: int, now_ns: int) -> int:
+        arrived_ns = now_ns - self._limits.transport_limit_ns - 1
+        times = self._tracks[prism].times_ns
+        if not len(times):
+            return arrived_ns
+        last_ns = int(times[-1])
+        return arrived_ns if arrived_ns >= last_ns + self._limits.outage_limit_ns else last_ns
+
+    def _forget_before(self, epoch_ns: int) -> None:
+        for prism, track in self._tracks.items():
+            self._tracks[prism] = track.since(epoch_ns)
+            times = self._unusable_ns[prism] = sorted(self._unusable_ns[prism])
+            # The newest one before the epoch is the only one of the past that can still be a reason.
+            del times[: max(0, bisect.bisect_right(times, epoch_ns) - 1)]
+
+    def _poses(self, epochs_ns: NDArray[np.int64]) -> PoseBatch:
+        batch = PoseBatch.blank(epochs_ns, self._prisms)
+        interpolated = []
+        for column, prism in enumerate(self._prisms):
+            track = self._tracks[prism]
+            between = interpolate(track.times_ns, track.points_m, epochs_ns, self._limits.outage_limit_ns)
+            interpolated.append(between)
+            self._describe(batch, column, prism, between)
+        batch.reason[:] = batch.prism_reason.max(axis=1)
+
+        usable_rows = np.flatnonzero(batch.reason == Reason.VALID)
+        if len(usable_rows):
+            self._fit(batch, usable_rows, interpolated)
+        return batch
+
+    def _describe(self, batch: PoseBatch, column: int, prism: int, between: Interpolated) -> None:
+        """Fill in what one prism's track says: its reason, its station, the age of its last measurement."""
+        track, epochs_ns = self._tracks[prism], batch.stamp_ns
+        latest = np.searchsorted(track.times_ns, epochs_ns, side="right") - 1
+        seen = latest >= 0
+        batch.station[:, column] = self._home_station.get(prism, 0)
+        batch.station[seen, column] = track.stations[latest[seen]]
+        batch.age_s[seen, column] = (epochs_ns[seen] - track.times_ns[latest[seen]]) / 1e9
+        batch.prism_reason[~between.valid, column] = Reason.OUTAGE
+        if self._unusable_ns[prism]:
+            unusable_ns = np.sort(np.array(self._unusable_ns[prism], dtype=np.int64))
+            newest = np.searchsorted(unusable_ns, epochs_ns, side="right") - 1
+            since_ns = np.where(seen, track.times_ns[latest] if len(track) else 0, -(2**63))
+            spoilt = ~between.valid & (newest >= 0) & (unusable_ns[newest] > since_ns)
+            batch.prism_reason[spoilt, column] = Reason.STATION_STATUS
+
+    def _fit(self, batch: PoseBatch, rows: NDArray[np.intp], interpolated: Sequence[Interpolated]) -> None:
+        """Fit the layout to the prisms at the rows where all of them are known."""
+        points = np.stack([i.points[rows] for i in interpolated], axis=1)
+        velocities = np.stack([i.velocities_mps[rows] for i in interpolated], axis=1)
+        covariances = np.stack(
+            [
+                self._prism_covariance(self._tracks[prism], i, rows)
+                for prism, i in zip(self._prisms, interpolated, strict=True)
+            ],
+            axis=1,
+        )
+        poses = poses_from_prisms(self._layout, points)
+        batch.reason[rows[poses.degenerate]] = Reason.DEGENERATE_GEOMETRY
+        fitted = ~poses.degenerate
+        rows, rotation, residual = rows[fitted], poses.rotation[fitted], poses.rms_m[fitted]
+        velocity, angular_velocity = twists(self._layout, rotation, velocities[fitted])
+        batch.position_m[rows] = poses.translation_m[fitted]
+        batch.orientation_xyzw[rows] = quaternion_from_rotation(rotation)
+        batch.covariance[rows] = pose_covariance(self._layout, rotation, covariances[fitted])
+        batch.velocity_mps[rows] = velocity
+        batch.angular_velocity_radps[rows] = angular_velocity
+        batch.residual_m[rows] = residual
+        batch.prism_residual_m[rows] = poses.residuals_m[fitted]
+        batch.reason[rows[rotation[:, 2, 2] <= math.cos(self._limits.tilt_limit_rad)]] = Reason.TILT
+        batch.reason[rows[residual > self._limits.residual_limit_m]] = Reason.RESIDUAL
+
+    def _prism_covariance(
+        self, track: Track, between: Interpolated, rows: NDArray[np.intp]
+    ) -> NDArray[np.float64]:
+        """(R, 3, 3) covariance of interpolated positions: noise, unseen acceleration, uncertain instants."""
+        after, fraction = between.after[rows], between.fraction[rows]
+        covariance = interpolated_covariance(
+            track.covariances_m2[after - 1],
+            track.covariances_m2[after],
+            fraction,
+            between.gap_ns[rows],
+            self._limits.acceleration_sigma_mps2,
+        )
+        sigmas_s = track.time_sigmas_ns / 1e9
+        time_variance = (1.0 - fraction) ** 2 * sigmas_s[after - 1] ** 2 + fraction**2 * sigmas_s[after] ** 2
+        velocity = between.velocities_mps[rows]
+        return np.add(covariance, time_variance[:, None, None] * velocity[:, :, None] * velocity[:, None, :])

@@ -1,0 +1,117 @@
+"""A recording through the live pipeline again: the same lines, bit for bit, at any speed."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from tsgt.errors import CorruptLineError, RecordingError
+from tsgt.master.feed import Feed
+from tsgt.master.stream_records import EventRecord, StatusRecord
+from tsgt.model import Measurement, Parameters, PointMeasurement, PolarMeasurement
+from tsgt.recording import decode_line, encode_line, read_lines
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from tsgt.clock import Clock
+    from tsgt.master.stream import StreamServer
+    from tsgt.recording import Line
+
+# What came from outside. Poses are made again; headers and parameters are not on the stream.
+_ARRIVALS: dict[str, type[Measurement | StatusRecord | EventRecord]] = {
+    "measurement": PolarMeasurement,
+    "point": PointMeasurement,
+    "status": StatusRecord,
+    "event": EventRecord,
+}
+
+
+def replayed(
+    path: Path,
+    *,
+    keep_going: bool = False,
+    on_problem: Callable[[RecordingError], None] | None = None,
+) -> Iterator[tuple[int, list[bytes]]]:
+    """Make the calls that the live master made, in the same order with the same instants.
+
+    Parameters
+    ----------
+    path
+        The recording.
+    keep_going
+        Skip lines that cannot be read instead of raising.
+    on_problem
+        Told of each line that is skipped.
+
+    Yields
+    ------
+    tuple[int, list[bytes]]
+        The instant of an arrival on the master's Unix clock in ns, and the lines that it brought to the stream.
+
+    Raises
+    ------
+    RecordingError
+        The recording cannot be read, or measurements stand in it before any parameters.
+    """
+    feed: Feed | None = None
+    for line in read_lines(path, keep_going=keep_going, on_problem=on_problem):
+        try:
+            if line.type == "parameters":
+                feed = Feed(decode_line(Parameters, line, path))
+            elif line.type in _ARRIVALS:
+                if feed is None:
+                    raise RecordingError(
+                        f"a line of type {line.type} stands before any parameters; this is not a whole recording",
+                        path=path,
+                        line=line.number,
+                    )
+                yield _arrival(feed, decode_line(_ARRIVALS[line.type], line, path), line)
+        except CorruptLineError as problem:
+            if not keep_going:
+                raise
+            if on_problem is not None:
+                on_problem(problem)
+
+
+def _arrival(
+    feed: Feed, record: Measurement | StatusRecord | EventRecord, line: Line
+) -> tuple[int, list[bytes]]:
+    if isinstance(record, StatusRecord | EventRecord):
+        return record.stamp_ns, [*map(encode_line, feed.advance(record.stamp_ns)), line.data]
+    return record.received_ns, [*map(encode_line, feed.measurement(record))]
+
+
+async def replay(
+    arrivals: Iterator[tuple[int, list[bytes]]], server: StreamServer, clock: Clock, *, speed: float
+) -> int:
+    """Publish replayed arrivals at their own pace times a speed, waiting for readers rather than losing lines.
+
+    Parameters
+    ----------
+    arrivals
+        From :func:`replayed`.
+    server
+        The open stream.
+    clock
+        Sets the pace.
+    speed
+        1 is the pace of the recording, infinity as fast as the readers can take.
+
+    Returns
+    -------
+    int
+        How many lines were published.
+    """
+    lines_published = 0
+    start_ns: int | None = None
+    began_ns = clock.monotonic_ns()
+    for now_ns, lines in arrivals:
+        start_ns = now_ns if start_ns is None else start_ns
+        if math.isfinite(speed):
+            await clock.sleep_until(began_ns + round((now_ns - start_ns) / speed))
+        for line in lines:
+            await server.publish_patiently(line)
+        lines_published += len(lines)
+    return lines_published

@@ -1,0 +1,221 @@
+"""Configuration files: what is wrong in one is said in one line that names file, key and value."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tsgt.config import (
+    MasterConfig,
+    ScenarioConfig,
+    json_schema,
+    load,
+    load_any,
+    load_prism_layout,
+    load_station_frames,
+)
+from tsgt.errors import ConfigError
+
+EXAMPLES = Path(__file__).parents[3] / "configs"
+MASTER = (EXAMPLES / "master.example.toml").read_text()
+FRAMES = (EXAMPLES / "station_frames.example.toml").read_text()
+
+PROBLEMS = {
+    "unknown key near a known one": (
+        ("queue_lines", "queue_line"),
+        "stream.queue_line: unknown key; did you mean queue_lines?",
+    ),
+    "unknown key near no other": (
+        ("[recording]", "[zzz]"),
+        "zzz: unknown key; known are kind, setup, stations, pipeline, stream, recording",
+    ),
+    "unknown key inside a table in an array": (
+        ("range_sigma_ppm", "range_sigma_pm"),
+        "stations[#1].noise.range_sigma_pm: unknown key; did you mean range_sigma_ppm?",
+    ),
+    "missing key": (("prism_constant_mm = 10.0  #", "#"), "stations[#1].prism_constant_mm: missing key"),
+    "number out of range": (
+        ("rate_hz = 20.0", "rate_hz = -1"),
+        "pipeline.rate_hz = -1: should be greater than 0",
+    ),
+    "not a number": (
+        ("rate_hz = 20.0", "rate_hz = nan"),
+        "pipeline.rate_hz = NaN: should be a finite number",
+    ),
+    "text for a number": (
+        ("rate_hz = 20.0", 'rate_hz = "20"'),
+        'pipeline.rate_hz = "20": should be a valid number',
+    ),
+    "date for a number": (
+        ("rate_hz = 20.0", "rate_hz = 2026-01-01"),
+        'pipeline.rate_hz = "2026-01-01": should be a valid number',
+    ),
+    "truth value for a number": (
+        ("station = 1", "station = true"),
+        "stations[#1].station = true: should be a valid integer",
+    ),
+    "no such choice": (
+        ('"linear"', '"cubic"'),
+        "pipeline.estimator = \"cubic\": should be 'linear'",
+    ),
+    "two stations of one number": (
+        ("station = 2", "station = 1"),
+        "stations: station 1 stands there more than once",
+    ),
+    "unknown kind": (
+        ('"master"', '"slave"'),
+        'kind = "slave": should be one of "master", "station_frames", "prism_layout", "scenario"',
+    ),
+    "kind that is no text": (('"master"', "[1]"), "kind = [1]: should be one of"),
+    "no kind": (('kind = "master"', ""), "kind: missing key; one of"),
+    "bad TOML": (
+        ("[pipeline]", "[pipeline"),
+        "not TOML: Expected ']' at the end of a table declaration (at line",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_a_problem_is_one_line_with_file_key_and_value(name: str, tmp_path: Path) -> None:
+    """Each kind of mistake is reported with the file, where in it, and what stands there."""
+    (good, bad), expected = PROBLEMS[name]
+    path = tmp_path / "master.toml"
+    assert good in MASTER
+    path.write_text(MASTER.replace(good, bad, 1))
+    with pytest.raises(ConfigError) as error:
+        load(path, MasterConfig)
+    assert str(error.value).startswith(f"{path}: {expected}")
+    assert "\n" not in str(error.value)
+    assert error.value.path == path
+
+
+def test_the_key_of_a_problem_is_kept_as_data(tmp_path: Path) -> None:
+    """A program finds the key of the mistake in the error itself."""
+    path = tmp_path / "master.toml"
+    path.write_text(MASTER.replace("outage_limit_s = 1.0", "outage_limit_s = 0"))
+    with pytest.raises(ConfigError) as error:
+        load(path, MasterConfig)
+    assert error.value.key == "pipeline.outage_limit_s"
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    """A file that is not there is named."""
+    with pytest.raises(ConfigError, match=r"nowhere\.toml: no such file"):
+        load(tmp_path / "nowhere.toml", MasterConfig)
+
+
+def test_folder_instead_of_a_file(tmp_path: Path) -> None:
+    """A folder is refused in words, not with a traceback."""
+    with pytest.raises(ConfigError, match="Is a directory"):
+        load_any(tmp_path)
+
+
+def test_binary_file(tmp_path: Path) -> None:
+    """A file that is no text is refused in words."""
+    path = tmp_path / "master.toml"
+    path.write_bytes(b"kind = \xff")
+    with pytest.raises(ConfigError, match=r"not UTF-8 text \(byte 7\)"):
+        load(path, MasterConfig)
+
+
+def test_a_file_of_another_kind(tmp_path: Path) -> None:
+    """Handing the prism layout where the scenario belongs says what was expected."""
+    path = tmp_path / "scenario.toml"
+    path.write_text('kind = "prism_layout"\n[prisms]\n')
+    with pytest.raises(ConfigError, match='kind = "prism_layout", but a file of kind "scenario" is needed'):
+        load(path, ScenarioConfig)
+
+
+def test_a_long_value_is_cut(tmp_path: Path) -> None:
+    """The line stays readable when a whole list stands where a number belongs."""
+    path = tmp_path / "master.toml"
+    path.write_text(MASTER.replace("rate_hz = 20.0", f"rate_hz = {list(range(100))}"))
+    with pytest.raises(ConfigError) as error:
+        load(path, MasterConfig)
+    assert len(str(error.value)) < 200
+
+
+def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
+    """A configuration works from any working folder; an absolute path stays as it is."""
+    path = tmp_path / "master.toml"
+    path.write_text(MASTER)
+    config = load(path, MasterConfig)
+    assert config.setup.prism_layout == tmp_path / "prism_layout.example.toml"
+    assert config.stream.socket == Path("/run/tsgt/poses.sock")
+
+
+FRAME_PROBLEMS = {
+    "scaled": (("0.9063077870366499, -0.42", "0.9163077870366499, -0.42"), "not a rotation: off by"),
+    "mirrored": (("[0.0, 0.0, 1.0, 0.1]", "[0.0, 0.0, -1.0, 0.1]"), "mirrors"),
+    "last row": (("[0.0, 0.0, 0.0, 1.0]", "[0.0, 0.0, 0.0, 2.0]"), r"the last row of a rigid transform"),
+    "short row": (
+        ("[0.0, 0.0, 1.0, 0.1]", "[0.0, 0.0, 1.0]"),
+        r"stations\.2\.T_station1_station\[#3\]\[#4\]: missing key",
+    ),
+    "number with leading zero": (("[stations.2]", "[stations.02]"), "should match pattern"),
+    "number zero": (("[stations.2]", "[stations.0]"), "should match pattern"),
+    "mistyped key": (("T_station1_station", "T_station_station1"), "did you mean T_station1_station"),
+}
+
+
+@pytest.mark.parametrize("name", FRAME_PROBLEMS)
+def test_frames_that_are_not_rigid_are_refused(name: str, tmp_path: Path) -> None:
+    """A station frame is a rotation and a translation, or it is an error that names the station."""
+    (good, bad), expected = FRAME_PROBLEMS[name]
+    path = tmp_path / "frames.toml"
+    path.write_text(FRAMES.replace(good, bad, 1))
+    with pytest.raises(ConfigError, match=expected) as error:
+        load_station_frames(path)
+    assert "stations." in str(error.value)
+
+
+def test_frames_typed_with_seven_digits_are_taken(tmp_path: Path) -> None:
+    """Rounding to what a report shows is no error."""
+    path = tmp_path / "frames.toml"
+    path.write_text(
+        FRAMES.replace("0.9063077870366499", "0.9063078").replace("0.42261826174069944", "0.4226183")
+    )
+    assert load_station_frames(path)[2][0] == (0.9063078, -0.4226183, 0.0, 2.0)
+
+
+def test_layout_with_uncertainty(tmp_path: Path) -> None:
+    """The sigmas that a calibration adds are allowed; integers are numbers too."""
+    path = tmp_path / "layout.toml"
+    path.write_text(
+        'kind = "prism_layout"\n[prisms.7]\nposition_m = [1, 2.5, 0]\nsigma_m = [0.001, 0.001, 0.002]\n'
+    )
+    assert load_prism_layout(path) == {7: (1.0, 2.5, 0.0)}
+
+
+SCENARIO_PROBLEMS = {
+    "[motion]\ninterval_min_s = 9.0": "motion: interval_min_s is above interval_max_s",
+    "[motion]\nspeed_weights = [1.0]": "motion: 4 speeds_mps, but 1 speed_weights",
+    "[motion]\nspeed_weights = [0.0, 0.0, 0.0, 0.0]": "motion: all speed_weights are 0",
+    "transport_min_ms = 300.0": "transport_min_ms is above transport_max_ms",
+    "[[stations]]\nstation = 1\nprism = 9\nposition_m = [0.0, 0.0, 0.0]": "tracks prism 9, which has no position",
+}
+
+
+@pytest.mark.parametrize("text", SCENARIO_PROBLEMS)
+def test_scenarios_that_contradict_themselves(text: str, tmp_path: Path) -> None:
+    """Values that are good each but not together are refused with the place."""
+    path = tmp_path / "scenario.toml"
+    path.write_text(f'kind = "scenario"\n{text}\n')
+    with pytest.raises(ConfigError) as error:
+        load(path, ScenarioConfig)
+    assert SCENARIO_PROBLEMS[text] in str(error.value)
+
+
+def test_every_key_is_described() -> None:
+    """The schema explains each key of each kind of file."""
+    for name, model in json_schema()["$defs"].items():
+        for key, entry in model["properties"].items():
+            # A table is described where it is defined.
+            assert "description" in entry or "$ref" in entry, f"{name}.{key}"
+
+
+def test_schema_of_one_kind_is_that_kind_alone() -> None:
+    """Asked for one kind, the schema does not mention the others."""
+    assert "ScenarioConfig" not in json.dumps(json_schema("prism_layout"))

@@ -1,0 +1,121 @@
+"""From files to parameters: units, and whether everything fits together."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tsgt.config import MasterConfig, NoiseConfig, PipelineConfig, ScenarioConfig, load, parameters
+from tsgt.config.parameters import noise, pipeline_parameters, scenario_parameters
+from tsgt.errors import ConfigError
+from tsgt.geometry import check_transform
+from tsgt.model import TRACKING_NOISE, Parameters, PipelineParameters
+
+EXAMPLES = Path(__file__).parents[3] / "configs"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Copy the example configurations."""
+    for path in EXAMPLES.glob("*.toml"):
+        shutil.copy(path, tmp_path)
+    return tmp_path
+
+
+def _parameters(folder: Path, *edits: tuple[str, str], file: str = "master") -> Parameters:
+    path = folder / f"{file}.example.toml"
+    text = path.read_text()
+    for good, bad in edits:
+        assert good in text
+        text = text.replace(good, bad, 1)
+    path.write_text(text)
+    return parameters(load(folder / "master.example.toml", MasterConfig))
+
+
+def test_units_become_si(folder: Path) -> None:
+    """Millimetres, milliseconds, arcseconds and degrees become metres, nanoseconds and radians."""
+    known = _parameters(
+        folder,
+        ("prism_constant_mm = 10.0", "prism_constant_mm = -34.4"),
+        ("latency_ms = 0.0", "latency_ms = 12.5"),
+        ("atmospheric_ppm = 0.0", "atmospheric_ppm = 7.5"),
+        ("angle_sigma_arcsec = 1.0", "angle_sigma_arcsec = 3600.0"),
+        ("tilt_limit_deg = 90.0", "tilt_limit_deg = 180.0"),
+        ("outage_limit_s = 1.0", "outage_limit_s = 0.75"),
+        ("rate_hz = 20.0", "rate_hz = 8"),
+    )
+    station = known.stations[0]
+    assert station.prism_constant_m == pytest.approx(-0.0344, abs=1e-15)
+    assert station.latency_ns == 12_500_000
+    assert station.atmospheric_ppm == 7.5
+    assert station.noise.angle_sigma_rad == pytest.approx(math.radians(1.0), rel=1e-12)
+    assert known.pipeline.tilt_limit_rad == math.pi
+    assert known.pipeline.outage_limit_ns == 750_000_000
+    assert known.pipeline.period_ns == 125_000_000
+
+
+def test_set_up_files_are_read(folder: Path) -> None:
+    """Frames and prism positions come from the files of the day."""
+    known = _parameters(folder)
+    assert known.stations[1].T_station1_station[0][3] == 2.0
+    assert [prism.prism for prism in known.prisms] == [1, 2, 3]
+    assert known.prisms[1].position_m == (0.4844, -0.1759, 1.4167)
+
+
+def test_defaults_are_those_of_the_model() -> None:
+    """A configuration that says nothing means the same as the program's own defaults."""
+    assert pipeline_parameters(PipelineConfig()) == PipelineParameters()
+    assert noise(NoiseConfig()) == TRACKING_NOISE
+
+
+def test_a_prism_that_nobody_tracks_is_left_out(folder: Path) -> None:
+    """A spare prism on the robot does not keep every pose waiting."""
+    layout = folder / "prism_layout.example.toml"
+    layout.write_text(layout.read_text() + "\n[prisms.4]\nposition_m = [0.0, 0.0, 2.0]\n")
+    assert [prism.prism for prism in _parameters(folder).prisms] == [1, 2, 3]
+
+
+def test_a_station_without_frame(folder: Path) -> None:
+    """The file that lacks the frame is named, and the station."""
+    with pytest.raises(ConfigError, match=r"station_frames\.example\.toml: stations\.5: missing"):
+        _parameters(folder, ("station = 3", "station = 5"))
+
+
+def test_a_prism_without_position(folder: Path) -> None:
+    """The file that lacks the prism is named, and who tracks it."""
+    with pytest.raises(
+        ConfigError, match=r"prism_layout\.example\.toml: prisms\.4: missing; station 3 tracks it"
+    ):
+        _parameters(folder, ("prism = 3", "prism = 4"))
+
+
+def test_fewer_than_three_prisms(folder: Path) -> None:
+    """Three stations on two prisms give no pose, and that is said before the robot drives."""
+    with pytest.raises(ConfigError, match="a pose needs 3 tracked prisms, the stations track 2"):
+        _parameters(folder, ("prism = 3", "prism = 2"))
+
+
+def test_a_missing_set_up_file(folder: Path) -> None:
+    """A set-up file that is not there yet is named."""
+    with pytest.raises(ConfigError, match=r"tomorrow\.toml: no such file"):
+        _parameters(folder, ("prism_layout.example.toml", "tomorrow.toml"))
+
+
+def test_reference_scenario_has_the_published_prism_distances() -> None:
+    """The layout is the one whose distances DESIGN gives: 0.987, 0.681 and 0.815 m."""
+    a, b, c = (np.array(prism.position_m) for prism in ScenarioConfig().prisms)
+    distances = [np.linalg.norm(a - b), np.linalg.norm(a - c), np.linalg.norm(b - c)]
+    np.testing.assert_allclose(distances, [0.987, 0.681, 0.815], atol=6e-4)
+
+
+def test_scenario_frames_are_level_and_rigid() -> None:
+    """A simulated station is turned about the plumb line alone, and stands where the scenario says."""
+    for station in scenario_parameters(ScenarioConfig()).stations:
+        T = np.array(station.T_station1_station)
+        check_transform(T)
+        assert T[2, 2] == 1.0
+    assert scenario_parameters(ScenarioConfig()).stations[0].T_station1_station[0] == (1.0, 0.0, 0.0, 0.0)

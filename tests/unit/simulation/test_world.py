@@ -1,0 +1,150 @@
+"""The simulated robot: what the reference scenario says of its motion, and that the truth is smooth."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from tsgt.config import MotionConfig, ScenarioConfig
+from tsgt.geometry import check_transform, transform_points
+from tsgt.simulation.world import STEP_S, World
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+PRISMS = np.array([prism.position_m for prism in ScenarioConfig().prisms])
+MOTION = MotionConfig()
+
+
+def _world(seed: int = 0, duration_s: float = 600.0, motion: MotionConfig = MOTION) -> World:
+    return World(motion, PRISMS, duration_s, np.random.default_rng(seed))
+
+
+def _times(duration_s: float, step_s: float = 0.05) -> NDArray[np.float64]:
+    return np.arange(0.0, duration_s, step_s)
+
+
+@pytest.fixture(scope="module")
+def hour() -> NDArray[np.float64]:
+    """Poses of an hour of driving at 20 Hz, (N, 4, 4)."""
+    return _world(duration_s=3600.0).pose_at(_times(3600.0))
+
+
+def _speeds(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Ground speed in m/s at each pose."""
+    velocity = np.gradient(poses[:, :2, 3], 0.05, axis=0)
+    return np.hypot(velocity[:, 0], velocity[:, 1])
+
+
+def test_speeds_come_as_often_as_the_scenario_says(hour: NDArray[np.float64]) -> None:
+    """Speeds 0, 0.5, 1.0 and 1.5 m/s take shares of 3, 2, 3 and 2 tenths of the time."""
+    speeds = _speeds(hour)
+    shares = np.array([np.mean(np.abs(speeds - speed) < 0.05) for speed in MOTION.speeds_mps])
+    np.testing.assert_allclose(shares / shares.sum(), [0.3, 0.2, 0.3, 0.2], atol=0.05)
+    # What is left is time spent changing from one speed to another.
+    assert shares.sum() > 0.8
+
+
+def test_shaking_while_moving(hour: NDArray[np.float64]) -> None:
+    """While moving, roll and pitch are 1.5 degrees rms each and heave is 20 mm rms."""
+    moving = hour[_speeds(hour) > 0.45]
+    roll, pitch = np.arctan2(moving[:, 2, 1], moving[:, 2, 2]), -np.arcsin(moving[:, 2, 0])
+    for angle in (roll, pitch):
+        assert math.degrees(math.sqrt(np.mean(angle**2))) == pytest.approx(1.5, rel=0.07)
+    heave = moving[:, 2, 3] - MOTION.area_centre_m[2]
+    assert math.sqrt(np.mean(heave**2)) == pytest.approx(0.020, rel=0.07)
+
+
+def test_a_standing_robot_does_not_move(hour: NDArray[np.float64]) -> None:
+    """A second and a half into a stop the robot stands still and level."""
+    still = np.convolve(_speeds(hour) < 1e-3, np.ones(61), mode="same") == 61
+    assert still.sum() > 1000
+    np.testing.assert_allclose(hour[still, 2, 2], 1.0, atol=1e-6)
+    np.testing.assert_allclose(hour[still, 2, 3], MOTION.area_centre_m[2], atol=1e-3)
+
+
+def test_yaw_rates_are_those_of_the_scenario(hour: NDArray[np.float64]) -> None:
+    """Turns are at 0.3 or 0.5 rad/s to either side; faster ones do not happen."""
+    yaw = np.unwrap(np.arctan2(hour[:, 1, 0], hour[:, 0, 0]))
+    rates = np.gradient(yaw, 0.05)
+    assert np.abs(rates).max() < 0.5 + 0.1  # pitch and roll add a little to what is seen from above
+    for rate in (0.3, -0.3, 0.5, -0.5):
+        assert np.mean(np.abs(rates - rate) < 0.01) > 0.02
+
+
+def test_the_robot_stays_around_its_area(hour: NDArray[np.float64]) -> None:
+    """The robot leaves the 40 m circle by no more than it takes to turn round, and uses most of it."""
+    distance = np.hypot(*(hour[:, :2, 3] - MOTION.area_centre_m[:2]).T)
+    assert distance.max() < MOTION.area_radius_m + 8.0
+    assert distance.max() > MOTION.area_radius_m - 5.0
+
+
+def test_it_drives_where_it_looks(hour: NDArray[np.float64]) -> None:
+    """The velocity points along the robot's x axis."""
+    velocity = np.gradient(hour[:, :3, 3], 0.05, axis=0)
+    fast = _speeds(hour) > 0.4
+    sideways = np.sum(velocity[fast] * hour[fast, :3, 1], axis=1)
+    assert np.abs(sideways).max() < 0.06
+
+
+def test_poses_are_rigid(hour: NDArray[np.float64]) -> None:
+    """Every hundredth pose is a proper rigid transform."""
+    for pose in hour[::100]:
+        check_transform(pose)
+
+
+def test_the_truth_is_smooth_between_its_grid_points() -> None:
+    """Over a millisecond, anywhere, a prism moves as its velocity and acceleration say, to a micrometre."""
+    start = np.arange(1.0, 59.0, STEP_S / 3)
+    world = _world(3, 60.0)
+    before, here, after = (world.prism_at(start + shift, 1) for shift in (-1e-3, 0.0, 1e-3))
+    bend = after - 2 * here + before
+    assert np.linalg.norm(bend, axis=1).max() < 5e-6  # 5 m/s^2 over 1 ms
+    assert np.linalg.norm(np.diff(bend, axis=0), axis=1).max() < 1e-6
+
+
+def test_the_same_generator_gives_the_same_world() -> None:
+    """One seed is one world, and another seed another."""
+    times = _times(60.0)
+    poses = _world(5, 60.0).pose_at(times)
+    np.testing.assert_array_equal(poses, _world(5, 60.0).pose_at(times))
+    assert np.abs(poses - _world(6, 60.0).pose_at(times)).max() > 0.1
+
+
+def test_an_instant_does_not_depend_on_its_company() -> None:
+    """Asked alone or among others, an instant has the same pose."""
+    world, times = _world(duration_s=20.0), _times(20.0, 0.013)
+    together = world.pose_at(times)
+    np.testing.assert_array_equal(together[777], world.pose_at(times[777:778])[0])
+
+
+def test_prisms_ride_on_the_robot() -> None:
+    """A prism is where the pose puts its place in the robot frame."""
+    world, times = _world(duration_s=20.0), _times(20.0)
+    np.testing.assert_allclose(
+        world.prism_at(times, 2), transform_points(world.pose_at(times), PRISMS[2]), atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("time_s", [-0.001, 20.001, math.nan])
+def test_outside_its_time_there_is_no_truth(time_s: float) -> None:
+    """Asking before the start, after the end or at no time at all is an error, not an extrapolation."""
+    with pytest.raises(ValueError, match="the truth reaches from 0 to 20"):
+        _world(duration_s=20.0).pose_at(np.array([1.0, time_s]))
+
+
+def test_the_truth_reaches_both_ends() -> None:
+    """The first and the last instant belong to the truth, also of a run that is no whole number of steps."""
+    world = _world(duration_s=7.013)
+    assert np.isfinite(world.pose_at(np.array([0.0, 7.013]))).all()
+
+
+def test_a_robot_that_only_stands() -> None:
+    """With the one speed 0 the robot stays where it starts, level."""
+    world = _world(duration_s=30.0, motion=MotionConfig(speeds_mps=(0.0,), speed_weights=(1.0,)))
+    poses = world.pose_at(_times(30.0))
+    np.testing.assert_allclose(poses[:, :3, 3], np.tile(MOTION.area_centre_m, (len(poses), 1)), atol=1e-12)
+    np.testing.assert_allclose(poses[:, 2, 2], 1.0, atol=1e-15)

@@ -1,0 +1,152 @@
+"""Reading configuration and set-up files, with one clear line for whatever is wrong in them."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import tomllib
+from typing import TYPE_CHECKING, Any, TypeVar, get_args
+
+from pydantic import BaseModel, TypeAdapter, ValidationError
+
+from tsgt.config.models import KINDS, Config, Model, PrismLayoutFile, StationFramesFile
+from tsgt.errors import ConfigError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pydantic_core import ErrorDetails
+
+    from tsgt.model import Matrix4, Vector3
+
+M = TypeVar("M", bound=Model)
+
+_SHOWN_CHARACTERS = 60
+
+
+def load(path: Path, model: type[M]) -> M:
+    """Read a file of one kind.
+
+    Parameters
+    ----------
+    path
+        The TOML file.
+    model
+        What it has to be, for example :class:`MasterConfig`.
+
+    Raises
+    ------
+    ConfigError
+        Missing file, bad TOML, another kind, unknown key, missing key or bad value; names file, key and value.
+    """
+    raw = _read(path)
+    kind = _kind(path, raw)
+    if KINDS[kind] is not model:
+        wanted = next(name for name, known in KINDS.items() if known is model)
+        raise ConfigError(
+            f'{path}: kind = "{kind}", but a file of kind "{wanted}" is needed', path=path, key="kind"
+        )
+    return _validated(path, raw, model)
+
+
+def load_any(path: Path) -> Model:
+    """Read a file of whatever kind it says it is; raises as :func:`load`."""
+    raw = _read(path)
+    return _validated(path, raw, KINDS[_kind(path, raw)])
+
+
+def load_station_frames(path: Path) -> dict[int, Matrix4]:
+    """Read where the stations stand: ``T_station1_station`` by station number; raises as :func:`load`."""
+    stations = load(path, StationFramesFile).stations
+    return {int(number): entry.T_station1_station for number, entry in stations.items()}
+
+
+def load_prism_layout(path: Path) -> dict[int, Vector3]:
+    """Read where the prisms sit on the robot, in m, by prism number; raises as :func:`load`."""
+    prisms = load(path, PrismLayoutFile).prisms
+    return {int(number): entry.position_m for number, entry in prisms.items()}
+
+
+def json_schema(kind: str | None = None) -> dict[str, Any]:
+    """Return the JSON Schema of one kind of file, or of all of them."""
+    if kind is not None:
+        return KINDS[kind].model_json_schema()
+    return TypeAdapter[Any](Config).json_schema()
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file", path=path) from None
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}", path=path) from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not UTF-8 text (byte {error.start})", path=path) from error
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: not TOML: {error}", path=path) from error
+
+
+def _kind(path: Path, raw: dict[str, Any]) -> str:
+    kind, known = raw.get("kind"), ", ".join(f'"{name}"' for name in KINDS)
+    if kind is None:
+        raise ConfigError(f"{path}: kind: missing key; one of {known} is needed", path=path, key="kind")
+    if not isinstance(kind, str) or kind not in KINDS:
+        raise ConfigError(f"{path}: kind = {_shown(kind)}: should be one of {known}", path=path, key="kind")
+    return kind
+
+
+def _validated(path: Path, raw: dict[str, Any], model: type[M]) -> M:
+    try:
+        # Through JSON: there strict types and the arrays that stand for tuples go together.
+        return model.model_validate_json(json.dumps(raw, default=str), context={"folder": path.parent})
+    except ValidationError as error:
+        # A mistyped key is reported as one unknown and one missing; the unknown one says more.
+        problem = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
+        key = _key(problem["loc"])
+        raise ConfigError(f"{path}: {_explained(problem, key, model)}", path=path, key=key) from error
+
+
+def _explained(problem: ErrorDetails, key: str, model: type[Model]) -> str:
+    if problem["type"] == "extra_forbidden":
+        known = _known_keys(model, problem["loc"][:-1])
+        near = difflib.get_close_matches(str(problem["loc"][-1]), known, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
+        return f"{key}: unknown key; {hint}"
+    if problem["type"] == "missing":
+        return f"{key}: missing key"
+    message = str(problem["ctx"]["error"]) if problem["type"] == "value_error" else problem["msg"]
+    message = message.removeprefix("Input ")
+    if isinstance(problem["input"], dict) or problem["type"] == "value_error":
+        return f"{key}: {message}" if key else message
+    return f"{key} = {_shown(problem['input'])}: {message}"
+
+
+def _shown(value: object) -> str:
+    text = json.dumps(value, default=str, ensure_ascii=False)
+    return text if len(text) <= _SHOWN_CHARACTERS else f"{text[: _SHOWN_CHARACTERS - 3]}..."
+
+
+def _key(location: tuple[int | str, ...]) -> str:
+    """Write a place as in TOML; an entry of an array by its ordinal: ``stations[#2].prism``."""
+    key = ""
+    for part in location:
+        if part == "[key]":  # pydantic's mark that a table's name is meant, not its content
+            continue
+        key += f"[#{part + 1}]" if isinstance(part, int) else f".{part}" if key else part
+    return key
+
+
+def _known_keys(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
+    """Names of the fields of the model that a place inside another model belongs to."""
+    for part in location:
+        if isinstance(part, str) and part in model.model_fields:
+            model = _innermost_model(model.model_fields[part].annotation) or model
+    return list(model.model_fields)
+
+
+def _innermost_model(annotation: Any) -> type[BaseModel] | None:
+    """Find the model in an annotation such as ``tuple[StationConfig, ...]``."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next((found for arg in get_args(annotation) if (found := _innermost_model(arg))), None)

@@ -1,0 +1,123 @@
+"""From what a file says to what the program computes with: metres, radians and nanoseconds, in one place."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from tsgt.config.files import load_prism_layout, load_station_frames
+from tsgt.errors import ConfigError
+from tsgt.model import (
+    ARCSECOND_RAD,
+    InstrumentNoise,
+    Matrix4,
+    Parameters,
+    PipelineParameters,
+    PrismPosition,
+    StationParameters,
+)
+
+if TYPE_CHECKING:
+    from tsgt.config.models import MasterConfig, NoiseConfig, PipelineConfig, ScenarioConfig, SimulatedStation
+
+MIN_PRISMS = 3
+
+
+def parameters(config: MasterConfig) -> Parameters:
+    """Read the set-up files that a master's configuration names, and put everything into SI units.
+
+    Prisms of the layout that no station tracks are left out: every pose would wait for them in vain.
+
+    Raises
+    ------
+    ConfigError
+        A set-up file cannot be used, a station has no frame, a prism has no position, or the stations track
+        fewer than three prisms.
+    """
+    frames = load_station_frames(config.setup.station_frames)
+    layout = load_prism_layout(config.setup.prism_layout)
+    for station in config.stations:
+        if station.station not in frames:
+            raise ConfigError(
+                f"{config.setup.station_frames}: stations.{station.station}: missing; each station needs a frame",
+                path=config.setup.station_frames,
+                key=f"stations.{station.station}",
+            )
+        if station.prism not in layout:
+            raise ConfigError(
+                f"{config.setup.prism_layout}: prisms.{station.prism}: missing; station {station.station} tracks it",
+                path=config.setup.prism_layout,
+                key=f"prisms.{station.prism}",
+            )
+    tracked = sorted({station.prism for station in config.stations})
+    if len(tracked) < MIN_PRISMS:
+        raise ConfigError(
+            f"{config.setup.prism_layout}: a pose needs {MIN_PRISMS} tracked prisms, the stations track {len(tracked)}",
+            path=config.setup.prism_layout,
+            key="prisms",
+        )
+    return Parameters(
+        stations=tuple(
+            StationParameters(
+                station=station.station,
+                prism=station.prism,
+                T_station1_station=frames[station.station],
+                prism_constant_m=station.prism_constant_mm / 1e3,
+                atmospheric_ppm=station.atmospheric_ppm,
+                latency_ns=round(station.latency_ms * 1e6),
+                noise=noise(station.noise),
+            )
+            for station in config.stations
+        ),
+        prisms=tuple(PrismPosition(prism=prism, position_m=layout[prism]) for prism in tracked),
+        pipeline=pipeline_parameters(config.pipeline),
+    )
+
+
+def scenario_parameters(scenario: ScenarioConfig) -> Parameters:
+    """Return what a master in the simulated world would know: the exact set-up, and the noise as it is."""
+    return Parameters(
+        stations=tuple(
+            StationParameters(
+                station=station.station,
+                prism=station.prism,
+                T_station1_station=level_frame(station),
+                prism_constant_m=station.prism_constant_mm / 1e3,
+                noise=noise(station.noise),
+            )
+            for station in scenario.stations
+        ),
+        prisms=tuple(PrismPosition(prism=p.prism, position_m=p.position_m) for p in scenario.prisms),
+        pipeline=pipeline_parameters(scenario.pipeline),
+    )
+
+
+def pipeline_parameters(pipeline: PipelineConfig) -> PipelineParameters:
+    """Convert the limits of the pipeline."""
+    return PipelineParameters(
+        estimator=pipeline.estimator,
+        period_ns=round(1e9 / pipeline.rate_hz),
+        outage_limit_ns=round(pipeline.outage_limit_s * 1e9),
+        transport_limit_ns=round(pipeline.transport_limit_s * 1e9),
+        residual_limit_m=pipeline.residual_limit_mm / 1e3,
+        tilt_limit_rad=math.radians(pipeline.tilt_limit_deg),
+        acceleration_sigma_mps2=pipeline.acceleration_sigma_mps2,
+    )
+
+
+def noise(config: NoiseConfig) -> InstrumentNoise:
+    """Convert the noise of an instrument."""
+    return InstrumentNoise(
+        range_sigma_m=config.range_sigma_mm / 1e3,
+        range_sigma_ppm=config.range_sigma_ppm,
+        angle_sigma_rad=config.angle_sigma_arcsec * ARCSECOND_RAD,
+        pointing_sigma_m=config.pointing_sigma_mm / 1e3,
+    )
+
+
+def level_frame(station: SimulatedStation) -> Matrix4:
+    """Return ``T_station1_station`` of a levelled instrument, turned about the plumb line."""
+    yaw = math.radians(station.yaw_deg)
+    c, s = math.cos(yaw), math.sin(yaw)
+    x, y, z = station.position_m
+    return ((c, -s, 0.0, x), (s, c, 0.0, y), (0.0, 0.0, 1.0, z), (0.0, 0.0, 0.0, 1.0))

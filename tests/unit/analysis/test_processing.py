@@ -1,0 +1,136 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from support.scene import START, driving, standing_scene
+
+from tsgt.analysis.processing import has_raw_angles, process, with_frames, with_layout
+from tsgt.errors import ConfigError, RecordingError
+from tsgt.model import PointMeasurement, Status
+from tsgt.recording import Recording, RecordingHeader
+
+if TYPE_CHECKING:
+    from tsgt.model import Measurement, Parameters
+
+PATH = Path("field.jsonl")
+SCENE = standing_scene().moving(driving)
+
+
+def recording_of(measurements: list[Measurement], parameters: Parameters = SCENE.parameters) -> Recording:
+    """Make a recording of measurements, in the order given."""
+    return Recording(
+        header=RecordingHeader(software="test", created_ns=0, source="test"),
+        parameters=parameters,
+        measurements=measurements,
+        end_ns=max((m.received_ns for m in measurements), default=None),
+    )
+
+
+def drive(*, delay_s: float = 0.1) -> list[Measurement]:
+    """Four seconds of three stations."""
+    return [
+        SCENE.measure(station, 0.4 * step + 0.11 * station, delay_s=delay_s)
+        for step in range(10)
+        for station in (1, 2, 3)
+    ]
+
+
+def test_the_poses_are_those_of_the_robot() -> None:
+    """Straight lines between exact measurements stay near the driven bend."""
+    poses = process(recording_of(drive()), path=PATH)
+    truth = [driving((stamp - START) / 1e9)[1] for stamp in poses.stamp_ns[poses.valid].tolist()]
+    np.testing.assert_allclose(poses.position_m[poses.valid], truth, atol=0.01)
+
+
+def test_late_measurements_count_where_they_belong() -> None:
+    """The order of arrival changes no pose, however late a measurement came."""
+    measurements = drive()
+    late = recording_of([*measurements[:5], *measurements[6:], measurements[5]])
+    a, b = process(recording_of(measurements), path=PATH), process(late, path=PATH)
+    np.testing.assert_array_equal(a.stamp_ns, b.stamp_ns)
+    np.testing.assert_array_equal(a.position_m, b.position_m)
+
+
+def test_invalid_poses_are_counted_by_reason() -> None:
+    """The counts and the valid poses make up all poses; reasons that do not occur are not listed."""
+    poses = process(recording_of(drive()), path=PATH)
+    counts = poses.invalid_counts()
+    assert set(counts) == {"outage"}
+    assert counts["outage"] + np.count_nonzero(poses.valid) == len(poses)
+
+
+def test_a_station_beside_the_three_may_be_silent() -> None:
+    """A fourth station without measurements is no reason to refuse: its prism is measured by another."""
+    fourth = replace(SCENE.parameters.stations[2], station=4)
+    parameters = replace(SCENE.parameters, stations=(*SCENE.parameters.stations, fourth))
+    assert process(recording_of(drive(), parameters), path=PATH).valid.any()
+
+
+def test_measurements_of_an_unknown_station_are_named() -> None:
+    """A station without parameters cannot be used, and that is said rather than that it is missing."""
+    parameters = replace(SCENE.parameters, stations=SCENE.parameters.stations[:2])
+    with pytest.raises(RecordingError, match="station 3 measured it, but is not among the parameters"):
+        process(recording_of(drive(), parameters), path=PATH)
+
+
+def test_a_station_that_only_reports_errors_is_named_with_them() -> None:
+    """The commonest status comes first."""
+    spoilt = [
+        replace(m, status=Status.NO_TARGET if i % 4 else Status.TILT) if m.station == 1 else m
+        for i, m in enumerate(drive())
+    ]
+    with pytest.raises(
+        RecordingError, match=r"prism 1 has no usable .*10 with status no_target \(7\), tilt \(3\)"
+    ):
+        process(recording_of(spoilt), path=PATH)
+
+
+def test_a_computed_pose_explains_more_than_a_gap() -> None:
+    """Where most epochs are gaps and all computed poses are upside down, the layout is what is wrong."""
+    mirrored = tuple(
+        replace(p, position_m=(p.position_m[0], -p.position_m[1], p.position_m[2]))
+        for p in SCENE.parameters.prisms
+    )
+    measurements = [*drive()[:6], *(SCENE.measure(station, 9.0) for station in (1, 2, 3))]
+    with pytest.raises(RecordingError, match=r"outage 1.*the prism layout is mirrored") as error:
+        process(recording_of(measurements, replace(SCENE.parameters, prisms=mirrored)), path=PATH)
+    assert "tilt" in str(error.value)
+
+
+def test_frames_are_replaced_by_station() -> None:
+    """Every station of the recording gets its new frame, everything else stays."""
+    frames = dict.fromkeys((1, 2, 3, 4), SCENE.parameters.stations[0].T_station1_station)
+    replaced = with_frames(SCENE.parameters, frames, path=Path("frames.toml"))
+    assert [s.T_station1_station for s in replaced.stations] == [frames[1]] * 3
+    assert replaced.stations[1].prism_constant_m == SCENE.parameters.stations[1].prism_constant_m
+    with pytest.raises(ConfigError, match=r"frames.toml: stations.3: missing"):
+        with_frames(SCENE.parameters, {1: frames[1], 2: frames[2]}, path=Path("frames.toml"))
+
+
+def test_the_layout_is_replaced_by_prism() -> None:
+    """Every prism of the recording gets its new position."""
+    layout = {k: (float(k), 0.0, 0.0) for k in (1, 2, 3, 4)}
+    replaced = with_layout(SCENE.parameters, layout, path=Path("prisms.toml"))
+    assert [(p.prism, p.position_m) for p in replaced.prisms] == [(k, layout[k]) for k in (1, 2, 3)]
+    with pytest.raises(ConfigError, match=r"prisms.toml: prisms.2: missing"):
+        with_layout(SCENE.parameters, {1: layout[1]}, path=Path("prisms.toml"))
+
+
+def test_frames_matter_to_raw_angles_only() -> None:
+    """Points are in frame 1 already."""
+    point = PointMeasurement(station=1, prism=1, sequence=0, stamp_ns=0, received_ns=0, position_m=(1, 2, 3))
+    assert not has_raw_angles([point])
+    assert has_raw_angles([point, SCENE.measure(1, 0.0)])
+
+
+def test_stations_at_different_times_give_no_pose() -> None:
+    """The advice is to look at the times."""
+    apart = [
+        SCENE.measure(station, 20.0 * station + 0.4 * step) for step in range(5) for station in (1, 2, 3)
+    ]
+    with pytest.raises(RecordingError, match="check that the stations' times overlap"):
+        process(recording_of(sorted(apart, key=lambda m: m.stamp_ns)), path=PATH)

@@ -1,0 +1,191 @@
+"""Reading the files that the authors published: tracks of prisms, and where the prisms sit on the robot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.config import load_prism_layout
+from tsgt.errors import DegenerateGeometryError, InputFileError
+from tsgt.geometry import check_layout
+from tsgt.model import PrismPosition
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from tsgt.model import Vector3
+
+PRISMS = 3
+TRACK_COLUMNS = 4
+NS_MAX = 2**63 - 1
+
+
+@dataclass(frozen=True, slots=True)
+class PublishedTrack:
+    """One prism's track as published.
+
+    Attributes
+    ----------
+    stamps_ns
+        (M,) Unix times in ns, strictly increasing.
+    points_m
+        (M, 3) positions in the frame ``station1`` in m.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    points_m: NDArray[np.float64]
+
+
+def read_track(path: Path) -> PublishedTrack:
+    """Read a published track: no header, separated by spaces: Unix time (s), x, y, z (m) in frame 1.
+
+    Parameters
+    ----------
+    path
+        The authors' ``trimble<k>.csv``.
+
+    Returns
+    -------
+    PublishedTrack
+        The times are the decimal texts to the nanosecond; no float stands between.
+
+    Raises
+    ------
+    InputFileError
+        The file is empty, a line has not four finite numbers, or time does not increase from line to line.
+    """
+    stamps: list[int] = []
+    points: list[list[float]] = []
+    for number, row in _rows(path):
+        if len(row) != TRACK_COLUMNS:
+            raise InputFileError(
+                f"expected 4 columns (Unix time in s, x, y, z in m), got {len(row)}", path=path, line=number
+            )
+        stamp = _nanoseconds(row[0], path, number)
+        if stamps and stamp == stamps[-1]:
+            raise InputFileError(
+                f"time stamp {row[0]} stands here a second time; keep one of the two lines",
+                path=path,
+                line=number,
+            )
+        if stamps and stamp < stamps[-1]:
+            raise InputFileError(
+                f"time runs backwards: {row[0]} is {(stamps[-1] - stamp) / 1e9:.3f} s before the line above; "
+                "sort the file by time or remove the line",
+                path=path,
+                line=number,
+            )
+        stamps.append(stamp)
+        points.append([_number(text, path, number) for text in row[1:]])
+    if not stamps:
+        raise InputFileError("holds no positions; expected lines of Unix time in s, x, y, z in m", path=path)
+    return PublishedTrack(np.array(stamps, dtype=np.int64), np.array(points))
+
+
+def read_tracks(paths: Sequence[Path]) -> tuple[PublishedTrack, ...]:
+    """Read the tracks of one drive, in the order of the prisms.
+
+    Raises
+    ------
+    InputFileError
+        As :func:`read_track`; also when the tracks have no time in common.
+    """
+    tracks = tuple(read_track(path) for path in paths)
+    latest = max(range(len(tracks)), key=lambda i: int(tracks[i].stamps_ns[0]))
+    first_to_end = min(range(len(tracks)), key=lambda i: int(tracks[i].stamps_ns[-1]))
+    late_ns = int(tracks[latest].stamps_ns[0] - tracks[first_to_end].stamps_ns[-1])
+    if late_ns > 0:
+        raise InputFileError(
+            f"begins {late_ns / 1e9:.1f} s after the end of {paths[first_to_end]}; take the tracks of one drive",
+            path=paths[latest],
+        )
+    return tracks
+
+
+def read_prisms(path: Path) -> tuple[PrismPosition, ...]:
+    """Read the prism positions on the robot.
+
+    Parameters
+    ----------
+    path
+        The authors' ``sensor_positions.csv``: separated by spaces, rows 1 to 3 are the prisms 1 to 3, and each
+        row starts with x, y, z in m in the robot frame; what follows (other sensors, covariances) is not used.
+        Or, by its ending ``.toml``, our own set-up file of kind ``prism_layout``.
+
+    Returns
+    -------
+    tuple[PrismPosition, ...]
+        Prisms 1 to 3.
+
+    Raises
+    ------
+    InputFileError
+        A row or a number is missing, or the prisms coincide or lie in a line.
+    ConfigError
+        The set-up file cannot be used.
+    """
+    positions = load_prism_layout(path) if path.suffix == ".toml" else _read_sensor_positions(path)
+    missing = [prism for prism in range(1, PRISMS + 1) if prism not in positions]
+    if missing:
+        raise InputFileError(
+            f"has no position of prism {missing[0]}; the tracks are those of 1 to 3", path=path
+        )
+    prisms = tuple(PrismPosition(prism=prism, position_m=positions[prism]) for prism in range(1, PRISMS + 1))
+    try:
+        check_layout([prism.position_m for prism in prisms])
+    except DegenerateGeometryError as error:
+        raise InputFileError(str(error), path=path) from error
+    return prisms
+
+
+def _read_sensor_positions(path: Path) -> dict[int, Vector3]:
+    positions: dict[int, Vector3] = {}
+    for number, row in _rows(path)[:PRISMS]:
+        if len(row) < 3:
+            raise InputFileError(
+                f"expected at least 3 columns (x, y, z in m in the robot frame), got {len(row)}",
+                path=path,
+                line=number,
+            )
+        x, y, z = (_number(text, path, number) for text in row[:3])
+        positions[len(positions) + 1] = (x, y, z)
+    return positions
+
+
+def _rows(path: Path) -> list[tuple[int, list[str]]]:
+    """Line numbers and columns of all lines that are not blank."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise InputFileError("is not a text file", path=path) from error
+    except OSError as error:
+        raise InputFileError(error.strerror or str(error), path=path) from error
+    rows = [(number, line.split()) for number, line in enumerate(text.splitlines(), start=1)]
+    return [(number, row) for number, row in rows if row]
+
+
+def _number(text: str, path: Path, line: int) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not np.isfinite(value):
+        raise InputFileError(f"expected a finite number, got {text!r}", path=path, line=line)
+    return value
+
+
+def _nanoseconds(text: str, path: Path, line: int) -> int:
+    """Decimal seconds to whole nanoseconds. A float would be off by up to 120 ns at today's Unix times."""
+    try:
+        stamp = Decimal(text)
+    except InvalidOperation:
+        stamp = Decimal("nan")
+    if not stamp.is_finite() or not 0 <= stamp <= Decimal(NS_MAX).scaleb(-9):
+        raise InputFileError(f"expected a Unix time in s, got {text!r}", path=path, line=line)
+    return int(stamp.scaleb(9).to_integral_value())

@@ -1,0 +1,78 @@
+"""Set-up files: what a calibration found, as TOML. ``tsgt.config`` reads them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from tsgt.recording import write_atomically
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+    from pathlib import Path
+
+    from tsgt.geometry import FloatArray
+
+
+def write_station_frames(path: Path, frames: Mapping[int, FloatArray], *, comment: str) -> None:
+    """Write a file of kind ``station_frames``.
+
+    Parameters
+    ----------
+    path
+        The file; it appears as a whole or not at all.
+    frames
+        (4, 4) ``T_station1_station`` in m by station number.
+    comment
+        Where the frames come from; one line on top of the file.
+
+    Raises
+    ------
+    OutputFileError
+        The file cannot be written.
+    """
+    tables = []
+    for station, T in sorted(frames.items()):
+        rows = ",\n".join(f"  {_numbers(row)}" for row in T)
+        tables.append(f"[stations.{station}]\nT_station1_station = [\n{rows},\n]\n")
+    _write(path, "station_frames", tables, comment)
+
+
+def write_prism_layout(
+    path: Path, positions_m: Mapping[int, FloatArray], sigmas_m: Mapping[int, FloatArray], *, comment: str
+) -> None:
+    """Write a file of kind ``prism_layout``.
+
+    Parameters
+    ----------
+    path
+        The file; it appears as a whole or not at all.
+    positions_m
+        (3,) position in the frame ``robot`` in m by prism number.
+    sigmas_m
+        (3,) one sigma of each coordinate in m by prism number.
+    comment
+        Where they come from; one line on top of the file.
+
+    Raises
+    ------
+    OutputFileError
+        The file cannot be written.
+    """
+    tables = [
+        f"[prisms.{prism}]\nposition_m = {_numbers(position)}\nsigma_m = {_numbers(sigmas_m[prism])}\n"
+        for prism, position in sorted(positions_m.items())
+    ]
+    _write(path, "prism_layout", tables, comment)
+
+
+def _numbers(values: FloatArray) -> str:
+    """Array of floats in the shortest form that reads back to the same bits."""
+    return f"[{', '.join(repr(float(value)) for value in values)}]"
+
+
+def _write(path: Path, kind: str, tables: Iterable[str], comment: str) -> None:
+    # A file name may hold a line break; a comment must not.
+    printable = "".join(character if character.isprintable() else "?" for character in comment)
+    text = "\n".join([f'# {printable}\nkind = "{kind}"\n', *tables])
+    with write_atomically(path) as file:
+        file.write(text.encode())

@@ -34,6 +34,7 @@ generated: $(VENV)/.test
 	$(BIN)/python -m tsgt.master.schema
 	$(BIN)/tsgt config schema > configs/schema/config.schema.json
 	$(BIN)/python -m tsgt.cli.reference docs/reference/cli.md
+	$(BIN)/python -m tsgt.config.reference docs/reference/configuration.md
 
 format: $(VENV)/.test
 	$(BIN)/ruff check --fix .

@@ -40,6 +40,8 @@ def run(main: Callable[[], Awaitable[T]]) -> T:
 
     Raises
     ------
+    TsgtError
+        The first one that ended a task group of the coroutine; a user wants its line, not the group's tree.
     KeyboardInterrupt
         SIGINT ended it.
     SystemExit
@@ -66,6 +68,16 @@ def run(main: Callable[[], Awaitable[T]]) -> T:
         if not terminated:
             raise
         raise SystemExit(0) from None
+    except ExceptionGroup as group:
+        known, others = group.split(TsgtError)
+        if known is None or others is not None:
+            raise
+        raise _first(known) from group
+
+
+def _first(group: ExceptionGroup[TsgtError]) -> TsgtError:
+    first = group.exceptions[0]
+    return _first(first) if isinstance(first, ExceptionGroup) else first
 
 
 async def keep_synced(

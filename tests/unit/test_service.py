@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import pytest
 from structlog.testing import capture_logs
 
-from tsgt.errors import RecordingError
-from tsgt.service import keep_synced, sd_notify, watchdog_interval_s
+from tsgt.errors import RecordingError, StreamError
+from tsgt.service import keep_synced, run, sd_notify, watchdog_interval_s
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -141,3 +141,31 @@ def test_watchdog_interval(
         else:
             monkeypatch.setenv(name, value)
     assert watchdog_interval_s() == interval_s
+
+
+def test_a_known_error_comes_out_of_a_task_group_as_itself() -> None:
+    """The user gets the error's one line, not a tree of exceptions."""
+
+    async def fail() -> None:
+        raise StreamError("nobody there")
+
+    async def main() -> None:
+        async with asyncio.TaskGroup() as group:
+            group.create_task(fail())
+
+    with pytest.raises(StreamError, match="nobody there"):
+        run(main)
+
+
+def test_an_unknown_error_keeps_its_tree() -> None:
+    """A bug is shown with everything that there is to know about it."""
+
+    async def fail() -> None:
+        raise ZeroDivisionError
+
+    async def main() -> None:
+        async with asyncio.TaskGroup() as group:
+            group.create_task(fail())
+
+    with pytest.raises(ExceptionGroup):
+        run(main)

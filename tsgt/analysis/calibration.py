@@ -52,7 +52,7 @@ def solve_stations(
     DegenerateGeometryError
         A station, which is named, has fewer than three targets in common with station 1, or they lie in a line.
     InputFileError
-        Repeated measurements of one target contradict each other.
+        Repeated measurements of one target contradict each other, or a constant exceeds a distance.
     """
     points = {
         station: _points(file.path, targets, target_constant_m, f"target {{}} of station {station}")
@@ -91,7 +91,7 @@ def solve_prisms(file: PrismFile, *, target_constant_m: float, prism_constant_m:
     DegenerateGeometryError
         There are fewer than three body points or they lie in a line; or three or more prisms do.
     InputFileError
-        Repeated measurements of one point contradict each other.
+        Repeated measurements of one point contradict each other, or a constant exceeds a distance.
     """
     body = _points(file.path, file.body, target_constant_m, "body point {}")
     prisms = _points(file.path, file.prisms, prism_constant_m, "prism {}")
@@ -129,6 +129,12 @@ def _points(
                 for sight, constant in zip(sights, constants, strict=True)
             ]
         )
+        if d.min() <= 0:
+            raise InputFileError(
+                f"{what.format(name)}: with its constant the distance is {d.min():.3f} m; correct the constant",
+                path=path,
+                line=sights[int(d.argmin())].line,
+            )
         positions = polar_to_cartesian(h, z, d)
         mean = positions.mean(axis=0)
         misses_m = np.linalg.norm(positions - mean, axis=1)

@@ -2,7 +2,7 @@
 
 Whatever the robot does, the distances between its prisms do not change. How far the measured ones stray from those
 of the layout says how well time, frames and interpolation fit together, without any other reference. What the
-figures mean is fixed in DESIGN.md, section 9, and in docs/reference/evaluate.md.
+figures mean is fixed in docs/reference/evaluate.md.
 """
 
 from __future__ import annotations

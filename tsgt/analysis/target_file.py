@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from tsgt.errors import InputFileError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from tsgt.model import Vector3
@@ -272,7 +272,7 @@ class _Row:
         )
 
 
-def _table(path: Path) -> tuple[_Header, list[_Row]]:
+def _table(path: Path) -> tuple[_Header, Iterator[_Row]]:
     """Header and rows of a comma-separated file; blank lines and those that start with # do not count."""
     try:
         text = path.read_text(encoding="utf-8-sig")  # spreadsheets write a byte order mark
@@ -287,16 +287,16 @@ def _table(path: Path) -> tuple[_Header, list[_Row]]:
     ]
     if not lines:
         raise InputFileError("is empty; expected a header line and one line per measurement", path=path)
-    header = _Header(path, *lines[0])
-    rows = []
-    for number, cells in lines[1:]:
-        if len(cells) != len(header.names):
-            raise InputFileError(
-                f"expected {len(header.names)} columns as in the header, got {len(cells)}",
-                path=path,
-                line=number,
-            )
-        rows.append(_Row(path, number, dict(zip(header.names, cells, strict=True))))
-    if not rows:
+    if len(lines) == 1:
         raise InputFileError("holds a header but no measurements", path=path)
-    return header, rows
+    header = _Header(path, *lines[0])
+    return header, _rows(header, lines[1:])
+
+
+def _rows(header: _Header, lines: list[tuple[int, list[str]]]) -> Iterator[_Row]:
+    """Cells by column name, line by line, so that a bad header is reported before bad lines."""
+    for number, cells in lines:
+        row = _Row(header.path, number, dict(zip(header.names, cells, strict=False)))
+        if len(cells) != len(header.names):
+            raise row.error(f"expected {len(header.names)} columns as in the header, got {len(cells)}")
+        yield row

@@ -1,6 +1,6 @@
 """A prism's position between two of its measurements: a straight line in time, unless they are too far apart.
 
-Paper section III-C: linear interpolation of each prism to common epochs, invalid across an outage.
+Paper section III-D: linear interpolation of each prism to common epochs, invalid across an outage.
 """
 
 from __future__ import annotations

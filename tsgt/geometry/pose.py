@@ -56,7 +56,7 @@ class Poses:
 
 
 def poses_from_prisms(layout: ArrayLike, points: ArrayLike) -> Poses:
-    """Fit the prism layout to measured prisms (paper section III-C), unweighted.
+    """Fit the prism layout to measured prisms (paper section III-D), unweighted.
 
     Parameters
     ----------

@@ -6,7 +6,7 @@ import math
 import pytest
 from support.records import EVENT, HEADER, HELLO, NO_POSE, PARAMETERS, POINT, POSE, STATUS, measurement
 
-from tsgt.model import PolarMeasurement
+from tsgt.model import PointMeasurement, PolarMeasurement
 from tsgt.recording import decode, encode_line
 
 

@@ -1,0 +1,91 @@
+"""One hour of field work through `tsgt process`, from start-up to the TUM file: CPU time and peak memory.
+
+The recording is what a master would have written: measurements of three stations at 2.5 Hz, the poses that it
+streamed (which `process` reads past and computes again), and nothing else. Beside it, in the same run: what start-up
+alone costs, and what reading every line of the file with the standard library's json costs.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+from tsgt.config import ScenarioConfig
+from tsgt.master.pipeline import Pipeline
+from tsgt.recording import RecordingHeader, RecordingWriter
+from tsgt.simulation.demo import play
+
+DURATION_S = 3600
+START_NS = 1_700_000_000_000_000_000
+REPEATS = 3
+
+
+def main() -> None:
+    """Print the table and the ratios."""
+    with tempfile.TemporaryDirectory() as folder:
+        recording, poses = Path(folder) / "hour.jsonl", Path(folder) / "hour.tum"
+        # In a process of its own: a child's peak memory starts from that of the process it was forked from.
+        with ProcessPoolExecutor(1) as pool:
+            measurements = pool.submit(write_recording, recording).result()
+        process_s, memory = best("-m", "tsgt", "process", str(recording), "--output", str(poses))
+        start_s, start_memory = best(
+            "-c", "import tsgt.analysis.processing, tsgt.analysis.export, tsgt.cli.desk"
+        )
+        json_s = min(read_with_json(recording) for _ in range(REPEATS))
+        pose_lines = len(poses.read_text().splitlines())
+        size_mb = recording.stat().st_size / 1e6
+
+    print(f"recording: {measurements} measurements, {size_mb:.0f} MB; {pose_lines} poses in the TUM file")
+    print(f"{'':34}{'CPU s':>8}{'peak MB':>9}")
+    print(f"{'tsgt process to TUM, all of it':34}{process_s:8.2f}{memory:9.0f}")
+    print(f"{'  of this start-up (imports)':34}{start_s:8.2f}{start_memory:9.0f}")
+    print(f"{'json.loads of every line':34}{json_s:8.2f}")
+    print(f"one hour of field work / CPU time of process: {DURATION_S / process_s:.0f}")
+    print(f"process / json.loads of every line: {process_s / json_s:.2f}")
+
+
+def write_recording(path: Path) -> int:
+    """Write the hour as a master would have; return the number of measurements."""
+    run = play(ScenarioConfig(), duration_s=DURATION_S, seed=1, start_ns=START_NS)
+    pipeline = Pipeline(run.parameters)
+    with RecordingWriter(path) as writer:
+        writer.write(RecordingHeader(software="benchmark", created_ns=START_NS, source="simulation"))
+        writer.write(run.parameters)
+        for measurement in run.measurements:
+            pipeline.add(measurement)
+            writer.write(measurement)
+        for pose in pipeline.advance(run.end_ns).records():
+            writer.write(pose)
+    return len(run.measurements)
+
+
+def best(*arguments: str) -> tuple[float, float]:
+    """Least CPU time in s of several runs of Python with these arguments, and the peak memory in MB."""
+    runs = []
+    for _ in range(REPEATS):
+        process = subprocess.Popen([sys.executable, *arguments], stdout=subprocess.DEVNULL)
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        if process.returncode:
+            raise SystemExit(f"{' '.join(arguments)} failed with {process.returncode}")
+        runs.append((usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1e3))
+    return min(runs)
+
+
+def read_with_json(path: Path) -> float:
+    """CPU time in s of parsing every line."""
+    before = time.process_time()
+    with path.open("rb") as file:
+        for line in file:
+            json.loads(line)
+    return time.process_time() - before
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,106 @@
+"""The authors' field data through the real command line, against figures computed outside of tsgt."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import pytest
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from support.cli import Tsgt
+
+
+class Expected(NamedTuple):
+    """Mean distances in mm, valid epochs, all epochs."""
+
+    mean_mm: dict[str, float]
+    valid: int
+    epochs: int
+
+
+SEGMENTS = {
+    ".": Expected({"1-2": 878.41, "1-3": 822.20, "2-3": 1037.22}, 1488, 2051),
+    "segment2": Expected({"1-2": 878.11, "1-3": 824.70, "2-3": 1041.16}, 1503, 1927),
+}
+STANDING_MM = {"1-2": 876.1, "1-3": 822.7, "2-3": 1035.4}  # SOURCE.md: 0.8761, 0.8227, 1.0354 m
+
+
+def imported(tsgt: Tsgt, field_data: Path, segment: str, output: Path, *, targets: bool) -> Path:
+    """Import one segment."""
+    day = field_data / "20220314"
+    tracks = [day / segment / f"trimble{k}.csv" for k in (1, 2, 3)]
+    extra = ["--targets", day / "GCP.txt"] if targets else []
+    arguments = ["--tracks", *tracks, "--prisms", day / "sensor_positions.csv", *extra, "--output", output]
+    assert tsgt("import", "rts", *arguments).code == 0
+    return output
+
+
+@pytest.mark.parametrize("targets", [False, True], ids=["points", "raw"])
+@pytest.mark.parametrize("segment", SEGMENTS)
+def test_inter_prism_distances(
+    tsgt: Tsgt, field_data: Path, tmp_path: Path, segment: str, *, targets: bool
+) -> None:
+    """Mean distances at 20 Hz to a hundredth of a millimetre, gaps counted apart, with and without targets."""
+    recording = imported(tsgt, field_data, segment, tmp_path / "r.jsonl", targets=targets)
+    result = tsgt("evaluate", recording, "--json").json()
+    expected = SEGMENTS[segment]
+    for pair, mean_mm in expected.mean_mm.items():
+        figures = result["inter_prism_mm"][pair]
+        assert figures["mean"] == pytest.approx(mean_mm, abs=0.006)
+        assert figures["valid"] == result["valid_poses"] == expected.valid
+        assert figures["invalid"] == result["invalid_epochs"] == expected.epochs - expected.valid
+    assert result["epochs"] == expected.epochs
+
+
+def test_static_distances(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
+    """The robot stands at the beginning of the first segment; its raw distances are those of SOURCE.md."""
+    recording = imported(tsgt, field_data, ".", tmp_path / "r.jsonl", targets=False)
+    result = tsgt("evaluate", recording, "--json").json()
+    assert result["still_s"] > 20.0
+    for pair, mean_mm in STANDING_MM.items():
+        figures = result["inter_prism_static_mm"][pair]
+        assert figures["mean"] == pytest.approx(mean_mm, abs=0.1)
+        assert 0.2 < figures["std"] < 0.6
+        assert figures["valid"] >= 40
+
+
+def test_the_second_segment_never_stands(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
+    """It has no static distances."""
+    recording = imported(tsgt, field_data, "segment2", tmp_path / "r.jsonl", targets=False)
+    result = tsgt("evaluate", recording, "--json").json()
+    assert [p["valid"] for p in result["inter_prism_static_mm"].values()] == [0, 0, 0]
+
+
+@pytest.mark.parametrize("segment", SEGMENTS)
+def test_evo_reads_the_trajectory(
+    tsgt: Tsgt, field_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, segment: str
+) -> None:
+    """The tool evo finds the trajectory valid, with the length that our poses have."""
+    monkeypatch.setenv("HOME", str(tmp_path))  # evo writes its settings there when it is first imported
+    file_interface = pytest.importorskip("evo.tools.file_interface")
+    recording = imported(tsgt, field_data, segment, tmp_path / "r.jsonl", targets=True)
+    output, table = tmp_path / "poses.tum", tmp_path / "poses.csv"
+    result = tsgt("process", recording, "--output", output, "--json").json()
+    trajectory = file_interface.read_tum_trajectory_file(str(output))
+    ok, details = trajectory.check()
+    assert ok, details
+    assert trajectory.num_poses == result["valid_poses"]
+    assert tsgt("export", recording, "--format", "csv", "--output", table).code == 0
+    rows = [line.split(",") for line in table.read_text(encoding="utf-8").splitlines()]
+    valid, x = rows[0].index("valid"), rows[0].index("x_m")
+    positions = np.array([row[x : x + 3] for row in rows[1:] if row[valid] == "1"], dtype=np.float64)
+    length_m = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+    assert trajectory.path_length == pytest.approx(length_m, abs=1e-5)
+
+
+def test_the_robot_frame_keeps_the_layout(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
+    """Reference distances are those of the authors' calibration_results.csv."""
+    recording = imported(tsgt, field_data, ".", tmp_path / "r.jsonl", targets=False)
+    result = tsgt("evaluate", recording, "--json").json()
+    published = np.loadtxt(field_data / "20220314" / "calibration_results.csv")[:3] * 1e3
+    for (a, b), distance_mm in zip(combinations((1, 2, 3), 2), published, strict=True):
+        assert result["inter_prism_mm"][f"{a}-{b}"]["reference"] == pytest.approx(distance_mm, abs=1e-6)

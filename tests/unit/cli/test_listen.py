@@ -1,0 +1,131 @@
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+import threading
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from support.records import EVENT, HELLO, NO_POSE, POINT, POSE, STATUS, measurement
+
+from tsgt.recording import encode_line
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from support.cli import Tsgt
+
+LINES = [encode_line(record) for record in (HELLO, measurement(0), POINT, POSE, NO_POSE, STATUS, EVENT)]
+
+
+POSE_TEXT = (
+    "22:13:20.050  pose  valid  1.000 2.000 -0.100 m  yaw 73.74 pitch 0.00 roll 0.00 deg"
+    "  residual 2.1 mm  ages 1: 0.25 s"
+)
+STATUS_TEXT = (
+    "22:13:22.000  status  19 of 20 poses valid; station 1: 4 of 5 usable, last ok 0.20 s ago; "
+    "station 2: no measurement yet"
+)
+
+
+@contextmanager
+def serving(path: Path, data: bytes) -> Iterator[None]:
+    """Serve one reader the data, then hang up."""
+
+    def serve() -> None:
+        connection, _ = listener.accept()
+        with connection:
+            connection.sendall(data)
+
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(path))
+        listener.listen()
+        thread = threading.Thread(target=serve)
+        thread.start()
+        try:
+            yield
+        finally:
+            thread.join()
+
+
+def test_every_type_is_shown_on_one_line(tsgt: Tsgt, tmp_path: Path) -> None:
+    """Each line of the stream becomes one readable line, and the end of the stream is success."""
+    with serving(tmp_path / "s", b"".join(line + b"\n" for line in LINES)):
+        outcome = tsgt("listen", "--socket", tmp_path / "s")
+    assert outcome.code == 0
+    assert outcome.err == ""
+    assert outcome.out.splitlines() == [
+        f"tsgt {HELLO.version}, stream protocol 1: measurement, point, pose, status, event",
+        "22:13:20.000  station 1 prism 1  horizontal 5.7296 deg  zenith 85.9437 deg  30.0000 m  ok",
+        "22:13:20.000  station 2 prism 2  1.000 -2.500 0.333 m  ok",
+        POSE_TEXT,
+        "22:13:20.100  pose  invalid (outage)  ages 1: -",
+        STATUS_TEXT,
+        "22:13:23.000  event lines_lost: lost 7 lines",
+    ]
+
+
+def test_json_is_the_stream_byte_for_byte(tsgt: Tsgt, tmp_path: Path) -> None:
+    """With --json the lines come out as they went in, of unknown types as well."""
+    data = b"".join(line + b"\n" for line in [*LINES, b'{"type":"weather", "wind":  1}'])
+    with serving(tmp_path / "s", data):
+        outcome = tsgt("listen", "--socket", tmp_path / "s", "--json")
+    assert outcome.out.encode() == data
+
+
+def test_unknown_types_and_keys_are_passed_over(tsgt: Tsgt, tmp_path: Path) -> None:
+    """Lines of a newer server are shown as far as they are known."""
+    event = json.dumps(json.loads(encode_line(EVENT)) | {"colour": "red"}).encode()
+    with serving(tmp_path / "s", b'{"type":"weather"}\n' + event + b"\n"):
+        outcome = tsgt("listen", "--socket", tmp_path / "s")
+    assert outcome.out == "22:13:23.000  event lines_lost: lost 7 lines\n"
+    assert outcome.err == ""
+
+
+def test_other_protocol_is_pointed_out(tsgt: Tsgt, tmp_path: Path) -> None:
+    """A server of another protocol is shown with a warning."""
+    hello = json.dumps(json.loads(encode_line(HELLO)) | {"protocol": 2}).encode()
+    with serving(tmp_path / "s", hello + b"\n"):
+        assert "made for protocol 1" in tsgt("listen", "--socket", tmp_path / "s").out
+
+
+def test_line_that_cannot_be_shown_is_reported(tsgt: Tsgt, tmp_path: Path) -> None:
+    """A broken line goes to stderr in one line, and listening goes on."""
+    with serving(tmp_path / "s", b'{"type":"event"}\ngarbage\n' + LINES[-1] + b"\n"):
+        outcome = tsgt("listen", "--socket", tmp_path / "s")
+    assert outcome.code == 0
+    assert len(outcome.err.splitlines()) == 2
+    assert outcome.out.splitlines()[-1].endswith("lost 7 lines")
+
+
+def test_count_stops_listening(tsgt: Tsgt, tmp_path: Path) -> None:
+    """After so many lines the command is done."""
+    with serving(tmp_path / "s", b"".join(line + b"\n" for line in LINES)):
+        outcome = tsgt("listen", "--socket", tmp_path / "s", "--json", "--count", "3")
+    assert len(outcome.out.splitlines()) == 3
+
+
+def test_nobody_there_is_one_line(tsgt: Tsgt, tmp_path: Path) -> None:
+    """Without a server the command fails in one line that says what to do."""
+    outcome = tsgt("listen", "--socket", tmp_path / "s")
+    assert outcome.code == 1
+    assert len(outcome.err.splitlines()) == 1
+    assert "start tsgt-master or tsgt replay" in outcome.err
+
+
+def test_stale_socket_is_one_line(tsgt: Tsgt, tmp_path: Path) -> None:
+    """A socket that nobody serves is as good as none."""
+    with socket.socket(socket.AF_UNIX) as stale:
+        stale.bind(str(tmp_path / "s"))
+    outcome = tsgt("listen", "--socket", tmp_path / "s")
+    assert outcome.code == 1
+    assert "Connection refused" in outcome.err
+
+
+def test_listening_needs_neither_numpy_nor_scipy() -> None:
+    """The command is up at once on a small computer."""
+    check = "import sys, tsgt.cli.live; sys.exit(bool({'numpy', 'scipy'} & sys.modules.keys()))"
+    assert subprocess.run([sys.executable, "-c", check], check=False).returncode == 0

@@ -1,0 +1,39 @@
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.records import EVENT, measurement
+
+from tsgt.cli.render import render, yaw_pitch_roll_deg
+from tsgt.recording import encode_line
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_angles_agree_with_scipy(seed: int) -> None:
+    """Yaw, pitch and roll are scipy's intrinsic ZYX angles."""
+    rotation = Rotation.random(rng=np.random.default_rng(seed))
+    x, y, z, w = rotation.as_quat(canonical=True)
+    assert yaw_pitch_roll_deg((x, y, z, w)) == pytest.approx(rotation.as_euler("ZYX", degrees=True))
+
+
+def test_straight_up_has_a_pitch() -> None:
+    """A pitch of 90 degrees, where rounding goes beyond what asin takes, is shown as such."""
+    s = math.sqrt(0.5) * (1 + 1e-15)
+    assert yaw_pitch_roll_deg((0.0, s, 0.0, s))[1] == pytest.approx(90.0)
+
+
+def test_measurement_without_distance_says_so() -> None:
+    """An angle-only measurement has no distance to show."""
+    text = render("measurement", encode_line(replace(measurement(0), slope_distance_m=None)))
+    assert text is not None
+    assert "no distance" in text
+
+
+@pytest.mark.parametrize("stamp_ns", [0, -5, 2**63 - 1, 10**30])
+def test_any_time_can_be_shown(stamp_ns: int) -> None:
+    """A clock that was never set right does not stop the display."""
+    assert render("event", encode_line(replace(EVENT, stamp_ns=stamp_ns))) is not None

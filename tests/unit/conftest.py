@@ -1,0 +1,5 @@
+"""Fixtures of the unit tests."""
+
+from __future__ import annotations
+
+from support.cli import tsgt  # noqa: F401 (a fixture)

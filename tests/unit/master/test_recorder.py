@@ -1,0 +1,64 @@
+"""The recorder on a disk that fills up and is emptied again."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+from structlog.testing import capture_logs
+from support.records import HEADER
+
+from tsgt.errors import RecordingError
+from tsgt.master.recorder import Recorder
+from tsgt.recording import RecordingWriter, encode_line
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+
+class FullDisk(RecordingWriter):
+    """A real recording on a disk that is full whenever the test says so."""
+
+    full = False
+
+    def write_line(self, line: bytes) -> None:
+        """Refuse the line, or write it."""
+        if self.full:
+            raise RecordingError("no room", path=self.path)
+        super().write_line(line)
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.path = path
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[FullDisk]:
+    """Open an empty recording."""
+    with FullDisk(tmp_path / "run.jsonl") as writer:
+        writer.write(HEADER)
+        yield writer
+
+
+def test_what_a_full_disk_refused_is_written_when_there_is_room(disk: FullDisk) -> None:
+    """No line is lost and the order is kept; the user is told once that it failed, and that it recovered."""
+    recorder = Recorder(disk)
+    with capture_logs() as logs:
+        for number in range(9):
+            disk.full = 3 <= number < 6
+            recorder.write_line(b"%d" % number)
+    lines = disk.path.read_bytes().splitlines()
+    assert lines == [encode_line(HEADER), *(b"%d" % number for number in range(9))]
+    assert [entry["event"] for entry in logs] == ["recording_failed", "recording_recovered"]
+
+
+def test_memory_is_bounded_and_the_loss_is_counted(disk: FullDisk) -> None:
+    """Beyond the limit the oldest lines go, and the log says how many."""
+    recorder = Recorder(disk, waiting_lines=4)
+    with capture_logs() as logs:
+        for number in range(10):
+            disk.full = number < 9
+            recorder.write_line(b"%d" % number)
+    assert disk.path.read_bytes().splitlines()[1:] == [b"5", b"6", b"7", b"8", b"9"]
+    assert logs[-1]["lost_lines"] == 5

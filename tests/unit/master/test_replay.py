@@ -1,0 +1,112 @@
+"""Replay: what is handed over when, what comes out, and what is said about recordings that do not fit."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+from support.records import EVENT, HEADER
+from support.scene import START, standing_scene
+
+from tsgt.errors import CorruptLineError, RecordingError
+from tsgt.master.feed import Feed
+from tsgt.master.replay import replay, replayed
+from tsgt.master.stream import StreamServer
+from tsgt.recording import RecordingWriter, encode_line
+from tsgt.simulation.clocks import VirtualClock
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+SCENE = standing_scene()
+
+
+def live_lines(path: Path, seconds: int = 3) -> list[bytes]:
+    """Record a short live run, as a master does; return the lines that its readers got."""
+    feed = Feed(SCENE.parameters)
+    lines: list[bytes] = []
+    for step in range(seconds * 10):
+        for station in (1, 2, 3):
+            lines += map(encode_line, feed.measurement(SCENE.measure(station, step / 10)))
+    event = replace(EVENT, stamp_ns=START + seconds * 1_000_000_000 + 5_000_000_000)
+    lines += [*map(encode_line, feed.advance(event.stamp_ns)), encode_line(event)]
+    with RecordingWriter(path) as writer:
+        for line in (encode_line(HEADER), encode_line(SCENE.parameters), *lines):
+            writer.write_line(line)
+    return lines
+
+
+def replayed_lines(path: Path) -> list[bytes]:
+    """All lines of a replay."""
+    return [line for _, lines in replayed(path) for line in lines]
+
+
+def test_a_replay_is_the_stream_again(tmp_path: Path) -> None:
+    """Poses, measurements and events come out as they did live, bit for bit."""
+    path = tmp_path / "run.jsonl"
+    lines = live_lines(path)
+    assert len(lines) > 100
+    assert replayed_lines(path) == lines
+
+
+def test_recorded_poses_are_made_again_not_copied(tmp_path: Path) -> None:
+    """Without its pose lines a recording gives the same stream."""
+    path = tmp_path / "run.jsonl"
+    lines = live_lines(path)
+    kept = [line for line in path.read_bytes().splitlines(keepends=True) if b'"type":"pose"' not in line]
+    path.write_bytes(b"".join(kept))
+    assert replayed_lines(path) == lines
+
+
+def test_each_session_begins_anew(tmp_path: Path) -> None:
+    """A master that was restarted on the same file had an empty pipeline, and so has the replay."""
+    path = tmp_path / "run.jsonl"
+    lines = live_lines(path)
+    assert live_lines(path) == lines
+    assert replayed_lines(path) == lines + lines
+
+
+def test_a_measurement_without_parameters_is_an_error(tmp_path: Path) -> None:
+    """What nobody can compute with is not passed over in silence."""
+    path = tmp_path / "run.jsonl"
+    with RecordingWriter(path) as writer:
+        writer.write(HEADER)
+        writer.write(SCENE.measure(1, 0.0))
+    with pytest.raises(
+        RecordingError, match="line 2: a line of type measurement stands before any parameters"
+    ):
+        replayed_lines(path)
+
+
+def test_a_line_with_a_wrong_field_stops_the_replay_unless_told_to_go_on(tmp_path: Path) -> None:
+    """A whole line that is no measurement is an error with its number, or reported and left out."""
+    path = tmp_path / "run.jsonl"
+    lines = live_lines(path)
+    with path.open("ab") as file:
+        file.write(b'{"type":"measurement","station":"one"}\n')
+    with pytest.raises(CorruptLineError, match="station"):
+        replayed_lines(path)
+    problems: list[RecordingError] = []
+    again = [line for _, some in replayed(path, keep_going=True, on_problem=problems.append) for line in some]
+    assert again == lines
+    assert len(problems) == 1
+
+
+@pytest.mark.parametrize(("speed", "lasts_s"), [(1.0, 8.0), (4.0, 2.0), (float("inf"), 0.0)])
+async def test_the_speed_sets_the_pace_and_nothing_else(tmp_path: Path, speed: float, lasts_s: float) -> None:
+    """A reader gets the same lines at any speed, in the recording's time divided by it."""
+    path, clock = tmp_path / "run.jsonl", VirtualClock(0)
+    lines = live_lines(path)
+    began_ns = clock.monotonic_ns()
+    async with StreamServer(tmp_path / "poses.sock", b"{}") as server:
+        reader, writer = await asyncio.open_unix_connection(tmp_path / "poses.sock")
+        await server.wait_for_reader()
+        published = await replay(replayed(path), server, clock, speed=speed)
+        ended_ns = clock.monotonic_ns()
+    received = (await reader.read()).splitlines()
+    writer.close()
+    assert received[1:] == lines
+    assert published == len(lines)
+    assert (ended_ns - began_ns) / 1e9 == pytest.approx(lasts_s, abs=0.2)

@@ -1,0 +1,41 @@
+"""Writing recordings from the command line, and telling of what could not be read in them."""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING
+
+import click
+
+import tsgt
+from tsgt.clock import SystemClock
+from tsgt.recording import RecordingHeader, encode_line, write_atomically
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+    from tsgt.errors import RecordingError
+    from tsgt.model import Parameters
+
+
+def write_recording(path: Path, *, source: str, parameters: Parameters, records: Iterable[object]) -> None:
+    """Write a whole recording, or nothing: header, parameters, records in the order given."""
+    header = RecordingHeader(
+        software=f"tsgt {tsgt.__version__}", created_ns=SystemClock().realtime_ns(), source=source
+    )
+    with write_atomically(path) as file:
+        for record in itertools.chain([header, parameters], records):
+            file.write(encode_line(record) + b"\n")
+
+
+def report_problem(problem: RecordingError) -> None:
+    """Tell the user of a line that is skipped."""
+    click.echo(f"warning: {problem}", err=True)
+
+
+def refuse_to_replace(inputs: Iterable[Path], output: Path) -> None:
+    """Refuse to write a result over a file that it is made from."""
+    for path in inputs:
+        if output.resolve() == path.resolve():
+            raise click.UsageError(f"the output would replace its own input {path}; choose another file")

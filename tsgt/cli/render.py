@@ -1,0 +1,127 @@
+"""Lines of the stream as text for people: one line each, degrees and millimetres."""
+
+from __future__ import annotations
+
+import math
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+from tsgt.master.stream_records import PROTOCOL_VERSION, EventRecord, HelloRecord, PoseRecord, StatusRecord
+from tsgt.model import PointMeasurement, PolarMeasurement
+from tsgt.recording import decode
+
+if TYPE_CHECKING:
+    from tsgt.model import Row4
+
+
+def render(kind: str, line: bytes) -> str | None:
+    """Put a line of the stream into words.
+
+    Parameters
+    ----------
+    kind
+        The line's ``type``.
+    line
+        The JSON object.
+
+    Returns
+    -------
+    str or None
+        One line of text; None for a type that this version does not know.
+
+    Raises
+    ------
+    ValueError
+        The line is of a known type, but a field is missing or wrong.
+    """
+    match kind:
+        case "hello":
+            return _hello(decode(HelloRecord, line))
+        case "measurement":
+            return _polar(decode(PolarMeasurement, line))
+        case "point":
+            return _point(decode(PointMeasurement, line))
+        case "pose":
+            return _pose(decode(PoseRecord, line))
+        case "status":
+            return _status(decode(StatusRecord, line))
+        case "event":
+            event = decode(EventRecord, line)
+            return f"{_time(event.stamp_ns)}  event {event.event}: {event.message}"
+        case _:
+            return None
+
+
+def _hello(hello: HelloRecord) -> str:
+    text = f"tsgt {hello.version}, stream protocol {hello.protocol}: {', '.join(hello.capabilities)}"
+    if hello.protocol != PROTOCOL_VERSION:
+        text += f" (made for protocol {PROTOCOL_VERSION}; figures may be misread, use tsgt listen of that version)"
+    return text
+
+
+def _polar(polar: PolarMeasurement) -> str:
+    distance = "no distance" if polar.slope_distance_m is None else f"{polar.slope_distance_m:.4f} m"
+    return (
+        f"{_time(polar.stamp_ns)}  station {polar.station} prism {polar.prism}  "
+        f"horizontal {math.degrees(polar.horizontal_angle_rad):.4f} deg  "
+        f"zenith {math.degrees(polar.zenith_angle_rad):.4f} deg  {distance}  {polar.status}"
+    )
+
+
+def _point(point: PointMeasurement) -> str:
+    return (
+        f"{_time(point.stamp_ns)}  station {point.station} prism {point.prism}  "
+        f"{_vector(point.position_m)} m  {point.status}"
+    )
+
+
+def _pose(pose: PoseRecord) -> str:
+    parts = [_time(pose.stamp_ns), "pose", "valid" if pose.valid else f"invalid ({pose.reason})"]
+    if pose.position_m is not None and pose.orientation_xyzw is not None:
+        yaw, pitch, roll = yaw_pitch_roll_deg(pose.orientation_xyzw)
+        parts.append(f"{_vector(pose.position_m)} m")
+        parts.append(f"yaw {yaw:.2f} pitch {pitch:.2f} roll {roll:.2f} deg")
+    if pose.residual_m is not None:
+        parts.append(f"residual {1e3 * pose.residual_m:.1f} mm")
+    ages = ", ".join(f"{share.id}: {_age(share.age_s)}" for share in pose.stations)
+    parts.append(f"ages {ages}")
+    return "  ".join(parts)
+
+
+def _status(status: StatusRecord) -> str:
+    stations = "; ".join(
+        f"station {s.id}: {s.usable} of {s.measurements} usable, last {s.status} {_age(s.age_s)} ago"
+        if s.status
+        else f"station {s.id}: no measurement yet"
+        for s in status.stations
+    )
+    return f"{_time(status.stamp_ns)}  status  {status.valid_poses} of {status.poses} poses valid; {stations}"
+
+
+def _time(stamp_ns: int) -> str:
+    seconds, rest_ns = divmod(stamp_ns, 1_000_000_000)
+    try:
+        text = datetime.fromtimestamp(seconds, tz=UTC).strftime("%H:%M:%S")
+    except (ValueError, OverflowError, OSError):  # a clock that was never set right
+        return f"{seconds} s"
+    return f"{text}.{rest_ns // 1_000_000:03d}"
+
+
+def _vector(values: tuple[float, ...]) -> str:
+    return " ".join(f"{value:.3f}" for value in values)
+
+
+def _age(age_s: float | None) -> str:
+    return "-" if age_s is None else f"{age_s:.2f} s"
+
+
+def yaw_pitch_roll_deg(quaternion_xyzw: Row4) -> tuple[float, float, float]:
+    """Angles in degrees of R = Rz(yaw) Ry(pitch) Rx(roll), from a unit quaternion.
+
+    Computed here with the standard library, so that ``tsgt listen`` starts without numpy and scipy.
+    """
+    x, y, z, w = quaternion_xyzw
+    yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
+    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    return math.degrees(yaw), math.degrees(pitch), math.degrees(roll)

@@ -1,0 +1,76 @@
+"""docs/reference/configuration.md, generated from the models: ``python -m tsgt.config.reference FILE``."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tsgt.config.files import json_schema
+from tsgt.config.models import KINDS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+_INTRODUCTION = """\
+# Configuration and set-up files
+
+Generated from the models (`make generated`); do not edit. All files are TOML. The key `kind` says what a file is;
+unknown keys are refused; a path is relative to the folder of the file that names it. Commented examples stand in
+`configs/`, and `tsgt config check FILE` says what is wrong with yours.
+"""
+
+
+def markdown() -> str:
+    """Return the page: a section per kind of file, a table per TOML table."""
+    return "\n".join([_INTRODUCTION, *map(_section, KINDS)])
+
+
+def _section(kind: str) -> str:
+    schema = json_schema(kind)
+    tables = "\n".join(_tables(schema, schema.get("$defs", {}), heading=""))
+    return f"## `{kind}`\n\n{schema['description'].replace('``', '`')}\n{tables}"
+
+
+def _tables(model: dict[str, Any], definitions: dict[str, Any], heading: str) -> Iterator[str]:
+    """Yield the table of a model's own keys, then those of the models within."""
+    own, within = [], []
+    required = model.get("required", [])
+    for key, field in model["properties"].items():
+        inner, name = _inner_model(key, field, definitions, heading)
+        if inner is not None:
+            within.append((inner, name))
+            continue
+        default = "required" if key in required else f"`{_toml(field.get('default'))}`"
+        own.append(f"| `{key}` | {default} | {field['description'].replace('``', '`')} |")
+    if own:
+        title = f"`{heading}` {model['description'].replace('``', '`')}\n\n" if heading else ""
+        yield "\n".join([f"\n{title}| key | default | meaning |", "|---|---|---|", *own, ""])
+    for inner, name in within:
+        yield from _tables(inner, definitions, name)
+
+
+def _inner_model(
+    key: str, field: dict[str, Any], definitions: dict[str, Any], heading: str
+) -> tuple[dict[str, Any] | None, str]:
+    """Find the model behind a key, and how its TOML table is written."""
+    path = f"{heading.strip('[]')}.{key}".strip(".")
+    (numbered,) = field.get("patternProperties", {"": {}}).values()
+    for place, name in (
+        (field, f"[{path}]"),
+        (field.get("items", {}), f"[[{path}]]"),
+        (numbered, f"[{path}.NUMBER]"),
+    ):
+        if "$ref" in place:
+            return definitions[place["$ref"].rsplit("/", 1)[-1]], name
+    return None, path
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, list):
+        return f"[{', '.join(map(_toml, value))}]"
+    return "none" if value is None else f'"{value}"' if isinstance(value, str) else str(value)
+
+
+if __name__ == "__main__":
+    Path(sys.argv[1]).write_text(markdown())

@@ -1,0 +1,221 @@
+"""One frame found in another from the points known in both: a least-squares fit with the noise of both sides.
+
+The start is Arun's alignment (Arun et al. 1987); Gauss-Newton on the rigid transforms then lets each miss count
+by its noise. For levelled instruments both work in the plane: heading and position.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.errors import DegenerateGeometryError, GeometryError
+from tsgt.geometry.alignment import align
+from tsgt.geometry.rigid import exp_so3, skew
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from tsgt.geometry.rigid import FloatArray
+
+Name = int | str
+
+STEPS_MAX = 20
+STEP_DONE = 1e-10  # m and rad: far below any instrument, well above rounding at 100 m
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointSet:
+    """Named points in one frame, with their noise.
+
+    Attributes
+    ----------
+    names
+        n different names: target numbers or names of body points.
+    points_m
+        (n, 3) coordinates in m.
+    covariances_m2
+        (n, 3, 3) covariances in the same frame in m^2; may be zero.
+    """
+
+    names: tuple[Name, ...]
+    points_m: FloatArray
+    covariances_m2: FloatArray
+
+    def __post_init__(self) -> None:
+        n = len(self.names)
+        if len(set(self.names)) != n:
+            raise GeometryError(
+                f"expected {n} different names of points, got {', '.join(map(str, self.names))}"
+            )
+        if self.points_m.shape != (n, 3) or self.covariances_m2.shape != (n, 3, 3):
+            raise GeometryError(
+                f"expected points ({n}, 3) and covariances ({n}, 3, 3), "
+                f"got {self.points_m.shape} and {self.covariances_m2.shape}"
+            )
+        if not (np.isfinite(self.points_m).all() and np.isfinite(self.covariances_m2).all()):
+            raise GeometryError("expected finite coordinates and covariances, got NaN or infinity")
+
+    def select(self, names: Sequence[Name]) -> PointSet:
+        """Take the points with these names, in this order."""
+        rows = [self.names.index(name) for name in names]
+        return PointSet(tuple(names), self.points_m[rows], self.covariances_m2[rows])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pairs:
+    """The same points in both frames, in the same order, and what is to be solved from them.
+
+    Attributes
+    ----------
+    source, target
+        The points in either frame, with the same names.
+    levelled
+        Both z axes are vertical: only heading and position are solved.
+    """
+
+    source: PointSet
+    target: PointSet
+    levelled: bool
+
+    @property
+    def names(self) -> tuple[Name, ...]:
+        """Names of the points."""
+        return self.source.names
+
+    def only(self, *names: Name) -> Pairs:
+        """Keep the points with these names, in this order."""
+        return Pairs(self.source.select(names), self.target.select(names), self.levelled)
+
+    def without(self, *names: Name) -> Pairs:
+        """Leave out the points with these names."""
+        return self.only(*(name for name in self.names if name not in names))
+
+    @property
+    def unknowns(self) -> list[int]:
+        """Which of (x, y, z, rotation about x, y, z) are solved."""
+        return [0, 1, 2, 5] if self.levelled else [0, 1, 2, 3, 4, 5]
+
+    @property
+    def redundancy(self) -> int:
+        """How many more coordinates there are than unknowns."""
+        return 3 * len(self.names) - len(self.unknowns)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """A rigid transform from source to target.
+
+    Attributes
+    ----------
+    rotation, translation_m
+        (3, 3) and (3,): ``target = rotation source + translation_m``.
+    covariance
+        (6, 6) of (x, y, z, rotation about the target frame's fixed axes x, y, z) in m and rad, from the noise
+        of the points; zero for what is not solved.
+    """
+
+    rotation: FloatArray
+    translation_m: FloatArray
+    covariance: FloatArray
+
+    def misses_m(self, pairs: Pairs) -> FloatArray:
+        """(n, 3) target minus transformed source in m."""
+        moved = pairs.source.points_m @ self.rotation.T + self.translation_m
+        misses: FloatArray = pairs.target.points_m - moved
+        return misses
+
+    def noise_m2(self, pairs: Pairs) -> FloatArray:
+        """(n, 3, 3) covariance of the misses from the noise of both points, in m^2."""
+        noise: FloatArray = (
+            self.rotation @ pairs.source.covariances_m2 @ self.rotation.T + pairs.target.covariances_m2
+        )
+        return noise
+
+    def misfit(self, pairs: Pairs) -> float:
+        """Sum of the squared misses over their noise; chi squared if the noise is as stated."""
+        misses = self.misses_m(pairs)[:, :, None]
+        return float(np.sum(misses * np.linalg.solve(self.noise_m2(pairs), misses)))
+
+
+def fit_frame(pairs: Pairs, *, weighted: bool) -> Fit:
+    """Fit by Gauss-Newton on the rigid transforms, from Arun's solution.
+
+    Parameters
+    ----------
+    pairs
+        At least three points; no noise may be singular.
+    weighted
+        Weigh each miss with the inverse of its noise; False is Arun's plain least squares.
+
+    Returns
+    -------
+    Fit
+        The optimum; its covariance is of first order in the noise.
+
+    Raises
+    ------
+    DegenerateGeometryError
+        The points do not determine the frame: too few, coinciding or in a line (levelled: above one another).
+
+    Notes
+    -----
+    The weights are those at Arun's rotation, which is off by so little that they would not change. Only where the
+    points lie in a line up to their noise do the steps not settle; Arun's solution then stands as it is, and its
+    covariance says how little it is worth.
+    """
+    start = _start(pairs)
+    noise = start.noise_m2(pairs)
+    if weighted:
+        weights = np.asarray(np.linalg.inv(noise), dtype=np.float64)
+        fit = start
+        for _ in range(STEPS_MAX):
+            step, covariance = _step(fit, pairs, weights, noise)
+            fit = Fit(exp_so3(step[3:]) @ fit.rotation, fit.translation_m + step[:3], covariance)
+            if np.abs(step).max() < STEP_DONE:
+                return fit
+    _, covariance = _step(start, pairs, np.eye(3), noise)
+    return Fit(start.rotation, start.translation_m, covariance)
+
+
+def _step(fit: Fit, pairs: Pairs, weights: FloatArray, noise_m2: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Gauss-Newton step (6,) of (translation, rotation), and the covariance (6, 6) of an optimum found here."""
+    free = pairs.unknowns
+    jacobian = pose_jacobian(pairs.source.points_m @ fit.rotation.T)[:, :, free]
+    projected = jacobian.transpose(0, 2, 1) @ weights
+    inverse = np.linalg.inv(np.sum(projected @ jacobian, axis=0))
+    step = np.zeros(6)
+    step[free] = inverse @ np.sum(projected @ fit.misses_m(pairs)[:, :, None], axis=0)[:, 0]
+    # Right for any weights; those of the noise itself leave the inverse alone.
+    spread = inverse @ np.sum(projected @ noise_m2 @ projected.transpose(0, 2, 1), axis=0) @ inverse
+    covariance = np.zeros((6, 6))
+    covariance[np.ix_(free, free)] = (spread + spread.T) / 2
+    return step, covariance
+
+
+def _start(pairs: Pairs) -> Fit:
+    """Align without weights: Arun's solution, or for levelled instruments its two-dimensional form about the vertical."""
+    nothing = np.zeros((6, 6))
+    source, target = pairs.source.points_m, pairs.target.points_m
+    if not pairs.levelled:
+        aligned = align(source, target)
+        return Fit(aligned.rotation, aligned.translation_m, nothing)
+    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
+    cosine = float(np.sum(a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1]))
+    sine = float(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]))
+    across, along = np.linalg.norm(b[:, :2]), np.linalg.norm(b)
+    if across <= 1e-6 * along or np.hypot(cosine, sine) == 0:
+        raise DegenerateGeometryError(
+            f"expected points apart from each other in plan, got a horizontal spread of {1e3 * across:.3f} mm; "
+            "add points beside them"
+        )
+    rotation = exp_so3(np.array([0.0, 0.0, np.arctan2(sine, cosine)]))
+    return Fit(rotation, target.mean(axis=0) - rotation @ source.mean(axis=0), nothing)
+
+
+def pose_jacobian(rotated_m: FloatArray) -> FloatArray:
+    """Differentiate R p + t with respect to (t, rotation about the fixed axes), given R p; (n, 3, 6)."""
+    identity = np.broadcast_to(np.eye(3), (len(rotated_m), 3, 3))
+    return np.concatenate([identity, -skew(rotated_m)], axis=2)

@@ -1,0 +1,56 @@
+"""The master's recording while the disk does what it likes: lines that it refuses wait until it takes them."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING
+
+import structlog
+
+from tsgt.errors import RecordingError
+
+if TYPE_CHECKING:
+    from tsgt.recording import RecordingWriter
+
+WAITING_LINES = 100_000
+"""About an hour of measurements and poses of three stations, 100 MB."""
+
+log = structlog.get_logger()
+
+
+class Recorder:
+    """Writes lines in order; on a full or failing disk keeps them in memory and tries again with the next line.
+
+    Parameters
+    ----------
+    writer
+        The open recording.
+    waiting_lines
+        How many lines wait at most; beyond that the oldest are lost, and counted in the log.
+    """
+
+    def __init__(self, writer: RecordingWriter, *, waiting_lines: int = WAITING_LINES) -> None:
+        self._writer = writer
+        self._waiting: deque[bytes] = deque()
+        self._waiting_lines = waiting_lines
+        self._failing = False
+        self._lost = 0
+
+    def write_line(self, line: bytes) -> None:
+        """Append a line, and before it those that still wait; never raises because of the disk."""
+        self._waiting.append(line)
+        try:
+            while self._waiting:
+                self._writer.write_line(self._waiting[0])
+                self._waiting.popleft()
+        except RecordingError as error:
+            if not self._failing:
+                log.error("recording_failed", error=str(error))  # noqa: TRY400 (the message says it all)
+            self._failing = True
+            if len(self._waiting) > self._waiting_lines:
+                self._waiting.popleft()
+                self._lost += 1
+        else:
+            if self._failing:
+                log.info("recording_recovered", lost_lines=self._lost)
+            self._failing, self._lost = False, 0

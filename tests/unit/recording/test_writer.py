@@ -1,8 +1,9 @@
 from __future__ import annotations
 
+import errno
 import json
 import os
-import resource
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,9 @@ from tsgt.errors import RecordingError, RecordingVersionError
 from tsgt.recording import RecordingWriter, encode_line, load_recording
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
+
+    from typing_extensions import Buffer
 
 
 @pytest.fixture
@@ -31,18 +34,31 @@ def writer(path: Path) -> Iterator[RecordingWriter]:
         yield opened
 
 
-def limit_file_size(size: int | None) -> None:
-    """Let no file of this process grow beyond a size: a disk that fills up, without a disk."""
-    _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (hard if size is None else size, hard))
+@dataclass
+class Disk:
+    """A disk with little room: takes what fits of a write, as a real one does, then none.
+
+    A limit by the kernel (RLIMIT_FSIZE) would hold for all files of the process, the log of the test run included.
+    """
+
+    room_bytes: int
+    real_write: Callable[[int, Buffer], int]
+
+    def write(self, descriptor: int, data: Buffer) -> int:
+        """Stand in for os.write."""
+        if self.room_bytes <= 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        written = self.real_write(descriptor, memoryview(data)[: self.room_bytes])
+        self.room_bytes -= written
+        return written
 
 
 @pytest.fixture
-def full_disk(path: Path, writer: RecordingWriter) -> Iterator[None]:  # noqa: ARG001 (after the writer's first lines)
-    """Room for thirty more bytes."""
-    limit_file_size(path.stat().st_size + 30)
-    yield
-    limit_file_size(None)
+def disk(writer: RecordingWriter, monkeypatch: pytest.MonkeyPatch) -> Disk:  # noqa: ARG001 (after its first lines)
+    """Leave room for thirty more bytes."""
+    disk = Disk(30, os.write)
+    monkeypatch.setattr(os, "write", disk.write)
+    return disk
 
 
 def test_line_is_with_the_kernel_at_once(path: Path, writer: RecordingWriter) -> None:
@@ -167,29 +183,27 @@ def test_impossible_place_is_one_line(place: str, tmp_path: Path) -> None:
         RecordingWriter(tmp_path / place)
 
 
-@pytest.mark.usefixtures("full_disk")
+@pytest.mark.usefixtures("disk")
 def test_full_disk_leaves_no_half_line(path: Path, writer: RecordingWriter) -> None:
     """A line that does not fit is an error in one line, and nothing of it stays."""
     with pytest.raises(
-        RecordingError, match=r"^[^\n]*a line was left out \(File too large\)[^\n]*room[^\n]*$"
+        RecordingError, match=r"^[^\n]*a line was left out \(No space left on device\)[^\n]*room[^\n]*$"
     ):
         writer.write(measurement(0))
     assert path.read_bytes() == recording_bytes()
 
 
-@pytest.mark.usefixtures("full_disk")
-def test_writing_goes_on_when_there_is_room_again(path: Path, writer: RecordingWriter) -> None:
+def test_writing_goes_on_when_there_is_room_again(path: Path, writer: RecordingWriter, disk: Disk) -> None:
     """After a line was left out the next one is written as soon as it fits."""
     with pytest.raises(RecordingError):
         writer.write(measurement(0))
-    limit_file_size(None)
+    disk.room_bytes = 10_000
     writer.write(measurement(1))
     assert path.read_bytes() == recording_bytes(measurement(1))
 
 
-@pytest.mark.usefixtures("full_disk")
 def test_half_line_that_cannot_be_cut_goes_later(
-    path: Path, writer: RecordingWriter, monkeypatch: pytest.MonkeyPatch
+    path: Path, writer: RecordingWriter, disk: Disk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """When even the cutting fails, the half line is removed before the next one is written."""
     with monkeypatch.context() as patch:
@@ -197,7 +211,7 @@ def test_half_line_that_cannot_be_cut_goes_later(
         with pytest.raises(RecordingError):
             writer.write(measurement(0))
     assert path.stat().st_size > len(recording_bytes())
-    limit_file_size(None)
+    disk.room_bytes = 10_000
     writer.write(measurement(1))
     assert path.read_bytes() == recording_bytes(measurement(1))
 

@@ -12,7 +12,7 @@ import numpy as np
 from tsgt.analysis.calibration import solve_prisms, solve_stations
 from tsgt.analysis.setup_files import write_prism_layout, write_station_frames
 from tsgt.analysis.target_file import read_prism_file, read_target_file
-from tsgt.cli.options import json_option
+from tsgt.cli.options import finite, json_option
 from tsgt.cli.output import CHECK_FAILED, print_json, print_table
 from tsgt.geometry import cartesian_to_polar
 
@@ -27,6 +27,7 @@ file_argument = click.argument("file", type=click.Path(path_type=Path))
 target_constant_option = click.option(
     "--target-constant-mm",
     type=float,
+    callback=finite,
     default=0.0,
     show_default=True,
     help="Added to each measured distance of a target, where its line has no constant_mm.",
@@ -107,6 +108,7 @@ def targets(
 @click.option(
     "--prism-constant-mm",
     type=float,
+    callback=finite,
     default=0.0,
     show_default=True,
     help="Added to each measured distance of a prism, where its line has no constant_mm.",

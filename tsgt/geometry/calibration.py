@@ -31,7 +31,7 @@ FALSE_ALARM = 1e-4
 SCALE_MAX = 2.0
 """How much larger than its model the noise may be (one sigma) before points count as contradictory.
 
-The authors' four sets of field targets show 0.7 to 1.9 times ``tsgt.model.TARGET_NOISE``."""
+The authors' four sets of field targets show 0.5 to 1.2 times ``tsgt.model.TARGET_NOISE``."""
 
 PREDICTION_LIMIT_M = 0.02
 PREDICTION_LIMIT_RAD = 0.1
@@ -60,7 +60,7 @@ class Limits:
 
 STATION_LIMITS = Limits(weak_rad=0.5e-3, blunder_m=0.01)
 """For stations. 0.5 mrad is 10 mm at a prism 20 m off the axis, as much as all the rest of the system together.
-Targets all around give 0.03 to 0.06 mrad (the authors' field sets), four of them nearly in a line 1.8 to 3 mrad.
+Targets all around give 0.06 to 0.11 mrad (the authors' field sets), four of them nearly in a line 3 to 5 mrad.
 A constant wrong by 10 mm moves single targets of these sets by up to 10 mm."""
 
 BODY_LIMITS = Limits(weak_rad=5e-3, blunder_m=0.003)

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import asyncio
 
-# Event loops on virtual time count in steps; a shorter sleep might not move them at all.
-_SHORTEST_SLEEP_NS = 1_000
-
 
 class VirtualClock:
     """The time of the running event loop, so that a loop on virtual time carries everything with it.
@@ -30,6 +27,4 @@ class VirtualClock:
 
     async def sleep_until(self, monotonic_ns: int) -> None:
         """Sleep on the event loop; an instant that has passed still lets other tasks run once."""
-        await asyncio.sleep(0)
-        while (missing_ns := monotonic_ns - self.monotonic_ns()) > 0:  # noqa: ASYNC110 (no event tells of time)
-            await asyncio.sleep(max(missing_ns, _SHORTEST_SLEEP_NS) / 1e9)
+        await asyncio.sleep(max(0, monotonic_ns - self.monotonic_ns()) / 1e9)

@@ -253,8 +253,10 @@ class PipelineParameters:
         A pose whose robot z axis leans further than this from straight up is invalid: the prism layout is
         mirrored, or two stations have swapped prisms.
     acceleration_sigma_mps2
-        One sigma, per axis, of a prism's acceleration between two measurements: what straight-line
+        One sigma, per axis, of the robot's acceleration between two measurements: what straight-line
         interpolation does not see, and the covariance therefore has to carry.
+    angular_acceleration_sigma_radps2
+        The same for its angular acceleration.
     """
 
     __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
@@ -265,7 +267,8 @@ class PipelineParameters:
     transport_limit_ns: int = 2_000_000_000
     residual_limit_m: float = 0.05
     tilt_limit_rad: float = math.pi / 2
-    acceleration_sigma_mps2: float = 0.5
+    acceleration_sigma_mps2: float = 0.3
+    angular_acceleration_sigma_radps2: float = 0.15
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

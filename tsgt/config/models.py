@@ -136,8 +136,10 @@ class PipelineConfig(Model):
     """A pose whose prisms miss their layout by more than this (root mean square) is not valid."""
     tilt_limit_deg: Annotated[float, Field(gt=0, le=180)] = 90.0
     """A pose whose robot leans further than this is not valid: mirrored layout or swapped prisms."""
-    acceleration_sigma_mps2: NotNegative = 0.5
-    """One sigma of a prism's acceleration between two measurements, per axis; goes into the covariance."""
+    acceleration_sigma_mps2: NotNegative = 0.3
+    """One sigma of the robot's acceleration between two measurements, per axis; goes into the covariance."""
+    angular_acceleration_sigma_radps2: NotNegative = 0.15
+    """One sigma of its angular acceleration, per axis; goes into the covariance."""
 
 
 class SetupConfig(Model):

@@ -102,6 +102,7 @@ def pipeline_parameters(pipeline: PipelineConfig) -> PipelineParameters:
         residual_limit_m=pipeline.residual_limit_mm / 1e3,
         tilt_limit_rad=math.radians(pipeline.tilt_limit_deg),
         acceleration_sigma_mps2=pipeline.acceleration_sigma_mps2,
+        angular_acceleration_sigma_radps2=pipeline.angular_acceleration_sigma_radps2,
     )
 
 

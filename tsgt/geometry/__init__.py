@@ -12,7 +12,13 @@ so that a live stream, its replay and later processing agree exactly.
 from __future__ import annotations
 
 from tsgt.geometry.alignment import Alignment, BatchAlignment, align, align_many, align_triplets
-from tsgt.geometry.interpolation import NO_GAP_NS, Interpolated, interpolate, interpolated_covariance
+from tsgt.geometry.interpolation import (
+    NO_GAP_NS,
+    Interpolated,
+    interpolate,
+    interpolated_covariance,
+    unseen_s2,
+)
 from tsgt.geometry.polar import (
     cartesian_jacobian,
     cartesian_to_polar,
@@ -22,7 +28,14 @@ from tsgt.geometry.polar import (
     polar_to_cartesian,
     raw_distance,
 )
-from tsgt.geometry.pose import Poses, check_layout, pose_covariance, poses_from_prisms, twists
+from tsgt.geometry.pose import (
+    Poses,
+    check_layout,
+    pose_covariance,
+    poses_from_prisms,
+    twists,
+    unseen_motion_covariance,
+)
 from tsgt.geometry.rigid import (
     FloatArray,
     check_transform,
@@ -70,4 +83,6 @@ __all__ = [
     "transform_from",
     "transform_points",
     "twists",
+    "unseen_motion_covariance",
+    "unseen_s2",
 ]

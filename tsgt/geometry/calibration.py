@@ -61,7 +61,7 @@ class Limits:
 STATION_LIMITS = Limits(weak_rad=0.5e-3, blunder_m=0.01)
 """For stations. 0.5 mrad is 10 mm at a prism 20 m off the axis, as much as all the rest of the system together.
 Targets all around give 0.06 to 0.11 mrad (the authors' field sets), four of them nearly in a line 3 to 5 mrad.
-A constant wrong by 10 mm moves single targets of these sets by up to 10 mm."""
+A constant wrong by 10 mm moves single targets of these sets by up to 11 mm."""
 
 BODY_LIMITS = Limits(weak_rad=5e-3, blunder_m=0.003)
 """For the robot's body: 5 mm at a prism one metre off the axis; all points are seen from about one side, so that

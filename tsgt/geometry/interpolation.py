@@ -108,13 +108,9 @@ def interpolate(
 
 
 def interpolated_covariance(
-    cov_before: FloatArray,
-    cov_after: FloatArray,
-    fraction: FloatArray,
-    gap_ns: NDArray[np.int64],
-    acceleration_sigma_mps2: float,
+    cov_before: FloatArray, cov_after: FloatArray, fraction: FloatArray
 ) -> FloatArray:
-    """Propagate the noise of two samples, and the curve that a straight line does not see, to an epoch.
+    """Propagate the noise of two samples to an epoch on the line between them.
 
     Parameters
     ----------
@@ -122,18 +118,32 @@ def interpolated_covariance(
         Covariances of the two samples in m^2, shape (N, 3, 3).
     fraction
         Where the epoch lies between them, 0 to 1, shape (N,).
-    gap_ns
-        Time between them in ns, shape (N,).
-    acceleration_sigma_mps2
-        One sigma per axis of the prism's acceleration, taken as constant between them: the line misses the curve by
-        a t_before t_after / 2.
 
     Returns
     -------
     FloatArray
         Shape (N, 3, 3), in m^2.
     """
-    gap_s = np.asarray(gap_ns) * 1e-9
-    missed_m = acceleration_sigma_mps2 / 2 * (fraction * gap_s) * ((1 - fraction) * gap_s)
     f = fraction[:, None, None]
-    return (1 - f) ** 2 * cov_before + f**2 * cov_after + (missed_m**2)[:, None, None] * np.eye(3)
+    covariance: FloatArray = (1 - f) ** 2 * cov_before + f**2 * cov_after
+    return covariance
+
+
+def unseen_s2(fraction: FloatArray, gap_ns: NDArray[np.int64]) -> FloatArray:
+    """By how much the straight line misses the path, per unit of acceleration: t_before t_after / 2.
+
+    Parameters
+    ----------
+    fraction
+        Where the epoch lies between two samples, 0 to 1, shape (N,).
+    gap_ns
+        Time between the two in ns, shape (N,).
+
+    Returns
+    -------
+    FloatArray
+        Shape (N,), in m per m/s^2, for an acceleration that is constant between the samples.
+    """
+    gap_s = np.asarray(gap_ns) * 1e-9
+    missed: FloatArray = (fraction * gap_s) * ((1 - fraction) * gap_s) / 2
+    return missed

@@ -14,7 +14,7 @@ import numpy as np
 
 from tsgt.errors import DegenerateGeometryError, GeometryError
 from tsgt.geometry.alignment import align_many, align_triplets, fit_gain, spread_m
-from tsgt.geometry.rigid import dot, rotate
+from tsgt.geometry.rigid import dot, rotate, skew
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -114,6 +114,55 @@ def pose_covariance(layout: FloatArray, rotation: FloatArray, prism_covariances:
         in_world = np.concatenate([rotation @ gain[:3] @ to_robot, rotation @ gain[3:] @ to_robot], axis=1)
         covariance += in_world @ prism_covariances[:, i] @ np.swapaxes(in_world, 1, 2)
     return 0.5 * (covariance + np.swapaxes(covariance, 1, 2))
+
+
+def unseen_motion_covariance(
+    layout: FloatArray,
+    rotation: FloatArray,
+    unseen: FloatArray,
+    *,
+    acceleration_sigma_mps2: float,
+    angular_acceleration_sigma_radps2: float,
+) -> FloatArray:
+    """Propagate a robot's unknown acceleration, which straight-line interpolation does not see, through the fit.
+
+    The robot accelerates as a whole: the errors of its prisms have one cause and are far from independent. What is
+    common to them moves the pose; only what differs, in time to the next measurement or in place on a turning robot,
+    turns it.
+
+    Parameters
+    ----------
+    layout
+        The prisms in the robot frame in m, shape (P, 3).
+    rotation
+        ``R_world_robot`` of the poses, shape (N, 3, 3).
+    unseen
+        By how much each prism's interpolation misses per unit of acceleration, in s^2, shape (N, P): see
+        :func:`tsgt.geometry.unseen_s2`.
+    acceleration_sigma_mps2
+        One sigma, per axis, of the acceleration of the prisms' centroid.
+    angular_acceleration_sigma_radps2
+        One sigma, per axis, of the robot's angular acceleration.
+
+    Returns
+    -------
+    FloatArray
+        Shape (N, 6, 6), in the order and axes of :func:`pose_covariance`, to which it adds.
+    """
+    arms = skew(layout - layout.mean(axis=0))
+    straight, turning = np.zeros((2, len(rotation), 6, 3))
+    for i, gain in enumerate(_layout_gain(layout)):
+        straight += unseen[:, i, None, None] * gain
+        turning += unseen[:, i, None, None] * (gain @ arms[i])
+    covariance = np.zeros((len(rotation), 6, 6))
+    for sigma, effect in (
+        (acceleration_sigma_mps2, straight),
+        (angular_acceleration_sigma_radps2, turning),
+    ):
+        # From the robot frame, in which the gains are constant, to the world.
+        in_world = np.concatenate([rotation @ effect[:, :3], rotation @ effect[:, 3:]], axis=1)
+        covariance += sigma**2 * (in_world @ np.ascontiguousarray(np.swapaxes(in_world, 1, 2)))
+    return covariance
 
 
 def twists(

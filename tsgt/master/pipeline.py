@@ -25,6 +25,8 @@ from tsgt.geometry import (
     poses_from_prisms,
     quaternion_from_rotation,
     twists,
+    unseen_motion_covariance,
+    unseen_s2,
 )
 from tsgt.master.pose_batch import PoseBatch, Reason
 from tsgt.master.tracks import Track, build_tracks, measured_at_ns, usable
@@ -200,6 +202,7 @@ class Pipeline:
             ],
             axis=1,
         )
+        unseen = np.stack([unseen_s2(i.fraction[rows], i.gap_ns[rows]) for i in interpolated], axis=1)
         poses = poses_from_prisms(self._layout, points)
         batch.reason[rows[poses.degenerate]] = Reason.DEGENERATE_GEOMETRY
         fitted = ~poses.degenerate
@@ -207,7 +210,15 @@ class Pipeline:
         velocity, angular_velocity = twists(self._layout, rotation, velocities[fitted])
         batch.position_m[rows] = poses.translation_m[fitted]
         batch.orientation_xyzw[rows] = quaternion_from_rotation(rotation)
-        batch.covariance[rows] = pose_covariance(self._layout, rotation, covariances[fitted])
+        batch.covariance[rows] = pose_covariance(
+            self._layout, rotation, covariances[fitted]
+        ) + unseen_motion_covariance(
+            self._layout,
+            rotation,
+            unseen[fitted],
+            acceleration_sigma_mps2=self._limits.acceleration_sigma_mps2,
+            angular_acceleration_sigma_radps2=self._limits.angular_acceleration_sigma_radps2,
+        )
         batch.velocity_mps[rows] = velocity
         batch.angular_velocity_radps[rows] = angular_velocity
         batch.residual_m[rows] = residual
@@ -218,14 +229,10 @@ class Pipeline:
     def _prism_covariance(
         self, track: Track, between: Interpolated, rows: NDArray[np.intp]
     ) -> NDArray[np.float64]:
-        """(R, 3, 3) covariance of interpolated positions: noise, unseen acceleration, uncertain instants."""
+        """(R, 3, 3) covariance of interpolated positions: noise of the instruments and uncertain instants."""
         after, fraction = between.after[rows], between.fraction[rows]
         covariance = interpolated_covariance(
-            track.covariances_m2[after - 1],
-            track.covariances_m2[after],
-            fraction,
-            between.gap_ns[rows],
-            self._limits.acceleration_sigma_mps2,
+            track.covariances_m2[after - 1], track.covariances_m2[after], fraction
         )
         sigmas_s = track.time_sigmas_ns / 1e9
         time_variance = (1.0 - fraction) ** 2 * sigmas_s[after - 1] ** 2 + fraction**2 * sigmas_s[after] ** 2

@@ -20,6 +20,8 @@ from tsgt.geometry import (
     transform_from,
     transform_points,
     twists,
+    unseen_motion_covariance,
+    unseen_s2,
 )
 from tsgt.model import TRACKING_NOISE
 
@@ -61,6 +63,13 @@ def fitted(count: int) -> Callable[[Items], Results]:
             quaternion_from_rotation(poses.rotation),
             pose_covariance(layout, poses.rotation, COVARIANCES[items, :count]),
             *twists(layout, poses.rotation, VELOCITIES[items, :count]),
+            unseen_motion_covariance(
+                layout,
+                poses.rotation,
+                np.abs(VELOCITIES[items, :count, 0]),
+                acceleration_sigma_mps2=0.3,
+                angular_acceleration_sigma_radps2=0.2,
+            ),
         )
 
     return compute
@@ -79,9 +88,10 @@ def interpolated(items: Items) -> Results:
     """One prism at the epochs, with its covariance."""
     found = interpolate(TIMES_NS, PRISMS[:, 0], EPOCHS_NS[items], 10**9)
     covariance = interpolated_covariance(
-        COVARIANCES[found.after % N, 0], COVARIANCES[found.after - 1, 1], found.fraction, found.gap_ns, 0.5
+        COVARIANCES[found.after % N, 0], COVARIANCES[found.after - 1, 1], found.fraction
     )
-    return found.points, found.velocities_mps, found.fraction, covariance
+    unseen = unseen_s2(found.fraction, found.gap_ns)
+    return found.points, found.velocities_mps, found.fraction, covariance, unseen
 
 
 @pytest.mark.parametrize(

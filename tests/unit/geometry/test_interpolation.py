@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tsgt.errors import GeometryError
-from tsgt.geometry import NO_GAP_NS, interpolate, interpolated_covariance
+from tsgt.geometry import NO_GAP_NS, interpolate, interpolated_covariance, unseen_s2
 
 SECOND_NS = 1_000_000_000
 START_NS = 1_647_269_269_671_000_000
@@ -114,9 +114,9 @@ def test_covariance_matches_monte_carlo_of_a_curved_path() -> None:
     after = after + acceleration * gap_s**2 / 2
     truth = acceleration * (fraction * gap_s) ** 2 / 2
     errors = before + fraction * (after - before) - truth
-    predicted = interpolated_covariance(
-        covariances[:1], covariances[1:], np.array([fraction]), np.array([800_000_000]), acceleration_sigma
-    )[0]
+    noise = interpolated_covariance(covariances[:1], covariances[1:], np.array([fraction]))[0]
+    unseen_m = acceleration_sigma * unseen_s2(np.array([fraction]), np.array([800_000_000]))[0]
+    predicted = noise + unseen_m**2 * np.eye(3)
     # Whitened, the sample covariance is the identity; with 20000 draws its entries scatter by 0.01.
     whitening = np.linalg.inv(np.linalg.cholesky(predicted))
     np.testing.assert_allclose(whitening @ (errors.T @ errors / draws) @ whitening.T, np.eye(3), atol=0.05)
@@ -125,5 +125,6 @@ def test_covariance_matches_monte_carlo_of_a_curved_path() -> None:
 def test_covariance_on_a_sample_is_that_sample() -> None:
     """At fraction 1 nothing but the sample after counts."""
     before, after = np.diag([1.0, 2, 3])[None], np.diag([4.0, 5, 6])[None]
-    found = interpolated_covariance(before, after, np.array([1.0]), np.array([SECOND_NS]), 0.5)
+    found = interpolated_covariance(before, after, np.array([1.0]))
     np.testing.assert_array_equal(found, after)
+    assert unseen_s2(np.array([1.0]), np.array([SECOND_NS]))[0] == 0.0

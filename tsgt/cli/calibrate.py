@@ -64,7 +64,7 @@ def targets(
     """Solve the stations' frames from targets that they all measured.
 
     FILE is our CSV or the authors' marker file. Exit code 3: targets contradict each other and it cannot be told
-    which is wrong (nothing is written then), or they fix a frame only weakly.
+    which is wrong (nothing is written then), they fix a frame only weakly, or --levelled stations are not level.
     """
     measured = read_target_file(file)
     frames = solve_stations(
@@ -175,6 +175,7 @@ def _frame_json(frame: FrameCalibration) -> dict[str, Any]:
         "sigma_mm": (1e3 * sigmas[:3]).tolist(),
         "sigma_mrad": (1e3 * sigmas[3:]).tolist(),
         "weak": [_weak_json(weak) for weak in frame.weak],
+        "tilt_mrad": None if frame.tilt_rad is None else 1e3 * frame.tilt_rad,
     }
 
 
@@ -247,6 +248,13 @@ def _warn(title: str, point: str, frame: FrameCalibration) -> None:
             err=True,
         )
 
+    if frame.tilt_rad is not None:
+        click.echo(
+            f"check failed: {title}: not level with station 1, the {point}s show {1e3 * frame.tilt_rad:.2f} mrad between "
+            "the vertical axes; solve without --levelled, or level both and measure again",
+            err=True,
+        )
+
 
 def _may_write(output: Path, frames: Iterable[FrameCalibration]) -> bool:
     if all(frame.consistent for frame in frames):
@@ -256,4 +264,5 @@ def _may_write(output: Path, frames: Iterable[FrameCalibration]) -> bool:
 
 
 def _exit_code(frames: Iterable[FrameCalibration]) -> int:
-    return 0 if all(frame.consistent and not frame.weak for frame in frames) else CHECK_FAILED
+    sound = all(frame.consistent and not frame.weak and frame.tilt_rad is None for frame in frames)
+    return 0 if sound else CHECK_FAILED

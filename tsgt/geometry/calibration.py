@@ -126,6 +126,9 @@ class FrameCalibration:
         rejected then, and the frame must not be used.
     weak
         Axes about which the frame is poorly held, worst first; empty for a good set of points.
+    tilt_rad
+        Angle between the z axes in rad where the frames were taken as levelled and the points say beyond their
+        noise that they are not; None otherwise.
     """
 
     T: FloatArray
@@ -136,6 +139,7 @@ class FrameCalibration:
     rejected: tuple[RejectedPoint, ...]
     consistent: bool
     weak: tuple[WeakAxis, ...]
+    tilt_rad: float | None
 
     @property
     def rms_m(self) -> float:
@@ -229,6 +233,7 @@ def calibrate_frame(
         ),
         consistent=bad is not None,
         weak=_weak_axes(fit.covariance, kept.target.points_m, limits.weak_rad),
+        tilt_rad=_tilt_rad(kept) if levelled else None,
     )
 
 
@@ -302,13 +307,17 @@ class _Prediction:
 
     @property
     def implausibility(self) -> float:
-        """Squared miss over its noise.
-
-        Where the others disagree among themselves more than their noise model says, the model is taken to be
-        optimistic by as much, up to ``SCALE_MAX``.
-        """
+        """Squared miss over its noise."""
         squared = float(self.miss_m @ np.linalg.solve(self.noise_m2, self.miss_m))
-        return squared / min(max(self.scale, 1.0), SCALE_MAX**2)
+        return squared / _noise_scale(self.scale)
+
+
+def _noise_scale(scatter: float) -> float:
+    """Factor on the noise model's variances, given what the points scatter among themselves in units of it.
+
+    Where they disagree more than the model says, it is taken to be optimistic by as much, up to ``SCALE_MAX``.
+    """
+    return min(max(scatter, 1.0), SCALE_MAX**2)
 
 
 def _suspect(pairs: Pairs, blunder_m: float) -> Name | None:
@@ -353,3 +362,17 @@ def _weak_axes(covariance: FloatArray, points_m: FloatArray, limit_rad: float) -
             x, y, z = (axis if axis @ points_m.mean(axis=0) >= 0 else -axis).tolist()
             weak.append(WeakAxis((x, y, z), float(np.sqrt(variance))))
     return tuple(weak)
+
+
+def _tilt_rad(pairs: Pairs) -> float | None:
+    """Angle between the z axes if the points demand one: the misfit then drops by more than two unknowns explain."""
+    free = Pairs(pairs.source, pairs.target, levelled=False)
+    try:
+        tilted = fit_frame(free, weighted=True)
+    except DegenerateGeometryError:
+        return None  # a line of points cannot tell
+    left = tilted.misfit(free)
+    drop = fit_frame(pairs, weighted=True).misfit(pairs) - left
+    if drop <= chi2.isf(FALSE_ALARM, 2) * _noise_scale(left / free.redundancy):
+        return None
+    return float(np.arccos(np.clip(tilted.rotation[2, 2], -1.0, 1.0)))

@@ -134,7 +134,8 @@ def test_four_field_targets_nearly_in_a_line_are_weak(
 def test_a_line_of_targets_is_enough_for_levelled_stations(tsgt: Tsgt, markers: Path, tmp_path: Path) -> None:
     """With --levelled the same four targets hold the frame."""
     path = only(markers, tmp_path, "1234")
-    assert tsgt("calibrate", "targets", path, "--target-constant-mm", 10, "--levelled").code == 0
+    done = tsgt("calibrate", "targets", path, "--target-constant-mm", 10, "--levelled", "--json")
+    assert all(station["weak"] == [] for station in done.json()["stations"].values())
 
 
 def test_the_table_shows_every_target(tsgt: Tsgt, markers: Path, tmp_path: Path) -> None:
@@ -235,3 +236,13 @@ def test_every_json_key_is_documented(
     page = HOW_TO.read_text(encoding="utf-8")
     text = page[page.index(section) :]
     assert [key for key in keys if f"`.{key}" not in text and f"`{key}" not in text] == []
+
+
+def test_levelled_stations_that_are_not_level_are_told(tsgt: Tsgt, markers: Path) -> None:
+    """On the field data station 2 leans by a third of a milliradian: with --levelled that is a failed check."""
+    done = tsgt("calibrate", "targets", markers, "--target-constant-mm", 10, "--levelled", "--json")
+    assert done.code == 3
+    stations = done.json()["stations"]
+    assert stations["2"]["tilt_mrad"] == pytest.approx(0.34, abs=0.03)
+    assert stations["3"]["tilt_mrad"] is None
+    assert "station 2: not level with station 1" in done.err

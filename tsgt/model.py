@@ -33,6 +33,43 @@ LAST_INSTANT_NS = 2**63 - 1
 """Times are kept in 64 bits; 2262 is the year that they end in."""
 
 
+LARGEST_NUMBER = 2**31 - 1
+"""For numbers of stations and prisms."""
+
+
+def check_instants(*times_ns: int) -> None:
+    """Refuse times that do not fit into 64 bits or lie before 1970.
+
+    Raises
+    ------
+    ValueError
+        With the first such time.
+    """
+    for time_ns in times_ns:
+        if not 0 <= time_ns <= LAST_INSTANT_NS:
+            raise ValueError(f"a time of {time_ns} ns is outside what a clock can show")
+
+
+def check_finite(*numbers: float) -> None:
+    """Refuse NaN and infinity, which an instrument or a radio may send and no JSON can hold.
+
+    Raises
+    ------
+    ValueError
+        With the first such number.
+    """
+    for number in numbers:
+        if not math.isfinite(number):
+            raise ValueError(f"{number} is not a finite number")
+
+
+def _check_limits(record: object, **limits: tuple[float, float]) -> None:
+    """Refuse parameters outside their limits, both of which are allowed."""
+    for name, (least, most) in limits.items():
+        if not least <= getattr(record, name) <= most:
+            raise ValueError(f"{name} is {getattr(record, name)}, expected {least:g} to {most:g}")
+
+
 class Status(StrEnum):
     """What the instrument said of a measurement, in one vocabulary for all makes."""
 
@@ -107,8 +144,9 @@ class PolarMeasurement:
     instrument_time_ns: int | None = None
 
     def __post_init__(self) -> None:
-        """Refuse instants that no clock shows."""
-        _check_instants(self.stamp_ns, self.received_ns, self.host_time_ns)
+        """Refuse what cannot be a measurement: instants that no clock shows, angles that are no numbers."""
+        check_instants(self.stamp_ns, self.received_ns, self.host_time_ns, self.stamp_sigma_ns)
+        check_finite(self.horizontal_angle_rad, self.zenith_angle_rad, self.slope_distance_m or 0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -147,8 +185,9 @@ class PointMeasurement:
     status: Status = Status.OK
 
     def __post_init__(self) -> None:
-        """Refuse instants that no clock shows."""
-        _check_instants(self.stamp_ns, self.received_ns)
+        """Refuse what cannot be a measurement: instants that no clock shows, coordinates that are no numbers."""
+        check_instants(self.stamp_ns, self.received_ns)
+        check_finite(*self.position_m)
 
 
 Measurement = PolarMeasurement | PointMeasurement
@@ -178,6 +217,16 @@ class InstrumentNoise:
     range_sigma_ppm: float
     angle_sigma_rad: float
     pointing_sigma_m: float
+
+    def __post_init__(self) -> None:
+        """Refuse noise that no instrument has."""
+        _check_limits(
+            self,
+            range_sigma_m=(0, 1e3),
+            range_sigma_ppm=(0, 1e6),
+            angle_sigma_rad=(0, math.pi),
+            pointing_sigma_m=(0, 1e3),
+        )
 
 
 TRACKING_NOISE = InstrumentNoise(
@@ -232,6 +281,17 @@ class StationParameters:
     latency_ns: int = 0
     noise: InstrumentNoise = TRACKING_NOISE
 
+    def __post_init__(self) -> None:
+        """Refuse what no station can have."""
+        _check_limits(
+            self,
+            station=(1, LARGEST_NUMBER),
+            prism=(1, LARGEST_NUMBER),
+            prism_constant_m=(-10, 10),
+            atmospheric_ppm=(-1e4, 1e4),
+            latency_ns=(-(10**12), 10**12),
+        )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PipelineParameters:
@@ -269,6 +329,19 @@ class PipelineParameters:
     tilt_limit_rad: float = math.pi / 2
     acceleration_sigma_mps2: float = 0.3
     angular_acceleration_sigma_radps2: float = 0.15
+
+    def __post_init__(self) -> None:
+        """Refuse limits that nothing can be computed with."""
+        _check_limits(
+            self,
+            period_ns=(1_000_000, 1e12),
+            outage_limit_ns=(0, 1e15),
+            transport_limit_ns=(0, 1e15),
+            residual_limit_m=(0, 1e6),
+            tilt_limit_rad=(0, math.pi),
+            acceleration_sigma_mps2=(0, 1e6),
+            angular_acceleration_sigma_radps2=(0, 1e6),
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -309,9 +382,3 @@ class Parameters:
     stations: tuple[StationParameters, ...]
     prisms: tuple[PrismPosition, ...]
     pipeline: PipelineParameters = PipelineParameters()
-
-
-def _check_instants(*times_ns: int) -> None:
-    for time_ns in times_ns:
-        if not 0 <= time_ns <= LAST_INSTANT_NS:
-            raise ValueError(f"a time of {time_ns} ns is outside what a clock can show")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import hypothesis.strategies as st
@@ -14,11 +15,22 @@ from tsgt.model import Status
 from tsgt.recording import encode_line
 
 if TYPE_CHECKING:
+    from support.scene import Scene
+
     from tsgt.master.stream_records import PoseRecord
     from tsgt.model import Measurement, PolarMeasurement
 
 TRANSPORT_NS = 2_000_000_000
 SCENE = standing_scene().moving(driving)
+
+# A fourth station helps the first on its prism.
+FOUR = replace(
+    SCENE,
+    parameters=replace(
+        SCENE.parameters,
+        stations=(*SCENE.parameters.stations, replace(SCENE.parameters.stations[1], station=4, prism=1)),
+    ),
+)
 
 # Steps between a station's measurements: its rate with jitter, now and then a gap beyond the outage limit.
 steps = st.lists(
@@ -32,22 +44,24 @@ steps = st.lists(
 
 
 @st.composite
-def arrivals(draw: st.DrawFn) -> list[PolarMeasurement]:
-    """Measurements of three stations in order of arrival; each station's arrive in order and in time."""
+def arrivals(draw: st.DrawFn, scene: Scene = SCENE) -> list[PolarMeasurement]:
+    """Measurements of all stations in order of arrival; each station's arrive in order and in time."""
     everything = []
-    for station in (1, 2, 3):
+    for station in range(1, len(scene.parameters.stations) + 1):
         time_s, arrival_s = draw(st.floats(0.0, 1.0)), 0.0
         for step_s, delay_s, status in draw(steps):
             # Whole microseconds: their sums round to exact nanoseconds, so that order is kept.
             time_s = round(time_s + step_s, 6)
             arrival_s = max(arrival_s, round(time_s + delay_s, 6))
-            everything.append(SCENE.measure(station, time_s, delay_s=arrival_s - time_s, status=status))
+            everything.append(scene.measure(station, time_s, delay_s=arrival_s - time_s, status=status))
     return sorted(everything, key=lambda m: m.received_ns)
 
 
-def live(measurements: list[PolarMeasurement], ticks_ns: list[int], end_ns: int) -> list[bytes]:
+def live(
+    measurements: list[PolarMeasurement], ticks_ns: list[int], end_ns: int, scene: Scene = SCENE
+) -> list[bytes]:
     """Lines of a live run whose timer also fires at the instants given."""
-    feed = Feed(SCENE.parameters)
+    feed = Feed(scene.parameters)
     calls = [(m.received_ns, m) for m in measurements] + [(tick, None) for tick in ticks_ns if tick < end_ns]
     records: list[Measurement | PoseRecord] = []
     for now_ns, measurement in sorted(calls, key=lambda call: call[0]):
@@ -74,6 +88,20 @@ def test_the_desk_gives_what_the_stream_gave(
     assert desk == poses(live(measurements, ticks_ns, end_ns))
 
 
+@settings(deadline=None, max_examples=60)
+@given(arrivals(FOUR), st.lists(st.integers(START, START + 100 * 10**9), max_size=30))
+def test_the_same_with_two_stations_on_one_prism(
+    measurements: list[PolarMeasurement], ticks_ns: list[int]
+) -> None:
+    """Each of the stations on a prism is waited for, so the order in which they arrive does not matter."""
+    end_ns = max((m.received_ns for m in measurements), default=START)
+    pipeline = Pipeline(FOUR.parameters)
+    for measurement in sorted(measurements, key=lambda m: m.stamp_ns):
+        pipeline.add(measurement)
+    desk = [encode_line(pose) for pose in pipeline.advance(end_ns).records()]
+    assert desk == poses(live(measurements, ticks_ns, end_ns, FOUR))
+
+
 @settings(deadline=None, max_examples=30)
 @given(arrivals(), st.lists(st.integers(START, START + 100 * 10**9), max_size=30))
 def test_the_timer_changes_no_line_and_no_order(
@@ -97,11 +125,11 @@ def test_stamps_of_poses_increase_by_one_period(measurements: list[PolarMeasurem
     assert stamps == list(range(stamps[0], stamps[-1] + 1, period)) if stamps else True
 
 
-@settings(deadline=None, max_examples=30)
-@given(arrivals())
+@settings(deadline=None, max_examples=60)
+@given(st.one_of(arrivals(), arrivals(FOUR)))
 def test_the_announced_deadline_is_when_the_next_pose_is_due(measurements: list[PolarMeasurement]) -> None:
     """At the deadline there is a pose, one nanosecond before there is none."""
-    pipeline = Pipeline(SCENE.parameters)
+    pipeline = Pipeline(FOUR.parameters if any(m.station == 4 for m in measurements) else SCENE.parameters)
     for measurement in measurements:
         pipeline.add(measurement)
         pipeline.advance(measurement.received_ns)

@@ -11,15 +11,15 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, model_validator
 
-from tsgt.model import Matrix4, Vector3  # noqa: TC001 (pydantic looks them up)
+from tsgt.model import LARGEST_NUMBER, Matrix4, Vector3
 
 # A calibration writes 17 digits; a matrix typed off a report has seven or so.
 RIGID_TOLERANCE = 1e-6
 
-Number = Annotated[int, Field(ge=1)]
-NumberKey = Annotated[str, Field(pattern=r"^[1-9][0-9]*$")]
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
+Number = Annotated[int, Field(ge=1, le=LARGEST_NUMBER)]
+NumberKey = Annotated[str, Field(pattern=r"^[1-9][0-9]{0,8}$")]
+Positive = Annotated[float, Field(gt=0, le=1e6)]
+NotNegative = Annotated[float, Field(ge=0, le=1e6)]
 
 
 def _beside_the_file(path: Path, info: ValidationInfo) -> Path:
@@ -78,7 +78,7 @@ class NoiseConfig(Model):
     """Constant part of the noise of the slope distance."""
     range_sigma_ppm: NotNegative = 2.0
     """Part that grows with the distance."""
-    angle_sigma_arcsec: NotNegative = 1.0
+    angle_sigma_arcsec: Annotated[float, Field(ge=0, le=648_000)] = 1.0
     """Noise of each angle."""
     pointing_sigma_mm: NotNegative = 1.0
     """What pointing at the prism adds, per axis."""
@@ -91,11 +91,11 @@ class StationConfig(Model):
     """Number of the station."""
     prism: Number
     """Number of the prism that it tracks."""
-    prism_constant_mm: float
+    prism_constant_mm: Annotated[float, Field(ge=-10_000, le=10_000)]
     """Added to every slope distance. No default: a forgotten constant shows in nothing but wrong poses."""
-    atmospheric_ppm: float = 0.0
+    atmospheric_ppm: Annotated[float, Field(ge=-10_000, le=10_000)] = 0.0
     """Scale correction of the slope distance, only what the instrument does not apply itself."""
-    latency_ms: float = 0.0
+    latency_ms: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
     """From the measurement to its time stamp; taken off the stamp. Positive: the stamp is late."""
     noise: NoiseConfig = NoiseConfig()
     """Noise of one measurement."""
@@ -126,7 +126,7 @@ class PipelineConfig(Model):
 
     estimator: Literal["linear"] = "linear"
     """Name of the estimator."""
-    rate_hz: Annotated[float, Field(gt=0, le=1000)] = 20.0
+    rate_hz: Annotated[float, Field(ge=0.01, le=1000)] = 20.0
     """Poses per second."""
     outage_limit_s: Positive = 1.0
     """Two measurements of one prism further apart than this leave the time between them without pose."""
@@ -252,9 +252,9 @@ class SimulatedStation(Model):
     """Where it stands, in the frame of station 1."""
     yaw_deg: float = 0.0
     """Direction of its circle's zero in the frame of station 1, positive to the left of its x axis."""
-    rate_hz: Positive = 2.5
+    rate_hz: Annotated[float, Field(gt=0, le=100)] = 2.5
     """Measurements per second; the first one comes at a random moment of the first period."""
-    prism_constant_mm: float = 10.0
+    prism_constant_mm: Annotated[float, Field(ge=-10_000, le=10_000)] = 10.0
     """What the instrument's slope distance lacks to the prism's centre."""
     noise: NoiseConfig = NoiseConfig(range_sigma_ppm=0.0)
     """Noise of one measurement."""
@@ -276,7 +276,7 @@ class ScenarioConfig(Model):
     """What this file is."""
     name: str = "dynamic"
     """Name of the scenario."""
-    duration_s: Positive = 600.0
+    duration_s: Annotated[float, Field(gt=0, le=86_400)] = 600.0
     """How long it takes; a command may ask for less."""
     motion: MotionConfig = MotionConfig()
     """How the robot drives."""

@@ -28,6 +28,7 @@ class Feed:
     def __init__(self, parameters: Parameters) -> None:
         self._pipeline = Pipeline(parameters)
         self._now_ns = -(2**63)
+        self._begun = False
 
     def measurement(self, measurement: Measurement) -> list[Measurement | PoseRecord]:
         """Take a measurement at its ``received_ns``; return it between the poses due before and those due with it.
@@ -37,6 +38,9 @@ class Feed:
         """
         if measurement.received_ns < self._now_ns:
             measurement = dataclasses.replace(measurement, received_ns=self._now_ns)
+        if not self._begun:
+            self._pipeline.begin_at(measurement.received_ns)
+            self._begun = True
         due = self.advance(measurement.received_ns)
         self._pipeline.add(measurement)
         return [*due, measurement, *self.advance(measurement.received_ns)]

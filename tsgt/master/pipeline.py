@@ -3,7 +3,7 @@
 Pure: no clock, no sockets. Poses are computed at epochs, the whole multiples of a period in Unix time. An epoch is
 *decided* as soon as each prism either has a measurement at or after it, or cannot get one any more that would help:
 everything that was made up to now less the transport limit has arrived, and the prism's last measurement is further
-back than the outage limit. A decided epoch gets its pose at once, so live poses wait for what they need and no
+back than the outage limit. Where several stations are on one prism, each of them has its say. A decided epoch gets its pose at once, so live poses wait for what they need and no
 longer; and what is decided does not depend on when the pipeline is asked, so that a replay gives the same poses.
 A measurement that arrives later than the transport limit, or out of its station's order, may come too late for the
 stream; :mod:`tsgt.analysis` hands all measurements over in the order of time and loses none.
@@ -29,7 +29,7 @@ from tsgt.geometry import (
     unseen_s2,
 )
 from tsgt.master.pose_batch import PoseBatch, Reason
-from tsgt.master.tracks import Track, build_tracks, measured_at_ns, usable
+from tsgt.master.tracks import Track, believable, build_tracks, measured_at_ns, usable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -38,13 +38,6 @@ if TYPE_CHECKING:
 
     from tsgt.geometry import Interpolated
     from tsgt.model import Measurement, Parameters
-
-# A measurement cannot have been made after it arrived; a clock offset that is a little off may make it seem so.
-_AHEAD_AT_MOST_NS = 1_000_000_000
-
-# The first epoch is at most this much before the first arrival: a station whose clock is years behind must not
-# make the stream begin years ago.
-_BEHIND_AT_MOST_NS = 3_600_000_000_000
 
 # Bounds the memory of a long recording's intermediate arrays; results do not depend on it.
 _EPOCHS_AT_ONCE = 8192
@@ -75,25 +68,38 @@ class Pipeline:
         self._tracks = {prism: Track.empty() for prism in self._prisms}
         self._unusable_ns: dict[int, list[int]] = {prism: [] for prism in self._prisms}
         self._pending: list[Measurement] = []
+        # Who can measure a prism, and up to when each station's measurements, which arrive in order, are here.
+        self._trackers = {
+            prism: {s.station for s in parameters.stations if s.prism == prism} for prism in self._prisms
+        }
+        self._reported_ns: dict[int, int] = {}
+        self._not_before_ns = 0
         self._next_epoch_ns: int | None = None
         self._started = False
+
+    def begin_at(self, now_ns: int) -> None:
+        """Make no poses for what lies before an instant less the transport limit.
+
+        A live run calls this when it begins: a first measurement stamped by a clock that is years behind, or one
+        from a long backlog, must not make the stream begin there.
+        """
+        self._not_before_ns = now_ns - self._limits.transport_limit_ns
 
     def add(self, measurement: Measurement) -> None:
         """Take a measurement.
 
-        Passed over are those of a station or prism that the parameters do not name, and those stamped more than a
-        second after they arrived: such a stamp is wrong, and believing it would stop the stream until then.
+        Passed over are those of a station or prism that the parameters do not name, and those that cannot have
+        been made when their stamp says.
         """
         station = self._stations.get(measurement.station)
-        if station is None or measurement.prism not in self._tracks:
+        if station is None or measurement.prism not in self._tracks or not believable(measurement, station):
             return
         time_ns = measured_at_ns(measurement, station)
-        if time_ns > measurement.received_ns + _AHEAD_AT_MOST_NS:
-            return
-        begin_ns = max(time_ns, measurement.received_ns - _BEHIND_AT_MOST_NS)
-        first_epoch = -(-begin_ns // self._limits.period_ns) * self._limits.period_ns
+        first_epoch = -(-max(time_ns, self._not_before_ns) // self._limits.period_ns) * self._limits.period_ns
         if self._next_epoch_ns is None or (not self._started and first_epoch < self._next_epoch_ns):
             self._next_epoch_ns = first_epoch
+        self._trackers[measurement.prism].add(station.station)
+        self._reported_ns[station.station] = max(time_ns, self._reported_ns.get(station.station, 0))
         if usable(measurement):
             self._pending.append(measurement)
         else:
@@ -128,15 +134,10 @@ class Pipeline:
         epoch = self._next_epoch_ns
         if epoch is None:
             return None
-        deadlines = [epoch]
-        for prism in self._prisms:
-            times = self._tracks[prism].times_ns
-            if not len(times):
-                deadlines.append(epoch + self._limits.transport_limit_ns + 1)
-            elif times[-1] < epoch:
-                lost_ns = int(times[-1]) + self._limits.outage_limit_ns
-                deadlines.append(max(epoch, lost_ns) + self._limits.transport_limit_ns + 1)
-        return max(deadlines)
+        waits_ns = [self._waits_until_ns(prism, epoch) for prism in self._prisms]
+        return max(
+            [epoch, *(wait_ns + self._limits.transport_limit_ns + 1 for wait_ns in waits_ns if wait_ns)]
+        )
 
     def _take_pending(self) -> None:
         if self._pending:
@@ -147,11 +148,28 @@ class Pipeline:
 
     def _decided_until_ns(self, prism: int, now_ns: int) -> int:
         arrived_ns = now_ns - self._limits.transport_limit_ns - 1
+        reported_ns = (self._reported_ns.get(station, 0) for station in self._trackers[prism])
+        known_ns = max(arrived_ns, min(reported_ns, default=0))
         times = self._tracks[prism].times_ns
-        if not len(times):
+        before = int(np.searchsorted(times, known_ns, side="right"))
+        if not before:
             return arrived_ns
-        last_ns = int(times[-1])
+        last_ns = int(times[before - 1])
         return arrived_ns if arrived_ns >= last_ns + self._limits.outage_limit_ns else last_ns
+
+    def _waits_until_ns(self, prism: int, epoch_ns: int) -> int | None:
+        """Up to when everything must have arrived for an epoch to be decided; None if nothing is waited for."""
+        times = self._tracks[prism].times_ns
+        after = int(np.searchsorted(times, epoch_ns))
+        lost_ns = epoch_ns
+        if after:
+            lost_ns = max(epoch_ns, int(times[after - 1]) + self._limits.outage_limit_ns)
+        if after == len(times):
+            return lost_ns
+        bracket_ns = int(times[after])
+        if all(self._reported_ns.get(station, 0) >= bracket_ns for station in self._trackers[prism]):
+            return None
+        return min(bracket_ns, lost_ns)
 
     def _forget_before(self, epoch_ns: int) -> None:
         for prism, track in self._tracks.items():

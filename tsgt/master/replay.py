@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from tsgt.master.stream import StreamServer
     from tsgt.recording import Line
 
-# What came from outside. Poses are made again; headers and parameters are not on the stream.
+# What came from outside; headers and parameters are not on the stream.
 _ARRIVALS: dict[str, type[Measurement | StatusRecord | EventRecord]] = {
     "measurement": PolarMeasurement,
     "point": PointMeasurement,
@@ -56,10 +56,19 @@ def replayed(
         The recording cannot be read, or measurements stand in it before any parameters.
     """
     feed: Feed | None = None
+    missing_poses = 0
     for line in read_lines(path, keep_going=keep_going, on_problem=on_problem):
         try:
             if line.type == "parameters":
-                feed = Feed(decode_line(Parameters, line, path))
+                feed, missing_poses = Feed(decode_line(Parameters, line, path)), 0
+            elif line.type == "pose" and feed is not None:
+                # One that was not made yet was due by the timer, with nothing arriving any more.
+                missing_poses += 1
+                due_ns = feed.next_deadline_ns()
+                if missing_poses > 0 and due_ns is not None:
+                    poses = [encode_line(pose) for pose in feed.advance(due_ns)]
+                    missing_poses -= len(poses)
+                    yield due_ns, poses
             elif line.type in _ARRIVALS:
                 if feed is None:
                     raise RecordingError(
@@ -67,7 +76,11 @@ def replayed(
                         path=path,
                         line=line.number,
                     )
-                yield _arrival(feed, decode_line(_ARRIVALS[line.type], line, path), line)
+                now_ns, lines, poses_made = _arrival(
+                    feed, decode_line(_ARRIVALS[line.type], line, path), line
+                )
+                missing_poses -= poses_made
+                yield now_ns, lines
         except CorruptLineError as problem:
             if not keep_going:
                 raise
@@ -77,10 +90,17 @@ def replayed(
 
 def _arrival(
     feed: Feed, record: Measurement | StatusRecord | EventRecord, line: Line
-) -> tuple[int, list[bytes]]:
+) -> tuple[int, list[bytes], int]:
+    """Hand over what arrived: the instant, the lines that it brought, and how many of them are poses."""
     if isinstance(record, StatusRecord | EventRecord):
-        return record.stamp_ns, [*map(encode_line, feed.advance(record.stamp_ns)), line.data]
-    return record.received_ns, [*map(encode_line, feed.measurement(record))]
+        now_ns = record.stamp_ns
+        records: list[object] = [*feed.advance(now_ns), record]
+    else:
+        now_ns = record.received_ns
+        records = [*feed.measurement(record)]
+    # What stood in the file goes out as it stood there, with keys that only a newer program knows.
+    lines = [line.data if each is record else encode_line(each) for each in records]
+    return now_ns, lines, len(records) - 1
 
 
 async def replay(

@@ -12,7 +12,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 import tsgt
-from tsgt.model import ROBOT_FRAME, WORLD_FRAME, Row4, Status, Vector3
+from tsgt.model import ROBOT_FRAME, WORLD_FRAME, Row4, Status, Vector3, check_instants
 
 PROTOCOL_VERSION = 1
 
@@ -195,6 +195,10 @@ class StatusRecord:
     valid_poses: int
     stations: tuple[StationStatus, ...]
 
+    def __post_init__(self) -> None:
+        """Refuse instants that no clock shows."""
+        check_instants(self.stamp_ns)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EventRecord:
@@ -222,3 +226,7 @@ class EventRecord:
     message: str
     station: int | None = None
     count: int | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse instants that no clock shows."""
+        check_instants(self.stamp_ns)

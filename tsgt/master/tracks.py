@@ -62,9 +62,10 @@ class Track:
         return len(self.times_ns)
 
     def merged(self, other: Track) -> Track:
-        """Return both in the order of time; of two positions at the same instant, the earlier known one stays.
+        """Return both in the order of time; of two positions at one instant that of the lower station stays.
 
-        A station that has nothing new may send its last measurement again, with the same instant.
+        A station that has nothing new may send its last measurement again, with the same instant. Which of two
+        stations wins must not depend on which came first, or a replay and the desk would differ.
         """
         names = [field.name for field in fields(Track)]
         joined = Track(
@@ -72,19 +73,23 @@ class Track:
         )
         if np.all(np.diff(joined.times_ns) > 0):
             return joined
-        _, first = np.unique(joined.times_ns, return_index=True)
-        return joined._rows(first)
+        ordered = joined.select(np.lexsort((joined.stations, joined.times_ns)))
+        return ordered.select(np.unique(ordered.times_ns, return_index=True)[1])
 
     def since(self, time_ns: int) -> Track:
         """Return the part that later epochs need: from the last position before an instant on."""
-        return self._rows(slice(max(0, int(np.searchsorted(self.times_ns, time_ns)) - 1), None))
+        return self.select(slice(max(0, int(np.searchsorted(self.times_ns, time_ns)) - 1), None))
 
-    def _rows(self, rows: slice | NDArray[np.intp]) -> Track:
+    def select(self, rows: slice | NDArray[np.intp]) -> Track:
+        """Return the given positions, by a slice or by their indices."""
         return Track(**{field.name: getattr(self, field.name)[rows] for field in fields(Track)})
 
 
 FARTHEST_M = 100_000.0
 """No total station measures so far, and no robot drives there: numbers beyond are garbage."""
+
+AHEAD_AT_MOST_NS = 1_000_000_000
+"""A measurement cannot have been made after it arrived; a clock offset that is a little off may make it seem so."""
 
 
 def usable(measurement: Measurement) -> bool:
@@ -102,6 +107,14 @@ def measured_at_ns(measurement: Measurement, station: StationParameters) -> int:
     return measurement.stamp_ns - station.latency_ns
 
 
+def believable(measurement: Measurement, station: StationParameters) -> bool:
+    """Tell whether a measurement can have been made when its stamp says.
+
+    One from the future cannot, and believing it would stop the stream until then.
+    """
+    return measured_at_ns(measurement, station) <= measurement.received_ns + AHEAD_AT_MOST_NS
+
+
 def build_tracks(parameters: Parameters, measurements: Iterable[Measurement]) -> dict[int, Track]:
     """Tracks of all prisms of the layout from the usable measurements of the stations in the parameters.
 
@@ -110,8 +123,8 @@ def build_tracks(parameters: Parameters, measurements: Iterable[Measurement]) ->
     parameters
         Station frames, constants, latencies, noise; and the prisms.
     measurements
-        In any order. Unusable ones, and those of stations or prisms that the parameters do not name, are
-        passed over.
+        In any order. Unusable and unbelievable ones, and those of stations or prisms that the parameters do not
+        name, are passed over.
 
     Returns
     -------
@@ -122,10 +135,13 @@ def build_tracks(parameters: Parameters, measurements: Iterable[Measurement]) ->
     tracks = {prism.prism: Track.empty() for prism in parameters.prisms}
     groups: dict[tuple[int, int, type], list[Measurement]] = defaultdict(list)
     for measurement in measurements:
-        if usable(measurement) and measurement.station in stations and measurement.prism in tracks:
+        station = stations.get(measurement.station)
+        if station is None or measurement.prism not in tracks:
+            continue
+        if usable(measurement) and believable(measurement, station):
             groups[measurement.station, measurement.prism, type(measurement)].append(measurement)
-    for (station, prism, _), group in groups.items():
-        tracks[prism] = tracks[prism].merged(_track_of(stations[station], group))
+    for (number, prism, _), group in groups.items():
+        tracks[prism] = tracks[prism].merged(_track_of(stations[number], group))
     return tracks
 
 

@@ -38,7 +38,7 @@ PROBLEMS = {
     "missing key": (("prism_constant_mm = 10.0  #", "#"), "stations[#1].prism_constant_mm: missing key"),
     "number out of range": (
         ("rate_hz = 20.0", "rate_hz = -1"),
-        "pipeline.rate_hz = -1: should be greater than 0",
+        "pipeline.rate_hz = -1: should be greater than or equal to 0.01",
     ),
     "not a number": (
         ("rate_hz = 20.0", "rate_hz = nan"),

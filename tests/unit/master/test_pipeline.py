@@ -298,9 +298,23 @@ def test_a_stamp_from_the_future_stops_nothing(scene: Scene) -> None:
     )
 
 
-def test_a_stamp_from_long_ago_does_not_start_the_stream_there(scene: Scene) -> None:
-    """A station that begins in another year makes the stream begin an hour ago at most."""
-    wrong = scene.measure(2, -40_000_000.0, delay_s=40_000_000.0)
-    poses = poses_of(scene, [wrong, *every(scene, [0.0, 0.4])], until_s=0.5)
-    assert poses.stamp_ns[0] == START - 3600 * SECOND
+def test_a_live_run_begins_when_it_begins(scene: Scene) -> None:
+    """A station that begins in another year does not make the live stream begin there."""
+    pipeline = Pipeline(scene.parameters)
+    pipeline.begin_at(START)
+    for measurement in [scene.measure(2, -40_000_000.0, delay_s=40_000_000.0), *every(scene, [0.0, 0.4])]:
+        pipeline.add(measurement)
+    poses = pipeline.advance(START + SECOND // 2)
+    assert poses.stamp_ns[0] == START - 2 * SECOND
     assert poses.valid[-8:].all()
+
+
+def test_at_one_instant_the_lower_station_counts(scene: Scene) -> None:
+    """Two stations on one prism at the same nanosecond: which one counts does not depend on the order."""
+    stations = (*scene.parameters.stations, replace(scene.parameters.stations[1], station=4, prism=1))
+    two = replace(scene, parameters=replace(scene.parameters, stations=stations))
+    other = replace(two.measure(4, 0.2), slope_distance_m=35.0)
+    measurements = [*every(two, [0.0, 0.2, 0.4]), other, two.measure(4, 0.4)]
+    ahead, behind = (poses_of(two, order, until_s=3.0) for order in (measurements, measurements[::-1]))
+    np.testing.assert_array_equal(ahead.position_m, behind.position_m)
+    assert ahead.station[4, 0] == 1

@@ -60,6 +60,34 @@ def test_recorded_poses_are_made_again_not_copied(tmp_path: Path) -> None:
     assert replayed_lines(path) == lines
 
 
+def test_poses_of_the_timer_are_replayed_after_a_crash(tmp_path: Path) -> None:
+    """When the stations fell silent, poses went on until the master was killed; the replay goes as far."""
+    path = tmp_path / "run.jsonl"
+    feed = Feed(SCENE.parameters)
+    records = [
+        r for step in range(5) for s in (1, 2, 3) for r in feed.measurement(SCENE.measure(s, step / 10))
+    ]
+    for _ in range(7):
+        deadline_ns = feed.next_deadline_ns()
+        assert deadline_ns is not None
+        records += feed.advance(deadline_ns)
+    with RecordingWriter(path) as writer:
+        for record in (HEADER, SCENE.parameters, *records):
+            writer.write(record)
+    assert replayed_lines(path) == [encode_line(record) for record in records]
+
+
+def test_keys_of_a_newer_writer_are_passed_on(tmp_path: Path) -> None:
+    """A measurement goes out as it stands in the file, with what this program does not know of it."""
+    path = tmp_path / "run.jsonl"
+    line = encode_line(SCENE.measure(1, 0.0))[:-1] + b',"temperature_degC":-12.5}'
+    with RecordingWriter(path) as writer:
+        writer.write(HEADER)
+        writer.write(SCENE.parameters)
+        writer.write_line(line)
+    assert replayed_lines(path) == [line]
+
+
 def test_each_session_begins_anew(tmp_path: Path) -> None:
     """A master that was restarted on the same file had an empty pipeline, and so has the replay."""
     path = tmp_path / "run.jsonl"

@@ -1,19 +1,26 @@
-"""What a long-running program owes the system: an orderly end, signs of life to systemd, data on the disk."""
+"""What a long-running program owes the system.
+
+An orderly end, signs of life to systemd, data on the disk, and sockets that belong to one program at a time.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import os
 import signal
 import socket
+import stat
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, NoReturn, TypeVar
 
 import structlog
 
-from tsgt.errors import TsgtError
+from tsgt.errors import StreamError, TsgtError
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Awaitable, Callable, Iterator
+    from pathlib import Path
 
     from tsgt.clock import Clock
 
@@ -21,6 +28,11 @@ T = TypeVar("T")
 
 SYNC_INTERVAL_S = 1.0
 """How often a recording is brought to the disk: the most that a power cut can take."""
+
+MAX_SOCKET_PATH_BYTES = 107
+"""What sockaddr_un holds, less the end of the string: unix(7)."""
+
+_BACKLOG = 100
 
 log = structlog.get_logger()
 
@@ -139,3 +151,101 @@ def watchdog_interval_s() -> float | None:
     if not timeout_us.isdecimal() or (pid is not None and pid != str(os.getpid())):
         return None
     return int(timeout_us) / 2e6
+
+
+class UnixListener:
+    """A UNIX socket that listens, and that no other program listens on.
+
+    Parameters
+    ----------
+    path
+        Where. A stale socket of an earlier run is replaced; the folder is created if need be.
+    mode
+        Its permissions.
+
+    Attributes
+    ----------
+    socket
+        To be given to an event loop.
+
+    Raises
+    ------
+    StreamError
+        Another program serves the socket, or it cannot be made.
+    """
+
+    def __init__(self, path: Path, mode: int) -> None:
+        self._path = path
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with _locked(path.parent):
+                self.socket = _bind(path, mode)
+                self._inode = path.lstat().st_ino
+                self.socket.listen(_BACKLOG)
+        except StreamError:
+            raise
+        except OSError as error:
+            raise StreamError(
+                f"{path}: the socket cannot be made ({error.strerror}); choose another path"
+            ) from error
+
+    def remove(self) -> None:
+        """Remove the file, unless another program has put its own there."""
+        with suppress(OSError):  # it is gone, or its folder is: then there is nothing of ours to remove
+            if self._path.lstat().st_ino == self._inode:
+                self._path.unlink()
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Keep another program from opening the same socket between our look at it and our listening."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise StreamError(
+                f"{folder}: another program is opening a socket in this folder; try again in a moment"
+            ) from error
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _bind(path: Path, mode: int) -> socket.socket:
+    if len(os.fsencode(path)) > MAX_SOCKET_PATH_BYTES:
+        raise StreamError(
+            f"{path}: the path of a socket has at most {MAX_SOCKET_PATH_BYTES} bytes; choose a shorter one"
+        )
+    _remove_stale(path)
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        # bind() gives the file the mode of the socket less the umask: it is never open to more than `mode` says.
+        os.fchmod(listener.fileno(), mode)
+        listener.bind(os.fspath(path))
+        path.chmod(mode)
+    except BaseException:
+        listener.close()
+        raise
+    return listener
+
+
+def _remove_stale(path: Path) -> None:
+    """Remove a socket that nobody answers; leave everything else alone."""
+    try:
+        is_socket = stat.S_ISSOCK(path.lstat().st_mode)
+    except FileNotFoundError:
+        return
+    if not is_socket:
+        raise StreamError(f"{path}: is not a socket and is left alone; remove it or choose another path")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.setblocking(False)
+        try:
+            probe.connect(os.fspath(path))
+        except ConnectionRefusedError:
+            path.unlink()
+            log.info("stale_socket_replaced", path=str(path))
+            return
+        except BlockingIOError:
+            pass  # so many wait there that it does not answer, but it is there
+    raise StreamError(f"{path}: another program serves this socket; stop it or choose another path")

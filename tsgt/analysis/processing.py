@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.errors import ConfigError, RecordingError
+from tsgt.errors import ConfigError, DegenerateGeometryError, RecordingError
+from tsgt.geometry import check_layout
 from tsgt.master.pipeline import Pipeline
 from tsgt.master.pose_batch import Reason
-from tsgt.master.tracks import usable
+from tsgt.master.tracks import believable, usable
 from tsgt.model import PolarMeasurement, PrismPosition
 
 if TYPE_CHECKING:
@@ -23,8 +24,8 @@ if TYPE_CHECKING:
     from tsgt.recording import Recording
 
 
-EPOCHS_MAX = 4_000_000
-"""More poses at once than this (55 h at 20 Hz, about 2.5 GB) come of a wrong clock, not of field work."""
+EPOCHS_MAX = 2_000_000
+"""More poses at once than this (28 h at 20 Hz, about 1.5 GB) come of a wrong clock, not of field work."""
 
 
 def process(recording: Recording, *, path: Path) -> PoseBatch:
@@ -53,12 +54,18 @@ def process(recording: Recording, *, path: Path) -> PoseBatch:
     """
     parameters = recording.parameters
     pipeline = Pipeline(parameters)
-    _check_measured(parameters, recording.measurements, path)
-    _check_span(parameters, recording.measurements, path)
-    for measurement in sorted(recording.measurements, key=lambda m: m.stamp_ns):
+    stations = {station.station: station for station in parameters.stations}
+    measurements = [
+        m for m in recording.measurements if m.station not in stations or believable(m, stations[m.station])
+    ]
+    _check_measured(parameters, measurements, path)
+    _check_span(parameters, measurements, path)
+    for measurement in sorted(measurements, key=lambda m: m.stamp_ns):
         pipeline.add(measurement)
     assert recording.end_ns is not None  # noqa: S101 (it has measurements, and each of them arrived)
-    poses = pipeline.advance(recording.end_ns)
+    # A master that was left running has nothing to say for the days after the last measurement.
+    first_ns = min(m.stamp_ns for m in measurements)
+    poses = pipeline.advance(min(recording.end_ns, first_ns + EPOCHS_MAX * parameters.pipeline.period_ns))
     if not poses.valid.any():
         raise RecordingError(_why_none_is_valid(poses, parameters), path=path)
     return poses
@@ -105,12 +112,17 @@ def with_layout(parameters: Parameters, layout: Mapping[int, Vector3], *, path: 
     Raises
     ------
     ConfigError
-        A prism of the recording has no position in the file.
+        A prism of the recording has no position in the file, or no pose can come of the layout.
     """
     missing = [p.prism for p in parameters.prisms if p.prism not in layout]
     if missing:
         raise ConfigError(f"{path}: prisms.{missing[0]}: missing; the recording has this prism", path=path)
-    prisms = (PrismPosition(prism=p.prism, position_m=layout[p.prism]) for p in parameters.prisms)
+    numbers = [p.prism for p in parameters.prisms]
+    try:
+        check_layout([layout[number] for number in numbers], names=numbers)
+    except DegenerateGeometryError as error:
+        raise ConfigError(f"{path}: {error}", path=path, key="prisms") from error
+    prisms = (PrismPosition(prism=number, position_m=layout[number]) for number in numbers)
     return dataclasses.replace(parameters, prisms=tuple(prisms))
 
 

@@ -14,6 +14,7 @@ from tsgt.analysis.setup_files import write_prism_layout, write_station_frames
 from tsgt.analysis.target_file import read_prism_file, read_target_file
 from tsgt.cli.options import finite, json_option
 from tsgt.cli.output import CHECK_FAILED, print_json, print_table
+from tsgt.cli.recordings import refuse_to_replace
 from tsgt.geometry import cartesian_to_polar
 
 if TYPE_CHECKING:
@@ -66,6 +67,7 @@ def targets(
     FILE is our CSV or the authors' marker file. Exit code 3: targets contradict each other and it cannot be told
     which is wrong (nothing is written then), they fix a frame only weakly, or --levelled stations are not level.
     """
+    refuse_to_replace([file], output)
     measured = read_target_file(file)
     frames = solve_stations(
         measured,
@@ -124,6 +126,7 @@ def prisms(
     code 3: body points contradict each other and it cannot be told which is wrong (nothing is written then),
     or they fix the robot frame only weakly.
     """
+    refuse_to_replace([file], output)
     solved = solve_prisms(
         read_prism_file(file),
         target_constant_m=target_constant_mm / 1e3,

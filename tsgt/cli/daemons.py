@@ -29,9 +29,11 @@ def client(config_path: Path) -> None:
 @_config_option
 def master(config_path: Path) -> None:
     """Collect the stations' measurements over the radio and stream poses (in this release: only check its file)."""
-    from tsgt.config import MasterConfig, load, parameters  # noqa: PLC0415 (`--help` needs none of it)
+    # Only here, as `--help` needs none of it.
+    from tsgt.config import MasterConfig, load, parameters  # noqa: PLC0415
+    from tsgt.master.pipeline import Pipeline  # noqa: PLC0415
 
-    parameters(load(config_path, MasterConfig))
+    Pipeline(parameters(load(config_path, MasterConfig)))
     raise TsgtError(
         f"{config_path}: the configuration is good, but this release has no radio link to collect from; "
         "`tsgt demo` and `tsgt replay` run the same pipeline and stream"

@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING
 
 import click
 import numpy as np
-import structlog
 
 import tsgt
 from tsgt import service
 from tsgt.analysis.metrics import PoseErrors, inner_part, pose_errors
-from tsgt.cli.options import json_option
+from tsgt.cli.options import finite, json_option
 from tsgt.cli.output import print_json
 from tsgt.clock import SystemClock, UnixTimeline
 from tsgt.config import ScenarioConfig, load
@@ -38,8 +37,6 @@ if TYPE_CHECKING:
 DEFAULT_DURATION_S = 30.0
 SECONDS_PER_LINE = 5
 
-log = structlog.get_logger()
-
 
 @dataclass(frozen=True, slots=True)
 class Result:
@@ -54,7 +51,8 @@ class Result:
 @click.option(
     "--duration",
     "duration_s",
-    type=click.FloatRange(min=0, min_open=True),
+    type=click.FloatRange(min=0, max=86_400, min_open=True),
+    callback=finite,
     help="How many seconds it runs.  [default: 30, or what --scenario says]",
 )
 @click.option("--socket", "socket_path", type=click.Path(path_type=Path), help="Socket for the poses.")
@@ -80,6 +78,8 @@ def demo(
     scenario = ScenarioConfig() if scenario_path is None else load(scenario_path, ScenarioConfig)
     if duration_s is None:
         duration_s = DEFAULT_DURATION_S if scenario_path is None else scenario.duration_s
+    if output is not None and output.exists():
+        raise click.UsageError(f"{output} exists; a demo makes a recording of its own, choose another file")
     if socket_path is None or output is None:
         folder = Path(tempfile.mkdtemp(prefix="tsgt-demo-"))
         socket_path, output = socket_path or folder / "poses.sock", output or folder / "demo.jsonl"
@@ -105,7 +105,7 @@ def demo(
         return
     click.echo(f"poses        {result.poses}, of which {result.valid_poses} valid")
     if math.isnan(position_rms_mm):
-        click.echo("against the truth: too short; the first and the last 2 s do not count")
+        click.echo("against the truth: no valid pose to compare; the first and the last 2 s do not count")
     else:
         click.echo(f"position     {position_rms_mm:.1f} mm rms off the truth, at the centroid of the prisms")
         click.echo(f"orientation  {orientation_rms_deg:.2f} deg rms off the truth")
@@ -134,8 +134,6 @@ async def run_demo(
     hello = encode_line(HelloRecord())
     async with StreamServer(socket_path, hello, unix_now_ns=unix_now_ns) as server:
         with RecordingWriter(output) as writer:
-            if writer.cut_bytes:
-                log.warning("recording_repaired", path=str(output), cut_bytes=writer.cut_bytes)
             click.echo(f"poses on     {socket_path}", err=True)
             click.echo(f"try          {_program()} listen --socket {socket_path}", err=True)
             run = play(scenario, duration_s=duration_s, seed=seed, start_ns=unix_now_ns())
@@ -147,14 +145,17 @@ async def run_demo(
             writer.write(header)
             writer.write(run.parameters)
             recorder, progress = Recorder(writer), Progress(run)
-            async with asyncio.TaskGroup() as group:
-                syncing = group.create_task(service.keep_synced(writer.sync, clock))
-                async for step in live(run, clock, timeline):
-                    for line in map(encode_line, step.records):
-                        recorder.write_line(line)
-                        server.publish(line)
-                    progress.show(step, readers=server.readers)
-                syncing.cancel()
+            try:
+                async with asyncio.TaskGroup() as group:
+                    syncing = group.create_task(service.keep_synced(writer.sync, clock))
+                    async for step in live(run, clock, timeline):
+                        for line in map(encode_line, step.records):
+                            recorder.write_line(line)
+                            server.publish(line)
+                        progress.show(step, readers=server.readers)
+                    syncing.cancel()
+            finally:
+                recorder.close()
     return progress.result()
 
 

@@ -89,7 +89,7 @@ def process(
     as_json: bool,
 ) -> None:
     """Compute the poses of RECORDING from all its measurements, in the order of time."""
-    refuse_to_replace([recording], output)
+    refuse_to_replace([recording, frames, prisms], output)
     began_s = time.perf_counter()
     loaded = _load(recording, keep_going=keep_going, rate_hz=rate_hz, frames=frames, prisms=prisms)
     poses = process_recording(loaded, path=recording)

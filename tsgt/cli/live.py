@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from tsgt import service
-from tsgt.cli.options import keep_going_option, recording_argument, socket_option
+from tsgt.cli.options import a_number, keep_going_option, recording_argument, socket_option
 from tsgt.cli.recordings import report_problem
 from tsgt.cli.render import render
 from tsgt.clock import SystemClock
@@ -50,6 +50,7 @@ def listen(socket_path: Path, *, as_json: bool, count: int | None) -> None:
 @click.option(
     "--speed",
     type=click.FloatRange(min=0, min_open=True),
+    callback=a_number,
     default=1.0,
     show_default=True,
     help="Times the pace of the recording; inf: as fast as the readers take it.",

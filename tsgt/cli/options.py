@@ -19,6 +19,13 @@ def finite(_context: click.Context, _parameter: click.Parameter, value: float | 
     return value
 
 
+def a_number(_context: click.Context, _parameter: click.Parameter, value: float | None) -> float | None:
+    """Refuse NaN, but not infinity; for the ``callback`` of an option."""
+    if value is not None and math.isnan(value):
+        raise click.BadParameter("nan is not a number")
+    return value
+
+
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
 
 socket_option = click.option(

@@ -34,8 +34,8 @@ def report_problem(problem: RecordingError) -> None:
     click.echo(f"warning: {problem}", err=True)
 
 
-def refuse_to_replace(inputs: Iterable[Path], output: Path) -> None:
-    """Refuse to write a result over a file that it is made from."""
+def refuse_to_replace(inputs: Iterable[Path | None], output: Path | None) -> None:
+    """Refuse to write a result over a file that it is made from; a path that is None was not given."""
     for path in inputs:
-        if output.resolve() == path.resolve():
+        if path is not None and output is not None and output.resolve() == path.resolve():
             raise click.UsageError(f"the output would replace its own input {path}; choose another file")

@@ -39,6 +39,16 @@ class Recorder:
     def write_line(self, line: bytes) -> None:
         """Append a line, and before it those that still wait; never raises because of the disk."""
         self._waiting.append(line)
+        self._write_waiting()
+
+    def close(self) -> None:
+        """Try once more to write what waits, and say how many lines are lost if that fails."""
+        self._write_waiting()
+        if self._waiting:
+            log.error("recording_incomplete", lost_lines=self._lost + len(self._waiting))
+            self._waiting.clear()
+
+    def _write_waiting(self) -> None:
         try:
             while self._waiting:
                 self._writer.write_line(self._waiting[0])

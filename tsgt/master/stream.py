@@ -12,23 +12,19 @@ callbacks.
 from __future__ import annotations
 
 import asyncio
-import fcntl
-import os
-import socket
-import stat
+import select
 import time
 from collections import deque
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Self
 
 import structlog
 
-from tsgt.errors import StreamError
 from tsgt.master.stream_records import EventRecord
 from tsgt.recording import encode_line
+from tsgt.service import UnixListener
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
     from pathlib import Path
 
 QUEUE_LINES = 2000
@@ -36,8 +32,8 @@ QUEUE_LINES = 2000
 CLOSE_TIMEOUT_S = 0.5
 """How long readers have, at the end, to take what is waiting for them."""
 
-MAX_PATH_BYTES = 107
-"""What sockaddr_un holds, less the end of the string: unix(7)."""
+_TURNS_TO_SET_UP = 5
+"""Turns of the event loop from accepting a connection to its protocol, with some in hand."""
 
 log = structlog.get_logger()
 
@@ -83,31 +79,23 @@ class StreamServer:
         self._unix_now_ns = unix_now_ns
         self._readers: set[_Reader] = set()
         self._changed = asyncio.Event()
+        self._closing = False
 
     async def __aenter__(self) -> Self:
-        try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            with _locked(self._path.parent):
-                listener = _bind(self._path, self._mode)
-                self._inode = self._path.lstat().st_ino
-                loop = asyncio.get_running_loop()
-                self._server = await loop.create_unix_server(self._new_reader, sock=listener)
-        except StreamError:
-            raise
-        except OSError as error:
-            raise StreamError(
-                f"{self._path}: the socket cannot be made ({error.strerror}); choose another with --socket"
-            ) from error
+        self._listener = UnixListener(self._path, self._mode)
+        loop = asyncio.get_running_loop()
+        self._server = await loop.create_unix_server(self._new_reader, sock=self._listener.socket)
         log.info("stream_opened", path=str(self._path))
         return self
 
     async def __aexit__(self, *_: object) -> None:
+        self._closing = True
+        self._listener.remove()
+        # No new connections; those that asyncio is just setting up come to their end while there is a server.
+        asyncio.get_running_loop().remove_reader(self._listener.socket)
+        for _ in range(_TURNS_TO_SET_UP):
+            await asyncio.sleep(0)
         self._server.close()
-        try:
-            if self._path.lstat().st_ino == self._inode:
-                self._path.unlink()
-        except FileNotFoundError:
-            pass
         try:
             async with asyncio.timeout(CLOSE_TIMEOUT_S):
                 await self._until(lambda: not any(reader.waiting for reader in self._readers))
@@ -148,8 +136,17 @@ class StreamServer:
             self._changed.clear()
             await self._changed.wait()
 
-    def _new_reader(self) -> _Reader:
+    def _new_reader(self) -> asyncio.Protocol:
+        if self._closing:
+            return _TooLate()
         return _Reader(self._readers, self._changed, self._hello, self._queue_lines, self._unix_now_ns)
+
+
+class _TooLate(asyncio.Protocol):
+    """A connection that was made while the server closed."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        transport.close()
 
 
 class _Reader(asyncio.Protocol):
@@ -207,7 +204,10 @@ class _Reader(asyncio.Protocol):
         """Readers have nothing to say yet."""
 
     def eof_received(self) -> bool:
-        return True  # it may still read: `tsgt listen < /dev/null`, a shell pipe through socat
+        """Keep the connection of a reader that only has nothing to say: a shell pipe through socat."""
+        poller = select.poll()
+        poller.register(self._transport.get_extra_info("socket").fileno(), select.POLLOUT)
+        return not any(events & select.POLLHUP for _, events in poller.poll(0))
 
     def pause_writing(self) -> None:
         self._paused = True
@@ -234,53 +234,3 @@ class _Reader(asyncio.Protocol):
             message=f"this reader was too slow and lost {self._lost} lines here",
             count=self._lost,
         )
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Keep another program from opening the same socket between our look at it and our listening."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
-    finally:
-        os.close(descriptor)
-
-
-def _bind(path: Path, mode: int) -> socket.socket:
-    if len(os.fsencode(path)) > MAX_PATH_BYTES:
-        raise StreamError(
-            f"{path}: the path of a socket has at most {MAX_PATH_BYTES} bytes; choose a shorter one"
-        )
-    _remove_stale(path)
-    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    try:
-        # bind() gives the file the mode of the socket less the umask: it is never open to more than `mode` says.
-        os.fchmod(listener.fileno(), mode)
-        listener.bind(os.fspath(path))
-        path.chmod(mode)
-    except BaseException:
-        listener.close()
-        raise
-    return listener
-
-
-def _remove_stale(path: Path) -> None:
-    """Remove a socket that nobody answers; leave everything else alone."""
-    try:
-        is_socket = stat.S_ISSOCK(path.lstat().st_mode)
-    except FileNotFoundError:
-        return
-    if not is_socket:
-        raise StreamError(f"{path}: is not a socket and is left alone; remove it or choose another path")
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-        probe.setblocking(False)
-        try:
-            probe.connect(os.fspath(path))
-        except ConnectionRefusedError:
-            path.unlink()
-            log.info("stale_socket_replaced", path=str(path))
-            return
-        except BlockingIOError:
-            pass  # so many wait there that it does not answer, but it is there
-    raise StreamError(f"{path}: another program serves this socket; stop it or choose another path")

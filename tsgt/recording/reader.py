@@ -158,12 +158,12 @@ def load_recording(
 
 
 def _unreadable(raw: bytes, why: str, path: Path, line: int) -> RecordingError:
-    if raw.endswith(b"\n"):
-        return CorruptLineError(f"cannot be read: {why}; --keep-going skips it", path=path, line=line)
-    if len(raw) == MAX_LINE_BYTES:
+    if len(raw) > MAX_LINE_BYTES and raw.endswith(b"\n"):
         return CorruptLineError(
             f"is longer than {MAX_LINE_BYTES} bytes; --keep-going skips it", path=path, line=line
         )
+    if raw.endswith(b"\n"):
+        return CorruptLineError(f"cannot be read: {why}; --keep-going skips it", path=path, line=line)
     return RecordingError("the last line is torn and is skipped", path=path, line=line)
 
 
@@ -173,9 +173,10 @@ def _raw_lines(path: Path) -> Iterator[bytes]:
         with path.open("rb") as file:
             read_line = functools.partial(file.readline, MAX_LINE_BYTES)
             for raw in iter(read_line, b""):
-                yield raw
                 piece = raw
                 while len(piece) == MAX_LINE_BYTES and not piece.endswith(b"\n"):
                     piece = read_line()
+                # Whether a line that is too long ever ends tells a corrupt one from a torn tail.
+                yield raw if piece is raw or not piece.endswith(b"\n") else raw + b"\n"
     except OSError as error:
         raise RecordingError(f"cannot be read ({error.strerror})", path=path) from error

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.scene import START, driving, standing_scene
 
+from tsgt.analysis import processing
 from tsgt.analysis.processing import has_raw_angles, process, with_frames, with_layout
 from tsgt.errors import ConfigError, RecordingError
 from tsgt.model import PointMeasurement, Status
@@ -113,7 +114,7 @@ def test_frames_are_replaced_by_station() -> None:
 
 def test_the_layout_is_replaced_by_prism() -> None:
     """Every prism of the recording gets its new position."""
-    layout = {k: (float(k), 0.0, 0.0) for k in (1, 2, 3, 4)}
+    layout = {k: (float(k), float(k * k), 0.0) for k in (1, 2, 3, 4)}
     replaced = with_layout(SCENE.parameters, layout, path=Path("prisms.toml"))
     assert [(p.prism, p.position_m) for p in replaced.prisms] == [(k, layout[k]) for k in (1, 2, 3)]
     with pytest.raises(ConfigError, match=r"prisms.toml: prisms.2: missing"):
@@ -134,3 +135,24 @@ def test_stations_at_different_times_give_no_pose() -> None:
     ]
     with pytest.raises(RecordingError, match="check that the stations' times overlap"):
         process(recording_of(sorted(apart, key=lambda m: m.stamp_ns)), path=PATH)
+
+
+def test_a_stamp_from_the_future_is_passed_over() -> None:
+    """One wrong stamp, months ahead of its arrival, does not make a recording unusable."""
+    wrong = replace(drive()[0], stamp_ns=drive()[0].stamp_ns + 10_000_000 * 10**9)
+    poses, same = (process(recording_of(m), path=PATH) for m in (drive(), [*drive(), wrong]))
+    np.testing.assert_array_equal(poses.position_m, same.position_m)
+
+
+def test_a_master_left_running_is_no_reason_to_refuse(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Status lines for long after the last measurement end the poses at some point, not the program."""
+    monkeypatch.setattr(processing, "EPOCHS_MAX", 200)
+    recording = replace(recording_of(drive()), end_ns=START + 10_000_000 * 10**9)
+    assert 150 < len(process(recording, path=PATH)) <= 200
+
+
+def test_a_layout_that_no_pose_can_come_of_is_refused() -> None:
+    """The file that holds the layout is named."""
+    layout = {1: (0.0, 0.0, 0.0), 2: (0.0, 0.0, 0.0), 3: (1.0, 0.0, 0.0)}
+    with pytest.raises(ConfigError, match=r"^prisms.toml: prisms 1 and 2 are 0.0 mm apart"):
+        with_layout(SCENE.parameters, layout, path=Path("prisms.toml"))

@@ -62,3 +62,17 @@ def test_memory_is_bounded_and_the_loss_is_counted(disk: FullDisk) -> None:
             recorder.write_line(b"%d" % number)
     assert disk.path.read_bytes().splitlines()[1:] == [b"5", b"6", b"7", b"8", b"9"]
     assert logs[-1]["lost_lines"] == 5
+
+
+def test_what_still_waits_at_the_end_is_tried_once_more(disk: FullDisk) -> None:
+    """Closing writes what waited if there is room by now, and else says how many lines are lost."""
+    recorder = Recorder(disk)
+    with capture_logs() as logs:
+        for full in (False, True):
+            disk.full = True
+            recorder.write_line(b"one")
+            recorder.write_line(b"two")
+            disk.full = full
+            recorder.close()
+    assert disk.path.read_bytes().splitlines()[1:] == [b"one", b"two"]
+    assert logs[-1] == {"event": "recording_incomplete", "lost_lines": 2, "log_level": "error"}

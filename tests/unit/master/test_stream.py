@@ -6,6 +6,7 @@ import json
 import os
 import socket
 import stat
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -263,14 +264,14 @@ async def test_closing_hands_over_what_waits(path: Path) -> None:
 
 async def test_closing_does_not_wait_for_ever(path: Path) -> None:
     """A reader that sleeps at the end holds the program up for the stated time and no longer."""
-    async with StreamServer(path, HELLO) as server:
-        sleepy = SleepyClient(path)
-        await server.wait_for_reader()
-        for number in range(100):
-            server.publish(line(number, BIG))
-        began_s = asyncio.get_running_loop().time()
-        with capture_logs() as logs:
-            await server.__aexit__()
+    server = await StreamServer(path, HELLO).__aenter__()
+    sleepy = SleepyClient(path)
+    await server.wait_for_reader()
+    for number in range(100):
+        server.publish(line(number, BIG))
+    began_s = asyncio.get_running_loop().time()
+    with capture_logs() as logs:
+        await server.__aexit__()
     assert asyncio.get_running_loop().time() - began_s == pytest.approx(CLOSE_TIMEOUT_S)
     assert {"event": "stream_closed_on_slow_readers", "log_level": "warning", "readers": 1} in logs
     sleepy.socket.close()
@@ -378,3 +379,29 @@ async def test_socket_of_a_successor_is_not_removed(path: Path) -> None:
             path.rename(path.with_suffix(".old"))
             other.bind(str(path))
         assert path.is_socket()
+
+
+async def test_a_reader_that_left_is_noticed_though_nothing_is_published(path: Path) -> None:
+    """Its connection goes at once, so that a stream with nothing to say does not fill up with the dead."""
+    async with StreamServer(path, HELLO) as server:
+        for _ in range(20):
+            client = await Client.connect(path)
+            await client.close()
+            await settle()
+        assert server.readers == 0
+
+
+@pytest.mark.parametrize("turns", range(5))
+async def test_a_reader_that_comes_at_the_very_end_is_let_go(path: Path, turns: int) -> None:
+    """Whenever it connects while the server closes, its connection ends instead of hanging."""
+    with socket.socket(socket.AF_UNIX) as late:
+        async with StreamServer(path, HELLO) as server:
+            late.setblocking(False)
+            late.connect(str(path))
+            for _ in range(turns):
+                await asyncio.sleep(0)
+        await settle()
+        assert server.readers == 0
+        late.settimeout(1.0)
+        with suppress(ConnectionResetError):  # it was never accepted
+            assert late.recv(1000) in (b"", HELLO + b"\n")

@@ -209,3 +209,12 @@ def test_folder_is_one_line(tmp_path: Path) -> None:
     """A folder in place of the file is an error of ours."""
     with pytest.raises(RecordingError, match=r"cannot be read \(Is a directory"):
         load_recording(tmp_path)
+
+
+def test_long_torn_tail_is_skipped_as_torn(tmp_path: Path) -> None:
+    """A power cut can leave a tail of zeros longer than any line; it is torn, not a corrupt line in the middle."""
+    path = tmp_path / "r.jsonl"
+    path.write_bytes(recording_bytes(measurement(0)) + b"\0" * 3_000_000)
+    problems: list[RecordingError] = []
+    assert len(load_recording(path, on_problem=problems.append).measurements) == 1
+    assert [str(problem).endswith("the last line is torn and is skipped") for problem in problems] == [True]

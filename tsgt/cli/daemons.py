@@ -7,7 +7,7 @@ from typing import NoReturn
 
 import click
 
-from tsgt.cli.main import run
+from tsgt.cli.main import HELP_OPTIONS, run
 from tsgt.errors import TsgtError
 
 _config_option = click.option(
@@ -15,7 +15,7 @@ _config_option = click.option(
 )
 
 
-@click.command("tsgt-client")
+@click.command("tsgt-client", context_settings=HELP_OPTIONS)
 @_config_option
 def client(config_path: Path) -> None:
     """Read the total station beside this computer and answer the master over the radio (not in this release)."""
@@ -25,7 +25,7 @@ def client(config_path: Path) -> None:
     )
 
 
-@click.command("tsgt-master")
+@click.command("tsgt-master", context_settings=HELP_OPTIONS)
 @_config_option
 def master(config_path: Path) -> None:
     """Collect the stations' measurements over the radio and stream poses (in this release: only check its file)."""

@@ -185,12 +185,13 @@ class Progress:
         if not sys.stderr.isatty() and self._updates % SECONDS_PER_LINE:
             return
         elapsed_s = (step.now_ns - self._run.start_ns) / 1e9
-        text = f"{elapsed_s:5.0f} s  {len(self._valid):5d}/{self._poses} poses valid"
+        # Fits into 80 columns, or a terminal would not write it over.
+        text = f"{elapsed_s:5.0f} s  {len(self._valid)}/{self._poses} poses valid"
         if self._valid:
             position = " ".join(f"{value:6.2f}" for value in self._valid[-1].position_m or ())
             off_mm = self._errors(self._valid).position_rms_mm
-            text += f"  at {position} m  off by {off_mm:5.1f} mm rms"
-        text += f"  {readers} reader{'' if readers == 1 else 's'}"
+            text += f"  at {position} m  off {off_mm:.1f} mm rms"
+        text += f"  {readers} readers"
         # On a terminal one line is written over again and again, until the run has ended.
         click.echo(f"\r{text}\x1b[K" if sys.stderr.isatty() else text, err=True, nl=not sys.stderr.isatty())
 

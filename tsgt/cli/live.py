@@ -49,7 +49,7 @@ def listen(socket_path: Path, *, as_json: bool, count: int | None) -> None:
 @socket_option
 @click.option(
     "--speed",
-    type=click.FloatRange(min=0, min_open=True),
+    type=click.FloatRange(min=0.001),
     callback=a_number,
     default=1.0,
     show_default=True,
@@ -82,7 +82,9 @@ def replay(recording: Path, *, socket_path: Path, speed: float, wait: bool, keep
             if wait:
                 click.echo(f"waiting for a reader: tsgt listen --socket {socket_path}", err=True)
                 await server.wait_for_reader()
-            return await play(itertools.chain([first], arrivals), server, SystemClock(), speed=speed)
+            lines = await play(itertools.chain([first], arrivals), server, SystemClock(), speed=speed)
+            await server.finish()
+            return lines
 
     click.echo(f"{service.run(serve)} lines replayed", err=True)
 
@@ -93,7 +95,7 @@ def _lines(socket_path: Path) -> Iterator[bytes]:
             connection.connect(str(socket_path))
         except OSError as error:
             raise StreamError(
-                f"{socket_path}: no stream there ({error.strerror or error}); start tsgt-master or tsgt replay, "
+                f"{socket_path}: no stream there ({error.strerror or error}); start tsgt demo or tsgt replay, "
                 "or give the right --socket"
             ) from error
         # A server that gives up on us, because we were too slow at its end, resets the connection.

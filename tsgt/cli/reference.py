@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from tsgt.cli.daemons import client, master
-from tsgt.cli.main import cli
+from tsgt.cli.main import HELP_OPTIONS, cli
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -34,7 +34,12 @@ def _walk(
     path: str, command: click.Command, parent: click.Context | None
 ) -> Iterator[tuple[str, click.Context]]:
     context = click.Context(
-        command, parent=parent, info_name=path.rsplit(" ", 1)[-1], terminal_width=100, max_content_width=100
+        command,
+        parent=parent,
+        info_name=path.rsplit(" ", 1)[-1],
+        terminal_width=100,
+        max_content_width=100,
+        help_option_names=HELP_OPTIONS["help_option_names"],
     )
     yield path, context
     if isinstance(command, click.Group):

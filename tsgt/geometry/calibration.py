@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from tsgt.errors import DegenerateGeometryError, GeometryError
 from tsgt.geometry.frame_fit import Pairs, PointSet, fit_frame, pose_jacobian
@@ -328,7 +328,7 @@ def _suspect(pairs: Pairs, blunder_m: float) -> Name | None:
         if prediction is not None and prediction.length_m >= blunder_m:
             scores[name] = prediction.implausibility
     worst = max(scores, key=lambda name: scores[name], default=None)
-    if worst is None or scores[worst] <= chi2.isf(FALSE_ALARM / len(pairs.names), 3):
+    if worst is None or scores[worst] <= chdtri(3, FALSE_ALARM / len(pairs.names)):
         return None
     return worst
 
@@ -350,7 +350,7 @@ def _bad_points(pairs: Pairs, blunder_m: float) -> tuple[Name, ...] | None:
         bad.append(suspect)
         kept = kept.without(suspect)
     misfit = fit_frame(kept, weighted=True).misfit(kept)
-    return tuple(bad) if misfit <= SCALE_MAX**2 * chi2.isf(FALSE_ALARM, kept.redundancy) else None
+    return tuple(bad) if misfit <= SCALE_MAX**2 * chdtri(kept.redundancy, FALSE_ALARM) else None
 
 
 def _weak_axes(covariance: FloatArray, points_m: FloatArray, limit_rad: float) -> tuple[WeakAxis, ...]:
@@ -373,6 +373,6 @@ def _tilt_rad(pairs: Pairs) -> float | None:
         return None  # a line of points cannot tell
     left = tilted.misfit(free)
     drop = fit_frame(pairs, weighted=True).misfit(pairs) - left
-    if drop <= chi2.isf(FALSE_ALARM, 2) * _noise_scale(left / free.redundancy):
+    if drop <= chdtri(2, FALSE_ALARM) * _noise_scale(left / free.redundancy):
         return None
     return float(np.arccos(np.clip(tilted.rotation[2, 2], -1.0, 1.0)))

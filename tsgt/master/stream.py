@@ -93,7 +93,7 @@ class StreamServer:
         self._listener.remove()
         # No new connections; those that asyncio is just setting up come to their end while there is a server.
         asyncio.get_running_loop().remove_reader(self._listener.socket)
-        for _ in range(_TURNS_TO_SET_UP):
+        for _turn in range(_TURNS_TO_SET_UP):
             await asyncio.sleep(0)
         self._server.close()
         try:
@@ -126,6 +126,13 @@ class StreamServer:
         await asyncio.sleep(0)
         await self._until(lambda: not any(reader.full for reader in self._readers))
         self.publish(line)
+
+    async def finish(self) -> None:
+        """Return when every reader has taken everything and is let go, however long it takes; for a replay."""
+        await self._until(lambda: not any(reader.waiting for reader in self._readers))
+        for reader in self._readers:
+            reader.close()  # which sends what the transport still holds
+        await self._until(lambda: not self._readers)
 
     async def wait_for_reader(self) -> None:
         """Return when at least one reader is connected."""

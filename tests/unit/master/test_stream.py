@@ -405,3 +405,21 @@ async def test_a_reader_that_comes_at_the_very_end_is_let_go(path: Path, turns: 
         late.settimeout(1.0)
         with suppress(ConnectionResetError):  # it was never accepted
             assert late.recv(1000) in (b"", HELLO + b"\n")
+
+
+async def test_finishing_waits_for_a_reader_however_slow(path: Path) -> None:
+    """A reader that comes back after a minute still gets every line, and only then the stream ends."""
+    async with StreamServer(path, HELLO) as server:
+        sleepy = SleepyClient(path)
+        await server.wait_for_reader()
+        for number in range(100):
+            server.publish(line(number, BIG))
+        finishing = asyncio.create_task(server.finish())
+        await asyncio.sleep(60.0)
+        assert not finishing.done()
+        while not finishing.done():
+            sleepy.take()
+            await asyncio.sleep(0.01)
+    sleepy.take()
+    assert [record["number"] for record in sleepy.records()] == list(range(100))
+    sleepy.socket.close()

@@ -11,7 +11,11 @@
     │   └── RecordingVersionError  it was written in another version of the format
     ├── GeometryError          numbers that no geometry can be computed from
     │   └── DegenerateGeometryError  points that coincide or lie in a line
-    └── StreamError            the pose socket cannot be opened or reached
+    ├── StreamError            a socket of ours cannot be opened or reached
+    └── RadioError             the radio does not do what it was told
+        ├── RadioSettingsError     it was told something that it cannot do
+        ├── RadioNotFoundError     there is none: wiring, pins, SPI
+        └── RadioTimeoutError      a transmission did not end
 
 A message says what happened, where, and what to do; the same data is kept in attributes.
 """
@@ -82,4 +86,20 @@ class DegenerateGeometryError(GeometryError):
 
 
 class StreamError(TsgtError, OSError):
-    """The pose socket cannot be opened or reached: it is in use, or nobody serves it."""
+    """A socket (poses, simulated air) cannot be opened or reached: it is in use, or nobody serves it."""
+
+
+class RadioError(TsgtError):
+    """The radio does not do what it was told: a register does not keep its value, a pin is taken, SPI fails."""
+
+
+class RadioSettingsError(RadioError, ValueError):
+    """Settings or a payload that the radio cannot take: SF 6, 20 dBm not asked for, 256 bytes."""
+
+
+class RadioNotFoundError(RadioError):
+    """No radio answers: SPI is switched off, a wire or the chip-select pin is wrong, the chip is another one."""
+
+
+class RadioTimeoutError(RadioError, TimeoutError):
+    """A transmission did not end when it had to; the radio has been reset."""

@@ -1,0 +1,272 @@
+"""A Raspberry Pi without hardware: stand-ins for spidev, gpiod 2 and RPi.GPIO with pins and a bus behind them."""
+
+from __future__ import annotations
+
+import enum
+import os
+from dataclasses import dataclass, field
+from types import ModuleType, SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+    from typing import Self
+
+
+class Value(enum.Enum):
+    """gpiod.line.Value."""
+
+    INACTIVE = 0
+    ACTIVE = 1
+
+
+LINE = SimpleNamespace(
+    Value=Value,
+    Direction=enum.Enum("Direction", "INPUT OUTPUT"),
+    Edge=enum.Enum("Edge", "NONE RISING FALLING"),
+    Bias=enum.Enum("Bias", "AS_IS PULL_DOWN PULL_UP"),
+    Clock=enum.Enum("Clock", "MONOTONIC REALTIME"),
+)
+
+
+class FakePi:
+    """Pins, bus, and what is wrong with them.
+
+    Attributes
+    ----------
+    levels
+        Of each pin that has been set up, by BCM number.
+    transfers
+        Bytes of each transfer.
+    nss_pin
+        The pin whose level ``nss_during_transfer`` keeps for each transfer.
+    answer, on_drive
+        What the bus answers, and who is told of every output that is set.
+    open_error, transfer_error, request_errors, import_errors
+        What spidev raises on opening and on transferring, what asking for a pin raises, what an import raises.
+    """
+
+    def __init__(self, dev: Path, nss_pin: int | None = 25) -> None:
+        self.levels: dict[int, bool] = {}
+        self.transfers: list[bytes] = []
+        self.nss_during_transfer: list[bool | None] = []
+        self.answer: Callable[[bytes], bytes] = lambda data: data
+        self.nss_pin = nss_pin
+        self.open_error: Exception | None = None
+        self.transfer_error: Exception | None = None
+        self.no_cs_error: Exception | None = None
+        self.request_errors: dict[int, Exception] = {}
+        self.chip_error: Exception | None = None
+        self.labels = {"gpiochip0": "raspberrypi-exp-gpio", "gpiochip4": "pinctrl-rp1"}
+        self.buses: list[Any] = []
+        self.requests: list[FakeRequest] = []
+        self.on_drive: Callable[[int, bool], None] = lambda _pin, _level: None
+        self._dev = dev
+        for name in (*self.labels, "spidev0.0"):
+            (dev / name).touch()
+
+    def drive(self, pin: int, *, level: bool) -> None:
+        """Let a program set an output."""
+        self.levels[pin] = level
+        self.on_drive(pin, level)
+
+    @property
+    def open_things(self) -> int:
+        """How many buses and pins have not been let go."""
+        return len([bus for bus in self.buses if bus.is_open]) + len(self.levels)
+
+    def spidev(self) -> ModuleType:
+        """Make a stand-in for spidev 3."""
+        pi = self
+
+        class SpiDev:
+            def __init__(self) -> None:
+                self._fd = -1
+                self.is_open = False
+                self.max_speed_hz = self.mode = -1
+                self._no_cs = False
+                pi.buses.append(self)
+
+            @property
+            def no_cs(self) -> bool:
+                return self._no_cs
+
+            @no_cs.setter
+            def no_cs(self, value: bool) -> None:
+                if pi.no_cs_error is not None:
+                    raise pi.no_cs_error
+                self._no_cs = value
+
+            def open(self, bus: int, device: int) -> None:
+                if pi.open_error is not None:
+                    raise pi.open_error
+                self._fd = os.open(pi._dev / f"spidev{bus}.{device}", os.O_RDWR)
+                self.is_open = True
+
+            def fileno(self) -> int:
+                return self._fd
+
+            def xfer2(self, data: list[int]) -> list[int]:
+                if pi.transfer_error is not None:
+                    raise pi.transfer_error
+                pi.transfers.append(bytes(data))
+                pi.nss_during_transfer.append(None if pi.nss_pin is None else pi.levels[pi.nss_pin])
+                return list(pi.answer(bytes(data)))
+
+            def close(self) -> None:
+                if self.is_open:
+                    os.close(self._fd)
+                self.is_open = False
+
+        return _module("spidev", SpiDev=SpiDev)
+
+    def gpiod(self) -> ModuleType:
+        """Make a stand-in for gpiod 2."""
+        pi = self
+
+        class Chip:
+            def __init__(self, path: str) -> None:
+                if pi.chip_error is not None:
+                    raise pi.chip_error
+                self._name = os.path.basename(path)  # noqa: PTH119 (as given)
+
+            def __enter__(self) -> Self:
+                return self
+
+            def __exit__(self, *_: object) -> None: ...
+
+            def get_info(self) -> SimpleNamespace:
+                return SimpleNamespace(label=pi.labels[self._name])
+
+        def request_lines(
+            path: str, consumer: str, config: dict[int, LineSettings], event_buffer_size: int
+        ) -> FakeRequest:
+            assert consumer
+            assert event_buffer_size
+            ((pin, settings),) = config.items()
+            if pin in pi.request_errors:
+                raise pi.request_errors[pin]
+            request = FakeRequest(pi, path, pin, settings)
+            pi.requests.append(request)
+            return request
+
+        return _module("gpiod", Chip=Chip, LineSettings=LineSettings, line=LINE, request_lines=request_lines)
+
+    def rpi(self) -> ModuleType:
+        """Make a stand-in for the package RPi with its GPIO."""
+        return _module("RPi", GPIO=FakeRpiGpio(self))
+
+
+@dataclass
+class LineSettings:
+    """gpiod.LineSettings."""
+
+    direction: Any
+    output_value: Value | None = None
+    edge_detection: Any = None
+    bias: Any = None
+    event_clock: Any = None
+
+
+class FakeRequest:
+    """gpiod.LineRequest of one line."""
+
+    def __init__(self, pi: FakePi, path: str, pin: int, settings: LineSettings) -> None:
+        self.path, self.pin, self.settings = path, pin, settings
+        self.fd, self._writer = os.pipe()
+        self._pi = pi
+        self._events: list[SimpleNamespace] = []
+        self._seqno = 0
+        pi.levels[pin] = settings.output_value is Value.ACTIVE
+
+    def set_value(self, pin: int, value: Value) -> None:
+        """Drive the line."""
+        assert pin == self.pin
+        self._pi.drive(pin, level=value is Value.ACTIVE)
+
+    def get_value(self, pin: int) -> Value:
+        """Read the line."""
+        assert pin == self.pin
+        return Value.ACTIVE if self._pi.levels[pin] else Value.INACTIVE
+
+    def rise(self, timestamp_ns: int, *, lost: int = 0) -> None:
+        """Let an edge come, after some that the kernel's buffer had no room for."""
+        self._seqno += 1 + lost
+        self._events.append(SimpleNamespace(timestamp_ns=timestamp_ns, line_seqno=self._seqno))
+        os.write(self._writer, b".")
+
+    def read_edge_events(self) -> list[SimpleNamespace]:
+        """Return all edges that wait; would block if there were none."""
+        assert self._events, "read_edge_events() blocks when there are none"
+        os.read(self.fd, 100)
+        events, self._events = self._events, []
+        return events
+
+    def release(self) -> None:
+        """Let go of the line."""
+        del self._pi.levels[self.pin]
+        os.close(self.fd)
+        os.close(self._writer)
+
+
+@dataclass
+class FakeRpiGpio:
+    """RPi.GPIO; its interrupts are called by the test, from a thread."""
+
+    pi: FakePi
+    BCM: int = 11
+    OUT: int = 0
+    IN: int = 1
+    LOW: int = 0
+    HIGH: int = 1
+    RISING: int = 31
+    PUD_DOWN: int = 21
+    detect_error: Exception | None = None
+    callbacks: dict[int, Callable[[int], None]] = field(default_factory=dict)
+    pulls: dict[int, int] = field(default_factory=dict)
+    mode: int = 0
+
+    def setwarnings(self, flag: bool) -> None:  # noqa: FBT001 (as there)
+        """Take it."""
+
+    def setmode(self, mode: int) -> None:
+        """Choose how pins are numbered."""
+        self.mode = mode
+
+    def setup(self, pin: int, direction: int, *, initial: int = 0, pull_up_down: int = 20) -> None:
+        """Set up a pin."""
+        assert self.mode == self.BCM
+        if pin in self.pi.request_errors:
+            raise self.pi.request_errors[pin]
+        self.pi.levels[pin] = direction == self.OUT and bool(initial)
+        self.pulls[pin] = pull_up_down
+
+    def output(self, pin: int, level: int) -> None:
+        """Drive a pin."""
+        self.pi.drive(pin, level=bool(level))
+
+    def input(self, pin: int) -> int:
+        """Read a pin."""
+        return int(self.pi.levels[pin])
+
+    def add_event_detect(self, pin: int, edge: int, callback: Callable[[int], None]) -> None:
+        """Ask for interrupts."""
+        assert edge == self.RISING
+        if self.detect_error is not None:
+            raise self.detect_error
+        self.callbacks[pin] = callback
+
+    def remove_event_detect(self, pin: int) -> None:
+        """End them."""
+        del self.callbacks[pin]
+
+    def cleanup(self, pin: int) -> None:
+        """Let go of a pin."""
+        del self.pi.levels[pin]
+
+
+def _module(name: str, **attributes: Any) -> ModuleType:
+    module = ModuleType(name)
+    vars(module).update(attributes)
+    return module

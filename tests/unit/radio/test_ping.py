@@ -1,0 +1,190 @@
+from __future__ import annotations
+
+import asyncio
+from contextlib import aclosing, asynccontextmanager
+from typing import TYPE_CHECKING
+
+import pytest
+from support.plain_radio import AIRTIME_NS, PlainRadio
+
+from tsgt.radio.ping import Answer, Exchange, Strength, answer, ping, summarise, summarise_answers
+from tsgt.simulation.clocks import VirtualClock
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+    from tsgt.radio.base import Radio
+
+TIMEOUT_NS = 200_000_000
+
+
+async def test_every_request_is_answered() -> None:
+    """Three requests, three replies, in order, each after the time that the reply is on the air."""
+    async with _pair() as (here, _):
+        exchanges = await _ping(here, count=3)
+    assert [exchange.number for exchange in exchanges] == [0, 1, 2]
+    assert [exchange.round_trip_ns for exchange in exchanges] == [AIRTIME_NS] * 3
+
+
+async def test_a_reply_tells_how_the_request_was_heard() -> None:
+    """Strengths of both directions arrive, to a tenth of a dBm and a quarter of a dB."""
+    async with _pair() as (here, _):
+        (exchange,) = await _ping(here, count=1)
+    assert exchange.reply is not None
+    assert exchange.reply.here == Strength(-80.0, 7.25)
+    assert exchange.reply.there == Strength(-101.3, -11.5)
+
+
+async def test_a_reply_tells_how_long_the_one_before_took() -> None:
+    """The turn-round comes with the next reply; the first has none to tell."""
+    async with _pair(think_ns=3_000_000) as (here, _):
+        exchanges = await _ping(here, count=3)
+    turn_rounds_ns = [exchange.reply and exchange.reply.previous_turn_round_ns for exchange in exchanges]
+    assert turn_rounds_ns == [None, 3_000_000, 3_000_000]
+    assert summarise(exchanges).turn_round_ns == (3_000_000, 3_000_000)
+
+
+async def test_a_new_run_starts_without_turn_round() -> None:
+    """What the last reply to somebody else took is not told to a new run."""
+    async with _pair() as (here, _):
+        await _ping(here, count=2, run=1)
+        (exchange,) = await _ping(here, count=1, run=2)
+    assert exchange.reply is not None
+    assert exchange.reply.previous_turn_round_ns is None
+
+
+async def test_request_and_reply_have_the_length_asked_for() -> None:
+    """The packets are filled up, so that their time on air is that of the payload to be tested."""
+    lengths = []
+    async with _pair(on_air=lambda payload: lengths.append(len(payload))) as (here, _):
+        await _ping(here, count=1, payload_bytes=40)
+    assert lengths == [40, 40]
+
+
+async def test_a_lost_reply_is_given_up_in_time() -> None:
+    """Without a reply the next request leaves when the time-out has passed."""
+    here = PlainRadio(VirtualClock(0))
+    exchanges = await _ping(here, count=2)
+    assert [exchange.reply for exchange in exchanges] == [None, None]
+    assert exchanges[1].started_at_ns == exchanges[0].sent_at_ns + TIMEOUT_NS
+    assert summarise(exchanges).loss == 1.0
+
+
+async def test_a_late_reply_does_not_pass_for_the_next() -> None:
+    """A reply to an earlier request is counted as late and answers nothing."""
+    async with _pair(think_ns=TIMEOUT_NS) as (here, _):
+        first, second = await _ping(here, count=2)
+    assert first.reply is None
+    assert second.late == 1
+
+
+async def test_a_second_reply_counts_once() -> None:
+    """An echo of a reply is counted as late."""
+    async with _pair() as (here, there):
+        there.on_sent = here.hear_twice
+        exchanges = await _ping(here, count=2)
+    assert [exchange.reply is not None for exchange in exchanges] == [True, True]
+    assert [exchange.late for exchange in exchanges] == [0, 1]
+
+
+async def test_packets_of_others_are_ignored_and_counted() -> None:
+    """Short ones, long ones and the replies to another run do not disturb."""
+    other = PlainRadio(VirtualClock(0))
+    async with _pair() as (here, there):
+        there.on_sent, to_here = other.hear, there.on_sent
+        await _ping(here, count=1, run=8)
+        there.on_sent = to_here
+        for payload in (b"t1", bytes(34), (await other.receive()).payload, b"\xa5!"):
+            here.hear(payload)
+        (exchange,) = await _ping(here, count=1, run=7)
+    assert exchange.reply is not None
+    assert exchange.foreign == 4
+
+
+async def test_packets_of_others_do_not_prolong_the_wait() -> None:
+    """A busy channel does not move the time-out."""
+    here = PlainRadio(VirtualClock(0))
+
+    async def chatter() -> None:
+        while True:
+            await asyncio.sleep(0.15)
+            here.hear(b"chatter")
+
+    busy = asyncio.create_task(chatter())
+    first, second = await _ping(here, count=2)
+    busy.cancel()
+    await asyncio.wait([busy])
+    assert second.started_at_ns - first.sent_at_ns == TIMEOUT_NS
+
+
+async def test_a_request_is_answered_once() -> None:
+    """The same request again, as an echo brings it, gets no second reply."""
+    sent: list[bytes] = []
+    there, requests = PlainRadio(VirtualClock(0)), PlainRadio(VirtualClock(0))
+    there.on_sent = sent.append
+    requests.on_sent = there.hear_twice
+    answers: list[Answer] = []
+    answering = asyncio.create_task(_collect(there, answers))
+    await _ping(requests, count=1)
+    there.hear(b"t1")
+    await asyncio.sleep(1)
+    answering.cancel()
+    await asyncio.wait([answering])
+    assert len(sent) == 1
+    assert [(each.number, each.turn_round_ns is not None) for each in answers] == [
+        (0, True),
+        (0, False),
+        (None, False),
+    ]
+    summary = summarise_answers(answers)
+    assert (summary.answered, summary.repeated, summary.foreign) == (1, 1, 1)
+
+
+async def test_the_rate_counts_both_ways() -> None:
+    """Ten exchanges of two packets of 50 ms each are twenty packets in a second."""
+    async with _pair() as (here, _):
+        exchanges = await _ping(here, count=10)
+    assert summarise(exchanges).packets_per_s == pytest.approx(20.0)
+
+
+def test_nothing_sent_has_no_figures() -> None:
+    """A run that was stopped before its first request has an empty summary."""
+    summary = summarise([])
+    assert (summary.sent, summary.received, summary.loss, summary.packets_per_s) == (0, 0, None, None)
+    assert summarise_answers([]).turn_round_ns is None
+
+
+async def _ping(radio: Radio, *, count: int, run: int = 7, payload_bytes: int = 34) -> list[Exchange]:
+    requests = ping(
+        radio, VirtualClock(0), run=run, count=count, payload_bytes=payload_bytes, timeout_ns=TIMEOUT_NS
+    )
+    async with aclosing(requests) as exchanges:
+        return [exchange async for exchange in exchanges]
+
+
+async def _collect(radio: Radio, answers: list[Answer]) -> None:
+    async with aclosing(answer(radio)) as results:
+        async for result in results:
+            answers.append(result)  # noqa: PERF401 (it is cancelled, and has to leave what it has)
+
+
+@asynccontextmanager
+async def _pair(
+    *, think_ns: int = 0, on_air: Callable[[bytes], None] = lambda _: None
+) -> AsyncIterator[tuple[PlainRadio, PlainRadio]]:
+    """Two radios that hear each other, the second answering after the time that it is to take."""
+    clock = VirtualClock(0)
+    here, there = PlainRadio(clock), PlainRadio(clock, rssi_dbm=-101.3, snr_db=-11.5, latency_ns=think_ns)
+
+    def carry(radio: PlainRadio, payload: bytes) -> None:
+        on_air(payload)
+        radio.hear(payload)
+
+    here.on_sent = lambda payload: carry(there, payload)
+    there.on_sent = lambda payload: carry(here, payload)
+    answering = asyncio.create_task(_collect(there, []))
+    try:
+        yield here, there
+    finally:
+        answering.cancel()
+        await asyncio.wait([answering])

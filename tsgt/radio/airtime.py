@@ -1,0 +1,119 @@
+"""Time on air of a LoRa packet, in integers (SX1276 data sheet 4.1.1.6 and 4.1.1.7).
+
+A rate stands as the denominator of the coding rate, 5 to 8 for 4/5 to 4/8. Bandwidths are the data sheet's
+nominal ones in hertz. Results are exact at 31.25, 62.5, 125, 250 and 500 kHz, where a symbol lasts a whole
+number of nanoseconds; elsewhere they are rounded half up.
+"""
+
+from __future__ import annotations
+
+# A symbol longer than this lets the crystals drift apart within it, hence the low data rate optimisation.
+_LONGEST_SYMBOL_MS = 16
+
+SYNC_QUARTER_SYMBOLS = 17
+"""What follows the preamble's programmed symbols: 2 of sync word and 2.25 of start of frame, in quarters."""
+
+HEADER_SYMBOLS = 8
+"""The first symbols after that, always at rate 4/8: header and start of the payload."""
+
+
+def symbol_time_ns(spreading_factor: int, bandwidth_hz: int) -> int:
+    """Duration of one symbol, 2^SF / BW, in nanoseconds."""
+    return _divide_half_up((1 << spreading_factor) * 1_000_000_000, bandwidth_hz)
+
+
+def low_data_rate_required(spreading_factor: int, bandwidth_hz: int) -> bool:
+    """Whether a symbol lasts longer than 16 ms, so that the low data rate optimisation must be on."""
+    return (1 << spreading_factor) * 1000 > _LONGEST_SYMBOL_MS * bandwidth_hz
+
+
+def payload_symbols(
+    payload_bytes: int,
+    *,
+    spreading_factor: int,
+    coding_rate: int,
+    explicit_header: bool = True,
+    crc: bool = True,
+    low_data_rate: bool = False,
+) -> int:
+    """Count the symbols after the preamble: header, payload and CRC.
+
+    Parameters
+    ----------
+    payload_bytes
+        Length of the payload, 1 to 255.
+    spreading_factor
+        6 to 12.
+    coding_rate
+        Denominator of the coding rate, 5 to 8.
+    explicit_header
+        The packet says its own length, rate and whether it has a CRC.
+    crc
+        Two bytes of CRC follow the payload.
+    low_data_rate
+        The low data rate optimisation is on: two bits fewer per symbol.
+
+    Returns
+    -------
+    int
+        Number of symbols, at least 8.
+    """
+    bits = 8 * payload_bytes - 4 * spreading_factor + 28 + 16 * crc - 20 * (not explicit_header)
+    bits_per_block = 4 * (spreading_factor - 2 * low_data_rate)
+    blocks = max(-(-bits // bits_per_block), 0)
+    return HEADER_SYMBOLS + blocks * coding_rate
+
+
+def airtime_us(
+    payload_bytes: int,
+    *,
+    spreading_factor: int,
+    bandwidth_hz: int,
+    coding_rate: int,
+    preamble_symbols: int = 8,
+    explicit_header: bool = True,
+    crc: bool = True,
+    low_data_rate: bool | None = None,
+) -> int:
+    """Time from the first symbol of the preamble to the end of the packet.
+
+    Parameters
+    ----------
+    payload_bytes, spreading_factor, coding_rate, explicit_header, crc
+        As for :func:`payload_symbols`.
+    bandwidth_hz
+        Nominal bandwidth in hertz.
+    preamble_symbols
+        Value of the preamble register; 4.25 symbols more are sent.
+    low_data_rate
+        The low data rate optimisation; None follows :func:`low_data_rate_required`.
+
+    Returns
+    -------
+    int
+        Microseconds.
+    """
+    if low_data_rate is None:
+        low_data_rate = low_data_rate_required(spreading_factor, bandwidth_hz)
+    symbols = payload_symbols(
+        payload_bytes,
+        spreading_factor=spreading_factor,
+        coding_rate=coding_rate,
+        explicit_header=explicit_header,
+        crc=crc,
+        low_data_rate=low_data_rate,
+    )
+    quarter_symbols = 4 * (preamble_symbols + symbols) + SYNC_QUARTER_SYMBOLS
+    return _divide_half_up((quarter_symbols << spreading_factor) * 1_000_000, 4 * bandwidth_hz)
+
+
+def bit_rate_Bps(spreading_factor: int, bandwidth_hz: int, coding_rate: int) -> float:  # noqa: N802 (unit)
+    """Nominal rate of the payload, SF * 4/CR * BW / 2^SF, in bytes per second.
+
+    Preamble and header are not in it, nor the two bits per symbol that low data rate optimisation takes.
+    """
+    return spreading_factor * 4 * bandwidth_hz / ((coding_rate << spreading_factor) * 8)
+
+
+def _divide_half_up(numerator: int, denominator: int) -> int:
+    return (2 * numerator + denominator) // (2 * denominator)

@@ -1,0 +1,393 @@
+"""The bus and the pins of an SX127x behind one small protocol, and its back ends on a Raspberry Pi."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import fcntl
+import time
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+from tsgt.errors import RadioError, RadioNotFoundError, RadioSettingsError
+
+
+@dataclass(frozen=True, slots=True)
+class Edge:
+    """A rising edge of DIO0.
+
+    Attributes
+    ----------
+    at_ns
+        When it came, on the clock that the driver was given (CLOCK_MONOTONIC).
+    lost
+        How many edges before it were seen by the hardware but could not be reported.
+    """
+
+    at_ns: int
+    lost: int = 0
+
+
+_DEV = Path("/dev")
+
+EdgeCallback = Callable[[Edge], None]
+
+
+class Hal(Protocol):
+    """Bus and pins of one SX127x. Everything is called in the event loop's thread."""
+
+    @property
+    def stamp_sigma_ns(self) -> int:
+        """One sigma of the time stamps of edges, in ns."""
+        ...
+
+    def transfer(self, data: bytes) -> bytes:
+        """Exchange bytes in one chip-select window; the answer is as long as what was sent.
+
+        Raises
+        ------
+        RadioError
+            The bus failed.
+        """
+        ...
+
+    def set_reset(self, *, low: bool) -> None:
+        """Pull NRESET low (True) or release it (False)."""
+        ...
+
+    def dio0(self) -> bool:
+        """Level of DIO0 at this moment."""
+        ...
+
+    def on_dio0(self, callback: EdgeCallback) -> None:
+        """From now on call ``callback`` in the running event loop's thread for every rising edge of DIO0."""
+        ...
+
+    def close(self) -> None:
+        """Let go of bus and pins."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wiring:
+    """How the radio is connected; pins in BCM numbers.
+
+    Attributes
+    ----------
+    backend
+        ``gpiod``: edges are stamped in the kernel; ``rpi-gpio``: RPi.GPIO or its stand-in rpi-lgpio.
+    spi_bus, spi_device
+        As in /dev/spidev<bus>.<device>.
+    spi_hz
+        SPI clock, at most 10 MHz (data sheet, SPI timing).
+    reset_pin, dio0_pin
+        NRESET and DIO0 of the radio.
+    nss_pin
+        Pin that is driven by hand as chip select; None where the SPI driver of the kernel does it.
+    gpio_chip
+        Path such as /dev/gpiochip0; None: found by its label. ``gpiod`` only.
+    """
+
+    backend: Literal["gpiod", "rpi-gpio"] = "gpiod"
+    spi_bus: int = 0
+    spi_device: int = 0
+    spi_hz: int = 5_000_000
+    reset_pin: int
+    dio0_pin: int
+    nss_pin: int | None
+    gpio_chip: str | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 < self.spi_hz <= 10_000_000:
+            raise RadioSettingsError(f"spi_hz must be at most 10000000, got {self.spi_hz}")
+
+
+DRAGINO_HAT = Wiring(reset_pin=17, dio0_pin=4, nss_pin=25)
+"""The Dragino LoRa/GPS HAT, whose chip select is on BCM 25 and not on CE0 or CE1."""
+
+
+def open_hal(wiring: Wiring) -> Hal:
+    """Open bus and pins on a Raspberry Pi.
+
+    Raises
+    ------
+    RadioNotFoundError
+        There is no such SPI bus or GPIO chip.
+    RadioError
+        A package is missing, the bus or a pin is taken, or permission is lacking.
+    """
+    spi = _Spi(wiring)
+    try:
+        pins = _GpiodPins(wiring) if wiring.backend == "gpiod" else _RpiGpioPins(wiring)
+    except RadioError:
+        spi.close()
+        raise
+    return _PiHal(spi, pins)
+
+
+class _Pins(Protocol):
+    """What the two packages for pins have in common here."""
+
+    stamp_sigma_ns: int
+
+    def set_nss(self, *, low: bool) -> None: ...
+
+    def set_reset(self, *, low: bool) -> None: ...
+
+    def dio0(self) -> bool: ...
+
+    def on_dio0(self, callback: EdgeCallback) -> None: ...
+
+    def close(self) -> None: ...
+
+
+class _PiHal:
+    """The bus and the pins, joined where chip select is a pin that is driven by hand."""
+
+    def __init__(self, spi: _Spi, pins: _Pins) -> None:
+        self._spi = spi
+        self._pins = pins
+        self.stamp_sigma_ns = pins.stamp_sigma_ns
+
+    def transfer(self, data: bytes) -> bytes:
+        self._pins.set_nss(low=True)
+        try:
+            return self._spi.transfer(data)
+        finally:
+            self._pins.set_nss(low=False)
+
+    def set_reset(self, *, low: bool) -> None:
+        self._pins.set_reset(low=low)
+
+    def dio0(self) -> bool:
+        return self._pins.dio0()
+
+    def on_dio0(self, callback: EdgeCallback) -> None:
+        self._pins.on_dio0(callback)
+
+    def close(self) -> None:
+        self._pins.close()
+        self._spi.close()
+
+
+_INSTALL = "pip install 'tsgt[pi]', on a Pi 5 'tsgt[pi5]'"
+_GPIO_GROUP = "no permission for the GPIO pins: sudo usermod -aG gpio $USER, then log in again"
+_WHY_BUSY = {
+    "NSS": "an overlay such as spi0-1cs,cs0_pin=25 drives it; remove that, or set no nss_pin",
+    "reset": "another program drives it",
+    "DIO0": "the overlay w1-gpio takes BCM 4; remove it or move it to another pin",
+}
+
+
+def _busy(pin: int, role: str) -> RadioError:
+    return RadioError(
+        f"BCM {pin} ({role}) is in use: {_WHY_BUSY[role]}, or tsgt runs twice; gpioinfo shows who has it"
+    )
+
+
+class _Spi:
+    """The SPI bus of the kernel, held for this process alone."""
+
+    def __init__(self, wiring: Wiring) -> None:
+        try:
+            import spidev  # noqa: PLC0415 (there is none but on a Pi)
+        except ImportError as error:
+            raise RadioError(f"the Python package spidev is missing: {_INSTALL}") from error
+        self._path = f"/dev/spidev{wiring.spi_bus}.{wiring.spi_device}"
+        self._bus = spidev.SpiDev()
+        try:
+            self._bus.open(wiring.spi_bus, wiring.spi_device)
+        except FileNotFoundError as error:
+            raise RadioNotFoundError(
+                f"there is no {self._path}: switch SPI on (sudo raspi-config nonint do_spi 0) and reboot"
+            ) from error
+        except PermissionError as error:
+            raise RadioError(
+                f"no permission for {self._path}: sudo usermod -aG spi $USER, then log in again"
+            ) from error
+        except OSError as error:
+            raise RadioError(f"{self._path} cannot be opened: {error}") from error
+        try:
+            # Two programs on one radio would each see half of it; the kernel does not mind, so we do.
+            fcntl.flock(self._bus.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._bus.mode = 0
+            self._bus.max_speed_hz = wiring.spi_hz
+        except BlockingIOError as error:
+            self.close()
+            raise RadioError(f"{self._path} is in use: tsgt runs twice, or two radios share it") from error
+        except OSError as error:
+            self.close()
+            raise RadioError(f"{self._path} cannot be set to mode 0, {wiring.spi_hz} Hz: {error}") from error
+        if wiring.nss_pin is not None:
+            with suppress(OSError):  # not every controller can leave its own chip select alone
+                self._bus.no_cs = True
+
+    def transfer(self, data: bytes) -> bytes:
+        try:
+            return bytes(self._bus.xfer2(list(data)))
+        except OSError as error:
+            raise RadioError(f"{self._path}: transfer failed: {error}") from error
+
+    def close(self) -> None:
+        self._bus.close()
+
+
+class _GpiodPins:
+    """Pins through the GPIO character device; the kernel stamps each edge in its interrupt handler."""
+
+    stamp_sigma_ns = 10_000
+    """From the edge to the stamp a Pi takes 2 to 10 us (facts of others; not measured by us)."""
+
+    _EVENT_BUFFER = 64
+    _CHIP_LABELS = ("pinctrl-bcm2835", "pinctrl-bcm2711", "pinctrl-rp1")
+    """Labels of the chip behind the pin header: Pi 0 to 3, 4, 5."""
+
+    def __init__(self, wiring: Wiring) -> None:
+        try:
+            import gpiod  # noqa: PLC0415 (there is none but on a Pi)
+        except ImportError as error:
+            raise RadioError(f"the Python package gpiod is missing: {_INSTALL}") from error
+        if not hasattr(gpiod, "request_lines"):
+            raise RadioError(f"the Python package gpiod is older than 2.0: {_INSTALL}")
+        self._gpiod = gpiod
+        self._chip = wiring.gpio_chip or self._find_chip()
+        line = gpiod.line
+        self._released, self._low = line.Value.ACTIVE, line.Value.INACTIVE
+        output = gpiod.LineSettings(direction=line.Direction.OUTPUT, output_value=line.Value.ACTIVE)
+        edges = gpiod.LineSettings(
+            direction=line.Direction.INPUT,
+            edge_detection=line.Edge.RISING,
+            bias=line.Bias.PULL_DOWN,
+            event_clock=line.Clock.MONOTONIC,
+        )
+        self._nss_pin, self._reset_pin, self._dio0_pin = wiring.nss_pin, wiring.reset_pin, wiring.dio0_pin
+        self._last_seqno = 0
+        with ExitStack() as stack:
+            if self._nss_pin is not None:
+                self._nss = self._request(stack, self._nss_pin, "NSS", output)
+            self._reset = self._request(stack, self._reset_pin, "reset", output)
+            self._dio0 = self._request(stack, self._dio0_pin, "DIO0", edges)
+            self._open = stack.pop_all()
+
+    def _find_chip(self) -> str:
+        try:
+            for path in sorted(_DEV.glob("gpiochip*")):
+                with self._gpiod.Chip(str(path)) as chip:
+                    if chip.get_info().label in self._CHIP_LABELS:
+                        return str(path)
+        except PermissionError as error:
+            raise RadioError(_GPIO_GROUP) from error
+        raise RadioNotFoundError(
+            f"no /dev/gpiochip* has the label {', '.join(self._CHIP_LABELS)}: on a board other than a Raspberry Pi, "
+            "name it as gpio_chip"
+        )
+
+    def _request(self, stack: ExitStack, pin: int, role: str, settings: object) -> Any:
+        try:
+            request = self._gpiod.request_lines(
+                self._chip, consumer="tsgt", config={pin: settings}, event_buffer_size=self._EVENT_BUFFER
+            )
+        except FileNotFoundError as error:
+            raise RadioNotFoundError(f"there is no GPIO chip {self._chip}: gpiodetect lists them") from error
+        except PermissionError as error:
+            raise RadioError(_GPIO_GROUP) from error
+        except OSError as error:
+            if error.errno == errno.EBUSY:
+                raise _busy(pin, role) from error
+            raise RadioError(f"BCM {pin} ({role}) cannot be had: {error}") from error
+        stack.callback(request.release)
+        return request
+
+    def set_nss(self, *, low: bool) -> None:
+        if self._nss_pin is not None:
+            self._nss.set_value(self._nss_pin, self._low if low else self._released)
+
+    def set_reset(self, *, low: bool) -> None:
+        self._reset.set_value(self._reset_pin, self._low if low else self._released)
+
+    def dio0(self) -> bool:
+        return bool(self._dio0.get_value(self._dio0_pin) == self._released)
+
+    def on_dio0(self, callback: EdgeCallback) -> None:
+        def read_edges() -> None:
+            for event in self._dio0.read_edge_events():
+                # Numbers count up by one for each edge of the line; a full buffer drops the oldest.
+                lost = event.line_seqno - self._last_seqno - 1
+                self._last_seqno = event.line_seqno
+                callback(Edge(event.timestamp_ns, lost))
+
+        loop = asyncio.get_running_loop()
+        loop.add_reader(self._dio0.fd, read_edges)
+        self._open.callback(loop.remove_reader, self._dio0.fd)
+
+    def close(self) -> None:
+        self._open.close()
+
+
+class _RpiGpioPins:
+    """Pins through RPi.GPIO or rpi-lgpio; edges are stamped in a thread of Python, when it gets to run."""
+
+    stamp_sigma_ns = 1_000_000
+
+    def __init__(self, wiring: Wiring) -> None:
+        try:
+            from RPi import GPIO  # noqa: PLC0415 (there is none but on a Pi)
+        except ImportError as error:
+            raise RadioError(f"the Python package RPi.GPIO is missing: {_INSTALL}") from error
+        except RuntimeError as error:
+            raise RadioError(
+                f"RPi.GPIO does not work on this board ({error}): use gpiod or rpi-lgpio"
+            ) from error
+        self._gpio = GPIO
+        self._nss_pin, self._reset_pin, self._dio0_pin = wiring.nss_pin, wiring.reset_pin, wiring.dio0_pin
+        GPIO.setwarnings(False)  # a program that was killed has left its pins set up
+        GPIO.setmode(GPIO.BCM)
+        with ExitStack() as stack:
+            if self._nss_pin is not None:
+                self._set_up(stack, self._nss_pin, "NSS", GPIO.OUT, initial=GPIO.HIGH)
+            self._set_up(stack, self._reset_pin, "reset", GPIO.OUT, initial=GPIO.HIGH)
+            self._set_up(stack, self._dio0_pin, "DIO0", GPIO.IN, pull_up_down=GPIO.PUD_DOWN)
+            self._open = stack.pop_all()
+
+    def _set_up(self, stack: ExitStack, pin: int, role: str, direction: int, **options: int) -> None:
+        try:
+            self._gpio.setup(pin, direction, **options)
+        except Exception as error:  # rpi-lgpio has a class of its own, which RPi.GPIO does not know
+            if "busy" in str(error).lower():
+                raise _busy(pin, role) from error
+            if "/dev/mem" in str(error) or "permission" in str(error).lower():
+                raise RadioError(_GPIO_GROUP) from error
+            raise RadioError(f"BCM {pin} ({role}) cannot be had: {error}") from error
+        stack.callback(self._gpio.cleanup, pin)
+
+    def set_nss(self, *, low: bool) -> None:
+        if self._nss_pin is not None:
+            self._gpio.output(self._nss_pin, self._gpio.LOW if low else self._gpio.HIGH)
+
+    def set_reset(self, *, low: bool) -> None:
+        self._gpio.output(self._reset_pin, self._gpio.LOW if low else self._gpio.HIGH)
+
+    def dio0(self) -> bool:
+        return bool(self._gpio.input(self._dio0_pin))
+
+    def on_dio0(self, callback: EdgeCallback) -> None:
+        loop = asyncio.get_running_loop()
+
+        def seen_in_thread(_channel: int) -> None:
+            edge = Edge(time.monotonic_ns())
+            with suppress(RuntimeError):  # the loop has just been closed
+                loop.call_soon_threadsafe(callback, edge)
+
+        try:
+            self._gpio.add_event_detect(self._dio0_pin, self._gpio.RISING, callback=seen_in_thread)
+        except RuntimeError as error:
+            raise RadioError(
+                f"RPi.GPIO gets no interrupts ({error}), as on every kernel since 6.6: use gpiod or rpi-lgpio"
+            ) from error
+        self._open.callback(self._gpio.remove_event_detect, self._dio0_pin)
+
+    def close(self) -> None:
+        self._open.close()

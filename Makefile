@@ -28,6 +28,7 @@ pytest: $(VENV)/.test
 bench: $(VENV)/.test
 	$(BIN)/python benchmarks/alignment.py
 	$(BIN)/python benchmarks/process.py
+	$(BIN)/python benchmarks/air.py
 
 # Schemas, field tables and the command reference come from the code; a test fails when they are stale.
 generated: $(VENV)/.test
@@ -51,6 +52,7 @@ $(VENV)/.runtime: $(VENV)/bin/python pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable .
 	touch $@
 
-$(VENV)/.test: $(VENV)/.runtime
+$(VENV)/.test: $(VENV)/.runtime tests/interop/requirements.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[test]"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --requirement tests/interop/requirements.txt
 	touch $@

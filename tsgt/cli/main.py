@@ -27,6 +27,7 @@ COMMANDS = {
     "import": "tsgt.cli.importing:import_group",
     "listen": "tsgt.cli.live:listen",
     "process": "tsgt.cli.desk:process",
+    "radio": "tsgt.cli.radio:radio",
     "replay": "tsgt.cli.live:replay",
 }
 
@@ -49,7 +50,10 @@ class LazyGroup(click.Group):
         return command
 
 
-@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+HELP_OPTIONS = {"help_option_names": ["-h", "--help"]}
+
+
+@click.group(cls=LazyGroup, context_settings=HELP_OPTIONS)
 @click.version_option(tsgt.__version__, prog_name="tsgt")
 def cli() -> None:
     """Outdoor 6-DOF reference poses for robots, from robotic total stations.
@@ -81,9 +85,9 @@ def run(command: click.Command, arguments: list[str] | None = None) -> NoReturn:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except OSError as error:
-        if error.filename is None:
+        if error.strerror is None:
             raise
-        click.echo(f"error: {error.filename}: {error.strerror}", err=True)
+        click.echo(f"error: {error.filename or 'the output cannot be written'}: {error.strerror}", err=True)
         sys.exit(1)
     sys.exit(result if isinstance(result, int) else 0)
 

@@ -227,7 +227,6 @@ class SX127x:
         for poll_at_ns in range(due_ns + TX_POLL_NS, due_ns + TX_TIMEOUT_NS + 1, TX_POLL_NS):
             timeout_s = max(0, poll_at_ns - self._clock.monotonic_ns()) / 1e9
             await asyncio.wait([self._tx_edge], timeout=timeout_s)
-            await self._let_edges_in()
             if self._tx_edge.done():
                 edge = self._tx_edge.result()
                 return Transmitted(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import structlog
 
-from tsgt.errors import RadioError, RadioNotFoundError
+from tsgt.errors import RadioNotFoundError
 from tsgt.radio import registers as reg
 from tsgt.radio.register_access import RegisterAccess
 from tsgt.radio.register_values import (
@@ -165,13 +165,7 @@ class Chip:
         return bool(self._flags() & Irq.RX_DONE)
 
     def take_packet(self) -> Arrival | None:
-        """Read the packet that waits, if there is one, and clear its flags.
-
-        Raises
-        ------
-        RadioError
-            The flags cannot be cleared.
-        """
+        """Read the packet that waits, if there is one, and clear its flags."""
         first = Register.FIFO_RX_CURRENT_ADDR
         status = self._registers.read_burst(first, Register.HOP_CHANNEL - first + 1)
 
@@ -182,8 +176,6 @@ class Chip:
         if flags == _ABSENT or not flags & Irq.RX_DONE:
             return None
         self._registers.write(Register.IRQ_FLAGS, flags)
-        if self.packet_waits():  # not another one: the shortest packet takes milliseconds
-            raise RadioError("RxDone cannot be cleared")
         self._registers.write(Register.FIFO_ADDR_PTR, value(Register.FIFO_RX_CURRENT_ADDR))
         rssi_dbm, snr_db = packet_strength(
             value(Register.PKT_RSSI_VALUE),

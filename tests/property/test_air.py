@@ -1,0 +1,139 @@
+"""Whatever is sent and heard: the air does not break, and every lock has an end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.air import RecordingAntenna, frame, modulation
+
+from tsgt.simulation.air import Air
+from tsgt.simulation.frames import Frame, Listening, Modulation
+from tsgt.simulation.link import FixedLoss, LinkModel
+from tsgt.simulation.timeline import VirtualTimeline
+
+NAMES = ("a", "b", "c")
+
+MODULATIONS = st.builds(
+    Modulation,
+    # Two values each, so that frames and receivers often match.
+    frequency_hz=st.sampled_from([905e6, 905.05e6, 0.0]),
+    spreading_factor=st.sampled_from([6, 7, 12]),
+    bandwidth_hz=st.sampled_from([500_000, 7_800]),
+    inverted_iq=st.booleans(),
+    sync_word=st.sampled_from([0x12, 0x34]),
+    explicit_header=st.booleans(),
+    low_data_rate=st.booleans(),
+)
+PLAIN = modulation(spreading_factor=7, bandwidth_hz=500_000)
+
+
+@dataclass(frozen=True)
+class Deed:
+    """What a radio does, and when."""
+
+    radio: str
+    what: str
+    after_ns: int
+    settings: dict[str, Any]
+
+
+def deeds(modulations: st.SearchStrategy[Modulation]) -> st.SearchStrategy[list[Deed]]:
+    """Make sequences of what radios may do."""
+    sending = st.fixed_dictionaries(
+        {
+            "modulation": modulations,
+            "coding_rate": st.integers(5, 8),
+            "crc": st.booleans(),
+            "preamble_symbols": st.sampled_from([0, 6, 8, 20]),
+            "payload": st.binary(max_size=255),
+            "power_dbm": st.sampled_from([-90.0, -20.0, 8.0, 14.0, 20.0]),
+        }
+    )
+    hearing = st.fixed_dictionaries(
+        {
+            "modulation": modulations,
+            "preamble_symbols": st.sampled_from([0, 8, 30]),
+            "max_payload_bytes": st.sampled_from([0, 64, 255]),
+            "payload_bytes": st.integers(0, 255),
+            "coding_rate": st.integers(5, 8),
+            "crc": st.booleans(),
+        }
+    )
+    radios = st.sampled_from(NAMES)
+    gaps_ns = st.integers(0, 20_000_000)
+    return st.lists(
+        st.one_of(
+            st.builds(Deed, radios, st.just("transmit"), gaps_ns, sending),
+            st.builds(Deed, radios, st.just("listen"), gaps_ns, hearing),
+            st.builds(Deed, radios, st.sampled_from(["deaf", "stop", "leave", "ask"]), gaps_ns, st.just({})),
+        ),
+        max_size=40,
+    )
+
+
+class StrictAntenna(RecordingAntenna):
+    """Checks that what it is told makes sense: a lock, perhaps a header, an end, in the order of time."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.locked = False
+
+    def preamble_detected(self, at_ns: int) -> None:
+        """Check that nobody locks twice."""
+        assert not self.locked
+        self.locked = True
+        super().preamble_detected(at_ns)
+
+    def header_received(self, at_ns: int, header: Any) -> None:
+        """Check that a header belongs to a lock."""
+        assert self.locked
+        super().header_received(at_ns, header)
+
+    def frame_ended(self, at_ns: int, reception: Any) -> None:
+        """Check that an end does so, too."""
+        assert self.locked
+        self.locked = False
+        if reception is not None:
+            assert len(reception.payload) == reception.header.payload_bytes
+        super().frame_ended(at_ns, reception)
+
+
+@given(
+    st.one_of(deeds(MODULATIONS), deeds(st.just(PLAIN))), st.integers(0, 2**32), st.sampled_from([60, 120])
+)
+@settings(deadline=None)
+def test_arbitrary_traffic(sequence: list[Deed], seed: int, loss_db: float) -> None:
+    """Arbitrary frames, receivers, cuts and departures raise nothing; every lock ends; nothing is left behind."""
+    timeline = VirtualTimeline()
+    link = LinkModel(path_loss=FixedLoss(default_db=loss_db), fading_sigma_db=3.0, rayleigh_fading=True)
+    air = Air(timeline, np.random.default_rng(seed), link)
+    antennas = {name: StrictAntenna() for name in NAMES}
+    ports = {name: air.join(antennas[name], name) for name in NAMES}
+    for deed in sequence:
+        timeline.advance(deed.after_ns)
+        now_ns, port, antenna = timeline.now_ns(), ports[deed.radio], antennas[deed.radio]
+        if deed.what == "transmit":
+            port.transmit(Frame(start_ns=now_ns, **deed.settings))
+        elif deed.what == "stop":
+            port.stop_transmitting(now_ns)
+        elif deed.what == "ask":
+            assert np.isfinite(port.rssi_dbm(now_ns))
+            port.preamble_present(PLAIN, now_ns)
+        else:
+            antenna.locked = False
+            port.listen(Listening(since_ns=now_ns, **deed.settings) if deed.what == "listen" else None)
+            if deed.what == "leave":
+                air.leave(deed.radio)
+                ports[deed.radio] = air.join(antenna, deed.radio)
+    while (next_ns := timeline.next_ns()) is not None:
+        timeline.advance_to(next_ns)
+    for antenna in antennas.values():
+        assert not antenna.locked
+        assert antenna.events == sorted(antenna.events, key=lambda event: event[0])
+    timeline.advance(10**15)
+    ports["a"].transmit(frame(start_ns=timeline.now_ns()))
+    assert len(air.frames) == 1

@@ -28,6 +28,7 @@ from tsgt.radio.ping import (
     summarise,
     summarise_answers,
 )
+from tsgt.radio.regions import LOWEST_DBM, REGIONS, preset_power_dbm
 from tsgt.radio.sx127x import RadioStatistics, SX127x
 
 if TYPE_CHECKING:
@@ -82,11 +83,14 @@ def _byte(_context: click.Context, _parameter: click.Parameter, value: str) -> i
     f"[required; with --simulated {SIMULATED_FREQUENCY_MHZ:g}]",
 )
 @click.option(
+    "--region",
+    type=click.Choice(sorted(REGIONS)),
+    help="Take the power that the region allows on this channel, and refuse a channel outside its bands.",
+)
+@click.option(
     "--power-dbm",
     type=click.IntRange(2, 17),
-    default=2,
-    show_default=True,
-    help="Power; 2 is plenty within a building.",
+    help="Power.  [default: that of --region; without one 2, which is plenty within a building]",
 )
 @click.option(
     "--sync-word",
@@ -120,7 +124,8 @@ def ping_command(
     timeout_ms: int | None,
     modem: Modem,
     frequency_mhz: float | None,
-    power_dbm: int,
+    region: str | None,
+    power_dbm: int | None,
     sync_word: int,
     wiring: Wiring,
     distance_m: float,
@@ -141,11 +146,15 @@ def ping_command(
         if not simulated:
             raise click.UsageError("give --frequency-mhz, a carrier that you may use where you are")
         frequency_mhz = SIMULATED_FREQUENCY_MHZ
+    frequency_hz = round(frequency_mhz * 1e6)
+    preset_dbm = LOWEST_DBM
+    if region is not None:
+        preset_dbm = preset_power_dbm(region, frequency_hz=frequency_hz, bandwidth_hz=modem.bandwidth_hz)
     settings = LoRaSettings(
-        frequency_hz=round(frequency_mhz * 1e6),
+        frequency_hz=frequency_hz,
         **dataclasses.asdict(modem),
         sync_word=sync_word,
-        power_dbm=power_dbm,
+        power_dbm=preset_dbm if power_dbm is None else power_dbm,
     )
     if answering:
         _answer(settings, wiring, count=count, as_json=as_json)

@@ -153,14 +153,20 @@ class _PiHal:
         self.stamp_sigma_ns = pins.stamp_sigma_ns
 
     def transfer(self, data: bytes) -> bytes:
-        self._pins.set_nss(low=True)
         try:
-            return self._spi.transfer(data)
-        finally:
-            self._pins.set_nss(low=False)
+            self._pins.set_nss(low=True)
+            try:
+                return self._spi.transfer(data)
+            finally:
+                self._pins.set_nss(low=False)
+        except OSError as error:
+            raise RadioError(f"{self._spi.path}: transfer failed: {error}") from error
 
     def set_reset(self, *, low: bool) -> None:
-        self._pins.set_reset(low=low)
+        try:
+            self._pins.set_reset(low=low)
+        except OSError as error:
+            raise RadioError(f"{self._spi.path}: the reset pin cannot be set: {error}") from error
 
     def dio0(self) -> bool:
         return self._pins.dio0()
@@ -196,20 +202,20 @@ class _Spi:
             import spidev  # noqa: PLC0415 (there is none but on a Pi)
         except ImportError as error:
             raise RadioError(f"the Python package spidev is missing: {_INSTALL}") from error
-        self._path = f"/dev/spidev{wiring.spi_bus}.{wiring.spi_device}"
+        self.path = f"/dev/spidev{wiring.spi_bus}.{wiring.spi_device}"
         self._bus = spidev.SpiDev()
         try:
             self._bus.open(wiring.spi_bus, wiring.spi_device)
         except FileNotFoundError as error:
             raise RadioNotFoundError(
-                f"there is no {self._path}: switch SPI on (sudo raspi-config nonint do_spi 0) and reboot"
+                f"there is no {self.path}: switch SPI on (sudo raspi-config nonint do_spi 0) and reboot"
             ) from error
         except PermissionError as error:
             raise RadioError(
-                f"no permission for {self._path}: sudo usermod -aG spi $USER, then log in again"
+                f"no permission for {self.path}: sudo usermod -aG spi $USER, then log in again"
             ) from error
         except OSError as error:
-            raise RadioError(f"{self._path} cannot be opened: {error}") from error
+            raise RadioError(f"{self.path} cannot be opened: {error}") from error
         try:
             # Two programs on one radio would each see half of it; the kernel does not mind, so we do.
             fcntl.flock(self._bus.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -217,19 +223,16 @@ class _Spi:
             self._bus.max_speed_hz = wiring.spi_hz
         except BlockingIOError as error:
             self.close()
-            raise RadioError(f"{self._path} is in use: tsgt runs twice, or two radios share it") from error
+            raise RadioError(f"{self.path} is in use: tsgt runs twice, or two radios share it") from error
         except OSError as error:
             self.close()
-            raise RadioError(f"{self._path} cannot be set to mode 0, {wiring.spi_hz} Hz: {error}") from error
+            raise RadioError(f"{self.path} cannot be set to mode 0, {wiring.spi_hz} Hz: {error}") from error
         if wiring.nss_pin is not None:
             with suppress(OSError):  # not every controller can leave its own chip select alone
                 self._bus.no_cs = True
 
     def transfer(self, data: bytes) -> bytes:
-        try:
-            return bytes(self._bus.xfer2(list(data)))
-        except OSError as error:
-            raise RadioError(f"{self._path}: transfer failed: {error}") from error
+        return bytes(self._bus.xfer2(list(data)))
 
     def close(self) -> None:
         self._bus.close()

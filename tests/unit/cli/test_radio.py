@@ -265,3 +265,10 @@ async def _requests(radio: Radio) -> AsyncIterator[Exchange]:
 async def _drain(results: AsyncIterator[object]) -> None:
     async for _ in results:
         pass
+
+
+def test_a_channel_outside_the_region_is_refused(tsgt: Tsgt) -> None:
+    """With --region the command does not transmit where that region has no band."""
+    done = tsgt("radio", "ping", "--simulated", "--frequency-mhz", 905, "--region", "EU868")
+    assert done.code == 1
+    assert "905 MHz with 250 kHz is not within a band of EU868" in done.err

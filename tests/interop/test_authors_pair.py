@@ -1,0 +1,415 @@
+"""A station and a master built from descriptions of the authors' nodes, each against ours and against the other."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass, field, replace
+from statistics import fmean
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from support.radios import MS, running_timeline
+from support.shots import READING, ScriptedInstrument
+
+from tsgt.clock import UnixTimeline
+from tsgt.errors import InstrumentError
+from tsgt.master.collector import Collector
+from tsgt.model import Status
+from tsgt.radio.base import LoRaSettings
+from tsgt.radio.classic import (
+    ClassicStation,
+    MeasureOrder,
+    Ordered,
+    Poll,
+    Shot,
+    Synchronisation,
+    Timing,
+)
+from tsgt.radio.classic_messages import Command, MeasurementMessage, raw_status, status_of
+from tsgt.simulation.air import Air
+from tsgt.simulation.authors_node import AuthorsMaster, AuthorsNode
+from tsgt.simulation.clocks import DriftingClock, VirtualClock
+from tsgt.simulation.link import LinkModel
+from tsgt.simulation.radios import opener
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator, Coroutine
+
+    from tsgt.radio.base import Radio
+    from tsgt.radio.classic import Order
+    from tsgt.station.instrument import Reading
+
+SECOND = 1000 * MS
+START_NS = 1_790_000_000 * SECOND
+AHEAD_NS = -500_000_000 * SECOND
+"""A Pi without battery clock starts years behind."""
+spreading_factors = pytest.mark.parametrize("spreading_factor", [8, 9])
+
+
+def _settings(spreading_factor: int) -> LoRaSettings:
+    return LoRaSettings(
+        frequency_hz=905_000_000, spreading_factor=spreading_factor, bandwidth_hz=250_000, coding_rate=6
+    )
+
+
+@dataclass
+class Field:
+    """A channel with a master's radio, and whatever has been put beside it."""
+
+    radio: Radio
+    clock: VirtualClock
+    settings: LoRaSettings
+    air: Air
+    stack: AsyncExitStack
+    tasks: list[asyncio.Task[None]] = field(default_factory=list)
+    clocks: dict[int, DriftingClock] = field(default_factory=dict)
+    instruments: dict[int, ScriptedInstrument] = field(default_factory=dict)
+
+    async def add_authors_node(self, station: int) -> None:
+        """Start a node of the authors'."""
+        radio, clock, instrument = await self._host(station)
+        node = AuthorsNode(station, radio, clock, instrument, 1, np.random.default_rng(station))
+        await self._start(node.run())
+
+    async def add_our_station(self, station: int) -> None:
+        """Start a station that answers by the core of ours."""
+        radio, clock, instrument = await self._host(station)
+        await self._start(_serve(station, radio, clock, instrument))
+
+    async def _host(self, station: int) -> tuple[Radio, DriftingClock, ScriptedInstrument]:
+        clock = self.clocks[station] = DriftingClock(self.clock, offset_ns=AHEAD_NS)
+        instrument = self.instruments[station] = ScriptedInstrument(clock)
+        rng = np.random.default_rng(10 + station)
+        open_radio = opener(self.air, f"station{station}", clock, rng, self.settings)
+        return await self.stack.enter_async_context(open_radio()), clock, instrument
+
+    async def _start(self, program: Coroutine[None, None, None]) -> None:
+        self.tasks.append(asyncio.create_task(program))
+        await asyncio.sleep(1.1)  # the instrument takes a second until it tracks
+
+    def our_master(self) -> Collector:
+        """Return what runs turns of ours."""
+        return Collector(self.radio, self.clock, UnixTimeline.fixed_now(self.clock), self.timing)
+
+    def their_master(self, *stations: int) -> AuthorsMaster:
+        """Return a master of the authors'."""
+        return AuthorsMaster(stations, self.radio, self.clock, np.random.default_rng(5))
+
+    @property
+    def timing(self) -> Timing:
+        """Of the turns."""
+        return Timing.of(self.settings, 250 * MS)
+
+
+@asynccontextmanager
+async def _field(spreading_factor: int = 9) -> AsyncGenerator[Field]:
+    air = Air(running_timeline(), np.random.default_rng(0), LinkModel())
+    clock, settings = VirtualClock(START_NS), _settings(spreading_factor)
+    async with AsyncExitStack() as stack:
+        open_radio = opener(air, "master", clock, np.random.default_rng(1), settings)
+        site = Field(await stack.enter_async_context(open_radio()), clock, settings, air, stack)
+        try:
+            yield site
+        finally:
+            for task in site.tasks:
+                task.cancel()
+            results = await asyncio.gather(*site.tasks, return_exceptions=True)
+            assert all(isinstance(result, asyncio.CancelledError) for result in results), results
+
+
+async def _serve(station: int, radio: Radio, clock: DriftingClock, instrument: ScriptedInstrument) -> None:
+    """Answer as our client does, with one task less."""
+    timeline = UnixTimeline.fixed_now(clock)
+    core = ClassicStation(station)
+
+    def message(reading: Reading) -> MeasurementMessage:
+        return MeasurementMessage(
+            station=station,
+            status=raw_status(reading.status),
+            zenith_angle_rad=reading.zenith_angle_rad,
+            horizontal_angle_rad=reading.horizontal_angle_rad,
+            slope_distance_m=reading.slope_distance_m or 0.0,
+            time_ns=timeline.unix_ns(reading.at_ns),
+        )
+
+    async def carry_out(order: Order) -> bytes:
+        if isinstance(order, MeasureOrder):
+            return core.shot(message(await instrument.measure()))
+        await instrument.direct()
+        return core.executed(order, ok=True)
+
+    async def read() -> None:
+        while True:
+            core.measured(message(await instrument.read()))
+
+    reading = asyncio.create_task(read())
+    try:
+        while True:
+            packet = await radio.receive()
+            answer = core.received(packet.payload, timeline.unix_ns(packet.received_at_ns))
+            if answer is not None:
+                await radio.transmit(answer if isinstance(answer, bytes) else await carry_out(answer))
+    finally:
+        reading.cancel()
+        await asyncio.wait([reading])
+
+
+# --- Our master, their node -----------------------------------------------------------------------------------
+
+
+async def _polled(site: Field, station: int = 1) -> MeasurementMessage | None:
+    poll = Poll(station, site.timing)
+    await site.our_master().take(poll)
+    return poll.message
+
+
+@spreading_factors
+async def test_our_master_gets_their_measurement(spreading_factor: int) -> None:
+    """Polar values, raw as the instrument gave them, and the time of their arrival on the node's Unix clock."""
+    async with _field(spreading_factor) as site:
+        await site.add_authors_node(1)
+        site.instruments[1].give()
+        given_ns = site.clocks[1].realtime_ns()
+        await asyncio.sleep(0.3)
+        message = await _polled(site)
+    assert message == MeasurementMessage(
+        station=1,
+        status=0,
+        zenith_angle_rad=READING.zenith_angle_rad,
+        horizontal_angle_rad=READING.horizontal_angle_rad,
+        slope_distance_m=99.5,
+        time_ns=given_ns,
+    )
+
+
+async def test_their_node_repeats_itself() -> None:
+    """Without a new measurement the same one comes again, to the last bit, and its time tells."""
+    async with _field() as site:
+        await site.add_authors_node(1)
+        site.instruments[1].give()
+        one, two = await _polled(site), await _polled(site)
+        site.instruments[1].give()
+        three = await _polled(site)
+    assert one == two
+    assert three is not None
+    assert one is not None
+    assert three.time_ns > one.time_ns
+
+
+async def test_their_zeros_are_no_measurement() -> None:
+    """Before its first measurement their node sends zeros as a good one."""
+    async with _field() as site:
+        await site.add_authors_node(1)
+        message = await _polled(site)
+    assert message is not None
+    assert (message.status, message.time_ns) == (0, 0)
+    assert not status_of(message).usable
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (Status.TILT, Status.TILT),
+        (Status.WRONG_DISTANCE, Status.WRONG_DISTANCE),
+        (Status.NO_TARGET, Status.NO_TARGET),
+        (Status.ERROR, Status.NO_TARGET),
+    ],
+)
+@pytest.mark.parametrize("station", [1, 2, 3])
+async def test_their_errors_have_no_time(given: Status, expected: Status, station: int) -> None:
+    """What they send for a time, zeros or ones, is read as none; and none of it is usable."""
+    async with _field() as site:
+        await site.add_authors_node(station)
+        site.instruments[station].give()
+        site.instruments[station].give(given)
+        message = await _polled(site, station)
+    assert message is not None
+    assert (message.time_ns, message.slope_distance_m) == (0, -1.0)
+    assert status_of(message) is expected
+
+
+async def test_their_measurement_without_distance_has_angles() -> None:
+    """Below a metre the angles and the time are good, and the distance is 0."""
+    async with _field() as site:
+        await site.add_authors_node(1)
+        site.instruments[1].give(Status.ANGLE_ONLY)
+        message = await _polled(site)
+    assert message is not None
+    assert status_of(message) is Status.ANGLE_ONLY
+    assert (message.zenith_angle_rad, message.slope_distance_m) == (READING.zenith_angle_rad, 0.0)
+    assert message.time_ns > 0
+
+
+async def test_their_node_without_instrument_answers_on() -> None:
+    """A plug that is pulled shows as an error and costs no time-out."""
+    async with _field() as site:
+        await site.add_authors_node(1)
+        site.instruments[1].fail()
+        message = await _polled(site)
+    assert message is not None
+    assert status_of(message) is Status.NO_TARGET
+
+
+@spreading_factors
+async def test_our_master_synchronises_their_node(spreading_factor: int) -> None:
+    """Each cycle brings a sample; with the known delay of polling the mean offset is right to 0.1 ms."""
+    async with _field(spreading_factor) as site:
+        await site.add_authors_node(1)
+        turn = Synchronisation(1, 50, site.timing, stamp_delay_ns=700_000)
+        await site.our_master().take(turn)
+        message = await _polled(site)
+    offsets_ns = [sample.station_ns - sample.sent_ns - sample.forward_ns for sample in turn.samples]
+    assert len(offsets_ns) == 50
+    assert fmean(offset - AHEAD_NS for offset in offsets_ns) == pytest.approx(0, abs=0.1 * MS)
+    assert max(abs(offset - AHEAD_NS) for offset in offsets_ns) < 0.7 * MS
+    assert all(-0.5 * MS < sample.excess_ns < 3 * MS for sample in turn.samples)
+    assert message is not None
+
+
+async def test_a_step_of_their_clock_is_in_the_next_samples() -> None:
+    """Their stamps follow the Unix clock when it is set."""
+    async with _field() as site:
+        await site.add_authors_node(1)
+        site.clocks[1].step(7 * SECOND)
+        turn = Synchronisation(1, 5, site.timing)
+        await site.our_master().take(turn)
+    for sample in turn.samples:
+        offset_ns = sample.station_ns - sample.sent_ns - sample.forward_ns
+        assert offset_ns - AHEAD_NS == pytest.approx(7 * SECOND, abs=2 * MS)
+
+
+async def test_our_master_takes_their_node_to_targets_and_back() -> None:
+    """Direct mode, a single measurement with the instrument's own time in whole seconds, and back to a new prism."""
+    async with _field() as site:
+        await site.add_authors_node(1)
+        instrument, master = site.instruments[1], site.our_master()
+        instrument.target = replace(READING, instrument_time_ns=123_456_789_012)
+        to_targets = Ordered(1, Command("d", 1), 3 * SECOND)
+        await master.take(to_targets)
+        shot = Shot(1, site.timing)
+        await master.take(shot)
+        back = Ordered(1, Command("n", 1, 4), 3 * SECOND)
+        await master.take(back)
+        again = Ordered(1, Command("n", 1, 5), 3 * SECOND)
+        await master.take(again)
+    assert (to_targets.ok, back.ok, again.ok) == (True, True, True)
+    assert shot.message is not None
+    assert (status_of(shot.message), shot.message.time_ns) == (Status.OK, 123 * SECOND)
+    assert instrument.prisms == [1, None, 4]  # while it tracks, it keeps its prism
+
+
+async def test_a_failed_target_of_theirs_is_an_error() -> None:
+    """A refused change of mode is a no, and a single measurement that fails has its status."""
+    async with _field() as site:
+        await site.add_authors_node(1)
+        instrument, master = site.instruments[1], site.our_master()
+        instrument.refusal = InstrumentError("busy")
+        refused = Ordered(1, Command("d", 1), 3 * SECOND)
+        await master.take(refused)
+        instrument.refusal = None
+        await master.take(Ordered(1, Command("d", 1), 3 * SECOND))
+        instrument.target = InstrumentError("nothing there")
+        shot = Shot(1, site.timing)
+        await master.take(shot)
+    assert refused.ok is False
+    assert shot.message is not None
+    assert not status_of(shot.message).usable
+
+
+async def test_a_node_left_in_synchronisation_is_got_out() -> None:
+    """A master that was killed leaves a node that answers no poll; an order of the next master frees it."""
+    async with _field() as site:
+        await site.add_authors_node(1)
+        await site.radio.transmit(b"p1")
+        assert await _polled(site) is None
+        order = Ordered(1, Command("n", 1, 1), 3 * SECOND)
+        await site.our_master().take(order)
+        assert order.ok
+        assert await _polled(site) is not None
+
+
+@pytest.mark.parametrize(("spreading_factor", "rate_hz"), [(9, 1.62), (8, 2.88)])
+async def test_three_of_their_nodes_are_polled_at_the_rate_of_the_paper(
+    spreading_factor: int, rate_hz: float
+) -> None:
+    """Round after round, with the turn-round of their nodes and no pause of ours."""
+    rounds = 20
+    async with _field(spreading_factor) as site:
+        for station in (1, 2, 3):
+            await site.add_authors_node(station)
+        start_ns = site.clock.monotonic_ns()
+        answers = [await _polled(site, station) for _ in range(rounds) for station in (1, 2, 3)]
+        duration_s = (site.clock.monotonic_ns() - start_ns) / 1e9
+    assert None not in answers
+    assert rounds / duration_s == pytest.approx(rate_hz, abs=0.02)
+
+
+# --- Their master, our station --------------------------------------------------------------------------------
+
+
+@spreading_factors
+async def test_their_master_gets_our_measurement(spreading_factor: int) -> None:
+    """The bytes are taken for what they are, and each request is answered, also without a new measurement."""
+    async with _field(spreading_factor) as site:
+        await site.add_our_station(1)
+        given_ns = site.clocks[1].realtime_ns()
+        site.instruments[1].give()
+        master = site.their_master(1)
+        answers = [await master.poll(1) for _ in range(2)]
+    assert answers[0] == answers[1] == (1, 0, 1.25, 2.5, 99.5, given_ns // SECOND, given_ns % SECOND)
+
+
+async def test_their_master_gets_an_error_before_our_first_measurement() -> None:
+    """Status 3 is one that it leaves out."""
+    async with _field() as site:
+        await site.add_our_station(1)
+        answer = await site.their_master(1).poll(1)
+    assert answer == (1, 3, 0.0, 0.0, 0.0, 0, 0)
+
+
+@spreading_factors
+async def test_their_master_synchronises_our_station(spreading_factor: int) -> None:
+    """Its midpoint is right to half of what its polling takes."""
+    async with _field(spreading_factor) as site:
+        await site.add_our_station(1)
+        master = site.their_master(1)
+        await master.synchronise(1)
+        await master.synchronise(1)
+    assert master.offset_ns[1] == pytest.approx(AHEAD_NS, abs=0.5 * MS)
+
+
+async def test_their_master_takes_our_station_to_targets_and_back() -> None:
+    """``d`` is answered when the instrument is ready, a target when it is measured, ``n`` at once while it tracks."""
+    async with _field() as site:
+        await site.add_our_station(1)
+        master = site.their_master(1)
+        assert await master.ask(b"n1") == b"nOk"
+        assert await master.ask(b"d1", 2 * SECOND) == b"dOk"
+        assert await master.ask(b"d1") == b"dOk"
+        shot = await master.poll(1, 10 * SECOND)
+        assert shot is not None
+        assert shot.slope_distance_m == 99.5
+        assert await master.ask(b"n1", 2 * SECOND) == b"nOk"
+        assert await master.poll(1) == (1, 3, 0.0, 0.0, 0.0, 0, 0)
+
+
+async def test_their_mission_runs_with_stations_of_both() -> None:
+    """Their master, one node of theirs and two stations of ours: synchronised, polled, synchronised again."""
+    async with _field() as site:
+        await site.add_authors_node(1)
+        await site.add_our_station(2)
+        await site.add_our_station(3)
+        for instrument in site.instruments.values():
+            instrument.give()
+        master = site.their_master(1, 2, 3)
+        running = asyncio.create_task(master.run())
+        await asyncio.sleep(340)
+        running.cancel()
+        await asyncio.wait([running])
+    counts = [sum(m.station == station for m in master.measurements) for station in (1, 2, 3)]
+    assert min(counts) > 400
+    assert max(counts) - min(counts) <= 1
+    for station in (1, 2, 3):
+        assert master.offset_ns[station] == pytest.approx(AHEAD_NS, abs=1 * MS)

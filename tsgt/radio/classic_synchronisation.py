@@ -1,0 +1,192 @@
+"""Comparing clocks with the paper's protocol, which gives its replies no numbers."""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import TYPE_CHECKING
+
+from tsgt.model import ClockSample
+from tsgt.radio.classic_messages import (
+    COMMAND_BYTES,
+    PING_REPLY_BYTES,
+    TIME_REPLY_BYTES,
+    Command,
+    PingReply,
+    TimeReply,
+    decode_reply,
+)
+from tsgt.radio.classic_turn import Request
+
+if TYPE_CHECKING:
+    from tsgt.radio.classic_messages import Letter
+    from tsgt.radio.classic_turn import Timing
+
+
+class _Step(Enum):
+    ENTER = "p"
+    FLUSH = "s, to hear that the station has done with everything before"
+    PING = "e"
+    STAMP = "s"
+    LEAVE = "c"
+
+
+class Synchronisation:
+    """Compare a station's clock with the master's, cycle by cycle.
+
+    A cycle takes two requests: a ping, of which the station stamps the reception, and a request for that stamp.
+    Neither reply says which cycle it belongs to. A sample is made only if
+
+    - the ping was answered in this cycle, not earlier than a reply can be there;
+    - after a ping without an answer the station has answered something else first: it answers in order, so that no
+      reply of the lost cycle can come any more (``p`` and ``s`` are sent for that, and the stamp is passed over);
+    - the stamp has not come before in this synchronisation;
+    - both instants of the master are edges and no guesses.
+
+    A sample bounds the clock's offset from both sides. If the bounds of two samples exclude each other, one of them
+    is wrong or the station's clock was set between them, and all before the second are dropped. Cycles that brought
+    no sample are repeated until there are samples for half of them, but at most as many again.
+
+    Parameters
+    ----------
+    station
+        Which station.
+    cycles
+        How many cycles, 1 or more.
+    timing
+        How long packets and replies take.
+    stamp_delay_ns
+        How late the station stamps a reception, after its RxDone.
+
+    Attributes
+    ----------
+    samples
+        One for each good cycle, all of which agree with each other.
+    answered
+        Whether the station has answered anything.
+    """
+
+    SILENT = 3
+    """So many requests in a row without a reply end the synchronisation."""
+    FAREWELLS = 2
+    """How often ``c`` is sent: nothing answers it, and a node that misses it does not answer polls."""
+    SLACK_NS = 5_000_000
+    """Clocks, stamps and known times may be off by this much before a reply or a sample is refused."""
+    SLACK_PPM = 500
+    """Drift that a station's clock may have between two samples."""
+
+    def __init__(self, station: int, cycles: int, timing: Timing, stamp_delay_ns: int = 0) -> None:
+        self.station = station
+        self.samples: list[ClockSample] = []
+        self.answered = False
+        self._cycles = cycles
+        self._timing = timing
+        self._back_ns = timing.airtime_ns(PING_REPLY_BYTES) + timing.rx_done_ns
+        self._forward_ns = timing.airtime_ns(COMMAND_BYTES) + timing.rx_done_ns + stamp_delay_ns
+        self._step = _Step.ENTER
+        self._flush = False
+        self._begun = 0
+        self._silent = 0
+        self._farewells = 0
+        self._contradicted = False
+        self._ping_ns = (0, 0)
+        self._stamps_ns = {0}  # a station without a stamp sends 0
+
+    def request(self) -> Request | None:
+        """See :meth:`Turn.request`."""
+        match self._step:
+            case _Step.ENTER:
+                self._step = _Step.FLUSH if self._flush else _Step.PING
+                return self._ask("p", 0)
+            case _Step.PING:
+                self._begun += 1
+                return self._ask("e", self._timing.timeout_ns(PING_REPLY_BYTES))
+            case _Step.STAMP | _Step.FLUSH:
+                return self._ask("s", self._timing.timeout_ns(TIME_REPLY_BYTES))
+            case _Step.LEAVE if self._farewells < self.FAREWELLS:
+                self._farewells += 1
+                return self._ask("c", 0)
+            case _Step.LEAVE:
+                return None
+
+    def replied(self, payload: bytes, *, sent_ns: int, received_ns: int, exact: bool) -> bool:
+        """See :meth:`Turn.replied`."""
+        reply = decode_reply(payload)
+        if isinstance(reply, PingReply) and self._step is _Step.PING:
+            if reply.station != self.station or received_ns < self._earliest_ns(sent_ns):
+                return False
+            self._ping_ns = (sent_ns, received_ns)
+            self._step = _Step.STAMP if exact else self._next_cycle()
+        elif isinstance(reply, TimeReply) and self._step is _Step.FLUSH:
+            self._stamps_ns.add(reply.time_ns)
+            self._flush = False
+            self._step = _Step.PING
+        elif isinstance(reply, TimeReply) and self._step is _Step.STAMP:
+            self._take(reply.time_ns)
+            self._step = self._next_cycle()
+        else:
+            return False
+        self.answered = True
+        self._silent = 0
+        return True
+
+    def timed_out(self) -> None:
+        """See :meth:`Turn.timed_out`."""
+        self._silent += 1
+        if self._silent >= self.SILENT:
+            self._end()
+        elif (
+            self._step is not _Step.STAMP
+        ):  # a stamp that did not arrive is still there, and is asked for again
+            self._flush = True
+            self._step = _Step.ENTER if self._cycles_left() else self._end()
+
+    def _ask(self, letter: Letter, reply_timeout_ns: int) -> Request:
+        return Request(Command(letter, self.station).to_bytes(), reply_timeout_ns)
+
+    def _earliest_ns(self, sent_ns: int) -> int:
+        tolerance_ns = self.SLACK_NS + self._timing.symbol_ns // 4
+        return sent_ns + self._forward_ns + self._back_ns - tolerance_ns
+
+    def _take(self, station_ns: int) -> None:
+        if station_ns in self._stamps_ns:
+            self._flush = True
+            return
+        self._stamps_ns.add(station_ns)
+        sent_ns, received_ns = self._ping_ns
+        sample = ClockSample(
+            sent_ns=sent_ns,
+            station_ns=station_ns,
+            received_ns=received_ns,
+            forward_ns=self._forward_ns,
+            back_ns=self._back_ns,
+        )
+        if self.samples and not self._agree(self.samples[-1], sample):
+            self._contradicted = True
+            self.samples.clear()
+        self.samples.append(sample)
+
+    def _agree(self, one: ClockSample, other: ClockSample) -> bool:
+        slack_ns = self.SLACK_NS + (other.sent_ns - one.sent_ns) * self.SLACK_PPM // 1_000_000
+        (one_low, one_high), (other_low, other_high) = _offset_bounds_ns(one), _offset_bounds_ns(other)
+        return one_low - slack_ns <= other_high and other_low - slack_ns <= one_high
+
+    def _cycles_left(self) -> bool:
+        enough = 2 * len(self.samples) >= self._cycles
+        return self._begun < (self._cycles if enough else 2 * self._cycles)
+
+    def _next_cycle(self) -> _Step:
+        if not self._cycles_left():
+            return self._end()
+        return _Step.ENTER if self._flush else _Step.PING
+
+    def _end(self) -> _Step:
+        if self._contradicted and 2 * len(self.samples) < self._cycles:
+            self.samples.clear()  # too few to say which of those that exclude each other are right
+        self._step = _Step.LEAVE
+        return self._step
+
+
+def _offset_bounds_ns(sample: ClockSample) -> tuple[int, int]:
+    """Least and largest offset of the station's clock (positive: ahead of the master's) that a sample allows."""
+    most_ns = sample.station_ns - sample.sent_ns - sample.forward_ns
+    return most_ns - max(0, sample.excess_ns), most_ns

@@ -50,9 +50,23 @@ def test_the_master_example_spells_the_defaults_out() -> None:
     """What the example calls a default is one."""
     raw = tomllib.loads((CONFIGS / "master.example.toml").read_text())
     minimal = {key: raw[key] for key in ("kind", "setup", "stations")}
+    minimal["radio"] = {
+        key: raw["radio"][key] for key in ("kind", "frequency_mhz", "spreading_factor", "region")
+    }
+    minimal["protocol"] = {"kind": raw["protocol"]["kind"]}
     config = MasterConfig.model_validate_json(json.dumps(minimal))
     spelt = MasterConfig.model_validate_json(json.dumps(raw))
     assert spelt == config
+
+
+def test_the_geofence_in_the_master_example_works() -> None:
+    """It is commented out; whoever takes the comment signs away has a fence, with the defaults spelt out."""
+    text = (CONFIGS / "master.example.toml").read_text()
+    start = text.index("# [[geofences]]")
+    fence = "\n".join(line[2:] for line in text[start : text.index("\n\n", start)].splitlines())
+    config = MasterConfig.model_validate_json(json.dumps(tomllib.loads(text + fence)))
+    (written,) = config.geofences
+    assert written == written.model_copy(update={"sigmas": 3.0, "hysteresis_m": 0.5, "lost_after_s": 2.0})
 
 
 def test_the_set_up_examples_are_those_of_the_reference_scenario() -> None:

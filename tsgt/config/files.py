@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from tsgt.config.models import KINDS, Config, Model, PrismLayoutFile, StationFramesFile
+from tsgt.config.base import Model
+from tsgt.config.models import KINDS, Config
+from tsgt.config.setup import PrismLayoutFile, StationFramesFile
 from tsgt.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -103,18 +105,24 @@ def _validated(path: Path, raw: dict[str, Any], model: type[M]) -> M:
     except ValidationError as error:
         # A mistyped key is reported as one unknown and one missing; the unknown one says more.
         problem = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
-        key = _key(problem["loc"])
+        key = _key(_without_tags(problem["loc"], raw))
         raise ConfigError(f"{path}: {_explained(problem, key, model)}", path=path, key=key) from error
 
 
 def _explained(problem: ErrorDetails, key: str, model: type[Model]) -> str:
-    if problem["type"] == "extra_forbidden":
-        known = _known_keys(model, problem["loc"][:-1])
-        near = difflib.get_close_matches(str(problem["loc"][-1]), known, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
-        return f"{key}: unknown key; {hint}"
-    if problem["type"] == "missing":
-        return f"{key}: missing key"
+    match problem["type"]:
+        case "extra_forbidden":
+            known = _known_keys(model, problem["loc"][:-1])
+            near = difflib.get_close_matches(str(problem["loc"][-1]), known, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
+            return f"{key}: unknown key; {hint}"
+        case "missing":
+            return f"{key}: missing key"
+        case "union_tag_not_found":
+            return f"{key}.kind: missing key"
+        case "union_tag_invalid":
+            known_kinds = problem["ctx"]["expected_tags"].replace("'", '"')
+            return f"{key}.kind = {_shown(problem['ctx']['tag'])}: should be one of {known_kinds}"
     message = str(problem["ctx"]["error"]) if problem["type"] == "value_error" else problem["msg"]
     message = message.removeprefix("Input ")
     if isinstance(problem["input"], dict) or problem["type"] == "value_error":
@@ -137,16 +145,39 @@ def _key(location: tuple[int | str, ...]) -> str:
     return key
 
 
+def _without_tags(location: tuple[int | str, ...], raw: Any) -> tuple[int | str, ...]:
+    """Leave out what a place has between a table and its keys where the table is of one of several kinds."""
+    place: list[int | str] = []
+    for part in location:
+        if isinstance(raw, dict) and part not in raw and raw.get("kind") == part:
+            continue
+        place.append(part)
+        try:
+            raw = raw[part]
+        except (LookupError, TypeError):
+            raw = None
+    return tuple(place)
+
+
 def _known_keys(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
     """Names of the fields of the model that a place inside another model belongs to."""
+    kinds: list[type[BaseModel]] = []
     for part in location:
         if isinstance(part, str) and part in model.model_fields:
-            model = _innermost_model(model.model_fields[part].annotation) or model
+            kinds = _innermost_models(model.model_fields[part].annotation)
+            model = kinds[0] if kinds else model
+        else:
+            model = next((kind for kind in kinds if part in _names(kind)), model)
     return list(model.model_fields)
 
 
-def _innermost_model(annotation: Any) -> type[BaseModel] | None:
-    """Find the model in an annotation such as ``tuple[StationConfig, ...]``."""
+def _names(model: type[BaseModel]) -> tuple[Any, ...]:
+    """Return what a table may say under its key ``kind`` to be of this model."""
+    return get_args(model.model_fields["kind"].annotation) if "kind" in model.model_fields else ()
+
+
+def _innermost_models(annotation: Any) -> list[type[BaseModel]]:
+    """Find the models in an annotation such as ``tuple[StationConfig, ...]``."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    return next((found for arg in get_args(annotation) if (found := _innermost_model(arg))), None)
+        return [annotation]
+    return [found for arg in get_args(annotation) for found in _innermost_models(arg)]

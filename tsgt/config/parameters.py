@@ -18,7 +18,10 @@ from tsgt.model import (
 )
 
 if TYPE_CHECKING:
-    from tsgt.config.models import MasterConfig, NoiseConfig, PipelineConfig, ScenarioConfig, SimulatedStation
+    from tsgt.config.base import NoiseConfig
+    from tsgt.config.master import MasterConfig
+    from tsgt.config.pipeline import PipelineConfig
+    from tsgt.config.scenario import ScenarioConfig, SimulatedStation
 
 MIN_PRISMS = 3
 

@@ -32,29 +32,37 @@ def _section(kind: str) -> str:
     return f"## `{kind}`\n\n{schema['description'].replace('``', '`')}\n{tables}"
 
 
-def _tables(model: dict[str, Any], definitions: dict[str, Any], heading: str) -> Iterator[str]:
+def _tables(
+    model: dict[str, Any], definitions: dict[str, Any], heading: str, kind: str = ""
+) -> Iterator[str]:
     """Yield the table of a model's own keys, then those of the models within."""
     own, within = [], []
     required = model.get("required", [])
     for key, field in model["properties"].items():
-        inner, name = _inner_model(key, field, definitions, heading)
-        if inner is not None:
-            within.append((inner, name))
+        inner, name = _inner_models(key, field, definitions, heading)
+        if inner:
+            within += [(each, name, each_kind) for each_kind, each in inner.items()]
             continue
         default = "required" if key in required else f"`{_toml(field.get('default'))}`"
         own.append(f"| `{key}` | {default} | {field['description'].replace('``', '`')} |")
     if own:
-        title = f"`{heading}` {model['description'].replace('``', '`')}\n\n" if heading else ""
+        title = ""
+        if heading:
+            one_of = f' with `kind = "{kind}"`' if kind else ""
+            title = f"`{heading}`{one_of} {model['description'].replace('``', '`')}\n\n"
         yield "\n".join([f"\n{title}| key | default | meaning |", "|---|---|---|", *own, ""])
-    for inner, name in within:
-        yield from _tables(inner, definitions, name)
+    for each, name, each_kind in within:
+        yield from _tables(each, definitions, name, each_kind)
 
 
-def _inner_model(
+def _inner_models(
     key: str, field: dict[str, Any], definitions: dict[str, Any], heading: str
-) -> tuple[dict[str, Any] | None, str]:
-    """Find the model behind a key, and how its TOML table is written."""
+) -> tuple[dict[str, dict[str, Any]], str]:
+    """Find the models behind a key, by their kind if there are several, and how its TOML table is written."""
     path = f"{heading.strip('[]')}.{key}".strip(".")
+    if "discriminator" in field:
+        kinds = field["discriminator"]["mapping"]
+        return {kind: definitions[_name(reference)] for kind, reference in kinds.items()}, f"[{path}]"
     (numbered,) = field.get("patternProperties", {"": {}}).values()
     for place, name in (
         (field, f"[{path}]"),
@@ -62,8 +70,12 @@ def _inner_model(
         (numbered, f"[{path}.NUMBER]"),
     ):
         if "$ref" in place:
-            return definitions[place["$ref"].rsplit("/", 1)[-1]], name
-    return None, path
+            return {"": definitions[_name(place["$ref"])]}, name
+    return {}, path
+
+
+def _name(reference: str) -> str:
+    return reference.rsplit("/", 1)[-1]
 
 
 def _toml(value: Any) -> str:

@@ -29,7 +29,7 @@ PROBLEMS = {
     ),
     "unknown key near no other": (
         ("[recording]", "[zzz]"),
-        "zzz: unknown key; known are kind, setup, stations, pipeline, stream, recording",
+        "zzz: unknown key; known are kind, setup, stations, radio, protocol, pipeline, frame_watch, geofences, stream",
     ),
     "unknown key inside a table in an array": (
         ("range_sigma_ppm", "range_sigma_pm"),
@@ -64,9 +64,30 @@ PROBLEMS = {
         ("station = 2", "station = 1"),
         "stations: station 1 stands there more than once",
     ),
+    "unknown key in a table of several kinds": (
+        ("spreading_factor", "spreadin_factor"),
+        "radio.spreadin_factor: unknown key; did you mean spreading_factor?",
+    ),
+    "key of another kind of table": (
+        ('kind = "sx127x"', 'kind = "simulated"'),
+        "radio.wiring: unknown key; known are frequency_mhz,",
+    ),
+    "value in a table of several kinds": (
+        ("reset_pin = 17", "reset_pin = -2"),
+        "radio.wiring.reset_pin = -2: should be greater than or equal to 0",
+    ),
+    "unknown kind of table": (
+        ('kind = "sx127x"', 'kind = "sx1262"'),
+        'radio.kind = "sx1262": should be one of "sx127x", "simulated"',
+    ),
+    "no kind of table": (('kind = "sx127x"', ""), "radio.kind: missing key"),
+    "missing key in a table of several kinds": (
+        ("frequency_mhz = 905.0", ""),
+        "radio.frequency_mhz: missing key",
+    ),
     "unknown kind": (
         ('"master"', '"slave"'),
-        'kind = "slave": should be one of "master", "station_frames", "prism_layout", "scenario"',
+        'kind = "slave": should be one of "client", "master", "station_frames", "prism_layout", "scenario"',
     ),
     "kind that is no text": (('"master"', "[1]"), "kind = [1]: should be one of"),
     "no kind": (('kind = "master"', ""), "kind: missing key; one of"),
@@ -193,7 +214,10 @@ SCENARIO_PROBLEMS = {
     "[motion]\ninterval_min_s = 9.0": "motion: interval_min_s is above interval_max_s",
     "[motion]\nspeed_weights = [1.0]": "motion: 4 speeds_mps, but 1 speed_weights",
     "[motion]\nspeed_weights = [0.0, 0.0, 0.0, 0.0]": "motion: all speed_weights are 0",
-    "transport_min_ms = 300.0": "transport_min_ms is above transport_max_ms",
+    "[motion]\nroute_m = [[0.0, 0.0, 0.0]]": "motion: route_m has one way point; a route has at least two",
+    "[[occlusions]]\nrate_per_min = 1.0\nduration_min_s = 2.0\nduration_max_s = 1.0": (
+        "occlusions[#1]: duration_min_s is above duration_max_s"
+    ),
     "[[stations]]\nstation = 1\nprism = 9\nposition_m = [0.0, 0.0, 0.0]": "tracks prism 9, which has no position",
 }
 

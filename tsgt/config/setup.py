@@ -1,0 +1,44 @@
+"""What the set-up files of the day hold, as ``tsgt calibrate`` writes them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator
+
+from tsgt.config.base import Model, NumberKey, rigid
+from tsgt.model import Matrix4, Vector3
+
+
+class StationFrame(Model):
+    """Where one station stands."""
+
+    T_station1_station: Annotated[Matrix4, AfterValidator(rigid)]
+    """Rigid transform, 4x4 row by row, from the station's frame to that of station 1, in m."""
+
+
+class StationFramesFile(Model):
+    """Where the stations stand: written by ``tsgt calibrate targets``."""
+
+    kind: Literal["station_frames"]
+    """What this file is."""
+    stations: dict[NumberKey, StationFrame]
+    """One table per station, named by its number."""
+
+
+class PrismEntry(Model):
+    """Where one prism sits on the robot."""
+
+    position_m: Vector3
+    """Its centre in the frame of the robot, [x, y, z]."""
+    sigma_m: Vector3 | None = None
+    """One sigma of each coordinate, as the calibration found it."""
+
+
+class PrismLayoutFile(Model):
+    """Where the prisms sit on the robot: written by ``tsgt calibrate prisms``."""
+
+    kind: Literal["prism_layout"]
+    """What this file is."""
+    prisms: dict[NumberKey, PrismEntry]
+    """One table per prism, named by its number."""

@@ -29,6 +29,9 @@ T = TypeVar("T")
 SYNC_INTERVAL_S = 1.0
 """How often a recording is brought to the disk: the most that a power cut can take."""
 
+STATUS_INTERVAL_S = 1.0
+"""How often systemd is told how the service does."""
+
 MAX_SOCKET_PATH_BYTES = 107
 """What sockaddr_un holds, less the end of the string: unix(7)."""
 
@@ -151,6 +154,26 @@ def watchdog_interval_s() -> float | None:
     if not timeout_us.isdecimal() or (pid is not None and pid != str(os.getpid())):
         return None
     return int(timeout_us) / 2e6
+
+
+async def keep_notified(status: Callable[[], str], clock: Clock) -> NoReturn:
+    """Tell systemd that the service is ready, then how it does and that it lives, and at the end that it stops.
+
+    Parameters
+    ----------
+    status
+        One line for people, asked for each second.
+    clock
+        Sets the pace.
+    """
+    interval_s = min(STATUS_INTERVAL_S, watchdog_interval_s() or STATUS_INTERVAL_S)
+    sd_notify("READY=1", f"STATUS={status()}")
+    try:
+        while True:
+            await clock.sleep_until(clock.monotonic_ns() + round(interval_s * 1e9))
+            sd_notify("WATCHDOG=1", f"STATUS={status()}")
+    finally:
+        sd_notify("STOPPING=1")
 
 
 class UnixListener:

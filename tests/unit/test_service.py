@@ -11,7 +11,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from tsgt.errors import RecordingError, StreamError
-from tsgt.service import keep_synced, run, sd_notify, watchdog_interval_s
+from tsgt.service import keep_notified, keep_synced, run, sd_notify, watchdog_interval_s
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -141,6 +141,25 @@ def test_watchdog_interval(
         else:
             monkeypatch.setenv(name, value)
     assert watchdog_interval_s() == interval_s
+
+
+async def test_systemd_hears_ready_alive_and_stopping(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ready at once, alive as often as systemd asks, and at the end that it stops."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(str(tmp_path / "notify"))
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        monkeypatch.setenv("WATCHDOG_USEC", "1000000")
+        clock = StepClock()
+        telling = asyncio.create_task(keep_notified(lambda: "well", clock))
+        await asyncio.sleep(0)
+        await clock.step()
+        telling.cancel()
+        await asyncio.wait([telling])
+        messages = [systemd.recv(100) for _ in range(3)]
+    assert messages == [b"READY=1\nSTATUS=well", b"WATCHDOG=1\nSTATUS=well", b"STOPPING=1"]
+    assert clock.wanted_ns == [5_500_000_000, 5_500_000_000]
 
 
 def test_a_known_error_comes_out_of_a_task_group_as_itself() -> None:

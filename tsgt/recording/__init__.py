@@ -6,10 +6,11 @@ A killed program leaves at most one torn line, which the reader skips and the ne
 cut can take more: what was written since the last :meth:`RecordingWriter.sync`. The format is described in
 docs/reference/recording.md.
 
-Nothing here waits, asks for the time or logs, so the pure parts of the program may use it.
+Nothing that can be imported from here waits, asks for the time or logs, so the pure parts of the program may use it;
+:mod:`tsgt.recording.recorder` does log.
 """
 
-from tsgt.recording.files import write_atomically
+from tsgt.recording.files import new_recording_path, write_atomically
 from tsgt.recording.format import FORMAT_VERSION, Line, RecordingHeader, decode, decode_line, encode_line
 from tsgt.recording.reader import Recording, load_recording, read_lines
 from tsgt.recording.writer import RecordingWriter
@@ -24,6 +25,7 @@ __all__ = [
     "decode_line",
     "encode_line",
     "load_recording",
+    "new_recording_path",
     "read_lines",
     "write_atomically",
 ]

@@ -1,13 +1,15 @@
-"""Files that are there as a whole or not at all."""
+"""Files that are there as a whole or not at all, and names for new ones."""
 
 from __future__ import annotations
 
 import os
 import secrets
 from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
+from itertools import count
 from typing import TYPE_CHECKING, BinaryIO
 
-from tsgt.errors import OutputFileError, TsgtError
+from tsgt.errors import OutputFileError, RecordingError, TsgtError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -58,6 +60,45 @@ def write_atomically(path: Path) -> Iterator[BinaryIO]:
         if error.filename not in (None, str(path), str(part)) or isinstance(error, TsgtError):
             raise
         raise OutputFileError(f"cannot be written ({error.strerror})", path=path) from error
+
+
+def new_recording_path(directory: Path, name: str, unix_ns: int) -> Path:
+    """Make an empty file for a new recording, with a name that no file there has.
+
+    Parameters
+    ----------
+    directory
+        Where; it is made if need be.
+    name
+        What the name begins with.
+    unix_ns
+        The time that it is named after, in ns. A computer without a battery clock may see the same time at each
+        start; the name then gets a number.
+
+    Returns
+    -------
+    Path
+        For example ``name-20261121T055100Z.jsonl``, or ``name-20261121T055100Z-2.jsonl``.
+
+    Raises
+    ------
+    RecordingError
+        The folder or the file cannot be made.
+    """
+    stem = f"{name}-{datetime.fromtimestamp(unix_ns // 1_000_000_000, UTC):%Y%m%dT%H%M%SZ}"
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        for number in count(1):
+            path = directory / f"{stem}{'' if number == 1 else f'-{number}'}.jsonl"
+            with suppress(FileExistsError):
+                path.open("xb").close()
+                break
+    except OSError as error:
+        raise RecordingError(
+            f"no file can be made there ({error.strerror}); check the folder and its permissions",
+            path=directory,
+        ) from error
+    return path
 
 
 def sync_folder(path: Path) -> None:

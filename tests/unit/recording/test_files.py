@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tsgt.errors import InputFileError, OutputFileError
-from tsgt.recording import write_atomically
+from tsgt.errors import InputFileError, OutputFileError, RecordingError
+from tsgt.recording import new_recording_path, write_atomically
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -79,3 +79,19 @@ def test_symbolic_link_stays(tmp_path: Path) -> None:
         file.write(b"poses")
     assert (tmp_path / "link").is_symlink()
     assert (tmp_path / "target").read_bytes() == b"poses"
+
+
+def test_a_new_recording_never_has_the_name_of_another(tmp_path: Path) -> None:
+    """A clock that shows the same time at each start gives numbers; the folder is made."""
+    folder = tmp_path / "a" / "b"
+    paths = [new_recording_path(folder, "station1", 1_700_000_000_999_999_999) for _ in range(3)]
+    stem = "station1-20231114T221320Z"
+    assert [path.name for path in paths] == [f"{stem}.jsonl", f"{stem}-2.jsonl", f"{stem}-3.jsonl"]
+    assert all(path.read_bytes() == b"" for path in paths)
+
+
+def test_a_new_recording_where_none_can_be(tmp_path: Path) -> None:
+    """The error names the folder."""
+    (tmp_path / "file").touch()
+    with pytest.raises(RecordingError, match="file: no file can be made there"):
+        new_recording_path(tmp_path / "file", "master", 0)

@@ -9,8 +9,8 @@ from structlog.testing import capture_logs
 from support.records import HEADER
 
 from tsgt.errors import RecordingError
-from tsgt.master.recorder import Recorder
 from tsgt.recording import RecordingWriter, encode_line
+from tsgt.recording.recorder import Recorder
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

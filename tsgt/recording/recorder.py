@@ -1,7 +1,8 @@
-"""The master's recording while the disk does what it likes: lines that it refuses wait until it takes them."""
+"""A recording while the disk does what it likes: lines that it refuses wait until it takes them."""
 
 from __future__ import annotations
 
+import threading
 from collections import deque
 from typing import TYPE_CHECKING
 
@@ -21,6 +22,9 @@ log = structlog.get_logger()
 class Recorder:
     """Writes lines in order; on a full or failing disk keeps them in memory and tries again with the next line.
 
+    Where the caller must not wait for a slow disk, it calls :meth:`put`, and :meth:`flush` in a thread. A line that
+    was put is written by :meth:`close` at the latest, whatever became of the thread.
+
     Parameters
     ----------
     writer
@@ -33,17 +37,37 @@ class Recorder:
         self._writer = writer
         self._waiting: deque[bytes] = deque()
         self._waiting_lines = waiting_lines
+        self._lock = threading.Lock()
         self._failing = False
         self._lost = 0
 
+    @property
+    def waiting(self) -> int:
+        """How many lines are not in the file yet."""
+        return len(self._waiting)
+
+    @property
+    def failing(self) -> bool:
+        """Whether the disk refused a line the last time that it was tried."""
+        return self._failing
+
+    def put(self, line: bytes) -> None:
+        """Take a line without writing it yet; never waits."""
+        self._waiting.append(line)
+
+    def flush(self) -> None:
+        """Write what waits, in order; never raises because of the disk. May be called from another thread."""
+        with self._lock:
+            self._write_waiting()
+
     def write_line(self, line: bytes) -> None:
         """Append a line, and before it those that still wait; never raises because of the disk."""
-        self._waiting.append(line)
-        self._write_waiting()
+        self.put(line)
+        self.flush()
 
     def close(self) -> None:
         """Try once more to write what waits, and say how many lines are lost if that fails."""
-        self._write_waiting()
+        self.flush()
         if self._waiting:
             log.error("recording_incomplete", lost_lines=self._lost + len(self._waiting))
             self._waiting.clear()
@@ -57,7 +81,7 @@ class Recorder:
             if not self._failing:
                 log.error("recording_failed", error=str(error))  # noqa: TRY400 (the message says it all)
             self._failing = True
-            if len(self._waiting) > self._waiting_lines:
+            while len(self._waiting) > self._waiting_lines:
                 self._waiting.popleft()
                 self._lost += 1
         else:

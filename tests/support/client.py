@@ -1,0 +1,137 @@
+"""A station's client between a simulated instrument and a master that a test plays, on virtual time."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from support.radios import PAPER, make_side, running_timeline
+
+from tsgt.config import ClientConfig, ScenarioConfig
+from tsgt.config.client import JournalConfig, SimulatedInstrumentConfig
+from tsgt.config.radio import ClassicConfig, SimulatedRadioConfig
+from tsgt.radio.classic_messages import MeasurementMessage, decode_reply
+from tsgt.recording.journal import load_journal
+from tsgt.simulation.air import Air
+from tsgt.simulation.clocks import DriftingClock, VirtualClock
+from tsgt.simulation.instrument import SimulatedInstrument
+from tsgt.simulation.link import LinkModel
+from tsgt.simulation.radios import opener
+from tsgt.simulation.witness import WatchedInstrument
+from tsgt.simulation.world import scenario_world
+from tsgt.station.daemon import run_client
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator
+    from pathlib import Path
+
+    from support.radios import Side
+
+    from tsgt.model import PolarMeasurement
+    from tsgt.radio.base import OpenRadio
+    from tsgt.radio.classic_messages import Reply
+    from tsgt.station.instrument import Reading
+
+START_NS = 1_700_000_000_000_000_000
+OFFSET_NS = -3_600_000_000_000
+"""The station's computer believes that it is an hour earlier."""
+
+SCENARIO = ScenarioConfig(targets_m=((20.0, 5.0, 0.5), (0.5, 0.0, 0.0)))
+
+
+def client_config(folder: Path, *, station: int = 1, prism: int = 1) -> ClientConfig:
+    """Make a configuration whose instrument and radio are not read."""
+    return ClientConfig(
+        kind="client",
+        station=station,
+        prism=prism,
+        instrument=SimulatedInstrumentConfig(kind="simulated", socket=folder / "i.sock"),
+        radio=SimulatedRadioConfig(
+            kind="simulated",
+            air_socket=folder / "air.sock",
+            name=f"station{station}",
+            frequency_mhz=905.0,
+            spreading_factor=9,
+        ),
+        protocol=ClassicConfig(kind="classic"),
+        journal=JournalConfig(directory=folder / "journals"),
+        status_socket=folder / "client.sock",
+    )
+
+
+@dataclass
+class Field:
+    """One station and a master's radio."""
+
+    folder: Path
+    instrument: SimulatedInstrument
+    clock: DriftingClock
+    master: Side
+    open_radio: OpenRadio
+    read: list[Reading]
+    client: asyncio.Task[None] | None = None
+
+    def start(self) -> None:
+        """Start the client."""
+        watched = WatchedInstrument(self.instrument, self.read.append)
+        self.client = asyncio.create_task(
+            run_client(
+                client_config(self.folder), instrument=watched, open_radio=self.open_radio, clock=self.clock
+            )
+        )
+
+    async def kill(self) -> None:
+        """Cancel the client wherever it is."""
+        if self.client is not None:
+            self.client.cancel()
+            await asyncio.wait([self.client])
+            self.client = None
+
+    async def ask(self, payload: bytes, timeout_s: float = 0.25) -> Reply | None:
+        """Send a request and return the reply; None when there is none in time after the request's end."""
+        await self.master.radio.transmit(payload)
+        with suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s):
+                return decode_reply((await self.master.radio.receive()).payload)
+        return None
+
+    async def poll(self) -> MeasurementMessage:
+        """Ask for data and insist."""
+        reply = await self.ask(b"t1")
+        assert isinstance(reply, MeasurementMessage), reply
+        return reply
+
+    def journals(self) -> list[list[PolarMeasurement]]:
+        """Return what stands in each journal, in the order of the client's starts."""
+        paths = sorted((self.folder / "journals").iterdir(), key=lambda path: path.stat().st_mtime_ns)
+        return [load_journal(path).measurements for path in paths]
+
+
+@asynccontextmanager
+async def field_day(folder: Path, scenario: ScenarioConfig = SCENARIO) -> AsyncGenerator[Field]:
+    """Set up a station and a master's radio; end both with the block."""
+    timeline = running_timeline()
+    rng = np.random.default_rng(7)
+    air = Air(timeline, np.random.default_rng(0), LinkModel())
+    clock = DriftingClock(VirtualClock(START_NS), offset_ns=OFFSET_NS, drift_ppm=10.0)
+    world = scenario_world(scenario, 600.0, np.random.default_rng(3))
+    master = make_side(air, "master")
+    await master.radio.start(PAPER)
+    day = Field(
+        folder=folder,
+        instrument=SimulatedInstrument(scenario.stations[0], scenario, world, clock, rng),
+        clock=clock,
+        master=master,
+        open_radio=opener(air, "station1", clock, rng, PAPER),
+        read=[],
+    )
+    try:
+        day.start()
+        await asyncio.sleep(0.1)  # the radios need a moment to get up
+        yield day
+    finally:
+        await day.kill()
+        await master.radio.close()

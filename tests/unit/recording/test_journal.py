@@ -1,0 +1,70 @@
+"""Journals: what a client writes can be read back, and nothing else is taken for one."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+from support.records import HEADER, PARAMETERS, measurement
+
+from tsgt.errors import CorruptLineError, RecordingError
+from tsgt.model import Status
+from tsgt.recording import encode_line
+from tsgt.recording.journal import JournalRecord, TargetRecord, load_journal
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+HEAD = JournalRecord(station=1, unix_at_zero_ns=5)
+TARGET = TargetRecord(
+    station=1,
+    stamp_ns=7,
+    horizontal_angle_rad=0.1,
+    zenith_angle_rad=1.5,
+    slope_distance_m=None,
+    status=Status.ANGLE_ONLY,
+    raw_status=4,
+    instrument_time_ns=None,
+)
+
+
+def write(path: Path, *records: object, tail: bytes = b"") -> Path:
+    """Write lines as they stand in a file."""
+    path.write_bytes(b"".join(encode_line(record) + b"\n" for record in records) + tail)
+    return path
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    """Measurements and targets come back as they were; a torn last line is told and skipped."""
+    problems: list[RecordingError] = []
+    path = write(
+        tmp_path / "j.jsonl", HEADER, HEAD, measurement(0), TARGET, measurement(1), tail=b'{"type":"mea'
+    )
+    journal = load_journal(path, on_problem=problems.append)
+    assert journal.station == 1
+    assert journal.measurements == [measurement(0), measurement(1)]
+    assert journal.targets == [TARGET]
+    assert "torn" in str(problems[0])
+
+
+def test_a_recording_is_no_journal(tmp_path: Path) -> None:
+    """Whoever names the wrong file is told so."""
+    path = write(tmp_path / "r.jsonl", HEADER, PARAMETERS, measurement(0))
+    with pytest.raises(RecordingError, match="is no journal of a station"):
+        load_journal(path)
+
+
+def test_two_journals_in_one_file_are_refused(tmp_path: Path) -> None:
+    """Their times would lie on different clocks."""
+    other = JournalRecord(station=1, unix_at_zero_ns=6)
+    path = write(tmp_path / "j.jsonl", HEADER, HEAD, measurement(0), HEADER, other)
+    with pytest.raises(CorruptLineError, match="line 5: begins a second journal"):
+        load_journal(path)
+
+
+def test_a_target_that_cannot_be(tmp_path: Path) -> None:
+    """A field that is wrong is named, with its line."""
+    line = encode_line(TARGET).replace(b'"stamp_ns":7', b'"stamp_ns":-1')
+    path = write(tmp_path / "j.jsonl", HEADER, HEAD, tail=line + b"\n")
+    with pytest.raises(CorruptLineError, match="line 3"):
+        load_journal(path)

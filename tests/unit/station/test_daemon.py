@@ -1,0 +1,331 @@
+"""The client's daemon between instrument, radio and disk, each of which fails."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import threading
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from structlog.testing import capture_logs
+from support.client import OFFSET_NS, SCENARIO, START_NS, client_config, field_day
+
+from tsgt.config.scenario import StatusFaultConfig
+from tsgt.errors import RadioError, RecordingError, StreamError
+from tsgt.model import Status
+from tsgt.radio.classic_messages import Acknowledgement, MeasurementMessage, PingReply, TimeReply
+from tsgt.recording import RecordingWriter, read_lines
+from tsgt.recording.journal import load_journal
+from tsgt.station.daemon import run_client
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator, Callable
+    from pathlib import Path
+
+    from tsgt.radio.base import Radio
+
+
+async def test_every_measurement_is_journalled_and_the_newest_is_answered(tmp_path: Path) -> None:
+    """The journal holds what was read, on the station's clock, raw; a poll gets the last of it."""
+    async with field_day(tmp_path) as day:
+        await asyncio.sleep(10.0)
+        message = await day.poll()
+        await day.kill()
+        (journal,) = day.journals()
+    assert len(journal) in (25, 26)
+    assert [m.sequence for m in journal] == list(range(len(journal)))
+    assert [m.host_time_ns for m in journal] == [START_NS + OFFSET_NS + reading.at_ns for reading in day.read]
+    assert all(m.stamp_ns == m.host_time_ns == m.received_ns for m in journal)
+    assert message.time_ns in [m.host_time_ns for m in journal[-2:]]
+    newest = next(m for m in journal if m.host_time_ns == message.time_ns)
+    assert message.slope_distance_m == newest.slope_distance_m
+    assert message.horizontal_angle_rad == newest.horizontal_angle_rad
+    assert message.status == 0
+
+
+async def test_the_ping_is_stamped_with_the_end_of_its_reception(tmp_path: Path) -> None:
+    """`s` returns the RxDone of `e` on the station's own Unix clock, whatever happened in between."""
+    async with field_day(tmp_path) as day:
+        sent = await day.master.radio.transmit(b"e1")
+        async with asyncio.timeout(1.0):
+            reply = await day.master.radio.receive()
+        assert reply.payload == PingReply(1).to_bytes()
+        stamp = await day.ask(b"s1")
+    assert isinstance(stamp, TimeReply)
+    true_ns = START_NS + sent.done_at_ns
+    symbols = (stamp.time_ns - OFFSET_NS - true_ns) / 2_048_000
+    assert 0.3 < symbols < 1.2  # RxDone of an SX127x comes 0.65 to 0.95 symbols after the end on the air
+
+
+async def test_before_the_first_measurement_there_is_an_answer_too(tmp_path: Path) -> None:
+    """Without an instrument the master gets a status instead of silence."""
+    async with field_day(tmp_path) as day:
+        day.instrument.plugged = False
+        await day.kill()
+        day.start()
+        await asyncio.sleep(0.1)
+        message = await day.poll()
+    assert (message.status, message.time_ns) == (3, 0)
+
+
+@pytest.mark.parametrize("status", ["tilt", "wrong_distance", "no_target", "angle_only"])
+async def test_a_bad_status_is_journalled_and_sent(tmp_path: Path, status: str) -> None:
+    """What the instrument complains of reaches the journal and the master."""
+    fault = StatusFaultConfig(station=1, status=status, start_s=2.0, end_s=60.0)  # type: ignore[arg-type]
+    async with field_day(tmp_path, SCENARIO.model_copy(update={"faults": (fault,)})) as day:
+        await asyncio.sleep(3.0)
+        message = await day.poll()
+        await day.kill()
+        (journal,) = day.journals()
+    expected = {"tilt": 1, "wrong_distance": 2, "no_target": 3, "angle_only": 4}[status]
+    assert (message.status, message.slope_distance_m) == (expected, 0.0)
+    assert (journal[-1].status, journal[-1].raw_status) == (Status(status), expected)
+    assert journal[-1].slope_distance_m is None
+    assert journal[0].status is Status.OK
+
+
+async def test_an_instrument_that_is_unplugged_comes_back(tmp_path: Path) -> None:
+    """The radio goes on with the last measurement; new ones come a few seconds after the cable is in."""
+    async with field_day(tmp_path) as day:
+        with capture_logs() as logs:
+            await asyncio.sleep(5.0)
+            day.instrument.plugged = False
+            await asyncio.sleep(60.0)
+            stale = await day.poll()
+            day.instrument.plugged = True
+            await asyncio.sleep(6.0)
+            fresh = await day.poll()
+    assert START_NS + OFFSET_NS < stale.time_ns < START_NS + OFFSET_NS + 6_000_000_000
+    assert fresh.time_ns > stale.time_ns + 55_000_000_000
+    events = [entry["event"] for entry in logs]
+    assert events.count("instrument_lost") == 1
+    assert events.count("instrument_connected") == 1
+
+
+async def test_a_radio_that_fails_leaves_the_journal_whole(tmp_path: Path) -> None:
+    """Measurements go on while there is no radio, and are offered when it is back."""
+    async with field_day(tmp_path) as day:
+        await day.kill()
+        broken, opened = True, day.open_radio
+
+        @asynccontextmanager
+        async def open_radio() -> AsyncGenerator[Radio]:
+            if broken:
+                raise RadioError("no chip")
+            async with opened() as radio:
+                yield radio
+
+        day.open_radio = open_radio
+        day.read.clear()
+        day.start()
+        await asyncio.sleep(20.0)
+        assert await day.ask(b"t1") is None
+        broken = False
+        await asyncio.sleep(6.0)
+        assert (await day.poll()).status == 0
+        await day.kill()
+        assert len(day.journals()[-1]) == len(day.read) >= 60
+
+
+async def test_orders_change_what_is_measured(tmp_path: Path) -> None:
+    """`d` stops the tracking, `t` then measures a target, `n` with a prism tracks that one."""
+    async with field_day(tmp_path) as day:
+        await asyncio.sleep(1.0)
+        assert await day.ask(b"d1") == Acknowledgement("d", ok=True)
+        before = len(day.read)
+        day.instrument.aim(1)
+        shot = await day.ask(b"t1", timeout_s=5.0)
+        assert isinstance(shot, MeasurementMessage)
+        assert shot.slope_distance_m == pytest.approx(20.6216, abs=0.01)
+        assert len(day.read) == before
+        day.instrument.aim(2)
+        near = await day.ask(b"t1", timeout_s=5.0)
+        assert isinstance(near, MeasurementMessage)
+        assert (near.status, near.slope_distance_m) == (4, 0.0)
+        ordered_ns = day.clock.realtime_ns()
+        assert await day.ask(b"n12") == Acknowledgement("n", ok=True)
+        next_ns = (await day.poll()).time_ns
+        assert next_ns == 0 or next_ns > ordered_ns  # not one of the other prism
+        await asyncio.sleep(1.0)
+        assert (await day.poll()).status == 0
+        await day.kill()
+        (path,) = (tmp_path / "journals").iterdir()
+        journal = load_journal(path)
+    assert [m.prism for m in journal.measurements] == sorted(m.prism for m in journal.measurements)
+    assert {m.prism for m in journal.measurements} == {1, 2}
+    assert [target.status for target in journal.targets] == [Status.OK, Status.ANGLE_ONLY]
+
+
+async def test_an_order_that_fails_is_refused_and_changes_nothing(tmp_path: Path) -> None:
+    """A prism that the instrument does not know gives `nNo`, and the old one is tracked on."""
+    async with field_day(tmp_path) as day:
+        await asyncio.sleep(1.0)
+        assert await day.ask(b"n19") == Acknowledgement("n", ok=False)
+        await asyncio.sleep(2.0)
+        assert (await day.poll()).status == 0
+        day.instrument.plugged = False
+        await asyncio.sleep(1.0)
+        assert await day.ask(b"n13") == Acknowledgement("n", ok=False)
+        assert await day.ask(b"d1") == Acknowledgement("d", ok=False)
+        await day.kill()
+        assert {m.prism for m in day.journals()[0]} == {1}
+
+
+async def test_a_shot_that_fails_is_answered(tmp_path: Path) -> None:
+    """In direct mode without an instrument the master gets a status; the mode stays when the instrument is back."""
+    async with field_day(tmp_path) as day:
+        await asyncio.sleep(1.0)
+        assert await day.ask(b"d1") == Acknowledgement("d", ok=True)
+        day.instrument.plugged = False
+        day.instrument.aim(1)
+        failed = await day.ask(b"t1", timeout_s=5.0)
+        assert isinstance(failed, MeasurementMessage)
+        assert failed.status == 3
+        day.instrument.plugged = True
+        await asyncio.sleep(6.0)
+        shot = await day.ask(b"t1", timeout_s=5.0)
+    assert isinstance(shot, MeasurementMessage)
+    assert shot.status == 0
+
+
+async def test_a_full_disk_stops_neither_instrument_nor_radio(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Lines wait in memory and stand in the journal when there is room; the status says so meanwhile."""
+    full = False
+    write_line = RecordingWriter.write_line
+
+    def write_if_room(writer: RecordingWriter, line: bytes) -> None:
+        if full:
+            raise RecordingError("no room", path=tmp_path)
+        write_line(writer, line)
+
+    monkeypatch.setattr(RecordingWriter, "write_line", write_if_room)
+    async with field_day(tmp_path) as day:
+        await asyncio.sleep(2.0)
+        full = True
+        await asyncio.sleep(10.0)
+        assert (await day.poll()).time_ns > START_NS + OFFSET_NS + 11_000_000_000
+        status = await asked(tmp_path / "client.sock")
+        assert not status["journal_ok"]
+        assert 20 <= status["journal_waiting"] <= 28
+        full = False
+        await asyncio.sleep(1.0)
+        assert (await asked(tmp_path / "client.sock"))["journal_ok"]
+        await day.kill()
+        assert [m.sequence for m in day.journals()[0]] == list(range(len(day.read)))
+
+
+async def test_a_slow_disk_holds_up_no_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """While a write hangs, pings and polls are answered, soon with the measurement that it holds up."""
+    released, writing = threading.Event(), threading.Event()
+    write_line = RecordingWriter.write_line
+
+    def write_slowly(writer: RecordingWriter, line: bytes) -> None:
+        if b'"measurement"' in line:
+            writing.set()
+            released.wait(10.0)
+        write_line(writer, line)
+
+    monkeypatch.setattr(RecordingWriter, "write_line", write_slowly)
+
+    # In virtual time a thread stops the clock; so here the thread is not one of the loop's.
+    async def in_bare_thread(function: Callable[[], None]) -> None:
+        done = asyncio.Event()
+        loop = asyncio.get_running_loop()
+
+        def call() -> None:
+            function()
+            loop.call_soon_threadsafe(done.set)
+
+        threading.Thread(target=call).start()
+        while not done.is_set():  # noqa: ASYNC110 (time has to pass meanwhile)
+            await asyncio.sleep(0.001)
+
+    monkeypatch.setattr("tsgt.station.journal.asyncio.to_thread", in_bare_thread)
+    async with field_day(tmp_path) as day:
+        await asyncio.sleep(1.0)
+        assert await asyncio.get_running_loop().run_in_executor(None, writing.wait, 5.0)
+        assert await day.ask(b"e1") == PingReply(1)
+        assert (await day.poll()).time_ns > 0
+        assert not day.journals()[0]
+        released.set()
+
+
+async def test_a_client_that_is_killed_anywhere_has_journalled_what_it_read(tmp_path: Path) -> None:
+    """Cancelled after any number of steps of the event loop and started again: nothing that was read is missing."""
+    async with field_day(tmp_path) as day:
+        for run in range(60):
+            await day.kill()
+            day.read.clear()
+            day.start()
+            await asyncio.sleep(0.4)
+            for _ in range(run):
+                await asyncio.sleep(0)
+            await day.kill()
+            stamps = {START_NS + OFFSET_NS + reading.at_ns for reading in day.read}
+            journalled = {
+                m.host_time_ns
+                for path in (tmp_path / "journals").iterdir()
+                for m in load_journal(path).measurements
+            }
+            assert stamps <= journalled
+
+
+async def test_the_journal_begins_with_what_a_merge_needs(tmp_path: Path) -> None:
+    """Header, then whose journal it is and how its times came about."""
+    async with field_day(tmp_path):
+        pass
+    (path,) = (tmp_path / "journals").iterdir()
+    assert path.name == "station1-20231114T211320Z.jsonl"
+    first, second, *_ = read_lines(path)
+    assert first.type == "recording"
+    assert json.loads(second.data) == {
+        "type": "journal",
+        "station": 1,
+        "unix_at_zero_ns": START_NS + OFFSET_NS,
+    }
+
+
+async def test_the_status_says_how_it_goes(tmp_path: Path) -> None:
+    """One line, then the end; it knows instrument, master and journal."""
+    async with field_day(tmp_path) as day:
+        first = await asked(tmp_path / "client.sock")
+        assert (first["last"], first["master_heard_s"], first["measurements"]) == (None, None, 0)
+        await asyncio.sleep(20.0)
+        await day.poll()
+        status = await asked(tmp_path / "client.sock")
+    assert status["type"] == "client_status"
+    assert status["instrument"] == "simulated total station 1"
+    assert (status["mode"], status["prism"], status["locked"]) == ("tracking", 1, True)
+    assert status["rate_hz"] == pytest.approx(2.5, abs=0.11)
+    assert 0 <= status["last"]["age_s"] < 0.5
+    assert status["last"]["status"] == "ok"
+    assert 0 < status["master_heard_s"] < 0.3
+    assert status["rssi_dbm"] < 0
+    assert status["journal_ok"]
+    assert status["radio_ok"]
+
+
+async def test_a_second_client_does_not_take_the_socket(tmp_path: Path) -> None:
+    """Two clients with one configuration are a mistake; the second one ends with a line that says so."""
+    async with field_day(tmp_path) as day:
+        with pytest.raises(StreamError, match="another program serves this socket"):
+            await run_client(
+                client_config(tmp_path),
+                instrument=day.instrument,
+                open_radio=day.open_radio,
+                clock=day.clock,
+            )
+
+
+async def asked(path: Path) -> dict[str, Any]:
+    """Ask the client how it does."""
+    reader, writer = await asyncio.open_unix_connection(path)
+    line = await reader.read()
+    writer.close()
+    status = json.loads(line)
+    assert isinstance(status, dict)
+    return status

@@ -1,0 +1,134 @@
+"""What a station's journal holds besides measurements, and reading it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+from tsgt.errors import CorruptLineError, RecordingError
+from tsgt.model import PolarMeasurement, Status, check_finite, check_instants
+from tsgt.recording.format import decode_line
+from tsgt.recording.reader import read_lines
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JournalRecord:
+    """The second line of a journal: whose it is.
+
+    Attributes
+    ----------
+    type
+        Always ``journal``.
+    station
+        Number of the station, from 1.
+    unix_at_zero_ns
+        What was added to CLOCK_MONOTONIC of the station's computer to get the times in this file, in ns; the same
+        from the start of the client to its end.
+    """
+
+    type: Literal["journal"] = "journal"
+    station: int
+    unix_at_zero_ns: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TargetRecord:
+    """A single measurement of a target that a person had aimed at.
+
+    Attributes
+    ----------
+    type
+        Always ``target``.
+    station
+        Number of the station that measured, from 1.
+    stamp_ns
+        The station computer's stamp in ns, on its own clock.
+    horizontal_angle_rad
+        Horizontal circle, clockwise from the circle's zero, in rad; 0 where the instrument gave none.
+    zenith_angle_rad
+        Angle from straight up in rad; 0 where the instrument gave none.
+    slope_distance_m
+        Slope distance in m as the instrument gave it; null where it gave none.
+    status
+        The instrument's verdict, as in ``measurement``.
+    raw_status
+        The number that the instrument itself gave for it.
+    instrument_time_ns
+        The instrument's own stamp in ns, on the instrument's clock; null where it has none.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
+
+    type: Literal["target"] = "target"
+    station: int
+    stamp_ns: int
+    horizontal_angle_rad: float
+    zenith_angle_rad: float
+    slope_distance_m: float | None
+    status: Status
+    raw_status: int
+    instrument_time_ns: int | None
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be a measurement."""
+        check_instants(self.stamp_ns)
+        check_finite(self.horizontal_angle_rad, self.zenith_angle_rad, self.slope_distance_m or 0.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Journal:
+    """What a station measured in one run of its client.
+
+    Attributes
+    ----------
+    station
+        Number of the station.
+    measurements
+        All of them, in the order in which they were read; times are on the station's own clock.
+    targets
+        Single measurements of targets, likewise.
+    """
+
+    station: int
+    measurements: list[PolarMeasurement]
+    targets: list[TargetRecord]
+
+
+def load_journal(path: Path, *, on_problem: Callable[[RecordingError], None] | None = None) -> Journal:
+    """Read a journal.
+
+    Parameters
+    ----------
+    path
+        The journal; its last line may be torn.
+    on_problem
+        Told of a torn last line, which is skipped.
+
+    Raises
+    ------
+    RecordingError
+        The file cannot be read, or is no journal.
+    CorruptLineError
+        A line is not what a client can have written.
+    """
+    head: JournalRecord | None = None
+    measurements: list[PolarMeasurement] = []
+    targets: list[TargetRecord] = []
+    for line in read_lines(path, on_problem=on_problem):
+        match line.type:
+            case "journal":
+                record = decode_line(JournalRecord, line, path)
+                if head is not None and head != record:
+                    raise CorruptLineError("begins a second journal", path=path, line=line.number)
+                head = record
+            case "measurement":
+                measurements.append(decode_line(PolarMeasurement, line, path))
+            case "target":
+                targets.append(decode_line(TargetRecord, line, path))
+    if head is None:
+        raise RecordingError("is no journal of a station; give a file that tsgt-client wrote", path=path)
+    return Journal(station=head.station, measurements=measurements, targets=targets)

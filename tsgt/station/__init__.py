@@ -1,0 +1,1 @@
+"""The client beside a total station: reads it, journals every measurement, answers the radio."""

@@ -1,0 +1,78 @@
+"""What the client asks of a total station, and the records that pass between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+from tsgt.model import check_finite, check_instants
+
+if TYPE_CHECKING:
+    from tsgt.model import Status
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reading:
+    """One measurement as the instrument gave it.
+
+    Attributes
+    ----------
+    at_ns
+        When it was taken, as well as the host can tell, on CLOCK_MONOTONIC of the station's computer.
+    prism
+        Number of the prism that was tracked; None for a single measurement of a target.
+    horizontal_angle_rad, zenith_angle_rad
+        As in :class:`~tsgt.model.PolarMeasurement`; 0 where the instrument gave none.
+    slope_distance_m
+        As in :class:`~tsgt.model.PolarMeasurement`; None where the instrument gave none.
+    status, raw_status
+        The verdict, in the common vocabulary and as the instrument's own number.
+    instrument_time_ns
+        The instrument's own stamp, None where it has none.
+    """
+
+    at_ns: int
+    prism: int | None
+    horizontal_angle_rad: float
+    zenith_angle_rad: float
+    slope_distance_m: float | None
+    status: Status
+    raw_status: int = 0
+    instrument_time_ns: int | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what no instrument can have measured."""
+        check_instants(self.at_ns)
+        check_finite(self.horizontal_angle_rad, self.zenith_angle_rad, self.slope_distance_m or 0.0)
+
+
+class Instrument(Protocol):
+    """A robotic total station. One owner, one call at a time; :meth:`read` alone may be cancelled at any time.
+
+    Every method raises :class:`~tsgt.errors.InstrumentError` when the instrument refuses or is gone. After that
+    :meth:`connect` is tried again, as often as need be.
+    """
+
+    async def connect(self) -> str:
+        """Find and identify the instrument; return its name and number for people. Nothing is tracked yet."""
+        ...
+
+    async def track(self, prism: int) -> None:
+        """Lock on to a prism and measure it continuously, as fast as the instrument can."""
+        ...
+
+    async def read(self) -> Reading:
+        """Return the next measurement while tracking. None is given twice; one without a target has its status."""
+        ...
+
+    async def direct(self) -> None:
+        """Stop tracking and get ready for single measurements of targets that a person aims at."""
+        ...
+
+    async def measure(self) -> Reading:
+        """Measure the target that the instrument points at, once; only after :meth:`direct`."""
+        ...
+
+    async def close(self) -> None:
+        """Let go of the instrument; it may be connected again."""
+        ...

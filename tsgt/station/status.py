@@ -1,0 +1,109 @@
+"""How a station's client does, as it tells whoever asks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import tsgt
+from tsgt.model import Status, check_instants
+
+Mode = Literal["tracking", "direct"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LastMeasurement:
+    """What the instrument gave last.
+
+    Attributes
+    ----------
+    age_s
+        From the measurement to this record, in s.
+    prism
+        Number of the prism that was tracked; null for a single measurement of a target.
+    horizontal_angle_rad, zenith_angle_rad
+        As the instrument gave them, in rad; 0 where it gave none.
+    slope_distance_m
+        As the instrument gave it, in m, without prism constant; null where it gave none.
+    status
+        The instrument's verdict.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
+
+    age_s: float
+    prism: int | None
+    horizontal_angle_rad: float
+    zenith_angle_rad: float
+    slope_distance_m: float | None
+    status: Status
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClientStatus:
+    """How a station's client does at this moment.
+
+    Attributes
+    ----------
+    type
+        Always ``client_status``.
+    version
+        Of the program.
+    stamp_ns
+        Time of the record on the station's own Unix clock in ns, which need not be right.
+    station
+        Number of the station, from 1.
+    instrument
+        Name and number of the instrument; null while there is no connection to it.
+    mode
+        ``tracking`` a prism, or ``direct``: single measurements of targets.
+    prism
+        Number of the prism that is tracked, or was before direct mode.
+    locked
+        Whether there was a target at the last measurement; null before the first one.
+    last
+        The last measurement; null before the first one.
+    measurements
+        How many have been read since the client started.
+    rate_hz
+        Measurements of the last ten seconds, per second.
+    journal
+        Path of the journal.
+    journal_ok
+        Whether the disk took the last line that was to be written.
+    journal_waiting
+        How many lines are not in the journal yet; a disk that is full lets them pile up.
+    master_heard_s
+        From the last packet of the master for this station to this record, in s; null before the first one.
+    rssi_dbm
+        Strength of that packet in dBm; null before the first one.
+    snr_db
+        Its ratio to the noise in dB; null before the first one.
+    radio_ok
+        Whether the radio is open and answered when it was used last.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
+
+    type: Literal["client_status"] = "client_status"
+    version: str = tsgt.__version__
+    stamp_ns: int
+    station: int
+    instrument: str | None
+    mode: Mode
+    prism: int
+    locked: bool | None
+    last: LastMeasurement | None
+    measurements: int
+    rate_hz: float
+    journal: str
+    journal_ok: bool
+    journal_waiting: int
+    master_heard_s: float | None
+    rssi_dbm: float | None
+    snr_db: float | None
+    radio_ok: bool
+
+    def __post_init__(self) -> None:
+        """Refuse instants that no clock shows."""
+        check_instants(self.stamp_ns)

@@ -3,21 +3,32 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import hypothesis.strategies as st
 from hypothesis import given, settings
+from support.records import CLOCK, EVENT, HEADER, STATUS
 from support.scene import START, driving, standing_scene
 
+from tsgt.config.master import GeofenceConfig
 from tsgt.master.feed import Feed
+from tsgt.master.geofence import Geofence
+from tsgt.master.monitor import Monitor
+from tsgt.master.outlet import Outlet
 from tsgt.master.pipeline import Pipeline
+from tsgt.master.replay import replayed
 from tsgt.model import Status
 from tsgt.recording import encode_line
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from support.scene import Scene
 
-    from tsgt.master.stream_records import PoseRecord
+    from tsgt.master.stream_records import ClockRecord, EventRecord, PoseRecord, StatusRecord
     from tsgt.model import Measurement, PolarMeasurement
 
 TRANSPORT_NS = 2_000_000_000
@@ -137,3 +148,37 @@ def test_the_announced_deadline_is_when_the_next_pose_is_due(measurements: list[
     if deadline_ns is not None:
         assert len(pipeline.advance(deadline_ns - 1)) == 0
         assert len(pipeline.advance(deadline_ns)) > 0
+
+
+@settings(deadline=None, max_examples=30)
+@given(
+    arrivals(),
+    st.lists(
+        st.tuples(st.integers(START, START + 40 * 10**9), st.sampled_from([CLOCK, EVENT, STATUS])),
+        max_size=20,
+    ),
+    st.lists(st.integers(START, START + 40 * 10**9), max_size=20),
+)
+def test_a_replay_gives_every_line_of_the_stream_again(
+    measurements: list[PolarMeasurement],
+    others: list[tuple[int, ClockRecord | EventRecord | StatusRecord]],
+    ticks_ns: list[int],
+) -> None:
+    """Clock, status and event lines between the measurements, and a fence's own, come back in their places."""
+    fence = Geofence(GeofenceConfig(name="yard", polygon_m=((29, 0), (30, 0), (30, 40), (29, 40))))
+    lines: list[bytes] = []
+    monitor = Monitor([1, 2, 3])
+    outlet = Outlet(SCENE.parameters, monitor, [fence], lambda _record, line: lines.append(line))
+    calls: list[tuple[int, Callable[[], None]]] = [
+        *((m.received_ns, partial(outlet.measurement, m)) for m in measurements),
+        *((at_ns, partial(outlet.put, replace(record, stamp_ns=at_ns))) for at_ns, record in others),
+        *((at_ns, partial(outlet.advance, at_ns)) for at_ns in ticks_ns),
+    ]
+    for _, call in sorted(calls, key=lambda each: each[0]):
+        call()
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "run.jsonl"
+        path.write_bytes(
+            b"".join(line + b"\n" for line in (*map(encode_line, (HEADER, SCENE.parameters)), *lines))
+        )
+        assert [line for _, some in replayed(path) for line in some] == lines

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from tsgt.errors import CorruptLineError, RecordingError
 from tsgt.master.feed import Feed
-from tsgt.master.stream_records import EventRecord, StatusRecord
+from tsgt.master.stream_records import ClockRecord, EventRecord, StatusRecord
 from tsgt.model import Measurement, Parameters, PointMeasurement, PolarMeasurement
 from tsgt.recording import decode_line, encode_line, read_lines
 
@@ -20,9 +20,10 @@ if TYPE_CHECKING:
     from tsgt.recording import Line
 
 # What came from outside; headers and parameters are not on the stream.
-_ARRIVALS: dict[str, type[Measurement | StatusRecord | EventRecord]] = {
+_ARRIVALS: dict[str, type[Measurement | StatusRecord | EventRecord | ClockRecord]] = {
     "measurement": PolarMeasurement,
     "point": PointMeasurement,
+    "clock": ClockRecord,
     "status": StatusRecord,
     "event": EventRecord,
 }
@@ -89,10 +90,10 @@ def replayed(
 
 
 def _arrival(
-    feed: Feed, record: Measurement | StatusRecord | EventRecord, line: Line
+    feed: Feed, record: Measurement | StatusRecord | EventRecord | ClockRecord, line: Line
 ) -> tuple[int, list[bytes], int]:
     """Hand over what arrived: the instant, the lines that it brought, and how many of them are poses."""
-    if isinstance(record, StatusRecord | EventRecord):
+    if isinstance(record, StatusRecord | EventRecord | ClockRecord):
         now_ns = record.stamp_ns
         records: list[object] = [*feed.advance(now_ns), record]
     else:

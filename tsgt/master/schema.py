@@ -16,6 +16,7 @@ from pydantic import TypeAdapter
 
 from tsgt.master.stream_records import (
     PROTOCOL_VERSION,
+    ClockRecord,
     EventRecord,
     HelloRecord,
     PoseRecord,
@@ -24,6 +25,7 @@ from tsgt.master.stream_records import (
     StatusRecord,
 )
 from tsgt.model import (
+    ClockSample,
     InstrumentNoise,
     Parameters,
     PipelineParameters,
@@ -33,16 +35,20 @@ from tsgt.model import (
     StationParameters,
 )
 from tsgt.recording import FORMAT_VERSION, RecordingHeader
+from tsgt.recording.journal import JournalRecord, TargetRecord
 
 Line = (
     HelloRecord
     | PolarMeasurement
     | PointMeasurement
     | PoseRecord
+    | ClockRecord
     | StatusRecord
     | EventRecord
     | RecordingHeader
     | Parameters
+    | JournalRecord
+    | TargetRecord
 )
 
 SCHEMA = Path("configs/schema/stream.schema.json")
@@ -55,6 +61,8 @@ PAGES: dict[Path, tuple[type, ...]] = {
         PointMeasurement,
         PoseRecord,
         StationShare,
+        ClockRecord,
+        ClockSample,
         StatusRecord,
         StationStatus,
         EventRecord,
@@ -66,6 +74,8 @@ PAGES: dict[Path, tuple[type, ...]] = {
         InstrumentNoise,
         PrismPosition,
         PipelineParameters,
+        JournalRecord,
+        TargetRecord,
     ),
 }
 

@@ -84,7 +84,12 @@ class StreamServer:
     async def __aenter__(self) -> Self:
         self._listener = UnixListener(self._path, self._mode)
         loop = asyncio.get_running_loop()
-        self._server = await loop.create_unix_server(self._new_reader, sock=self._listener.socket)
+        try:
+            self._server = await loop.create_unix_server(self._new_reader, sock=self._listener.socket)
+        except BaseException:  # cancelled: nobody will call __aexit__
+            self._listener.remove()
+            self._listener.socket.close()
+            raise
         log.info("stream_opened", path=str(self._path))
         return self
 

@@ -12,11 +12,11 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 import tsgt
-from tsgt.model import ROBOT_FRAME, WORLD_FRAME, Row4, Status, Vector3, check_instants
+from tsgt.model import ROBOT_FRAME, WORLD_FRAME, ClockSample, Row4, Status, Vector3, check_instants
 
 PROTOCOL_VERSION = 1
 
-CAPABILITIES = ("measurement", "point", "pose", "status", "event")
+CAPABILITIES = ("measurement", "point", "pose", "clock", "status", "event")
 
 Kind = Literal["interpolated", "predicted", "smoothed"]
 Reason = Literal["", "outage", "station_status", "degenerate_geometry", "residual", "tilt"]
@@ -160,6 +160,27 @@ class StationStatus:
         From its last measurement to this record, in s; null before the first one.
     status
         What the instrument said of its last measurement; null before the first one.
+    prism
+        Number of the prism that it is told to track; null when that is not known.
+    locked
+        Whether it had a target at its last measurement; null before the first one.
+    answering
+        Whether it answered the last request; null before the first one.
+    last_heard_s
+        From its last radio message to this record, in s; null before the first one.
+    rate_hz
+        Distinct measurements per second over the last ten seconds; null before the first one.
+    loss
+        Share of the last fifty requests that it did not answer, 0 to 1; null before the first request.
+    rssi_dbm
+        Strength of its last radio message in dBm; null before the first one.
+    snr_db
+        Ratio of its last radio message to the noise in dB; null before the first one.
+    clock_offset_ns
+        Its clock against the master's now, in ns, positive when the station is ahead; null before the first
+        synchronisation.
+    clock_bound_ns
+        The offset is within this of the truth, in ns; null before the first synchronisation.
     """
 
     __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
@@ -169,6 +190,16 @@ class StationStatus:
     usable: int
     age_s: float | None
     status: Status | None
+    prism: int | None = None
+    locked: bool | None = None
+    answering: bool | None = None
+    last_heard_s: float | None = None
+    rate_hz: float | None = None
+    loss: float | None = None
+    rssi_dbm: float | None = None
+    snr_db: float | None = None
+    clock_offset_ns: int | None = None
+    clock_bound_ns: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -194,6 +225,56 @@ class StatusRecord:
     poses: int
     valid_poses: int
     stations: tuple[StationStatus, ...]
+
+    def __post_init__(self) -> None:
+        """Refuse instants that no clock shows."""
+        check_instants(self.stamp_ns)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClockRecord:
+    """What a synchronisation found of a station's clock, with the raw exchanges that it rests on.
+
+    Attributes
+    ----------
+    type
+        Always ``clock``.
+    stamp_ns
+        When it was found, on the master's Unix clock in ns.
+    station
+        Number of the station, from 1.
+    filter
+        Name of the filter: ``regression`` or ``paper``.
+    offset_ns
+        The station's clock against the master's at ``stamp_ns``, in ns; positive: the station is ahead.
+    frequency_ppm
+        By how much the station's clock gains on the master's, in 1e-6; positive: the station runs fast. 0 where the
+        filter does not know.
+    sigma_ns
+        One sigma of the offset at ``stamp_ns``, in ns.
+    bound_ns
+        The offset at ``stamp_ns`` is within this of the truth, in ns.
+    restarted
+        Whether everything known of the clock before was thrown away: first synchronisation, restart, step.
+    samples
+        All exchanges of this synchronisation.
+    rejected
+        How many of them the filter left out.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
+
+    type: Literal["clock"] = "clock"
+    stamp_ns: int
+    station: int
+    filter: str
+    offset_ns: int
+    frequency_ppm: float
+    sigma_ns: int
+    bound_ns: int
+    restarted: bool
+    samples: tuple[ClockSample, ...]
+    rejected: int
 
     def __post_init__(self) -> None:
         """Refuse instants that no clock shows."""

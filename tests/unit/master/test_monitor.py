@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
+
+from tsgt.master.clock_offset import ClockEstimate
 from tsgt.master.monitor import Monitor
 from tsgt.model import PolarMeasurement, Status
 
@@ -55,3 +58,46 @@ def test_counts_poses() -> None:
         monitor.pose(valid=valid)
     status = monitor.status(SECOND)
     assert (status.stamp_ns, status.poses, status.valid_poses) == (SECOND, 3, 2)
+
+
+def test_the_rate_is_that_of_the_last_ten_seconds() -> None:
+    """Measurements every 0.5 s are 2 Hz; when no more come the rate falls to nothing."""
+    monitor = Monitor([2])
+    for n in range(60):
+        monitor.measurement(replace(MEASUREMENT, sequence=n, received_ns=n * SECOND // 2))
+    assert monitor.status(30 * SECOND - 1).stations[0].rate_hz == pytest.approx(2.0)
+    assert monitor.status(34 * SECOND + 1).stations[0].rate_hz == pytest.approx(1.1)
+    assert monitor.status(60 * SECOND).stations[0].rate_hz == 0
+
+
+def test_loss_is_the_share_of_the_last_fifty_requests() -> None:
+    """Older ones are forgotten."""
+    monitor = Monitor([2])
+    for n in range(150):
+        monitor.asked(2, answered=n >= 100 and n % 5 > 0)
+    assert monitor.status(SECOND).stations[0].loss == pytest.approx(0.2)
+
+
+def test_the_last_radio_message_is_shown() -> None:
+    """With its strength, and how long ago it was."""
+    monitor = Monitor([2])
+    monitor.heard(2, 3 * SECOND, rssi_dbm=-91.5, snr_db=7.25)
+    station = monitor.status(5 * SECOND).stations[0]
+    assert (station.last_heard_s, station.rssi_dbm, station.snr_db) == (2.0, -91.5, 7.25)
+
+
+def test_the_clock_is_asked_for_at_the_time_of_the_status() -> None:
+    """Offset and bound are those of now."""
+    monitor = Monitor([2], lambda station, now_ns: ClockEstimate(now_ns + station, 1, 7, 0.0))
+    station = monitor.status(5 * SECOND).stations[0]
+    assert (station.clock_offset_ns, station.clock_bound_ns) == (5 * SECOND + 2, 7)
+
+
+@pytest.mark.parametrize(
+    ("status", "locked"), [(Status.OK, True), (Status.ANGLE_ONLY, True), (Status.NO_TARGET, False)]
+)
+def test_a_station_is_locked_while_it_has_a_target(status: Status, locked: bool) -> None:  # noqa: FBT001 (a parameter)
+    """By its last measurement; an angle without a distance has a target."""
+    monitor = Monitor([2])
+    monitor.measurement(replace(MEASUREMENT, status=status))
+    assert monitor.status(SECOND).stations[0].locked is locked

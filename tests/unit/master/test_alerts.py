@@ -1,0 +1,66 @@
+"""The alerts: what happens to stations becomes an event once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from support.records import SECOND, START, measurement
+
+from tsgt.master.alerts import Alerts
+from tsgt.model import Status
+
+
+def test_a_station_is_lost_once_and_back_once() -> None:
+    """Five seconds without an answer to a request, and then one."""
+    alerts = Alerts([1, 2], START)
+    assert alerts.asked(1, START + SECOND, answered=True) == []
+    names = []
+    for second in range(2, 12):
+        now_ns = START + second * SECOND
+        assert alerts.asked(1, now_ns, answered=False) == []
+        names += [event.event for event in alerts.tick(now_ns, unix_ns=now_ns)]
+    assert names == ["station_lost"]
+    (back,) = alerts.asked(1, START + 61 * SECOND, answered=True)
+    assert (back.event, back.station) == ("station_back", 1)
+    assert "after 60 s" in back.message
+
+
+def test_a_station_that_is_not_asked_is_not_lost() -> None:
+    """While the others are synchronised for the first time, nobody asks it."""
+    alerts = Alerts([1], START)
+    assert alerts.tick(START + 60 * SECOND, unix_ns=START + 60 * SECOND) == []
+
+
+def test_refusing_to_track_is_told_once() -> None:
+    """And so is the end of it; one that tracks at once is not worth a word."""
+    alerts = Alerts([1], START)
+    assert alerts.ordered(1, 4, START, tracks=True) == []
+    events = [e for tracks in (False, False, True) for e in alerts.ordered(1, 4, START, tracks=tracks)]
+    assert [event.event for event in events] == ["station_not_tracking", "station_tracking"]
+
+
+def test_a_change_of_what_the_instrument_says_is_told() -> None:
+    """Each kind of error once, and that it measures again; low accuracy is normal in motion."""
+    alerts = Alerts([1], START)
+    statuses = [
+        Status.OK,
+        Status.LOW_ACCURACY,
+        Status.TILT,
+        Status.TILT,
+        Status.WRONG_DISTANCE,
+        Status.OK,
+        Status.NO_TARGET,
+    ]
+    events = [e for s in statuses for e in alerts.measurement(replace(measurement(0), status=s), START)]
+    assert {event.event for event in events} == {"instrument_status"}
+    texts = ["not levelled", "wrong distance", "measures again", "no prism"]
+    assert [text in event.message for text, event in zip(texts, events, strict=True)] == [True] * 4
+
+
+@pytest.mark.parametrize(("steps_s", "told"), [([0.05, 0.09], 0), ([0.05, 0.2], 1), ([-3600.0, -3600.0], 1)])
+def test_a_step_of_the_unix_clock_is_told_once(steps_s: list[float], told: int) -> None:
+    """What slews by less than 0.1 s is not told; each further step is."""
+    alerts = Alerts([1], START)
+    events = [e for s in steps_s for e in alerts.tick(START, unix_ns=START + round(s * 1e9))]
+    assert [event.event for event in events] == ["unix_clock_stepped"] * told

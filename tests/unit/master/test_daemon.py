@@ -1,0 +1,316 @@
+"""The master's daemon among simulated stations, driver and air and all, on virtual time."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import asynccontextmanager
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from support.field import STATIONS, TRUE, field_of, running
+from support.radios import PAPER
+from support.scene import START, driving, standing_scene
+
+from tsgt.config.master import GeofenceConfig
+from tsgt.errors import RadioError
+from tsgt.geometry import rotation_from_quaternion
+from tsgt.master.fence_command import run_fence_command
+from tsgt.master.replay import replayed
+from tsgt.master.stream_records import ClockRecord, EventRecord, PoseRecord, StatusRecord
+from tsgt.model import PolarMeasurement, Status
+from tsgt.recording import encode_line, read_lines
+from tsgt.service import run
+from tsgt.simulation.radios import opener
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator
+    from pathlib import Path
+
+    from support.field import Field
+
+    from tsgt.radio.base import Radio, Transmitted
+
+DRIVING = standing_scene().moving(driving)
+MS = 1_000_000
+
+
+def events(field: Field) -> list[str]:
+    """Names of the events so far, with the station that each is about."""
+    return [f"{e.event} {e.station or ''}".strip() for e in field.of(EventRecord)]
+
+
+def stamp_errors_ms(measurements: list[PolarMeasurement]) -> list[float]:
+    """How far stamps are from the truth, which stands in the instants of the scene's instrument."""
+    errors_ms = []
+    for measurement in measurements:
+        off_ns = (measurement.stamp_ns - START - measurement.station) % (400 * MS)
+        errors_ms.append(min(off_ns, 400 * MS - off_ns) / MS)
+    return errors_ms
+
+
+@pytest.mark.parametrize(
+    ("authors", "rate_hz", "error_ms"), [(False, 1.6, 0.5), (True, 1.5, 4.0)], ids=["ours", "authors'"]
+)
+async def test_poses_come_out(tmp_path: Path, *, authors: bool, rate_hz: float, error_ms: float) -> None:
+    """Stations with wrong clocks are told to track, synchronised and polled; stamps and poses are right.
+
+    The authors' node takes up to 4 ms from the interrupt to its stamp, of measurements and of packets.
+    """
+    async with field_of(tmp_path, DRIVING, authors=authors) as field, running(field.master()):
+        await asyncio.sleep(40)
+    poses = [pose for pose in field.of(PoseRecord) if pose.valid]
+    assert len(poses) > 0.85 * len(field.of(PoseRecord))
+    for pose in poses:
+        assert pose.position_m is not None
+        assert pose.orientation_xyzw is not None
+        rotation, position = DRIVING.motion((pose.stamp_ns - START) / 1e9)
+        assert pose.position_m == pytest.approx(position, abs=0.02)
+        assert rotation_from_quaternion(np.array(pose.orientation_xyzw)) == pytest.approx(rotation, abs=0.03)
+    assert max(stamp_errors_ms(field.of(PolarMeasurement))) < error_ms
+    status = next(s for s in field.of(StatusRecord) if s.stamp_ns > START + 20_000 * MS)
+    for station in status.stations:
+        assert station.rate_hz is not None
+        assert station.rate_hz >= rate_hz
+        assert station.prism == station.id
+        assert station.locked
+        assert station.loss == 0
+        assert station.snr_db is not None
+        assert station.clock_bound_ns is not None
+    assert events(field) == []
+
+
+async def test_repeats_are_heard_but_not_sent_on(tmp_path: Path) -> None:
+    """Polls come more often than measurements where one station answers: each measurement is there once."""
+    async with field_of(tmp_path) as field:
+        await field.stations[2].kill()
+        await field.stations[3].kill()
+        async with running(field.master()):
+            await asyncio.sleep(60)
+    times = [m.host_time_ns for m in field.of(PolarMeasurement)]
+    assert len(times) > 50
+    assert len(times) == len(set(times))
+
+
+@pytest.mark.parametrize("authors", [False, True], ids=["ours", "authors'"])
+async def test_error_statuses_never_enter_a_pose_and_are_told(tmp_path: Path, *, authors: bool) -> None:
+    """Not levelled, wrong distance, too close, no prism: no pose, but status, measurement and event."""
+    async with field_of(tmp_path, authors=authors) as field, running(field.master()):
+        await asyncio.sleep(20)
+        for status in (Status.TILT, Status.WRONG_DISTANCE, Status.ANGLE_ONLY, Status.NO_TARGET):
+            field.stations[2].instrument.status = status
+            await asyncio.sleep(5)
+            seen = [m for m in field.of(PolarMeasurement) if m.station == 2][-1]
+            assert seen.status is status
+            assert field.of(StatusRecord)[-1].stations[1].status is status
+            assert field.of(EventRecord)[-1].event == "instrument_status"
+            last = field.of(PoseRecord)[-1]
+            assert not last.valid
+            assert last.reason == "station_status"
+        field.stations[2].instrument.status = Status.OK
+        await asyncio.sleep(5)
+        assert field.of(PoseRecord)[-1].valid
+    untimed = [m for m in field.of(PolarMeasurement) if m.stamp_sigma_ns == 1_000_000_000]
+    assert [m.status for m in untimed] == (
+        [Status.TILT, Status.WRONG_DISTANCE, Status.NO_TARGET] if authors else []
+    )
+
+
+async def test_a_station_dies_and_comes_back_with_another_clock(tmp_path: Path) -> None:
+    """The others go on as ever; it is found within seconds, its new clock is noticed, nothing is wrong."""
+    async with field_of(tmp_path, DRIVING) as field, running(field.master()):
+        await asyncio.sleep(40)
+        await field.stations[2].kill()
+        await asyncio.sleep(30)
+        lost_at = len(field.records)
+        field.stations[2].clock.step(3_600_000 * MS)
+        field.stations[2].start()
+        await asyncio.sleep(15)
+    assert events(field) == ["station_lost 2", "station_back 2", "station_clock_stepped 2"]
+    assert max(stamp_errors_ms(field.of(PolarMeasurement))) < 0.2
+    others = [m for m in field.records[:lost_at] if isinstance(m, PolarMeasurement) and m.station == 1]
+    gaps = [b.stamp_ns - a.stamp_ns for a, b in pairwise(others)]
+    assert max(gaps) < 2500 * MS  # the synchronisation of another one
+    assert field.of(PoseRecord)[-1].valid
+
+
+async def test_a_step_of_the_station_clock_costs_no_measurement(tmp_path: Path) -> None:
+    """What comes before the new clock is known waits for it: every answer is on the stream in the end."""
+    async with field_of(tmp_path, authors=True) as field, running(field.master()):
+        await asyncio.sleep(30)
+        before = len(field.of(PolarMeasurement))
+        field.stations[1].clock.step(-60_000 * MS)
+        await asyncio.sleep(10)
+    after = field.of(PolarMeasurement)[before:]
+    assert [m.sequence for m in after if m.station == 1] == sorted(
+        m.sequence for m in after if m.station == 1
+    )
+    assert events(field) == ["station_clock_stepped 1"]
+    assert max(stamp_errors_ms(field.of(PolarMeasurement))) < 4.0
+    stepped_ns = field.of(EventRecord)[-1].stamp_ns
+    found = next(c for c in field.of(ClockRecord) if c.stamp_ns > stepped_ns)
+    assert found.station == 1
+    assert found.restarted
+    assert found.stamp_ns - stepped_ns < 2000 * MS
+
+
+async def test_a_station_left_in_direct_mode_tracks_again(tmp_path: Path) -> None:
+    """The master begins with the order to track, so that no poll is taken for an order to measure."""
+    async with field_of(tmp_path) as field:
+        field.stations[1].instrument.direct_mode = True
+        async with running(field.master()):
+            await asyncio.sleep(20)
+    assert not field.stations[1].instrument.direct_mode
+    assert field.of(StatusRecord)[-1].stations[0].measurements > 10
+
+
+async def test_a_station_that_refuses_to_track_is_told_again(tmp_path: Path) -> None:
+    """An instrument that finds no prism is announced, not polled, and used as soon as it tracks."""
+    async with field_of(tmp_path) as field:
+        field.stations[1].instrument.refuses = True
+        async with running(field.master()):
+            await asyncio.sleep(20)
+            assert events(field) == ["station_not_tracking 1"]
+            assert not [m for m in field.of(PolarMeasurement) if m.station == 1]
+            assert [m for m in field.of(PolarMeasurement) if m.station == 2]
+            field.stations[1].instrument.refuses = False
+            await asyncio.sleep(15)
+    assert events(field) == ["station_not_tracking 1", "station_tracking 1"]
+    assert field.of(PoseRecord)[-1].valid
+
+
+@pytest.mark.parametrize("protocol", [{}, {"clock_filter": "paper"}], ids=["regression", "paper"])
+async def test_the_recording_is_the_stream_and_replays_bit_for_bit(
+    tmp_path: Path, protocol: dict[str, Any]
+) -> None:
+    """Header and parameters come first; then stand the lines of the stream, and a replay makes them again."""
+    fence = GeofenceConfig(
+        name="yard", polygon_m=((29.5, 0), (40, 0), (40, 40), (29.5, 40)), hysteresis_m=0.1
+    )
+    async with (
+        field_of(tmp_path, DRIVING) as field,
+        running(field.master(field.config(protocol=protocol, geofences=(fence,)))),
+    ):
+        await asyncio.sleep(25)
+        field.stations[3].instrument.status = Status.NO_TARGET
+        await asyncio.sleep(5)
+        await field.stations[3].kill()
+        await asyncio.sleep(10.03)
+    streamed = [encode_line(record) for record in field.records]
+    lines = list(read_lines(field.recording()))
+    assert [line.type for line in lines[:2]] == ["recording", "parameters"]
+    assert [line.data for line in lines[2:]] == streamed
+    assert [line for _, some in replayed(field.recording()) for line in some] == streamed
+    assert {"fence_left", "fence_entered", "station_lost 3"} <= set(events(field))
+
+
+@pytest.mark.parametrize("at_ms", [0, 1, 30, 200, 1000, 1777, 4000, 4100, 5321, 9000])
+async def test_it_can_be_stopped_at_any_moment_and_started_again(tmp_path: Path, at_ms: int) -> None:
+    """It ends within a second with its last lines on disk; the next run has a recording of its own, and poses."""
+    async with field_of(tmp_path) as field:
+        task = asyncio.create_task(field.master())
+        await asyncio.sleep(at_ms / 1e3)
+        task.cancel()
+        stopped_ns = TRUE.monotonic_ns()
+        await asyncio.wait([task])
+        assert TRUE.monotonic_ns() - stopped_ns < 1000 * MS
+        assert task.cancelled()
+        lines = [line.data for line in read_lines(field.recording())]
+        assert lines[2:] == [encode_line(record) for record in field.records]
+        field.records.clear()
+        async with running(field.master()):
+            await asyncio.sleep(12)
+        assert field.of(PoseRecord)[-1].valid
+        assert len(list((tmp_path / "recordings").iterdir())) == 2
+
+
+async def test_a_radio_that_fails_is_opened_again(tmp_path: Path) -> None:
+    """Readers are told once, the status goes on, and poses come back by themselves."""
+    async with field_of(tmp_path) as field:
+        works = True
+
+        @asynccontextmanager
+        async def open_radio() -> AsyncGenerator[Radio]:
+            if not works:
+                raise RadioError("no chip answers")
+            async with field.open_radio()() as radio:
+                transmit = radio.transmit
+
+                async def breakable(payload: bytes, *, at_ns: int | None = None) -> Transmitted:
+                    if not works:
+                        raise RadioError("unplugged")
+                    return await transmit(payload, at_ns=at_ns)
+
+                with patch.object(radio, "transmit", breakable):
+                    yield radio
+
+        async with running(field.master(open_radio=open_radio)):
+            await asyncio.sleep(15)
+            works = False
+            await asyncio.sleep(15)
+            assert events(field) == ["radio_failed"]
+            works = True
+            await asyncio.sleep(15)
+            assert events(field) == ["radio_failed", "radio_back"]
+            assert field.of(PoseRecord)[-1].valid
+    assert len(field.of(StatusRecord)) >= 44
+
+
+async def test_a_step_of_the_masters_unix_clock_is_told_and_bends_nothing(tmp_path: Path) -> None:
+    """Stamps stay on the timeline of the start."""
+    async with field_of(tmp_path) as field:
+        clock = _Steppable()
+        async with running(field.master(clock=clock)):
+            await asyncio.sleep(15)
+            clock.ahead_ns = 5000 * MS
+            await asyncio.sleep(5)
+    (event,) = field.of(EventRecord)
+    assert event.event == "unix_clock_stepped"
+    assert "set by +5.000 s" in event.message
+    assert max(stamp_errors_ms(field.of(PolarMeasurement))) < 0.1
+    assert all(pose.valid for pose in field.of(PoseRecord)[-20:])
+
+
+class _Steppable:
+    """The true time with a Unix clock that somebody sets."""
+
+    def __init__(self) -> None:
+        self.ahead_ns = 0
+        self.monotonic_ns = TRUE.monotonic_ns
+        self.sleep_until = TRUE.sleep_until
+
+    def realtime_ns(self) -> int:
+        return TRUE.realtime_ns() + self.ahead_ns
+
+
+async def test_garbage_and_foreign_packets_change_nothing(tmp_path: Path) -> None:
+    """A sender that fills the pauses with packets of other kinds costs measurements, but nothing is wrong."""
+    async with field_of(tmp_path) as field:
+
+        async def jam() -> None:
+            rng = np.random.default_rng(1)
+            async with opener(field.air, "foreign", TRUE, rng, PAPER)() as radio:
+                while True:
+                    await radio.transmit(rng.bytes(int(rng.integers(1, 40))))
+                    await asyncio.sleep(float(rng.uniform(0.5, 2.0)))
+
+        async with running(jam()), running(field.master()):
+            await asyncio.sleep(60)
+    assert all(status.poses for status in field.of(StatusRecord)[-5:])
+    assert max(stamp_errors_ms(field.of(PolarMeasurement))) < 1.0
+    assert {m.station for m in field.of(PolarMeasurement)} == set(STATIONS)
+
+
+def test_a_fence_runs_its_command(tmp_path: Path) -> None:
+    """At a crossing the command runs with the event in its environment; one that fails is only logged."""
+
+    async def commands() -> None:
+        script = f'echo "$TSGT_EVENT $TSGT_FENCE" > {tmp_path}/said'
+        await run_fence_command(("sh", "-c", script), event="fence_left", fence="yard")
+        await run_fence_command(("/nonexistent",), event="fence_left", fence="yard")
+        await run_fence_command(("false",), event="fence_left", fence="yard")
+
+    run(commands)
+    assert (tmp_path / "said").read_text() == "fence_left yard\n"

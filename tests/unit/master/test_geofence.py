@@ -1,0 +1,195 @@
+"""The geo-fence: crossing, uncertainty, margin, hysteresis, loss of the pose."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.records import NO_POSE, POSE, SECOND, START
+
+from tsgt.config.master import GeofenceConfig
+from tsgt.master.geofence import Geofence
+
+if TYPE_CHECKING:
+    from tsgt.master.stream_records import PoseRecord
+
+SQUARE = ((0.0, 0.0), (10.0, 0.0), (10.0, 10.0), (0.0, 10.0))
+BAY = ((0.0, 0.0), (9.0, 0.0), (9.0, 9.0), (6.0, 9.0), (6.0, 3.0), (3.0, 3.0), (3.0, 9.0), (0.0, 9.0))
+
+
+def fence(**changes: object) -> Geofence:
+    """Build a fence around the square that takes the position as exact."""
+    settings = {"name": "yard", "polygon_m": SQUARE, "sigmas": 0.0, "hysteresis_m": 0.5}
+    return Geofence(GeofenceConfig.model_validate(settings | changes))
+
+
+def at(x: float, y: float, *, sigma_x_m: float = 0.0, sigma_y_m: float = 0.0, rho: float = 0.0) -> PoseRecord:
+    """Build a valid pose at x, y."""
+    covariance = np.zeros((6, 6))
+    covariance[:2, :2] = [
+        [sigma_x_m**2, rho * sigma_x_m * sigma_y_m],
+        [rho * sigma_x_m * sigma_y_m, sigma_y_m**2],
+    ]
+    return dataclasses.replace(POSE, position_m=(x, y, 0.0), covariance=tuple(covariance.ravel().tolist()))
+
+
+def run(watched: Geofence, poses: list[PoseRecord]) -> list[str]:
+    """Hand over poses a tenth of a second apart; what each of them brought, the empty word for nothing."""
+    words = []
+    for number, pose in enumerate(poses):
+        events = watched.pose(pose, START + number * SECOND // 10)
+        assert len(events) <= 1
+        words.append(events[0].event if events else "")
+    return words
+
+
+def test_the_first_pose_beyond_the_boundary_gives_the_event() -> None:
+    """It names the fence, the place and how far; its stamp is when it was noticed."""
+    watched = fence()
+    assert watched.pose(at(9.9, 5.0), START) == []
+    (event,) = watched.pose(at(10.25, 5.0), START + 7)
+    assert (event.event, event.stamp_ns) == ("fence_left", START + 7)
+    assert event.message == "fence yard left: the robot is 0.25 m beyond its limit at x 10.25, y 5.00 m"
+
+
+def test_a_robot_that_starts_beyond_is_told_of_at_once() -> None:
+    """The first valid pose arms the fence; a start on the right side is no event."""
+    assert run(fence(), [at(11, 5)]) == ["fence_left"]
+    assert run(fence(), [at(5, 5)]) == [""]
+
+
+def test_it_is_back_only_beyond_the_hysteresis() -> None:
+    """Driving along the boundary gives one event, not a hundred."""
+    poses = [at(x, 5) for x in (9.0, 10.1, 9.9, 10.1, 9.6, 9.4, 9.9)]
+    assert run(fence(), poses) == ["", "fence_left", "", "", "", "fence_entered", ""]
+
+
+def test_keep_outside_turns_it_round() -> None:
+    """An area that is forbidden is left by driving into it."""
+    poses = [at(x, 5) for x in (12.0, 10.1, 9.9, 10.4, 10.6)]
+    assert run(fence(keep="outside"), poses) == ["", "", "fence_left", "", "fence_entered"]
+
+
+def test_the_margin_keeps_the_origin_away() -> None:
+    """A robot whose front is a metre ahead of its origin has to turn a metre earlier."""
+    assert run(fence(margin_m=1.0), [at(8.9, 5), at(9.1, 5)]) == ["", "fence_left"]
+    assert run(fence(margin_m=1.0, keep="outside"), [at(11.1, 5), at(10.9, 5)]) == ["", "fence_left"]
+
+
+def test_the_uncertainty_counts_across_the_edge_only() -> None:
+    """0.2 m of sigma along an edge is harmless beside it, across it three of them are not."""
+    along, across = at(9.5, 5, sigma_y_m=0.2), at(9.5, 5, sigma_x_m=0.2)
+    assert run(fence(sigmas=3.0), [along, across]) == ["", "fence_left"]
+
+
+def test_an_edge_further_off_counts_if_the_position_is_poor_that_way() -> None:
+    """The east edge is nearer, but it is the north edge that the robot may have crossed."""
+    assert run(fence(sigmas=3.0), [at(9.5, 9.0, sigma_y_m=0.4)]) == ["fence_left"]
+
+
+def test_on_the_boundary_the_uncertainty_counts_as_well() -> None:
+    """Wherever rounding puts a point on the boundary; without uncertainty it is still in."""
+    for point in ((10.0, 5.0), (0.0, 5.0), (5.0, 0.0), (5.0, 10.0), (0.0, 0.0), (10.0, 10.0)):
+        assert run(fence(), [at(*point)]) == [""]
+        assert run(fence(sigmas=1.0), [at(*point, sigma_x_m=0.1, sigma_y_m=0.1)]) == ["fence_left"]
+
+
+@given(
+    x=st.floats(-2, 11), y=st.floats(-2, 11), sx=st.floats(0, 1), sy=st.floats(0, 1), rho=st.floats(-0.99, 0.99),
+    keep=st.sampled_from(["inside", "outside"]), margin=st.floats(0, 1),
+)  # fmt: skip
+def test_it_agrees_with_brute_force(
+    x: float, y: float, sx: float, sy: float, rho: float, keep: str, margin: float
+) -> None:
+    """Oracle: every point of the boundary in steps of 5 mm; left if any of them is too near in sigmas, or beyond."""
+    corners = np.array(BAY)
+    steps = np.linspace(0, 1, 1801)[:, None]
+    offsets = np.concatenate(
+        [a * (1 - steps) + b * steps for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+    ) - [x, y]
+    inside = 0 < x < 9 and 0 < y < 9 and not (3 < x < 6 and y > 3)
+    left_at_all = inside != (keep == "inside")
+    # Per edge the nearest point counts, in its own direction.
+    per_edge = offsets.reshape(len(BAY), -1, 2)
+    lengths = np.linalg.norm(per_edge, axis=2)
+    nearest = per_edge[np.arange(len(BAY)), lengths.argmin(axis=1)]
+    distance = lengths.min(axis=1)
+    if distance.min() < 0.2:  # the oracle's steps are too coarse for a direction
+        return
+    u = nearest / distance[:, None]
+    covariance = np.array([[sx**2, rho * sx * sy], [rho * sx * sy, sy**2]])
+    spare = float((distance - 2.0 * np.sqrt(np.einsum("ni,ij,nj->n", u, covariance, u))).min()) - margin
+    if not left_at_all and math.isclose(spare, 0.0, abs_tol=0.05):
+        # Near the limit the oracle's directions, off by 2.5 mm at 200 mm or more, decide nothing.
+        return
+    expected = "fence_left" if left_at_all or spare < 0 else ""
+    pose = at(x, y, sigma_x_m=sx, sigma_y_m=sy, rho=rho)
+    assert run(fence(polygon_m=BAY, sigmas=2.0, keep=keep, margin_m=margin), [pose]) == [expected]
+
+
+@given(st.lists(st.tuples(st.floats(-2, 12), st.floats(-2, 12), st.integers(0, 3 * SECOND)), max_size=30))
+def test_events_alternate(steps: list[tuple[float, float, int]]) -> None:
+    """Whatever the robot does and however long poses stay away: left, entered, left, and so on."""
+    watched, now_ns, events = fence(sigmas=1.0), START, []
+    for x, y, wait_ns in steps:
+        now_ns += wait_ns
+        events += watched.pose(at(x, y, sigma_x_m=0.1), now_ns)
+    words = [event.event for event in events]
+    assert words == (["fence_left", "fence_entered"] * len(words))[: len(words)]
+
+
+def test_no_valid_pose_for_a_while_counts_as_leaving() -> None:
+    """At the deadline, once; invalid poses do not put it off. The next valid pose inside brings it back."""
+    watched = fence(lost_after_s=2.0)
+    assert watched.next_deadline_ns() is None
+    assert watched.tick(START) == []
+    watched.pose(at(5, 5), START)
+    assert watched.next_deadline_ns() == START + 2 * SECOND
+    assert watched.pose(NO_POSE, START + SECOND) == []
+    assert watched.tick(START + 2 * SECOND - 1) == []
+    (event,) = watched.tick(START + 2 * SECOND)
+    assert event.event == "fence_left"
+    assert event.message == "fence yard left: no valid pose for 2 s"
+    assert watched.next_deadline_ns() is None
+    assert watched.tick(START + 9 * SECOND) == []
+    # Within the hysteresis: it was loss that made it leave, not the boundary.
+    assert [e.event for e in watched.pose(at(9.9, 5), START + 10 * SECOND)] == ["fence_entered"]
+
+
+def test_a_loss_is_noticed_with_the_next_pose_where_no_tick_came() -> None:
+    """An invalid pose or a valid one after the deadline does what the tick would have done."""
+    watched = fence()
+    watched.pose(at(5, 5), START)
+    assert [e.event for e in watched.pose(NO_POSE, START + 2 * SECOND)] == ["fence_left"]
+    watched.pose(at(5, 5), START + 3 * SECOND)
+    late = watched.pose(at(5, 5), START + 6 * SECOND)
+    assert [e.event for e in late] == ["fence_left", "fence_entered"]
+
+
+def test_a_loss_beyond_the_boundary_is_no_second_event() -> None:
+    """It has left already; back it is when the hysteresis says so."""
+    watched = fence()
+    watched.pose(at(11, 5), START)
+    assert watched.tick(START + 5 * SECOND) == []
+    assert watched.pose(at(9.9, 5), START + 6 * SECOND) == []
+    assert [e.event for e in watched.pose(at(9.0, 5), START + 7 * SECOND)] == ["fence_entered"]
+
+
+def test_without_a_valid_pose_it_is_not_armed() -> None:
+    """A master that starts before its stations does not cry at once."""
+    watched = fence()
+    assert watched.pose(NO_POSE, START) == []
+    assert watched.tick(START + 100 * SECOND) == []
+
+
+def test_a_polygon_that_bounds_no_area_is_refused_by_the_configuration() -> None:
+    """With the words of the check."""
+    with pytest.raises(ValueError, match=r"edges 1-2 .* and 3-4 .* cross"):
+        fence(polygon_m=((0.0, 0.0), (10.0, 10.0), (10.0, 0.0), (0.0, 10.0)))
+    with pytest.raises(ValueError, match="less than or equal to 1000000"):
+        fence(polygon_m=((0.0, 0.0), (1e300, 0.0), (0.0, 1e300)))

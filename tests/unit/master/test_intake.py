@@ -1,0 +1,274 @@
+"""The intake: from answers to measurements on the master's clock."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import hypothesis.strategies as st
+import pytest
+from hypothesis import given
+from hypothesis import settings as limits
+from support.scene import START
+
+from tsgt.master.clock_offset import clock_filter
+from tsgt.master.intake import UNTIMED_SIGMA_NS, Intake
+from tsgt.model import ClockSample, Status
+from tsgt.radio.classic_messages import MeasurementMessage, decode_reply, no_measurement_yet
+
+if TYPE_CHECKING:
+    from tsgt.master.intake import Arrival, Synchronised
+
+MS = 1_000_000
+SECOND = 1000 * MS
+AIR_NS = 55 * MS
+AHEAD_NS = 7200 * SECOND
+
+
+def samples(at_ns: int, ahead_ns: int = AHEAD_NS, count: int = 5) -> list[ClockSample]:
+    """Exchanges without error, 0.25 s apart, the last of which ends at an instant."""
+    return [
+        ClockSample(
+            sent_ns=received_ns - 2 * AIR_NS,
+            station_ns=received_ns - AIR_NS + ahead_ns,
+            received_ns=received_ns,
+            forward_ns=AIR_NS,
+            back_ns=AIR_NS,
+        )
+        for received_ns in range(at_ns - (count - 1) * 250 * MS, at_ns + 1, 250 * MS)
+    ]
+
+
+def message(time_ns: int, *, status: int = 0, distance_m: float = 30.0) -> MeasurementMessage:
+    """Make an answer of station 1."""
+    return MeasurementMessage(
+        station=1,
+        status=status,
+        zenith_angle_rad=1.5,
+        horizontal_angle_rad=0.5,
+        slope_distance_m=distance_m,
+        time_ns=time_ns,
+    )
+
+
+def failure(status: int) -> MeasurementMessage:
+    """Make the answer of an authors' node that reports an error."""
+    return replace(
+        message(0, status=status), zenith_angle_rad=-1.0, horizontal_angle_rad=-1.0, slope_distance_m=-1.0
+    )
+
+
+class Master:
+    """One station's intake, polled at instants that count from the start, in ms."""
+
+    def __init__(self, *, synchronised: bool = True) -> None:
+        self.intake = Intake({1: 4}, lambda: clock_filter("regression"))
+        if synchronised:
+            self.synchronise(0)
+
+    def synchronise(self, at_ms: int, ahead_ns: int = AHEAD_NS) -> Synchronised:
+        """Take a synchronisation whose last exchange ends at an instant."""
+        at_ns = START + at_ms * MS
+        return self.intake.synchronised(1, samples(at_ns, ahead_ns), at_ns)
+
+    def poll(self, at_ms: int, answer: MeasurementMessage) -> Arrival:
+        """Take an answer that has been received at an instant, 194 ms after the request for it began."""
+        received_ns = START + at_ms * MS
+        return self.intake.answered(answer, requested_ns=received_ns - 194 * MS, received_ns=received_ns)
+
+
+def test_a_measurement_is_put_on_the_masters_clock() -> None:
+    """Its stamp is the host's less what the station is ahead; everything raw is kept."""
+    arrival = Master().poll(1000, message(START + 750 * MS + AHEAD_NS))
+    assert not arrival.stepped
+    measurement = arrival.measurement
+    assert measurement is not None
+    assert measurement.stamp_ns == pytest.approx(START + 750 * MS, abs=20_000)
+    assert measurement.host_time_ns == START + 750 * MS + AHEAD_NS
+    assert (measurement.station, measurement.prism, measurement.sequence) == (1, 4, 0)
+    assert measurement.received_ns == START + 1000 * MS
+    assert 0 < measurement.stamp_sigma_ns < MS
+
+
+def test_a_repeat_is_no_measurement() -> None:
+    """The same station time again is the same measurement."""
+    master = Master()
+    assert master.poll(1000, message(START + 750 * MS + AHEAD_NS)).measurement is not None
+    assert master.poll(1500, message(START + 750 * MS + AHEAD_NS)).measurement is None
+    measurement = master.poll(2000, message(START + 1750 * MS + AHEAD_NS)).measurement
+    assert measurement is not None
+    assert measurement.sequence == 1
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [no_measurement_yet(1), replace(message(0), zenith_angle_rad=0.0, slope_distance_m=0.0)],
+    ids=["ours", "authors'"],
+)
+def test_before_its_first_measurement_a_station_says_nothing(answer: MeasurementMessage) -> None:
+    """Time 0 is no time, whatever the status."""
+    arrival = Master().poll(1000, answer)
+    assert arrival == (None, False, False)
+
+
+def test_an_error_without_a_time_is_told_once_until_it_changes() -> None:
+    """It is stamped with its arrival, very uncertain, and never taken for a sign of another clock."""
+    master = Master()
+    arrivals = [
+        master.poll(1000 * n, failure(status)) for n, status in enumerate((1, 1, 2, 2, 2, 1), start=1)
+    ]
+    told = [arrival.measurement for arrival in arrivals if arrival.measurement is not None]
+    assert [m.status for m in told] == [Status.TILT, Status.WRONG_DISTANCE, Status.TILT]
+    assert [m.stamp_ns - START for m in told] == [1000 * MS, 3000 * MS, 6000 * MS]
+    assert {m.stamp_sigma_ns for m in told} == {UNTIMED_SIGMA_NS}
+    assert {m.slope_distance_m for m in told} == {None}
+    assert not any(arrival.stepped for arrival in arrivals)
+
+
+def test_an_error_with_a_wild_time_is_one_without() -> None:
+    """The time field of an authors' node that reports an error means nothing."""
+    master = Master()
+    master.poll(500, message(START + 250 * MS + AHEAD_NS))
+    arrival = master.poll(1000, replace(failure(3), time_ns=12_345 * SECOND))
+    assert arrival.measurement is not None
+    assert arrival.measurement.stamp_ns == START + 1000 * MS
+    assert not arrival.stepped
+
+
+def test_an_error_with_a_good_time_is_stamped_with_it() -> None:
+    """Our clients stamp errors as they stamp everything."""
+    arrival = Master().poll(1000, message(START + 800 * MS + AHEAD_NS, status=1))
+    assert arrival.measurement is not None
+    assert arrival.measurement.status is Status.TILT
+    assert arrival.measurement.stamp_ns == pytest.approx(START + 800 * MS, abs=20_000)
+
+
+@pytest.mark.parametrize("step_s", [3600, 0.4, -3.0, -1e6, -1.6e9])
+def test_after_a_step_measurements_wait_for_the_new_clock(step_s: float) -> None:
+    """The first that cannot be says so, once; then all come in their order, with the new clock."""
+    master = Master()
+    step_ns = round(step_s * 1e9)
+    master.poll(1000, message(START + 750 * MS + AHEAD_NS))
+    made_ms = (2000, 2400, 2800)
+    arrivals = [master.poll(ms + 200, message(START + ms * MS + AHEAD_NS + step_ns)) for ms in made_ms]
+    assert [(a.measurement, a.stepped, a.doubtful) for a in arrivals] == [
+        (None, True, True),
+        (None, False, False),
+        (None, False, False),
+    ]
+    assert master.intake.clock(1, START + 3000 * MS) is None
+    found = master.synchronise(4500, AHEAD_NS + step_ns)
+    assert found.record.restarted
+    assert not found.stepped  # it has been told
+    assert [round((m.stamp_ns - START) / MS) for m in found.measurements] == list(made_ms)
+    assert [m.sequence for m in found.measurements] == [1, 2, 3]
+    assert master.poll(5000, message(START + 4900 * MS + AHEAD_NS + step_ns)).measurement is not None
+
+
+def test_a_step_that_only_a_synchronisation_can_see_is_told_by_it() -> None:
+    """20 ms could as well be the way; the next synchronisation finds them."""
+    master = Master()
+    assert master.poll(1000, message(START + 750 * MS + AHEAD_NS + 5 * MS)).measurement is not None
+    found = master.synchronise(30_000, AHEAD_NS + 20 * MS)
+    assert found.stepped
+    assert found.record.restarted
+
+
+def test_the_clock_line_says_what_was_found() -> None:
+    """Offset at its stamp, with the raw exchanges."""
+    found = Master(synchronised=False).synchronise(0)
+    assert found.measurements == []
+    assert found.record.offset_ns == pytest.approx(AHEAD_NS, abs=20_000)
+    assert found.record.samples == tuple(samples(START))
+    assert (found.record.filter, found.record.restarted, found.record.rejected) == ("regression", True, 0)
+
+
+def test_before_the_first_synchronisation_measurements_wait() -> None:
+    """None is lost, and none is stamped by guess."""
+    master = Master(synchronised=False)
+    assert master.poll(1000, message(START + 750 * MS + AHEAD_NS)) == (None, False, False)
+    (measurement,) = master.synchronise(3000).measurements
+    assert measurement.stamp_ns == pytest.approx(START + 750 * MS, abs=20_000)
+
+
+def test_a_measurement_without_distance_has_none() -> None:
+    """Distance 0 stands for none."""
+    arrival = Master().poll(1000, message(START + 750 * MS + AHEAD_NS, status=4, distance_m=0.0))
+    assert arrival.measurement is not None
+    assert arrival.measurement.status is Status.ANGLE_ONLY
+    assert arrival.measurement.slope_distance_m is None
+
+
+@limits(deadline=None, max_examples=200)
+@given(
+    st.lists(
+        st.one_of(
+            st.builds(
+                lambda head, tail: bytes([1, head % 5]) + tail,
+                st.integers(0, 4),
+                st.binary(min_size=32, max_size=32),
+            ),
+            st.builds(message, st.integers(0, 2**32 * SECOND - 1), status=st.integers(0, 4)).map(
+                MeasurementMessage.to_bytes
+            ),
+            st.just(None),
+        ),
+        max_size=12,
+    )
+)
+def test_no_message_can_break_it(answers: list[bytes | None]) -> None:
+    """Whatever 34 bytes say, and whenever a synchronisation comes: measurements have instants that clocks show."""
+    master = Master()
+    for number, answer in enumerate(answers, start=1):
+        if answer is None:
+            for measurement in master.synchronise(number * 1000).measurements:
+                assert measurement.stamp_ns >= 0
+            continue
+        decoded = decode_reply(answer)
+        if isinstance(decoded, MeasurementMessage):
+            master.poll(number * 1000, decoded)
+
+
+def test_a_station_that_was_silent_is_synchronised_before_it_is_believed() -> None:
+    """A clock that stood still while the station was off makes new measurements look old: they wait."""
+    master = Master()
+    assert master.poll(1000, message(START + 700 * MS + AHEAD_NS)).measurement is not None
+    master.intake.unanswered(1)
+    off_ns = 20 * SECOND  # its clock went on from where it was when the power went
+    back = master.poll(21_200, message(START + 21_000 * MS - off_ns + AHEAD_NS))
+    assert back.measurement is None
+    assert back.doubtful
+    assert not back.stepped
+    found = master.synchronise(23_000, AHEAD_NS - off_ns)
+    assert found.stepped
+    (measurement,) = found.measurements
+    assert measurement.stamp_ns == pytest.approx(START + 21_000 * MS, abs=MS)
+
+
+def test_a_station_that_was_only_not_asked_is_believed_at_once() -> None:
+    """While others are synchronised nobody asks it: that is no silence of its own."""
+    master = Master()
+    master.poll(1000, message(START + 700 * MS + AHEAD_NS))
+    later = master.poll(30_000, message(START + 29_800 * MS + AHEAD_NS))
+    assert later.measurement is not None
+    assert not later.doubtful
+
+
+def test_after_a_silence_the_same_clock_is_not_called_another_one() -> None:
+    """The synchronisation agrees with what was known, so what waited is let go and nothing is announced."""
+    master = Master()
+    master.poll(1000, message(START + 700 * MS + AHEAD_NS))
+    master.intake.unanswered(1)
+    assert master.poll(21_200, message(START + 21_000 * MS + AHEAD_NS)).doubtful
+    found = master.synchronise(23_000)
+    assert not found.stepped
+    assert [m.stamp_ns for m in found.measurements] == [pytest.approx(START + 21_000 * MS, abs=MS)]
+
+
+def test_a_backward_step_while_nothing_new_was_measured_is_noticed() -> None:
+    """Repeats say that nothing was measured before them, so an older measurement cannot come after."""
+    master = Master()
+    same = message(START + 700 * MS + AHEAD_NS)
+    for at_ms in (1000, 1600, 2200, 2800):
+        master.poll(at_ms, same)
+    assert master.poll(3400, message(START + 3200 * MS + AHEAD_NS - 1500 * MS)).stepped

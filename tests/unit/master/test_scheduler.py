@@ -1,0 +1,229 @@
+"""The scheduler on a made-up channel where each turn takes its time, without radio and clock."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from support.radios import PAPER
+
+from tsgt.master.scheduler import Cadence, Scheduler, StationPlan, Task
+from tsgt.model import ClockSample
+from tsgt.radio.classic import Ordered, Poll, Synchronisation, Timing
+from tsgt.radio.classic_messages import no_measurement_yet
+
+MS = 1_000_000
+SECOND = 1000 * MS
+TIMING = Timing.of(PAPER, 250 * MS)
+SAMPLE = ClockSample(sent_ns=0, station_ns=1, received_ns=2, forward_ns=0, back_ns=0)
+
+# Durations at the paper's settings: a poll that is answered and one that is not, a cycle, what is around the cycles.
+POLL_NS, TIMEOUT_NS, CYCLE_NS, FRAME_NS = 195 * MS, 304 * MS, 245 * MS, 162 * MS
+
+PAPERS = Cadence(initial_cycles=50, resync_cycles=5, interval_ns=300 * SECOND)
+
+
+@dataclass
+class Channel:
+    """Carries turns out: stations answer, are dead, or refuse orders."""
+
+    cadence: Cadence = PAPERS
+    stations: int = 3
+    now_ns: int = 0
+    dead: set[int] = field(default_factory=set)
+    refusing: set[int] = field(default_factory=set)
+    turns: list[tuple[int, Task]] = field(default_factory=list)
+    spent_ns: Counter[int] = field(default_factory=Counter)
+
+    def __post_init__(self) -> None:
+        self.scheduler = Scheduler(
+            [StationPlan(station=n, prism=n + 3) for n in range(1, self.stations + 1)],
+            self.cadence,
+            TIMING,
+            self.now_ns,
+        )
+
+    def run(self, until_s: float) -> None:
+        """Take turns until an instant."""
+        while self.now_ns < until_s * SECOND:
+            turn = self.scheduler.next(self.now_ns)
+            if isinstance(turn, int):
+                assert turn > self.now_ns
+                self.now_ns = turn
+                continue
+            self.turns.append((self.now_ns, turn))
+            took_ns = self._carry_out(turn)
+            self.spent_ns[turn.station] += took_ns
+            self.now_ns += took_ns
+            self.scheduler.finished(turn, self.now_ns)
+
+    def _carry_out(self, turn: Task) -> int:
+        dead = turn.station in self.dead
+        if isinstance(turn, Ordered):
+            turn.ok = None if dead else turn.station not in self.refusing
+            return 10 * SECOND if dead else 500 * MS
+        if isinstance(turn, Poll):
+            turn.message = None if dead else no_measurement_yet(turn.station)
+            return TIMEOUT_NS if dead else POLL_NS
+        turn.answered = not dead
+        if dead:
+            return FRAME_NS + 3 * TIMEOUT_NS
+        turn.samples = [SAMPLE] * turn._cycles
+        return FRAME_NS + turn._cycles * CYCLE_NS
+
+    def of(self, kind: type[Any], *, since_s: float = 0) -> list[tuple[int, Any]]:
+        """Return turns of a kind with their instants."""
+        return [(at, turn) for at, turn in self.turns if isinstance(turn, kind) and at >= since_s * SECOND]
+
+    def rate_hz(self, station: int, since_s: float) -> float:
+        """How often a station was polled with success."""
+        polls = [
+            turn for _, turn in self.of(Poll, since_s=since_s) if turn.station == station and turn.answered
+        ]
+        return len(polls) / (self.now_ns / SECOND - since_s)
+
+
+def test_each_station_is_told_to_track_then_synchronised_then_polled() -> None:
+    """The order goes first with the station's prism; all are synchronised before the first poll."""
+    channel = Channel()
+    channel.run(60)
+    kinds = [(type(turn), turn.station) for _, turn in channel.turns[:9]]
+    assert kinds == [(kind, n) for kind in (Ordered, Synchronisation, Poll) for n in (1, 2, 3)]
+    assert channel.of(Ordered)[0][1]._order.to_bytes() == b"n14"
+    assert [turn._cycles for _, turn in channel.of(Synchronisation)[:3]] == [50, 50, 50]
+
+
+def test_three_stations_get_the_rate_that_the_air_allows() -> None:
+    """Round robin; synchronisations take less than a twentieth of the time."""
+    channel = Channel()
+    channel.run(700)
+    for station in (1, 2, 3):
+        assert channel.rate_hz(station, 100) == pytest.approx(SECOND / POLL_NS / 3, rel=0.05)
+    assert all(turn.station == place % 3 + 1 for place, (_, turn) in enumerate(channel.turns))
+
+
+def test_synchronisations_are_staggered_evenly() -> None:
+    """After the first minutes each station has its own every 300 s, 100 s after the one before it."""
+    channel = Channel()
+    channel.run(3000)
+    later = [(at, turn.station) for at, turn in channel.of(Synchronisation, since_s=700)]
+    assert [turn._cycles for _, turn in channel.of(Synchronisation, since_s=100)] == [5] * len(
+        channel.of(Synchronisation, since_s=100)
+    )
+    for (one_ns, one), (other_ns, other) in pairwise(later):
+        assert (other_ns - one_ns) / SECOND == pytest.approx(100, abs=2)
+        assert other == one % 3 + 1
+
+
+def test_early_synchronisations_leave_time_for_polls_between_them() -> None:
+    """Stations that were first synchronised one after the other do not take the channel together again."""
+    channel = Channel(Cadence(initial_cycles=5, resync_cycles=5, interval_ns=300 * SECOND))
+    channel.run(300)
+    starts_ns = [at for at, _ in channel.of(Synchronisation, since_s=10)]
+    assert min(b - a for a, b in pairwise(starts_ns)) > 5 * SECOND
+
+
+def test_a_dead_station_costs_the_others_little() -> None:
+    """It gets a twentieth of the time; the others are polled more often than with it alive."""
+    channel = Channel()
+    channel.run(120)
+    channel.dead.add(3)
+    spent_ns = channel.spent_ns[3]
+    channel.run(150)
+    channel.run(1350)
+    assert (channel.spent_ns[3] - spent_ns) / (1230 * SECOND) < 0.055
+    two_alone_hz = SECOND / POLL_NS / 2
+    assert channel.rate_hz(1, 150) > 0.93 * two_alone_hz
+    assert channel.rate_hz(2, 150) > 0.93 * two_alone_hz
+
+
+def test_a_station_that_was_never_there_costs_the_others_little() -> None:
+    """Its first synchronisation fails, and so do the next ones, further and further apart."""
+    channel = Channel(dead={2})
+    channel.run(60)
+    assert not [turn for _, turn in channel.of(Poll) if turn.station == 2]
+    spent_ns = channel.spent_ns[2]
+    channel.run(660)
+    assert (channel.spent_ns[2] - spent_ns) / (600 * SECOND) < 0.055
+    channel.dead.clear()
+    channel.run(720)
+    assert channel.rate_hz(2, 690) > 1.5
+    back = [
+        turn for _, turn in channel.of(Synchronisation, since_s=660) if turn.station == 2 and turn.samples
+    ]
+    assert back[0]._cycles == 5  # the others do not wait 12 s for it
+
+
+@pytest.mark.parametrize(("outage_s", "found_s"), [(0.5, 1.0), (10, 6.0), (300, 25.0)])
+def test_a_station_is_found_again_soon(outage_s: float, found_s: float) -> None:
+    """The longer it was silent the longer it may take; from then on it has its turn in every round."""
+    channel = Channel()
+    channel.run(60)
+    channel.dead.add(1)
+    channel.run(60 + outage_s)
+    channel.dead.clear()
+    channel.run(60 + outage_s + found_s)
+    channel.run(90 + outage_s + found_s)
+    since_s = 60 + outage_s + found_s
+    assert channel.rate_hz(1, since_s) == pytest.approx(channel.rate_hz(2, since_s), rel=0.05)
+
+
+def test_one_lost_packet_costs_no_more_than_itself() -> None:
+    """After a single time-out the station has its next turn in the next round."""
+    channel = Channel()
+    channel.run(60)
+    channel.dead.add(1)
+    channel.run(60.5)
+    channel.dead.clear()
+    channel.run(70)
+    assert [turn.station for _, turn in channel.of(Poll)[-9:]] in (
+        [1, 2, 3] * 3,
+        [2, 3, 1] * 3,
+        [3, 1, 2] * 3,
+    )
+
+
+def test_a_station_that_refuses_to_track_is_told_again_and_never_polled() -> None:
+    """In direct mode a poll would be an order to measure; orders come less and less often."""
+    channel = Channel(refusing={3})
+    channel.run(300)
+    assert not [turn for _, turn in channel.of(Poll) if turn.station == 3]
+    orders_ns = [at for at, turn in channel.of(Ordered) if turn.station == 3]
+    gaps_ns = [b - a for a, b in pairwise(orders_ns[2:])]
+    assert gaps_ns[-1] > 9 * SECOND
+    channel.refusing.clear()
+    channel.run(330)
+    assert [turn for _, turn in channel.of(Poll) if turn.station == 3]
+
+
+def test_a_station_with_another_clock_is_synchronised_before_anything_else() -> None:
+    """Whoever is next in the round waits."""
+    channel = Channel()
+    channel.run(90)
+    channel.scheduler.resynchronise(2, channel.now_ns)
+    channel.run(92)
+    (at_ns, turn), *_ = channel.of(Synchronisation, since_s=90)
+    assert turn.station == 2
+    assert at_ns == next(at for at, _ in channel.turns if at >= 90 * SECOND)
+    channel.run(400)
+    following = [at / SECOND for at, t in channel.of(Synchronisation, since_s=91) if t.station == 2]
+    assert following[0] < 190  # its frequency is learnt anew
+
+
+def test_with_nobody_there_the_channel_rests() -> None:
+    """When every station is left alone there is an instant to wait for."""
+    channel = Channel(stations=1, dead={1})
+    channel.run(600)
+    assert channel.spent_ns[1] < 60 * SECOND
+
+
+def test_a_turn_that_was_broken_off_is_taken_again() -> None:
+    """The radio failed within the first order: the station is told once more in its next turn."""
+    channel = Channel()
+    first = channel.scheduler.next(0)
+    assert isinstance(first, Ordered)
+    channel.run(60)
+    assert [turn.station for _, turn in channel.of(Ordered)] == [2, 3, 1]

@@ -1,0 +1,126 @@
+"""What happens to stations, and is worth an event on the stream. Pure: instants and findings in, events out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from tsgt.master.stream_records import EventRecord
+from tsgt.model import Status
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from tsgt.model import Measurement
+
+LOST_AFTER_NS = 5_000_000_000
+"""A station that has been asked and not heard for this long is lost."""
+
+CLOCK_STEP_NS = 100_000_000
+"""The machine's Unix clock has been stepped when it has left the master's timeline by this much more than before."""
+
+_MEANING = {
+    Status.OK: "measures",
+    Status.LOW_ACCURACY: "measures",
+    Status.ANGLE_ONLY: "measures angles without a distance; the prism may be nearer than 1 m",
+    Status.NO_TARGET: "has no prism, or reports another error",
+    Status.TILT: "is not levelled",
+    Status.WRONG_DISTANCE: "reports a wrong distance; it may be on the wrong prism",
+    Status.ERROR: "reports an error",
+}
+
+
+@dataclass(slots=True)
+class _Station:
+    """What is known of one station."""
+
+    heard_ns: int
+    unanswered: bool = False
+    lost: bool = False
+    refused: bool = False
+    meaning: str = _MEANING[Status.OK]
+
+
+class Alerts:
+    """Turns findings into events, once per change.
+
+    Parameters
+    ----------
+    stations
+        Numbers of the stations.
+    now_ns
+        The present on the master's Unix clock in ns, like all instants here.
+    """
+
+    def __init__(self, stations: Iterable[int], now_ns: int) -> None:
+        self._stations = {station: _Station(now_ns) for station in stations}
+        self._unix_ahead_ns = 0
+
+    def asked(self, station: int, now_ns: int, *, answered: bool) -> list[EventRecord]:
+        """Take note of a turn of a station; tell when it is back."""
+        found = self._stations[station]
+        found.unanswered = not answered
+        if not answered:
+            return []
+        silent_s = (now_ns - found.heard_ns) / 1e9
+        found.heard_ns = now_ns
+        if not found.lost:
+            return []
+        found.lost = False
+        return [_event(now_ns, "station_back", f"answers again after {silent_s:.0f} s", station)]
+
+    def ordered(self, station: int, prism: int, now_ns: int, *, tracks: bool) -> list[EventRecord]:
+        """Take note of whether a station says that it tracks its prism."""
+        found = self._stations[station]
+        if tracks != found.refused:
+            return []
+        found.refused = not tracks
+        if tracks:
+            return [_event(now_ns, "station_tracking", f"now tracks prism {prism}", station)]
+        text = f"does not track prism {prism}; look at its instrument. It is told again, and not polled until it does"
+        return [_event(now_ns, "station_not_tracking", text, station)]
+
+    def stepped(self, station: int, now_ns: int) -> list[EventRecord]:
+        """Tell that a station's clock was found to be another one."""
+        text = "has another clock than before: restarted, or set; its measurements are put on the new one"
+        return [_event(now_ns, "station_clock_stepped", text, station)]
+
+    def measurement(self, measurement: Measurement, now_ns: int) -> list[EventRecord]:
+        """Tell when an instrument reports an error, another one, or none any more."""
+        found = self._stations.get(measurement.station)
+        meaning = _MEANING[measurement.status]
+        if found is None or meaning == found.meaning:
+            return []
+        found.meaning = meaning
+        again = " again" if measurement.status.usable else ""
+        return [_event(now_ns, "instrument_status", f"{meaning}{again}", measurement.station)]
+
+    def tick(self, now_ns: int, *, unix_ns: int) -> list[EventRecord]:
+        """Tell what time alone brings.
+
+        Parameters
+        ----------
+        now_ns
+            The present on the timeline that was fixed at the start.
+        unix_ns
+            The present as the machine's Unix clock shows it.
+        """
+        events = []
+        for number, station in self._stations.items():
+            if station.unanswered and not station.lost and now_ns - station.heard_ns > LOST_AFTER_NS:
+                station.lost = True
+                text = f"not heard for {(now_ns - station.heard_ns) / 1e9:.0f} s"
+                events.append(_event(now_ns, "station_lost", text, number))
+        ahead_ns = unix_ns - now_ns
+        if abs(ahead_ns - self._unix_ahead_ns) > CLOCK_STEP_NS:
+            text = (
+                f"the Unix clock of this computer was set by {(ahead_ns - self._unix_ahead_ns) / 1e9:+.3f} s and is "
+                f"now {ahead_ns / 1e9:+.3f} s from the time of this stream, which goes on as it was"
+            )
+            events.append(EventRecord(stamp_ns=now_ns, event="unix_clock_stepped", message=text))
+            self._unix_ahead_ns = ahead_ns
+        return events
+
+
+def _event(now_ns: int, event: str, text: str, station: int) -> EventRecord:
+    return EventRecord(stamp_ns=now_ns, event=event, message=f"station {station} {text}", station=station)

@@ -1,0 +1,134 @@
+"""The geo-fence: tells when the robot leaves an area, or may have left it, and when it is back.
+
+Pure: poses and instants come in, events go out. A fence is armed by the first valid pose. From then on the robot
+counts as gone in two cases, each of which is enough: its position, at as many standard deviations as configured,
+lies on the wrong side of the boundary; or nobody has known for a while where it is.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Protocol
+
+from tsgt.master.stream_records import EventRecord
+from tsgt.polygon import contains, distance_to_edge, edges
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from tsgt.master.stream_records import PoseRecord
+    from tsgt.polygon import Point
+
+
+class FenceSettings(Protocol):
+    """What a fence needs to know: ``tsgt.config.GeofenceConfig`` in its units, which this core may not import."""
+
+    @property
+    def name(self) -> str:
+        """Its name in events."""
+
+    @property
+    def keep(self) -> str:
+        """``inside`` or ``outside``: where the robot belongs."""
+
+    @property
+    def polygon_m(self) -> Sequence[Point]:
+        """Corners [x, y] in order, in the frame ``station1``; a simple polygon."""
+
+    @property
+    def margin_m(self) -> float:
+        """The robot has to stay this far on the right side."""
+
+    @property
+    def sigmas(self) -> float:
+        """How many standard deviations of the position count."""
+
+    @property
+    def hysteresis_m(self) -> float:
+        """It is back only this much further on the right side."""
+
+    @property
+    def lost_after_s(self) -> float:
+        """No valid pose for this long counts as leaving."""
+
+
+class Geofence:
+    """Watches one area.
+
+    Parameters
+    ----------
+    settings
+        The area and its limits.
+    """
+
+    def __init__(self, settings: FenceSettings) -> None:
+        self.name = settings.name
+        self._settings = settings
+        self._edges = edges(settings.polygon_m)
+        self._lost_after_ns = round(settings.lost_after_s * 1e9)
+        self._last_valid_ns: int | None = None
+        self._beyond = False
+        self._lost = False
+
+    def pose(self, record: PoseRecord, now_ns: int) -> list[EventRecord]:
+        """Take a pose, valid or not, that came out at ``now_ns``; return what it changed."""
+        events = self.tick(now_ns)
+        if not record.valid or record.position_m is None or record.covariance is None:
+            return events
+        self._last_valid_ns = now_ns
+        gone_before = self._beyond or self._lost
+        x, y, _ = record.position_m
+        spare_m = self._spare_m((x, y), record.covariance)
+        self._beyond = spare_m < (self._settings.hysteresis_m if self._beyond else 0.0)
+        self._lost = False
+        if self._beyond == gone_before:
+            return events
+        what = f"{abs(spare_m):.2f} m {'beyond' if spare_m < 0 else 'within'} its limit at x {x:.2f}, y {y:.2f} m"
+        if self._beyond:
+            return [
+                *events,
+                self._event(now_ns, "fence_left", f"fence {self.name} left: the robot is {what}"),
+            ]
+        return [
+            *events,
+            self._event(now_ns, "fence_entered", f"fence {self.name} entered: the robot is {what}"),
+        ]
+
+    def tick(self, now_ns: int) -> list[EventRecord]:
+        """Notice that no valid pose has come for too long."""
+        deadline_ns = self.next_deadline_ns()
+        if deadline_ns is None or now_ns < deadline_ns:
+            return []
+        self._lost = True
+        if self._beyond:
+            return []
+        message = f"fence {self.name} left: no valid pose for {self._settings.lost_after_s:g} s"
+        return [self._event(now_ns, "fence_left", message)]
+
+    def next_deadline_ns(self) -> int | None:
+        """Return when :meth:`tick` is to be called if no valid pose comes before; None while nothing runs out."""
+        if self._last_valid_ns is None or self._lost:
+            return None
+        return self._last_valid_ns + self._lost_after_ns
+
+    def _spare_m(self, point: Point, covariance: Sequence[float]) -> float:
+        """Return how far the robot may still go, at the stated number of standard deviations; negative: beyond.
+
+        Every edge counts with the uncertainty in its own direction: one further off is the nearer one if the
+        position is poor that way.
+        """
+        xx, xy, _, _, _, _, _, yy, *_ = covariance
+        ways = [
+            (distance, self._settings.sigmas * math.sqrt(max(u * u * xx + 2 * u * v * xy + v * v * yy, 0.0)))
+            for distance, (u, v) in (distance_to_edge(point, edge) for edge in self._edges)
+        ]
+        on_right_side = contains(self._settings.polygon_m, point) == (self._settings.keep == "inside")
+        spare_m = (
+            min(d - unsure for d, unsure in ways) if on_right_side else -min(d + unsure for d, unsure in ways)
+        )
+        return spare_m - self._settings.margin_m
+
+    @staticmethod
+    def _event(now_ns: int, event: str, message: str) -> EventRecord:
+        # Stamped when it is noticed, not with the pose: a replay puts it after the poses that were due by then.
+        return EventRecord(stamp_ns=now_ns, event=event, message=message)

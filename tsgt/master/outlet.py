@@ -1,0 +1,106 @@
+"""Everything that leaves the master, in one order: to the readers of the stream, into the recording, to the watchers.
+
+What a line says of an instant stands behind all poses that were due by then. A replay makes the same calls with the
+same instants, so it gives the same lines bit for bit.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Protocol
+
+from tsgt.master.feed import Feed
+from tsgt.master.stream_records import EventRecord, PoseRecord
+from tsgt.model import PolarMeasurement
+from tsgt.recording import encode_line
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from tsgt.master.monitor import Monitor
+    from tsgt.master.stream_records import ClockRecord, StatusRecord
+    from tsgt.model import Measurement, Parameters
+
+
+class Watcher(Protocol):
+    """Looks at what goes out, and may have an event to add."""
+
+    def pose(self, record: PoseRecord, now_ns: int) -> Sequence[EventRecord]:
+        """Take a pose that came out at an instant."""
+        ...
+
+    def tick(self, now_ns: int) -> Sequence[EventRecord]:
+        """Notice what time alone has brought."""
+        ...
+
+    def next_deadline_ns(self) -> int | None:
+        """Return when :meth:`tick` has to be called; None while nothing runs out."""
+        ...
+
+
+class Outlet:
+    """Turns what happens into lines, puts them in order and hands them out.
+
+    Parameters
+    ----------
+    parameters
+        Stations, prisms and limits in force.
+    monitor
+        Counts what goes out.
+    watchers
+        Asked about each pose.
+    hand_out
+        Takes each record with its line.
+    """
+
+    def __init__(
+        self,
+        parameters: Parameters,
+        monitor: Monitor,
+        watchers: Sequence[Watcher],
+        hand_out: Callable[[object, bytes], None],
+    ) -> None:
+        self._feed = Feed(parameters)
+        self._monitor = monitor
+        self._watchers = watchers
+        self._hand_out = hand_out
+        self._changed = asyncio.Event()
+
+    def measurement(self, measurement: Measurement) -> None:
+        """Send a measurement, and the poses that it completes."""
+        self._send(self._feed.measurement(measurement), measurement.received_ns)
+
+    def put(self, record: StatusRecord | EventRecord | ClockRecord) -> None:
+        """Send a record in its place, after the poses that are due by its stamp."""
+        self._send([*self._feed.advance(record.stamp_ns), record], record.stamp_ns)
+
+    def advance(self, now_ns: int) -> None:
+        """Send the poses that are due by now, and what the watchers make of the time."""
+        self._send(self._feed.advance(now_ns), now_ns)
+        for watcher in self._watchers:
+            for event in watcher.tick(now_ns):
+                self.put(event)
+
+    def next_deadline_ns(self) -> int | None:
+        """Return when :meth:`advance` has to be called if nothing happens before."""
+        deadlines_ns = [self._feed.next_deadline_ns(), *(w.next_deadline_ns() for w in self._watchers)]
+        return min((deadline_ns for deadline_ns in deadlines_ns if deadline_ns is not None), default=None)
+
+    async def changed(self) -> None:
+        """Return when something has been sent since the last call, so that the next deadline may be another."""
+        await self._changed.wait()
+        self._changed.clear()
+
+    def _send(self, records: Sequence[object], now_ns: int) -> None:
+        events: list[EventRecord] = []
+        for record in records:
+            self._hand_out(record, encode_line(record))
+            if isinstance(record, PoseRecord):
+                self._monitor.pose(valid=record.valid)
+                for watcher in self._watchers:
+                    events += watcher.pose(record, now_ns)
+            elif isinstance(record, PolarMeasurement):
+                self._monitor.measurement(record)
+        for event in events:
+            self.put(event)
+        self._changed.set()

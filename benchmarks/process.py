@@ -7,6 +7,7 @@ alone costs, and what reading every line of the file with the standard library's
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import subprocess
@@ -14,12 +15,24 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
+from itertools import chain
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from tsgt.config import ScenarioConfig
+import numpy as np
+
+from tsgt.config import ScenarioConfig, scenario_parameters
 from tsgt.master.pipeline import Pipeline
 from tsgt.recording import RecordingHeader, RecordingWriter
-from tsgt.simulation.demo import play
+from tsgt.simulation.clocks import VirtualClock
+from tsgt.simulation.event_loop import run_virtual
+from tsgt.simulation.instrument import SimulatedInstrument
+from tsgt.simulation.world import scenario_world
+from tsgt.station.session import Session
+
+if TYPE_CHECKING:
+    from tsgt.config.scenario import SimulatedStation
+    from tsgt.model import PolarMeasurement
 
 DURATION_S = 3600
 START_NS = 1_700_000_000_000_000_000
@@ -52,17 +65,39 @@ def main() -> None:
 
 def write_recording(path: Path) -> int:
     """Write the hour as a master would have; return the number of measurements."""
-    run = play(ScenarioConfig(), duration_s=DURATION_S, seed=1, start_ns=START_NS)
-    pipeline = Pipeline(run.parameters)
+    scenario = ScenarioConfig()
+    parameters = scenario_parameters(scenario)
+    measurements = sorted(run_virtual(lambda: measured(scenario)), key=lambda m: m.stamp_ns)
+    pipeline = Pipeline(parameters)
     with RecordingWriter(path) as writer:
         writer.write(RecordingHeader(software="benchmark", created_ns=START_NS, source="simulation"))
-        writer.write(run.parameters)
-        for measurement in run.measurements:
+        writer.write(parameters)
+        for measurement in measurements:
             pipeline.add(measurement)
             writer.write(measurement)
-        for pose in pipeline.advance(run.end_ns).records():
+        for pose in pipeline.advance(START_NS + DURATION_S * 1_000_000_000).records():
             writer.write(pose)
-    return len(run.measurements)
+    return len(measurements)
+
+
+async def measured(scenario: ScenarioConfig) -> list[PolarMeasurement]:
+    """Let all stations of a scenario track their prisms for the hour."""
+    world_rng, *rngs = np.random.default_rng(1).spawn(1 + len(scenario.stations))
+    world, clock = scenario_world(scenario, DURATION_S, world_rng), VirtualClock(START_NS)
+
+    async def one(station: SimulatedStation, rng: np.random.Generator) -> list[PolarMeasurement]:
+        instrument = SimulatedInstrument(station, scenario, world, clock, rng)
+        await instrument.connect()
+        await instrument.track(station.prism)
+        session = Session(station.station, station.prism)
+        readings = []
+        while clock.monotonic_ns() < DURATION_S * 1_000_000_000:
+            reading = await instrument.read()
+            readings.append(session.measured(reading, START_NS + reading.at_ns))
+        return readings
+
+    stations = zip(scenario.stations, rngs, strict=True)
+    return list(chain.from_iterable(await asyncio.gather(*(one(station, rng) for station, rng in stations))))
 
 
 def best(*arguments: str) -> tuple[float, float]:

@@ -12,6 +12,7 @@
     ├── GeometryError          numbers that no geometry can be computed from
     │   └── DegenerateGeometryError  points that coincide or lie in a line
     ├── StreamError            a socket of ours cannot be opened or reached
+    ├── InstrumentError        the total station does not do what it was told, or is gone
     └── RadioError             the radio does not do what it was told
         ├── RadioSettingsError     it was told something that it cannot do
         ├── RadioNotFoundError     there is none: wiring, pins, SPI
@@ -87,6 +88,10 @@ class DegenerateGeometryError(GeometryError):
 
 class StreamError(TsgtError, OSError):
     """A socket (poses, simulated air) cannot be opened or reached: it is in use, or nobody serves it."""
+
+
+class InstrumentError(TsgtError):
+    """The total station does not do what it was told: unplugged, switched off, no target, garbage on the line."""
 
 
 class RadioError(TsgtError):

@@ -194,6 +194,36 @@ Measurement = PolarMeasurement | PointMeasurement
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ClockSample:
+    """One two-way exchange with a station, from which its clock is judged.
+
+    Attributes
+    ----------
+    sent_ns
+        When the request began on the air, on the master's Unix clock in ns.
+    station_ns
+        The station's stamp of the request's reception, on the station's clock in ns.
+    received_ns
+        When the reply was received (RxDone), on the master's Unix clock in ns.
+    forward_ns
+        What the way out takes at least, known beforehand: from ``sent_ns`` to the station's stamp, in ns.
+    back_ns
+        What the way back takes at least, known beforehand: from the station's stamp to ``received_ns``, in ns.
+    """
+
+    sent_ns: int
+    station_ns: int
+    received_ns: int
+    forward_ns: int
+    back_ns: int
+
+    @property
+    def excess_ns(self) -> int:
+        """What the round trip took beyond what is known; the station's stamp may be late by at most this."""
+        return self.received_ns - self.sent_ns - self.forward_ns - self.back_ns
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class InstrumentNoise:
     """One-sigma noise of a total station's single measurement, in the form of its data sheet.
 

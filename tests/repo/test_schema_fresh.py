@@ -8,6 +8,7 @@ from typing import Any, Literal
 import pytest
 from jsonschema import Draft202012Validator
 from support.records import (
+    CLOCK,
     EVENT,
     HEADER,
     HELLO,
@@ -23,7 +24,7 @@ from tsgt.master import schema
 from tsgt.recording import encode_line
 
 ROOT = Path(__file__).parents[2]
-RECORDS = [HELLO, measurement(0), POINT, POSE, NO_POSE, STATUS, EVENT, HEADER, PARAMETERS]
+RECORDS = [HELLO, measurement(0), POINT, POSE, NO_POSE, CLOCK, STATUS, EVENT, HEADER, PARAMETERS]
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from tsgt.master.stream_records import (
+    ClockRecord,
     EventRecord,
     HelloRecord,
     PoseRecord,
@@ -11,6 +12,7 @@ from tsgt.master.stream_records import (
     StatusRecord,
 )
 from tsgt.model import (
+    ClockSample,
     Parameters,
     PointMeasurement,
     PolarMeasurement,
@@ -71,6 +73,26 @@ STATUS = StatusRecord(
         StationStatus(id=1, measurements=5, usable=4, age_s=0.2, status=Status.OK),
         StationStatus(id=2, measurements=0, usable=0, age_s=None, status=None),
     ),
+)
+CLOCK = ClockRecord(
+    stamp_ns=START + 2 * SECOND,
+    station=2,
+    filter="regression",
+    offset_ns=-7_200_000_123_456,
+    frequency_ppm=9.7,
+    sigma_ns=25_000,
+    bound_ns=310_000,
+    restarted=True,
+    samples=(
+        ClockSample(
+            sent_ns=START + SECOND,
+            station_ns=START - 7199 * SECOND,
+            received_ns=START + SECOND + 111_000_000,
+            forward_ns=55_300_000,
+            back_ns=55_300_000,
+        ),
+    ),
+    rejected=0,
 )
 EVENT = EventRecord(stamp_ns=START + 3 * SECOND, event="lines_lost", message="lost 7 lines", count=7)
 

@@ -55,7 +55,7 @@ def solve_stations(
         Repeated measurements of one target contradict each other, or a constant exceeds a distance.
     """
     points = {
-        station: _points(file.path, targets, target_constant_m, f"target {{}} of station {station}")
+        station: mean_points(file.path, targets, target_constant_m, f"target {{}} of station {station}")
         for station, targets in file.sights.items()
     }
     frames: dict[int, FrameCalibration] = {}
@@ -93,8 +93,8 @@ def solve_prisms(file: PrismFile, *, target_constant_m: float, prism_constant_m:
     InputFileError
         Repeated measurements of one point contradict each other, or a constant exceeds a distance.
     """
-    body = _points(file.path, file.body, target_constant_m, "body point {}")
-    prisms = _points(file.path, file.prisms, prism_constant_m, "prism {}")
+    body = mean_points(file.path, file.body, target_constant_m, "body point {}")
+    prisms = mean_points(file.path, file.prisms, prism_constant_m, "prism {}")
     cad = PointSet(
         names=tuple(file.cad_m),
         points_m=np.array(list(file.cad_m.values())),
@@ -109,13 +109,30 @@ def solve_prisms(file: PrismFile, *, target_constant_m: float, prism_constant_m:
     return solved
 
 
-def _points(
+def mean_points(
     path: Path,
     measured: Mapping[int, Sequence[Sight]] | Mapping[str, Sequence[Sight]],
     constant_m: float,
     what: str,
 ) -> PointSet:
-    """Mean position of each target in the frame of the station, with its covariance."""
+    """Return the mean position of each target in the frame of the station, with its covariance.
+
+    Parameters
+    ----------
+    path
+        Where the measurements come from, for messages.
+    measured
+        By name of the target: its measurements, at least one.
+    constant_m
+        Added to the slope distances that have no constant of their own, in m.
+    what
+        How to call a target in messages, with ``{}`` for its name.
+
+    Raises
+    ------
+    InputFileError
+        Repeated measurements of one target contradict each other, or a constant exceeds a distance.
+    """
     names: list[Name] = []
     points, covariances = [], []
     for name, sights in measured.items():

@@ -115,6 +115,24 @@ def read_target_file(path: Path) -> TargetFile:
     InputFileError
         The file cannot be read, is empty, has a wrong column or number, or a station is missing.
     """
+    file = read_some_targets(path)
+    if 1 not in file.sights:
+        raise InputFileError(
+            "holds no usable target of station 1, whose frame is the world; add them", path=path
+        )
+    if len(file.sights) == 1:
+        raise InputFileError("holds targets of station 1 only; add those of the other stations", path=path)
+    return file
+
+
+def read_some_targets(path: Path) -> TargetFile:
+    """Read a file of targets as :func:`read_target_file` does, whichever stations it holds.
+
+    Raises
+    ------
+    InputFileError
+        The file cannot be read, is empty, or has a wrong column or number.
+    """
     header, rows = _table(path)
     sights: dict[int, dict[int, list[Sight]]] = {}
     skipped: list[str] = []
@@ -132,12 +150,6 @@ def read_target_file(path: Path) -> TargetFile:
             continue
         sight = row.sight("azimuth", "elevation", "distance") if is_marker_file else row.sight()
         sights.setdefault(station, {}).setdefault(target, []).append(sight)
-    if 1 not in sights:
-        raise InputFileError(
-            "holds no usable target of station 1, whose frame is the world; add them", path=path
-        )
-    if len(sights) == 1:
-        raise InputFileError("holds targets of station 1 only; add those of the other stations", path=path)
     return TargetFile(path, dict(sorted(sights.items())), tuple(skipped))
 
 

@@ -1,4 +1,4 @@
-"""The commands ``tsgt calibrate targets`` and ``tsgt calibrate prisms``."""
+"""The group ``tsgt calibrate``, with the commands that solve: ``targets`` and ``prisms``."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ import numpy as np
 from tsgt.analysis.calibration import solve_prisms, solve_stations
 from tsgt.analysis.setup_files import write_prism_layout, write_station_frames
 from tsgt.analysis.target_file import read_prism_file, read_target_file
+from tsgt.cli.check import check
+from tsgt.cli.collect import collect
 from tsgt.cli.options import finite, json_option
 from tsgt.cli.output import CHECK_FAILED, print_json, print_table
 from tsgt.cli.recordings import refuse_to_replace
@@ -42,6 +44,10 @@ output_option = click.option(
 @click.group()
 def calibrate() -> None:
     """Find where the stations stand and where the prisms sit."""
+
+
+calibrate.add_command(collect)
+calibrate.add_command(check)
 
 
 @calibrate.command()

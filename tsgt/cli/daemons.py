@@ -1,4 +1,4 @@
-"""Entry points of the daemons, which wait for the radio link: until then they say so, and the master checks."""
+"""Entry points of the daemons: each puts its parts together as its configuration says, and runs them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import NoReturn
 import click
 
 from tsgt.cli.main import HELP_OPTIONS, run
-from tsgt.errors import TsgtError
 
 _config_option = click.option(
     "--config", "config_path", type=click.Path(path_type=Path), required=True, help="Configuration, TOML."
@@ -18,26 +17,46 @@ _config_option = click.option(
 @click.command("tsgt-client", context_settings=HELP_OPTIONS)
 @_config_option
 def client(config_path: Path) -> None:
-    """Read the total station beside this computer and answer the master over the radio (not in this release)."""
-    raise TsgtError(
-        f"{config_path}: this release has no instrument driver and no radio link, so there is no station client "
-        "to start; see CHANGELOG.md"
-    )
+    """Read the total station beside this computer, journal it, and answer the master over the radio.
+
+    Runs until SIGTERM or Ctrl-C. Instrument, radio and disk may fail and come back meanwhile.
+    """
+    # Only here, as `--help` needs none of it.
+    from tsgt import service  # noqa: PLC0415
+    from tsgt.cli.composition import make_instrument, radio_opener  # noqa: PLC0415
+    from tsgt.clock import SystemClock  # noqa: PLC0415
+    from tsgt.config import ClientConfig, load  # noqa: PLC0415
+    from tsgt.radio.from_config import lora_settings  # noqa: PLC0415
+    from tsgt.station.daemon import run_client  # noqa: PLC0415
+
+    config = load(config_path, ClientConfig)
+    clock = SystemClock()
+    open_radio = radio_opener(config.radio, lora_settings(config.radio, config_path), clock)
+    instrument = make_instrument(config.instrument)
+    service.run(lambda: run_client(config, instrument=instrument, open_radio=open_radio, clock=clock))
 
 
 @click.command("tsgt-master", context_settings=HELP_OPTIONS)
 @_config_option
 def master(config_path: Path) -> None:
-    """Collect the stations' measurements over the radio and stream poses (in this release: only check its file)."""
-    # Only here, as `--help` needs none of it.
-    from tsgt.config import MasterConfig, load, parameters  # noqa: PLC0415
-    from tsgt.master.pipeline import Pipeline  # noqa: PLC0415
+    """Collect the stations' measurements over the radio, and stream and record poses.
 
-    Pipeline(parameters(load(config_path, MasterConfig)))
-    raise TsgtError(
-        f"{config_path}: the configuration is good, but this release has no radio link to collect from; "
-        "`tsgt demo` and `tsgt replay` run the same pipeline and stream"
-    )
+    Runs until SIGTERM or Ctrl-C. Stations, radio and disk may fail and come back meanwhile.
+    """
+    # Only here, as `--help` needs none of it.
+    from tsgt import service  # noqa: PLC0415
+    from tsgt.cli.composition import radio_opener  # noqa: PLC0415
+    from tsgt.clock import SystemClock  # noqa: PLC0415
+    from tsgt.config import MasterConfig, load, parameters  # noqa: PLC0415
+    from tsgt.master.daemon import run_master  # noqa: PLC0415
+    from tsgt.radio.from_config import lora_settings  # noqa: PLC0415
+
+    config = load(config_path, MasterConfig)
+    in_force = parameters(config)
+    settings = lora_settings(config.radio, config_path)
+    clock = SystemClock()
+    open_radio = radio_opener(config.radio, settings, clock)
+    service.run(lambda: run_master(config, in_force, settings, open_radio=open_radio, clock=clock))
 
 
 def main_client() -> NoReturn:

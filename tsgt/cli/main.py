@@ -29,6 +29,8 @@ COMMANDS = {
     "process": "tsgt.cli.desk:process",
     "radio": "tsgt.cli.radio:radio",
     "replay": "tsgt.cli.live:replay",
+    "status": "tsgt.cli.status:status",
+    "simulate": "tsgt.cli.simulate:simulate_command",
 }
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 DEFAULT_SOCKET = Path("/run/tsgt/poses.sock")
+DEFAULT_CLIENT_SOCKET = Path("/run/tsgt/client.sock")
 
 path_type = click.Path(path_type=Path)
 
@@ -46,3 +47,7 @@ keep_going_option = click.option(
 )
 
 recording_argument = click.argument("recording", type=path_type)
+
+master_config_option = click.option(
+    "--config", "config_path", type=path_type, required=True, help="Configuration of the master, TOML."
+)

@@ -6,7 +6,15 @@ import math
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-from tsgt.master.stream_records import PROTOCOL_VERSION, EventRecord, HelloRecord, PoseRecord, StatusRecord
+from tsgt.master.stream_records import (
+    PROTOCOL_VERSION,
+    ClockRecord,
+    EventRecord,
+    HelloRecord,
+    PoseRecord,
+    StationStatus,
+    StatusRecord,
+)
 from tsgt.model import PointMeasurement, PolarMeasurement
 from tsgt.recording import decode
 
@@ -43,11 +51,13 @@ def render(kind: str, line: bytes) -> str | None:
             return _point(decode(PointMeasurement, line))
         case "pose":
             return _pose(decode(PoseRecord, line))
+        case "clock":
+            return _clock(decode(ClockRecord, line))
         case "status":
             return _status(decode(StatusRecord, line))
         case "event":
             event = decode(EventRecord, line)
-            return f"{_time(event.stamp_ns)}  event {event.event}: {event.message}"
+            return f"{clock_time(event.stamp_ns)}  event {event.event}: {event.message}"
         case _:
             return None
 
@@ -62,7 +72,7 @@ def _hello(hello: HelloRecord) -> str:
 def _polar(polar: PolarMeasurement) -> str:
     distance = "no distance" if polar.slope_distance_m is None else f"{polar.slope_distance_m:.4f} m"
     return (
-        f"{_time(polar.stamp_ns)}  station {polar.station} prism {polar.prism}  "
+        f"{clock_time(polar.stamp_ns)}  station {polar.station} prism {polar.prism}  "
         f"horizontal {math.degrees(polar.horizontal_angle_rad):.4f} deg  "
         f"zenith {math.degrees(polar.zenith_angle_rad):.4f} deg  {distance}  {polar.status}"
     )
@@ -70,13 +80,13 @@ def _polar(polar: PolarMeasurement) -> str:
 
 def _point(point: PointMeasurement) -> str:
     return (
-        f"{_time(point.stamp_ns)}  station {point.station} prism {point.prism}  "
+        f"{clock_time(point.stamp_ns)}  station {point.station} prism {point.prism}  "
         f"{_vector(point.position_m)} m  {point.status}"
     )
 
 
 def _pose(pose: PoseRecord) -> str:
-    parts = [_time(pose.stamp_ns), "pose", "valid" if pose.valid else f"invalid ({pose.reason})"]
+    parts = [clock_time(pose.stamp_ns), "pose", "valid" if pose.valid else f"invalid ({pose.reason})"]
     if pose.position_m is not None and pose.orientation_xyzw is not None:
         yaw, pitch, roll = yaw_pitch_roll_deg(pose.orientation_xyzw)
         parts.append(f"{_vector(pose.position_m)} m")
@@ -88,17 +98,45 @@ def _pose(pose: PoseRecord) -> str:
     return "  ".join(parts)
 
 
-def _status(status: StatusRecord) -> str:
-    stations = "; ".join(
-        f"station {s.id}: {s.usable} of {s.measurements} usable, last {s.status} {_age(s.age_s)} ago"
-        if s.status
-        else f"station {s.id}: no measurement yet"
-        for s in status.stations
+def _clock(clock: ClockRecord) -> str:
+    # Of a clock that was never set the microseconds are of no use beside the years, but nor do they harm.
+    side = "ahead of" if clock.offset_ns >= 0 else "behind"
+    return (
+        f"{clock_time(clock.stamp_ns)}  clock of station {clock.station} is {abs(clock.offset_ns) / 1e9:.6f} s {side} the "
+        f"master's, within {clock.bound_ns / 1e6:.3f} ms, {clock.frequency_ppm:+.2f} ppm; "
+        f"{len(clock.samples) - clock.rejected} of {len(clock.samples)} exchanges used ({clock.filter})"
+        f"{', begun anew' if clock.restarted else ''}"
     )
-    return f"{_time(status.stamp_ns)}  status  {status.valid_poses} of {status.poses} poses valid; {stations}"
 
 
-def _time(stamp_ns: int) -> str:
+def _status(status: StatusRecord) -> str:
+    stations = "; ".join(map(_station, status.stations))
+    return f"{clock_time(status.stamp_ns)}  status  {status.valid_poses} of {status.poses} poses valid; {stations}"
+
+
+def _station(station: StationStatus) -> str:
+    if station.status is None:
+        parts = ["no measurement yet"]
+    else:
+        parts = [
+            f"{station.usable} of {station.measurements} usable",
+            f"last {station.status} {_age(station.age_s)} ago",
+        ]
+    if station.last_heard_s is not None:
+        parts.append(f"heard {_age(station.last_heard_s)} ago")
+    if station.rate_hz is not None:
+        parts.append(f"{station.rate_hz:.1f} Hz")
+    if station.loss is not None:
+        parts.append(f"{100 * station.loss:.0f} % lost")
+    if station.rssi_dbm is not None and station.snr_db is not None:
+        parts.append(f"{station.rssi_dbm:.0f} dBm, SNR {station.snr_db:.0f} dB")
+    if station.clock_bound_ns is not None:
+        parts.append(f"clock within {station.clock_bound_ns / 1e6:.1f} ms")
+    return f"station {station.id}: {', '.join(parts)}"
+
+
+def clock_time(stamp_ns: int) -> str:
+    """Write the time of day in UTC, to the millisecond; seconds for a time that no calendar has."""
     seconds, rest_ns = divmod(stamp_ns, 1_000_000_000)
     try:
         text = datetime.fromtimestamp(seconds, tz=UTC).strftime("%H:%M:%S")

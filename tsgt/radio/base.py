@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -163,3 +165,8 @@ class Radio(Protocol):
     async def close(self) -> None:
         """Fall silent and let go of the hardware; tasks that wait in :meth:`receive` are not woken."""
         ...
+
+
+OpenRadio = Callable[[], AbstractAsyncContextManager[Radio]]
+"""Makes a context that holds a radio which is set up and receives; entering raises :class:`RadioError`, or
+:class:`StreamError` for a simulated radio without its air."""

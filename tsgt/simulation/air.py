@@ -74,12 +74,15 @@ class Air:
     ----------
     frames
         Those on the air, and those that overlapped one whose reception is not decided yet.
+    airtime_ns
+        Of all frames together, in ns.
     """
 
     def __init__(self, timeline: Timeline, rng: np.random.Generator, link: LinkModel) -> None:
         self.timeline = timeline
         self.link = link
         self.frames: list[OnAir] = []
+        self.airtime_ns = 0
         self._seed = int(rng.integers(2**63))
         self._sent: Counter[str] = Counter()
         self._radios: dict[str, Transceiver] = {}
@@ -117,6 +120,7 @@ class Air:
         """Put a frame on the air, for all but its sender."""
         self._forget()
         self._sent[sender.name] += 1
+        self.airtime_ns += frame.end_ns - frame.start_ns
         on_air = OnAir(frame, sender, self._sent[sender.name])
         self.frames.append(on_air)
         for radio in self._radios.values():

@@ -1,132 +1,160 @@
-"""The demonstration: a scenario in real time, its measurements through the live pipeline."""
+"""The demonstration: the real daemons as processes, with air, instruments and robot simulated in this one.
+
+Everything that the daemons touch outside themselves is real: sockets, files, signals, time. Radios and instruments
+are simulated, and reached over UNIX sockets; so a daemon can be killed and started again like one in the field.
+"""
 
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass
+from contextlib import AsyncExitStack, suppress
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.config import scenario_parameters
-from tsgt.master.feed import Feed
-from tsgt.master.monitor import Monitor
-from tsgt.master.stream_records import PoseRecord
-from tsgt.simulation.stations import simulated_measurements
-from tsgt.simulation.world import World
+from tsgt.errors import StreamError
+from tsgt.simulation.air_server import AirServer
+from tsgt.simulation.instrument import SimulatedInstrument
+from tsgt.simulation.instrument_socket import InstrumentServer
+from tsgt.simulation.mission import scenario_link
+from tsgt.simulation.processes import Process
+from tsgt.simulation.world import scenario_world
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import Callable
 
-    from tsgt.clock import Clock, UnixTimeline
+    from tsgt.clock import Clock
     from tsgt.config import ScenarioConfig
-    from tsgt.master.stream_records import StatusRecord
-    from tsgt.model import Measurement, Parameters, PolarMeasurement
+    from tsgt.simulation.demo_files import DemoFiles
+    from tsgt.simulation.link import LinkModel
 
-STATUS_PERIOD_NS = 1_000_000_000
+STARTUP_LIMIT_S = 60.0
+"""From the start of the daemons to the first pose; a slow machine takes five seconds."""
+
+_MAX_LINE_BYTES = 1 << 20
+_RECONNECT_S = 0.2
+_LAST_LINES_S = 2.0
 
 
-@dataclass(frozen=True, slots=True)
-class Run:
-    """A scenario played from start to end: the truth, and what the master gets of it.
+class Demo:
+    """A scenario in real time.
+
+    Parameters
+    ----------
+    scenario
+        World, stations and prisms.
+    files
+        Configuration of the daemons, written already.
+    duration_s
+        From the first pose to the end.
+    seed
+        Of everything that is drawn.
+    clock
+        CLOCK_MONOTONIC of this machine, which all processes share.
 
     Attributes
     ----------
     world
-        The truth; its instants count from the start of the run.
-    parameters
-        What the master knows of the set-up.
-    measurements
-        All of them, in the order of arrival.
-    start_ns, end_ns
-        Unix time in ns.
+        The truth; its zero is ``start_ns``.
+    start_ns
+        CLOCK_MONOTONIC at the start of the world, in ns.
+    processes
+        The daemons: the clients in the order of the stations, then the master.
     """
 
-    world: World
-    parameters: Parameters
-    measurements: list[PolarMeasurement]
-    start_ns: int
-    end_ns: int
+    def __init__(
+        self, scenario: ScenarioConfig, files: DemoFiles, *, duration_s: float, seed: int, clock: Clock
+    ) -> None:
+        self._scenario = scenario
+        self._files = files
+        self._duration_s = duration_s
+        self._clock = clock
+        world_rng, self._air_rng, *self._instrument_rngs = np.random.default_rng(seed).spawn(
+            2 + len(scenario.stations)
+        )
+        self.world = scenario_world(scenario, duration_s + STARTUP_LIMIT_S + 10, world_rng)
+        self.start_ns = clock.monotonic_ns()
+        self.processes = [
+            Process(
+                f"client {station}",
+                "main_client",
+                ("--config", str(files.client_config(station))),
+                files.folder / f"client{station}.log",
+            )
+            for station in files.stations
+        ]
+        self.processes.append(
+            Process(
+                "master",
+                "main_master",
+                ("--config", str(files.master_config)),
+                files.folder / "master.log",
+            )
+        )
+        self._first_pose = asyncio.Event()
+        self._ending = False
 
+    async def run(self, on_line: Callable[[bytes], None]) -> None:
+        """Run to the end, or until cancelled, which ends the daemons in order too.
 
-@dataclass(frozen=True, slots=True)
-class Step:
-    """What one instant of a live run brings.
+        Parameters
+        ----------
+        on_line
+            Gets each line of the master's stream.
 
-    Attributes
-    ----------
-    now_ns
-        The instant, Unix time in ns.
-    records
-        For the stream and the recording, in this order.
-    poses
-        Those among the records.
-    status
-        That among the records, if there is one; the last step has one.
-    """
+        Raises
+        ------
+        StreamError
+            A socket cannot be made, or no pose comes.
+        """
+        async with AsyncExitStack() as stack:
+            await stack.enter_async_context(AirServer(self._files.air_socket, self._link(), self._air_rng))
+            for station, rng in zip(self._scenario.stations, self._instrument_rngs, strict=True):
+                instrument = SimulatedInstrument(
+                    station, self._scenario, self.world, self._clock, rng, start_ns=self.start_ns
+                )
+                path = self._files.instrument_socket(station.station)
+                await stack.enter_async_context(InstrumentServer(path, instrument))
+            tasks = [asyncio.create_task(process.keep_running()) for process in self.processes]
+            reading = asyncio.create_task(self._read(on_line))
+            try:
+                await self._until_the_end()
+            finally:
+                self._ending = True
+                for task in tasks:
+                    task.cancel()
+                await asyncio.wait(tasks)
+                await asyncio.wait([reading], timeout=_LAST_LINES_S)
+                reading.cancel()
+                await asyncio.wait([reading])
 
-    now_ns: int
-    records: list[Measurement | PoseRecord | StatusRecord]
-    poses: list[PoseRecord]
-    status: StatusRecord | None
+    def _link(self) -> LinkModel:
+        """Return the scenario's conditions; the robot's radio stays in the middle of its area."""
+        places = {f"station{s.station}": s.position_m for s in self._scenario.stations}
+        places["master"] = self._scenario.motion.area_centre_m
+        return scenario_link(self._scenario.radio, places, self._air_rng)
 
-
-def play(scenario: ScenarioConfig, *, duration_s: float, seed: int, start_ns: int) -> Run:
-    """Compute a whole run ahead of time; the same seed gives the same run, moved to the start given."""
-    world_generator, station_generator = np.random.default_rng(seed).spawn(2)
-    prisms_m = np.array([prism.position_m for prism in scenario.prisms])
-    world = World(scenario.motion, prisms_m, duration_s, world_generator)
-    return Run(
-        world=world,
-        parameters=scenario_parameters(scenario),
-        measurements=simulated_measurements(scenario, world, station_generator, start_ns=start_ns),
-        start_ns=start_ns,
-        end_ns=start_ns + round(duration_s * 1e9),
-    )
-
-
-async def live(run: Run, clock: Clock, timeline: UnixTimeline) -> AsyncIterator[Step]:
-    """Feed a run to the live pipeline at its own pace.
-
-    Every record belongs to the instant that the run has planned for it, however late the machine is; so the records
-    depend on the run alone, and a replay of the recording gives them again. When cancelled, it closes the run with
-    a last step and ends.
-
-    Parameters
-    ----------
-    run
-        What is to arrive, and when.
-    clock, timeline
-        Set the pace.
-    """
-    feed = Feed(run.parameters)
-    monitor = Monitor(station.station for station in run.parameters.stations)
-    arrivals = iter(run.measurements)
-    arrival = next(arrivals, None)
-    status_ns = run.start_ns + STATUS_PERIOD_NS
-    finished = False
-    while not finished:
-        due_ns = (arrival.received_ns if arrival else None, feed.next_deadline_ns(), status_ns, run.end_ns)
-        now_ns = min(instant for instant in due_ns if instant is not None)
+    async def _until_the_end(self) -> None:
         try:
-            await clock.sleep_until(timeline.monotonic_ns(now_ns))
-            finished = now_ns >= run.end_ns
-        except asyncio.CancelledError:
-            now_ns = min(now_ns, timeline.unix_ns(clock.monotonic_ns()))
-            finished = True
+            async with asyncio.timeout(STARTUP_LIMIT_S):
+                await self._first_pose.wait()
+        except TimeoutError:
+            raise StreamError(
+                f"{self._files.folder}: no pose within {STARTUP_LIMIT_S:g} s; see the logs in this folder"
+            ) from None
+        await asyncio.sleep(self._duration_s)
 
-        records: list[Measurement | PoseRecord | StatusRecord] = []
-        while arrival is not None and arrival.received_ns <= now_ns:
-            records += feed.measurement(arrival)
-            monitor.measurement(arrival)
-            arrival = next(arrivals, None)
-        records += feed.advance(now_ns)
-        poses = [record for record in records if isinstance(record, PoseRecord)]
-        for pose in poses:
-            monitor.pose(valid=pose.valid)
-        status = None
-        if finished or now_ns >= status_ns:
-            status = monitor.status(now_ns)
-            status_ns = now_ns + STATUS_PERIOD_NS
-            records.append(status)
-        yield Step(now_ns, records, poses, status)
+    async def _read(self, on_line: Callable[[bytes], None]) -> None:
+        """Follow the stream, also of a master that was started again, until the end."""
+        while not self._ending:
+            with suppress(OSError):
+                reader, writer = await asyncio.open_unix_connection(self._files.socket, limit=_MAX_LINE_BYTES)
+                try:
+                    while line := await reader.readline():
+                        if line.startswith(b'{"type":"pose"'):
+                            self._first_pose.set()
+                        on_line(line)
+                finally:
+                    writer.close()
+            if not self._ending:
+                await asyncio.sleep(_RECONNECT_S)

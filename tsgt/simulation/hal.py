@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 from tsgt.radio.hal import Edge
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from tsgt.radio.hal import EdgeCallback
     from tsgt.simulation.chip import SX1276Chip
 
@@ -15,7 +17,7 @@ if TYPE_CHECKING:
 class SimulatedHal:
     """A :class:`tsgt.radio.hal.Hal` on a chip in this process; transfers take no time.
 
-    Edges are stamped with the time at which the simulated chip raised the pin, on the chip's timeline.
+    Edges are stamped with the time at which the simulated chip raised the pin.
 
     Parameters
     ----------
@@ -23,10 +25,19 @@ class SimulatedHal:
         What is on the bus.
     stamp_sigma_ns
         What the host claims of its time stamps; the chip's own jitter is in them already.
+    local_ns
+        From the chip's timeline to the host's CLOCK_MONOTONIC; the same unless the host's clock has an error.
     """
 
-    def __init__(self, chip: SX1276Chip, *, stamp_sigma_ns: int = 3_000) -> None:
+    def __init__(
+        self,
+        chip: SX1276Chip,
+        *,
+        stamp_sigma_ns: int = 3_000,
+        local_ns: Callable[[int], int] = int,
+    ) -> None:
         self.stamp_sigma_ns = stamp_sigma_ns
+        self._local_ns = local_ns
         self._chip = chip
         self._edges_to_lose = 0
         self._edges_lost = 0
@@ -55,7 +66,7 @@ class SimulatedHal:
                 self._edges_to_lose -= 1
                 self._edges_lost += self._losses_counted
                 return
-            loop.call_soon(callback, Edge(at_ns, self._edges_lost))
+            loop.call_soon(callback, Edge(self._local_ns(at_ns), self._edges_lost))
             self._edges_lost = 0
 
         self._chip.on_dio(0, changed)

@@ -1,8 +1,8 @@
 """The truth: where the simulated robot and its prisms are at any instant.
 
-The robot gets commands (speed and yaw rate, constant for some seconds), follows them smoothly, and is shaken by the
-ground while it moves. Its motion is computed on a fine grid and joined by cubic splines; the splines *are* the
-truth, so that it can be asked for at any instant and is smooth there.
+The robot gets commands (speed and yaw rate, constant for some seconds) or speeds along a route, follows them
+smoothly, and is shaken by the ground while it moves. Its motion is computed on a fine grid and joined by cubic
+splines; the splines *are* the truth, so that it can be asked for at any instant and is smooth there.
 """
 
 from __future__ import annotations
@@ -17,11 +17,16 @@ from scipy.ndimage import gaussian_filter1d
 from tsgt.geometry import transform_from, transform_points
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
     from numpy.typing import NDArray
 
-    from tsgt.config import MotionConfig
+    from tsgt.config import MotionConfig, ScenarioConfig
+    from tsgt.config.scenario import OcclusionConfig
 
 STEP_S = 0.02
+
+ROUTE_STEP_M = 0.05
 
 # Towards the area, a robot outside turns at the rate that would take away its error of heading in this time.
 STEERING_TIME_S = 1.0
@@ -42,6 +47,8 @@ class World:
         The truth reaches from 0 to here.
     generator
         Source of all randomness; the same state gives the same world.
+    occlusions_s
+        By station number: when its prism is hidden from it, from and to in s from the start, (K, 2).
     """
 
     def __init__(
@@ -50,9 +57,11 @@ class World:
         prisms_m: NDArray[np.float64],
         duration_s: float,
         generator: np.random.Generator,
+        occlusions_s: Mapping[int, NDArray[np.float64]] | None = None,
     ) -> None:
         self.prisms_m = prisms_m
         self.duration_s = duration_s
+        self.occlusions_s = occlusions_s or {}
         # Two steps more, so that the last instant lies inside the splines whatever rounding does.
         times_s = np.arange(math.ceil(duration_s / STEP_S) + 3) * STEP_S
         self._spline = CubicSpline(times_s, _motion(motion, len(times_s), generator))
@@ -77,26 +86,148 @@ class World:
         """Return the position of one prism, by its row in the layout, in ``station1`` at N instants: (N, 3)."""
         return transform_points(self.pose_at(times_s), self.prisms_m[index])
 
+    def hidden(self, station: int, time_s: float) -> bool:
+        """Tell whether something stands between a station and its prism, at an instant in s from the start."""
+        spans_s = self.occlusions_s.get(station)
+        return spans_s is not None and bool(np.any((spans_s[:, 0] <= time_s) & (time_s < spans_s[:, 1])))
+
+
+def scenario_world(scenario: ScenarioConfig, duration_s: float, generator: np.random.Generator) -> World:
+    """Make the world of a scenario: its robot, its prisms in their order, and what hides them."""
+    # The drive does not depend on what hides the robot on its way.
+    drive, hiding = generator.spawn(2)
+    numbers = [station.station for station in scenario.stations]
+    return World(
+        scenario.motion,
+        np.array([prism.position_m for prism in scenario.prisms]),
+        duration_s,
+        drive,
+        draw_occlusions(scenario.occlusions, numbers, duration_s, hiding),
+    )
+
+
+def draw_occlusions(
+    occlusions: Sequence[OcclusionConfig],
+    stations: Sequence[int],
+    duration_s: float,
+    generator: np.random.Generator,
+) -> dict[int, NDArray[np.float64]]:
+    """Draw when the prisms are hidden.
+
+    Parameters
+    ----------
+    occlusions
+        What hides them, how often and for how long.
+    stations
+        Their numbers; each keeps its draws when another one is added after it.
+    duration_s
+        Nothing begins later than this.
+    generator
+        Source of all randomness.
+
+    Returns
+    -------
+    dict
+        By station number: from and to in s, (K, 2). They may overlap.
+    """
+    shared = _spans([o for o in occlusions if o.common], duration_s, generator.spawn(1)[0])
+    own = [o for o in occlusions if not o.common]
+    return {
+        station: np.concatenate([shared, _spans(own, duration_s, generator.spawn(1)[0])])
+        for station in stations
+    }
+
+
+def _spans(
+    occlusions: Sequence[OcclusionConfig], duration_s: float, generator: np.random.Generator
+) -> NDArray[np.float64]:
+    spans = [np.empty((0, 2))]
+    for occlusion in occlusions:
+        count = generator.poisson(occlusion.rate_per_min / 60.0 * duration_s)
+        start_s = generator.uniform(0.0, duration_s, count)
+        length_s = generator.uniform(occlusion.duration_min_s, occlusion.duration_max_s, count)
+        spans.append(np.column_stack([start_s, start_s + length_s]))
+    return np.concatenate(spans)
+
 
 def _motion(motion: MotionConfig, n: int, generator: np.random.Generator) -> NDArray[np.float64]:
     """State on the grid, (n, 6): x, y, z in m, yaw, pitch, roll in rad."""
     start_yaw = generator.uniform(-math.pi, math.pi)
-    commands = _commands(motion, n, start_yaw, generator)
-    speed, yaw_rate = _smoothed(commands, motion.command_smoothing_s).T
-    yaw = start_yaw + np.cumsum(yaw_rate) * STEP_S
+    if motion.route_m:
+        speeds = _route_commands(motion, n, generator)
+        state = _along(motion, np.cumsum(_smoothed(speeds[:, None], motion.command_smoothing_s)) * STEP_S)
+    else:
+        commands = _commands(motion, n, start_yaw, generator)
+        speeds = commands[:, 0]
+        state = _driven(motion, _smoothed(commands, motion.command_smoothing_s), start_yaw)
     shaking = _unit_noise(n, 3, motion.shaking_smoothing_s, generator)
-    shaking *= _smoothed((commands[:, :1] > 0).astype(np.float64), motion.command_smoothing_s)
+    shaking *= _smoothed((speeds[:, None] > 0).astype(np.float64), motion.command_smoothing_s)
+    state[:, 2] += shaking[:, 0] * motion.heave_rms_mm / 1e3
+    state[:, 4:] += shaking[:, 1:] * math.radians(motion.tilt_rms_deg)
+    return state
+
+
+def _driven(motion: MotionConfig, commands: NDArray[np.float64], start_yaw: float) -> NDArray[np.float64]:
+    """State of a robot that follows speeds and yaw rates (n, 2) from the centre of its area, without shaking."""
+    speed, yaw_rate = commands.T
+    yaw = start_yaw + np.cumsum(yaw_rate) * STEP_S
     x, y, z = motion.area_centre_m
-    return np.column_stack(
-        [
-            x + np.cumsum(speed * np.cos(yaw)) * STEP_S,
-            y + np.cumsum(speed * np.sin(yaw)) * STEP_S,
-            z + shaking[:, 0] * motion.heave_rms_mm / 1e3,
-            yaw,
-            shaking[:, 1] * math.radians(motion.tilt_rms_deg),
-            shaking[:, 2] * math.radians(motion.tilt_rms_deg),
-        ]
-    )
+    state = np.zeros((len(commands), 6))
+    state[:, 0] = x + np.cumsum(speed * np.cos(yaw)) * STEP_S
+    state[:, 1] = y + np.cumsum(speed * np.sin(yaw)) * STEP_S
+    state[:, 2] = z
+    state[:, 3] = yaw
+    return state
+
+
+def _along(motion: MotionConfig, driven_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """State of a robot that has driven so far along its route, (n,), without shaking; it looks ahead and uphill."""
+    way_m, points = _path(motion)
+    path = CubicSpline(way_m, points)
+    driven_m = np.clip(driven_m, 0.0, way_m[-1])
+    ahead = path(driven_m, 1)
+    state = np.zeros((len(driven_m), 6))
+    state[:, :3] = path(driven_m)
+    state[:, 3] = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
+    state[:, 4] = -np.arctan2(ahead[:, 2], np.hypot(ahead[:, 0], ahead[:, 1]))  # nose up is negative
+    return state
+
+
+def _path(motion: MotionConfig) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the route with its corners rounded: way from its start in m, (m,), and positions, (m, 3)."""
+    corners = np.array(motion.route_m)
+    at_corner_m = _lengths(corners)
+    count = max(2, round(at_corner_m[-1] / ROUTE_STEP_M) + 1)
+    steps_m = np.linspace(0.0, at_corner_m[-1], count)
+    points = np.column_stack([np.interp(steps_m, at_corner_m, column) for column in corners.T])
+    points = gaussian_filter1d(points, motion.corner_smoothing_m / ROUTE_STEP_M, axis=0, mode="nearest")
+    # At both ends the filter squeezes the points; equal steps along the way keep the speed what it is.
+    way_m = _lengths(points)
+    steps_m = np.linspace(0.0, way_m[-1], count)
+    return steps_m, np.column_stack([np.interp(steps_m, way_m, column) for column in points.T])
+
+
+def _lengths(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Way from the first of the points to each of them, (n,)."""
+    steps_m = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps_m)])
+
+
+def _route_commands(motion: MotionConfig, n: int, generator: np.random.Generator) -> NDArray[np.float64]:
+    """Speed in m/s before smoothing, (n,); 0 from the end of the route on."""
+    end_m = _path(motion)[0][-1]
+    weights = np.array(motion.speed_weights) / sum(motion.speed_weights)
+    speeds = np.zeros(n)
+    driven_m = speed = next_draw = 0.0
+    for step in range(n):
+        if step * STEP_S >= next_draw:
+            speed = float(generator.choice(motion.speeds_mps, p=weights))
+            next_draw += generator.uniform(motion.interval_min_s, motion.interval_max_s)
+        if driven_m + speed * STEP_S > end_m:
+            break
+        speeds[step] = speed
+        driven_m += speed * STEP_S
+    return speeds
 
 
 def _commands(

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.records import EVENT, measurement
+from support.records import CLOCK, EVENT, STATUS, measurement
 
 from tsgt.cli.render import render, yaw_pitch_roll_deg
 from tsgt.recording import encode_line
@@ -31,6 +31,33 @@ def test_measurement_without_distance_says_so() -> None:
     text = render("measurement", encode_line(replace(measurement(0), slope_distance_m=None)))
     assert text is not None
     assert "no distance" in text
+
+
+def test_a_clock_says_on_which_side_it_is() -> None:
+    """A negative offset is a clock that is behind."""
+    assert render("clock", encode_line(CLOCK)) == (
+        "22:13:22.000  clock of station 2 is 7200.000123 s behind the master's, within 0.310 ms, +9.70 ppm; "
+        "1 of 1 exchanges used (regression), begun anew"
+    )
+
+
+def test_a_status_shows_what_is_known() -> None:
+    """What a station has not shown yet is left out; the rest stands with its unit."""
+    station = replace(
+        STATUS.stations[0],
+        last_heard_s=0.1,
+        rate_hz=1.7,
+        loss=0.02,
+        rssi_dbm=-90.4,
+        snr_db=8.0,
+        clock_bound_ns=310_000,
+    )
+    text = render("status", encode_line(replace(STATUS, stations=(station, STATUS.stations[1]))))
+    assert text is not None
+    assert (
+        "station 1: 4 of 5 usable, last ok 0.20 s ago, heard 0.10 s ago, 1.7 Hz, 2 % lost, -90 dBm, SNR 8 dB, "
+        "clock within 0.3 ms; station 2: no measurement yet"
+    ) in text
 
 
 @pytest.mark.parametrize("stamp_ns", [0, 2**63 - 1])

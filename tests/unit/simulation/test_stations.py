@@ -1,4 +1,4 @@
-"""Simulated stations: what they measure is the truth plus the noise stated, and it arrives in order."""
+"""What simulated stations measure is the truth plus the noise stated."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from support.arrivals import simulated_measurements
 
 from tsgt.config import MotionConfig, NoiseConfig, ScenarioConfig, scenario_parameters
 from tsgt.geometry import corrected_distance, invert, polar_to_cartesian, transform_points
 from tsgt.master.tracks import build_tracks
-from tsgt.simulation.stations import simulated_measurements
 from tsgt.simulation.world import World
 
 if TYPE_CHECKING:

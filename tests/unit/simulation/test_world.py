@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from tsgt.config import MotionConfig, ScenarioConfig
+from tsgt.config.scenario import OcclusionConfig
 from tsgt.geometry import check_transform, transform_points
-from tsgt.simulation.world import STEP_S, World
+from tsgt.simulation.world import STEP_S, World, draw_occlusions, scenario_world
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -148,3 +149,93 @@ def test_a_robot_that_only_stands() -> None:
     poses = world.pose_at(_times(30.0))
     np.testing.assert_allclose(poses[:, :3, 3], np.tile(MOTION.area_centre_m, (len(poses), 1)), atol=1e-12)
     np.testing.assert_allclose(poses[:, 2, 2], 1.0, atol=1e-15)
+
+
+# ------------------------------------------------------------------------------------------------------ routes
+
+ROUTE = MotionConfig(route_m=((0.0, 0.0, 0.0), (30.0, 0.0, 3.0), (30.0, 40.0, 3.0)))
+
+
+def test_a_route_is_driven_to_its_end() -> None:
+    """The robot starts at the first way point, ends at the last one and stands there."""
+    poses = _world(duration_s=300.0, motion=ROUTE).pose_at(np.array([0.0, 299.0, 300.0]))
+    # The smoothing of corners and of speeds takes a little off both ends.
+    np.testing.assert_allclose(poses[0, :2, 3], (0.0, 0.0), atol=2.0)
+    np.testing.assert_allclose(poses[1, :2, 3], (30.0, 40.0), atol=2.0)
+    np.testing.assert_allclose(poses[1], poses[2], atol=1e-6)
+
+
+def test_a_route_is_kept_to() -> None:
+    """The robot never leaves the route by more than its rounded corners do, and never turns back."""
+    position = _world(duration_s=300.0, motion=ROUTE).pose_at(_times(300.0))[:, :3, 3]
+    to_first_leg = np.abs(position[:, 1])
+    to_second_leg = np.abs(position[:, 0] - 30.0)
+    assert np.minimum(to_first_leg, to_second_leg).max() < 1.5
+    assert np.diff(position[:, 0] + position[:, 1]).min() > -1e-3
+
+
+def test_on_a_route_the_robot_looks_ahead_and_uphill() -> None:
+    """The robot's x axis points along the route, its nose up where the route climbs."""
+    poses = _world(duration_s=300.0, motion=ROUTE.model_copy(update={"tilt_rms_deg": 0.0})).pose_at(
+        _times(300.0)
+    )
+    climbing = (poses[:, 0, 3] > 10.0) & (poses[:, 0, 3] < 20.0)
+    along = np.array([30.0, 0.0, 3.0]) / math.hypot(30.0, 3.0)
+    np.testing.assert_allclose(poses[climbing, :3, 0], np.tile(along, (climbing.sum(), 1)), atol=1e-3)
+
+
+def test_speeds_on_a_route_are_those_drawn() -> None:
+    """On a straight route the robot drives at the speeds of its configuration."""
+    motion = MotionConfig(route_m=((0.0, 0.0, 0.0), (1000.0, 0.0, 0.0)), heave_rms_mm=0.0)
+    speeds = _speeds(_world(duration_s=600.0, motion=motion).pose_at(_times(600.0)))
+    shares = [np.mean(np.abs(speeds - speed) < 0.02) for speed in motion.speeds_mps]
+    assert sum(shares) > 0.75
+    assert min(shares) > 0.05
+
+
+# -------------------------------------------------------------------------------------------------- occlusions
+
+TREES = OcclusionConfig(rate_per_min=3.0, duration_min_s=1.0, duration_max_s=2.0)
+BENDS = OcclusionConfig(rate_per_min=1.0, duration_min_s=5.0, duration_max_s=10.0, common=True)
+
+
+def test_occlusions_come_as_often_and_last_as_long_as_the_scenario_says() -> None:
+    """In ten hours there are 1800 of three per minute, each within its limits."""
+    spans = draw_occlusions([TREES], [1], 36_000.0, np.random.default_rng(0))[1]
+    assert len(spans) == pytest.approx(1800, abs=150)
+    lengths = spans[:, 1] - spans[:, 0]
+    assert lengths.min() >= 1.0
+    assert lengths.max() <= 2.0
+
+
+def test_common_occlusions_hide_the_robot_from_all_stations() -> None:
+    """What is common comes to all stations at once, the rest to each in its own time."""
+    spans = draw_occlusions([TREES, BENDS], [1, 2], 3600.0, np.random.default_rng(0))
+    one, other = ({tuple(span) for span in spans[station].tolist()} for station in (1, 2))
+    common = one & other
+    assert len(common) == pytest.approx(60, abs=25)
+    assert all(to - since >= 5.0 for since, to in common)
+    assert all(to - since <= 2.0 for since, to in (one | other) - common)
+
+
+def test_a_hidden_prism_is_hidden_in_its_time_only() -> None:
+    """The world says who is hidden when; a station without occlusions sees always."""
+    world = World(MOTION, PRISMS, 20.0, np.random.default_rng(0), {2: np.array([[3.0, 4.0], [8.0, 9.0]])})
+    assert [world.hidden(2, time_s) for time_s in (2.9, 3.0, 3.9, 4.0, 8.5)] == [
+        False,
+        True,
+        True,
+        False,
+        True,
+    ]
+    assert not world.hidden(1, 3.5)
+
+
+def test_occlusions_do_not_change_the_drive() -> None:
+    """The same seed drives the same way with and without trees."""
+    scenario = ScenarioConfig()
+    times = _times(30.0)
+    open_world = scenario_world(scenario, 30.0, np.random.default_rng(4))
+    forest = scenario.model_copy(update={"occlusions": (TREES, BENDS)})
+    forest_world = scenario_world(forest, 30.0, np.random.default_rng(4))
+    np.testing.assert_array_equal(open_world.pose_at(times), forest_world.pose_at(times))

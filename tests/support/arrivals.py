@@ -1,8 +1,4 @@
-"""What the simulated stations measure, and when the master gets it.
-
-Not modelled here: clocks that drift, packets that are lost, instruments that lose lock. Measurements arrive after
-a random delay, and that is all.
-"""
+"""Measurements of a scenario without daemons and radio: each arrives after a random delay, and that is all."""
 
 from __future__ import annotations
 
@@ -11,8 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.config import scenario_parameters
-from tsgt.geometry import cartesian_to_polar, invert, raw_distance, transform_points
+from tsgt.geometry import invert, raw_distance, transform_points
 from tsgt.model import PolarMeasurement
+from tsgt.simulation.instrument import with_noise
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -23,6 +20,9 @@ if TYPE_CHECKING:
     from tsgt.model import StationParameters
     from tsgt.simulation.world import World
 
+DELAY_S = (0.05, 0.25)
+"""From a measurement to its arrival, evenly distributed."""
+
 
 def simulated_measurements(
     scenario: ScenarioConfig, world: World, generator: np.random.Generator, *, start_ns: int
@@ -32,7 +32,7 @@ def simulated_measurements(
     Parameters
     ----------
     scenario
-        Stations, their noise and the delay of the transport.
+        Stations and their noise.
     world
         The truth; its prisms in the order of the scenario's.
     generator
@@ -52,8 +52,7 @@ def simulated_measurements(
         period_s = 1.0 / config.rate_hz
         times_s = np.arange(generator.uniform(0.0, period_s), world.duration_s, period_s)
         points = world.prism_at(times_s, rows[station.prism])
-        delays_s = generator.uniform(scenario.transport_min_ms, scenario.transport_max_ms, len(times_s)) / 1e3
-        measurements.extend(_measured(station, times_s, points, delays_s, generator, start_ns))
+        measurements.extend(_measured(station, times_s, points, generator, start_ns))
     return sorted((m for m in measurements if m.received_ns <= end_ns), key=lambda m: m.received_ns)
 
 
@@ -61,20 +60,13 @@ def _measured(
     station: StationParameters,
     times_s: NDArray[np.float64],
     points: NDArray[np.float64],
-    delays_s: NDArray[np.float64],
     generator: np.random.Generator,
     start_ns: int,
 ) -> Iterator[PolarMeasurement]:
     """One station's measurements of a prism that is at the given points, (N, 3) in ``station1``."""
-    noise = station.noise
+    delays_s = generator.uniform(*DELAY_S, len(times_s))
     seen = transform_points(invert(np.array(station.T_station1_station)), points)
-    seen = seen + generator.normal(0.0, noise.pointing_sigma_m, seen.shape)
-    horizontal, zenith, distance = cartesian_to_polar(seen)
-    angle_noise = generator.normal(0.0, noise.angle_sigma_rad, (2, len(times_s)))
-    horizontal = np.mod(horizontal + angle_noise[0] / np.sin(zenith), 2 * np.pi)
-    zenith = zenith + angle_noise[1]
-    range_sigma = np.hypot(noise.range_sigma_m, noise.range_sigma_ppm * 1e-6 * distance)
-    distance = distance + range_sigma * generator.standard_normal(len(times_s))
+    horizontal, zenith, distance = with_noise(seen, station.noise, generator)
     slope = raw_distance(distance, constant_m=station.prism_constant_m, ppm=station.atmospheric_ppm)
     stamps = start_ns + np.rint(times_s * 1e9).astype(np.int64)
     received = stamps + np.rint(delays_s * 1e9).astype(np.int64)

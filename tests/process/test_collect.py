@@ -1,0 +1,194 @@
+"""``tsgt calibrate collect`` as a process, against the client's daemon as another one, in real time."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from tsgt.analysis.target_file import read_some_targets
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+ROOT = Path(__file__).parents[2]
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
+
+RADIO = """
+[radio]
+kind = "simulated"
+air_socket = "air.sock"
+name = "{name}"
+frequency_mhz = 905.0
+spreading_factor = 7
+[protocol]
+kind = "classic"
+"""
+
+CLIENT = """
+kind = "client"
+station = 1
+prism = 1
+status_socket = "client.sock"
+[instrument]
+kind = "simulated"
+socket = "instrument.sock"
+[journal]
+directory = "journals"
+""" + RADIO.format(name="station1")
+
+MASTER = """
+kind = "master"
+[setup]
+station_frames = "station_frames.toml"
+prism_layout = "prism_layout.toml"
+[[stations]]
+station = 1
+prism = 1
+prism_constant_mm = 10.0
+[stream]
+socket = "poses.sock"
+""" + RADIO.format(name="master")
+
+# The instrument stays aimed at one target, as nobody is there to turn it.
+SURROUNDINGS = """
+import asyncio, sys
+from pathlib import Path
+import numpy as np
+from tsgt.clock import SystemClock
+from tsgt.config import ScenarioConfig
+from tsgt.log import configure_logging
+from tsgt.simulation.air_server import AirServer
+from tsgt.simulation.instrument import SimulatedInstrument
+from tsgt.simulation.instrument_socket import InstrumentServer
+from tsgt.simulation.link import LinkModel
+from tsgt.simulation.world import scenario_world
+
+async def main(folder):
+    scenario, rng, clock = ScenarioConfig(targets_m=((12.0, 5.0, 1.0),)), np.random.default_rng(0), SystemClock()
+    world = scenario_world(scenario, 60.0, rng)
+    instrument = SimulatedInstrument(scenario.stations[0], scenario, world, clock, rng)
+    instrument.aim(1)
+    async with AirServer(folder / "air.sock", LinkModel(), rng):
+        async with InstrumentServer(folder / "instrument.sock", instrument):
+            print("ready", flush=True)
+            await asyncio.sleep(120)
+
+configure_logging()
+asyncio.run(main(Path(sys.argv[1])))
+"""
+
+
+@contextmanager
+def process(*arguments: str, **options: Any) -> Iterator[subprocess.Popen[bytes]]:
+    """Run Python, kill it at the end."""
+    with subprocess.Popen([sys.executable, *arguments], env=ENVIRONMENT, **options) as started:
+        try:
+            yield started
+        finally:
+            started.kill()
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Iterator[Path]:
+    """Folder with both configurations; air, instrument and client run."""
+    (tmp_path / "client.toml").write_text(CLIENT)
+    (tmp_path / "master.toml").write_text(MASTER)
+    run_client = "from tsgt.cli.daemons import main_client; main_client()"
+    with ExitStack() as stack:
+        around = stack.enter_context(process("-c", SURROUNDINGS, str(tmp_path), stdout=subprocess.PIPE))
+        assert around.stdout is not None
+        assert around.stdout.readline() == b"ready\n"
+        log = stack.enter_context((tmp_path / "client.log").open("wb"))
+        stack.enter_context(process("-c", run_client, "--config", str(tmp_path / "client.toml"), stderr=log))
+        wait_for_mode(tmp_path, "tracking")
+        yield tmp_path
+
+
+def wait_for_mode(folder: Path, mode: str) -> None:
+    """Ask the client until its instrument does that."""
+    found = None
+    for _ in range(400):
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+            if connection.connect_ex(str(folder / "client.sock")) == 0:
+                with connection.makefile("rb") as file:
+                    found = json.loads(file.read())["mode"]
+                if found == mode:
+                    return
+        time.sleep(0.05)  # the other process runs in real time
+    raise AssertionError(f"the client is {found}, not {mode}")
+
+
+@pytest.mark.parametrize("waiting", [True, False])
+def test_ctrl_c_leaves_what_was_measured_and_a_station_that_tracks(folder: Path, *, waiting: bool) -> None:
+    """While it waits for a key, and while the instrument measures; the exit code is that of Ctrl-C."""
+    path = folder / "targets.csv"
+    command = (
+        "-m",
+        "tsgt",
+        "calibrate",
+        "collect",
+        "--config",
+        str(folder / "master.toml"),
+        "--output",
+        str(path),
+    )
+    with process(*command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as collect:
+        assert collect.stdin is not None
+        collect.stdin.write(b"\n" if waiting else b"\n\n")
+        collect.stdin.flush()
+        for _ in range(400):
+            if path.exists() and len(path.read_text().splitlines()) == 2:
+                break
+            time.sleep(0.05)
+        wait_for_mode(folder, "direct")
+        time.sleep(0.5)  # into the second measurement, which takes at least a second
+        collect.send_signal(signal.SIGINT)
+        # Ends without a key: nothing hangs on the input.
+        assert collect.wait(20) == 130
+        assert collect.stderr is not None
+        assert collect.stderr.read().endswith(b"stopped\n")
+    wait_for_mode(folder, "tracking")
+    (sight,) = read_some_targets(path).sights[1][1]
+    assert sight.slope_distance_m == pytest.approx((12.0**2 + 5.0**2 + 1.0) ** 0.5, abs=0.03)
+
+
+def test_keys_may_come_from_a_file(folder: Path) -> None:
+    """The end of the input is the end of the work; what is missing is said."""
+    path = folder / "targets.csv"
+    command = (
+        "-m",
+        "tsgt",
+        "calibrate",
+        "collect",
+        "--config",
+        str(folder / "master.toml"),
+        "--output",
+        str(path),
+    )
+    done = subprocess.run(
+        [sys.executable, *command, "--targets", "3"],
+        env=ENVIRONMENT, input=b"\ns\n", capture_output=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert b"2 measurements are missing" in done.stderr
+    wait_for_mode(folder, "tracking")
+    check = ("-m", "tsgt", "calibrate", "check", "--config", str(folder / "master.toml"), "--json")
+    done = subprocess.run(
+        [sys.executable, *check, "--targets-file", str(path)],
+        env=ENVIRONMENT, input=b"\n", capture_output=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    station = json.loads(done.stdout)["stations"]["1"]
+    assert station["ok"]
+    assert station["moved_mrad"] is None
+    assert station["moved_mm"] < 7.0

@@ -1,0 +1,93 @@
+"""The master's daemon as a process, in real time; the air that its radio wants is not there."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tsgt.recording import read_lines
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+ROOT = Path(__file__).parents[2]
+LONGEST_START_S = 30.0
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    """Return the example of the repository, with a simulated radio and everything in one folder."""
+    for name in ("prism_layout", "station_frames"):
+        shutil.copy(ROOT / "configs" / f"{name}.example.toml", tmp_path)
+    text = (ROOT / "configs" / "master.example.toml").read_text()
+    text = re.sub(r"\[radio.wiring\].*?\n\n", "", text, flags=re.DOTALL)
+    text = text.replace('kind = "sx127x"', 'kind = "simulated"\nair_socket = "air.sock"\nname = "master"')
+    text = text.replace("/run/tsgt", ".").replace("/var/lib/tsgt", "recordings")
+    path = tmp_path / "master.toml"
+    path.write_text(text)
+    return path
+
+
+@pytest.fixture
+def daemon(config: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """Start it, and kill it at the end if it is still there."""
+    program = "from tsgt.cli.daemons import main_master; main_master()"
+    command = [sys.executable, "-c", program, "--config", str(config)]
+    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE) as process:
+        yield process
+        process.kill()
+
+
+def connected(path: Path) -> socket.socket:
+    """Connect to the stream as soon as it is there."""
+    give_up = time.monotonic() + LONGEST_START_S
+    while True:
+        reader = socket.socket(socket.AF_UNIX)
+        try:
+            reader.connect(str(path))
+        except OSError:
+            reader.close()
+            if time.monotonic() > give_up:
+                raise
+            time.sleep(0.05)
+        else:
+            return reader
+
+
+def test_it_streams_without_its_radio_and_ends_when_it_is_told_to(
+    config: Path, daemon: subprocess.Popen[bytes]
+) -> None:
+    """Readers get status lines each second; SIGTERM ends it within a second, with status 0 and a whole recording."""
+    with connected(config.parent / "poses.sock") as reader, reader.makefile("rb") as lines:
+        while json.loads(lines.readline())["type"] != "status":
+            pass
+        told = time.monotonic()
+        daemon.send_signal(signal.SIGTERM)
+        assert daemon.wait(timeout=10) == 0
+        assert time.monotonic() - told < 1.0
+    (recording,) = (config.parent / "recordings").iterdir()
+    types = [line.type for line in read_lines(recording)]
+    assert types[:3] == ["recording", "parameters", "event"]
+    assert "status" in types
+    assert daemon.stderr is not None
+    logged = [json.loads(line)["event"] for line in daemon.stderr]
+    assert {"stream_opened", "master_started", "radio_lost", "master_stopped"} <= set(logged)
+
+
+def test_a_configuration_that_cannot_be_used_is_one_line(tmp_path: Path) -> None:
+    """Exit status 2, and what is wrong."""
+    program = "from tsgt.cli.daemons import main_master; main_master()"
+    command = [sys.executable, "-c", program, "--config", str(tmp_path / "none.toml")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr == f"error: {tmp_path / 'none.toml'}: no such file\n"

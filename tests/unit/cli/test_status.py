@@ -1,0 +1,194 @@
+"""`tsgt status`: what it says of a master and of a client, and what its exit code says."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import socket
+import threading
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tsgt.cli.status import client_text, duration, master_text, station_word
+from tsgt.master.stream_records import HelloRecord, StationStatus, StatusRecord
+from tsgt.model import Status
+from tsgt.recording import encode_line
+from tsgt.station.status import ClientStatus, LastMeasurement
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from support.cli import Tsgt
+
+NOW_NS = 1_700_000_000_000_000_000
+WIDTH = 40
+
+STATION = StationStatus(
+    id=2,
+    measurements=100,
+    usable=100,
+    age_s=0.6,
+    status=Status.OK,
+    prism=2,
+    locked=True,
+    answering=True,
+    last_heard_s=0.3,
+    rate_hz=1.58,
+    loss=0.02,
+    rssi_dbm=-81.4,
+    snr_db=9.0,
+    clock_offset_ns=12_345_678_901,
+    clock_bound_ns=840_000,
+)
+MASTER = StatusRecord(stamp_ns=NOW_NS, poses=400, valid_poses=390, stations=(STATION,))
+CLIENT = ClientStatus(
+    stamp_ns=NOW_NS,
+    station=3,
+    instrument="simulated total station 3",
+    mode="tracking",
+    prism=3,
+    locked=True,
+    last=LastMeasurement(
+        age_s=0.2,
+        prism=3,
+        horizontal_angle_rad=1.0,
+        zenith_angle_rad=1.5,
+        slope_distance_m=75.1234,
+        status=Status.OK,
+    ),
+    measurements=1234,
+    rate_hz=2.5,
+    journal="/var/lib/tsgt/station3-20261121T101112Z.jsonl",
+    journal_ok=True,
+    journal_waiting=0,
+    master_heard_s=0.4,
+    rssi_dbm=-79.0,
+    snr_db=9.5,
+    radio_ok=True,
+)
+
+
+def test_a_master_that_is_well() -> None:
+    """Its poses, and of each station what it does, how often, how strong, and how well its clock is known."""
+    lines, well = master_text(MASTER)
+    text = "\n".join(lines)
+    assert well
+    for part in ("valid 390", "STATION 2  TRACKING", "1.58 Hz", "loss 2 %", "-81 dBm", "within 0.84 ms"):
+        assert part in text
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"last_heard_s": None, "answering": None}, "NOT HEARD YET"),
+        ({"last_heard_s": 12.0, "answering": False}, "SILENT 12 s"),
+        ({"status": None, "age_s": None}, "NO MEASUREMENT YET"),
+        ({"age_s": 5.0}, "OLD 5.0 s"),
+        ({"status": Status.TILT}, "NOT LEVEL"),
+        ({"status": Status.NO_TARGET}, "NO PRISM"),
+        ({"status": Status.WRONG_DISTANCE}, "WRONG TARGET"),
+        ({"status": Status.ANGLE_ONLY}, "NO DISTANCE"),
+    ],
+)
+def test_a_station_that_needs_somebody_is_said_to(change: dict[str, object], word: str) -> None:
+    """Each way of not being well has its word, and spoils the verdict."""
+    station = dataclasses.replace(STATION, **change)  # type: ignore[arg-type]
+    assert station_word(station) == (word, False)
+    assert not master_text(dataclasses.replace(MASTER, stations=(station,)))[1]
+
+
+def test_a_station_that_was_not_asked_is_not_called_silent() -> None:
+    """While others are synchronised a station waits its turn: that is no fault of it."""
+    station = dataclasses.replace(STATION, last_heard_s=24.0, age_s=24.3)
+    assert station_word(station) == ("TRACKING", True)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"instrument": None}, "NO INSTRUMENT"),
+        ({"last": None}, "NO MEASUREMENT"),
+        ({"journal_ok": False, "journal_waiting": 17}, "DISK FAILS"),
+        ({"radio_ok": False}, "NO RADIO"),
+        ({"master_heard_s": None}, "MASTER NOT HEARD"),
+        ({"master_heard_s": 60.0}, "MASTER NOT HEARD"),
+    ],
+)
+def test_a_client_that_needs_somebody_is_said_to(change: dict[str, object], words: str) -> None:
+    """Each way of not being well has its words, and spoils the verdict."""
+    lines, well = client_text(dataclasses.replace(CLIENT, **change))  # type: ignore[arg-type]
+    assert not well
+    assert any(words in line for line in lines)
+
+
+def test_a_client_in_direct_mode_is_well_without_measurements() -> None:
+    """Between two targets nothing is measured."""
+    assert client_text(dataclasses.replace(CLIENT, mode="direct", last=None))[1]
+
+
+def test_both_fit_on_a_small_screen() -> None:
+    """No line is longer than forty characters."""
+    lines = [*master_text(MASTER)[0], *client_text(CLIENT)[0]]
+    assert max(len(line.replace("\x1b[1m", "").replace("\x1b[0m", "")) for line in lines) <= WIDTH
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(0.34, "0.3 s"), (47, "47 s"), (600, "10 min"), (9000, "2 h")])
+def test_durations_take_little_room(seconds: float, text: str) -> None:
+    """A figure and a unit that fits it."""
+    assert duration(seconds) == text
+
+
+def _serve(path: Path, *lines: bytes) -> threading.Thread:
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    listener.bind(str(path))
+    listener.listen()
+
+    def answer() -> None:
+        connection, _ = listener.accept()
+        with connection, listener:
+            connection.sendall(b"".join(line + b"\n" for line in lines))
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    return thread
+
+
+def test_a_master_is_asked_over_its_stream(tsgt: Tsgt, tmp_path: Path) -> None:
+    """The first status line after the greeting is shown; poses before it are passed over."""
+    serving = _serve(tmp_path / "s", encode_line(HelloRecord()), b'{"type":"pose"}', encode_line(MASTER))
+    outcome = tsgt("status", "--socket", tmp_path / "s")
+    serving.join()
+    assert outcome.code == 0, outcome.err
+    assert outcome.out.startswith("MASTER  22:13:20")
+
+
+def test_a_client_is_asked_at_its_own_socket(tsgt: Tsgt, tmp_path: Path) -> None:
+    """With --json the record comes as it is; a client that needs somebody makes exit code 3."""
+    serving = _serve(tmp_path / "s", encode_line(dataclasses.replace(CLIENT, instrument=None)))
+    outcome = tsgt("status", "--socket", tmp_path / "s", "--json")
+    serving.join()
+    assert outcome.code == 3
+    assert json.loads(outcome.out)["station"] == 3
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [([], "ended without a status"), ([b"SSH-2.0-OpenSSH"], "no stream of tsgt")],
+)
+def test_something_else_on_the_socket_is_an_error(
+    tsgt: Tsgt, tmp_path: Path, lines: list[bytes], words: str
+) -> None:
+    """One line that says what is wrong, and exit code 1."""
+    serving = _serve(tmp_path / "s", *lines)
+    outcome = tsgt("status", "--socket", tmp_path / "s")
+    serving.join()
+    assert outcome.code == 1
+    assert words in outcome.err
+
+
+def test_nobody_at_the_socket(tsgt: Tsgt, tmp_path: Path) -> None:
+    """One line that names the socket, and exit code 1."""
+    outcome = tsgt("status", "--socket", tmp_path / "nobody")
+    assert outcome.code == 1
+    assert "nobody answers" in outcome.err

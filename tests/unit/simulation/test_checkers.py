@@ -1,0 +1,105 @@
+"""The checkers of simulated runs: silent about a good run, and loud about each planted defect."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from support.missions import mission
+
+from tsgt.master.stream_records import EventRecord
+from tsgt.model import Status
+from tsgt.simulation.checkers import violations
+
+if TYPE_CHECKING:
+    from tsgt.simulation.scenario import Run
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Half a minute in which nothing goes wrong."""
+    return mission(tmp_path_factory.mktemp("run"))
+
+
+@pytest.fixture
+def run(good: Run) -> Run:
+    """Return a copy whose records may be spoilt."""
+    (session,) = good.sessions
+    spoilt = copy.copy(session)
+    spoilt.measurements = list(session.measurements)
+    spoilt.digest = session.digest.copy()
+    spoilt._pose_numbers = copy.copy(session._pose_numbers)
+    return dataclasses.replace(good, sessions=[spoilt])
+
+
+def _checks(run: Run) -> set[str]:
+    return {violation.check for violation in violations(run)}
+
+
+def test_a_good_run_has_no_violations(good: Run) -> None:
+    """Nothing is found where nothing is wrong, in a run that has something to check."""
+    assert violations(good) == []
+    (session,) = good.sessions
+    assert len(session.measurements) > 60
+    assert len(session.valid_poses().stamp_ns) > 300
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"horizontal_angle_rad": 1.0},
+        {"zenith_angle_rad": 1.0},
+        {"slope_distance_m": 60.0},
+        {"status": Status.TILT},
+    ],
+    ids=str,
+)
+def test_an_altered_measurement(run: Run, change: dict[str, Any]) -> None:
+    """A measurement whose content has changed on its way is not in the journal like that."""
+    measurements = run.sessions[0].measurements
+    measurements[40] = dataclasses.replace(measurements[40], **change)
+    assert "journal" in _checks(run)
+
+
+def test_a_measurement_that_nobody_made(run: Run) -> None:
+    """A measurement with a host time that no client ever saw is noticed twice over."""
+    measurements = run.sessions[0].measurements
+    measurements[40] = dataclasses.replace(measurements[40], host_time_ns=measurements[40].host_time_ns + 1)
+    assert {"journal", "time"} <= _checks(run)
+
+
+def test_a_repeat(run: Run) -> None:
+    """The same measurement handed over again is noticed, even under another number."""
+    measurements = run.sessions[0].measurements
+    measurements.append(dataclasses.replace(measurements[40], sequence=999))
+    assert _checks(run) == {"twice"}
+
+
+@pytest.mark.parametrize("ahead", [-1, 1])
+def test_a_time_stamp_beyond_its_bound(run: Run, ahead: int) -> None:
+    """A stamp that is 50 ms off, in either direction, is further off than any bound stated here."""
+    measurements = run.sessions[0].measurements
+    late_ns = ahead * 50_000_000
+    measurements[40] = dataclasses.replace(measurements[40], stamp_ns=measurements[40].stamp_ns + late_ns)
+    assert "time" in _checks(run)
+
+
+def test_a_pose_from_an_unusable_measurement(run: Run) -> None:
+    """If what a valid pose rests on was unusable, the pose is wrong."""
+    measurements = run.sessions[0].measurements
+    measurements[40] = dataclasses.replace(measurements[40], status=Status.TILT)
+    assert "pose" in _checks(run)
+
+
+def test_a_pose_that_is_somewhere_else(run: Run) -> None:
+    """A pose off by a millimetre is not where its measurements are."""
+    run.sessions[0]._pose_numbers[8 * 100] += 1e-3
+    assert _checks(run) == {"pose"}
+
+
+def test_a_line_that_was_streamed_but_not_recorded(run: Run) -> None:
+    """The replay of a recording that lacks a line is not the stream."""
+    run.sessions[0].take(EventRecord(stamp_ns=1, event="planted", message="not in the recording"))
+    assert _checks(run) == {"replay"}

@@ -1,0 +1,156 @@
+"""Whole missions on virtual time: the real daemons, crashes and restarts included."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from support.missions import QUICK, mission
+
+from tsgt.cli.simulate_figures import estimator_figures, figures, station_figures
+from tsgt.simulation.checkers import violations
+from tsgt.simulation.scenario_files import find_scenario, with_stations
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tsgt.simulation.mission import Mission
+
+
+def test_a_mission_of_a_minute(tmp_path: Path) -> None:
+    """Three stations deliver above 1.3 Hz each, stamped to 0.3 ms (their drift is not known at once), and the poses are good to centimetres."""
+    run = mission(tmp_path, duration_s=60.0)
+    assert violations(run) == []
+    for figure in station_figures(run).values():
+        assert figure.measured == pytest.approx(150, abs=1)
+        assert figure.rate_hz > 1.3
+        assert figure.duplicates == 0
+        assert figure.time_error_us[2] < 300
+    poses = estimator_figures(run)
+    assert poses.valid_poses > 600
+    assert poses.position_rms_mm < 40
+    assert poses.orientation_rms_deg < 2
+
+
+def test_one_seed_is_one_run(tmp_path: Path) -> None:
+    """The same seed gives the same lines on the stream, to the last bit, and another seed others."""
+    one, same, other = (
+        mission(tmp_path / name, duration_s=10.0, seed=seed)
+        for name, seed in (("one", 3), ("same", 3), ("other", 4))
+    )
+    assert json.dumps(figures(one)) == json.dumps(figures(same))
+    assert one.sessions[0].digest.digest() == same.sessions[0].digest.digest()
+    assert one.sessions[0].digest.digest() != other.sessions[0].digest.digest()
+
+
+def test_clocks_that_drift_either_way(tmp_path: Path) -> None:
+    """Stations drift by plus and minus what is asked for, are years behind, and the master knows both."""
+    run = mission(tmp_path, duration_s=40.0, drift_ppm=50.0)
+    assert violations(run) == []
+    last = {clock.station: clock for clock in run.sessions[0].clocks}
+    drifts = [last[station].frequency_ppm for station in (1, 2, 3)]
+    assert drifts == pytest.approx([50.0, -50.0, 50.0], abs=10.0)
+    assert all(clock.offset_ns < -(10**15) for clock in last.values())
+
+
+def test_the_authors_node_is_polled(tmp_path: Path) -> None:
+    """Stations with the authors' node deliver a little slower, stamped to a millisecond or two."""
+    run = mission(tmp_path, duration_s=40.0, node="authors")
+    assert violations(run) == []
+    for figure in station_figures(run).values():
+        assert 1.2 < figure.rate_hz < 1.65
+        assert figure.time_error_us[2] < 3000
+    assert estimator_figures(run).valid_poses > 300
+
+
+def test_lost_packets_cost_measurements_and_nothing_else(tmp_path: Path) -> None:
+    """A tenth of all packets lost: fewer measurements arrive, all of them right."""
+    scenario = find_scenario("dynamic")
+    lossy = scenario.model_copy(update={"radio": scenario.radio.model_copy(update={"loss_probability": 0.1})})
+    run = mission(tmp_path, lossy, duration_s=40.0)
+    assert violations(run) == []
+    for figure in station_figures(run).values():
+        assert 15 < figure.delivered < 50
+
+
+def test_hidden_prisms_never_enter_a_pose(tmp_path: Path) -> None:
+    """In the forest stations lose their prism; that is delivered as a status, and no pose is made of it."""
+    run = mission(tmp_path, find_scenario("snowmobile"), duration_s=60.0, seed=1)
+    assert violations(run) == []
+    statuses = {measurement.status for measurement in run.sessions[0].measurements}
+    assert statuses == {"ok", "no_target"}
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_fewer_or_more_stations_than_prisms(tmp_path: Path, count: int) -> None:
+    """Two stations measure but make no pose; five share three prisms."""
+    run = mission(tmp_path, with_stations(find_scenario("dynamic"), count), duration_s=20.0)
+    assert violations(run) == []
+    assert list(station_figures(run)) == list(range(1, count + 1))
+    assert all(figure.delivered > 5 for figure in station_figures(run).values())
+    assert (estimator_figures(run).valid_poses > 0) == (count >= 3)
+
+
+def test_a_client_that_crashes_and_comes_back(tmp_path: Path) -> None:
+    """The others go on, the station is back by itself after its restart, and poses with it."""
+
+    async def crash(mission: Mission) -> None:
+        await mission.sleep_until(15.0)
+        await mission.kill("station2")
+        await mission.sleep_until(20.0)
+        mission.start_station(2)
+
+    run = mission(tmp_path, duration_s=45.0, script=crash)
+    assert violations(run) == []
+    stamps = {
+        station: np.array(
+            [(m.stamp_ns - run.start_ns) / 1e9 for m in run.sessions[0].measurements if m.station == station]
+        )
+        for station in (1, 2, 3)
+    }
+    assert not np.any((stamps[2] > 15.5) & (stamps[2] < 20.0))
+    assert np.sum(stamps[2] > 30.0) > 15
+    assert np.sum((stamps[1] > 15.0) & (stamps[1] < 20.0)) > 3
+    poses_s = (run.sessions[0].valid_poses().stamp_ns - run.start_ns) / 1e9
+    assert np.sum(poses_s > 30.0) > 150
+    assert len(run.witnesses[2].journals) == 2
+
+
+def test_a_master_that_crashes_and_comes_back(tmp_path: Path) -> None:
+    """The second master makes a recording of its own, synchronises all clocks again, and poses come back."""
+
+    async def crash(mission: Mission) -> None:
+        await mission.sleep_until(15.0)
+        await mission.kill("master")
+        await mission.sleep_until(17.0)
+        mission.start_master()
+
+    run = mission(tmp_path, duration_s=45.0, script=crash)
+    assert violations(run) == []
+    first, second = run.sessions
+    assert first.recording() != second.recording()
+    assert {clock.station for clock in second.clocks} == {1, 2, 3}
+    assert len(second.valid_poses().stamp_ns) > 150
+
+
+def test_a_clock_that_is_set_while_the_client_runs(tmp_path: Path) -> None:
+    """A step of a station's Unix clock bends nothing: its client has fixed its time at its start."""
+
+    async def step(mission: Mission) -> None:
+        await mission.sleep_until(15.0)
+        mission.clocks[1].step(3_600_000_000_000)
+
+    run = mission(tmp_path, duration_s=30.0, script=step)
+    assert violations(run) == []
+    assert not any(clock.restarted for clock in run.sessions[0].clocks[3:])
+
+
+def test_the_paper_filter_lags_behind(tmp_path: Path) -> None:
+    """With the paper's filter and 50 ppm the stamps are off, by no more than its bound says."""
+    paper = QUICK.model_copy(update={"clock_filter": "paper", "resync_interval_s": 20.0})
+    run = mission(tmp_path, duration_s=120.0, drift_ppm=50.0, protocol=paper)
+    assert violations(run) == []
+    for figure in station_figures(run).values():
+        assert figure.time_error_us[2] > 2000

@@ -1,0 +1,93 @@
+"""What both daemons are put together from, by what their configurations name."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING
+
+from tsgt.config.radio import HardwareRadioConfig, SimulatedRadioConfig
+from tsgt.radio.from_config import wiring
+from tsgt.radio.hal import open_hal
+from tsgt.radio.sx127x import SX127x
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator
+
+    from tsgt.clock import Clock
+    from tsgt.config.client import InstrumentConfig
+    from tsgt.config.radio import RadioConfig
+    from tsgt.radio.base import LoRaSettings, OpenRadio, Radio
+    from tsgt.station.instrument import Instrument
+
+
+def make_instrument(config: InstrumentConfig) -> Instrument:
+    """Return the instrument that a configuration names under ``[instrument]``; nothing is connected yet."""
+    # Only here, as for the radio below.
+    from tsgt.simulation.instrument_socket import RemoteInstrument  # noqa: PLC0415
+
+    return RemoteInstrument(config.socket)
+
+
+def radio_opener(config: RadioConfig, settings: LoRaSettings, clock: Clock) -> OpenRadio:
+    """Return what opens the radio that a configuration names.
+
+    Parameters
+    ----------
+    config
+        What stands under ``[radio]``.
+    settings
+        Those of :func:`~tsgt.radio.from_config.lora_settings`.
+    clock
+        The machine's.
+    """
+    if isinstance(config, HardwareRadioConfig):
+        return _hardware(config, settings, clock)
+    return _simulated(config, settings, clock)
+
+
+def _hardware(config: HardwareRadioConfig, settings: LoRaSettings, clock: Clock) -> OpenRadio:
+    @asynccontextmanager
+    async def open_radio() -> AsyncGenerator[Radio]:
+        radio = SX127x(open_hal(wiring(config.wiring)), clock, allow_20_dbm=config.allow_20_dbm)
+        try:
+            await radio.start(settings)
+            yield radio
+        finally:
+            await radio.close()
+
+    return open_radio
+
+
+def _simulated(config: SimulatedRadioConfig, settings: LoRaSettings, clock: Clock) -> OpenRadio:
+    @asynccontextmanager
+    async def open_radio() -> AsyncGenerator[Radio]:
+        # Only here, so that a daemon in the field does not load the simulation.
+        import numpy as np  # noqa: PLC0415
+
+        from tsgt.simulation.air_client import AirClient  # noqa: PLC0415
+        from tsgt.simulation.chip import SX1276Chip  # noqa: PLC0415
+        from tsgt.simulation.hal import SimulatedHal  # noqa: PLC0415
+        from tsgt.simulation.timeline import LoopTimeline  # noqa: PLC0415
+
+        timeline = LoopTimeline(asyncio.get_running_loop())
+        async with AirClient(config.air_socket, config.name, timeline) as air:
+            chip = SX1276Chip(timeline, air.join, np.random.default_rng())
+            radio = SX127x(SimulatedHal(chip), clock, allow_20_dbm=config.allow_20_dbm)
+            try:
+                await radio.start(settings)
+                # Without its air the radio would be deaf for ever and not know it.
+                async with asyncio.TaskGroup() as group:
+                    losing = group.create_task(air.wait_lost())
+                    yield radio
+                    losing.cancel()
+            except ExceptionGroup as errors:
+                raise _first(errors) from None
+            finally:
+                await radio.close()
+
+    return open_radio
+
+
+def _first(error: Exception) -> Exception:
+    return _first(error.exceptions[0]) if isinstance(error, ExceptionGroup) else error

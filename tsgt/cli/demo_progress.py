@@ -1,0 +1,134 @@
+"""How a demonstration goes, on stderr: poses, what they are off the truth, and how each station does."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import click
+import numpy as np
+
+from tsgt.analysis.metrics import PoseErrors, pose_errors
+from tsgt.cli.status import station_word
+from tsgt.geometry import rotation_from_quaternion, transform_from
+from tsgt.master.stream_records import EventRecord, PoseRecord, StatusRecord
+from tsgt.recording import decode
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from tsgt.clock import UnixTimeline
+    from tsgt.simulation.demo import Demo
+
+LINE_INTERVAL_S = 5.0
+"""How often there is a line where the output is no terminal."""
+
+
+class Progress:
+    """Keeps the poses of a demonstration and tells how it goes, with every status line of the master.
+
+    Parameters
+    ----------
+    demo
+        Truth and daemons.
+    timeline
+        From CLOCK_MONOTONIC, which the truth is on, to Unix time, which the poses are on.
+
+    Attributes
+    ----------
+    poses
+        How many have come, valid or not.
+    first_ns, last_ns
+        Unix time in ns of the first and the last of them; 0 before.
+    """
+
+    def __init__(self, demo: Demo, timeline: UnixTimeline) -> None:
+        self._demo = demo
+        self._start_ns = timeline.unix_ns(demo.start_ns)
+        self._valid: list[PoseRecord] = []
+        self._on_terminal = sys.stderr.isatty()
+        self._block_lines = 0
+        self._shown_at_s = 0.0
+        self._starts = 0
+        self.poses = 0
+        self.first_ns = 0
+        self.last_ns = 0
+
+    def line(self, line: bytes) -> None:
+        """Take a line of the master's stream."""
+        if line.startswith(b'{"type":"pose"'):
+            self._pose(decode(PoseRecord, line))
+        elif line.startswith(b'{"type":"status"'):
+            self._status(decode(StatusRecord, line))
+        elif line.startswith(b'{"type":"event"'):
+            event = decode(EventRecord, line)
+            self._say(f"event  {event.event}: {event.message}")
+
+    def valid_stamps_ns(self) -> NDArray[np.int64]:
+        """Return the times of the valid poses, Unix time in ns."""
+        return np.array([pose.stamp_ns for pose in self._valid], dtype=np.int64)
+
+    def errors(self, counts: NDArray[np.bool_] | None = None) -> PoseErrors:
+        """Compare valid poses with the truth: all of them, or those that count."""
+        poses = self._valid
+        if counts is not None:
+            poses = [pose for pose, counted in zip(poses, counts, strict=True) if counted]
+        stamps_ns = np.array([pose.stamp_ns for pose in poses], dtype=np.int64)
+        positions = np.array([pose.position_m for pose in poses], dtype=np.float64).reshape(-1, 3)
+        quaternions = np.array([pose.orientation_xyzw for pose in poses], dtype=np.float64).reshape(-1, 4)
+        world = self._demo.world
+        return pose_errors(
+            transform_from(rotation_from_quaternion(quaternions), positions),
+            world.pose_at((stamps_ns - self._start_ns) / 1e9),
+            world.prisms_m.mean(axis=0),
+        )
+
+    def _pose(self, pose: PoseRecord) -> None:
+        self.first_ns = self.first_ns or pose.stamp_ns
+        self.last_ns = pose.stamp_ns
+        self.poses += 1
+        if pose.valid:
+            self._valid.append(pose)
+
+    def _status(self, status: StatusRecord) -> None:
+        starts = sum(process.starts for process in self._demo.processes)
+        if starts != self._starts:
+            self._starts = starts
+            pids = "  ".join(f"{p.name}: {p.pid or 'down'}" for p in self._demo.processes)
+            self._say(f"processes  {pids}")
+        now_s = time.monotonic()
+        if not self._on_terminal and now_s - self._shown_at_s < LINE_INTERVAL_S:
+            return
+        self._shown_at_s = now_s
+        elapsed_s = (status.stamp_ns - self._start_ns) / 1e9
+        text = f"{elapsed_s:5.0f} s  {len(self._valid)}/{self.poses} poses valid"
+        if self._valid:
+            position = " ".join(f"{value:6.2f}" for value in self._valid[-1].position_m or ())
+            text += f"  at {position} m  off {self.errors().position_rms_mm:.1f} mm rms"
+        lines = [text]
+        for station in status.stations:
+            word, _ = station_word(station)
+            rate = "" if station.rate_hz is None else f"  {station.rate_hz:.2f} Hz"
+            strength = "" if station.rssi_dbm is None else f"  {station.rssi_dbm:.0f} dBm"
+            clock = (
+                ""
+                if station.clock_bound_ns is None
+                else f"  clock within {station.clock_bound_ns / 1e6:.2f} ms"
+            )
+            lines.append(f"         station {station.id}  {word}{rate}{strength}{clock}")
+        self._show(lines)
+
+    def _show(self, lines: list[str]) -> None:
+        """Write a block; on a terminal over the one before."""
+        if self._on_terminal:
+            up = f"\x1b[{self._block_lines}A" if self._block_lines else ""
+            click.echo(up + "\n".join(f"\x1b[K{line}" for line in lines), err=True)
+            self._block_lines = len(lines)
+        else:
+            click.echo("\n".join(lines), err=True)
+
+    def _say(self, text: str) -> None:
+        """Write a line that stays."""
+        self._block_lines = 0
+        click.echo(text, err=True)

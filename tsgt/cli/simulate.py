@@ -1,0 +1,229 @@
+"""The command ``simulate``: the whole system in virtual time."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import tempfile
+import time
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+import numpy as np
+
+from tsgt.analysis.export import tum_lines
+from tsgt.cli.options import finite, json_option
+from tsgt.cli.output import CHECK_FAILED, print_json, print_table
+from tsgt.cli.simulate_figures import figures
+from tsgt.config.radio import ClassicMasterConfig
+from tsgt.errors import OutputFileError, TsgtError
+from tsgt.geometry import quaternion_from_rotation
+from tsgt.log import configure_logging
+from tsgt.recording import write_atomically
+from tsgt.simulation.checkers import Violation, violations
+from tsgt.simulation.scenario import Options, simulate
+from tsgt.simulation.scenario_files import MOST_STATIONS, find_scenario, with_stations
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from tsgt.config import ScenarioConfig
+    from tsgt.simulation.scenario import Run
+
+LISTED_VIOLATIONS = 20
+
+
+@click.command("simulate")
+@click.argument("scenario_name", metavar="[SCENARIO]", default="dynamic")
+@click.option(
+    "--protocol",
+    type=click.Choice(["classic"]),
+    default="classic",
+    show_default=True,
+    help="What master and stations speak.",
+)
+@click.option(
+    "--duration",
+    "duration_s",
+    type=click.FloatRange(min=0, max=86_400, min_open=True),
+    callback=finite,
+    help="How many seconds it measures.  [default: what the scenario says]",
+)
+@click.option(
+    "--stations",
+    type=click.IntRange(1, MOST_STATIONS),
+    help="How many; more than there are prisms track them in turn.  [default: those of the scenario]",
+)
+@click.option(
+    "--loss",
+    type=click.FloatRange(0, 1),
+    callback=finite,
+    help="Probability that a packet is not heard.  [default: what the scenario says]",
+)
+@click.option(
+    "--drift-ppm",
+    type=click.FloatRange(-1000, 1000),
+    callback=finite,
+    default=10.0,
+    show_default=True,
+    help="Drift of the stations' clocks against the master's: plus for the first, minus for the second, and so on.",
+)
+@click.option(
+    "--clock-filter",
+    type=click.Choice(["regression", "paper"]),
+    default="regression",
+    show_default=True,
+    help="How the master follows the stations' clocks.",
+)
+@click.option(
+    "--node",
+    type=click.Choice(["ours", "authors"]),
+    default="ours",
+    show_default=True,
+    help="What the stations run: our client, or a node as the paper's authors deployed it.",
+)
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Another seed, another run."
+)
+@click.option("--output", type=click.Path(path_type=Path), help="Keep the master's recording here.")
+@click.option("--truth", type=click.Path(path_type=Path), help="Write the true poses here, as TUM.")
+@json_option
+def simulate_command(
+    *,
+    scenario_name: str,
+    protocol: str,
+    duration_s: float | None,
+    stations: int | None,
+    loss: float | None,
+    drift_ppm: float,
+    clock_filter: Any,
+    node: Any,
+    seed: int,
+    output: Path | None,
+    truth: Path | None,
+    as_json: bool,
+) -> int:
+    """Run master and stations in virtual time, on a simulated robot, radio channel, instruments and clocks.
+
+    SCENARIO is dynamic, static, quarry, ski-trail, snowmobile, or the path of a file. The daemons are the real
+    ones, and one seed gives one run. Everything is checked on the way; what must not happen and does is listed,
+    with exit code 3.
+    """
+    for path in (output, truth):
+        if path is not None and path.exists() and path.is_file():
+            raise click.UsageError(f"{path} exists; choose another file")
+    scenario = find_scenario(scenario_name)
+    if stations is not None:
+        scenario = with_stations(scenario, stations)
+    if loss is not None:
+        radio = scenario.radio.model_copy(update={"loss_probability": loss})
+        scenario = scenario.model_copy(update={"radio": radio})
+    options = Options(
+        duration_s=scenario.duration_s if duration_s is None else duration_s,
+        drift_ppm=drift_ppm,
+        seed=seed,
+        node=node,
+        protocol=ClassicMasterConfig(kind="classic", clock_filter=clock_filter),
+    )
+    configure_logging("error")  # what happens on the way stands in the figures
+    began_s = time.perf_counter()
+    with tempfile.TemporaryDirectory(prefix="tsgt-simulate-") as folder:
+        run = _simulate(scenario, options, Path(folder))
+        found = violations(run)
+        result = {
+            "scenario": scenario.name,
+            "protocol": protocol,
+            "node": node,
+            "clock_filter": clock_filter,
+            "seed": seed,
+            **figures(run),
+            "violations": len(found),
+            "violations_listed": [f"{v.check}: {v.detail}" for v in found[:LISTED_VIOLATIONS]],
+        }
+        if output is not None:
+            _keep_recording(run, output)
+    if truth is not None:
+        _write_truth(run, truth)
+    result["wall_seconds"] = time.perf_counter() - began_s
+    if as_json:
+        print_json(result)
+    else:
+        _print(result, found)
+    return CHECK_FAILED if found else 0
+
+
+def _simulate(scenario: ScenarioConfig, options: Options, folder: Path) -> Run:
+    with _progress(options.duration_s) as progress:
+        try:
+            return simulate(scenario, options, folder=folder, progress=progress)
+        except ExceptionGroup as group:
+            known = group.subgroup(TsgtError)
+            if known is None:
+                raise
+            error: BaseException = known
+            while isinstance(error, ExceptionGroup):
+                error = error.exceptions[0]
+            raise error from group
+
+
+@contextmanager
+def _progress(duration_s: float) -> Iterator[Callable[[float], None]]:
+    """Show on a terminal how many seconds have been simulated."""
+    if not sys.stderr.isatty():
+        yield lambda now_s: None  # noqa: ARG005 (nobody looks)
+        return
+    with click.progressbar(length=max(1, round(duration_s)), label="simulating", file=sys.stderr) as bar:
+        yield lambda now_s: bar.update(round(now_s) - bar.pos)
+
+
+def _keep_recording(run: Run, output: Path) -> None:
+    path = run.sessions[-1].recording()
+    if path is None:
+        raise OutputFileError("the master made no recording that could be kept", path=output)
+    with path.open("rb") as source, write_atomically(output) as target:
+        shutil.copyfileobj(source, target)
+
+
+def _write_truth(run: Run, truth: Path) -> None:
+    """Write the true poses at the epochs of the stream, from the start to the end of the run."""
+    period_ns = run.parameters.pipeline.period_ns
+    stamps_ns = np.arange(
+        -(-run.start_ns // period_ns) * period_ns, run.end_ns + 1, period_ns, dtype=np.int64
+    )
+    poses = run.world.pose_at((stamps_ns - run.start_ns) / 1e9)
+    columns = (stamps_ns, poses[:, :3, 3], quaternion_from_rotation(poses[:, :3, :3]))
+    with write_atomically(truth) as file:
+        file.writelines(line.encode() for line in tum_lines(zip(*(c.tolist() for c in columns), strict=True)))
+
+
+def _print(result: dict[str, Any], found: list[Violation]) -> None:
+    click.echo(
+        f"{result['scenario']}, {result['protocol']} ({result['node']}), seed {result['seed']}: "
+        f"{result['sim_seconds']:g} s simulated in {result['wall_seconds']:.1f} s\n"
+    )
+    rows = [
+        [
+            str(number),
+            *(str(station[key]) for key in ("measured", "delivered", "duplicates")),
+            f"{station['rate_hz']:.2f}",
+            *(f"{station['time_error_us'][key]:.0f}" for key in ("p50", "p99", "max")),
+        ]
+        for number, station in result["stations"].items()
+    ]
+    header = ["station", "measured", "delivered", "twice", "rate Hz", "time error us: p50", "p99", "max"]
+    print_table(header, rows)
+    for name, estimator in result["estimators"].items():
+        click.echo(
+            f"\n{name}: {estimator['valid_poses']} of {estimator['poses']} poses valid\n"
+            f"  position     {estimator['position_rms_mm']:.1f} mm rms off the truth, at the centroid of the prisms\n"
+            f"  orientation  {estimator['orientation_rms_deg']:.2f} deg rms off the truth\n"
+            f"  inter-prism  {estimator['inter_prism_mean_mm']:.1f} mm mean error of the distances"
+        )
+    click.echo(f"\nairtime      {result['airtime_fraction']:.1%} of the time")
+    click.echo(f"violations   {len(found)}")
+    for line in result["violations_listed"]:
+        click.echo(f"  {line}")
+    if len(found) > LISTED_VIOLATIONS:
+        click.echo(f"  ... and {len(found) - LISTED_VIOLATIONS} more")

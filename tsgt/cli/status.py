@@ -1,0 +1,224 @@
+"""The command ``status``: what runs on this computer and how well, readable on a small screen in the sun."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import socket
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from tsgt.cli.options import DEFAULT_CLIENT_SOCKET, DEFAULT_SOCKET, path_type
+from tsgt.cli.output import CHECK_FAILED
+from tsgt.cli.render import clock_time
+from tsgt.errors import StreamError
+from tsgt.master.stream_records import HelloRecord, StationStatus, StatusRecord
+from tsgt.model import Status
+from tsgt.recording import decode
+from tsgt.recording.format import Typed
+from tsgt.station.status import ClientStatus
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+TIMEOUT_S = 5.0
+"""A master sends a status each second; one that sends none for this long is stuck."""
+
+LATE_S = 3.0
+"""A station that was last heard, or measured, longer ago than this needs somebody to look."""
+
+MASTER_LATE_S = 10.0
+"""A master that synchronises with another station is silent here for a second or two."""
+
+WORDS = {
+    Status.OK: "TRACKING",
+    Status.LOW_ACCURACY: "TRACKING",
+    Status.ANGLE_ONLY: "NO DISTANCE",
+    Status.NO_TARGET: "NO PRISM",
+    Status.TILT: "NOT LEVEL",
+    Status.WRONG_DISTANCE: "WRONG TARGET",
+    Status.ERROR: "ERROR",
+}
+"""What an instrument's status is called where there is no room for a sentence."""
+
+
+@click.command()
+@click.option(
+    "--socket",
+    "socket_path",
+    type=path_type,
+    envvar="TSGT_SOCKET",
+    show_envvar=True,
+    help=f"Socket of a master or of a client.  [default: {DEFAULT_SOCKET}, else {DEFAULT_CLIENT_SOCKET}]",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print the status record as it comes.")
+def status(socket_path: Path | None, *, as_json: bool) -> int:
+    """Tell how the daemon on this computer does: the master with all its stations, or a station's client.
+
+    Exit code 1: none runs. 3: one runs, but something needs a person: a station that is not heard or does not track,
+    no valid pose.
+    """
+    record, line = _ask(socket_path)
+    if isinstance(record, ClientStatus):
+        text, well = client_text(record)
+    else:
+        text, well = master_text(record)
+    click.echo(line.rstrip() if as_json else "\n".join(text))
+    return 0 if well else CHECK_FAILED
+
+
+def master_text(record: StatusRecord) -> tuple[list[str], bool]:
+    """Put a master's status into lines of at most 40 characters, and tell whether all is well."""
+    valid = record.valid_poses > 0
+    lines = [
+        f"MASTER  {clock_time(record.stamp_ns)} UTC",
+        f"poses {record.poses}, valid {record.valid_poses}",
+    ]
+    well = valid
+    for station in record.stations:
+        word, good = station_word(station)
+        lines += ["", _headline(f"STATION {station.id}  {word}", good=good), *_station_lines(station)]
+        well = well and good
+    return lines, well
+
+
+def station_word(station: StationStatus) -> tuple[str, bool]:
+    """Say in a word or two how a station does, and whether that is well."""
+    if station.last_heard_s is None:
+        return "NOT HEARD YET", False
+    if station.last_heard_s > LATE_S and not station.answering:
+        return f"SILENT {duration(station.last_heard_s)}", False
+    if station.status is None or station.age_s is None:
+        return "NO MEASUREMENT YET", False
+    if (
+        station.status.usable and station.age_s - station.last_heard_s > LATE_S
+    ):  # it answers, but always the same
+        return f"OLD {duration(station.age_s)}", False
+    return WORDS[station.status], station.status.usable
+
+
+def _station_lines(station: StationStatus) -> list[str]:
+    """Two to four lines of figures, as far as they are known."""
+    lines = []
+    prism = "" if station.prism is None else f"prism {station.prism}  "
+    rate = "" if station.rate_hz is None else f"{station.rate_hz:.2f} Hz  "
+    age = "" if station.age_s is None else f"last {duration(station.age_s)}"
+    lines.append(f"  {prism}{rate}{age}".rstrip())
+    loss = "" if station.loss is None else f"loss {100 * station.loss:.0f} %  "
+    strength = "" if station.rssi_dbm is None else f"{station.rssi_dbm:.0f} dBm  "
+    snr = "" if station.snr_db is None else f"SNR {station.snr_db:.0f}"
+    lines.append(f"  {loss}{strength}{snr}".rstrip())
+    if station.clock_bound_ns is not None:
+        lines.append(f"  clock within {station.clock_bound_ns / 1e6:.2f} ms")
+    return [line for line in lines if line.strip()]
+
+
+def client_text(record: ClientStatus) -> tuple[list[str], bool]:
+    """Put a client's status into lines of at most 40 characters, and tell whether all is well."""
+    problems = _client_problems(record)
+    lines = [_headline(f"STATION {record.station}  {problems[0] if problems else 'OK'}", good=not problems)]
+    lines += [_headline(problem, good=False) for problem in problems[1:]]
+    lines += ["", record.instrument or "no instrument"]
+    if record.mode == "tracking":
+        lines.append(f"tracking prism {record.prism}, {record.rate_hz:.2f} Hz")
+    else:
+        lines.append("direct: single measurements")
+    if (last := record.last) is not None:
+        distance = "no distance" if last.slope_distance_m is None else f"{last.slope_distance_m:.4f} m"
+        lines += [
+            f"last {duration(last.age_s)}: {WORDS[last.status]}",
+            f"  hz {math.degrees(last.horizontal_angle_rad):.4f} v {math.degrees(last.zenith_angle_rad):.4f} deg",
+            f"  {distance}",
+        ]
+    lines += ["", f"{record.measurements} measured, journal {'ok' if record.journal_ok else 'FAILS'}"]
+    if record.journal_waiting:
+        lines.append(f"  {record.journal_waiting} not written yet")
+    lines.append(f"  {Path(record.journal).name}")
+    if record.master_heard_s is None:
+        lines.append("master not heard yet")
+    else:
+        lines.append(f"master heard {duration(record.master_heard_s)} ago")
+        lines.append(f"  {record.rssi_dbm or 0:.0f} dBm  SNR {record.snr_db or 0:.0f}")
+    return lines, not problems
+
+
+def _client_problems(record: ClientStatus) -> list[str]:
+    """Say what needs a person, the most urgent first, in a few words each."""
+    last = record.last
+    problems = []
+    if record.instrument is None:
+        problems.append("NO INSTRUMENT")
+    elif record.mode == "tracking":
+        if last is None or (last.status.usable and last.age_s > LATE_S):
+            problems.append("NO MEASUREMENT" if last is None else f"OLD {duration(last.age_s)}")
+        elif not last.status.usable:
+            problems.append(WORDS[last.status])
+    if not record.journal_ok:
+        problems.append("DISK FAILS")
+    if not record.radio_ok:
+        problems.append("NO RADIO")
+    elif record.master_heard_s is None or record.master_heard_s > MASTER_LATE_S:
+        problems.append("MASTER NOT HEARD")
+    return problems
+
+
+def duration(seconds: float) -> str:
+    """Write a duration so that it takes little room: 0.4 s, 12 s, 3 min, 2 h."""
+    if seconds < 10:
+        return f"{seconds:.1f} s"
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.0f} h"
+
+
+def _headline(text: str, *, good: bool) -> str:
+    """Write what needs a person so that it is seen; click leaves the codes out where there is no terminal."""
+    return click.style(text, bold=True, reverse=not good)
+
+
+def _ask(socket_path: Path | None) -> tuple[StatusRecord | ClientStatus, bytes]:
+    """Ask at the socket given, else at where a master, then a client would be."""
+    if socket_path is not None:
+        return _status_of(socket_path)
+    try:
+        return _status_of(DEFAULT_SOCKET)
+    except StreamError:
+        with contextlib.suppress(StreamError):
+            return _status_of(DEFAULT_CLIENT_SOCKET)
+    raise StreamError(
+        f"nothing runs here: nobody serves {DEFAULT_SOCKET} or {DEFAULT_CLIENT_SOCKET}; "
+        "start tsgt-master or tsgt-client, or give --socket"
+    )
+
+
+def _status_of(path: Path) -> tuple[StatusRecord | ClientStatus, bytes]:
+    """Wait for the first status line on a socket."""
+    for line in _lines(path):
+        try:
+            match decode(Typed, line).type:
+                case "status":
+                    return decode(StatusRecord, line), line
+                case "client_status":
+                    return decode(ClientStatus, line), line
+                case "hello":
+                    decode(HelloRecord, line)
+        except ValueError as error:
+            raise StreamError(f"{path}: what it says is no stream of tsgt ({error})") from error
+    raise StreamError(f"{path}: it ended without a status; is it a replay?")
+
+
+def _lines(path: Path) -> Iterator[bytes]:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+        connection.settimeout(TIMEOUT_S)
+        try:
+            connection.connect(str(path))
+            with connection.makefile("rb") as file:
+                yield from file
+        except TimeoutError as error:
+            raise StreamError(
+                f"{path}: no status within {TIMEOUT_S:g} s; the daemon is stuck, see its log"
+            ) from error
+        except OSError as error:
+            raise StreamError(f"{path}: nobody answers ({error.strerror or error})") from error

@@ -1,0 +1,150 @@
+"""A whole mission in virtual time, from its start to its end: the same seed gives the same one."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from tsgt.config.radio import ClassicMasterConfig
+from tsgt.simulation.event_loop import run_virtual
+from tsgt.simulation.mission import DRAIN_S, START_UNIX_NS, Mission, Node
+from tsgt.simulation.timeline import VirtualTimeline
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine
+    from pathlib import Path
+
+    from tsgt.config import ScenarioConfig
+    from tsgt.model import Parameters
+    from tsgt.simulation.witness import Session, StationWitness
+    from tsgt.simulation.world import World
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """What may be set of a run besides its scenario.
+
+    Attributes
+    ----------
+    duration_s
+        How long it measures.
+    drift_ppm
+        See :class:`~tsgt.simulation.mission.Mission`.
+    seed
+        Of everything that is drawn.
+    node
+        What the stations run.
+    protocol
+        What the master speaks.
+    """
+
+    duration_s: float
+    drift_ppm: float = 10.0
+    seed: int = 0
+    node: Node = "ours"
+    protocol: ClassicMasterConfig = field(default_factory=lambda: ClassicMasterConfig(kind="classic"))
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """A mission that is over.
+
+    Attributes
+    ----------
+    parameters
+        What the master knew of the set-up: the exact truth.
+    world
+        The truth; its instants count from the start of the run.
+    duration_s
+        How long it measured, without the drain.
+    sessions
+        What the master sent out, one entry for each time that it was started.
+    witnesses
+        What was read from the instruments, by station number.
+    airtime_s
+        How long there was a packet on the air.
+    start_ns
+        Unix time of the start on the master's clock, in ns.
+    """
+
+    parameters: Parameters
+    world: World
+    duration_s: float
+    sessions: list[Session]
+    witnesses: dict[int, StationWitness]
+    airtime_s: float
+    start_ns: int = START_UNIX_NS
+
+    @property
+    def end_ns(self) -> int:
+        """Unix time of the end on the master's clock, in ns; the drain comes after it."""
+        return self.start_ns + round(self.duration_s * 1e9)
+
+
+def simulate(
+    scenario: ScenarioConfig,
+    options: Options,
+    *,
+    folder: Path,
+    progress: Callable[[float], None] = lambda now_s: None,  # noqa: ARG005 (nobody looks)
+    script: Callable[[Mission], Coroutine[None, None, None]] | None = None,
+) -> Run:
+    """Run a mission on virtual time; the same scenario, options and script give the same run.
+
+    Parameters
+    ----------
+    scenario, options
+        What happens.
+    folder
+        An empty folder for recordings, journals and sockets.
+    progress
+        Told of the virtual time in s, each virtual second.
+    script
+        Runs beside the daemons: kills and starts them, steps clocks.
+
+    Raises
+    ------
+    ExceptionGroup
+        A daemon has ended with an error.
+    """
+    timeline = VirtualTimeline()
+
+    async def run() -> Run:
+        mission = Mission(
+            scenario,
+            options.protocol,
+            node=options.node,
+            drift_ppm=options.drift_ppm,
+            duration_s=options.duration_s,
+            seed=options.seed,
+            folder=folder,
+            timeline=timeline,
+        )
+        for station in scenario.stations:
+            mission.start_station(station.station)
+        mission.start_master()
+        acting = asyncio.create_task(script(mission)) if script is not None else None
+        try:
+            for second in range(1, math.ceil(options.duration_s) + 1):
+                await mission.until(min(second, options.duration_s))
+                progress(mission.now_s)
+            airtime_s = mission.air.airtime_ns / 1e9
+            await mission.until(options.duration_s + DRAIN_S)
+            if acting is not None:
+                await acting
+        finally:
+            if acting is not None:
+                acting.cancel()
+            await mission.end()
+        return Run(
+            parameters=mission.parameters,
+            world=mission.world,
+            duration_s=options.duration_s,
+            sessions=mission.sessions,
+            witnesses=mission.witnesses,
+            airtime_s=airtime_s,
+        )
+
+    return run_virtual(run, timeline)

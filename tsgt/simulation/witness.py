@@ -1,0 +1,176 @@
+"""What a simulated run leaves behind for figures and checkers: what went in, and what came out."""
+
+from __future__ import annotations
+
+from array import array
+from dataclasses import dataclass, field
+from hashlib import blake2b
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.master.stream_records import ClockRecord, PoseRecord, StatusRecord
+from tsgt.model import PolarMeasurement
+from tsgt.recording import encode_line
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from tsgt.station.instrument import Instrument, Reading
+
+
+@dataclass(frozen=True, slots=True)
+class ValidPoses:
+    """The valid poses of a stream, in its order.
+
+    Attributes
+    ----------
+    stamp_ns
+        (N,) on the master's Unix clock.
+    position_m
+        (N, 3) in frame ``station1``.
+    orientation_xyzw
+        (N, 4).
+    residual_m
+        (N,) as stated.
+    after
+        (N,) how many measurements stood in the stream before each pose.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    position_m: NDArray[np.float64]
+    orientation_xyzw: NDArray[np.float64]
+    residual_m: NDArray[np.float64]
+    after: NDArray[np.int64]
+
+
+class Session:
+    """What one run of the master sent out, from its start to its end. Its method :meth:`take` is the master's observer.
+
+    Hours of poses are kept as numbers, and what the lines were as a hash.
+
+    Parameters
+    ----------
+    folder
+        Where the master keeps its recording, the only file there.
+
+    Attributes
+    ----------
+    measurements, clocks, statuses
+        The records of these types.
+    poses
+        How many poses, valid or not.
+    digest
+        Hash of all lines.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self.measurements: list[PolarMeasurement] = []
+        self.clocks: list[ClockRecord] = []
+        self.statuses: list[StatusRecord] = []
+        self.poses = 0
+        self.digest = blake2b()
+        self._pose_stamps = array("q")
+        self._pose_after = array("q")
+        self._pose_numbers = array("d")
+
+    def take(self, record: object) -> None:
+        """Take a record that goes out."""
+        self.digest.update(encode_line(record) + b"\n")
+        if isinstance(record, PolarMeasurement):
+            self.measurements.append(record)
+        elif isinstance(record, ClockRecord):
+            self.clocks.append(record)
+        elif isinstance(record, StatusRecord):
+            self.statuses.append(record)
+        elif isinstance(record, PoseRecord):
+            self.poses += 1
+            if record.valid:
+                self._take_pose(record)
+
+    def _take_pose(self, pose: PoseRecord) -> None:
+        self._pose_stamps.append(pose.stamp_ns)
+        self._pose_after.append(len(self.measurements))
+        self._pose_numbers.extend(pose.position_m or ())
+        self._pose_numbers.extend(pose.orientation_xyzw or ())
+        self._pose_numbers.append(np.nan if pose.residual_m is None else pose.residual_m)
+
+    def valid_poses(self) -> ValidPoses:
+        """Return the valid poses so far."""
+        numbers = np.array(self._pose_numbers).reshape(-1, 8)
+        return ValidPoses(
+            stamp_ns=np.array(self._pose_stamps, dtype=np.int64),
+            position_m=numbers[:, :3],
+            orientation_xyzw=numbers[:, 3:7],
+            residual_m=numbers[:, 7],
+            after=np.array(self._pose_after, dtype=np.int64),
+        )
+
+    def recording(self) -> Path | None:
+        """Return the recording; None when the master did not get as far as that."""
+        return next(iter(sorted(self._folder.glob("*.jsonl"))), None)
+
+
+@dataclass(slots=True)
+class StationWitness:
+    """What a station's client read from its instrument, whether it went any further or not.
+
+    Attributes
+    ----------
+    station
+        Its number.
+    stamps_ns
+        By the host time of each reading in ns: the true time of that instant, in ns from the start.
+    journals
+        The folders of the client's journals, one for each time that it was started.
+    """
+
+    station: int
+    stamps_ns: dict[int, int] = field(default_factory=dict)
+    journals: list[Path] = field(default_factory=list)
+
+
+class WatchedInstrument:
+    """An instrument that tells somebody else, too, what is read from it.
+
+    Parameters
+    ----------
+    instrument
+        The one that is watched.
+    watch
+        Gets each reading of the tracked prism.
+    """
+
+    def __init__(self, instrument: Instrument, watch: Callable[[Reading], None]) -> None:
+        self._instrument = instrument
+        self._watch = watch
+
+    async def connect(self) -> str:
+        """Find and identify the instrument."""
+        return await self._instrument.connect()
+
+    async def track(self, prism: int) -> None:
+        """Lock on to a prism."""
+        await self._instrument.track(prism)
+
+    async def read(self) -> Reading:
+        """Return the next measurement, and tell."""
+        reading = await self._instrument.read()
+        self._watch(reading)
+        return reading
+
+    async def direct(self) -> None:
+        """Get ready for single measurements."""
+        await self._instrument.direct()
+
+    async def measure(self) -> Reading:
+        """Measure the target once."""
+        return await self._instrument.measure()
+
+    async def close(self) -> None:
+        """Let go of the instrument."""
+        await self._instrument.close()

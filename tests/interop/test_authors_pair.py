@@ -29,7 +29,7 @@ from tsgt.radio.classic import (
 )
 from tsgt.radio.classic_messages import Command, MeasurementMessage, raw_status, status_of
 from tsgt.simulation.air import Air
-from tsgt.simulation.authors_node import AuthorsMaster, AuthorsNode
+from tsgt.simulation.authors_node import AUTHORS_STAMP_DELAY_MS, AuthorsMaster, AuthorsNode
 from tsgt.simulation.clocks import DriftingClock, VirtualClock
 from tsgt.simulation.link import LinkModel
 from tsgt.simulation.radios import opener
@@ -257,7 +257,7 @@ async def test_our_master_synchronises_their_node(spreading_factor: int) -> None
     """Each cycle brings a sample; with the known delay of polling the mean offset is right to 0.1 ms."""
     async with _field(spreading_factor) as site:
         await site.add_authors_node(1)
-        turn = Synchronisation(1, 50, site.timing, stamp_delay_ns=700_000)
+        turn = Synchronisation(1, 50, site.timing, stamp_delay_ns=round(AUTHORS_STAMP_DELAY_MS * MS))
         await site.our_master().take(turn)
         message = await _polled(site)
     offsets_ns = [sample.station_ns - sample.sent_ns - sample.forward_ns for sample in turn.samples]
@@ -357,6 +357,7 @@ async def test_their_master_gets_our_measurement(spreading_factor: int) -> None:
         given_ns = site.clocks[1].realtime_ns()
         site.instruments[1].give()
         master = site.their_master(1)
+        await master.synchronise(1)
         answers = [await master.poll(1) for _ in range(2)]
     assert answers[0] == answers[1] == (1, 0, 1.25, 2.5, 99.5, given_ns // SECOND, given_ns % SECOND)
 

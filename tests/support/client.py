@@ -99,7 +99,8 @@ class Field:
         return None
 
     async def poll(self) -> MeasurementMessage:
-        """Ask for data and insist."""
+        """Ask for data and insist; ping first, for the station has to have been synchronised once."""
+        await self.ask(b"e1")
         reply = await self.ask(b"t1")
         assert isinstance(reply, MeasurementMessage), reply
         return reply

@@ -21,7 +21,7 @@ from tsgt.model import Status
 from tsgt.radio.classic import ClassicStation, DirectOrder, TrackOrder
 from tsgt.radio.classic_messages import MeasurementMessage, raw_status
 from tsgt.simulation.air import Air
-from tsgt.simulation.authors_node import AuthorsNode
+from tsgt.simulation.authors_node import AUTHORS_STAMP_DELAY_MS, AuthorsNode
 from tsgt.simulation.clocks import DriftingClock, VirtualClock
 from tsgt.simulation.link import LinkModel
 from tsgt.simulation.radios import opener
@@ -204,7 +204,7 @@ class Field:
     def config(self, **changes: Any) -> MasterConfig:
         """Make the master's configuration, with a short first synchronisation."""
         protocol = {"initial_cycles": 5} | changes.pop("protocol", {})
-        delay_ms = 0.7 if self.stations[1].authors else 0.0
+        delay_ms = AUTHORS_STAMP_DELAY_MS if self.stations[1].authors else 0.0
         return MasterConfig(
             kind="master",
             setup=SetupConfig(station_frames=self.folder / "frames", prism_layout=self.folder / "prisms"),

@@ -14,7 +14,10 @@ if TYPE_CHECKING:
     from tsgt.model import Measurement
 
 LOST_AFTER_NS = 5_000_000_000
-"""A station that has been asked and not heard for this long is lost."""
+"""A station that has been asked for this long without an answer is lost. Nobody asks it while others are synchronised."""
+
+IDLE_AFTER_NS = 10_000_000_000
+"""A station that answers without anything new for this long has lost its instrument; no instrument pauses so long."""
 
 CLOCK_STEP_NS = 100_000_000
 """The machine's Unix clock has been stepped when it has left the master's timeline by this much more than before."""
@@ -35,9 +38,14 @@ class _Station:
     """What is known of one station."""
 
     heard_ns: int
-    unanswered: bool = False
+    missed_ns: int | None = None
+    """Since when it has been asked without an answer; None while it answers."""
+    misses: int = 0
     lost: bool = False
     refused: bool = False
+    nothing_new_ns: int | None = None
+    """Since when its answers hold no new measurement; None while they do."""
+    idle: bool = False
     meaning: str = _MEANING[Status.OK]
 
 
@@ -59,9 +67,11 @@ class Alerts:
     def asked(self, station: int, now_ns: int, *, answered: bool) -> list[EventRecord]:
         """Take note of a turn of a station; tell when it is back."""
         found = self._stations[station]
-        found.unanswered = not answered
         if not answered:
+            found.missed_ns = now_ns if found.missed_ns is None else found.missed_ns
+            found.misses += 1
             return []
+        found.missed_ns, found.misses = None, 0
         silent_s = (now_ns - found.heard_ns) / 1e9
         found.heard_ns = now_ns
         if not found.lost:
@@ -85,15 +95,36 @@ class Alerts:
         text = "has another clock than before: restarted, or set; its measurements are put on the new one"
         return [_event(now_ns, "station_clock_stepped", text, station)]
 
-    def measurement(self, measurement: Measurement, now_ns: int) -> list[EventRecord]:
-        """Tell when an instrument reports an error, another one, or none any more."""
-        found = self._stations.get(measurement.station)
-        meaning = _MEANING[measurement.status]
-        if found is None or meaning == found.meaning:
+    def polled(self, station: int, now_ns: int) -> list[EventRecord]:
+        """Take note of an answer to a poll, before the measurement that it may hold; tell when none comes any more.
+
+        A node that repeats an error without a time has been told of already.
+        """
+        found = self._stations[station]
+        found.nothing_new_ns = now_ns if found.nothing_new_ns is None else found.nothing_new_ns
+        idle_ns = now_ns - found.nothing_new_ns
+        if found.idle or idle_ns <= IDLE_AFTER_NS or found.meaning != _MEANING[Status.OK]:
             return []
-        found.meaning = meaning
-        again = " again" if measurement.status.usable else ""
-        return [_event(now_ns, "instrument_status", f"{meaning}{again}", measurement.station)]
+        found.idle = True
+        text = f"answers, but has measured nothing for {idle_ns / 1e9:.0f} s; look at its instrument"
+        return [_event(now_ns, "station_idle", text, station)]
+
+    def measurement(self, measurement: Measurement, now_ns: int) -> list[EventRecord]:
+        """Tell when an instrument measures again, and when it reports an error, another one, or none any more."""
+        found = self._stations.get(measurement.station)
+        if found is None:
+            return []
+        events = []
+        found.nothing_new_ns = None
+        if found.idle:
+            found.idle = False
+            events.append(_event(now_ns, "station_measuring", "measures again", measurement.station))
+        meaning = _MEANING[measurement.status]
+        if meaning != found.meaning:
+            found.meaning = meaning
+            again = " again" if measurement.status.usable else ""
+            events.append(_event(now_ns, "instrument_status", f"{meaning}{again}", measurement.station))
+        return events
 
     def tick(self, now_ns: int, *, unix_ns: int) -> list[EventRecord]:
         """Tell what time alone brings.
@@ -107,7 +138,9 @@ class Alerts:
         """
         events = []
         for number, station in self._stations.items():
-            if station.unanswered and not station.lost and now_ns - station.heard_ns > LOST_AFTER_NS:
+            missed_ns = station.missed_ns
+            late = missed_ns is not None and now_ns - missed_ns > LOST_AFTER_NS
+            if late and station.misses > 1 and not station.lost:
                 station.lost = True
                 text = f"not heard for {(now_ns - station.heard_ns) / 1e9:.0f} s"
                 events.append(_event(now_ns, "station_lost", text, number))

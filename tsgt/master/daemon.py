@@ -153,13 +153,14 @@ class _Master:
         now_ns = self._now_ns()
         protocol = config.protocol
         self._prisms = {station.station: station.prism for station in config.stations}
+        delays_ns = {station.station: round(station.stamp_delay_ms * 1e6) for station in config.stations}
         self._timing = Timing.of(settings, round(protocol.reply_timeout_ms * 1e6))
         self._scheduler = Scheduler(
             [
                 StationPlan(
                     station=station.station,
                     prism=station.prism,
-                    stamp_delay_ns=round(station.stamp_delay_ms * 1e6),
+                    stamp_delay_ns=delays_ns[station.station],
                 )
                 for station in config.stations
             ],
@@ -167,7 +168,7 @@ class _Master:
             self._timing,
             now_ns,
         )
-        self._intake = Intake(self._prisms, lambda: clock_filter(protocol.clock_filter))
+        self._intake = Intake(self._prisms, lambda: clock_filter(protocol.clock_filter), delays_ns)
         self._monitor = Monitor(self._prisms, self._intake.clock)
         self._alerts = Alerts(self._prisms, now_ns)
         watchers: list[Watcher] = [
@@ -272,6 +273,7 @@ class _Master:
     def _polled(self, poll: Poll, packet: Packet, requested_ns: int) -> None:
         if poll.message is None:
             return
+        self._put(self._alerts.polled(poll.station, self._now_ns()))
         arrival = self._intake.answered(
             poll.message,
             requested_ns=requested_ns,
@@ -348,9 +350,11 @@ class _Fence:
     def _acted_on(self, events: Sequence[EventRecord]) -> Sequence[EventRecord]:
         if self._config.command:
             for event in events:
-                self._group.create_task(
-                    run_fence_command(self._config.command, event=event.event, fence=self._config.name)
-                )
+                command = run_fence_command(self._config.command, event=event.event, fence=self._config.name)
+                try:
+                    self._group.create_task(command)
+                except RuntimeError:  # the master is ending, and starts nothing any more
+                    command.close()
         return events
 
 

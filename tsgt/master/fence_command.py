@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 TIMEOUT_S = 10.0
 """How long it may take before it is killed, with what it has started."""
 
+KILL_TIMEOUT_S = 0.5
+"""How long is waited for it to be gone then: one that may not be killed must not keep the master from ending."""
+
 log = structlog.get_logger()
 
 
@@ -47,8 +50,8 @@ async def _problem(command: Sequence[str], environment: dict[str, str]) -> str:
             stdout=asyncio.subprocess.DEVNULL,
             start_new_session=True,
         )
-    except OSError as error:
-        return f"cannot be started ({error.strerror})"
+    except (OSError, ValueError) as error:  # ValueError: a zero byte among the arguments
+        return f"cannot be started ({error})"
     try:
         async with asyncio.timeout(TIMEOUT_S):
             status = await process.wait()
@@ -58,6 +61,8 @@ async def _problem(command: Sequence[str], environment: dict[str, str]) -> str:
         return f"exit status {status}" if status else ""
     finally:
         if process.returncode is None:
-            with suppress(ProcessLookupError):
+            with suppress(ProcessLookupError, PermissionError):  # it may have become another user's
                 os.killpg(process.pid, signal.SIGKILL)
-            await process.wait()
+            with suppress(TimeoutError):
+                async with asyncio.timeout(KILL_TIMEOUT_S):
+                    await process.wait()

@@ -11,9 +11,10 @@ from collections import deque
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
+from tsgt.master.clock_line import highest_offset_ns
 from tsgt.master.clock_offset import ArrivalCheck
 from tsgt.master.stream_records import ClockRecord
-from tsgt.model import LAST_INSTANT_NS, PolarMeasurement, Status
+from tsgt.model import PolarMeasurement, Status
 from tsgt.radio.classic_messages import OK, status_of
 
 if TYPE_CHECKING:
@@ -30,8 +31,15 @@ SILENCE_NS = 5_000_000_000
 """A station that was silent for longer may have been switched off and on, and have another clock; no computer that
 a station client runs on starts faster."""
 
+STALE_NS = 1_000_000_000
+"""Instruments that track measure more often than this. A new measurement that looks older may be one of a clock that
+stood still, or was set back, while nobody asked the station."""
+
 HELD_MEASUREMENTS = 100
 """How many wait for a synchronisation at most; the oldest goes first."""
+
+KNOWN_MEASUREMENTS = 1000
+"""So many of the last ones are known when they come again, played back by somebody or out of a radio's buffer."""
 
 
 class Intake:
@@ -43,11 +51,21 @@ class Intake:
         Number of the prism by number of the station that tracks it.
     new_filter
         Makes the filter of one station's clock.
+    stamp_delays_ns
+        By station, where there is one: how late its computer stamps receptions on average, in ns; as much as that
+        one stamp may be off by.
     """
 
-    def __init__(self, prisms: Mapping[int, int], new_filter: Callable[[], ClockFilter]) -> None:
+    def __init__(
+        self,
+        prisms: Mapping[int, int],
+        new_filter: Callable[[], ClockFilter],
+        stamp_delays_ns: Mapping[int, int] | None = None,
+    ) -> None:
+        delays_ns = stamp_delays_ns or {}
         self._stations = {
-            station: _Station(station, prism, new_filter()) for station, prism in prisms.items()
+            station: _Station(station, prism, new_filter(), delays_ns.get(station, 0))
+            for station, prism in prisms.items()
         }
 
     def answered(self, message: MeasurementMessage, *, requested_ns: int, received_ns: int) -> Arrival:
@@ -87,7 +105,8 @@ class Arrival(NamedTuple):
     stepped
         The station's clock has just been found to be another one.
     doubtful
-        The station has to be synchronised before its measurements can be used: it stepped, or was silent.
+        The station has to be synchronised before its measurements can be used: it stepped, was silent, begins anew,
+        or sends what looks old.
     """
 
     measurement: PolarMeasurement | None = None
@@ -103,7 +122,7 @@ class Synchronised(NamedTuple):
     record
         For the stream.
     measurements
-        Those that waited for it, in the order of their arrival.
+        Those that waited for it and are of this clock, in the order of their arrival.
     stepped
         It has just been found that the station's clock is another one than before.
     """
@@ -123,13 +142,15 @@ class _Untimed:
 class _Station:
     """One station's clock and what was last heard from it."""
 
-    def __init__(self, station: int, prism: int, clock: ClockFilter) -> None:
+    def __init__(self, station: int, prism: int, clock: ClockFilter, stamp_delay_ns: int) -> None:
         self._station = station
         self._prism = prism
         self._clock = clock
+        self._stamp_delay_ns = stamp_delay_ns
         self._check = ArrivalCheck()
         self._offset_ns: int | None = None
         self._last: int | _Untimed | None = None
+        self._known: deque[int] = deque(maxlen=KNOWN_MEASUREMENTS)
         self._held: deque[tuple[MeasurementMessage, int]] = deque(maxlen=HELD_MEASUREMENTS)
         self._sequence = 0
         self._heard_ns: int | None = None
@@ -138,37 +159,60 @@ class _Station:
 
     def answered(self, message: MeasurementMessage, requested_ns: int, received_ns: int) -> Arrival:
         status = status_of(message)
+        missed = self.missed
         back = self._is_back(received_ns)
         if message.time_ns == 0:
             self._check.nothing_new(requested_ns)
             if message.status == OK or not (message.zenith_angle_rad or message.horizontal_angle_rad):
-                return Arrival(doubtful=back)  # it has not measured anything yet
+                return Arrival(
+                    doubtful=self._begins_anew(missed=missed) or back
+                )  # it has not measured anything yet
             return Arrival(self._untimed(message, received_ns), doubtful=back)
-        if message.time_ns == self._last:
-            self._check.nothing_new(requested_ns)
+        if message.time_ns in self._known:
+            if message.time_ns == self._last:  # and not an older one that somebody plays back
+                self._check.nothing_new(requested_ns)
             return Arrival(doubtful=back)
         present = self.clock(received_ns)
         if present is None or self._doubtful:
-            self._last = message.time_ns
-            self._held.append((message, received_ns))
+            self._hold(message, received_ns)
             return Arrival(doubtful=back)
         # By the clock as it is now: carried back to a time of years ago its bound would excuse anything.
-        if not self._check.check(
-            message.time_ns - present.offset_ns,
-            requested_ns=requested_ns,
-            received_ns=received_ns,
-            bound_ns=present.bound_ns,
-        ):
-            if status not in (Status.OK, Status.ANGLE_ONLY):  # an authors' node has no time for its errors
-                return Arrival(self._untimed(message, received_ns))
-            self._last = message.time_ns
+        stamp_ns, timed = message.time_ns - present.offset_ns, status in (Status.OK, Status.ANGLE_ONLY)
+        possible = self._check.check(
+            stamp_ns, requested_ns=requested_ns, received_ns=received_ns, bound_ns=present.bound_ns
+        )
+        stale = stamp_ns < requested_ns - present.bound_ns - STALE_NS
+        if not timed and (stale or not possible):  # an authors' node has no time for its errors
+            return Arrival(self._untimed(message, received_ns))
+        if not possible:
             self._offset_ns = None
             self._clock.forget()
             self._check = ArrivalCheck()
-            self._held.append((message, received_ns))
+            self._hold(message, received_ns)
             return Arrival(stepped=True, doubtful=True)
-        self._last = message.time_ns
+        if stale:
+            self._doubtful = True
+            self._hold(message, received_ns)
+            return Arrival(doubtful=True)
+        self._take(message)
         return Arrival(self._measurement(message, received_ns))
+
+    def _take(self, message: MeasurementMessage) -> None:
+        self._last = message.time_ns
+        self._known.append(message.time_ns)
+
+    def _hold(self, message: MeasurementMessage, received_ns: int) -> None:
+        self._take(message)
+        self._held.append((message, received_ns))
+
+    def _begins_anew(self, *, missed: bool) -> bool:
+        """Tell whether the program of a station without a measurement was started again.
+
+        It was if there was a measurement before, and may have been if a request was lost.
+        """
+        anew, self._last = missed or self._last is not None, None
+        self._doubtful = self._doubtful or anew
+        return anew
 
     def _is_back(self, received_ns: int) -> bool:
         """Tell whether this is the first answer after a silence in which the station may have got another clock.
@@ -182,14 +226,17 @@ class _Station:
         return silent
 
     def synchronised(self, samples: Sequence[ClockSample], now_ns: int) -> Synchronised:
+        newest = samples[-1]
+        known = self._offset_ns is not None
+        if known and self._doubtful and not self._agrees(newest):
+            self._clock.forget()  # the paper's filter would go there a tenth of the way
         self._heard_ns, self.missed, self._doubtful = now_ns, False, False
         updated = self._clock.update(samples)
-        stepped = updated.restarted and self._offset_ns is not None
-        newest = samples[-1]
+        stepped = updated.restarted and known
         self._offset_ns = newest.station_ns - newest.sent_ns - newest.forward_ns
         # The first, rough offset says when "now" is over there.
         self._offset_ns = self._clock.at(now_ns + self._offset_ns).offset_ns
-        estimate = self._clock.at(now_ns + self._offset_ns)
+        estimate = self._at(now_ns + self._offset_ns)
         record = ClockRecord(
             stamp_ns=now_ns,
             station=self._station,
@@ -202,12 +249,23 @@ class _Station:
             samples=tuple(samples),
             rejected=updated.rejected,
         )
-        measurements = [self._measurement(message, received_ns) for message, received_ns in self._held]
+        released = [self._released(message, received_ns, estimate) for message, received_ns in self._held]
         self._held.clear()
-        return Synchronised(record, measurements, stepped)
+        return Synchronised(record, [m for m in released if m is not None], stepped)
+
+    def _agrees(self, sample: ClockSample) -> bool:
+        """Whether an exchange is possible with the clock as it is known."""
+        estimate = self._at(sample.station_ns)
+        highest_ns = highest_offset_ns(sample) + estimate.bound_ns
+        lowest_ns = highest_offset_ns(sample) - max(sample.excess_ns, 0) - estimate.bound_ns
+        return lowest_ns <= estimate.offset_ns <= highest_ns
 
     def clock(self, now_ns: int) -> ClockEstimate | None:
-        return None if self._offset_ns is None else self._clock.at(now_ns + self._offset_ns)
+        return None if self._offset_ns is None else self._at(now_ns + self._offset_ns)
+
+    def _at(self, station_ns: int) -> ClockEstimate:
+        estimate = self._clock.at(station_ns)
+        return replace(estimate, bound_ns=estimate.bound_ns + self._stamp_delay_ns)
 
     def _untimed(self, message: MeasurementMessage, received_ns: int) -> PolarMeasurement | None:
         """Take an error without a time, or with one that cannot be, once until something else comes."""
@@ -217,13 +275,20 @@ class _Station:
         self._last = known_by
         return self._record(message, received_ns, received_ns, UNTIMED_SIGMA_NS)
 
+    def _released(
+        self, message: MeasurementMessage, received_ns: int, present: ClockEstimate
+    ) -> PolarMeasurement | None:
+        """Stamp what was held, if it can be of the clock that has been found and not of one before that."""
+        stamp_ns = message.time_ns - present.offset_ns
+        if received_ns - 2 * STALE_NS <= stamp_ns <= received_ns + present.bound_ns:
+            return self._measurement(message, received_ns)
+        if status_of(message) in (Status.OK, Status.ANGLE_ONLY):
+            return None  # nobody knows when it was; the station's journal has it
+        return self._record(message, received_ns, received_ns, UNTIMED_SIGMA_NS)
+
     def _measurement(self, message: MeasurementMessage, received_ns: int) -> PolarMeasurement:
         estimate = self._clock.at(message.time_ns)
-        stamp_ns = message.time_ns - estimate.offset_ns
-        if not 0 <= stamp_ns <= LAST_INSTANT_NS:  # held, and of a clock that has been set once more since
-            record = self._record(message, received_ns, received_ns, UNTIMED_SIGMA_NS)
-            return replace(record, status=Status.ERROR)  # nobody knows when it was, so no pose may have it
-        return self._record(message, received_ns, stamp_ns, estimate.sigma_ns)
+        return self._record(message, received_ns, message.time_ns - estimate.offset_ns, estimate.sigma_ns)
 
     def _record(
         self, message: MeasurementMessage, received_ns: int, stamp_ns: int, sigma_ns: int

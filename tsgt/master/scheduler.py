@@ -27,6 +27,9 @@ ORDER_TIMEOUT_NS = 1_000_000_000
 """A station that tracks says so at once. One that has to turn to its prism first takes longer, and is asked again:
 waiting for it would keep all others waiting, just as a lost packet would."""
 
+LATEST_ANSWER_NS = 20_000_000_000
+"""A station may answer an order this late."""
+
 FIRST_INTERVAL_NS = 30_000_000_000
 """From a station's first synchronisation to its second. Before that, the frequency of its clock is but a guess."""
 _INTERVAL_GROWTH = 3
@@ -81,6 +84,11 @@ class Cadence:
     interval_ns: int
     first_interval_ns: int = FIRST_INTERVAL_NS
 
+    def following_ns(self, earlier: int) -> int:
+        """Return the time from a synchronisation to the next one, when there were so many ``earlier`` ones; in ns."""
+        grown_ns: int = self.first_interval_ns * _INTERVAL_GROWTH**earlier
+        return min(grown_ns, self.interval_ns)
+
 
 class Scheduler:
     """Hands out turns, one at a time.
@@ -128,7 +136,13 @@ class Scheduler:
         station = self._station(turn.station)
         took_ns = now_ns - self._began_ns
         if isinstance(turn, Ordered):
-            station.silent, station.tracks = turn.ok is None, bool(turn.ok)
+            # It does not say whose it is: it may be another's, late. That one is no second time late.
+            sure = station.agreed or not any(
+                other is not station and now_ns < other.may_answer_ns for other in self._round
+            )
+            station.silent, station.tracks = turn.ok is None, bool(turn.ok) and sure
+            station.agreed = bool(turn.ok)
+            station.may_answer_ns = now_ns + LATEST_ANSWER_NS if turn.ok is None else 0
             station.refused = 0 if turn.ok else station.refused + 1
             station.not_before_ns = now_ns + _pause_ns(station.refused, took_ns)
             return
@@ -143,9 +157,13 @@ class Scheduler:
                 station.due_ns = now_ns + self._cadence.first_interval_ns
 
     def resynchronise(self, station: int, now_ns: int) -> None:
-        """Synchronise a station before anything else: its clock has been found to be another one."""
+        """Synchronise a station before anything else: its clock has been found to be another one.
+
+        It may have been restarted, and then tracks the prism of its own configuration; so it is told its prism again.
+        """
         found = self._station(station)
         found.urgent = True
+        found.tracks = found.agreed = False
         found.due_ns = now_ns
         found.synchronisations = min(found.synchronisations, 1)
 
@@ -167,7 +185,7 @@ class Scheduler:
 
     def _synchronised(self, station: _Station, now_ns: int) -> None:
         cadence = self._cadence
-        interval_ns = cadence.first_interval_ns * _INTERVAL_GROWTH**station.synchronisations
+        interval_ns = cadence.following_ns(station.synchronisations)
         station.synchronisations = min(station.synchronisations + 1, 20)
         station.urgent = False
         self._spaced_ns = now_ns + _SPACING_NS
@@ -200,6 +218,10 @@ class _Station:
         It has said that it tracks.
     silent
         It did not answer last.
+    agreed
+        It said so in answer to the last order; see ``tracks``.
+    may_answer_ns
+        Until then its answer to an order may still come, in the turn of another.
     fruitless, refused
         Polls and synchronisations in a row that brought nothing; orders in a row that were not carried out.
     synchronisations
@@ -213,6 +235,8 @@ class _Station:
     plan: StationPlan
     tracks: bool = False
     silent: bool = False
+    agreed: bool = False
+    may_answer_ns: int = 0
     fruitless: int = 0
     refused: int = 0
     synchronisations: int = 0

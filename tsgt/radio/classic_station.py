@@ -13,6 +13,12 @@ from tsgt.radio.classic_messages import (
     no_measurement_yet,
 )
 
+_INTRODUCTIONS = 3
+"""So many requests are answered as if there were no measurement yet, unless the station is synchronised before.
+
+A master that knew the station before its restart cannot see from a measurement that its clock may be another one. One
+that is told that there is none can."""
+
 
 @dataclass(frozen=True, slots=True)
 class TrackOrder:
@@ -55,6 +61,7 @@ class ClassicStation:
     def __init__(self, station: int) -> None:
         self._station = station
         self._newest = no_measurement_yet(station)
+        self._introductions = _INTRODUCTIONS
         self._stamp_ns = 0
         self._direct = False
         self._prism: int | None = None
@@ -84,9 +91,15 @@ class ClassicStation:
         if command is None or command.station != self._station:
             return None
         match command.letter:
+            case "t" if self._direct:
+                return self._begin(MeasureOrder())
+            case "t" if self._introductions:
+                self._introductions -= 1
+                return no_measurement_yet(self._station).to_bytes()
             case "t":
-                return self._begin(MeasureOrder()) if self._direct else self._newest.to_bytes()
+                return self._newest.to_bytes()
             case "e":
+                self._introductions = 0
                 self._stamp_ns = at_ns
                 return PingReply(self._station).to_bytes()
             case "s":

@@ -44,7 +44,8 @@ class Synchronisation:
 
     A sample bounds the clock's offset from both sides. If the bounds of two samples exclude each other, one of them
     is wrong or the station's clock was set between them, and all before the second are dropped. Cycles that brought
-    no sample are repeated until there are samples for half of them, but at most as many again.
+    no sample are repeated until there are samples for half of them, but at most as many again. A sample that is alone
+    at the end does not count.
 
     Parameters
     ----------
@@ -69,6 +70,8 @@ class Synchronisation:
     """So many requests in a row without a reply end the synchronisation."""
     FAREWELLS = 2
     """How often ``c`` is sent: nothing answers it, and a node that misses it does not answer polls."""
+    FEWEST = 2
+    """So many samples have to agree, if that many cycles were asked for."""
     SLACK_NS = 5_000_000
     """Clocks, stamps and known times may be off by this much before a reply or a sample is refused."""
     SLACK_PPM = 500
@@ -182,6 +185,8 @@ class Synchronisation:
     def _end(self) -> _Step:
         if self._contradicted and 2 * len(self.samples) < self._cycles:
             self.samples.clear()  # too few to say which of those that exclude each other are right
+        elif len(self.samples) < min(self.FEWEST, self._cycles):
+            self.samples.clear()  # nothing would contradict a stamp that somebody plays back
         self._step = _Step.LEAVE
         return self._step
 

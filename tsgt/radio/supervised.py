@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import TYPE_CHECKING, NoReturn
 
 import structlog
@@ -53,6 +54,9 @@ async def keep_radio(
         except RadioSettingsError:
             raise
         except (RadioError, StreamError) as error:
+            if (task := asyncio.current_task()) is not None and task.cancelling():
+                # Told to stop in the very moment in which the radio failed: the error took the place of the order.
+                raise asyncio.CancelledError from None
             if clock.monotonic_ns() - began_ns > LONGEST_PAUSE_NS:
                 pause_ns, logged = FIRST_PAUSE_NS, ""
             if str(error) != logged:

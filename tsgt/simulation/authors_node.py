@@ -69,6 +69,11 @@ class AuthorsTiming:
     timeout_ns: int = 250_000_000
 
 
+AUTHORS_STAMP_DELAY_MS = 0.7
+"""How late their node stamps a ping, on average: half a look, 0.5 ms, and the seven transfers of a packet of two
+bytes, 0.23 ms. What a master is to be told as ``stamp_delay_ms``."""
+
+
 class _PolledRadio:
     """A radio as their program sees it: late, and deaf to what came before it last began to listen."""
 

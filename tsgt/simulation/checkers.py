@@ -54,7 +54,7 @@ class Violation(NamedTuple):
 def violations(run: Run) -> list[Violation]:
     """Check a run.
 
-    A delivered measurement is in its station's journal as it was delivered; none is delivered twice; none has a time
+    What a client has read is in its journal, and as it is there it was delivered; none is delivered twice; none has a time
     stamp off by more than the bound stated; no valid pose rests on an unusable measurement; a replay of the recording
     gives the stream again.
     """
@@ -71,7 +71,7 @@ def violations(run: Run) -> list[Violation]:
 
 
 def altered(witness: StationWitness, sessions: Sequence[Session]) -> Iterator[Violation]:
-    """Compare what was delivered of one station with its journals."""
+    """Compare what was read and what was delivered of one station with its journals."""
     read = set()
     for folder in witness.journals:
         for path in sorted(folder.glob("*.jsonl")):
@@ -80,6 +80,11 @@ def altered(witness: StationWitness, sessions: Sequence[Session]) -> Iterator[Vi
                 for line in read_lines(path)
                 if line.type == "measurement"
             }
+    for host_time_ns in sorted(witness.stamps_ns.keys() - {time_ns for _, time_ns, *_ in read}):
+        yield Violation(
+            "journal",
+            f"not in the journal of station {witness.station}, which has read it at {host_time_ns} ns",
+        )
     for session in sessions:
         for measurement in session.measurements:
             if measurement.station == witness.station and _content(measurement) not in read:

@@ -1,20 +1,22 @@
 """Ten named troubles of a station's clock, and how a clock filter of the master bears each of them.
 
-Only the clock is simulated: exchanges of the protocol ``classic`` at the paper's modem settings and at its schedule
-(50 cycles at the start, then 5 cycles every 300 s), and in between a measurement at each poll, whose stamp is put on
+Only the clock is simulated: exchanges of the protocol ``classic`` at the paper's modem settings and when the master's
+scheduler has them (50 cycles at the start, then 5 cycles each time: after 30, 90, 270 s, and from then on every 300 s;
+with the paper's filter every 300 s from the start), and in between a measurement at each poll, whose stamp is put on
 the master's clock by the filter and compared with the truth. The master's clock is the true time.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tsgt.master.clock_offset import ArrivalCheck, ClockEstimate, clock_filter
+from tsgt.master.scheduler import Cadence
 from tsgt.model import ClockSample
 from tsgt.radio.airtime import airtime_us, symbol_time_ns
 
@@ -36,9 +38,11 @@ _MEASUREMENT_WAY_S = (
 )
 _CYCLE_S = 0.24
 _REPLY_TIMEOUT_S = 0.25
-_INITIAL_CYCLES = 50
-_RESYNC_CYCLES = 5
-_RESYNC_S = 300.0
+_REGRESSION_CADENCE = Cadence(initial_cycles=50, resync_cycles=5, interval_ns=300_000_000_000)
+_CADENCES: dict[FilterName, Cadence] = {
+    "regression": _REGRESSION_CADENCE,
+    "paper": replace(_REGRESSION_CADENCE, first_interval_ns=_REGRESSION_CADENCE.interval_ns),
+}
 _MOST_TIMEOUTS = 3
 
 # Three stations at 1.72 Hz. The instrument measures at its own pace of 2.2 Hz or so.
@@ -214,9 +218,12 @@ class _Run:
         self._scenario = scenario
         self._clock = _StationClock(scenario)
         self._filter = clock_filter(name)
+        self._cadence = _CADENCES[name]
         self._check = ArrivalCheck()
         self._rng = np.random.default_rng(seed)
         self._unknown = True
+        self._synchronisations = 0
+        self._due_s = 0.0
         self._synchronised_s = -math.inf
         self._errors_ns: list[int] = []
         self._bounds_ns: list[int] = []
@@ -227,16 +234,12 @@ class _Run:
     def outcome(self) -> ClockOutcome:
         """Run it."""
         s = self._scenario
-        now_s = due_s = 0.0
+        now_s = 0.0
         while now_s < s.duration_s:
-            if self._unknown:
-                now_s = self._synchronise(now_s, _INITIAL_CYCLES)
-                due_s = now_s + _RESYNC_S
-            elif now_s >= due_s and self._reachable(now_s):
-                now_s = self._synchronise(now_s, _RESYNC_CYCLES)
-                due_s += _RESYNC_S
+            if self._unknown or (now_s >= self._due_s and self._reachable(now_s)):
+                now_s = self._synchronise(now_s)
             else:
-                now_s = self._poll(now_s, min(max(due_s, now_s + 10.0), s.duration_s))
+                now_s = self._poll(now_s, min(max(self._due_s, now_s + 10.0), s.duration_s))
         errors_ns, times_s = np.array(self._errors_ns), np.array(self._times_s)
         p50_ns, p99_ns, max_ns = np.quantile(np.abs(errors_ns), [0.5, 0.99, 1.0])
         return ClockOutcome(
@@ -263,8 +266,9 @@ class _Run:
         step = self._scenario.step
         return step is not None and step.at_s - step.away_s <= at_s < step.at_s
 
-    def _synchronise(self, start_s: float, cycles: int) -> float:
+    def _synchronise(self, start_s: float) -> float:
         """Exchange packets, update the filter, and return when that was done."""
+        cycles = self._cadence.resync_cycles if self._synchronisations else self._cadence.initial_cycles
         samples = list[ClockSample]()
         now_s, timeouts = start_s, 0
         for _ in range(cycles):
@@ -281,6 +285,10 @@ class _Run:
             self._restarts += self._filter.update(samples).restarted
             self._synchronised_s = start_s
             self._unknown = False
+        following_ns = self._cadence.following_ns(self._synchronisations)
+        interval_ns = following_ns if samples else self._cadence.first_interval_ns
+        self._due_s = now_s + interval_ns / 1e9
+        self._synchronisations += bool(samples)
         return now_s
 
     def _exchange(self, at_s: float) -> ClockSample:
@@ -319,7 +327,7 @@ class _Run:
         ):
             if no_answer or taken_ns < 0:
                 continue
-            if self._away(taken_ns / 1e9):
+            if self._away(poll_s) or self._away(taken_ns / 1e9):
                 continue
             estimate = self._filter.at(_START_NS + stamp_ns)
             assigned_ns = stamp_ns - estimate.offset_ns
@@ -333,6 +341,7 @@ class _Run:
                 self._withheld += 1
                 self._filter.forget()
                 self._unknown = True
+                self._synchronisations = 1  # the clock is another one; the station is the same
                 return float(poll_s) + _POLL_S
             self._note(taken_ns, assigned_ns, estimate)
         return until_s

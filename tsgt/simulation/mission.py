@@ -7,6 +7,7 @@ started again at any instant; what it then finds (its journal's folder, the air,
 from __future__ import annotations
 
 import asyncio
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -16,9 +17,9 @@ from tsgt.config.client import JournalConfig, SimulatedInstrumentConfig
 from tsgt.config.master import RecordingConfig, SetupConfig, StationConfig, StreamConfig
 from tsgt.config.radio import ClassicConfig, ClassicMasterConfig, SimulatedRadioConfig
 from tsgt.master.daemon import run_master
-from tsgt.radio.base import LoRaSettings
+from tsgt.radio.from_config import lora_settings
 from tsgt.simulation.air import Air
-from tsgt.simulation.authors_node import AuthorsNode
+from tsgt.simulation.authors_node import AUTHORS_STAMP_DELAY_MS, AuthorsNode
 from tsgt.simulation.clocks import DriftingClock, VirtualClock
 from tsgt.simulation.instrument import SimulatedInstrument
 from tsgt.simulation.link import LinkModel, LogDistanceLoss
@@ -29,7 +30,6 @@ from tsgt.station.daemon import run_client
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine
-    from pathlib import Path
 
     from tsgt.config import ScenarioConfig
     from tsgt.config.scenario import ScenarioRadioConfig, SimulatedStation
@@ -44,9 +44,6 @@ START_UNIX_NS = 1_800_000_000_000_000_000
 
 DRAIN_S = 5.0
 """How long a run goes on after its end, so that what is under way can arrive."""
-
-AUTHORS_STAMP_DELAY_MS = 0.6
-"""How late the authors' node stamps a ping, on average: it looks once a millisecond, and then reads two bytes."""
 
 _YEAR_NS = 365 * 86_400 * 10**9
 _RARELY_S = 1e6  # of fsync, which a simulation has no use for
@@ -108,7 +105,9 @@ class Mission:
         self._node = node
         self._folder = folder
         self._clock = VirtualClock(START_UNIX_NS)
-        self._settings = _lora_settings(scenario.radio)
+        self._settings = lora_settings(
+            _radio_config(scenario, "master", folder), Path(f"scenario {scenario.name}")
+        )
         self._rngs = {s.station: rng for s, rng in zip(scenario.stations, station_rngs, strict=True)}
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self.parameters = scenario_parameters(scenario)
@@ -152,7 +151,11 @@ class Mission:
             ended, _ = await asyncio.wait(
                 self._tasks.values(), timeout=step_s, return_when=asyncio.FIRST_EXCEPTION
             )
-            errors = [error for task in ended if isinstance(error := task.exception(), Exception)]
+            errors = [
+                error
+                for task in ended
+                if not task.cancelled() and isinstance(error := task.exception(), Exception)
+            ]
             if errors:
                 raise ExceptionGroup("a daemon has ended", errors)
 
@@ -235,16 +238,6 @@ class Mission:
 
 def _name(station: int) -> str:
     return f"station{station}"
-
-
-def _lora_settings(radio: ScenarioRadioConfig) -> LoRaSettings:
-    return LoRaSettings(
-        frequency_hz=round(radio.frequency_mhz * 1e6),
-        spreading_factor=radio.spreading_factor,
-        bandwidth_hz=round(radio.bandwidth_khz * 1e3),
-        coding_rate=radio.coding_rate,
-        power_dbm=radio.power_dbm,
-    )
 
 
 def scenario_link(

@@ -32,6 +32,18 @@ def test_a_station_that_is_not_asked_is_not_lost() -> None:
     assert alerts.tick(START + 60 * SECOND, unix_ns=START + 60 * SECOND) == []
 
 
+def test_one_lost_packet_is_no_lost_station() -> None:
+    """It had not been heard for long because it had not been asked."""
+    alerts = Alerts([1], START)
+    alerts.asked(1, START + 24 * SECOND, answered=False)
+    for second in (25, 40):
+        now_ns = START + second * SECOND
+        assert alerts.tick(now_ns, unix_ns=now_ns) == []
+    alerts.asked(1, START + 40 * SECOND, answered=False)
+    (lost,) = alerts.tick(START + 41 * SECOND, unix_ns=START + 41 * SECOND)
+    assert lost.event == "station_lost"
+
+
 def test_refusing_to_track_is_told_once() -> None:
     """And so is the end of it; one that tracks at once is not worth a word."""
     alerts = Alerts([1], START)
@@ -64,3 +76,38 @@ def test_a_step_of_the_unix_clock_is_told_once(steps_s: list[float], told: int) 
     alerts = Alerts([1], START)
     events = [e for s in steps_s for e in alerts.tick(START, unix_ns=START + round(s * 1e9))]
     assert [event.event for event in events] == ["unix_clock_stepped"] * told
+
+
+def test_a_unix_clock_that_was_set_forward_is_ahead_of_the_stream() -> None:
+    """Signs in words and numbers: plus is forward."""
+    (event,) = Alerts([1], START).tick(START, unix_ns=START + 2 * SECOND)
+    assert "was set by +2.000 s and is now +2.000 s from" in event.message
+
+
+def test_a_station_whose_instrument_is_gone_is_told_of_once() -> None:
+    """It goes on answering with its last measurement: after ten seconds that is an event, and so is the next new one."""
+    alerts = Alerts([1], START)
+    alerts.polled(1, START)
+    alerts.measurement(measurement(0), START)
+    names = []
+    for second in range(1, 30):
+        names += [event.event for event in alerts.polled(1, START + second * SECOND)]
+    assert names == ["station_idle"]
+    events = alerts.measurement(measurement(0), START + 31 * SECOND)
+    assert [event.event for event in events] == ["station_measuring"]
+
+
+def test_a_station_that_is_not_polled_is_not_idle() -> None:
+    """A first measurement half a minute after the last poll, as when others are synchronised, is nothing special."""
+    alerts = Alerts([1], START)
+    alerts.polled(1, START)
+    alerts.measurement(measurement(0), START)
+    assert alerts.polled(1, START + 30 * SECOND) == []
+    assert alerts.measurement(measurement(0), START + 30 * SECOND) == []
+
+
+def test_an_error_that_is_repeated_is_not_idleness() -> None:
+    """The authors' nodes repeat an error without a time: the error itself has been told."""
+    alerts = Alerts([1], START)
+    alerts.measurement(replace(measurement(0), status=Status.TILT), START)
+    assert [e for second in range(60) for e in alerts.polled(1, START + second * SECOND)] == []

@@ -92,6 +92,13 @@ def test_an_edge_further_off_counts_if_the_position_is_poor_that_way() -> None:
     assert run(fence(sigmas=3.0), [at(9.5, 9.0, sigma_y_m=0.4)]) == ["fence_left"]
 
 
+def test_an_oblique_edge_sees_how_x_and_y_vary_together() -> None:
+    """0.7 m before an edge at 45 degrees: what errs towards it may have crossed it, what errs along it has not."""
+    diamond = ((10.0, 0.0), (0.0, 10.0), (-10.0, 0.0), (0.0, -10.0))
+    poses = [at(4.5, 4.5, sigma_x_m=0.3, sigma_y_m=0.3, rho=rho) for rho in (-0.9, 0.9)]
+    assert run(fence(polygon_m=diamond, sigmas=2.0), poses) == ["", "fence_left"]
+
+
 def test_on_the_boundary_the_uncertainty_counts_as_well() -> None:
     """Wherever rounding puts a point on the boundary; without uncertainty it is still in."""
     for point in ((10.0, 5.0), (0.0, 5.0), (5.0, 0.0), (5.0, 10.0), (0.0, 0.0), (10.0, 10.0)):

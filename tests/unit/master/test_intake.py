@@ -272,3 +272,90 @@ def test_a_backward_step_while_nothing_new_was_measured_is_noticed() -> None:
     for at_ms in (1000, 1600, 2200, 2800):
         master.poll(at_ms, same)
     assert master.poll(3400, message(START + 3200 * MS + AHEAD_NS - 1500 * MS)).stepped
+
+
+def test_a_clock_that_stood_still_while_nobody_asked_is_doubted() -> None:
+    """Others were synchronised meanwhile, and no request was lost: what looks old waits for a synchronisation."""
+    master = Master()
+    off_ns = 15 * SECOND
+    back = master.poll(15_200, message(START + 15_000 * MS - off_ns + AHEAD_NS))
+    assert back == (None, False, True)
+    (measurement,) = master.synchronise(17_000, AHEAD_NS - off_ns).measurements
+    assert measurement.stamp_ns == pytest.approx(START + 15_000 * MS, abs=MS)
+
+
+@pytest.mark.parametrize("step_s", [6.0, -6.0, 1e8, -1e8, 3e9])
+def test_what_was_held_before_a_restart_gets_no_time_of_the_clock_after_it(step_s: float) -> None:
+    """Nobody knows when it was; the station's journal has it."""
+    master = Master()
+    master.poll(1000, message(START + 700 * MS + AHEAD_NS))
+    master.intake.unanswered(1)
+    assert master.poll(8000, message(START + 7800 * MS + AHEAD_NS)).doubtful
+    found = master.synchronise(20_000, AHEAD_NS + round(step_s * 1e9) if step_s < 1e9 else AHEAD_NS - START)
+    assert found.stepped
+    assert found.measurements == []
+
+
+def test_what_is_played_back_is_no_measurement_and_no_step() -> None:
+    """An answer of before, received again, is known; the station's own next one is taken as ever."""
+    master = Master()
+    old = message(START + 750 * MS + AHEAD_NS)
+    master.poll(1000, old)
+    master.poll(1600, message(START + 1400 * MS + AHEAD_NS))
+    assert master.poll(9000, old) == (None, False, False)
+    assert master.poll(9600, message(START + 9400 * MS + AHEAD_NS)).measurement is not None
+
+
+def test_a_station_that_begins_anew_is_doubted() -> None:
+    """It had measured, and now has no measurement yet: its program was started again, with whatever clock."""
+    master = Master()
+    master.poll(1000, message(START + 750 * MS + AHEAD_NS))
+    assert master.poll(1600, no_measurement_yet(1)) == (None, False, True)
+    assert master.poll(2200, message(START + 2000 * MS + AHEAD_NS - 100 * MS)) == (None, False, False)
+    found = master.synchronise(3500, AHEAD_NS - 100 * MS)
+    assert found.stepped
+    (measurement,) = found.measurements
+    assert measurement.stamp_ns == pytest.approx(START + 2000 * MS, abs=MS)
+
+
+def test_a_station_that_begins_anew_once_more_is_doubted_once_more() -> None:
+    """There was no measurement in between, but a request was lost; without that, one that has none is left alone."""
+    master = Master()
+    assert master.poll(1000, no_measurement_yet(1)) == (None, False, False)
+    master.intake.unanswered(1)
+    assert master.poll(1600, no_measurement_yet(1)) == (None, False, True)
+    master.synchronise(3000)
+    assert master.poll(3600, no_measurement_yet(1)) == (None, False, False)
+
+
+def test_the_papers_filter_begins_anew_after_a_restart() -> None:
+    """A tenth of the way each time, it would need an hour to get there."""
+    master = Master()
+    master.intake = Intake({1: 4}, lambda: clock_filter("paper"))
+    master.synchronise(0)
+    master.poll(1000, message(START + 700 * MS + AHEAD_NS))
+    master.intake.unanswered(1)
+    assert master.poll(21_200, message(START + 1200 * MS + AHEAD_NS)).doubtful
+    found = master.synchronise(23_000, AHEAD_NS - 20 * SECOND)
+    assert found.stepped
+    assert found.record.offset_ns == pytest.approx(AHEAD_NS - 20 * SECOND, abs=MS)
+
+
+def test_the_papers_filter_begins_anew_after_a_step_that_a_measurement_has_shown() -> None:
+    """The next mean is taken whole."""
+    master = Master()
+    master.intake = Intake({1: 4}, lambda: clock_filter("paper"))
+    master.synchronise(0)
+    ahead_ns = AHEAD_NS + 3600 * SECOND
+    assert master.poll(1000, message(START + 800 * MS + ahead_ns)).stepped
+    found = master.synchronise(2500, ahead_ns)
+    assert found.record.restarted
+    assert found.record.offset_ns == pytest.approx(ahead_ns, abs=MS)
+
+
+def test_a_stamp_that_is_late_by_an_average_may_be_off_by_as_much() -> None:
+    """The bound says so."""
+    plain, late = Master(synchronised=False), Master(synchronised=False)
+    late.intake = Intake({1: 4}, lambda: clock_filter("regression"), {1: 700_000})
+    bounds = [master.synchronise(0).record.bound_ns for master in (plain, late)]
+    assert bounds[1] - bounds[0] == 700_000

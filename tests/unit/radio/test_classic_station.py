@@ -30,8 +30,25 @@ def test_a_request_before_the_first_measurement_is_answered(station: ClassicStat
 
 def test_the_newest_measurement_is_sent_again_and_again(station: ClassicStation) -> None:
     """A measurement answers every request until there is a newer one."""
+    station.received(b"e1", 4)
     station.measured(SOME)
     assert [station.received(b"t1", 5) for _ in range(2)] == [SOME.to_bytes()] * 2
+
+
+def test_a_station_that_begins_says_so_until_it_is_synchronised(station: ClassicStation) -> None:
+    """A master that knew it before its restart has to learn that its clock may be another one."""
+    station.measured(SOME)
+    assert [station.received(b"t1", 5) for _ in range(2)] == [NONE_YET] * 2
+    station.received(b"e1", 6)
+    assert station.received(b"t1", 7) == SOME.to_bytes()
+
+
+def test_a_station_that_nobody_synchronises_gives_its_measurements_in_the_end(
+    station: ClassicStation,
+) -> None:
+    """The authors' master synchronises when it is time, and does not wait for that."""
+    station.measured(SOME)
+    assert [station.received(b"t1", 5) for _ in range(4)] == [NONE_YET] * 3 + [SOME.to_bytes()]
 
 
 @pytest.mark.parametrize("payload", [b"", b"t2", b"e2", b"x1", b"e1 ", bytes(34), SOME.to_bytes(), b"dOk"])
@@ -72,6 +89,7 @@ def test_an_order_is_carried_out_and_then_answered(station: ClassicStation) -> N
 
 def test_a_failed_order_changes_nothing(station: ClassicStation) -> None:
     """After ``dNo`` the station tracks on, after ``nNo`` it stays in direct mode."""
+    station.received(b"e1", 4)
     station.measured(SOME)
     station.received(b"d1", 5)
     assert station.executed(DirectOrder(), ok=False) == b"dNo"
@@ -111,6 +129,7 @@ def test_requests_in_direct_mode_are_single_measurements(station: ClassicStation
 
 def test_one_order_at_a_time(station: ClassicStation) -> None:
     """While one is under way others are passed over, requests for data and pings are answered."""
+    station.received(b"e1", 4)
     station.measured(SOME)
     station.received(b"d1", 5)
     assert [station.received(payload, 6) for payload in (b"d1", b"n1", b"n13")] == [None] * 3

@@ -330,3 +330,18 @@ def test_guessed_instants_make_no_sample() -> None:
     link.run(turn)
     assert link.sent[3:6] == [b"e1", b"e1", b"s1"]
     assert len(turn.samples) == 4
+
+
+def test_a_sample_that_is_alone_does_not_count() -> None:
+    """Somebody plays back a stamp, and nothing else arrives that could contradict it."""
+
+    def played_back(exchange: Exchange) -> None:
+        if exchange.number > 1:
+            exchange.heard = False
+        if exchange.number == 2:
+            exchange.replies.append((TimeReply(OFFSET_NS - 10**15).to_bytes(), FORWARD_NS + 100 * MS))
+
+    link, turn = Link(played_back), Synchronisation(1, 5, TIMING)
+    link.run(turn)
+    assert turn.samples == []
+    assert turn.answered

@@ -87,5 +87,23 @@ async def test_what_it_can_never_do_ends_it() -> None:
         await keep_radio(Attempts(RadioSettingsError("20 dBm")).open, _never, CLOCK)
 
 
+async def test_a_radio_that_fails_while_it_is_told_to_stop_stops() -> None:
+    """The error takes the place of the cancellation, which must not be lost: nobody cancels twice."""
+
+    async def use(_radio: Radio) -> None:
+        try:
+            await asyncio.sleep(1e6)
+        except asyncio.CancelledError:
+            raise RadioError("gone") from None
+
+    task = asyncio.create_task(keep_radio(Attempts().open, use, CLOCK))
+    await asyncio.sleep(1.0)
+    task.cancel()
+    done, _ = await asyncio.wait([task], timeout=60.0)
+    task.cancel()
+    assert done
+    assert task.cancelled()
+
+
 async def _never(_radio: Radio) -> None:
     raise AssertionError

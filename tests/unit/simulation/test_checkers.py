@@ -70,6 +70,13 @@ def test_a_measurement_that_nobody_made(run: Run) -> None:
     assert {"journal", "time"} <= _checks(run)
 
 
+def test_a_measurement_that_is_read_and_not_journalled(run: Run) -> None:
+    """It is missed, although nobody else ever saw it."""
+    witness = dataclasses.replace(run.witnesses[1], stamps_ns=run.witnesses[1].stamps_ns | {12_345: 0})
+    run = dataclasses.replace(run, witnesses=run.witnesses | {1: witness})
+    assert _checks(run) == {"journal"}
+
+
 def test_a_repeat(run: Run) -> None:
     """The same measurement handed over again is noticed, even under another number."""
     measurements = run.sessions[0].measurements

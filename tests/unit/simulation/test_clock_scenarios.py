@@ -20,9 +20,10 @@ def test_there_are_ten() -> None:
 @pytest.mark.parametrize("name", OBSERVABLE)
 def test_regression_keeps_a_millisecond(name: str) -> None:
     """Where the trouble can be observed, 99 of 100 stamps are within 1 ms, and all within the stated bound."""
-    outcome = run_clock_scenario(BY_NAME[name], "regression")
-    assert outcome.p99_ns < 1 * MS
-    assert outcome.bound_held == 1.0
+    for seed in range(5):
+        outcome = run_clock_scenario(BY_NAME[name], "regression", seed=seed)
+        assert outcome.p99_ns < 1 * MS
+        assert outcome.bound_held == 1.0
 
 
 def test_regression_cannot_see_a_constant_asymmetry_but_its_bound_covers_it() -> None:

@@ -105,7 +105,7 @@ async def test_an_instrument_that_is_unplugged_comes_back(tmp_path: Path) -> Non
 
 
 async def test_a_radio_that_fails_leaves_the_journal_whole(tmp_path: Path) -> None:
-    """Measurements go on while there is no radio, and are offered when it is back."""
+    """Measurements go on while there is no radio, which the status says, and are offered when it is back."""
     async with field_day(tmp_path) as day:
         await day.kill()
         broken, opened = True, day.open_radio
@@ -121,6 +121,7 @@ async def test_a_radio_that_fails_leaves_the_journal_whole(tmp_path: Path) -> No
         day.read.clear()
         day.start()
         await asyncio.sleep(20.0)
+        assert not (await asked(tmp_path / "client.sock"))["radio_ok"]
         assert await day.ask(b"t1") is None
         broken = False
         await asyncio.sleep(6.0)

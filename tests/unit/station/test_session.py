@@ -45,7 +45,8 @@ def ask(session: Session, payload: bytes, seconds: float = 0.0) -> object:
 
 
 def answer(session: Session, payload: bytes) -> MeasurementMessage:
-    """Ask for data."""
+    """Ask for data, of a station that has been synchronised."""
+    ask(session, b"e" + payload[1:])
     raw = ask(session, payload)
     assert isinstance(raw, bytes)
     message = decode_reply(raw)

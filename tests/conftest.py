@@ -5,10 +5,15 @@ from __future__ import annotations
 import asyncio
 import inspect
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
+import structlog
 
 from tsgt.simulation.event_loop import run_virtual
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 FIELD_DATA = Path(__file__).parents[2] / "shared" / "data" / "rts"
 
@@ -27,6 +32,13 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
 
     run_virtual(checked)
     return True
+
+
+@pytest.fixture(autouse=True)
+def _logging_as_before() -> Iterator[None]:
+    """Undo what a command has set; a level of its own would hide events from the tests after it."""
+    yield
+    structlog.reset_defaults()
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ import os
 import signal
 import socket
 import stat
+import time
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, NoReturn, TypeVar
 
@@ -37,11 +38,14 @@ MAX_SOCKET_PATH_BYTES = 107
 
 _BACKLOG = 100
 
+_FOLDER_LOCK_LIMIT_S = 1.0
+"""How long to wait for another program that opens a socket in the same folder; it takes a millisecond."""
+
 log = structlog.get_logger()
 
 
 def run(main: Callable[[], Awaitable[T]]) -> T:
-    """Run a coroutine to its end in an event loop of its own; SIGINT and SIGTERM cancel it.
+    """Run a coroutine to its end in an event loop of its own; SIGINT, SIGTERM and SIGHUP cancel it.
 
     Parameters
     ----------
@@ -60,7 +64,7 @@ def run(main: Callable[[], Awaitable[T]]) -> T:
     KeyboardInterrupt
         SIGINT ended it.
     SystemExit
-        SIGTERM ended it, with status 0: a service that was told to stop has not failed.
+        SIGTERM or SIGHUP ended it, with status 0: a service that was told to stop has not failed.
     """
     terminated = False
 
@@ -75,6 +79,9 @@ def run(main: Callable[[], Awaitable[T]]) -> T:
                 task.cancel()
 
         loop.add_signal_handler(signal.SIGTERM, terminate)
+        loop.add_signal_handler(
+            signal.SIGHUP, terminate
+        )  # the terminal, or the connection to this Pi, is gone
         return await main()
 
     try:
@@ -224,12 +231,17 @@ def _locked(folder: Path) -> Iterator[None]:
     """Keep another program from opening the same socket between our look at it and our listening."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise StreamError(
-                f"{folder}: another program is opening a socket in this folder; try again in a moment"
-            ) from error
+        deadline_s = time.monotonic() + _FOLDER_LOCK_LIMIT_S
+        while True:  # daemons that start together meet here
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError as error:
+                if time.monotonic() > deadline_s:
+                    raise StreamError(
+                        f"{folder}: another program has locked this folder; stop it or choose another folder"
+                    ) from error
+                time.sleep(0.005)
         yield
     finally:
         os.close(descriptor)

@@ -60,9 +60,10 @@ def ended_by(number: signal.Signals, program: str) -> tuple[int, list[str]]:
         return process.returncode, (lines[0] + rest).splitlines()
 
 
-def test_sigterm_ends_a_service_cleanly() -> None:
-    """SIGTERM cancels the program, its clean-up runs, and the exit code is that of success, within a second."""
-    assert ended_by(signal.SIGTERM, PROGRAM) == (0, ["running", "cleaned up"])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_a_service_cleanly(number: signal.Signals) -> None:
+    """It cancels the program, its clean-up runs, and the exit code is that of success, within a second."""
+    assert ended_by(number, PROGRAM) == (0, ["running", "cleaned up"])
 
 
 def test_sigint_ends_a_program_cleanly() -> None:

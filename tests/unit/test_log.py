@@ -1,23 +1,14 @@
 from __future__ import annotations
 
+import errno
 import io
 import json
 import sys
-from typing import TYPE_CHECKING
 
 import pytest
 import structlog
 
 from tsgt.log import configure_logging
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-
-@pytest.fixture(autouse=True)
-def _restored() -> Iterator[None]:
-    yield
-    structlog.reset_defaults()
 
 
 class Terminal(io.StringIO):
@@ -75,3 +66,21 @@ def test_level_drops_what_is_below(capsys: pytest.CaptureFixture[str]) -> None:
     structlog.get_logger().error("important")
     (line,) = capsys.readouterr().err.splitlines()
     assert json.loads(line)["event"] == "important"
+
+
+class Unwritable(io.StringIO):
+    """A stderr on a full disk, or behind a pipe that is gone."""
+
+    def write(self, _text: str) -> int:
+        """Fail."""
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.parametrize("stderr", [Unwritable(), None], ids=["full disk", "closed"])
+def test_a_log_that_cannot_be_written_ends_nothing(
+    stderr: io.StringIO | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A daemon goes on without."""
+    monkeypatch.setattr(sys, "stderr", stderr)
+    configure_logging()
+    structlog.get_logger().error("something_happened")

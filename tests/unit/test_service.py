@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import os
 import socket
 import threading
@@ -11,7 +12,14 @@ import pytest
 from structlog.testing import capture_logs
 
 from tsgt.errors import RecordingError, StreamError
-from tsgt.service import keep_notified, keep_synced, run, sd_notify, watchdog_interval_s
+from tsgt.service import (
+    UnixListener,
+    keep_notified,
+    keep_synced,
+    run,
+    sd_notify,
+    watchdog_interval_s,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -188,3 +196,15 @@ def test_an_unknown_error_keeps_its_tree() -> None:
 
     with pytest.raises(ExceptionGroup):
         run(main)
+
+
+def test_programs_that_open_sockets_together_wait_for_each_other(tmp_path: Path) -> None:
+    """One that finds the folder locked for a moment opens its socket after that."""
+    descriptor = os.open(tmp_path, os.O_RDONLY)
+    fcntl.flock(descriptor, fcntl.LOCK_EX)
+    other = threading.Timer(0.05, os.close, (descriptor,))
+    other.start()
+    listener = UnixListener(tmp_path / "a.sock", 0o600)
+    other.join()
+    listener.socket.close()
+    assert (tmp_path / "a.sock").exists()

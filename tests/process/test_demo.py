@@ -146,6 +146,50 @@ def test_demo_ends_cleanly_on_a_signal(start: Start, tmp_path: Path, number: sig
     assert not any(Path(f"/proc/{pid}").exists() for pid in pids.values())
 
 
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (("--socket", "{}/" + 90 * "long"), "at most 107 bytes"),
+        (("--socket", "{}"), "is not a socket"),
+        (("--output", "{}/none/x.jsonl"), "there is no such folder"),
+    ],
+)
+def test_what_cannot_be_is_said_at_once(
+    start: Start, tmp_path: Path, arguments: tuple[str, str], reason: str
+) -> None:
+    """Neither after a minute without poses nor after the whole run."""
+    demo = start(arguments[0], arguments[1].format(tmp_path))
+    assert demo.process.wait(20) in {1, 2}
+    assert demo.process.stdout is not None
+    assert not demo.process.stdout.read()
+    deadline_s = time.monotonic() + PATIENCE_S
+    while reason not in "".join(demo.said):
+        assert time.monotonic() < deadline_s, "".join(demo.said)
+        time.sleep(0.01)
+
+
+def test_daemons_do_not_outlive_a_demo_that_is_killed(start: Start) -> None:
+    """Kill -9 of the demo itself leaves no process behind."""
+    demo = start("--duration", "60")
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not demo.pids():
+        assert time.monotonic() < deadline_s, "".join(demo.said)
+        time.sleep(0.1)
+    pids = demo.pids().values()
+    demo.process.kill()
+    # Orphans that nobody waits for may stay as zombies where PID 1 is no init: those have no command line.
+    while any(_command_line(pid) for pid in pids):
+        assert time.monotonic() < deadline_s
+        time.sleep(0.1)
+
+
+def _command_line(pid: int) -> bytes:
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes()
+    except OSError:
+        return b""
+
+
 def test_killed_daemons_come_back_and_nothing_read_is_lost(start: Start) -> None:
     """Kill -9 of each daemon in turn: poses come back by themselves, journals hold what the clients had read."""
     demo = start("--duration", "45")

@@ -13,6 +13,7 @@ from tsgt.cli.options import json_option
 from tsgt.cli.output import print_json
 from tsgt.config import (
     KINDS,
+    ClientConfig,
     MasterConfig,
     Model,
     PrismLayoutFile,
@@ -26,6 +27,7 @@ from tsgt.config import (
 from tsgt.errors import ConfigError, GeometryError
 from tsgt.geometry import check_layout
 from tsgt.model import Parameters, PrismPosition
+from tsgt.radio.from_config import lora_settings
 
 
 @click.group("config")
@@ -62,11 +64,21 @@ def _summary(file: Path, content: Model) -> dict[str, Any]:
     match content:
         case MasterConfig():
             known = parameters(content)
+            lora_settings(content.radio, file)
             _check_layout(content.setup.prism_layout, known.prisms)
             return {
                 **_numbers(known),
                 "socket": str(content.stream.socket),
                 "recordings": str(content.recording.directory),
+            }
+        case ClientConfig():
+            lora_settings(content.radio, file)
+            return {
+                "station": content.station,
+                "prism": content.prism,
+                "instrument": content.instrument.kind,
+                "journal": str(content.journal.directory),
+                "socket": str(content.status_socket),
             }
         case ScenarioConfig():
             known = scenario_parameters(content)

@@ -18,7 +18,7 @@ from tsgt import service
 from tsgt.analysis.metrics import inner_part
 from tsgt.cli.demo_progress import Progress
 from tsgt.cli.options import finite, json_option
-from tsgt.cli.output import print_json
+from tsgt.cli.output import print_json, require_new_file
 from tsgt.clock import SystemClock, UnixTimeline
 from tsgt.config import ScenarioConfig, load
 from tsgt.errors import OutputFileError, StreamError
@@ -77,13 +77,16 @@ def demo(
     scenario = ScenarioConfig() if scenario_path is None else load(scenario_path, ScenarioConfig)
     if duration_s is None:
         duration_s = DEFAULT_DURATION_S if scenario_path is None else scenario.duration_s
-    if output is not None and output.exists():
-        raise click.UsageError(f"{output} exists; a demo makes a recording of its own, choose another file")
+    require_new_file(output)
     folder = Path(tempfile.mkdtemp(prefix="tsgt-demo-"))
     socket_path = socket_path or folder / "poses.sock"
     if len(str(folder.absolute() / "instrument1.sock")) > MAX_SOCKET_PATH_BYTES:
         raise StreamError(f"{folder}: the path is too long for sockets; set TMPDIR to a shorter one")
     configure_logging("warning")  # what is worth telling stands in the progress
+    # Tried here: that the master cannot open it would only stand in the master's log.
+    listener = service.UnixListener(socket_path.absolute(), 0o600)
+    listener.socket.close()
+    listener.remove()
     result = _run(scenario, folder, socket_path.absolute(), output, duration_s=duration_s, seed=seed)
     if as_json:
         print_json(

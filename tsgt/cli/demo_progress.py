@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 import time
 from typing import TYPE_CHECKING
@@ -123,7 +124,8 @@ class Progress:
         """Write a block; on a terminal over the one before."""
         if self._on_terminal:
             up = f"\x1b[{self._block_lines}A" if self._block_lines else ""
-            click.echo(up + "\n".join(f"\x1b[K{line}" for line in lines), err=True)
+            width = shutil.get_terminal_size().columns  # a line that wraps would not be written over
+            click.echo(up + "\n".join(f"\x1b[K{line[:width]}" for line in lines), err=True)
             self._block_lines = len(lines)
         else:
             click.echo("\n".join(lines), err=True)

@@ -95,8 +95,8 @@ def _lines(socket_path: Path) -> Iterator[bytes]:
             connection.connect(str(socket_path))
         except OSError as error:
             raise StreamError(
-                f"{socket_path}: no stream there ({error.strerror or error}); start tsgt demo or tsgt replay, "
-                "or give the right --socket"
+                f"{socket_path}: no stream there ({error.strerror or error}); start tsgt-master, tsgt demo or "
+                "tsgt replay, or give the right --socket"
             ) from error
         # A server that gives up on us, because we were too slow at its end, resets the connection.
         with connection.makefile("rb") as file, contextlib.suppress(ConnectionResetError):

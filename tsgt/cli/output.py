@@ -10,6 +10,7 @@ import click
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+    from pathlib import Path
 
 CHECK_FAILED = 3
 
@@ -38,3 +39,13 @@ def _finite(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+def require_new_file(path: Path | None) -> None:
+    """Refuse a file that exists, or whose folder does not: before a long run, not after it."""
+    if path is None:
+        return
+    if path.is_file():
+        raise click.UsageError(f"{path} exists; choose another file")
+    if not path.absolute().parent.is_dir():
+        raise click.UsageError(f"{path}: there is no such folder")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import sys
 import tempfile
@@ -15,7 +16,7 @@ import numpy as np
 
 from tsgt.analysis.export import tum_lines
 from tsgt.cli.options import finite, json_option
-from tsgt.cli.output import CHECK_FAILED, print_json, print_table
+from tsgt.cli.output import CHECK_FAILED, print_json, print_table, require_new_file
 from tsgt.cli.simulate_figures import figures
 from tsgt.config.radio import ClassicMasterConfig
 from tsgt.errors import OutputFileError, TsgtError
@@ -112,8 +113,7 @@ def simulate_command(
     with exit code 3.
     """
     for path in (output, truth):
-        if path is not None and path.exists() and path.is_file():
-            raise click.UsageError(f"{path} exists; choose another file")
+        require_new_file(path)
     scenario = find_scenario(scenario_name)
     if stations is not None:
         scenario = with_stations(scenario, stations)
@@ -207,8 +207,8 @@ def _print(result: dict[str, Any], found: list[Violation]) -> None:
         [
             str(number),
             *(str(station[key]) for key in ("measured", "delivered", "duplicates")),
-            f"{station['rate_hz']:.2f}",
-            *(f"{station['time_error_us'][key]:.0f}" for key in ("p50", "p99", "max")),
+            _figure(station["rate_hz"], 2),
+            *(_figure(station["time_error_us"][key], 0) for key in ("p50", "p99", "max")),
         ]
         for number, station in result["stations"].items()
     ]
@@ -217,9 +217,10 @@ def _print(result: dict[str, Any], found: list[Violation]) -> None:
     for name, estimator in result["estimators"].items():
         click.echo(
             f"\n{name}: {estimator['valid_poses']} of {estimator['poses']} poses valid\n"
-            f"  position     {estimator['position_rms_mm']:.1f} mm rms off the truth, at the centroid of the prisms\n"
-            f"  orientation  {estimator['orientation_rms_deg']:.2f} deg rms off the truth\n"
-            f"  inter-prism  {estimator['inter_prism_mean_mm']:.1f} mm mean error of the distances"
+            f"  position     {_figure(estimator['position_rms_mm'], 1)} mm rms off the truth, at the centroid of the "
+            "prisms\n"
+            f"  orientation  {_figure(estimator['orientation_rms_deg'], 2)} deg rms off the truth\n"
+            f"  inter-prism  {_figure(estimator['inter_prism_mean_mm'], 1)} mm mean error of the distances"
         )
     click.echo(f"\nairtime      {result['airtime_fraction']:.1%} of the time")
     click.echo(f"violations   {len(found)}")
@@ -227,3 +228,8 @@ def _print(result: dict[str, Any], found: list[Violation]) -> None:
         click.echo(f"  {line}")
     if len(found) > LISTED_VIOLATIONS:
         click.echo(f"  ... and {len(found) - LISTED_VIOLATIONS} more")
+
+
+def _figure(value: float, digits: int) -> str:
+    """Write a figure, a dash where there was nothing to compute it from."""
+    return "-" if math.isnan(value) else f"{value:.{digits}f}"

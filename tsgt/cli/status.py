@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import socket
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -210,12 +211,19 @@ def _status_of(path: Path) -> tuple[StatusRecord | ClientStatus, bytes]:
 
 
 def _lines(path: Path) -> Iterator[bytes]:
+    deadline_s = time.monotonic() + TIMEOUT_S
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
         connection.settimeout(TIMEOUT_S)
+        received = b""
         try:
             connection.connect(str(path))
-            with connection.makefile("rb") as file:
-                yield from file
+            while chunk := connection.recv(65536):
+                *lines, received = (received + chunk).split(b"\n")
+                yield from lines
+                # For the whole, or one that sends something else now and then would hold us for ever.
+                if (left_s := deadline_s - time.monotonic()) <= 0:
+                    raise TimeoutError
+                connection.settimeout(left_s)
         except TimeoutError as error:
             raise StreamError(
                 f"{path}: no status within {TIMEOUT_S:g} s; the daemon is stuck, see its log"

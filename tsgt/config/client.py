@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from tsgt.config.base import Model, Number, Positive, RelativePath
+from tsgt.config.base import Model, Positive, RelativePath
 from tsgt.config.radio import ClassicConfig, RadioConfig
 
 
@@ -39,8 +39,8 @@ class ClientConfig(Model):
     """What this file is."""
     station: Annotated[int, Field(ge=1, le=9)]
     """Number of this station; one digit, as it goes over the radio."""
-    prism: Number
-    """Number of the prism that it tracks from the start."""
+    prism: Annotated[int, Field(ge=1, le=9)]
+    """Number of the prism that it tracks from the start; one digit too."""
     instrument: InstrumentConfig
     """The total station."""
     radio: RadioConfig

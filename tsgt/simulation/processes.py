@@ -17,6 +17,17 @@ RESTART_AFTER_S = 1.0
 STOP_TIMEOUT_S = 5.0
 """How long a process has to end after SIGTERM; it should take one second."""
 
+# Stdin is a pipe that ends when we do, however that happens; nobody would stop the daemon after that.
+_PROGRAM = """
+import os, signal, threading
+def outlived():
+    os.read(0, 1)
+    os.kill(os.getpid(), signal.SIGTERM)
+threading.Thread(target=outlived, daemon=True).start()
+from tsgt.cli.daemons import {entry_point} as main
+main()
+"""
+
 
 @dataclass(slots=True)
 class Process:
@@ -52,9 +63,9 @@ class Process:
                 process = await asyncio.create_subprocess_exec(
                     sys.executable,
                     "-c",
-                    f"from tsgt.cli.daemons import {self.entry_point} as main; main()",
+                    _PROGRAM.format(entry_point=self.entry_point),
                     *self.arguments,
-                    stdin=asyncio.subprocess.DEVNULL,
+                    stdin=asyncio.subprocess.PIPE,
                     stdout=log_file,
                     stderr=log_file,
                     start_new_session=True,  # Ctrl-C is for the demonstration, which ends them in order

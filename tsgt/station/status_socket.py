@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING
 
 from tsgt.recording import encode_line
 from tsgt.service import UnixListener
-from tsgt.station.status import ClientStatus
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-__all__ = ["ClientStatus", "serving_status"]
+    from tsgt.station.status import ClientStatus
 
 
 @contextmanager

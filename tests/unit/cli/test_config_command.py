@@ -36,6 +36,30 @@ def test_check_says_what_a_file_is(tsgt: Tsgt, name: str) -> None:  # noqa: F811
     assert "[1, 2, 3]" in str(as_json.json())
 
 
+@pytest.mark.parametrize("name", ["client.example", "client.sf8.example"])
+def test_check_says_what_a_client_is(tsgt: Tsgt, name: str) -> None:  # noqa: F811 (a fixture)
+    """The examples are as the installation guide has them checked."""
+    outcome = tsgt("config", "check", EXAMPLES / f"{name}.toml", "--json")
+    assert outcome.code == 0
+    assert (outcome.json()["kind"], outcome.json()["station"]) == ("client", 1)
+
+
+@pytest.mark.parametrize("name", ["client.example", "master.example"])
+def test_check_refuses_what_the_radio_cannot_do(
+    tsgt: Tsgt,  # noqa: F811 (a fixture)
+    tmp_path: Path,
+    name: str,
+) -> None:
+    """What the daemon would not start with is no good configuration."""
+    for path in EXAMPLES.glob("*.example.toml"):
+        shutil.copy(path, tmp_path)
+    path = tmp_path / f"{name}.toml"
+    path.write_text(path.read_text().replace("frequency_mhz = 905.0", "frequency_mhz = 868.1"))
+    outcome = tsgt("config", "check", path)
+    assert outcome.code == 2
+    assert "not within a band of CA915" in outcome.err
+
+
 def test_check_follows_the_set_up_files(tsgt: Tsgt, tmp_path: Path) -> None:  # noqa: F811 (a fixture)
     """A configuration whose set-up files are not there is no good one: exit 2 and one line."""
     shutil.copy(EXAMPLES / "master.example.toml", tmp_path)

@@ -113,7 +113,7 @@ def test_nobody_there_is_one_line(tsgt: Tsgt, tmp_path: Path) -> None:
     outcome = tsgt("listen", "--socket", tmp_path / "s")
     assert outcome.code == 1
     assert len(outcome.err.splitlines()) == 1
-    assert "start tsgt demo or tsgt replay" in outcome.err
+    assert "start tsgt-master, tsgt demo or tsgt replay" in outcome.err
 
 
 def test_stale_socket_is_one_line(tsgt: Tsgt, tmp_path: Path) -> None:

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
 
 from tsgt.cli import simulate
+from tsgt.config import ScenarioConfig
 from tsgt.recording import load_recording
 from tsgt.simulation.checkers import Violation
+from tsgt.simulation.mission import START_UNIX_NS
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    import pytest
     from support.cli import Tsgt
+
+START_S = START_UNIX_NS / 1e9
 
 
 def test_the_keys_that_others_rely_on(tsgt: Tsgt) -> None:
@@ -59,6 +65,47 @@ def test_recording_and_truth_are_kept(tsgt: Tsgt, tmp_path: Path) -> None:
     np.testing.assert_allclose(np.diff(rows[:, 0]), 0.05, atol=1e-6)
 
 
+def test_the_figures_follow_from_the_files(tsgt: Tsgt, tmp_path: Path) -> None:
+    """Oracle: rates, and errors of the poses, computed from nothing but recording and truth."""
+    recording, truth = tmp_path / "run.jsonl", tmp_path / "truth.tum"
+    arguments = ("simulate", "dynamic", "--duration", 60, "--output", recording, "--truth", truth, "--json")
+    found = tsgt(*arguments).json()
+    records = [json.loads(line) for line in recording.read_text().splitlines()]
+    of = {name: [r for r in records if r["type"] == name] for name in ("clock", "measurement", "pose")}
+    true = {
+        round(row[0] * 20): (row[1:4], Rotation.from_quat(row[4:]))
+        for row in np.loadtxt(truth, converters={0: lambda text: float(text) - START_S})
+    }
+
+    first = {clock["station"]: clock["stamp_ns"] / 1e9 - START_S for clock in reversed(of["clock"])}
+    synchronised_s = max(first.values())
+    for number, station in found["stations"].items():
+        arrivals_s = {
+            m["host_time_ns"]: m["received_ns"] / 1e9 - START_S
+            for m in of["measurement"]
+            if m["station"] == int(number)
+        }
+        counted = sum(synchronised_s <= arrival_s <= 60 for arrival_s in arrivals_s.values())
+        assert station["rate_hz"] == pytest.approx(counted / (60 - synchronised_s), rel=1e-6)
+
+    centroid_m = np.mean([prism.position_m for prism in ScenarioConfig().prisms], axis=0)
+    misses_m, turns_rad = [], []
+    for pose in of["pose"]:
+        epoch = round((pose["stamp_ns"] / 1e9 - START_S) * 20)
+        if not pose["valid"] or not 2 * 20 <= epoch <= 58 * 20:
+            continue
+        turn, (position_m, true_turn) = Rotation.from_quat(pose["orientation_xyzw"]), true[epoch]
+        misses_m.append(
+            pose["position_m"] + turn.apply(centroid_m) - position_m - true_turn.apply(centroid_m)
+        )
+        turns_rad.append((turn.inv() * true_turn).magnitude())
+    linear = found["estimators"]["linear"]
+    position_rms_mm = 1e3 * np.sqrt(np.mean(np.sum(np.square(misses_m), axis=1)))
+    assert linear["position_rms_mm"] == pytest.approx(position_rms_mm, rel=1e-4)
+    orientation_rms_deg = np.degrees(np.sqrt(np.mean(np.square(turns_rad))))
+    assert linear["orientation_rms_deg"] == pytest.approx(orientation_rms_deg, rel=1e-4)
+
+
 def test_existing_files_are_not_replaced(tsgt: Tsgt, tmp_path: Path) -> None:
     """A recording of an earlier run stays what it is."""
     recording = tmp_path / "run.jsonl"
@@ -67,6 +114,22 @@ def test_existing_files_are_not_replaced(tsgt: Tsgt, tmp_path: Path) -> None:
     assert result.code == 2
     assert "exists; choose another file" in result.err
     assert recording.read_text() == "precious"
+
+
+@pytest.mark.parametrize("option", ["--output", "--truth"])
+def test_a_missing_folder_is_said_before_the_run(tsgt: Tsgt, tmp_path: Path, option: str) -> None:
+    """Nobody waits for hours of simulation that cannot be kept."""
+    result = tsgt("simulate", option, tmp_path / "none" / "x")
+    assert result.code == 2
+    assert "there is no such folder" in result.err
+
+
+def test_a_run_too_short_for_poses_has_dashes(tsgt: Tsgt) -> None:
+    """The first synchronisation takes longer."""
+    result = tsgt("simulate", "--duration", "3")
+    assert result.code == 0
+    assert "nan" not in result.out
+    assert "position     - mm" in result.out
 
 
 def test_an_unknown_scenario(tsgt: Tsgt) -> None:

@@ -192,3 +192,32 @@ def test_nobody_at_the_socket(tsgt: Tsgt, tmp_path: Path) -> None:
     outcome = tsgt("status", "--socket", tmp_path / "nobody")
     assert outcome.code == 1
     assert "nobody answers" in outcome.err
+
+
+def test_one_that_talks_of_something_else_is_not_listened_to_for_ever(
+    tsgt: Tsgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The time limit is for the status, not for the next line."""
+    monkeypatch.setattr("tsgt.cli.status.TIMEOUT_S", 0.2)
+    path = tmp_path / "a.sock"
+    over = threading.Event()
+
+    def talk(listener: socket.socket) -> None:
+        connection, _ = listener.accept()
+        with connection:
+            while not over.wait(0.02):
+                try:
+                    connection.sendall(b'{"type":"other"}\n')
+                except OSError:
+                    return
+
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
+        listener.bind(str(path))
+        listener.listen()
+        talking = threading.Thread(target=talk, args=(listener,))
+        talking.start()
+        outcome = tsgt("status", "--socket", str(path))
+        over.set()
+        talking.join()
+    assert outcome.code == 1
+    assert "no status within" in outcome.err

@@ -50,6 +50,9 @@ if TYPE_CHECKING:
 
 STATUS_PERIOD_NS = 1_000_000_000
 
+STUCK_NS = 60_000_000_000
+"""No turn takes so long, not even a first synchronisation over a bad link; systemd then starts the master anew."""
+
 log = structlog.get_logger()
 
 
@@ -177,6 +180,7 @@ class _Master:
         ]
         self._outlet = Outlet(parameters, self._monitor, watchers, self._logged(hand_out))
         self._radio_failed = False
+        self._turn_ns: int | None = None  # since when there has been a turn; None without a radio
 
     # --- Time ---------------------------------------------------------------------------------------------------
 
@@ -208,10 +212,13 @@ class _Master:
             )
 
     async def watchdog(self) -> None:
-        """Tell systemd that this program lives, as often as it wants."""
+        """Tell systemd that this program lives, as often as it wants, unless its turns have come to a standstill."""
         interval_s = service.watchdog_interval_s()
         while interval_s is not None:
-            service.sd_notify("WATCHDOG=1")
+            if self._turn_ns is not None and self._now_ns() - self._turn_ns > STUCK_NS:
+                log.error("turns_stuck", for_s=(self._now_ns() - self._turn_ns) / 1e9)
+            else:
+                service.sd_notify("WATCHDOG=1")
             await self._clock.sleep_until(self._clock.monotonic_ns() + round(interval_s * 1e9))
 
     # --- Radio --------------------------------------------------------------------------------------------------
@@ -238,13 +245,17 @@ class _Master:
     async def collect(self, radio: Radio) -> None:
         """Take turns with the stations, for as long as the radio does."""
         collector = Collector(radio, self._clock, self._timeline, self._timing)
-        while True:
-            turn = self._scheduler.next(self._now_ns())
-            if isinstance(turn, int):
-                await self._clock.sleep_until(self._timeline.monotonic_ns(turn))
-                continue
-            await collector.take(turn)
-            self._finished(turn, collector)
+        try:
+            while True:
+                self._turn_ns = self._now_ns()
+                turn = self._scheduler.next(self._turn_ns)
+                if isinstance(turn, int):
+                    await self._clock.sleep_until(self._timeline.monotonic_ns(turn))
+                    continue
+                await collector.take(turn)
+                self._finished(turn, collector)
+        finally:
+            self._turn_ns = None
 
     def _finished(self, turn: Task, collector: Collector) -> None:
         now_ns, station = self._now_ns(), turn.station

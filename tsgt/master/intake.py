@@ -155,6 +155,7 @@ class _Station:
         self._sequence = 0
         self._heard_ns: int | None = None
         self._doubtful = False
+        self._had_nothing = False
         self.missed = False
 
     def answered(self, message: MeasurementMessage, requested_ns: int, received_ns: int) -> Arrival:
@@ -164,9 +165,9 @@ class _Station:
         if message.time_ns == 0:
             self._check.nothing_new(requested_ns)
             if message.status == OK or not (message.zenith_angle_rad or message.horizontal_angle_rad):
-                return Arrival(
-                    doubtful=self._begins_anew(missed=missed) or back
-                )  # it has not measured anything yet
+                # It has not measured anything yet.
+                self._had_nothing = True
+                return Arrival(doubtful=self._begins_anew(missed=missed) or back)
             return Arrival(self._untimed(message, received_ns), doubtful=back)
         if message.time_ns in self._known:
             if message.time_ns == self._last:  # and not an older one that somebody plays back
@@ -190,7 +191,7 @@ class _Station:
             self._check = ArrivalCheck()
             self._hold(message, received_ns)
             return Arrival(stepped=True, doubtful=True)
-        if stale:
+        if stale or self._had_nothing:  # between the nothing and this its program may have been started again
             self._doubtful = True
             self._hold(message, received_ns)
             return Arrival(doubtful=True)
@@ -230,7 +231,7 @@ class _Station:
         known = self._offset_ns is not None
         if known and self._doubtful and not self._agrees(newest):
             self._clock.forget()  # the paper's filter would go there a tenth of the way
-        self._heard_ns, self.missed, self._doubtful = now_ns, False, False
+        self._heard_ns, self.missed, self._doubtful, self._had_nothing = now_ns, False, False, False
         updated = self._clock.update(samples)
         stepped = updated.restarted and known
         self._offset_ns = newest.station_ns - newest.sent_ns - newest.forward_ns

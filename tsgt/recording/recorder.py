@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 WAITING_LINES = 100_000
 """About an hour of measurements and poses of three stations, 100 MB."""
 
+HUNG_FACTOR = 2
+"""A disk that refuses lines is told from one that does not even answer, for which this many times more may wait."""
+
 log = structlog.get_logger()
 
 
@@ -53,7 +56,10 @@ class Recorder:
 
     def put(self, line: bytes) -> None:
         """Take a line without writing it yet; never waits."""
-        self._waiting.append(line)
+        if len(self._waiting) < HUNG_FACTOR * self._waiting_lines:
+            self._waiting.append(line)
+        else:  # a write has been hanging for hours, and the oldest lines are in its hands
+            self._lost += 1
 
     def flush(self) -> None:
         """Write what waits, in order; never raises because of the disk. May be called from another thread."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import socket
 from contextlib import asynccontextmanager
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -314,3 +315,47 @@ def test_a_fence_runs_its_command(tmp_path: Path) -> None:
 
     run(commands)
     assert (tmp_path / "said").read_text() == "fence_left yard\n"
+
+
+async def test_a_master_whose_turns_stand_still_is_not_kept_alive(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The watchdog hears of it while there are turns, and no more after a minute without the end of one."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(str(tmp_path / "notify"))
+        systemd.setblocking(False)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        monkeypatch.setenv("WATCHDOG_USEC", "10000000")
+
+        signs_of_life = 0
+
+        def heard() -> None:
+            nonlocal signs_of_life
+            signs_of_life += b"WATCHDOG=1" in systemd.recv(1000)
+
+        asyncio.get_running_loop().add_reader(systemd, heard)
+        async with field_of(tmp_path) as field:
+            stuck = asyncio.Event()
+
+            @asynccontextmanager
+            async def open_radio() -> AsyncGenerator[Radio]:
+                async with field.open_radio()() as radio:
+                    transmit = radio.transmit
+
+                    async def hanging(payload: bytes, *, at_ns: int | None = None) -> Transmitted:
+                        if stuck.is_set():
+                            await asyncio.Event().wait()
+                        return await transmit(payload, at_ns=at_ns)
+
+                    with patch.object(radio, "transmit", hanging):
+                        yield radio
+
+            async with running(field.master(open_radio=open_radio)):
+                await asyncio.sleep(30)
+                assert signs_of_life >= 5
+                stuck.set()
+                await asyncio.sleep(70)
+                before = signs_of_life
+                await asyncio.sleep(30)
+                assert signs_of_life == before
+        asyncio.get_running_loop().remove_reader(systemd)

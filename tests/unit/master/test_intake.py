@@ -359,3 +359,15 @@ def test_a_stamp_that_is_late_by_an_average_may_be_off_by_as_much() -> None:
     late.intake = Intake({1: 4}, lambda: clock_filter("regression"), {1: 700_000})
     bounds = [master.synchronise(0).record.bound_ns for master in (plain, late)]
     assert bounds[1] - bounds[0] == 700_000
+
+
+def test_the_first_measurement_after_nothing_waits_for_a_synchronisation() -> None:
+    """Between the two the station's program may have been started again, with a clock a little off."""
+    master = Master()
+    master.poll(1000, no_measurement_yet(1))
+    first = master.poll(1600, message(START + 1300 * MS + AHEAD_NS + 30 * MS))
+    assert first.measurement is None
+    assert first.doubtful
+    (measurement,) = master.synchronise(3000, AHEAD_NS + 30 * MS).measurements
+    assert measurement.stamp_ns == pytest.approx(START + 1300 * MS, abs=MS)
+    assert master.poll(3600, message(START + 3300 * MS + AHEAD_NS + 30 * MS)).measurement is not None

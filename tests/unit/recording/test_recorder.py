@@ -76,3 +76,11 @@ def test_what_still_waits_at_the_end_is_tried_once_more(disk: FullDisk) -> None:
             recorder.close()
     assert disk.path.read_bytes().splitlines()[1:] == [b"one", b"two"]
     assert logs[-1] == {"event": "recording_incomplete", "lost_lines": 2, "log_level": "error"}
+
+
+def test_a_write_that_hangs_for_hours_does_not_fill_the_memory(disk: FullDisk) -> None:
+    """What waits for a disk that does not even answer is bounded; the newest lines go, and are counted."""
+    recorder = Recorder(disk, waiting_lines=10)
+    for _ in range(50):
+        recorder.put(b"{}")
+    assert recorder.waiting == 20

@@ -128,20 +128,17 @@ def wait_for_mode(folder: Path, mode: str) -> None:
     raise AssertionError(f"the client is {found}, not {mode}")
 
 
+def collect_command(folder: Path, output: Path) -> tuple[str, ...]:
+    """Arguments of Python that collect targets into a file."""
+    config = str(folder / "master.toml")
+    return ("-m", "tsgt", "calibrate", "collect", "--config", config, "--output", str(output))
+
+
 @pytest.mark.parametrize("waiting", [True, False])
 def test_ctrl_c_leaves_what_was_measured_and_a_station_that_tracks(folder: Path, *, waiting: bool) -> None:
     """While it waits for a key, and while the instrument measures; the exit code is that of Ctrl-C."""
     path = folder / "targets.csv"
-    command = (
-        "-m",
-        "tsgt",
-        "calibrate",
-        "collect",
-        "--config",
-        str(folder / "master.toml"),
-        "--output",
-        str(path),
-    )
+    command = collect_command(folder, path)
     with process(*command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as collect:
         assert collect.stdin is not None
         collect.stdin.write(b"\n" if waiting else b"\n\n")
@@ -165,16 +162,7 @@ def test_ctrl_c_leaves_what_was_measured_and_a_station_that_tracks(folder: Path,
 def test_keys_may_come_from_a_file(folder: Path) -> None:
     """The end of the input is the end of the work; what is missing is said."""
     path = folder / "targets.csv"
-    command = (
-        "-m",
-        "tsgt",
-        "calibrate",
-        "collect",
-        "--config",
-        str(folder / "master.toml"),
-        "--output",
-        str(path),
-    )
+    command = collect_command(folder, path)
     done = subprocess.run(
         [sys.executable, *command, "--targets", "3"],
         env=ENVIRONMENT, input=b"\ns\n", capture_output=True, timeout=60, check=False,

@@ -17,8 +17,7 @@ from tsgt.geometry import rotation_from_quaternion
 from tsgt.master.intake import UNTIMED_SIGMA_NS
 from tsgt.master.replay import replayed
 from tsgt.master.tracks import build_tracks, usable
-from tsgt.model import PolarMeasurement
-from tsgt.recording import decode_line, read_lines
+from tsgt.recording.journal import load_journal
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.master.tracks import Track
-    from tsgt.model import Parameters
+    from tsgt.model import Parameters, PolarMeasurement
     from tsgt.simulation.scenario import Run
     from tsgt.simulation.witness import Session, StationWitness, ValidPoses
 
@@ -75,11 +74,7 @@ def altered(witness: StationWitness, sessions: Sequence[Session]) -> Iterator[Vi
     read = set()
     for folder in witness.journals:
         for path in sorted(folder.glob("*.jsonl")):
-            read |= {
-                _content(decode_line(PolarMeasurement, line, path))
-                for line in read_lines(path)
-                if line.type == "measurement"
-            }
+            read |= {_content(measurement) for measurement in load_journal(path).measurements}
     for host_time_ns in sorted(witness.stamps_ns.keys() - {time_ns for _, time_ns, *_ in read}):
         yield Violation(
             "journal",

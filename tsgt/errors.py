@@ -12,6 +12,7 @@
     ├── GeometryError          numbers that no geometry can be computed from
     │   └── DegenerateGeometryError  points that coincide or lie in a line
     ├── StreamError            a socket of ours cannot be opened or reached
+    ├── MessageError           bytes or numbers that make no packet of ours
     ├── InstrumentError        the total station does not do what it was told, or is gone
     └── RadioError             the radio does not do what it was told
         ├── RadioSettingsError     it was told something that it cannot do
@@ -88,6 +89,10 @@ class DegenerateGeometryError(GeometryError):
 
 class StreamError(TsgtError, OSError):
     """A socket (poses, simulated air) cannot be opened or reached: it is in use, or nobody serves it."""
+
+
+class MessageError(TsgtError, ValueError):
+    """Bytes that are no message of ours, or a message that does not go into its fields: foreign, cut off, damaged."""
 
 
 class InstrumentError(TsgtError):

@@ -106,6 +106,8 @@ class PolarMeasurement:
         station's latency is not taken off; whoever computes with it does that.
     stamp_sigma_ns
         One sigma of ``stamp_ns`` in ns, without the instrument's latency.
+    stamp_bound_ns
+        ``stamp_ns`` is within this of the truth, in ns; null where nobody can say.
     received_ns
         When the master had it, on the master's Unix clock, in ns.
     horizontal_angle_rad
@@ -119,9 +121,9 @@ class PolarMeasurement:
         The instrument's verdict: ``ok``, ``low_accuracy``, ``angle_only``, ``no_target``, ``tilt``,
         ``wrong_distance`` or ``error``. The first two are usable.
     raw_status
-        The number that the instrument itself gave for it.
+        The number that the instrument itself gave for it; 0 where the radio does not carry it.
     host_time_ns
-        The station computer's stamp in ns, on its own clock.
+        The station computer's stamp in ns, on its own clock; null where the radio does not carry it.
     instrument_time_ns
         The instrument's own stamp in ns, on the instrument's clock; null where it has none.
     """
@@ -134,18 +136,20 @@ class PolarMeasurement:
     sequence: int
     stamp_ns: int
     stamp_sigma_ns: int = 0
+    stamp_bound_ns: int | None = None
     received_ns: int
     horizontal_angle_rad: float
     zenith_angle_rad: float
     slope_distance_m: float | None
     status: Status = Status.OK
     raw_status: int = 0
-    host_time_ns: int
+    host_time_ns: int | None
     instrument_time_ns: int | None = None
 
     def __post_init__(self) -> None:
         """Refuse what cannot be a measurement: instants that no clock shows, angles that are no numbers."""
-        check_instants(self.stamp_ns, self.received_ns, self.host_time_ns, self.stamp_sigma_ns)
+        check_instants(self.stamp_ns, self.received_ns, self.stamp_sigma_ns)
+        check_instants(self.stamp_bound_ns or 0, self.host_time_ns or 0)
         check_finite(self.horizontal_angle_rad, self.zenith_angle_rad, self.slope_distance_m or 0.0)
 
 

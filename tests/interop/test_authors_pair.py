@@ -20,7 +20,6 @@ from tsgt.model import Status
 from tsgt.radio.base import LoRaSettings
 from tsgt.radio.classic import (
     ClassicStation,
-    MeasureOrder,
     Ordered,
     Poll,
     Shot,
@@ -28,6 +27,7 @@ from tsgt.radio.classic import (
     Timing,
 )
 from tsgt.radio.classic_messages import Command, MeasurementMessage, raw_status, status_of
+from tsgt.radio.orders import MeasureOrder
 from tsgt.simulation.air import Air
 from tsgt.simulation.authors_node import AUTHORS_STAMP_DELAY_MS, AuthorsMaster, AuthorsNode
 from tsgt.simulation.clocks import DriftingClock, VirtualClock
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Coroutine
 
     from tsgt.radio.base import Radio
-    from tsgt.radio.classic import Order
+    from tsgt.radio.classic_station import ClassicOrder
     from tsgt.station.instrument import Reading
 
 SECOND = 1000 * MS
@@ -134,7 +134,7 @@ async def _serve(station: int, radio: Radio, clock: DriftingClock, instrument: S
             time_ns=timeline.unix_ns(reading.at_ns),
         )
 
-    async def carry_out(order: Order) -> bytes:
+    async def carry_out(order: ClassicOrder) -> bytes:
         if isinstance(order, MeasureOrder):
             return core.shot(message(await instrument.measure()))
         await instrument.direct()

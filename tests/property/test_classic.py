@@ -12,7 +12,6 @@ from support.radios import MS, PAPER
 from tsgt.model import Status
 from tsgt.radio.classic import (
     ClassicStation,
-    MeasureOrder,
     Ordered,
     Poll,
     Shot,
@@ -33,6 +32,7 @@ from tsgt.radio.classic_messages import (
     no_measurement_yet,
     status_of,
 )
+from tsgt.radio.orders import MeasureOrder
 
 TIMING = Timing.of(PAPER, 250 * MS)
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
 from tsgt.model import Status
+from tsgt.radio.authentication import Authenticator
 from tsgt.radio.base import LoRaSettings
 from tsgt.radio.classic import Timing
 from tsgt.radio.classic_messages import (
@@ -20,6 +23,25 @@ from tsgt.radio.classic_messages import (
     raw_status,
     status_of,
 )
+from tsgt.radio.message_codec import decode_beacon, encode_beacon, encode_reply
+from tsgt.radio.message_codec import decode_reply as decode_superframe_reply
+from tsgt.radio.messages import (
+    GRANT_BYTES,
+    AnswerPart,
+    Beacon,
+    Confirmation,
+    Introduction,
+    OrderPart,
+    Reply,
+    Run,
+    SessionPart,
+    ShotPart,
+    Sighting,
+    SlotOrder,
+    StatePart,
+    StationEntry,
+)
+from tsgt.radio.run_codec import DISTANCE_WIDTHS, HORIZONTAL_WIDTHS, TIME_WIDTHS, ZENITH_WIDTHS
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "radio-protocol.md").read_text()
 
@@ -113,3 +135,174 @@ def test_airtimes_stand_there(spreading_factor: int, column: int) -> None:
         f"{timing.airtime_ns(int(row[1])) / 1e6:.2f} ms" for row in packets
     ]
     assert reported[column] == f"{timing.rx_done_ns / 1e6:.2f} ms"
+
+
+# --- The superframe ------------------------------------------------------------------------------------------------
+
+
+def test_every_grant_stands_there() -> None:
+    """The table of grants is that of the code."""
+    rows = _rows("grant | reply, at most")
+    assert [int(grant) for grant, _ in rows] == list(range(16))
+    assert rows[0][1] == "no slot"
+    assert [longest for _, longest in rows[1:]] == [f"{length} bytes" for length in GRANT_BYTES[1:]]
+
+
+def test_every_status_of_the_superframe_stands_there() -> None:
+    """The table of verdicts is that of the code: a shot with each of them has its number in these bits."""
+    rows = _rows("status | in tsgt")
+    assert {Status(name.strip("`")) for _, name in rows} == set(Status)
+    for number, name in rows:
+        content = encode_reply(Reply(shot=ShotPart(0, Status(name.strip("`")), 0, 0, None)))
+        assert int.from_bytes(content[:2], "big") & 0b111 == int(number)
+
+
+def test_the_widths_of_residuals_stand_there() -> None:
+    """Four for each kind of number."""
+    widths = {kind: tuple(map(int, cells)) for kind, *cells in _rows("residual | 0")}
+    assert widths == {
+        "time": TIME_WIDTHS,
+        "horizontal": HORIZONTAL_WIDTHS,
+        "zenith": ZENITH_WIDTHS,
+        "distance": DISTANCE_WIDTHS,
+    }
+
+
+class Example(NamedTuple):
+    """What stands under one heading of an example."""
+
+    field_bits: str
+    content: bytes
+    sender: str
+    code: bytes
+
+
+def _examples() -> dict[str, Example]:
+    found = {}
+    for section in re.split(r"^#### Example: ", PAGE, flags=re.MULTILINE)[1:]:
+        title, _, body = section.partition("\n")
+        rows = re.findall(r"^\| (\d+) \| (-?\d+) \| [^|]+ \|$", body, re.MULTILINE)
+        field_bits = "".join(f"{int(value) % 2 ** int(bits):0{bits}b}" for bits, value in rows)
+        content, sender, code = re.findall(r"Content `(.*?)`, (code .*?): `(.*?)`", body)[0]
+        found[title] = Example(field_bits, bytes.fromhex(content), sender, bytes.fromhex(code))
+    return found
+
+
+EXAMPLES = _examples()
+BEACON = Beacon(
+    frame=421 % 256,
+    sent=160_123_456 % 2**16,
+    cumulative=1029 % 256,
+    order=SlotOrder(first=1),
+    stations=(StationEntry(0b1111, 2), StationEntry(0b1110, 4), StationEntry(0b1111, 8)),
+)
+BEACON_WITH_ITEMS = Beacon(
+    frame=424 % 256,
+    sent=161_296_000 % 2**16,
+    cumulative=1035 % 256,
+    order=SlotOrder(first=2, reverse=True),
+    stations=(StationEntry(0b1111, 2), StationEntry(0b1111, 2), StationEntry(0b0100, 8)),
+    session=SessionPart(
+        nonce=0x0123456789AB, counter_high=424 >> 8, sent_high=161_296_000 >> 16, guard=23, turn_round=32
+    ),
+    confirmations=(Confirmation(3, 0x33333333),),
+    orders=(OrderPart(2, 5, 0, 3),),
+)
+SINGLE = Sighting(1041 % 256, 10_025_000 % 2**17, Status.OK, 5_000_000, 4_233_600, 756_032)
+RUN = Run(
+    sightings=(
+        Sighting(1032 % 256, 57_903, Status.OK, 3_010_000, 4_200_100, 612_300),
+        Sighting(1031 % 256, 57_903 - 25_003, Status.OK, 2_994_895, 4_200_280, 608_057),
+        Sighting(1030 % 256, 57_903 - 50_001, Status.LOW_ACCURACY, 2_979_988, 4_200_430, 603_756),
+        Sighting(1028 % 256, 57_903 - 100_011, Status.LOW_ACCURACY, 2_950_388, 4_200_760, 595_046),
+    ),
+    quality=2,
+)
+JOINING = Reply(
+    introduction=Introduction(nonce=0x33333333, lineage=0xBEEF, run_start=5417, oldest=5417),
+    state=StatePart(prism=3, direct=False, connected=True, late=1, doubted=0, rssi_dbm=-97),
+    runs=(
+        Run(
+            sightings=(Sighting(5418, 2**36 - 9_000, Status.OK, 9_000_000, 4_190_000, 1_843_212),),
+            direct=True,
+            quality=5,
+            wide=True,
+            prism=3,
+            far=True,
+        ),
+    ),
+)
+REPLIES = {
+    "one measurement": Reply(runs=(Run(sightings=(SINGLE,)),)),
+    "a run": Reply(runs=(RUN,)),
+    "a station joins": JOINING,
+    "an answer": Reply(
+        state=StatePart(prism=4, direct=False, connected=True, late=0, doubted=0, rssi_dbm=-88),
+        turn_round_us=178_344,
+        answer=AnswerPart(5, ok=True),
+    ),
+    "a shot": Reply(shot=ShotPart(6, Status.OK, 12_345_678, 4_100_000, 423_456)),
+}
+BEACONS = {"a beacon": BEACON, "a beacon with items": BEACON_WITH_ITEMS}
+GIVEN = {name: _bytes(cell) for name, cell in _rows("given | value")}
+
+
+def test_every_example_is_tested() -> None:
+    """None more, none less."""
+    assert EXAMPLES.keys() == BEACONS.keys() | REPLIES.keys()
+
+
+@pytest.mark.parametrize("title", EXAMPLES)
+def test_the_fields_of_an_example_are_its_content(title: str) -> None:
+    """Number after number, with zeros at the end, they are the bytes."""
+    example = EXAMPLES[title]
+    bits = example.field_bits + "0" * (-len(example.field_bits) % 8)
+    assert int(bits, 2).to_bytes(len(bits) // 8, "big") == example.content
+
+
+@pytest.mark.parametrize("title", BEACONS)
+def test_the_beacons_stand_there(title: str) -> None:
+    """Each is sent in these bytes, and understood from them."""
+    assert encode_beacon(BEACONS[title]) == EXAMPLES[title].content
+    assert decode_beacon(EXAMPLES[title].content) == BEACONS[title]
+
+
+@pytest.mark.parametrize("title", REPLIES)
+def test_the_replies_stand_there(title: str) -> None:
+    """Each is sent in these bytes, and understood from them."""
+    assert encode_reply(REPLIES[title]) == EXAMPLES[title].content
+    assert decode_superframe_reply(EXAMPLES[title].content) == REPLIES[title]
+
+
+@pytest.mark.parametrize("title", EXAMPLES)
+def test_the_codes_stand_there(title: str) -> None:
+    """Each is what the code computes, and what the table of its input says, computed here."""
+    example = EXAMPLES[title]
+    session = int.from_bytes(GIVEN["session"], "big")
+    numbers = [int(number) for number in re.findall(r"\d+", example.sender)]
+    authenticator = Authenticator(GIVEN["key"])
+    if title in BEACONS:
+        (counter,) = numbers
+        code = authenticator.beacon_code(session=session, counter=counter, content=example.content)
+        values = [1, session, 0, 0, counter, 0, 0, len(example.content)]
+    else:
+        (station, sequence), counter = numbers, 421
+        nonce = int.from_bytes(GIVEN[f"nonce of station {station}"], "big")
+        answered = EXAMPLES["a beacon"].code
+        code = authenticator.reply_code(
+            session=session,
+            station=station,
+            station_nonce=nonce,
+            counter=counter,
+            beacon_code=answered,
+            sequence=sequence,
+            content=example.content,
+        )
+        answered_number = int.from_bytes(answered, "big")
+        values = [2, session, station, nonce, counter, answered_number, sequence, len(example.content)]
+    lengths = [int(row[0]) for row in _rows("bytes | input")[:-1]]
+    hashed = b"".join(value.to_bytes(length, "big") for value, length in zip(values, lengths, strict=True))
+    assert code == example.code
+    person = re.findall(r"the person `(.*?)`", PAGE)[0].encode()
+    digest = hashlib.blake2s(hashed + example.content, digest_size=4, key=GIVEN["key"], person=person)
+    assert digest.digest() == example.code

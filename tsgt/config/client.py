@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from tsgt.config.base import Model, Positive, RelativePath
-from tsgt.config.radio import ClassicConfig, RadioConfig
+from tsgt.config.radio import ProtocolConfig, RadioConfig, check_numbers
 
 
 class SimulatedInstrumentConfig(Model):
@@ -37,17 +37,22 @@ class ClientConfig(Model):
 
     kind: Literal["client"]
     """What this file is."""
-    station: Annotated[int, Field(ge=1, le=9)]
-    """Number of this station; one digit, as it goes over the radio."""
-    prism: Annotated[int, Field(ge=1, le=9)]
-    """Number of the prism that it tracks from the start; one digit too."""
+    station: Annotated[int, Field(ge=1, le=16)]
+    """Number of this station; 1 to 9 with the protocol `classic`, to 16 with `superframe`."""
+    prism: Annotated[int, Field(ge=1, le=16)]
+    """Number of the prism that it tracks from the start; the same."""
     instrument: InstrumentConfig
     """The total station."""
     radio: RadioConfig
     """The radio; the same modem settings as the master's."""
-    protocol: ClassicConfig
+    protocol: ProtocolConfig
     """What is spoken over it; the same as the master's."""
     journal: JournalConfig = JournalConfig()
     """What stays."""
     status_socket: RelativePath = Path("/run/tsgt/client.sock")
     """UNIX socket on which `tsgt status` asks."""
+
+    @model_validator(mode="after")
+    def _numbers_fit_the_protocol(self) -> ClientConfig:
+        check_numbers(self.protocol, self.station, self.prism)
+        return self

@@ -9,7 +9,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from tsgt.config.base import Model, NoiseConfig, Number, Positive, RelativePath, no_two_share
 from tsgt.config.pipeline import PipelineConfig
-from tsgt.config.radio import ClassicMasterConfig, RadioConfig
+from tsgt.config.radio import MasterProtocolConfig, RadioConfig, check_numbers
 from tsgt.polygon import check_simple
 
 Corner = tuple[Annotated[float, Field(ge=-1e6, le=1e6)], Annotated[float, Field(ge=-1e6, le=1e6)]]
@@ -18,9 +18,6 @@ Corner = tuple[Annotated[float, Field(ge=-1e6, le=1e6)], Annotated[float, Field(
 def _simple(corners: tuple[Corner, ...]) -> tuple[Corner, ...]:
     check_simple(corners)
     return corners
-
-
-LARGEST_DIGIT = 9
 
 
 class StationConfig(Model):
@@ -114,7 +111,7 @@ class MasterConfig(Model):
     """One entry per station."""
     radio: RadioConfig
     """The radio; the same modem settings as the clients'."""
-    protocol: ClassicMasterConfig
+    protocol: MasterProtocolConfig
     """What is spoken over it; the same as the clients'."""
     pipeline: PipelineConfig = PipelineConfig()
     """How measurements become poses."""
@@ -130,9 +127,5 @@ class MasterConfig(Model):
     @model_validator(mode="after")
     def _numbers_fit_the_protocol(self) -> MasterConfig:
         for station in self.stations:
-            if station.station > LARGEST_DIGIT or station.prism > LARGEST_DIGIT:
-                raise ValueError(
-                    f"station {station.station} with prism {station.prism}: the protocol classic sends one digit for "
-                    "each, so both are 1 to 9"
-                )
+            check_numbers(self.protocol, station.station, station.prism)
         return self

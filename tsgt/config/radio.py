@@ -98,3 +98,47 @@ class ClassicMasterConfig(ClassicConfig):
     """From one synchronisation of a station to its next; stations are staggered."""
     clock_filter: Literal["regression", "paper"] = "regression"
     """How offsets become a clock: `regression` follows drift, `paper` is the paper's low-pass with w = 0.1."""
+
+
+class SuperframeConfig(Model):
+    """One beacon of the master per frame, then one slot for each station: every measurement gets through."""
+
+    kind: Literal["superframe"]
+    """Name of the protocol. There is no default: all daemons of a mission speak the same one."""
+    key_file: RelativePath | None = None
+    """The key that all radios of a mission share, made by `tsgt radio key`. Without one anybody can take part."""
+
+
+class SuperframeMasterConfig(SuperframeConfig):
+    """The same as the master runs it; what it says of time it tells the stations itself."""
+
+    start_jitter_ms: Annotated[float, Field(ge=0.5, le=50)] = 5.0
+    """How late a station's computer starts a transmission at worst: 5 as a rule, 1 to 2 with real-time priority."""
+    turn_round_ms: Annotated[float, Field(ge=3, le=60)] = 8.0
+    """What a station's computer needs from the end of a beacon to its first slot."""
+    clock_error_ppm: Annotated[float, Field(ge=0, le=1000)] = 100.0
+    """By how much two computers' clocks may run apart."""
+    phase_lock: bool = True
+    """Let the frame follow the instruments, so that their measurements wait as short as can be."""
+
+
+ProtocolConfig = Annotated[ClassicConfig | SuperframeConfig, Field(discriminator="kind")]
+MasterProtocolConfig = Annotated[ClassicMasterConfig | SuperframeMasterConfig, Field(discriminator="kind")]
+
+LARGEST_NUMBERS = {"classic": 9, "superframe": 16}
+"""Of stations and prisms: one digit, or four bits."""
+
+
+def check_numbers(protocol: ClassicConfig | SuperframeConfig, station: int, prism: int) -> None:
+    """Refuse numbers that a protocol cannot send.
+
+    Raises
+    ------
+    ValueError
+        With the limit.
+    """
+    largest = LARGEST_NUMBERS[protocol.kind]
+    if max(station, prism) > largest:
+        raise ValueError(
+            f"station {station} with prism {prism}: the protocol {protocol.kind} can send numbers from 1 to {largest}"
+        )

@@ -17,23 +17,19 @@ from tsgt.radio.classic_messages import (
     MeasurementMessage,
     decode_reply,
 )
-from tsgt.radio.classic_station import ClassicStation, DirectOrder, MeasureOrder, Order, TrackOrder
+from tsgt.radio.classic_station import ClassicStation
 from tsgt.radio.classic_synchronisation import Synchronisation
 from tsgt.radio.classic_turn import TURN_ROUND_NS, Request, Timing, Turn
 
 __all__ = [
     "TURN_ROUND_NS",
     "ClassicStation",
-    "DirectOrder",
-    "MeasureOrder",
-    "Order",
     "Ordered",
     "Poll",
     "Request",
     "Shot",
     "Synchronisation",
     "Timing",
-    "TrackOrder",
     "Turn",
 ]
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from tsgt.radio.classic_messages import (
     Acknowledgement,
     MeasurementMessage,
@@ -12,6 +10,7 @@ from tsgt.radio.classic_messages import (
     decode_command,
     no_measurement_yet,
 )
+from tsgt.radio.orders import DirectOrder, MeasureOrder, TrackOrder
 
 _INTRODUCTIONS = 3
 """So many requests are answered as if there were no measurement yet, unless the station is synchronised before.
@@ -20,30 +19,8 @@ A master that knew the station before its restart cannot see from a measurement 
 that is told that there is none can."""
 
 
-@dataclass(frozen=True, slots=True)
-class TrackOrder:
-    """Go back to tracking.
-
-    Attributes
-    ----------
-    prism
-        The prism to track; None: the one that was tracked before.
-    """
-
-    prism: int | None
-
-
-@dataclass(frozen=True, slots=True)
-class DirectOrder:
-    """Stop tracking and get ready for single measurements."""
-
-
-@dataclass(frozen=True, slots=True)
-class MeasureOrder:
-    """Make one single measurement."""
-
-
-Order = TrackOrder | DirectOrder | MeasureOrder
+ClassicOrder = TrackOrder | DirectOrder | MeasureOrder
+"""What this protocol can order."""
 
 
 class ClassicStation:
@@ -65,13 +42,13 @@ class ClassicStation:
         self._stamp_ns = 0
         self._direct = False
         self._prism: int | None = None
-        self._under_way: Order | None = None
+        self._under_way: ClassicOrder | None = None
 
     def measured(self, message: MeasurementMessage) -> None:
         """Keep the newest measurement of the tracked prism for the next request, and for those after it."""
         self._newest = message
 
-    def received(self, payload: bytes, at_ns: int) -> bytes | Order | None:
+    def received(self, payload: bytes, at_ns: int) -> bytes | ClassicOrder | None:
         """Take a packet.
 
         Parameters
@@ -83,7 +60,7 @@ class ClassicStation:
 
         Returns
         -------
-        bytes, Order or None
+        bytes, ClassicOrder or None
             The answer, to be sent at once; an order to be carried out and then reported; or None, where there is
             nothing to answer: the packet is not for this station, not of this protocol, or ``p`` or ``c``.
         """
@@ -136,7 +113,7 @@ class ClassicStation:
     def _tracks(self, prism: int | None) -> bool:
         return not self._direct and prism in (None, self._prism)
 
-    def _begin(self, order: Order) -> Order | None:
+    def _begin(self, order: ClassicOrder) -> ClassicOrder | None:
         if self._under_way is not None:
             return None
         self._under_way = order

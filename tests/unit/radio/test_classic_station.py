@@ -2,8 +2,9 @@ from __future__ import annotations
 
 import pytest
 
-from tsgt.radio.classic import ClassicStation, DirectOrder, MeasureOrder, TrackOrder
+from tsgt.radio.classic import ClassicStation
 from tsgt.radio.classic_messages import MeasurementMessage, no_measurement_yet
+from tsgt.radio.orders import DirectOrder, MeasureOrder, TrackOrder
 
 NONE_YET = no_measurement_yet(1).to_bytes()
 SOME = MeasurementMessage(

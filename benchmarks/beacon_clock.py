@@ -1,0 +1,130 @@
+"""What a station makes of the beacons' times: errors and bounds in all scenarios, and what the fit costs.
+
+Errors are those of the times as they go over the air, in steps of 16 us; see docs/explanation/superframe-clock.md.
+``--json`` prints the same figures in us.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import json
+import statistics
+import time
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.radio.beacon_clock import BeaconClock
+from tsgt.simulation.beacon_scenarios import BEACON_SCENARIOS, run_beacon_scenario
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from tsgt.simulation.beacon_scenarios import BeaconScenario, Told
+
+SETTLED_S = 5.0
+"""Live figures are of what is measured after this."""
+FULL = 200
+FRAME_NS = 400_000_000
+
+
+@dataclass(frozen=True)
+class Row:
+    """Figures of a scenario, in us where nothing else is said."""
+
+    scenario: str
+    summary: str
+    live_p50: float
+    live_p99: float
+    late_p50: float | None
+    late_p99: float | None
+    bound_p50: float
+    bound_p99: float
+    told: int
+    broken: int
+    nearest_to_bound: float
+
+
+def main() -> None:
+    """Print a row for each scenario, and what calls cost."""
+    parser = argparse.ArgumentParser(description="Time errors of the fit of beacons, over many seeds.")
+    parser.add_argument("--json", action="store_true", help="figures for a machine")
+    parser.add_argument("--seeds", type=int, default=50, help="how many runs of each scenario (default 50)")
+    arguments = parser.parse_args()
+    rows = [row(scenario, arguments.seeds) for scenario in BEACON_SCENARIOS]
+    if arguments.json:
+        print(json.dumps({"rows": [asdict(r) for r in rows], "cost_us": cost_us()}, indent=1))
+        return
+    print(
+        "| scenario | what happens | live p50 | p99 | late p50 | p99 | bound p50 | p99 | told | broken | at most |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|---|---|")
+    for r in rows:
+        late = "| | " if r.late_p50 is None else f"| {r.late_p50:.0f} | {r.late_p99:.0f} "
+        print(
+            f"| `{r.scenario}` | {r.summary} | {r.live_p50:.0f} | {r.live_p99:.0f} {late}"
+            f"| {r.bound_p50:.0f} | {r.bound_p99:.0f} | {r.told} | {r.broken} | {r.nearest_to_bound:.2f} |"
+        )
+    print()
+    for call, figure in cost_us().items():
+        print(f"{call}: {figure:.0f} us")
+
+
+def row(scenario: BeaconScenario, seeds: int) -> Row:
+    """Run a scenario with seeds 0 and up."""
+    told = [t for seed in range(seeds) for t in run_beacon_scenario(scenario, seed).told]
+    live = [t for t in told if t.live and t.measured_s >= SETTLED_S]
+    late = [t for t in told if not t.live and t.measured_s >= SETTLED_S]
+    ratios = [abs(t.error_us) / t.bound_us for t in told]
+    bounds = np.quantile([t.bound_us for t in live], [0.5, 0.99])
+    return Row(
+        scenario=scenario.name,
+        summary=scenario.summary,
+        live_p50=_error(live, 0.5),
+        live_p99=_error(live, 0.99),
+        late_p50=_error(late, 0.5) if late else None,
+        late_p99=_error(late, 0.99) if late else None,
+        bound_p50=float(bounds[0]),
+        bound_p99=float(bounds[1]),
+        told=len(told),
+        broken=sum(ratio > 1 for ratio in ratios),
+        nearest_to_bound=max(ratios),
+    )
+
+
+def _error(told: list[Told], share: float) -> float:
+    return float(np.quantile([abs(t.rounded_us) for t in told], share))
+
+
+def cost_us() -> dict[str, float]:
+    """Time calls of a clock with 200 pairs and more: medians."""
+    jitter_ns = np.random.default_rng(0).normal(0.0, 28_000, 2 * FULL)
+    pairs = [(10**12 + k * FRAME_NS + round(jitter_ns[k]), k * FRAME_NS // 1000) for k in range(2 * FULL)]
+    clock = BeaconClock()
+    for received_ns, sent_us in pairs[:FULL]:
+        clock.add(received_ns, sent_us, 20_000)
+    adding, live = [], []
+    for received_ns, sent_us in pairs[FULL:]:
+        adding.append(_seconds(partial(clock.add, received_ns, sent_us, 20_000)))
+        live.append(_seconds(partial(clock.at, received_ns - FRAME_NS // 2)))
+    firsts = [_seconds(partial(copy.deepcopy(clock).at, pairs[FULL][0])) for _ in range(5)]
+    past = [_seconds(partial(clock.at, received_ns + 1)) for received_ns, _ in reversed(pairs[:FULL])]
+    return {
+        "add": 1e6 * statistics.median(adding),
+        "at, live": 1e6 * statistics.median(live),
+        "at, one after the other of an outage": 1e6 * statistics.median(past),
+        "at, the first of them": 1e6 * statistics.median(firsts),
+    }
+
+
+def _seconds(call: Callable[[], object]) -> float:
+    start_s = time.perf_counter()
+    call()
+    return time.perf_counter() - start_s
+
+
+if __name__ == "__main__":
+    main()

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 log = structlog.get_logger()
 
-PREPARATION_NS = 5_000_000
+PREPARATION_NS = 3_000_000
 """How long before its instant a transmission is prepared and reception ends: the longest payload over a slow bus."""
 TX_POLL_NS = 5_000_000
 """From the end of a packet, and again and again, until its TxDone is looked for without an edge."""

@@ -1,0 +1,64 @@
+"""How long a reply is granted."""
+
+from __future__ import annotations
+
+import pytest
+from support.frames import TIMING
+from support.radios import PAPER
+
+from tsgt.radio.grants import UNKNOWN_GRANT, Demand, demand_bytes, expected, grant, longest_grant
+from tsgt.radio.messages import GRANT_BYTES
+from tsgt.radio.rhythm import Beat
+from tsgt.radio.superframe import FrameTiming
+
+BEAT = Beat(period_us=400_000, phase_us=0, spread_us=0)
+
+
+def granted(demand: Demand, *, cap: int = len(GRANT_BYTES) - 1, silent: int = 0) -> int:
+    """Return a grant in bytes."""
+    return GRANT_BYTES[grant(demand, cap=cap, silent=silent)]
+
+
+def test_a_grant_holds_what_is_wanted_and_little_more() -> None:
+    """The shortest that is long enough."""
+    for count in range(1, 14):
+        for extended in (False, True):
+            demand = Demand(count, extended=extended)
+            longest = granted(demand)
+            assert longest >= demand_bytes(demand)
+            assert GRANT_BYTES[GRANT_BYTES.index(longest) - 1] < demand_bytes(demand)
+    assert granted(Demand(1)) == 17
+
+
+def test_a_grant_is_not_longer_than_the_cap() -> None:
+    """Nor, for one that may be gone, than what is granted to an unknown station."""
+    assert granted(Demand(1000), cap=GRANT_BYTES.index(71)) == 71
+    assert granted(Demand(1000), silent=6) == GRANT_BYTES[UNKNOWN_GRANT]
+    assert granted(Demand(1), silent=6) == 17
+
+
+@pytest.mark.parametrize(
+    ("newest_us", "count"), [(390_000, 1), (250_000, 1), (1000, 1), (-5000, 2), (-100_000, 2)]
+)
+def test_the_beat_says_how_many_there_are(newest_us: int, count: int) -> None:
+    """Counted from the newest that has come to when the reply is composed; at least one."""
+    assert expected(BEAT, newest_us=newest_us, heard_us=400_000, slot_us=800_000) == count
+
+
+def test_after_a_pause_measurements_may_begin_again() -> None:
+    """As many as there can be since the last reply."""
+    assert expected(BEAT, newest_us=0, heard_us=10_000_000, slot_us=10_400_000) == 1
+    assert expected(BEAT, newest_us=0, heard_us=10_000_000, slot_us=10_900_000) == 3
+
+
+def test_all_grants_together_fit_into_a_frame() -> None:
+    """With many stations, and with a slow modem; an introduction fits always."""
+    for stations in range(1, 17):
+        slot_ns = TIMING.airtime_ns(GRANT_BYTES[longest_grant(TIMING, stations)]) + TIMING.guard_ns
+        assert stations * slot_ns <= 5_000_000_000
+    slow = FrameTiming(
+        PAPER.__class__(frequency_hz=905_000_000, spreading_factor=12, bandwidth_hz=125_000, coding_rate=5),
+        guard_ns=TIMING.guard_ns,
+        turn_round_ns=TIMING.turn_round_ns,
+    )
+    assert longest_grant(slow, 3) == UNKNOWN_GRANT

@@ -1,0 +1,215 @@
+"""The queue of a station, and how far a master has got with it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.hand_master import queued
+
+from tsgt.radio import outbox as outbox_module
+from tsgt.radio.outbox import RESTART_SKIP, Delivery, Extent, Outbox
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from tsgt.radio.outbox import Queued
+
+
+def of(numbers: Iterable[int], *, run_start: int = 0, backlog: Iterable[int] = ()) -> Outbox:
+    """Make an outbox with these numbers."""
+    box = Outbox(run_start, [queued(number, number) for number in backlog])
+    for number in numbers:
+        box.add(queued(number, number))
+    return box
+
+
+def anything(_: Queued) -> bool:
+    """Want everything."""
+    return True
+
+
+def left(box: Outbox) -> list[int]:
+    """Return what is queued, newest first."""
+    return [each.sequence for each in box.newest_first()]
+
+
+def test_the_newest_comes_first() -> None:
+    """What earlier runs have left comes after what this one has measured."""
+    box = of([1007, 1008], run_start=1007, backlog=[3, 5])
+    assert left(box) == [1008, 1007, 5, 3]
+    assert (len(box), box.oldest) == (4, 3)
+
+
+def test_what_is_removed_is_gone() -> None:
+    """Also numbers that are not there, and everything up to one."""
+    box = of(range(10))
+    box.remove([2, 9, 77])
+    box.remove_through(4)
+    assert left(box) == [8, 7, 6, 5]
+    box.remove_through(100)
+    assert (len(box), box.oldest) == (0, 10)
+    assert of([], run_start=40).oldest == 40
+
+
+def test_numbers_rise() -> None:
+    """A number that is not higher than those before would be taken for another measurement."""
+    box = of([1, 2])
+    with pytest.raises(ValueError, match="measurement 2 comes after 2"):
+        box.add(queued(2, 2))
+
+
+def test_the_oldest_leaves_when_there_are_too_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The queue does not grow for ever, and says what it let go."""
+    monkeypatch.setattr(outbox_module, "MOST_QUEUED", 3)
+    box = of(range(5))
+    assert (left(box), box.left_through) == ([4, 3, 2], 1)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "run_start", "backlog", "expected"),
+    [
+        ([], 0, [], Extent(0, None)),
+        ([0, 1, 2], 0, [], Extent(0, None)),
+        ([1, 2, 5], 0, [], Extent(1, (3, 4))),
+        ([1, 3, 9], 0, [], Extent(1, (2, 8))),
+        # Numbers that the restart has left out are known to be missing, those beyond are not.
+        ([1007], 1007, [6], Extent(6, None)),
+        ([1007], 1007, [5], Extent(5, (6, 6))),
+        ([], 1007, [5], Extent(5, (6, 6))),
+        ([1009], 1007, [5], Extent(5, (6, 1008))),
+        ([1009], 1007, [6], Extent(6, (1007, 1008))),
+    ],
+)
+def test_what_a_master_waits_for(
+    numbers: list[int], run_start: int, backlog: list[int], expected: Extent
+) -> None:
+    """From the oldest on, and which numbers after it never come."""
+    assert of(numbers, run_start=run_start, backlog=backlog).extent(anything) == expected
+
+
+def test_the_cumulative_number_is_the_lowest_that_it_can_be() -> None:
+    """Eight bits are read from what is certain on; what has not been sent is not delivered."""
+    box = of(range(1000))
+    delivery = Delivery(box, anything)
+    delivery.sent(range(600))
+    delivery.delivered_through(300 % 256)
+    assert box.oldest == 45  # it might be 300 too
+    delivery.delivered_through(300 % 256)
+    assert box.oldest == 45
+    delivery.delivered_through(200)
+    delivery.delivered_through(300 % 256)
+    assert box.oldest == 301
+    delivery.delivered_through(500 % 256)
+    assert box.oldest == 501
+    delivery.delivered_through(600 % 256)  # it has not been sent
+    assert box.oldest == 501
+    delivery.delivered_through(599 % 256)
+    assert box.oldest == 600
+
+
+def test_a_gap_stops_the_cumulative_number_until_the_master_knows_of_it() -> None:
+    """A number that never comes holds the master up; nothing beyond is taken for delivered meanwhile."""
+    box = of([*range(10), *range(300, 400)])
+    delivery = Delivery(box, anything)
+    delivery.sent(range(400))
+    delivery.delivered(range(10))
+    told = [delivery.outdated]
+    delivery.delivered_through(300 % 256)  # which the master says of 44, if at all
+    assert box.oldest == 300
+    delivery.delivered_through(9)
+    assert box.oldest == 300
+    told.append(delivery.outdated)
+    delivery.introduce()
+    assert delivery.oldest == 300
+    delivery.introduced(300)
+    assert [*told, delivery.outdated] == [True, True, False]
+    delivery.delivered_through(350 % 256)
+    assert box.oldest == 351
+
+
+def test_what_had_to_leave_is_a_gap_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The master waits for it until it is told not to."""
+    monkeypatch.setattr(outbox_module, "MOST_QUEUED", 3)
+    box = of(range(3))
+    delivery = Delivery(box, anything)
+    told = [delivery.outdated]
+    box.add(queued(3, 3))
+    told.append(delivery.outdated)
+    delivery.introduce()
+    delivery.introduced(delivery.oldest)
+    assert [*told, delivery.outdated] == [False, True, False]
+
+
+def test_a_number_is_narrow_only_if_it_can_be_nothing_else() -> None:
+    """Next to anything that the master may have as its highest."""
+    delivery = Delivery(of(range(1000)), anything)
+    assert not delivery.may_be_narrow(0, 0)
+    delivery.sent(range(100))
+    delivery.delivered([50])
+    assert delivery.may_be_narrow(100, 100)
+    assert not delivery.may_be_narrow(200, 200)
+    assert not delivery.may_be_narrow(60, 200)
+    delivery.delivered([150])
+    assert delivery.may_be_narrow(200, 200)
+
+
+class Model:
+    """A master that knows nothing but what it is told, with sets instead of ranges."""
+
+    def __init__(self) -> None:
+        self.received: set[int] = set()
+        self.settled: set[int] = set()
+
+    def introduced(self, oldest: int, run_start: int) -> None:
+        """Take an introduction."""
+        self.settled |= {*range(oldest), *range(max(run_start - RESTART_SKIP, 0), run_start)}
+
+    @property
+    def cumulative(self) -> int:
+        """Up to here nothing is missing."""
+        number = 0
+        while number in self.received or number in self.settled:
+            number += 1
+        return number - 1
+
+
+@given(st.data())
+@settings(max_examples=60, deadline=None)
+def test_nothing_is_deleted_that_the_master_does_not_have(data: st.DataObject) -> None:
+    """Whatever is lost, whoever restarts: a measurement leaves the queue when a master has it, and not before."""
+    numbers = iter(range(10_000))
+    box = of([])
+    recorded: set[int] = set()
+    for _ in range(data.draw(st.integers(1, 3), label="masters and runs")):
+        if data.draw(st.booleans(), label="the station restarts"):
+            backlog = list(box.newest_first())[::-1]
+            start = next(numbers) + RESTART_SKIP
+            numbers = iter(range(start, 100_000))
+            box = Outbox(start, backlog)
+        model, delivery = Model(), Delivery(box, anything)
+        model.introduced(delivery.oldest, box.run_start)
+        delivery.introduced(delivery.oldest)
+        for _ in range(data.draw(st.integers(1, 40), label="frames")):
+            for _ in range(data.draw(st.sampled_from([0, 1, 1, 1, 2, 90]), label="new")):
+                box.add(queued(next(numbers), 0))
+            batch = [each.sequence for each, _ in zip(box.newest_first(), range(12), strict=False)]
+            introduces = delivery.outdated
+            if introduces:
+                delivery.introduce()
+            delivery.sent(batch)
+            if data.draw(st.booleans(), label="heard"):
+                if introduces:
+                    model.introduced(delivery.oldest, box.run_start)
+                model.received |= set(batch)
+                recorded |= set(batch)
+                if data.draw(st.booleans(), label="acknowledged"):
+                    delivery.delivered(batch)
+                    if introduces:
+                        delivery.introduced(delivery.oldest)
+            before = set(left(box))
+            if data.draw(st.booleans(), label="cumulative"):
+                delivery.delivered_through(model.cumulative % 256)
+            assert before - set(left(box)) <= recorded

@@ -1,0 +1,118 @@
+"""What a station and a master have to say to each other besides measurements: orders, answers, how the station does."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING, NamedTuple
+
+from tsgt.radio.orders import DirectOrder, MeasureOrder, Order, SearchOrder, TrackOrder
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from tsgt.radio.messages import AnswerPart, OrderPart, Reply, ShotPart, StatePart
+
+REMEMBERED_TICKETS = 8
+"""Tickets come round after 16 orders; one that is repeated is one of the latest."""
+
+LONGEST_TURN_ROUND_PAUSE = 48
+"""The master makes room for a turn-round in one of sixteen replies. After so many without it the backlog waits."""
+
+
+class Situation(NamedTuple):
+    """What the instrument is doing.
+
+    Attributes
+    ----------
+    prism
+        Number of the prism that it tracks, or did before direct mode.
+    direct
+        It is in direct mode.
+    connected
+        There is one.
+    """
+
+    prism: int
+    direct: bool
+    connected: bool
+
+
+class Conversation:
+    """The station's side of it, in one session of a master. Everything is said until it is acknowledged.
+
+    Attributes
+    ----------
+    answers, shots
+        What became of orders, oldest first, not acknowledged yet.
+    """
+
+    def __init__(self) -> None:
+        self.answers: deque[AnswerPart] = deque()
+        self.shots: deque[ShotPart] = deque()
+        self._tickets: deque[int] = deque(maxlen=REMEMBERED_TICKETS)
+        self._orders: deque[tuple[int, Order]] = deque()
+        self._told: Situation | None = None
+        self._said: dict[
+            int, int
+        ] = {}  # prisms that the master may take for the tracked one, by the latest frame
+        self._replies_since = 0
+
+    # --- Orders -----------------------------------------------------------------------------------------------
+
+    def take(self, parts: Iterable[OrderPart]) -> None:
+        """Take orders to this station; those that have come before are passed over."""
+        for part in parts:
+            if part.ticket not in self._tickets:
+                self._tickets.append(part.ticket)
+                self._orders.append((part.ticket, _order(part)))
+
+    def next_order(self) -> tuple[int, Order] | None:
+        """Return the next order and its ticket, once; None without any."""
+        return self._orders.popleft() if self._orders else None
+
+    # --- Replies ----------------------------------------------------------------------------------------------
+
+    def must_tell(self, situation: Situation) -> bool:
+        """Whether the master does not know, or may not know, what the instrument is doing."""
+        return situation != self._told or any(prism != situation.prism for prism in self._said)
+
+    @property
+    def turn_round_is_overdue(self) -> bool:
+        """Whether a turn-round, and a word of how the station does, are wanted more than the backlog."""
+        return self._replies_since >= LONGEST_TURN_ROUND_PAUSE
+
+    def plain_prism(self, state: StatePart | None) -> int | None:
+        """Return the prism that the master is certain to take for the tracked one, in a reply with this part."""
+        prisms = set(self._said)
+        if state is not None:
+            prisms.add(state.prism)
+        return None if self._told is None or prisms - {self._told.prism} else self._told.prism
+
+    def said(self, reply: Reply, counter: int) -> None:
+        """Take it that a reply is on the air in this frame."""
+        if reply.state is not None:
+            self._said[reply.state.prism] = counter
+        self._replies_since = 0 if reply.turn_round_us is not None else self._replies_since + 1
+
+    def acknowledged(self, reply: Reply, counter: int) -> None:
+        """Take it that the master has the reply of this frame."""
+        state = reply.state
+        if state is not None:
+            self._told = Situation(state.prism, state.direct, state.connected)
+            self._said = {prism: said for prism, said in self._said.items() if said > counter}
+        if reply.answer is not None and reply.answer in self.answers:
+            self.answers.remove(reply.answer)
+        if reply.shot is not None and reply.shot in self.shots:
+            self.shots.remove(reply.shot)
+
+
+def _order(part: OrderPart) -> Order:
+    match part.order:
+        case 0:
+            return TrackOrder(part.argument + 1)
+        case 1:
+            return SearchOrder()
+        case 2:
+            return DirectOrder()
+        case _:  # the codec lets no other through
+            return MeasureOrder()

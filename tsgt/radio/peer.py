@@ -1,0 +1,366 @@
+"""One station of the superframe as the master knows it: who it is, what has come from it, what it will want. Pure."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+from tsgt.radio.grants import UNKNOWN_GRANT, Demand, expected, grant
+from tsgt.radio.heard import Heard, TimedSighting
+from tsgt.radio.inbox import Inbox
+from tsgt.radio.message_codec import angle_rad, distance_m
+from tsgt.radio.messages import (
+    GRANT_BYTES,
+    SINGLE_QUALITY,
+    TIME_BITS,
+    TIME_UNIT_US,
+    WIDE_TIME_BITS,
+    Confirmation,
+    OrderPart,
+    quality_bound_us,
+)
+from tsgt.radio.orders import DirectOrder, MeasureOrder, SearchOrder, TrackOrder
+from tsgt.radio.rhythm import Beat, Rhythm
+
+if TYPE_CHECKING:
+    from tsgt.radio.messages import AnswerPart, Reply, Run, ShotPart, StatePart
+    from tsgt.radio.orders import Order
+    from tsgt.radio.round_trip import RoundTrip
+
+EXACT_SIGMA_NS = 100_000
+"""Kernel stamps are tens of times better; one that is worse was found without its edge, or without kernel stamps."""
+
+SIGMAS = 4
+"""A stamp is within so many sigma of the truth."""
+
+FIRST_EXCHANGES = 8
+EXCHANGE_EVERY = 16
+"""How often the link constant is measured: so often at the start, then in one of so many replies."""
+
+EXCHANGE_STEP = 5
+"""From the frame of one station's to that of the next one's: long replies are not to follow each other closely."""
+
+MISSING_EVERY = 32
+"""How often a station is asked again, in frames, for measurements that it did not send though it could have."""
+
+USUAL_BEAT = Beat(period_us=400_000, phase_us=0, spread_us=50_000)
+"""Of an instrument that tracks; each soon shows its own."""
+
+LATEST_US = 20_000
+"""Nothing is measured later than this after its slot has begun."""
+
+HISTORY = 4
+"""Of so many frames a beacon says whether a reply is written."""
+
+_ROUNDING_NS = 9_000
+"""Half a unit of time, and what rounding to microseconds adds."""
+
+_ORDER_CODES: dict[type[Order], int] = {TrackOrder: 0, SearchOrder: 1, DirectOrder: 2, MeasureOrder: 3}
+
+
+class Reception(NamedTuple):
+    """A reply among the instants of its frame.
+
+    Attributes
+    ----------
+    counter
+        Of the frame.
+    sent_ns, sent_sigma_ns
+        TxDone of the beacon on the master's CLOCK_MONOTONIC.
+    slot_ns
+        When the station's slot began.
+    received_ns, received_sigma_ns
+        RxDone of the reply.
+    lateness_ns
+        By how much that is later than foreseen.
+    payload_bytes, granted_bytes
+        How long it is, and how long it may have been.
+    """
+
+    counter: int
+    sent_ns: int
+    sent_sigma_ns: int
+    slot_ns: int
+    received_ns: int
+    received_sigma_ns: int
+    lateness_ns: int
+    payload_bytes: int
+    granted_bytes: int
+
+
+@dataclass(slots=True)
+class _Pending:
+    """An order that is not answered yet."""
+
+    ticket: int
+    order: Order
+
+
+class Peer:
+    """What the master knows of one station.
+
+    Parameters
+    ----------
+    number, prism
+        Of the station, and of the prism that it tracks unless it says otherwise.
+    trip
+        For the constant of its link.
+    zero_ns
+        Zero of the session time on the master's CLOCK_MONOTONIC.
+    pace
+        From one of its first self-calibrations to the next, in frames.
+
+    Attributes
+    ----------
+    nonce
+        Of its introduction to this session; None: it has not joined.
+    introducing
+        Its last reply still held its introduction.
+    silent
+        For how many frames in which it had a slot it has not been heard.
+    late, doubted
+        How many slots it had to leave empty, and how many beacons it doubted, since it was first heard.
+    """
+
+    def __init__(self, number: int, prism: int, trip: RoundTrip, zero_ns: int, pace: int) -> None:
+        self.number = number
+        self.inbox = Inbox()
+        self.nonce: int | None = None
+        self.introducing = False
+        self.silent = 0
+        self.late = 0
+        self.doubted = 0
+        self._prism = prism
+        self._trip = trip
+        self._zero_ns = zero_ns
+        self._pace = pace
+        self._confirm: int | None = None
+        self._state: StatePart | None = None
+        self._ticket = 0
+        self._pending: _Pending | None = None
+        self._replies: dict[int, tuple[int, ...]] = {}
+        self._exchange: tuple[int, int] | None = None
+        self._rhythm = Rhythm()
+        self._heard_us: int | None = None
+        self._withheld = 0
+        self._plain = False
+
+    def forget_session(self) -> None:
+        """Begin a new session; what has been received and written stands."""
+        self.nonce, self._confirm, self._state, self._exchange = None, None, None, None
+        self._replies.clear()
+
+    # --- Orders -------------------------------------------------------------------------------------------------
+
+    def order(self, order: Order) -> int:
+        """Take an order in the place of one that is not answered yet; return its ticket."""
+        self._ticket = (self._ticket + 1) % 16
+        self._pending = _Pending(self._ticket, order)
+        return self._ticket
+
+    @property
+    def order_part(self) -> OrderPart | None:
+        """The order as a beacon says it; None where there is none, or nobody who would obey."""
+        if self._pending is None or self.nonce is None or self.introducing:
+            return None
+        ticket, order = self._pending.ticket, self._pending.order
+        prism = self._prism
+        if isinstance(order, TrackOrder):
+            prism = order.prism or (self._state.prism if self._state else prism)
+        argument = prism - 1 if isinstance(order, TrackOrder) else 0
+        return OrderPart(self.number, ticket, _ORDER_CODES[type(order)], argument)
+
+    # --- For the next beacon --------------------------------------------------------------------------------------
+
+    @property
+    def confirmation(self) -> Confirmation | None:
+        """What the next beacon says to a station that has introduced itself."""
+        return None if self._confirm is None else Confirmation(self.number, self._confirm)
+
+    def confirmed(self) -> None:
+        """Take note that the confirmation has gone out."""
+        self._confirm = None
+
+    def history(self, counter: int) -> int:
+        """Return which replies of the frames before this one are in the recording; see ``StationEntry``."""
+        bits = 0
+        for bit in range(HISTORY):
+            numbers = self._replies.get(counter - 1 - bit)
+            if numbers is not None and self.inbox.is_written(numbers):
+                bits |= 1 << bit
+        return bits
+
+    def grant(self, counter: int, slot_ns: int, *, cap: int) -> int:
+        """Return the grant for a frame in which its slot begins at about this instant; ``cap`` at most."""
+        newest_us = self._rhythm.newest_us
+        if self.introducing or self.nonce is None or newest_us is None or self._heard_us is None:
+            return UNKNOWN_GRANT
+        new = expected(
+            self._rhythm.beat or USUAL_BEAT,
+            newest_us=newest_us,
+            heard_us=self._heard_us,
+            slot_us=self._session_us(slot_ns),
+        )
+        withheld = 0 if counter % MISSING_EVERY == self.number else self._withheld
+        missing = max(self.inbox.missing - withheld, 0)
+        calibrates = (
+            (counter - self.number) % self._pace == 0
+            if self._trip.exchanges < FIRST_EXCHANGES
+            else (counter - EXCHANGE_STEP * self.number) % EXCHANGE_EVERY == 0
+        )
+        # What was received before all that a beacon tells may come again: the acknowledgement may have been missed.
+        unknown = len(self._replies[max(self._replies)]) if self.silent >= HISTORY and self._replies else 0
+        demand = Demand(
+            measurements=new + missing + self.inbox.unwritten + unknown,
+            scattered=missing > 0,
+            plain=self._plain,
+            extended=calibrates,
+            answer=self._pending is not None,
+            shot=self._pending is not None and isinstance(self._pending.order, MeasureOrder),
+        )
+        return grant(demand, cap=cap, silent=self.silent)
+
+    # --- Replies --------------------------------------------------------------------------------------------------
+
+    def first_number(self, reply: Reply) -> int:
+        """Return the full number of the first measurement of a reply; 0 where there is none."""
+        return self._newest(reply.runs[0], reply) if reply.runs else 0
+
+    def take(self, reply: Reply, at: Reception) -> Heard:
+        """Take a reply that is known to be this station's.
+
+        Parameters
+        ----------
+        reply
+            What it says.
+        at
+            When it came.
+        """
+        joined = self._introduced(reply)
+        prism = self._prism_of(reply)
+        numbers, sightings = [], []
+        for run in reply.runs:
+            found = self._timed(run, self._newest(run, reply), run.prism or prism, at)
+            numbers += [sighting.sequence for sighting in found]
+            sightings += [sighting for sighting in found if self.inbox.take(sighting.sequence)]
+        sightings.sort(key=lambda sighting: sighting.sequence)
+        self._replies[at.counter] = tuple(numbers)
+        for counter in [counter for counter in self._replies if counter < at.counter - HISTORY]:
+            del self._replies[counter]
+        for sighting in sightings:
+            self._rhythm.add(self._session_us(sighting.measured_ns))
+        self._heard_us = self._session_us(at.slot_ns)
+        self.silent = 0
+        # One that sends nothing may have had no room: a measurement that is worse than most takes more.
+        self._plain = bool(reply.runs) and _is_plain(reply.runs[0])
+        if at.granted_bytes - at.payload_bytes >= GRANT_BYTES[2] - GRANT_BYTES[1]:
+            self._withheld = self.inbox.missing  # there was room for another one
+        self._withheld = min(self._withheld, self.inbox.missing)
+        answer, shot = self._answered(reply)
+        return Heard(
+            station=self.number,
+            sightings=tuple(sightings),
+            repeated=len(numbers) - len(sightings),
+            joined=joined,
+            state=reply.state,
+            doubted_beacons=self._stated(reply.state),
+            link_doubted=not self._exchanged(reply, at),
+            lateness_ns=at.lateness_ns,
+            answer=answer,
+            shot=shot,
+        )
+
+    def _introduced(self, reply: Reply) -> bool:
+        introduction = reply.introduction
+        self.introducing = introduction is not None
+        if introduction is None:
+            return False
+        joined = introduction.nonce != self.nonce
+        if joined:
+            self._state, self._exchange = None, None
+            self._replies.clear()
+        self.nonce = self._confirm = introduction.nonce
+        self.inbox.introduced(introduction)
+        return joined
+
+    def _prism_of(self, reply: Reply) -> int:
+        """Return what is tracked where a run does not say: what the station told before, or tells for the first time."""
+        state = self._state or reply.state
+        return self._prism if state is None else state.prism
+
+    def _stated(self, state: StatePart | None) -> int:
+        """Take note of how the station does; return how many more beacons it doubted."""
+        doubted = 0
+        if state is not None:
+            if self._state is not None:
+                self.late += (state.late - self._state.late) % 256
+                doubted = (state.doubted - self._state.doubted) % 16
+                self.doubted += doubted
+            self._state = state
+        return doubted
+
+    def _exchanged(self, reply: Reply, at: Reception) -> bool:
+        """Measure the link constant where reply and frame before it allow; return whether it is possible."""
+        before, self._exchange = self._exchange, None
+        possible = True
+        if before is not None and before[0] == at.counter - 1 and reply.turn_round_us is not None:
+            possible = self._trip.add(before[1] - 1000 * reply.turn_round_us)
+        if max(at.sent_sigma_ns, at.received_sigma_ns) <= EXACT_SIGMA_NS:
+            self._exchange = (at.counter, at.received_ns - at.sent_ns)
+        return possible
+
+    def _answered(self, reply: Reply) -> tuple[AnswerPart | None, ShotPart | None]:
+        """Return what the reply says to the order that waits for it, which then waits no more."""
+        ticket = None if self._pending is None else self._pending.ticket
+        answer = reply.answer if reply.answer is not None and reply.answer.ticket == ticket else None
+        shot = reply.shot if reply.shot is not None and reply.shot.ticket == ticket else None
+        if answer is not None or shot is not None:
+            self._pending = None
+        return answer, shot
+
+    # --- Numbers and times ------------------------------------------------------------------------------------------
+
+    def _newest(self, run: Run, reply: Reply) -> int:
+        number = run.sightings[0].sequence
+        return number if run.wide else self.inbox.unwrapped(number, reply.introduction)
+
+    def _timed(self, run: Run, newest_number: int, prism: int, at: Reception) -> list[TimedSighting]:
+        newest = run.sightings[0]
+        span_us = TIME_UNIT_US << (WIDE_TIME_BITS if run.wide else TIME_BITS)
+        end_us = self._session_us(at.slot_ns) + LATEST_US
+        origin_us = self._session_us(at.sent_ns) if run.direct else 0
+        newest_us = end_us - (end_us - origin_us - TIME_UNIT_US * newest.time) % span_us
+        claimed_ns = 1000 * quality_bound_us(run.quality)
+        if run.direct:  # a beacon that somebody held back makes its reply late by as much
+            claimed_ns += max(at.lateness_ns, 0) + SIGMAS * at.sent_sigma_ns
+        sigma_ns = math.hypot(claimed_ns / SIGMAS, _ROUNDING_NS / math.sqrt(3), self._trip.sigma_ns)
+        bound_ns = claimed_ns + _ROUNDING_NS + self._trip.bound_ns
+        timed = []
+        for sighting in run.sightings:
+            back = sighting is not newest
+            number = newest_number + (sighting.sequence - newest.sequence if back else 0)
+            time_us = newest_us + (TIME_UNIT_US * (sighting.time - newest.time) if back else 0)
+            if number < 0:
+                continue
+            timed.append(
+                TimedSighting(
+                    sequence=number,
+                    prism=prism,
+                    measured_ns=self._zero_ns + 1000 * time_us + self._trip.link_ns,
+                    sigma_ns=round(sigma_ns),
+                    bound_ns=bound_ns,
+                    status=sighting.status,
+                    horizontal_angle_rad=angle_rad(sighting.horizontal),
+                    zenith_angle_rad=angle_rad(sighting.zenith),
+                    slope_distance_m=distance_m(sighting.distance, far=run.far),
+                )
+            )
+        return timed
+
+    def _session_us(self, monotonic_ns: int) -> int:
+        return (monotonic_ns - self._zero_ns + 500) // 1000
+
+
+def _is_plain(run: Run) -> bool:
+    return run.quality <= SINGLE_QUALITY and run.prism is None and not (run.direct or run.wide or run.far)

@@ -1,0 +1,266 @@
+"""What a station knows of one session of a master: its frames, its time, and what it has of this station."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+from tsgt.radio.beacon_clock import BeaconClock
+from tsgt.radio.conversation import Conversation
+from tsgt.radio.messages import SESSION_TIME_BITS, TIME_UNIT_US, TURN_ROUND_BITS
+from tsgt.radio.outbox import Delivery
+from tsgt.radio.reply_packing import Timed, quality_of
+from tsgt.radio.superframe import GUARD_UNIT_NS, FrameTiming
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from tsgt.radio.base import LoRaSettings
+    from tsgt.radio.messages import Beacon, Reply, SessionPart
+    from tsgt.radio.outbox import Outbox, Queued
+
+HISTORY = 4
+"""A beacon tells of so many frames before it whether the reply is in the recording."""
+
+FRAME_BITS = 8
+_SENT_BITS = 16
+
+_DIRECT_EXTRA_US = 2000.0
+"""A time that rests on one beacon is worse than it looks, by as much as the reply may start late."""
+
+_SIGMAS = 4
+"""A bound is so many sigma."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reception:
+    """When a beacon left, by the master's clock, and when it came, by the station's.
+
+    Attributes
+    ----------
+    session
+        The master's nonce.
+    counter
+        Number of the frame in the session.
+    received_ns
+        RxDone on CLOCK_MONOTONIC of the station's computer.
+    sigma_ns
+        One sigma of that.
+    sent_us
+        TxDone in session time.
+    boot
+        Since which start of the station's computer its clock has run like this.
+    """
+
+    session: int
+    counter: int
+    received_ns: int
+    sigma_ns: int
+    sent_us: int
+    boot: str
+
+
+class HeardBeacon(NamedTuple):
+    """A beacon that has been found authentic; times on CLOCK_MONOTONIC."""
+
+    beacon: Beacon
+    code: bytes
+    counter: int
+    received_ns: int
+    sigma_ns: int
+
+
+@dataclass(slots=True)
+class SentReply:
+    """A reply that is on the air, or was.
+
+    Attributes
+    ----------
+    heard
+        The beacon that it answers.
+    reply
+        What it says.
+    sequences
+        The measurements in it.
+    done_ns
+        TxDone on CLOCK_MONOTONIC; None while it is not known to better than a millisecond.
+    """
+
+    heard: HeardBeacon
+    reply: Reply
+    sequences: tuple[int, ...]
+    done_ns: int | None = None
+
+
+class StationSession:
+    """One session of a master.
+
+    Parameters
+    ----------
+    heard
+        A beacon with a session part.
+    part
+        That part.
+    nonce
+        The station's own nonce for this session, 32 bits.
+    settings
+        Of the modem.
+    outbox
+        What is to be delivered.
+    boot
+        Since which start of this computer its clock has run like this.
+    clocks
+        What earlier runs of the program knew of this master's time, by the start of this computer.
+
+    Attributes
+    ----------
+    master_nonce, nonce
+        The master's and the station's.
+    confirmed
+        The master has proved that it has heard this station in this session; it is no recording.
+    heard
+        The newest beacon.
+    timing
+        Of the frames.
+    clock
+        The master's time on this computer's clock.
+    delivery
+        What the master has.
+    conversation
+        What else there is to say.
+    last_reply
+        The latest reply; None before the first.
+    """
+
+    def __init__(
+        self,
+        heard: HeardBeacon,
+        part: SessionPart,
+        nonce: int,
+        settings: LoRaSettings,
+        outbox: Outbox,
+        boot: str,
+        clocks: Mapping[str, BeaconClock],
+    ) -> None:
+        self.master_nonce = part.nonce
+        self.nonce = nonce
+        self.confirmed = False
+        self.heard = heard
+        self._before: HeardBeacon | None = None
+        self.timing = _timing(settings, part)
+        self._boot = boot
+        self._clocks = dict(clocks)
+        self.clock = self._clocks.setdefault(boot, BeaconClock())
+        self.delivery = Delivery(outbox, self.can_time)
+        self.conversation = Conversation()
+        self.last_reply: SentReply | None = None
+        self._unanswered: deque[SentReply] = deque(maxlen=HISTORY)
+
+    # --- Beacons ----------------------------------------------------------------------------------------------
+
+    def counter_of(self, beacon: Beacon) -> int | None:
+        """Return the number of the frame, if the beacon is of this session; None for one that is not, or is not new."""
+        if beacon.session is None:
+            following = self.heard.counter + 1
+            return following + (beacon.frame - following) % (1 << FRAME_BITS)
+        counter = full_counter(beacon.session, beacon)
+        of_this = beacon.session.nonce == self.master_nonce
+        return counter if of_this and counter > self.heard.counter else None
+
+    def listen(self, heard: HeardBeacon) -> None:
+        """Take the next authentic beacon."""
+        self._before, self.heard = self.heard, heard
+        if heard.beacon.session is not None:
+            self.timing = _timing(self.timing.settings, heard.beacon.session)
+
+    def reception(self) -> Reception | None:
+        """Return when the beacon before the newest came and had left, if the newest tells.
+
+        None also before the master is confirmed: it may be a recording, whose times would bend the clock.
+        """
+        before, beacon = self._before, self.heard.beacon
+        follows = before is not None and before.counter + 1 == self.heard.counter
+        if before is None or not follows or not self.confirmed or not beacon.sent:
+            return None
+        sent_us = self._unwrap(before.received_ns, beacon)
+        if sent_us is None:
+            return None
+        return Reception(
+            session=self.master_nonce,
+            counter=before.counter,
+            received_ns=before.received_ns,
+            sigma_ns=before.sigma_ns,
+            sent_us=sent_us,
+            boot=self._boot,
+        )
+
+    def _unwrap(self, received_ns: int, beacon: Beacon) -> int | None:
+        if beacon.session is None:
+            return self.clock.unwrap(received_ns, beacon.sent)
+        sent_us = beacon.session.sent_high << _SENT_BITS | beacon.sent
+        now = self.clock.at(received_ns)
+        if now is None:
+            return sent_us
+        half = 1 << SESSION_TIME_BITS - 1  # in a session of 13 days and more
+        return sent_us + (round(now.time_us) - sent_us + half >> SESSION_TIME_BITS << SESSION_TIME_BITS)
+
+    # --- Acknowledgement --------------------------------------------------------------------------------------
+
+    def replied(self, reply: Reply, sequences: tuple[int, ...]) -> None:
+        """Take it that the newest beacon is answered like this."""
+        self.last_reply = SentReply(self.heard, reply, sequences)
+        self._unanswered.append(self.last_reply)
+        self.delivery.sent(sequences)
+        self.conversation.said(reply, self.heard.counter)
+
+    def acknowledge(self, history: int) -> None:
+        """Take which of the latest replies are in the recording, as the newest beacon says."""
+        for sent in list(self._unanswered):
+            age = self.heard.counter - sent.heard.counter - 1
+            if age < HISTORY and history >> age & 1:
+                self._unanswered.remove(sent)
+                self.delivery.delivered(sent.sequences)
+                if sent.reply.introduction is not None:
+                    self.delivery.introduced(sent.reply.introduction.oldest)
+                self.conversation.acknowledged(sent.reply, sent.heard.counter)
+
+    # --- Time -------------------------------------------------------------------------------------------------
+
+    def can_time(self, queued: Queued) -> bool:
+        """Whether this master's time of a measurement can be told: not if it is of another start of this computer."""
+        return queued.boot in self._clocks
+
+    def timed(self, queued: Queued, slot_ns: int) -> Timed | None:
+        """Return a measurement with its time for a slot that begins then; None where nothing useful is known."""
+        clock = self._clocks[queued.boot]
+        live = queued.boot == self._boot
+        time = clock.at(queued.at_ns)
+        direct = False
+        if live and (time is None or time.bound_us > _DIRECT_EXTRA_US):
+            alone = clock.elapsed(self.heard.received_ns, queued.at_ns)
+            stamp_us = _SIGMAS * self.heard.sigma_ns / 1000
+            if time is None or alone.bound_us + stamp_us + _DIRECT_EXTRA_US < time.bound_us:
+                time, direct = alone._replace(bound_us=alone.bound_us + stamp_us), True
+        quality = None if time is None else quality_of(time.bound_us)
+        if time is None or quality is None:
+            return None
+        age_ns = slot_ns - queued.at_ns if live else None
+        return Timed(queued, round(time.time_us / TIME_UNIT_US), quality, direct, age_ns)
+
+    def turn_round_us(self) -> int | None:
+        """Return what the previous reply took from RxDone of its beacon to its TxDone, if it was in the frame before."""
+        last = self.last_reply
+        if last is None or last.done_ns is None or last.heard.counter + 1 != self.heard.counter:
+            return None
+        took_us = round(self.clock.elapsed(last.heard.received_ns, last.done_ns).time_us)
+        return took_us if took_us < 1 << TURN_ROUND_BITS else None
+
+
+def _timing(settings: LoRaSettings, part: SessionPart) -> FrameTiming:
+    return FrameTiming(settings, part.guard * GUARD_UNIT_NS, part.turn_round * GUARD_UNIT_NS)
+
+
+def full_counter(part: SessionPart, beacon: Beacon) -> int:
+    """Return the number of a beacon's frame in the session that it tells of."""
+    return part.counter_high << FRAME_BITS | beacon.frame

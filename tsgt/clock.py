@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import time
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 
@@ -43,6 +44,14 @@ class SystemClock:
     async def sleep_until(self, monotonic_ns: int) -> None:
         """Sleep on the event loop; an instant that has passed still lets other tasks run once."""
         await asyncio.sleep(max(0, monotonic_ns - self.monotonic_ns()) / 1e9)
+
+
+def boot_id() -> str:
+    """Return what names the present start of this machine, from which CLOCK_MONOTONIC counts; empty where unknown."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+    except (OSError, UnicodeDecodeError):
+        return ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
     from support.radios import Side
 
+    from tsgt.config.radio import ProtocolConfig
     from tsgt.model import PolarMeasurement
     from tsgt.radio.base import OpenRadio
     from tsgt.radio.classic_messages import Reply
@@ -42,8 +43,10 @@ OFFSET_NS = -3_600_000_000_000
 SCENARIO = ScenarioConfig(targets_m=((20.0, 5.0, 0.5), (0.5, 0.0, 0.0)))
 
 
-def client_config(folder: Path, *, station: int = 1, prism: int = 1) -> ClientConfig:
-    """Make a configuration whose instrument and radio are not read."""
+def client_config(
+    folder: Path, *, station: int = 1, prism: int = 1, protocol: ProtocolConfig | None = None
+) -> ClientConfig:
+    """Make a configuration whose instrument and radio are not read; of the protocol classic."""
     return ClientConfig(
         kind="client",
         station=station,
@@ -56,7 +59,7 @@ def client_config(folder: Path, *, station: int = 1, prism: int = 1) -> ClientCo
             frequency_mhz=905.0,
             spreading_factor=9,
         ),
-        protocol=ClassicConfig(kind="classic"),
+        protocol=protocol or ClassicConfig(kind="classic"),
         journal=JournalConfig(directory=folder / "journals"),
         status_socket=folder / "client.sock",
     )
@@ -64,7 +67,15 @@ def client_config(folder: Path, *, station: int = 1, prism: int = 1) -> ClientCo
 
 @dataclass
 class Field:
-    """One station and a master's radio."""
+    """One station and a master's radio.
+
+    Attributes
+    ----------
+    protocol
+        What the client speaks; None: classic.
+    key, boot
+        As the client gets them.
+    """
 
     folder: Path
     instrument: SimulatedInstrument
@@ -72,6 +83,9 @@ class Field:
     master: Side
     open_radio: OpenRadio
     read: list[Reading]
+    protocol: ProtocolConfig | None = None
+    key: bytes | None = None
+    boot: str = "boot"
     client: asyncio.Task[None] | None = None
 
     def start(self) -> None:
@@ -79,7 +93,13 @@ class Field:
         watched = WatchedInstrument(self.instrument, self.read.append)
         self.client = asyncio.create_task(
             run_client(
-                client_config(self.folder), instrument=watched, open_radio=self.open_radio, clock=self.clock
+                client_config(self.folder, protocol=self.protocol),
+                PAPER,
+                instrument=watched,
+                open_radio=self.open_radio,
+                clock=self.clock,
+                key=self.key,
+                boot=self.boot,
             )
         )
 
@@ -112,7 +132,13 @@ class Field:
 
 
 @asynccontextmanager
-async def field_day(folder: Path, scenario: ScenarioConfig = SCENARIO) -> AsyncGenerator[Field]:
+async def field_day(
+    folder: Path,
+    scenario: ScenarioConfig = SCENARIO,
+    *,
+    protocol: ProtocolConfig | None = None,
+    key: bytes | None = None,
+) -> AsyncGenerator[Field]:
     """Set up a station and a master's radio; end both with the block."""
     timeline = running_timeline()
     rng = np.random.default_rng(7)
@@ -128,6 +154,8 @@ async def field_day(folder: Path, scenario: ScenarioConfig = SCENARIO) -> AsyncG
         master=master,
         open_radio=opener(air, "station1", clock, rng, PAPER),
         read=[],
+        protocol=protocol,
+        key=key,
     )
     try:
         day.start()

@@ -28,11 +28,68 @@ class JournalRecord:
     unix_at_zero_ns
         What was added to CLOCK_MONOTONIC of the station's computer to get the times in this file, in ns; the same
         from the start of the client to its end.
+    boot
+        Which start of the computer its CLOCK_MONOTONIC counts from: the kernel's boot id; empty where unknown.
+    lineage
+        The same, 0 to 65535, in all journals whose sequence numbers go on from one to the next; null where each
+        begins at 0, as over the protocol classic.
+    run_start
+        Sequence number of the first measurement.
     """
 
     type: Literal["journal"] = "journal"
     station: int
     unix_at_zero_ns: int
+    boot: str = ""
+    lineage: int | None = None
+    run_start: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReceptionRecord:
+    """When the station received one of the master's beacons, and when the master had sent it.
+
+    Attributes
+    ----------
+    type
+        Always ``reception``.
+    stamp_ns
+        The end of its reception (RxDone) in ns, on the station computer's clock.
+    stamp_sigma_ns
+        One sigma of that.
+    session
+        Number of the master's session, 48 bits.
+    counter
+        Number of the frame in it.
+    sent_us
+        When it had left (TxDone), in us from the start of the session by the master's clock.
+    """
+
+    type: Literal["reception"] = "reception"
+    stamp_ns: int
+    stamp_sigma_ns: int
+    session: int
+    counter: int
+    sent_us: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AcknowledgedRecord:
+    """How far the master's recording has got; written now and then.
+
+    Attributes
+    ----------
+    type
+        Always ``acknowledged``.
+    stamp_ns
+        When, on the station computer's clock, in ns.
+    oldest
+        Every measurement with a lower sequence number has been acknowledged, or was given up.
+    """
+
+    type: Literal["acknowledged"] = "acknowledged"
+    stamp_ns: int
+    oldest: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

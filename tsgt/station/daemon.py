@@ -3,43 +3,57 @@
 from __future__ import annotations
 
 import asyncio
+import secrets
 from functools import partial
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
 import structlog
 
 import tsgt
 from tsgt import service
 from tsgt.clock import UnixTimeline
-from tsgt.errors import RadioError
-from tsgt.radio.classic import TURN_ROUND_NS, MeasureOrder, Order
+from tsgt.radio.authentication import Authenticator
+from tsgt.radio.conversation import Situation
+from tsgt.radio.orders import MeasureOrder, Order
+from tsgt.radio.outbox import Outbox
+from tsgt.radio.superframe_station import SuperframeStation
 from tsgt.radio.supervised import keep_radio
 from tsgt.recording import RecordingHeader, RecordingWriter, new_recording_path
 from tsgt.recording.journal import JournalRecord
 from tsgt.recording.recorder import Recorder
-from tsgt.station.journal import JournalQueue
+from tsgt.station.backlog import LINEAGE_BITS, Backlog, read_backlog
+from tsgt.station.classic_link import ClassicLink
+from tsgt.station.journal import PATIENCE_S, JournalQueue
 from tsgt.station.keeper import Done, InstrumentKeeper
 from tsgt.station.session import Session
 from tsgt.station.status_socket import serving_status
+from tsgt.station.superframe_link import SuperframeLink
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine
     from pathlib import Path
+    from typing import Any, NoReturn
 
     from tsgt.clock import Clock
     from tsgt.config import ClientConfig
-    from tsgt.radio.base import OpenRadio, Radio
-    from tsgt.recording.journal import TargetRecord
+    from tsgt.radio.base import LoRaSettings, OpenRadio, Radio
     from tsgt.station.instrument import Instrument, Reading
+    from tsgt.station.link import Link
     from tsgt.station.status import ClientStatus
-
-LATEST_ANSWER_NS = 20_000_000_000
-"""An answer to an order that took longer is not sent: the master has given up, and asks others meanwhile."""
 
 log = structlog.get_logger()
 
 
 async def run_client(
-    config: ClientConfig, *, instrument: Instrument, open_radio: OpenRadio, clock: Clock
+    config: ClientConfig,
+    settings: LoRaSettings,
+    *,
+    instrument: Instrument,
+    open_radio: OpenRadio,
+    clock: Clock,
+    key: bytes | None = None,
+    random_bits: Callable[[int], int] = secrets.randbits,
+    boot: str = "",
 ) -> None:
     """Run a station's client until it is cancelled.
 
@@ -48,13 +62,22 @@ async def run_client(
     Parameters
     ----------
     config
-        Station, prism, journal and status socket; the rest is given by what follows.
+        Station, prism, protocol, journal and status socket; the rest is given by what follows.
+    settings
+        Those of the radio.
     instrument
         The total station.
     open_radio
         Opens the radio.
     clock
         Its Unix time is read once, here, and need not be right.
+    key
+        What the radios of a mission share, where the protocol has one; None: whoever speaks the protocol is believed.
+    random_bits
+        Returns a number with so many random bits.
+    boot
+        Which start of this computer its clock counts from; empty where unknown, and then no other run's clock is
+        taken for this one.
 
     Raises
     ------
@@ -65,20 +88,61 @@ async def run_client(
     """
     timeline = UnixTimeline.fixed_now(clock)
     now_ns = timeline.unix_ns(clock.monotonic_ns())
+    superframe = config.protocol.kind == "superframe"
+    # What earlier runs have left; over the protocol classic each begins anew.
+    backlog = read_backlog(config.journal.directory, config.station) if superframe else Backlog()
+    lineage = backlog.lineage
+    if superframe and lineage is None:
+        lineage = random_bits(LINEAGE_BITS)
     path = new_recording_path(config.journal.directory, f"station{config.station}", now_ns)
     with RecordingWriter(path) as writer:
         recorder = Recorder(writer)
-        journal = JournalQueue(recorder)
-        client = _Client(config, instrument, clock, timeline, recorder, journal, path)
-        header = RecordingHeader(
-            software=f"tsgt {tsgt.__version__}",
-            created_ns=now_ns,
-            source=f"tsgt-client, station {config.station}",
+        # To a classic master, which asks for the newest measurement only, one that has waited is worth nothing.
+        journal = JournalQueue(recorder, patience_s=None if superframe else PATIENCE_S)
+        session = Session(config.station, config.prism, backlog.run_start)
+        client = _Client(session, instrument, clock, timeline, recorder, journal, path)
+        client.write(
+            RecordingHeader(
+                software=f"tsgt {tsgt.__version__}",
+                created_ns=now_ns,
+                source=f"tsgt-client, station {config.station}",
+            )
         )
-        journal.write(header, _nothing)
-        journal.write(
-            JournalRecord(station=config.station, unix_at_zero_ns=timeline.unix_at_zero_ns), _nothing
+        client.write(
+            JournalRecord(
+                station=config.station,
+                unix_at_zero_ns=timeline.unix_at_zero_ns,
+                boot=boot,
+                lineage=lineage,
+                run_start=backlog.run_start,
+            )
         )
+        if lineage is None:
+            client.link = ClassicLink(session, clock, timeline, on_order=client.give, begin=client.begin)
+        else:
+            authenticator = Authenticator(key)
+            outbox = Outbox(backlog.run_start, backlog.queued)
+            station = SuperframeStation(
+                config.station,
+                settings,
+                authenticator,
+                outbox,
+                lineage=lineage,
+                boot=boot,
+                receptions=backlog.receptions,
+                random_bits=random_bits,
+            )
+            client.link = SuperframeLink(
+                station,
+                outbox,
+                boot,
+                clock,
+                timeline,
+                authenticated=authenticator.authentic,
+                situation=client.situation,
+                on_order=client.give,
+                write=client.write,
+            )
         try:
             with serving_status(config.status_socket, client.status):
                 log.info("client_started", station=config.station, journal=str(path))
@@ -89,7 +153,7 @@ async def run_client(
                         service.keep_synced(writer.sync, clock, config.journal.fsync_interval_s)
                     )
                     group.create_task(client.keeper.keep())
-                    group.create_task(keep_radio(open_radio, client.answer, clock))
+                    group.create_task(keep_radio(open_radio, client.talk, clock))
                     group.create_task(service.keep_notified(client.status_line, clock))
         finally:
             recorder.close()
@@ -97,13 +161,22 @@ async def run_client(
 
 
 class _Client:
-    """What ties instrument, journal and radio together."""
+    """What ties instrument, journal and radio together.
 
+    Attributes
+    ----------
+    link
+        The protocol.
+    tasks
+        What runs beside each other.
+    """
+
+    link: Link
     tasks: asyncio.TaskGroup
 
     def __init__(
         self,
-        config: ClientConfig,
+        session: Session,
         instrument: Instrument,
         clock: Clock,
         timeline: UnixTimeline,
@@ -111,94 +184,78 @@ class _Client:
         journal: JournalQueue,
         path: Path,
     ) -> None:
+        self._session = session
         self._clock = clock
         self._timeline = timeline
         self._recorder = recorder
         self._journal = journal
         self._path = path
-        self._session = Session(config.station, config.prism)
-        self._radio: Radio | None = None
-        self._ordered_ns = 0
+        self._radio_ok = False
         self.keeper = InstrumentKeeper(
-            instrument, self._session, clock, on_reading=self._measured, on_done=self._done
+            instrument, session, clock, on_reading=self._measured, on_done=self._done
         )
+
+    def write(self, record: object) -> None:
+        """Put a record into the journal that nothing follows from."""
+        self._journal.write(record, _nothing)
 
     # --- Instrument -------------------------------------------------------------------------------------------
 
     def _measured(self, reading: Reading) -> None:
         measurement = self._session.measured(reading, self._timeline.unix_ns(reading.at_ns))
-        self._journal.write(measurement, partial(self._session.offer, measurement))
+        self._journal.write(measurement, partial(self.link.offer, measurement))
+
+    def give(self, order: Order) -> None:
+        """Have an order of the master carried out."""
+        log.info("order_received", order=type(order).__name__)
+        self.keeper.give(order)
 
     def _done(self, done: Done) -> None:
         """Answer an order, a measurement when it is journalled."""
         if not isinstance(done.order, MeasureOrder):
-            self._answer_order(self._session.executed(done.order, ok=done.ok))
+            if done.ok:
+                self._session.executed(done.order)
+            self.link.executed(done.order, ok=done.ok)
         elif done.reading is None:
-            self._answer_order(self._session.shot_failed(self._now_ns()))
+            self.link.shot(None)
         else:
             target = self._session.shot(done.reading, self._timeline.unix_ns(done.reading.at_ns))
-            self._journal.write(target, partial(self._answer_shot, target))
+            self._journal.write(target, partial(self.link.shot, target))
 
-    def _answer_shot(self, target: TargetRecord) -> None:
-        self._answer_order(self._session.shot_answer(target))
-
-    def _answer_order(self, answer: bytes) -> None:
-        late_ns = self._now_ns() - self._ordered_ns
-        if self._radio is None or late_ns > LATEST_ANSWER_NS:
-            log.warning("order_unanswered", late_s=late_ns / 1e9)
-            return
-        # Beside the radio's own task, which goes on answering, and beside the instrument's, which goes on reading.
-        self.tasks.create_task(self._send(self._radio, answer))
-
-    async def _send(self, radio: Radio, answer: bytes) -> None:
-        try:
-            await radio.transmit(answer)
-        except RadioError as error:
-            log.warning("order_unanswered", error=str(error))
+    def situation(self) -> Situation:
+        """Say what the instrument is doing."""
+        return Situation(
+            prism=self._session.prism,
+            direct=self._session.mode == "direct",
+            connected=self.keeper.description is not None,
+        )
 
     # --- Radio ------------------------------------------------------------------------------------------------
 
-    async def answer(self, radio: Radio) -> NoReturn:
-        """Answer the master; nothing on this way waits for anything but the radio."""
-        self._radio = radio
+    async def talk(self, radio: Radio) -> NoReturn:
+        """Answer the master over this radio."""
+        self._radio_ok = True
         try:
-            while True:
-                packet = await radio.receive()
-                if self._clock.monotonic_ns() - packet.received_at_ns > TURN_ROUND_NS:
-                    log.warning(
-                        "request_too_old"
-                    )  # this computer was busy; the master asks somebody else by now
-                    continue
-                received_ns = self._timeline.unix_ns(packet.received_at_ns)
-                answer = self._session.received(
-                    packet.payload, received_ns, rssi_dbm=packet.rssi_dbm, snr_db=packet.snr_db
-                )
-                if isinstance(answer, bytes):
-                    await radio.transmit(answer)
-                elif answer is not None:
-                    self._give(answer, received_ns)
+            await self.link.talk(radio)
         finally:
-            self._radio = None
+            self._radio_ok = False
 
-    def _give(self, order: Order, received_ns: int) -> None:
-        log.info("order_received", order=type(order).__name__)
-        self._ordered_ns = received_ns
-        self.keeper.give(order)
+    def begin(self, coroutine: Coroutine[Any, Any, None]) -> None:
+        """Run something beside the radio's own task, and beside the instrument's."""
+        self.tasks.create_task(coroutine)
 
     # --- People -----------------------------------------------------------------------------------------------
-
-    def _now_ns(self) -> int:
-        return self._timeline.unix_ns(self._clock.monotonic_ns())
 
     def status(self) -> ClientStatus:
         """Say how it goes."""
         return self._session.status(
-            self._now_ns(),
+            self._timeline.unix_ns(self._clock.monotonic_ns()),
+            self.link.status(),
             instrument=self.keeper.description,
             journal=str(self._path),
             journal_ok=not self._recorder.failing,
             journal_waiting=self._recorder.waiting,
-            radio_ok=self._radio is not None,
+            radio_ok=self._radio_ok,
         )
 
     def status_line(self) -> str:
@@ -215,8 +272,9 @@ class _Client:
             if status.master_heard_s is None
             else f"master {status.master_heard_s:.0f} s ago"
         )
+        queued = f", {status.queued} queued" if status.queued else ""
         problems = ("" if status.radio_ok else ", no radio") + ("" if status.journal_ok else ", disk fails")
-        return f"station {status.station}: {instrument}, {last}, {master}{problems}"
+        return f"station {status.station}: {instrument}, {last}, {master}{queued}{problems}"
 
 
 def _nothing() -> None:

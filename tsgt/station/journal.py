@@ -24,15 +24,19 @@ class JournalQueue:
     ----------
     recorder
         Takes the lines; also what is still here when it is closed.
+    patience_s
+        How long a measurement waits for the disk before it is worth more to the robot than to the journal; None: until
+        the disk has taken or refused it.
     """
 
-    def __init__(self, recorder: Recorder) -> None:
+    def __init__(self, recorder: Recorder, *, patience_s: float | None) -> None:
         self._recorder = recorder
+        self._patience_s = patience_s
         self._followed: list[Callable[[], None]] = []
         self._pending = asyncio.Event()
 
     def write(self, record: object, then: Callable[[], None]) -> None:
-        """Take a record; call back when the disk has taken or refused it, or after :data:`PATIENCE_S`; never wait."""
+        """Take a record; call back when the disk has taken or refused it, or patience ends; never wait."""
         self._recorder.put(encode_line(record))
         self._followed.append(then)
         self._pending.set()
@@ -45,7 +49,7 @@ class JournalQueue:
             followed, self._followed = self._followed, []
             writing = asyncio.ensure_future(asyncio.to_thread(self._recorder.flush))
             try:
-                while not (await asyncio.wait([writing], timeout=PATIENCE_S))[0]:
+                while not (await asyncio.wait([writing], timeout=self._patience_s))[0]:
                     followed += self._followed
                     self._followed = []
                     _call(followed)

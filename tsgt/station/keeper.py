@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NoReturn
 import structlog
 
 from tsgt.errors import InstrumentError
-from tsgt.radio.classic import DirectOrder, MeasureOrder, Order, TrackOrder
+from tsgt.radio.orders import DirectOrder, MeasureOrder, Order, SearchOrder, TrackOrder
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -39,7 +39,7 @@ class Done:
     ok
         Whether the instrument has done it.
     reading
-        What a :class:`~tsgt.radio.classic.MeasureOrder` has given; None for others, and when it failed.
+        What a :class:`~tsgt.radio.orders.MeasureOrder` has given; None for others, and when it failed.
     """
 
     order: Order
@@ -89,8 +89,12 @@ class InstrumentKeeper:
         self.description: str | None = None
 
     def give(self, order: Order) -> None:
-        """Have an order carried out, as soon as the instrument is free; the session gives one at a time."""
-        if self.description is None:
+        """Have an order carried out, as soon as the instrument is free; one at a time.
+
+        It fails at once without an instrument, and so does a single measurement while a prism is tracked.
+        """
+        tracking = self._session.mode == "tracking"
+        if self.description is None or (tracking and isinstance(order, MeasureOrder)):
             self._on_done(Done(order, ok=False))
             return
         self._order = order
@@ -154,6 +158,8 @@ class InstrumentKeeper:
             match order:
                 case TrackOrder(prism):
                     await self._instrument.track(prism or self._session.prism)
+                case SearchOrder():
+                    await self._instrument.track(self._session.prism)
                 case DirectOrder():
                     await self._instrument.direct()
                 case MeasureOrder():

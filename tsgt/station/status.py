@@ -10,6 +10,30 @@ from tsgt.model import Status, check_instants
 
 Mode = Literal["tracking", "direct"]
 
+ProtocolName = Literal["classic", "superframe"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkStatus:
+    """How a station's client does over the radio; fields as in :class:`ClientStatus`.
+
+    Attributes
+    ----------
+    heard_ns
+        RxDone of the last packet of the master for this station, on its Unix clock; None before the first one.
+    """
+
+    protocol: ProtocolName
+    heard_ns: int | None
+    rssi_dbm: float | None
+    snr_db: float | None
+    authenticated: bool | None = None
+    joined: bool | None = None
+    queued: int | None = None
+    late: int | None = None
+    doubted: int | None = None
+    clock_bound_ns: int | None = None
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LastMeasurement:
@@ -81,6 +105,22 @@ class ClientStatus:
         Its ratio to the noise in dB; null before the first one.
     radio_ok
         Whether the radio is open and answered when it was used last.
+    protocol
+        What is spoken over the radio, ``classic`` or ``superframe``. The protocol classic has none of the following,
+        and they are null.
+    authenticated
+        Whether there is a key; without one anybody can take part.
+    joined
+        Whether a master has confirmed this station in its session.
+    queued
+        How many measurements are still to be delivered.
+    late
+        In how many of its slots the station was silent, or overran, because its computer was late.
+    doubted
+        How many beacons came at a time at which they cannot have been sent: somebody holds packets back, or a clock
+        has been set.
+    clock_bound_ns
+        How well the master's time is known, in ns; null where it is not yet.
     """
 
     __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
@@ -103,6 +143,13 @@ class ClientStatus:
     rssi_dbm: float | None
     snr_db: float | None
     radio_ok: bool
+    protocol: ProtocolName
+    authenticated: bool | None
+    joined: bool | None
+    queued: int | None
+    late: int | None
+    doubted: int | None
+    clock_bound_ns: int | None
 
     def __post_init__(self) -> None:
         """Refuse instants that no clock shows."""

@@ -84,3 +84,31 @@ def test_a_write_that_hangs_for_hours_does_not_fill_the_memory(disk: FullDisk) -
     for _ in range(50):
         recorder.put(b"{}")
     assert recorder.waiting == 20
+
+
+def test_the_caller_finds_out_what_became_of_a_line(disk: FullDisk) -> None:
+    """Written, still waiting, or lost; by the number under which it was put."""
+    recorder = Recorder(disk, waiting_lines=2)
+    recorder.write_line(b"0")
+    disk.full = True
+    for number in range(1, 5):
+        assert recorder.taken == number
+        recorder.put(b"%d" % number)
+    assert [recorder.written(range(n, n + 1)) for n in range(5)] == [True, None, None, None, None]
+    recorder.flush()
+    assert [recorder.written(range(n, n + 1)) for n in range(5)] == [True, False, False, None, None]
+    disk.full = False
+    recorder.flush()
+    assert [recorder.written(range(n, n + 1)) for n in range(5)] == [True, False, False, True, True]
+    assert recorder.written(range(2, 5)) is False
+    assert recorder.written(range(3, 5)) is True
+
+
+def test_a_line_that_could_not_even_wait_counts_as_lost(disk: FullDisk) -> None:
+    """While a write hangs; those before and after it are written."""
+    recorder = Recorder(disk, waiting_lines=1)
+    for number in range(3):
+        recorder.put(b"%d" % number)
+    recorder.flush()
+    recorder.write_line(b"3")
+    assert [recorder.written(range(n, n + 1)) for n in range(4)] == [True, True, False, True]

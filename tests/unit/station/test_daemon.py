@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from structlog.testing import capture_logs
 from support.client import OFFSET_NS, SCENARIO, START_NS, client_config, field_day
+from support.radios import PAPER
 
 from tsgt.config.scenario import StatusFaultConfig
 from tsgt.errors import RadioError, RecordingError, StreamError
@@ -287,6 +288,9 @@ async def test_the_journal_begins_with_what_a_merge_needs(tmp_path: Path) -> Non
         "type": "journal",
         "station": 1,
         "unix_at_zero_ns": START_NS + OFFSET_NS,
+        "boot": "boot",
+        "lineage": None,
+        "run_start": 0,
     }
 
 
@@ -316,6 +320,7 @@ async def test_a_second_client_does_not_take_the_socket(tmp_path: Path) -> None:
         with pytest.raises(StreamError, match="another program serves this socket"):
             await run_client(
                 client_config(tmp_path),
+                PAPER,
                 instrument=day.instrument,
                 open_radio=day.open_radio,
                 clock=day.clock,

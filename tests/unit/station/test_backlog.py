@@ -1,0 +1,148 @@
+"""What a new run of the client finds in the journals of earlier ones."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from structlog.testing import capture_logs
+from support.records import HEADER, measurement
+
+from tsgt.radio.outbox import RESTART_SKIP
+from tsgt.radio.station_session import Reception
+from tsgt.recording import encode_line
+from tsgt.recording.journal import AcknowledgedRecord, JournalRecord, ReceptionRecord
+from tsgt.station import backlog as backlog_module
+from tsgt.station.backlog import Backlog, queued, read_backlog
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import pytest
+
+    from tsgt.model import PolarMeasurement
+
+ZERO_NS = 1_000
+
+
+def head(
+    run_start: int, *, station: int = 1, boot: str = "b", lineage: int | None = 7, zero_ns: int = ZERO_NS
+) -> JournalRecord:
+    """Make the line that says whose journal it is."""
+    return JournalRecord(
+        station=station, unix_at_zero_ns=zero_ns, boot=boot, lineage=lineage, run_start=run_start
+    )
+
+
+def journal(folder: Path, name: str, *records: object, tail: bytes = b"") -> None:
+    """Write a journal."""
+    lines = b"".join(encode_line(record) + b"\n" for record in (HEADER, *records))
+    (folder / f"{name}.jsonl").write_bytes(lines + tail)
+
+
+def numbers(backlog: Backlog) -> list[int]:
+    """Return what is queued."""
+    return [each.sequence for each in backlog.queued]
+
+
+def acknowledged(oldest: int) -> AcknowledgedRecord:
+    """Say how far the master has got."""
+    return AcknowledgedRecord(stamp_ns=5, oldest=oldest)
+
+
+def measured(*sequences: int) -> list[PolarMeasurement]:
+    """Make measurements with these numbers."""
+    return [measurement(sequence) for sequence in sequences]
+
+
+def test_without_journals_everything_begins(tmp_path: Path) -> None:
+    """Also where there are only those of another station, or of the protocol classic, or none at all."""
+    assert read_backlog(tmp_path / "missing", 1) == Backlog()
+    journal(tmp_path, "station1-a", head(0, lineage=None), *measured(0, 1))
+    journal(tmp_path, "station1-b", head(0, station=2), *measured(0, 1))
+    (tmp_path / "station1-c.jsonl").write_bytes(b"\0" * 100)
+    (tmp_path / "station1-d.jsonl").write_bytes(b"")
+    assert read_backlog(tmp_path, 1) == Backlog()
+
+
+def test_what_is_not_acknowledged_is_left(tmp_path: Path) -> None:
+    """The numbers go on, with room for those that the journal has lost."""
+    journal(
+        tmp_path, "station1-a", head(0), acknowledged(0), *measured(0, 1, 2), acknowledged(2), *measured(3)
+    )
+    backlog = read_backlog(tmp_path, 1)
+    assert (backlog.lineage, backlog.run_start) == (7, 4 + RESTART_SKIP)
+    assert numbers(backlog) == [2, 3]
+    assert backlog.queued[0] == queued(measurement(2), ZERO_NS, "b")
+    assert backlog.queued[0].at_ns == measurement(2).stamp_ns - ZERO_NS
+
+
+def test_several_runs_are_left_in_order(tmp_path: Path) -> None:
+    """By their numbers, for the names come from a clock that may be wrong; no further back than need be."""
+    journal(tmp_path, "station1-9", head(0), acknowledged(0), *measured(0, 1))
+    journal(tmp_path, "station1-1", head(1002, boot="c"), acknowledged(1), *measured(1002))
+    journal(tmp_path, "station1-5", head(2003), acknowledged(1), *measured(2003))
+    backlog = read_backlog(tmp_path, 1)
+    assert numbers(backlog) == [1, 1002, 2003]
+    assert [each.boot for each in backlog.queued] == ["b", "c", "b"]
+    assert backlog.run_start == 2004 + RESTART_SKIP
+    journal(tmp_path, "station1-6", head(3004), acknowledged(3004))
+    backlog = read_backlog(tmp_path, 1)
+    assert (numbers(backlog), backlog.run_start) == ([], 3004 + RESTART_SKIP)
+
+
+def test_receptions_of_beacons_come_back(tmp_path: Path) -> None:
+    """On the computer's own clock, with what names its start."""
+    record = ReceptionRecord(stamp_ns=9_000, stamp_sigma_ns=3, session=77, counter=5, sent_us=400)
+    journal(tmp_path, "station1-a", head(0), record)
+    assert read_backlog(tmp_path, 1).receptions == (
+        Reception(session=77, counter=5, received_ns=8_000, sigma_ns=3, sent_us=400, boot="b"),
+    )
+
+
+def test_runs_of_unknown_starts_of_the_computer_share_no_clock(tmp_path: Path) -> None:
+    """Nor with the new run."""
+    journal(tmp_path, "station1-a", head(0, boot=""), *measured(0))
+    journal(tmp_path, "station1-b", head(1001, boot=""), *measured(1001))
+    boots = {each.boot for each in read_backlog(tmp_path, 1).queued}
+    assert len(boots) == 2
+    assert "" not in boots
+
+
+def test_damage_costs_what_is_damaged(tmp_path: Path) -> None:
+    """A torn end, a line of garbage."""
+    journal(tmp_path, "station1-a", head(0), *measured(0, 1), tail=b'garbage\n{"type":"measurement","sta')
+    assert numbers(read_backlog(tmp_path, 1)) == [0, 1]
+
+
+def test_an_unreadable_journal_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The client starts all the same."""
+    journal(tmp_path, "station1-a", head(0), *measured(0))
+    heads = backlog_module._head
+
+    def then_gone(path: Path, station: int) -> JournalRecord | None:
+        found = heads(path, station)
+        path.unlink()
+        return found
+
+    monkeypatch.setattr(backlog_module, "_head", then_gone)
+    with capture_logs() as logs:
+        assert numbers(read_backlog(tmp_path, 1)) == []
+    assert [entry["event"] for entry in logs] == ["journal_unreadable"]
+
+
+def test_what_is_too_much_stays_in_the_journal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The oldest; and it is said."""
+    monkeypatch.setattr(backlog_module, "MOST_MEASUREMENTS", 3)
+    journal(tmp_path, "station1-a", head(0), *measured(*range(5)))
+    with capture_logs() as logs:
+        assert numbers(read_backlog(tmp_path, 1)) == [2, 3, 4]
+    assert logs == [{"event": "backlog_left_behind", "log_level": "warning", "measurements": 2}]
+
+
+def test_of_a_long_journal_the_end_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A client that ran for days starts as fast as any other."""
+    monkeypatch.setattr(backlog_module, "_TAIL_BYTES", 1000)
+    journal(tmp_path, "station1-a", head(0), *measured(*range(100)))
+    backlog = read_backlog(tmp_path, 1)
+    assert 1 <= len(backlog.queued) < 10
+    assert backlog.run_start == 100 + RESTART_SKIP

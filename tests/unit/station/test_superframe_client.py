@@ -1,0 +1,257 @@
+"""The client's daemon on the superframe, between a simulated instrument and a master that the test plays."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import asynccontextmanager, suppress
+from typing import TYPE_CHECKING
+
+import pytest
+from structlog.testing import capture_logs
+from support.client import START_NS, field_day
+from support.hand_master import KEY, TIMING, HandMaster
+from support.radios import MS
+from unit.station.test_daemon import asked
+
+from tsgt.clock import UnixTimeline
+from tsgt.config.radio import SuperframeConfig
+from tsgt.errors import RecordingError
+from tsgt.radio.messages import AnswerPart, OrderPart
+from tsgt.recording import RecordingWriter, read_lines
+from tsgt.recording.journal import load_journal
+from tsgt.simulation.clocks import VirtualClock
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator, Sequence
+    from pathlib import Path
+
+    from support.client import Field
+    from support.hand_master import Answered
+
+    from tsgt.model import PolarMeasurement
+
+SUPERFRAME = SuperframeConfig(kind="superframe")
+
+
+class OnAir:
+    """The hand's master on a radio; the only station is number 1."""
+
+    def __init__(self, day: Field) -> None:
+        self._day = day
+        self._clock = VirtualClock(START_NS)
+        self.master = HandMaster(stations=1, station=1, session_every=4)
+
+    async def frame(self, orders: Sequence[OrderPart] = ()) -> Answered | None:
+        """Play one frame, from beacon to reply."""
+        radio = self._day.master.radio
+        payload = self.master.beacon(orders=orders)
+        self.master.left(await radio.transmit(payload))
+        deadline_ns = self.master.beacon_done_ns + 400 * MS
+        with suppress(TimeoutError):
+            async with asyncio.timeout((deadline_ns - self._clock.monotonic_ns()) / 1e9):
+                return self.master.take((await radio.receive()).payload)
+        return None
+
+    async def frames(self, seconds: float) -> None:
+        """Play frames one after the other."""
+        end_ns = self._clock.monotonic_ns() + round(seconds * 1e9)
+        while self._clock.monotonic_ns() < end_ns:
+            await self.frame()
+
+    async def drained(self, day: Field) -> None:
+        """Play frames until nothing is queued."""
+        await self.frames(5.0)
+        assert (await asked(day.folder / "client.sock"))["queued"] <= 3
+
+
+@asynccontextmanager
+async def superframe_day(folder: Path) -> AsyncGenerator[tuple[Field, OnAir]]:
+    """Set up a station that has the key, and its master."""
+    async with field_day(folder, protocol=SUPERFRAME, key=KEY) as day:
+        yield day, OnAir(day)
+
+
+def journalled(folder: Path) -> list[PolarMeasurement]:
+    """Return what stands in all journals."""
+    measurements = [
+        measurement
+        for path in (folder / "journals").iterdir()
+        for measurement in load_journal(path).measurements
+    ]
+    return sorted(measurements, key=lambda measurement: measurement.sequence)
+
+
+async def test_every_measurement_is_delivered_in_time(tmp_path: Path) -> None:
+    """With the master's time, which the station's clock, an hour and 10 ppm off, is brought to."""
+    async with superframe_day(tmp_path) as (day, air):
+        await air.frames(60.0)
+        await day.kill()
+        true_ns = {reading.at_ns: day.clock.true_ns(reading.at_ns) for reading in day.read}
+    assert len(air.master.received) >= len(day.read) - 2
+    unix_at_zero_ns = UnixTimeline(journalled(tmp_path)[0].stamp_ns - day.read[0].at_ns).unix_at_zero_ns
+    for measurement in journalled(tmp_path):
+        if measurement.sequence in air.master.received:
+            error_ns = (
+                air.master.received[measurement.sequence] - true_ns[measurement.stamp_ns - unix_at_zero_ns]
+            )
+            assert abs(error_ns) < 100_000
+
+
+async def test_a_client_that_is_killed_anywhere_loses_nothing(tmp_path: Path) -> None:
+    """Started again after any number of steps of the event loop: what was read is delivered, once it is there."""
+    async with superframe_day(tmp_path) as (day, air):
+        air.master.session_every = 1
+        for run in range(25):
+            await air.frames(1.5)
+            await day.kill()
+            day.start()
+            for _ in range(7 * run):
+                await asyncio.sleep(0)
+        await air.drained(day)
+        await day.kill()
+        sequences = [measurement.sequence for measurement in journalled(tmp_path)]
+        assert len(set(sequences)) == len(sequences) >= len(day.read)
+        assert set(sequences[:-3]) <= set(air.master.received)
+        assert set(air.master.received) <= set(sequences)
+
+
+async def test_a_restarted_computer_delivers_what_it_had(tmp_path: Path) -> None:
+    """Measured while the master was away; timed by the clock of before, whose beacons the journal has."""
+    async with superframe_day(tmp_path) as (day, air):
+        await air.frames(20.0)
+        await asyncio.sleep(10.0)
+        await day.kill()
+        before = {measurement.sequence for measurement in journalled(tmp_path)}
+        assert len(before - set(air.master.received)) > 20
+        day.boot = "another"
+        day.start()
+        await asyncio.sleep(1.0)
+        await air.frames(15.0)
+        assert before <= set(air.master.received)
+
+
+async def test_what_is_of_an_unknown_clock_stays_in_the_journal(tmp_path: Path) -> None:
+    """The master was restarted too, so that nobody can say when it was measured."""
+    async with superframe_day(tmp_path) as (day, air):
+        await air.frames(5.0)
+        await asyncio.sleep(5.0)
+        await day.kill()
+        day.boot = "another"
+        with capture_logs() as logs:
+            day.start()
+            await asyncio.sleep(0.1)
+            new = OnAir(day)
+            new.master.session = 0x77
+            await new.frames(5.0)
+        assert [entry["event"] for entry in logs].count("backlog_left_behind") == 1
+        assert (await asked(tmp_path / "client.sock"))["queued"] <= 2
+        assert min(new.master.received) > 1000
+
+
+async def test_orders_are_carried_out_and_answered(tmp_path: Path) -> None:
+    """Another prism, single measurements, back again, and a search."""
+    async with superframe_day(tmp_path) as (day, air):
+        await air.frames(3.0)
+
+        async def order(ticket: int, kind: int, argument: int = 0) -> Answered:
+            for _ in range(20):
+                answered = await air.frame([OrderPart(1, ticket, kind, argument)])
+                if answered and (answered.reply.answer or answered.reply.shot):
+                    await air.frame()  # which acknowledges it
+                    return answered
+            raise AssertionError
+
+        assert (await order(1, 2)).reply.answer == AnswerPart(1, ok=True)
+        assert (await asked(tmp_path / "client.sock"))["mode"] == "direct"
+        day.instrument.aim(1)
+        shot = (await order(2, 3)).reply.shot
+        assert shot is not None
+        assert shot.distance == pytest.approx(206_216, abs=100)
+        assert (await order(3, 0, 1)).reply.answer == AnswerPart(3, ok=True)
+        assert (await asked(tmp_path / "client.sock"))["prism"] == 2
+        assert (await order(4, 1)).reply.answer == AnswerPart(4, ok=True)
+        assert (await order(5, 3)).reply.answer == AnswerPart(5, ok=False)  # it is not in direct mode
+        assert (await order(6, 0, 8)).reply.answer == AnswerPart(
+            6, ok=False
+        )  # the instrument knows no prism 9
+        await air.frames(3.0)
+        await day.kill()
+        (path,) = (tmp_path / "journals").iterdir()
+        assert len(load_journal(path).targets) == 1
+        assert {measurement.prism for measurement in journalled(tmp_path)} == {1, 2}
+
+
+async def test_what_the_disk_holds_up_is_not_delivered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A full disk lets it through, for then nothing would be; a line that is still to be written does not."""
+    full = False
+    write_line = RecordingWriter.write_line
+
+    def write_if_room(writer: RecordingWriter, line: bytes) -> None:
+        if full:
+            raise RecordingError("no room", path=tmp_path)
+        write_line(writer, line)
+
+    monkeypatch.setattr(RecordingWriter, "write_line", write_if_room)
+    async with superframe_day(tmp_path) as (day, air):
+        await air.frames(4.0)
+        full = True
+        await air.frames(6.0)
+        assert len(air.master.received) >= len(day.read) - 2
+        full = False
+        await air.frames(1.0)
+
+
+async def test_the_journal_tells_of_beacons_and_acknowledgement(tmp_path: Path) -> None:
+    """What a restart needs."""
+    async with superframe_day(tmp_path) as (day, air):
+        await air.frames(20.0)
+        await day.kill()
+    (path,) = (tmp_path / "journals").iterdir()
+    types = [line.type for line in read_lines(path)]
+    assert types[:3] == ["recording", "journal", "acknowledged"]
+    assert types.count("reception") > 20
+    assert 3 <= types.count("acknowledged") <= 6
+
+
+async def test_the_status_says_how_delivery_goes(tmp_path: Path) -> None:
+    """Before and after a master is there."""
+    async with superframe_day(tmp_path) as (day, air):
+        await asyncio.sleep(5.0)
+        before = await asked(day.folder / "client.sock")
+        assert (before["protocol"], before["authenticated"], before["joined"]) == ("superframe", True, False)
+        assert (before["queued"], before["clock_bound_ns"]) == (12, None)
+        await air.frames(20.0)
+        after = await asked(day.folder / "client.sock")
+    assert after["joined"]
+    assert (after["late"], after["doubted"]) == (0, 0)
+    assert after["queued"] <= 2
+    assert 0 < after["clock_bound_ns"] < 200_000
+    assert after["master_heard_s"] < 0.5
+
+
+async def test_a_station_without_a_key_says_so(tmp_path: Path) -> None:
+    """In the log and in the status; a master with a key does not know it, nor it the master."""
+    with capture_logs() as logs:
+        async with field_day(tmp_path, protocol=SUPERFRAME) as day:
+            air = OnAir(day)
+            await air.frames(10.0)
+            status = await asked(tmp_path / "client.sock")
+    assert [entry["event"] for entry in logs if entry["event"] == "unauthenticated"] == ["unauthenticated"]
+    assert [entry["event"] for entry in logs].count("beacon_refused") == 1
+    assert (status["authenticated"], status["joined"], status["master_heard_s"]) == (False, False, None)
+    assert not air.master.received
+
+
+async def test_replies_begin_on_time(tmp_path: Path) -> None:
+    """At the slot, to the radio's own precision: the guard is for others."""
+    async with superframe_day(tmp_path) as (day, air):
+        await air.frames(10.0)
+        payload = air.master.beacon()
+        air.master.left(await day.master.radio.transmit(payload))
+        packet = await day.master.radio.receive()
+        began_ns = packet.received_at_ns - TIMING.reception_ns - TIMING.airtime_ns(len(packet.payload))
+        slot_ns = air.master.beacon_done_ns - 67_000 + TIMING.turn_round_ns
+        assert abs(began_ns - slot_ns) < MS
+        air.master.take(packet.payload)

@@ -1,0 +1,186 @@
+"""What earlier runs of a station's client have left behind: read from their journals at the start."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import structlog
+
+from tsgt.model import PolarMeasurement
+from tsgt.radio.message_codec import angle_code
+from tsgt.radio.outbox import RESTART_SKIP, Queued
+from tsgt.radio.station_session import Reception
+from tsgt.recording import decode
+from tsgt.recording.format import MAX_LINE_BYTES, Typed
+from tsgt.recording.journal import AcknowledgedRecord, JournalRecord, ReceptionRecord
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+MOST_MEASUREMENTS = 10_000
+"""More than an hour; what is older stays in the journals."""
+
+LINEAGE_BITS = 16
+
+_TAIL_BYTES = 8_000_000
+"""So many measurements take at most so much of a journal, with the beacons between them."""
+
+_HEAD_LINES = 2
+
+log = structlog.get_logger()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Backlog:
+    """What a new run of the client goes on from.
+
+    Attributes
+    ----------
+    lineage
+        Of the sequence numbers that go on; None where there are none.
+    run_start
+        Number of the first measurement of this run.
+    queued
+        What has not been acknowledged, oldest first.
+    receptions
+        Of beacons, in the order in which they were made.
+    """
+
+    lineage: int | None = None
+    run_start: int = 0
+    queued: tuple[Queued, ...] = ()
+    receptions: tuple[Reception, ...] = ()
+
+
+def queued(measurement: PolarMeasurement, unix_at_zero_ns: int, boot: str) -> Queued:
+    """Return a measurement of a journal as it is delivered.
+
+    Parameters
+    ----------
+    measurement
+        Its ``stamp_ns`` is on the Unix clock of the run that made it.
+    unix_at_zero_ns, boot
+        See :class:`~tsgt.recording.journal.JournalRecord`.
+    """
+    return Queued(
+        sequence=measurement.sequence,
+        at_ns=measurement.stamp_ns - unix_at_zero_ns,
+        boot=boot,
+        prism=measurement.prism,
+        status=measurement.status,
+        horizontal=angle_code(measurement.horizontal_angle_rad),
+        zenith=angle_code(measurement.zenith_angle_rad),
+        distance_m=measurement.slope_distance_m,
+    )
+
+
+def read_backlog(directory: Path, station: int) -> Backlog:
+    """Read what is left from a folder of journals; lines and files that cannot be read are passed over.
+
+    Parameters
+    ----------
+    directory
+        The folder.
+    station
+        Number of the station.
+    """
+    journals = [
+        (head, path)
+        for path in sorted(directory.glob(f"station{station}-*.jsonl"))
+        if (head := _head(path, station)) is not None
+    ]
+    if not journals:
+        return Backlog()
+    # The names tell the order only as well as the computer's Unix clock; the numbers do, within a lineage.
+    lineage = journals[-1][0].lineage
+    runs = sorted(
+        (journal for journal in journals if journal[0].lineage == lineage),
+        key=lambda journal: journal[0].run_start,
+        reverse=True,
+    )
+    oldest, last = 0, runs[0][0].run_start - 1
+    measurements: list[Queued] = []
+    receptions: list[Reception] = []
+    for head, path in runs:
+        tail = _tail(head, path)
+        measurements = tail.measurements + measurements
+        receptions = tail.receptions + receptions
+        last = max((last, *(each.sequence for each in tail.measurements[-1:])))
+        oldest = max(oldest, tail.oldest)
+        if oldest >= head.run_start or len(measurements) > MOST_MEASUREMENTS:
+            break
+    undelivered = [each for each in measurements if each.sequence >= oldest]
+    if len(undelivered) > MOST_MEASUREMENTS:
+        log.warning("backlog_left_behind", measurements=len(undelivered) - MOST_MEASUREMENTS)
+    return Backlog(
+        lineage=lineage,
+        run_start=last + 1 + RESTART_SKIP,
+        queued=tuple(undelivered[-MOST_MEASUREMENTS:]),
+        receptions=tuple(receptions[-MOST_MEASUREMENTS:]),
+    )
+
+
+def _head(path: Path, station: int) -> JournalRecord | None:
+    """Return whose journal this is; None for one of another station or without a lineage."""
+    try:
+        with path.open("rb") as file:
+            lines = [file.readline(MAX_LINE_BYTES) for _ in range(_HEAD_LINES)]
+        head = decode(JournalRecord, lines[-1])
+    except (OSError, ValueError):
+        return None
+    if not head.boot:  # then no two runs are known to share a clock
+        head = replace(head, boot=path.name)
+    return head if head.station == station and head.lineage is not None else None
+
+
+class _Tail(NamedTuple):
+    """What the end of a journal holds, in the order of the file.
+
+    Attributes
+    ----------
+    measurements, receptions
+        Those.
+    oldest
+        All measurements below it are acknowledged, or were given up.
+    """
+
+    measurements: list[Queued]
+    receptions: list[Reception]
+    oldest: int
+
+
+def _tail(head: JournalRecord, path: Path) -> _Tail:
+    tail = _Tail([], [], 0)
+    zero_ns = head.unix_at_zero_ns
+    try:
+        with path.open("rb") as file:
+            file.seek(max(0, path.stat().st_size - _TAIL_BYTES))
+            for line in file:
+                try:
+                    match decode(Typed, line).type:
+                        case "measurement":
+                            measurement = decode(PolarMeasurement, line)
+                            tail.measurements.append(queued(measurement, zero_ns, head.boot))
+                        case "reception":
+                            tail.receptions.append(
+                                _reception(decode(ReceptionRecord, line), zero_ns, head.boot)
+                            )
+                        case "acknowledged":
+                            tail = tail._replace(oldest=decode(AcknowledgedRecord, line).oldest)
+                except ValueError:
+                    continue  # torn, or the rest of a line that begins before the tail
+    except OSError as error:
+        log.warning("journal_unreadable", path=str(path), error=error.strerror or str(error))
+    return tail
+
+
+def _reception(record: ReceptionRecord, zero_ns: int, boot: str) -> Reception:
+    return Reception(
+        session=record.session,
+        counter=record.counter,
+        received_ns=record.stamp_ns - zero_ns,
+        sigma_ns=record.stamp_sigma_ns,
+        sent_us=record.sent_us,
+        boot=boot,
+    )

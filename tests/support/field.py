@@ -14,12 +14,18 @@ from support.scene import START, standing_scene
 from tsgt.clock import UnixTimeline
 from tsgt.config import MasterConfig
 from tsgt.config.master import RecordingConfig, SetupConfig, StationConfig, StreamConfig
-from tsgt.config.radio import ClassicMasterConfig, SimulatedRadioConfig
+from tsgt.config.radio import ClassicMasterConfig, SimulatedRadioConfig, SuperframeMasterConfig
 from tsgt.errors import InstrumentError
 from tsgt.master.daemon import run_master
 from tsgt.model import Status
-from tsgt.radio.classic import ClassicStation, DirectOrder, TrackOrder
+from tsgt.radio.authentication import Authenticator
+from tsgt.radio.classic import ClassicStation
 from tsgt.radio.classic_messages import MeasurementMessage, raw_status
+from tsgt.radio.conversation import Situation
+from tsgt.radio.message_codec import angle_code
+from tsgt.radio.orders import DirectOrder, TrackOrder
+from tsgt.radio.outbox import Outbox, Queued
+from tsgt.radio.superframe_station import SuperframeStation
 from tsgt.simulation.air import Air
 from tsgt.simulation.authors_node import AUTHORS_STAMP_DELAY_MS, AuthorsNode
 from tsgt.simulation.clocks import DriftingClock, VirtualClock
@@ -36,11 +42,13 @@ if TYPE_CHECKING:
 
     from tsgt.clock import Clock
     from tsgt.radio.base import OpenRadio, Packet, Radio
+    from tsgt.radio.station_session import Reception
 
 T = TypeVar("T")
 
 STATIONS = (1, 2, 3)
 PERIOD_NS = 400_000_000
+KEY = bytes(range(32))
 TRUE = VirtualClock(START)
 """The true time, which the master's clock shows; zero of the loop is the start of the scene."""
 
@@ -149,6 +157,99 @@ async def classic_client(station: int, radio: Radio, clock: DriftingClock, tool:
                 await radio.transmit(answer)
 
 
+class Notebook:
+    """What a station of the superframe keeps across its starts, as a journal does: measurements, and times of beacons.
+
+    Attributes
+    ----------
+    outbox
+        What is not acknowledged.
+    made_ns
+        True time of each measurement, by its number.
+    """
+
+    def __init__(self) -> None:
+        self.outbox = Outbox(0)
+        self.made_ns: dict[int, int] = {}
+        self.receptions: list[Reception] = []
+
+    def start(self) -> None:
+        """Leave out the numbers that a torn journal may have lost."""
+        if self.made_ns:
+            self.outbox = Outbox(max(self.made_ns) + 1001, reversed(list(self.outbox.newest_first())))
+
+
+async def superframe_client(
+    number: int,
+    radio: Radio,
+    clock: DriftingClock,
+    tool: SceneInstrument,
+    notes: Notebook,
+    rng: np.random.Generator,
+) -> NoReturn:
+    """Answer beacons as a station's client does."""
+    notes.start()
+    outbox = notes.outbox
+    situation = Situation(prism=number, direct=tool.direct_mode, connected=True)
+    station = SuperframeStation(
+        number,
+        PAPER,
+        Authenticator(KEY),
+        outbox,
+        lineage=number,
+        boot="boot",
+        receptions=notes.receptions,
+        random_bits=lambda bits: int(rng.integers(1 << bits)),
+    )
+
+    async def read() -> NoReturn:
+        sequence = outbox.run_start
+        while True:
+            reading = await tool.read()
+            outbox.add(
+                Queued(
+                    sequence=sequence,
+                    at_ns=reading.at_ns,
+                    boot="boot",
+                    prism=reading.prism or number,
+                    status=reading.status,
+                    horizontal=angle_code(reading.horizontal_angle_rad),
+                    zenith=angle_code(reading.zenith_angle_rad),
+                    distance_m=reading.slope_distance_m,
+                )
+            )
+            notes.made_ns[sequence] = TRUE.realtime_ns() - (TRUE.realtime_ns() - number) % PERIOD_NS
+            sequence += 1
+
+    async def obey() -> None:
+        nonlocal situation
+        order = station.next_order()
+        if isinstance(order, TrackOrder):
+            ok = not tool.refuses
+            if ok:
+                await tool.track(order.prism or number)
+                situation = situation._replace(prism=order.prism or number, direct=False)
+            station.executed(ok=ok)
+        elif isinstance(order, DirectOrder):
+            await tool.direct()
+            situation = situation._replace(direct=True)
+            station.executed(ok=True)
+
+    async with asyncio.TaskGroup() as group:
+        group.create_task(read())
+        while True:
+            heard = station.received(await radio.receive())
+            if heard is not None and heard.reception is not None:
+                notes.receptions.append(heard.reception)
+            await obey()
+            if heard is None or heard.slot_ns is None:
+                continue
+            await clock.sleep_until(heard.slot_ns - 6_000_000)
+            reply = station.compose(situation, clock.monotonic_ns())
+            if reply is not None:
+                station.sent(await radio.transmit(reply, at_ns=heard.slot_ns))
+
+
 @dataclass
 class Station:
     """A station of the field, which can be killed and started.
@@ -157,6 +258,8 @@ class Station:
     ----------
     clock
         Its computer's: seconds to hours off the master's, and 10 ppm fast.
+    notes
+        What it keeps, on the superframe.
     """
 
     number: int
@@ -164,6 +267,8 @@ class Station:
     scene: Scene
     authors: bool
     clock: DriftingClock
+    superframe: bool = False
+    notes: Notebook = field(default_factory=Notebook)
     _task: asyncio.Task[None] | None = None
     _starts: int = 0
     instrument: SceneInstrument = field(init=False)
@@ -188,6 +293,8 @@ class Station:
         async with opener(self.air, f"station-{self.number}", self.clock, rng, PAPER)() as radio:
             if self.authors:
                 await AuthorsNode(self.number, radio, self.clock, self.instrument, self.number, rng).run()
+            if self.superframe:
+                await superframe_client(self.number, radio, self.clock, self.instrument, self.notes, rng)
             await classic_client(self.number, radio, self.clock, self.instrument)
 
 
@@ -200,10 +307,16 @@ class Field:
     scene: Scene
     stations: dict[int, Station]
     records: list[Any] = field(default_factory=list)
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(11))
 
     def config(self, **changes: Any) -> MasterConfig:
-        """Make the master's configuration, with a short first synchronisation."""
-        protocol = {"initial_cycles": 5} | changes.pop("protocol", {})
+        """Make the master's configuration; with a short first synchronisation, or frames without a lock."""
+        changed = changes.pop("protocol", {})
+        protocol: ClassicMasterConfig | SuperframeMasterConfig
+        if self.stations[1].superframe:
+            protocol = SuperframeMasterConfig(kind="superframe", **{"phase_lock": False} | changed)
+        else:
+            protocol = ClassicMasterConfig(kind="classic", **{"initial_cycles": 5} | changed)
         delay_ms = AUTHORS_STAMP_DELAY_MS if self.stations[1].authors else 0.0
         return MasterConfig(
             kind="master",
@@ -219,7 +332,7 @@ class Field:
                 frequency_mhz=905.0,
                 spreading_factor=9,
             ),
-            protocol=ClassicMasterConfig(kind="classic", **protocol),
+            protocol=protocol,
             stream=StreamConfig(socket=self.folder / "poses.sock"),
             recording=RecordingConfig(directory=self.folder / "recordings"),
             **changes,
@@ -230,7 +343,12 @@ class Field:
         return opener(self.air, "master", TRUE, np.random.default_rng(100), PAPER)
 
     async def master(
-        self, config: MasterConfig | None = None, *, open_radio: OpenRadio | None = None, clock: Clock = TRUE
+        self,
+        config: MasterConfig | None = None,
+        *,
+        open_radio: OpenRadio | None = None,
+        clock: Clock = TRUE,
+        key: bytes | None = KEY,
     ) -> None:
         """Run the master until cancelled; what goes out is kept in :attr:`records`."""
         await run_master(
@@ -239,6 +357,8 @@ class Field:
             PAPER,
             open_radio=open_radio or self.open_radio(),
             clock=clock,
+            key=key,
+            random_bits=lambda bits: int(self.rng.integers(1 << bits)),
             observe=self.records.append,
         )
 
@@ -253,15 +373,25 @@ class Field:
 
 @asynccontextmanager
 async def field_of(
-    folder: Path, scene: Scene | None = None, *, authors: bool = False
+    folder: Path,
+    scene: Scene | None = None,
+    *,
+    authors: bool = False,
+    superframe: bool = False,
+    link: LinkModel | None = None,
 ) -> AsyncGenerator[Field]:
     """Start three stations, and stop what is left of them at the end."""
-    air = Air(running_timeline(), np.random.default_rng(7), LinkModel())
+    air = Air(running_timeline(), np.random.default_rng(7), link or LinkModel())
     scene = scene or standing_scene()
     offsets_s = {1: 0.3, 2: -7200.0, 3: 86_400.0}
     stations = {
         n: Station(
-            n, air, scene, authors, DriftingClock(TRUE, offset_ns=int(offsets_s[n] * 1e9), drift_ppm=10.0)
+            n,
+            air,
+            scene,
+            authors,
+            DriftingClock(TRUE, offset_ns=int(offsets_s[n] * 1e9), drift_ppm=10.0),
+            superframe=superframe,
         )
         for n in STATIONS
     }

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from tsgt.config import ScenarioConfig
-from tsgt.config.radio import ClassicMasterConfig
-from tsgt.simulation.scenario import Options, Run, simulate
+from tsgt.config.radio import ClassicMasterConfig, SuperframeMasterConfig
+from tsgt.simulation.options import Options
+from tsgt.simulation.scenario import Run, simulate
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
@@ -17,13 +18,15 @@ if TYPE_CHECKING:
 QUICK = ClassicMasterConfig(kind="classic", initial_cycles=5)
 """The protocol with a short synchronisation at the start: 1.2 s for each station."""
 
+SUPERFRAME = SuperframeMasterConfig(kind="superframe")
+
 
 def mission(
     folder: Path,
     scenario: ScenarioConfig | None = None,
     *,
     script: Callable[[Mission], Coroutine[None, None, None]] | None = None,
-    protocol: ClassicMasterConfig = QUICK,
+    protocol: ClassicMasterConfig | SuperframeMasterConfig = QUICK,
     **options: Any,
 ) -> Run:
     """Run half a minute of the reference scenario, or what else is asked for."""

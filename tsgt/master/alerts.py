@@ -47,6 +47,8 @@ class _Station:
     """Since when its answers hold no new measurement; None while they do."""
     idle: bool = False
     meaning: str = _MEANING[Status.OK]
+    newest: tuple[int, int] = (-1, 0)
+    """Sequence number and stamp of the newest measurement."""
 
 
 class Alerts:
@@ -87,7 +89,7 @@ class Alerts:
         found.refused = not tracks
         if tracks:
             return [_event(now_ns, "station_tracking", f"now tracks prism {prism}", station)]
-        text = f"does not track prism {prism}; look at its instrument. It is told again, and not polled until it does"
+        text = f"does not track prism {prism}; look at its instrument. It is told again"
         return [_event(now_ns, "station_not_tracking", text, station)]
 
     def stepped(self, station: int, now_ns: int) -> list[EventRecord]:
@@ -95,8 +97,26 @@ class Alerts:
         text = "has another clock than before: restarted, or set; its measurements are put on the new one"
         return [_event(now_ns, "station_clock_stepped", text, station)]
 
+    def beacon_doubted(self, station: int, now_ns: int, count: int) -> list[EventRecord]:
+        """Tell that a station received beacons at a time at which they cannot have been sent."""
+        text = (
+            f"station {station} received {count} beacons at a time at which they cannot have been sent; somebody may be "
+            "holding back packets and sending them later. They are not used"
+        )
+        return [
+            EventRecord(stamp_ns=now_ns, event="beacon_doubted", message=text, station=station, count=count)
+        ]
+
+    def link_doubted(self, station: int, now_ns: int) -> list[EventRecord]:
+        """Tell that the time between a station and the master came out as it cannot be."""
+        text = (
+            "and the master disagree on how long a packet takes; somebody may be holding back packets and sending them "
+            "later, or a radio stamps badly. This exchange is not used"
+        )
+        return [_event(now_ns, "link_doubted", text, station)]
+
     def polled(self, station: int, now_ns: int) -> list[EventRecord]:
-        """Take note of an answer to a poll, before the measurement that it may hold; tell when none comes any more.
+        """Take note of an answer, before the measurement that it may hold; tell when none comes any more.
 
         A node that repeats an error without a time has been told of already.
         """
@@ -115,10 +135,14 @@ class Alerts:
         if found is None:
             return []
         events = []
+        late = measurement.sequence < found.newest[0] and measurement.stamp_ns < found.newest[1]
         found.nothing_new_ns = None
         if found.idle:
             found.idle = False
             events.append(_event(now_ns, "station_measuring", "measures again", measurement.station))
+        if late:  # it tells how the instrument did, not how it does
+            return events
+        found.newest = (measurement.sequence, measurement.stamp_ns)
         meaning = _MEANING[measurement.status]
         if meaning != found.meaning:
             found.meaning = meaning

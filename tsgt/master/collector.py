@@ -67,7 +67,7 @@ class Collector:
             airtime_ns = self._timing.airtime_ns(len(request.payload))
             self.requested_ns = self._timeline.unix_ns(sent.done_at_ns - self._timing.tx_done_ns - airtime_ns)
             deadline_ns = sent.done_at_ns + request.reply_timeout_ns
-            while (packet := await self._next_packet(deadline_ns)) is not None:
+            while (packet := await next_packet(self._radio, self._clock, deadline_ns)) is not None:
                 # One from before the request went out answers an earlier one.
                 if packet.received_at_ns > sent.done_at_ns and turn.replied(
                     packet.payload,
@@ -81,11 +81,12 @@ class Collector:
             else:
                 turn.timed_out()
 
-    async def _next_packet(self, deadline_ns: int) -> Packet | None:
-        """Wait for a packet until a monotonic instant; None when there is none by then."""
-        # Again without waiting: this task may wake up late, with a packet there that was not.
-        for wait_ns in (max(0, deadline_ns - self._clock.monotonic_ns()), 0):
-            with suppress(TimeoutError):
-                async with asyncio.timeout(wait_ns / 1e9):
-                    return await self._radio.receive()
-        return None
+
+async def next_packet(radio: Radio, clock: Clock, deadline_ns: int) -> Packet | None:
+    """Wait for a packet until a monotonic instant; None when there is none by then."""
+    # Again without waiting: this task may wake up late, with a packet there that was not.
+    for wait_ns in (max(0, deadline_ns - clock.monotonic_ns()), 0):
+        with suppress(TimeoutError):
+            async with asyncio.timeout(wait_ns / 1e9):
+                return await radio.receive()
+    return None

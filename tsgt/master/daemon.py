@@ -1,36 +1,37 @@
 """The master's daemon: radio in, poses out.
 
-One task group holds everything: the radio with the turns of the stations, the timer of the poses, the status of
-each second, the disk. What happens is decided in the pure parts (:mod:`tsgt.master.scheduler`,
-:mod:`tsgt.master.intake`, :mod:`tsgt.master.outlet`); here they are connected with radio, socket, disk and time.
+One task group holds everything: the radio with its link to the stations, the timer of the poses, the status of each
+second, the disk. What is spoken over the radio is a matter of the link (:mod:`tsgt.master.classic_link`,
+:mod:`tsgt.master.superframe_link`), what leaves the program one of :mod:`tsgt.master.outlet`; here they are connected
+with radio, socket, disk and time.
 """
 
 from __future__ import annotations
 
 import asyncio
+import secrets
 from contextlib import asynccontextmanager
-from dataclasses import replace
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, NoReturn, Protocol
 
 import structlog
 
 import tsgt
 from tsgt import service
 from tsgt.clock import UnixTimeline
+from tsgt.config.radio import ClassicMasterConfig
 from tsgt.errors import RadioError, StreamError
 from tsgt.master.alerts import Alerts
-from tsgt.master.clock_offset import clock_filter
-from tsgt.master.collector import Collector
+from tsgt.master.classic_link import ClassicLink
+from tsgt.master.disk import Disk
 from tsgt.master.fence_command import run_fence_command
 from tsgt.master.frame_watch import FrameWatch
 from tsgt.master.geofence import Geofence
-from tsgt.master.intake import Intake
 from tsgt.master.monitor import Monitor
 from tsgt.master.outlet import Outlet
-from tsgt.master.scheduler import Cadence, Scheduler, StationPlan
+from tsgt.master.reports import Reports
 from tsgt.master.stream import StreamServer
 from tsgt.master.stream_records import EventRecord, HelloRecord
-from tsgt.radio.classic import Ordered, Poll, Synchronisation, Timing
+from tsgt.master.superframe_link import SuperframeLink
 from tsgt.radio.supervised import keep_radio
 from tsgt.recording import RecordingHeader, RecordingWriter, encode_line
 from tsgt.recording.files import new_recording_path
@@ -43,10 +44,9 @@ if TYPE_CHECKING:
     from tsgt.config import MasterConfig
     from tsgt.config.master import FrameWatchConfig, GeofenceConfig
     from tsgt.master.outlet import Watcher
-    from tsgt.master.scheduler import Task
-    from tsgt.master.stream_records import PoseRecord
-    from tsgt.model import Parameters, PolarMeasurement
-    from tsgt.radio.base import LoRaSettings, OpenRadio, Packet, Radio
+    from tsgt.master.stream_records import PoseRecord, StatusRecord
+    from tsgt.model import Parameters
+    from tsgt.radio.base import LoRaSettings, OpenRadio, Radio
 
 STATUS_PERIOD_NS = 1_000_000_000
 
@@ -63,6 +63,8 @@ async def run_master(
     *,
     open_radio: OpenRadio,
     clock: Clock,
+    key: bytes | None = None,
+    random_bits: Callable[[int], int] = secrets.randbits,
     observe: Callable[[object], None] = lambda _record: None,
 ) -> None:
     """Collect, compute, stream and record until cancelled.
@@ -79,6 +81,10 @@ async def run_master(
         Opens the radio, as often as it takes.
     clock
         Time; the radio's.
+    key
+        That of ``protocol.key_file``; None: there is none, and anybody can take part.
+    random_bits
+        Returns so many random bits: for nonces.
     observe
         Sees every record that goes out, in their order: for simulations and tests.
 
@@ -93,11 +99,11 @@ async def run_master(
     start_ns = timeline.unix_ns(clock.monotonic_ns())
     path = new_recording_path(config.recording.directory, "master", start_ns)
     with RecordingWriter(path) as writer:
-        recorder, unwritten = Recorder(writer), asyncio.Event()
+        recorder = Recorder(writer)
+        disk = Disk(recorder)
 
         def hand_out(record: object, line: bytes) -> None:
-            recorder.put(line)
-            unwritten.set()
+            disk.put(line)
             server.publish(line)
             observe(record)
 
@@ -115,27 +121,54 @@ async def run_master(
         )
         try:
             async with server, asyncio.TaskGroup() as group:
-                master = _Master(config, parameters, settings, clock, timeline, hand_out, group)
+                master = _Master(config, parameters, clock, timeline, hand_out, group)
+                link = _link(config, settings, disk, master.reports, key=key, random_bits=random_bits)
                 log.info("master_started", recording=str(path), stations=len(config.stations))
                 service.sd_notify("READY=1")
-                group.create_task(_write(recorder, unwritten))
+                group.create_task(disk.run())
                 group.create_task(service.keep_synced(writer.sync, clock, config.recording.fsync_interval_s))
                 group.create_task(master.keep_time())
-                group.create_task(master.report())
-                group.create_task(master.watchdog())
-                group.create_task(keep_radio(master.watched(open_radio), master.collect, clock))
+                group.create_task(master.report(link))
+                group.create_task(master.watchdog(link))
+                group.create_task(keep_radio(master.watched(open_radio), link.run, clock))
         finally:
             service.sd_notify("STOPPING=1")
             recorder.close()
             log.info("master_stopped")
 
 
-async def _write(recorder: Recorder, unwritten: asyncio.Event) -> NoReturn:
-    """Write lines in a thread: a disk that takes its time must not keep the radio waiting."""
-    while True:
-        await unwritten.wait()
-        unwritten.clear()
-        await asyncio.to_thread(recorder.flush)
+class Link(Protocol):
+    """A protocol as the master runs it: reports what the stations send."""
+
+    @property
+    def turn_ns(self) -> int | None:
+        """Since when the present turn with a station, or frame with all, lasts; None without a radio."""
+        ...
+
+    def status(self, now_ns: int) -> StatusRecord:
+        """Report how the link and its stations do at an instant on the master's Unix clock."""
+        ...
+
+    async def run(self, radio: Radio) -> None:
+        """Use a radio for as long as it works."""
+        ...
+
+
+def _link(
+    config: MasterConfig,
+    settings: LoRaSettings,
+    disk: Disk,
+    reports: Reports,
+    *,
+    key: bytes | None,
+    random_bits: Callable[[int], int],
+) -> Link:
+    protocol = config.protocol
+    if isinstance(protocol, ClassicMasterConfig):
+        return ClassicLink(config.stations, protocol, settings, reports)
+    return SuperframeLink(
+        config.stations, protocol, settings, disk, reports, key=key, random_bits=random_bits
+    )
 
 
 class _Master:
@@ -145,42 +178,22 @@ class _Master:
         self,
         config: MasterConfig,
         parameters: Parameters,
-        settings: LoRaSettings,
         clock: Clock,
         timeline: UnixTimeline,
         hand_out: Callable[[object, bytes], None],
         group: asyncio.TaskGroup,
     ) -> None:
         self._clock = clock
-        self._timeline = timeline
-        now_ns = self._now_ns()
-        protocol = config.protocol
-        self._prisms = {station.station: station.prism for station in config.stations}
-        delays_ns = {station.station: round(station.stamp_delay_ms * 1e6) for station in config.stations}
-        self._timing = Timing.of(settings, round(protocol.reply_timeout_ms * 1e6))
-        self._scheduler = Scheduler(
-            [
-                StationPlan(
-                    station=station.station,
-                    prism=station.prism,
-                    stamp_delay_ns=delays_ns[station.station],
-                )
-                for station in config.stations
-            ],
-            _cadence(config),
-            self._timing,
-            now_ns,
-        )
-        self._intake = Intake(self._prisms, lambda: clock_filter(protocol.clock_filter), delays_ns)
-        self._monitor = Monitor(self._prisms, self._intake.clock)
-        self._alerts = Alerts(self._prisms, now_ns)
+        stations = [station.station for station in config.stations]
+        monitor = Monitor(stations)
+        alerts = Alerts(stations, timeline.unix_ns(clock.monotonic_ns()))
         watchers: list[Watcher] = [
             _FrameWatcher(config.frame_watch, parameters.pipeline.period_ns),
             *(_Fence(fence, group) for fence in config.geofences),
         ]
-        self._outlet = Outlet(parameters, self._monitor, watchers, self._logged(hand_out))
+        self._outlet = Outlet(parameters, monitor, watchers, self._logged(hand_out))
+        self.reports = Reports(clock, timeline, self._outlet, monitor, alerts)
         self._radio_failed = False
-        self._turn_ns: int | None = None  # since when there has been a turn; None without a radio
 
     # --- Time ---------------------------------------------------------------------------------------------------
 
@@ -188,22 +201,22 @@ class _Master:
         """Send poses when they are due and no measurement brings them."""
         while True:
             deadline_ns = self._outlet.next_deadline_ns()
-            wait_s = None if deadline_ns is None else max(0, deadline_ns - self._now_ns()) / 1e9
+            wait_s = None if deadline_ns is None else max(0, deadline_ns - self.reports.now_ns()) / 1e9
             try:
                 async with asyncio.timeout(wait_s):
                     await self._outlet.changed()
             except TimeoutError:
-                self._outlet.advance(self._now_ns())
+                self._outlet.advance(self.reports.now_ns())
 
-    async def report(self) -> NoReturn:
+    async def report(self, link: Link) -> NoReturn:
         """Send a status each second, and what time has brought."""
         next_ns = self._clock.monotonic_ns()
         while True:
             next_ns = max(next_ns + STATUS_PERIOD_NS, self._clock.monotonic_ns())
             await self._clock.sleep_until(next_ns)
-            now_ns = self._now_ns()
-            self._put(self._alerts.tick(now_ns, unix_ns=self._clock.realtime_ns()))
-            status = self._monitor.status(now_ns)
+            now_ns = self.reports.now_ns()
+            self.reports.events(self.reports.alerts.tick(now_ns, unix_ns=self._clock.realtime_ns()))
+            status = link.status(now_ns)
             self._outlet.put(status)
             heard = sum(s.last_heard_s is not None and s.last_heard_s < 5 for s in status.stations)
             service.sd_notify(
@@ -211,12 +224,13 @@ class _Master:
                 f"{status.valid_poses} of {status.poses} poses valid"
             )
 
-    async def watchdog(self) -> None:
+    async def watchdog(self, link: Link) -> None:
         """Tell systemd that this program lives, as often as it wants, unless its turns have come to a standstill."""
         interval_s = service.watchdog_interval_s()
         while interval_s is not None:
-            if self._turn_ns is not None and self._now_ns() - self._turn_ns > STUCK_NS:
-                log.error("turns_stuck", for_s=(self._now_ns() - self._turn_ns) / 1e9)
+            turn_ns, now_ns = link.turn_ns, self.reports.now_ns()
+            if turn_ns is not None and now_ns - turn_ns > STUCK_NS:
+                log.error("turns_stuck", for_s=(now_ns - turn_ns) / 1e9)
             else:
                 service.sd_notify("WATCHDOG=1")
             await self._clock.sleep_until(self._clock.monotonic_ns() + round(interval_s * 1e9))
@@ -232,86 +246,15 @@ class _Master:
                 async with open_radio() as radio:
                     if self._radio_failed:
                         self._radio_failed = False
-                        self._put([self._event("radio_back", "the radio of the master works again")])
+                        self.reports.event("radio_back", "the radio of the master works again")
                     yield radio
             except (RadioError, StreamError) as error:
                 if not self._radio_failed:
                     self._radio_failed = True
-                    self._put([self._event("radio_failed", f"no station can be asked: {error}")])
+                    self.reports.event("radio_failed", f"no station can be asked: {error}")
                 raise
 
         return opened
-
-    async def collect(self, radio: Radio) -> None:
-        """Take turns with the stations, for as long as the radio does."""
-        collector = Collector(radio, self._clock, self._timeline, self._timing)
-        try:
-            while True:
-                self._turn_ns = self._now_ns()
-                turn = self._scheduler.next(self._turn_ns)
-                if isinstance(turn, int):
-                    await self._clock.sleep_until(self._timeline.monotonic_ns(turn))
-                    continue
-                await collector.take(turn)
-                self._finished(turn, collector)
-        finally:
-            self._turn_ns = None
-
-    def _finished(self, turn: Task, collector: Collector) -> None:
-        now_ns, station = self._now_ns(), turn.station
-        self._scheduler.finished(turn, now_ns)
-        answered = turn.ok is not None if isinstance(turn, Ordered) else turn.answered
-        self._monitor.asked(station, answered=answered)
-        self._put(self._alerts.asked(station, now_ns, answered=answered))
-        if not answered or collector.last is None:
-            self._intake.unanswered(station)
-            return
-        self._monitor.heard(station, now_ns, rssi_dbm=collector.last.rssi_dbm, snr_db=collector.last.snr_db)
-        if isinstance(turn, Ordered):
-            prism = self._prisms[station]
-            self._monitor.tracks(station, prism if turn.ok else None)
-            self._put(self._alerts.ordered(station, prism, now_ns, tracks=bool(turn.ok)))
-        elif isinstance(turn, Synchronisation) and turn.samples:
-            found = self._intake.synchronised(station, turn.samples, now_ns)
-            if found.stepped:
-                self._put(self._alerts.stepped(station, now_ns))
-            self._outlet.put(found.record)
-            for measurement in found.measurements:
-                self._measured(measurement)
-        elif isinstance(turn, Poll):
-            self._polled(turn, collector.last, collector.requested_ns)
-
-    def _polled(self, poll: Poll, packet: Packet, requested_ns: int) -> None:
-        if poll.message is None:
-            return
-        self._put(self._alerts.polled(poll.station, self._now_ns()))
-        arrival = self._intake.answered(
-            poll.message,
-            requested_ns=requested_ns,
-            received_ns=self._timeline.unix_ns(packet.received_at_ns),
-        )
-        if arrival.measurement is not None:
-            self._measured(arrival.measurement)
-        if arrival.doubtful:
-            self._scheduler.resynchronise(poll.station, self._now_ns())
-        if arrival.stepped:
-            self._put(self._alerts.stepped(poll.station, self._now_ns()))
-
-    def _measured(self, measurement: PolarMeasurement) -> None:
-        self._outlet.measurement(measurement)
-        self._put(self._alerts.measurement(measurement, self._now_ns()))
-
-    # --- Small things -------------------------------------------------------------------------------------------
-
-    def _now_ns(self) -> int:
-        return self._timeline.unix_ns(self._clock.monotonic_ns())
-
-    def _put(self, events: Sequence[EventRecord]) -> None:
-        for event in events:
-            self._outlet.put(event)
-
-    def _event(self, event: str, message: str) -> EventRecord:
-        return EventRecord(stamp_ns=self._now_ns(), event=event, message=message)
 
     @staticmethod
     def _logged(hand_out: Callable[[object, bytes], None]) -> Callable[[object, bytes], None]:
@@ -367,16 +310,3 @@ class _Fence:
                 except RuntimeError:  # the master is ending, and starts nothing any more
                     command.close()
         return events
-
-
-def _cadence(config: MasterConfig) -> Cadence:
-    protocol = config.protocol
-    interval_ns = round(protocol.resync_interval_s * 1e9)
-    cadence = Cadence(
-        initial_cycles=protocol.initial_cycles,
-        resync_cycles=protocol.resync_cycles,
-        interval_ns=interval_ns,
-    )
-    if protocol.clock_filter == "paper":  # which knows no frequency that it could learn sooner
-        return replace(cadence, first_interval_ns=interval_ns)
-    return cadence

@@ -289,10 +289,18 @@ class _Station:
 
     def _measurement(self, message: MeasurementMessage, received_ns: int) -> PolarMeasurement:
         estimate = self._clock.at(message.time_ns)
-        return self._record(message, received_ns, message.time_ns - estimate.offset_ns, estimate.sigma_ns)
+        bound_ns = estimate.bound_ns + self._stamp_delay_ns
+        return self._record(
+            message, received_ns, message.time_ns - estimate.offset_ns, estimate.sigma_ns, bound_ns
+        )
 
     def _record(
-        self, message: MeasurementMessage, received_ns: int, stamp_ns: int, sigma_ns: int
+        self,
+        message: MeasurementMessage,
+        received_ns: int,
+        stamp_ns: int,
+        sigma_ns: int,
+        bound_ns: int | None = None,
     ) -> PolarMeasurement:
         self._sequence += 1
         return PolarMeasurement(
@@ -301,6 +309,7 @@ class _Station:
             sequence=self._sequence - 1,
             stamp_ns=stamp_ns,
             stamp_sigma_ns=sigma_ns,
+            stamp_bound_ns=bound_ns,
             received_ns=received_ns,
             horizontal_angle_rad=message.horizontal_angle_rad,
             zenith_angle_rad=message.zenith_angle_rad,

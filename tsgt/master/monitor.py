@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from tsgt.master.stream_records import StationStatus, StatusRecord
 from tsgt.master.tracks import usable
-from tsgt.model import Status
+from tsgt.model import PolarMeasurement, Status
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -29,17 +29,10 @@ class Monitor:
     ----------
     stations
         Numbers of the stations to report on, in the order of the report.
-    clock
-        Returns what a station's clock shows against the master's at an instant; None while nobody knows.
     """
 
-    def __init__(
-        self,
-        stations: Iterable[int],
-        clock: Callable[[int, int], ClockEstimate | None] = lambda _station, _now_ns: None,
-    ) -> None:
+    def __init__(self, stations: Iterable[int]) -> None:
         self._stations = {station: _Station() for station in stations}
-        self._clock = clock
         self._poses = 0
         self._valid_poses = 0
 
@@ -56,6 +49,11 @@ class Monitor:
         """Take note of the prism that a station says it tracks; None: it does not."""
         self._stations[station].prism = prism
 
+    def stands(self, station: int, *, joined: bool, missing: int, late: int, doubted: int) -> None:
+        """Take note of how a station stands in the protocol superframe; see :class:`StationStatus`."""
+        found = self._stations[station]
+        found.joined, found.missing, found.late, found.doubted = joined, missing, late, doubted
+
     def measurement(self, measurement: Measurement) -> None:
         """Count a measurement; one of a station that is not reported on is passed over."""
         station = self._stations.get(measurement.station)
@@ -64,7 +62,12 @@ class Monitor:
         station.measurements += 1
         station.first_ns = station.first_ns or measurement.received_ns
         station.usable += usable(measurement)
-        station.stamp_ns, station.status = measurement.stamp_ns, measurement.status
+        late = measurement.sequence < station.sequence and measurement.stamp_ns < (station.stamp_ns or 0)
+        if not late:
+            station.sequence = measurement.sequence
+            station.stamp_ns, station.status = measurement.stamp_ns, measurement.status
+            if isinstance(measurement, PolarMeasurement):
+                station.stamp_bound_ns = measurement.stamp_bound_ns
         station.arrivals_ns.append(measurement.received_ns)
 
     def pose(self, *, valid: bool) -> None:
@@ -72,20 +75,38 @@ class Monitor:
         self._poses += 1
         self._valid_poses += valid
 
-    def status(self, now_ns: int) -> StatusRecord:
+    def status(
+        self,
+        now_ns: int,
+        *,
+        clock: Callable[[int, int], ClockEstimate | None] = lambda _station, _now_ns: None,
+        protocol: Literal["classic", "superframe"] | None = None,
+        authenticated: bool | None = None,
+        frame_ms: float | None = None,
+    ) -> StatusRecord:
         """Report what was counted so far.
 
         Parameters
         ----------
         now_ns
             The present on the master's Unix clock.
+        clock
+            Returns what a station's clock shows against the master's at an instant; None while nobody knows.
+        protocol, authenticated, frame_ms
+            See :class:`~tsgt.master.stream_records.StatusRecord`.
         """
         stations = (
-            station.status_at(number, now_ns, self._clock(number, now_ns))
+            station.status_at(number, now_ns, clock(number, now_ns))
             for number, station in self._stations.items()
         )
         return StatusRecord(
-            stamp_ns=now_ns, poses=self._poses, valid_poses=self._valid_poses, stations=tuple(stations)
+            stamp_ns=now_ns,
+            poses=self._poses,
+            valid_poses=self._valid_poses,
+            stations=tuple(stations),
+            protocol=protocol,
+            authenticated=authenticated,
+            frame_ms=frame_ms,
         )
 
 
@@ -95,7 +116,9 @@ class _Station:
 
     measurements: int = 0
     usable: int = 0
+    sequence: int = -1
     stamp_ns: int | None = None
+    stamp_bound_ns: int | None = None
     status: Status | None = None
     prism: int | None = None
     heard_ns: int | None = None
@@ -104,6 +127,10 @@ class _Station:
     answers: deque[bool] = field(default_factory=lambda: deque(maxlen=LOSS_REQUESTS))
     arrivals_ns: deque[int] = field(default_factory=deque)
     first_ns: int = 0
+    joined: bool | None = None
+    missing: int | None = None
+    late: int | None = None
+    doubted: int | None = None
 
     def status_at(self, number: int, now_ns: int, clock: ClockEstimate | None) -> StationStatus:
         while self.arrivals_ns and self.arrivals_ns[0] <= now_ns - RATE_WINDOW_NS:
@@ -124,6 +151,11 @@ class _Station:
             snr_db=self.snr_db,
             clock_offset_ns=None if clock is None else clock.offset_ns,
             clock_bound_ns=None if clock is None else clock.bound_ns,
+            stamp_bound_ns=self.stamp_bound_ns,
+            joined=self.joined,
+            missing=self.missing,
+            late=self.late,
+            doubted=self.doubted,
         )
 
     def _rate_hz(self, now_ns: int) -> float | None:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from tsgt.master.monitor import Monitor
-    from tsgt.master.stream_records import ClockRecord, StatusRecord
+    from tsgt.master.stream_records import BeaconRecord, ClockRecord, StatusRecord
     from tsgt.model import Measurement, Parameters
 
 
@@ -70,7 +70,7 @@ class Outlet:
         """Send a measurement, and the poses that it completes."""
         self._send(self._feed.measurement(measurement), measurement.received_ns)
 
-    def put(self, record: StatusRecord | EventRecord | ClockRecord) -> None:
+    def put(self, record: StatusRecord | EventRecord | ClockRecord | BeaconRecord) -> None:
         """Send a record in its place, after the poses that are due by its stamp."""
         self._send([*self._feed.advance(record.stamp_ns), record], record.stamp_ns)
 

@@ -3,10 +3,10 @@
 Pure: no clock, no sockets. Poses are computed at epochs, the whole multiples of a period in Unix time. An epoch is
 *decided* as soon as each prism either has a measurement at or after it, or cannot get one any more that would help:
 everything that was made up to now less the transport limit has arrived, and the prism's last measurement is further
-back than the outage limit. Where several stations are on one prism, each of them has its say. A decided epoch gets its pose at once, so live poses wait for what they need and no
+back than the outage limit. A measurement behind a gap in its station's numbers does not count until the gap is closed,
+or the transport limit has passed. Where several stations are on one prism, each of them has its say. A decided epoch gets its pose at once, so live poses wait for what they need and no
 longer; and what is decided does not depend on when the pipeline is asked, so that a replay gives the same poses.
-A measurement that arrives later than the transport limit, or out of its station's order, may come too late for the
-stream; :mod:`tsgt.analysis` hands all measurements over in the order of time and loses none.
+A measurement that arrives later than the transport limit may come too late for the stream; :mod:`tsgt.analysis` hands all measurements over in the order of time and loses none.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from tsgt.geometry import (
     unseen_motion_covariance,
     unseen_s2,
 )
+from tsgt.master.arrivals import Arrivals
 from tsgt.master.pose_batch import PoseBatch, Reason
 from tsgt.master.tracks import Track, believable, build_tracks, measured_at_ns, usable
 
@@ -68,11 +69,12 @@ class Pipeline:
         self._tracks = {prism: Track.empty() for prism in self._prisms}
         self._unusable_ns: dict[int, list[int]] = {prism: [] for prism in self._prisms}
         self._pending: list[Measurement] = []
-        # Who can measure a prism, and up to when each station's measurements, which arrive in order, are here.
+        # Who can measure a prism, and up to when each station's measurements are here.
         self._trackers = {
             prism: {s.station for s in parameters.stations if s.prism == prism} for prism in self._prisms
         }
-        self._reported_ns: dict[int, int] = {}
+        self._arrivals = {s.station: Arrivals(self._limits.transport_limit_ns) for s in parameters.stations}
+        self._now_ns = 0
         self._not_before_ns = 0
         self._next_epoch_ns: int | None = None
         self._started = False
@@ -99,7 +101,7 @@ class Pipeline:
         if self._next_epoch_ns is None or (not self._started and first_epoch < self._next_epoch_ns):
             self._next_epoch_ns = first_epoch
         self._trackers[measurement.prism].add(station.station)
-        self._reported_ns[station.station] = max(time_ns, self._reported_ns.get(station.station, 0))
+        self._arrivals[station.station].add(measurement.sequence, time_ns)
         if usable(measurement):
             self._pending.append(measurement)
         else:
@@ -114,6 +116,7 @@ class Pipeline:
             The present on the master's Unix clock; measurements made more than the transport limit before it
             are taken to have been added.
         """
+        self._now_ns = now_ns
         self._take_pending()
         period = self._limits.period_ns
         start = self._next_epoch_ns
@@ -148,8 +151,8 @@ class Pipeline:
 
     def _decided_until_ns(self, prism: int, now_ns: int) -> int:
         arrived_ns = now_ns - self._limits.transport_limit_ns - 1
-        reported_ns = (self._reported_ns.get(station, 0) for station in self._trackers[prism])
-        known_ns = max(arrived_ns, min(reported_ns, default=0))
+        complete_ns = (self._arrivals[station].complete_ns(now_ns) for station in self._trackers[prism])
+        known_ns = max(arrived_ns, min(complete_ns, default=0))
         times = self._tracks[prism].times_ns
         before = int(np.searchsorted(times, known_ns, side="right"))
         if not before:
@@ -167,9 +170,13 @@ class Pipeline:
         if after == len(times):
             return lost_ns
         bracket_ns = int(times[after])
-        if all(self._reported_ns.get(station, 0) >= bracket_ns for station in self._trackers[prism]):
+        arrivals = [self._arrivals[station] for station in self._trackers[prism]]
+        incomplete = [each for each in arrivals if each.complete_ns(self._now_ns) < bracket_ns]
+        if not incomplete:
             return None
-        return min(bracket_ns, lost_ns)
+        # The gaps may be given up before the bracket itself is old enough.
+        gaps_ns = max(each.given_up_after_ns(bracket_ns) or bracket_ns for each in incomplete)
+        return min(bracket_ns, lost_ns, gaps_ns)
 
     def _forget_before(self, epoch_ns: int) -> None:
         for prism, track in self._tracks.items():

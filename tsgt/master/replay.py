@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from tsgt.errors import CorruptLineError, RecordingError
 from tsgt.master.feed import Feed
-from tsgt.master.stream_records import ClockRecord, EventRecord, StatusRecord
+from tsgt.master.stream_records import BeaconRecord, ClockRecord, EventRecord, StatusRecord
 from tsgt.model import Measurement, Parameters, PointMeasurement, PolarMeasurement
 from tsgt.recording import decode_line, encode_line, read_lines
 
@@ -20,10 +20,11 @@ if TYPE_CHECKING:
     from tsgt.recording import Line
 
 # What came from outside; headers and parameters are not on the stream.
-_ARRIVALS: dict[str, type[Measurement | StatusRecord | EventRecord | ClockRecord]] = {
+_ARRIVALS: dict[str, type[Measurement | StatusRecord | EventRecord | ClockRecord | BeaconRecord]] = {
     "measurement": PolarMeasurement,
     "point": PointMeasurement,
     "clock": ClockRecord,
+    "beacon": BeaconRecord,
     "status": StatusRecord,
     "event": EventRecord,
 }
@@ -90,10 +91,10 @@ def replayed(
 
 
 def _arrival(
-    feed: Feed, record: Measurement | StatusRecord | EventRecord | ClockRecord, line: Line
+    feed: Feed, record: Measurement | StatusRecord | EventRecord | ClockRecord | BeaconRecord, line: Line
 ) -> tuple[int, list[bytes], int]:
     """Hand over what arrived: the instant, the lines that it brought, and how many of them are poses."""
-    if isinstance(record, StatusRecord | EventRecord | ClockRecord):
+    if isinstance(record, StatusRecord | EventRecord | ClockRecord | BeaconRecord):
         now_ns = record.stamp_ns
         records: list[object] = [*feed.advance(now_ns), record]
     else:

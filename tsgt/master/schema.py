@@ -16,6 +16,7 @@ from pydantic import TypeAdapter
 
 from tsgt.master.stream_records import (
     PROTOCOL_VERSION,
+    BeaconRecord,
     ClockRecord,
     EventRecord,
     HelloRecord,
@@ -35,7 +36,7 @@ from tsgt.model import (
     StationParameters,
 )
 from tsgt.recording import FORMAT_VERSION, RecordingHeader
-from tsgt.recording.journal import JournalRecord, TargetRecord
+from tsgt.recording.journal import AcknowledgedRecord, JournalRecord, ReceptionRecord, TargetRecord
 
 Line = (
     HelloRecord
@@ -43,12 +44,15 @@ Line = (
     | PointMeasurement
     | PoseRecord
     | ClockRecord
+    | BeaconRecord
     | StatusRecord
     | EventRecord
     | RecordingHeader
     | Parameters
     | JournalRecord
     | TargetRecord
+    | ReceptionRecord
+    | AcknowledgedRecord
 )
 
 SCHEMA = Path("configs/schema/stream.schema.json")
@@ -63,6 +67,7 @@ PAGES: dict[Path, tuple[type, ...]] = {
         StationShare,
         ClockRecord,
         ClockSample,
+        BeaconRecord,
         StatusRecord,
         StationStatus,
         EventRecord,
@@ -76,6 +81,8 @@ PAGES: dict[Path, tuple[type, ...]] = {
         PipelineParameters,
         JournalRecord,
         TargetRecord,
+        ReceptionRecord,
+        AcknowledgedRecord,
     ),
 }
 

@@ -16,7 +16,7 @@ from tsgt.model import ROBOT_FRAME, WORLD_FRAME, ClockSample, Row4, Status, Vect
 
 PROTOCOL_VERSION = 1
 
-CAPABILITIES = ("measurement", "point", "pose", "clock", "status", "event")
+CAPABILITIES = ("measurement", "point", "pose", "clock", "beacon", "status", "event")
 
 Kind = Literal["interpolated", "predicted", "smoothed"]
 Reason = Literal["", "outage", "station_status", "degenerate_geometry", "residual", "tilt"]
@@ -181,6 +181,17 @@ class StationStatus:
         synchronisation.
     clock_bound_ns
         The offset is within this of the truth, in ns; null before the first synchronisation.
+    stamp_bound_ns
+        The time of its newest measurement is within this of the truth, in ns; null before the first one.
+    joined
+        Whether it has joined the present session of the master; null with the protocol classic.
+    missing
+        How many measurements are known to have been made and have not come yet; null with the protocol classic.
+    late
+        How many of its slots it had to leave empty because its computer was late; null with the protocol classic.
+    doubted
+        How many beacons it received at a time at which they cannot have been sent, as when somebody holds them back;
+        null with the protocol classic.
     """
 
     __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
@@ -200,6 +211,11 @@ class StationStatus:
     snr_db: float | None = None
     clock_offset_ns: int | None = None
     clock_bound_ns: int | None = None
+    stamp_bound_ns: int | None = None
+    joined: bool | None = None
+    missing: int | None = None
+    late: int | None = None
+    doubted: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -218,13 +234,25 @@ class StatusRecord:
         How many of them were valid.
     stations
         One entry per station.
+    protocol
+        Name of the protocol that is spoken with them: ``classic`` or ``superframe``; null when there is no radio, as in
+        a replay.
+    authenticated
+        Whether a key keeps others from taking part; ``classic`` has none. Null when there is no radio.
+    frame_ms
+        How long a frame lasts, from beacon to beacon, mean over the last ones, in ms; null with ``classic``.
     """
+
+    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
     type: Literal["status"] = "status"
     stamp_ns: int
     poses: int
     valid_poses: int
     stations: tuple[StationStatus, ...]
+    protocol: Literal["classic", "superframe"] | None = None
+    authenticated: bool | None = None
+    frame_ms: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse instants that no clock shows."""
@@ -279,6 +307,37 @@ class ClockRecord:
     def __post_init__(self) -> None:
         """Refuse instants that no clock shows."""
         check_instants(self.stamp_ns)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BeaconRecord:
+    """A beacon of the protocol superframe has gone out.
+
+    The stations journal when they received it; so measurements that only a journal has can be put on the master's clock.
+
+    Attributes
+    ----------
+    type
+        Always ``beacon``.
+    stamp_ns
+        When its transmission had ended (TxDone), on the master's Unix clock in ns.
+    stamp_sigma_ns
+        One sigma of that, in ns; large where the radio's interrupt was lost.
+    session
+        Random number of the master's session.
+    counter
+        Number of the beacon in the session, from 0.
+    """
+
+    type: Literal["beacon"] = "beacon"
+    stamp_ns: int
+    stamp_sigma_ns: int
+    session: int
+    counter: int
+
+    def __post_init__(self) -> None:
+        """Refuse instants that no clock shows."""
+        check_instants(self.stamp_ns, self.stamp_sigma_ns)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

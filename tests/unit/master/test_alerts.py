@@ -111,3 +111,23 @@ def test_an_error_that_is_repeated_is_not_idleness() -> None:
     alerts = Alerts([1], START)
     alerts.measurement(replace(measurement(0), status=Status.TILT), START)
     assert [e for second in range(60) for e in alerts.polled(1, START + second * SECOND)] == []
+
+
+def test_a_status_that_comes_late_is_no_news() -> None:
+    """It tells how the instrument did, not how it does."""
+    alerts = Alerts([1], START)
+    newest = replace(measurement(9), station=1, stamp_ns=START + 9 * SECOND)
+    assert alerts.measurement(newest, START + 10 * SECOND) == []
+    late = replace(newest, sequence=3, stamp_ns=START + 3 * SECOND, status=Status.TILT)
+    assert alerts.measurement(late, START + 10 * SECOND) == []
+    again = replace(late, sequence=0, stamp_ns=START + 11 * SECOND)
+    assert [event.event for event in alerts.measurement(again, START + 11 * SECOND)] == ["instrument_status"]
+
+
+def test_packets_that_were_held_back_are_told() -> None:
+    """By the station that was to be deceived, or by the time that a packet took."""
+    alerts = Alerts([1], START)
+    (doubted,) = alerts.beacon_doubted(1, START, 3)
+    assert (doubted.event, doubted.station, doubted.count) == ("beacon_doubted", 1, 3)
+    (link,) = alerts.link_doubted(1, START)
+    assert (link.event, link.station) == ("link_doubted", 1)

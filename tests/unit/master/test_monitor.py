@@ -88,8 +88,11 @@ def test_the_last_radio_message_is_shown() -> None:
 
 def test_the_clock_is_asked_for_at_the_time_of_the_status() -> None:
     """Offset and bound are those of now."""
-    monitor = Monitor([2], lambda station, now_ns: ClockEstimate(now_ns + station, 1, 7, 0.0))
-    station = monitor.status(5 * SECOND).stations[0]
+    monitor = Monitor([2])
+    status = monitor.status(
+        5 * SECOND, clock=lambda station, now_ns: ClockEstimate(now_ns + station, 1, 7, 0.0)
+    )
+    station = status.stations[0]
     assert (station.clock_offset_ns, station.clock_bound_ns) == (5 * SECOND + 2, 7)
 
 
@@ -101,3 +104,32 @@ def test_a_station_is_locked_while_it_has_a_target(status: Status, locked: bool)
     monitor = Monitor([2])
     monitor.measurement(replace(MEASUREMENT, status=status))
     assert monitor.status(SECOND).stations[0].locked is locked
+
+
+def test_a_measurement_that_comes_late_is_counted_but_is_not_the_newest() -> None:
+    """After an outage old ones come in between; a new count begins with younger times."""
+    monitor = Monitor([2])
+    monitor.measurement(replace(MEASUREMENT, sequence=9, stamp_bound_ns=5))
+    late = replace(MEASUREMENT, sequence=3, stamp_ns=2 * SECOND, status=Status.TILT, stamp_bound_ns=7)
+    monitor.measurement(late)
+    station = monitor.status(12 * SECOND).stations[0]
+    assert (station.measurements, station.status, station.age_s, station.stamp_bound_ns) == (
+        2,
+        Status.OK,
+        2.0,
+        5,
+    )
+    monitor.measurement(replace(late, sequence=0, stamp_ns=11 * SECOND))
+    assert monitor.status(12 * SECOND).stations[0].status is Status.TILT
+
+
+def test_how_a_station_stands_on_the_superframe() -> None:
+    """Nulls until something is known, as with the other protocol."""
+    monitor = Monitor([2])
+    station = monitor.status(SECOND).stations[0]
+    assert (station.joined, station.missing, station.late, station.doubted) == (None, None, None, None)
+    monitor.stands(2, joined=True, missing=3, late=4, doubted=5)
+    status = monitor.status(SECOND, protocol="superframe", authenticated=True, frame_ms=378.5)
+    assert (status.protocol, status.authenticated, status.frame_ms) == ("superframe", True, 378.5)
+    station = status.stations[0]
+    assert (station.joined, station.missing, station.late, station.doubted) == (True, 3, 4, 5)

@@ -87,6 +87,19 @@ def test_a_pose_waits_for_the_last_station_and_no_longer(scene: Scene) -> None:
     assert pipeline.advance(START + SECOND // 2).valid.tolist() == [True] * 3
 
 
+def test_a_pose_waits_for_a_measurement_that_is_sent_again(scene: Scene) -> None:
+    """A gap in a station's numbers is not bridged by a straight line while what is missing may still come."""
+    pipeline = Pipeline(scene.parameters)
+    for measurement in every(scene, [0.0, 0.4, 0.8], stations=(1, 2)):
+        pipeline.add(replace(measurement, sequence=round((measurement.stamp_ns - START) / (0.4 * SECOND))))
+    pipeline.add(scene.measure(3, 0.0))
+    pipeline.add(replace(scene.measure(3, 0.8), sequence=2))
+    assert len(pipeline.advance(START + SECOND)) == 1
+    assert pipeline.next_deadline_ns() == START + round(2.8 * SECOND) + 1
+    pipeline.add(replace(scene.measure(3, 0.4), sequence=1))
+    assert len(pipeline.advance(START + SECOND)) == 16
+
+
 @pytest.mark.parametrize(("gap_s", "valid"), [(1.0, True), (1.000000001, False)])
 def test_an_interval_longer_than_the_outage_limit_is_invalid(scene: Scene, gap_s: float, valid: bool) -> None:  # noqa: FBT001
     """One second is the limit, and belongs to what is still valid."""

@@ -20,12 +20,14 @@ import structlog
 
 from tsgt.config import ScenarioConfig
 from tsgt.config.master import FrameWatchConfig
+from tsgt.config.radio import ClassicMasterConfig
 from tsgt.geometry import exp_so3, transform_from
 from tsgt.master.feed import Feed
 from tsgt.master.frame_watch import FrameWatch
 from tsgt.master.stream_records import PoseRecord
 from tsgt.recording import load_recording
-from tsgt.simulation.scenario import Options, simulate
+from tsgt.simulation.options import Options
+from tsgt.simulation.scenario import simulate
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -33,7 +35,7 @@ if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
     from tsgt.master.stream_records import EventRecord
     from tsgt.model import Measurement, Parameters
-    from tsgt.simulation.mission import Node
+    from tsgt.simulation.options import Node
 
     Drive = tuple[Parameters, Sequence[Measurement]]
 
@@ -44,7 +46,8 @@ SEEDS = (1, 2, 3)
 def drive(seed: int, node: Node) -> Drive:
     """Run the reference scenario with the paper's protocol at its modem settings; what the master received."""
     with TemporaryDirectory() as name:
-        options = Options(duration_s=DURATION_S, seed=seed, node=node)
+        classic = ClassicMasterConfig(kind="classic")
+        options = Options(duration_s=DURATION_S, seed=seed, node=node, protocol=classic)
         run = simulate(ScenarioConfig(), options, folder=Path(name))
         (path,) = Path(name).glob("master*/*.jsonl")
         return run.parameters, load_recording(path).measurements

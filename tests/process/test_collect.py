@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from tsgt.analysis.target_file import read_some_targets
+from tsgt.radio.key_file import write_key
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -31,8 +32,13 @@ name = "{name}"
 frequency_mhz = 905.0
 spreading_factor = 7
 [protocol]
-kind = "classic"
+{protocol}
 """
+
+PROTOCOLS = {
+    "classic": 'kind = "classic"',
+    "superframe": 'kind = "superframe"\nkey_file = "mission.key"',
+}
 
 CLIENT = """
 kind = "client"
@@ -44,7 +50,7 @@ kind = "simulated"
 socket = "instrument.sock"
 [journal]
 directory = "journals"
-""" + RADIO.format(name="station1")
+"""
 
 MASTER = """
 kind = "master"
@@ -57,7 +63,7 @@ prism = 1
 prism_constant_mm = 10.0
 [stream]
 socket = "poses.sock"
-""" + RADIO.format(name="master")
+"""
 
 # The instrument stays aimed at one target, as nobody is there to turn it.
 SURROUNDINGS = """
@@ -98,11 +104,13 @@ def process(*arguments: str, **options: Any) -> Iterator[subprocess.Popen[bytes]
             started.kill()
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Iterator[Path]:
+@pytest.fixture(params=PROTOCOLS)
+def folder(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]:
     """Folder with both configurations; air, instrument and client run."""
-    (tmp_path / "client.toml").write_text(CLIENT)
-    (tmp_path / "master.toml").write_text(MASTER)
+    protocol = PROTOCOLS[request.param]
+    (tmp_path / "client.toml").write_text(CLIENT + RADIO.format(name="station1", protocol=protocol))
+    (tmp_path / "master.toml").write_text(MASTER + RADIO.format(name="master", protocol=protocol))
+    write_key(tmp_path / "mission.key")
     run_client = "from tsgt.cli.daemons import main_client; main_client()"
     with ExitStack() as stack:
         around = stack.enter_context(process("-c", SURROUNDINGS, str(tmp_path), stdout=subprocess.PIPE))

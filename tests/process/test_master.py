@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from tsgt.radio.key_file import write_key
 from tsgt.recording import read_lines
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ def config(tmp_path: Path) -> Path:
     text = re.sub(r"\[radio.wiring\].*?\n\n", "", text, flags=re.DOTALL)
     text = text.replace('kind = "sx127x"', 'kind = "simulated"\nair_socket = "air.sock"\nname = "master"')
     text = text.replace("/run/tsgt", ".").replace("/var/lib/tsgt", "recordings")
+    write_key(tmp_path / "radio.key")
     path = tmp_path / "master.toml"
     path.write_text(text)
     return path

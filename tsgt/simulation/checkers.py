@@ -5,8 +5,7 @@ Each check goes its own way to what it checks: journals are read from disk, pose
 
 from __future__ import annotations
 
-from bisect import bisect_right
-from collections import defaultdict
+import math
 from hashlib import blake2b
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -17,10 +16,11 @@ from tsgt.geometry import rotation_from_quaternion
 from tsgt.master.intake import UNTIMED_SIGMA_NS
 from tsgt.master.replay import replayed
 from tsgt.master.tracks import build_tracks, usable
-from tsgt.recording.journal import load_journal
+from tsgt.recording import load_recording
+from tsgt.simulation.witness import Measured
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -29,9 +29,12 @@ if TYPE_CHECKING:
     from tsgt.simulation.scenario import Run
     from tsgt.simulation.witness import Session, StationWitness, ValidPoses
 
-# Until the next statement a bound may grow, by no more than two crystals can disagree.
-_BOUND_GROWTH = 100e-6
 _ROUNDING_NS = 1_000
+# Half of a unit on the air, and what is lost in the sums on either side.
+_ANGLE_ROUNDING_RAD = math.tau / 2**25 * 1.001
+_DISTANCE_ROUNDING_M = 0.0501e-3
+# More than any station's latency, which is taken off the stamps.
+_LATENCY_NS = 5_000_000_000
 _RESIDUAL_TOLERANCE_M = 1e-6
 
 
@@ -53,68 +56,91 @@ class Violation(NamedTuple):
 def violations(run: Run) -> list[Violation]:
     """Check a run.
 
-    What a client has read is in its journal, and as it is there it was delivered; none is delivered twice; none has a time
-    stamp off by more than the bound stated; no valid pose rests on an unusable measurement; a replay of the recording
-    gives the stream again.
+    What a client has read is in its journal, and as it is there it was delivered; none is delivered twice; over the
+    protocol ``superframe`` all that was not delivered still waits; none has a time stamp off by more than its bound; no
+    valid pose rests on an unusable measurement; a replay of the recording gives the stream again.
     """
     found: list[Violation] = []
-    for witness in run.witnesses.values():
+    measured = {number: Measured(witness) for number, witness in run.witnesses.items()}
+    for number, witness in run.witnesses.items():
         if witness.journals:
-            found += altered(witness, run.sessions)
+            found += altered(witness, measured[number], run.sessions)
+        if run.superframe:
+            found += lost(witness, measured[number], run.sessions)
     for session in run.sessions:
         found += delivered_twice(session)
-        found += beyond_bound(session, run.witnesses, start_ns=run.start_ns)
+        found += beyond_bound(session, measured, start_ns=run.start_ns)
         found += wrong_poses(session, run.parameters)
         found += replayed_otherwise(session)
     return found
 
 
-def altered(witness: StationWitness, sessions: Sequence[Session]) -> Iterator[Violation]:
+def altered(witness: StationWitness, measured: Measured, sessions: Sequence[Session]) -> Iterator[Violation]:
     """Compare what was read and what was delivered of one station with its journals."""
-    read = set()
-    for folder in witness.journals:
-        for path in sorted(folder.glob("*.jsonl")):
-            read |= {_content(measurement) for measurement in load_journal(path).measurements}
-    for host_time_ns in sorted(witness.stamps_ns.keys() - {time_ns for _, time_ns, *_ in read}):
+    for host_time_ns in sorted(witness.stamps_ns.keys() - {m.host_time_ns for m in measured.journalled}):
         yield Violation(
             "journal",
             f"not in the journal of station {witness.station}, which has read it at {host_time_ns} ns",
         )
     for session in sessions:
         for measurement in session.measurements:
-            if measurement.station == witness.station and _content(measurement) not in read:
+            if measurement.station != witness.station:
+                continue
+            journalled = measured.in_journal(measurement)
+            if journalled is None or not _same_content(journalled, measurement):
                 yield Violation(
                     "journal", f"not in the journal of station {witness.station} as delivered: {measurement}"
                 )
+
+
+def lost(witness: StationWitness, measured: Measured, sessions: Sequence[Session]) -> Iterator[Violation]:
+    """Count what is in a station's journals and in no recording: so many must still wait in its queue.
+
+    A master acknowledges what it has recorded, and a station keeps what is not acknowledged; so a measurement that is
+    missing on both sides was acknowledged and lost.
+    """
+    recorded = {
+        (measurement.station, measurement.sequence)
+        for session in sessions
+        if (path := session.recording()) is not None
+        for measurement in load_recording(path).measurements
+    }
+    missing = [m.sequence for m in measured.journalled if (witness.station, m.sequence) not in recorded]
+    queued = (witness.statuses[-1].queued or 0) if witness.statuses else 0
+    if len(missing) > queued:
+        yield Violation(
+            "lost",
+            f"station {witness.station} has journalled {len(missing)} measurements that no recording has, but only "
+            f"{queued} wait in its queue; the first is number {missing[0]}",
+        )
 
 
 def delivered_twice(session: Session) -> Iterator[Violation]:
     """Look for measurements that the pipeline was handed more than once."""
     seen = set()
     for measurement in session.measurements:
-        key = (measurement.station, measurement.host_time_ns, measurement.status)
+        over_superframe = measurement.host_time_ns is None
+        identity = measurement.sequence if over_superframe else (measurement.host_time_ns, measurement.status)
+        key = (measurement.station, identity)
         if measurement.stamp_sigma_ns < UNTIMED_SIGMA_NS and key in seen:
             yield Violation("twice", f"delivered again: {measurement}")
         seen.add(key)
 
 
-def beyond_bound(
-    session: Session, witnesses: dict[int, StationWitness], *, start_ns: int
-) -> Iterator[Violation]:
-    """Compare time stamps with the truth and with the bound that the master stated before and after them."""
-    stated = _stated_bounds(session)
+def beyond_bound(session: Session, measured: Mapping[int, Measured], *, start_ns: int) -> Iterator[Violation]:
+    """Compare time stamps with the truth and with the bound that each of them states."""
     for measurement in session.measurements:
         if measurement.stamp_sigma_ns >= UNTIMED_SIGMA_NS and not usable(measurement):
             continue  # an error without a time of its own claims none
-        true_ns = witnesses[measurement.station].stamps_ns.get(measurement.host_time_ns)
+        true_ns = measured[measurement.station].true_ns(measurement)
         if true_ns is None:
             yield Violation("time", f"nobody has read this measurement: {measurement}")
             continue
         error_ns = measurement.stamp_ns - start_ns - true_ns
-        bound_ns = _bound_ns(stated[measurement.station], measurement)
+        bound_ns = measurement.stamp_bound_ns
         if bound_ns is None:
-            yield Violation("time", f"delivered before any bound was stated: {measurement}")
-        elif abs(error_ns) > bound_ns:
+            yield Violation("time", f"delivered without a bound of its time: {measurement}")
+        elif abs(error_ns) > bound_ns + _ROUNDING_NS:
             yield Violation(
                 "time",
                 f"station {measurement.station} at {(measurement.stamp_ns - start_ns) / 1e9:.3f} s: stamp off by "
@@ -127,10 +153,13 @@ def wrong_poses(session: Session, parameters: Parameters) -> Iterator[Violation]
     poses = session.valid_poses()
     tracks = build_tracks(parameters, [m for m in session.measurements if usable(m)])
     missed = np.flatnonzero(~_explained(poses, slice(None), tracks, parameters))
+    stamps_ns = np.array([m.stamp_ns for m in session.measurements], dtype=np.int64)
+    around_ns = parameters.pipeline.outage_limit_ns + _LATENCY_NS
     for index in missed.tolist():
         # Later measurements may have come between those that the pose was made from: look at the past alone.
-        before = session.measurements[: poses.after[index]]
-        tracks = build_tracks(parameters, [m for m in before if usable(m)])
+        before = stamps_ns[: poses.after[index]]
+        near = np.flatnonzero(np.abs(before - poses.stamp_ns[index]) <= around_ns).tolist()
+        tracks = build_tracks(parameters, [m for i in near if usable(m := session.measurements[i])])
         if not _explained(poses, [index], tracks, parameters)[0]:
             yield Violation(
                 "pose",
@@ -157,40 +186,20 @@ def replayed_otherwise(session: Session) -> Iterator[Violation]:
         yield Violation("replay", f"a replay of {path.name} is not what was streamed")
 
 
-def _content(measurement: PolarMeasurement) -> tuple[object, ...]:
-    """Return what must not change on the way."""
-    return (
-        measurement.station,
-        measurement.host_time_ns,
-        measurement.horizontal_angle_rad,
-        measurement.zenith_angle_rad,
-        measurement.slope_distance_m,
-        measurement.status,
-    )
-
-
-def _stated_bounds(session: Session) -> dict[int, list[tuple[int, int]]]:
-    """By station: when a bound was stated, and which, both in ns, in the order of time."""
-    stated: dict[int, list[tuple[int, int]]] = defaultdict(list)
-    for clock in session.clocks:
-        stated[clock.station].append((clock.stamp_ns, clock.bound_ns))
-    for status in session.statuses:
-        for station in status.stations:
-            if station.clock_bound_ns is not None:
-                stated[station.id].append((status.stamp_ns, station.clock_bound_ns))
-    for bounds in stated.values():
-        bounds.sort()
-    return stated
-
-
-def _bound_ns(stated: Sequence[tuple[int, int]], measurement: PolarMeasurement) -> float | None:
-    """Return the larger of the bounds that were stated around the arrival; None where there was none before it."""
-    after = bisect_right(stated, (measurement.received_ns, 2**63))
-    if after == 0:
-        return None
-    around = stated[after - 1 : after + 1]
-    apart_ns = max(abs(measurement.stamp_ns - stamp_ns) for stamp_ns, _ in around)
-    return max(bound_ns for _, bound_ns in around) + apart_ns * _BOUND_GROWTH + _ROUNDING_NS
+def _same_content(journalled: PolarMeasurement, delivered: PolarMeasurement) -> bool:
+    """Whether a measurement has come as it stands in the journal, but for what the protocol rounds."""
+    if journalled.status is not delivered.status:
+        return False
+    angles_rad = [(m.horizontal_angle_rad, m.zenith_angle_rad) for m in (journalled, delivered)]
+    distances_m = (journalled.slope_distance_m, delivered.slope_distance_m)
+    if delivered.host_time_ns is not None:
+        return angles_rad[0] == angles_rad[1] and distances_m[0] == distances_m[1]
+    turned_rad = [abs(math.remainder(a - b, math.tau)) for a, b in zip(*angles_rad, strict=True)]
+    if journalled.prism != delivered.prism or max(turned_rad) > _ANGLE_ROUNDING_RAD:
+        return False
+    if distances_m[0] is None or distances_m[1] is None:
+        return distances_m[0] is distances_m[1]
+    return abs(distances_m[0] - distances_m[1]) <= _DISTANCE_ROUNDING_M
 
 
 def _explained(

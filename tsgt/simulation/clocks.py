@@ -71,6 +71,8 @@ class DriftingClock:
         By how much it gains on the true time, in 1e-6; positive: it runs fast.
     drift_steps
         Later drifts (a crystal gets warm): each from a true time in ns on, in 1e-6. In any order.
+    booted_ns
+        True time at which the computer was switched on, in ns.
     """
 
     def __init__(
@@ -80,15 +82,20 @@ class DriftingClock:
         offset_ns: int = 0,
         drift_ppm: float = 0.0,
         drift_steps: Iterable[tuple[int, float]] = (),
+        booted_ns: int = 0,
     ) -> None:
         self._true = true
         self._offset_ns = offset_ns
-        self._stretches = [_Stretch(0, 0, drift_ppm)]
-        for from_ns, ppm in sorted(drift_steps):
-            self._stretches.append(_Stretch(from_ns, self.local_ns(from_ns), ppm))
+        steps = sorted(drift_steps)
+        self._stretches = [
+            _Stretch(booted_ns, 0, max((s for s in steps if s[0] <= booted_ns), default=(0, drift_ppm))[1])
+        ]
+        for from_ns, ppm in steps:
+            if from_ns > booted_ns:
+                self._stretches.append(_Stretch(from_ns, self.local_ns(from_ns), ppm))
 
     def monotonic_ns(self) -> int:
-        """Return CLOCK_MONOTONIC of this computer in nanoseconds; zero at true zero."""
+        """Return CLOCK_MONOTONIC of this computer in nanoseconds; zero when it was switched on."""
         return self.local_ns(self._true.monotonic_ns())
 
     def realtime_ns(self) -> int:
@@ -125,6 +132,32 @@ class DriftingClock:
         while self.local_ns(true_ns) < local_ns:
             true_ns += 1
         return true_ns
+
+
+RAMP_TURNS_NS = 600 * 10**9
+"""How long a drift that ramps grows before it falls again: a computer warms up in the sun and cools down in a cloud."""
+
+_RAMP_STEP_NS = 10**9
+
+
+def ramped(drift_ppm: float, ramp_ppm_per_min: float, until_ns: int) -> list[tuple[int, float]]:
+    """Return the steps of a drift that changes all the time, for :class:`DriftingClock`.
+
+    Parameters
+    ----------
+    drift_ppm
+        At the start, in 1e-6.
+    ramp_ppm_per_min
+        By how much it grows in a minute; after :data:`RAMP_TURNS_NS` it falls as fast, and so on.
+    until_ns
+        True time of the last step, in ns.
+    """
+    steps = []
+    for from_ns in range(0, until_ns, _RAMP_STEP_NS):
+        turns, since_turn_ns = divmod(from_ns + _RAMP_STEP_NS // 2, RAMP_TURNS_NS)
+        grown_ns = since_turn_ns if turns % 2 == 0 else RAMP_TURNS_NS - since_turn_ns
+        steps.append((from_ns, drift_ppm + ramp_ppm_per_min * grown_ns / 60e9))
+    return steps
 
 
 class _Stretch(NamedTuple):

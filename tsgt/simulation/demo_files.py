@@ -4,17 +4,32 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from tsgt.config import scenario_parameters
+from tsgt.radio.key_file import write_key
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from tsgt.config import ScenarioConfig
+    from tsgt.config.scenario import SimulatedStation
+
+Protocol = Literal["superframe", "classic"]
 
 INITIAL_CYCLES = 8
 """Fewer than the paper's 50, which take half a minute: nobody wants to wait so long for a demonstration."""
+
+_SUPERFRAME = """\
+[protocol]
+kind = "superframe"     # every measurement gets through; `tsgt demo --protocol classic` shows the paper's
+key_file = "radio.key"  # the same for all
+"""
+
+_CLASSIC = """\
+[protocol]
+kind = "classic"        # the paper's
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +61,11 @@ class DemoFiles:
         return self.folder / "master.toml"
 
     @property
+    def key(self) -> Path:
+        """Key of all radios, where the protocol has one."""
+        return self.folder / "radio.key"
+
+    @property
     def recordings(self) -> Path:
         """Folder of the master's recordings."""
         return self.folder / "recordings"
@@ -58,13 +78,19 @@ class DemoFiles:
         """Return the UNIX socket of a station's simulated instrument."""
         return self.folder / f"instrument{station}.sock"
 
+    def status_socket(self, station: int) -> Path:
+        """Return the UNIX socket on which a station's client says how it does."""
+        return self.folder / f"client{station}.sock"
+
     def journals(self, station: int) -> Path:
         """Return the folder of a station's journals."""
         return self.folder / f"journals{station}"
 
 
-def write_demo_files(folder: Path, scenario: ScenarioConfig, socket: Path) -> DemoFiles:
-    """Write all configuration and set-up files of a scenario into a folder.
+def write_demo_files(
+    folder: Path, scenario: ScenarioConfig, socket: Path, protocol: Protocol = "superframe"
+) -> DemoFiles:
+    """Write all configuration and set-up files of a scenario into a folder, and a key.
 
     Parameters
     ----------
@@ -74,6 +100,8 @@ def write_demo_files(folder: Path, scenario: ScenarioConfig, socket: Path) -> De
         Stations, prisms and limits.
     socket
         Where the poses are to go.
+    protocol
+        What master and stations speak.
     """
     files = DemoFiles(folder, socket, tuple(station.station for station in scenario.stations))
     parameters = scenario_parameters(scenario)
@@ -87,15 +115,15 @@ def write_demo_files(folder: Path, scenario: ScenarioConfig, socket: Path) -> De
         for prism in parameters.prisms
     ]
     (folder / "prism_layout.toml").write_text("\n".join(['kind = "prism_layout"\n', *prisms]))
-    files.master_config.write_text(_master(files, scenario))
+    if protocol == "superframe":
+        write_key(files.key)
+    files.master_config.write_text(_master(files, scenario, protocol))
     for station in scenario.stations:
-        files.client_config(station.station).write_text(
-            _client(files, scenario, station.station, station.prism)
-        )
+        files.client_config(station.station).write_text(_client(files, scenario, station, protocol))
     return files
 
 
-def _master(files: DemoFiles, scenario: ScenarioConfig) -> str:
+def _master(files: DemoFiles, scenario: ScenarioConfig, protocol: Protocol) -> str:
     stations = "\n".join(
         f"[[stations]]\nstation = {station.station}\nprism = {station.prism}\n"
         f"prism_constant_mm = {station.prism_constant_mm!r}\n"
@@ -105,6 +133,7 @@ def _master(files: DemoFiles, scenario: ScenarioConfig) -> str:
     pipeline = "\n".join(
         f"{key} = {json.dumps(value)}" for key, value in scenario.pipeline.model_dump().items()
     )
+    classic = f"{_CLASSIC}initial_cycles = {INITIAL_CYCLES}      # the paper's 50 take half a minute\n"
     return f"""\
 kind = "master"
 
@@ -113,10 +142,7 @@ station_frames = "station_frames.toml"
 prism_layout = "prism_layout.toml"
 
 {_radio(scenario, "master")}
-[protocol]
-kind = "classic"        # the paper's; the only one so far
-initial_cycles = {INITIAL_CYCLES}      # the paper's 50 take half a minute
-
+{_SUPERFRAME if protocol == "superframe" else classic}
 [pipeline]
 {pipeline}
 
@@ -129,23 +155,22 @@ directory = "{files.recordings.name}"
 {stations}"""
 
 
-def _client(files: DemoFiles, scenario: ScenarioConfig, station: int, prism: int) -> str:
+def _client(files: DemoFiles, scenario: ScenarioConfig, station: SimulatedStation, protocol: Protocol) -> str:
+    number = station.station
     return f"""\
 kind = "client"
-station = {station}
-prism = {prism}
-status_socket = "client{station}.sock"
+station = {number}
+prism = {station.prism}
+status_socket = "{files.status_socket(number).name}"
 
 [instrument]
 kind = "simulated"
-socket = "{files.instrument_socket(station).name}"
+socket = "{files.instrument_socket(number).name}"
 
-{_radio(scenario, f"station{station}")}
-[protocol]
-kind = "classic"
-
+{_radio(scenario, f"station{number}")}
+{_SUPERFRAME if protocol == "superframe" else _CLASSIC}
 [journal]
-directory = "{files.journals(station).name}"
+directory = "{files.journals(number).name}"
 """
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from tsgt.simulation.link import REQUIRED_SNR_DB
+from tsgt.radio.link_budget import REQUIRED_SNR_DB
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

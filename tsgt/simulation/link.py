@@ -1,7 +1,7 @@
 """From transmitted power to whether a packet is received: link budget and packet error rates.
 
-Sources: SX1276 data sheet Rev 4 for the SNR limits; packet error rates fitted to the theory of non-coherent
-detection of orthogonal symbols with the chip's codes (docs/explanation/simulated-radio.md).
+Packet error rates are fitted to the theory of non-coherent detection of orthogonal symbols with the chip's codes
+(docs/explanation/simulated-radio.md).
 """
 
 from __future__ import annotations
@@ -14,13 +14,10 @@ from hashlib import blake2b
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Protocol
 
+from tsgt.radio.link_budget import NOISE_FIGURE_DB, noise_dbm, path_loss_db
+
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-
-REQUIRED_SNR_DB = {6: -5.0, 7: -7.5, 8: -10.0, 9: -12.5, 10: -15.0, 11: -17.5, 12: -20.0}
-"""SNR that the data sheet asks for, by spreading factor."""
-
-_THERMAL_NOISE_DBM_PER_HZ = -174.0
 
 # SNR at which half of the packets of 64 bytes at rate 4/6 get through; SF6 continues the row.
 _MEDIAN_SNR_DB = {6: -5.9, 7: -8.7, 8: -11.49, 9: -14.31, 10: -17.16, 11: -19.86, 12: -22.73}
@@ -38,11 +35,6 @@ _HEADER_BYTES = 2.5
 _DETECTION_GAIN_DB = 2.5
 
 _NORMAL = NormalDist()
-
-
-def noise_dbm(bandwidth_hz: float, noise_figure_db: float) -> float:
-    """Noise power of a receiver in its bandwidth."""
-    return _THERMAL_NOISE_DBM_PER_HZ + 10 * math.log10(bandwidth_hz) + noise_figure_db
 
 
 def detection_probability(snr_db: float, spreading_factor: int) -> float:
@@ -155,13 +147,11 @@ class LogDistanceLoss:
         for name in (sender, receiver):
             if name not in self.positions_m:
                 raise ValueError(f"radio {name!r} has no position in the link model")
-        distance_m = max(1.0, math.dist(self.positions_m[sender], self.positions_m[receiver]))
-        # A chip whose carrier was never set sends at 0 Hz.
-        first_metre_db = 20 * math.log10(4 * math.pi * max(frequency_hz, 1.0) / 299_792_458)
+        distance_m = math.dist(self.positions_m[sender], self.positions_m[receiver])
         pair = "\0".join(sorted((sender, receiver)))
         shadowing_db = self.shadowing_sigma_db * normal(uniforms(self.seed, "shadowing", pair)[0])
-        over_distance_db = 10 * self.exponent * math.log10(distance_m)
-        return first_metre_db + over_distance_db + shadowing_db - 2 * self.antenna_gain_db
+        over_distance_db = path_loss_db(distance_m, frequency_hz, self.exponent)
+        return over_distance_db + shadowing_db - 2 * self.antenna_gain_db
 
 
 @dataclass(kw_only=True, slots=True)
@@ -183,7 +173,7 @@ class LinkModel:
     """
 
     path_loss: PathLoss = field(default_factory=FixedLoss)
-    noise_figure_db: float = 6.5
+    noise_figure_db: float = NOISE_FIGURE_DB
     fading_sigma_db: float = 0.0
     rayleigh_fading: bool = False
     loss_probability: float = 0.0

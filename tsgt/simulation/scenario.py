@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from tsgt.config.radio import ClassicMasterConfig
+from tsgt.config.radio import SuperframeMasterConfig
 from tsgt.simulation.event_loop import run_virtual
-from tsgt.simulation.mission import DRAIN_S, START_UNIX_NS, Mission, Node
+from tsgt.simulation.mission import DRAIN_S, START_UNIX_NS, Mission
 from tsgt.simulation.timeline import VirtualTimeline
 
 if TYPE_CHECKING:
@@ -18,33 +18,9 @@ if TYPE_CHECKING:
 
     from tsgt.config import ScenarioConfig
     from tsgt.model import Parameters
+    from tsgt.simulation.options import Options, Outage
     from tsgt.simulation.witness import Session, StationWitness
     from tsgt.simulation.world import World
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Options:
-    """What may be set of a run besides its scenario.
-
-    Attributes
-    ----------
-    duration_s
-        How long it measures.
-    drift_ppm
-        See :class:`~tsgt.simulation.mission.Mission`.
-    seed
-        Of everything that is drawn.
-    node
-        What the stations run.
-    protocol
-        What the master speaks.
-    """
-
-    duration_s: float
-    drift_ppm: float = 10.0
-    seed: int = 0
-    node: Node = "ours"
-    protocol: ClassicMasterConfig = field(default_factory=lambda: ClassicMasterConfig(kind="classic"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +40,11 @@ class Run:
     witnesses
         What was read from the instruments, by station number.
     airtime_s
-        How long there was a packet on the air.
+        How long there was a packet on the air, of whomever.
+    superframe
+        Whether that protocol was spoken.
+    outages
+        When who did not hear whom.
     start_ns
         Unix time of the start on the master's clock, in ns.
     """
@@ -75,6 +55,8 @@ class Run:
     sessions: list[Session]
     witnesses: dict[int, StationWitness]
     airtime_s: float
+    superframe: bool
+    outages: tuple[Outage, ...] = ()
     start_ns: int = START_UNIX_NS
 
     @property
@@ -112,31 +94,33 @@ def simulate(
     timeline = VirtualTimeline()
 
     async def run() -> Run:
-        mission = Mission(
-            scenario,
-            options.protocol,
-            node=options.node,
-            drift_ppm=options.drift_ppm,
-            duration_s=options.duration_s,
-            seed=options.seed,
-            folder=folder,
-            timeline=timeline,
-        )
+        mission = Mission(scenario, options, folder=folder, timeline=timeline)
         for station in scenario.stations:
             mission.start_station(station.station)
         mission.start_master()
-        acting = asyncio.create_task(script(mission)) if script is not None else None
+        if options.foreign_per_s:
+            mission.start_foreign()
+        acts = [
+            *([script(mission)] if script is not None else []),
+            *(mission.interrupt(outage) for outage in options.outages),
+            *(mission.restart(restart.station, restart.at_s) for restart in options.restarts),
+        ]
+        acting = [asyncio.create_task(act) for act in acts]
         try:
             for second in range(1, math.ceil(options.duration_s) + 1):
                 await mission.until(min(second, options.duration_s))
                 progress(mission.now_s)
             airtime_s = mission.air.airtime_ns / 1e9
             await mission.until(options.duration_s + DRAIN_S)
-            if acting is not None:
-                await acting
+            if script is not None:
+                await acting[0]
+            for act in acting:
+                if act.done():
+                    act.result()
         finally:
-            if acting is not None:
-                acting.cancel()
+            for act in acting:
+                act.cancel()
+            await asyncio.gather(*acting, return_exceptions=True)
             await mission.end()
         return Run(
             parameters=mission.parameters,
@@ -145,6 +129,8 @@ def simulate(
             sessions=mission.sessions,
             witnesses=mission.witnesses,
             airtime_s=airtime_s,
+            superframe=isinstance(options.protocol, SuperframeMasterConfig),
+            outages=options.outages,
         )
 
     return run_virtual(run, timeline)

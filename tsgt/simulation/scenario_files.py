@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tsgt.config import ScenarioConfig, load
+from tsgt.config.radio import LARGEST_NUMBERS
 from tsgt.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -14,8 +15,7 @@ if TYPE_CHECKING:
 
 _FILES = Path(__file__).parent / "scenarios"
 
-MOST_STATIONS = 9
-"""The protocol sends a station's number as one digit."""
+MOST_STATIONS = LARGEST_NUMBERS["superframe"]
 
 _GOLDEN_ANGLE_RAD = math.pi * (3 - math.sqrt(5))
 _EXTRA_STATION_RADIUS_M = 5.0

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.master.stream_records import ClockRecord, PoseRecord, StatusRecord
+from tsgt.master.stream_records import BeaconRecord, ClockRecord, PoseRecord, StatusRecord
 from tsgt.model import PolarMeasurement
 from tsgt.recording import encode_line
+from tsgt.recording.journal import load_journal
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.station.instrument import Instrument, Reading
+    from tsgt.station.status import ClientStatus
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,23 +58,34 @@ class Session:
     ----------
     folder
         Where the master keeps its recording, the only file there.
+    now_ns
+        Tells the Unix time in ns.
 
     Attributes
     ----------
     measurements, clocks, statuses
         The records of these types.
+    arrived_ns
+        When each of the measurements was handed out, Unix time in ns.
     poses
         How many poses, valid or not.
+    frames, framed_ns
+        How many frames there have been from the first beacon to the last, and how long they took.
     digest
         Hash of all lines.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, now_ns: Callable[[], int]) -> None:
         self._folder = folder
+        self._now_ns = now_ns
         self.measurements: list[PolarMeasurement] = []
+        self.arrived_ns: list[int] = []
         self.clocks: list[ClockRecord] = []
         self.statuses: list[StatusRecord] = []
         self.poses = 0
+        self.frames = 0
+        self.framed_ns = 0
+        self._first_beacon: BeaconRecord | None = None
         self.digest = blake2b()
         self._pose_stamps = array("q")
         self._pose_after = array("q")
@@ -83,6 +96,7 @@ class Session:
         self.digest.update(encode_line(record) + b"\n")
         if isinstance(record, PolarMeasurement):
             self.measurements.append(record)
+            self.arrived_ns.append(self._now_ns())
         elif isinstance(record, ClockRecord):
             self.clocks.append(record)
         elif isinstance(record, StatusRecord):
@@ -91,6 +105,9 @@ class Session:
             self.poses += 1
             if record.valid:
                 self._take_pose(record)
+        elif isinstance(record, BeaconRecord):
+            first = self._first_beacon = self._first_beacon or record
+            self.frames, self.framed_ns = record.counter - first.counter, record.stamp_ns - first.stamp_ns
 
     def _take_pose(self, pose: PoseRecord) -> None:
         self._pose_stamps.append(pose.stamp_ns)
@@ -123,15 +140,59 @@ class StationWitness:
     ----------
     station
         Its number.
+    folder
+        Of its journals; None: it keeps none.
     stamps_ns
         By the host time of each reading in ns: the true time of that instant, in ns from the start.
-    journals
-        The folders of the client's journals, one for each time that it was started.
+    statuses
+        What it said of itself each time before it ended.
     """
 
     station: int
+    folder: Path | None
     stamps_ns: dict[int, int] = field(default_factory=dict)
-    journals: list[Path] = field(default_factory=list)
+    statuses: list[ClientStatus] = field(default_factory=list)
+
+    @property
+    def journals(self) -> list[Path]:
+        """Its journals, one for each time that it was started."""
+        return [] if self.folder is None else sorted(self.folder.glob("*.jsonl"))
+
+
+class Measured:
+    """Finds for what the master has delivered when it was measured, and what the journals say of it.
+
+    Over the protocol ``classic`` a measurement keeps its station's time; over ``superframe`` it is found by its number.
+
+    Parameters
+    ----------
+    witness
+        Of the station.
+
+    Attributes
+    ----------
+    journalled
+        What stands in the station's journals, in their order.
+    """
+
+    def __init__(self, witness: StationWitness) -> None:
+        self._true_ns = witness.stamps_ns
+        self.journalled = [m for path in witness.journals for m in load_journal(path).measurements]
+        self._by_sequence = {m.sequence: m for m in self.journalled}
+        self._by_host_time = {m.host_time_ns: m for m in self.journalled}
+
+    def in_journal(self, measurement: PolarMeasurement) -> PolarMeasurement | None:
+        """Return the measurement as the journal has it; None where it has not."""
+        if measurement.host_time_ns is None:
+            return self._by_sequence.get(measurement.sequence)
+        return self._by_host_time.get(measurement.host_time_ns)
+
+    def true_ns(self, measurement: PolarMeasurement) -> int | None:
+        """Return the true time of the client's stamp in ns from the start; None: nobody has read it."""
+        host_time_ns = measurement.host_time_ns
+        if host_time_ns is None and (journalled := self.in_journal(measurement)) is not None:
+            host_time_ns = journalled.host_time_ns
+        return None if host_time_ns is None else self._true_ns.get(host_time_ns)
 
 
 class WatchedInstrument:

@@ -4,23 +4,28 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import math
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from support.missions import mission
+from support.missions import QUICK, SUPERFRAME, mission
 
 from tsgt.master.stream_records import EventRecord
 from tsgt.model import Status
 from tsgt.simulation.checkers import violations
+from tsgt.simulation.witness import Measured
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from tsgt.simulation.scenario import Run
 
 
-@pytest.fixture(scope="module")
-def good(tmp_path_factory: pytest.TempPathFactory) -> Run:
+@pytest.fixture(scope="module", params=["classic", "superframe"])
+def good(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Half a minute in which nothing goes wrong."""
-    return mission(tmp_path_factory.mktemp("run"))
+    protocol = QUICK if request.param == "classic" else SUPERFRAME
+    return mission(tmp_path_factory.mktemp("run"), protocol=protocol)
 
 
 @pytest.fixture
@@ -63,10 +68,27 @@ def test_an_altered_measurement(run: Run, change: dict[str, Any]) -> None:
     assert "journal" in _checks(run)
 
 
-def test_a_measurement_that_nobody_made(run: Run) -> None:
-    """A measurement with a host time that no client ever saw is noticed twice over."""
+@pytest.mark.parametrize("units", [0.49, 0.51])
+@pytest.mark.parametrize("key", ["horizontal_angle_rad", "zenith_angle_rad", "slope_distance_m"])
+def test_what_the_radio_rounds(run: Run, key: str, units: float) -> None:
+    """Half a unit of an angle or of a distance is what ``superframe`` may round; ``classic`` rounds nothing."""
     measurements = run.sessions[0].measurements
-    measurements[40] = dataclasses.replace(measurements[40], host_time_ns=measurements[40].host_time_ns + 1)
+    journalled = Measured(run.witnesses[measurements[40].station]).in_journal(measurements[40])
+    assert journalled is not None
+    unit = 1e-4 if key == "slope_distance_m" else math.tau / 2**24
+    rounded = getattr(journalled, key) + units * unit
+    measurements[40] = dataclasses.replace(measurements[40], **{key: rounded})
+    assert ("journal" in _checks(run)) == (units > 0.5 or not run.superframe)
+
+
+def test_a_measurement_that_nobody_made(run: Run) -> None:
+    """A measurement with a host time, or a number, that no client ever saw is noticed twice over."""
+    measurements = run.sessions[0].measurements
+    host_time_ns = measurements[40].host_time_ns
+    if host_time_ns is None:
+        measurements[40] = dataclasses.replace(measurements[40], sequence=99_999)
+    else:
+        measurements[40] = dataclasses.replace(measurements[40], host_time_ns=host_time_ns + 1)
     assert {"journal", "time"} <= _checks(run)
 
 
@@ -77,10 +99,30 @@ def test_a_measurement_that_is_read_and_not_journalled(run: Run) -> None:
     assert _checks(run) == {"journal"}
 
 
+def test_what_is_acknowledged_and_lost(run: Run, tmp_path: Path) -> None:
+    """Over ``superframe`` a measurement that is in no recording has to wait in a queue still."""
+    session = run.sessions[0]
+    recording = session.recording()
+    assert recording is not None
+    lines = recording.read_bytes().splitlines(keepends=True)
+    index = next(i for i, line in enumerate(lines) if line.startswith(b'{"type":"measurement","station":2'))
+    (tmp_path / recording.name).write_bytes(b"".join(lines[:index] + lines[index + 1 :]))
+    session._folder = tmp_path
+    witness = run.witnesses[2]
+    delivered = sum(measurement.station == 2 for measurement in session.measurements)
+    missing = len(Measured(witness).journalled) - delivered + 1
+    for queued in (missing - 1, missing):
+        statuses = [dataclasses.replace(status, queued=queued) for status in witness.statuses]
+        emptied = dataclasses.replace(witness, statuses=statuses)
+        found = _checks(dataclasses.replace(run, witnesses=run.witnesses | {2: emptied}))
+        assert ("lost" in found) == (run.superframe and queued < missing)
+
+
 def test_a_repeat(run: Run) -> None:
-    """The same measurement handed over again is noticed, even under another number."""
+    """The same measurement handed over again is noticed, over ``classic`` even under another number."""
     measurements = run.sessions[0].measurements
-    measurements.append(dataclasses.replace(measurements[40], sequence=999))
+    number = measurements[40].sequence if run.superframe else 999
+    measurements.append(dataclasses.replace(measurements[40], sequence=number))
     assert _checks(run) == {"twice"}
 
 

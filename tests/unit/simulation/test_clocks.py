@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import time
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tsgt.simulation.clocks import DriftingClock, VirtualClock
+from tsgt.simulation.clocks import DriftingClock, VirtualClock, ramped
 
 START_NS = 1_700_000_000_123_456_789
 HOUR_NS = 3_600_000_000_000
@@ -76,6 +77,14 @@ def test_a_drift_that_changes() -> None:
     clock = DriftingClock(VirtualClock(START_NS), drift_ppm=0.0, drift_steps=warming)
     gained_ms = [(clock.local_ns(n * HOUR_NS) - n * HOUR_NS) / 1e6 for n in range(4)]
     assert gained_ms == [0.0, 0.0, 72.0, 36.0]
+
+
+def test_a_drift_that_ramps() -> None:
+    """From 5 ppm on by 6 ppm a minute, for ten minutes up and for ten down: the gain is the area below the ramp."""
+    minute_ns = 60_000_000_000
+    clock = DriftingClock(VirtualClock(START_NS), drift_steps=ramped(5.0, 6.0, 20 * minute_ns))
+    gained_us = [(clock.local_ns(n * minute_ns) - n * minute_ns) / 1e3 for n in (1, 10, 20)]
+    assert gained_us == pytest.approx([60 * 8, 600 * 35, 1200 * 35], abs=0.01)
 
 
 @given(instants_ns, drifts_ppm, st.lists(st.tuples(instants_ns, drifts_ppm), max_size=3))

@@ -6,11 +6,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from tsgt.cli.composition import radio_key
 from tsgt.config import ClientConfig, MasterConfig, ScenarioConfig, load, parameters, scenario_parameters
 from tsgt.simulation.demo_files import write_demo_files
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from tsgt.simulation.demo_files import Protocol
 
 
 def test_the_master_knows_exactly_the_set_up_of_the_scenario(tmp_path: Path) -> None:
@@ -19,10 +22,13 @@ def test_the_master_knows_exactly_the_set_up_of_the_scenario(tmp_path: Path) -> 
     assert parameters(load(files.master_config, MasterConfig)) == scenario_parameters(ScenarioConfig())
 
 
+@pytest.mark.parametrize("protocol", ["superframe", "classic"])
 @pytest.mark.parametrize("station", [1, 2, 3])
-def test_each_client_finds_its_instrument_and_the_master_s_air(tmp_path: Path, station: int) -> None:
-    """A client's file names its own instrument and journal, and the modem settings of the master."""
-    files = write_demo_files(tmp_path, ScenarioConfig(), tmp_path / "poses.sock")
+def test_each_client_finds_its_instrument_and_the_master_s_air(
+    tmp_path: Path, station: int, protocol: Protocol
+) -> None:
+    """A client's file names its own instrument and journal, and the modem settings and protocol of the master."""
+    files = write_demo_files(tmp_path, ScenarioConfig(), tmp_path / "poses.sock", protocol)
     client = load(files.client_config(station), ClientConfig)
     master = load(files.master_config, MasterConfig)
     assert client.station == station
@@ -30,4 +36,6 @@ def test_each_client_finds_its_instrument_and_the_master_s_air(tmp_path: Path, s
     assert client.journal.directory == files.journals(station)
     names = {"name"}
     assert client.radio.model_dump(exclude=names) == master.radio.model_dump(exclude=names)
-    assert client.protocol.kind == master.protocol.kind
+    assert client.protocol.kind == master.protocol.kind == protocol
+    assert radio_key(client.protocol) == radio_key(master.protocol)
+    assert (radio_key(master.protocol) is not None) == (protocol == "superframe")

@@ -5,14 +5,13 @@ import math
 import numpy as np
 import pytest
 
+from tsgt.radio.link_budget import REQUIRED_SNR_DB, noise_dbm
 from tsgt.simulation.link import (
-    REQUIRED_SNR_DB,
     FixedLoss,
     LinkModel,
     LogDistanceLoss,
     detection_probability,
     header_probability,
-    noise_dbm,
     payload_probability,
     uniforms,
 )

@@ -7,18 +7,27 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from support.missions import QUICK, mission
+from support.missions import QUICK, SUPERFRAME, mission
 
-from tsgt.cli.simulate_figures import estimator_figures, figures, station_figures
+from tsgt.cli.simulate_figures import (
+    estimator_figures,
+    figures,
+    frame_ms,
+    outage_figures,
+    station_figures,
+)
 from tsgt.config.radio import ClassicMasterConfig
 from tsgt.simulation.authors_node import AuthorsTiming
 from tsgt.simulation.checkers import violations
+from tsgt.simulation.options import Outage, Restart
 from tsgt.simulation.scenario_files import find_scenario, with_stations
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tsgt.simulation.mission import Mission, Node
+    from tsgt.config import ScenarioConfig
+    from tsgt.simulation.mission import Mission
+    from tsgt.simulation.options import Node
 
 
 def test_a_mission_of_a_minute(tmp_path: Path) -> None:
@@ -172,6 +181,60 @@ def test_a_master_that_crashes_and_comes_back(tmp_path: Path) -> None:
     assert len(second.valid_poses().stamp_ns) > 150
 
 
+def test_an_outage(tmp_path: Path) -> None:
+    """While the robot is behind a hill for one station nothing arrives from it, and from the others more."""
+    run = mission(tmp_path, duration_s=40.0, outages=(Outage((2,), 15.0, 10.0),))
+    assert violations(run) == []
+    received_s = {
+        station: np.array(
+            [
+                (m.received_ns - run.start_ns) / 1e9
+                for m in run.sessions[0].measurements
+                if m.station == station
+            ]
+        )
+        for station in (1, 2, 3)
+    }
+    assert not np.any((received_s[2] > 15.5) & (received_s[2] < 25.0))
+    assert np.sum(received_s[2] > 27.0) > 15
+    assert np.sum((received_s[1] > 15.0) & (received_s[1] < 25.0)) > 5
+    (outage,) = outage_figures(run)
+    assert np.isnan(outage.drained_s)  # what was measured meanwhile is lost over this protocol
+    assert 0 < outage.live_age_ms < 1000
+
+
+def test_restarts_that_are_asked_for(tmp_path: Path) -> None:
+    """A client and the master end when they are told to, and are back two seconds later."""
+    run = mission(tmp_path, duration_s=40.0, restarts=(Restart(1, 15.0), Restart(None, 20.0)))
+    assert violations(run) == []
+    assert [len(witness.journals) for witness in run.witnesses.values()] == [2, 1, 1]
+    assert [len(witness.statuses) for witness in run.witnesses.values()] == [2, 1, 1]
+    assert len(run.sessions) == 2
+    made_s = np.array(sorted(run.witnesses[1].stamps_ns.values())) / 1e9
+    assert not np.any((made_s > 15.0) & (made_s < 17.0))
+    assert np.sum(made_s > 17.0) > 50
+
+
+def test_somebody_else_on_the_channel(tmp_path: Path) -> None:
+    """Foreign packets cost some measurements and bend none, and change nothing of what is measured."""
+    alone, disturbed = (
+        mission(tmp_path / name, duration_s=40.0, foreign_per_s=per_s)
+        for name, per_s in (("alone", 0.0), ("disturbed", 0.5))
+    )
+    assert violations(disturbed) == []
+    for one, other in zip(station_figures(alone).values(), station_figures(disturbed).values(), strict=True):
+        assert one.measured == other.measured
+        assert 0.5 * one.delivered < other.delivered < one.delivered
+
+
+def test_stamps_that_scatter_and_drifts_that_change(tmp_path: Path) -> None:
+    """Time errors grow by the stamps' scatter and stay within the bounds stated."""
+    run = mission(tmp_path, duration_s=60.0, stamp_jitter_us=20.0, drift_ramp_ppm_per_min=1.0)
+    assert violations(run) == []
+    for figure in station_figures(run).values():
+        assert 5 < figure.time_error_us[0] < 300
+
+
 def test_a_clock_that_is_set_while_the_client_runs(tmp_path: Path) -> None:
     """A step of a station's Unix clock bends nothing: its client has fixed its time at its start."""
 
@@ -191,3 +254,113 @@ def test_the_paper_filter_lags_behind(tmp_path: Path) -> None:
     assert violations(run) == []
     for figure in station_figures(run).values():
         assert figure.time_error_us[2] > 2000
+
+
+# --- The protocol superframe ----------------------------------------------------------------------------------------
+
+
+def _lossy(loss: float) -> ScenarioConfig:
+    scenario = find_scenario("dynamic")
+    return scenario.model_copy(update={"radio": scenario.radio.model_copy(update={"loss_probability": loss})})
+
+
+def test_the_superframe_delivers_everything(tmp_path: Path) -> None:
+    """Three stations deliver all that they measure, at once and once, and the poses are better for it."""
+    run = mission(tmp_path, duration_s=60.0, protocol=SUPERFRAME)
+    assert violations(run) == []
+    for figure in station_figures(run).values():
+        assert figure.delivered == figure.measured == pytest.approx(150, abs=1)
+        assert figure.rate_hz == pytest.approx(2.5, abs=0.06)
+        assert figure.duplicates == 0
+        assert figure.age_ms[0] < 300
+        assert figure.within_2s > 0.99
+        assert figure.time_error_us[2] < 100
+    poses = estimator_figures(run)
+    assert poses.valid_poses > 1100
+    assert poses.position_rms_mm < 20
+    assert 350 < frame_ms(run) < 450
+
+
+def test_one_seed_is_one_run_of_the_superframe(tmp_path: Path) -> None:
+    """Nonces, keys and all."""
+    one, same, other = (
+        mission(tmp_path / name, _lossy(0.1), duration_s=10.0, seed=seed, protocol=SUPERFRAME)
+        for name, seed in (("one", 3), ("same", 3), ("other", 4))
+    )
+    assert json.dumps(figures(one)) == json.dumps(figures(same))
+    assert one.sessions[0].digest.digest() == same.sessions[0].digest.digest()
+    assert one.sessions[0].digest.digest() != other.sessions[0].digest.digest()
+
+
+@pytest.mark.parametrize("authenticated", [True, False])
+def test_an_outage_over_the_superframe(tmp_path: Path, *, authenticated: bool) -> None:
+    """Behind a hill, with a tenth of all packets lost: everything arrives afterwards, what is live first."""
+    run = mission(
+        tmp_path,
+        _lossy(0.1),
+        duration_s=70.0,
+        protocol=SUPERFRAME,
+        outages=(Outage((1, 2, 3), 20.0, 20.0),),
+        authenticated=authenticated,
+    )
+    assert violations(run) == []
+    for figure in station_figures(run).values():
+        assert figure.delivered == figure.measured
+    (outage,) = outage_figures(run)
+    assert 1 < outage.drained_s < 20
+    assert outage.live_age_ms < 1000
+    assert outage.time_error_us[2] < 200
+
+
+def test_restarts_over_the_superframe(tmp_path: Path) -> None:
+    """Nothing that was measured is lost when clients or the master end and start again, and no bound is broken."""
+    run = mission(
+        tmp_path,
+        _lossy(0.1),
+        duration_s=70.0,
+        protocol=SUPERFRAME,
+        drift_ppm=50.0,
+        stamp_jitter_us=20.0,
+        restarts=(Restart(1, 15.0), Restart(2, 15.2), Restart(None, 30.0), Restart(1, 30.5)),
+        outages=(Outage((3,), 25.0, 10.0),),
+    )
+    assert violations(run) == []
+    assert [len(witness.journals) for witness in run.witnesses.values()] == [3, 2, 1]
+    for figure in station_figures(run).values():
+        assert figure.delivered == figure.measured
+
+
+def test_a_computer_that_was_off(tmp_path: Path) -> None:
+    """Its clock begins anew; what it has in its journal from before arrives with a bound that holds."""
+
+    async def reboot(mission: Mission) -> None:
+        await mission.reboot(1, at_s=30.0, off_s=10.0)
+
+    run = mission(
+        tmp_path,
+        duration_s=70.0,
+        protocol=SUPERFRAME,
+        drift_ppm=50.0,
+        script=reboot,
+        outages=(Outage((1,), 22.0, 10.0),),
+    )
+    assert violations(run) == []
+    station = station_figures(run)[1]
+    assert station.delivered == station.measured == pytest.approx(2.5 * 60, abs=2)
+
+
+def test_forged_packets_over_the_superframe(tmp_path: Path) -> None:
+    """Somebody sends noise and what he has heard, changed and unchanged: it costs some packets and bends nothing."""
+    run = mission(tmp_path, duration_s=60.0, protocol=SUPERFRAME, foreign_per_s=1.0)
+    assert violations(run) == []
+    for figure in station_figures(run).values():
+        assert figure.delivered >= figure.measured - 1
+        assert figure.duplicates == 0
+
+
+def test_many_stations(tmp_path: Path) -> None:
+    """Twelve stations share the channel, and each delivers what it measures."""
+    run = mission(tmp_path, with_stations(find_scenario("dynamic"), 12), duration_s=30.0, protocol=SUPERFRAME)
+    assert violations(run) == []
+    for figure in station_figures(run).values():
+        assert figure.delivered >= figure.measured - 2  # frames last 2.5 s, and the drain 5 s

@@ -85,10 +85,10 @@ def test_only_the_forest_hides_the_robot() -> None:
 
 
 def test_more_stations_than_prisms_track_them_in_turn() -> None:
-    """Nine stations on three prisms: three on each, all at places of their own not far from the others."""
-    stations = with_stations(ScenarioConfig(), 9).stations
-    assert [station.station for station in stations] == list(range(1, 10))
-    assert [station.prism for station in stations] == [1, 2, 3] * 3
+    """Sixteen stations on three prisms, five or six on each, all at places of their own not far from the others."""
+    stations = with_stations(ScenarioConfig(), 16).stations
+    assert [station.station for station in stations] == list(range(1, 17))
+    assert [station.prism for station in stations] == [1, 2, 3] * 5 + [1]
     apart_m = [
         math.dist(a.position_m, b.position_m) for i, a in enumerate(stations) for b in stations[i + 1 :]
     ]

@@ -1,0 +1,90 @@
+"""What the configuration files of a mission's daemons would say; radios and instruments are handed to them anyway."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from tsgt.config import ClientConfig, MasterConfig
+from tsgt.config.client import JournalConfig, SimulatedInstrumentConfig
+from tsgt.config.master import RecordingConfig, SetupConfig, StationConfig, StreamConfig
+from tsgt.config.radio import (
+    ClassicConfig,
+    ClassicMasterConfig,
+    SimulatedRadioConfig,
+    SuperframeConfig,
+)
+from tsgt.simulation.authors_node import AUTHORS_STAMP_DELAY_MS
+from tsgt.simulation.options import MASTER
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tsgt.config import ScenarioConfig
+    from tsgt.config.scenario import SimulatedStation
+    from tsgt.simulation.options import Options
+
+STATUS_SOCKET = "client.sock"
+
+_RARELY_S = 1e6  # of fsync, which a simulation has no use for
+
+
+def station_name(station: int) -> str:
+    """Return the name of a station's radio and daemon."""
+    return f"station{station}"
+
+
+def radio_config(scenario: ScenarioConfig, name: str, folder: Path) -> SimulatedRadioConfig:
+    """Say of the radio what a file would; the radio itself is handed to the daemon."""
+    radio = scenario.radio
+    return SimulatedRadioConfig(
+        kind="simulated",
+        air_socket=folder / "air.sock",
+        name=name,
+        frequency_mhz=radio.frequency_mhz,
+        spreading_factor=radio.spreading_factor,
+        bandwidth_khz=radio.bandwidth_khz,
+        coding_rate=radio.coding_rate,
+        power_dbm=radio.power_dbm,
+    )
+
+
+def master_config(scenario: ScenarioConfig, options: Options, folder: Path) -> MasterConfig:
+    """Return the master's, with its recording and its socket in a folder."""
+    return MasterConfig(
+        kind="master",
+        # Not read: the parameters are handed to the daemon.
+        setup=SetupConfig(station_frames=folder / "frames.toml", prism_layout=folder / "layout.toml"),
+        stations=tuple(
+            StationConfig(
+                station=s.station,
+                prism=s.prism,
+                prism_constant_mm=s.prism_constant_mm,
+                stamp_delay_ms=AUTHORS_STAMP_DELAY_MS if options.node == "authors" else 0.0,
+                noise=s.noise,
+            )
+            for s in scenario.stations
+        ),
+        radio=radio_config(scenario, MASTER, folder),
+        protocol=options.protocol,
+        pipeline=scenario.pipeline,
+        stream=StreamConfig(socket=folder / "poses.sock"),
+        recording=RecordingConfig(directory=folder, fsync_interval_s=_RARELY_S),
+    )
+
+
+def client_config(
+    scenario: ScenarioConfig, entry: SimulatedStation, options: Options, folder: Path
+) -> ClientConfig:
+    """Return that of a station's client, with its journal and its socket in a folder."""
+    classic = isinstance(options.protocol, ClassicMasterConfig)
+    return ClientConfig(
+        kind="client",
+        station=entry.station,
+        prism=entry.prism,
+        # Not reached: the instrument is handed to the daemon.
+        instrument=SimulatedInstrumentConfig(kind="simulated", socket=folder / "instrument.sock"),
+        radio=radio_config(scenario, station_name(entry.station), folder),
+        protocol=ClassicConfig(kind="classic") if classic else SuperframeConfig(kind="superframe"),
+        journal=JournalConfig(directory=folder, fsync_interval_s=_RARELY_S),
+        status_socket=folder / STATUS_SOCKET,
+    )

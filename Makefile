@@ -30,6 +30,7 @@ bench: $(VENV)/.test
 	$(BIN)/python benchmarks/process.py
 	$(BIN)/python benchmarks/air.py
 	$(BIN)/python benchmarks/clock_scenarios.py
+	$(BIN)/python benchmarks/beacon_clock.py
 
 # Schemas, field tables and the command reference come from the code; a test fails when they are stale.
 generated: $(VENV)/.test

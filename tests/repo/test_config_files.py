@@ -46,17 +46,28 @@ def test_the_reference_scenario_spells_everything_out() -> None:
     assert _keys(written) == _keys(ScenarioConfig().model_dump())
 
 
-def test_the_master_example_spells_the_defaults_out() -> None:
-    """What the example calls a default is one."""
-    raw = tomllib.loads((CONFIGS / "master.example.toml").read_text())
+@pytest.mark.parametrize("name", ["master", "master.classic"])
+def test_the_master_examples_spell_the_defaults_out(name: str) -> None:
+    """What an example calls a default is one, and it leaves out nothing of its protocol."""
+    raw = tomllib.loads((CONFIGS / f"{name}.example.toml").read_text())
     minimal = {key: raw[key] for key in ("kind", "setup", "stations")}
     minimal["radio"] = {
         key: raw["radio"][key] for key in ("kind", "frequency_mhz", "spreading_factor", "region")
     }
-    minimal["protocol"] = {"kind": raw["protocol"]["kind"]}
+    minimal["protocol"] = {
+        key: raw["protocol"][key] for key in ("kind", "key_file") if key in raw["protocol"]
+    }
     config = MasterConfig.model_validate_json(json.dumps(minimal))
     spelt = MasterConfig.model_validate_json(json.dumps(raw))
     assert spelt == config
+    assert set(raw["protocol"]) == set(type(spelt.protocol).model_fields)
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.example.toml")), ids=lambda path: path.stem)
+def test_every_example_says_why_it_speaks_its_protocol(path: Path) -> None:
+    """There is no silent choice: beside the name of the protocol stands the reason."""
+    _, given, protocol = path.read_text().partition("[protocol]\n")
+    assert "because" in protocol.partition("\n[")[0] or not given
 
 
 def test_the_geofence_in_the_master_example_works() -> None:

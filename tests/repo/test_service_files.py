@@ -16,6 +16,7 @@ from tsgt.config.master import RecordingConfig, StreamConfig
 
 ROOT = Path(__file__).parents[2]
 UNITS = sorted((ROOT / "configs" / "systemd").glob("*.service"))
+DROP_IN = ROOT / "configs" / "systemd" / "real-time.conf"
 RULES = ROOT / "configs" / "udev" / "60-tsgt.rules"
 
 LARGEST_EXPOSURE = 1.0
@@ -68,6 +69,33 @@ def test_systemd_finds_nothing_wrong(unit: Path, runnable: Path) -> None:
     # Other units of this machine may have faults of their own.
     own = [line for line in done.stderr.splitlines() if unit.name in line]
     assert (done.returncode, own) == (0, [])
+
+
+@needs_systemd
+@each_unit
+def test_systemd_takes_the_real_time_priority(unit: Path, runnable: Path) -> None:
+    """The drop-in fits both units: systemd reads it without a word, and with another policy it would complain."""
+    folder = runnable.with_name(f"{unit.name}.d")
+    folder.mkdir()
+    said = []
+    for text in (DROP_IN.read_text(), DROP_IN.read_text().replace("fifo", "first")):
+        (folder / DROP_IN.name).write_text(text)
+        done = subprocess.run(
+            [SYSTEMD_ANALYZE, "verify", "--man=no", str(runnable)],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        said.append([line for line in done.stderr.splitlines() if unit.name in line])
+    assert said[0] == []
+    assert "first" in said[1][0]
+
+
+def test_real_time_priority_is_below_that_of_interrupts() -> None:
+    """The kernel's interrupt threads, which have 50, must not wait for a daemon that waits for them."""
+    service = Lines(DROP_IN)["Service"]
+    assert service["CPUSchedulingPolicy"] == "fifo"
+    assert 0 < int(service["CPUSchedulingPriority"]) < 50
 
 
 @needs_systemd

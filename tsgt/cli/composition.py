@@ -6,9 +6,10 @@ import asyncio
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
-from tsgt.config.radio import HardwareRadioConfig, SimulatedRadioConfig
+from tsgt.config.radio import HardwareRadioConfig, SimulatedRadioConfig, SuperframeConfig
 from tsgt.radio.from_config import wiring
 from tsgt.radio.hal import open_hal
+from tsgt.radio.key_file import read_key
 from tsgt.radio.sx127x import SX127x
 
 if TYPE_CHECKING:
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
     from tsgt.clock import Clock
     from tsgt.config.client import InstrumentConfig
-    from tsgt.config.radio import RadioConfig
+    from tsgt.config.radio import ClassicConfig, RadioConfig
     from tsgt.radio.base import LoRaSettings, OpenRadio, Radio
     from tsgt.station.instrument import Instrument
 
@@ -27,6 +28,19 @@ def make_instrument(config: InstrumentConfig) -> Instrument:
     from tsgt.simulation.instrument_socket import RemoteInstrument  # noqa: PLC0415
 
     return RemoteInstrument(config.socket)
+
+
+def radio_key(protocol: ClassicConfig | SuperframeConfig) -> bytes | None:
+    """Return the key that a configuration names under ``[protocol]``; None without one, and for a protocol without.
+
+    Raises
+    ------
+    ConfigError
+        As :func:`~tsgt.radio.key_file.read_key`.
+    """
+    if isinstance(protocol, SuperframeConfig) and protocol.key_file is not None:
+        return read_key(protocol.key_file)
+    return None
 
 
 def radio_opener(config: RadioConfig, settings: LoRaSettings, clock: Clock) -> OpenRadio:

@@ -24,6 +24,7 @@ from tsgt.config import (
     parameters,
     scenario_parameters,
 )
+from tsgt.config.radio import ClassicConfig, SuperframeConfig
 from tsgt.errors import ConfigError, GeometryError
 from tsgt.geometry import check_layout
 from tsgt.model import Parameters, PrismPosition
@@ -68,6 +69,7 @@ def _summary(file: Path, content: Model) -> dict[str, Any]:
             _check_layout(content.setup.prism_layout, known.prisms)
             return {
                 **_numbers(known),
+                **_protocol(content.protocol),
                 "socket": str(content.stream.socket),
                 "recordings": str(content.recording.directory),
             }
@@ -77,6 +79,7 @@ def _summary(file: Path, content: Model) -> dict[str, Any]:
                 "station": content.station,
                 "prism": content.prism,
                 "instrument": content.instrument.kind,
+                **_protocol(content.protocol),
                 "journal": str(content.journal.directory),
                 "socket": str(content.status_socket),
             }
@@ -94,6 +97,17 @@ def _summary(file: Path, content: Model) -> dict[str, Any]:
         case StationFramesFile():
             return {"stations": [int(number) for number in content.stations]}
     raise TypeError(f"no summary for {type(content).__name__}")
+
+
+def _protocol(protocol: ClassicConfig | SuperframeConfig) -> dict[str, Any]:
+    """Name protocol and key. The key itself is its user's alone, so that who checks may not be able to read it."""
+    said: dict[str, Any] = {"protocol": protocol.kind}
+    if isinstance(protocol, SuperframeConfig):
+        key = protocol.key_file
+        said["key"] = "none, anybody can take part" if key is None else str(key)
+        if key is not None and not key.exists():
+            said["key"] += " (there is no such file; `tsgt radio key` makes one)"
+    return said
 
 
 def _numbers(known: Parameters) -> dict[str, Any]:

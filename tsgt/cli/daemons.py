@@ -23,17 +23,24 @@ def client(config_path: Path) -> None:
     """
     # Only here, as `--help` needs none of it.
     from tsgt import service  # noqa: PLC0415
-    from tsgt.cli.composition import make_instrument, radio_opener  # noqa: PLC0415
-    from tsgt.clock import SystemClock  # noqa: PLC0415
+    from tsgt.cli.composition import make_instrument, radio_key, radio_opener  # noqa: PLC0415
+    from tsgt.clock import SystemClock, boot_id  # noqa: PLC0415
     from tsgt.config import ClientConfig, load  # noqa: PLC0415
     from tsgt.radio.from_config import lora_settings  # noqa: PLC0415
     from tsgt.station.daemon import run_client  # noqa: PLC0415
 
     config = load(config_path, ClientConfig)
     clock = SystemClock()
-    open_radio = radio_opener(config.radio, lora_settings(config.radio, config_path), clock)
+    settings = lora_settings(config.radio, config_path)
+    key = radio_key(config.protocol)
+    open_radio = radio_opener(config.radio, settings, clock)
     instrument = make_instrument(config.instrument)
-    service.run(lambda: run_client(config, instrument=instrument, open_radio=open_radio, clock=clock))
+    boot = boot_id()
+    service.run(
+        lambda: run_client(
+            config, settings, instrument=instrument, open_radio=open_radio, clock=clock, key=key, boot=boot
+        )
+    )
 
 
 @click.command("tsgt-master", context_settings=HELP_OPTIONS)
@@ -45,7 +52,7 @@ def master(config_path: Path) -> None:
     """
     # Only here, as `--help` needs none of it.
     from tsgt import service  # noqa: PLC0415
-    from tsgt.cli.composition import radio_opener  # noqa: PLC0415
+    from tsgt.cli.composition import radio_key, radio_opener  # noqa: PLC0415
     from tsgt.clock import SystemClock  # noqa: PLC0415
     from tsgt.config import MasterConfig, load, parameters  # noqa: PLC0415
     from tsgt.master.daemon import run_master  # noqa: PLC0415
@@ -54,9 +61,10 @@ def master(config_path: Path) -> None:
     config = load(config_path, MasterConfig)
     in_force = parameters(config)
     settings = lora_settings(config.radio, config_path)
+    key = radio_key(config.protocol)
     clock = SystemClock()
     open_radio = radio_opener(config.radio, settings, clock)
-    service.run(lambda: run_master(config, in_force, settings, open_radio=open_radio, clock=clock))
+    service.run(lambda: run_master(config, in_force, settings, open_radio=open_radio, clock=clock, key=key))
 
 
 def main_client() -> NoReturn:

@@ -10,7 +10,7 @@ import tempfile
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -29,6 +29,7 @@ from tsgt.simulation.demo_files import write_demo_files
 
 if TYPE_CHECKING:
     from tsgt.analysis.metrics import PoseErrors
+    from tsgt.simulation.demo_files import DemoFiles
 
 DEFAULT_DURATION_S = 30.0
 
@@ -46,6 +47,13 @@ class Result:
 
 @click.command()
 @click.option(
+    "--protocol",
+    type=click.Choice(["superframe", "classic"]),
+    default="superframe",
+    show_default=True,
+    help="What master and stations speak.",
+)
+@click.option(
     "--duration",
     "duration_s",
     type=click.FloatRange(min=0, max=86_400, min_open=True),
@@ -60,6 +68,7 @@ class Result:
 @click.option("--scenario", "scenario_path", type=click.Path(path_type=Path), help="Another scenario (TOML).")
 @json_option
 def demo(
+    protocol: Any,
     duration_s: float | None,
     socket_path: Path | None,
     output: Path | None,
@@ -87,7 +96,8 @@ def demo(
     listener = service.UnixListener(socket_path.absolute(), 0o600)
     listener.socket.close()
     listener.remove()
-    result = _run(scenario, folder, socket_path.absolute(), output, duration_s=duration_s, seed=seed)
+    files = write_demo_files(folder, scenario, socket_path.absolute(), protocol)
+    result = _run(scenario, files, output, duration_s=duration_s, seed=seed)
     if as_json:
         print_json(
             {
@@ -121,20 +131,18 @@ def demo(
 
 def _run(
     scenario: ScenarioConfig,
-    folder: Path,
-    socket_path: Path,
+    files: DemoFiles,
     output: Path | None,
     *,
     duration_s: float,
     seed: int,
 ) -> Result:
     """Run a demonstration to its end or to Ctrl-C."""
-    files = write_demo_files(folder, scenario, socket_path)
     clock = SystemClock()
     timeline = UnixTimeline.fixed_now(clock)
-    click.echo(f"poses on     {socket_path}", err=True)
-    click.echo(f"try          {_program()} listen --socket {socket_path}", err=True)
-    click.echo(f"             {_program()} status --socket {socket_path}", err=True)
+    click.echo(f"poses on     {files.socket}", err=True)
+    click.echo(f"try          {_program()} listen --socket {files.socket}", err=True)
+    click.echo(f"             {_program()} status --socket {files.socket}", err=True)
 
     async def run() -> tuple[Demo, Progress]:
         demo = Demo(scenario, files, duration_s=duration_s, seed=seed, clock=clock)

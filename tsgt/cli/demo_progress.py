@@ -112,11 +112,8 @@ class Progress:
             word, _ = station_word(station)
             rate = "" if station.rate_hz is None else f"  {station.rate_hz:.2f} Hz"
             strength = "" if station.rssi_dbm is None else f"  {station.rssi_dbm:.0f} dBm"
-            clock = (
-                ""
-                if station.clock_bound_ns is None
-                else f"  clock within {station.clock_bound_ns / 1e6:.2f} ms"
-            )
+            bound_ns = station.stamp_bound_ns if station.clock_bound_ns is None else station.clock_bound_ns
+            clock = "" if bound_ns is None else f"  clock within {bound_ns / 1e6:.2f} ms"
             lines.append(f"         station {station.id}  {word}{rate}{strength}{clock}")
         self._show(lines)
 

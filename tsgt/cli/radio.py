@@ -1,4 +1,4 @@
-"""The command group ``radio``: what a LoRa packet costs, and a bench test of two radios."""
+"""The command group ``radio``: what a channel carries, a bench test of two radios, the key of a mission."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ import click
 
 from tsgt.cli.options import json_option
 from tsgt.cli.output import print_json
+from tsgt.cli.radio_key import key_command
 from tsgt.cli.radio_options import Modem, modem_options
 from tsgt.cli.radio_ping import ping_command
+from tsgt.cli.radio_plan import plan_command
 from tsgt.radio.airtime import (
     SYNC_QUARTER_SYMBOLS,
     airtime_us,
@@ -20,10 +22,12 @@ from tsgt.radio.base import MAX_PAYLOAD_BYTES
 
 @click.group()
 def radio() -> None:
-    """LoRa radios: time on air, and a bench test of two."""
+    """LoRa radios: time on air, what a channel carries, a bench test of two, a key."""
 
 
 radio.add_command(ping_command, "ping")
+radio.add_command(plan_command, "plan")
+radio.add_command(key_command, "key")
 
 
 @radio.command()

@@ -18,13 +18,14 @@ from tsgt.analysis.export import tum_lines
 from tsgt.cli.options import finite, json_option
 from tsgt.cli.output import CHECK_FAILED, print_json, print_table, require_new_file
 from tsgt.cli.simulate_figures import figures
-from tsgt.config.radio import ClassicMasterConfig
+from tsgt.config.radio import LARGEST_NUMBERS, ClassicMasterConfig, SuperframeMasterConfig
 from tsgt.errors import OutputFileError, TsgtError
 from tsgt.geometry import quaternion_from_rotation
 from tsgt.log import configure_logging
 from tsgt.recording import write_atomically
 from tsgt.simulation.checkers import Violation, violations
-from tsgt.simulation.scenario import Options, simulate
+from tsgt.simulation.options import Options, Outage, Restart
+from tsgt.simulation.scenario import simulate
 from tsgt.simulation.scenario_files import MOST_STATIONS, find_scenario, with_stations
 
 if TYPE_CHECKING:
@@ -40,8 +41,8 @@ LISTED_VIOLATIONS = 20
 @click.argument("scenario_name", metavar="[SCENARIO]", default="dynamic")
 @click.option(
     "--protocol",
-    type=click.Choice(["classic"]),
-    default="classic",
+    type=click.Choice(["superframe", "classic"]),
+    default="superframe",
     show_default=True,
     help="What master and stations speak.",
 )
@@ -72,18 +73,57 @@ LISTED_VIOLATIONS = 20
     help="Drift of the stations' clocks against the master's: plus for the first, minus for the second, and so on.",
 )
 @click.option(
+    "--drift-ramp-ppm-per-min",
+    type=click.FloatRange(-50, 50),
+    callback=finite,
+    default=0.0,
+    show_default=True,
+    help="By how much that drift grows, as the computers get warm; after ten minutes it falls again.",
+)
+@click.option(
+    "--stamp-jitter-us",
+    type=click.FloatRange(0, 10_000),
+    callback=finite,
+    default=0.0,
+    show_default=True,
+    help="Scatter of each computer's stamps of its radio, one sigma.",
+)
+@click.option(
     "--clock-filter",
     type=click.Choice(["regression", "paper"]),
     default="regression",
     show_default=True,
-    help="How the master follows the stations' clocks.",
+    help="How the master follows the stations' clocks; of the protocol classic.",
 )
 @click.option(
     "--node",
     type=click.Choice(["ours", "authors"]),
     default="ours",
     show_default=True,
-    help="What the stations run: our client, or a node as the paper's authors deployed it.",
+    help="What the stations run: our client, or a node as the paper's authors deployed it, which speaks classic.",
+)
+@click.option("--no-key", is_flag=True, help="Radios without a key; of the protocol superframe.")
+@click.option(
+    "--outage",
+    "outage_texts",
+    metavar="STATIONS:START:SECONDS",
+    multiple=True,
+    help="The master and these stations do not hear each other for a time; all, or numbers with commas.",
+)
+@click.option(
+    "--restart",
+    "restart_texts",
+    metavar="STATION:AT",
+    multiple=True,
+    help="A client, or the master, ends at this time and is started again 2 s later.",
+)
+@click.option(
+    "--foreign-per-s",
+    type=click.FloatRange(0, 100),
+    callback=finite,
+    default=0.0,
+    show_default=True,
+    help="Packets per second of somebody else: noise, and what it has heard, as it was, cut or changed.",
 )
 @click.option(
     "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Another seed, another run."
@@ -99,8 +139,14 @@ def simulate_command(
     stations: int | None,
     loss: float | None,
     drift_ppm: float,
+    drift_ramp_ppm_per_min: float,
+    stamp_jitter_us: float,
     clock_filter: Any,
     node: Any,
+    no_key: bool,
+    outage_texts: tuple[str, ...],
+    restart_texts: tuple[str, ...],
+    foreign_per_s: float,
     seed: int,
     output: Path | None,
     truth: Path | None,
@@ -114,18 +160,32 @@ def simulate_command(
     """
     for path in (output, truth):
         require_new_file(path)
+    if protocol != "classic" and node == "authors":
+        raise click.UsageError("the authors' node speaks classic alone; say --protocol classic")
     scenario = find_scenario(scenario_name)
     if stations is not None:
         scenario = with_stations(scenario, stations)
+    numbers = tuple(station.station for station in scenario.stations)
+    for number in numbers:
+        if number > LARGEST_NUMBERS[protocol]:
+            raise click.UsageError(f"station {number}: {protocol} knows 1 to {LARGEST_NUMBERS[protocol]}")
     if loss is not None:
         radio = scenario.radio.model_copy(update={"loss_probability": loss})
         scenario = scenario.model_copy(update={"radio": radio})
     options = Options(
         duration_s=scenario.duration_s if duration_s is None else duration_s,
         drift_ppm=drift_ppm,
+        drift_ramp_ppm_per_min=drift_ramp_ppm_per_min,
+        stamp_jitter_us=stamp_jitter_us,
         seed=seed,
         node=node,
-        protocol=ClassicMasterConfig(kind="classic", clock_filter=clock_filter),
+        protocol=SuperframeMasterConfig(kind="superframe")
+        if protocol == "superframe"
+        else ClassicMasterConfig(kind="classic", clock_filter=clock_filter),
+        authenticated=not no_key,
+        outages=tuple(Outage.parse(text, numbers) for text in outage_texts),
+        restarts=tuple(Restart.parse(text, numbers) for text in restart_texts),
+        foreign_per_s=foreign_per_s,
     )
     configure_logging("error")  # what happens on the way stands in the figures
     began_s = time.perf_counter()
@@ -136,7 +196,7 @@ def simulate_command(
             "scenario": scenario.name,
             "protocol": protocol,
             "node": node,
-            "clock_filter": clock_filter,
+            "clock_filter": clock_filter if protocol == "classic" else None,
             "seed": seed,
             **figures(run),
             "violations": len(found),
@@ -208,12 +268,26 @@ def _print(result: dict[str, Any], found: list[Violation]) -> None:
             str(number),
             *(str(station[key]) for key in ("measured", "delivered", "duplicates")),
             _figure(station["rate_hz"], 2),
+            *(_figure(station["age_ms"][key], 0) for key in ("p50", "p99")),
+            f"{station['within_2s']:.2%}",
             *(_figure(station["time_error_us"][key], 0) for key in ("p50", "p99", "max")),
+            *("-" if station[key] is None else str(station[key]) for key in ("queued", "late_slots")),
         ]
         for number, station in result["stations"].items()
     ]
-    header = ["station", "measured", "delivered", "twice", "rate Hz", "time error us: p50", "p99", "max"]
+    header = [
+        *("station", "measured", "delivered", "twice", "rate Hz", "age ms: p50", "p99", "in 2 s"),
+        *("time error us: p50", "p99", "max", "queued", "late"),
+    ]
     print_table(header, rows)
+    if "frame_ms" in result:
+        click.echo(f"\nframe        {_figure(result['frame_ms'], 0)} ms in the mean")
+    for outage in result["outages"]:
+        click.echo(
+            f"\noutage       of {', '.join(map(str, outage['stations']))}, {outage['seconds']:g} s from "
+            f"{outage['start_s']:g} s on: drained after {_figure(outage['drained_s'], 1)} s, meanwhile live "
+            f"measurements were {_figure(outage['live_age_ms']['p50'], 0)} ms old in the median"
+        )
     for name, estimator in result["estimators"].items():
         click.echo(
             f"\n{name}: {estimator['valid_poses']} of {estimator['poses']} poses valid\n"

@@ -12,10 +12,18 @@ from tsgt.analysis.inter_prism import inter_prism
 from tsgt.analysis.metrics import inner_part, pose_errors
 from tsgt.geometry import rotation_from_quaternion, transform_from
 from tsgt.master.tracks import build_tracks
+from tsgt.simulation.witness import Measured
 
 if TYPE_CHECKING:
+    from collections.abc import Collection, Sequence
+
+    from tsgt.simulation.options import Outage
     from tsgt.simulation.scenario import Run
     from tsgt.simulation.witness import StationWitness
+
+
+IN_TIME_NS = 2_000_000_000
+"""What reaches the pipeline so long after it was measured is still of use to a robot that drives."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,10 +39,18 @@ class StationFigures:
     duplicates
         How many the pipeline was handed again.
     rate_hz
-        Different measurements that reached the pipeline per second, from the end of the initial synchronisation of
-        all stations to the end of the run; NaN where that never ended.
+        Different measurements that reached the pipeline per second, up to the end of the run: from the end of the
+        initial synchronisation of all stations, or over ``superframe`` from when the last station was first heard; NaN
+        where that never came.
     time_error_us
         Percentiles 50, 99 and 100 of the absolute error of their time stamps, in us; NaN without any.
+    age_ms
+        Percentiles 50 and 99 of the time from a measurement to the pipeline, in ms; NaN without any.
+    within_2s
+        Which part of those measured reached the pipeline within :data:`IN_TIME_NS`.
+    queued, late_slots
+        How many still waited in the station's queue at the end, and how many slots it left empty because it was late;
+        None where there is neither.
     """
 
     measured: int
@@ -42,6 +58,48 @@ class StationFigures:
     duplicates: int
     rate_hz: float
     time_error_us: tuple[float, float, float]
+    age_ms: tuple[float, float]
+    within_2s: float
+    queued: int | None
+    late_slots: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class OutageFigures:
+    """What an outage did.
+
+    Attributes
+    ----------
+    drained_s
+        From its end until the last measurement made before that had arrived from all of its stations; NaN: never.
+    live_age_ms
+        Median age of what these stations measured meanwhile, from the outage's end until it was drained.
+    time_error_us
+        Percentiles 50, 99 and 100 of the absolute error of the time stamps of what they measured within the outage.
+    """
+
+    drained_s: float
+    live_age_ms: float
+    time_error_us: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class _Delivery:
+    """A measurement that reached the pipeline for the first time; instants in ns from the start."""
+
+    measured_ns: int
+    received_ns: int
+    arrived_ns: int
+    error_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Station:
+    """What was measured by one station, by true time in ns from the start, and what of it arrived."""
+
+    measured_ns: list[int]
+    deliveries: dict[int, _Delivery]
+    duplicates: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,48 +115,116 @@ class EstimatorFigures:
 
 def station_figures(run: Run) -> dict[int, StationFigures]:
     """Count and time what came from each station."""
-    synchronised_ns = _synchronised_ns(run)
-    return {
-        number: _station_figures(run, witness, synchronised_ns) for number, witness in run.witnesses.items()
-    }
+    stations = _stations(run)
+    return {number: _station_figures(run, number, stations) for number in run.witnesses}
 
 
-def _synchronised_ns(run: Run) -> int | None:
-    """Return when the last station had been synchronised for the first time; None if that never was."""
+def outage_figures(run: Run) -> list[OutageFigures]:
+    """Tell of each outage how long it lasted on."""
+    stations = _stations(run)
+    return [_outage_figures(outage, stations) for outage in run.outages]
+
+
+def _stations(run: Run) -> dict[int, _Station]:
+    return {number: _station(run, witness) for number, witness in run.witnesses.items()}
+
+
+def _station(run: Run, witness: StationWitness) -> _Station:
+    """Find out what of a station's measurements before the end of the run arrived, and when."""
+    found = Measured(witness)
+    end_ns = run.end_ns - run.start_ns
+    deliveries: dict[int, _Delivery] = {}
+    duplicates = 0
+    for session in run.sessions:
+        seen: set[int] = set()
+        for measurement, arrived_ns in zip(session.measurements, session.arrived_ns, strict=True):
+            if measurement.station != witness.station:
+                continue
+            true_ns = found.true_ns(measurement)
+            if true_ns is None or true_ns > end_ns:
+                continue
+            duplicates += true_ns in seen
+            seen.add(true_ns)
+            delivery = _Delivery(
+                measured_ns=true_ns,
+                received_ns=measurement.received_ns - run.start_ns,
+                arrived_ns=arrived_ns - run.start_ns,
+                error_ns=measurement.stamp_ns - run.start_ns - true_ns,
+            )
+            deliveries.setdefault(true_ns, delivery)
+    measured_ns = [true_ns for true_ns in witness.stamps_ns.values() if true_ns <= end_ns]
+    return _Station(measured_ns, deliveries, duplicates)
+
+
+def _counted_from_ns(run: Run, stations: dict[int, _Station]) -> int | None:
+    """Return when the last station was synchronised, or heard, for the first time; None if one never was."""
     first_ns: dict[int, int] = {}
     for session in run.sessions:
         for clock in session.clocks:
-            first_ns.setdefault(clock.station, clock.stamp_ns)
+            first_ns.setdefault(clock.station, clock.stamp_ns - run.start_ns)
+    for number, station in stations.items():
+        if run.superframe and station.deliveries:
+            first_ns[number] = min(delivery.received_ns for delivery in station.deliveries.values())
     return max(first_ns.values()) if first_ns.keys() >= run.witnesses.keys() else None
 
 
-def _station_figures(run: Run, witness: StationWitness, synchronised_ns: int | None) -> StationFigures:
-    duplicates, errors_ns = 0, []
-    received_ns: dict[int, int] = {}
-    end_ns = run.end_ns - run.start_ns
-    for session in run.sessions:
-        seen: set[int] = set()
-        for measurement in session.measurements:
-            true_ns = witness.stamps_ns.get(measurement.host_time_ns)
-            if measurement.station != witness.station or true_ns is None or true_ns > end_ns:
-                continue
-            duplicates += measurement.host_time_ns in seen
-            seen.add(measurement.host_time_ns)
-            if measurement.host_time_ns not in received_ns:
-                received_ns[measurement.host_time_ns] = measurement.received_ns
-                errors_ns.append(abs(measurement.stamp_ns - run.start_ns - true_ns))
+def _station_figures(run: Run, number: int, stations: dict[int, _Station]) -> StationFigures:
+    from_ns, end_ns = _counted_from_ns(run, stations), run.end_ns - run.start_ns
+    station, statuses = stations[number], run.witnesses[number].statuses
+    deliveries = station.deliveries.values()
     rate_hz = math.nan
-    if synchronised_ns is not None and synchronised_ns < run.end_ns:
-        counted = sum(synchronised_ns <= at_ns <= run.end_ns for at_ns in received_ns.values())
-        rate_hz = counted / ((run.end_ns - synchronised_ns) / 1e9)
-    p50, p99, most = np.percentile(errors_ns, [50, 99, 100]) / 1e3 if errors_ns else [math.nan] * 3
+    if from_ns is not None and from_ns < end_ns:
+        counted = sum(from_ns <= delivery.received_ns <= end_ns for delivery in deliveries)
+        rate_hz = counted / ((end_ns - from_ns) / 1e9)
+    ages_ns = [delivery.arrived_ns - delivery.measured_ns for delivery in deliveries]
     return StationFigures(
-        measured=sum(true_ns <= end_ns for true_ns in witness.stamps_ns.values()),
-        delivered=len(received_ns),
-        duplicates=duplicates,
+        measured=len(station.measured_ns),
+        delivered=len(deliveries),
+        duplicates=station.duplicates,
         rate_hz=rate_hz,
-        time_error_us=(float(p50), float(p99), float(most)),
+        time_error_us=_errors_us(deliveries),
+        age_ms=_percentiles(ages_ns, 50, 99, unit_ns=1e6),
+        within_2s=sum(age_ns <= IN_TIME_NS for age_ns in ages_ns) / max(1, len(station.measured_ns)),
+        queued=statuses[-1].queued if statuses else None,
+        late_slots=sum(status.late or 0 for status in statuses) if run.superframe else None,
     )
+
+
+def _outage_figures(outage: Outage, stations: dict[int, _Station]) -> OutageFigures:
+    start_ns, end_ns = round(outage.start_s * 1e9), round(outage.end_s * 1e9)
+    those = [stations[number] for number in outage.stations]
+    deliveries = [delivery for station in those for delivery in station.deliveries.values()]
+    drained_ns = math.nan
+    if all(ns in station.deliveries for station in those for ns in station.measured_ns if ns < end_ns):
+        before = (delivery.arrived_ns for delivery in deliveries if delivery.measured_ns < end_ns)
+        drained_ns = max(end_ns, *before) - end_ns
+    live_ns = [
+        delivery.arrived_ns - delivery.measured_ns
+        for delivery in deliveries
+        # Without a drain all that came after it: no comparison with NaN holds.
+        if end_ns <= delivery.measured_ns and not delivery.measured_ns > end_ns + drained_ns
+    ]
+    return OutageFigures(
+        drained_s=drained_ns / 1e9,
+        live_age_ms=_percentiles(live_ns, 50, unit_ns=1e6)[0],
+        time_error_us=_errors_us([d for d in deliveries if start_ns <= d.measured_ns < end_ns]),
+    )
+
+
+def _errors_us(deliveries: Collection[_Delivery]) -> tuple[float, float, float]:
+    return _percentiles([abs(delivery.error_ns) for delivery in deliveries], 50, 99, 100, unit_ns=1e3)
+
+
+def _percentiles(values_ns: Sequence[int], *percentiles: int, unit_ns: float) -> tuple[Any, ...]:
+    if not values_ns:
+        return (math.nan,) * len(percentiles)
+    return tuple(float(value) for value in np.percentile(values_ns, percentiles) / unit_ns)
+
+
+def frame_ms(run: Run) -> float:
+    """Return the mean time from one beacon to the next, in ms; NaN without any."""
+    frames = sum(session.frames for session in run.sessions)
+    return sum(session.framed_ns for session in run.sessions) / frames / 1e6 if frames else math.nan
 
 
 def estimator_figures(run: Run) -> EstimatorFigures:
@@ -135,16 +261,19 @@ def figures(run: Run) -> dict[str, Any]:
     """Put the figures under the keys that others rely on."""
     estimator = estimator_figures(run)
     return {
-        "stations": {
-            number: {
-                "measured": station.measured,
-                "delivered": station.delivered,
-                "duplicates": station.duplicates,
-                "rate_hz": station.rate_hz,
-                "time_error_us": dict(zip(("p50", "p99", "max"), station.time_error_us, strict=True)),
+        "stations": {number: _station_keys(station) for number, station in station_figures(run).items()},
+        **({"frame_ms": frame_ms(run)} if run.superframe else {}),
+        "outages": [
+            {
+                "stations": outage.stations,
+                "start_s": outage.start_s,
+                "seconds": outage.seconds,
+                "drained_s": found.drained_s,
+                "live_age_ms": {"p50": found.live_age_ms},
+                "time_error_us": dict(zip(("p50", "p99", "max"), found.time_error_us, strict=True)),
             }
-            for number, station in station_figures(run).items()
-        },
+            for outage, found in zip(run.outages, outage_figures(run), strict=True)
+        ],
         "estimators": {
             run.parameters.pipeline.estimator: {
                 "poses": estimator.poses,
@@ -156,4 +285,18 @@ def figures(run: Run) -> dict[str, Any]:
         },
         "airtime_fraction": run.airtime_s / run.duration_s,
         "sim_seconds": run.duration_s,
+    }
+
+
+def _station_keys(station: StationFigures) -> dict[str, Any]:
+    return {
+        "measured": station.measured,
+        "delivered": station.delivered,
+        "duplicates": station.duplicates,
+        "rate_hz": station.rate_hz,
+        "time_error_us": dict(zip(("p50", "p99", "max"), station.time_error_us, strict=True)),
+        "age_ms": dict(zip(("p50", "p99"), station.age_ms, strict=True)),
+        "within_2s": station.within_2s,
+        "queued": station.queued,
+        "late_slots": station.late_slots,
     }

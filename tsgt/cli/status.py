@@ -77,6 +77,10 @@ def master_text(record: StatusRecord) -> tuple[list[str], bool]:
         f"MASTER  {clock_time(record.stamp_ns)} UTC",
         f"poses {record.poses}, valid {record.valid_poses}",
     ]
+    if record.frame_ms is not None:
+        lines.append(f"frame {record.frame_ms:.0f} ms")
+    if record.protocol == "superframe" and not record.authenticated:
+        lines.append(_headline("NO KEY: anybody can take part", good=False))
     well = valid
     for station in record.stations:
         word, good = station_word(station)
@@ -101,7 +105,7 @@ def station_word(station: StationStatus) -> tuple[str, bool]:
 
 
 def _station_lines(station: StationStatus) -> list[str]:
-    """Two to four lines of figures, as far as they are known."""
+    """Return some lines of figures, as far as they are known."""
     lines = []
     prism = "" if station.prism is None else f"prism {station.prism}  "
     rate = "" if station.rate_hz is None else f"{station.rate_hz:.2f} Hz  "
@@ -113,6 +117,10 @@ def _station_lines(station: StationStatus) -> list[str]:
     lines.append(f"  {loss}{strength}{snr}".rstrip())
     if station.clock_bound_ns is not None:
         lines.append(f"  clock within {station.clock_bound_ns / 1e6:.2f} ms")
+    elif station.stamp_bound_ns is not None:
+        lines.append(f"  time within {station.stamp_bound_ns / 1e6:.2f} ms")
+    counts = {"missing": station.missing, "slots late": station.late, "beacons doubted": station.doubted}
+    lines += [f"  {count} {of_what}" for of_what, count in counts.items() if count]
     return [line for line in lines if line.strip()]
 
 
@@ -142,7 +150,21 @@ def client_text(record: ClientStatus) -> tuple[list[str], bool]:
     else:
         lines.append(f"master heard {duration(record.master_heard_s)} ago")
         lines.append(f"  {record.rssi_dbm or 0:.0f} dBm  SNR {record.snr_db or 0:.0f}")
+    if record.protocol == "superframe":
+        lines += _superframe_lines(record)
     return lines, not problems
+
+
+def _superframe_lines(record: ClientStatus) -> list[str]:
+    """Say how delivery and time of the protocol superframe do."""
+    lines = [f"{record.queued} to deliver, {record.late} slots late"]
+    if record.clock_bound_ns is not None:
+        lines.append(f"  clock within {record.clock_bound_ns / 1e6:.2f} ms")
+    if record.doubted:
+        lines.append(f"  {record.doubted} beacons doubted")
+    if not record.authenticated:
+        lines.append(_headline("NO KEY: anybody can take part", good=False))
+    return lines
 
 
 def _client_problems(record: ClientStatus) -> list[str]:
@@ -162,6 +184,8 @@ def _client_problems(record: ClientStatus) -> list[str]:
         problems.append("NO RADIO")
     elif record.master_heard_s is None or record.master_heard_s > MASTER_LATE_S:
         problems.append("MASTER NOT HEARD")
+    elif record.joined is False:
+        problems.append("NOT JOINED")
     return problems
 
 

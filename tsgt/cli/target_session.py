@@ -7,29 +7,24 @@ from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from typing import TYPE_CHECKING
 
 from tsgt.analysis.target_file import Sight
-from tsgt.cli.composition import radio_opener
-from tsgt.clock import UnixTimeline
+from tsgt.cli.composition import radio_key, radio_opener
+from tsgt.cli.target_orders import ClassicOrders, superframe_orders
+from tsgt.config.radio import ClassicMasterConfig
 from tsgt.errors import InstrumentError, RadioError, StreamError, TsgtError
-from tsgt.master.collector import Collector
 from tsgt.model import Status
-from tsgt.radio.classic import Ordered, Shot, Timing
-from tsgt.radio.classic_messages import Command, status_of
 from tsgt.radio.from_config import lora_settings
+from tsgt.radio.orders import DirectOrder, MeasureOrder, TrackOrder
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable, Mapping
     from pathlib import Path
 
     from tsgt.cli.operator import Operator
+    from tsgt.cli.target_orders import Answer, Orders
     from tsgt.clock import Clock
     from tsgt.config import MasterConfig
     from tsgt.radio.base import OpenRadio
-
-ORDER_TIMEOUT_NS = 10_000_000_000
-"""How long a change of mode may take; some instruments need seconds."""
-
-ATTEMPTS = 3
-"""How often an order is given to a station that does not answer."""
+    from tsgt.radio.orders import Order
 
 MEANING = {
     Status.TILT: "the instrument is not level; level it, then all its targets have to be measured again",
@@ -45,10 +40,8 @@ class TargetSession:
 
     Parameters
     ----------
-    collector
-        On a radio that nobody else uses.
-    timing
-        Of its modem.
+    orders
+        Gives them to the stations.
     prisms
         By station: the prism that it tracks otherwise.
 
@@ -58,9 +51,8 @@ class TargetSession:
         Stations that may be in direct mode.
     """
 
-    def __init__(self, collector: Collector, timing: Timing, prisms: Mapping[int, int]) -> None:
-        self._collector = collector
-        self._timing = timing
+    def __init__(self, orders: Orders, prisms: Mapping[int, int]) -> None:
+        self._orders = orders
         self._prisms = prisms
         self.direct: set[int] = set()
 
@@ -83,21 +75,20 @@ class TargetSession:
         """
         # Each time: a station that has started anew tracks its prism, and would answer with that.
         self.direct.add(station)
-        if not await self._order(Command("d", station)):
+        if not (await self._give(station, DirectOrder())).ok:
             raise InstrumentError(
                 f"station {station} cannot leave its tracking; look at its instrument, then try again"
             )
-        turn = Shot(station, self._timing)
-        await self._collector.take(turn)
-        if turn.message is None:
+        answer = await self._orders.give(station, MeasureOrder())
+        if answer is None:
             raise InstrumentError(f"station {station} has not sent a measurement; aim again and repeat")
-        status = status_of(turn.message)
+        status = answer.status if answer.slope_distance_m or not answer.status.usable else Status.ANGLE_ONLY
         if not status.usable:
             raise InstrumentError(f"station {station}: {MEANING[status]}")
         return Sight(
-            horizontal_angle_rad=turn.message.horizontal_angle_rad,
-            zenith_angle_rad=turn.message.zenith_angle_rad,
-            slope_distance_m=turn.message.slope_distance_m,
+            horizontal_angle_rad=answer.horizontal_angle_rad,
+            zenith_angle_rad=answer.zenith_angle_rad,
+            slope_distance_m=answer.slope_distance_m,
             constant_m=constant_m,
             line=0,
         )
@@ -107,7 +98,7 @@ class TargetSession:
         sentences = []
         for station in sorted(self.direct):
             try:
-                if await self._order(Command("n", station, self._prisms[station])):
+                if (await self._give(station, TrackOrder(self._prisms[station]))).ok:
                     continue
                 trouble = f"it does not find prism {self._prisms[station]}; see that it has sight of it"
             except InstrumentError:
@@ -120,16 +111,13 @@ class TargetSession:
         self.direct.clear()
         return sentences
 
-    async def _order(self, order: Command) -> bool:
-        """Give an order until it is answered; return whether the station did it."""
-        for _ in range(ATTEMPTS):
-            turn = Ordered(order.station, order, ORDER_TIMEOUT_NS)
-            await self._collector.take(turn)
-            if turn.ok is not None:
-                return turn.ok
-        raise InstrumentError(
-            f"station {order.station} does not answer; see that its client runs and is in reach, then try again"
-        )
+    async def _give(self, station: int, order: Order) -> Answer:
+        answer = await self._orders.give(station, order)
+        if answer is None:
+            raise InstrumentError(
+                f"station {station} does not answer; see that its client runs and is in reach, then try again"
+            )
+        return answer
 
 
 async def shot(session: TargetSession, operator: Operator, station: int, constant_m: float) -> Sight | None:
@@ -168,10 +156,11 @@ async def target_session(
     TsgtError
         The radio cannot be opened, as a rule because the master uses it.
     ConfigError
-        The chip cannot do what the configuration asks of it.
+        The chip cannot do what the configuration asks of it, or the key cannot be read.
     """
     settings = lora_settings(config.radio, path)
-    timing = Timing.of(settings, round(config.protocol.reply_timeout_ms * 1e6))
+    protocol = config.protocol
+    key = radio_key(protocol)
     if await _answers(config.stream.socket):
         raise TsgtError(
             f"tsgt-master is running (it serves {config.stream.socket}) and owns the radio; stop it first: "
@@ -186,9 +175,15 @@ async def target_session(
             raise TsgtError(
                 f"{error}; if another program such as tsgt-master uses the radio, stop it first"
             ) from error
-        collector = Collector(radio, clock, UnixTimeline.fixed_now(clock), timing)
         prisms = {station.station: station.prism for station in config.stations}
-        session = TargetSession(collector, timing, prisms)
+        orders: Orders
+        if isinstance(protocol, ClassicMasterConfig):
+            orders = ClassicOrders(radio, clock, protocol, settings)
+        else:
+            orders = await stack.enter_async_context(
+                superframe_orders(radio, clock, prisms, protocol, settings, key)
+            )
+        session = TargetSession(orders, prisms)
         try:
             yield session
         finally:

@@ -1,4 +1,4 @@
-"""Targets collected and checked over the simulated air, with our stations and with the authors' nodes."""
+"""Targets collected and checked over the simulated air: both protocols, and the authors' nodes."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ import asyncio
 import json
 from contextlib import asynccontextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
 import numpy as np
 import pytest
-from support.field import TRUE, SceneInstrument, field_of
+from support.client import client_config
+from support.field import TRUE, SceneInstrument, Station, field_of
+from support.radios import PAPER
 from support.scene import FRAMES
 
 from tsgt.analysis.calibration import mean_points
@@ -20,9 +22,13 @@ from tsgt.analysis.target_file import read_some_targets, read_target_file
 from tsgt.cli.check import measure_again, print_check
 from tsgt.cli.collect import collect_targets
 from tsgt.cli.target_session import TargetSession, target_session
-from tsgt.errors import InputFileError, TsgtError
+from tsgt.config.client import JournalConfig
+from tsgt.config.radio import SuperframeConfig, SuperframeMasterConfig
+from tsgt.errors import InputFileError, RadioError, TsgtError
 from tsgt.geometry import cartesian_to_polar, invert, transform_points
 from tsgt.model import Status
+from tsgt.simulation.radios import opener
+from tsgt.station.daemon import run_client
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
@@ -31,8 +37,10 @@ if TYPE_CHECKING:
     from support.cli import Tsgt
     from support.field import Field
 
+    from tsgt.radio.base import OpenRadio
     from tsgt.station.instrument import Reading
 
+KEY = bytes(range(32))
 TARGETS = np.array([[20.0, 3.0, 0.5], [5.0, 18.0, -0.5], [-14.0, 9.0, 1.0], [-8.0, -16.0, 0.2]])
 STATIONS = (1, 2, 3)
 
@@ -87,28 +95,74 @@ class Script:
         self.said.append(text)
 
 
+Speaks = Literal["classic", "authors", "superframe"]
+"""Our client in either protocol, or a node of the authors."""
+
+BOTH: tuple[Speaks, ...] = ("classic", "superframe")
+
+
+class SuperframeClient(Station):
+    """A station that runs the client's daemon."""
+
+    folder: Path
+
+    async def _run(self) -> None:
+        config = client_config(self.folder, station=self.number, prism=self.number)
+        config = config.model_copy(
+            update={
+                "protocol": SuperframeConfig(kind="superframe"),
+                "journal": JournalConfig(directory=self.folder / f"journals{self.number}"),
+                "status_socket": self.folder / f"client{self.number}.sock",
+            }
+        )
+        rng = np.random.default_rng((self.number, self._starts))
+        await run_client(
+            config,
+            PAPER,
+            instrument=self.instrument,
+            open_radio=opener(self.air, f"station-{self.number}", self.clock, rng, PAPER),
+            clock=self.clock,
+            key=KEY,
+            random_bits=lambda bits: int(rng.integers(1 << bits)),
+            boot="one",
+        )
+
+
 @asynccontextmanager
 async def aimed(
-    folder: Path, *, authors: bool = False
+    folder: Path, speaks: Speaks = "classic"
 ) -> AsyncGenerator[tuple[Field, dict[int, AimedInstrument]]]:
     """Stations with instruments that can be aimed."""
-    async with field_of(folder, authors=authors) as field:
+    async with field_of(folder, authors=speaks == "authors") as field:
         instruments = {}
         for number, station in field.stations.items():
             await station.kill()
             instruments[number] = AimedInstrument(field.scene, number, station.clock)
             instruments[number].T = FRAMES[number - 1]
-            station.instrument = instruments[number]
-            station.start()
+            if speaks == "superframe":
+                client = SuperframeClient(number, field.air, field.scene, authors=False, clock=station.clock)
+                client.folder = folder
+                field.stations[number] = client
+            field.stations[number].instrument = instruments[number]
+            field.stations[number].start()
         await asyncio.sleep(1.0)
         yield field, instruments
 
 
 @asynccontextmanager
-async def session(field: Field, script: Script) -> AsyncGenerator[TargetSession]:
+async def session(
+    field: Field, script: Script, open_radio: OpenRadio | None = None
+) -> AsyncGenerator[TargetSession]:
     """Open the master's radio for targets."""
+    config = field.config()
+    if isinstance(field.stations[1], SuperframeClient):
+        key_file = field.folder / "mission.key"
+        key_file.write_text(KEY.hex() + "\n")
+        key_file.chmod(0o600)
+        protocol = SuperframeMasterConfig(kind="superframe", key_file=key_file)
+        config = config.model_copy(update={"protocol": protocol})
     async with target_session(
-        field.config(), field.folder / "master.toml", TRUE, script.say, field.open_radio()
+        config, field.folder / "master.toml", TRUE, script.say, open_radio or field.open_radio()
     ) as opened:
         yield opened
 
@@ -124,11 +178,11 @@ async def collected(
     return collection
 
 
-@pytest.mark.parametrize("authors", [False, True])
-async def test_all_targets_are_collected_and_the_frames_come_out(tmp_path: Path, *, authors: bool) -> None:
+@pytest.mark.parametrize("speaks", ["classic", "authors", "superframe"])
+async def test_all_targets_are_collected_and_the_frames_come_out(tmp_path: Path, speaks: Speaks) -> None:
     """Station by station, target by target; the file solves to where the stations stand; all track again."""
     path = tmp_path / "targets.csv"
-    async with aimed(tmp_path, authors=authors) as (field, instruments):
+    async with aimed(tmp_path, speaks) as (field, instruments):
         script = Script(instruments)
         collection = await collected(field, script, path)
         assert not [tool for tool in instruments.values() if tool.direct_mode]
@@ -145,9 +199,12 @@ async def test_all_targets_are_collected_and_the_frames_come_out(tmp_path: Path,
         assert np.linalg.norm(solved.T[:3, 3] - FRAMES[station - 1][:3, 3]) < 0.01
 
 
-async def test_a_failed_measurement_is_told_in_words_and_asked_for_again(tmp_path: Path) -> None:
+@pytest.mark.parametrize("speaks", BOTH)
+async def test_a_failed_measurement_is_told_in_words_and_asked_for_again(
+    tmp_path: Path, speaks: Speaks
+) -> None:
     """The status of the instrument, and what to do about it."""
-    async with aimed(tmp_path) as (field, instruments):
+    async with aimed(tmp_path, speaks) as (field, instruments):
         instruments[1].status = Status.TILT
         script = Script(instruments, "", "q")
         collection = await collected(field, script, tmp_path / "targets.csv")
@@ -156,9 +213,10 @@ async def test_a_failed_measurement_is_told_in_words_and_asked_for_again(tmp_pat
     assert collection.count(1, 1) == 0
 
 
-async def test_a_silent_station_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize("speaks", BOTH)
+async def test_a_silent_station_is_named(tmp_path: Path, speaks: Speaks) -> None:
     """The others can go on; at the end it is said that it may not be tracking."""
-    async with aimed(tmp_path) as (field, instruments):
+    async with aimed(tmp_path, speaks) as (field, instruments):
         await field.stations[1].kill()
         script = Script(instruments, "", "q")
         await collected(field, script, tmp_path / "targets.csv")
@@ -166,9 +224,12 @@ async def test_a_silent_station_is_named(tmp_path: Path) -> None:
     assert script.said[-1].startswith("note: station 1 is not tracking again: it does not answer")
 
 
-async def test_a_station_that_started_anew_measures_the_target_all_the_same(tmp_path: Path) -> None:
+@pytest.mark.parametrize("speaks", BOTH)
+async def test_a_station_that_started_anew_measures_the_target_all_the_same(
+    tmp_path: Path, speaks: Speaks
+) -> None:
     """It tracks its prism after the start; the answer must not be the prism."""
-    async with aimed(tmp_path) as (field, instruments):
+    async with aimed(tmp_path, speaks) as (field, instruments):
         script = Script(instruments)
         collection = TargetCollection(tmp_path / "targets.csv", [1], [1, 2])
         async with session(field, script) as stations:
@@ -179,6 +240,45 @@ async def test_a_station_that_started_anew_measures_the_target_all_the_same(tmp_
             second = await stations.shoot(1, constant_m=0.0)
     assert second.slope_distance_m == pytest.approx(first.slope_distance_m)
     assert collection.count(1, 1) == 0
+
+
+async def test_measurements_are_left_to_a_master(tmp_path: Path) -> None:
+    """Over the superframe stations send what they measure; nothing is acknowledged that nobody records."""
+    async with aimed(tmp_path, "superframe") as (field, instruments):
+        script = Script(instruments)
+        async with session(field, script) as stations:
+            await asyncio.sleep(8.0)
+            await stations.shoot(1, constant_m=0.0)
+        reader, writer = await asyncio.open_unix_connection(tmp_path / "client2.sock")
+        status = json.loads(await reader.read())
+        writer.close()
+    assert status["joined"]
+    assert status["queued"] == status["measurements"] > 20
+
+
+class BrokenRadio:
+    """A radio whose chip does not answer any more."""
+
+    async def transmit(self, payload: bytes, *, at_ns: int | None = None) -> NoReturn:
+        """Fail."""
+        raise RadioError(f"no answer to {len(payload)} bytes for {at_ns}")
+
+
+@pytest.mark.parametrize("speaks", BOTH)
+async def test_a_radio_that_fails_ends_it_at_once(tmp_path: Path, speaks: Speaks) -> None:
+    """Nobody waits for answers that cannot come; it is said which stations may not be tracking."""
+
+    @asynccontextmanager
+    async def open_radio() -> AsyncGenerator[Any]:
+        yield BrokenRadio()
+
+    async with aimed(tmp_path, speaks) as (field, instruments):
+        script, began_s = Script(instruments), asyncio.get_running_loop().time()
+        with pytest.raises(RadioError, match="no answer"):
+            async with session(field, script, open_radio) as stations:
+                await stations.shoot(1, constant_m=0.0)
+        assert asyncio.get_running_loop().time() - began_s < 1.0
+    assert script.said[-1].startswith("note: station 1 is not tracking again: the radio failed (no answer")
 
 
 async def test_keys(tmp_path: Path) -> None:
@@ -194,14 +294,17 @@ async def test_keys(tmp_path: Path) -> None:
     assert "station 1 has not measured target 9 yet" in script.said
 
 
+@pytest.mark.parametrize("speaks", BOTH)
 @pytest.mark.parametrize("stop", ["q", None, "cancel"])
-async def test_it_goes_on_where_it_stopped(tmp_path: Path, stop: str | None) -> None:
+async def test_it_goes_on_where_it_stopped(tmp_path: Path, stop: str | None, speaks: Speaks) -> None:
     """After q, the end of the input and Ctrl-C alike: what was measured is in the file, the stations track."""
     path = tmp_path / "targets.csv"
-    async with aimed(tmp_path) as (field, instruments):
+    async with aimed(tmp_path, speaks) as (field, instruments):
         if stop == "cancel":
             task = asyncio.create_task(collected(field, Script(instruments), path))
-            await asyncio.sleep(13.0)  # in the middle of the third measurement
+            await asyncio.sleep(
+                13.0 if speaks == "classic" else 17.0
+            )  # in the middle of the third measurement
             task.cancel()
             await asyncio.wait([task])
             assert task.cancelled()

@@ -60,6 +60,22 @@ def test_check_refuses_what_the_radio_cannot_do(
     assert "not within a band of CA915" in outcome.err
 
 
+@pytest.mark.parametrize("kind", ["client", "master"])
+def test_check_names_protocol_and_key(tsgt: Tsgt, tmp_path: Path, kind: str) -> None:  # noqa: F811 (a fixture)
+    """Who copies an example learns that the key is still to be made, and who does without one what that means."""
+    for path in EXAMPLES.glob("*.example.toml"):
+        shutil.copy(path, tmp_path)
+    path = tmp_path / f"{kind}.example.toml"
+    found = tsgt("config", "check", path, "--json").json()
+    assert found["protocol"] == "superframe"
+    assert found["key"].startswith(f"{tmp_path / 'radio.key'} (there is no such file")
+    tsgt("radio", "key", tmp_path / "radio.key")
+    assert tsgt("config", "check", path, "--json").json()["key"] == str(tmp_path / "radio.key")
+    path.write_text(path.read_text().replace('key_file = "radio.key"', ""))
+    assert "anybody can take part" in tsgt("config", "check", path).out
+    assert "key " not in tsgt("config", "check", tmp_path / f"{kind}.classic.example.toml").out
+
+
 def test_check_follows_the_set_up_files(tsgt: Tsgt, tmp_path: Path) -> None:  # noqa: F811 (a fixture)
     """A configuration whose set-up files are not there is no good one: exit 2 and one line."""
     shutil.copy(EXAMPLES / "master.example.toml", tmp_path)

@@ -21,14 +21,17 @@ if TYPE_CHECKING:
     from support.cli import Tsgt
 
 START_S = START_UNIX_NS / 1e9
+CLASSIC = ("--protocol", "classic")
 
 
 def test_the_keys_that_others_rely_on(tsgt: Tsgt) -> None:
     """Machines find everything under the names that are promised."""
-    found = tsgt("simulate", "dynamic", "--stations", 1, "--duration", 20, "--json").json()
+    found = tsgt("simulate", "dynamic", *CLASSIC, "--stations", 1, "--duration", 20, "--json").json()
     station = found["stations"]["1"]
     assert station.keys() >= {"measured", "delivered", "duplicates", "rate_hz", "time_error_us"}
+    assert station.keys() >= {"age_ms", "within_2s", "queued", "late_slots"}
     assert station["time_error_us"].keys() == {"p50", "p99", "max"}
+    assert station["age_ms"].keys() == {"p50", "p99"}
     assert station["measured"] == 50
     assert found["estimators"]["linear"].keys() >= {
         "position_rms_mm",
@@ -43,7 +46,7 @@ def test_the_keys_that_others_rely_on(tsgt: Tsgt) -> None:
 
 def test_the_text(tsgt: Tsgt) -> None:
     """People get a line for each station, and how many violations there were."""
-    result = tsgt("simulate", "--stations", 1, "--duration", 16)
+    result = tsgt("simulate", *CLASSIC, "--stations", 1, "--duration", 16)
     assert result.code == 0
     assert "dynamic, classic (ours), seed 0: 16 s simulated in" in result.out
     assert "violations   0" in result.out
@@ -53,7 +56,7 @@ def test_recording_and_truth_are_kept(tsgt: Tsgt, tmp_path: Path) -> None:
     """The recording can be processed, and the truth is there for each of its epochs."""
     recording, truth = tmp_path / "run.jsonl", tmp_path / "truth.tum"
     result = tsgt(
-        *("simulate", "dynamic", "--stations", 1, "--duration", 20),
+        *("simulate", "dynamic", *CLASSIC, "--stations", 1, "--duration", 20),
         *("--output", recording, "--truth", truth, "--json"),
     )
     assert result.code == 0
@@ -68,7 +71,18 @@ def test_recording_and_truth_are_kept(tsgt: Tsgt, tmp_path: Path) -> None:
 def test_the_figures_follow_from_the_files(tsgt: Tsgt, tmp_path: Path) -> None:
     """Oracle: rates, and errors of the poses, computed from nothing but recording and truth."""
     recording, truth = tmp_path / "run.jsonl", tmp_path / "truth.tum"
-    arguments = ("simulate", "dynamic", "--duration", 60, "--output", recording, "--truth", truth, "--json")
+    arguments = (
+        "simulate",
+        "dynamic",
+        *CLASSIC,
+        "--duration",
+        60,
+        "--output",
+        recording,
+        "--truth",
+        truth,
+        "--json",
+    )
     found = tsgt(*arguments).json()
     records = [json.loads(line) for line in recording.read_text().splitlines()]
     of = {name: [r for r in records if r["type"] == name] for name in ("clock", "measurement", "pose")}
@@ -126,10 +140,26 @@ def test_a_missing_folder_is_said_before_the_run(tsgt: Tsgt, tmp_path: Path, opt
 
 def test_a_run_too_short_for_poses_has_dashes(tsgt: Tsgt) -> None:
     """The first synchronisation takes longer."""
-    result = tsgt("simulate", "--duration", "3")
+    result = tsgt("simulate", *CLASSIC, "--duration", "3")
     assert result.code == 0
     assert "nan" not in result.out
     assert "position     - mm" in result.out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (("--node", "authors"), "the authors' node speaks classic alone"),
+        ((*CLASSIC, "--stations", 10), "station 10: classic knows 1 to 9"),
+        (("--outage", "4:10:10"), "there is no station 4"),
+        (("--restart", "10"), "expected STATION:AT"),
+    ],
+)
+def test_what_does_not_go_together(tsgt: Tsgt, arguments: tuple[str | int, ...], reason: str) -> None:
+    """It is refused before anything runs."""
+    result = tsgt("simulate", *arguments)
+    assert result.code == 2
+    assert reason in result.err
 
 
 def test_an_unknown_scenario(tsgt: Tsgt) -> None:
@@ -143,7 +173,7 @@ def test_violations_make_the_check_fail(tsgt: Tsgt, monkeypatch: pytest.MonkeyPa
     """What must not happen is listed, not without end, and the exit code is 3."""
     planted = [Violation("time", f"planted {number}") for number in range(25)]
     monkeypatch.setattr(simulate, "violations", lambda _run: planted)
-    result = tsgt("simulate", "--stations", 1, "--duration", 16)
+    result = tsgt("simulate", *CLASSIC, "--stations", 1, "--duration", 16)
     assert result.code == 3
     assert "violations   25" in result.out
     assert "time: planted 19" in result.out

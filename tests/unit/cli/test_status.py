@@ -66,6 +66,13 @@ CLIENT = ClientStatus(
     rssi_dbm=-79.0,
     snr_db=9.5,
     radio_ok=True,
+    protocol="superframe",
+    authenticated=True,
+    joined=True,
+    queued=2,
+    late=1,
+    doubted=0,
+    clock_bound_ns=80_000,
 )
 
 
@@ -113,6 +120,7 @@ def test_a_station_that_was_not_asked_is_not_called_silent() -> None:
         ({"radio_ok": False}, "NO RADIO"),
         ({"master_heard_s": None}, "MASTER NOT HEARD"),
         ({"master_heard_s": 60.0}, "MASTER NOT HEARD"),
+        ({"joined": False}, "NOT JOINED"),
     ],
 )
 def test_a_client_that_needs_somebody_is_said_to(change: dict[str, object], words: str) -> None:
@@ -120,6 +128,16 @@ def test_a_client_that_needs_somebody_is_said_to(change: dict[str, object], word
     lines, well = client_text(dataclasses.replace(CLIENT, **change))  # type: ignore[arg-type]
     assert not well
     assert any(words in line for line in lines)
+
+
+def test_a_client_says_how_delivery_and_clock_do() -> None:
+    """Over the protocol superframe; and loudly that there is no key, which is no fault."""
+    assert "2 to deliver, 1 slots late" in client_text(CLIENT)[0]
+    assert "  clock within 0.08 ms" in client_text(CLIENT)[0]
+    lines, well = client_text(dataclasses.replace(CLIENT, authenticated=False, doubted=3))
+    assert well
+    assert any("NO KEY" in line for line in lines)
+    assert "  3 beacons doubted" in lines
 
 
 def test_a_client_in_direct_mode_is_well_without_measurements() -> None:
@@ -221,3 +239,23 @@ def test_one_that_talks_of_something_else_is_not_listened_to_for_ever(
         talking.join()
     assert outcome.code == 1
     assert "no status within" in outcome.err
+
+
+def test_the_superframe_shows_frames_times_and_what_is_missing() -> None:
+    """A missing key is not to be overlooked; what is zero is left out."""
+    station = dataclasses.replace(
+        STATION, clock_bound_ns=None, stamp_bound_ns=152_000, joined=True, missing=12, late=0, doubted=1
+    )
+    record = dataclasses.replace(
+        MASTER, stations=(station,), protocol="superframe", authenticated=False, frame_ms=378.2
+    )
+    text, well = master_text(record)
+    plain = "\n".join(text)
+    assert well
+    assert "frame 378 ms" in plain
+    assert "NO KEY" in plain
+    assert "time within 0.15 ms" in plain
+    assert "12 missing" in plain
+    assert "1 beacons doubted" in plain
+    assert "late" not in plain
+    assert "NO KEY" not in "\n".join(master_text(dataclasses.replace(record, authenticated=True))[0])

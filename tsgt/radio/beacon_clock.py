@@ -134,6 +134,7 @@ class BeaconClock:
         self._stretches: list[Stretch] = []
         self._rival: Stretch | None = None
         self._rival_in_full = False  # whether its times are known to 2^40 us, and not just to 2^16
+        self._rival_live = False
 
     @property
     def last_received_ns(self) -> int | None:
@@ -145,7 +146,9 @@ class BeaconClock:
         """See the class."""
         return sum(map(len, self._stretches))
 
-    def add(self, received_ns: int, sent_us: int, sigma_ns: int, *, in_full: bool = False) -> bool:
+    def add(
+        self, received_ns: int, sent_us: int, sigma_ns: int, *, in_full: bool = False, live: bool = True
+    ) -> bool:
         """Take a pair, in the order of reception.
 
         Parameters
@@ -158,6 +161,8 @@ class BeaconClock:
             One sigma of ``received_ns``, as the radio states it.
         in_full
             That time is from a session part, and not from :meth:`unwrap`.
+        live
+            The master has heard the answer to this beacon, so that it was no recording of long ago.
 
         Returns
         -------
@@ -165,7 +170,8 @@ class BeaconClock:
             False: this cannot be. It is more than 200 us off the fit, and more than jitter and the clocks can
             explain: a beacon that was held up, or a clock that somebody has touched. The fit keeps away from it, but
             its bound contains it until there is one that agrees. Five in a row that agree with each other instead
-            begin the fit anew; if they are off by more than 5 ms, one of them has to be known in full.
+            begin the fit anew, if one of them was live; if they are off by more than 5 ms, one of them has to be known
+            in full as well.
         """
         sent_ns = 1000 * sent_us
         newest_ns = self._rival.last_ns if self._rival else self.last_received_ns
@@ -181,7 +187,7 @@ class BeaconClock:
         if agrees or self._rival is not None:
             self._jitter.add(pair)  # one that stands alone tells nothing of the others
         if not agrees:
-            self._doubt(pair, stretch, in_full=in_full)
+            self._doubt(pair, stretch, in_full=in_full, live=live)
             return abs(stretch.missed_us(pair)) <= DOUBTED_US
         stretch.add(pair)
         if unknown and self._jitter.known:
@@ -253,31 +259,34 @@ class BeaconClock:
         index = self._index(local_ns)
         stretch = self._stretches[index]
         instant = _instant(stretch, local_ns)
+        outvoted = len(stretch) < _FEWEST_RIVALS  # it may have been wrong from its first pair on
+        if local_ns <= stretch.last_ns and not outvoted:
+            return instant
         if index + 1 < len(self._stretches):
-            if local_ns <= stretch.last_ns:
-                return instant
             # Somewhere here one stretch turned into the next; nobody knows where.
             return _either(instant, _instant(self._stretches[index + 1], local_ns))
-        if self._rival is None or local_ns <= stretch.last_ns:
+        if self._rival is None:
             return instant
         # The rate may have changed right after the last pair.
         share = (local_ns - stretch.last_ns) / (self._rival.first_ns - stretch.last_ns)
+        share = max(share, 1.0) if outvoted else share
         return instant._replace(bound_us=instant.bound_us + abs(self._off_us(self._rival)) * share)
 
     def _index(self, local_ns: int) -> int:
         """Return which stretch an instant is in; those between two belong to the earlier one."""
         return max(bisect_right(self._stretches, local_ns, key=lambda stretch: stretch.first_ns) - 1, 0)
 
-    def _doubt(self, pair: Pair, stretch: Stretch, *, in_full: bool) -> None:
+    def _doubt(self, pair: Pair, stretch: Stretch, *, in_full: bool, live: bool) -> None:
         """Hold a pair that does not agree with the fit against others of its kind."""
         if self._rival is None or not self._rival.agrees(pair):
             self._rival = Stretch(pair, stretch.rate_ppm, _SLEWED_SIGMA_PPM)
-            self._rival_in_full = in_full
+            self._rival_in_full, self._rival_live = in_full, live
             return
         self._rival.add(pair)
         self._rival_in_full = self._rival_in_full or in_full
+        self._rival_live = self._rival_live or live
         sure = self._rival_in_full or abs(self._off_us(self._rival)) <= _SURE_US
-        if sure and len(self._rival) >= _FEWEST_RIVALS:
+        if sure and self._rival_live and len(self._rival) >= _FEWEST_RIVALS:
             self._stretches.append(self._rival)
             self._rival = None
 

@@ -16,7 +16,8 @@ REMEMBERED_TICKETS = 8
 """Tickets come round after 16 orders; one that is repeated is one of the latest."""
 
 LONGEST_TURN_ROUND_PAUSE = 48
-"""The master makes room for a turn-round in one of sixteen replies. After so many without it the backlog waits."""
+"""The master makes room for a turn-round in one of sixteen replies. After so many without it the backlog waits; it
+waits for the first one too, and when a beacon has been doubted, for nothing else shows a delay that is always there."""
 
 
 class Situation(NamedTuple):
@@ -55,7 +56,7 @@ class Conversation:
         self._said: dict[
             int, int
         ] = {}  # prisms that the master may take for the tracked one, by the latest frame
-        self._replies_since = 0
+        self._replies_since = LONGEST_TURN_ROUND_PAUSE
 
     # --- Orders -----------------------------------------------------------------------------------------------
 
@@ -80,6 +81,10 @@ class Conversation:
     def turn_round_is_overdue(self) -> bool:
         """Whether a turn-round, and a word of how the station does, are wanted more than the backlog."""
         return self._replies_since >= LONGEST_TURN_ROUND_PAUSE
+
+    def doubt(self) -> None:
+        """Want a turn-round, and a word of how the station does, at once."""
+        self._replies_since = LONGEST_TURN_ROUND_PAUSE
 
     def plain_prism(self, state: StatePart | None) -> int | None:
         """Return the prism that the master is certain to take for the tracked one, in a reply with this part."""

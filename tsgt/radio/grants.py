@@ -26,6 +26,8 @@ from tsgt.radio.messages import (
 from tsgt.radio.superframe import LONGEST_FRAME_NS
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
     from tsgt.radio.rhythm import Beat
     from tsgt.radio.superframe import FrameTiming
 
@@ -39,6 +41,9 @@ MANY_STATIONS = 8
 
 ABSENT_FRAMES = 6
 """A station that was silent for so many frames gets no more than :data:`UNKNOWN_GRANT`."""
+
+AGAIN_FRAMES = 4
+"""A station that was silent for longer is not asked again before the others."""
 
 MOST_MEASUREMENTS = 15
 
@@ -107,6 +112,26 @@ def longest_grant(timing: FrameTiming, stations: int) -> int:
     most = CAPS[stations >= MANY_STATIONS]
     fitting = [index for index in range(most + 1) if timing.airtime_ns(GRANT_BYTES[index]) <= slot_ns]
     return max(fitting[-1] if fitting else 0, UNKNOWN_GRANT)
+
+
+def asked_again(silent: Mapping[int, int], granted: Sequence[int]) -> set[int]:
+    """Return which stations the next frame is for alone; none where it is for all.
+
+    Where many share the channel, a station whose packet was lost would wait long for its next slot. Those of a whole
+    frame that were not heard, though they usually are, get a short one of their own.
+
+    Parameters
+    ----------
+    silent
+        By index of the station: for how many frames it has not been heard.
+    granted
+        By index: the grants of the frame before; empty where there was none.
+    """
+    present = {index for index, frames in silent.items() if frames <= AGAIN_FRAMES}
+    if len(present) < MANY_STATIONS or not granted or not all(granted[index] for index in present):
+        return set()
+    missed = {index for index in present if silent[index]}
+    return missed if 2 * len(missed) <= len(present) else set()
 
 
 def expected(beat: Beat, *, newest_us: int, heard_us: int, slot_us: int) -> int:

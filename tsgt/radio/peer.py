@@ -333,9 +333,10 @@ class Peer:
         newest_us = end_us - (end_us - origin_us - TIME_UNIT_US * newest.time) % span_us
         claimed_ns = 1000 * quality_bound_us(run.quality)
         if run.direct:  # a beacon that somebody held back makes its reply late by as much
-            claimed_ns += max(at.lateness_ns, 0) + SIGMAS * at.sent_sigma_ns
+            usual_ns = 2 * (self._trip.link_ns - self._trip.nominal_ns)
+            claimed_ns += max(at.lateness_ns - usual_ns, 0) + SIGMAS * at.sent_sigma_ns
         sigma_ns = math.hypot(claimed_ns / SIGMAS, _ROUNDING_NS / math.sqrt(3), self._trip.sigma_ns)
-        bound_ns = claimed_ns + _ROUNDING_NS + self._trip.bound_ns
+        bound_ns = claimed_ns + _ROUNDING_NS + self._trip.bound_ns + self._trip.delay_ns
         timed = []
         for sighting in run.sightings:
             back = sighting is not newest

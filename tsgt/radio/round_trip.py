@@ -50,12 +50,18 @@ class RoundTrip:
         The constant; nominal until it has been measured.
     sigma_ns, bound_ns
         One sigma of it, and what it is within of the truth.
+    nominal_ns
+        As given.
+    delay_ns
+        What somebody may be adding to it at present on one of the two ways, by the last exchange; 0 when that was as
+        usual.
     exchanges
         How many measurements it rests on, of the last 256.
     """
 
     def __init__(self, nominal_ns: int, symbol_ns: int) -> None:
-        self._nominal_ns = nominal_ns
+        self.nominal_ns = nominal_ns
+        self.delay_ns = 0
         self._possible_ns = _POSSIBLE_SYMBOLS * symbol_ns
         self._last_ns: float | None = None
         self._changes_ns: deque[float] = deque(maxlen=_REMEMBERED)
@@ -80,16 +86,18 @@ class RoundTrip:
         bool
             False: the link is not like this. A packet was held up on the way, or a stamp is wrong.
         """
-        off_ns = twice_link_ns / 2 - self._nominal_ns
+        off_ns = twice_link_ns / 2 - self.nominal_ns
         if self._last_ns is not None:
             self._changes_ns.append(abs(off_ns - self._last_ns))
         self._last_ns = off_ns
         jitter_ns = self._jitter_ns()
         possible = abs(off_ns) <= self._possible_ns + _SIGMAS * jitter_ns
-        usual = True
+        usual, from_usual_ns = True, abs(off_ns)
         if self._good_ns:
+            from_usual_ns = abs(off_ns - median(self._good_ns))
             allowed_ns = _SIGMAS * jitter_ns * math.sqrt(1 + 1 / self.exchanges)
-            usual = abs(off_ns - median(self._good_ns)) <= max(_SHIFTED_NS, allowed_ns)
+            usual = from_usual_ns <= max(_SHIFTED_NS, allowed_ns)
+        self.delay_ns = 0 if possible and usual else math.ceil(2 * from_usual_ns)
         if possible and (usual or self.exchanges < _FEW):
             self._good_ns.append(off_ns)
             self._measure(jitter_ns)
@@ -115,6 +123,6 @@ class RoundTrip:
         self._state(mean_ns, bound_ns)
 
     def _state(self, off_ns: float, bound_ns: float) -> None:
-        self.link_ns = self._nominal_ns + round(off_ns)
+        self.link_ns = self.nominal_ns + round(off_ns)
         self.bound_ns = math.ceil(bound_ns)
         self.sigma_ns = math.ceil(bound_ns / _SIGMAS)

@@ -231,21 +231,28 @@ class StationSession:
         """Whether this master's time of a measurement can be told: not if it is of another start of this computer."""
         return queued.boot in self._clocks
 
-    def timed(self, queued: Queued, slot_ns: int) -> Timed | None:
-        """Return a measurement with its time for a slot that begins then; None where nothing useful is known."""
+    def timed(self, queued: Queued, slot_ns: int, newest: Timed | None = None) -> Timed | None:
+        """Return a measurement with its time for a slot that begins then; None where nothing useful is known.
+
+        A change between direct times and others costs a run of its own, so it keeps to what ``newest`` in the reply has,
+        unless it is better otherwise.
+        """
         clock = self._clocks[queued.boot]
         live = queued.boot == self._boot
         time = clock.at(queued.at_ns)
         direct = False
-        if live and (time is None or time.bound_us > _DIRECT_EXTRA_US):
+        extra_us = 0.0 if newest is not None and newest.direct else _DIRECT_EXTRA_US
+        if newest is not None and not newest.direct:
+            live = live and time is None
+        if live and (time is None or time.bound_us > extra_us):
             alone = clock.elapsed(self.heard.received_ns, queued.at_ns)
             stamp_us = _SIGMAS * self.heard.sigma_ns / 1000
-            if time is None or alone.bound_us + stamp_us + _DIRECT_EXTRA_US < time.bound_us:
+            if time is None or alone.bound_us + stamp_us + extra_us < time.bound_us:
                 time, direct = alone._replace(bound_us=alone.bound_us + stamp_us), True
         quality = None if time is None else quality_of(time.bound_us)
         if time is None or quality is None:
             return None
-        age_ns = slot_ns - queued.at_ns if live else None
+        age_ns = slot_ns - queued.at_ns if queued.boot == self._boot else None
         return Timed(queued, round(time.time_us / TIME_UNIT_US), quality, direct, age_ns)
 
     def turn_round_us(self) -> int | None:

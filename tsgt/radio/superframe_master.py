@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 from tsgt.errors import MessageError
 from tsgt.radio.airtime import TX_DONE_NS, symbol_time_ns
 from tsgt.radio.authentication import CODE_BYTES
-from tsgt.radio.grants import UNKNOWN_GRANT, longest_grant
+from tsgt.radio.grants import UNKNOWN_GRANT, asked_again, longest_grant
 from tsgt.radio.message_codec import decode_reply, encode_beacon
 from tsgt.radio.messages import (
     GRANT_BYTES,
@@ -145,14 +145,9 @@ class SuperframeMaster:
         records: bool = True,
     ) -> None:
         symbol_ns = symbol_time_ns(timing.settings.spreading_factor, timing.settings.bandwidth_hz)
+        pace = math.ceil(len(prisms) / CALIBRATED_AT_ONCE)
         self._peers = {
-            number: Peer(
-                number,
-                prism,
-                RoundTrip(timing.link_ns, symbol_ns),
-                now_ns,
-                math.ceil(len(prisms) / CALIBRATED_AT_ONCE),
-            )
+            number: Peer(number, prism, RoundTrip(timing.link_ns, symbol_ns), now_ns, pace)
             for number, prism in prisms.items()
         }
         self._entries = max(prisms)
@@ -378,9 +373,13 @@ class SuperframeMaster:
         """Return the grants by index for a beacon that begins then."""
         grants = [0] * self._entries
         slot_ns = start_ns + self._timing.airtime_ns(beacon_bytes) + self._timing.turn_round_ns
+        silent = {number - 1: peer.silent for number, peer in self._peers.items()}
+        again = asked_again(silent, self._frame.grants)
         for index in slot_sequence(self._entries, self._order):
             peer = self._peers.get(index + 1)
             if peer is None or (peer.silent > ABSENT_AFTER_FRAMES and not invites):
+                continue
+            if again and index not in again:
                 continue
             grants[index] = UNKNOWN_GRANT
             if self._records:
@@ -398,5 +397,5 @@ class SuperframeMaster:
 
 def _no_frame(start_ns: int) -> _Frame:
     """Return what stands for the frame before the first one."""
-    draft = Beacon(frame=0, sent=0, cumulative=0, order=SlotOrder(), stations=())
-    return _Frame(-1, start_ns - IDLE_FRAME_NS, (), SlotOrder(), draft)
+    no_beacon = Beacon(frame=0, sent=0, cumulative=0, order=SlotOrder(), stations=())
+    return _Frame(-1, start_ns - IDLE_FRAME_NS, (), SlotOrder(), no_beacon)

@@ -169,11 +169,17 @@ class SuperframeStation:
         joined = self._sessions.confirm(session)
         left_behind = self._outbox.keep(session.can_time) if joined else 0
         reception = session.reception()
-        doubted = reception is not None and not session.clock.add(
-            reception.received_ns, reception.sent_us, reception.sigma_ns, in_full=beacon.session is not None
-        )
-        self.doubted += doubted
         mine = self._station - 1
+        doubted = reception is not None and not session.clock.add(
+            reception.received_ns,
+            reception.sent_us,
+            reception.sigma_ns,
+            in_full=beacon.session is not None,
+            live=mine < len(beacon.stations) and bool(beacon.stations[mine].history & 1),
+        )
+        if doubted:
+            self.doubted += 1
+            session.conversation.doubt()
         if session.confirmed and mine < len(beacon.stations):
             session.acknowledge(beacon.stations[mine].history)
             if session.heard.counter % len(beacon.stations) == mine:
@@ -352,8 +358,11 @@ class SuperframeStation:
         goes first then, for once.
         """
         newest = islice(filter(session.can_time, self._outbox.newest_first()), most)
-        times = (session.timed(queued, slot_ns) for queued in newest)
-        urgent = [each for each in times if each is not None]
+        urgent: list[Timed] = []
+        for queued in newest:
+            timed = session.timed(queued, slot_ns, urgent[0] if urgent else None)
+            if timed is not None:
+                urgent.append(timed)
         if 1 < len(self._outbox) <= FEW:
             urgent[1:] = urgent[:0:-1]
             if self._passed_over >= LONGEST_WAIT:

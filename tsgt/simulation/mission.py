@@ -313,7 +313,7 @@ class Mission:
         for at_s in (outage.start_s, outage.end_s):
             await self.sleep_until(at_s)
             for station in outage.stations:
-                hidden = any(station in o.stations and o.covers(self.now_s) for o in self._options.outages)
+                hidden = any(station in o.stations and o.covers(at_s) for o in self._options.outages)
                 self.air.link.attenuate(MASTER, station_name(station), _OUT_OF_REACH_DB if hidden else 0.0)
 
     async def end(self) -> None:

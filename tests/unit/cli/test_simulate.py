@@ -44,6 +44,24 @@ def test_the_keys_that_others_rely_on(tsgt: Tsgt) -> None:
     assert found["wall_seconds"] > 0
 
 
+def test_the_keys_of_the_superframe(tsgt: Tsgt) -> None:
+    """The protocol that is spoken unless told otherwise has frames, queues, late slots and outages to tell of."""
+    found = tsgt(
+        *("simulate", "--stations", 2, "--duration", 20, "--outage", "2:8:4", "--restart", "1:10"),
+        *("--drift-ramp-ppm-per-min", 1, "--stamp-jitter-us", 20, "--foreign-per-s", 0.2, "--json"),
+    ).json()
+    assert found["protocol"] == "superframe"
+    assert found["violations"] == 0
+    assert 100 < found["frame_ms"] < 500
+    station = found["stations"]["2"]
+    assert station["queued"] < 5
+    assert station["late_slots"] >= 0
+    (outage,) = found["outages"]
+    assert (outage["stations"], outage["start_s"], outage["seconds"]) == ([2], 8, 4)
+    assert 0 < outage["drained_s"] < 5
+    assert outage["live_age_ms"]["p50"] > 0
+
+
 def test_the_text(tsgt: Tsgt) -> None:
     """People get a line for each station, and how many violations there were."""
     result = tsgt("simulate", *CLASSIC, "--stations", 1, "--duration", 16)

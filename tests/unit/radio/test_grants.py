@@ -6,7 +6,15 @@ import pytest
 from support.frames import TIMING
 from support.radios import PAPER
 
-from tsgt.radio.grants import UNKNOWN_GRANT, Demand, demand_bytes, expected, grant, longest_grant
+from tsgt.radio.grants import (
+    UNKNOWN_GRANT,
+    Demand,
+    asked_again,
+    demand_bytes,
+    expected,
+    grant,
+    longest_grant,
+)
 from tsgt.radio.messages import GRANT_BYTES
 from tsgt.radio.rhythm import Beat
 from tsgt.radio.superframe import FrameTiming
@@ -62,3 +70,22 @@ def test_all_grants_together_fit_into_a_frame() -> None:
         turn_round_ns=TIMING.turn_round_ns,
     )
     assert longest_grant(slow, 3) == UNKNOWN_GRANT
+
+
+def test_where_many_share_the_channel_the_unheard_are_asked_again() -> None:
+    """After a frame for all, and once: the frame after that is for all again."""
+    silent = dict.fromkeys(range(8), 0) | {2: 1, 5: 4}
+    assert asked_again(silent, [2] * 8) == {2, 5}
+    assert asked_again(silent, [0, 0, 4, 0, 0, 4, 0, 0]) == set()
+
+
+def test_few_stations_are_not_asked_again() -> None:
+    """Their next slot comes soon; nor are more than half of many, for then the channel is gone."""
+    assert asked_again({0: 0, 1: 1, 2: 0}, [2, 2, 2]) == set()
+    assert asked_again(dict.fromkeys(range(8), 1), [2] * 8) == set()
+
+
+def test_who_has_been_gone_for_long_keeps_nobody_from_being_asked_again() -> None:
+    """It has no slot in most frames, and gets none of its own."""
+    silent = dict.fromkeys(range(9), 0) | {2: 1, 8: 30}
+    assert asked_again(silent, [2] * 8 + [0]) == {2}

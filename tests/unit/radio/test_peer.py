@@ -316,7 +316,7 @@ def test_an_order_gets_room_for_its_answer() -> None:
 
 
 def test_many_stations_may_send_more_at_once_but_not_all_of_them() -> None:
-    """With eight a reply may have 125 bytes; with sixteen a frame in which all do would be too long."""
+    """With eight a reply may hold fifteen measurements; with sixteen a frame in which all do would be too long."""
     caps = {}
     for count in (7, 8, 16):
         frames = frames_of(range(1, count + 1))
@@ -328,7 +328,7 @@ def test_many_stations_may_send_more_at_once_but_not_all_of_them() -> None:
             frames.answer(station, Reply(runs=(run,)), sequence=60)
         frames.end()
         caps[count] = granted(frames)
-    assert caps == {7: 71, 8: 125, 16: 89}
+    assert caps == {7: 71, 8: 107, 16: 89}
 
 
 def test_angles_and_distance_come_back_as_they_were(frames: Frames) -> None:

@@ -176,15 +176,14 @@ def _station_figures(run: Run, number: int, stations: dict[int, _Station]) -> St
     if from_ns is not None and from_ns < end_ns:
         counted = sum(from_ns <= delivery.received_ns <= end_ns for delivery in deliveries)
         rate_hz = counted / ((end_ns - from_ns) / 1e9)
-    ages_ns = [delivery.arrived_ns - delivery.measured_ns for delivery in deliveries]
     return StationFigures(
         measured=len(station.measured_ns),
         delivered=len(deliveries),
         duplicates=station.duplicates,
         rate_hz=rate_hz,
         time_error_us=_errors_us(deliveries),
-        age_ms=_percentiles(ages_ns, 50, 99, unit_ns=1e6),
-        within_2s=sum(age_ns <= IN_TIME_NS for age_ns in ages_ns) / max(1, len(station.measured_ns)),
+        age_ms=_percentiles(_ages_ns(deliveries), 50, 99, unit_ns=1e6),
+        within_2s=_within_2s(_ages_ns(deliveries), len(station.measured_ns)),
         queued=statuses[-1].queued if statuses else None,
         late_slots=sum(status.late or 0 for status in statuses) if run.superframe else None,
     )
@@ -209,6 +208,14 @@ def _outage_figures(outage: Outage, stations: dict[int, _Station]) -> OutageFigu
         live_age_ms=_percentiles(live_ns, 50, unit_ns=1e6)[0],
         time_error_us=_errors_us([d for d in deliveries if start_ns <= d.measured_ns < end_ns]),
     )
+
+
+def _ages_ns(deliveries: Collection[_Delivery]) -> list[int]:
+    return [delivery.arrived_ns - delivery.measured_ns for delivery in deliveries]
+
+
+def _within_2s(ages_ns: Sequence[int], measured: int) -> float:
+    return sum(age_ns <= IN_TIME_NS for age_ns in ages_ns) / max(1, measured)
 
 
 def _errors_us(deliveries: Collection[_Delivery]) -> tuple[float, float, float]:
@@ -262,6 +269,7 @@ def figures(run: Run) -> dict[str, Any]:
     estimator = estimator_figures(run)
     return {
         "stations": {number: _station_keys(station) for number, station in station_figures(run).items()},
+        "all": _all_keys(run),
         **({"frame_ms": frame_ms(run)} if run.superframe else {}),
         "outages": [
             {
@@ -285,6 +293,23 @@ def figures(run: Run) -> dict[str, Any]:
         },
         "airtime_fraction": run.airtime_s / run.duration_s,
         "sim_seconds": run.duration_s,
+    }
+
+
+def _all_keys(run: Run) -> dict[str, Any]:
+    """Put the figures of all stations together under the keys of one."""
+    stations = _stations(run).values()
+    measured = sum(len(station.measured_ns) for station in stations)
+    deliveries = [delivery for station in stations for delivery in station.deliveries.values()]
+    return {
+        "measured": measured,
+        "delivered": len(deliveries),
+        "duplicates": sum(station.duplicates for station in stations),
+        "time_error_us": dict(zip(("p50", "p99", "max"), _errors_us(deliveries), strict=True)),
+        "age_ms": dict(
+            zip(("p50", "p99"), _percentiles(_ages_ns(deliveries), 50, 99, unit_ns=1e6), strict=True)
+        ),
+        "within_2s": _within_2s(_ages_ns(deliveries), measured),
     }
 
 

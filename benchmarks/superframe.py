@@ -67,6 +67,9 @@ def row(case: str, result: dict[str, Any]) -> str:
     ]
     for outage in result["outages"]:
         within = outage["time_error_us"]
+        if outage["drained_s"] is None:
+            cells[0] += " (what was measured within the outage is lost)"
+            continue
         cells[0] += (
             f" (drained {outage['drained_s']:.1f} s, live age p50 {outage['live_age_ms']['p50']:.0f} ms, "
             f"time error of what was measured within {within['p50']:.0f} / {within['p99']:.0f} / {within['max']:.0f})"

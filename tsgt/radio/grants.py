@@ -118,7 +118,8 @@ def asked_again(silent: Mapping[int, int], granted: Sequence[int]) -> set[int]:
     """Return which stations the next frame is for alone; none where it is for all.
 
     Where many share the channel, a station whose packet was lost would wait long for its next slot. Those of a whole
-    frame that were not heard, though they usually are, get a short one of their own.
+    frame that were not heard, though they usually are, get a short one of their own; but one alone that was missed once
+    can wait.
 
     Parameters
     ----------
@@ -131,7 +132,8 @@ def asked_again(silent: Mapping[int, int], granted: Sequence[int]) -> set[int]:
     if len(present) < MANY_STATIONS or not granted or not all(granted[index] for index in present):
         return set()
     missed = {index for index in present if silent[index]}
-    return missed if 2 * len(missed) <= len(present) else set()
+    worth_it = sum(silent[index] for index in missed) > 1
+    return missed if worth_it and 2 * len(missed) <= len(present) else set()
 
 
 def expected(beat: Beat, *, newest_us: int, heard_us: int, slot_us: int) -> int:

@@ -35,7 +35,7 @@ SIGMAS = 4
 """A stamp is within so many sigma of the truth."""
 
 FIRST_EXCHANGES = 8
-EXCHANGE_EVERY = 16
+EXCHANGE_EVERY = 32
 """How often the link constant is measured: so often at the start, then in one of so many replies."""
 
 EXCHANGE_STEP = 5
@@ -48,7 +48,7 @@ USUAL_BEAT = Beat(period_us=400_000, phase_us=0, spread_us=50_000)
 """Of an instrument that tracks; each soon shows its own."""
 
 LATEST_US = 20_000
-"""Nothing is measured later than this after its slot has begun."""
+"""Nothing is measured later than this after its reply should have begun, or has."""
 
 HISTORY = 4
 """Of so many frames a beacon says whether a reply is written."""
@@ -239,6 +239,7 @@ class Peer:
         """
         joined = self._introduced(reply)
         prism = self._prism_of(reply)
+        missing = self.inbox.missing
         numbers, sightings = [], []
         for run in reply.runs:
             found = self._timed(run, self._newest(run, reply), run.prism or prism, at)
@@ -256,6 +257,8 @@ class Peer:
         self._plain = bool(reply.runs) and _is_plain(reply.runs[0])
         if at.granted_bytes - at.payload_bytes >= GRANT_BYTES[2] - GRANT_BYTES[1]:
             self._withheld = self.inbox.missing  # there was room for another one
+        elif self.inbox.missing < missing:
+            self._withheld = 0  # what it could not send before, it can
         self._withheld = min(self._withheld, self.inbox.missing)
         answer, shot = self._answered(reply)
         return Heard(
@@ -328,7 +331,7 @@ class Peer:
     def _timed(self, run: Run, newest_number: int, prism: int, at: Reception) -> list[TimedSighting]:
         newest = run.sightings[0]
         span_us = TIME_UNIT_US << (WIDE_TIME_BITS if run.wide else TIME_BITS)
-        end_us = self._session_us(at.slot_ns) + LATEST_US
+        end_us = self._session_us(at.slot_ns + max(at.lateness_ns, 0)) + LATEST_US
         origin_us = self._session_us(at.sent_ns) if run.direct else 0
         newest_us = end_us - (end_us - origin_us - TIME_UNIT_US * newest.time) % span_us
         claimed_ns = 1000 * quality_bound_us(run.quality)

@@ -118,6 +118,35 @@ def test_a_beacon_that_was_held_up_is_refused() -> None:
     assert after.bound_us < 128
 
 
+def test_a_beacon_that_was_held_up_for_long_does_not_keep_others_from_being_understood() -> None:
+    """Its pair is 40 ms off; the low bits of the next ones are completed all the same."""
+    clock = taught(150)
+    clock.add(received_ns(sent_us(150) + 40_000), sent_us(150), SIGMA_NS)
+    assert clock.unwrap(received_ns(sent_us(152)), sent_us(152) & 0xFFFF) == sent_us(152)
+
+
+def test_recordings_of_long_ago_never_outvote_the_fit() -> None:
+    """However many agree with each other: the master has heard no answer to any of them."""
+    clock = taught(150)
+    for k in range(150, 180):
+        assert not clock.add(received_ns(sent_us(k + 50)), sent_us(k), SIGMA_NS, in_full=True, live=False)
+    at = clock.at(received_ns(sent_us(230)))
+    assert at is not None
+    assert abs(at.time_us - sent_us(230)) < 1000
+
+
+def test_a_first_pair_that_is_outvoted_says_nothing_surely() -> None:
+    """Neither of its own time nor of what was before it."""
+    clock = BeaconClock()
+    clock.add(received_ns(sent_us(0) + 30_000), sent_us(0), SIGMA_NS)
+    for k in range(1, 10):
+        clock.add(received_ns(sent_us(k)), sent_us(k), SIGMA_NS, in_full=True)
+        for early_us in (sent_us(0) - 20_000_000, sent_us(0)):
+            at = clock.at(received_ns(early_us))
+            assert at is not None
+            assert abs(at.time_us - early_us) <= at.bound_us
+
+
 def test_a_clock_that_was_touched_is_followed_within_seconds() -> None:
     """NTP slews the clock by 500 ppm: some pairs are refused, then the new rate is known; the bound holds all the time."""
     clock = taught(150)

@@ -79,6 +79,13 @@ def test_where_many_share_the_channel_the_unheard_are_asked_again() -> None:
     assert asked_again(silent, [0, 0, 4, 0, 0, 4, 0, 0]) == set()
 
 
+def test_one_that_was_missed_once_is_not_asked_again() -> None:
+    """It may just have been late, and a frame for it alone costs all others a third of theirs."""
+    silent = dict.fromkeys(range(8), 0)
+    assert asked_again(silent | {2: 1}, [2] * 8) == set()
+    assert asked_again(silent | {2: 2}, [2] * 8) == {2}
+
+
 def test_few_stations_are_not_asked_again() -> None:
     """Their next slot comes soon; nor are more than half of many, for then the channel is gone."""
     assert asked_again({0: 0, 1: 1, 2: 0}, [2, 2, 2]) == set()
@@ -87,5 +94,5 @@ def test_few_stations_are_not_asked_again() -> None:
 
 def test_who_has_been_gone_for_long_keeps_nobody_from_being_asked_again() -> None:
     """It has no slot in most frames, and gets none of its own."""
-    silent = dict.fromkeys(range(9), 0) | {2: 1, 8: 30}
+    silent = dict.fromkeys(range(9), 0) | {2: 2, 8: 30}
     assert asked_again(silent, [2] * 8 + [0]) == {2}

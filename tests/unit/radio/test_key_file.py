@@ -92,7 +92,7 @@ def test_a_missing_key_is_said_with_the_command_that_makes_one(tmp_path: Path) -
 
 @pytest.mark.parametrize(
     "content",
-    [b"", b"secret\n", b"00" * (KEY_BYTES - 1), b"00" * (KEY_BYTES + 1), b"\xff" * 5000, b"0x" * 32],
+    [b"", b"secret\n", b"00" * (KEY_BYTES - 1), b"00" * (KEY_BYTES + 1), b"\xff" * 5000, b"0x" * 32, b"00" * KEY_BYTES + b" " * 1000 + b"x"],
 )
 def test_what_is_no_key_is_refused(key: Path, content: bytes) -> None:
     """A torn copy or another file is no key."""
@@ -106,6 +106,25 @@ def test_white_space_does_not_matter(key: Path) -> None:
     before = read_key(key)
     key.write_text(f" {key.read_text().upper()}\r\n\n")
     assert read_key(key) == before
+
+
+def test_a_link_to_a_key_is_as_good_as_what_it_leads_to(key: Path) -> None:
+    """Its file has to belong to the user and to be his alone; one that leads nowhere is no file."""
+    link = key.parent / "link"
+    link.symlink_to(key)
+    assert read_key(link) == read_key(key)
+    key.chmod(0o640)
+    with pytest.raises(ConfigError, match="its mode is 0640"):
+        read_key(link)
+    key.unlink()
+    with pytest.raises(ConfigError, match="no such file"):
+        read_key(link)
+
+
+def test_a_path_that_cannot_be_is_said() -> None:
+    """A configuration may hold any character."""
+    with pytest.raises(ConfigError, match="cannot be read"):
+        read_key(Path("radio\0.key"))
 
 
 def test_only_a_file_is_a_key(tmp_path: Path) -> None:

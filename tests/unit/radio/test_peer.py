@@ -48,6 +48,15 @@ def test_a_narrow_time_is_found_again(frames: Frames, age_ms: float) -> None:
     assert 30 * US < found.sigma_ns < found.bound_ns / 3
 
 
+def test_a_measurement_made_within_the_slot_of_a_late_reply_is_not_two_seconds_older(frames: Frames) -> None:
+    """A short reply in a long slot may begin late, and say what was measured meanwhile."""
+    frames.begin()
+    made_us = slot_us(frames) + 50_000
+    run = Run(sightings=(sighting(1, made_us),))
+    (found,) = frames.answer(1, Reply(runs=(run,)), sequence=1, late_ns=60 * MS).sightings
+    assert found.measured_ns == pytest.approx(ZERO_NS + 1000 * made_us + LINK_NS, abs=9 * US)
+
+
 @pytest.mark.parametrize("age_s", [3, 3600, 86_400, 12 * 86_400])
 def test_a_wide_time_may_lie_long_before_the_masters_start(frames: Frames, age_s: int) -> None:
     """Even before its clock was at zero."""
@@ -101,6 +110,22 @@ def test_a_direct_time_counts_from_this_frames_beacon(frames: Frames, late_ms: f
     assert heard.lateness_ns == pytest.approx(late_ms * MS + 200 * US, abs=US)
     on_time_ns = 16 * US + 9 * US + LINK_BOUND_NS + 12 * US
     assert found.bound_ns == pytest.approx(on_time_ns + max(heard.lateness_ns, 0), abs=60 * US)
+
+
+def test_a_delay_does_not_hide_in_a_short_link(frames: Frames) -> None:
+    """Replies over a link that is shorter than the nominal one come early; held back, they come on time."""
+    frames.link_ns = TIMING.link_ns - 100 * US
+    for _ in range(8):
+        exchange(frames)
+    late_us = 200
+    frames.begin()
+    made_us = slot_us(frames) - 120_000
+    run = Run(
+        sightings=(sighting(1, made_us - late_us, origin_us=frames.sent_us),), direct=True, quality=0
+    )
+    heard = frames.answer(1, Reply(runs=(run,)), sequence=1, late_ns=late_us * US)
+    assert heard.lateness_ns == pytest.approx(0, abs=US)
+    assert heard.sightings[0].bound_ns > late_us * US
 
 
 def test_a_direct_time_is_worth_no_more_than_the_masters_stamp(frames: Frames) -> None:
@@ -260,7 +285,7 @@ def test_one_measurement_needs_seventeen_bytes() -> None:
         frames.run(1)
         found += [GRANT_BYTES[entry.grant] for entry in frames.beacon.stations]
     assert sorted(set(found)) == [17, 26]
-    assert found.count(26) == 3 * 64 / 16
+    assert found.count(26) == 3 * 64 / 32
 
 
 def test_whoever_was_not_heard_gets_room_for_what_has_come_up_since() -> None:

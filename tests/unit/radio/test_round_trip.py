@@ -62,6 +62,16 @@ def test_a_packet_that_was_held_up_is_noticed_and_does_not_count() -> None:
     assert trip.link_ns == before_ns
 
 
+def test_what_somebody_adds_is_known_until_it_is_over() -> None:
+    """The whole of it, which may be on one of the two ways; 0 after the next exchange that is as usual."""
+    trip, _ = measured(NOMINAL_NS, 64)
+    assert trip.delay_ns == 0
+    trip.add(2 * NOMINAL_NS + 3_000_000)
+    assert trip.delay_ns == pytest.approx(3_000_000, abs=30_000)
+    trip.add(2 * NOMINAL_NS)
+    assert trip.delay_ns == 0
+
+
 def test_what_no_chip_does_is_refused_at_once() -> None:
     """The first exchange already is compared with what is known beforehand."""
     trip = RoundTrip(NOMINAL_NS, SYMBOL_NS)

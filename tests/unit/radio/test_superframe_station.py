@@ -317,6 +317,19 @@ def test_an_order_is_carried_out_once() -> None:
     assert answered.reply.answer is None
 
 
+def test_a_ticket_that_has_come_round_is_another_order() -> None:
+    """While the station did not hear the master, fifteen orders have come to nothing."""
+    master, station, _ = joined()
+    master.frame(station, orders=[OrderPart(2, ticket=5, order=0, argument=2)])
+    assert station.next_order() == TrackOrder(3)
+    station.executed(ok=True)
+    master.frame(station, orders=[OrderPart(2, ticket=6, order=1)])
+    assert station.next_order() == SearchOrder()
+    station.executed(ok=True)
+    master.frame(station, orders=[OrderPart(2, ticket=5, order=2)])
+    assert station.next_order() == DirectOrder()
+
+
 def test_orders_are_carried_out_one_after_the_other() -> None:
     """Each kind, and each has its own answer."""
     master, station, _ = joined()

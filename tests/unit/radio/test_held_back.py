@@ -1,0 +1,149 @@
+"""Beacons that somebody jams at a station and plays to it later: what it measures keeps its time, or a bound says so."""
+
+from __future__ import annotations
+
+from random import Random
+from typing import TYPE_CHECKING
+
+import pytest
+from support.frames import KEY, TIMING
+
+from tsgt.radio.authentication import Authenticator
+from tsgt.radio.orders import DirectOrder
+from tsgt.simulation.exchange import MS, Exchange
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+    from tsgt.simulation.exchange import Member
+
+DELAYS_NS = (300_000, 3 * MS, 30 * MS)
+
+
+def exchange_of(frames: int = 0) -> Exchange:
+    """Return an exchange of three stations that has been under way for so many frames."""
+    exchange = Exchange(TIMING, Authenticator(KEY), Random(1).getrandbits)
+    for _ in range(frames):
+        exchange.frame()
+    return exchange
+
+
+def hold_back(exchange: Exchange, late_ns: int, frames: int, which: Collection[int]) -> dict[int, str]:
+    """Run frames, hold some beacons back from station 2; return in which frames the master has found that out, and how."""
+    told = {}
+    for frame in range(frames):
+        exchange.frame(late_ns={2: late_ns} if frame in which else {})
+        heard = exchange.heard.get(2)
+        if heard is not None and heard.doubted_beacons:
+            told[frame] = "beacon_doubted"
+        elif heard is not None and heard.link_doubted:
+            told[frame] = "link_doubted"
+    return told
+
+
+def beyond_bound(member: Member) -> dict[int, int]:
+    """Return by how much times are further off than they are said to be."""
+    beyond = {k: abs(off) - member.received[k].bound_ns for k, off in member.errors_ns().items()}
+    return {number: ns for number, ns in beyond.items() if ns > 0}
+
+
+@pytest.mark.parametrize("late_ns", DELAYS_NS)
+def test_a_single_beacon_shifts_no_time(late_ns: int) -> None:
+    """Every tenth one is held back: times stay as good as they were, and the master is told of it."""
+    exchange = exchange_of(60)
+    told = hold_back(exchange, late_ns, 60, range(0, 60, 10))
+    member = exchange.members[2]
+    errors_ns = member.errors_ns()
+    assert max(abs(errors_ns[k]) for k in errors_ns if k > 20) < 60_000
+    assert beyond_bound(member) == {}
+    assert list(told.values()).count("beacon_doubted") >= 3
+    assert min(told) == 1
+
+
+@pytest.mark.parametrize("late_ns", DELAYS_NS)
+def test_from_some_time_on_all_are_held_back(late_ns: int) -> None:
+    """The station follows what it cannot tell from another rate; the master knows at once and says how far times are off."""
+    exchange = exchange_of(60)
+    told = hold_back(exchange, late_ns, 100, range(100))
+    assert min(told) == 1
+    assert list(told.values()).count("link_doubted") > 5
+    assert beyond_bound(exchange.members[2]) == {}
+
+
+@pytest.mark.parametrize("late_ns", [3 * MS, 30 * MS])
+def test_all_are_held_back_from_the_start(late_ns: int) -> None:
+    """The round trip is longer than any chip makes it, and the bound contains what it may be."""
+    exchange = exchange_of()
+    assert "link_doubted" in hold_back(exchange, late_ns, 100, range(100)).values()
+    assert beyond_bound(exchange.members[2]) == {}
+
+
+def test_less_than_chips_may_differ_by_is_not_noticed_from_the_start() -> None:
+    """0.3 ms of delay pass for a link constant of 0.15 ms more; times are off by the other half."""
+    exchange = exchange_of()
+    assert hold_back(exchange, 300_000, 100, range(100)) == {}
+    errors_ns = exchange.members[2].errors_ns()
+    assert 140_000 < max(abs(errors_ns[k]) for k in errors_ns if k > 40) < 200_000
+
+
+@pytest.mark.parametrize("backlog_s", [0, 20])
+@pytest.mark.parametrize("which", [[0], [0, 1], [1], [2], [0, 1, 2], [3, 4], [0, 1, 2, 3, 4, 5, 6, 7]])
+@pytest.mark.parametrize("late_ns", DELAYS_NS)
+def test_the_first_beacons_of_a_station(late_ns: int, which: list[int], backlog_s: int) -> None:
+    """It knows no better than them, and says so; also of what it measured before it heard any."""
+    exchange = exchange_of()
+    member = exchange.members[2]
+    member.next_ns -= backlog_s * 1000 * MS
+    hold_back(exchange, late_ns, 60, which)
+    assert beyond_bound(member) == {}
+    assert set(member.made_ns) - set(member.received) <= set(range(len(member.made_ns) - 3, len(member.made_ns)))
+
+
+@pytest.mark.parametrize("late_s", [2, 20])
+def test_beacons_that_were_missed_are_no_time(late_s: int) -> None:
+    """A station that hears no master is played what it has missed: authentic, new to it, and seconds old."""
+    exchange = exchange_of(60)
+    member = exchange.members[2]
+    late_ns = late_s * 1000 * MS
+    recorded, until_ns = list[tuple[int, bytes]](), exchange.now_ns + late_ns + 15_000 * MS
+    while exchange.now_ns < until_ns:
+        recorded.append((exchange.begin(), exchange.done_ns + late_ns)[::-1])
+        while recorded[0][0] <= exchange.done_ns:
+            played_ns, beacon = recorded.pop(0)
+            exchange.hear(2, late_ns=played_ns - exchange.done_ns, beacon=beacon)
+        exchange.end()
+    for _ in range(20):
+        exchange.frame()
+    assert member.core.doubted > 20
+    assert beyond_bound(member) == {}
+    assert max(map(abs, member.errors_ns().values())) < 100_000
+    assert set(member.made_ns) - set(member.received) <= set(range(len(member.made_ns) - 3, len(member.made_ns)))
+
+
+def test_a_session_of_yesterday_played_back() -> None:
+    """To a station that hears no master: never confirmed, nothing deleted, nothing obeyed; the real one is heard at once."""
+    yesterday = Exchange(TIMING, Authenticator(KEY), Random(2).getrandbits, start_ns=1000 * MS)
+    recorded = []
+    for frame in range(200):
+        if frame % 20 == 0:
+            yesterday.master.order(2, DirectOrder())
+        yesterday.frame()
+        recorded.append(yesterday.beacon)
+    exchange = exchange_of(60)
+    member = exchange.members[2]
+    joined = []
+    for beacon in recorded:
+        exchange.frame(deaf=[2])
+        before = len(member.outbox)
+        exchange.hear(2, beacon=beacon, late_ns=200 * MS)
+        joined.append(member.core.joined)
+        assert len(member.outbox) >= before
+        assert member.core.next_order() is None
+    assert not any(joined[40:])  # from the first one on that tells of its session
+    exchange.frame()
+    assert 2 in exchange.heard
+    assert member.core.joined
+    for _ in range(60):
+        exchange.frame()
+    assert beyond_bound(member) == {}
+    assert set(member.made_ns) - set(member.received) <= set(range(len(member.made_ns) - 3, len(member.made_ns)))

@@ -23,12 +23,8 @@ def main() -> None:
     parser.add_argument("--packets", type=int, default=1_000_000, help="how many (default a million)")
     parser.add_argument("--seed", type=int, default=0, help="of what is sent (default 0)")
     arguments = parser.parse_args()
-    settings = LoRaSettings(
-        frequency_hz=905_000_000, spreading_factor=9, bandwidth_hz=250_000, coding_rate=6
-    )
-    timing = FrameTiming.stated(
-        settings, start_jitter_ns=5 * MS, turn_round_ns=8 * MS, clock_error_ppm=100.0
-    )
+    settings = LoRaSettings(frequency_hz=905_000_000, spreading_factor=9, bandwidth_hz=250_000, coding_rate=6)
+    timing = FrameTiming.stated(settings, start_jitter_ns=5 * MS, turn_round_ns=8 * MS, clock_error_ppm=100.0)
     rng, begun_s = np.random.default_rng(arguments.seed), time.perf_counter()
     result = forge(timing, rng.bytes(32), arguments.packets, rng, per_step=200)
     print("| kind | to stations | accepted | to the master | accepted |")

@@ -71,6 +71,7 @@ class _Row:
 @click.option(
     "--rate-hz",
     type=click.FloatRange(0.01, 100),
+    callback=finite,
     default=2.5,
     show_default=True,
     help="How often each instrument measures.",
@@ -78,6 +79,7 @@ class _Row:
 @click.option(
     "--loss",
     type=click.FloatRange(0, 0.9),
+    callback=finite,
     default=0.0,
     show_default=True,
     help="Probability that a radio does not hear a packet.",
@@ -86,6 +88,7 @@ class _Row:
 @click.option(
     "--frequency-mhz",
     type=click.FloatRange(137, 1020),
+    callback=finite,
     help="Carrier.  [default: a channel of the region, or 905]",
 )
 @click.option("--power-dbm", type=int, help="At the radio, 2 to 17 or 20.  [default: the region's, or 2]")
@@ -100,6 +103,7 @@ class _Row:
 @click.option(
     "--path-loss-exponent",
     type=click.FloatRange(1.5, 6),
+    callback=finite,
     default=3.0,
     show_default=True,
     help="2 in free space, 2.7 to 3.5 over ground and through trees.",
@@ -107,6 +111,7 @@ class _Row:
 @click.option(
     "--antenna-gain-db",
     type=click.FloatRange(-30, 30),
+    callback=finite,
     default=DIPOLE_DBI,
     show_default=True,
     help="Of each antenna, its cable deducted, in dBi; 2.15 is a dipole.",
@@ -114,6 +119,7 @@ class _Row:
 @click.option(
     "--start-jitter-ms",
     type=click.FloatRange(0.5, 50),
+    callback=finite,
     default=_SUPERFRAME.start_jitter_ms,
     show_default=True,
     help="How late a computer starts a transmission at worst; as in the master's configuration.",
@@ -121,6 +127,7 @@ class _Row:
 @click.option(
     "--turn-round-ms",
     type=click.FloatRange(3, 60),
+    callback=finite,
     default=_SUPERFRAME.turn_round_ms,
     show_default=True,
     help="What a computer needs from a beacon to the first slot; likewise.",

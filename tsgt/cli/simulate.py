@@ -91,9 +91,7 @@ LISTED_VIOLATIONS = 20
 @click.option(
     "--clock-filter",
     type=click.Choice(["regression", "paper"]),
-    default="regression",
-    show_default=True,
-    help="How the master follows the stations' clocks; of the protocol classic.",
+    help="How the master follows the stations' clocks; of the protocol classic.  [default: regression]",
 )
 @click.option(
     "--node",
@@ -162,6 +160,12 @@ def simulate_command(
         require_new_file(path)
     if protocol != "classic" and node == "authors":
         raise click.UsageError("the authors' node speaks classic alone; say --protocol classic")
+    if protocol != "classic" and clock_filter is not None:
+        raise click.UsageError(
+            "--clock-filter is of classic, where the master follows clocks; say --protocol classic"
+        )
+    if protocol == "classic" and no_key:
+        raise click.UsageError("--no-key is of superframe; classic never has a key")
     scenario = find_scenario(scenario_name)
     if stations is not None:
         scenario = with_stations(scenario, stations)
@@ -181,12 +185,13 @@ def simulate_command(
         node=node,
         protocol=SuperframeMasterConfig(kind="superframe")
         if protocol == "superframe"
-        else ClassicMasterConfig(kind="classic", clock_filter=clock_filter),
+        else ClassicMasterConfig(kind="classic", clock_filter=clock_filter or "regression"),
         authenticated=not no_key,
         outages=tuple(Outage.parse(text, numbers) for text in outage_texts),
         restarts=tuple(Restart.parse(text, numbers) for text in restart_texts),
         foreign_per_s=foreign_per_s,
     )
+    _check_times(options)
     configure_logging("error")  # what happens on the way stands in the figures
     began_s = time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="tsgt-simulate-") as folder:
@@ -196,7 +201,7 @@ def simulate_command(
             "scenario": scenario.name,
             "protocol": protocol,
             "node": node,
-            "clock_filter": clock_filter if protocol == "classic" else None,
+            "clock_filter": (clock_filter or "regression") if protocol == "classic" else None,
             "seed": seed,
             **figures(run),
             "violations": len(found),
@@ -212,6 +217,18 @@ def simulate_command(
     else:
         _print(result, found)
     return CHECK_FAILED if found else 0
+
+
+def _check_times(options: Options) -> None:
+    """Refuse what would happen after the end of the run: it would look as if nothing came of it."""
+    starts_s = [("--outage", outage.start_s) for outage in options.outages]
+    starts_s += [("--restart", restart.at_s) for restart in options.restarts]
+    for option, start_s in starts_s:
+        if start_s >= options.duration_s:
+            raise click.UsageError(
+                f"{option} at {start_s:g} s: the run ends at {options.duration_s:g} s; give an earlier one, or a longer "
+                "--duration"
+            )
 
 
 def _simulate(scenario: ScenarioConfig, options: Options, folder: Path) -> Run:

@@ -33,6 +33,8 @@ LATE_S = 3.0
 MASTER_LATE_S = 10.0
 """A master that synchronises with another station is silent here for a second or two."""
 
+MASTER_NOT_HEARD = "MASTER NOT HEARD"
+
 WORDS = {
     Status.OK: "TRACKING",
     Status.LOW_ACCURACY: "TRACKING",
@@ -106,6 +108,8 @@ def station_word(station: StationStatus) -> tuple[str, bool]:
 
 def _station_lines(station: StationStatus) -> list[str]:
     """Return some lines of figures, as far as they are known."""
+    if station.last_heard_s is None:
+        return ["  off, too far, or other key, protocol", "  or radio: `tsgt status` there tells"]
     lines = []
     prism = "" if station.prism is None else f"prism {station.prism}  "
     rate = "" if station.rate_hz is None else f"{station.rate_hz:.2f} Hz  "
@@ -150,9 +154,20 @@ def client_text(record: ClientStatus) -> tuple[list[str], bool]:
     else:
         lines.append(f"master heard {duration(record.master_heard_s)} ago")
         lines.append(f"  {record.rssi_dbm or 0:.0f} dBm  SNR {record.snr_db or 0:.0f}")
+    if MASTER_NOT_HEARD in problems:
+        lines += _why_not_heard(record)
     if record.protocol == "superframe":
         lines += _superframe_lines(record)
     return lines, not problems
+
+
+def _why_not_heard(record: ClientStatus) -> list[str]:
+    """Say what the radio hears instead of the master, and what is to be compared with the master's configuration."""
+    if record.refused and record.unknown_packets:
+        return [f"  {record.refused} beacons refused: compare the keys"]
+    if record.unknown_packets:
+        return [f"  {record.unknown_packets} packets not understood:", "  compare protocols and keys"]
+    return ["  nothing heard: master off, too far,", "  or other frequency, SF, bandwidth"]
 
 
 def _superframe_lines(record: ClientStatus) -> list[str]:
@@ -183,7 +198,7 @@ def _client_problems(record: ClientStatus) -> list[str]:
     if not record.radio_ok:
         problems.append("NO RADIO")
     elif record.master_heard_s is None or record.master_heard_s > MASTER_LATE_S:
-        problems.append("MASTER NOT HEARD")
+        problems.append(MASTER_NOT_HEARD)
     elif record.joined is False:
         problems.append("NOT JOINED")
     return problems

@@ -166,7 +166,10 @@ class Alerts:
             late = missed_ns is not None and now_ns - missed_ns > LOST_AFTER_NS
             if late and station.misses > 1 and not station.lost:
                 station.lost = True
-                text = f"not heard for {(now_ns - station.heard_ns) / 1e9:.0f} s"
+                text = (
+                    f"not heard for {(now_ns - station.heard_ns) / 1e9:.0f} s; `tsgt status` on its computer tells "
+                    "whether it hears this master"
+                )
                 events.append(_event(now_ns, "station_lost", text, number))
         ahead_ns = unix_ns - now_ns
         if abs(ahead_ns - self._unix_ahead_ns) > CLOCK_STEP_NS:

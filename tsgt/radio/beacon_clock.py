@@ -214,11 +214,8 @@ class BeaconClock:
         if not self._stretches:
             return None
         rival = self._rival
-        near = (
-            self._at(received_ns)
-            if rival is None or not self._rival_in_full
-            else _instant(rival, received_ns)
-        )
+        # A single beacon that was held back must not keep the next ones from being understood.
+        near = _instant(rival if rival and self._rival_in_full else self._stretches[-1], received_ns)
         if near.bound_us > _UNIQUE_US:
             return None
         near_us = round(near.time_us)

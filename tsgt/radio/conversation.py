@@ -12,11 +12,8 @@ if TYPE_CHECKING:
 
     from tsgt.radio.messages import AnswerPart, OrderPart, Reply, ShotPart, StatePart
 
-REMEMBERED_TICKETS = 8
-"""Tickets come round after 16 orders; one that is repeated is one of the latest."""
-
 LONGEST_TURN_ROUND_PAUSE = 48
-"""The master makes room for a turn-round in one of sixteen replies. After so many without it the backlog waits; it
+"""The master makes room for a turn-round in one of 32 replies. After so many without it the backlog waits; it
 waits for the first one too, and when a beacon has been doubted, for nothing else shows a delay that is always there."""
 
 
@@ -50,7 +47,7 @@ class Conversation:
     def __init__(self) -> None:
         self.answers: deque[AnswerPart] = deque()
         self.shots: deque[ShotPart] = deque()
-        self._tickets: deque[int] = deque(maxlen=REMEMBERED_TICKETS)
+        self._tickets: frozenset[int] = frozenset()
         self._orders: deque[tuple[int, Order]] = deque()
         self._told: Situation | None = None
         self._said: dict[
@@ -61,11 +58,15 @@ class Conversation:
     # --- Orders -----------------------------------------------------------------------------------------------
 
     def take(self, parts: Iterable[OrderPart]) -> None:
-        """Take orders to this station; those that have come before are passed over."""
-        for part in parts:
-            if part.ticket not in self._tickets:
-                self._tickets.append(part.ticket)
-                self._orders.append((part.ticket, _order(part)))
+        """Take a beacon's orders to this station; those that have come before are passed over.
+
+        An order stands in each beacon until it is answered or another one takes its place, and then never again. So a
+        ticket that was not in the last beacon with orders is another order's, however often tickets have come round.
+        """
+        parts = tuple(parts)
+        self._orders.extend((part.ticket, _order(part)) for part in parts if part.ticket not in self._tickets)
+        if parts:
+            self._tickets = frozenset(part.ticket for part in parts)
 
     def next_order(self) -> tuple[int, Order] | None:
         """Return the next order and its ticket, once; None without any."""

@@ -50,12 +50,13 @@ def read_key(path: Path) -> bytes:
             f"{path}: no such file; copy the key of the mission to there, or make one by `tsgt radio key {path}`",
             path=path,
         ) from None
-    except OSError as error:
+    except (OSError, ValueError) as error:  # the latter: a path with a zero byte
+        reason = error.strerror if isinstance(error, OSError) else error
         raise ConfigError(
-            f"{path}: the key cannot be read ({error.strerror}); it has to belong to the user {_user(os.geteuid())}",
+            f"{path}: the key cannot be read ({reason}); it has to belong to the user {_user(os.geteuid())}",
             path=path,
         ) from error
-    if re.fullmatch(rb"\s*[0-9A-Fa-f]{%d}\s*" % _DIGITS, content) is None:
+    if len(content) == _MOST_BYTES or re.fullmatch(rb"\s*[0-9A-Fa-f]{%d}\s*" % _DIGITS, content) is None:
         raise ConfigError(
             f"{path}: not a key, which is one line of {_DIGITS} hexadecimal digits; copy the file of another radio "
             "of the mission again, as it is",
@@ -110,7 +111,7 @@ def _check_access(path: Path, found: os.stat_result) -> None:
     mode = stat.S_IMODE(found.st_mode)
     if mode not in (0o600, 0o400):
         raise ConfigError(
-            f"{path}: its mode is {mode:04o}, so that others than its owner could use the key; `chmod 600 {path}`",
+            f"{path}: its mode is {mode:04o}, but nobody else may use a key; `chmod 600 {path}`",
             path=path,
         )
 

@@ -240,7 +240,7 @@ class Peer:
         joined = self._introduced(reply)
         prism = self._prism_of(reply)
         missing = self.inbox.missing
-        numbers, sightings = [], []
+        missing, numbers, sightings = self.inbox.missing, [], []
         for run in reply.runs:
             found = self._timed(run, self._newest(run, reply), run.prism or prism, at)
             numbers += [sighting.sequence for sighting in found]
@@ -255,7 +255,9 @@ class Peer:
         self.silent = 0
         # One that sends nothing may have had no room: a measurement that is worse than most takes more.
         self._plain = bool(reply.runs) and _is_plain(reply.runs[0])
-        if at.granted_bytes - at.payload_bytes >= GRANT_BYTES[2] - GRANT_BYTES[1]:
+        if self.inbox.missing < missing:
+            self._withheld = 0  # it sends what was missing; the next may have needed a run of its own
+        elif at.granted_bytes - at.payload_bytes >= GRANT_BYTES[2] - GRANT_BYTES[1]:
             self._withheld = self.inbox.missing  # there was room for another one
         elif self.inbox.missing < missing:
             self._withheld = 0  # what it could not send before, it can

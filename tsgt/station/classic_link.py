@@ -12,6 +12,7 @@ from tsgt.radio.classic import TURN_ROUND_NS, ClassicStation
 from tsgt.radio.classic_messages import MeasurementMessage, decode_command, raw_status
 from tsgt.radio.orders import SearchOrder
 from tsgt.station.status import LinkStatus
+from tsgt.station.strangers import Strangers
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
@@ -61,6 +62,7 @@ class ClassicLink:
         self._station = ClassicStation(session.station)
         self._radio: Radio | None = None
         self._heard: Packet | None = None
+        self._strangers = Strangers(clock)
         self._ordered_ns = 0
 
     def offer(self, measurement: PolarMeasurement) -> None:
@@ -120,6 +122,7 @@ class ClassicLink:
 
     async def _received(self, packet: Packet, radio: Radio) -> None:
         command = decode_command(packet.payload)
+        self._strangers.heard(master=command is not None)
         if command is not None and command.station == self._session.station:
             self._heard = packet
         received_ns = self._timeline.unix_ns(packet.received_at_ns)
@@ -138,6 +141,7 @@ class ClassicLink:
             heard_ns=None if heard is None else self._timeline.unix_ns(heard.received_at_ns),
             rssi_dbm=None if heard is None else heard.rssi_dbm,
             snr_db=None if heard is None else heard.snr_db,
+            unknown_packets=self._strangers.packets,
         )
 
     def _now_ns(self) -> int:

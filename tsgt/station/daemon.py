@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import secrets
+from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,7 @@ import structlog
 import tsgt
 from tsgt import service
 from tsgt.clock import UnixTimeline
+from tsgt.errors import RecordingError
 from tsgt.radio.authentication import Authenticator
 from tsgt.radio.conversation import Situation
 from tsgt.radio.orders import MeasureOrder, Order
@@ -117,6 +119,11 @@ async def run_client(
                 run_start=backlog.run_start,
             )
         )
+        # The next run goes on from here, even if the power goes before the first regular sync: otherwise it would
+        # give numbers again that the master has.
+        recorder.flush()
+        with suppress(RecordingError):
+            writer.sync()
         if lineage is None:
             client.link = ClassicLink(session, clock, timeline, on_order=client.give, begin=client.begin)
         else:

@@ -168,6 +168,7 @@ class Session:
             master_heard_s=None if link.heard_ns is None else _seconds(now_ns - link.heard_ns),
             rssi_dbm=link.rssi_dbm,
             snr_db=link.snr_db,
+            unknown_packets=link.unknown_packets,
             radio_ok=radio_ok,
             protocol=link.protocol,
             authenticated=link.authenticated,
@@ -175,6 +176,7 @@ class Session:
             queued=link.queued,
             late=link.late,
             doubted=link.doubted,
+            refused=link.refused,
             clock_bound_ns=link.clock_bound_ns,
         )
 

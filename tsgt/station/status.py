@@ -27,11 +27,13 @@ class LinkStatus:
     heard_ns: int | None
     rssi_dbm: float | None
     snr_db: float | None
+    unknown_packets: int = 0
     authenticated: bool | None = None
     joined: bool | None = None
     queued: int | None = None
     late: int | None = None
     doubted: int | None = None
+    refused: int | None = None
     clock_bound_ns: int | None = None
 
 
@@ -103,6 +105,9 @@ class ClientStatus:
         Strength of that packet in dBm; null before the first one.
     snr_db
         Its ratio to the noise in dB; null before the first one.
+    unknown_packets
+        How many packets of anybody have come since the master's last one. If it is not heard and these become more, it
+        speaks another protocol, or has another key.
     radio_ok
         Whether the radio is open and answered when it was used last.
     protocol
@@ -119,6 +124,8 @@ class ClientStatus:
     doubted
         How many beacons came at a time at which they cannot have been sent: somebody holds packets back, or a clock
         has been set.
+    refused
+        How many packets looked like a beacon with a wrong code: the master has another key, or somebody forges beacons.
     clock_bound_ns
         How well the master's time is known, in ns; null where it is not yet.
     """
@@ -142,6 +149,7 @@ class ClientStatus:
     master_heard_s: float | None
     rssi_dbm: float | None
     snr_db: float | None
+    unknown_packets: int
     radio_ok: bool
     protocol: ProtocolName
     authenticated: bool | None
@@ -149,6 +157,7 @@ class ClientStatus:
     queued: int | None
     late: int | None
     doubted: int | None
+    refused: int | None
     clock_bound_ns: int | None
 
     def __post_init__(self) -> None:

@@ -10,6 +10,7 @@ from tsgt.radio.message_codec import angle_code
 from tsgt.recording.journal import AcknowledgedRecord, ReceptionRecord
 from tsgt.station.backlog import queued
 from tsgt.station.status import LinkStatus
+from tsgt.station.strangers import Strangers
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -86,6 +87,7 @@ class SuperframeLink:
         if not authenticated:
             log.warning("unauthenticated", key_file=None)
         self._logged_ns: dict[str, int] = {}
+        self._strangers = Strangers(clock)
 
     def offer(self, measurement: PolarMeasurement) -> None:
         """See the protocol; whatever has been measured will be delivered."""
@@ -118,6 +120,7 @@ class SuperframeLink:
             packet = await radio.receive()
             refused = self._station.refused
             heard = self._station.received(packet)
+            self._strangers.heard(master=heard is not None)
             if self._station.refused != refused and self._is_seldom("beacon_refused"):
                 log.warning("beacon_refused", refused=self._station.refused)
             if heard is not None:
@@ -190,6 +193,8 @@ class SuperframeLink:
             heard_ns=None if station.heard_ns is None else self._timeline.unix_ns(station.heard_ns),
             rssi_dbm=station.rssi_dbm,
             snr_db=station.snr_db,
+            unknown_packets=self._strangers.packets,
+            refused=station.refused,
             authenticated=self._authenticated,
             joined=station.joined,
             queued=len(self._outbox),

@@ -100,6 +100,8 @@ def test_20_dbm_is_warned_about_everywhere(tsgt: Tsgt) -> None:
         ((*SUPERFRAME, 3, "--loss", 1), "--loss"),
         ((*SUPERFRAME, 3, "--rate-hz", 0), "--rate-hz"),
         ((*SUPERFRAME, 3, "--distance-m", "nan"), "--distance-m"),
+        ((*SUPERFRAME, 3, "--rate-hz", "nan"), "--rate-hz"),
+        ((*SUPERFRAME, 3, "--loss", "nan"), "--loss"),
         ((*SUPERFRAME, 3, "--region", "MARS"), "--region"),
         (("radio", "plan", "--stations", 3), "--protocol"),
     ],

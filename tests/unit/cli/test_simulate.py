@@ -171,6 +171,10 @@ def test_a_run_too_short_for_poses_has_dashes(tsgt: Tsgt) -> None:
         ((*CLASSIC, "--stations", 10), "station 10: classic knows 1 to 9"),
         (("--outage", "4:10:10"), "there is no station 4"),
         (("--restart", "10"), "expected STATION:AT"),
+        (("--duration", 20, "--outage", "all:20:5"), "--outage at 20 s: the run ends at 20 s"),
+        (("--duration", 20, "--restart", "master:60"), "--restart at 60 s: the run ends at 20 s"),
+        (("--clock-filter", "paper"), "say --protocol classic"),
+        ((*CLASSIC, "--no-key"), "classic never has a key"),
     ],
 )
 def test_what_does_not_go_together(tsgt: Tsgt, arguments: tuple[str | int, ...], reason: str) -> None:

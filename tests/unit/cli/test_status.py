@@ -65,6 +65,7 @@ CLIENT = ClientStatus(
     master_heard_s=0.4,
     rssi_dbm=-79.0,
     snr_db=9.5,
+    unknown_packets=2,
     radio_ok=True,
     protocol="superframe",
     authenticated=True,
@@ -72,6 +73,7 @@ CLIENT = ClientStatus(
     queued=2,
     late=1,
     doubted=0,
+    refused=0,
     clock_bound_ns=80_000,
 )
 
@@ -128,6 +130,21 @@ def test_a_client_that_needs_somebody_is_said_to(change: dict[str, object], word
     lines, well = client_text(dataclasses.replace(CLIENT, **change))  # type: ignore[arg-type]
     assert not well
     assert any(words in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"unknown_packets": 0}, "nothing heard: master off"),
+        ({"unknown_packets": 40}, "40 packets not understood"),
+        ({"unknown_packets": 40, "refused": 9}, "9 beacons refused: compare the keys"),
+    ],
+)
+def test_a_client_says_why_it_does_not_hear_its_master(change: dict[str, object], words: str) -> None:
+    """What its radio hears tells a missing master from one with another protocol or key."""
+    lines, _ = client_text(dataclasses.replace(CLIENT, master_heard_s=None, **change))  # type: ignore[arg-type]
+    assert any(words in line for line in lines)
+    assert max(len(line) for line in lines[1:]) <= 40
 
 
 def test_a_client_says_how_delivery_and_clock_do() -> None:

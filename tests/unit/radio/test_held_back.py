@@ -22,7 +22,7 @@ DELAYS_NS = (300_000, 3 * MS, 30 * MS)
 
 def exchange_of(frames: int = 0) -> Exchange:
     """Return an exchange of three stations that has been under way for so many frames."""
-    exchange = Exchange(TIMING, Authenticator(KEY), Random(1).getrandbits)
+    exchange = Exchange(TIMING, Authenticator(KEY), Random(1).getrandbits)  # noqa: S311 (a test has no secrets)
     for _ in range(frames):
         exchange.frame()
     return exchange
@@ -96,7 +96,9 @@ def test_the_first_beacons_of_a_station(late_ns: int, which: list[int], backlog_
     member.next_ns -= backlog_s * 1000 * MS
     hold_back(exchange, late_ns, 60, which)
     assert beyond_bound(member) == {}
-    assert set(member.made_ns) - set(member.received) <= set(range(len(member.made_ns) - 3, len(member.made_ns)))
+    assert set(member.made_ns) - set(member.received) <= set(
+        range(len(member.made_ns) - 3, len(member.made_ns))
+    )
 
 
 @pytest.mark.parametrize("late_s", [2, 20])
@@ -117,12 +119,14 @@ def test_beacons_that_were_missed_are_no_time(late_s: int) -> None:
     assert member.core.doubted > 20
     assert beyond_bound(member) == {}
     assert max(map(abs, member.errors_ns().values())) < 100_000
-    assert set(member.made_ns) - set(member.received) <= set(range(len(member.made_ns) - 3, len(member.made_ns)))
+    assert set(member.made_ns) - set(member.received) <= set(
+        range(len(member.made_ns) - 3, len(member.made_ns))
+    )
 
 
 def test_a_session_of_yesterday_played_back() -> None:
     """To a station that hears no master: never confirmed, nothing deleted, nothing obeyed; the real one is heard at once."""
-    yesterday = Exchange(TIMING, Authenticator(KEY), Random(2).getrandbits, start_ns=1000 * MS)
+    yesterday = Exchange(TIMING, Authenticator(KEY), Random(2).getrandbits, start_ns=1000 * MS)  # noqa: S311 (as above)
     recorded = []
     for frame in range(200):
         if frame % 20 == 0:
@@ -146,4 +150,6 @@ def test_a_session_of_yesterday_played_back() -> None:
     for _ in range(60):
         exchange.frame()
     assert beyond_bound(member) == {}
-    assert set(member.made_ns) - set(member.received) <= set(range(len(member.made_ns) - 3, len(member.made_ns)))
+    assert set(member.made_ns) - set(member.received) <= set(
+        range(len(member.made_ns) - 3, len(member.made_ns))
+    )

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import os
 import stat
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 from tsgt.errors import ConfigError, OutputFileError
 from tsgt.radio.authentication import KEY_BYTES
 from tsgt.radio.key_file import read_key, write_key
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @pytest.fixture
@@ -92,7 +89,15 @@ def test_a_missing_key_is_said_with_the_command_that_makes_one(tmp_path: Path) -
 
 @pytest.mark.parametrize(
     "content",
-    [b"", b"secret\n", b"00" * (KEY_BYTES - 1), b"00" * (KEY_BYTES + 1), b"\xff" * 5000, b"0x" * 32, b"00" * KEY_BYTES + b" " * 1000 + b"x"],
+    [
+        b"",
+        b"secret\n",
+        b"00" * (KEY_BYTES - 1),
+        b"00" * (KEY_BYTES + 1),
+        b"\xff" * 5000,
+        b"0x" * 32,
+        b"00" * KEY_BYTES + b" " * 1000 + b"x",
+    ],
 )
 def test_what_is_no_key_is_refused(key: Path, content: bytes) -> None:
     """A torn copy or another file is no key."""

@@ -120,9 +120,7 @@ def test_a_delay_does_not_hide_in_a_short_link(frames: Frames) -> None:
     late_us = 200
     frames.begin()
     made_us = slot_us(frames) - 120_000
-    run = Run(
-        sightings=(sighting(1, made_us - late_us, origin_us=frames.sent_us),), direct=True, quality=0
-    )
+    run = Run(sightings=(sighting(1, made_us - late_us, origin_us=frames.sent_us),), direct=True, quality=0)
     heard = frames.answer(1, Reply(runs=(run,)), sequence=1, late_ns=late_us * US)
     assert heard.lateness_ns == pytest.approx(0, abs=US)
     assert heard.sightings[0].bound_ns > late_us * US
@@ -310,6 +308,20 @@ def test_missing_measurements_are_asked_for() -> None:
     frames.measure(1)  # and it had room for more
     frames.end()
     assert granted(frames) <= 26
+
+
+def test_a_station_that_sends_what_was_missing_is_granted_on() -> None:
+    """Though it left room: the next older one may need a run of its own, which takes more than that."""
+    frames = settled()
+    station = frames.stations[1]
+    first_missing = station.sequence
+    station.sequence += 50
+    frames.run(1)
+    frames.begin()
+    old = sighting(first_missing + 20, slot_us(frames) - 10_000_000, wide=True)
+    frames.answer(1, Reply(runs=(Run(sightings=(old,), wide=True),)), sequence=first_missing + 20)
+    frames.end()
+    assert granted(frames) == 71
 
 
 def test_what_is_not_written_yet_comes_again() -> None:

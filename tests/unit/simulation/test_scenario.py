@@ -203,6 +203,17 @@ def test_an_outage(tmp_path: Path) -> None:
     assert 0 < outage.live_age_ms < 1000
 
 
+def test_an_outage_ends_between_two_nanoseconds(tmp_path: Path) -> None:
+    """Instants are rounded to whole ones; the hill must not stay for that."""
+    outage = Outage((2,), 2.1, 0.2)
+    assert round(outage.end_s * 1e9) / 1e9 < outage.end_s
+    run = mission(tmp_path, duration_s=20.0, outages=(outage,))
+    received_s = [
+        (m.received_ns - run.start_ns) / 1e9 for m in run.sessions[0].measurements if m.station == 2
+    ]
+    assert max(received_s) > 15.0
+
+
 def test_restarts_that_are_asked_for(tmp_path: Path) -> None:
     """A client and the master end when they are told to, and are back two seconds later."""
     run = mission(tmp_path, duration_s=40.0, restarts=(Restart(1, 15.0), Restart(None, 20.0)))

@@ -131,6 +131,7 @@ def test_the_status_before_anything_has_happened() -> None:
         master_heard_s=None,
         rssi_dbm=None,
         snr_db=None,
+        unknown_packets=0,
         radio_ok=True,
         protocol="classic",
         authenticated=None,
@@ -138,6 +139,7 @@ def test_the_status_before_anything_has_happened() -> None:
         queued=None,
         late=None,
         doubted=None,
+        refused=None,
         clock_bound_ns=None,
     )
 

@@ -255,3 +255,23 @@ async def test_replies_begin_on_time(tmp_path: Path) -> None:
         slot_ns = air.master.beacon_done_ns - 67_000 + TIMING.turn_round_ns
         assert abs(began_ns - slot_ns) < MS
         air.master.take(packet.payload)
+
+
+async def test_the_numbers_of_a_run_are_on_the_disk_before_the_first_is_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run of which nothing was left after a power cut would be followed by one with the same numbers."""
+    synced: list[bytes] = []
+    sync = RecordingWriter.sync
+
+    def watched(writer: RecordingWriter) -> None:
+        (path,) = (tmp_path / "journals").iterdir()
+        synced.append(path.read_bytes())
+        sync(writer)
+
+    monkeypatch.setattr(RecordingWriter, "sync", watched)
+    async with superframe_day(tmp_path) as (day, air):
+        await air.frame()
+        await day.kill()
+    assert b"run_start" in synced[0]
+    assert b"measurement" not in synced[0]

@@ -1,0 +1,197 @@
+"""Whoever has no key changes nothing, and without a key anybody may send anything: nothing falls over."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import replace
+from unittest.mock import patch
+
+import numpy as np
+from support.frames import KEY, TIMING
+
+from tsgt.errors import MessageError
+from tsgt.model import Status
+from tsgt.radio.authentication import CODE_BYTES, Authenticator
+from tsgt.radio.message_codec import decode_reply, encode_beacon, encode_reply
+from tsgt.radio.messages import (
+    AnswerPart,
+    Beacon,
+    Confirmation,
+    Introduction,
+    OrderPart,
+    Reply,
+    Run,
+    SessionPart,
+    ShotPart,
+    Sighting,
+    SlotOrder,
+    StatePart,
+    StationEntry,
+)
+from tsgt.simulation.exchange import Exchange
+from tsgt.simulation.forgery import KINDS, forge, state
+
+
+def test_no_forged_packet_has_an_effect() -> None:
+    """Of all kinds, to both sides, at any moment of a frame: not a byte on the air is another one because of them."""
+    result = forge(TIMING, KEY, 30_000, np.random.default_rng(1), per_step=50)
+    assert min(result.sent[kind, target] for kind in KINDS for target in ("station", "master")) > 500
+    assert +result.accepted == {}
+    assert (result.diverged, result.same_state) == (0, True)
+
+
+def test_an_effect_would_be_seen() -> None:
+    """Were codes not compared, in all three ways in which it is looked for."""
+    with patch("hmac.compare_digest", return_value=True):
+        result = forge(TIMING, KEY, 5000, np.random.default_rng(1), per_step=50)
+    assert result.accepted.total() > 100
+    assert result.diverged > 0
+    assert not result.same_state
+
+
+def test_two_states_are_told_apart() -> None:
+    """Down to a counter in one of the stations."""
+    one, other = (Exchange(TIMING, Authenticator(KEY), lambda bits: 7 % (1 << bits)) for _ in range(2))
+    for exchange in (one, other):
+        exchange.frame()
+        exchange.frame()
+    assert state(one) == state(other)
+    other.members[3].core.late += 1
+    assert state(one) != state(other)
+
+
+class _Anybody:
+    """Sends what nobody would, with codes that are right: any values in any fields."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng = rng
+        self._authenticator = Authenticator(None)
+
+    def bits(self, width: int) -> int:
+        """Return a number: any, or one at the edge of its field."""
+        last = (1 << width) - 1
+        edges = (0, 1, last, last // 2)
+        if self._rng.random() < 0.3:
+            return edges[int(self._rng.integers(len(edges)))]
+        return int.from_bytes(self._rng.bytes(8), "big") & last
+
+    def chance(self, share: float = 0.5) -> bool:
+        """Toss a coin."""
+        return bool(self._rng.random() < share)
+
+    def beacon(self, exchange: Exchange, number: int) -> bytes:
+        """Make one that the station takes to be its master's, or that begins another session."""
+        entries = int(self._rng.integers(1, 17)) if self.chance(0.2) else len(exchange.members)
+        core = exchange.members[number].core
+        session = core._sessions.current
+        assert session is not None
+        counter = session.heard.counter + 1 + (self.bits(3) if self.chance() else 0)
+        if self.chance(0.05):
+            counter = self.bits(24)
+        master = self.bits(48) if self.chance(0.05) else session.master_nonce
+        part = SessionPart(
+            nonce=master,
+            counter_high=counter >> 8 & 0xFFFF,
+            sent_high=self.bits(24),
+            guard=self.bits(8),
+            turn_round=self.bits(8),
+        )
+        numbers = [1 + self.bits(4) % entries for _ in range(3)]
+        sent = self.bits(16)
+        content = encode_beacon(
+            Beacon(
+                frame=counter % 256,
+                sent=sent,
+                cumulative=self.bits(8),
+                order=SlotOrder(self.bits(4), self.chance()),
+                stations=tuple(StationEntry(self.bits(4), self.bits(4)) for _ in range(entries)),
+                session=replace(part, sent_high=part.sent_high if sent else 0) if self.chance() else None,
+                confirmations=(Confirmation(min(number, entries), session.nonce),) if self.chance() else (),
+                orders=tuple(OrderPart(n, self.bits(4), self.bits(2) and 1 + self.bits(1)) for n in numbers),
+            )
+        )
+        return content + self._authenticator.beacon_code(session=master, counter=counter, content=content)
+
+    def reply(self, exchange: Exchange, number: int) -> bytes:
+        """Make one that the master takes to be a station's."""
+        peer = exchange.master.peer(number)
+        introduction = Introduction(
+            nonce=self.bits(32), lineage=self.bits(2), run_start=self.bits(32), oldest=self.bits(32)
+        )
+        state_part = StatePart(
+            prism=1 + self.bits(4),
+            direct=self.chance(),
+            connected=self.chance(),
+            late=self.bits(8),
+            doubted=self.bits(4),
+            rssi_dbm=-self.bits(7),
+        )
+        values = (self.bits(24), self.bits(24), self.bits(24) or None)
+        reply = Reply(
+            runs=tuple(self._run() for _ in range(self.bits(2))),
+            introduction=introduction if self.chance(0.2) else None,
+            state=state_part if self.chance() else None,
+            turn_round_us=self.bits(22) if self.chance() else None,
+            answer=AnswerPart(self.bits(4), self.chance()) if self.chance() else None,
+            shot=ShotPart(self.bits(4), Status.OK, *values) if self.chance() else None,
+        )
+        content = encode_reply(reply)
+        nonce = peer.nonce if reply.introduction is None else reply.introduction.nonce
+        return content + self._authenticator.reply_code(
+            session=exchange.master.session,
+            station=number,
+            station_nonce=nonce or 0,
+            counter=exchange.master.counter,
+            beacon_code=exchange.beacon[-CODE_BYTES:],
+            sequence=peer.first_number(decode_reply(content)),
+            content=content,
+        )
+
+    def _run(self) -> Run:
+        wide = self.chance()
+        sequence, time = self.bits(32 if wide else 8), self.bits(36 if wide else 17)
+        sightings = []
+        for _ in range(1 + self.bits(4)):
+            values = (self.bits(24), self.bits(24), self.bits(24) or None)
+            sightings.append(Sighting(sequence, time, Status.OK, *values))
+            sequence -= 1 + self.bits(int(self._rng.integers(1, 32)))
+            time -= self.bits(int(self._rng.integers(1, 35)))
+        return Run(
+            sightings=tuple(sightings),
+            direct=self.chance(),
+            quality=self.bits(4),
+            wide=wide,
+            prism=1 + self.bits(4) if self.chance() else None,
+            far=self.chance(),
+        )
+
+
+def test_without_a_key_nothing_falls_over() -> None:
+    """Orders, sessions, numbers and times of anybody, all of which is believed."""
+    rng = np.random.default_rng(3)
+    anybody = _Anybody(rng)
+    exchange = Exchange(TIMING, Authenticator(None), anybody.bits)
+    exchange.frame()
+    believed = 0
+    for _ in range(250):
+        exchange.begin()
+        for number, member in exchange.members.items():
+            own = exchange.hear(number) if anybody.chance() else None
+            with suppress(MessageError):
+                beacon = anybody.beacon(exchange, number)
+                exchange.hear(number, beacon=beacon, late_ns=anybody.bits(33) if anybody.chance(0.1) else 0)
+            if member.core.next_order() is not None:
+                member.core.executed(ok=anybody.chance())
+            if own is not None and anybody.chance():
+                exchange.deliver(number, own)
+            with suppress(MessageError):
+                reply = anybody.reply(exchange, number)
+                received_ns = exchange.done_ns + anybody.bits(29)
+                heard = exchange.master.received(
+                    reply, received_ns, 3000 if anybody.chance(0.9) else 1_000_000
+                )
+                if heard is not None:
+                    believed += 1
+                    exchange.master.peer(number).inbox.written([got.sequence for got in heard.sightings])
+        exchange.end()
+    assert believed > 200

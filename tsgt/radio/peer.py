@@ -11,7 +11,6 @@ from tsgt.radio.heard import Heard, TimedSighting
 from tsgt.radio.inbox import Inbox
 from tsgt.radio.message_codec import angle_rad, distance_m
 from tsgt.radio.messages import (
-    GRANT_BYTES,
     SINGLE_QUALITY,
     TIME_BITS,
     TIME_UNIT_US,
@@ -46,6 +45,9 @@ MISSING_EVERY = 32
 
 USUAL_BEAT = Beat(period_us=400_000, phase_us=0, spread_us=50_000)
 """Of an instrument that tracks; each soon shows its own."""
+
+ANY_RUN_BYTES = 21
+"""A measurement in a run of its own takes no more, however old it is."""
 
 LATEST_US = 20_000
 """Nothing is measured later than this after its reply should have begun, or has."""
@@ -240,7 +242,8 @@ class Peer:
         joined = self._introduced(reply)
         prism = self._prism_of(reply)
         missing = self.inbox.missing
-        missing, numbers, sightings = self.inbox.missing, [], []
+        numbers: list[int] = []
+        sightings: list[TimedSighting] = []
         for run in reply.runs:
             found = self._timed(run, self._newest(run, reply), run.prism or prism, at)
             numbers += [sighting.sequence for sighting in found]
@@ -257,10 +260,8 @@ class Peer:
         self._plain = bool(reply.runs) and _is_plain(reply.runs[0])
         if self.inbox.missing < missing:
             self._withheld = 0  # it sends what was missing; the next may have needed a run of its own
-        elif at.granted_bytes - at.payload_bytes >= GRANT_BYTES[2] - GRANT_BYTES[1]:
-            self._withheld = self.inbox.missing  # there was room for another one
-        elif self.inbox.missing < missing:
-            self._withheld = 0  # what it could not send before, it can
+        elif at.granted_bytes - at.payload_bytes >= ANY_RUN_BYTES:
+            self._withheld = self.inbox.missing  # there was room for any of them
         self._withheld = min(self._withheld, self.inbox.missing)
         answer, shot = self._answered(reply)
         return Heard(

@@ -103,7 +103,8 @@ def test_the_lock_halves_the_age() -> None:
 
 def test_frames_that_are_longer_than_the_beat_are_not_locked() -> None:
     """Where a frame does not fit into the instruments' period, it starts as soon as it can."""
-    assert superframe(4, 0.1) == superframe(4, 0.1, phase_lock=False)
+    free = superframe(4, 0.1, phase_lock=False)
+    assert superframe(4, 0.1).cycle_ms == pytest.approx(free.cycle_ms)
 
 
 def test_shorter_guards_make_shorter_frames() -> None:

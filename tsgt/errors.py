@@ -14,6 +14,7 @@
     ├── StreamError            a socket of ours cannot be opened or reached
     ├── MessageError           bytes or numbers that make no packet of ours
     ├── InstrumentError        the total station does not do what it was told, or is gone
+    │   └── InstrumentRefusedError  it answers, and will not do this: a licence or a target is missing
     └── RadioError             the radio does not do what it was told
         ├── RadioSettingsError     it was told something that it cannot do
         ├── RadioNotFoundError     there is none: wiring, pins, SPI
@@ -97,6 +98,10 @@ class MessageError(TsgtError, ValueError):
 
 class InstrumentError(TsgtError):
     """The total station does not do what it was told: unplugged, switched off, no target, garbage on the line."""
+
+
+class InstrumentRefusedError(InstrumentError):
+    """The total station answers, but cannot or will not do this: no licence, no target. Trying again changes nothing."""
 
 
 class RadioError(TsgtError):

@@ -101,6 +101,33 @@ class ScenarioRadioConfig(Model):
     """That a packet is not heard, whatever its power."""
 
 
+class InstrumentModelConfig(Model):
+    """How a simulated total station behaves; the defaults are what public recordings and manuals show."""
+
+    tick_jitter_ms: NotNegative = 4.0
+    """Spread of the instants at which it measures about even ones, one sigma."""
+    processing_min_ms: NotNegative = 20.0
+    """From a measurement or a question, whichever is later, to its answer it takes at least this ..."""
+    processing_max_ms: NotNegative = 60.0
+    """... and at most this; all between are equally likely."""
+    stalls_per_min: NotNegative = 0.0
+    """How often it takes 300 to 700 ms instead, on average."""
+    clock_drift_ppm: Annotated[float, Field(ge=-1000, le=1000)] = 20.0
+    """By how much its own clock gains on the true time; positive: it runs fast."""
+    angle_delay_ms: Annotated[float, Field(ge=-100, le=100)] = 0.0
+    """By how much its angles are newer than its distance."""
+    prediction_s: NotNegative = 2.0
+    """How long the telescope keeps moving when the prism is hidden, before the lock is lost."""
+    baud: Annotated[int, Field(ge=2400, le=921_600)] = 115_200
+    """Bits per second of its line."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> InstrumentModelConfig:
+        if self.processing_min_ms > self.processing_max_ms:
+            raise ValueError("processing_min_ms is above processing_max_ms")
+        return self
+
+
 class SimulatedStation(Model):
     """A simulated total station: set up level, turned by some angle about the plumb line."""
 
@@ -118,6 +145,8 @@ class SimulatedStation(Model):
     """What the instrument's slope distance lacks to the prism's centre."""
     noise: NoiseConfig = NoiseConfig(range_sigma_ppm=0.0)
     """Noise of one measurement."""
+    instrument: InstrumentModelConfig = InstrumentModelConfig()
+    """What else there is to say of the instrument."""
 
 
 class SimulatedPrism(Model):

@@ -6,6 +6,25 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
+class Direction:
+    """Where a prism is believed to be, seen from a station, in the terms of its own circles.
+
+    Attributes
+    ----------
+    horizontal_angle_rad
+        Horizontal circle, clockwise from the circle's zero, in rad.
+    zenith_angle_rad
+        Angle from straight up, in rad.
+    spread_rad
+        It is within this of the direction, to every side, in rad.
+    """
+
+    horizontal_angle_rad: float
+    zenith_angle_rad: float
+    spread_rad: float
+
+
+@dataclass(frozen=True, slots=True)
 class TrackOrder:
     """Go back to tracking.
 
@@ -20,7 +39,15 @@ class TrackOrder:
 
 @dataclass(frozen=True, slots=True)
 class SearchOrder:
-    """Look for the tracked prism anew, even if the instrument seems to have it. Not in the protocol classic."""
+    """Look for the tracked prism anew, even if the instrument seems to have it. Not in the protocol classic.
+
+    Attributes
+    ----------
+    towards
+        Where to look for it; None: where the station last had it.
+    """
+
+    towards: Direction | None = None
 
 
 @dataclass(frozen=True, slots=True)

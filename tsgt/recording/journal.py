@@ -46,6 +46,53 @@ class JournalRecord:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class InstrumentRecord:
+    """What measured, and how it was set: written after each connection and each change, as read back from it.
+
+    Attributes
+    ----------
+    type
+        Always ``instrument``.
+    stamp_ns
+        From when on, on the station computer's clock, in ns.
+    make, model, serial_number, firmware
+        Whose it is; empty where it does not say.
+    prism_type
+        Reflector that it is set to, in the words of the configuration; empty where unknown.
+    prism_constant_m
+        What the instrument itself adds to a distance for it, in m, in its maker's convention; null where unknown. The
+        distances in this file have it, so the master must add only what is still missing.
+    atmospheric_ppm
+        Scale correction of the distance that the instrument itself applies, in 1e-6; null where unknown.
+    temperature_c, pressure_hpa
+        The air that this stands for, in degrees Celsius and hPa; null where unknown.
+    distance_mode
+        How it measures distances, in the words of the driver; empty where unknown.
+    latency_ns
+        What has been taken off the stamps for the time from the measurement to the fastest answer, in ns.
+    angle_delay_ns
+        By how much the angles are newer than the distance, in ns; positive: newer. Not corrected in this file.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
+
+    type: Literal["instrument"] = "instrument"
+    stamp_ns: int = 0
+    make: str
+    model: str = ""
+    serial_number: str = ""
+    firmware: str = ""
+    prism_type: str = ""
+    prism_constant_m: float | None = None
+    atmospheric_ppm: float | None = None
+    temperature_c: float | None = None
+    pressure_hpa: float | None = None
+    distance_mode: str = ""
+    latency_ns: int = 0
+    angle_delay_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ReceptionRecord:
     """When the station received one of the master's beacons, and when the master had sent it.
 

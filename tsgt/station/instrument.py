@@ -9,6 +9,44 @@ from tsgt.model import check_finite, check_instants
 
 if TYPE_CHECKING:
     from tsgt.model import Status
+    from tsgt.radio.orders import Direction
+    from tsgt.recording.journal import InstrumentRecord
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Atmosphere:
+    """The air between instrument and prism.
+
+    Attributes
+    ----------
+    temperature_c
+        In degrees Celsius, in the shade.
+    pressure_hpa
+        In hPa as a barometer beside the instrument shows it: not reduced to sea level.
+    """
+
+    temperature_c: float
+    pressure_hpa: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Condition:
+    """How an instrument does, for people.
+
+    Attributes
+    ----------
+    activity
+        What it is doing: ``tracking``, ``looking for the prism around its last direction``, ...
+    problem
+        What a person should see to: not level, battery low, licence missing, point the telescope at the prism; empty
+        when there is nothing.
+    battery_percent
+        Charge of its battery; None where it does not say.
+    """
+
+    activity: str = ""
+    problem: str = ""
+    battery_percent: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,6 +67,8 @@ class Reading:
         The verdict, in the common vocabulary and as the instrument's own number.
     instrument_time_ns
         The instrument's own stamp, None where it has none.
+    received_ns
+        When its first byte reached the host, on the same clock as ``at_ns``; None where no line tells.
     """
 
     at_ns: int
@@ -39,26 +79,38 @@ class Reading:
     status: Status
     raw_status: int = 0
     instrument_time_ns: int | None = None
+    received_ns: int | None = None
 
     def __post_init__(self) -> None:
         """Refuse what no instrument can have measured."""
-        check_instants(self.at_ns)
+        check_instants(self.at_ns, self.received_ns or 0)
         check_finite(self.horizontal_angle_rad, self.zenith_angle_rad, self.slope_distance_m or 0.0)
 
 
 class Instrument(Protocol):
     """A robotic total station. One owner, one call at a time; :meth:`read` alone may be cancelled at any time.
 
-    Every method raises :class:`~tsgt.errors.InstrumentError` when the instrument refuses or is gone. After that
-    :meth:`connect` is tried again, as often as need be.
+    Every method raises :class:`~tsgt.errors.InstrumentError` when the instrument is gone or does not answer. After that
+    :meth:`connect` is tried again, as often as need be. :class:`~tsgt.errors.InstrumentRefusedError` says instead that
+    it answers and will not do this; it goes on with what it did before.
     """
 
     async def connect(self) -> str:
         """Find and identify the instrument; return its name and number for people. Nothing is tracked yet."""
         ...
 
-    async def track(self, prism: int) -> None:
-        """Lock on to a prism and measure it continuously, as fast as the instrument can."""
+    async def track(self, prism: int, towards: Direction | None = None) -> None:
+        """Track a prism and measure it continuously, as fast as the instrument can.
+
+        It returns as soon as the instrument is set up; that the prism is not found yet is what readings say.
+
+        Parameters
+        ----------
+        prism
+            Its number.
+        towards
+            Where it is believed to be; None: where the telescope points, or where it was last.
+        """
         ...
 
     async def read(self) -> Reading:
@@ -73,6 +125,20 @@ class Instrument(Protocol):
         """Measure the target that the instrument points at, once; only after :meth:`direct`."""
         ...
 
+    async def set_atmosphere(self, atmosphere: Atmosphere) -> None:
+        """Let the instrument correct distances for this air from now on; also while tracking, between two readings."""
+        ...
+
+    @property
+    def condition(self) -> Condition:
+        """How it does at the moment."""
+        ...
+
+    @property
+    def record(self) -> InstrumentRecord | None:
+        """What is known of it and of its settings, for the journal; None before :meth:`connect`. Changes with them."""
+        ...
+
     async def close(self) -> None:
-        """Let go of the instrument; it may be connected again."""
+        """Let go of the instrument; it may be connected again. It stays on, and keeps its lock."""
         ...

@@ -31,6 +31,8 @@ bench: $(VENV)/.test
 	$(BIN)/python benchmarks/air.py
 	$(BIN)/python benchmarks/clock_scenarios.py
 	$(BIN)/python benchmarks/beacon_clock.py
+	$(BIN)/python benchmarks/instrument_time.py
+	$(BIN)/python benchmarks/instrument.py
 
 # Schemas, field tables and the command reference come from the code; a test fails when they are stale.
 generated: $(VENV)/.test

@@ -130,7 +130,7 @@ def asked(folder: Path) -> dict[str, Any]:
         connection.settimeout(5.0)
         connection.connect(str(folder / "client.sock"))
         with connection.makefile("rb") as file:
-            status = json.loads(file.read())
+            status = json.loads(file.readline())
     assert isinstance(status, dict)
     return status
 

@@ -129,7 +129,7 @@ def wait_for_mode(folder: Path, mode: str) -> None:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
             if connection.connect_ex(str(folder / "client.sock")) == 0:
                 with connection.makefile("rb") as file:
-                    found = json.loads(file.read())["mode"]
+                    found = json.loads(file.readline())["mode"]
                 if found == mode:
                     return
         time.sleep(0.05)  # the other process runs in real time

@@ -25,6 +25,7 @@ from tsgt.radio.messages import (
     SlotOrder,
     StatePart,
     StationEntry,
+    Towards,
 )
 
 LONGEST_PACKET_BYTES = 255
@@ -52,6 +53,8 @@ def beacons(draw: st.DrawFn) -> Beacon:
     numbers = st.integers(1, len(stations))
     tracks = st.builds(OrderPart, numbers, _bits(4), st.just(0), _bits(4))
     others = st.builds(OrderPart, numbers, _bits(4), st.integers(1, 3))
+    directions = st.builds(Towards, _bits(16), _bits(16))
+    searches = st.builds(OrderPart, numbers, _bits(4), st.just(4), _bits(4), directions)
     return Beacon(
         frame=draw(_bits(8)),
         sent=draw(st.integers(1, 2**16 - 1)),
@@ -60,7 +63,7 @@ def beacons(draw: st.DrawFn) -> Beacon:
         stations=stations,
         session=draw(st.none() | sessions),
         confirmations=draw(st.lists(st.builds(Confirmation, numbers, _bits(32)), max_size=3).map(tuple)),
-        orders=draw(st.lists(tracks | others, max_size=3).map(tuple)),
+        orders=draw(st.lists(tracks | others | searches, max_size=3).map(tuple)),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import re
 from pathlib import Path
 from typing import NamedTuple
@@ -40,7 +41,10 @@ from tsgt.radio.messages import (
     SlotOrder,
     StatePart,
     StationEntry,
+    Towards,
 )
+from tsgt.radio.order_codec import order_part, spread_rad
+from tsgt.radio.orders import Direction, DirectOrder, MeasureOrder, SearchOrder, TrackOrder
 from tsgt.radio.run_codec import DISTANCE_WIDTHS, HORIZONTAL_WIDTHS, TIME_WIDTHS, ZENITH_WIDTHS
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "radio-protocol.md").read_text()
@@ -157,6 +161,21 @@ def test_every_status_of_the_superframe_stands_there() -> None:
         assert int.from_bytes(content[:2], "big") & 0b111 == int(number)
 
 
+def test_every_order_stands_there() -> None:
+    """The table of orders is that of the code, and so is how far around a direction to search."""
+    rows = _rows("order | the station")
+    direction = Direction(1.0, 1.5, math.radians(1.9))
+    orders = (TrackOrder(4), SearchOrder(), DirectOrder(), MeasureOrder(), SearchOrder(direction))
+    parts = [order_part(1, 0, order, tracked=1) for order in orders]
+    assert [part.order for part in parts] == [int(order) for order, *_ in rows]
+    arguments = [argument for *_, argument in rows]
+    assert arguments[:4] == ["its number less 1", "0", "0", "0"]
+    assert [part.argument for part in parts] == [3, 0, 0, 0, 6]
+    times, divided = re.findall(r"([\d.]+)° times 2\^\(argument / (\d)\)", arguments[4])[0]
+    for code in range(16):
+        assert math.degrees(spread_rad(code)) == pytest.approx(float(times) * 2 ** (code / int(divided)))
+
+
 def test_the_widths_of_residuals_stand_there() -> None:
     """Four for each kind of number."""
     widths = {kind: tuple(map(int, cells)) for kind, *cells in _rows("residual | 0")}
@@ -208,6 +227,14 @@ BEACON_WITH_ITEMS = Beacon(
     confirmations=(Confirmation(3, 0x33333333),),
     orders=(OrderPart(2, 5, 0, 3),),
 )
+BEACON_WITH_DIRECTION = Beacon(
+    frame=425 % 256,
+    sent=161_700_000 % 2**16,
+    cumulative=144,
+    order=SlotOrder(first=2, reverse=True),
+    stations=(StationEntry(0b1111, 2), StationEntry(0b1111, 2), StationEntry(0b1111, 3)),
+    orders=(OrderPart(3, 6, 4, 6, Towards(19_532, 16_537)),),
+)
 SINGLE = Sighting(1041 % 256, 10_025_000 % 2**17, Status.OK, 5_000_000, 4_233_600, 756_032)
 RUN = Run(
     sightings=(
@@ -243,7 +270,11 @@ REPLIES = {
     ),
     "a shot": Reply(shot=ShotPart(6, Status.OK, 12_345_678, 4_100_000, 423_456)),
 }
-BEACONS = {"a beacon": BEACON, "a beacon with items": BEACON_WITH_ITEMS}
+BEACONS = {
+    "a beacon": BEACON,
+    "a beacon with items": BEACON_WITH_ITEMS,
+    "a beacon that says where to look": BEACON_WITH_DIRECTION,
+}
 GIVEN = {name: _bytes(cell) for name, cell in _rows("given | value")}
 
 

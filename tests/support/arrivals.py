@@ -9,7 +9,7 @@ import numpy as np
 from tsgt.config import scenario_parameters
 from tsgt.geometry import invert, raw_distance, transform_points
 from tsgt.model import PolarMeasurement
-from tsgt.simulation.instrument import with_noise
+from tsgt.simulation.noise import with_noise
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

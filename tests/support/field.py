@@ -23,7 +23,7 @@ from tsgt.radio.classic import ClassicStation
 from tsgt.radio.classic_messages import MeasurementMessage, raw_status
 from tsgt.radio.conversation import Situation
 from tsgt.radio.message_codec import angle_code
-from tsgt.radio.orders import DirectOrder, TrackOrder
+from tsgt.radio.orders import DirectOrder, SearchOrder, TrackOrder
 from tsgt.radio.outbox import Outbox, Queued
 from tsgt.radio.superframe_station import SuperframeStation
 from tsgt.simulation.air import Air
@@ -31,7 +31,7 @@ from tsgt.simulation.authors_node import AUTHORS_STAMP_DELAY_MS, AuthorsNode
 from tsgt.simulation.clocks import DriftingClock, VirtualClock
 from tsgt.simulation.link import LinkModel
 from tsgt.simulation.radios import opener
-from tsgt.station.instrument import Reading
+from tsgt.station.instrument import Condition, Reading
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Coroutine
@@ -42,7 +42,10 @@ if TYPE_CHECKING:
 
     from tsgt.clock import Clock
     from tsgt.radio.base import OpenRadio, Packet, Radio
+    from tsgt.radio.orders import Direction
     from tsgt.radio.station_session import Reception
+    from tsgt.recording.journal import InstrumentRecord
+    from tsgt.station.instrument import Atmosphere
 
 T = TypeVar("T")
 
@@ -64,6 +67,8 @@ class SceneInstrument:
         It does not track when it is told to.
     direct_mode
         It was told to measure single targets.
+    sought
+        Where it was told to look for its prism, with the true time.
     """
 
     def __init__(self, scene: Scene, station: int, clock: DriftingClock) -> None:
@@ -73,13 +78,16 @@ class SceneInstrument:
         self.status = Status.OK
         self.refuses = False
         self.direct_mode = False
+        self.sought: list[tuple[int, Direction]] = []
 
     async def connect(self) -> str:
         """Say what it is."""
         return "scene"
 
-    async def track(self, prism: int) -> None:
+    async def track(self, prism: int, towards: Direction | None = None) -> None:
         """Track, or refuse to."""
+        if towards is not None:
+            self.sought.append((TRUE.monotonic_ns(), towards))
         if self.refuses:
             raise InstrumentError(f"no prism {prism}")
         self.direct_mode = False
@@ -101,6 +109,19 @@ class SceneInstrument:
 
     async def close(self) -> None:
         """Do nothing."""
+
+    async def set_atmosphere(self, atmosphere: Atmosphere) -> None:
+        """Do nothing: there is none."""
+
+    @property
+    def condition(self) -> Condition:
+        """Nobody asks."""
+        return Condition()
+
+    @property
+    def record(self) -> InstrumentRecord | None:
+        """Nobody writes one."""
+        return None
 
     def _reading(self, true_ns: int) -> Reading:
         seen = self._scene.measure(self._station, true_ns / 1e9)
@@ -224,12 +245,15 @@ async def superframe_client(
     async def obey() -> None:
         nonlocal situation
         order = station.next_order()
-        if isinstance(order, TrackOrder):
-            ok = not tool.refuses
-            if ok:
-                await tool.track(order.prism or number)
-                situation = situation._replace(prism=order.prism or number, direct=False)
-            station.executed(ok=ok)
+        if isinstance(order, TrackOrder | SearchOrder):
+            prism = (order.prism if isinstance(order, TrackOrder) else None) or situation.prism
+            try:
+                await tool.track(prism, order.towards if isinstance(order, SearchOrder) else None)
+            except InstrumentError:
+                station.executed(ok=False)
+            else:
+                situation = situation._replace(prism=prism, direct=False)
+                station.executed(ok=True)
         elif isinstance(order, DirectOrder):
             await tool.direct()
             situation = situation._replace(direct=True)

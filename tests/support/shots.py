@@ -8,10 +8,13 @@ from typing import TYPE_CHECKING
 
 from tsgt.errors import InstrumentError
 from tsgt.model import Status
-from tsgt.station.instrument import Reading
+from tsgt.recording.journal import InstrumentRecord
+from tsgt.station.instrument import Condition, Reading
 
 if TYPE_CHECKING:
     from tsgt.clock import Clock
+    from tsgt.radio.orders import Direction
+    from tsgt.station.instrument import Atmosphere
 
 READING = Reading(
     at_ns=0,
@@ -21,6 +24,8 @@ READING = Reading(
     slope_distance_m=99.5,
     status=Status.OK,
 )
+
+RECORD = InstrumentRecord(make="Script", prism_type="round", prism_constant_m=0.0, atmospheric_ppm=0.0)
 
 
 class ScriptedInstrument:
@@ -41,6 +46,15 @@ class ScriptedInstrument:
         """What a change of mode ends with; else it takes a second."""
         self.prisms: list[int | None] = []
         """What it was told to track; None stands for single measurements."""
+        self.towards: list[Direction | None] = []
+        """Where it was told to look for each prism."""
+        self.plugged = True
+        """Without its cable it cannot be connected; :meth:`fail` pulls it out while somebody reads."""
+        self.condition = Condition(activity="tracking", battery_percent=80)
+        self.record: InstrumentRecord | None = None
+        """What it says of its settings; set by a connection and by :meth:`set_atmosphere`."""
+        self.air_refusal: InstrumentError | None = None
+        """What setting the air ends with."""
 
     def give(self, status: Status = Status.OK) -> Reading:
         """Make a measurement of the tracked prism now."""
@@ -56,12 +70,16 @@ class ScriptedInstrument:
         self._readings.put_nowait(InstrumentError("the instrument is gone"))
 
     async def connect(self) -> str:
-        """Be there."""
+        """Be there, with the settings that a person has made."""
+        if not self.plugged:
+            raise InstrumentError("nobody answers; is the cable in?")
+        self.record = RECORD
         return "scripted"
 
-    async def track(self, prism: int) -> None:
+    async def track(self, prism: int, towards: Direction | None = None) -> None:
         """Track a prism, after a second."""
         await self._change(prism)
+        self.towards.append(towards)
 
     async def read(self) -> Reading:
         """Return what :meth:`give` made."""
@@ -75,6 +93,18 @@ class ScriptedInstrument:
         """Return the target."""
         await self._sleep(2)
         return self._checked(self.target)
+
+    async def set_atmosphere(self, atmosphere: Atmosphere) -> None:
+        """Apply 10 ppm in any air, after a tenth of a second."""
+        await self._sleep(0.1)
+        if self.air_refusal is not None:
+            raise self.air_refusal
+        self.record = replace(
+            RECORD,
+            atmospheric_ppm=10.0,
+            temperature_c=atmosphere.temperature_c,
+            pressure_hpa=atmosphere.pressure_hpa,
+        )
 
     async def close(self) -> None:
         """Do nothing."""

@@ -13,7 +13,9 @@ if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
 
 
-def write_station_frames(path: Path, frames: Mapping[int, FloatArray], *, comment: str) -> None:
+def write_station_frames(
+    path: Path, frames: Mapping[int, FloatArray], rms_m: Mapping[int, float], *, comment: str
+) -> None:
     """Write a file of kind ``station_frames``.
 
     Parameters
@@ -22,6 +24,8 @@ def write_station_frames(path: Path, frames: Mapping[int, FloatArray], *, commen
         The file; it appears as a whole or not at all.
     frames
         (4, 4) ``T_station1_station`` in m by station number.
+    rms_m
+        By how much a station's targets missed those of station 1, root mean square, in m; station 1 has none.
     comment
         Where the frames come from; one line on top of the file.
 
@@ -33,7 +37,8 @@ def write_station_frames(path: Path, frames: Mapping[int, FloatArray], *, commen
     tables = []
     for station, T in sorted(frames.items()):
         rows = ",\n".join(f"  {_numbers(row)}" for row in T)
-        tables.append(f"[stations.{station}]\nT_station1_station = [\n{rows},\n]\n")
+        rms = f"rms_mm = {1e3 * rms_m[station]:.3f}\n" if station in rms_m else ""
+        tables.append(f"[stations.{station}]\nT_station1_station = [\n{rows},\n]\n{rms}")
     _write(path, "station_frames", tables, comment)
 
 

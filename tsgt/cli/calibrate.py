@@ -105,6 +105,7 @@ def targets(
         write_station_frames(
             output,
             {1: np.eye(4)} | {station: frame.T for station, frame in frames.items()},
+            {station: frame.rms_m for station, frame in frames.items()},
             comment=f"written by tsgt calibrate targets {file} {options}",
         )
     return _exit_code(frames.values())

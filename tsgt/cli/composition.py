@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import asynccontextmanager
+from functools import partial
 from typing import TYPE_CHECKING
 
+from tsgt.config.client import BridgeInstrumentConfig, LeicaInstrumentConfig, SimulatedInstrumentConfig
 from tsgt.config.radio import HardwareRadioConfig, SimulatedRadioConfig, SuperframeConfig
 from tsgt.radio.from_config import wiring
 from tsgt.radio.hal import open_hal
@@ -22,12 +24,31 @@ if TYPE_CHECKING:
     from tsgt.station.instrument import Instrument
 
 
-def make_instrument(config: InstrumentConfig) -> Instrument:
-    """Return the instrument that a configuration names under ``[instrument]``; nothing is connected yet."""
-    # Only here, as for the radio below.
-    from tsgt.simulation.instrument_socket import RemoteInstrument  # noqa: PLC0415
+def make_instrument(config: InstrumentConfig, clock: Clock) -> Instrument:
+    """Return the instrument that a configuration names under ``[instrument]``; nothing is connected yet.
 
-    return RemoteInstrument(config.socket)
+    Parameters
+    ----------
+    config
+        What stands there.
+    clock
+        The machine's.
+    """
+    # Each only where it is needed: a client is small, and whoever has no serial port needs no package for one.
+    match config:
+        case LeicaInstrumentConfig():
+            from tsgt.station.leica import LeicaInstrument  # noqa: PLC0415
+            from tsgt.station.serial_port import open_serial_port  # noqa: PLC0415
+
+            return LeicaInstrument(config, partial(open_serial_port, config.port, clock=clock), clock)
+        case BridgeInstrumentConfig():
+            from tsgt.station.bridge import BridgeInstrument  # noqa: PLC0415
+
+            return BridgeInstrument(config, clock)
+        case SimulatedInstrumentConfig():
+            from tsgt.simulation.instrument_socket import RemoteInstrument  # noqa: PLC0415
+
+            return RemoteInstrument(config.socket)
 
 
 def radio_key(protocol: ClassicConfig | SuperframeConfig) -> bytes | None:

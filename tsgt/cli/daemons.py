@@ -34,7 +34,7 @@ def client(config_path: Path) -> None:
     settings = lora_settings(config.radio, config_path)
     key = radio_key(config.protocol)
     open_radio = radio_opener(config.radio, settings, clock)
-    instrument = make_instrument(config.instrument)
+    instrument = make_instrument(config.instrument, clock)
     boot = boot_id()
     service.run(
         lambda: run_client(

@@ -12,12 +12,11 @@ from tsgt.cli.output import print_json, print_table
 from tsgt.cli.radio_options import Modem, modem_options
 from tsgt.config.radio import LARGEST_NUMBERS, ClassicMasterConfig, SuperframeMasterConfig
 from tsgt.radio.base import LoRaSettings
-from tsgt.radio.classic import Timing
+from tsgt.radio.from_config import planned_cycle
 from tsgt.radio.limits import DIPOLE_DBI, Use, exceeded
 from tsgt.radio.link_budget import path_loss_db, sensitivity_dbm
-from tsgt.radio.plan import Cycle, Load, classic_cycle, superframe_cycle
+from tsgt.radio.plan import Cycle, Load
 from tsgt.radio.regions import LOWEST_DBM, REGIONS, preset_power_dbm
-from tsgt.radio.superframe import FrameTiming
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -191,7 +190,7 @@ def plan_command(
     def row(settings: LoRaSettings, stations: int) -> _Row:
         needed_dbm = sensitivity_dbm(settings.spreading_factor, settings.bandwidth_hz)
         load = Load(stations=stations, rate_hz=rate_hz, loss=loss)
-        return _Row(settings, stations, received_dbm - needed_dbm, _cycle(spoken, load, settings))
+        return _Row(settings, stations, received_dbm - needed_dbm, planned_cycle(spoken, load, settings))
 
     planned = row(settings, stations)
     numbers = sorted({stations, *(n for n in _TABLE_STATIONS if n <= LARGEST_NUMBERS[protocol])})
@@ -228,23 +227,6 @@ def plan_command(
         click.echo(f"warning      {warning}")
     click.echo(f"\nRate in Hz and median age in s, by number of stations; link margin at {distance_m:g} m:\n")
     _print_table(table, numbers)
-
-
-def _cycle(protocol: MasterProtocol, load: Load, settings: LoRaSettings) -> Cycle:
-    if isinstance(protocol, ClassicMasterConfig):
-        return classic_cycle(
-            load,
-            Timing.of(settings, round(protocol.reply_timeout_ms * 1e6)),
-            resync_cycles=protocol.resync_cycles,
-            resync_interval_ns=round(protocol.resync_interval_s * 1e9),
-        )
-    timing = FrameTiming.stated(
-        settings,
-        start_jitter_ns=round(protocol.start_jitter_ms * 1e6),
-        turn_round_ns=round(protocol.turn_round_ms * 1e6),
-        clock_error_ppm=protocol.clock_error_ppm,
-    )
-    return superframe_cycle(load, timing, phase_lock=protocol.phase_lock)
 
 
 def _figures(cycle: Cycle) -> dict[str, Any]:

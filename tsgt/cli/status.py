@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import socket
+import textwrap
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,6 +25,8 @@ from tsgt.station.status import ClientStatus
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from tsgt.recording.journal import InstrumentRecord
+
 TIMEOUT_S = 5.0
 """A master sends a status each second; one that sends none for this long is stuck."""
 
@@ -32,6 +35,9 @@ LATE_S = 3.0
 
 MASTER_LATE_S = 10.0
 """A master that synchronises with another station is silent here for a second or two."""
+
+WIDTH = 40
+"""Characters of the narrowest terminal that is used in the field."""
 
 MASTER_NOT_HEARD = "MASTER NOT HEARD"
 
@@ -133,11 +139,14 @@ def client_text(record: ClientStatus) -> tuple[list[str], bool]:
     problems = _client_problems(record)
     lines = [_headline(f"STATION {record.station}  {problems[0] if problems else 'OK'}", good=not problems)]
     lines += [_headline(problem, good=False) for problem in problems[1:]]
-    lines += ["", record.instrument or "no instrument"]
-    if record.mode == "tracking":
-        lines.append(f"tracking prism {record.prism}, {record.rate_hz:.2f} Hz")
-    else:
+    lines += [_headline(part, good=False) for part in _wrapped(record.problem)]
+    lines += ["", *_instrument_lines(record)]
+    if record.mode == "direct":
         lines.append("direct: single measurements")
+    elif record.instrument is not None:
+        lines.append(f"tracking prism {record.prism}, {record.rate_hz:.2f} Hz")
+    if record.activity != "tracking":
+        lines += _wrapped(record.activity, "  ")
     if (last := record.last) is not None:
         distance = "no distance" if last.slope_distance_m is None else f"{last.slope_distance_m:.4f} m"
         lines += [
@@ -147,7 +156,9 @@ def client_text(record: ClientStatus) -> tuple[list[str], bool]:
         ]
     lines += ["", f"{record.measurements} measured, journal {'ok' if record.journal_ok else 'FAILS'}"]
     if record.journal_waiting:
-        lines.append(f"  {record.journal_waiting} not written yet")
+        lines.append(f"  {record.journal_waiting} lines not written yet")
+    if record.journal_lost:
+        lines.append(f"  {record.journal_lost} lines lost")
     lines.append(f"  {Path(record.journal).name}")
     if record.master_heard_s is None:
         lines.append("master not heard yet")
@@ -159,6 +170,33 @@ def client_text(record: ClientStatus) -> tuple[list[str], bool]:
     if record.protocol == "superframe":
         lines += _superframe_lines(record)
     return lines, not problems
+
+
+def _instrument_lines(record: ClientStatus) -> list[str]:
+    """Say which instrument it is, and what it adds to distances by itself."""
+    lines = _wrapped(record.instrument or "no instrument")
+    if record.battery_percent is not None:
+        lines.append(f"  battery {record.battery_percent} %")
+    if (settings := record.settings) is not None:
+        lines += setting_lines(settings)
+    return lines
+
+
+def setting_lines(settings: InstrumentRecord) -> list[str]:
+    """Say in lines of at most 40 characters what an instrument adds to a distance, as far as it is known."""
+    lines = []
+    if settings.prism_constant_m is not None:
+        lines.append(f"  prism {settings.prism_type} {1e3 * settings.prism_constant_m:+.1f} mm")
+    if settings.atmospheric_ppm is not None:
+        air = f"  air {settings.atmospheric_ppm:+.1f} ppm"
+        if settings.temperature_c is not None and settings.pressure_hpa is not None:
+            air += f": {settings.temperature_c:.1f} C, {settings.pressure_hpa:.1f} hPa"
+        lines.append(air)
+    return lines
+
+
+def _wrapped(text: str, indent: str = "") -> list[str]:
+    return textwrap.wrap(text, WIDTH, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False)
 
 
 def _why_not_heard(record: ClientStatus) -> list[str]:
@@ -188,7 +226,9 @@ def _client_problems(record: ClientStatus) -> list[str]:
     problems = []
     if record.instrument is None:
         problems.append("NO INSTRUMENT")
-    elif record.mode == "tracking":
+    elif record.problem:
+        problems.append("SEE TO THE INSTRUMENT")
+    if record.instrument is not None and record.mode == "tracking":
         if last is None or (last.status.usable and last.age_s > LATE_S):
             problems.append("NO MEASUREMENT" if last is None else f"OLD {duration(last.age_s)}")
         elif not last.status.usable:
@@ -221,19 +261,19 @@ def _headline(text: str, *, good: bool) -> str:
 def _ask(socket_path: Path | None) -> tuple[StatusRecord | ClientStatus, bytes]:
     """Ask at the socket given, else at where a master, then a client would be."""
     if socket_path is not None:
-        return _status_of(socket_path)
+        return status_of(socket_path)
     try:
-        return _status_of(DEFAULT_SOCKET)
+        return status_of(DEFAULT_SOCKET)
     except StreamError:
         with contextlib.suppress(StreamError):
-            return _status_of(DEFAULT_CLIENT_SOCKET)
+            return status_of(DEFAULT_CLIENT_SOCKET)
     raise StreamError(
         f"nothing runs here: nobody serves {DEFAULT_SOCKET} or {DEFAULT_CLIENT_SOCKET}; "
         "start tsgt-master or tsgt-client, or give --socket"
     )
 
 
-def _status_of(path: Path) -> tuple[StatusRecord | ClientStatus, bytes]:
+def status_of(path: Path) -> tuple[StatusRecord | ClientStatus, bytes]:
     """Wait for the first status line on a socket."""
     for line in _lines(path):
         try:

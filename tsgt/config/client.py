@@ -24,12 +24,16 @@ class SimulatedInstrumentConfig(Model):
     """UNIX socket of the simulated instrument."""
 
 
+TemperatureC = Annotated[float, Field(ge=-60, le=70)]
+PressureHpa = Annotated[float, Field(ge=400, le=1200)]
+
+
 class AtmosphereConfig(Model):
     """The air between instrument and prism, as thermometer and barometer beside the instrument show it."""
 
-    temperature_c: Annotated[float, Field(ge=-60, le=70)]
+    temperature_c: TemperatureC
     """Temperature in the shade."""
-    pressure_hpa: Annotated[float, Field(ge=400, le=1200)]
+    pressure_hpa: PressureHpa
     """Pressure at the instrument, not reduced to sea level."""
 
 

@@ -116,6 +116,9 @@ class InstrumentModelConfig(Model):
     """By how much its own clock gains on the true time; positive: it runs fast."""
     angle_delay_ms: Annotated[float, Field(ge=-100, le=100)] = 0.0
     """By how much its angles are newer than its distance."""
+    tells_prisms_apart: bool = True
+    """Whether it takes no other prism for its own: active prisms with numbers, as the paper's. With plain ones it takes
+    whichever it finds when it has lost its own."""
     prediction_s: NotNegative = 2.0
     """How long the telescope keeps moving when the prism is hidden, before the lock is lost."""
     baud: Annotated[int, Field(ge=2400, le=921_600)] = 115_200

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator
 
-from tsgt.config.base import Model, NumberKey, rigid
+from tsgt.config.base import Model, NotNegative, NumberKey, rigid
 from tsgt.model import Matrix4, Vector3
 
 
@@ -15,6 +15,8 @@ class StationFrame(Model):
 
     T_station1_station: Annotated[Matrix4, AfterValidator(rigid)]
     """Rigid transform, 4x4 row by row, from the station's frame to that of station 1, in m."""
+    rms_mm: NotNegative | None = None
+    """By how much its targets missed those of station 1, root mean square, as the calibration found it."""
 
 
 class StationFramesFile(Model):

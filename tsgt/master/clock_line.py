@@ -150,6 +150,19 @@ class Line:
         return (station_ns - self.origin_ns) / 1e9
 
 
+def sag_ns(since_s: float, until_s: float) -> float:
+    """Return how far an offset may lie off the straight line between two that are known, in ns.
+
+    A frequency that changes by a each second bends the line by ``a s u / 2`` at s after the one and u before the other.
+
+    Parameters
+    ----------
+    since_s, until_s
+        From the one before, and to the one after, in s.
+    """
+    return since_s * until_s * min(_WANDER_NS_PER_S2 / 2, _WANDER_LIMIT / max(since_s + until_s, 1e-9))
+
+
 def sift(samples: Sequence[ClockSample], frequency: float, noise_ns: float | None = None) -> Batch:
     """Leave out the exchanges of a synchronisation that cannot be, those before a step, and those stamped late.
 

@@ -29,6 +29,7 @@ from tsgt.master.geofence import Geofence
 from tsgt.master.monitor import Monitor
 from tsgt.master.outlet import Outlet
 from tsgt.master.reports import Reports
+from tsgt.master.searches import Searches
 from tsgt.master.stream import StreamServer
 from tsgt.master.stream_records import EventRecord, HelloRecord
 from tsgt.master.superframe_link import SuperframeLink
@@ -122,7 +123,9 @@ async def run_master(
         try:
             async with server, asyncio.TaskGroup() as group:
                 master = _Master(config, parameters, clock, timeline, hand_out, group)
-                link = _link(config, settings, disk, master.reports, key=key, random_bits=random_bits)
+                link = _link(
+                    config, parameters, settings, disk, master.reports, key=key, random_bits=random_bits
+                )
                 log.info("master_started", recording=str(path), stations=len(config.stations))
                 service.sd_notify("READY=1")
                 group.create_task(disk.run())
@@ -156,6 +159,7 @@ class Link(Protocol):
 
 def _link(
     config: MasterConfig,
+    parameters: Parameters,
     settings: LoRaSettings,
     disk: Disk,
     reports: Reports,
@@ -167,7 +171,14 @@ def _link(
     if isinstance(protocol, ClassicMasterConfig):
         return ClassicLink(config.stations, protocol, settings, reports)
     return SuperframeLink(
-        config.stations, protocol, settings, disk, reports, key=key, random_bits=random_bits
+        config.stations,
+        protocol,
+        settings,
+        disk,
+        reports,
+        Searches(parameters),
+        key=key,
+        random_bits=random_bits,
     )
 
 

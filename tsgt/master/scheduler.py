@@ -143,8 +143,11 @@ class Scheduler:
             station.silent, station.tracks = turn.ok is None, bool(turn.ok) and sure
             station.agreed = bool(turn.ok)
             station.may_answer_ns = now_ns + LATEST_ANSWER_NS if turn.ok is None else 0
-            station.refused = 0 if turn.ok else station.refused + 1
-            station.not_before_ns = now_ns + _pause_ns(station.refused, took_ns)
+            # A refusal costs little and a lost packet a lot: the latter is not multiplied by how often it was refused.
+            station.refused = 0 if turn.ok else station.refused + (turn.ok is False)
+            station.unanswered = station.unanswered + 1 if turn.ok is None else 0
+            failures = station.unanswered if turn.ok is None else station.refused
+            station.not_before_ns = now_ns + _pause_ns(failures, took_ns)
             return
         station.silent = not turn.answered
         fruitful = turn.answered if isinstance(turn, Poll) else bool(turn.samples)
@@ -222,8 +225,9 @@ class _Station:
         It said so in answer to the last order; see ``tracks``.
     may_answer_ns
         Until then its answer to an order may still come, in the turn of another.
-    fruitless, refused
-        Polls and synchronisations in a row that brought nothing; orders in a row that were not carried out.
+    fruitless, refused, unanswered
+        Polls and synchronisations in a row that brought nothing; orders that were refused since one was carried out,
+        and orders in a row without an answer.
     synchronisations
         How many there were since it was first heard or its clock was found to be another one.
     due_ns, urgent
@@ -239,6 +243,7 @@ class _Station:
     may_answer_ns: int = 0
     fruitless: int = 0
     refused: int = 0
+    unanswered: int = 0
     synchronisations: int = 0
     due_ns: int = 0
     urgent: bool = False

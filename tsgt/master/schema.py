@@ -36,7 +36,14 @@ from tsgt.model import (
     StationParameters,
 )
 from tsgt.recording import FORMAT_VERSION, RecordingHeader
-from tsgt.recording.journal import AcknowledgedRecord, JournalRecord, ReceptionRecord, TargetRecord
+from tsgt.recording.journal import (
+    AcknowledgedRecord,
+    InstrumentRecord,
+    JournalRecord,
+    ReceptionRecord,
+    TargetRecord,
+)
+from tsgt.recording.merged import MergedRecord
 
 Line = (
     HelloRecord
@@ -50,9 +57,11 @@ Line = (
     | RecordingHeader
     | Parameters
     | JournalRecord
+    | InstrumentRecord
     | TargetRecord
     | ReceptionRecord
     | AcknowledgedRecord
+    | MergedRecord
 )
 
 SCHEMA = Path("configs/schema/stream.schema.json")
@@ -80,9 +89,11 @@ PAGES: dict[Path, tuple[type, ...]] = {
         PrismPosition,
         PipelineParameters,
         JournalRecord,
+        InstrumentRecord,
         TargetRecord,
         ReceptionRecord,
         AcknowledgedRecord,
+        MergedRecord,
     ),
 }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -12,7 +13,7 @@ from tsgt.master.stream_records import BeaconRecord
 from tsgt.model import LAST_INSTANT_NS, PolarMeasurement
 from tsgt.radio.authentication import Authenticator
 from tsgt.radio.frame_lock import FrameLock
-from tsgt.radio.orders import TrackOrder
+from tsgt.radio.orders import SearchOrder, TrackOrder
 from tsgt.radio.superframe import FrameTiming
 from tsgt.radio.superframe_master import SuperframeMaster
 
@@ -23,9 +24,11 @@ if TYPE_CHECKING:
     from tsgt.config.radio import SuperframeMasterConfig
     from tsgt.master.disk import Disk
     from tsgt.master.reports import Reports
+    from tsgt.master.searches import Searches
     from tsgt.master.stream_records import StatusRecord
     from tsgt.radio.base import LoRaSettings, Packet, Radio, Transmitted
     from tsgt.radio.heard import Heard, TimedSighting
+    from tsgt.radio.orders import Direction
 
 DISK_PATIENCE_S = 0.015
 """A beacon waits so long for the disk to take the last reply. Acknowledging it a frame later costs a repetition."""
@@ -57,6 +60,8 @@ class SuperframeLink:
         Where the measurements that are reported end up.
     reports
         Told of all that happens.
+    searches
+        Says where stations that have lost their prism are to look for it.
     key
         Of the mission; None: anybody can take part.
     random_bits
@@ -75,6 +80,7 @@ class SuperframeLink:
         settings: LoRaSettings,
         disk: Disk,
         reports: Reports,
+        searches: Searches,
         *,
         key: bytes | None,
         random_bits: Callable[[int], int],
@@ -85,6 +91,7 @@ class SuperframeLink:
         self._authentic = key is not None
         self._disk = disk
         self._reports = reports
+        self._searches = searches
         self._master = SuperframeMaster(
             prisms,
             timing,
@@ -95,6 +102,7 @@ class SuperframeLink:
         )
         self._unwritten: deque[_Unwritten] = deque()
         self._tracking_ns: dict[int, int] = {}
+        self._sought: dict[int, Direction] = {}
         self._beacons_ns: deque[int] = deque(maxlen=16)
         self.turn_ns: int | None = None
         if key is None:
@@ -131,6 +139,7 @@ class SuperframeLink:
         self._settle()
         while self._unwritten and await self._disk.flushed(DISK_PATIENCE_S):
             self._settle()
+        self._search()
 
     def composing(self) -> None:
         """Tell what has been written while the beacon was waited for."""
@@ -161,7 +170,9 @@ class SuperframeLink:
         received_ns = reports.timeline.unix_ns(packet.received_at_ns)
         reports.events(reports.alerts.polled(station, now_ns))
         for sighting in heard.sightings:
-            reports.measured(self._measurement(station, sighting, received_ns))
+            measurement = self._measurement(station, sighting, received_ns)
+            reports.measured(measurement)
+            self._searches.measured(measurement)
         if heard.sightings:
             sequences = tuple(sighting.sequence for sighting in heard.sightings)
             self._unwritten.append(_Unwritten(station, sequences, range(first_line, self._disk.taken)))
@@ -203,7 +214,7 @@ class SuperframeLink:
             late=peer.late,
             doubted=peer.doubted,
         )
-        if heard.answer is not None:
+        if heard.answer is not None and isinstance(heard.order, TrackOrder):
             reports.events(reports.alerts.ordered(station, prism, now_ns, tracks=heard.answer.ok))
         if heard.state is None:
             return
@@ -214,6 +225,25 @@ class SuperframeLink:
         elif now_ns - self._tracking_ns.get(station, -TRACK_AGAIN_NS) >= TRACK_AGAIN_NS:
             self._tracking_ns[station] = now_ns
             self._master.order(station, TrackOrder(prism))
+
+    def _search(self) -> None:
+        """Tell stations that have lost their prism where to look for it, and no more what has grown old."""
+        now_ns = self._reports.now_ns()
+        for station, prism in self._prisms.items():
+            peer = self._master.peer(station)
+            towards = self._searches.towards(station, now_ns) if peer.is_tracking(prism) else None
+            if towards is None:
+                peer.withdraw(SearchOrder)
+            elif towards is not self._sought.get(station):
+                self._sought[station] = towards
+                self._master.order(station, SearchOrder(towards))
+                log.info(
+                    "search_ordered",
+                    station=station,
+                    horizontal_deg=round(math.degrees(towards.horizontal_angle_rad), 2),
+                    zenith_deg=round(math.degrees(towards.zenith_angle_rad), 2),
+                    spread_deg=round(math.degrees(towards.spread_rad), 2),
+                )
 
     def _measurement(self, station: int, sighting: TimedSighting, received_ns: int) -> PolarMeasurement:
         true_ns = self._reports.timeline.unix_ns(sighting.measured_ns)

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING, NamedTuple
 
-from tsgt.radio.orders import DirectOrder, MeasureOrder, Order, SearchOrder, TrackOrder
+from tsgt.radio.order_codec import order_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from tsgt.radio.messages import AnswerPart, OrderPart, Reply, ShotPart, StatePart
+    from tsgt.radio.orders import Order
 
 LONGEST_TURN_ROUND_PAUSE = 48
 """The master makes room for a turn-round in one of 32 replies. After so many without it the backlog waits; it
@@ -64,7 +65,9 @@ class Conversation:
         ticket that was not in the last beacon with orders is another order's, however often tickets have come round.
         """
         parts = tuple(parts)
-        self._orders.extend((part.ticket, _order(part)) for part in parts if part.ticket not in self._tickets)
+        self._orders.extend(
+            (part.ticket, order_of(part)) for part in parts if part.ticket not in self._tickets
+        )
         if parts:
             self._tickets = frozenset(part.ticket for part in parts)
 
@@ -110,15 +113,3 @@ class Conversation:
             self.answers.remove(reply.answer)
         if reply.shot is not None and reply.shot in self.shots:
             self.shots.remove(reply.shot)
-
-
-def _order(part: OrderPart) -> Order:
-    match part.order:
-        case 0:
-            return TrackOrder(part.argument + 1)
-        case 1:
-            return SearchOrder()
-        case 2:
-            return DirectOrder()
-        case _:  # the codec lets no other through
-            return MeasureOrder()

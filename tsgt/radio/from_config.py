@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from tsgt.config.radio import ClassicMasterConfig
 from tsgt.errors import ConfigError, RadioSettingsError
 from tsgt.radio.base import LoRaSettings
+from tsgt.radio.classic_turn import Timing
 from tsgt.radio.hal import Wiring
+from tsgt.radio.plan import classic_cycle, superframe_cycle
 from tsgt.radio.regions import LOWEST_DBM, preset_power_dbm
+from tsgt.radio.superframe import FrameTiming
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tsgt.config.radio import ModemConfig, WiringConfig
+    from tsgt.config.radio import MasterProtocolConfig, ModemConfig, WiringConfig
+    from tsgt.radio.plan import Cycle, Load
 
 
 def lora_settings(config: ModemConfig, path: Path) -> LoRaSettings:
@@ -65,3 +70,21 @@ def wiring(config: WiringConfig) -> Wiring:
         nss_pin=None if config.nss_pin < 0 else config.nss_pin,
         gpio_chip=config.gpio_chip,
     )
+
+
+def planned_cycle(protocol: MasterProtocolConfig, load: Load, settings: LoRaSettings) -> Cycle:
+    """Compute what a protocol carries with the master's settings."""
+    if isinstance(protocol, ClassicMasterConfig):
+        return classic_cycle(
+            load,
+            Timing.of(settings, round(protocol.reply_timeout_ms * 1e6)),
+            resync_cycles=protocol.resync_cycles,
+            resync_interval_ns=round(protocol.resync_interval_s * 1e9),
+        )
+    timing = FrameTiming.stated(
+        settings,
+        start_jitter_ns=round(protocol.start_jitter_ms * 1e6),
+        turn_round_ns=round(protocol.turn_round_ms * 1e6),
+        clock_error_ppm=protocol.clock_error_ppm,
+    )
+    return superframe_cycle(load, timing, phase_lock=protocol.phase_lock)

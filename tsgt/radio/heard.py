@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from tsgt.model import Status
     from tsgt.radio.messages import AnswerPart, ShotPart, StatePart
+    from tsgt.radio.orders import Order
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,8 +58,8 @@ class Heard:
         The station has just introduced itself: it, or this master, is new.
     state
         How it does, where the reply says so.
-    answer, shot
-        What became of an order: given once, however often the station says it.
+    order, answer, shot
+        What became of an order, and which it was: given once, however often the station says it.
     doubted_beacons
         How many beacons it has received since its last word at a time at which they cannot have been sent.
     link_doubted
@@ -72,6 +73,7 @@ class Heard:
     repeated: int = 0
     joined: bool = False
     state: StatePart | None = None
+    order: Order | None = None
     answer: AnswerPart | None = None
     shot: ShotPart | None = None
     doubted_beacons: int = 0

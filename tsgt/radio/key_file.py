@@ -24,13 +24,15 @@ _DIGITS = 2 * KEY_BYTES
 _MOST_BYTES = 1024
 
 
-def read_key(path: Path) -> bytes:
+def read_key(path: Path, *, owner: int | None = None) -> bytes:
     """Read the key of a mission.
 
     Parameters
     ----------
     path
         Of the file that :func:`write_key` has made, or of a copy of it.
+    owner
+        Number of the user to whom it has to belong; None: who runs this program.
 
     Raises
     ------
@@ -41,7 +43,7 @@ def read_key(path: Path) -> bytes:
         # A pipe must not be waited for.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         try:
-            _check_access(path, os.fstat(descriptor))
+            check_access(path, os.fstat(descriptor), os.geteuid() if owner is None else owner)
             content = os.read(descriptor, _MOST_BYTES)
         finally:
             os.close(descriptor)
@@ -98,11 +100,25 @@ def write_key(path: Path) -> None:
         raise OutputFileError(f"cannot be written ({error.strerror})", path=path) from error
 
 
-def _check_access(path: Path, found: os.stat_result) -> None:
+def check_access(path: Path, found: os.stat_result, owner: int) -> None:
+    """Refuse a file that is not its owner's alone.
+
+    Parameters
+    ----------
+    path, found
+        The file, and what is known of it.
+    owner
+        Number of the user who uses it.
+
+    Raises
+    ------
+    ConfigError
+        It is no file, belongs to somebody else, or somebody else may read or write it.
+    """
     if not stat.S_ISREG(found.st_mode):
         raise ConfigError(f"{path}: not a file; name the one that `tsgt radio key` made", path=path)
-    if found.st_uid != os.geteuid():
-        user = _user(os.geteuid())
+    if found.st_uid != owner:
+        user = _user(owner)
         raise ConfigError(
             f"{path}: belongs to the user {_user(found.st_uid)}, but a key has to belong to the one who uses it, here "
             f"{user}; run this as {_user(found.st_uid)}, or `sudo chown {user} {path}`",

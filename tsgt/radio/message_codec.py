@@ -28,6 +28,7 @@ from tsgt.radio.messages import (
     SlotOrder,
     StatePart,
     StationEntry,
+    Towards,
 )
 from tsgt.radio.run_codec import (
     VALUE_BITS,
@@ -47,7 +48,8 @@ _PADDING_BITS = 8
 
 _SINGLE, _RUNS, _EXTENDED = range(3)
 _END, _SESSION, _CONFIRMATION, _ORDER = range(4)
-_ORDERS = 4
+_ORDERS = 5
+_TRACK, _SEARCH_TOWARDS = 0, 4
 
 _FULL_CIRCLE = 1 << VALUE_BITS
 _LONGEST = (1 << VALUE_BITS) - 1
@@ -116,7 +118,7 @@ def decode_beacon(content: bytes) -> Beacon:
         elif item == _CONFIRMATION:
             confirmations.append(Confirmation(reader.take(4) + 1, reader.take(32)))
         else:
-            orders.append(OrderPart(reader.take(4) + 1, reader.take(4), reader.take(4), reader.take(4)))
+            orders.append(_take_order(reader))
     beacon = Beacon(
         frame=frame,
         sent=sent,
@@ -245,14 +247,30 @@ def _put_items(writer: BitWriter, beacon: Beacon) -> None:
         _put_station(writer, confirmation.station, beacon)
         writer.put(confirmation.nonce, 32)
     for order in beacon.orders:
-        if order.order >= _ORDERS or (order.order and order.argument):
-            raise MessageError(f"there is no order {order.order} with argument {order.argument}")
+        _refuse_no_order(order)
         writer.put(_ORDER, 2)
         _put_station(writer, order.station, beacon)
         writer.put(order.ticket, 4)
         writer.put(order.order, 4)
         writer.put(order.argument, 4)
+        if order.towards is not None:
+            writer.put(order.towards.horizontal, 16)
+            writer.put(order.towards.zenith, 16)
     writer.put(_END, 2)
+
+
+def _refuse_no_order(part: OrderPart) -> None:
+    argued = part.argument and part.order not in (_TRACK, _SEARCH_TOWARDS)
+    directed = part.towards is not None
+    if part.order >= _ORDERS or argued or directed != (part.order == _SEARCH_TOWARDS):
+        kind = "a direction" if directed else "no direction"
+        raise MessageError(f"there is no order {part.order} with argument {part.argument} and {kind}")
+
+
+def _take_order(reader: BitReader) -> OrderPart:
+    station, ticket, order, argument = reader.take(4) + 1, reader.take(4), reader.take(4), reader.take(4)
+    towards = Towards(reader.take(16), reader.take(16)) if order == _SEARCH_TOWARDS else None
+    return OrderPart(station, ticket, order, argument, towards)
 
 
 def _put_station(writer: BitWriter, station: int, beacon: Beacon) -> None:

@@ -103,6 +103,14 @@ class Confirmation:
 
 
 @dataclass(frozen=True, slots=True)
+class Towards:
+    """A direction in a station's circles, in units of 2 pi / 2^16: 20 arcseconds are enough to look for something."""
+
+    horizontal: int
+    zenith: int
+
+
+@dataclass(frozen=True, slots=True)
 class OrderPart:
     """An order to a station.
 
@@ -113,15 +121,19 @@ class OrderPart:
     ticket
         4 bits; another one for each order to this station. It is carried out once.
     order
-        4 bits: 0 track, 1 search, 2 direct, 3 measure.
+        4 bits: 0 track, 1 search, 2 direct, 3 measure, 4 search in a direction.
     argument
-        4 bits: the prism's number less one for ``track``, otherwise 0.
+        4 bits: the prism's number less one for 0; for 4 how wide to search, see
+        :func:`~tsgt.radio.order_codec.spread_rad`; otherwise 0.
+    towards
+        Where to search; with 4 alone.
     """
 
     station: int
     ticket: int
     order: int
     argument: int = 0
+    towards: Towards | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

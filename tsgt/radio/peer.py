@@ -16,14 +16,14 @@ from tsgt.radio.messages import (
     TIME_UNIT_US,
     WIDE_TIME_BITS,
     Confirmation,
-    OrderPart,
     quality_bound_us,
 )
-from tsgt.radio.orders import DirectOrder, MeasureOrder, SearchOrder, TrackOrder
+from tsgt.radio.order_codec import order_part
+from tsgt.radio.orders import MeasureOrder, SearchOrder
 from tsgt.radio.rhythm import Beat, Rhythm
 
 if TYPE_CHECKING:
-    from tsgt.radio.messages import AnswerPart, Reply, Run, ShotPart, StatePart
+    from tsgt.radio.messages import AnswerPart, OrderPart, Reply, Run, ShotPart, StatePart
     from tsgt.radio.orders import Order
     from tsgt.radio.round_trip import RoundTrip
 
@@ -57,8 +57,6 @@ HISTORY = 4
 
 _ROUNDING_NS = 9_000
 """Half a unit of time, and what rounding to microseconds adds."""
-
-_ORDER_CODES: dict[type[Order], int] = {TrackOrder: 0, SearchOrder: 1, DirectOrder: 2, MeasureOrder: 3}
 
 
 class Reception(NamedTuple):
@@ -161,17 +159,29 @@ class Peer:
         self._pending = _Pending(self._ticket, order)
         return self._ticket
 
+    def withdraw(self, kind: type[Order]) -> None:
+        """Say an order of this kind no more, answered or not; if it is carried out all the same, nobody is told."""
+        if self._pending is not None and isinstance(self._pending.order, kind):
+            self._pending = None
+
+    def is_tracking(self, prism: int) -> bool:
+        """Tell whether it is there, has said that its instrument tracks this prism, and has nothing else to do."""
+        state, pending = self._state, self._pending
+        return (
+            state is not None
+            and (state.prism, state.direct, state.connected) == (prism, False, True)
+            and self.silent < HISTORY
+            and not self.introducing
+            and (pending is None or isinstance(pending.order, SearchOrder))
+        )
+
     @property
     def order_part(self) -> OrderPart | None:
         """The order as a beacon says it; None where there is none, or nobody who would obey."""
         if self._pending is None or self.nonce is None or self.introducing:
             return None
-        ticket, order = self._pending.ticket, self._pending.order
-        prism = self._prism
-        if isinstance(order, TrackOrder):
-            prism = order.prism or (self._state.prism if self._state else prism)
-        argument = prism - 1 if isinstance(order, TrackOrder) else 0
-        return OrderPart(self.number, ticket, _ORDER_CODES[type(order)], argument)
+        tracked = self._prism if self._state is None else self._state.prism
+        return order_part(self.number, self._pending.ticket, self._pending.order, tracked)
 
     # --- For the next beacon --------------------------------------------------------------------------------------
 
@@ -263,7 +273,7 @@ class Peer:
         elif at.granted_bytes - at.payload_bytes >= ANY_RUN_BYTES:
             self._withheld = self.inbox.missing  # there was room for any of them
         self._withheld = min(self._withheld, self.inbox.missing)
-        answer, shot = self._answered(reply)
+        order, answer, shot = self._answered(reply)
         return Heard(
             station=self.number,
             sightings=tuple(sightings),
@@ -273,6 +283,7 @@ class Peer:
             doubted_beacons=self._stated(reply.state),
             link_doubted=not self._exchanged(reply, at),
             lateness_ns=at.lateness_ns,
+            order=order,
             answer=answer,
             shot=shot,
         )
@@ -316,14 +327,17 @@ class Peer:
             self._exchange = (at.counter, at.received_ns - at.sent_ns)
         return possible
 
-    def _answered(self, reply: Reply) -> tuple[AnswerPart | None, ShotPart | None]:
-        """Return what the reply says to the order that waits for it, which then waits no more."""
-        ticket = None if self._pending is None else self._pending.ticket
-        answer = reply.answer if reply.answer is not None and reply.answer.ticket == ticket else None
-        shot = reply.shot if reply.shot is not None and reply.shot.ticket == ticket else None
-        if answer is not None or shot is not None:
-            self._pending = None
-        return answer, shot
+    def _answered(self, reply: Reply) -> tuple[Order | None, AnswerPart | None, ShotPart | None]:
+        """Return the order that has waited for this reply, and waits no more, with what the reply says to it."""
+        pending = self._pending
+        if pending is None:
+            return None, None, None
+        answer = reply.answer if reply.answer is not None and reply.answer.ticket == pending.ticket else None
+        shot = reply.shot if reply.shot is not None and reply.shot.ticket == pending.ticket else None
+        if answer is None and shot is None:
+            return None, None, None
+        self._pending = None
+        return pending.order, answer, shot
 
     # --- Numbers and times ------------------------------------------------------------------------------------------
 

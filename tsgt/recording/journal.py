@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from tsgt.errors import CorruptLineError, RecordingError
 from tsgt.model import PolarMeasurement, Status, check_finite, check_instants
-from tsgt.recording.format import decode_line
+from tsgt.recording.format import RecordingHeader, decode_line
 from tsgt.recording.reader import read_lines
 
 if TYPE_CHECKING:
@@ -55,8 +55,14 @@ class InstrumentRecord:
         Always ``instrument``.
     stamp_ns
         From when on, on the station computer's clock, in ns.
-    make, model, serial_number, firmware
-        Whose it is; empty where it does not say.
+    make
+        Maker of the instrument.
+    model
+        Model, as the instrument says; empty where unknown.
+    serial_number
+        Its number; empty where unknown.
+    firmware
+        Version of its firmware; empty where unknown.
     prism_type
         Reflector that it is set to, in the words of the configuration; empty where unknown.
     prism_constant_m
@@ -64,8 +70,10 @@ class InstrumentRecord:
         distances in this file have it, so the master must add only what is still missing.
     atmospheric_ppm
         Scale correction of the distance that the instrument itself applies, in 1e-6; null where unknown.
-    temperature_c, pressure_hpa
-        The air that this stands for, in degrees Celsius and hPa; null where unknown.
+    temperature_c
+        Of the air that this stands for, in degrees Celsius; null where unknown.
+    pressure_hpa
+        Of the same air, in hPa; null where unknown.
     distance_mode
         How it measures distances, in the words of the driver; empty where unknown.
     latency_ns
@@ -189,28 +197,46 @@ class Journal:
 
     Attributes
     ----------
-    station
-        Number of the station.
+    head
+        Whose it is.
+    created_ns
+        When it was begun, on the station's own clock.
     measurements
         All of them, in the order in which they were read; times are on the station's own clock.
     targets
         Single measurements of targets, likewise.
+    receptions
+        Of the master's beacons, likewise.
     """
 
-    station: int
+    head: JournalRecord
+    created_ns: int
     measurements: list[PolarMeasurement]
     targets: list[TargetRecord]
+    receptions: list[ReceptionRecord]
+
+    @property
+    def station(self) -> int:
+        """Number of the station."""
+        return self.head.station
 
 
-def load_journal(path: Path, *, on_problem: Callable[[RecordingError], None] | None = None) -> Journal:
+def load_journal(
+    path: Path,
+    *,
+    keep_going: bool = False,
+    on_problem: Callable[[RecordingError], None] | None = None,
+) -> Journal:
     """Read a journal.
 
     Parameters
     ----------
     path
         The journal; its last line may be torn.
+    keep_going
+        Skip lines that cannot be read instead of raising.
     on_problem
-        Told of a torn last line, which is skipped.
+        Told of every line that is skipped: a torn last line always, others with ``keep_going``.
 
     Raises
     ------
@@ -220,19 +246,37 @@ def load_journal(path: Path, *, on_problem: Callable[[RecordingError], None] | N
         A line is not what a client can have written.
     """
     head: JournalRecord | None = None
+    created_ns = 0
     measurements: list[PolarMeasurement] = []
     targets: list[TargetRecord] = []
-    for line in read_lines(path, on_problem=on_problem):
-        match line.type:
-            case "journal":
-                record = decode_line(JournalRecord, line, path)
-                if head is not None and head != record:
-                    raise CorruptLineError("begins a second journal", path=path, line=line.number)
-                head = record
-            case "measurement":
-                measurements.append(decode_line(PolarMeasurement, line, path))
-            case "target":
-                targets.append(decode_line(TargetRecord, line, path))
+    receptions: list[ReceptionRecord] = []
+    for line in read_lines(path, keep_going=keep_going, on_problem=on_problem):
+        try:
+            match line.type:
+                case "recording":
+                    created_ns = created_ns or decode_line(RecordingHeader, line, path).created_ns
+                case "journal":
+                    record = decode_line(JournalRecord, line, path)
+                    if head is not None and head != record:
+                        raise CorruptLineError("begins a second journal", path=path, line=line.number)
+                    head = record
+                case "measurement":
+                    measurements.append(decode_line(PolarMeasurement, line, path))
+                case "target":
+                    targets.append(decode_line(TargetRecord, line, path))
+                case "reception":
+                    receptions.append(decode_line(ReceptionRecord, line, path))
+        except CorruptLineError as problem:
+            if not keep_going or line.type == "journal":
+                raise
+            if on_problem is not None:
+                on_problem(problem)
     if head is None:
         raise RecordingError("is no journal of a station; give a file that tsgt-client wrote", path=path)
-    return Journal(station=head.station, measurements=measurements, targets=targets)
+    return Journal(
+        head=head,
+        created_ns=created_ns,
+        measurements=measurements,
+        targets=targets,
+        receptions=receptions,
+    )

@@ -18,6 +18,7 @@ from tsgt.recording.format import (
     decode,
     decode_line,
 )
+from tsgt.recording.merged import MergedRecord
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -38,7 +39,7 @@ class Recording:
     parameters
         The parameters in force at the end: the last ones in the file.
     measurements
-        All measurements in the order of arrival.
+        All measurements in the order of arrival, and where they stand in the file those that were merged into it.
     end_ns
         Latest time on the master's Unix clock that the file knows of, in ns: of an arrival, a status or an event.
         None when it has none of these.
@@ -143,6 +144,9 @@ def load_recording(
                     measurement: Measurement = decode_line(_MEASUREMENTS[line.type], line, path)
                     measurements.append(measurement)
                     known_ns = measurement.received_ns
+                case "merged":
+                    measurements.append(decode_line(MergedRecord, line, path).measurement)
+                    known_ns = measurements[-1].received_ns
                 case "status" | "event":
                     known_ns = decode_line(_Stamped, line, path).stamp_ns
         except CorruptLineError as problem:

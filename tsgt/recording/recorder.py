@@ -35,6 +35,11 @@ class Recorder:
         The open recording.
     waiting_lines
         How many lines wait at most; beyond that the oldest are lost, and counted in the log.
+
+    Attributes
+    ----------
+    lost
+        How many lines have been lost in all.
     """
 
     def __init__(self, writer: RecordingWriter, *, waiting_lines: int = WAITING_LINES) -> None:
@@ -45,6 +50,7 @@ class Recorder:
         self._failing = False
         self._lost = 0
         self._taken = 0
+        self.lost = 0
         self._done = 0
         self._lost_numbers: list[range] = []
 
@@ -113,7 +119,10 @@ class Recorder:
             self._failing, self._lost = False, 0
 
     def _lose(self, number: int) -> None:
+        if not self._lost:
+            log.error("recording_loses_lines", waiting=len(self._waiting))
         self._lost += 1
+        self.lost += 1
         follows = self._lost_numbers and self._lost_numbers[-1].stop == number
         first = self._lost_numbers.pop().start if follows else number
         self._lost_numbers.append(range(first, number + 1))

@@ -16,6 +16,7 @@ from tsgt.geometry import rotation_from_quaternion
 from tsgt.master.intake import UNTIMED_SIGMA_NS
 from tsgt.master.replay import replayed
 from tsgt.master.tracks import build_tracks, usable
+from tsgt.model import Status
 from tsgt.recording import load_recording
 from tsgt.simulation.witness import Measured
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
     from tsgt.master.tracks import Track
     from tsgt.model import Parameters, PolarMeasurement
+    from tsgt.simulation.geocom_answers import Offered
     from tsgt.simulation.scenario import Run
     from tsgt.simulation.witness import Session, StationWitness, ValidPoses
 
@@ -36,6 +38,10 @@ _DISTANCE_ROUNDING_M = 0.0501e-3
 # More than any station's latency, which is taken off the stamps.
 _LATENCY_NS = 5_000_000_000
 _RESIDUAL_TOLERANCE_M = 1e-6
+# Ten digits behind the point are on the line.
+_LINE_ROUNDING = 1e-9
+# A stamp is less than this before or after the measurement: the slowest answer against the fastest, when few have come.
+_STAMP_LIMIT_NS = 40_000_000
 
 
 class Violation(NamedTuple):
@@ -56,7 +62,8 @@ class Violation(NamedTuple):
 def violations(run: Run) -> list[Violation]:
     """Check a run.
 
-    What a client has read is in its journal, and as it is there it was delivered; none is delivered twice; over the
+    What a client has read is in its journal, once, as its instrument gave it and with the time at which it was measured;
+    and as it is there it was delivered; none is delivered twice; over the
     protocol ``superframe`` all that was not delivered still waits; none has a time stamp off by more than its bound; no
     valid pose rests on an unusable measurement; a replay of the recording gives the stream again.
     """
@@ -65,6 +72,7 @@ def violations(run: Run) -> list[Violation]:
     for number, witness in run.witnesses.items():
         if witness.journals:
             found += altered(witness, measured[number], run.sessions)
+            found += misread(witness, measured[number])
         if run.superframe:
             found += lost(witness, measured[number], run.sessions)
     for session in run.sessions:
@@ -91,6 +99,41 @@ def altered(witness: StationWitness, measured: Measured, sessions: Sequence[Sess
                 yield Violation(
                     "journal", f"not in the journal of station {witness.station} as delivered: {measurement}"
                 )
+
+
+def misread(witness: StationWitness, measured: Measured) -> Iterator[Violation]:
+    """Compare the distances in a station's journals with those that its instrument has answered with."""
+    seen: set[Offered] = set()
+    offered: dict[int, list[Offered]] = {}
+    for each in witness.offered:
+        offered.setdefault(each.instrument_ms, []).append(each)
+    for journalled in measured.journalled:
+        if journalled.slope_distance_m is None or journalled.instrument_time_ns is None:
+            continue
+        candidates = offered.get(journalled.instrument_time_ns // 1_000_000, [])
+        truth = next((each for each in candidates if _same_values(each, journalled)), None)
+        if truth is None:
+            yield Violation("read", f"the instrument has never given this: {journalled}")
+            continue
+        if truth in seen:
+            yield Violation("read", f"in the journals of station {witness.station} twice: {journalled}")
+        seen.add(truth)
+        stamp_ns = measured.true_ns(journalled)
+        if stamp_ns is not None and abs(stamp_ns - truth.true_ns) > _STAMP_LIMIT_NS:
+            yield Violation(
+                "read",
+                f"station {witness.station} has stamped a measurement {(stamp_ns - truth.true_ns) / 1e6:.1f} ms after "
+                f"it was made: {journalled}",
+            )
+
+
+def _same_values(offered: Offered, journalled: PolarMeasurement) -> bool:
+    pairs = (
+        (offered.horizontal_angle_rad, journalled.horizontal_angle_rad),
+        (offered.zenith_angle_rad, journalled.zenith_angle_rad),
+        (offered.distance_m, journalled.slope_distance_m),
+    )
+    return all(value is not None and abs(given - value) < _LINE_ROUNDING for given, value in pairs)
 
 
 def lost(witness: StationWitness, measured: Measured, sessions: Sequence[Session]) -> Iterator[Violation]:
@@ -188,7 +231,11 @@ def replayed_otherwise(session: Session) -> Iterator[Violation]:
 
 def _same_content(journalled: PolarMeasurement, delivered: PolarMeasurement) -> bool:
     """Whether a measurement has come as it stands in the journal, but for what the protocol rounds."""
-    if journalled.status is not delivered.status:
+    # The protocol classic has no word for a low accuracy.
+    statuses = {
+        Status.OK if delivered.host_time_ns and m.status.usable else m.status for m in (journalled, delivered)
+    }
+    if len(statuses) > 1:
         return False
     angles_rad = [(m.horizontal_angle_rad, m.zenith_angle_rad) for m in (journalled, delivered)]
     distances_m = (journalled.slope_distance_m, delivered.slope_distance_m)

@@ -1,7 +1,7 @@
 """The demonstration: the real daemons as processes, with air, instruments and robot simulated in this one.
 
-Everything that the daemons touch outside themselves is real: sockets, files, signals, time. Radios and instruments
-are simulated, and reached over UNIX sockets; so a daemon can be killed and started again like one in the field.
+Everything that the daemons touch outside themselves is real: sockets, serial ports (pseudo-terminals), files, signals,
+time. Radios and instruments are simulated; so a daemon can be killed and started again like one in the field.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ import numpy as np
 
 from tsgt.errors import StreamError
 from tsgt.simulation.air_server import AirServer
-from tsgt.simulation.instrument import SimulatedInstrument
-from tsgt.simulation.instrument_socket import InstrumentServer
 from tsgt.simulation.mission import scenario_link
 from tsgt.simulation.processes import Process
+from tsgt.simulation.pty_line import PtyLine
+from tsgt.simulation.timeline import LoopTimeline
+from tsgt.simulation.total_station import SimulatedTotalStation
 from tsgt.simulation.world import scenario_world
 
 if TYPE_CHECKING:
@@ -107,14 +108,15 @@ class Demo:
         StreamError
             A socket cannot be made, or no pose comes.
         """
+        timeline = LoopTimeline(asyncio.get_running_loop())
         async with AsyncExitStack() as stack:
             await stack.enter_async_context(AirServer(self._files.air_socket, self._link(), self._air_rng))
             for station, rng in zip(self._scenario.stations, self._instrument_rngs, strict=True):
-                instrument = SimulatedInstrument(
-                    station, self._scenario, self.world, self._clock, rng, start_ns=self.start_ns
+                instrument = SimulatedTotalStation(
+                    station, self._scenario, self.world, timeline, rng, start_ns=self.start_ns
                 )
-                path = self._files.instrument_socket(station.station)
-                await stack.enter_async_context(InstrumentServer(path, instrument))
+                port = self._files.instrument_port(station.station)
+                await stack.enter_async_context(PtyLine(instrument, port))
             tasks = [asyncio.create_task(process.keep_running()) for process in self.processes]
             reading = asyncio.create_task(self._read(on_line))
             try:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from tsgt.config import scenario_parameters
 from tsgt.radio.key_file import write_key
+from tsgt.simulation.mission_configs import instrument_config
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -74,9 +75,9 @@ class DemoFiles:
         """Return the configuration of a station's client."""
         return self.folder / f"client{station}.toml"
 
-    def instrument_socket(self, station: int) -> Path:
-        """Return the UNIX socket of a station's simulated instrument."""
-        return self.folder / f"instrument{station}.sock"
+    def instrument_port(self, station: int) -> Path:
+        """Return the serial port of a station's simulated instrument."""
+        return self.folder / f"instrument{station}.tty"
 
     def status_socket(self, station: int) -> Path:
         """Return the UNIX socket on which a station's client says how it does."""
@@ -157,6 +158,7 @@ directory = "{files.recordings.name}"
 
 def _client(files: DemoFiles, scenario: ScenarioConfig, station: SimulatedStation, protocol: Protocol) -> str:
     number = station.station
+    instrument = instrument_config(station, files.instrument_port(number))
     return f"""\
 kind = "client"
 station = {number}
@@ -164,8 +166,13 @@ prism = {station.prism}
 status_socket = "{files.status_socket(number).name}"
 
 [instrument]
-kind = "simulated"
-socket = "{files.instrument_socket(number).name}"
+kind = "leica"
+port = "{files.instrument_port(number).name}"
+baud = {instrument.baud}
+prism_type = "{instrument.prism_type}"
+prism_constant_mm = {instrument.prism_constant_mm!r}
+latency_ms = {instrument.latency_ms!r}
+angle_delay_ms = {instrument.angle_delay_ms!r}
 
 {_radio(scenario, f"station{number}")}
 {_SUPERFRAME if protocol == "superframe" else _CLASSIC}

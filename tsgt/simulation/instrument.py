@@ -7,17 +7,17 @@ and found again, latency and its jitter, the errors of a 360 degree prism.
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tsgt.config.parameters import level_frame, noise
 from tsgt.errors import InstrumentError
-from tsgt.geometry import cartesian_to_polar, invert, raw_distance, transform_points
+from tsgt.geometry import invert, raw_distance, transform_points
 from tsgt.model import TARGET_NOISE, Status
 from tsgt.simulation.clocks import DriftingClock
-from tsgt.station.instrument import Reading
+from tsgt.simulation.noise import with_noise
+from tsgt.station.instrument import Condition, Reading
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -26,7 +26,9 @@ if TYPE_CHECKING:
     from tsgt.config import ScenarioConfig
     from tsgt.config.scenario import SimulatedStation
     from tsgt.model import InstrumentNoise
+    from tsgt.radio.orders import Direction
     from tsgt.simulation.world import World
+    from tsgt.station.instrument import Atmosphere
 
 LEAST_DISTANCE_M = 1.0
 """Closer than this there are angles, but no distance."""
@@ -117,7 +119,7 @@ class SimulatedInstrument:
         self._prism, self._direct = None, False
         return f"simulated total station {self._station.station}"
 
-    async def track(self, prism: int) -> None:
+    async def track(self, prism: int, towards: Direction | None = None) -> None:  # noqa: ARG002 (it finds it anyway)
         """Track a prism of the scenario from now on; it is found at once, where it is not hidden."""
         self._check_cable()
         if prism not in self._prism_rows:
@@ -156,6 +158,19 @@ class SimulatedInstrument:
         status = self._status_at(self._world_s(at_ns), Status.OK if self._target else Status.NO_TARGET)
         point = self._targets_m[self._target - 1] if self._target else None
         return self._reading(at_ns, None, point, status, TARGET_NOISE, constant_m=0.0)
+
+    async def set_atmosphere(self, atmosphere: Atmosphere) -> None:  # noqa: ARG002 (its air is the reference)
+        """Do nothing; there is no air between it and its prisms."""
+        self._check_cable()
+
+    @property
+    def condition(self) -> Condition:
+        """Nothing ever is the matter with it."""
+        return Condition()
+
+    @property
+    def record(self) -> None:
+        """It has no settings."""
 
     async def close(self) -> None:
         """Do nothing; the instrument stays on."""
@@ -215,34 +230,3 @@ class SimulatedInstrument:
             status=status,
             raw_status=RAW_STATUS.get(status, 3),
         )
-
-
-def with_noise(
-    points: NDArray[np.float64], noise: InstrumentNoise, generator: np.random.Generator
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Measure points as a total station does.
-
-    Parameters
-    ----------
-    points
-        (N, 3) in the frame of the station, in m.
-    noise
-        One sigma; all of it white.
-    generator
-        Source of the noise.
-
-    Returns
-    -------
-    tuple
-        Horizontal angle from 0 to 2 pi and zenith angle in rad, distance to the point in m; each (N,).
-    """
-    points = points + generator.normal(0.0, noise.pointing_sigma_m, points.shape)
-    horizontal, zenith, distance = cartesian_to_polar(points)
-    angle_noise = generator.normal(0.0, noise.angle_sigma_rad, (2, len(points)))
-    horizontal = np.mod(horizontal + angle_noise[0] / np.sin(zenith), 2 * math.pi)
-    range_sigma = np.hypot(noise.range_sigma_m, noise.range_sigma_ppm * 1e-6 * distance)
-    return (
-        horizontal,
-        zenith + angle_noise[1],
-        distance + range_sigma * generator.standard_normal(len(points)),
-    )

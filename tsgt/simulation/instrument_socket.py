@@ -19,10 +19,13 @@ from tsgt.recording import decode, encode_line
 from tsgt.recording.format import Typed
 from tsgt.service import UnixListener
 from tsgt.simulation.air_lines import LineBuffer
-from tsgt.station.instrument import Instrument, Reading
+from tsgt.station.instrument import Condition, Instrument, Reading
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from tsgt.radio.orders import Direction
+    from tsgt.station.instrument import Atmosphere
 
 ANSWER_TIMEOUT_S = 10.0
 """How long the instrument may take for anything that it is told; a single measurement takes 2 s."""
@@ -226,7 +229,7 @@ class RemoteInstrument:
             ) from error
         return (await self._told("connect")).description
 
-    async def track(self, prism: int) -> None:
+    async def track(self, prism: int, towards: Direction | None = None) -> None:  # noqa: ARG002 (it finds it anyway)
         """Track a prism."""
         await self._told("track", prism)
 
@@ -247,6 +250,19 @@ class RemoteInstrument:
         if shot is None:
             raise InstrumentError(f"{self._path}: the simulated instrument gives no measurement")
         return shot.reading()
+
+    async def set_atmosphere(self, atmosphere: Atmosphere) -> None:  # noqa: ARG002 (see the instrument)
+        """Do nothing."""
+        self._connected()
+
+    @property
+    def condition(self) -> Condition:
+        """Nothing ever is the matter with it."""
+        return Condition()
+
+    @property
+    def record(self) -> None:
+        """It has no settings."""
 
     async def close(self) -> None:
         """Leave the server."""

@@ -22,20 +22,23 @@ from tsgt.simulation.air import Air
 from tsgt.simulation.authors_node import AuthorsNode
 from tsgt.simulation.clocks import DriftingClock, VirtualClock, ramped
 from tsgt.simulation.foreign import ForeignRadio
-from tsgt.simulation.instrument import SimulatedInstrument
 from tsgt.simulation.link import LinkModel, LogDistanceLoss
 from tsgt.simulation.mission_configs import (
     STATUS_SOCKET,
     client_config,
+    instrument_config,
     master_config,
     radio_config,
     station_name,
 )
 from tsgt.simulation.options import MASTER
 from tsgt.simulation.radios import HostDelay, StampJitter, opener
+from tsgt.simulation.serial_line import SimulatedLine
+from tsgt.simulation.total_station import SimulatedTotalStation
 from tsgt.simulation.witness import Session, StationWitness, WatchedInstrument
 from tsgt.simulation.world import scenario_world
 from tsgt.station.daemon import run_client
+from tsgt.station.leica import LeicaInstrument
 from tsgt.station.status import ClientStatus
 
 if TYPE_CHECKING:
@@ -86,8 +89,8 @@ class Mission:
     ----------
     world
         The truth; its time is the true time.
-    clocks, instruments
-        The stations' clocks and total stations, by station number; they outlive the clients.
+    clocks, instruments, lines
+        The stations' clocks, total stations, and the cables between, by station number; they outlive the clients.
     sessions
         What the master sent out, one entry for each time that it was started.
     witnesses
@@ -128,12 +131,16 @@ class Mission:
             number: self._station_clock(number, offset_ns=-int(clock_rng.integers(3 * _YEAR_NS)))
             for number in numbers
         }
+        self._timeline = timeline
         self.instruments = {s.station: self._instrument(s) for s in scenario.stations}
+        self.lines = {number: self._line(number) for number in numbers}
         self._boots = dict.fromkeys(numbers, 1)
         self.sessions: list[Session] = []
         self.witnesses = {
             number: StationWitness(
-                number, None if options.node == "authors" else folder / station_name(number)
+                number,
+                None if options.node == "authors" else folder / station_name(number),
+                self.instruments[number].offered,
             )
             for number in numbers
         }
@@ -151,9 +158,23 @@ class Mission:
             booted_ns=booted_ns,
         )
 
-    def _instrument(self, entry: SimulatedStation) -> SimulatedInstrument:
+    def _instrument(self, entry: SimulatedStation) -> SimulatedTotalStation:
         rng = self._rngs[station_name(entry.station)].spawn(1)[0]
-        return SimulatedInstrument(entry, self._scenario, self.world, self.clocks[entry.station], rng)
+        return SimulatedTotalStation(
+            self._entry(entry.station), self._scenario, self.world, self._timeline, rng
+        )
+
+    def _line(self, station: int) -> SimulatedLine:
+        name = f"{station_name(station)}'s cable"
+        return SimulatedLine(self.instruments[station], self._timeline, self.clocks[station], name=name)
+
+    def _entry(self, station: int) -> SimulatedStation:
+        """Return what the scenario says of a station; the authors' instrument calls their node at once."""
+        entry = self._scenario.stations[self._index(station)]
+        if self._options.node != "authors":
+            return entry
+        model = entry.instrument.model_copy(update={"processing_min_ms": 0.0, "processing_max_ms": 1.0})
+        return entry.model_copy(update={"instrument": model})
 
     def _index(self, station: int) -> int:
         return [s.station for s in self._scenario.stations].index(station)
@@ -212,7 +233,7 @@ class Mission:
 
     def start_station(self, station: int) -> None:
         """Start a station's client, with a journal of its own beside the earlier ones, or the authors' node."""
-        entry = self._scenario.stations[self._index(station)]
+        entry = self._entry(station)
         authors = self._options.node == "authors"
         self._start(station_name(station), self._authors_node(entry) if authors else self._client(entry))
 
@@ -244,13 +265,17 @@ class Mission:
         return run_client(
             client_config(self._scenario, entry, self._options, folder),
             self._settings,
-            instrument=WatchedInstrument(self.instruments[station], watch),
+            instrument=WatchedInstrument(self._driver(entry), watch),
             open_radio=self._opener(station_name(station), clock, HostDelay()),
             clock=clock,
             key=self._key,
             random_bits=self._random_bits,
             boot=f"{station_name(station)}-{self._boots[station]}",
         )
+
+    def _driver(self, entry: SimulatedStation) -> LeicaInstrument:
+        config = instrument_config(entry, self._folder / station_name(entry.station))
+        return LeicaInstrument(config, self.lines[entry.station].open, self.clocks[entry.station])
 
     async def _authors_node(self, entry: SimulatedStation) -> None:
         station = entry.station
@@ -259,7 +284,7 @@ class Mission:
         def watch(_reading: Reading) -> None:
             witness.stamps_ns[clock.realtime_ns()] = self._clock.monotonic_ns()  # stamped on arrival
 
-        instrument = WatchedInstrument(self.instruments[station], watch)
+        instrument = WatchedInstrument(self._driver(entry), watch)
         async with self._opener(station_name(station), clock)() as radio:
             await AuthorsNode(station, radio, clock, instrument, entry.prism, rng).run()
 
@@ -304,7 +329,7 @@ class Mission:
         self.clocks[station] = self._station_clock(
             station, offset_ns=unix_ns - START_UNIX_NS, booted_ns=now_ns
         )
-        self.instruments[station] = self._instrument(self._scenario.stations[self._index(station)])
+        self.lines[station] = self._line(station)
         self._boots[station] += 1
         self.start_station(station)
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from tsgt.config import ClientConfig, MasterConfig
-from tsgt.config.client import JournalConfig, SimulatedInstrumentConfig
+from tsgt.config.client import JournalConfig, LeicaInstrumentConfig
 from tsgt.config.master import RecordingConfig, SetupConfig, StationConfig, StreamConfig
 from tsgt.config.radio import (
     ClassicConfig,
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tsgt.config import ScenarioConfig
+    from tsgt.config.client import Baud
     from tsgt.config.scenario import SimulatedStation
     from tsgt.simulation.options import Options
 
@@ -81,10 +82,26 @@ def client_config(
         kind="client",
         station=entry.station,
         prism=entry.prism,
-        # Not reached: the instrument is handed to the daemon.
-        instrument=SimulatedInstrumentConfig(kind="simulated", socket=folder / "instrument.sock"),
+        instrument=instrument_config(entry, folder / "instrument.tty"),
         radio=radio_config(scenario, station_name(entry.station), folder),
         protocol=ClassicConfig(kind="classic") if classic else SuperframeConfig(kind="superframe"),
         journal=JournalConfig(directory=folder, fsync_interval_s=_RARELY_S),
         status_socket=folder / STATUS_SOCKET,
+    )
+
+
+def instrument_config(entry: SimulatedStation, port: Path) -> LeicaInstrumentConfig:
+    """Return how a client sets its station's simulated instrument, of which it knows everything.
+
+    The instrument adds no prism constant; the master does.
+    """
+    model = entry.instrument
+    return LeicaInstrumentConfig(
+        kind="leica",
+        port=port,
+        baud=cast("Baud", model.baud),
+        prism_type="user",
+        prism_constant_mm=0.0,
+        latency_ms=model.processing_min_ms,
+        angle_delay_ms=model.angle_delay_ms,
     )

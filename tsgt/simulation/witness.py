@@ -15,12 +15,15 @@ from tsgt.recording import encode_line
 from tsgt.recording.journal import load_journal
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from tsgt.station.instrument import Instrument, Reading
+    from tsgt.radio.orders import Direction
+    from tsgt.recording.journal import InstrumentRecord
+    from tsgt.simulation.geocom_answers import Offered
+    from tsgt.station.instrument import Atmosphere, Condition, Instrument, Reading
     from tsgt.station.status import ClientStatus
 
 
@@ -142,6 +145,8 @@ class StationWitness:
         Its number.
     folder
         Of its journals; None: it keeps none.
+    offered
+        Every distance that its instrument has answered with.
     stamps_ns
         By the host time of each reading in ns: the true time of that instant, in ns from the start.
     statuses
@@ -150,6 +155,7 @@ class StationWitness:
 
     station: int
     folder: Path | None
+    offered: Sequence[Offered] = ()
     stamps_ns: dict[int, int] = field(default_factory=dict)
     statuses: list[ClientStatus] = field(default_factory=list)
 
@@ -214,9 +220,9 @@ class WatchedInstrument:
         """Find and identify the instrument."""
         return await self._instrument.connect()
 
-    async def track(self, prism: int) -> None:
-        """Lock on to a prism."""
-        await self._instrument.track(prism)
+    async def track(self, prism: int, towards: Direction | None = None) -> None:
+        """Track a prism."""
+        await self._instrument.track(prism, towards)
 
     async def read(self) -> Reading:
         """Return the next measurement, and tell."""
@@ -231,6 +237,20 @@ class WatchedInstrument:
     async def measure(self) -> Reading:
         """Measure the target once."""
         return await self._instrument.measure()
+
+    async def set_atmosphere(self, atmosphere: Atmosphere) -> None:
+        """Let the instrument correct for this air."""
+        await self._instrument.set_atmosphere(atmosphere)
+
+    @property
+    def condition(self) -> Condition:
+        """How it does."""
+        return self._instrument.condition
+
+    @property
+    def record(self) -> InstrumentRecord | None:
+        """What is known of it and of its settings."""
+        return self._instrument.record
 
     async def close(self) -> None:
         """Let go of the instrument."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import secrets
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -20,15 +21,17 @@ from tsgt.radio.orders import MeasureOrder, Order
 from tsgt.radio.outbox import Outbox
 from tsgt.radio.superframe_station import SuperframeStation
 from tsgt.radio.supervised import keep_radio
-from tsgt.recording import RecordingHeader, RecordingWriter, new_recording_path
-from tsgt.recording.journal import JournalRecord
+from tsgt.recording import RecordingHeader, RecordingWriter, decode, new_recording_path
+from tsgt.recording.journal import InstrumentRecord, JournalRecord
 from tsgt.recording.recorder import Recorder
 from tsgt.station.backlog import LINEAGE_BITS, Backlog, read_backlog
 from tsgt.station.classic_link import ClassicLink
+from tsgt.station.instrument import Atmosphere
 from tsgt.station.journal import PATIENCE_S, JournalQueue
 from tsgt.station.keeper import Done, InstrumentKeeper
+from tsgt.station.requests import Answer, AtmosphereRequest
 from tsgt.station.session import Session
-from tsgt.station.status_socket import serving_status
+from tsgt.station.status_socket import StatusSocket
 from tsgt.station.superframe_link import SuperframeLink
 
 if TYPE_CHECKING:
@@ -151,7 +154,7 @@ async def run_client(
                 write=client.write,
             )
         try:
-            with serving_status(config.status_socket, client.status):
+            with StatusSocket(config.status_socket) as status_socket:
                 log.info("client_started", station=config.station, journal=str(path))
                 async with asyncio.TaskGroup() as group:
                     client.tasks = group
@@ -161,6 +164,7 @@ async def run_client(
                     )
                     group.create_task(client.keeper.keep())
                     group.create_task(keep_radio(open_radio, client.talk, clock))
+                    group.create_task(status_socket.keep_answering(client.status, client.asked))
                     group.create_task(service.keep_notified(client.status_line, clock))
         finally:
             recorder.close()
@@ -198,8 +202,14 @@ class _Client:
         self._journal = journal
         self._path = path
         self._radio_ok = False
+        self._record: InstrumentRecord | None = None
         self.keeper = InstrumentKeeper(
-            instrument, session, clock, on_reading=self._measured, on_done=self._done
+            instrument,
+            session,
+            clock,
+            on_reading=self._measured,
+            on_record=self._set,
+            on_done=self._done,
         )
 
     def write(self, record: object) -> None:
@@ -211,6 +221,11 @@ class _Client:
     def _measured(self, reading: Reading) -> None:
         measurement = self._session.measured(reading, self._timeline.unix_ns(reading.at_ns))
         self._journal.write(measurement, partial(self.link.offer, measurement))
+
+    def _set(self, record: InstrumentRecord) -> None:
+        """Keep how the instrument is set from now on."""
+        self._record = replace(record, stamp_ns=self._now_ns())
+        self.write(self._record)
 
     def give(self, order: Order) -> None:
         """Have an order of the master carried out."""
@@ -256,14 +271,31 @@ class _Client:
     def status(self) -> ClientStatus:
         """Say how it goes."""
         return self._session.status(
-            self._timeline.unix_ns(self._clock.monotonic_ns()),
+            self._now_ns(),
             self.link.status(),
             instrument=self.keeper.description,
+            condition=self.keeper.condition,
+            settings=self._settings(),
             journal=str(self._path),
             journal_ok=not self._recorder.failing,
             journal_waiting=self._recorder.waiting,
+            journal_lost=self._recorder.lost,
             radio_ok=self._radio_ok,
         )
+
+    def _settings(self) -> InstrumentRecord | None:
+        return None if self.keeper.description is None else self._record
+
+    async def asked(self, line: bytes) -> Answer:
+        """Do what somebody asks for over the status socket."""
+        try:
+            request = decode(AtmosphereRequest, line)
+        except ValueError as error:
+            return Answer(problem=f"not understood: {error}", settings=self._settings())
+        problem = await self.keeper.set_atmosphere(
+            Atmosphere(temperature_c=request.temperature_c, pressure_hpa=request.pressure_hpa)
+        )
+        return Answer(problem=problem, settings=self._settings())
 
     def status_line(self) -> str:
         """Say the same in one line, for systemd."""
@@ -280,8 +312,17 @@ class _Client:
             else f"master {status.master_heard_s:.0f} s ago"
         )
         queued = f", {status.queued} queued" if status.queued else ""
-        problems = ("" if status.radio_ok else ", no radio") + ("" if status.journal_ok else ", disk fails")
+        problems = (f", {status.problem}" if status.problem else "") + (
+            "" if status.radio_ok else ", no radio"
+        )
+        if not status.journal_ok:
+            problems += f", disk fails: {status.journal_waiting} lines not written"
+        if status.journal_lost:
+            problems += f", {status.journal_lost} lines lost"
         return f"station {status.station}: {instrument}, {last}, {master}{queued}{problems}"
+
+    def _now_ns(self) -> int:
+        return self._timeline.unix_ns(self._clock.monotonic_ns())
 
 
 def _nothing() -> None:

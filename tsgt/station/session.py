@@ -15,7 +15,8 @@ from tsgt.recording.journal import TargetRecord
 from tsgt.station.status import ClientStatus, LastMeasurement
 
 if TYPE_CHECKING:
-    from tsgt.station.instrument import Reading
+    from tsgt.recording.journal import InstrumentRecord
+    from tsgt.station.instrument import Condition, Reading
     from tsgt.station.status import LinkStatus, Mode
 
 RATE_WINDOW_NS = 10_000_000_000
@@ -61,12 +62,14 @@ class Session:
         stamp_ns
             Its ``at_ns`` on the station's Unix timeline.
         """
+        # Raw, so that the desk can put the instrument's time on this computer's clock anew.
+        received_ns = reading.at_ns if reading.received_ns is None else reading.received_ns
         measurement = PolarMeasurement(
             station=self.station,
             prism=self.prism if reading.prism is None else reading.prism,
             sequence=self._run_start + self._measurements,
             stamp_ns=stamp_ns,
-            received_ns=stamp_ns,
+            received_ns=stamp_ns + received_ns - reading.at_ns,
             horizontal_angle_rad=reading.horizontal_angle_rad,
             zenith_angle_rad=reading.zenith_angle_rad,
             slope_distance_m=reading.slope_distance_m,
@@ -125,9 +128,12 @@ class Session:
         link: LinkStatus,
         *,
         instrument: str | None,
+        condition: Condition,
+        settings: InstrumentRecord | None,
         journal: str,
         journal_ok: bool,
         journal_waiting: int,
+        journal_lost: int,
         radio_ok: bool,
     ) -> ClientStatus:
         """Say how it goes.
@@ -138,7 +144,9 @@ class Session:
             On the station's Unix timeline.
         link
             How it goes over the radio; its ``heard_ns`` on the same timeline.
-        instrument, journal, journal_ok, journal_waiting, radio_ok
+        condition
+            Of the instrument.
+        instrument, settings, journal, journal_ok, journal_waiting, journal_lost, radio_ok
             Fields of :class:`ClientStatus`.
         """
         self._forget_before(now_ns - RATE_WINDOW_NS)
@@ -147,6 +155,10 @@ class Session:
             stamp_ns=now_ns,
             station=self.station,
             instrument=instrument,
+            activity=condition.activity,
+            problem=condition.problem,
+            battery_percent=condition.battery_percent,
+            settings=settings,
             mode=self.mode,
             prism=self.prism,
             locked=None if last is None else last.status not in (Status.NO_TARGET, Status.ERROR),
@@ -165,6 +177,7 @@ class Session:
             journal=journal,
             journal_ok=journal_ok,
             journal_waiting=journal_waiting,
+            journal_lost=journal_lost,
             master_heard_s=None if link.heard_ns is None else _seconds(now_ns - link.heard_ns),
             rssi_dbm=link.rssi_dbm,
             snr_db=link.snr_db,

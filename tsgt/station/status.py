@@ -7,6 +7,7 @@ from typing import ClassVar, Literal
 
 import tsgt
 from tsgt.model import Status, check_instants
+from tsgt.recording.journal import InstrumentRecord  # noqa: TC001 (pydantic looks it up when the program runs)
 
 Mode = Literal["tracking", "direct"]
 
@@ -81,6 +82,15 @@ class ClientStatus:
         Number of the station, from 1.
     instrument
         Name and number of the instrument; null while there is no connection to it.
+    activity
+        What the instrument is doing, in a few words; empty where it does not say.
+    problem
+        What a person should see to, as the instrument says; without a connection why there is none. Empty when there is
+        nothing.
+    battery_percent
+        Charge of the instrument's battery; null where it does not say.
+    settings
+        What is known of the instrument and of its settings, as read back from it and journalled; null where nothing is.
     mode
         ``tracking`` a prism, or ``direct``: single measurements of targets.
     prism
@@ -99,6 +109,8 @@ class ClientStatus:
         Whether the disk took the last line that was to be written.
     journal_waiting
         How many lines are not in the journal yet; a disk that is full lets them pile up.
+    journal_lost
+        How many lines will never be, because too many were waiting already.
     master_heard_s
         From the last packet of the master for this station to this record, in s; null before the first one.
     rssi_dbm
@@ -137,6 +149,10 @@ class ClientStatus:
     stamp_ns: int
     station: int
     instrument: str | None
+    activity: str
+    problem: str
+    battery_percent: int | None
+    settings: InstrumentRecord | None
     mode: Mode
     prism: int
     locked: bool | None
@@ -146,6 +162,7 @@ class ClientStatus:
     journal: str
     journal_ok: bool
     journal_waiting: int
+    journal_lost: int
     master_heard_s: float | None
     rssi_dbm: float | None
     snr_db: float | None

@@ -1,56 +1,111 @@
-"""The socket on which a station's client says how it does: whoever connects gets one JSON line, and the end."""
+"""The socket on which a station's client says how it does, and takes a request.
+
+Whoever connects gets one JSON line, the status. Whoever then says something within a second gets a line that answers
+it. Then the connection ends.
+"""
 
 from __future__ import annotations
 
 import asyncio
-from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING
+from contextlib import suppress
+from typing import TYPE_CHECKING, NoReturn, Self
 
 from tsgt.recording import encode_line
 from tsgt.service import UnixListener
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Awaitable, Callable
     from pathlib import Path
+    from socket import socket
 
+    from tsgt.station.requests import Answer
     from tsgt.station.status import ClientStatus
 
+PATIENCE_S = 1.0
+"""Whoever only wants the status closes at once, or when the end comes."""
 
-@contextmanager
-def serving_status(path: Path, status: Callable[[], ClientStatus], *, mode: int = 0o660) -> Iterator[None]:
-    """Serve the status from the running event loop, until the block ends.
+MAX_REQUEST_BYTES = 4096
 
-    Nothing is read and nobody is waited for: a line fits into the kernel's buffer of a new connection.
+
+class StatusSocket:
+    """The open socket; it is removed with the end of its block.
 
     Parameters
     ----------
     path
-        The socket. A stale one of an earlier run is replaced; its folder is created if need be.
-    status
-        Makes the record.
+        Where. A stale one of an earlier run is replaced; its folder is created if need be.
     mode
-        Permissions of the socket.
+        Its permissions.
 
     Raises
     ------
     StreamError
         Another program serves the socket, or it cannot be made.
     """
-    listener = UnixListener(path, mode)
-    listener.socket.setblocking(False)
 
-    def answer() -> None:
-        with suppress(OSError):  # who asked is gone already
-            connection, _ = listener.socket.accept()
-            with connection:
+    def __init__(self, path: Path, *, mode: int = 0o660) -> None:
+        self._listener = UnixListener(path, mode)
+        self._listener.socket.setblocking(False)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._listener.remove()
+        self._listener.socket.close()
+
+    async def keep_answering(
+        self, status: Callable[[], ClientStatus], request: Callable[[bytes], Awaitable[Answer]]
+    ) -> NoReturn:
+        """Let everybody in, for ever.
+
+        Parameters
+        ----------
+        status
+            Makes the first line.
+        request
+            Does what a line asks for.
+        """
+        loop = asyncio.get_running_loop()
+        listener = self._listener.socket
+
+        def let_in() -> None:
+            with suppress(OSError):  # who asked is gone already
+                connection, _ = listener.accept()
                 connection.setblocking(False)
-                connection.send(encode_line(status()) + b"\n")
+                talk = talks.create_task(_talk(connection, status, request))
+                talk.add_done_callback(lambda _: connection.close())
 
+        async with asyncio.TaskGroup() as talks:
+            loop.add_reader(listener, let_in)
+            try:
+                await asyncio.Event().wait()
+            finally:
+                loop.remove_reader(listener)
+        raise AssertionError  # which nobody reaches
+
+
+async def _talk(
+    connection: socket, status: Callable[[], ClientStatus], request: Callable[[bytes], Awaitable[Answer]]
+) -> None:
     loop = asyncio.get_running_loop()
-    loop.add_reader(listener.socket, answer)
-    try:
-        yield
-    finally:
-        loop.remove_reader(listener.socket)
-        listener.remove()
-        listener.socket.close()
+    with suppress(OSError):  # whoever asked is gone, or says nothing, which is a TimeoutError
+        async with asyncio.timeout(PATIENCE_S):
+            await loop.sock_sendall(connection, encode_line(status()) + b"\n")
+            line = await _line(connection)
+        if line:
+            answer = await request(line)
+            async with asyncio.timeout(PATIENCE_S):
+                await loop.sock_sendall(connection, encode_line(answer) + b"\n")
+
+
+async def _line(connection: socket) -> bytes:
+    """Return what comes up to the first line end, the end, or the limit."""
+    loop = asyncio.get_running_loop()
+    received = b""
+    while b"\n" not in received and len(received) < MAX_REQUEST_BYTES:
+        data = await loop.sock_recv(connection, MAX_REQUEST_BYTES)
+        if not data:
+            break
+        received += data
+    return received.partition(b"\n")[0]

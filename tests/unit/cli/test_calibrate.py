@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from tsgt.config import load_prism_layout, load_station_frames
+from tsgt.config import StationFramesFile, load, load_prism_layout, load_station_frames
 
 if TYPE_CHECKING:
     from support.cli import Tsgt
@@ -155,6 +155,9 @@ def test_the_set_up_file_holds_the_frames_bit_for_bit(tsgt: Tsgt, tmp_path: Path
     assert np.array(frames[2]).tolist() == done.json()["stations"]["2"]["T_station1_station"]
     np.testing.assert_array_equal(frames[1], np.eye(4))
     assert output.read_text(encoding="utf-8").startswith("# written by tsgt calibrate targets ")
+    written = load(output, StationFramesFile).stations
+    assert written["1"].rms_mm is None
+    assert written["2"].rms_mm == pytest.approx(done.json()["stations"]["2"]["rms_mm"], abs=1e-3)
 
 
 def test_a_contradiction_is_printed_but_no_file_is_written(tsgt: Tsgt, tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from tsgt.cli.status import client_text, duration, master_text, station_word
 from tsgt.master.stream_records import HelloRecord, StationStatus, StatusRecord
 from tsgt.model import Status
 from tsgt.recording import encode_line
+from tsgt.recording.journal import InstrumentRecord
 from tsgt.station.status import ClientStatus, LastMeasurement
 
 if TYPE_CHECKING:
@@ -46,6 +47,17 @@ CLIENT = ClientStatus(
     stamp_ns=NOW_NS,
     station=3,
     instrument="simulated total station 3",
+    activity="tracking",
+    problem="",
+    battery_percent=57,
+    settings=InstrumentRecord(
+        make="Leica",
+        prism_type="mini_360",
+        prism_constant_m=0.03,
+        atmospheric_ppm=8.1,
+        temperature_c=20.0,
+        pressure_hpa=1013.25,
+    ),
     mode="tracking",
     prism=3,
     locked=True,
@@ -62,6 +74,7 @@ CLIENT = ClientStatus(
     journal="/var/lib/tsgt/station3-20261121T101112Z.jsonl",
     journal_ok=True,
     journal_waiting=0,
+    journal_lost=0,
     master_heard_s=0.4,
     rssi_dbm=-79.0,
     snr_db=9.5,
@@ -119,6 +132,10 @@ def test_a_station_that_was_not_asked_is_not_called_silent() -> None:
         ({"instrument": None}, "NO INSTRUMENT"),
         ({"last": None}, "NO MEASUREMENT"),
         ({"journal_ok": False, "journal_waiting": 17}, "DISK FAILS"),
+        ({"journal_ok": False, "journal_waiting": 17}, "17 lines not written yet"),
+        ({"problem": "battery low, 9 %"}, "SEE TO THE INSTRUMENT"),
+        ({"problem": "battery low, 9 %"}, "battery low, 9 %"),
+        ({"instrument": None, "problem": "nobody answers on /dev/ttyUSB0"}, "nobody answers"),
         ({"radio_ok": False}, "NO RADIO"),
         ({"master_heard_s": None}, "MASTER NOT HEARD"),
         ({"master_heard_s": 60.0}, "MASTER NOT HEARD"),
@@ -147,6 +164,26 @@ def test_a_client_says_why_it_does_not_hear_its_master(change: dict[str, object]
     assert max(len(line) for line in lines[1:]) <= 40
 
 
+def test_a_client_says_what_its_instrument_does_and_how_it_is_set() -> None:
+    """Battery, what it adds to distances, and what it does when that is not the usual."""
+    text = "\n".join(client_text(CLIENT)[0])
+    for part in ("battery 57 %", "prism mini_360 +30.0 mm", "air +8.1 ppm: 20.0 C, 1013.2 hPa"):
+        assert part in text
+    looking = dataclasses.replace(CLIENT, activity="looking for the prism around its last direction")
+    assert "  looking for the prism around its last" in client_text(looking)[0]
+    silent = dataclasses.replace(CLIENT, settings=None, battery_percent=None, activity="")
+    assert not any(
+        word in "\n".join(client_text(silent)[0]) for word in ("battery", "prism m", "air", "None")
+    )
+
+
+def test_a_client_says_what_the_disk_has_lost() -> None:
+    """Also when the disk is well again; then nobody needs to do anything."""
+    lines, well = client_text(dataclasses.replace(CLIENT, journal_lost=3))
+    assert well
+    assert "  3 lines lost" in lines
+
+
 def test_a_client_says_how_delivery_and_clock_do() -> None:
     """Over the protocol superframe; and loudly that there is no key, which is no fault."""
     assert "2 to deliver, 1 slots late" in client_text(CLIENT)[0]
@@ -164,8 +201,12 @@ def test_a_client_in_direct_mode_is_well_without_measurements() -> None:
 
 def test_both_fit_on_a_small_screen() -> None:
     """No line is longer than forty characters."""
-    lines = [*master_text(MASTER)[0], *client_text(CLIENT)[0]]
-    assert max(len(line.replace("\x1b[1m", "").replace("\x1b[0m", "")) for line in lines) <= WIDTH
+    troubled = dataclasses.replace(CLIENT, problem="word " * 30, activity="doing " * 20)
+    lines = [*master_text(MASTER)[0], *client_text(CLIENT)[0], *client_text(troubled)[0]]
+    assert (
+        max(len(line.replace("\x1b[1m", "").replace("\x1b[7m", "").replace("\x1b[0m", "")) for line in lines)
+        <= WIDTH
+    )
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(0.34, "0.3 s"), (47, "47 s"), (600, "10 min"), (9000, "2 h")])

@@ -35,7 +35,7 @@ PROBLEMS = {
         ("range_sigma_ppm", "range_sigma_pm"),
         "stations[#1].noise.range_sigma_pm: unknown key; did you mean range_sigma_ppm?",
     ),
-    "missing key": (("prism_constant_mm = 10.0  #", "#"), "stations[#1].prism_constant_mm: missing key"),
+    "missing key": (("prism_constant_mm = 0.0   #", "#"), "stations[#1].prism_constant_mm: missing key"),
     "number out of range": (
         ("rate_hz = 20.0", "rate_hz = -1"),
         "pipeline.rate_hz = -1: should be greater than or equal to 0.01",

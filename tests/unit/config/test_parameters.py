@@ -40,7 +40,7 @@ def test_units_become_si(folder: Path) -> None:
     """Millimetres, milliseconds, arcseconds and degrees become metres, nanoseconds and radians."""
     known = _parameters(
         folder,
-        ("prism_constant_mm = 10.0", "prism_constant_mm = -34.4"),
+        ("prism_constant_mm = 0.0 ", "prism_constant_mm = -34.4 "),
         ("latency_ms = 0.0", "latency_ms = 12.5"),
         ("atmospheric_ppm = 0.0", "atmospheric_ppm = 7.5"),
         ("angle_sigma_arcsec = 1.0", "angle_sigma_arcsec = 3600.0"),

@@ -199,6 +199,19 @@ def test_a_station_that_refuses_to_track_is_told_again_and_never_polled() -> Non
     assert [turn for _, turn in channel.of(Poll) if turn.station == 3]
 
 
+def test_an_order_lost_after_many_refusals_costs_no_more_than_itself() -> None:
+    """An instrument that is being connected refuses often, which costs little; a lost packet is not paid for as often."""
+    channel = Channel(stations=1, refusing={1})
+    channel.run(20)
+    assert [turn.ok for _, turn in channel.of(Ordered)[:5]] == [False] * 5
+    waits_ns = channel.scheduler.next(channel.now_ns)
+    assert isinstance(waits_ns, int)
+    lost = channel.scheduler.next(waits_ns)
+    assert isinstance(lost, Ordered)
+    channel.scheduler.finished(lost, waits_ns + SECOND)
+    assert isinstance(channel.scheduler.next(waits_ns + SECOND), Synchronisation)
+
+
 def test_a_station_with_another_clock_is_synchronised_before_anything_else() -> None:
     """Whoever is next in the round waits; it may have been restarted, so it is told its prism again."""
     channel = Channel()

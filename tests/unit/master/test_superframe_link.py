@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import threading
 from collections import Counter
 from contextlib import asynccontextmanager
@@ -11,6 +12,7 @@ from statistics import mean, median
 from typing import TYPE_CHECKING
 from unittest.mock import patch
 
+import numpy as np
 import pytest
 from structlog.testing import capture_logs
 from support.field import STATIONS, TRUE, field_of, running
@@ -327,6 +329,110 @@ async def test_a_station_in_direct_mode_is_put_back_to_tracking(tmp_path: Path) 
             assert events(field) == ["station_not_tracking 1", "station_tracking 1"]
             assert station_status(field, 1).prism == 1
     assert not tool.direct_mode
+
+
+async def test_a_station_without_its_prism_is_told_where_the_robot_is(tmp_path: Path) -> None:
+    """Every 5 s, in its own circles, until it has it again; nobody else notices, and nothing is lost."""
+    scene = standing_scene().moving(driving)
+    with capture_logs() as logs:
+        async with field_of(tmp_path, scene, superframe=True) as field, running(field.master()):
+            tool = field.stations[2].instrument
+            await asyncio.sleep(20)
+            assert tool.sought == []
+            tool.status = Status.NO_TARGET
+            await asyncio.sleep(14)
+            tool.status = Status.OK
+            await asyncio.sleep(20)
+    assert len(tool.sought) == 3
+    assert field.stations[1].instrument.sought == field.stations[3].instrument.sought == []
+    after_s = [at_ns / SECOND - 20 for at_ns, _ in tool.sought]
+    assert after_s == pytest.approx([2.6, 7.8, 13.0], abs=0.4)
+    for at_ns, towards in tool.sought:
+        assert towards.spread_rad < math.radians(5)
+        for ahead_s in (0.0, 1.0):
+            true = scene.measure(2, at_ns / SECOND + ahead_s)
+            aside_rad = math.hypot(
+                math.remainder(towards.horizontal_angle_rad - true.horizontal_angle_rad, math.tau),
+                towards.zenith_angle_rad - true.zenith_angle_rad,
+            )
+            assert aside_rad < towards.spread_rad
+    assert events(field) == ["instrument_status 2", "instrument_status 2"]
+    ordered = [log for log in logs if log["event"] == "search_ordered"]
+    assert [log["station"] for log in ordered] == [2, 2, 2]
+    assert undelivered(field, until_s=53) == NOTHING
+    assert station_status(field, 1).rate_hz == pytest.approx(2.5, abs=0.11)
+
+
+async def test_directions_cost_the_others_nothing(tmp_path: Path) -> None:
+    """Frames on the instruments' beat last as long as before, and measurements come as early."""
+    async with field_of(tmp_path, superframe=True) as field:
+        async with running(field.master(field.config(protocol={"phase_lock": True}))):
+            await asyncio.sleep(40)
+            field.stations[2].instrument.status = Status.NO_TARGET
+            await asyncio.sleep(40)
+        assert len(field.stations[2].instrument.sought) == 6
+    middle_ns = START + 40 * SECOND
+    lengths_ms = [
+        (after.stamp_ns - before.stamp_ns) / MS
+        for before, after in pairwise(field.of(BeaconRecord))
+        if before.stamp_ns > middle_ns
+    ]
+    assert mean(lengths_ms) == pytest.approx(400, abs=0.5)
+    for number in (1, 3):
+        ages_ms: dict[bool, list[float]] = {False: [], True: []}
+        for m in field.of(PolarMeasurement):
+            if m.station == number and m.stamp_ns > START + 30 * SECOND:
+                ages_ms[m.stamp_ns > middle_ns].append((m.received_ns - m.stamp_ns) / MS)
+        assert median(ages_ms[True]) < median(ages_ms[False]) + 2
+        assert max(ages_ms[True]) < max(ages_ms[False]) + 40
+
+
+async def test_who_does_something_else_is_not_told_to_search(tmp_path: Path) -> None:
+    """A station in direct mode, whose operator aims at targets; it is asked to track, as ever."""
+    async with field_of(tmp_path, superframe=True) as field, running(field.master()):
+        tool = field.stations[1].instrument
+        await asyncio.sleep(10)
+        await field.stations[1].kill()
+        tool.direct_mode = tool.refuses = True
+        tool.status = Status.NO_TARGET
+        field.stations[1].start()
+        await asyncio.sleep(20)
+        assert station_status(field, 1).status is Status.NO_TARGET
+        assert tool.sought == []
+        assert "station_not_tracking 1" in events(field)
+
+
+async def test_a_search_that_is_refused_is_no_refusal_to_track(tmp_path: Path) -> None:
+    """It is told again after 5 s; nobody is alarmed."""
+    async with field_of(tmp_path, superframe=True) as field, running(field.master()):
+        tool = field.stations[3].instrument
+        await asyncio.sleep(10)
+        tool.status, tool.refuses = Status.NO_TARGET, True
+        await asyncio.sleep(10)
+    assert len(tool.sought) == 2
+    assert events(field) == ["instrument_status 3"]
+
+
+async def test_a_direction_that_has_grown_old_is_not_given_any_more(tmp_path: Path) -> None:
+    """A station that was away in the meantime gets one of now, or none."""
+    link = LinkModel()
+    driven = standing_scene().moving(lambda time_s: (np.eye(3), np.array([30.0, time_s - 20.0, -1.0])))
+    async with field_of(tmp_path, driven, superframe=True, link=link) as field, running(field.master()):
+        tool = field.stations[3].instrument
+        await asyncio.sleep(10)
+        tool.status = Status.NO_TARGET
+        await asyncio.sleep(1.6)
+        link.attenuate("master", "station-3", 200)
+        with capture_logs() as logs:
+            await asyncio.sleep(20)
+        assert [log["event"] for log in logs].count("search_ordered") == 1
+        assert tool.sought == []
+        link.attenuate("master", "station-3", 0)
+        await asyncio.sleep(5)
+    ((at_ns, towards),) = tool.sought
+    true = driven.measure(3, at_ns / SECOND)
+    aside_rad = math.remainder(towards.horizontal_angle_rad - true.horizontal_angle_rad, math.tau)
+    assert abs(aside_rad) < towards.spread_rad
 
 
 # --- Time -------------------------------------------------------------------------------------------------------------

@@ -81,6 +81,14 @@ def test_the_key_of_somebody_else_is_refused(key: Path, monkeypatch: pytest.Monk
         read_key(key)
 
 
+def test_a_key_may_be_that_of_another_user_who_is_named(key: Path) -> None:
+    """Whoever checks a machine as root looks at the key of the daemon's user."""
+    owner = key.stat().st_uid
+    assert read_key(key, owner=owner) == read_key(key)
+    with pytest.raises(ConfigError, match=rf"here {owner + 54321}; .*chown"):
+        read_key(key, owner=owner + 54321)
+
+
 def test_a_missing_key_is_said_with_the_command_that_makes_one(tmp_path: Path) -> None:
     """Nothing is made by itself: a new key on one machine would shut out all others."""
     with pytest.raises(ConfigError, match=r"no such file; .*`tsgt radio key"):

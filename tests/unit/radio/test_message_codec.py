@@ -35,6 +35,7 @@ from tsgt.radio.messages import (
     SlotOrder,
     StatePart,
     StationEntry,
+    Towards,
 )
 
 SIGHTING = Sighting(200, 100_000, Status.OK, 5_000_000, 4_194_304, 750_000)
@@ -213,7 +214,11 @@ def test_measurements_without_distance_stay_without() -> None:
         replace(BEACON, confirmations=(Confirmation(4, 0),)),
         replace(BEACON, orders=(OrderPart(0, 0, 0),)),
         replace(BEACON, orders=(OrderPart(1, 0, 4),)),
+        replace(BEACON, orders=(OrderPart(1, 0, 5),)),
         replace(BEACON, orders=(OrderPart(1, 0, 1, 1),)),
+        replace(BEACON, orders=(OrderPart(1, 0, 1, 0, Towards(1, 2)),)),
+        replace(BEACON, orders=(OrderPart(1, 0, 4, 16, Towards(1, 2)),)),
+        replace(BEACON, orders=(OrderPart(1, 0, 4, 0, Towards(2**16, 2)),)),
     ],
 )
 def test_beacons_that_do_not_fit_are_refused(beacon: Beacon) -> None:
@@ -266,6 +271,8 @@ _EXTENDED = ((1, 2), (7, 8), (1, 1), (9, 16), (3, 8), (0, 5), (0, 4), (0x12, 8))
         (_bits(*_EXTENDED, (3, 2), (0, 4), (0, 4), (0, 4), (0, 4), (0, 2), (1, 1)), "not in the form"),
         (_bits(*_EXTENDED, (3, 2), (1, 4), (0, 4), (0, 4), (0, 4), (0, 2)), "station 2"),
         (_bits(*_EXTENDED, (2, 2), (0, 4), (0, 16)), "cut off"),
+        (_bits(*_EXTENDED, (3, 2), (0, 4), (0, 4), (4, 4), (0, 4), (0, 16)), "cut off"),
+        (_bits(*_EXTENDED, (3, 2), (0, 4), (0, 4), (5, 4), (0, 4), (0, 2)), "no order 5"),
         (_bits(*_EXTENDED, (2, 2), (0, 4), (0, 32), (1, 2), *[(0, 8)] * 13, (0, 2)), "not in the form"),
     ],
 )

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from itertools import pairwise
 from statistics import median
+from typing import TYPE_CHECKING
 from unittest.mock import patch
 
 import pytest
@@ -26,8 +28,12 @@ from tsgt.radio.messages import (
     ShotPart,
     SlotOrder,
     StatePart,
+    Towards,
 )
-from tsgt.radio.orders import DirectOrder, MeasureOrder, SearchOrder, TrackOrder
+from tsgt.radio.orders import Direction, DirectOrder, MeasureOrder, SearchOrder, TrackOrder
+
+if TYPE_CHECKING:
+    from tsgt.radio.orders import Order
 
 STATE = StatePart(prism=1, direct=False, connected=True, late=0, doubted=0, rssi_dbm=-80)
 
@@ -298,27 +304,71 @@ def test_a_measurement_that_the_disk_lost_is_taken_again(frames: Frames) -> None
         (TrackOrder(3), 0, 2),
         (TrackOrder(None), 0, 1),
         (SearchOrder(), 1, 0),
+        (SearchOrder(Direction(math.pi, math.pi / 2, 0.0087)), 4, 3),
         (DirectOrder(), 2, 0),
         (MeasureOrder(), 3, 0),
     ],
 )
 def test_an_order_is_repeated_until_it_is_answered(
-    frames: Frames, order: TrackOrder | SearchOrder | DirectOrder | MeasureOrder, code: int, argument: int
+    frames: Frames, order: Order, code: int, argument: int
 ) -> None:
     """With the same ticket; the answer is handed on once, however often the station gives it."""
     ticket = frames.master.order(2, order)
     for _ in range(3):
         frames.run(1)
-        assert frames.beacon.orders == (OrderPart(2, ticket, code, argument),)
+        towards = Towards(2**15, 2**14) if code == 4 else None
+        assert frames.beacon.orders == (OrderPart(2, ticket, code, argument, towards),)
     frames.begin()
     other = frames.answer(2, Reply(answer=AnswerPart((ticket + 1) % 16, ok=True)))
-    assert other.answer is None
+    assert (other.order, other.answer) == (None, None)
     frames.end()
     frames.begin()
-    assert frames.answer(2, Reply(answer=AnswerPart(ticket, ok=False))).answer == AnswerPart(ticket, ok=False)
+    heard = frames.answer(2, Reply(answer=AnswerPart(ticket, ok=False)))
+    assert (heard.order, heard.answer) == (order, AnswerPart(ticket, ok=False))
     frames.end()
     assert frames.begin().orders == ()
     assert frames.answer(2, Reply(answer=AnswerPart(ticket, ok=False))).answer is None
+
+
+def test_an_order_that_is_withdrawn_is_said_no_more(frames: Frames) -> None:
+    """One of another kind stands; an answer that comes all the same is nobody's."""
+    ticket = frames.master.order(2, SearchOrder())
+    frames.master.order(1, TrackOrder(1))
+    frames.run(1)
+    for station in (1, 2):
+        frames.master.peer(station).withdraw(SearchOrder)
+    frames.begin()
+    assert [(part.station, part.order) for part in frames.beacon.orders] == [(1, 0)]
+    heard = frames.answer(2, Reply(answer=AnswerPart(ticket, ok=True)))
+    assert (heard.order, heard.answer) == (None, None)
+
+
+def test_whether_a_station_tracks_is_what_it_said_last(frames: Frames) -> None:
+    """Which prism, with an instrument, not in direct mode; not while it is away or has another order."""
+    peer = frames.master.peer(2)
+    state = replace(STATE, prism=2)
+
+    def says(state: StatePart) -> tuple[bool, bool]:
+        frames.begin()
+        frames.answer(2, Reply(state=state))
+        frames.end()
+        return peer.is_tracking(2), peer.is_tracking(3)
+
+    assert not peer.is_tracking(2)
+    assert says(state) == (True, False)
+    assert says(replace(state, prism=3)) == (False, True)
+    assert says(replace(state, direct=True)) == (False, False)
+    assert says(replace(state, connected=False)) == (False, False)
+    assert says(state) == (True, False)
+    frames.master.order(2, SearchOrder())
+    assert peer.is_tracking(2)
+    frames.master.order(2, TrackOrder(2))
+    assert not peer.is_tracking(2)
+    peer.withdraw(TrackOrder)
+    frames.run(3, silent=(2,))
+    assert peer.is_tracking(2)
+    frames.run(1, silent=(2,))
+    assert not peer.is_tracking(2)
 
 
 def test_a_shot_answers_an_order(frames: Frames) -> None:

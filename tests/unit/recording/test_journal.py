@@ -10,7 +10,7 @@ from support.records import HEADER, PARAMETERS, measurement
 from tsgt.errors import CorruptLineError, RecordingError
 from tsgt.model import Status
 from tsgt.recording import encode_line
-from tsgt.recording.journal import JournalRecord, TargetRecord, load_journal
+from tsgt.recording.journal import JournalRecord, ReceptionRecord, TargetRecord, load_journal
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -68,3 +68,25 @@ def test_a_target_that_cannot_be(tmp_path: Path) -> None:
     path = write(tmp_path / "j.jsonl", HEADER, HEAD, tail=line + b"\n")
     with pytest.raises(CorruptLineError, match="line 3"):
         load_journal(path)
+
+
+def test_receptions_come_back(tmp_path: Path) -> None:
+    """With the time at which the journal was begun, they tell what the station's clock showed."""
+    reception = ReceptionRecord(stamp_ns=7, stamp_sigma_ns=1, session=2, counter=3, sent_us=4)
+    journal = load_journal(write(tmp_path / "j.jsonl", HEADER, HEAD, reception))
+    assert journal.head == HEAD
+    assert journal.created_ns == HEADER.created_ns
+    assert journal.receptions == [reception]
+
+
+def test_lines_that_cannot_be_read_are_skipped_if_asked(tmp_path: Path) -> None:
+    """Each of them is told; whose journal it is has to be sure all the same."""
+    problems: list[RecordingError] = []
+    wrong = encode_line(TARGET).replace(b'"stamp_ns":7', b'"stamp_ns":-1') + b"\n"
+    path = write(tmp_path / "j.jsonl", HEADER, HEAD, tail=b"rubbish\n" + wrong + encode_line(TARGET) + b"\n")
+    journal = load_journal(path, keep_going=True, on_problem=problems.append)
+    assert journal.targets == [TARGET]
+    assert [problem.line for problem in problems] == [3, 4]
+    path = write(tmp_path / "j.jsonl", HEADER, HEAD, JournalRecord(station=2, unix_at_zero_ns=5))
+    with pytest.raises(CorruptLineError, match="begins a second journal"):
+        load_journal(path, keep_going=True)

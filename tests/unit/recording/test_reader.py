@@ -21,6 +21,7 @@ from support.records import (
 from tsgt.errors import CorruptLineError, RecordingError, RecordingVersionError
 from tsgt.recording import encode_line, load_recording, read_lines
 from tsgt.recording.format import MAX_LINE_BYTES
+from tsgt.recording.merged import MergedRecord
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -39,6 +40,18 @@ def test_measurements_come_in_order_of_arrival(path: Path) -> None:
     assert recording.header == HEADER
     assert recording.parameters == PARAMETERS
     assert recording.measurements == [measurement(1), POINT, measurement(0)]
+
+
+def test_merged_measurements_count_like_others(path: Path) -> None:
+    """They stand behind the others, and may be later than all that the master knew of."""
+    merged = MergedRecord(journal="station1.jsonl", measurement=measurement(9))
+    path.write_bytes(recording_bytes(measurement(1), merged))
+    recording = load_recording(path)
+    assert recording.measurements == [measurement(1), measurement(9)]
+    assert recording.end_ns == measurement(9).received_ns
+    path.write_bytes(recording_bytes(measurement(1)) + b'{"type":"merged","journal":"station1.jsonl"}\n')
+    with pytest.raises(CorruptLineError, match="line 4: cannot be used as merged"):
+        load_recording(path)
 
 
 @pytest.mark.parametrize(

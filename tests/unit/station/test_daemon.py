@@ -330,7 +330,7 @@ async def test_a_second_client_does_not_take_the_socket(tmp_path: Path) -> None:
 async def asked(path: Path) -> dict[str, Any]:
     """Ask the client how it does."""
     reader, writer = await asyncio.open_unix_connection(path)
-    line = await reader.read()
+    line = await reader.readline()
     writer.close()
     status = json.loads(line)
     assert isinstance(status, dict)

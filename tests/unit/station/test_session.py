@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from tsgt.model import PolarMeasurement, Status
 from tsgt.radio.orders import DirectOrder, MeasureOrder, SearchOrder, TrackOrder
-from tsgt.station.instrument import Reading
+from tsgt.recording.journal import InstrumentRecord
+from tsgt.station.instrument import Condition, Reading
 from tsgt.station.session import Session
 from tsgt.station.status import ClientStatus, LinkStatus
 
 SECOND = 1_000_000_000
 START = 1_600_000_000 * SECOND
 ZERO = START - 77
+SETTINGS = InstrumentRecord(make="i")
 SILENT = LinkStatus(protocol="classic", heard_ns=None, rssi_dbm=None, snr_db=None)
 
 
@@ -43,9 +47,12 @@ def status(session: Session, seconds: float, link: LinkStatus = SILENT) -> Clien
         START + round(seconds * SECOND),
         link,
         instrument="i",
+        condition=Condition(activity="tracking", problem="battery low", battery_percent=9),
+        settings=SETTINGS,
         journal="/j",
         journal_ok=True,
         journal_waiting=0,
+        journal_lost=0,
         radio_ok=True,
     )
 
@@ -69,6 +76,13 @@ def test_the_journal_gets_what_the_instrument_said() -> None:
         instrument_time_ns=99,
     )
     assert (second.sequence, second.host_time_ns) == (1, START + 400_000_000)
+
+
+def test_the_journal_gets_when_the_first_byte_came() -> None:
+    """Raw beside the stamp, so that the desk can make the stamp anew from the instrument's time."""
+    made = replace(reading(0.0), received_ns=77 + 95_000_000)
+    measurement = Session(3, 1).measured(made, ZERO + made.at_ns)
+    assert (measurement.stamp_ns, measurement.received_ns) == (START, START + 95_000_000)
 
 
 def test_the_numbers_go_on_from_those_of_earlier_runs() -> None:
@@ -119,6 +133,10 @@ def test_the_status_before_anything_has_happened() -> None:
         stamp_ns=START,
         station=3,
         instrument="i",
+        activity="tracking",
+        problem="battery low",
+        battery_percent=9,
+        settings=SETTINGS,
         mode="tracking",
         prism=1,
         locked=None,
@@ -128,6 +146,7 @@ def test_the_status_before_anything_has_happened() -> None:
         journal="/j",
         journal_ok=True,
         journal_waiting=0,
+        journal_lost=0,
         master_heard_s=None,
         rssi_dbm=None,
         snr_db=None,

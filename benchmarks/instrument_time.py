@@ -1,0 +1,110 @@
+"""How well the instrument's time is put on the host's clock, as measurements come.
+
+    python benchmarks/instrument_time.py
+
+The clock fit only, without lines and drivers: instrument times in whole ms, a crystal that is off and wanders, answers
+that are late by chance. As in the driver, exchanges for the time alone are what is fitted: 12 at the beginning, one for
+each of the next 32 distances, then two a second. The error is that of the newest distance, with the exchanges before it.
+What the fastest way itself needs is taken off, for the fit cannot see it. The figures stand in
+docs/explanation/instrument-time.md.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from tsgt.station.instrument_clock import InstrumentClock
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+RUNS = 40
+FASTEST_MS = 20.0
+DURATION_S = 900.0
+
+PERIODS_S = ((0, 5), (5, 60), (60, 300), (300, 900))
+
+
+class Case(NamedTuple):
+    """What is tried."""
+
+    name: str
+    delay_ms: Callable[[np.random.Generator], float] = lambda random: random.uniform(0, 40)
+    every_s: float = 0.5
+    drift_ppm: float = 20.0
+    wander_ppm: float = 0.0
+    gap_s: tuple[float, float] = (0.0, 0.0)
+    no_fastest: bool = False
+    """Whether the delay has no sharp lower end: then errors are against their own median."""
+
+
+def _stalling(random: np.random.Generator) -> float:
+    return random.uniform(300, 700) if random.random() < 0.1 else random.uniform(0, 40)
+
+
+CASES = (
+    Case("answers 0 to 40 ms late"),
+    Case("0 to 10 ms late", delay_ms=lambda random: random.uniform(0, 10)),
+    Case("0 to 40 ms, an exchange a second", every_s=1.0),
+    Case("50 ppm", drift_ppm=50.0),
+    Case("200 ppm", drift_ppm=200.0),
+    Case("rate changes by 1 ppm a minute", wander_ppm=1.0),
+    Case("exponentially late, 20 ms on average", delay_ms=lambda random: random.exponential(20)),
+    Case("every tenth 300 to 700 ms late", delay_ms=_stalling),
+    Case("normally late, sigma 6 ms", delay_ms=lambda random: abs(random.normal(30, 6)), no_fastest=True),
+    Case("nothing from 30 s to 90 s", gap_s=(30.0, 90.0)),
+)
+
+
+def errors(case: Case, seed: int) -> list[tuple[float, float, float]]:
+    """Return time since the start in s, error and bound in ms, of each stamp of one run."""
+    random = np.random.default_rng(seed)
+    drift = case.drift_ppm * random.choice((-1.0, 1.0)) * 1e-6
+    instrument_at_zero_ms = random.uniform(1e5, 1e8)
+    exchanges = np.r_[
+        np.arange(12) * 0.05, 0.8 + np.arange(32) * 0.4, np.arange(13.8, DURATION_S, case.every_s)
+    ]
+    distances = 0.7 + np.arange(0, DURATION_S, 0.4) + random.normal(0, 0.004, round(DURATION_S / 0.4))
+    wander = case.wander_ppm * 1e-6 / 60
+    clock = InstrumentClock()
+    found = []
+    events = sorted([(true_s, False) for true_s in exchanges] + [(true_s, True) for true_s in distances])
+    for true_s, is_distance in events:
+        if case.gap_s[0] <= true_s < case.gap_s[1]:
+            continue
+        instrument_ms = math.floor(
+            instrument_at_zero_ms + 1e3 * (true_s * (1 + drift) + 0.5 * wander * true_s**2)
+        )
+        arrived_ns = round(1e9 * (1000 + true_s) + 1e6 * (FASTEST_MS + case.delay_ms(random)))
+        if not is_distance:
+            clock.add(instrument_ms, arrived_ns)
+            continue
+        time = clock.stamp(instrument_ms, arrived_ns + 40_000_000)
+        if time is not None:
+            error_ms = (time.host_ns - 1e9 * (1000 + true_s)) / 1e6 - FASTEST_MS
+            found.append((float(true_s), error_ms, time.bound_ns / 1e6))
+    return found
+
+
+def main() -> None:
+    """Print a table."""
+    periods = " | ".join(f"{begin} to {end} s" for begin, end in PERIODS_S)
+    print(f"| error in ms: median / largest | {periods} | bound, median | outside it |")
+    print("|---" * (len(PERIODS_S) + 3) + "|")
+    for case in CASES:
+        table = np.array([row for seed in range(RUNS) for row in errors(case, seed)])
+        if case.no_fastest:
+            table[:, 1] -= np.median(table[:, 1])
+        cells = []
+        for begin, end in PERIODS_S:
+            part = np.abs(table[(table[:, 0] >= begin) & (table[:, 0] < end), 1])
+            cells.append(f"{np.median(part):.2f} / {part.max():.1f}")
+        outside = np.mean(np.abs(table[:, 1]) > table[:, 2])
+        print(f"| {case.name} | {' | '.join(cells)} | {np.median(table[:, 2]):.1f} | {100 * outside:.3f} % |")
+
+
+if __name__ == "__main__":
+    main()

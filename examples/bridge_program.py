@@ -1,0 +1,104 @@
+"""A program for the client's bridge, with an invented instrument in the place where yours will be.
+
+Usage, in the client's configuration: ``command = ["python3", "/path/bridge_program.py"]``; with the name of a CSV file
+after it the rows of that (horizontal angle and zenith angle in rad, slope distance in m) are given out one by one, again
+and again. It needs nothing but Python's standard library. What each line means stands in docs/reference/bridge.md.
+"""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import json
+import math
+import queue
+import sys
+import threading
+import time
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+PERIOD_NS = 400_000_000
+
+Row = tuple[float, float, float]
+
+
+def circling() -> Iterator[Row]:
+    """Yield what a station sees of a prism that drives in a circle, 20 m away."""
+    for step in itertools.count():
+        angle = 0.05 * step
+        x, y = 20 + 3 * math.cos(angle), 3 * math.sin(angle)
+        yield math.atan2(y, x) % (2 * math.pi), math.pi / 2, math.hypot(x, y)
+
+
+def rows_of(path: str) -> Iterable[Row]:
+    """Return the rows of a CSV file, over and over."""
+    with open(path, encoding="utf-8") as file:  # noqa: PTH123 (as anybody would write it)
+        rows = [(float(row[0]), float(row[1]), float(row[2])) for row in csv.reader(file)]
+    return itertools.cycle(rows)
+
+
+def say(record: dict[str, Any]) -> None:
+    """Print a line, and let it go at once: without flush it would wait in here for others."""
+    print(json.dumps(record), flush=True)
+
+
+def listen(commands: queue.Queue[dict[str, Any] | None]) -> None:
+    """Put the client's commands into a queue; None when the client is gone."""
+    for line in sys.stdin:
+        commands.put(json.loads(line))
+    commands.put(None)
+
+
+def measured(row: Row) -> dict[str, Any]:
+    """Return a measurement that was made just now. Replace this by your instrument, and the time by that of its callback."""
+    horizontal, zenith, distance = row
+    return {
+        "host_time_ns": time.monotonic_ns(),  # CLOCK_MONOTONIC
+        "horizontal_angle_rad": horizontal,
+        "zenith_angle_rad": zenith,
+        "slope_distance_m": distance,
+        "status": "ok",
+    }
+
+
+def main() -> None:
+    """Measure, and do what the client wants, until it is gone."""
+    rows = iter(rows_of(sys.argv[1]) if len(sys.argv) > 1 else circling())
+    commands: queue.Queue[dict[str, Any] | None] = queue.Queue()
+    threading.Thread(target=listen, args=(commands,), daemon=True).start()
+    say(
+        {
+            "type": "hello",
+            "bridge": 1,
+            "make": "Example",
+            "model": "invented",
+            "stamps": "host",
+            "commands": ["track", "direct", "measure"],
+        }
+    )
+    say({"type": "settings", "prism_type": "360", "prism_constant_m": 0.0})
+    prism: int | None = None
+    next_ns = time.monotonic_ns()
+    while True:
+        try:
+            command = commands.get(timeout=max(0, next_ns - time.monotonic_ns()) / 1e9)
+        except queue.Empty:
+            next_ns += PERIOD_NS
+            row = next(rows)
+            if prism is not None:
+                say({"type": "measurement", "prism": prism} | measured(row))
+            continue
+        if command is None:
+            return
+        if command["type"] == "measure":
+            say({"type": "shot", "id": command["id"]} | measured(next(rows)))
+            continue
+        prism = command["prism"] if command["type"] == "track" else None
+        say({"type": "done", "id": command["id"]})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,85 @@
+"""Whatever a bridge program prints, the client takes what can be, and nothing else."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import deque
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+from hypothesis import given
+from hypothesis import strategies as st
+from structlog.testing import capture_logs
+from support.bridge import HELLO, measured
+
+from tsgt.simulation.clocks import VirtualClock
+from tsgt.simulation.event_loop import run_virtual
+from tsgt.station.bridge_lines import LineCutter
+from tsgt.station.bridge_run import BridgeRun, Refusals
+from tsgt.station.bridge_times import OLDEST_NS, Stamper
+
+if TYPE_CHECKING:
+    from tsgt.station.instrument import Reading
+
+STAMPS = ("host", "instrument", "arrival")
+
+
+@given(st.binary(max_size=300), st.lists(st.integers(0, 300)), st.integers(1, 50))
+def test_pieces_do_not_matter(data: bytes, cuts: list[int], limit_bytes: int) -> None:
+    """However the output is cut into pieces, the lines are the same, and none is longer than its limit."""
+    cutter = LineCutter(limit_bytes)
+    lines = []
+    for begin, end in pairwise(sorted({0, len(data), *(cut for cut in cuts if cut < len(data))})):
+        lines += cutter.push(data[begin:end])
+    whole = [line[:limit_bytes] for line in data.split(b"\n")[:-1]]
+    assert lines == [line for line in whole if line.strip()]
+
+
+odd: st.SearchStrategy[Any] = st.sampled_from(
+    [None, True, -1, 0, 2, 7, 1e-9, 1e300, math.nan, -math.inf, 10**30, "", "ok", "tilt", "no_target", [], {}]
+)
+kinds = st.sampled_from(["measurement"] * 4 + ["shot", "done", "status", "settings", "hello", "weather"])
+ages_ns = st.none() | st.integers(-(10**6), 10**9) | st.integers(-(2**63), 2**64)
+
+lines = st.tuples(
+    kinds,
+    st.dictionaries(st.sampled_from([*measured(), "raw_status", "prism", "id", "problem"]), odd, max_size=2),
+    st.integers(0, 10**9),
+    ages_ns,
+)
+"""Type, fields that may be wrong, how long after the one before it comes, and its age then."""
+
+
+@given(st.sampled_from(STAMPS), st.lists(lines, max_size=20), st.binary(max_size=20))
+def test_readings_are_what_can_have_been_measured(
+    stamps: str, said: list[tuple[str, dict[str, Any], int, int | None]], rubbish: bytes
+) -> None:
+    """No line raises; every usable reading has angles, a distance and a time that can be, each time once."""
+    readings: deque[Reading] = deque()
+
+    async def main() -> None:
+        clock = VirtualClock(0)
+        run = BridgeRun("bridge", clock, Stamper(0), readings, Refusals(clock))
+        now_ns = 20 * 10**9
+        run.said(json.dumps(HELLO | {"stamps": stamps}).encode() + b"\n", now_ns)
+        run.switch(tracking=1)
+        for kind, wrong, after_ns, age_ns in said:
+            record = measured() | {"type": kind, "id": 1} | wrong
+            now_ns += after_ns
+            if age_ns is not None:
+                record |= {"host_time_ns": now_ns - age_ns, "instrument_time_ns": now_ns - age_ns + 77}
+            run.said(rubbish + b"\n" + json.dumps(record).encode() + b"\n", now_ns)
+
+    with capture_logs():
+        run_virtual(main)
+    usable = [reading for reading in readings if reading.status.usable]
+    assert all(before.at_ns < after.at_ns for before, after in pairwise(usable))
+    for reading in usable:
+        assert reading.prism == 1
+        assert 0 <= reading.horizontal_angle_rad <= 2 * math.pi
+        assert 0 <= reading.zenith_angle_rad <= 2 * math.pi
+        assert reading.slope_distance_m is not None
+        assert reading.slope_distance_m > 0
+        assert reading.received_ns is not None
+        assert 0 <= reading.received_ns - reading.at_ns <= OLDEST_NS

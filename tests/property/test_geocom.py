@@ -1,0 +1,235 @@
+"""GeoCOM: what is sent is what was meant, and whatever comes on the line, no reply is taken for another."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import re
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from support.geocom_line import (
+    REQUEST,
+    Cable,
+    FakeInstrument,
+    Fault,
+    checksum_of,
+    cut,
+    damaged,
+    doubled,
+    garbage_before,
+    late,
+    not_taken,
+    silent,
+    torn,
+)
+
+from tsgt.errors import InstrumentError, MessageError
+from tsgt.simulation.clocks import VirtualClock
+from tsgt.simulation.event_loop import run_virtual
+from tsgt.station.geocom import MAX_TRANSACTION, Byte, ReplyLine, Rpc, crc16_arc, decode_reply, encode_request
+from tsgt.station.geocom_codes import Verdict, name_of, verdict
+from tsgt.station.geocom_connection import GeoComConnection
+from tsgt.station.geocom_lines import ReplyLines, StampedLine
+from tsgt.station.port import Chunk
+
+latin = st.text(st.characters(max_codepoint=0xFF), max_size=20)
+reals = st.floats(-1e6, 1e6)
+values = st.lists(
+    st.one_of(st.integers(-(2**31), 2**31 - 1), reals, latin, st.integers(0, 255).map(Byte)), max_size=8
+)
+transactions = st.integers(1, MAX_TRANSACTION)
+
+
+@given(data=st.binary(max_size=60).map(bytes.hex))
+@example(data="123456789")
+def test_the_checksum_is_that_of_a_division_bit_by_bit(data: str) -> None:
+    """Two ways to compute it agree; the published check value is the second's as well."""
+    assert checksum_of("123456789") == 0xBB3D
+    assert crc16_arc(data.encode()) == checksum_of(data)
+
+
+@given(rpc=st.sampled_from(Rpc), parameters=values, transaction=transactions, checksum=st.booleans())
+def test_a_request_comes_back_as_it_was_sent(
+    rpc: Rpc,
+    parameters: list[int | float | str],
+    transaction: int,
+    checksum: bool,  # noqa: FBT001 (a parameter of hypothesis)
+) -> None:
+    """What stands in a request reads, as the values of a reply, as what was given; reals to the last decimal sent."""
+    line = encode_request(rpc, parameters, transaction=transaction, checksum=checksum, decimals=12)
+    assert line.endswith(b"\r\n")
+    assert line.count(b"\r") == line.count(b"\n") == 1
+    found = REQUEST.fullmatch(line[:-2].decode("ascii"))
+    assert found is not None
+    assert (int(found["rpc"]), int(found["transaction"])) == (rpc, transaction)
+    text = f"%R1P,0,{transaction}:0"
+    if parameters:
+        text += f",{found['parameters']}"
+    reply = decode_reply(text.encode())
+    assert len(reply.values) == len(parameters)
+    for value, parameter in zip(reply.values, parameters, strict=True):
+        assert type(value) is type(parameter)
+        assert value == (pytest.approx(parameter, abs=0.5e-12) if isinstance(parameter, float) else parameter)
+    if checksum:
+        assert int(found["checksum"]) == checksum_of(
+            line[:-2].decode().replace(f",{found['checksum']}:", ":", 1)
+        )
+
+
+@given(data=st.binary(max_size=120), head=st.sampled_from([b"", b"%R1P,0,1:0,", b"%R1P,0,1:", b"%R1P,"]))
+@example(data=b"9" * 5000, head=b"%R1P,0,1:0,")
+@example(data=b"1e999", head=b"%R1P,0,1:0,")
+@example(data=b"'2f'", head=b"%R1P,0,1:")
+def test_no_bytes_break_the_reading_of_a_reply(data: bytes, head: bytes) -> None:
+    """Whatever comes is a reply or refused with an error of ours."""
+    try:
+        reply = decode_reply(head + data)
+    except MessageError:
+        return
+    assert isinstance(reply, ReplyLine)
+
+
+@given(place=st.integers(0, 200), bit=st.integers(0, 7))
+def test_a_wrong_bit_never_passes_the_checksum(place: int, bit: int) -> None:
+    """With checksums a reply of which one bit is wrong is refused."""
+    text = "%R1P,0,17:0,1.2345678901,1.5707963268,0.0000048481,42.1234,123456"
+    head, body = text.split(":")
+    line = bytearray(f"{head},{checksum_of(text)}:{body}".encode())
+    assert decode_reply(bytes(line), checksum=True).values[-1] == 123456
+    line[place % len(line)] ^= 1 << bit
+    with pytest.raises(MessageError):
+        decode_reply(bytes(line), checksum=True)
+
+
+# --- lines
+
+good_lines = st.builds(
+    lambda transaction, numbers: f"%R1P,0,{transaction}:0,{','.join(map(str, numbers))}".encode(),
+    transactions,
+    st.lists(st.integers(0, 10**9), min_size=1, max_size=8),
+)
+ends = st.sampled_from([b"\r\n", b"\r", b"\n", b"\r\n\r\n"])
+rubbish = st.one_of(
+    st.just(b""),
+    st.sampled_from([b"?\r\n", b"%R1P,0,3:0,1.2", b"%R1", b"%R1Q,0,1:\r\n", b"\r\n", b"x" * 5000]),
+    st.binary(max_size=40).filter(lambda data: b"%R1P" not in data),
+)
+
+
+@given(
+    pieces=st.lists(st.tuples(rubbish, good_lines, ends), max_size=6),
+    cuts=st.lists(st.integers(0, 500), max_size=12),
+)
+def test_every_reply_is_found_and_stamped_however_it_comes(
+    pieces: list[tuple[bytes, bytes, bytes]], cuts: list[int]
+) -> None:
+    """Cut anywhere, with anything before it: each reply comes once, with the time at which its first byte was there."""
+    stream = b"".join(before + line + end for before, line, end in pieces)
+    byte_ns = 1_000_000
+    lines = ReplyLines(baud=10_000)
+    found: list[StampedLine] = []
+    places = [0, *sorted(place % (len(stream) + 1) for place in cuts), len(stream)]
+    for start, end in itertools.pairwise(places):
+        if end > start:
+            found += lines.push(Chunk(stream[start:end], end * byte_ns))
+    assert [line.data for line in found] == [line for _, line, _ in pieces]
+    for line in found:
+        assert stream[line.first_byte_ns // byte_ns :].startswith(line.data)
+
+
+def test_a_line_without_end_does_not_fill_the_memory() -> None:
+    """Rubbish that never ends is dropped, and the reply after it found."""
+    lines = ReplyLines(baud=115_200)
+    for number in range(1000):
+        assert not lines.push(Chunk(b"%R1P" * 256, number))
+    assert len(lines._buffer) <= 4096
+    assert len(lines._arrivals) <= 4
+    assert [line.data for line in lines.push(Chunk(b"\r%R1P,0,1:0\r", 1000))][-1] == b"%R1P,0,1:0"
+
+
+# --- codes
+
+
+@given(code=st.integers(-10, 70_000), has_values=st.booleans())
+def test_every_code_has_a_verdict_and_a_name(code: int, has_values: bool) -> None:  # noqa: FBT001
+    """No code is unknown to the program to the point of an error."""
+    assert isinstance(verdict(code, has_values=has_values), Verdict)
+    assert name_of(code).startswith(str(code))
+
+
+# --- the connection
+
+faults = st.one_of(
+    st.just(silent),
+    st.just(damaged),
+    st.just(doubled),
+    st.floats(0.001, 4.0).map(late),
+    st.integers(0, 30).map(cut),
+    st.builds(torn, st.integers(1, 30), st.floats(0.001, 3.0)),
+    rubbish.map(garbage_before),
+    st.sampled_from([3074, 3080, 3087, 3093, 3100, 3101, 3107, 3108, 3109]).map(not_taken),
+)
+steps = st.lists(
+    st.tuples(
+        st.sampled_from(["call", "call", "call", "cancel", "pause", "attention", "abort"]),
+        st.lists(faults, max_size=3),
+        st.floats(0.0, 1.5),
+    ),
+    max_size=12,
+)
+
+
+@settings(deadline=None, max_examples=200)
+@given(script=steps, checksum=st.booleans())
+def test_no_reply_is_taken_for_another(
+    script: list[tuple[str, list[Fault], float]],
+    checksum: bool,  # noqa: FBT001 (a parameter of hypothesis)
+) -> None:
+    """Whatever happens to the line and to those who wait: a reply is that to its request, and it goes on afterwards."""
+
+    async def run() -> None:
+        loop = asyncio.get_running_loop()
+        instrument = FakeInstrument(checksums=checksum)
+        clock = VirtualClock(0)
+        connection = GeoComConnection(await Cable(instrument).open(115_200), clock, checksum=checksum)
+
+        async def ask(number: int) -> None:
+            began_ns = clock.monotonic_ns()
+            reply = await connection.call(Rpc.TMC_GET_FULL_MEAS, number, number + 0.5, timeout_s=1.0)
+            if reply.code == 0:
+                assert reply.values == (number, number + 0.5)
+                assert began_ns <= reply.sent_ns <= reply.first_byte_ns < clock.monotonic_ns()
+
+        for number, (step, to_come, for_s) in enumerate(script):
+            instrument.faults.extend(to_come)
+            began_s = loop.time()
+            try:
+                match step:
+                    case "call":
+                        await ask(number)
+                    case "cancel":
+                        async with asyncio.timeout(for_s):
+                            await ask(number)
+                    case "pause":
+                        await asyncio.sleep(for_s)
+                    case "attention":
+                        await connection.attention()
+                    case "abort":
+                        await connection.abort()
+            except (InstrumentError, TimeoutError):
+                pass
+            assert loop.time() - began_s < 20.0
+        instrument.faults.clear()
+        await asyncio.sleep(10.0)
+        await connection.attention()
+        await ask(1000)
+
+    run_virtual(run)
+
+
+def test_the_names_of_the_procedures_are_different() -> None:
+    """An alias would mean that two procedures have one number."""
+    assert len(Rpc.__members__) == len(Rpc)
+    assert all(re.fullmatch(r"[A-Z]{3}_[A-Z0-9_]+", rpc.name) for rpc in Rpc)

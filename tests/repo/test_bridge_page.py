@@ -1,0 +1,93 @@
+"""The page on the bridge says what the code does."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tsgt.config.client import BridgeInstrumentConfig
+from tsgt.station.bridge_lines import (
+    AtmosphereCommand,
+    Command,
+    DirectCommand,
+    DoneLine,
+    Hello,
+    MeasureCommand,
+    MeasurementLine,
+    SettingsLine,
+    ShotLine,
+    StatusLine,
+    TrackCommand,
+    decode_program_line,
+)
+
+PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "bridge.md").read_text()
+
+COMMANDS: dict[str, type[Command]] = {
+    "track": TrackCommand,
+    "direct": DirectCommand,
+    "measure": MeasureCommand,
+    "atmosphere": AtmosphereCommand,
+}
+
+
+def blocks(language: str) -> list[str]:
+    """Return the page's blocks in a language."""
+    return re.findall(rf"^```{language}\n(.*?)^```", PAGE, flags=re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.parametrize("line", [Hello, MeasurementLine, DoneLine, StatusLine, SettingsLine])
+def test_every_field_is_in_its_table(line: type) -> None:
+    """The tables have the fields of the lines, and no others."""
+    (name,) = (field.default for field in dataclasses.fields(line) if field.name == "type")
+    table = PAGE.split(f"### `{name}`")[1].split("\n## ")[0].split("\n### ")[0]
+    rows = re.findall(r"^\| (`.*?`) \|", table, flags=re.MULTILINE)
+    documented = {field for row in rows for field in re.findall(r"`(\w+)`", row)}
+    assert documented == {field.name for field in dataclasses.fields(line)}
+
+
+def test_a_shot_has_the_fields_of_a_measurement() -> None:
+    """As the page says: all but the prism, and an id."""
+    shot, measurement = (
+        {field.name for field in dataclasses.fields(line)} for line in (ShotLine, MeasurementLine)
+    )
+    assert shot == measurement - {"prism"} | {"id"}
+
+
+def test_commands_have_the_fields_of_the_table() -> None:
+    """Type, and what the second column lists."""
+    for name, command in COMMANDS.items():
+        fields = re.search(rf"^\| `{name}` \| (.*?) \|", PAGE, flags=re.MULTILINE)
+        assert fields is not None
+        documented = {"type", *re.findall(r"`(\w+)`", fields[1])}
+        assert documented == {field.name for field in dataclasses.fields(command)}
+
+
+def test_the_lines_on_the_page_are_understood() -> None:
+    """Each that a program prints is one that the client takes."""
+    printed = blocks("json")[1].splitlines()
+    assert all(decode_program_line(line.encode()) is not None for line in printed)
+
+
+def test_the_script_on_the_page_works() -> None:
+    """A shell runs it, and the client understands what it prints."""
+    (script,) = blocks("sh")
+    run = subprocess.run(
+        ["sh", "-c", script.replace("while sleep 0.4", "for _ in once")],  # noqa: S607
+        capture_output=True,
+        check=True,
+    )
+    hello, measurement = map(decode_program_line, run.stdout.splitlines())
+    assert isinstance(hello, Hello)
+    assert isinstance(measurement, MeasurementLine)
+
+
+def test_the_configuration_on_the_page_is_valid() -> None:
+    """Its keys are those of the configuration."""
+    (block,) = blocks("toml")
+    keys = set(re.findall(r"^(\w+) =", block, flags=re.MULTILINE))
+    assert keys == set(BridgeInstrumentConfig.model_fields)

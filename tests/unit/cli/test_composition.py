@@ -1,0 +1,47 @@
+"""What the daemons are put together from."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tsgt.cli.composition import make_instrument
+from tsgt.config import ClientConfig, load
+from tsgt.errors import InstrumentError
+from tsgt.simulation.clocks import VirtualClock
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+
+# What a client beside a Leica instrument loads before it says its first word.
+CLIENT = f"""
+import sys
+from pathlib import Path
+from tsgt.cli.composition import make_instrument
+from tsgt.clock import SystemClock
+from tsgt.config import ClientConfig, load
+import tsgt.station.daemon
+make_instrument(load(Path({str(CONFIGS)!r}) / "client.example.toml", ClientConfig).instrument, SystemClock())
+print(*[name for name in ("numpy", "scipy", "matplotlib", "tsgt.simulation") if name in sys.modules])
+"""
+
+
+@pytest.mark.parametrize(
+    ("example", "kind"), [("client", "LeicaInstrument"), ("client.bridge", "BridgeInstrument")]
+)
+async def test_each_kind_of_instrument_is_made(example: str, kind: str) -> None:
+    """Of the kind that the configuration names; it needs neither port nor program before it is connected."""
+    config = load(CONFIGS / f"{example}.example.toml", ClientConfig)
+    instrument = make_instrument(config.instrument, VirtualClock(0))
+    assert type(instrument).__name__ == kind
+    with pytest.raises(InstrumentError, match=r"usb-FTDI|s7-bridge"):
+        await instrument.connect()
+    await instrument.close()
+
+
+def test_a_client_beside_an_instrument_is_small() -> None:
+    """It loads nothing that takes a small computer seconds to load."""
+    done = subprocess.run([sys.executable, "-c", CLIENT], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == ""

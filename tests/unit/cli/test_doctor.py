@@ -1,0 +1,107 @@
+"""`tsgt doctor`: lines, JSON and exit code; what the checks find is tested with them."""
+
+from __future__ import annotations
+
+import os
+import socket
+from typing import TYPE_CHECKING
+
+import pytest
+from support.made_up_machine import ADAPTER, MadeUpMachine
+
+from tsgt.cli import doctor
+from tsgt.cli.doctor import this_machine
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from support.cli import Tsgt
+
+
+@pytest.fixture
+def made_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> MadeUpMachine:
+    """Make a machine and let the command look at it; without hardware, whose checks need virtual time."""
+    made = MadeUpMachine(tmp_path)
+    made.change("client.toml", 'kind = "sx127x"', 'kind = "simulated"\nair_socket = "air"\nname = "one"')
+    made.change("client.toml", 'kind = "leica"', 'kind = "bridge"')
+    made.change("client.toml", f'port = "dev/serial/by-id/{ADAPTER}"', 'command = ["my-program", "--all"]')
+    made.change("client.toml", 'prism_type = "mini_360"', "")
+    made.programs = {"my-program"}
+    monkeypatch.setattr(doctor, "this_machine", made.machine)
+    return made
+
+
+def test_machine_that_is_ready_ends_with_0(tsgt: Tsgt, made_up: MadeUpMachine) -> None:
+    """One line per check, each with its verdict and its name, then the sum."""
+    done = tsgt("doctor", made_up.folder / "client.toml")
+    assert done.code == 0, done.out
+    *lines, total = done.out.splitlines()
+    assert lines[0].startswith("ok      configuration")
+    assert {line.split()[0] for line in lines} <= {"ok", "note", "skipped"}
+    assert total == f"all {sum(not line.startswith('skipped') for line in lines)} checks passed"
+
+
+def test_failed_check_ends_with_3(tsgt: Tsgt, made_up: MadeUpMachine) -> None:
+    """The others are made as well; the failed one is written so that it is seen."""
+    made_up.programs = set()
+    done = tsgt("doctor", made_up.folder / "client.toml")
+    assert done.code == 3
+    (line,) = (line for line in done.out.splitlines() if line.startswith("FAILED"))
+    assert "instrument" in line
+    assert "my-program" in line
+    assert done.out.splitlines()[-1].startswith("1 of ")
+
+
+def test_json_has_each_check_by_name(tsgt: Tsgt, made_up: MadeUpMachine) -> None:
+    """A check that could not be made is neither true nor false."""
+    made_up.programs = set()
+    done = tsgt("doctor", made_up.folder / "client.toml", "--json")
+    assert done.code == 3
+    said = done.json()
+    assert said["ok"] is False
+    checks = said["checks"]
+    assert (checks["configuration"]["ok"], checks["instrument"]["ok"], checks["radio"]["ok"]) == (
+        True,
+        False,
+        None,
+    )
+    assert all(check["detail"] and check["outcome"] for check in checks.values())
+
+
+def test_usual_configuration_is_found(
+    tsgt: Tsgt, made_up: MadeUpMachine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the installation guide puts it, nothing need be named; where there are two, one has to be."""
+    there, missing = made_up.folder / "client.toml", made_up.folder / "no.toml"
+    monkeypatch.setattr(doctor, "USUAL", (there, missing))
+    assert tsgt("doctor").code == 0
+    monkeypatch.setattr(doctor, "USUAL", (there, there))
+    assert tsgt("doctor").code == 2
+    monkeypatch.setattr(doctor, "USUAL", (missing, missing))
+    done = tsgt("doctor")
+    assert done.code == 3
+    assert "no such file" in done.out
+
+
+def test_this_machine_can_be_asked_everything(tsgt: Tsgt, tmp_path: Path) -> None:
+    """Without a fake: whatever is missing on the machine of the tests is a finding, not an error."""
+    MadeUpMachine(tmp_path)
+    done = tsgt("doctor", tmp_path / "client.toml", "--json")
+    assert done.code == 3  # the adapter of a made-up machine is no terminal
+    assert all(check["detail"] for check in done.json()["checks"].values())
+    assert "please report" not in done.out
+
+
+def test_socket_that_nobody_serves_is_no_daemon(tmp_path: Path) -> None:
+    """A stale socket, a file, nothing at all; one that somebody serves is told from these."""
+    machine = this_machine()
+    stale, served = tmp_path / "stale", tmp_path / "served"
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(os.fspath(stale))
+    assert not machine.serves(stale)
+    assert not machine.serves(tmp_path / "nothing")
+    assert machine.client_status(stale) is None
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(os.fspath(served))
+        listener.listen()
+        assert machine.serves(served)

@@ -1,4 +1,4 @@
-"""A station's client between a simulated instrument and a master that a test plays, on virtual time."""
+"""A station's client between a simulated total station and a master that a test plays, on virtual time."""
 
 from __future__ import annotations
 
@@ -11,18 +11,21 @@ import numpy as np
 from support.radios import PAPER, make_side, running_timeline
 
 from tsgt.config import ClientConfig, ScenarioConfig
-from tsgt.config.client import JournalConfig, SimulatedInstrumentConfig
+from tsgt.config.client import JournalConfig, LeicaInstrumentConfig
 from tsgt.config.radio import ClassicConfig, SimulatedRadioConfig
 from tsgt.radio.classic_messages import MeasurementMessage, decode_reply
 from tsgt.recording.journal import load_journal
 from tsgt.simulation.air import Air
 from tsgt.simulation.clocks import DriftingClock, VirtualClock
-from tsgt.simulation.instrument import SimulatedInstrument
 from tsgt.simulation.link import LinkModel
+from tsgt.simulation.mission_configs import instrument_config
 from tsgt.simulation.radios import opener
+from tsgt.simulation.serial_line import SimulatedLine
+from tsgt.simulation.total_station import SimulatedTotalStation
 from tsgt.simulation.witness import WatchedInstrument
 from tsgt.simulation.world import scenario_world
 from tsgt.station.daemon import run_client
+from tsgt.station.leica import LeicaInstrument
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
@@ -51,7 +54,7 @@ def client_config(
         kind="client",
         station=station,
         prism=prism,
-        instrument=SimulatedInstrumentConfig(kind="simulated", socket=folder / "i.sock"),
+        instrument=instrument_config(SCENARIO.stations[0], folder / "instrument.tty"),
         radio=SimulatedRadioConfig(
             kind="simulated",
             air_socket=folder / "air.sock",
@@ -71,6 +74,10 @@ class Field:
 
     Attributes
     ----------
+    instrument, line
+        The total station, and the cable to it.
+    read
+        What the clients have read from it.
     protocol
         What the client speaks; None: classic.
     key, boot
@@ -78,7 +85,8 @@ class Field:
     """
 
     folder: Path
-    instrument: SimulatedInstrument
+    instrument: SimulatedTotalStation
+    line: SimulatedLine
     clock: DriftingClock
     master: Side
     open_radio: OpenRadio
@@ -90,18 +98,26 @@ class Field:
 
     def start(self) -> None:
         """Start the client."""
-        watched = WatchedInstrument(self.instrument, self.read.append)
+        config = client_config(self.folder, protocol=self.protocol)
+        assert isinstance(config.instrument, LeicaInstrumentConfig)
+        driver = LeicaInstrument(config.instrument, self.line.open, self.clock)
         self.client = asyncio.create_task(
             run_client(
-                client_config(self.folder, protocol=self.protocol),
+                config,
                 PAPER,
-                instrument=watched,
+                instrument=WatchedInstrument(driver, self.read.append),
                 open_radio=self.open_radio,
                 clock=self.clock,
                 key=self.key,
                 boot=self.boot,
             )
         )
+
+    async def measuring(self) -> None:
+        """Return when a client that has just been started has read something, which takes two seconds."""
+        before = len(self.read)
+        while len(self.read) == before:  # noqa: ASYNC110 (time has to pass meanwhile)
+            await asyncio.sleep(0.01)
 
     async def kill(self) -> None:
         """Cancel the client wherever it is."""
@@ -139,7 +155,7 @@ async def field_day(
     protocol: ProtocolConfig | None = None,
     key: bytes | None = None,
 ) -> AsyncGenerator[Field]:
-    """Set up a station and a master's radio; end both with the block."""
+    """Set up a station that measures and a master's radio; end both with the block."""
     timeline = running_timeline()
     rng = np.random.default_rng(7)
     air = Air(timeline, np.random.default_rng(0), LinkModel())
@@ -147,9 +163,11 @@ async def field_day(
     world = scenario_world(scenario, 600.0, np.random.default_rng(3))
     master = make_side(air, "master")
     await master.radio.start(PAPER)
+    instrument = SimulatedTotalStation(scenario.stations[0], scenario, world, timeline, rng)
     day = Field(
         folder=folder,
-        instrument=SimulatedInstrument(scenario.stations[0], scenario, world, clock, rng),
+        instrument=instrument,
+        line=SimulatedLine(instrument, timeline, clock),
         clock=clock,
         master=master,
         open_radio=opener(air, "station1", clock, rng, PAPER),
@@ -159,7 +177,7 @@ async def field_day(
     )
     try:
         day.start()
-        await asyncio.sleep(0.1)  # the radios need a moment to get up
+        await day.measuring()
         yield day
     finally:
         await day.kill()

@@ -170,13 +170,13 @@ def _additions(
         compared = [(session, boot.against(session)) for session in recorded.sessions]
         why = _why_not(boot, recorded, compared)
         if why:
-            for index in {run.index for run in boot.runs}:
+            for index in {run.number for run in boot.runs}:
                 found[index].skipped = why
             continue
         for place, entry in enumerate(boot.entries):
-            time = _sort(place, entry, compared, known, found[entry.run.index])
+            time = _sort(place, entry, compared, known, found[entry.run.number])
             if time is not None:
-                record = _record(entry, time, paths[entry.run.index])
+                record = _record(entry, time, paths[entry.run.number])
                 additions.append(_Addition(time.unix_ns, len(additions), record))
     if found and all(each.skipped for each in found):
         raise RecordingError(

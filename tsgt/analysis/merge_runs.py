@@ -49,13 +49,13 @@ class Run(NamedTuple):
 
     Attributes
     ----------
-    index
+    number
         Which of the journals.
     journal
         What it holds.
     """
 
-    index: int
+    number: int
     journal: Journal
 
     @property
@@ -111,7 +111,7 @@ class Boot:
                 for run in self.runs
                 for measurement in run.journal.measurements
             ),
-            key=lambda entry: (entry.local_ns, entry.run.index),
+            key=lambda entry: (entry.local_ns, entry.run.number),
         )
         self._stamps_ns = [entry.local_ns for entry in self.entries]
         self._by_identity: dict[object, list[int]] = defaultdict(list)  # several in copies of a journal

@@ -204,12 +204,10 @@ def test_an_order_lost_after_many_refusals_costs_no_more_than_itself() -> None:
     channel = Channel(stations=1, refusing={1})
     channel.run(20)
     assert [turn.ok for _, turn in channel.of(Ordered)[:5]] == [False] * 5
-    waits_ns = channel.scheduler.next(channel.now_ns)
-    assert isinstance(waits_ns, int)
-    lost = channel.scheduler.next(waits_ns)
+    lost = channel.scheduler.next(channel.now_ns)
     assert isinstance(lost, Ordered)
-    channel.scheduler.finished(lost, waits_ns + SECOND)
-    assert isinstance(channel.scheduler.next(waits_ns + SECOND), Synchronisation)
+    channel.scheduler.finished(lost, channel.now_ns + SECOND)
+    assert isinstance(channel.scheduler.next(channel.now_ns + SECOND), Synchronisation)
 
 
 def test_a_station_with_another_clock_is_synchronised_before_anything_else() -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from tsgt.cli.composition import radio_key
 from tsgt.config import ClientConfig, MasterConfig, ScenarioConfig, load, parameters, scenario_parameters
+from tsgt.config.client import LeicaInstrumentConfig
 from tsgt.simulation.demo_files import write_demo_files
 
 if TYPE_CHECKING:
@@ -32,7 +33,8 @@ def test_each_client_finds_its_instrument_and_the_master_s_air(
     client = load(files.client_config(station), ClientConfig)
     master = load(files.master_config, MasterConfig)
     assert client.station == station
-    assert client.instrument.socket == files.instrument_socket(station)
+    assert isinstance(client.instrument, LeicaInstrumentConfig)
+    assert client.instrument.port == files.instrument_port(station)
     assert client.journal.directory == files.journals(station)
     names = {"name"}
     assert client.radio.model_dump(exclude=names) == master.radio.model_dump(exclude=names)

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import asyncio
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import pytest
 
 from tsgt.simulation.line_faults import LineFault
 from tsgt.simulation.serial_scripts import Bench, Script, all_scripts, run_script
+
+if TYPE_CHECKING:
+    from tsgt.simulation.geocom_answers import Offered
 
 SCRIPTS = all_scripts()
 KINDS = sorted({script.kind for script in SCRIPTS})
@@ -30,13 +34,18 @@ def test_a_fault_is_survived(kind: str) -> None:
 
 
 async def _wrong_digits(bench: Bench) -> None:
-    bench.line.faults.script.extend([LineFault.DIGIT] * 100)
-    await asyncio.sleep(10.0)
+    for _ in range(30):
+        bench.line.faults.script.append(LineFault.DIGIT)
+        await asyncio.sleep(1.0)
 
 
 async def _lie_about_time(bench: Bench) -> None:
     real = bench.station.offer
-    bench.station.offer = lambda o: real(o._replace(true_ns=o.true_ns + 10**9))  # type: ignore[method-assign]
+
+    def offer(result: Offered) -> None:
+        real(result._replace(true_ns=result.true_ns + 10**9))
+
+    bench.station.offer = offer  # type: ignore[method-assign]
     await asyncio.sleep(3.0)
 
 

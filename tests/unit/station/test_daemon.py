@@ -35,10 +35,11 @@ async def test_every_measurement_is_journalled_and_the_newest_is_answered(tmp_pa
         message = await day.poll()
         await day.kill()
         (journal,) = day.journals()
-    assert len(journal) in (25, 26)
+    assert len(journal) in (26, 27)
     assert [m.sequence for m in journal] == list(range(len(journal)))
     assert [m.host_time_ns for m in journal] == [START_NS + OFFSET_NS + reading.at_ns for reading in day.read]
-    assert all(m.stamp_ns == m.host_time_ns == m.received_ns for m in journal)
+    assert all(m.stamp_ns == m.host_time_ns for m in journal)
+    assert all(0 < m.received_ns - m.stamp_ns < 150_000_000 for m in journal)
     assert message.time_ns in [m.host_time_ns for m in journal[-2:]]
     newest = next(m for m in journal if m.host_time_ns == message.time_ns)
     assert message.slope_distance_m == newest.slope_distance_m
@@ -63,7 +64,7 @@ async def test_the_ping_is_stamped_with_the_end_of_its_reception(tmp_path: Path)
 async def test_before_the_first_measurement_there_is_an_answer_too(tmp_path: Path) -> None:
     """Without an instrument the master gets a status instead of silence."""
     async with field_day(tmp_path) as day:
-        day.instrument.plugged = False
+        day.line.plugged = False
         await day.kill()
         day.start()
         await asyncio.sleep(0.1)
@@ -71,18 +72,23 @@ async def test_before_the_first_measurement_there_is_an_answer_too(tmp_path: Pat
     assert (message.status, message.time_ns) == (3, 0)
 
 
-@pytest.mark.parametrize("status", ["tilt", "wrong_distance", "no_target", "angle_only"])
-async def test_a_bad_status_is_journalled_and_sent(tmp_path: Path, status: str) -> None:
-    """What the instrument complains of reaches the journal and the master."""
-    fault = StatusFaultConfig(station=1, status=status, start_s=2.0, end_s=60.0)  # type: ignore[arg-type]
+@pytest.mark.parametrize(
+    ("status", "sent", "raw_status"),
+    [("tilt", 1, 1290), ("wrong_distance", 2, 1291), ("no_target", 3, None), ("angle_only", 4, 1285)],
+)
+async def test_a_bad_status_is_journalled_and_sent(
+    tmp_path: Path, status: str, sent: int, raw_status: int | None
+) -> None:
+    """What the instrument complains of reaches the journal, with its own code, and the master."""
+    fault = StatusFaultConfig(station=1, status=status, start_s=4.0, end_s=60.0)  # type: ignore[arg-type]
     async with field_day(tmp_path, SCENARIO.model_copy(update={"faults": (fault,)})) as day:
         await asyncio.sleep(3.0)
         message = await day.poll()
         await day.kill()
         (journal,) = day.journals()
-    expected = {"tilt": 1, "wrong_distance": 2, "no_target": 3, "angle_only": 4}[status]
-    assert (message.status, message.slope_distance_m) == (expected, 0.0)
-    assert (journal[-1].status, journal[-1].raw_status) == (Status(status), expected)
+    assert (message.status, message.slope_distance_m) == (sent, 0.0)
+    assert journal[-1].status is Status(status)
+    assert raw_status in (None, journal[-1].raw_status)
     assert journal[-1].slope_distance_m is None
     assert journal[0].status is Status.OK
 
@@ -92,16 +98,16 @@ async def test_an_instrument_that_is_unplugged_comes_back(tmp_path: Path) -> Non
     async with field_day(tmp_path) as day:
         with capture_logs() as logs:
             await asyncio.sleep(5.0)
-            day.instrument.plugged = False
+            day.line.plugged = False
             await asyncio.sleep(60.0)
             stale = await day.poll()
-            day.instrument.plugged = True
+            day.line.plugged = True
             await asyncio.sleep(6.0)
             fresh = await day.poll()
-    assert START_NS + OFFSET_NS < stale.time_ns < START_NS + OFFSET_NS + 6_000_000_000
+    assert START_NS + OFFSET_NS < stale.time_ns < START_NS + OFFSET_NS + 8_000_000_000
     assert fresh.time_ns > stale.time_ns + 55_000_000_000
     events = [entry["event"] for entry in logs]
-    assert events.count("instrument_lost") == 1
+    assert 1 <= events.count("instrument_lost") <= 2  # it was pulled; there is no such device
     assert events.count("instrument_connected") == 1
 
 
@@ -132,10 +138,10 @@ async def test_a_radio_that_fails_leaves_the_journal_whole(tmp_path: Path) -> No
 
 
 async def test_orders_change_what_is_measured(tmp_path: Path) -> None:
-    """`d` stops the tracking, `t` then measures a target, `n` with a prism tracks that one."""
+    """`d` stops the tracking, `t` then measures a target, `n` with a prism tracks that one, once a person has locked in on it."""
     async with field_day(tmp_path) as day:
         await asyncio.sleep(1.0)
-        assert await day.ask(b"d1") == Acknowledgement("d", ok=True)
+        assert await day.ask(b"d1", timeout_s=2.0) == Acknowledgement("d", ok=True)
         before = len(day.read)
         day.instrument.aim(1)
         shot = await day.ask(b"t1", timeout_s=5.0)
@@ -143,34 +149,34 @@ async def test_orders_change_what_is_measured(tmp_path: Path) -> None:
         assert shot.slope_distance_m == pytest.approx(20.6216, abs=0.01)
         assert len(day.read) == before
         day.instrument.aim(2)
-        near = await day.ask(b"t1", timeout_s=5.0)
+        near = await day.ask(b"t1", timeout_s=20.0)
         assert isinstance(near, MeasurementMessage)
-        assert (near.status, near.slope_distance_m) == (4, 0.0)
+        assert (near.status, near.slope_distance_m) == (3, 0.0)  # too near to give a distance
         ordered_ns = day.clock.realtime_ns()
-        assert await day.ask(b"n12") == Acknowledgement("n", ok=True)
+        assert await day.ask(b"n12", timeout_s=2.0) == Acknowledgement("n", ok=True)
         next_ns = (await day.poll()).time_ns
         assert next_ns == 0 or next_ns > ordered_ns  # not one of the other prism
-        await asyncio.sleep(1.0)
+        day.instrument.lock_by_hand(2)
+        await asyncio.sleep(4.0)
         assert (await day.poll()).status == 0
         await day.kill()
         (path,) = (tmp_path / "journals").iterdir()
         journal = load_journal(path)
     assert [m.prism for m in journal.measurements] == sorted(m.prism for m in journal.measurements)
     assert {m.prism for m in journal.measurements} == {1, 2}
-    assert [target.status for target in journal.targets] == [Status.OK, Status.ANGLE_ONLY]
+    assert [target.status for target in journal.targets] == [Status.OK, Status.NO_TARGET]
 
 
 async def test_an_order_that_fails_is_refused_and_changes_nothing(tmp_path: Path) -> None:
-    """A prism that the instrument does not know gives `nNo`, and the old one is tracked on."""
+    """Without an instrument another prism gives `nNo`, and the old one is tracked on when it is back."""
     async with field_day(tmp_path) as day:
-        await asyncio.sleep(1.0)
-        assert await day.ask(b"n19") == Acknowledgement("n", ok=False)
-        await asyncio.sleep(2.0)
-        assert (await day.poll()).status == 0
-        day.instrument.plugged = False
+        day.line.plugged = False
         await asyncio.sleep(1.0)
         assert await day.ask(b"n13") == Acknowledgement("n", ok=False)
         assert await day.ask(b"d1") == Acknowledgement("d", ok=False)
+        day.line.plugged = True
+        await day.measuring()
+        assert (await day.poll()).status == 0
         await day.kill()
         assert {m.prism for m in day.journals()[0]} == {1}
 
@@ -179,13 +185,13 @@ async def test_a_shot_that_fails_is_answered(tmp_path: Path) -> None:
     """In direct mode without an instrument the master gets a status; the mode stays when the instrument is back."""
     async with field_day(tmp_path) as day:
         await asyncio.sleep(1.0)
-        assert await day.ask(b"d1") == Acknowledgement("d", ok=True)
-        day.instrument.plugged = False
+        assert await day.ask(b"d1", timeout_s=2.0) == Acknowledgement("d", ok=True)
+        day.line.plugged = False
         day.instrument.aim(1)
         failed = await day.ask(b"t1", timeout_s=5.0)
         assert isinstance(failed, MeasurementMessage)
         assert failed.status == 3
-        day.instrument.plugged = True
+        day.line.plugged = True
         await asyncio.sleep(6.0)
         shot = await day.ask(b"t1", timeout_s=5.0)
     assert isinstance(shot, MeasurementMessage)
@@ -263,7 +269,7 @@ async def test_a_client_that_is_killed_anywhere_has_journalled_what_it_read(tmp_
             await day.kill()
             day.read.clear()
             day.start()
-            await asyncio.sleep(0.4)
+            await day.measuring()
             for _ in range(run):
                 await asyncio.sleep(0)
             await day.kill()
@@ -297,13 +303,16 @@ async def test_the_journal_begins_with_what_a_merge_needs(tmp_path: Path) -> Non
 async def test_the_status_says_how_it_goes(tmp_path: Path) -> None:
     """One line, then the end; it knows instrument, master and journal."""
     async with field_day(tmp_path) as day:
+        await day.kill()
+        day.start()
+        await asyncio.sleep(0.1)
         first = await asked(tmp_path / "client.sock")
         assert (first["last"], first["master_heard_s"], first["measurements"]) == (None, None, 0)
         await asyncio.sleep(20.0)
         await day.poll()
         status = await asked(tmp_path / "client.sock")
     assert status["type"] == "client_status"
-    assert status["instrument"] == "simulated total station 1"
+    assert status["instrument"] == "Leica TCRP1201+ 230001"
     assert (status["mode"], status["prism"], status["locked"]) == ("tracking", 1, True)
     assert status["rate_hz"] == pytest.approx(2.5, abs=0.11)
     assert 0 <= status["last"]["age_s"] < 0.5

@@ -1,4 +1,4 @@
-"""The client's daemon on the superframe, between a simulated instrument and a master that the test plays."""
+"""The client's daemon on the superframe, between a simulated total station and a master that the test plays."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ async def test_a_client_that_is_killed_anywhere_loses_nothing(tmp_path: Path) ->
     async with superframe_day(tmp_path) as (day, air):
         air.master.session_every = 1
         for run in range(25):
-            await air.frames(1.5)
+            await air.frames(2.5)
             await day.kill()
             day.start()
             for _ in range(7 * run):
@@ -110,7 +110,7 @@ async def test_a_client_that_is_killed_anywhere_loses_nothing(tmp_path: Path) ->
         await air.drained(day)
         await day.kill()
         sequences = [measurement.sequence for measurement in journalled(tmp_path)]
-        assert len(set(sequences)) == len(sequences) >= len(day.read)
+        assert len(set(sequences)) == len(sequences) >= len(day.read) > 25
         assert set(sequences[:-3]) <= set(air.master.received)
         assert set(air.master.received) <= set(sequences)
 
@@ -169,16 +169,15 @@ async def test_orders_are_carried_out_and_answered(tmp_path: Path) -> None:
         assert shot.distance == pytest.approx(206_216, abs=100)
         assert (await order(3, 0, 1)).reply.answer == AnswerPart(3, ok=True)
         assert (await asked(tmp_path / "client.sock"))["prism"] == 2
+        day.instrument.aim_at_prism(2)
         assert (await order(4, 1)).reply.answer == AnswerPart(4, ok=True)
         assert (await order(5, 3)).reply.answer == AnswerPart(5, ok=False)  # it is not in direct mode
-        assert (await order(6, 0, 8)).reply.answer == AnswerPart(
-            6, ok=False
-        )  # the instrument knows no prism 9
-        await air.frames(3.0)
+        await air.frames(5.0)
         await day.kill()
         (path,) = (tmp_path / "journals").iterdir()
         assert len(load_journal(path).targets) == 1
-        assert {measurement.prism for measurement in journalled(tmp_path)} == {1, 2}
+        usable = [measurement for measurement in journalled(tmp_path) if measurement.status.usable]
+        assert {measurement.prism for measurement in usable} == {1, 2}
 
 
 async def test_what_the_disk_holds_up_is_not_delivered(
@@ -221,7 +220,7 @@ async def test_the_status_says_how_delivery_goes(tmp_path: Path) -> None:
         await asyncio.sleep(5.0)
         before = await asked(day.folder / "client.sock")
         assert (before["protocol"], before["authenticated"], before["joined"]) == ("superframe", True, False)
-        assert (before["queued"], before["clock_bound_ns"]) == (12, None)
+        assert (before["queued"], before["clock_bound_ns"]) == (13, None)
         await air.frames(20.0)
         after = await asked(day.folder / "client.sock")
     assert after["joined"]

@@ -87,5 +87,7 @@ class LineFaults:
 def _other_digit(data: bytes) -> bytes:
     """Return an answer with another digit somewhere; where, hangs on the answer."""
     digits = [i for i in range(len(data)) if data[i : i + 1].isdigit()]
+    if not digits:
+        return data
     at = digits[sum(data) % len(digits)]
     return data[:at] + (b"1" if data[at : at + 1] != b"1" else b"7") + data[at + 1 :]

@@ -130,7 +130,7 @@ def test_plan_and_simulation_agree(tsgt: Tsgt, protocol: str, stations: int, sec
     plan = tsgt("radio", "plan", *arguments).json()
     found = tsgt("simulate", *arguments, "--duration", seconds).json()
     duty = plan["duty_cycle"]
-    assert found["airtime_fraction"] == pytest.approx(duty["master"] + stations * duty["station"], rel=0.03)
+    assert found["airtime_fraction"] == pytest.approx(duty["master"] + stations * duty["station"], rel=0.05)
     each = found["stations"].values()
     assert fmean(station["rate_hz"] for station in each) == pytest.approx(plan["rate_hz"], rel=0.05)
     assert fmean(station["age_ms"]["p50"] for station in each) == pytest.approx(

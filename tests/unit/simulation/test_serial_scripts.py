@@ -34,9 +34,9 @@ def test_a_fault_is_survived(kind: str) -> None:
 
 
 async def _wrong_digits(bench: Bench) -> None:
-    for _ in range(30):
+    for _ in range(100):
         bench.line.faults.script.append(LineFault.DIGIT)
-        await asyncio.sleep(1.0)
+        await asyncio.sleep(0.73)
 
 
 async def _lie_about_time(bench: Bench) -> None:

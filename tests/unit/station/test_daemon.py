@@ -12,6 +12,7 @@ import pytest
 from structlog.testing import capture_logs
 from support.client import OFFSET_NS, SCENARIO, START_NS, client_config, field_day
 from support.radios import PAPER
+from support.shots import ScriptedInstrument
 
 from tsgt.config.scenario import StatusFaultConfig
 from tsgt.errors import RadioError, RecordingError, StreamError
@@ -330,7 +331,7 @@ async def test_a_second_client_does_not_take_the_socket(tmp_path: Path) -> None:
             await run_client(
                 client_config(tmp_path),
                 PAPER,
-                instrument=day.instrument,
+                instrument=ScriptedInstrument(day.clock),
                 open_radio=day.open_radio,
                 clock=day.clock,
             )

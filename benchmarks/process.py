@@ -26,8 +26,12 @@ from tsgt.master.pipeline import Pipeline
 from tsgt.recording import RecordingHeader, RecordingWriter
 from tsgt.simulation.clocks import VirtualClock
 from tsgt.simulation.event_loop import run_virtual
-from tsgt.simulation.instrument import SimulatedInstrument
+from tsgt.simulation.mission_configs import instrument_config
+from tsgt.simulation.serial_line import SimulatedLine
+from tsgt.simulation.timeline import VirtualTimeline
+from tsgt.simulation.total_station import SimulatedTotalStation
 from tsgt.simulation.world import scenario_world
+from tsgt.station.leica import LeicaInstrument
 from tsgt.station.session import Session
 
 if TYPE_CHECKING:
@@ -67,7 +71,9 @@ def write_recording(path: Path) -> int:
     """Write the hour as a master would have; return the number of measurements."""
     scenario = ScenarioConfig()
     parameters = scenario_parameters(scenario)
-    measurements = sorted(run_virtual(lambda: measured(scenario)), key=lambda m: m.stamp_ns)
+    timeline = VirtualTimeline()
+    unsorted = run_virtual(lambda: measured(scenario, timeline), timeline)
+    measurements = sorted(unsorted, key=lambda m: m.stamp_ns)
     pipeline = Pipeline(parameters)
     with RecordingWriter(path) as writer:
         writer.write(RecordingHeader(software="benchmark", created_ns=START_NS, source="simulation"))
@@ -80,13 +86,15 @@ def write_recording(path: Path) -> int:
     return len(measurements)
 
 
-async def measured(scenario: ScenarioConfig) -> list[PolarMeasurement]:
+async def measured(scenario: ScenarioConfig, timeline: VirtualTimeline) -> list[PolarMeasurement]:
     """Let all stations of a scenario track their prisms for the hour."""
     world_rng, *rngs = np.random.default_rng(1).spawn(1 + len(scenario.stations))
     world, clock = scenario_world(scenario, DURATION_S, world_rng), VirtualClock(START_NS)
 
     async def one(station: SimulatedStation, rng: np.random.Generator) -> list[PolarMeasurement]:
-        instrument = SimulatedInstrument(station, scenario, world, clock, rng)
+        far_end = SimulatedTotalStation(station, scenario, world, timeline, rng)
+        line = SimulatedLine(far_end, timeline, clock)
+        instrument = LeicaInstrument(instrument_config(station, Path()), line.open, clock)
         await instrument.connect()
         await instrument.track(station.prism)
         session = Session(station.station, station.prism)
@@ -94,6 +102,7 @@ async def measured(scenario: ScenarioConfig) -> list[PolarMeasurement]:
         while clock.monotonic_ns() < DURATION_S * 1_000_000_000:
             reading = await instrument.read()
             readings.append(session.measured(reading, START_NS + reading.at_ns))
+        await instrument.close()
         return readings
 
     stations = zip(scenario.stations, rngs, strict=True)

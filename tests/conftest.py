@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 import structlog
+from hypothesis import settings
 
 from tsgt.simulation.event_loop import run_virtual
 
@@ -16,6 +17,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 FIELD_DATA = Path(__file__).parents[2] / "shared" / "data" / "rts"
+
+# How long an example takes says how busy the machine is, no more.
+settings.register_profile("tsgt", deadline=None)
+settings.load_profile("tsgt")
 
 
 @pytest.hookimpl(tryfirst=True)

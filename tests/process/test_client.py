@@ -9,7 +9,7 @@ import socket
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +18,7 @@ import pytest
 from tsgt.recording.journal import load_journal
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
 ROOT = Path(__file__).parents[2]
 
@@ -28,8 +28,10 @@ station = 1
 prism = 1
 status_socket = "client.sock"
 [instrument]
-kind = "simulated"
-socket = "instrument.sock"
+kind = "leica"
+port = "instrument.tty"
+prism_type = "user"
+prism_constant_mm = 0.0
 [radio]
 kind = "simulated"
 air_socket = "air.sock"
@@ -43,27 +45,38 @@ directory = "journals"
 """
 
 SURROUNDINGS = """
-import asyncio, sys
+import asyncio, json, os, sys, time
 from pathlib import Path
 import numpy as np
-from tsgt.clock import SystemClock
 from tsgt.config import ScenarioConfig
+from tsgt.config.scenario import InstrumentModelConfig
 from tsgt.log import configure_logging
 from tsgt.simulation.air_server import AirServer
-from tsgt.simulation.instrument import SimulatedInstrument
-from tsgt.simulation.instrument_socket import InstrumentServer
 from tsgt.simulation.link import LinkModel
+from tsgt.simulation.pty_line import PtyLine
+from tsgt.simulation.timeline import LoopTimeline
+from tsgt.simulation.total_station import SimulatedTotalStation
 from tsgt.simulation.world import scenario_world
 
 async def main(folder):
-    scenario, rng, clock = ScenarioConfig(), np.random.default_rng(0), SystemClock()
-    station = scenario.stations[0].model_copy(update={"rate_hz": 20.0})
+    scenario, rng, timeline = ScenarioConfig(), np.random.default_rng(0), LoopTimeline(asyncio.get_running_loop())
+    quick = InstrumentModelConfig(processing_min_ms=1.0, processing_max_ms=5.0)
+    station = scenario.stations[0].model_copy(update={"rate_hz": 20.0, "instrument": quick})
     world = scenario_world(scenario, 60.0, rng)
-    instrument = SimulatedInstrument(station, scenario, world, clock, rng, start_ns=clock.monotonic_ns())
+    start_ns = timeline.now_ns()
+    instrument = SimulatedTotalStation(station, scenario, world, timeline, rng, start_ns=start_ns)
+    tty = folder / "instrument.tty"
     async with AirServer(folder / "air.sock", LinkModel(), rng):
-        async with InstrumentServer(folder / "instrument.sock", instrument):
+        async with PtyLine(instrument, tty) as line:
+            # As long as somebody has a terminal open, another one cannot get its name.
+            os.open(tty, os.O_RDWR | os.O_NOCTTY)
             print("ready", flush=True)
-            await asyncio.sleep(60)
+            while command := (await asyncio.to_thread(sys.stdin.readline)).strip():
+                getattr(line, command)()
+                times_ns = [[each.instrument_ms * 1_000_000, each.true_ns] for each in instrument.offered]
+                where = os.readlink(tty) if tty.is_symlink() else None
+                state = {"now_ns": time.monotonic_ns(), "tty": where, "offered": times_ns}
+                print(json.dumps(state), flush=True)
 
 configure_logging()
 asyncio.run(main(Path(sys.argv[1])))
@@ -78,15 +91,28 @@ def folder(tmp_path: Path) -> Path:
 
 
 @contextmanager
-def surroundings(folder: Path) -> Iterator[None]:
-    """Run air and instrument in another process."""
+def surroundings(folder: Path) -> Iterator[Callable[[str], dict[str, Any]]]:
+    """Run air and instrument in another process; what is yielded plugs and unplugs the instrument and says how it is."""
     with subprocess.Popen(
-        [sys.executable, "-c", SURROUNDINGS, str(folder)], stdout=subprocess.PIPE, env=_environment()
+        [sys.executable, "-c", SURROUNDINGS, str(folder)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env=_environment(),
+        text=True,
     ) as process:
-        assert process.stdout is not None
+        told, said = process.stdin, process.stdout
+        assert told is not None
+        assert said is not None
+
+        def tell(command: str) -> dict[str, Any]:
+            print(command, file=told, flush=True)
+            state = json.loads(said.readline())
+            assert isinstance(state, dict)
+            return state
+
         try:
-            assert process.stdout.readline() == b"ready\n"
-            yield
+            assert said.readline() == "ready\n"
+            yield tell
         finally:
             process.kill()
 
@@ -137,12 +163,12 @@ def asked(folder: Path) -> dict[str, Any]:
 
 def wait_for(folder: Path, measurements: int) -> dict[str, Any]:
     """Wait until the client has read so many measurements."""
-    for _ in range(200):
+    for _ in range(400):
         status = asked(folder)
         if status["measurements"] >= measurements:
             return status
         time.sleep(0.05)  # the other process runs in real time
-    raise AssertionError(f"no {measurements} measurements in 10 s")
+    raise AssertionError(f"no {measurements} measurements in 20 s")
 
 
 def test_a_client_runs_and_ends_as_systemd_wants_it(folder: Path) -> None:
@@ -157,11 +183,22 @@ def test_a_client_runs_and_ends_as_systemd_wants_it(folder: Path) -> None:
         mapped = Path(f"/proc/{process.pid}/maps").read_text()
         assert "/scipy/" not in mapped
         assert "/matplotlib/" not in mapped
+        drain(systemd)  # it holds few messages, and who sends one too many is not told
         process.send_signal(signal.SIGTERM)
         assert process.wait(timeout=1.0) == 0
         while (message := systemd.recv(1000)) != b"STOPPING=1":
             assert message.startswith(b"WATCHDOG=1\n")
     assert not (folder / "client.sock").exists()
+
+
+def drain(systemd: socket.socket) -> None:
+    """Receive what waits."""
+    patience_s = systemd.gettimeout()
+    systemd.setblocking(False)
+    with suppress(BlockingIOError):
+        while systemd.recv(1000):
+            pass
+    systemd.settimeout(patience_s)
 
 
 def test_a_client_that_is_killed_leaves_a_readable_journal(folder: Path) -> None:
@@ -186,8 +223,34 @@ def test_a_client_outlives_what_is_around_it(folder: Path) -> None:
             assert wait_for(folder, 5)["journal_ok"]
         alone = wait_until(folder, radio_ok=False, instrument=None)
         with surroundings(folder):
-            wait_until(folder, radio_ok=True, instrument="simulated total station 1")
+            wait_until(folder, radio_ok=True, instrument="Leica TCRP1201+ 230001")
             wait_for(folder, alone["measurements"] + 5)
+
+
+def test_a_cable_that_comes_back_under_another_name(folder: Path) -> None:
+    """The stable name leads to another terminal: readings come within 3 s, and from then on all that are offered."""
+    with surroundings(folder) as tell, client(folder) as (process, _):
+        systemd_ready(folder)
+        wait_for(folder, 5)
+        name = str((folder / "instrument.tty").readlink())
+        assert tell("unplug")["tty"] is None
+        before = wait_until(folder, instrument=None)
+        back = tell("plug")
+        assert back["tty"] not in (None, name)
+        wait_for(folder, before["measurements"] + 20)
+        state = tell("plug")  # it is in already
+        wait_for(folder, asked(folder)["measurements"] + 2)  # what was under way has come
+        assert process.poll() is None
+    (path,) = (folder / "journals").iterdir()
+    journal = load_journal(path)
+    back_ns = journal.head.unix_at_zero_ns + back["now_ns"]
+    first = next(each for each in journal.measurements if each.status.usable and each.received_ns > back_ns)
+    assert first.received_ns - back_ns < 3_000_000_000
+    read = [each.instrument_time_ns for each in journal.measurements if each.slope_distance_m is not None]
+    offered = {given_ns for given_ns, true_ns in state["offered"] if true_ns > back["now_ns"]}
+    assert len(offered) >= 15
+    assert offered <= set(read)
+    assert len(set(read)) == len(read)
 
 
 def wait_until(folder: Path, **expected: object) -> dict[str, Any]:

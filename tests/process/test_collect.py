@@ -46,8 +46,10 @@ station = 1
 prism = 1
 status_socket = "client.sock"
 [instrument]
-kind = "simulated"
-socket = "instrument.sock"
+kind = "leica"
+port = "instrument.tty"
+prism_type = "user"
+prism_constant_mm = 0.0
 [journal]
 directory = "journals"
 """
@@ -65,29 +67,37 @@ prism_constant_mm = 10.0
 socket = "poses.sock"
 """
 
-# The instrument stays aimed at one target, as nobody is there to turn it.
+# Somebody aims the instrument at one target as soon as it has been set to foil.
 SURROUNDINGS = """
 import asyncio, sys
 from pathlib import Path
 import numpy as np
-from tsgt.clock import SystemClock
 from tsgt.config import ScenarioConfig
+from tsgt.config.scenario import InstrumentModelConfig
 from tsgt.log import configure_logging
 from tsgt.simulation.air_server import AirServer
-from tsgt.simulation.instrument import SimulatedInstrument
-from tsgt.simulation.instrument_socket import InstrumentServer
+from tsgt.simulation.distance_meter import WITHOUT_PRISM
 from tsgt.simulation.link import LinkModel
+from tsgt.simulation.pty_line import PtyLine
+from tsgt.simulation.timeline import LoopTimeline
+from tsgt.simulation.total_station import SimulatedTotalStation
 from tsgt.simulation.world import scenario_world
 
 async def main(folder):
-    scenario, rng, clock = ScenarioConfig(targets_m=((12.0, 5.0, 1.0),)), np.random.default_rng(0), SystemClock()
+    scenario, rng = ScenarioConfig(targets_m=((12.0, 5.0, 1.0),)), np.random.default_rng(0)
+    timeline = LoopTimeline(asyncio.get_running_loop())
     world = scenario_world(scenario, 60.0, rng)
-    instrument = SimulatedInstrument(scenario.stations[0], scenario, world, clock, rng)
-    instrument.aim(1)
+    start_ns = timeline.now_ns()
+    quick = InstrumentModelConfig(processing_min_ms=1.0, processing_max_ms=5.0)
+    station = scenario.stations[0].model_copy(update={"instrument": quick})
+    instrument = SimulatedTotalStation(station, scenario, world, timeline, rng, start_ns=start_ns)
     async with AirServer(folder / "air.sock", LinkModel(), rng):
-        async with InstrumentServer(folder / "instrument.sock", instrument):
+        async with PtyLine(instrument, folder / "instrument.tty"):
             print("ready", flush=True)
-            await asyncio.sleep(120)
+            while True:
+                if instrument.settings.edm_mode in WITHOUT_PRISM:
+                    instrument.aim(1)
+                await asyncio.sleep(0.1)
 
 configure_logging()
 asyncio.run(main(Path(sys.argv[1])))
@@ -123,13 +133,14 @@ def folder(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]:
 
 
 def wait_for_mode(folder: Path, mode: str) -> None:
-    """Ask the client until its instrument does that."""
+    """Ask the client until its instrument is connected and does that."""
     found = None
     for _ in range(400):
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
             if connection.connect_ex(str(folder / "client.sock")) == 0:
                 with connection.makefile("rb") as file:
-                    found = json.loads(file.readline())["mode"]
+                    status = json.loads(file.readline())
+                found = status["instrument"] and status["mode"]
                 if found == mode:
                     return
         time.sleep(0.05)  # the other process runs in real time
@@ -159,7 +170,7 @@ def test_ctrl_c_leaves_what_was_measured_and_a_station_that_tracks(folder: Path,
         time.sleep(0.5)  # into the second measurement, which takes at least a second
         collect.send_signal(signal.SIGINT)
         # Ends without a key: nothing hangs on the input.
-        assert collect.wait(20) == 130
+        assert collect.wait(40) == 130
         assert collect.stderr is not None
         assert collect.stderr.read().endswith(b"stopped\n")
     wait_for_mode(folder, "tracking")

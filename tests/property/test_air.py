@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support.air import RecordingAntenna, frame, modulation
 
@@ -105,7 +105,6 @@ class StrictAntenna(RecordingAntenna):
 @given(
     st.one_of(deeds(MODULATIONS), deeds(st.just(PLAIN))), st.integers(0, 2**32), st.sampled_from([60, 120])
 )
-@settings(deadline=None)
 def test_arbitrary_traffic(sequence: list[Deed], seed: int, loss_db: float) -> None:
     """Arbitrary frames, receivers, cuts and departures raise nothing; every lock ends; nothing is left behind."""
     timeline = VirtualTimeline()

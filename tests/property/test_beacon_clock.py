@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tsgt.simulation.beacon_scenarios import BeaconScenario, run_beacon_scenario
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     seed=st.integers(0, 2**32 - 1),
     drift_ppm=st.floats(-100, 100),

@@ -16,7 +16,7 @@ MS = 1_000_000
 
 
 @pytest.mark.parametrize("name", ["regression", "paper"])
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     seed=st.integers(0, 2**32 - 1),
     ppm=st.floats(-60, 60),

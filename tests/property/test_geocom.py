@@ -181,7 +181,7 @@ steps = st.lists(
 )
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(script=steps, checksum=st.booleans())
 def test_no_reply_is_taken_for_another(
     script: list[tuple[str, list[Fault], float]],

@@ -24,7 +24,7 @@ from tsgt.geometry import (
     transform_points,
 )
 
-same_every_time = settings(deadline=None, derandomize=True)
+same_every_time = settings(derandomize=True)
 
 
 def vectors(limit: float, count: int | None = None) -> st.SearchStrategy[np.ndarray]:

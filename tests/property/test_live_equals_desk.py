@@ -85,7 +85,7 @@ def poses(lines: list[bytes]) -> list[bytes]:
     return [line for line in lines if line.startswith(b'{"type":"pose"')]
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(arrivals(), st.lists(st.integers(START, START + 100 * 10**9), max_size=30), st.floats(0.0, 5.0))
 def test_the_desk_gives_what_the_stream_gave(
     measurements: list[PolarMeasurement], ticks_ns: list[int], wait_s: float
@@ -99,7 +99,7 @@ def test_the_desk_gives_what_the_stream_gave(
     assert desk == poses(live(measurements, ticks_ns, end_ns))
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(arrivals(FOUR), st.lists(st.integers(START, START + 100 * 10**9), max_size=30))
 def test_the_same_with_two_stations_on_one_prism(
     measurements: list[PolarMeasurement], ticks_ns: list[int]
@@ -113,7 +113,7 @@ def test_the_same_with_two_stations_on_one_prism(
     assert desk == poses(live(measurements, ticks_ns, end_ns, FOUR))
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(arrivals(), st.lists(st.integers(START, START + 100 * 10**9), max_size=30))
 def test_the_timer_changes_no_line_and_no_order(
     measurements: list[PolarMeasurement], ticks_ns: list[int]
@@ -123,7 +123,7 @@ def test_the_timer_changes_no_line_and_no_order(
     assert live(measurements, ticks_ns, end_ns) == live(measurements, [], end_ns)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(arrivals())
 def test_stamps_of_poses_increase_by_one_period(measurements: list[PolarMeasurement]) -> None:
     """No epoch is left out and none is given twice."""
@@ -136,7 +136,7 @@ def test_stamps_of_poses_increase_by_one_period(measurements: list[PolarMeasurem
     assert stamps == list(range(stamps[0], stamps[-1] + 1, period)) if stamps else True
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(st.one_of(arrivals(), arrivals(FOUR)))
 def test_the_announced_deadline_is_when_the_next_pose_is_due(measurements: list[PolarMeasurement]) -> None:
     """At the deadline there is a pose, one nanosecond before there is none."""
@@ -150,7 +150,7 @@ def test_the_announced_deadline_is_when_the_next_pose_is_due(measurements: list[
         assert len(pipeline.advance(deadline_ns)) > 0
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(
     arrivals(),
     st.lists(

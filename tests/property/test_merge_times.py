@@ -16,7 +16,7 @@ MS = 1_000_000
 LARGEST_SWING_PPM = 10.0
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     seed=st.integers(0, 2**32 - 1),
     ppm=st.floats(-60, 60),

@@ -53,7 +53,7 @@ def test_cut_anywhere_can_be_continued(tmp_path: Path, monkeypatch: pytest.Monke
         assert load_recording(path).measurements[-1] == measurement(7)
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(at=st.integers(0, len(WHOLE) - 2), bits=st.integers(1, 255))
 def test_flipped_byte_is_found_or_harmless(at: int, bits: int) -> None:
     """A flipped byte gives an error with the number of its line, or another valid value."""

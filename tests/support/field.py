@@ -107,6 +107,9 @@ class SceneInstrument:
         await asyncio.sleep(2.0)
         return self._reading(TRUE.monotonic_ns())
 
+    async def check(self) -> None:
+        """Be there."""
+
     async def close(self) -> None:
         """Do nothing."""
 

@@ -94,6 +94,11 @@ class ScriptedInstrument:
         await self._sleep(2)
         return self._checked(self.target)
 
+    async def check(self) -> None:
+        """Be there with its cable only."""
+        if not self.plugged:
+            raise InstrumentError("nobody answers; is the cable in?")
+
     async def set_atmosphere(self, atmosphere: Atmosphere) -> None:
         """Apply 10 ppm in any air, after a tenth of a second."""
         await self._sleep(0.1)

@@ -45,6 +45,8 @@ class Bench:
         Of all randomness.
     station
         Which of its stations.
+    world
+        What is the case; without it that of the scenario, for ``duration_s``.
     """
 
     def __init__(
@@ -54,10 +56,11 @@ class Bench:
         seed: int = 2,
         station: int = 1,
         duration_s: float = 100.0,
+        world: World | None = None,
     ) -> None:
         self.scenario = scenario or ScenarioConfig(motion=STANDING)
         self.timeline = virtual_timeline()
-        self.world: World = scenario_world(self.scenario, duration_s, np.random.default_rng(1))
+        self.world = world or scenario_world(self.scenario, duration_s, np.random.default_rng(1))
         self.instrument = SimulatedTotalStation(
             self.scenario.stations[station - 1],
             self.scenario,

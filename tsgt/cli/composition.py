@@ -7,7 +7,7 @@ from contextlib import asynccontextmanager
 from functools import partial
 from typing import TYPE_CHECKING
 
-from tsgt.config.client import BridgeInstrumentConfig, LeicaInstrumentConfig, SimulatedInstrumentConfig
+from tsgt.config.client import BridgeInstrumentConfig, LeicaInstrumentConfig
 from tsgt.config.radio import HardwareRadioConfig, SimulatedRadioConfig, SuperframeConfig
 from tsgt.radio.from_config import wiring
 from tsgt.radio.hal import open_hal
@@ -45,10 +45,6 @@ def make_instrument(config: InstrumentConfig, clock: Clock) -> Instrument:
             from tsgt.station.bridge import BridgeInstrument  # noqa: PLC0415
 
             return BridgeInstrument(config, clock)
-        case SimulatedInstrumentConfig():
-            from tsgt.simulation.instrument_socket import RemoteInstrument  # noqa: PLC0415
-
-            return RemoteInstrument(config.socket)
 
 
 def radio_key(protocol: ClassicConfig | SuperframeConfig) -> bytes | None:

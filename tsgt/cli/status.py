@@ -145,7 +145,7 @@ def client_text(record: ClientStatus) -> tuple[list[str], bool]:
         lines.append("direct: single measurements")
     elif record.instrument is not None:
         lines.append(f"tracking prism {record.prism}, {record.rate_hz:.2f} Hz")
-    if record.activity != "tracking":
+    if not lines[-1].startswith(record.activity):  # an instrument that tracks says so itself
         lines += _wrapped(record.activity, "  ")
     if (last := record.last) is not None:
         distance = "no distance" if last.slope_distance_m is None else f"{last.slope_distance_m:.4f} m"

@@ -14,16 +14,6 @@ Baud = Literal[2400, 4800, 9600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_8
 
 PrismType = Literal["round", "mini", "tape", "360", "mini_360", "mini_zero", "user", "grz121", "mpr122"]
 
-
-class SimulatedInstrumentConfig(Model):
-    """A simulated total station of `tsgt demo`, reached over a UNIX socket."""
-
-    kind: Literal["simulated"]
-    """The instrument is simulated."""
-    socket: RelativePath
-    """UNIX socket of the simulated instrument."""
-
-
 TemperatureC = Annotated[float, Field(ge=-60, le=70)]
 PressureHpa = Annotated[float, Field(ge=400, le=1200)]
 
@@ -38,7 +28,7 @@ class AtmosphereConfig(Model):
 
 
 class LeicaInstrumentConfig(Model):
-    """A Leica total station that speaks GeoCOM over a serial line: TPS1200, TS15, TS16, TS30, TS60, MS50, MS60, ..."""
+    """A Leica total station that speaks GeoCOM over a serial line: TPS1200+, TS15, TS16, TS30, TS60, MS50, MS60, ..."""
 
     kind: Literal["leica"]
     """A Leica instrument on a serial line."""
@@ -90,9 +80,7 @@ class BridgeInstrumentConfig(Model):
     """From a measurement to the time that the program gives, taken off each stamp."""
 
 
-InstrumentConfig = Annotated[
-    SimulatedInstrumentConfig | LeicaInstrumentConfig | BridgeInstrumentConfig, Field(discriminator="kind")
-]
+InstrumentConfig = Annotated[LeicaInstrumentConfig | BridgeInstrumentConfig, Field(discriminator="kind")]
 
 
 class JournalConfig(Model):

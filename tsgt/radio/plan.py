@@ -1,7 +1,9 @@
 """What a channel carries: how often each station gets through, how old its data is, how long everybody transmits.
 
 Means over a long run, from the same times on air, grants and rules that the two protocols are made of. Losses are taken
-as independent of each other. A measurement's age is the time from when it was made to when the master has received it.
+as independent of each other. A measurement's age is the time from when the client has it to when the master has received
+it. What an instrument needs until a measurement can be read comes on top, and differs from one to the next: 50 to 130 ms
+for the simulated ones.
 """
 
 from __future__ import annotations
@@ -82,7 +84,8 @@ class Cycle:
     rate_hz
         Different measurements of each station that arrive.
     age_p50_ms, age_p99_ms
-        How old half of them, and all but one in a hundred, are at most when they arrive; of those that arrive live.
+        How old half of them, and all but one in a hundred, are at most when they arrive, counted from when the client
+        had them; of those that arrive live.
     master_duty, station_duty
         For what part of the time the master transmits, and each station.
     """

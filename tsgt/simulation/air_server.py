@@ -49,6 +49,8 @@ MAX_WAITING_BYTES = 1 << 20
 
 _FARTHEST_START_NS = 1_000_000_000
 
+_ANY_FREQUENCY_HZ = 868e6
+
 log = structlog.get_logger()
 
 
@@ -136,6 +138,8 @@ class AirServer:
             raise ValueError(f"this connection has joined as {connection.name!r} already")
         if line.name in self._members:
             raise ValueError(f"there is a radio {line.name!r} on the air already; each needs its own name")
+        # At the first frame that would reach it, it would be the sender who is dropped.
+        self.link.path_loss.loss_db(line.name, line.name, _ANY_FREQUENCY_HZ)
         connection.name = line.name
         connection.crystal_ppm = line.crystal_ppm
         self._members[line.name] = connection

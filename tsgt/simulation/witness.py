@@ -238,6 +238,10 @@ class WatchedInstrument:
         """Measure the target once."""
         return await self._instrument.measure()
 
+    async def check(self) -> None:
+        """See whether it is still there."""
+        await self._instrument.check()
+
     async def set_atmosphere(self, atmosphere: Atmosphere) -> None:
         """Let the instrument correct for this air."""
         await self._instrument.set_atmosphere(atmosphere)

@@ -86,11 +86,6 @@ class World:
         """Return the position of one prism, by its row in the layout, in ``station1`` at N instants: (N, 3)."""
         return transform_points(self.pose_at(times_s), self.prisms_m[index])
 
-    def hidden(self, station: int, time_s: float) -> bool:
-        """Tell whether something stands between a station and its prism, at an instant in s from the start."""
-        spans_s = self.occlusions_s.get(station)
-        return spans_s is not None and bool(np.any((spans_s[:, 0] <= time_s) & (time_s < spans_s[:, 1])))
-
 
 def scenario_world(scenario: ScenarioConfig, duration_s: float, generator: np.random.Generator) -> World:
     """Make the world of a scenario: its robot, its prisms in their order, and what hides them."""

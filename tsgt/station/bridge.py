@@ -132,6 +132,11 @@ class BridgeInstrument:
         at_ns = host_ns if host_ns is not None and given else run.answered_ns
         return reading_of(answer, None, at_ns, run.answered_ns)
 
+    async def check(self) -> None:
+        """See whether the program still runs."""
+        if (lost := self._running().lost) is not None:
+            raise lost
+
     async def set_atmosphere(self, atmosphere: Atmosphere) -> None:
         """Have the distances corrected for this air."""
         self._check_can("atmosphere", "set the air; set it at the instrument")

@@ -125,6 +125,10 @@ class Instrument(Protocol):
         """Measure the target that the instrument points at, once; only after :meth:`direct`."""
         ...
 
+    async def check(self) -> None:
+        """See whether the instrument is still there; called every few seconds after :meth:`direct`."""
+        ...
+
     async def set_atmosphere(self, atmosphere: Atmosphere) -> None:
         """Let the instrument correct distances for this air from now on; also while tracking, between two readings."""
         ...

@@ -207,7 +207,8 @@ class InstrumentClock:
             if second - lowest > max(5e6, 4 * (middle - second)):
                 del kept[0]
         if len(kept) < ENOUGH - 1:
-            self._first = kept or self._first[-1:]
+            # The oldest goes, whatever it is: samples from before a power cycle may be the most of them.
+            del self._first[0]
             return
         kept.sort()
         self._x0 = kept[0][0] * 1_000_000

@@ -28,6 +28,9 @@ LONGEST_PAUSE_NS = 1_000_000_000
 STEADY_NS = 5_000_000_000
 """After a connection that has lasted longer, pauses are short again and an error is worth a line in the log again."""
 
+CHECK_S = 2.0
+"""While single measurements are made nothing else would tell that the instrument is gone."""
+
 CLOSE_TIMEOUT_S = 0.5
 """How long an instrument has to be let go at the end; the program ends within a second."""
 
@@ -187,11 +190,20 @@ class InstrumentKeeper:
             elif self._order is not None:
                 await self._execute(self._order)
             elif self._session.mode == "direct":
-                await self._wanted.wait()
-                self._wanted.clear()
+                await self._wait()
             elif (reading := await self._read()) is not None:
                 self._note_record()
                 self._on_reading(reading)
+
+    async def _wait(self) -> None:
+        """Wait until somebody wants something, and see now and then whether the instrument is still there."""
+        try:
+            async with asyncio.timeout(CHECK_S):
+                await self._wanted.wait()
+        except TimeoutError:
+            await self._instrument.check()
+        else:
+            self._wanted.clear()
 
     def _note_record(self) -> None:
         record = self._instrument.record

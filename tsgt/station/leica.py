@@ -193,28 +193,36 @@ class LeicaInstrument:
         await self._stop_tracking()
         self._direct = True
         await clear(line)
-        foil = self._config.target == "foil"
         finder = self._finder(line)
         if finder is not None:
             try:
                 await finder.release()
-                if foil:
+                if self._config.target == "foil":
                     await finder.stop_recognising()
             except LicenceMissing:
                 self._identity = replace(self._identity, robotic=False)
-        if foil:
+        await self._set_target(line)
+        await self._read_back(line)
+
+    async def check(self) -> None:
+        """See whether it is still there, and how it is fed."""
+        await self._check_power(self._connected())
+
+    async def _set_target(self, line: GeoComConnection) -> None:
+        if self._config.target == "foil":
             modes = _PRECISE_TAPE_MODES if model_of(self._identity.model).precise_tape else _TAPE_MODES
             self._add_problem(await set_reflector(line, "tape", None))
             self._add_problem(await set_distance_mode(line, modes))
         else:
             await set_distance_mode(line, _PRISM_MODES)
-        await self._read_back(line)
 
     async def measure(self) -> Reading:
         """Measure the target that the telescope points at, once, in one face or in two; it takes some seconds."""
         line = self._connected()
         if not self._direct:
             raise InstrumentRefusedError("the instrument tracks; call direct first")
+        # It may have been switched off and on, or set by hand, since the last shot.
+        await self._set_target(line)
         prism = self._config.target == "prism"
         finder = self._finder(line) if prism else None
         if finder is not None:

@@ -173,6 +173,7 @@ class LossSequence:
             self._resume_ns = now_ns + PAUSES_NS[min(self._rounds, len(PAUSES_NS) - 1)]
             self._rounds += 1
             self._step = 0
+            self._turned_away = False  # from now on a person points it
             return None
         self._step += 1
         return looks[self._step - 1]

@@ -16,6 +16,11 @@ if TYPE_CHECKING:
 REPEAT_NS: Final = 500_000_000
 """A status without a distance that does not change is given this often."""
 
+MOST_MS: Final = 2**32
+"""An instrument's time has 32 bits."""
+
+_FARTHEST_M: Final = 20_000.0
+
 STATUS: Final = {
     Verdict.USABLE: Status.OK,
     Verdict.LOW_ACCURACY: Status.LOW_ACCURACY,
@@ -66,9 +71,13 @@ def full_measurement(reply: Reply) -> FullMeasurement:
     distance_m = time_ms = None
     if status.usable or status is Status.ANGLE_ONLY or status is Status.NO_TARGET:
         angles = numbers(reply, 2)
-        if angles is not None and abs(angles[0]) <= 2 * math.tau and 0 <= angles[1] <= math.tau:
+        if angles is not None and not (abs(angles[0]) <= 2 * math.tau and 0 <= angles[1] <= math.tau):
+            angles = None  # damaged on the line
+        if angles is not None:
             horizontal_rad, zenith_rad = angles
         whole = numbers(reply, 8)
+        if whole is not None and not (whole[6] <= _FARTHEST_M and abs(whole[7]) <= MOST_MS):
+            whole = None
         if status.usable and (angles is None or whole is None or whole[6] <= 0):
             status = Status.ANGLE_ONLY if angles is not None else Status.ERROR
         elif status.usable and whole is not None:

@@ -23,6 +23,12 @@ _SHOT_NS: Final = 8_000_000_000
 """A precise distance to a foil takes 1 to 3 s, and in bad air some more."""
 
 _FACE_S: Final = 30.0
+_TRIES: Final = 3
+_CLEAR, _MEASURE = 3, 1
+
+_APART_RAD: Final = math.radians(0.2)
+_APART_M: Final = 0.05
+"""The errors of an instrument's axes are a tenth of this: two faces that differ by more saw two targets."""
 
 
 async def shoot(line: GeoComConnection, clock: Clock) -> FullMeasurement:
@@ -30,11 +36,13 @@ async def shoot(line: GeoComConnection, clock: Clock) -> FullMeasurement:
 
     Raises
     ------
+    InstrumentRefusedError
+        It does not begin; the distance that it still has may be one to another target.
     InstrumentError
         The instrument does not answer.
     """
-    await clear(line)
-    await line.call(Rpc.TMC_DO_MEASURE, 1, 1)
+    await _do(line, _CLEAR)
+    await _do(line, _MEASURE)
     until_ns = clock.monotonic_ns() + _SHOT_NS
     while True:
         shot = full_measurement(await line.call(Rpc.TMC_GET_FULL_MEAS, _WAIT_MS, 1))
@@ -54,7 +62,7 @@ async def shoot_in_two_faces(line: GeoComConnection, clock: Clock, *, at_prism: 
     Raises
     ------
     InstrumentRefusedError
-        The instrument cannot change its face.
+        The instrument cannot change its face, or sees another target in it.
     InstrumentError
         The instrument does not answer.
     """
@@ -64,6 +72,7 @@ async def shoot_in_two_faces(line: GeoComConnection, clock: Clock, *, at_prism: 
     await _change_face(line, at_prism=at_prism)
     second = await shoot(line, clock)
     await _change_face(line, at_prism=False)
+    check_same_target(first, second)
     return both_faces(first, second)
 
 
@@ -74,9 +83,7 @@ def both_faces(first: FullMeasurement, second: FullMeasurement) -> FullMeasureme
     """
     if first.distance_m is None or second.distance_m is None:
         return first if first.distance_m is None else second
-    turned_rad = second.horizontal_angle_rad + math.pi
-    across_rad = math.remainder(turned_rad - first.horizontal_angle_rad, math.tau)
-    up_rad = math.tau - second.zenith_angle_rad - first.zenith_angle_rad
+    across_rad, up_rad = _apart_rad(first, second)
     worse = second if second.status is Status.LOW_ACCURACY else first
     return first._replace(
         horizontal_angle_rad=(first.horizontal_angle_rad + across_rad / 2) % math.tau,
@@ -84,6 +91,43 @@ def both_faces(first: FullMeasurement, second: FullMeasurement) -> FullMeasureme
         distance_m=(first.distance_m + second.distance_m) / 2,
         status=worse.status,
         code=worse.code,
+    )
+
+
+def _apart_rad(first: FullMeasurement, second: FullMeasurement) -> tuple[float, float]:
+    """Return by how much the second face points elsewhere, about the plumb line and in height."""
+    turned_rad = second.horizontal_angle_rad + math.pi
+    across_rad = math.remainder(turned_rad - first.horizontal_angle_rad, math.tau)
+    return across_rad, math.tau - second.zenith_angle_rad - first.zenith_angle_rad
+
+
+def check_same_target(first: FullMeasurement, second: FullMeasurement) -> None:
+    """Refuse two faces that cannot be of one target.
+
+    Raises
+    ------
+    InstrumentRefusedError
+        They are too far apart.
+    """
+    if first.distance_m is None or second.distance_m is None:
+        return
+    across_rad, up_rad = _apart_rad(first, second)
+    apart_rad = math.hypot(across_rad * math.sin(first.zenith_angle_rad), up_rad)
+    apart_m = abs(first.distance_m - second.distance_m)
+    if apart_rad > _APART_RAD or apart_m > _APART_M:
+        raise InstrumentRefusedError(
+            f"the two faces saw different things, {math.degrees(apart_rad):.2f} degrees and {apart_m:.3f} m apart: the"
+            " telescope was turned, or something came in between; measure again"
+        )
+
+
+async def _do(line: GeoComConnection, program: int) -> None:
+    for _ in range(_TRIES):
+        reply = await line.call(Rpc.TMC_DO_MEASURE, program, 1)
+        if done(reply):
+            return
+    raise InstrumentRefusedError(
+        f"the instrument begins no new measurement: {name_of(reply.code)}; measure again"
     )
 
 

@@ -9,6 +9,7 @@ import structlog
 from tsgt.station.geocom import Rpc
 from tsgt.station.instrument_clock import InstrumentClock
 from tsgt.station.leica_identity import numbers
+from tsgt.station.leica_measurement import MOST_MS
 
 if TYPE_CHECKING:
     from tsgt.station.geocom_connection import GeoComConnection
@@ -19,6 +20,9 @@ log = structlog.get_logger()
 _FEWEST_EXCHANGES: Final = 4
 _FIRST_EXCHANGES: Final = 12
 _MOST_EXCHANGES: Final = 24
+
+_REFUSALS: Final = 3
+"""One answer without a time may be an accident of the moment."""
 
 _SOON: Final = 40
 """Until the envelope rests on so many samples, pauses are used to take some more: it is worth some ms at the start."""
@@ -50,6 +54,11 @@ class InstrumentTimes:
         self._logged_ns: int | None = None
 
     @property
+    def stands(self) -> bool:
+        """Whether times can be told; distances alone would tell them worse, for their answers come late."""
+        return self._fit.stands
+
+    @property
     def wants_more(self) -> bool:
         """Whether another exchange would make times noticeably better."""
         return self._fit.samples < _SOON
@@ -68,8 +77,10 @@ class InstrumentTimes:
             It does not answer.
         """
         fewest = _FEWEST_EXCHANGES if self._fit.stands else _FIRST_EXCHANGES
+        refused = 0
         for number in range(1, _MOST_EXCHANGES + 1):
-            if not await self.exchange(line):
+            refused += not await self.exchange(line)
+            if refused == _REFUSALS:
                 return
             if number >= fewest and self._fit.stands and not self._fit.doubts:
                 return
@@ -78,7 +89,7 @@ class InstrumentTimes:
         """Ask for the time of an angle; return whether there was one. An instrument that is not level gives none."""
         reply = await line.call(Rpc.TMC_GET_ANGLE1, 1)
         values = numbers(reply, 4)
-        if values is None or values[3] <= 0:
+        if values is None or not 0 < abs(values[3]) <= MOST_MS:
             return False
         began = self._fit.began
         self._fit.add(int(values[3]), reply.first_byte_ns)

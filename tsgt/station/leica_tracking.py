@@ -45,6 +45,7 @@ _LOCK_NS: Final = 2_000_000_000  # between two looks at the lock, while distance
 _TIME_NS: Final = 500_000_000  # between two exchanges for the time alone, whose answers are the fastest
 _LOST_LOCK_NS: Final = 250_000_000  # and while they do not
 _STALE_NS: Final = 1_500_000_000  # the same distance for longer than this is no tracking
+_GAP_NS: Final = 600_000_000
 _RESTART_NS: Final = 3_000_000_000
 _STARTING_NS: Final = 600_000_000
 _SURE: Final = 3  # an answer that nothing can be done about is asked for again
@@ -247,7 +248,9 @@ class Tracking:
                 return None
             return await self._without(measured._replace(status=Status.NO_TARGET))
         at_ns = self._times.stamp(measured)
-        if self.finder is not None and self._lock is not Lock.IN and self._handover is None:
+        # After a gap the prism may be gone, and another one cross the line of sight.
+        gap = measured.first_byte_ns - self._last_new_ns > max(_GAP_NS, 3 * (self._pace.interval_ns or 0))
+        if self.finder is not None and (gap or self._lock is not Lock.IN) and self._handover is None:
             await self._ask_lock(self.finder)
         self._times.given(time_ms)
         self._pace.distance(time_ms)
@@ -288,7 +291,7 @@ class Tracking:
         slower = 1 if room else 2
         time_ns = _TIME_NS
         if self._times.wants_more:
-            time_ns = 0 if room else _TIME_NS // 2
+            time_ns = 0 if room or not self._times.stands else _TIME_NS // 2
         if self.finder is not None and now_ns - self._lock_asked_ns >= slower * _LOCK_NS:
             await self._ask_lock(self.finder)
         elif now_ns - self._time_asked_ns >= slower * time_ns:

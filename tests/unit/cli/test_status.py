@@ -171,6 +171,9 @@ def test_a_client_says_what_its_instrument_does_and_how_it_is_set() -> None:
         assert part in text
     looking = dataclasses.replace(CLIENT, activity="looking for the prism around its last direction")
     assert "  looking for the prism around its last" in client_text(looking)[0]
+    assert client_text(dataclasses.replace(CLIENT, activity=f"tracking prism {CLIENT.prism}")) == client_text(
+        CLIENT
+    )
     silent = dataclasses.replace(CLIENT, settings=None, battery_percent=None, activity="")
     assert not any(
         word in "\n".join(client_text(silent)[0]) for word in ("battery", "prism m", "air", "None")

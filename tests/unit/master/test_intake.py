@@ -199,7 +199,7 @@ def test_a_measurement_without_distance_has_none() -> None:
     assert arrival.measurement.slope_distance_m is None
 
 
-@limits(deadline=None, max_examples=200)
+@limits(max_examples=200)
 @given(
     st.lists(
         st.one_of(

@@ -109,7 +109,7 @@ def motion(
     return at
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     speed_mps=st.floats(0.0, 1.5),
     yaw_rate_radps=st.floats(-0.5, 0.5),

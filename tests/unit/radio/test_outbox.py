@@ -177,7 +177,7 @@ class Model:
 
 
 @given(st.data())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_nothing_is_deleted_that_the_master_does_not_have(data: st.DataObject) -> None:
     """Whatever is lost, whoever restarts: a measurement leaves the queue when a master has it, and not before."""
     numbers = iter(range(10_000))

@@ -322,13 +322,15 @@ async def test_client_that_does_not_read_is_dropped(path: Path, monkeypatch: pyt
 
 
 async def test_radio_without_position_is_told(path: Path) -> None:
-    """A frame that the link model has no loss for ends its sender with a reason, not the server."""
+    """A radio that the link model does not know is not let in: nobody else's frames are to end by it."""
     link = LinkModel(path_loss=LogDistanceLoss(positions_m={"tx": (0, 0, 0)}))
     async with Field(path, link) as field:
-        tx, _ = await field.radio("tx"), await field.radio("rx")
-        tx.port.transmit(frame())
+        tx = await field.radio("tx")
         with pytest.raises(StreamError, match="radio 'rx' has no position in the link model"):
-            await tx.client.wait_lost()
+            await field.radio("rx")
+        tx.port.transmit(frame())
+        await settle()
+        assert field.server.names == {"tx"}
 
 
 async def test_socket_is_the_users_own(path: Path) -> None:

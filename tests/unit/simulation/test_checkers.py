@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import json
 import math
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +13,7 @@ from support.missions import QUICK, SUPERFRAME, mission
 
 from tsgt.master.stream_records import EventRecord
 from tsgt.model import Status
-from tsgt.simulation.checkers import violations
+from tsgt.simulation.checkers import misread, violations
 from tsgt.simulation.witness import Measured
 
 if TYPE_CHECKING:
@@ -97,6 +98,45 @@ def test_a_measurement_that_is_read_and_not_journalled(run: Run) -> None:
     witness = dataclasses.replace(run.witnesses[1], stamps_ns=run.witnesses[1].stamps_ns | {12_345: 0})
     run = dataclasses.replace(run, witnesses=run.witnesses | {1: witness})
     assert _checks(run) == {"journal"}
+
+
+def test_a_value_that_the_instrument_never_gave(run: Run) -> None:
+    """A journalled distance that differs from all that were offered, by a hundredth of a millimetre, is noticed."""
+    witness = run.witnesses[1]
+    offered = list(witness.offered)
+    offered[20] = offered[20]._replace(distance_m=offered[20].distance_m + 1e-5)
+    witness = dataclasses.replace(witness, offered=offered)
+    (found,) = violations(dataclasses.replace(run, witnesses=run.witnesses | {1: witness}))
+    assert found.check == "read"
+    assert "never given" in found.detail
+
+
+def test_a_value_that_stands_in_the_journals_twice(run: Run, tmp_path: Path) -> None:
+    """The same answer under two numbers is one reading too many."""
+    witness = run.witnesses[1]
+    (path,) = witness.journals
+    *_, line = [line for line in path.read_bytes().splitlines() if b'"type":"measurement"' in line]
+    again = json.loads(line)
+    again["sequence"] += 1
+    (tmp_path / path.name).write_bytes(path.read_bytes() + json.dumps(again).encode() + b"\n")
+    witness = dataclasses.replace(witness, folder=tmp_path)
+    (found,) = misread(witness, Measured(witness))
+    assert found.check == "read"
+    assert "twice" in found.detail
+
+
+@pytest.mark.parametrize("off_ms", [-41, -39, 39, 41])
+def test_a_reading_that_is_stamped_wrongly(run: Run, off_ms: int) -> None:
+    """A stamp may be 40 ms before or after the instant of the distance, no more."""
+    witness = run.witnesses[1]
+    journalled = Measured(witness).journalled[20]
+    assert journalled.instrument_time_ns is not None
+    instrument_ms = journalled.instrument_time_ns // 1_000_000
+    (truth,) = [each for each in witness.offered if each.instrument_ms == instrument_ms]
+    assert journalled.host_time_ns is not None
+    stamps_ns = witness.stamps_ns | {journalled.host_time_ns: truth.true_ns + off_ms * 1_000_000}
+    witness = dataclasses.replace(witness, stamps_ns=stamps_ns)
+    assert [found.check for found in misread(witness, Measured(witness))] == ["read"] * (abs(off_ms) > 40)
 
 
 def test_what_is_acknowledged_and_lost(run: Run, tmp_path: Path) -> None:

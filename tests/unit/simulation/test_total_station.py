@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from support.total_stations import SETUP, SILENT, STANDING, Bench, Typed, with_station
 
-from tsgt.config import ScenarioConfig, scenario_parameters
+from tsgt.config import MotionConfig, ScenarioConfig, scenario_parameters
 from tsgt.config.scenario import StatusFaultConfig
 from tsgt.errors import InstrumentError
 from tsgt.geometry import corrected_distance, polar_to_cartesian, transform_points
+from tsgt.simulation.world import World
 
 NO_TARGETS, NO_TARGET, NOT_ENABLED, NO_LICENCE, NO_AREA, INACCURATE = 517, 8710, 8714, 27, 8720, 8716
 
@@ -73,6 +74,36 @@ async def test_ticks_are_even_but_for_their_jitter_and_the_drift() -> None:
     assert steps_ms.mean() == pytest.approx(400 * (1 + 500e-6), abs=0.05)
     assert steps_ms.std() == pytest.approx(3.0 * math.sqrt(2), rel=0.15)
     assert len(bench.instrument.offered) == 200
+
+
+async def test_each_station_measures_at_instants_of_its_own() -> None:
+    """Whatever the seed, the first distance comes within a period."""
+    phases = set()
+    for seed in (1, 2, 3):
+        bench = Bench(with_station(instrument={"tick_jitter_ms": 0.0}), seed=seed)
+        await bench.do(*SETUP)
+        await full(bench, 1)
+        phases.add(bench.instrument.offered[0].true_ns % 400_000_000)
+    assert len(phases) == 3
+
+
+async def test_after_its_end_the_world_stands_still() -> None:
+    """An instrument may be read for longer than there is a truth."""
+    bench = Bench(with_station(ScenarioConfig(), noise=SILENT), duration_s=2.0)
+    await bench.do(*SETUP)
+    answers = await full(bench, 12)
+    assert len({answer.values[6] for answer in answers[6:]}) == 1
+
+
+async def test_what_is_too_close_has_no_distance() -> None:
+    """Below a metre there are angles alone."""
+    still = MotionConfig(speeds_mps=(0.0,), speed_weights=(1.0,), area_centre_m=(0.5, 0.0, -1.0))
+    bench = Bench(ScenarioConfig(motion=still))
+    bench.instrument.aim_at_prism(1)
+    await bench.do(*SETUP)
+    await asyncio.sleep(1.0)
+    answer = await bench.ask(2167, 1000, 1)
+    assert (answer.code, float(answer.values[6])) == (1285, 0.0)
 
 
 async def test_a_stored_distance_is_given_again() -> None:
@@ -222,6 +253,19 @@ async def test_a_hidden_prism_is_predicted_and_then_lost() -> None:
     assert states.count("2") * 0.045 == pytest.approx(2.0, abs=0.4)
     answer = await bench.ask(2167, 500, 1)
     assert (answer.code, answer.values) == (1292, [])
+
+
+async def test_what_the_world_hides_is_lost() -> None:
+    """A tree between this station and the robot: no distance is taken as long as it is there."""
+    scenario = ScenarioConfig()
+    prisms = np.array([prism.position_m for prism in scenario.prisms])
+    spans_s = {1: np.array([[4.0, 5.0]])}
+    bench = Bench(scenario, world=World(scenario.motion, prisms, 60.0, np.random.default_rng(1), spans_s))
+    await bench.do(*SETUP)
+    await full(bench, 20)
+    true_s = [offered.true_ns / 1e9 for offered in bench.instrument.offered]
+    assert min(true_s) < 4.0
+    assert not [at_s for at_s in true_s if 4.0 <= at_s < 5.0]
 
 
 async def test_a_prism_that_comes_back_in_time_is_followed_again() -> None:

@@ -218,19 +218,6 @@ def test_common_occlusions_hide_the_robot_from_all_stations() -> None:
     assert all(to - since <= 2.0 for since, to in (one | other) - common)
 
 
-def test_a_hidden_prism_is_hidden_in_its_time_only() -> None:
-    """The world says who is hidden when; a station without occlusions sees always."""
-    world = World(MOTION, PRISMS, 20.0, np.random.default_rng(0), {2: np.array([[3.0, 4.0], [8.0, 9.0]])})
-    assert [world.hidden(2, time_s) for time_s in (2.9, 3.0, 3.9, 4.0, 8.5)] == [
-        False,
-        True,
-        True,
-        False,
-        True,
-    ]
-    assert not world.hidden(1, 3.5)
-
-
 def test_occlusions_do_not_change_the_drive() -> None:
     """The same seed drives the same way with and without trees."""
     scenario = ScenarioConfig()

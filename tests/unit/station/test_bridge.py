@@ -241,9 +241,19 @@ async def test_in_direct_mode_silence_is_no_stall() -> None:
     instrument, program, _ = await tracking()
     await instrument.direct()
     await asyncio.sleep(3600.0)
+    await instrument.check()
     await instrument.track(1)
     program.measure()
     await instrument.read()
+
+
+async def test_in_direct_mode_the_end_of_the_program_is_missed() -> None:
+    """Nobody reads then, but the client asks."""
+    instrument, program, _ = await tracking()
+    await instrument.direct()
+    program.exit("exit status 3")
+    with pytest.raises(InstrumentError, match="has ended"):
+        await instrument.check()
 
 
 async def test_a_command_without_an_answer_is_a_stall() -> None:

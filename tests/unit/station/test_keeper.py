@@ -15,7 +15,7 @@ from tsgt.errors import InstrumentError, InstrumentRefusedError
 from tsgt.radio.orders import Direction, DirectOrder, MeasureOrder, SearchOrder, TrackOrder
 from tsgt.simulation.clocks import VirtualClock
 from tsgt.station.instrument import Atmosphere, Condition, Reading
-from tsgt.station.keeper import NOT_CONNECTED, Done, InstrumentKeeper
+from tsgt.station.keeper import CHECK_S, NOT_CONNECTED, Done, InstrumentKeeper
 from tsgt.station.session import Session
 
 if TYPE_CHECKING:
@@ -169,6 +169,20 @@ async def test_the_air_is_set_while_nothing_is_measured() -> None:
     async with bench() as day:
         assert (await day.ordered(DirectOrder())).ok
         assert await day.keeper.set_atmosphere(WARM) == ""
+        assert (await day.ordered(MeasureOrder())).ok
+
+
+async def test_an_instrument_that_goes_while_nothing_is_measured_is_missed() -> None:
+    """In direct mode nobody reads: it is asked now and then, and connected again when it is back."""
+    async with bench() as day:
+        assert (await day.ordered(DirectOrder())).ok
+        day.instrument.plugged = False
+        await asyncio.sleep(CHECK_S + 0.1)
+        assert "is the cable in?" in day.keeper.condition.problem
+        day.instrument.plugged = True
+        await asyncio.sleep(3.0)
+        assert not day.keeper.condition.problem
+        assert day.instrument.prisms[-1] is None
         assert (await day.ordered(MeasureOrder())).ok
 
 

@@ -13,6 +13,9 @@ from tsgt.config.scenario import InstrumentModelConfig, StatusFaultConfig
 from tsgt.errors import InstrumentError, InstrumentRefusedError
 from tsgt.model import Status
 from tsgt.radio.orders import Direction
+from tsgt.simulation.geocom_server import Forced
+from tsgt.station.geocom import Rpc
+from tsgt.station.geocom_codes import ReturnCode
 from tsgt.station.instrument import Atmosphere
 from tsgt.station.keeper import InstrumentKeeper
 from tsgt.station.session import Session
@@ -310,6 +313,56 @@ async def test_single_measurements_of_a_foil(faces: int) -> None:
         await day.instrument.track(1)
         assert (await day.read_until(Status.OK, within_s=30.0)).prism == 1
         assert day.station.settings.prism_constant_m == 0.0
+
+
+@pytest.mark.parametrize("code", [ReturnCode.TMC_BUSY, ReturnCode.FATAL])
+async def test_the_distance_of_the_last_shot_is_not_given_again(code: ReturnCode) -> None:
+    """An instrument that will not forget it has it still, whatever it is pointed at by now."""
+    async with leica_bench() as day:
+        await day.begin()
+        await day.instrument.direct()
+        day.station.aim(1)
+        first = await day.instrument.measure()
+        day.station.server.forced.append(Forced(code=code, rpc=Rpc.TMC_DO_MEASURE, times=1))
+        second = await day.instrument.measure()
+        assert second.instrument_time_ns != first.instrument_time_ns
+        day.station.server.forced.append(Forced(code=code, rpc=Rpc.TMC_DO_MEASURE, times=20))
+        with pytest.raises(InstrumentRefusedError, match="begins no new measurement"):
+            await day.instrument.measure()
+
+
+async def test_a_shot_is_set_up_anew_after_a_power_cycle() -> None:
+    """The instrument has forgotten that the target is a foil; nobody had told that it was off."""
+    async with leica_bench() as day:
+        await day.begin()
+        await day.instrument.direct()
+        day.station.aim(1)
+        before = await day.instrument.measure()
+        day.station.switch_off()
+        day.station.switch_on()
+        await asyncio.sleep(6.0)
+        day.station.settings.prism_type, day.station.settings.prism_constant_m = 0, 0.0
+        day.station.aim(1)
+        after = await day.instrument.measure()
+    assert before.slope_distance_m is not None
+    assert after.slope_distance_m == pytest.approx(before.slope_distance_m, abs=0.01)
+
+
+async def test_the_wrap_of_its_time_costs_some_seconds() -> None:
+    """After 24.8 days its milliseconds are negative: stamps are as good as before, and not as good as distances alone."""
+    async with leica_bench() as day:
+        day.station._on_since_ns = day.clock.monotonic_ns() - (2**31 - 15_000) * 1_000_000
+        await day.begin()
+        readings = [reading for reading in await day.read_for(40.0) if reading.status.usable]
+        truths = {each.instrument_ms: each.true_ns for each in day.station.offered}
+        late_ms = [
+            (reading.at_ns - truths[reading.instrument_time_ns // 1_000_000]) / 1e6
+            for reading in readings
+            if reading.instrument_time_ns is not None
+        ]
+    assert any((reading.instrument_time_ns or 0) < 0 for reading in readings)
+    assert len(late_ms) > 85
+    assert all(15.0 < late < 30.0 for late in late_ms)
 
 
 async def test_calls_at_the_wrong_time_are_refused() -> None:

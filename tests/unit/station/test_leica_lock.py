@@ -133,6 +133,14 @@ def test_a_telescope_that_was_turned_away_goes_back_first() -> None:
     assert look.centre == HERE
 
 
+def test_a_person_may_turn_the_telescope_after_a_round_in_vain() -> None:
+    """Who was asked to point it at the prism must not see it turned away again."""
+    searches = sequence()
+    searches.turned_away()
+    assert round_of(searches, 0)[0].centre == HERE
+    assert round_of(searches, 60 * S)[0].centre is None
+
+
 def test_another_prism_has_no_last_direction() -> None:
     """What was known of the old one is of no use."""
     searches = sequence()

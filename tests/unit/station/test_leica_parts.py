@@ -7,13 +7,14 @@ import math
 import pytest
 
 from tsgt.config.client import LeicaInstrumentConfig
+from tsgt.errors import InstrumentRefusedError
 from tsgt.model import Status
 from tsgt.station.geocom_connection import Reply
 from tsgt.station.leica_measurement import FullMeasurement, Readings, full_measurement
 from tsgt.station.leica_models import model_of
 from tsgt.station.leica_pace import Pace
 from tsgt.station.leica_setup import PRISM_TYPES, TRACKING_MODES, wet_temperature_c
-from tsgt.station.leica_target import both_faces
+from tsgt.station.leica_target import both_faces, check_same_target
 
 MS = 1_000_000
 GOOD = (1.5, 1.6, 1e-6, 0.0, 0.0, 1e-6, 50.5, 12_345)
@@ -61,6 +62,10 @@ def test_other_codes_give_none(code: int, status: Status) -> None:
         (*GOOD[:6], 0.0, 12_345),
         (*GOOD[:6], float("nan"), 1),
         (*GOOD[:6], "x", 1),
+        (*GOOD[:6], 50_500.0, 12_345),
+        (*GOOD[:7], 1e308),
+        (15.2, *GOOD[1:]),
+        (1.5, 16.0, *GOOD[2:]),
         ("a", *GOOD[1:]),
     ],
 )
@@ -93,6 +98,20 @@ def test_the_mean_of_two_faces_is_free_of_the_axes_errors() -> None:
         assert mean.zenith_angle_rad == pytest.approx(1.4)
         assert mean.distance_m == pytest.approx(20.001)
         assert mean.status is Status.LOW_ACCURACY
+
+
+def test_two_faces_of_different_things_are_no_mean() -> None:
+    """Somebody has turned the telescope, or walked through the line of sight."""
+    first = FullMeasurement(1.0, 1.4, 20.0, 1, Status.OK, 0, 0)
+    second = FullMeasurement(1.0 + math.pi, math.tau - 1.4, 20.001, 2, Status.OK, 0, 0)
+    check_same_target(first, second)
+    for other in (
+        second._replace(distance_m=18.7),
+        second._replace(horizontal_angle_rad=1.02 + math.pi),
+        second._replace(zenith_angle_rad=math.tau - 1.38),
+    ):
+        with pytest.raises(InstrumentRefusedError, match="measure again"):
+            check_same_target(first, other)
 
 
 def test_a_status_is_repeated_now_and_then() -> None:

@@ -136,7 +136,7 @@ def asked_again(silent: Mapping[int, int], granted: Sequence[int]) -> set[int]:
     return missed if worth_it and 2 * len(missed) <= len(present) else set()
 
 
-def expected(beat: Beat, *, newest_us: int, heard_us: int, slot_us: int) -> int:
+def expected(beat: Beat, *, newest_us: int, heard_us: int, slot_us: int, ready_us: int = 0) -> int:
     """Return how many measurements a station has made at its slot that it could not have sent before; at least one.
 
     Parameters
@@ -149,11 +149,13 @@ def expected(beat: Beat, *, newest_us: int, heard_us: int, slot_us: int) -> int:
         When its last reply that came began.
     slot_us
         When its slot begins.
+    ready_us
+        How long a measurement needs from its instant until a reply can carry it.
     """
     if newest_us <= heard_us - 1.5 * beat.period_us:  # it did not measure, and may have begun again
         return max(math.ceil((slot_us - heard_us) / beat.period_us), 1)
-    ready_us = slot_us - COMPOSED_US + EARLY_US + EARLY_SPREADS * beat.spread_us
-    return max(int((ready_us - newest_us) / beat.period_us), 1)
+    made_us = slot_us - max(COMPOSED_US, ready_us) + EARLY_US + EARLY_SPREADS * beat.spread_us
+    return max(int((made_us - newest_us) / beat.period_us), 1)
 
 
 @lru_cache

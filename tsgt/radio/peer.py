@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -51,6 +52,10 @@ ANY_RUN_BYTES = 21
 
 LATEST_US = 20_000
 """Nothing is measured later than this after its reply should have begun, or has."""
+
+AGES_KEPT = 32
+READY_SHARE = 0.05
+"""Of so many replies it is looked at how old their newest measurement was; this share of them may be younger."""
 
 HISTORY = 4
 """Of so many frames a beacon says whether a reply is written."""
@@ -143,6 +148,7 @@ class Peer:
         self._exchange: tuple[int, int] | None = None
         self._rhythm = Rhythm()
         self._heard_us: int | None = None
+        self._newest_ages_us: deque[int] = deque(maxlen=AGES_KEPT)
         self._withheld = 0
         self._plain = False
 
@@ -213,6 +219,7 @@ class Peer:
             newest_us=newest_us,
             heard_us=self._heard_us,
             slot_us=self._session_us(slot_ns),
+            ready_us=self._ready_us(),
         )
         withheld = 0 if counter % MISSING_EVERY == self.number else self._withheld
         missing = max(self.inbox.missing - withheld, 0)
@@ -265,6 +272,9 @@ class Peer:
         for sighting in sightings:
             self._rhythm.add(self._session_us(sighting.measured_ns))
         self._heard_us = self._session_us(at.slot_ns)
+        if sightings:
+            newest_ns = max(sighting.measured_ns for sighting in sightings)
+            self._newest_ages_us.append((at.slot_ns - newest_ns) // 1000)
         self.silent = 0
         # One that sends nothing may have had no room: a measurement that is worse than most takes more.
         self._plain = bool(reply.runs) and _is_plain(reply.runs[0])
@@ -287,6 +297,15 @@ class Peer:
             answer=answer,
             shot=shot,
         )
+
+    def _ready_us(self) -> int:
+        """How old a measurement has to be to be in a reply: as young as its replies' youngest usually get.
+
+        Room for one that is made in time but not read yet would make every frame longer, and with frames as long as the
+        beat that leaves none to move it to where the measurement is in time.
+        """
+        ages_us = sorted(self._newest_ages_us)
+        return ages_us[int(READY_SHARE * len(ages_us))] if ages_us else 0
 
     def _introduced(self, reply: Reply) -> bool:
         introduction = reply.introduction

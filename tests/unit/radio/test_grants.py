@@ -53,6 +53,13 @@ def test_the_beat_says_how_many_there_are(newest_us: int, count: int) -> None:
     assert expected(BEAT, newest_us=newest_us, heard_us=400_000, slot_us=800_000) == count
 
 
+def test_no_room_is_kept_for_what_cannot_be_read_yet() -> None:
+    """A second measurement was made 90 ms before the slot; an instrument that needs 120 ms has one to send."""
+    slot_us = 890_000
+    assert expected(BEAT, newest_us=0, heard_us=400_000, slot_us=slot_us) == 2
+    assert expected(BEAT, newest_us=0, heard_us=400_000, slot_us=slot_us, ready_us=120_000) == 1
+
+
 def test_after_a_pause_measurements_may_begin_again() -> None:
     """As many as there can be since the last reply."""
     assert expected(BEAT, newest_us=0, heard_us=10_000_000, slot_us=10_400_000) == 1

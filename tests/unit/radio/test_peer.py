@@ -298,6 +298,23 @@ def test_whoever_was_not_heard_gets_room_for_what_has_come_up_since() -> None:
     assert set(found[6:]) == {44}
 
 
+def test_what_an_instrument_needs_is_learnt_from_its_replies() -> None:
+    """Replies whose newest measurement is never younger than 300 ms get no room for one that is."""
+    frames = settled()
+    frames.run(32)
+    frames.begin()
+    room = GRANT_BYTES[frames.beacon.stations[0].grant]
+    frames.end()
+    for _ in range(32):
+        frames.begin()
+        for station in frames.stations:
+            frames.measure(station, age_ms=300)
+        frames.end()
+    peer = frames.master._peers[1]
+    assert peer._ready_us() == pytest.approx(300_000, abs=1000)
+    assert granted(frames) <= room
+
+
 def test_missing_measurements_are_asked_for() -> None:
     """As many as the cap allows; no more when the station does not send them though it could."""
     frames = settled()

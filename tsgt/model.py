@@ -328,13 +328,47 @@ class StationParameters:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class MotionPrior:
+    """How a robot moves, as the estimator ``continuous`` expects it before anything is measured.
+
+    Attributes
+    ----------
+    acceleration_sigma_mps2
+        One sigma of the acceleration of the robot's origin along x, y, z of frame ``station1``.
+    acceleration_time_s
+        How long an acceleration lasts in s: after this its correlation has fallen to 1/e.
+    angular_acceleration_sigma_radps2
+        One sigma of the angular acceleration about x, y, z of the robot.
+    angular_acceleration_time_s
+        How long that lasts in s.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
+
+    acceleration_sigma_mps2: Vector3 = (0.4, 0.4, 0.2)
+    acceleration_time_s: float = 0.8
+    angular_acceleration_sigma_radps2: Vector3 = (0.15, 0.15, 0.2)
+    angular_acceleration_time_s: float = 0.4
+
+    def __post_init__(self) -> None:
+        """Refuse motion that no robot has."""
+        _check_limits(
+            self, acceleration_time_s=(1e-3, 1e4), angular_acceleration_time_s=(1e-3, 1e4)
+        )
+        for sigma in (*self.acceleration_sigma_mps2, *self.angular_acceleration_sigma_radps2):
+            if not 1e-6 <= sigma <= 1e6:
+                raise ValueError(f"a sigma of an acceleration is {sigma}, expected 1e-06 to 1e+06")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PipelineParameters:
     """How measurements become poses.
 
     Attributes
     ----------
     estimator
-        Name of the estimator: ``linear``.
+        Name of the estimator: ``linear`` (straight lines between measurements) or ``continuous`` (one smooth
+        trajectory through all of them).
     period_ns
         Step of the pose epochs in ns; epochs are the whole multiples of it in Unix time.
     outage_limit_ns
@@ -348,14 +382,26 @@ class PipelineParameters:
         mirrored, or two stations have swapped prisms.
     acceleration_sigma_mps2
         One sigma, per axis, of the robot's acceleration between two measurements: what straight-line
-        interpolation does not see, and the covariance therefore has to carry.
+        interpolation does not see, and the covariance therefore has to carry. For ``linear``.
     angular_acceleration_sigma_radps2
-        The same for its angular acceleration.
+        The same for its angular acceleration. For ``linear``.
+    motion
+        How the robot moves. For ``continuous``.
+    noise_scale
+        What the noise of all instruments is multiplied by. For ``continuous``.
+    lag_ns
+        How long a live pose waits for measurements on its other side until it is smoothed for good, in ns; what
+        arrives later than this after it was made does not count. For ``continuous``.
+    position_sigma_limit_m
+        A pose whose position (of the prisms' centroid, in the direction in which it is known worst) has a sigma
+        above this is invalid. For ``continuous``.
+    rotation_sigma_limit_rad
+        The same for the sigma of its rotation. For ``continuous``.
     """
 
     __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
-    estimator: Literal["linear"] = "linear"
+    estimator: Literal["linear", "continuous"] = "linear"
     period_ns: int = 50_000_000
     outage_limit_ns: int = 1_000_000_000
     transport_limit_ns: int = 2_000_000_000
@@ -363,6 +409,11 @@ class PipelineParameters:
     tilt_limit_rad: float = math.pi / 2
     acceleration_sigma_mps2: float = 0.3
     angular_acceleration_sigma_radps2: float = 0.15
+    motion: MotionPrior = MotionPrior()
+    noise_scale: float = 1.0
+    lag_ns: int = 3_000_000_000
+    position_sigma_limit_m: float = 0.05
+    rotation_sigma_limit_rad: float = math.radians(2.0)
 
     def __post_init__(self) -> None:
         """Refuse limits that nothing can be computed with."""
@@ -375,6 +426,10 @@ class PipelineParameters:
             tilt_limit_rad=(0, math.pi),
             acceleration_sigma_mps2=(0, 1e6),
             angular_acceleration_sigma_radps2=(0, 1e6),
+            noise_scale=(1e-3, 1e3),
+            lag_ns=(0, 60_000_000_000),
+            position_sigma_limit_m=(0, 1e6),
+            rotation_sigma_limit_rad=(0, math.pi),
         )
 
 

@@ -12,6 +12,7 @@ so that a live stream, its replay and later processing agree exactly.
 from __future__ import annotations
 
 from tsgt.geometry.alignment import Alignment, BatchAlignment, align, align_many, align_triplets
+from tsgt.geometry.fixed_lag import FixedLag
 from tsgt.geometry.interpolation import (
     NO_GAP_NS,
     Interpolated,
@@ -19,6 +20,7 @@ from tsgt.geometry.interpolation import (
     interpolated_covariance,
     unseen_s2,
 )
+from tsgt.geometry.knots import Knots
 from tsgt.geometry.polar import (
     cartesian_jacobian,
     cartesian_to_polar,
@@ -36,6 +38,7 @@ from tsgt.geometry.pose import (
     twists,
     unseen_motion_covariance,
 )
+from tsgt.geometry.prism_factors import Observations
 from tsgt.geometry.rigid import (
     FloatArray,
     check_transform,
@@ -49,14 +52,19 @@ from tsgt.geometry.rigid import (
     transform_from,
     transform_points,
 )
+from tsgt.geometry.trajectory import Trajectory, point_covariance, ros_covariance
 
 __all__ = [
     "NO_GAP_NS",
     "Alignment",
     "BatchAlignment",
+    "FixedLag",
     "FloatArray",
     "Interpolated",
+    "Knots",
+    "Observations",
     "Poses",
+    "Trajectory",
     "align",
     "align_many",
     "align_triplets",
@@ -71,12 +79,14 @@ __all__ = [
     "invert",
     "log_so3",
     "measurement_covariance",
+    "point_covariance",
     "polar_jacobian",
     "polar_to_cartesian",
     "pose_covariance",
     "poses_from_prisms",
     "quaternion_from_rotation",
     "raw_distance",
+    "ros_covariance",
     "rotate",
     "rotation_from_quaternion",
     "skew",

@@ -1,0 +1,294 @@
+"""The estimator ``continuous``: one smooth trajectory through raw measurements at their own times. Pure.
+
+Prior: the robot's accelerations (:mod:`tsgt.geometry.motion_prior`). Likelihood: range and two angles of each measurement
+through the rigid robot (:mod:`tsgt.geometry.prism_factors`). The most probable trajectory is found by Gauss and Newton's
+method with halved steps on the states at the knots; each step solves one block tridiagonal system
+(:mod:`tsgt.geometry.block_tridiagonal`), whose inverse's blocks are the covariances. After S. Anderson and T. D. Barfoot, "Full
+STEAM ahead: exactly sparse Gaussian process regression for batch continuous-time trajectory estimation on SE(3)", IROS
+2015, with the position in frame ``station1`` and the rotation in the robot's frame, each with its own prior.
+docs/explanation/continuous-trajectory.md derives it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from tsgt.geometry.block_tridiagonal import BlockFactor, factorise
+from tsgt.geometry.knots import STATE, Knots, Steps, linearise_steps
+from tsgt.geometry.motion_prior import axis_sigmas
+from tsgt.geometry.prism_factors import linearise
+from tsgt.geometry.so3 import inverse_right_jacobian
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from tsgt.geometry.prism_factors import Linearised, Observations
+    from tsgt.geometry.rigid import FloatArray
+    from tsgt.model import MotionPrior
+
+LEAST_STEP_S = 0.02
+"""Knots are no closer: within half of this a robot's motion is told by velocity and acceleration."""
+
+OUTLYING = 4.0
+"""In sigmas of three dimensions: farther from the trajectory than this, a measurement counts the less the farther it is.
+One in a thousand good ones is (chi-square, 3 degrees of freedom: 16 is passed by 0.11 %)."""
+
+START_SPEED = 10.0
+START_TURN = 10.0
+"""One sigma of a robot's first velocity in m/s and of its turning in rad/s."""
+
+START_POSITION_M = 1e4
+START_ROTATION_RAD = 1e2
+"""One sigma of the first pose: none that tells anything."""
+
+MOST_ITERATIONS = 30
+SETTLED = 1e-3
+"""Less gain in cost (minus twice a log density) than this ends the search."""
+
+LEAST_SHARE = 1e-3
+"""A step is halved until it helps, but not below this."""
+
+
+@dataclass(frozen=True, slots=True)
+class Anchor:
+    """What is known of the first knot besides the measurements.
+
+    Attributes
+    ----------
+    mean
+        One knot.
+    information
+        (18, 18) inverse covariance of its error.
+    """
+
+    mean: Knots
+    information: FloatArray
+
+
+class Solution(NamedTuple):
+    """The most probable trajectory.
+
+    Attributes
+    ----------
+    knots
+        States.
+    factor
+        Of the system at the solution.
+    distances
+        (M,) squared distances of the measurements from the trajectory, in sigmas; good ones have 3 on average.
+    weights
+        (M,) what each measurement counts, 1 for those that are no outliers.
+    linearised
+        Measurements at the solution.
+    at
+        (M,) which knot each of them is near.
+    cost
+        Minus twice the logarithm of the posterior density, less what does not depend on the trajectory.
+    iterations
+        How many steps it took.
+    """
+
+    knots: Knots
+    factor: BlockFactor
+    distances: FloatArray
+    weights: FloatArray
+    linearised: Linearised
+    at: NDArray[np.intp]
+    cost: float
+    iterations: int
+
+
+class System(NamedTuple):
+    """The normal equations at some trajectory."""
+
+    diagonal: FloatArray
+    beside: FloatArray
+    gradient: FloatArray
+    cost: float
+    distances: FloatArray
+    weights: FloatArray
+    linearised: Linearised
+
+
+def knot_times(time_s: FloatArray, *, least_step_s: float = LEAST_STEP_S) -> FloatArray:
+    """Choose the instants of knots for measurements at some instants, in the order of time.
+
+    Parameters
+    ----------
+    time_s
+        (M,) in s, at least one.
+    least_step_s
+        Knots are no closer.
+    """
+    slots = np.unique(np.round(time_s / least_step_s).astype(np.int64))
+    # The mean of its measurements' times, so that one alone has its knot exactly there.
+    index = np.searchsorted(slots, np.round(time_s / least_step_s).astype(np.int64))
+    times: FloatArray = np.bincount(index, time_s) / np.bincount(index)
+    kept = np.concatenate([[True], np.diff(times) > 0.25 * least_step_s])
+    return times[kept]
+
+
+def nearest(knots_s: FloatArray, time_s: FloatArray) -> NDArray[np.intp]:
+    """(M,) which knot is nearest in time."""
+    after = np.clip(np.searchsorted(knots_s, time_s), 1, max(len(knots_s) - 1, 1))
+    if len(knots_s) == 1:
+        return np.zeros(len(time_s), np.intp)
+    return after - (time_s - knots_s[after - 1] < knots_s[after] - time_s)
+
+
+def start_anchor(first: Knots, prior: MotionPrior) -> Anchor:
+    """Return what is known of a robot of which nothing is known yet, about a first guess."""
+    sigmas = np.concatenate(
+        [
+            np.full(3, START_POSITION_M),
+            np.full(3, START_ROTATION_RAD),
+            np.full(3, START_SPEED),
+            np.full(3, START_TURN),
+            axis_sigmas(prior),
+        ]
+    )
+    zero = np.zeros((1, 3))
+    return Anchor(
+        Knots(first.time_s, first.position, first.rotation, zero, zero, zero, zero), np.diag(sigmas**-2.0)
+    )
+
+
+def solve(
+    observations: Observations,
+    guess: Knots,
+    prior: MotionPrior,
+    *,
+    anchor: Anchor | None = None,
+    most_iterations: int = MOST_ITERATIONS,
+) -> Solution:
+    """Find the most probable trajectory.
+
+    Parameters
+    ----------
+    observations
+        Measurements, in any order.
+    guess
+        States to begin with; their instants are those of the result's knots. Rotations must be right to about a radian.
+    prior
+        How the robot may move.
+    anchor
+        What is known of the first knot; nothing when not given.
+    most_iterations
+        After so many steps it ends where it is.
+
+    Raises
+    ------
+    GeometryError
+        The measurements do not determine the trajectory.
+    """
+    anchor = start_anchor(guess.select(slice(0, 1)), prior) if anchor is None else anchor
+    at = nearest(guess.time_s, observations.time_s)
+    steps = Steps.of(guess.time_s, prior)
+    knots, iterations = guess, 0
+    system = assemble(observations, at, knots, steps, anchor)
+    factor = factorise(system.diagonal, system.beside)
+    while iterations < most_iterations:
+        iterations += 1
+        move = factor.solve(-system.gradient)
+        tried, following = _searched(observations, at, knots, move, system, steps, anchor)
+        if tried is None:
+            break
+        gained = system.cost - tried.cost
+        knots, system = following, tried
+        factor = factorise(system.diagonal, system.beside)
+        if gained < SETTLED:
+            break
+    return Solution(
+        knots, factor, system.distances, system.weights, system.linearised, at, system.cost, iterations
+    )
+
+
+def _searched(
+    observations: Observations,
+    at: NDArray[np.intp],
+    knots: Knots,
+    move: FloatArray,
+    system: System,
+    steps: Steps,
+    anchor: Anchor,
+) -> tuple[System | None, Knots]:
+    """Go so far along a move that the cost falls; None where it does not on any way that rounding leaves visible.
+
+    Half of a step is better than a damped one here: damping by the diagonal would hold the whole stiff chain of knots
+    for the sake of one that turned too far.
+    """
+    promised = -float(np.einsum("ki,ki->", move, system.gradient))
+    if promised < SETTLED:
+        return None, knots
+    share = 1.0
+    while share > LEAST_SHARE:
+        following = knots.moved(share * move)
+        tried = assemble(observations, at, following, steps, anchor)
+        if tried.cost < system.cost - 0.1 * share * promised:
+            return tried, following
+        share /= 2.0
+    return None, knots
+
+
+def assemble(
+    observations: Observations, at: NDArray[np.intp], knots: Knots, steps: Steps, anchor: Anchor
+) -> System:
+    """Make the normal equations at some trajectory; ``at`` (M,) says which knot each measurement is near."""
+    count = len(knots)
+    linearised = linearise(observations, knots, at)
+    whiten = np.linalg.inv(np.linalg.cholesky(linearised.covariance(observations)))
+    residuals = (whiten @ linearised.residuals_m[..., None])[..., 0]
+    distances = np.einsum("ij,ij->i", residuals, residuals)
+    weights = np.where(distances > OUTLYING**2, OUTLYING**2 / np.maximum(distances, 1e-300), 1.0)
+    capped = np.where(
+        distances > OUTLYING**2,
+        OUTLYING**2 * (1.0 + np.log(np.maximum(distances, OUTLYING**2) / OUTLYING**2)),
+        distances,
+    )
+    jacobian = whiten @ linearised.jacobian
+    weighted = np.swapaxes(jacobian * weights[:, None, None], 1, 2)
+    diagonal, gradient = np.zeros((count, STATE, STATE)), np.zeros((count, STATE))
+    np.add.at(diagonal, at, weighted @ jacobian)
+    np.add.at(gradient, at, (weighted @ residuals[..., None])[..., 0])
+
+    between = linearise_steps(knots, steps)
+    earlier = np.swapaxes(between.by_earlier, 1, 2) @ between.weights
+    later = np.swapaxes(between.by_later, 1, 2) @ between.weights
+    diagonal[:-1] += earlier @ between.by_earlier
+    diagonal[1:] += later @ between.by_later
+    beside = earlier @ between.by_later
+    gradient[:-1] += (earlier @ between.residuals[..., None])[..., 0]
+    gradient[1:] += (later @ between.residuals[..., None])[..., 0]
+
+    error = knots.select(slice(0, 1)).error_from(anchor.mean)[0]
+    by_error = np.eye(STATE)
+    by_error[3:6, 3:6] = inverse_right_jacobian(error[3:6])
+    diagonal[0] += by_error.T @ anchor.information @ by_error
+    gradient[0] += by_error.T @ anchor.information @ error
+    cost = (
+        float(capped.sum())
+        + float(np.einsum("ki,kij,kj->", between.residuals, between.weights, between.residuals))
+        + float(error @ anchor.information @ error)
+    )
+    return System(diagonal, beside, gradient, cost, distances, weights, linearised)
+
+
+def log_evidence(solution: Solution, observations: Observations, prior: MotionPrior) -> float:
+    """How well a prior explains the measurements: logarithm of their density, trajectory integrated out (Laplace).
+
+    Terms that are the same for all priors are left out; measurements and noise must be the same where two are compared.
+    """
+    steps = Steps.of(solution.knots.time_s, prior)
+    _, step_logdet = np.linalg.slogdet(steps.information)
+    _, noise_logdet = np.linalg.slogdet(solution.linearised.covariance(observations))
+    anchor_logdet = -2.0 * float(np.log(axis_sigmas(prior)).sum())
+    return -0.5 * (
+        solution.cost
+        + solution.factor.log_determinant()
+        - float(step_logdet.sum())
+        - anchor_logdet
+        + float(noise_logdet.sum())
+    )

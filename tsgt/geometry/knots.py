@@ -1,0 +1,203 @@
+"""A trajectory as its states at some instants, and what the motion prior says of neighbours. Pure.
+
+The error of a state has 18 parts, in this order, three of each: position (frame ``station1``), rotation (about the axes of
+the robot, ``R Exp(d)``), velocity (frame ``station1``), angular velocity (robot), and the two accelerations likewise. So the
+parts of axis i are i, 6 + i and 12 + i.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.geometry.motion_prior import axis_sigmas, process_information, transition
+from tsgt.geometry.rigid import FloatArray, dot, exp_so3, log_so3, skew
+from tsgt.geometry.so3 import inverse_right_jacobian
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from tsgt.model import MotionPrior
+
+STATE = 18
+
+_LEAST_LONG_WAY_RAD = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class Knots:
+    """States at K instants.
+
+    Attributes
+    ----------
+    time_s
+        (K,) strictly increasing, from the trajectory's origin of time.
+    position, velocity, acceleration
+        (K, 3) of the robot's origin in frame ``station1``: m, m/s, m/s^2.
+    rotation
+        (K, 3, 3) ``R_station1_robot``.
+    angular_velocity, angular_acceleration
+        (K, 3) in the frame of the robot: rad/s, rad/s^2.
+    """
+
+    time_s: FloatArray
+    position: FloatArray
+    rotation: FloatArray
+    velocity: FloatArray
+    angular_velocity: FloatArray
+    acceleration: FloatArray
+    angular_acceleration: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    def select(self, rows: slice | NDArray[np.intp]) -> Knots:
+        """Return some of them."""
+        return Knots(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    def moved(self, error: FloatArray) -> Knots:
+        """Return the states with errors, shape (K, 18), added."""
+        return Knots(
+            self.time_s,
+            self.position + error[:, 0:3],
+            self.rotation @ exp_so3(error[:, 3:6]),
+            self.velocity + error[:, 6:9],
+            self.angular_velocity + error[:, 9:12],
+            self.acceleration + error[:, 12:15],
+            self.angular_acceleration + error[:, 15:18],
+        )
+
+    def error_from(self, other: Knots) -> FloatArray:
+        """Return the errors, shape (K, 18), that :meth:`moved` would have to add to ``other`` to get these states."""
+        return np.concatenate(
+            [
+                self.position - other.position,
+                log_so3(np.swapaxes(other.rotation, 1, 2) @ self.rotation),
+                self.velocity - other.velocity,
+                self.angular_velocity - other.angular_velocity,
+                self.acceleration - other.acceleration,
+                self.angular_acceleration - other.angular_acceleration,
+            ],
+            axis=1,
+        )
+
+
+def joined(parts: list[Knots]) -> Knots:
+    """Return the states of all parts in their order."""
+    return Knots(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Knots)))
+
+
+@dataclass(frozen=True, slots=True)
+class Steps:
+    """What the prior says of the K - 1 steps from knot to knot; depends on their times alone.
+
+    Attributes
+    ----------
+    phi
+        (K - 1, 6, 3, 3) transition of each axis.
+    information
+        (K - 1, 6, 3, 3) inverse of the covariance of what is added on the way.
+    """
+
+    phi: FloatArray
+    information: FloatArray
+
+    @classmethod
+    def of(cls, time_s: FloatArray, prior: MotionPrior) -> Steps:
+        """Make them for K instants."""
+        dt_s = np.diff(time_s)[:, None]
+        times_s = np.array([prior.acceleration_time_s, prior.angular_acceleration_time_s])
+        two_phi, two_information = transition(dt_s, times_s), process_information(dt_s, times_s)
+        weights = 1.0 / axis_sigmas(prior) ** 2
+        return cls(
+            np.repeat(two_phi, 3, axis=1),
+            np.repeat(two_information, 3, axis=1) * weights[:, None, None],
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class LinearisedSteps:
+    """How far K - 1 steps are from what the prior expects.
+
+    Attributes
+    ----------
+    earlier, later
+        (K - 1, 6, 3) by axis: velocity and acceleration of the earlier knot, with zero for its position; the later
+        knot's position or turn counted from there, its velocity and acceleration.
+    residuals
+        (K - 1, 18) later state less what is expected of the earlier one.
+    by_earlier, by_later
+        (K - 1, 18, 18) their derivatives.
+    weights
+        (K - 1, 18, 18) information.
+    """
+
+    earlier: FloatArray
+    later: FloatArray
+    residuals: FloatArray
+    by_earlier: FloatArray
+    by_later: FloatArray
+    weights: FloatArray
+
+
+def linearise_steps(knots: Knots, steps: Steps) -> LinearisedSteps:
+    """Compare neighbours with the motion prior; exact derivatives.
+
+    The rotation from one knot to the next, as a vector, is the sum of the turns on the way only where the axis stands
+    still. Where it wanders, dt^2 / 12 of the cross product of both angular velocities is taken off (W. Magnus, 1954, to
+    fourth order in dt); the rest is linear in the angular acceleration, as the prior has it.
+    """
+    count = len(knots) - 1
+    dt_s = np.diff(knots.time_s)
+    turn = turn_between(knots.select(slice(None, -1)), knots.select(slice(1, None)))
+    before, after = knots.angular_velocity[:-1], knots.angular_velocity[1:]
+    wander = (dt_s**2 / 12)[:, None]
+    earlier = _stacked(
+        np.zeros((count, 6)),
+        np.concatenate([knots.velocity[:-1], before], axis=1),
+        np.concatenate([knots.acceleration[:-1], knots.angular_acceleration[:-1]], axis=1),
+    )
+    later = _stacked(
+        np.concatenate([np.diff(knots.position, axis=0), turn - wander * np.cross(before, after)], axis=1),
+        np.concatenate([knots.velocity[1:], after], axis=1),
+        np.concatenate([knots.acceleration[1:], knots.angular_acceleration[1:]], axis=1),
+    )
+    residuals = (later - (steps.phi @ earlier[..., None])[..., 0]).transpose(0, 2, 1).reshape(count, STATE)
+    by_earlier = -spread(steps.phi)
+    by_later = np.broadcast_to(np.eye(STATE), (count, STATE, STATE)).copy()
+    by_earlier[:, 3:6, 3:6] = -inverse_right_jacobian(-turn)
+    by_earlier[:, 3:6, 9:12] += wander[:, None] * skew(after)
+    by_later[:, 3:6, 3:6] = inverse_right_jacobian(turn)
+    by_later[:, 3:6, 9:12] -= wander[:, None] * skew(before)
+    return LinearisedSteps(earlier, later, residuals, by_earlier, by_later, spread(steps.information))
+
+
+def turn_between(before: Knots, after: Knots) -> FloatArray:
+    """Turn from some states to others in rad, (N, 3): by more than pi where the angular velocities say so.
+
+    A robot that goes on turning while nothing is seen of it comes back farther round than the shortest way. Less than
+    0.3 rad from where it was it may have made a whole turn or none: then the shortest way stands.
+    """
+    turn = log_so3(np.swapaxes(before.rotation, 1, 2) @ after.rotation)
+    dt_s = (after.time_s - before.time_s)[:, None]
+    expected = 0.5 * dt_s * (before.angular_velocity + after.angular_velocity)
+    angle = np.sqrt(dot(turn, turn))[:, None]
+    the_other_way = turn * (1.0 - 2 * np.pi / np.maximum(angle, _LEAST_LONG_WAY_RAD))
+    off, other_off = turn - expected, the_other_way - expected
+    longer = (angle[:, 0] > _LEAST_LONG_WAY_RAD) & (dot(other_off, other_off) < dot(off, off))
+    return np.where(longer[:, None], the_other_way, turn)
+
+
+def spread(by_axis: FloatArray) -> FloatArray:
+    """Return matrices of the six axes, (N, 6, 3, 3), as one of the state, (N, 18, 18)."""
+    matrix = np.zeros((len(by_axis), 3, 6, 3, 6))
+    axes = np.arange(6)
+    matrix[:, :, axes, :, axes] = by_axis.transpose(1, 0, 2, 3)
+    return matrix.reshape(-1, STATE, STATE)
+
+
+def _stacked(position: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> FloatArray:
+    """Return the three orders, (N, 6) each, by axis: (N, 6, 3)."""
+    return np.stack([position, velocity, acceleration], axis=-1)

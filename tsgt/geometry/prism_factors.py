@@ -1,0 +1,200 @@
+"""What a total station says of a robot's trajectory: its range and two angles to a prism as residuals. Pure.
+
+A prism's measurement is compared with where the robot's motion puts the prism at the time of the measurement:
+``h(T_1k^-1 T_1R(t) p)``. The range's residual stands along the line of sight; those of the two angles stand across it, as
+lengths at the measured distance (horizontally, and in the plane of the zenith angle), so that neither the circle's zero
+nor the direction straight up is a special case.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.geometry.rigid import FloatArray, dot, exp_so3, rotate, skew
+from tsgt.geometry.so3 import right_jacobian
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from tsgt.geometry.knots import Knots
+
+
+@dataclass(frozen=True, slots=True)
+class Observations:
+    """M measurements of prisms, in the order of time.
+
+    Attributes
+    ----------
+    time_s
+        (M,) when they were made, in s from the trajectory's origin of time, the station's latency taken off.
+    time_sigma_s
+        (M,) one sigma of it.
+    points_m
+        (M, 3) measured prism in the frame of its station, constants applied.
+    sigmas_m
+        (M, 3) one sigma along the line of sight, and across it: horizontally, and in the plane of the zenith angle.
+    polar
+        (M,) angles and a range; otherwise the three coordinates themselves were measured.
+    station, prism
+        (M,) rows of ``frames`` and ``layout`` that they belong to.
+    frames
+        (S, 4, 4) ``T_station1_station``.
+    layout
+        (P, 3) prisms in the robot frame in m.
+    """
+
+    time_s: FloatArray
+    time_sigma_s: FloatArray
+    points_m: FloatArray
+    sigmas_m: FloatArray
+    polar: NDArray[np.bool_]
+    station: NDArray[np.intp]
+    prism: NDArray[np.intp]
+    frames: FloatArray
+    layout: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    def select(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Observations:
+        """Return some of them."""
+        kept = {
+            f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name not in ("frames", "layout")
+        }
+        return replace(self, **kept)
+
+    def in_world(self) -> FloatArray:
+        """(M, 3) measured points in frame ``station1``, in m."""
+        frames = self.frames[self.station]
+        return rotate(frames[:, :3, :3], self.points_m) + frames[:, :3, 3]
+
+
+@dataclass(frozen=True, slots=True)
+class Linearised:
+    """Residuals of M measurements and how they change with the trajectory.
+
+    Attributes
+    ----------
+    residuals_m
+        (M, 3) predicted less measured: along the line of sight, horizontally and vertically across it.
+    jacobian
+        (M, 3, 18) by the error of the knot's state, in the order of :class:`~tsgt.geometry.knots.Knots`.
+    by_point
+        (M, 3, 3) by the prism's position in frame ``station1``.
+    point_m, velocity_mps
+        (M, 3) where the trajectory puts the prism at the time of the measurement, and how fast it is there.
+    rotation
+        (M, 3, 3) of the robot at that time.
+    """
+
+    residuals_m: FloatArray
+    jacobian: FloatArray
+    by_point: FloatArray
+    point_m: FloatArray
+    velocity_mps: FloatArray
+    rotation: FloatArray
+
+    def covariance(self, observations: Observations) -> FloatArray:
+        """(M, 3, 3) covariance of the residuals in m^2: the instrument's noise, and uncertain times on a moving prism."""
+        moved = rotate(self.by_point, self.velocity_mps) * observations.time_sigma_s[:, None]
+        covariance: FloatArray = moved[:, :, None] * moved[:, None, :]
+        for axis in range(3):
+            covariance[:, axis, axis] += observations.sigmas_m[:, axis] ** 2
+        return covariance
+
+
+def linearise(observations: Observations, knots: Knots, at: NDArray[np.intp]) -> Linearised:
+    """Compare measurements with a trajectory.
+
+    Parameters
+    ----------
+    observations
+        M measurements.
+    knots
+        The trajectory.
+    at
+        (M,) which knot each measurement is near; from there the robot's velocity and acceleration carry to its time.
+
+    Returns
+    -------
+    Linearised
+        Exact derivatives; see ``docs/explanation/continuous-trajectory.md``.
+    """
+    delta_s = (observations.time_s - knots.time_s[at])[:, None]
+    half = 0.5 * delta_s**2
+    arm = observations.layout[observations.prism]
+    turn = knots.angular_velocity[at] * delta_s + knots.angular_acceleration[at] * half
+    turned = exp_so3(turn)
+    rotation = knots.rotation[at] @ turned
+    point = (
+        knots.position[at]
+        + knots.velocity[at] * delta_s
+        + knots.acceleration[at] * half
+        + rotate(rotation, arm)
+    )
+    rate = knots.angular_velocity[at] + knots.angular_acceleration[at] * delta_s
+    velocity = knots.velocity[at] + knots.acceleration[at] * delta_s + rotate(rotation, np.cross(rate, arm))
+    residuals, by_point = _compared(observations, point)
+    jacobian = np.empty((len(observations), 3, 18))
+    by_rotation_then = -by_point @ rotation @ skew(arm)
+    by_turn = by_rotation_then @ right_jacobian(turn)
+    jacobian[:, :, 0:3] = by_point
+    jacobian[:, :, 3:6] = by_rotation_then @ np.swapaxes(turned, 1, 2)
+    jacobian[:, :, 6:9] = by_point * delta_s[:, None]
+    jacobian[:, :, 9:12] = by_turn * delta_s[:, None]
+    jacobian[:, :, 12:15] = by_point * half[:, None]
+    jacobian[:, :, 15:18] = by_turn * half[:, None]
+    return Linearised(residuals, jacobian, by_point, point, velocity, rotation)
+
+
+def _compared(observations: Observations, point: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Residuals of predicted points in frame ``station1``, (M, 3), and their derivatives by these, (M, 3, 3)."""
+    frames = observations.frames[observations.station]
+    to_station = np.swapaxes(frames[:, :3, :3], 1, 2)
+    predicted = rotate(to_station, point - frames[:, :3, 3])
+    measured = observations.points_m
+    residuals = predicted - measured
+    by_predicted = np.broadcast_to(np.eye(3), (len(point), 3, 3)).copy()
+    polar = observations.polar
+    if polar.any():
+        axes, measured_m = line_of_sight_axes(measured[polar])
+        seen = predicted[polar]
+        distance_m = np.sqrt(dot(seen, seen))
+        direction = seen / distance_m[:, None]
+        residuals[polar, 0] = distance_m - measured_m
+        residuals[polar, 1:] = measured_m[:, None] * rotate(axes, direction)[:, 1:]
+        shrink = (measured_m / distance_m)[:, None, None]
+        away = axes[:, 1:] - (axes[:, 1:] @ direction[:, :, None]) * direction[:, None, :]
+        by_predicted[polar, 0] = direction
+        by_predicted[polar, 1:] = shrink * away
+    return residuals, by_predicted @ to_station
+
+
+def line_of_sight_axes(points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Give unit vectors along and across the lines of sight to points in the station frame.
+
+    Parameters
+    ----------
+    points_m
+        (M, 3).
+
+    Returns
+    -------
+    axes : FloatArray
+        (M, 3, 3) rows: along, horizontally across (growing horizontal angle), across with growing zenith angle.
+    distance_m : FloatArray
+        (M,).
+    """
+    distance_m = np.sqrt(dot(points_m, points_m))
+    along = points_m / distance_m[:, None]
+    flat = np.hypot(along[:, 0], along[:, 1])
+    safe = np.where(flat > 0, flat, 1.0)
+    cosine, sine = np.where(flat > 0, along[:, 0] / safe, 1.0), np.where(flat > 0, along[:, 1] / safe, 0.0)
+    zero = np.zeros_like(flat)
+    # Horizontal angles grow clockwise, seen from above.
+    horizontal = np.stack([sine, -cosine, zero], axis=-1)
+    downward = np.stack([along[:, 2] * cosine, along[:, 2] * sine, -flat], axis=-1)
+    return np.stack([along, horizontal, downward], axis=1), distance_m

@@ -1,0 +1,185 @@
+"""A fitted trajectory at any instant: pose, velocity, covariance. Pure.
+
+Between two knots the motion prior interpolates, given both (S. Anderson and others, "Batch nonlinear continuous-time
+trajectory estimation as exactly sparse Gaussian process regression", Autonomous Robots 39, 2015); before the first and after
+the last one it predicts, and the covariance grows as it honestly must.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.geometry.knots import STATE, Knots, joined, spread, turn_between
+from tsgt.geometry.motion_prior import axis_sigmas, axis_times_s, between, process_noise, transition
+from tsgt.geometry.rigid import FloatArray, exp_so3, skew
+from tsgt.geometry.so3 import inverse_right_jacobian, right_jacobian
+
+if TYPE_CHECKING:
+    from tsgt.model import MotionPrior
+
+_AT_ONCE = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """A robot's motion with its uncertainty.
+
+    Attributes
+    ----------
+    knots
+        States at K instants.
+    prior
+        How the robot moves between them.
+    covariance
+        (K, 18, 18) of the states' errors.
+    beside
+        (K - 1, 18, 18) covariance of each state's error (rows) with the next one's (columns).
+    """
+
+    knots: Knots
+    prior: MotionPrior
+    covariance: FloatArray
+    beside: FloatArray
+
+    def at(self, time_s: FloatArray) -> tuple[Knots, FloatArray]:
+        """Return the states at N instants, in any order, and the covariance of their errors, (N, 18, 18)."""
+        parts = [self._at(time_s[i : i + _AT_ONCE]) for i in range(0, len(time_s), _AT_ONCE)]
+        if not parts:
+            return self.knots.select(slice(0, 0)), np.empty((0, STATE, STATE))
+        return joined([states for states, _ in parts]), np.concatenate([found for _, found in parts])
+
+    def _at(self, time_s: FloatArray) -> tuple[Knots, FloatArray]:
+        later = np.searchsorted(self.knots.time_s, time_s, side="left")
+        inside = (later > 0) & (later < len(self.knots))
+        if inside.all():
+            return self._between(time_s, later)
+        states, covariance = self._beyond(time_s, np.clip(later - 1, 0, None))
+        if inside.any():
+            some, some_covariance = self._between(time_s[inside], later[inside])
+            for name in Knots.__slots__:
+                getattr(states, name)[inside] = getattr(some, name)
+            covariance[inside] = some_covariance
+        return states, covariance
+
+    def _beyond(self, time_s: FloatArray, knot: np.ndarray) -> tuple[Knots, FloatArray]:
+        """Predict from one knot, forwards or backwards: the prior's process looks the same either way."""
+        start = self.knots.select(knot)
+        dt_s = time_s - start.time_s
+        ahead_s = np.abs(dt_s)[:, None]
+        times_s, sigmas = axis_times_s(self.prior), axis_sigmas(self.prior)
+        phi = transition(ahead_s, times_s)
+        noise = process_noise(ahead_s, times_s) * (sigmas**2)[:, None, None]
+        # Backwards a velocity has the other sign, and with it what couples it with position and acceleration.
+        flip = np.where(dt_s < 0, -1.0, 1.0)[:, None]
+        for row, column in ((0, 1), (1, 0), (1, 2), (2, 1)):
+            phi[..., row, column] *= flip
+            noise[..., row, column] *= flip
+        zero = np.zeros((len(time_s), 6))
+        moved = phi @ np.stack([zero, _velocities(start), _accelerations(start)], axis=-1)[..., None]
+        moved = moved[..., 0]
+        wander, before, here = (dt_s**2 / 12)[:, None], start.angular_velocity, moved[:, 3:, 1]
+        turn = moved[:, 3:, 0] + wander * np.cross(before, here)
+        states = _states(time_s, start.position + moved[:, :3, 0], start.rotation @ exp_so3(turn), moved)
+        to_error = _to_error(turn, wander, before)
+        by_start = to_error @ spread(phi)
+        by_start[:, 3:6, 9:12] -= to_error[:, 3:6, 3:6] @ (wander[..., None] * skew(here))
+        by_start[:, 3:6, 3:6] = exp_so3(-turn)
+        covariance = by_start @ self.covariance[knot] @ np.swapaxes(by_start, 1, 2)
+        return states, _symmetric(covariance + to_error @ spread(noise) @ np.swapaxes(to_error, 1, 2))
+
+    def _between(self, time_s: FloatArray, later: np.ndarray) -> tuple[Knots, FloatArray]:
+        before, after = self.knots.select(later - 1), self.knots.select(later)
+        dt_s, step_s = time_s - before.time_s, after.time_s - before.time_s
+        times_s = axis_times_s(self.prior)
+        from_earlier, from_later, left = between(dt_s[:, None], (step_s - dt_s)[:, None], times_s)
+        wander, rate, later_rate = (step_s**2 / 12)[:, None], before.angular_velocity, after.angular_velocity
+        full_turn = turn_between(before, after)
+        turn = full_turn - wander * np.cross(rate, later_rate)
+        zero = np.zeros((len(time_s), 3))
+        earlier = np.stack(
+            [np.concatenate([before.position, zero], axis=1), _velocities(before), _accelerations(before)],
+            axis=-1,
+        )
+        at_later = np.stack(
+            [np.concatenate([after.position, turn], axis=1), _velocities(after), _accelerations(after)],
+            axis=-1,
+        )
+        found = (from_earlier @ earlier[..., None] + from_later @ at_later[..., None])[..., 0]
+        wander_here, here = (dt_s**2 / 12)[:, None], found[:, 3:, 1]
+        found_turn = found[:, 3:, 0] + wander_here * np.cross(rate, here)
+        states = _states(time_s, found[:, :3, 0], before.rotation @ exp_so3(found_turn), found)
+        by_earlier, by_later = spread(from_earlier), spread(from_later)
+        # The later rotation enters by the turn from the earlier one, less its wander; the result's by the turn to it.
+        by_turn = by_later[:, :, 3:6].copy()
+        by_later[:, :, 3:6] = by_turn @ inverse_right_jacobian(full_turn)
+        by_later[:, :, 9:12] -= by_turn @ (wander[..., None] * skew(rate))
+        by_earlier[:, :, 3:6] = -by_turn @ inverse_right_jacobian(-full_turn)
+        by_earlier[:, :, 9:12] += by_turn @ (wander[..., None] * skew(later_rate))
+        to_error = _to_error(found_turn, wander_here, rate)
+        by_earlier, by_later = to_error @ by_earlier, to_error @ by_later
+        by_earlier[:, 3:6, 9:12] -= to_error[:, 3:6, 3:6] @ (wander_here[..., None] * skew(here))
+        by_earlier[:, 3:6, 3:6] += exp_so3(-found_turn)
+        added = to_error @ spread(left * (axis_sigmas(self.prior) ** 2)[:, None, None])
+        cross = by_earlier @ self.beside[later - 1] @ np.swapaxes(by_later, 1, 2)
+        covariance = (
+            by_earlier @ self.covariance[later - 1] @ np.swapaxes(by_earlier, 1, 2)
+            + by_later @ self.covariance[later] @ np.swapaxes(by_later, 1, 2)
+            + cross
+            + np.swapaxes(cross, 1, 2)
+        )
+        return states, _symmetric(covariance + added @ np.swapaxes(to_error, 1, 2))
+
+
+def _to_error(turn: FloatArray, wander: FloatArray, rate: FloatArray) -> FloatArray:
+    """How errors in what the prior is linear in, turn less wander among it, become errors of a state; (N, 18, 18)."""
+    matrix = np.broadcast_to(np.eye(STATE), (len(turn), STATE, STATE)).copy()
+    matrix[:, 3:6, 3:6] = right_jacobian(turn)
+    matrix[:, 3:6, 9:12] = matrix[:, 3:6, 3:6] @ (wander[..., None] * skew(rate))
+    return matrix
+
+
+def _states(time_s: FloatArray, position: FloatArray, rotation: FloatArray, axes: FloatArray) -> Knots:
+    return Knots(time_s, position, rotation, axes[:, :3, 1], axes[:, 3:, 1], axes[:, :3, 2], axes[:, 3:, 2])
+
+
+def _velocities(knots: Knots) -> FloatArray:
+    return np.concatenate([knots.velocity, knots.angular_velocity], axis=1)
+
+
+def _accelerations(knots: Knots) -> FloatArray:
+    return np.concatenate([knots.acceleration, knots.angular_acceleration], axis=1)
+
+
+def _symmetric(matrix: FloatArray) -> FloatArray:
+    return 0.5 * (matrix + np.swapaxes(matrix, 1, 2))
+
+
+def ros_covariance(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Pose covariances as they leave the program.
+
+    Parameters
+    ----------
+    rotation
+        ``R_station1_robot``, (N, 3, 3).
+    covariance
+        Of states' errors, (N, 18, 18), or their first six parts.
+
+    Returns
+    -------
+    FloatArray
+        (N, 6, 6): x, y, z, rotation about the fixed axes x, y, z of ``station1``.
+    """
+    turned = np.zeros((len(rotation), 6, 6))
+    turned[:, :3, :3] = np.eye(3)
+    turned[:, 3:, 3:] = rotation
+    return _symmetric(turned @ covariance[:, :6, :6] @ np.swapaxes(turned, 1, 2))
+
+
+def point_covariance(rotation: FloatArray, covariance: FloatArray, arm: FloatArray) -> FloatArray:
+    """Covariance, (N, 3, 3), of where a point at ``arm`` (3,) in the robot frame is in frame ``station1``, in m^2."""
+    by_error = np.concatenate([np.broadcast_to(np.eye(3), rotation.shape), -rotation @ skew(arm)], axis=2)
+    found: FloatArray = by_error @ covariance[:, :6, :6] @ np.swapaxes(by_error, 1, 2)
+    return found

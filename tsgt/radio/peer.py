@@ -54,8 +54,7 @@ LATEST_US = 20_000
 """Nothing is measured later than this after its reply should have begun, or has."""
 
 AGES_KEPT = 32
-READY_SHARE = 0.05
-"""Of so many replies it is looked at how old their newest measurement was; this share of them may be younger."""
+"""Of so many replies it is looked at how old their newest measurement was."""
 
 HISTORY = 4
 """Of so many frames a beacon says whether a reply is written."""
@@ -299,13 +298,12 @@ class Peer:
         )
 
     def _ready_us(self) -> int:
-        """How old a measurement has to be to be in a reply: as young as its replies' youngest usually get.
+        """How old a measurement has to be to be in a reply: as the youngest of late was.
 
         Room for one that is made in time but not read yet would make every frame longer, and with frames as long as the
         beat that leaves none to move it to where the measurement is in time.
         """
-        ages_us = sorted(self._newest_ages_us)
-        return ages_us[int(READY_SHARE * len(ages_us))] if ages_us else 0
+        return min(self._newest_ages_us, default=0)
 
     def _introduced(self, reply: Reply) -> bool:
         introduction = reply.introduction

@@ -34,9 +34,9 @@ def test_a_fault_is_survived(kind: str) -> None:
 
 
 async def _wrong_digits(bench: Bench) -> None:
-    for _ in range(100):
+    for _ in range(300):
         bench.line.faults.script.append(LineFault.DIGIT)
-        await asyncio.sleep(0.73)
+        await asyncio.sleep(0.31)
 
 
 async def _lie_about_time(bench: Bench) -> None:
@@ -59,5 +59,5 @@ async def _never_again(bench: Bench) -> None:
 )
 def test_the_judge_is_awake(act: object, complaint: str) -> None:
     """Digits that change without a checksum, stamps beside the truth and endless silence are found."""
-    script = replace(Script("", 1, 3.0, _never_again), act=act)  # type: ignore[arg-type]
+    script = replace(Script("", 2, 3.0, _never_again), act=act)  # type: ignore[arg-type]
     assert any(complaint in wrong for wrong in run_script(script).wrong)

@@ -6,6 +6,7 @@
     ├── ConfigError            a configuration or set-up file cannot be used
     ├── InputFileError         a data file from outside cannot be used
     ├── OutputFileError        a result cannot be written
+    ├── MissingExtraError      a library that an extra of tsgt brings is not installed
     ├── RecordingError         a recording or journal cannot be read or written
     │   ├── CorruptLineError   one of its lines cannot be read
     │   └── RecordingVersionError  it was written in another version of the format
@@ -60,6 +61,15 @@ class OutputFileError(TsgtError):
     def __init__(self, message: str, *, path: Path) -> None:
         super().__init__(f"{path}: {message}")
         self.path = path
+
+
+class MissingExtraError(TsgtError, ImportError):
+    """A library that only some commands need is not installed: matplotlib, mcap."""
+
+    def __init__(self, purpose: str, *, library: str, extra: str) -> None:
+        super().__init__(f"{purpose} need {library}, which is not installed: pip install 'tsgt[{extra}]'")
+        self.library = library
+        self.extra = extra
 
 
 class RecordingError(TsgtError):

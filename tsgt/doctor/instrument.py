@@ -73,9 +73,7 @@ async def check_instrument(
         return [skipped(name, _STOP) for name in _NAMES]
     if isinstance(config, BridgeInstrumentConfig):
         return [check_program(machine, config)]
-    if isinstance(config, LeicaInstrumentConfig):
-        return await _ask(machine, config)
-    return [skipped("instrument", "it is simulated")]
+    return await _ask(machine, config)
 
 
 def check_program(machine: Machine, config: BridgeInstrumentConfig) -> Finding:

@@ -1,0 +1,106 @@
+"""The look that all figures share: legible in a paper's column, for the colour-blind, and in grey.
+
+Lines differ in colour, in lightness and in dashes, so that two of the three may be lost. matplotlib is an extra: it
+is imported when a figure is made, and never opens a window.
+"""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from tsgt.errors import MissingExtraError, OutputFileError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from matplotlib.figure import Figure
+
+COLUMN_MM = 88.0
+"""Width of a column in most journals."""
+PAGE_MM = 180.0
+"""Width of both columns."""
+
+FORMATS = (".png", ".pdf", ".svg")
+
+
+class Stroke(NamedTuple):
+    """How one of several curves is drawn."""
+
+    color: str
+    linestyle: str | tuple[int, tuple[float, ...]]
+    marker: str
+
+
+# Okabe and Ito's palette (2008), of which those colours are taken that differ in lightness too, darkest first.
+STROKES = (
+    Stroke("#000000", "-", "o"),
+    Stroke("#0072B2", (0, (5, 1.5)), "s"),
+    Stroke("#D55E00", (0, (1.2, 1.2)), "^"),
+    Stroke("#009E73", (0, (5, 1.5, 1.2, 1.5)), "D"),
+    Stroke("#E69F00", (0, (8, 2)), "v"),
+    Stroke("#56B4E9", (0, (3, 1, 1, 1, 1, 1)), "P"),
+)
+
+_STYLE: dict[Any, Any] = {
+    "font.size": 8,
+    "axes.labelsize": 8,
+    "axes.titlesize": 8,
+    "legend.fontsize": 7,
+    "xtick.labelsize": 7,
+    "ytick.labelsize": 7,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "grid.color": "#d9d9d9",
+    "grid.linewidth": 0.5,
+    "lines.linewidth": 1.2,
+    "lines.markersize": 4,
+    "legend.frameon": False,
+    "savefig.dpi": 200,
+    "svg.hashsalt": "tsgt",
+    "pdf.fonttype": 42,  # letters stay letters: searchable, and what publishers ask for
+}
+
+
+@contextmanager
+def drawing(*, width_mm: float, height_mm: float) -> Iterator[Figure]:
+    """Give an empty figure in the shared style; it is to be saved before the block ends.
+
+    Parameters
+    ----------
+    width_mm, height_mm
+        Size on paper.
+
+    Raises
+    ------
+    MissingExtraError
+        matplotlib is not installed.
+    """
+    try:
+        import matplotlib as mpl  # noqa: PLC0415 (an extra)
+        from matplotlib.figure import Figure  # noqa: PLC0415
+    except ImportError as error:
+        raise MissingExtraError("figures", library="matplotlib", extra="report") from error
+    with mpl.rc_context(_STYLE):
+        yield Figure(figsize=(width_mm / 25.4, height_mm / 25.4), layout="constrained")
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure in the format that its name ends in: one of :data:`FORMATS`.
+
+    Raises
+    ------
+    OutputFileError
+        Another ending, or a file that cannot be written.
+    """
+    if path.suffix not in FORMATS:
+        raise OutputFileError(f"figures end in {', '.join(FORMATS)}", path=path)
+    # Without a date, so that the same numbers give the same file.
+    metadata = {".png": None, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}[path.suffix]
+    try:
+        figure.savefig(path, metadata=metadata)
+    except OSError as error:
+        raise OutputFileError(error.strerror or str(error), path=path) from error

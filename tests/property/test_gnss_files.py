@@ -1,0 +1,104 @@
+"""The reader of RTKLIB's files: what was written is read back, and whatever else comes is refused in one line."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from support.pos_files import SECOND, Variant, write_pos
+
+from tsgt.analysis.gnss import receivers
+from tsgt.analysis.gnss_files import read_pos
+from tsgt.errors import InputFileError
+
+FIRST = 1_483_228_800  # 2017-01-01, from when on GPS is 18 s ahead of UTC
+LAST = 4_000_000_000
+
+variants = st.builds(
+    Variant,
+    coordinates=st.sampled_from(["geodetic", "sexagesimal", "ecef", "baseline"]),
+    system=st.sampled_from(["GPST", "UTC", "JST"]),
+    week=st.booleans(),
+    separator=st.sampled_from([" ", ",", "\t", ";"]),
+    velocity=st.booleans(),
+    decimals=st.integers(0, 9),
+)
+metres = st.floats(-5e3, 5e3).map(lambda value: round(value, 4))
+rows = st.lists(
+    st.tuples(
+        st.integers(FIRST, LAST), st.tuples(metres, metres, metres), st.integers(1, 7), st.integers(0, 60)
+    ),
+    min_size=1,
+    max_size=8,
+    unique_by=lambda row: row[0],
+)
+
+
+@given(variants, rows)
+def test_what_was_written_is_read(
+    variant: Variant, written: list[tuple[int, tuple[float, ...], int, int]]
+) -> None:
+    """Times exactly, places to the last digit of each format, in any order of time."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = write_pos(
+            Path(folder) / "rover.pos",
+            [second * SECOND for second, *_ in written],
+            np.array([place for _, place, *_ in written]),
+            variant,
+            quality=[quality for *_, quality, _ in written],
+            satellites=[satellites for *_, satellites in written],
+        )
+        file = read_pos(path)
+        (found,) = receivers([file])
+    expected = sorted(written)
+    assert found.times_ns.tolist() == [second * SECOND for second, *_ in expected]
+    assert found.quality.tolist() == [quality for *_, quality, _ in expected]
+    assert found.satellites.tolist() == [satellites for *_, satellites in expected]
+    places = np.array([place for _, place, *_ in expected])
+    apart_m = np.linalg.norm(found.points_m[1:] - found.points_m[0], axis=1)
+    np.testing.assert_allclose(apart_m, np.linalg.norm(places[1:] - places[0], axis=1), atol=5e-4)
+
+
+@given(
+    variants,
+    st.integers(0, 1500),
+    st.integers(0, 30),
+    st.text(st.sampled_from("0123456789.-/:, %\n\teE+abQ'\"é\u0660"), max_size=30),
+)
+def test_damage_is_refused_or_read(variant: Variant, start: int, length: int, put_in: str) -> None:
+    """A file in which something was overwritten is read, or refused with its name; nothing else happens."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "rover.pos"
+        times = [FIRST * SECOND + k * SECOND for k in range(3)]
+        write_pos(path, times, np.array([[k, 1.0, 2.0] for k in range(3)]), variant)
+        text = path.read_text(encoding="utf-8")
+        path.write_text(text[:start] + put_in + text[start + length :], encoding="utf-8")
+        check(path)
+
+
+@given(st.binary(max_size=200), st.booleans())
+def test_garbage_is_refused(content: bytes, header: bool) -> None:  # noqa: FBT001 (given by hypothesis)
+    """Bytes of any kind, also after a good header."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "rover.pos"
+        before = "\n".join([*Variant().header(), ""]).encode() if header else b""
+        path.write_bytes(before + content)
+        check(path)
+
+
+def check(path: Path) -> None:
+    """Read a file; where that works, the numbers are such as can be computed with."""
+    said = ""
+    try:
+        (found,) = receivers([read_pos(path)])
+    except InputFileError as error:
+        said = str(error)
+    if said:
+        assert said.startswith(str(path))
+        assert "\n" not in said
+        return
+    assert np.isfinite(found.points_m).all()
+    assert (np.diff(found.times_ns) > 0).all()

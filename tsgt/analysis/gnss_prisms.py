@@ -1,0 +1,102 @@
+"""Distances between prisms over time, to stand beside those between satellite receivers."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.analysis.gnss import Distances
+from tsgt.analysis.inter_prism import EPOCH_NS
+from tsgt.errors import RecordingError
+from tsgt.geometry import interpolate
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from tsgt.master.tracks import Track
+    from tsgt.model import Parameters
+
+
+def prism_pairs(parameters: Parameters, tracks: Mapping[int, Track], path: Path) -> tuple[Distances, ...]:
+    """Measure the distances between all prisms over time, as ``tsgt evaluate`` does: at 20 Hz, all pairs or none.
+
+    Parameters
+    ----------
+    parameters
+        The prism layout (the reference distances) and the outage limit.
+    tracks
+        One track per prism of the layout, in frame ``station1``.
+    path
+        The recording, for messages.
+
+    Raises
+    ------
+    RecordingError
+        A prism was not measured, or the layout has one prism only.
+    """
+    layout = {prism.prism: np.array(prism.position_m) for prism in parameters.prisms}
+    missing = [prism for prism in layout if not len(tracks[prism])]
+    if missing or len(layout) < 2:
+        what = f"prism {missing[0]} was not measured" if missing else "it has one prism only"
+        raise RecordingError(f"no distances between prisms: {what}", path=path)
+    start_ns = max(int(tracks[prism].times_ns[0]) for prism in layout)
+    end_ns = min(int(tracks[prism].times_ns[-1]) for prism in layout)
+    epochs = np.arange(-(-start_ns // EPOCH_NS), end_ns // EPOCH_NS + 1, dtype=np.int64) * EPOCH_NS
+    limit_ns = parameters.pipeline.outage_limit_ns
+    at_epochs = {p: interpolate(tracks[p].times_ns, tracks[p].points_m, epochs, limit_ns) for p in layout}
+    valid = np.logical_and.reduce([at_epochs[prism].valid for prism in layout])
+    return tuple(
+        Distances(
+            name=f"{a}-{b}",
+            times_ns=epochs[valid],
+            distances_m=np.linalg.norm(at_epochs[a].points - at_epochs[b].points, axis=1)[valid],
+            reference_m=float(np.linalg.norm(layout[a] - layout[b])),
+            quality=None,
+            invalid_ns=epochs[~valid],
+        )
+        for a, b in combinations(layout, 2)
+    )
+
+
+def common_part(
+    gnss: Sequence[Distances], prisms: Sequence[Distances], path: Path
+) -> tuple[tuple[Distances, ...], tuple[Distances, ...]]:
+    """Cut both to the time that they share, so that their figures are of the same stretch of the way.
+
+    Parameters
+    ----------
+    gnss, prisms
+        Distances between receivers, and between prisms.
+    path
+        The recording, for messages.
+
+    Raises
+    ------
+    RecordingError
+        They share no time.
+    """
+    theirs, ours = span(gnss), span(prisms)
+    if theirs is None or ours is None:
+        which = "receivers" if theirs is None else "prisms"
+        raise RecordingError(f"nothing to compare: there are no distances between {which}", path=path)
+    start_ns, end_ns = max(theirs[0], ours[0]), min(theirs[1], ours[1])
+    if start_ns > end_ns:
+        late = ours[0] > theirs[1]
+        raise RecordingError(
+            f"its distances {'begin' if late else 'end'} {(start_ns - end_ns) / 1e9:.1f} s "
+            f"{'after the end' if late else 'before the start'} of the receivers'; was the master's clock right?",
+            path=path,
+        )
+    both = tuple(tuple(pair.between(start_ns, end_ns) for pair in pairs) for pairs in (gnss, prisms))
+    if None in map(span, both):
+        raise RecordingError("while its prisms were seen the receivers had no positions in common", path=path)
+    return both[0], both[1]
+
+
+def span(pairs: Sequence[Distances]) -> tuple[int, int] | None:
+    """Return the first and the last time of any distance; None without one."""
+    times = np.concatenate([np.empty(0, np.int64), *(pair.times_ns for pair in pairs)])
+    return (int(times.min()), int(times.max())) if len(times) else None

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from tsgt.model import Measurement
 
 POSE_COLUMNS = (
-    *("stamp_ns", "valid", "reason"),
+    *("stamp_ns", "valid", "reason", "estimator", "kind"),
     *("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"),
     *("sigma_x_m", "sigma_y_m", "sigma_z_m", "sigma_rx_rad", "sigma_ry_rad", "sigma_rz_rad"),
     *("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps"),
@@ -75,7 +75,7 @@ def pose_csv(poses: Iterable[PoseRecord]) -> Iterator[str]:
         )
         yield _line(
             (
-                *(pose.stamp_ns, int(pose.valid), pose.reason),
+                *(pose.stamp_ns, int(pose.valid), pose.reason, pose.estimator, pose.kind),
                 *(pose.position_m or [None] * 3),
                 *(pose.orientation_xyzw or [None] * 4),
                 *sigmas,

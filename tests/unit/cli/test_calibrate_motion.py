@@ -1,0 +1,110 @@
+"""``tsgt calibrate motion`` through the real command line: on a made-up drive and on a published one."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from support.published import write_prisms, write_targets, write_tracks
+
+from tsgt.config import load_station_frames, load_station_latencies
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from support.cli import Tsgt
+    from support.scene import Motion
+
+from tsgt.geometry import exp_so3
+
+
+def winding(time_s: float) -> Motion:
+    """Rotation and position of a robot that winds its way over uneven ground."""
+    around = 0.1 * time_s
+    tilt = exp_so3(np.array([0.05 * np.sin(5 * around), 0.05 * np.cos(4 * around), 0.0]))
+    place = [40 + 12 * np.sin(around), 10 + 8 * np.sin(2 * around), -1 + 0.5 * np.sin(3.1 * around)]
+    return exp_so3(np.array([0.0, 0.0, 0.5 * around])) @ tilt, np.array(place)
+
+
+@pytest.fixture
+def recording(tsgt: Tsgt, tmp_path: Path) -> Path:
+    """Return a minute of exact measurements."""
+    path = tmp_path / "recording.jsonl"
+    tracks = write_tracks(tmp_path, winding, duration_s=60.0)
+    done = tsgt(
+        "import", "rts", "--tracks", *tracks, "--prisms", write_prisms(tmp_path),
+        "--targets", write_targets(tmp_path), "--output", path,
+    )  # fmt: skip
+    assert done.code == 0
+    return path
+
+
+def test_exact_measurements_need_no_correction(tsgt: Tsgt, recording: Path, tmp_path: Path) -> None:
+    """Corrections are far below a millimetre, and the file says what the JSON says."""
+    output = tmp_path / "frames.toml"
+    done = tsgt("calibrate", "motion", recording, "--no-held-out", "--output", output, "--json")
+    assert done.code == 0
+    found = done.json()
+    assert list(found["stations"]) == ["2", "3"]
+    for station in found["stations"].values():
+        assert station["correction_mm"] < 1.0
+        assert abs(station["latency_ms"]) < 0.5
+        assert len(station["sigma_mm"]) == len(station["sigma_mrad"]) == 3
+    assert found["before"] is found["after"] is None
+    frames, latencies = load_station_frames(output), load_station_latencies(output)
+    assert sorted(frames) == sorted(latencies) == [1, 2, 3]
+    assert [list(row) for row in frames[2]] == found["stations"]["2"]["T_station1_station"]
+    assert latencies[3] == round(1e6 * found["stations"]["3"]["latency_ms"])
+
+
+def test_text_names_the_stations(tsgt: Tsgt, recording: Path) -> None:
+    """Without --json a table for people comes."""
+    done = tsgt(
+        "calibrate", "motion", recording, "--no-held-out", "--frames", "unknown", "--dof", "4", "--prisms"
+    )
+    assert done.code == 0
+    assert "station 2 x" in done.out
+    assert "latency beside station 1" in done.out
+
+
+def test_points_without_angles_are_refused(tsgt: Tsgt, tmp_path: Path) -> None:
+    """A recording imported without targets does not tell what stations measured."""
+    path = tmp_path / "points.jsonl"
+    tracks = write_tracks(tmp_path, winding)
+    assert (
+        tsgt("import", "rts", "--tracks", *tracks, "--prisms", write_prisms(tmp_path), "--output", path).code
+        == 0
+    )
+    done = tsgt("calibrate", "motion", path)
+    assert done.code == 1
+    assert "import the recording with its targets" in done.err
+
+
+def test_the_layout_is_written_only_if_it_was_sought(tsgt: Tsgt, recording: Path, tmp_path: Path) -> None:
+    """--prism-output without --prisms is a usage error, before anything is computed."""
+    assert tsgt("calibrate", "motion", recording, "--prism-output", tmp_path / "prisms.toml").code == 2
+
+
+@pytest.mark.parametrize(("segment", "p95"), [(".", 0.55), ("segment2", 0.65)])
+def test_published_drives_are_predicted_better(
+    tsgt: Tsgt, field_data: Path, tmp_path: Path, segment: str, p95: float
+) -> None:
+    """What the calibration has not seen is missed by at most 0.6 of what straight lines miss it by, at gaps 0.45."""
+    day = field_data / "20220314"
+    path = tmp_path / "r.jsonl"
+    tracks = [day / segment / f"trimble{k}.csv" for k in (1, 2, 3)]
+    done = tsgt(
+        "import", "rts", "--tracks", *tracks, "--prisms", day / "sensor_positions.csv",
+        "--targets", day / "GCP.txt", "--output", path,
+    )  # fmt: skip
+    assert done.code == 0
+    done = tsgt("calibrate", "motion", path, "--json")
+    assert done.code == 0
+    found = done.json()
+    linear, before, after = found["linear"], found["before"], found["after"]
+    assert linear["n"] == before["n"] == after["n"]
+    assert after["mean"] < 0.6 * linear["mean"]
+    assert after["mean"] < before["mean"]
+    assert after["p95"] < p95 * linear["p95"]
+    assert after["gaps"]["mean"] < 0.45 * linear["gaps"]["mean"]

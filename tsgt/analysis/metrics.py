@@ -43,6 +43,85 @@ class PoseErrors:
         return math.degrees(_rms(self.rotation_rad))
 
 
+NEES_95 = 12.591587
+"""95th percentile of chi-square with 6 degrees of freedom."""
+
+
+@dataclass(frozen=True, slots=True)
+class NeesFigures:
+    """Normalised estimation error squared, of position and rotation together; NaN without poses.
+
+    Attributes
+    ----------
+    mean
+        6 where the covariances are right; above that they promise too much.
+    above_95
+        Which share is above what 5 % of right ones are above.
+    max
+        The largest one.
+    """
+
+    mean: float
+    above_95: float
+    max: float
+
+    @classmethod
+    def of(cls, errors: NDArray[np.float64], covariance: NDArray[np.float64]) -> NeesFigures:
+        """Weigh errors, (N, 6), with their covariances, (N, 6, 6)."""
+        if not len(errors):
+            return cls(math.nan, math.nan, math.nan)
+        nees = np.einsum("ni,ni->n", errors, np.linalg.solve(covariance, errors[..., None])[..., 0])
+        return cls(mean=float(nees.mean()), above_95=float(np.mean(nees > NEES_95)), max=float(nees.max()))
+
+
+@dataclass(frozen=True, slots=True)
+class PoseFigures:
+    """How far poses are from the truth; NaN where none could be compared.
+
+    Attributes
+    ----------
+    compared
+        How many there are.
+    position_rms_mm, orientation_rms_deg
+        Root mean squares, unaligned.
+    nees
+        Whether the errors are as large as the covariances say.
+    """
+
+    compared: int
+    position_rms_mm: float
+    orientation_rms_deg: float
+    nees: NeesFigures
+
+    @classmethod
+    def of(
+        cls,
+        estimated: NDArray[np.float64],
+        covariance: NDArray[np.float64],
+        true: NDArray[np.float64],
+        point_m: NDArray[np.float64],
+    ) -> PoseFigures:
+        """Compare poses with the truth at the same instants.
+
+        Parameters
+        ----------
+        estimated, true, point_m
+            As for :func:`pose_errors`.
+        covariance
+            (N, 6, 6) of the estimated ones, rotations about fixed axes.
+        """
+        errors = pose_errors(estimated, true, point_m)
+        turned = log_so3(estimated[:, :3, :3] @ np.swapaxes(true[:, :3, :3], 1, 2))
+        return cls(
+            compared=len(estimated),
+            position_rms_mm=errors.position_rms_mm,
+            orientation_rms_deg=errors.orientation_rms_deg,
+            nees=NeesFigures.of(
+                np.concatenate([estimated[:, :3, 3] - true[:, :3, 3], turned], axis=1), covariance
+            ),
+        )
+
+
 def pose_errors(
     estimated: NDArray[np.float64], true: NDArray[np.float64], point_m: NDArray[np.float64]
 ) -> PoseErrors:

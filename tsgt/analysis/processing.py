@@ -3,35 +3,33 @@
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
-import numpy as np
-
+from tsgt.analysis.refusals import EPOCHS_MAX, believed, check_measured, check_span, why_none_is_valid
+from tsgt.analysis.smoothing import smoothed
 from tsgt.errors import ConfigError, DegenerateGeometryError, RecordingError
 from tsgt.geometry import check_layout
 from tsgt.master.pipeline import Pipeline
-from tsgt.master.pose_batch import Reason
-from tsgt.master.tracks import believable, usable
 from tsgt.model import PolarMeasurement, PrismPosition
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from tsgt.master.pose_batch import PoseBatch
     from tsgt.model import Matrix4, Measurement, Parameters, Vector3
     from tsgt.recording import Recording
 
-
-EPOCHS_MAX = 2_000_000
-"""More poses at once than this (28 h at 20 Hz, about 1.5 GB) come of a wrong clock, not of field work."""
+Estimator = Literal["linear", "continuous"]
 
 
-def process(recording: Recording, *, path: Path) -> PoseBatch:
-    """Compute the poses of a recording with the parameters that it holds.
+def process(
+    recording: Recording, *, path: Path, on_progress: Callable[[float], None] | None = None
+) -> PoseBatch:
+    """Compute the poses of a recording with the parameters, and by the estimator, that it holds.
 
-    Measurements that came late count where they belong. Without late ones the poses are those of the live stream.
+    Measurements that came late count where they belong. Of ``linear``, without late ones, the poses are those of the
+    live stream; of ``continuous`` each pose knows all measurements on both sides.
 
     Parameters
     ----------
@@ -39,6 +37,8 @@ def process(recording: Recording, *, path: Path) -> PoseBatch:
         Measurements and the parameters in force.
     path
         Its file, for messages.
+    on_progress
+        Called now and then with the share of the work that is done, 0 to 1.
 
     Returns
     -------
@@ -52,14 +52,13 @@ def process(recording: Recording, *, path: Path) -> PoseBatch:
     DegenerateGeometryError
         The prism layout cannot be used: prisms coincide or lie in a line.
     """
+    if recording.parameters.pipeline.estimator == "continuous":
+        return smoothed(recording, path=path, on_progress=on_progress).poses
     parameters = recording.parameters
     pipeline = Pipeline(parameters)
-    stations = {station.station: station for station in parameters.stations}
-    measurements = [
-        m for m in recording.measurements if m.station not in stations or believable(m, stations[m.station])
-    ]
-    _check_measured(parameters, measurements, path)
-    _check_span(parameters, measurements, path)
+    measurements = believed(recording)
+    check_measured(parameters, measurements, path)
+    check_span(parameters, measurements, path)
     for measurement in sorted(measurements, key=lambda m: m.stamp_ns):
         pipeline.add(measurement)
     assert recording.end_ns is not None  # noqa: S101 (it has measurements, and each of them arrived)
@@ -67,8 +66,16 @@ def process(recording: Recording, *, path: Path) -> PoseBatch:
     first_ns = min(m.stamp_ns for m in measurements)
     poses = pipeline.advance(min(recording.end_ns, first_ns + EPOCHS_MAX * parameters.pipeline.period_ns))
     if not poses.valid.any():
-        raise RecordingError(_why_none_is_valid(poses, parameters), path=path)
+        raise RecordingError(why_none_is_valid(poses, parameters), path=path)
     return poses
+
+
+def with_estimator(recording: Recording, estimator: Estimator) -> Recording:
+    """Return the same recording, to be processed by another estimator."""
+    pipeline = dataclasses.replace(recording.parameters.pipeline, estimator=estimator)
+    return dataclasses.replace(
+        recording, parameters=dataclasses.replace(recording.parameters, pipeline=pipeline)
+    )
 
 
 def with_frames(parameters: Parameters, frames: Mapping[int, Matrix4], *, path: Path) -> Parameters:
@@ -94,6 +101,15 @@ def with_frames(parameters: Parameters, frames: Mapping[int, Matrix4], *, path: 
             f"{path}: stations.{missing[0]}: missing; the recording has this station", path=path
         )
     stations = (dataclasses.replace(s, T_station1_station=frames[s.station]) for s in parameters.stations)
+    return dataclasses.replace(parameters, stations=tuple(stations))
+
+
+def with_latencies(parameters: Parameters, latencies_ns: Mapping[int, int]) -> Parameters:
+    """Replace the latencies of those stations that a set-up file has one for, in ns by station number."""
+    stations = (
+        dataclasses.replace(s, latency_ns=latencies_ns.get(s.station, s.latency_ns))
+        for s in parameters.stations
+    )
     return dataclasses.replace(parameters, stations=tuple(stations))
 
 
@@ -129,81 +145,3 @@ def with_layout(parameters: Parameters, layout: Mapping[int, Vector3], *, path: 
 def has_raw_angles(measurements: Sequence[Measurement]) -> bool:
     """Tell whether station frames matter to any of the measurements: Cartesian points are in frame 1 already."""
     return any(isinstance(m, PolarMeasurement) for m in measurements)
-
-
-def _check_measured(parameters: Parameters, measurements: Sequence[Measurement], path: Path) -> None:
-    """Refuse a recording in which a prism of the layout was never measured: no pose can come of it."""
-    if not measurements:
-        raise RecordingError("holds no measurements, so there is nothing to process", path=path)
-    known = {station.station for station in parameters.stations}
-    seen = {m.prism for m in measurements if usable(m) and m.station in known}
-    for prism in (p.prism for p in parameters.prisms):
-        if prism not in seen:
-            raise RecordingError(
-                f"prism {prism} has no usable measurement ({_what_came(prism, known, measurements, parameters)}), "
-                "and a pose needs all prisms of the layout; add its station's measurements or take a layout without it",
-                path=path,
-            )
-
-
-def _check_span(parameters: Parameters, measurements: Sequence[Measurement], path: Path) -> None:
-    stamps = [m.stamp_ns for m in measurements]
-    span_ns = max(stamps) - min(stamps)
-    if span_ns > EPOCHS_MAX * parameters.pipeline.period_ns:
-        raise RecordingError(
-            f"its measurements span {span_ns / 86_400e9:.1f} days, too many for one trajectory: "
-            "leave out those that were stamped by a wrong clock, or process with a lower --rate",
-            path=path,
-        )
-
-
-def _what_came(
-    prism: int, known: set[int], measurements: Sequence[Measurement], parameters: Parameters
-) -> str:
-    came = [m for m in measurements if m.prism == prism]
-    strangers = sorted({m.station for m in came} - known)
-    if strangers:
-        return f"station {strangers[0]} measured it, but is not among the parameters"
-    if came:
-        statuses = Counter(m.status.value for m in came)
-        return f"{len(came)} with status " + ", ".join(
-            f"{status} ({n})" for status, n in statuses.most_common()
-        )
-    homes = [str(s.station) for s in parameters.stations if s.prism == prism]
-    return f"station {' and '.join(homes)} sent none of it" if homes else "no station tracks it"
-
-
-def _why_none_is_valid(poses: PoseBatch, parameters: Parameters) -> str:
-    counts = poses.invalid_counts()
-    if not counts:
-        return "the measurements of the stations have no pose epoch in common; record for longer"
-    # A pose that was computed and refused tells more than gaps, of which every recording has some.
-    computed = [r for r in (Reason.TILT, Reason.RESIDUAL, Reason.DEGENERATE_GEOMETRY) if r.word in counts]
-    candidates = computed or [r for r in Reason if r.word in counts]
-    limits = parameters.pipeline
-    match max(candidates, key=lambda reason: counts[reason.word]):
-        case Reason.TILT:
-            advice = (
-                "the robot would lie upside down: the prism layout is mirrored or two prisms are swapped; "
-                "check numbers and signs of the prism positions"
-            )
-        case Reason.RESIDUAL:
-            typical_mm = float(np.nanmedian(poses.residual_m)) * 1e3
-            advice = (
-                f"the prisms miss their layout by {typical_mm:.0f} mm (median), allowed are "
-                f"{limits.residual_limit_m * 1e3:.0f} mm: check for swapped prisms, another robot's layout, "
-                "wrong station frames"
-            )
-        case Reason.DEGENERATE_GEOMETRY:
-            advice = (
-                "the measured prisms lie in a line or at one place: check which station tracks which prism"
-            )
-        case Reason.STATION_STATUS:
-            advice = "the stations report errors: check tilt, prism and lock"
-        case _:
-            advice = (
-                f"at no epoch do all prisms have measurements at most {limits.outage_limit_ns / 1e9:g} s apart "
-                "around it: check that the stations' times overlap"
-            )
-    listed = ", ".join(f"{reason} {count}" for reason, count in counts.items())
-    return f"none of {len(poses)} poses is valid ({listed}); {advice}"

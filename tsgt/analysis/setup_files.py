@@ -14,7 +14,12 @@ if TYPE_CHECKING:
 
 
 def write_station_frames(
-    path: Path, frames: Mapping[int, FloatArray], rms_m: Mapping[int, float], *, comment: str
+    path: Path,
+    frames: Mapping[int, FloatArray],
+    rms_m: Mapping[int, float],
+    *,
+    comment: str,
+    latencies_ms: Mapping[int, float] | None = None,
 ) -> None:
     """Write a file of kind ``station_frames``.
 
@@ -28,6 +33,8 @@ def write_station_frames(
         By how much a station's targets missed those of station 1, root mean square, in m; station 1 has none.
     comment
         Where the frames come from; one line on top of the file.
+    latencies_ms
+        From the measurement to its stamp by station number, where they were found too.
 
     Raises
     ------
@@ -38,7 +45,8 @@ def write_station_frames(
     for station, T in sorted(frames.items()):
         rows = ",\n".join(f"  {_numbers(row)}" for row in T)
         rms = f"rms_mm = {1e3 * rms_m[station]:.3f}\n" if station in rms_m else ""
-        tables.append(f"[stations.{station}]\nT_station1_station = [\n{rows},\n]\n{rms}")
+        late = "" if latencies_ms is None else f"latency_ms = {latencies_ms[station]:.6f}\n"
+        tables.append(f"[stations.{station}]\nT_station1_station = [\n{rows},\n]\n{rms}{late}")
     _write(path, "station_frames", tables, comment)
 
 

@@ -19,13 +19,14 @@ from tsgt.log import configure_logging
 # Where each command lives. A command's module is imported only when it is called or asked for help, so that
 # `tsgt listen` on a small computer does not load scipy.
 COMMANDS = {
+    "analyse": "tsgt.cli.analyse:analyse",
     "atmosphere": "tsgt.cli.atmosphere:atmosphere",
     "calibrate": "tsgt.cli.calibrate:calibrate",
     "config": "tsgt.cli.config:config",
     "demo": "tsgt.cli.demo:demo",
     "doctor": "tsgt.cli.doctor:doctor",
-    "evaluate": "tsgt.cli.desk:evaluate",
-    "export": "tsgt.cli.desk:export",
+    "evaluate": "tsgt.cli.desk_evaluate:evaluate",
+    "export": "tsgt.cli.exporting:export",
     "import": "tsgt.cli.importing:import_group",
     "listen": "tsgt.cli.live:listen",
     "merge": "tsgt.cli.merge:merge",

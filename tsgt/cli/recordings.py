@@ -1,4 +1,4 @@
-"""Writing recordings from the command line, and telling of what could not be read in them."""
+"""Writing results from the command line, and telling of what could not be read in them."""
 
 from __future__ import annotations
 
@@ -27,6 +27,12 @@ def write_recording(path: Path, *, source: str, parameters: Parameters, records:
     with write_atomically(path) as file:
         for record in itertools.chain([header, parameters], records):
             file.write(encode_line(record) + b"\n")
+
+
+def write_lines(path: Path, lines: Iterable[str]) -> None:
+    """Write a text, or nothing."""
+    with write_atomically(path) as file:
+        file.writelines(line.encode() for line in lines)
 
 
 def report_problem(problem: RecordingError) -> None:

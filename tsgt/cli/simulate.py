@@ -305,14 +305,27 @@ def _print(result: dict[str, Any], found: list[Violation]) -> None:
             f"{outage['start_s']:g} s on: drained after {_figure(outage['drained_s'], 1)} s, meanwhile live "
             f"measurements were {_figure(outage['live_age_ms']['p50'], 0)} ms old in the median"
         )
-    for name, estimator in result["estimators"].items():
-        click.echo(
-            f"\n{name}: {estimator['valid_poses']} of {estimator['poses']} poses valid\n"
-            f"  position     {_figure(estimator['position_rms_mm'], 1)} mm rms off the truth, at the centroid of the "
-            "prisms\n"
-            f"  orientation  {_figure(estimator['orientation_rms_deg'], 2)} deg rms off the truth\n"
-            f"  inter-prism  {_figure(estimator['inter_prism_mean_mm'], 1)} mm mean error of the distances"
-        )
+    click.echo("\nPoses against the truth, positions at the centroid of the prisms")
+    rows = [
+        [
+            name,
+            str(found["poses"]),
+            str(found["valid_poses"]),
+            _figure(found["position_rms_mm"], 1),
+            _figure(found["orientation_rms_deg"], 2),
+            _figure(found["nees"]["mean"], 1),
+            *(_figure(found["newest_ms"][key], 0) if "newest_ms" in found else "-" for key in ("p50", "p99")),
+        ]
+        for name, found in {
+            **result["estimators"],
+            **{f"live, {kind}": found for kind, found in result["live"].items()},
+        }.items()
+    ]
+    print_table(
+        ["", "poses", "valid", "rms mm", "rms deg", "NEES (6)", "newest data, age ms: p50", "p99"], rows
+    )
+    inter_prism_mm = next(iter(result["estimators"].values()))["inter_prism_mean_mm"]
+    click.echo(f"\ninter-prism  {_figure(inter_prism_mm, 1)} mm mean error of the distances")
     click.echo(f"\nairtime      {result['airtime_fraction']:.1%} of the time")
     click.echo(f"violations   {len(found)}")
     for line in result["violations_listed"]:

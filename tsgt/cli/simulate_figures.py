@@ -1,4 +1,4 @@
-"""Figures of a simulated run: what was measured and delivered, how well it was timed, how good the poses were."""
+"""Figures of a simulated run: what was measured and delivered, how well it was timed, and all figures under their keys."""
 
 from __future__ import annotations
 
@@ -8,10 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tsgt.analysis.inter_prism import inter_prism
-from tsgt.analysis.metrics import inner_part, pose_errors
-from tsgt.geometry import rotation_from_quaternion, transform_from
-from tsgt.master.tracks import build_tracks
+from tsgt.cli.simulate_poses import pose_keys
 from tsgt.simulation.witness import Measured
 
 if TYPE_CHECKING:
@@ -100,17 +97,6 @@ class _Station:
     measured_ns: list[int]
     deliveries: dict[int, _Delivery]
     duplicates: int
-
-
-@dataclass(frozen=True, slots=True)
-class EstimatorFigures:
-    """How good an estimator's poses were, against the truth and against the prism layout; NaN without poses."""
-
-    poses: int
-    valid_poses: int
-    position_rms_mm: float
-    orientation_rms_deg: float
-    inter_prism_mean_mm: float
 
 
 def station_figures(run: Run) -> dict[int, StationFigures]:
@@ -234,39 +220,8 @@ def frame_ms(run: Run) -> float:
     return sum(session.framed_ns for session in run.sessions) / frames / 1e6 if frames else math.nan
 
 
-def estimator_figures(run: Run) -> EstimatorFigures:
-    """Compare the poses of the stream with the truth, and the measured prisms with their layout."""
-    poses = [session.valid_poses() for session in run.sessions]
-    stamps_ns = np.concatenate([p.stamp_ns for p in poses])
-    counts = inner_part(stamps_ns, run.start_ns, run.end_ns)
-    rotation = rotation_from_quaternion(np.concatenate([p.orientation_xyzw for p in poses])[counts])
-    errors = pose_errors(
-        transform_from(rotation, np.concatenate([p.position_m for p in poses])[counts]),
-        run.world.pose_at((stamps_ns[counts] - run.start_ns) / 1e9),
-        run.world.prisms_m.mean(axis=0),
-    )
-    return EstimatorFigures(
-        poses=sum(session.poses for session in run.sessions),
-        valid_poses=len(stamps_ns),
-        position_rms_mm=errors.position_rms_mm,
-        orientation_rms_deg=errors.orientation_rms_deg,
-        inter_prism_mean_mm=_inter_prism_mean_mm(run),
-    )
-
-
-def _inter_prism_mean_mm(run: Run) -> float:
-    """Return the mean over all pairs of how far their interpolated distances are from those of the layout."""
-    measurements = [measurement for session in run.sessions for measurement in session.measurements]
-    tracks = build_tracks(run.parameters, measurements)
-    if not all(len(track) for track in tracks.values()):
-        return math.nan
-    pairs = inter_prism(run.parameters, tracks).dynamic
-    return float(np.mean([pair.summary().mean_abs_error for pair in pairs]))
-
-
 def figures(run: Run) -> dict[str, Any]:
     """Put the figures under the keys that others rely on."""
-    estimator = estimator_figures(run)
     return {
         "stations": {number: _station_keys(station) for number, station in station_figures(run).items()},
         "all": _all_keys(run),
@@ -282,15 +237,7 @@ def figures(run: Run) -> dict[str, Any]:
             }
             for outage, found in zip(run.outages, outage_figures(run), strict=True)
         ],
-        "estimators": {
-            run.parameters.pipeline.estimator: {
-                "poses": estimator.poses,
-                "valid_poses": estimator.valid_poses,
-                "position_rms_mm": estimator.position_rms_mm,
-                "orientation_rms_deg": estimator.orientation_rms_deg,
-                "inter_prism_mean_mm": estimator.inter_prism_mean_mm,
-            }
-        },
+        **pose_keys(run),
         "airtime_fraction": run.airtime_s / run.duration_s,
         "sim_seconds": run.duration_s,
     }

@@ -46,7 +46,8 @@ def test_inter_prism_distances(
 ) -> None:
     """Mean distances at 20 Hz to a hundredth of a millimetre, gaps counted apart, with and without targets."""
     recording = imported(tsgt, field_data, segment, tmp_path / "r.jsonl", targets=targets)
-    result = tsgt("evaluate", recording, "--json").json()
+    options = ("--estimator", "linear", "--no-held-out", "--json")
+    result = tsgt("evaluate", recording, *options).json()
     expected = SEGMENTS[segment]
     for pair, mean_mm in expected.mean_mm.items():
         figures = result["inter_prism_mm"][pair]
@@ -59,7 +60,7 @@ def test_inter_prism_distances(
 def test_static_distances(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
     """The robot stands at the beginning of the first segment; its raw distances are those of SOURCE.md."""
     recording = imported(tsgt, field_data, ".", tmp_path / "r.jsonl", targets=False)
-    result = tsgt("evaluate", recording, "--json").json()
+    result = tsgt("evaluate", recording, "--no-held-out", "--json").json()
     assert result["still_s"] > 20.0
     for pair, mean_mm in STANDING_MM.items():
         figures = result["inter_prism_static_mm"][pair]
@@ -71,25 +72,33 @@ def test_static_distances(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
 def test_the_second_segment_never_stands(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
     """It has no static distances."""
     recording = imported(tsgt, field_data, "segment2", tmp_path / "r.jsonl", targets=False)
-    result = tsgt("evaluate", recording, "--json").json()
+    result = tsgt("evaluate", recording, "--no-held-out", "--json").json()
     assert [p["valid"] for p in result["inter_prism_static_mm"].values()] == [0, 0, 0]
 
 
+@pytest.mark.parametrize("estimator", ["linear", "continuous"])
 @pytest.mark.parametrize("segment", SEGMENTS)
 def test_evo_reads_the_trajectory(
-    tsgt: Tsgt, field_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, segment: str
+    tsgt: Tsgt,
+    field_data: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    segment: str,
+    estimator: str,
 ) -> None:
     """The tool evo finds the trajectory valid, with the length that our poses have."""
     monkeypatch.setenv("HOME", str(tmp_path))  # evo writes its settings there when it is first imported
     file_interface = pytest.importorskip("evo.tools.file_interface")
     recording = imported(tsgt, field_data, segment, tmp_path / "r.jsonl", targets=True)
-    output, table = tmp_path / "poses.tum", tmp_path / "poses.csv"
-    result = tsgt("process", recording, "--output", output, "--json").json()
+    output, poses, table = (tmp_path / name for name in ("poses.tum", "poses.jsonl", "poses.csv"))
+    options = ("--estimator", estimator, "--json", "--output")
+    result = tsgt("process", recording, *options, output).json()
+    assert tsgt("process", recording, *options, poses).code == 0
     trajectory = file_interface.read_tum_trajectory_file(str(output))
     ok, details = trajectory.check()
     assert ok, details
     assert trajectory.num_poses == result["valid_poses"]
-    assert tsgt("export", recording, "--format", "csv", "--output", table).code == 0
+    assert tsgt("export", poses, "--format", "csv", "--output", table).code == 0
     rows = [line.split(",") for line in table.read_text(encoding="utf-8").splitlines()]
     valid, x = rows[0].index("valid"), rows[0].index("x_m")
     positions = np.array([row[x : x + 3] for row in rows[1:] if row[valid] == "1"], dtype=np.float64)
@@ -97,10 +106,45 @@ def test_evo_reads_the_trajectory(
     assert trajectory.path_length == pytest.approx(length_m, abs=1e-5)
 
 
+class HeldOut(NamedTuple):
+    """What linear misses on average in mm, at gaps too; how many points; how much of that continuous may miss."""
+
+    linear_mm: float
+    linear_gaps_mm: float
+    n: int
+    gaps: int
+    mean: float
+    p95: float
+    at_gaps: float
+
+
+HELD_OUT = {
+    ".": HeldOut(14.70, 29.68, 395, 206, mean=0.72, p95=0.62, at_gaps=0.49),
+    "segment2": HeldOut(21.71, 36.21, 437, 163, mean=0.77, p95=0.75, at_gaps=0.52),
+}
+
+
+@pytest.mark.parametrize("segment", SEGMENTS)
+def test_held_out_measurements(tsgt: Tsgt, field_data: Path, tmp_path: Path, segment: str) -> None:
+    """The smooth trajectory predicts what it has not seen better than straight lines do, and far better at gaps."""
+    recording = imported(tsgt, field_data, segment, tmp_path / "r.jsonl", targets=True)
+    found = tsgt("evaluate", recording, "--estimator", "continuous", "--json").json()
+    linear, continuous = found["held_out_mm"]["linear"], found["held_out_mm"]["continuous"]
+    expected = HELD_OUT[segment]
+    assert linear["mean"] == pytest.approx(expected.linear_mm, abs=0.01)
+    assert linear["gaps"]["mean"] == pytest.approx(expected.linear_gaps_mm, abs=0.01)
+    for each in (linear, continuous):
+        assert (each["n"], each["gaps"]["n"]) == (expected.n, expected.gaps)
+    assert continuous["mean"] < expected.mean * linear["mean"]
+    assert continuous["p95"] < expected.p95 * linear["p95"]
+    assert continuous["gaps"]["mean"] < expected.at_gaps * linear["gaps"]["mean"]
+    assert found["valid_poses"] > 0.95 * found["poses"]
+
+
 def test_the_robot_frame_keeps_the_layout(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
     """Reference distances are those of the authors' calibration_results.csv."""
     recording = imported(tsgt, field_data, ".", tmp_path / "r.jsonl", targets=False)
-    result = tsgt("evaluate", recording, "--json").json()
+    result = tsgt("evaluate", recording, "--no-held-out", "--json").json()
     published = np.loadtxt(field_data / "20220314" / "calibration_results.csv")[:3] * 1e3
     for (a, b), distance_mm in zip(combinations((1, 2, 3), 2), published, strict=True):
         assert result["inter_prism_mm"][f"{a}-{b}"]["reference"] == pytest.approx(distance_mm, abs=1e-6)

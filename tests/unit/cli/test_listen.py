@@ -22,7 +22,7 @@ LINES = [encode_line(record) for record in (HELLO, measurement(0), POINT, POSE, 
 
 
 POSE_TEXT = (
-    "22:13:20.050  pose  valid  1.000 2.000 -0.100 m  yaw 73.74 pitch 0.00 roll 0.00 deg"
+    "22:13:20.050  pose  interpolated  valid  1.000 2.000 -0.100 m  yaw 73.74 pitch 0.00 roll 0.00 deg"
     "  residual 2.1 mm  ages 1: 0.25 s"
 )
 STATUS_TEXT = (
@@ -62,7 +62,7 @@ def test_every_type_is_shown_on_one_line(tsgt: Tsgt, tmp_path: Path) -> None:
         "22:13:20.000  station 1 prism 1  horizontal 5.7296 deg  zenith 85.9437 deg  30.0000 m  ok",
         "22:13:20.000  station 2 prism 2  1.000 -2.500 0.333 m  ok",
         POSE_TEXT,
-        "22:13:20.100  pose  invalid (outage)  ages 1: -",
+        "22:13:20.100  pose  interpolated  invalid (outage)  ages 1: -",
         STATUS_TEXT,
         "22:13:23.000  event lines_lost: lost 7 lines",
     ]

@@ -1,0 +1,197 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from support.scene import LAYOUT, SECOND, START, Motion, standing_scene
+
+from tsgt.analysis.evaluation import held_out
+from tsgt.analysis.held_out import FOLDS
+from tsgt.analysis.processing import process, with_estimator
+from tsgt.analysis.smoothing import smoothed
+from tsgt.errors import RecordingError
+from tsgt.geometry import exp_so3
+from tsgt.master.observations import build_observations
+from tsgt.master.pose_batch import Kind, Reason
+from tsgt.model import Status
+from tsgt.recording import Recording, RecordingHeader
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from tsgt.model import Measurement, Parameters, PolarMeasurement
+
+PATH = Path("field.jsonl")
+
+
+def wandering(time_s: float) -> Motion:
+    """Rotation and position of a robot that speeds up, slows down and turns all the time."""
+    position = (
+        30 + 1.5 * np.sin(0.8 * time_s),
+        20 - 1.2 * np.cos(1.1 * time_s),
+        -1 + 0.05 * np.sin(1.7 * time_s),
+    )
+    return exp_so3(np.array([0.0, 0.0, 0.6 * np.sin(0.7 * time_s)])), np.array(position)
+
+
+SCENE = standing_scene().moving(wandering)
+
+
+def recording_of(measurements: Sequence[Measurement], parameters: Parameters = SCENE.parameters) -> Recording:
+    """Make a recording of measurements, in the order given."""
+    return with_estimator(
+        Recording(
+            header=RecordingHeader(software="test", created_ns=0, source="test"),
+            parameters=parameters,
+            measurements=list(measurements),
+            end_ns=max((m.received_ns for m in measurements), default=None),
+        ),
+        "continuous",
+    )
+
+
+def drive(seconds: float = 14.0, *, noise_m: float = 0.002) -> list[PolarMeasurement]:
+    """Three stations at 2.5 Hz, ranges with some noise."""
+    rng = np.random.default_rng(2)
+    return [
+        replace(m, slope_distance_m=m.slope_distance_m + rng.normal(scale=noise_m))  # type: ignore[operator]
+        for step in range(round(seconds / 0.4))
+        for m in [SCENE.measure(station, 0.4 * step + 0.11 * station) for station in (1, 2, 3)]
+    ]
+
+
+def test_the_poses_are_those_of_the_robot() -> None:
+    """Smoothed ones, all the way from the first to the last measurement, better than straight lines make them."""
+    measurements = drive()
+    found = smoothed(recording_of(measurements), path=PATH)
+    poses = found.poses
+    assert set(poses.kind.tolist()) == {Kind.SMOOTHED}
+    assert found.motion.tuned
+    first, last = measurements[0].stamp_ns, measurements[-1].stamp_ns
+    assert 0 <= poses.stamp_ns[0] - first < 50_000_000
+    assert 0 <= last - poses.stamp_ns[-1] < 50_000_000
+    truth = np.array([wandering((stamp - START) / 1e9)[1] for stamp in poses.stamp_ns.tolist()])
+    centroid = LAYOUT.mean(axis=0)
+    turned = np.array([wandering((stamp - START) / 1e9)[0] for stamp in poses.stamp_ns.tolist()])
+    missed_m = np.linalg.norm(
+        poses.position_m + _rotations(poses.orientation_xyzw) @ centroid - truth - turned @ centroid, axis=1
+    )
+    inner = slice(40, -40)
+    assert poses.valid[inner].all()
+    assert np.sqrt(np.mean(missed_m[inner] ** 2)) < 0.002
+    lines = process(with_estimator(recording_of(measurements), "linear"), path=PATH)
+    assert lines.kind.max() == Kind.INTERPOLATED
+
+
+def _rotations(orientation_xyzw: np.ndarray) -> np.ndarray:
+    x, y, z, w = orientation_xyzw.T
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    ).transpose(2, 0, 1)
+
+
+def test_process_takes_the_estimator_of_the_recording() -> None:
+    """And gives the same poses."""
+    recording = recording_of(drive())
+    np.testing.assert_array_equal(
+        process(recording, path=PATH).position_m, smoothed(recording, path=PATH).poses.position_m
+    )
+
+
+def test_late_measurements_count_where_they_belong() -> None:
+    """The order of arrival changes no pose, however late a measurement came."""
+    measurements = drive()
+    late = [*measurements[:5], *measurements[6:], measurements[5]]
+    a, b = (smoothed(recording_of(some), path=PATH).poses for some in (measurements, late))
+    np.testing.assert_array_equal(a.position_m, b.position_m)
+
+
+def test_too_few_measurements_take_the_recorded_motion() -> None:
+    """Nobody can tell from two seconds how a robot moves."""
+    found = smoothed(recording_of(drive(2.0)), path=PATH)
+    assert not found.motion.tuned
+    assert found.motion.prior == SCENE.parameters.pipeline.motion
+
+
+def test_a_prism_out_of_sight_is_named_and_bridged_while_that_is_honest() -> None:
+    """Two prisms and the robot's inertia carry on for a while; the pose stays valid, the prism's share says outage."""
+    measurements = [m for m in drive() if m.station != 2 or not 6.0 < (m.stamp_ns - START) / SECOND < 8.0]
+    poses = smoothed(recording_of(measurements), path=PATH).poses
+    out = poses.prism_reason[:, 1] == Reason.OUTAGE
+    inside = (poses.stamp_ns > START + 6.5 * SECOND) & (poses.stamp_ns < START + 7.5 * SECOND)
+    assert out[inside].all()
+    assert poses.valid[inside].any()
+    sigma = np.sqrt(np.trace(poses.covariance[:, :3, :3], axis1=1, axis2=2))
+    assert sigma[inside].max() > 1.15 * np.median(sigma)
+
+
+def test_nothing_is_valid_where_nothing_was_measured() -> None:
+    """A gap of six seconds in all stations is not bridged."""
+    measurements = [m for m in drive() if not 5.0 < (m.stamp_ns - START) / SECOND < 11.0]
+    poses = smoothed(recording_of(measurements), path=PATH).poses
+    middle = np.abs(poses.stamp_ns - (START + 8 * SECOND)) < SECOND
+    assert not poses.valid[middle].any()
+    assert poses.valid[~middle].any()
+
+
+def test_one_wrong_measurement_spoils_no_pose() -> None:
+    """It is passed over as an outlier."""
+    measurements = drive()
+    wrong = measurements[60]
+    measurements[60] = replace(wrong, slope_distance_m=wrong.slope_distance_m + 1.0)  # type: ignore[operator]
+    poses = smoothed(recording_of(measurements), path=PATH).poses
+    near = np.abs(poses.stamp_ns - wrong.stamp_ns) < SECOND
+    assert poses.valid[near].all()
+
+
+def test_a_mirrored_layout_is_said_to_be_one() -> None:
+    """The robot would lie upside down."""
+    mirrored = tuple(
+        replace(p, position_m=(p.position_m[0], -p.position_m[1], p.position_m[2]))
+        for p in SCENE.parameters.prisms
+    )
+    with pytest.raises(RecordingError, match="the prism layout is mirrored"):
+        smoothed(recording_of(drive(), replace(SCENE.parameters, prisms=mirrored)), path=PATH)
+
+
+def test_another_robots_layout_makes_no_poses() -> None:
+    """The prisms miss it by decimetres."""
+    other = tuple(
+        replace(p, position_m=(1.5 * p.position_m[0], 1.5 * p.position_m[1], p.position_m[2]))
+        for p in SCENE.parameters.prisms
+    )
+    poses = smoothed(recording_of(drive(), replace(SCENE.parameters, prisms=other)), path=PATH).poses
+    # At the very ends one prism alone may be near.
+    assert poses.invalid_counts()["residual"] > 0.95 * len(poses)
+
+
+def test_no_measurements_are_refused() -> None:
+    """So is a prism that was never seen."""
+    with pytest.raises(RecordingError, match="holds no measurements"):
+        smoothed(recording_of([]), path=PATH)
+    blind = [replace(m, status=Status.NO_TARGET) if m.station == 1 else m for m in drive()]
+    with pytest.raises(RecordingError, match="prism 1 has no usable measurement"):
+        smoothed(recording_of(blind), path=PATH)
+
+
+def test_what_is_held_out_was_not_seen() -> None:
+    """Moving a left-out measurement moves no prediction, neither its own nor another one of its fold."""
+    origin_ns = START
+    observations, _ = build_observations(SCENE.parameters, drive(), origin_ns=origin_ns)
+    found = held_out(observations, SCENE.parameters.pipeline)
+    assert found["linear"].figures.n == found["continuous"].figures.n == 3 * 25
+    assert found["continuous"].figures.mean < 0.5 * found["linear"].figures.mean
+    points = observations.points_m.copy()
+    points[np.flatnonzero(observations.prism == 0)[FOLDS]] += 0.02
+    moved = held_out(replace(observations, points_m=points), SCENE.parameters.pipeline)
+    # It is the first of fold 0 of its prism, which leaves five out.
+    assert moved["continuous"].missed_m[0] > 0.015
+    np.testing.assert_array_equal(moved["continuous"].missed_m[1:5], found["continuous"].missed_m[1:5])
+    assert (moved["continuous"].missed_m[5:] != found["continuous"].missed_m[5:]).any()

@@ -1,0 +1,251 @@
+"""The command ``evaluate``: what measurements and poses say of each other, and of a reference."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+import click
+import numpy as np
+
+from tsgt.analysis.consistency import outliers, residual_figures
+from tsgt.analysis.evaluation import held_out
+from tsgt.analysis.inter_prism import inter_prism
+from tsgt.analysis.processing import process, with_estimator
+from tsgt.analysis.reference import compare, read_tum
+from tsgt.analysis.smoothing import smoothed
+from tsgt.cli.desk_input import (
+    duration_s,
+    estimator_option,
+    frames_option,
+    load,
+    motion_keys,
+    motion_text,
+    pose_counts,
+    pose_summary,
+    prisms_option,
+    progress,
+)
+from tsgt.cli.options import json_option, keep_going_option, path_type, recording_argument
+from tsgt.cli.output import print_json, print_table
+from tsgt.errors import GeometryError, RecordingError
+from tsgt.master.observations import build_observations
+from tsgt.master.pose_batch import PoseBatch
+from tsgt.master.tracks import build_tracks
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from tsgt.analysis.consistency import Outlier
+    from tsgt.analysis.held_out import HeldOut
+    from tsgt.analysis.inter_prism import PairDistances
+    from tsgt.analysis.metrics import PoseFigures
+    from tsgt.analysis.processing import Estimator
+    from tsgt.analysis.reference import Reference
+    from tsgt.analysis.smoothing import Smoothed
+    from tsgt.recording import Recording
+
+LISTED_OUTLIERS = 10
+
+
+@click.command()
+@recording_argument
+@estimator_option
+@click.option(
+    "--reference",
+    "reference_path",
+    type=path_type,
+    help="Trajectory to compare with: TUM, of the robot's frame in the frame of station 1.",
+)
+@click.option(
+    "--held-out/--no-held-out",
+    "with_held_out",
+    default=True,
+    help="Leave measurements out and predict them, which takes most of the time.  [default: do]",
+)
+@frames_option
+@prisms_option
+@keep_going_option
+@json_option
+def evaluate(
+    *,
+    recording: Path,
+    estimator: Estimator | None,
+    reference_path: Path | None,
+    with_held_out: bool,
+    frames: Path | None,
+    prisms: Path | None,
+    keep_going: bool,
+    as_json: bool,
+) -> None:
+    """Judge RECORDING: by what it says of itself, and by a reference if there is one.
+
+    The distances between its prisms cannot change; each measurement should be what the others predict; no residual
+    should be larger than the noise that makes it.
+    """
+    loaded = load(recording, keep_going=keep_going, estimator=estimator, frames=frames, prisms=prisms)
+    reference = None if reference_path is None else read_tum(reference_path)
+    parameters = loaded.parameters
+    with progress("fitting") as on_progress:
+        continuous = smoothed(loaded, path=recording, on_progress=on_progress)
+    if parameters.pipeline.estimator == "continuous":
+        poses = continuous.poses
+    else:
+        poses = process(loaded, path=recording)
+    found = inter_prism(parameters, build_tracks(parameters, loaded.measurements))
+    left_out = _held_out(loaded, continuous, recording) if with_held_out else None
+    strays = outliers(continuous.fit, continuous.sources)
+    residuals = residual_figures(continuous.fit, continuous.sources)
+    compared = {} if reference is None else _compared(loaded, continuous, reference, recording)
+    if as_json:
+        chosen = compared.get(parameters.pipeline.estimator)
+        print_json(
+            {
+                "estimator": parameters.pipeline.estimator,
+                "duration_s": duration_s(poses),
+                **pose_counts(poses),
+                "epochs": found.epochs,
+                "invalid_epochs": found.invalid_epochs,
+                "inter_prism_mm": _figures(found.dynamic),
+                "still_s": found.still_s,
+                "inter_prism_static_mm": _figures(found.static),
+                **({} if left_out is None else {"held_out_mm": _held_out_keys(left_out)}),
+                **motion_keys(continuous.motion),
+                "residuals": {
+                    station: {axis: dataclasses.asdict(figures) for axis, figures in axes.items()}
+                    for station, axes in residuals.items()
+                },
+                "outliers": [dataclasses.asdict(stray) for stray in strays],
+                **({} if chosen is None else dataclasses.asdict(chosen)),
+                **(
+                    {"estimators": {name: dataclasses.asdict(each) for name, each in compared.items()}}
+                    if compared
+                    else {}
+                ),
+            }
+        )
+        return
+    click.echo(f"{pose_summary(poses)} over {duration_s(poses):.1f} s")
+    valid = found.epochs - found.invalid_epochs
+    click.echo(
+        f"\nDistances between prisms at 20 Hz, interpolated: {valid} of {found.epochs} epochs valid (mm)"
+    )
+    _print_pairs(found.dynamic)
+    click.echo(f"\nDistances between prisms standing still, raw pairs within {found.still_s:.1f} s (mm)")
+    _print_pairs(found.static)
+    if left_out is not None:
+        click.echo("\nMeasurements predicted from the others, by how much they were missed (mm)")
+        _print_held_out(left_out)
+    click.echo(f"\n{motion_text(continuous.motion)}")
+    click.echo("\nResiduals of the continuous trajectory, in the sigmas that they should have")
+    rows = [
+        [
+            f"{station} {axis.replace('_', ' ')}",
+            str(f.n),
+            *_numbers(f.mean, f.std),
+            f"{f.beyond_3_sigma:.2%}",
+        ]
+        for station, axes in residuals.items()
+        for axis, f in axes.items()
+    ]
+    print_table(["station", "n", "mean", "std", "beyond 3"], rows)
+    _print_outliers(strays)
+    if compared:
+        click.echo(f"\nAgainst {reference_path}")
+        _print_compared(compared)
+
+
+def _held_out(loaded: Recording, continuous: Smoothed, path: Path) -> dict[Estimator, HeldOut]:
+    # The fit's own measurements carry the noise as it was found; what is held out must not have told of that.
+    observations, _ = build_observations(
+        loaded.parameters, continuous.sources, origin_ns=continuous.origin_ns
+    )
+    try:
+        with progress("predicting left-out measurements") as on_progress:
+            return held_out(observations, loaded.parameters.pipeline, on_progress=on_progress)
+    except GeometryError as error:
+        raise RecordingError(str(error), path=path) from error
+
+
+def _held_out_keys(left_out: dict[Estimator, HeldOut]) -> dict[str, Any]:
+    return {
+        name: {**dataclasses.asdict(each.figures), "gaps": dataclasses.asdict(each.gaps)}
+        for name, each in left_out.items()
+    }
+
+
+def _compared(
+    loaded: Recording, continuous: Smoothed, reference: Reference, path: Path
+) -> dict[Estimator, PoseFigures]:
+    centroid_m = np.mean([prism.position_m for prism in loaded.parameters.prisms], axis=0)
+    try:
+        linear = process(with_estimator(loaded, "linear"), path=path)
+    except RecordingError:
+        # It has no valid pose, which is a result as well.
+        linear = PoseBatch.blank(np.empty(0, np.int64), continuous.poses.prisms)
+    return {
+        "linear": compare(linear, reference, centroid_m),
+        "continuous": compare(continuous.poses, reference, centroid_m),
+    }
+
+
+def _figures(pairs: Sequence[PairDistances]) -> dict[str, Any]:
+    return {pair.name: dataclasses.asdict(pair.summary()) for pair in pairs}
+
+
+def _print_pairs(pairs: Sequence[PairDistances]) -> None:
+    rows = []
+    for pair in pairs:
+        found = pair.summary()
+        figures = (found.reference, found.mean, found.std, found.mean_abs_error, found.p95)
+        rows.append([pair.name, str(found.valid), *_numbers(*figures)])
+    print_table(["pair", "n", "reference", "mean", "std", "mean |error|", "p95 |error|"], rows)
+
+
+def _print_held_out(left_out: dict[Estimator, HeldOut]) -> None:
+    rows = []
+    for name, each in left_out.items():
+        for label, f in ((name, each.figures), (f"{name}, gaps over 1 s", each.gaps)):
+            rows.append([label, str(f.n), *_numbers(f.mean, f.median, f.p95)])
+    print_table(["estimator", "n", "mean", "median", "p95"], rows)
+
+
+def _print_outliers(strays: Sequence[Outlier]) -> None:
+    if not strays:
+        return
+    click.echo(f"\nMeasurements that stray too far to be noise: {len(strays)}")
+    rows = [
+        [
+            datetime.fromtimestamp(stray.stamp_ns / 1e9, UTC).isoformat(sep=" ", timespec="milliseconds")[
+                :-6
+            ],
+            str(stray.station),
+            str(stray.prism),
+            f"{stray.missed_mm:.1f}",
+            f"{stray.sigmas:.1f}",
+        ]
+        for stray in strays[:LISTED_OUTLIERS]
+    ]
+    print_table(["time (UTC)", "station", "prism", "mm", "sigmas"], rows)
+    if len(strays) > LISTED_OUTLIERS:
+        click.echo(f"... and {len(strays) - LISTED_OUTLIERS} more; --json has all")
+
+
+def _print_compared(compared: dict[Estimator, PoseFigures]) -> None:
+    rows = [
+        [
+            name,
+            str(f.compared),
+            *_numbers(f.position_rms_mm, f.orientation_rms_deg, f.nees.mean, f.nees.max),
+            "-" if math.isnan(f.nees.above_95) else f"{f.nees.above_95:.1%}",
+        ]
+        for name, f in compared.items()
+    ]
+    print_table(["estimator", "n", "rms mm", "rms deg", "NEES (6)", "largest", "above 95 %"], rows)
+
+
+def _numbers(*figures: float) -> list[str]:
+    return ["-" if math.isnan(figure) else f"{figure:.2f}" for figure in figures]

@@ -23,6 +23,9 @@ def follow(path: str) -> None:
             # Whatever else comes, now or in later versions of tsgt, is passed over.
             if record["type"] != "pose":
                 continue
+            # The same pose comes again a few seconds later, smoothed; who needs it now takes it as it is predicted.
+            if record["kind"] == "smoothed":
+                continue
             if not record["valid"]:
                 print(f"no pose: {record['reason']}", flush=True)
                 continue

@@ -352,9 +352,7 @@ class MotionPrior:
 
     def __post_init__(self) -> None:
         """Refuse motion that no robot has."""
-        _check_limits(
-            self, acceleration_time_s=(1e-3, 1e4), angular_acceleration_time_s=(1e-3, 1e4)
-        )
+        _check_limits(self, acceleration_time_s=(1e-3, 1e4), angular_acceleration_time_s=(1e-3, 1e4))
         for sigma in (*self.acceleration_sigma_mps2, *self.angular_acceleration_sigma_radps2):
             if not 1e-6 <= sigma <= 1e6:
                 raise ValueError(f"a sigma of an acceleration is {sigma}, expected 1e-06 to 1e+06")
@@ -401,7 +399,7 @@ class PipelineParameters:
 
     __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
-    estimator: Literal["linear", "continuous"] = "linear"
+    estimator: Literal["linear", "continuous"] = "continuous"
     period_ns: int = 50_000_000
     outage_limit_ns: int = 1_000_000_000
     transport_limit_ns: int = 2_000_000_000
@@ -412,8 +410,8 @@ class PipelineParameters:
     motion: MotionPrior = MotionPrior()
     noise_scale: float = 1.0
     lag_ns: int = 3_000_000_000
-    position_sigma_limit_m: float = 0.05
-    rotation_sigma_limit_rad: float = math.radians(2.0)
+    position_sigma_limit_m: float = 0.1
+    rotation_sigma_limit_rad: float = math.radians(5.0)
 
     def __post_init__(self) -> None:
         """Refuse limits that nothing can be computed with."""

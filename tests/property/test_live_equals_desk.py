@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 TRANSPORT_NS = 2_000_000_000
 SCENE = standing_scene().moving(driving)
+CONTINUOUS = SCENE.with_limits(estimator="continuous")
 
 # A fourth station helps the first on its prism.
 FOUR = replace(
@@ -123,6 +124,15 @@ def test_the_timer_changes_no_line_and_no_order(
     assert live(measurements, ticks_ns, end_ns) == live(measurements, [], end_ns)
 
 
+@settings(max_examples=10)
+@given(arrivals(CONTINUOUS), st.lists(st.integers(START, START + 10 * 10**9), max_size=30))
+def test_nor_does_it_with_predictions(measurements: list[PolarMeasurement], ticks_ns: list[int]) -> None:
+    """Predicted and smoothed poses are the same as well, to the last bit."""
+    end_ns = START + 10 * 10**9
+    early = [m for m in measurements if m.received_ns < end_ns]
+    assert live(early, ticks_ns, end_ns, CONTINUOUS) == live(early, [], end_ns, CONTINUOUS)
+
+
 @settings(max_examples=30)
 @given(arrivals())
 def test_stamps_of_poses_increase_by_one_period(measurements: list[PolarMeasurement]) -> None:
@@ -165,10 +175,38 @@ def test_a_replay_gives_every_line_of_the_stream_again(
     ticks_ns: list[int],
 ) -> None:
     """Clock, status and event lines between the measurements, and a fence's own, come back in their places."""
+    _replayed_again(SCENE, measurements, others, ticks_ns)
+
+
+@settings(max_examples=10)
+@given(
+    arrivals(CONTINUOUS),
+    st.lists(
+        st.tuples(st.integers(START, START + 10 * 10**9), st.sampled_from([CLOCK, EVENT, STATUS])),
+        max_size=5,
+    ),
+    st.lists(st.integers(START, START + 10 * 10**9), max_size=20),
+)
+def test_a_replay_of_predicted_and_smoothed_poses_gives_them_again(
+    measurements: list[PolarMeasurement],
+    others: list[tuple[int, ClockRecord | EventRecord | StatusRecord]],
+    ticks_ns: list[int],
+) -> None:
+    """What a prediction was made from does not depend on when the timer fired, but on what had come by its epoch."""
+    early = [m for m in measurements if m.received_ns < START + 10 * 10**9]
+    _replayed_again(CONTINUOUS, early, others, ticks_ns)
+
+
+def _replayed_again(
+    scene: Scene,
+    measurements: list[PolarMeasurement],
+    others: list[tuple[int, ClockRecord | EventRecord | StatusRecord]],
+    ticks_ns: list[int],
+) -> None:
     fence = Geofence(GeofenceConfig(name="yard", polygon_m=((29, 0), (30, 0), (30, 40), (29, 40))))
     lines: list[bytes] = []
     monitor = Monitor([1, 2, 3])
-    outlet = Outlet(SCENE.parameters, monitor, [fence], lambda _record, line: lines.append(line))
+    outlet = Outlet(scene.parameters, monitor, [fence], lambda _record, line: lines.append(line))
     calls: list[tuple[int, Callable[[], None]]] = [
         *((m.received_ns, partial(outlet.measurement, m)) for m in measurements),
         *((at_ns, partial(outlet.put, replace(record, stamp_ns=at_ns))) for at_ns, record in others),
@@ -179,6 +217,6 @@ def test_a_replay_gives_every_line_of_the_stream_again(
     with TemporaryDirectory() as folder:
         path = Path(folder) / "run.jsonl"
         path.write_bytes(
-            b"".join(line + b"\n" for line in (*map(encode_line, (HEADER, SCENE.parameters)), *lines))
+            b"".join(line + b"\n" for line in (*map(encode_line, (HEADER, scene.parameters)), *lines))
         )
         assert [line for _, some in replayed(path) for line in some] == lines

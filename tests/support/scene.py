@@ -82,7 +82,7 @@ class Scene:
         """Return the same scene with another motion."""
         return replace(self, motion=motion)
 
-    def with_limits(self, **limits: float) -> Scene:
+    def with_limits(self, **limits: float | str) -> Scene:
         """Return the same scene with other limits in the pipeline's parameters."""
         pipeline = replace(self.parameters.pipeline, **limits)  # type: ignore[arg-type]
         return replace(self, parameters=replace(self.parameters, pipeline=pipeline))
@@ -105,6 +105,6 @@ def standing_scene() -> Scene:
                 PrismPosition(prism=number, position_m=tuple(LAYOUT[number - 1].tolist()))
                 for number in (1, 2, 3)
             ),
-            pipeline=PipelineParameters(),
+            pipeline=PipelineParameters(estimator="linear"),
         )
     )

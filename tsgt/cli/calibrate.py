@@ -12,6 +12,7 @@ import numpy as np
 from tsgt.analysis.calibration import solve_prisms, solve_stations
 from tsgt.analysis.setup_files import write_prism_layout, write_station_frames
 from tsgt.analysis.target_file import read_prism_file, read_target_file
+from tsgt.cli.calibrate_motion import motion
 from tsgt.cli.check import check
 from tsgt.cli.collect import collect
 from tsgt.cli.options import finite, json_option
@@ -48,6 +49,7 @@ def calibrate() -> None:
 
 calibrate.add_command(collect)
 calibrate.add_command(check)
+calibrate.add_command(motion)
 
 
 @calibrate.command()

@@ -29,20 +29,38 @@ from tsgt.simulation.demo_files import write_demo_files
 
 if TYPE_CHECKING:
     from tsgt.analysis.metrics import PoseErrors
+    from tsgt.master.stream_records import Kind
     from tsgt.simulation.demo_files import DemoFiles
 
 DEFAULT_DURATION_S = 30.0
 
 
 @dataclass(frozen=True, slots=True)
-class Result:
-    """What a demonstration has come to."""
+class PosesResult:
+    """What the poses of one kind have come to."""
 
-    poses: int
-    valid_poses: int
+    count: int
+    valid: int
+    errors: PoseErrors
+
+    def keys(self) -> dict[str, Any]:
+        """Return it for machines."""
+        return {
+            "poses": self.count,
+            "valid_poses": self.valid,
+            "position_rms_mm": self.errors.position_rms_mm,
+            "orientation_rms_deg": self.errors.orientation_rms_deg,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What a demonstration has come to; `live` only where poses are predicted and smoothed."""
+
+    poses: PosesResult
+    live: PosesResult | None
     restarts: int
     recording: Path | None
-    errors: PoseErrors
 
 
 @click.command()
@@ -101,31 +119,33 @@ def demo(
     if as_json:
         print_json(
             {
-                "poses": result.poses,
-                "valid_poses": result.valid_poses,
+                **result.poses.keys(),
+                **({} if result.live is None else {"live": result.live.keys()}),
                 "socket": str(socket_path),
                 "recording": None if result.recording is None else str(result.recording),
-                "position_rms_mm": result.errors.position_rms_mm,
-                "orientation_rms_deg": result.errors.orientation_rms_deg,
                 "folder": str(folder),
                 "restarts": result.restarts,
             }
         )
         return
-    click.echo(f"poses        {result.poses}, of which {result.valid_poses} valid")
-    if math.isnan(result.errors.position_rms_mm):
+    click.echo(f"poses        {result.poses.count}, of which {result.poses.valid} valid")
+    errors = result.poses.errors
+    if math.isnan(errors.position_rms_mm):
         click.echo("against the truth: no valid pose to compare; the first and the last 2 s do not count")
     else:
         click.echo(
-            f"position     {result.errors.position_rms_mm:.1f} mm rms off the truth, at the centroid of the prisms"
+            f"position     {errors.position_rms_mm:.1f} mm rms off the truth, at the centroid of the prisms"
         )
-        click.echo(f"orientation  {result.errors.orientation_rms_deg:.2f} deg rms off the truth")
+        click.echo(f"orientation  {errors.orientation_rms_deg:.2f} deg rms off the truth")
+    if result.live is not None:
+        click.echo(
+            f"live         {result.live.valid} of {result.live.count} predictions valid, "
+            f"{result.live.errors.position_rms_mm:.1f} mm and {result.live.errors.orientation_rms_deg:.2f} deg rms off"
+        )
     click.echo(f"everything   {folder}: configuration, logs, journals")
     if result.recording is not None:
         click.echo(f"recording    {result.recording}")
-        click.echo(
-            f"go on with   {_program()} process {result.recording} --estimator linear --output poses.tum"
-        )
+        click.echo(f"go on with   {_program()} process {result.recording} --output poses.tum")
         click.echo(f"             {_program()} evaluate {result.recording}")
 
 
@@ -152,15 +172,18 @@ def _run(
         return demo, progress
 
     demo, progress = service.run(run)
-    stamps_ns = progress.valid_stamps_ns()
-    counts = inner_part(stamps_ns, progress.first_ns, progress.last_ns)
     return Result(
-        poses=progress.poses,
-        valid_poses=len(stamps_ns),
+        poses=_poses(progress, progress.kind),
+        live=_poses(progress, "predicted") if progress.poses["predicted"] else None,
         restarts=sum(max(0, process.starts - 1) for process in demo.processes),
         recording=_kept(sorted(files.recordings.glob("*.jsonl")), output),
-        errors=progress.errors(counts),
     )
+
+
+def _poses(progress: Progress, kind: Kind) -> PosesResult:
+    stamps_ns = progress.valid_stamps_ns(kind)
+    counts = inner_part(stamps_ns, progress.first_ns, progress.last_ns)
+    return PosesResult(progress.poses[kind], len(stamps_ns), progress.errors(kind, counts))
 
 
 def _kept(recordings: list[Path], output: Path | None) -> Path | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import sys
 import time
+from collections import Counter, defaultdict
 from typing import TYPE_CHECKING
 
 import click
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.clock import UnixTimeline
+    from tsgt.master.stream_records import Kind
     from tsgt.simulation.demo import Demo
 
 LINE_INTERVAL_S = 5.0
@@ -39,7 +41,7 @@ class Progress:
     Attributes
     ----------
     poses
-        How many have come, valid or not.
+        How many have come, valid or not, by kind.
     first_ns, last_ns
         Unix time in ns of the first and the last of them; 0 before.
     """
@@ -47,12 +49,12 @@ class Progress:
     def __init__(self, demo: Demo, timeline: UnixTimeline) -> None:
         self._demo = demo
         self._start_ns = timeline.unix_ns(demo.start_ns)
-        self._valid: list[PoseRecord] = []
+        self._valid: defaultdict[Kind, list[PoseRecord]] = defaultdict(list)
         self._on_terminal = sys.stderr.isatty()
         self._block_lines = 0
         self._shown_at_s = 0.0
         self._starts = 0
-        self.poses = 0
+        self.poses: Counter[Kind] = Counter()
         self.first_ns = 0
         self.last_ns = 0
 
@@ -66,13 +68,18 @@ class Progress:
             event = decode(EventRecord, line)
             self._say(f"event  {event.event}: {event.message}")
 
-    def valid_stamps_ns(self) -> NDArray[np.int64]:
-        """Return the times of the valid poses, Unix time in ns."""
-        return np.array([pose.stamp_ns for pose in self._valid], dtype=np.int64)
+    @property
+    def kind(self) -> Kind:
+        """The kind of poses that the figures are of: the best that the estimator makes."""
+        return "smoothed" if self.poses["predicted"] else "interpolated"
 
-    def errors(self, counts: NDArray[np.bool_] | None = None) -> PoseErrors:
-        """Compare valid poses with the truth: all of them, or those that count."""
-        poses = self._valid
+    def valid_stamps_ns(self, kind: Kind) -> NDArray[np.int64]:
+        """Return the times of the valid poses of a kind, Unix time in ns."""
+        return np.array([pose.stamp_ns for pose in self._valid[kind]], dtype=np.int64)
+
+    def errors(self, kind: Kind, counts: NDArray[np.bool_] | None = None) -> PoseErrors:
+        """Compare valid poses of a kind with the truth: all of them, or those that count."""
+        poses = self._valid[kind]
         if counts is not None:
             poses = [pose for pose, counted in zip(poses, counts, strict=True) if counted]
         stamps_ns = np.array([pose.stamp_ns for pose in poses], dtype=np.int64)
@@ -87,10 +94,10 @@ class Progress:
 
     def _pose(self, pose: PoseRecord) -> None:
         self.first_ns = self.first_ns or pose.stamp_ns
-        self.last_ns = pose.stamp_ns
-        self.poses += 1
+        self.last_ns = max(self.last_ns, pose.stamp_ns)
+        self.poses[pose.kind] += 1
         if pose.valid:
-            self._valid.append(pose)
+            self._valid[pose.kind].append(pose)
 
     def _status(self, status: StatusRecord) -> None:
         starts = sum(process.starts for process in self._demo.processes)
@@ -103,10 +110,11 @@ class Progress:
             return
         self._shown_at_s = now_s
         elapsed_s = (status.stamp_ns - self._start_ns) / 1e9
-        text = f"{elapsed_s:5.0f} s  {len(self._valid)}/{self.poses} poses valid"
-        if self._valid:
-            position = " ".join(f"{value:6.2f}" for value in self._valid[-1].position_m or ())
-            text += f"  at {position} m  off {self.errors().position_rms_mm:.1f} mm rms"
+        valid = self._valid[self.kind]
+        text = f"{elapsed_s:5.0f} s  {len(valid)}/{self.poses[self.kind]} poses valid"
+        if valid:
+            position = " ".join(f"{value:6.2f}" for value in valid[-1].position_m or ())
+            text += f"  at {position} m  off {self.errors(self.kind).position_rms_mm:.1f} mm rms"
         lines = [text]
         for station in status.stations:
             word, _ = station_word(station)

@@ -6,7 +6,14 @@ Each file says by its top-level key ``kind`` what it is: ``client``, ``master``,
 
 from tsgt.config.base import Model, NoiseConfig
 from tsgt.config.client import ClientConfig
-from tsgt.config.files import json_schema, load, load_any, load_prism_layout, load_station_frames
+from tsgt.config.files import (
+    json_schema,
+    load,
+    load_any,
+    load_prism_layout,
+    load_station_frames,
+    load_station_latencies,
+)
 from tsgt.config.master import MasterConfig, StationConfig
 from tsgt.config.models import KINDS
 from tsgt.config.parameters import parameters, scenario_parameters
@@ -31,6 +38,7 @@ __all__ = [
     "load_any",
     "load_prism_layout",
     "load_station_frames",
+    "load_station_latencies",
     "parameters",
     "scenario_parameters",
 ]

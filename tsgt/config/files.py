@@ -63,6 +63,16 @@ def load_station_frames(path: Path) -> dict[int, Matrix4]:
     return {int(number): entry.T_station1_station for number, entry in stations.items()}
 
 
+def load_station_latencies(path: Path) -> dict[int, int]:
+    """Read the stations' latencies in ns by station number, of those in the file that have one; raises as :func:`load`."""
+    stations = load(path, StationFramesFile).stations
+    return {
+        int(number): round(entry.latency_ms * 1e6)
+        for number, entry in stations.items()
+        if entry.latency_ms is not None
+    }
+
+
 def load_prism_layout(path: Path) -> dict[int, Vector3]:
     """Read where the prisms sit on the robot, in m, by prism number; raises as :func:`load`."""
     prisms = load(path, PrismLayoutFile).prisms

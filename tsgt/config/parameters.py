@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from tsgt.config.files import load_prism_layout, load_station_frames
+from tsgt.config.files import load_prism_layout, load_station_frames, load_station_latencies
 from tsgt.errors import ConfigError
 from tsgt.model import (
     ARCSECOND_RAD,
     InstrumentNoise,
     Matrix4,
+    MotionPrior,
     Parameters,
     PipelineParameters,
     PrismPosition,
@@ -38,6 +39,7 @@ def parameters(config: MasterConfig) -> Parameters:
         fewer than three prisms.
     """
     frames = load_station_frames(config.setup.station_frames)
+    latencies_ns = load_station_latencies(config.setup.station_frames)
     layout = load_prism_layout(config.setup.prism_layout)
     for station in config.stations:
         if station.station not in frames:
@@ -67,7 +69,7 @@ def parameters(config: MasterConfig) -> Parameters:
                 T_station1_station=frames[station.station],
                 prism_constant_m=station.prism_constant_mm / 1e3,
                 atmospheric_ppm=station.atmospheric_ppm,
-                latency_ns=round(station.latency_ms * 1e6),
+                latency_ns=latencies_ns.get(station.station, round(station.latency_ms * 1e6)),
                 noise=noise(station.noise),
             )
             for station in config.stations
@@ -106,6 +108,16 @@ def pipeline_parameters(pipeline: PipelineConfig) -> PipelineParameters:
         tilt_limit_rad=math.radians(pipeline.tilt_limit_deg),
         acceleration_sigma_mps2=pipeline.acceleration_sigma_mps2,
         angular_acceleration_sigma_radps2=pipeline.angular_acceleration_sigma_radps2,
+        motion=MotionPrior(
+            acceleration_sigma_mps2=pipeline.motion.acceleration_sigma_mps2,
+            acceleration_time_s=pipeline.motion.acceleration_time_s,
+            angular_acceleration_sigma_radps2=pipeline.motion.angular_acceleration_sigma_radps2,
+            angular_acceleration_time_s=pipeline.motion.angular_acceleration_time_s,
+        ),
+        noise_scale=pipeline.noise_scale,
+        lag_ns=round(pipeline.lag_s * 1e9),
+        position_sigma_limit_m=pipeline.position_sigma_limit_mm / 1e3,
+        rotation_sigma_limit_rad=math.radians(pipeline.rotation_sigma_limit_deg),
     )
 
 

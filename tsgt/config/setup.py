@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator
+from pydantic import AfterValidator, Field
 
 from tsgt.config.base import Model, NotNegative, NumberKey, rigid
 from tsgt.model import Matrix4, Vector3
@@ -17,10 +17,12 @@ class StationFrame(Model):
     """Rigid transform, 4x4 row by row, from the station's frame to that of station 1, in m."""
     rms_mm: NotNegative | None = None
     """By how much its targets missed those of station 1, root mean square, as the calibration found it."""
+    latency_ms: Annotated[float, Field(ge=-1e6, le=1e6)] | None = None
+    """From the measurement to its time stamp, as ``tsgt calibrate motion`` found it; instead of the configuration's."""
 
 
 class StationFramesFile(Model):
-    """Where the stations stand: written by ``tsgt calibrate targets``."""
+    """Where the stations stand: written by ``tsgt calibrate targets`` or ``motion``."""
 
     kind: Literal["station_frames"]
     """What this file is."""

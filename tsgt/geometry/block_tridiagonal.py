@@ -46,8 +46,8 @@ class BlockFactor:
 
     def last(self) -> FloatArray:
         """(B, B) lower triangle L: ``L L^T`` is the information of the last block when the others are eliminated."""
-        size, count = self.size, self.banded.shape[1] // self.size
-        by_block = self.banded.reshape(2 * size, count, size)[:, -1]
+        size = self.size
+        by_block = self.banded[:, -size:]
         lower = np.zeros((size, size))
         for column in range(size):
             lower[column:, column] = by_block[: size - column, column]
@@ -78,11 +78,11 @@ class BlockFactor:
     def _blocks(self) -> tuple[FloatArray, FloatArray]:
         """Blocks of the factor: (K, B, B) lower triangles on the diagonal, (K - 1, B, B) below it."""
         size, count = self.size, self.banded.shape[1] // self.size
-        by_block = self.banded.reshape(2 * size, count, size)
+        by_block = self.banded.T.reshape(count, size, 2 * size)
         lower, below = np.zeros((count, size, size)), np.zeros((max(count - 1, 0), size, size))
         for column in range(size):
-            lower[:, column:, column] = by_block[: size - column, :, column].T
-            below[:, :, column] = by_block[size - column : 2 * size - column, :-1, column].T
+            lower[:, column:, column] = by_block[:, column, : size - column]
+            below[:, :, column] = by_block[:-1, column, size - column : 2 * size - column]
         return lower, below
 
 
@@ -102,13 +102,14 @@ def factorise(diagonal: FloatArray, beside: FloatArray) -> BlockFactor:
         The matrix is not positive definite: something is not determined.
     """
     count, size, _ = diagonal.shape
-    banded = np.zeros((2 * size, count, size))
+    # Column by column, as LAPACK goes through it.
+    by_column = np.zeros((count, size, 2 * size))
     for column in range(size):
-        banded[: size - column, :, column] = diagonal[:, column:, column].T
-        banded[size - column : 2 * size - column, :-1, column] = beside[:, column, :].T
+        by_column[:, column, : size - column] = diagonal[:, column:, column]
+        by_column[:-1, column, size - column : 2 * size - column] = beside[:, column]
     try:
         factor = cholesky_banded(
-            banded.reshape(2 * size, count * size), overwrite_ab=True, lower=True, check_finite=False
+            by_column.reshape(count * size, 2 * size).T, overwrite_ab=True, lower=True, check_finite=False
         )
     except LinAlgError as error:
         raise GeometryError("the measurements do not determine the trajectory") from error

@@ -128,7 +128,7 @@ def knot_times(time_s: FloatArray, *, least_step_s: float = LEAST_STEP_S) -> Flo
     index = np.searchsorted(slots, np.round(time_s / least_step_s).astype(np.int64))
     times: FloatArray = np.bincount(index, time_s) / np.bincount(index)
     kept = np.concatenate([[True], np.diff(times) > 0.25 * least_step_s])
-    return times[kept]
+    return np.asarray(times[kept])
 
 
 def nearest(knots_s: FloatArray, time_s: FloatArray) -> NDArray[np.intp]:

@@ -22,15 +22,14 @@ from tsgt.geometry.tuning import scaled, tune
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from tsgt.geometry.continuous import Solution
     from tsgt.geometry.prism_factors import Observations
     from tsgt.geometry.rigid import FloatArray
     from tsgt.model import MotionPrior
 
-KNOTS_AT_ONCE = 4096
-"""About ten minutes of 3 stations at 2.5 Hz."""
+KNOTS_AT_ONCE = 1024
+"""About two minutes of 3 stations at 2.5 Hz: their blocks fit into a cache."""
 
-OVERLAP = 256
+OVERLAP = 128
 """Knots on either side of a piece that are solved with it and left to its neighbours."""
 
 
@@ -107,8 +106,7 @@ def fit(
     times_s = knot_times(observations.time_s)
     at = nearest(times_s, observations.time_s)
     pieces = _pieces(len(times_s))
-    solutions: list[tuple[Solution, slice]] = []
-    knots, covariances, besides = [], [], []
+    knots, covariances, besides, residuals_m, distances, weights = [], [], [], [], [], []
     for done, piece in enumerate(pieces):
         report(done / len(pieces))
         rows = slice(
@@ -122,7 +120,10 @@ def fit(
         covariances.append(covariance[inner])
         besides.append(beside[inner])
         kept = slice(*np.searchsorted(at[rows], (piece.kept.start, piece.kept.stop)))
-        solutions.append((solution, kept))
+        # Not the whole solution: its factor is as large as all that is kept.
+        residuals_m.append(solution.linearised.residuals_m[kept])
+        distances.append(solution.distances[kept])
+        weights.append(solution.weights[kept])
     report(1.0)
     trajectory = Trajectory(
         joined(knots), prior, np.concatenate(covariances), np.concatenate(besides)[: len(times_s) - 1]
@@ -131,9 +132,9 @@ def fit(
         trajectory,
         observations,
         noise_scale,
-        np.concatenate([each.linearised.residuals_m[kept] for each, kept in solutions]),
-        np.concatenate([each.distances[kept] for each, kept in solutions]),
-        np.concatenate([each.weights[kept] for each, kept in solutions]),
+        np.concatenate(residuals_m),
+        np.concatenate(distances),
+        np.concatenate(weights),
     )
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import secrets
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING, NoReturn, Protocol
 
 import structlog
@@ -23,6 +24,7 @@ from tsgt.errors import RadioError, StreamError
 from tsgt.master.alerts import Alerts
 from tsgt.master.classic_link import ClassicLink
 from tsgt.master.disk import Disk
+from tsgt.master.feed import Feed
 from tsgt.master.fence_command import run_fence_command
 from tsgt.master.frame_watch import FrameWatch
 from tsgt.master.geofence import Geofence
@@ -31,7 +33,7 @@ from tsgt.master.outlet import Outlet
 from tsgt.master.reports import Reports
 from tsgt.master.searches import Searches
 from tsgt.master.stream import StreamServer
-from tsgt.master.stream_records import EventRecord, HelloRecord
+from tsgt.master.stream_records import EventRecord, HelloRecord, PoseRecord
 from tsgt.master.superframe_link import SuperframeLink
 from tsgt.radio.supervised import keep_radio
 from tsgt.recording import RecordingHeader, RecordingWriter, encode_line
@@ -45,8 +47,8 @@ if TYPE_CHECKING:
     from tsgt.config import MasterConfig
     from tsgt.config.master import FrameWatchConfig, GeofenceConfig
     from tsgt.master.outlet import Watcher
-    from tsgt.master.stream_records import PoseRecord, StatusRecord
-    from tsgt.model import Parameters
+    from tsgt.master.stream_records import StatusRecord
+    from tsgt.model import Measurement, Parameters
     from tsgt.radio.base import LoRaSettings, OpenRadio, Radio
 
 STATUS_PERIOD_NS = 1_000_000_000
@@ -199,7 +201,7 @@ class _Master:
         monitor = Monitor(stations)
         alerts = Alerts(stations, timeline.unix_ns(clock.monotonic_ns()))
         watchers: list[Watcher] = [
-            _FrameWatcher(config.frame_watch, parameters.pipeline.period_ns),
+            _FrameWatcher(config.frame_watch, parameters),
             *(_Fence(fence, group) for fence in config.geofences),
         ]
         self._outlet = Outlet(parameters, monitor, watchers, self._logged(hand_out))
@@ -280,13 +282,19 @@ class _Master:
 
 
 class _FrameWatcher:
-    """The watch over the frames, as one that knows no time."""
+    """The watch over the frames, as one that knows no time; it has the poses of the estimator ``linear`` in any case."""
 
-    def __init__(self, config: FrameWatchConfig, period_ns: int) -> None:
-        self._watch = FrameWatch(config, period_ns)
+    def __init__(self, config: FrameWatchConfig, parameters: Parameters) -> None:
+        self._watch = FrameWatch(config, parameters.pipeline.period_ns)
+        pipeline = replace(parameters.pipeline, estimator="linear")
+        self._linear = Feed(replace(parameters, pipeline=pipeline))
 
-    def pose(self, record: PoseRecord, now_ns: int) -> Sequence[EventRecord]:
-        return self._watch.pose(record, now_ns)
+    def pose(self, record: PoseRecord, now_ns: int) -> Sequence[EventRecord]:  # noqa: ARG002 (it has its own)
+        return ()
+
+    def measurement(self, record: Measurement) -> Sequence[EventRecord]:
+        poses = (found for found in self._linear.measurement(record) if isinstance(found, PoseRecord))
+        return [event for pose in poses for event in self._watch.pose(pose, record.received_ns)]
 
     def tick(self, now_ns: int) -> Sequence[EventRecord]:  # noqa: ARG002 (nothing runs out)
         return ()
@@ -305,6 +313,9 @@ class _Fence:
 
     def pose(self, record: PoseRecord, now_ns: int) -> Sequence[EventRecord]:
         return self._acted_on(self._fence.pose(record, now_ns))
+
+    def measurement(self, record: Measurement) -> Sequence[EventRecord]:
+        return self._fence.measurement(record)
 
     def tick(self, now_ns: int) -> Sequence[EventRecord]:
         return self._acted_on(self._fence.tick(now_ns))

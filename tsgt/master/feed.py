@@ -9,9 +9,12 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING
 
+from tsgt.master.continuous_pipeline import ContinuousPipeline
 from tsgt.master.pipeline import Pipeline
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from tsgt.master.stream_records import PoseRecord
     from tsgt.model import Measurement, Parameters
 
@@ -26,7 +29,8 @@ class Feed:
     """
 
     def __init__(self, parameters: Parameters) -> None:
-        self._pipeline = Pipeline(parameters)
+        continuous = parameters.pipeline.estimator == "continuous"
+        self._pipeline = ContinuousPipeline(parameters) if continuous else Pipeline(parameters)
         self._now_ns = -(2**63)
         self._begun = False
 
@@ -49,6 +53,10 @@ class Feed:
         """Return the poses that are due by now. To be called before any other record is put in its place."""
         self._now_ns = max(self._now_ns, now_ns)
         return list(self._pipeline.advance(self._now_ns).records())
+
+    def too_late(self) -> Mapping[int, int] | None:
+        """Return how many measurements of which station came too late for ``continuous``; None with ``linear``."""
+        return self._pipeline.too_late if isinstance(self._pipeline, ContinuousPipeline) else None
 
     def next_deadline_ns(self) -> int | None:
         """Return when :meth:`advance` should be called if nothing arrives before; None while nothing waits."""

@@ -80,7 +80,8 @@ class FrameWatch:
     def pose(self, record: PoseRecord, now_ns: int) -> list[EventRecord]:
         """Take a pose that came out at ``now_ns``; return ``frame_suspect`` or ``frame_restored`` where it is so.
 
-        Poses that are not valid for another reason than their residual say nothing of the frames.
+        Poses that are not valid for another reason than their residual say nothing of the frames. It is made for the
+        estimator ``linear``: the other one bends its trajectory until the prisms fit.
         """
         if record.residual_m is None or record.velocity_mps is None or record.reason not in ("", "residual"):
             return []

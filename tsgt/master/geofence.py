@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from tsgt.master.stream_records import PoseRecord
+    from tsgt.model import Measurement
     from tsgt.polygon import Point
 
 
@@ -71,9 +72,17 @@ class Geofence:
         self._lost = False
 
     def pose(self, record: PoseRecord, now_ns: int) -> list[EventRecord]:
-        """Take a pose, valid or not, that came out at ``now_ns``; return what it changed."""
+        """Take a pose, valid or not, that came out at ``now_ns``; return what it changed.
+
+        Smoothed poses are passed over: they tell where the robot was.
+        """
         events = self.tick(now_ns)
-        if not record.valid or record.position_m is None or record.covariance is None:
+        if (
+            record.kind == "smoothed"
+            or not record.valid
+            or record.position_m is None
+            or record.covariance is None
+        ):
             return events
         self._last_valid_ns = now_ns
         gone_before = self._beyond or self._lost
@@ -93,6 +102,10 @@ class Geofence:
             *events,
             self._event(now_ns, "fence_entered", f"fence {self.name} entered: the robot is {what}"),
         ]
+
+    def measurement(self, record: Measurement) -> list[EventRecord]:  # noqa: ARG002 (poses tell where the robot is)
+        """Take a measurement, which says nothing here."""
+        return []
 
     def tick(self, now_ns: int) -> list[EventRecord]:
         """Notice that no valid pose has come for too long."""

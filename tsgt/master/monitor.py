@@ -11,7 +11,7 @@ from tsgt.master.tracks import usable
 from tsgt.model import PolarMeasurement, Status
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Mapping
 
     from tsgt.master.clock_offset import ClockEstimate
     from tsgt.model import Measurement
@@ -69,6 +69,11 @@ class Monitor:
             if isinstance(measurement, PolarMeasurement):
                 station.stamp_bound_ns = measurement.stamp_bound_ns
         station.arrivals_ns.append(measurement.received_ns)
+
+    def too_late(self, counts: Mapping[int, int]) -> None:
+        """Take note of how many measurements of each station came too late for the estimator so far."""
+        for number, station in self._stations.items():
+            station.too_late = counts.get(number, 0)
 
     def pose(self, *, valid: bool) -> None:
         """Count a pose."""
@@ -131,6 +136,7 @@ class _Station:
     missing: int | None = None
     late: int | None = None
     doubted: int | None = None
+    too_late: int | None = None
 
     def status_at(self, number: int, now_ns: int, clock: ClockEstimate | None) -> StationStatus:
         while self.arrivals_ns and self.arrivals_ns[0] <= now_ns - RATE_WINDOW_NS:
@@ -156,6 +162,7 @@ class _Station:
             missing=self.missing,
             late=self.late,
             doubted=self.doubted,
+            too_late=self.too_late,
         )
 
     def _rate_hz(self, now_ns: int) -> float | None:

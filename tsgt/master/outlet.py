@@ -29,6 +29,10 @@ class Watcher(Protocol):
         """Take a pose that came out at an instant."""
         ...
 
+    def measurement(self, record: Measurement) -> Sequence[EventRecord]:
+        """Take a measurement that has come."""
+        ...
+
     def tick(self, now_ns: int) -> Sequence[EventRecord]:
         """Notice what time alone has brought."""
         ...
@@ -96,11 +100,17 @@ class Outlet:
         for record in records:
             self._hand_out(record, encode_line(record))
             if isinstance(record, PoseRecord):
-                self._monitor.pose(valid=record.valid)
+                if record.kind != "smoothed":  # each of them has been there before, predicted
+                    self._monitor.pose(valid=record.valid)
                 for watcher in self._watchers:
                     events += watcher.pose(record, now_ns)
             elif isinstance(record, PolarMeasurement):
                 self._monitor.measurement(record)
+                for watcher in self._watchers:
+                    events += watcher.measurement(record)
+        too_late = self._feed.too_late()
+        if too_late is not None:
+            self._monitor.too_late(too_late)
         for event in events:
             self.put(event)
         self._changed.set()

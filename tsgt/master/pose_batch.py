@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 from enum import IntEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -25,8 +25,9 @@ class Reason(IntEnum):
     TILT = 1
     RESIDUAL = 2
     DEGENERATE_GEOMETRY = 3
-    OUTAGE = 4
-    STATION_STATUS = 5
+    UNCERTAIN = 4
+    OUTAGE = 5
+    STATION_STATUS = 6
 
     @property
     def word(self) -> stream_records.Reason:
@@ -39,9 +40,31 @@ _WORD: tuple[stream_records.Reason, ...] = (
     "tilt",
     "residual",
     "degenerate_geometry",
+    "uncertain",
     "outage",
     "station_status",
 )
+
+
+class Kind(IntEnum):
+    """How a pose came about, and so which estimator made it."""
+
+    INTERPOLATED = 0
+    PREDICTED = 1
+    SMOOTHED = 2
+
+    @property
+    def word(self) -> stream_records.Kind:
+        """The word on the stream."""
+        return _KIND_WORD[self]
+
+    @property
+    def estimator(self) -> Literal["linear", "continuous"]:
+        """Name of the estimator that makes such poses."""
+        return "linear" if self == Kind.INTERPOLATED else "continuous"
+
+
+_KIND_WORD: tuple[stream_records.Kind, ...] = ("interpolated", "predicted", "smoothed")
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +75,8 @@ class PoseBatch:
     ----------
     stamp_ns
         (N,) epochs on the master's Unix clock.
+    kind
+        (N,) values of :class:`Kind`.
     reason
         (N,) values of :class:`Reason`.
     position_m, orientation_xyzw
@@ -75,6 +100,7 @@ class PoseBatch:
     """
 
     stamp_ns: NDArray[np.int64]
+    kind: NDArray[np.int8]
     reason: NDArray[np.int8]
     position_m: NDArray[np.float64]
     orientation_xyzw: NDArray[np.float64]
@@ -89,11 +115,14 @@ class PoseBatch:
     prisms: tuple[int, ...]
 
     @classmethod
-    def blank(cls, stamp_ns: NDArray[np.int64], prisms: tuple[int, ...]) -> PoseBatch:
+    def blank(
+        cls, stamp_ns: NDArray[np.int64], prisms: tuple[int, ...], kind: Kind = Kind.INTERPOLATED
+    ) -> PoseBatch:
         """Make a batch in which nothing is computed and nothing is invalid yet."""
         n, p = len(stamp_ns), len(prisms)
         return cls(
             stamp_ns=stamp_ns,
+            kind=np.full(n, kind, np.int8),
             reason=np.zeros(n, np.int8),
             position_m=np.full((n, 3), np.nan),
             orientation_xyzw=np.full((n, 4), np.nan),
@@ -116,6 +145,12 @@ class PoseBatch:
         arrays = {f.name: np.concatenate([getattr(b, f.name) for b in batches]) for f in fields(cls)[:-1]}
         return cls(**arrays, prisms=batches[0].prisms)
 
+    def select(self, rows: NDArray[np.bool_]) -> PoseBatch:
+        """Return some of them."""
+        return PoseBatch(
+            **{f.name: getattr(self, f.name)[rows] for f in fields(self)[:-1]}, prisms=self.prisms
+        )
+
     def __len__(self) -> int:
         return len(self.stamp_ns)
 
@@ -131,10 +166,11 @@ class PoseBatch:
 
     def records(self) -> Iterable[stream_records.PoseRecord]:
         """Yield each pose as it leaves the program; numbers that were not computed are None."""
-        computed = np.isfinite(self.residual_m)
+        computed = np.isfinite(self.position_m[:, 0])
         # One conversion to Python numbers per array, not per element.
         rows = zip(
             self.stamp_ns.tolist(),
+            self.kind.tolist(),
             self.reason.tolist(),
             computed.tolist(),
             self.position_m.tolist(),
@@ -148,6 +184,7 @@ class PoseBatch:
         )
         for (
             stamp,
+            kind,
             reason,
             known,
             position,
@@ -167,11 +204,11 @@ class PoseBatch:
                 covariance=tuple(covariance) if known else None,
                 velocity_mps=tuple(velocity) if known else None,
                 angular_velocity_radps=tuple(turning) if known else None,
-                estimator="linear",
-                kind="interpolated",
+                estimator=Kind(kind).estimator,
+                kind=_KIND_WORD[kind],
                 valid=reason == Reason.VALID,
                 reason=_WORD[reason],
-                residual_m=residual if known else None,
+                residual_m=None if math.isnan(residual) else residual,
                 stations=shares,
             )
 

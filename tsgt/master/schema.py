@@ -28,6 +28,7 @@ from tsgt.master.stream_records import (
 from tsgt.model import (
     ClockSample,
     InstrumentNoise,
+    MotionPrior,
     Parameters,
     PipelineParameters,
     PointMeasurement,
@@ -88,6 +89,7 @@ PAGES: dict[Path, tuple[type, ...]] = {
         InstrumentNoise,
         PrismPosition,
         PipelineParameters,
+        MotionPrior,
         JournalRecord,
         InstrumentRecord,
         TargetRecord,

@@ -19,7 +19,7 @@ PROTOCOL_VERSION = 1
 CAPABILITIES = ("measurement", "point", "pose", "clock", "beacon", "status", "event")
 
 Kind = Literal["interpolated", "predicted", "smoothed"]
-Reason = Literal["", "outage", "station_status", "degenerate_geometry", "residual", "tilt"]
+Reason = Literal["", "outage", "station_status", "degenerate_geometry", "uncertain", "residual", "tilt"]
 
 # Named here because pydantic looks the names of annotations up when the program runs.
 PositionOrNone = Vector3 | None
@@ -65,9 +65,10 @@ class StationShare:
         the first one.
     residual_m
         Distance in m between its prism as measured and the same prism of the fitted layout; null when there
-        is no fit.
+        is no fit. Unless interpolated: the middle one of three measurements near the pose.
     reason
-        Why this prism has no position at the pose: ``outage`` or ``station_status``; empty when it has one.
+        Why this prism has no position at the pose: ``outage`` or ``station_status``; empty when it has one. A pose that
+        is not interpolated can be valid without it.
     """
 
     __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
@@ -109,14 +110,15 @@ class PoseRecord:
     estimator
         Name of the estimator that made it.
     kind
-        ``interpolated`` between measurements, ``predicted`` beyond the last one, or ``smoothed`` with measurements
-        on both sides.
+        ``interpolated`` between measurements (estimator ``linear``), ``predicted`` from those that had come before the
+        pose, at once, or ``smoothed`` with those on both sides of it, a lag later.
     valid
         Whether the pose may be used. An invalid pose is sent too, so that a reader knows why it has none.
     reason
         Why it is not valid: ``outage`` (a prism without measurements for too long), ``station_status`` (the
         instrument reported an error), ``degenerate_geometry`` (prisms in a line or at one place), ``residual``
-        (the prisms miss their layout by too much), ``tilt`` (the robot would lean too far: mirrored layout or
+        (the prisms miss their layout by too much), ``uncertain`` (all prisms are there, but the pose is not known well
+        enough), ``tilt`` (the robot would lean too far: mirrored layout or
         swapped prisms). Empty when valid.
     residual_m
         Root mean square over the prisms of their distance in m from the fitted layout; null when there is no
@@ -192,6 +194,9 @@ class StationStatus:
     doubted
         How many beacons it received at a time at which they cannot have been sent, as when somebody holds them back;
         null with the protocol classic.
+    too_late
+        How many of its measurements came so late that the poses of their time had been smoothed for good; they count at the
+        desk only. Null with the estimator linear.
     """
 
     __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
@@ -216,6 +221,7 @@ class StationStatus:
     missing: int | None = None
     late: int | None = None
     doubted: int | None = None
+    too_late: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

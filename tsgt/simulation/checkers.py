@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from tsgt.errors import RecordingError
-from tsgt.geometry import rotation_from_quaternion
+from tsgt.geometry import log_so3, rotation_from_quaternion
 from tsgt.master.intake import UNTIMED_SIGMA_NS
 from tsgt.master.replay import replayed
 from tsgt.master.tracks import build_tracks, usable
@@ -38,6 +38,9 @@ _DISTANCE_ROUNDING_M = 0.0501e-3
 # More than any station's latency, which is taken off the stamps.
 _LATENCY_NS = 5_000_000_000
 _RESIDUAL_TOLERANCE_M = 1e-6
+# In m and rad. A robot that does what its motion prior thinks unlikely is now and then off by more than sigmas allow.
+_STATE_TOLERANCE = 0.02
+_STATE_SIGMAS = 6.0
 # Ten digits behind the point are on the line.
 _LINE_ROUNDING = 1e-9
 # A stamp is less than this before or after the measurement: the slowest answer against the fastest, when few have come.
@@ -79,6 +82,7 @@ def violations(run: Run) -> list[Violation]:
         found += delivered_twice(session)
         found += beyond_bound(session, measured, start_ns=run.start_ns)
         found += wrong_poses(session, run.parameters)
+        found += wrong_states(session, run)
         found += replayed_otherwise(session)
     return found
 
@@ -192,8 +196,9 @@ def beyond_bound(session: Session, measured: Mapping[int, Measured], *, start_ns
 
 
 def wrong_poses(session: Session, parameters: Parameters) -> Iterator[Violation]:
-    """Fit the prisms of each valid pose again, from usable measurements alone."""
+    """Fit the prisms of each valid pose of the estimator ``linear`` again, from usable measurements alone."""
     poses = session.valid_poses()
+    poses = poses.select(poses.kind == "interpolated")
     tracks = build_tracks(parameters, [m for m in session.measurements if usable(m)])
     missed = np.flatnonzero(~_explained(poses, slice(None), tracks, parameters))
     stamps_ns = np.array([m.stamp_ns for m in session.measurements], dtype=np.int64)
@@ -207,6 +212,24 @@ def wrong_poses(session: Session, parameters: Parameters) -> Iterator[Violation]
             yield Violation(
                 "pose",
                 f"the pose at {poses.stamp_ns[index]} ns is called valid, but no usable measurements explain it",
+            )
+
+
+def wrong_states(session: Session, run: Run) -> Iterator[Violation]:
+    """Compare each valid pose of the estimator ``continuous`` with the truth and with the uncertainty that it states."""
+    poses = session.valid_poses()
+    poses = poses.select(poses.kind != "interpolated")
+    truth = run.world.pose_at((poses.stamp_ns - run.start_ns) / 1e9)
+    turned = rotation_from_quaternion(poses.orientation_xyzw) @ np.swapaxes(truth[:, :3, :3], 1, 2)
+    errors = np.concatenate([poses.position_m - truth[:, :3, 3], log_so3(turned)], axis=1)
+    for name, part in (("m", slice(3)), ("rad", slice(3, None))):
+        off = np.linalg.norm(errors[:, part], axis=1)
+        sigma = np.sqrt(np.linalg.eigvalsh(poses.covariance[:, part, part])[:, -1])
+        for index in np.flatnonzero(off > _STATE_TOLERANCE + _STATE_SIGMAS * sigma).tolist():
+            yield Violation(
+                "pose",
+                f"the {poses.kind[index]} pose at {poses.stamp_ns[index]} ns is called valid and off by "
+                f"{off[index]:.4f} {name}, where its sigma is said to be {sigma[index]:.4f} {name}",
             )
 
 

@@ -131,9 +131,9 @@ def _master(files: DemoFiles, scenario: ScenarioConfig, protocol: Protocol) -> s
         f"noise = {{ {_inline(station.noise.model_dump())} }}\n"
         for station in scenario.stations
     )
-    pipeline = "\n".join(
-        f"{key} = {json.dumps(value)}" for key, value in scenario.pipeline.model_dump().items()
-    )
+    limits = scenario.pipeline.model_dump(mode="json")
+    motion = limits.pop("motion")
+    pipeline = "\n".join(f"{key} = {json.dumps(value)}" for key, value in limits.items())
     classic = f"{_CLASSIC}initial_cycles = {INITIAL_CYCLES}      # the paper's 50 take half a minute\n"
     return f"""\
 kind = "master"
@@ -146,6 +146,7 @@ prism_layout = "prism_layout.toml"
 {_SUPERFRAME if protocol == "superframe" else classic}
 [pipeline]
 {pipeline}
+motion = {{ {_inline(motion)} }}
 
 [stream]
 socket = {json.dumps(str(files.socket))}
@@ -196,5 +197,5 @@ power_dbm = {radio.power_dbm}
 """
 
 
-def _inline(values: dict[str, float]) -> str:
+def _inline(values: dict[str, float | list[float]]) -> str:
     return ", ".join(f"{key} = {value!r}" for key, value in values.items())

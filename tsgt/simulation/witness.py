@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from array import array
-from dataclasses import dataclass, field
+from collections import Counter
+from dataclasses import dataclass, field, fields
 from hashlib import blake2b
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
-from tsgt.master.stream_records import BeaconRecord, ClockRecord, PoseRecord, StatusRecord
+from tsgt.master.stream_records import BeaconRecord, ClockRecord, Kind, PoseRecord, StatusRecord
 from tsgt.model import PolarMeasurement
 from tsgt.recording import encode_line
 from tsgt.recording.journal import load_journal
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
     from tsgt.simulation.geocom_answers import Offered
     from tsgt.station.instrument import Atmosphere, Condition, Instrument, Reading
     from tsgt.station.status import ClientStatus
+
+
+_KINDS: tuple[Kind, ...] = get_args(Kind)
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +47,12 @@ class ValidPoses:
         (N,) as stated.
     after
         (N,) how many measurements stood in the stream before each pose.
+    kind
+        (N,) how each came about, in the word of the stream.
+    newest_s
+        (N,) age of the newest measurement before each.
+    covariance
+        (N, 6, 6) as stated.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -50,6 +60,13 @@ class ValidPoses:
     orientation_xyzw: NDArray[np.float64]
     residual_m: NDArray[np.float64]
     after: NDArray[np.int64]
+    kind: NDArray[np.str_]
+    newest_s: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+    def select(self, rows: NDArray[np.bool_]) -> ValidPoses:
+        """Return some of them."""
+        return ValidPoses(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
 class Session:
@@ -71,7 +88,7 @@ class Session:
     arrived_ns
         When each of the measurements was handed out, Unix time in ns.
     poses
-        How many poses, valid or not.
+        How many poses, valid or not, by kind.
     frames, framed_ns
         How many frames there have been from the first beacon to the last, and how long they took.
     digest
@@ -85,13 +102,14 @@ class Session:
         self.arrived_ns: list[int] = []
         self.clocks: list[ClockRecord] = []
         self.statuses: list[StatusRecord] = []
-        self.poses = 0
+        self.poses: Counter[Kind] = Counter()
         self.frames = 0
         self.framed_ns = 0
         self._first_beacon: BeaconRecord | None = None
         self.digest = blake2b()
         self._pose_stamps = array("q")
         self._pose_after = array("q")
+        self._pose_kinds = array("b")
         self._pose_numbers = array("d")
 
     def take(self, record: object) -> None:
@@ -105,7 +123,7 @@ class Session:
         elif isinstance(record, StatusRecord):
             self.statuses.append(record)
         elif isinstance(record, PoseRecord):
-            self.poses += 1
+            self.poses[record.kind] += 1
             if record.valid:
                 self._take_pose(record)
         elif isinstance(record, BeaconRecord):
@@ -118,16 +136,23 @@ class Session:
         self._pose_numbers.extend(pose.position_m or ())
         self._pose_numbers.extend(pose.orientation_xyzw or ())
         self._pose_numbers.append(np.nan if pose.residual_m is None else pose.residual_m)
+        ages_s = (share.age_s for share in pose.stations if share.age_s is not None)
+        self._pose_numbers.append(min(ages_s, default=np.nan))
+        self._pose_numbers.extend(pose.covariance or ())
+        self._pose_kinds.append(_KINDS.index(pose.kind))
 
     def valid_poses(self) -> ValidPoses:
         """Return the valid poses so far."""
-        numbers = np.array(self._pose_numbers).reshape(-1, 8)
+        numbers = np.array(self._pose_numbers).reshape(-1, 45)
         return ValidPoses(
             stamp_ns=np.array(self._pose_stamps, dtype=np.int64),
             position_m=numbers[:, :3],
             orientation_xyzw=numbers[:, 3:7],
             residual_m=numbers[:, 7],
             after=np.array(self._pose_after, dtype=np.int64),
+            kind=np.array(_KINDS)[np.array(self._pose_kinds, dtype=np.intp)],
+            newest_s=numbers[:, 8],
+            covariance=numbers[:, 9:].reshape(-1, 6, 6),
         )
 
     def recording(self) -> Path | None:

@@ -57,8 +57,8 @@ PROBLEMS = {
         "stations[#1].station = true: should be a valid integer",
     ),
     "no such choice": (
-        ('"linear"', '"cubic"'),
-        "pipeline.estimator = \"cubic\": should be 'linear'",
+        ('estimator = "continuous"', 'estimator = "cubic"'),
+        "pipeline.estimator = \"cubic\": should be 'linear' or 'continuous'",
     ),
     "two stations of one number": (
         ("station = 2", "station = 1"),

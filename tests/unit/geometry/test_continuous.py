@@ -10,11 +10,11 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
-from support.prior_motion import SIGMAS_M, as_points, draw_motions, in_time, measure, rows_at
+from support.prior_motion import SIGMAS_M, STEP_S, as_points, draw_motions, in_time, measure, rows_at
 from support.scene import FRAMES, LAYOUT
 
 from tsgt.errors import GeometryError
-from tsgt.geometry import Observations, cartesian_to_polar
+from tsgt.geometry import Observations, cartesian_to_polar, exp_so3
 from tsgt.geometry.continuous import (
     LEAST_STEP_S,
     OUTLYING,
@@ -318,6 +318,32 @@ def test_one_visible_prism_leaves_a_covariance_that_says_so(observations: Observ
     by_error[:, 3:] = -found.rotation[-1] @ np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     of_prism = by_error @ after[:6, :6] @ by_error.T
     assert np.sqrt(np.linalg.eigvalsh(of_prism).max()) < 0.01
+
+
+@pytest.mark.parametrize("rate_radps", [0.0, 1.5, 2.5])
+def test_a_robot_that_turns_fast_while_one_prism_is_seen_is_not_lost(rate_radps: float) -> None:
+    """The first guess turns on where two prisms are not seen, and puts the robot where the third one is."""
+    time_s = np.arange(round(8.0 / STEP_S) + 1, dtype=np.float64) * STEP_S
+    still = np.zeros((len(time_s), 3))
+    velocity, rates = (np.tile(v, (len(time_s), 1)) for v in ([0.8, -0.5, 0.0], [0.3, 0.0, rate_radps]))
+    motion = Knots(
+        time_s,
+        np.array([60.0, 45.0, -1.0]) + time_s[:, None] * velocity,
+        exp_so3(time_s[:, None] * rates),
+        velocity,
+        rates,
+        still,
+        still,
+    )
+    whole = in_time(measure(motion, until_s=7.5, seed=18))
+    data = whole.select((whole.time_s < 3.0) | (whole.time_s > 4.5) | (whole.prism == 0))
+    start = guess_of(data)
+    truth = motion.select(rows_at(start.time_s))
+    away = start.error_from(truth)
+    assert np.linalg.norm(away[:, 3:6], axis=1).max() < 0.7
+    found = solve(data, start, PRIOR)
+    assert np.all(found.weights == 1.0)
+    assert np.linalg.norm(found.knots.error_from(truth)[:, 3:6], axis=1).max() < 0.1
 
 
 def test_knots_stand_at_measurements() -> None:

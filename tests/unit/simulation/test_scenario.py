@@ -9,13 +9,8 @@ import numpy as np
 import pytest
 from support.missions import QUICK, SUPERFRAME, mission
 
-from tsgt.cli.simulate_figures import (
-    estimator_figures,
-    figures,
-    frame_ms,
-    outage_figures,
-    station_figures,
-)
+from tsgt.cli.simulate_figures import figures, frame_ms, outage_figures, station_figures
+from tsgt.cli.simulate_poses import estimator_figures
 from tsgt.config.radio import ClassicMasterConfig
 from tsgt.simulation.authors_node import AuthorsTiming
 from tsgt.simulation.checkers import violations
@@ -39,10 +34,10 @@ def test_a_mission_of_a_minute(tmp_path: Path) -> None:
         assert figure.rate_hz > 1.3
         assert figure.duplicates == 0
         assert figure.time_error_us[2] < 300
-    poses = estimator_figures(run)
+    poses = estimator_figures(run)["linear"]
     assert poses.valid_poses > 600
-    assert poses.position_rms_mm < 40
-    assert poses.orientation_rms_deg < 2
+    assert poses.against_truth.position_rms_mm < 40
+    assert poses.against_truth.orientation_rms_deg < 2
 
 
 @pytest.mark.parametrize(("node", "least_hz", "most_hz"), [("ours", 1.5, 1.72), ("authors", 1.3, 1.6)])
@@ -88,7 +83,7 @@ def test_the_authors_node_is_polled(tmp_path: Path) -> None:
     for figure in station_figures(run).values():
         assert 1.2 < figure.rate_hz < 1.65
         assert figure.time_error_us[2] < 3000
-    assert estimator_figures(run).valid_poses > 300
+    assert estimator_figures(run)["linear"].valid_poses > 300
 
 
 def test_lost_packets_cost_measurements_and_nothing_else(tmp_path: Path) -> None:
@@ -119,7 +114,7 @@ def test_fewer_or_more_stations_than_prisms(tmp_path: Path, count: int) -> None:
     assert violations(run) == []
     assert list(station_figures(run)) == list(range(1, count + 1))
     assert all(figure.delivered > 5 for figure in station_figures(run).values())
-    assert (estimator_figures(run).valid_poses > 0) == (count >= 3)
+    assert (estimator_figures(run)["linear"].valid_poses > 0) == (count >= 3)
 
 
 def test_a_client_that_crashes_and_comes_back(tmp_path: Path) -> None:
@@ -293,8 +288,9 @@ def test_the_superframe_delivers_everything(tmp_path: Path) -> None:
         assert figure.within_2s > 0.99
         assert figure.time_error_us[2] < 100
     poses = estimator_figures(run)
-    assert poses.valid_poses > 1100
-    assert poses.position_rms_mm < 20
+    assert poses["linear"].valid_poses > 1100
+    assert poses["linear"].against_truth.position_rms_mm < 20
+    assert poses["continuous"].against_truth.position_rms_mm < 3
     assert 350 < frame_ms(run) < 450
 
 

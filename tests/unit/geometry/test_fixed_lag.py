@@ -1,0 +1,168 @@
+"""The fixed lag: measurements one by one, at the same cost for each, as good as all at once where it matters."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.prior_motion import draw_motions, in_time, measure, rows_at
+
+from tsgt.geometry import FixedLag, FloatArray, Observations, Trajectory
+from tsgt.geometry.continuous import knot_times, solve
+from tsgt.geometry.first_guess import first_guess
+from tsgt.model import MotionPrior
+
+PRIOR = MotionPrior()
+LAG_S = 3.0
+
+
+@pytest.fixture(scope="module")
+def observations() -> Observations:
+    """Twelve seconds of a robot that moves as the prior says."""
+    return drawn(1)
+
+
+def drawn(seed: int, until_s: float = 12.0) -> Observations:
+    """Measurements of some motion, in the order of time."""
+    (motion,) = draw_motions(PRIOR, count=1, duration_s=until_s, seed=seed)
+    return in_time(measure(motion, until_s=until_s, seed=seed))
+
+
+def batch(observations: Observations) -> Trajectory:
+    """All at once."""
+    found = solve(observations, first_guess(observations, knot_times(observations.time_s)), PRIOR)
+    return Trajectory(found.knots, PRIOR, *found.factor.marginals())
+
+
+def followed(observations: Observations, *, lag_s: float = LAG_S) -> FixedLag:
+    """One by one; what is older than the lag is let go of."""
+    window = FixedLag(PRIOR)
+    for row in range(len(observations)):
+        window.update(observations.select(slice(row, row + 1)))
+        window.forget(observations.time_s[row] - lag_s)
+    return window
+
+
+def test_the_end_is_that_of_the_whole_trajectory(observations: Observations) -> None:
+    """What the window has let go of is not forgotten: state and covariance at the end are those of all measurements."""
+    at_s = np.array([observations.time_s[-1] + 0.3])
+    state, covariance = followed(observations).predict(float(at_s[0]))
+    expected, expected_covariance = batch(observations).at(at_s)
+    sigmas = np.sqrt(np.diagonal(expected_covariance, axis1=1, axis2=2))
+    assert np.abs(state.error_from(expected) / sigmas).max() < 0.05
+    np.testing.assert_allclose(covariance, expected_covariance, rtol=0.05, atol=1e-3 * sigmas.max() ** 2)
+
+
+def test_a_smoothed_state_is_nearly_that_of_the_whole_trajectory(observations: Observations) -> None:
+    """A few seconds of measurements on its later side are as good as all."""
+    window = FixedLag(PRIOR)
+    whole = batch(observations)
+    for row in range(len(observations)):
+        window.update(observations.select(slice(row, row + 1)))
+        now_s = observations.time_s[row]
+        if now_s > 2 * LAG_S:
+            at_s = np.array([now_s - LAG_S])
+            state, covariance = window.trajectory().at(at_s)
+            expected, expected_covariance = whole.at(at_s)
+            sigmas = np.sqrt(np.diagonal(expected_covariance, axis1=1, axis2=2))
+            assert np.abs(state.error_from(expected) / sigmas)[:, :6].max() < 0.3
+            assert np.trace(covariance[0, :6, :6]) < 1.05 * np.trace(expected_covariance[0, :6, :6])
+        window.forget(now_s - LAG_S)
+
+
+def test_the_window_does_not_grow(observations: Observations) -> None:
+    """Hours cost no more than seconds."""
+    window = followed(observations)
+    assert window.observations is not None
+    assert len(window.observations) < 1.5 * LAG_S * 7.5
+    assert window.horizon_s > observations.time_s[-1] - 1.5 * LAG_S
+
+
+def test_a_late_measurement_counts(observations: Observations) -> None:
+    """Within the lag it does not matter when a measurement comes."""
+    order = np.arange(len(observations))
+    late = len(order) - 8
+    order = np.concatenate([order[:late], order[late + 1 :], [late]])
+    in_order, out_of_order = followed(observations), followed(observations.select(order))
+    at_s = float(observations.time_s[-1])
+    state, covariance = out_of_order.predict(at_s)
+    expected, expected_covariance = in_order.predict(at_s)
+    sigmas = np.sqrt(np.diagonal(expected_covariance, axis1=1, axis2=2))
+    assert np.abs(state.error_from(expected) / sigmas).max() < 0.05
+    np.testing.assert_allclose(covariance, expected_covariance, rtol=0.02, atol=1e-3 * sigmas.max() ** 2)
+
+
+def test_what_has_been_let_go_of_is_named(observations: Observations) -> None:
+    """The horizon is the instant before which nothing counts any more, never after what was asked to be kept."""
+    window = FixedLag(PRIOR)
+    for row in range(len(observations)):
+        window.update(observations.select(slice(row, row + 1)))
+        window.forget(observations.time_s[row] - LAG_S)
+        assert window.horizon_s <= observations.time_s[row] - LAG_S
+
+
+def test_it_begins_when_three_prisms_have_been_measured_twice(observations: Observations) -> None:
+    """Two prisms, however often, tell no rotation."""
+    two = observations.select(observations.prism != 2)
+    assert not followed(two).following
+    assert followed(observations).following
+
+
+@pytest.mark.parametrize("off_m", [0.2, 1.0, 30.0])
+def test_an_outlier_does_little(observations: Observations, off_m: float) -> None:
+    """One wrong distance moves the trajectory by no more than its sigmas."""
+    row = len(observations) - 12
+    points = observations.points_m.copy()
+    points[row] *= 1 + off_m / np.linalg.norm(points[row])
+    wrong = followed(replace(observations, points_m=points))
+    without = followed(observations.select(np.arange(len(observations)) != row))
+    at_s = float(observations.time_s[-1])
+    state, covariance = wrong.predict(at_s)
+    expected, _ = without.predict(at_s)
+    sigmas = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    assert np.abs(state.error_from(expected) / sigmas)[:, :6].max() < 1.0
+
+
+def test_it_begins_anew_after_an_outage(observations: Observations) -> None:
+    """After half a minute without measurements it is found again within a second."""
+    later = drawn(2, 3.0)
+    again = replace(later, time_s=later.time_s + observations.time_s[-1] + 30.0)
+    window = followed(observations)
+    for row in range(len(again)):
+        window.update(again.select(slice(row, row + 1)))
+        window.forget(again.time_s[row] - LAG_S)
+    state, covariance = window.predict(float(again.time_s[-1]))
+    expected, _ = batch(again).at(again.time_s[-1:])
+    sigmas = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    assert np.abs(state.error_from(expected) / sigmas).max() < 0.3
+
+
+def test_one_prism_alone_is_followed_with_growing_uncertainty(observations: Observations) -> None:
+    """It goes on, and says how much less it knows."""
+    start = observations.time_s <= 6.0
+    alone = observations.select(start | ((observations.prism == 0) & (observations.time_s < 8.0)))
+    _, covariance = followed(observations.select(start)).predict(6.0)
+    _, then = followed(alone).predict(8.0)
+    assert np.trace(then[0, 3:6, 3:6]) > 10 * np.trace(covariance[0, 3:6, 3:6])
+
+
+def test_covariances_are_honest() -> None:
+    """NEES of predicted and smoothed poses, over motions drawn from the prior, is that of 6 degrees of freedom."""
+    predicted: list[float] = []
+    smoothed: list[float] = []
+    motions = draw_motions(PRIOR, count=12, duration_s=9.0, seed=7)
+    for seed, motion in enumerate(motions):
+        measured = in_time(measure(motion, until_s=8.0, seed=seed))
+        window = followed(measured)
+        for found, at_s in ((predicted, 8.4), (smoothed, 5.6)):
+            at = np.array([at_s])
+            state, covariance = window.predict(at_s) if found is predicted else window.trajectory().at(at)
+            found.append(_nees(state.error_from(motion.select(rows_at(at)))[:, :6], covariance[:, :6, :6]))
+    # 95 % band of the mean of 12 draws of chi-square with 6 degrees of freedom, divided by 12.
+    for found in (predicted, smoothed):
+        assert 4.2 < np.mean(found) < 8.1
+
+
+def _nees(error: FloatArray, covariance: FloatArray) -> float:
+    return float(error[0] @ np.linalg.solve(covariance[0], error[0]))

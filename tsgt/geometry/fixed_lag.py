@@ -1,0 +1,277 @@
+"""The estimator ``continuous`` while measurements come in: a window of knots that moves along with time. Pure.
+
+Problem: the trajectory of hours must be known now, at the same cost for each measurement. Idea: keep the knots of the
+last few seconds; what came before is one Gaussian on the oldest of them, left over when the older ones are eliminated
+(the Schur complement). Within the window a measurement counts whenever it comes, and all are linearised again where the
+trajectory now is. docs/explanation/continuous-trajectory.md says more.
+
+A new measurement may lie far from what was predicted because the robot did the unexpected, or because it is wrong; so what
+it first counts is judged by its distance in sigmas of the prediction, not in those of the instrument.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.errors import GeometryError
+from tsgt.geometry.block_tridiagonal import BlockFactor, factorise
+from tsgt.geometry.continuous import (
+    LEAST_STEP_S,
+    OUTLYING,
+    Anchor,
+    Solution,
+    System,
+    assemble,
+    knot_times,
+    nearest,
+    solve,
+    start_anchor,
+)
+from tsgt.geometry.first_guess import first_guess
+from tsgt.geometry.knots import STATE, Knots, Steps, joined
+from tsgt.geometry.motion_prior import axis_times_s, transition
+from tsgt.geometry.prism_factors import Observations, linearise
+from tsgt.geometry.rigid import exp_so3
+from tsgt.geometry.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from tsgt.geometry.rigid import FloatArray
+    from tsgt.model import MotionPrior
+
+SURE_RAD = 0.1
+"""One sigma of the rotation: known so well, the robot is followed from one measurement to the next."""
+
+LOST_RAD = 0.5
+"""One sigma of the rotation: not known so well any more, it has to be guessed anew; straight lines would not do."""
+
+SETTLED = 1.0
+"""In squared sigmas of the whole window: a step that is to gain less is the last one."""
+
+MOST_STEPS = 5
+"""Where these do not settle it, every step is tried before it is taken, as in :func:`tsgt.geometry.continuous.solve`."""
+
+_AS_GOOD_AS_NOTHING = np.repeat([1.0, 1.0, 10.0, 10.0, 10.0, 10.0], 3)
+"""One sigma of the first state once measurements tell it to millimetres: m, rad, and these per second once and twice.
+With less still, rounding would lose it beside the stiff steps between knots when it is eliminated."""
+
+
+class FixedLag:
+    """Follows a robot.
+
+    Parameters
+    ----------
+    prior
+        How it moves.
+
+    Attributes
+    ----------
+    observations
+        The measurements of the window, in the order of time; None before the first one.
+    residuals_m
+        (M, 3) what each of them is off the trajectory by, as :class:`~tsgt.geometry.prism_factors.Linearised` has it;
+        NaN while there is none.
+    """
+
+    def __init__(self, prior: MotionPrior) -> None:
+        self._prior = prior
+        self._horizon_s = -np.inf
+        self._knots: Knots | None = None
+        self._anchor: Anchor | None = None
+        self._settled = False
+        self._solved: tuple[Knots, BlockFactor] | None = None
+        self._trajectory: Trajectory | None = None
+        self._end: Trajectory | None = None
+        self.observations: Observations | None = None
+        self.residuals_m: FloatArray = np.empty((0, 3))
+
+    @property
+    def horizon_s(self) -> float:
+        """Measurements made before this are too late: what they would have changed is no longer in the window."""
+        return self._horizon_s
+
+    @property
+    def following(self) -> bool:
+        """Whether there is a trajectory."""
+        return self._solved is not None
+
+    def update(self, new: Observations) -> None:
+        """Take measurements, in the order of time, none before :attr:`horizon_s`."""
+        held, self.observations = self.observations, _merged(self.observations, new)
+        try:
+            if not self._settled or held is None or not self._followed(held, new):
+                self._begin(self.observations)
+        except GeometryError:  # not determined, or not yet
+            self._settled, self._knots, self._solved = False, None, None
+            self.residuals_m = np.full((len(self.observations), 3), np.nan)
+
+    def forget(self, before_s: float) -> None:
+        """Let go of what was before an instant; states from then on can still be asked for, and no others."""
+        if self.observations is None:
+            return
+        if self._settled:
+            try:
+                self._marginalise(before_s)
+            except GeometryError:  # by rounding alone; what the window holds is enough to begin with
+                self._settled = False
+        if not self._settled:
+            self._horizon_s = max(self._horizon_s, before_s)
+            self._keep(self.observations.time_s >= before_s)
+
+    def _marginalise(self, before_s: float) -> None:
+        """Leave of the past one Gaussian on the last knot that is not after an instant."""
+        assert self.observations is not None  # noqa: S101 (it is settled)
+        assert self._knots is not None  # noqa: S101 (it is settled)
+        assert self._anchor is not None  # noqa: S101 (it is settled)
+        first = int(np.searchsorted(self._knots.time_s, before_s, side="right")) - 1
+        if first <= 0:
+            return
+        at = nearest(self._knots.time_s, self.observations.time_s)
+        past, knots = at < first, self._knots.select(slice(first + 1))
+        system = assemble(
+            self.observations.select(past), at[past], knots, Steps.of(knots.time_s, self._prior), self._anchor
+        )
+        factor = factorise(system.diagonal, system.beside)
+        left = factor.last()
+        mean = knots.select(slice(first, None)).moved(factor.solve(-system.gradient)[first:])
+        self._anchor = Anchor(mean, left @ left.T)
+        self._knots = self._knots.select(slice(first, None))
+        self._horizon_s = float(self._knots.time_s[0])
+        self._keep(~past)
+
+    def predict(self, time_s: float) -> tuple[Knots, FloatArray]:
+        """Return the state at an instant, with its covariance, (1, 18, 18), by all measurements so far."""
+        assert self._end is not None  # noqa: S101 (only called while following)
+        trajectory = self._end if time_s >= self._end.knots.time_s[-1] else self.trajectory()
+        return trajectory.at(np.array([time_s]))
+
+    def trajectory(self) -> Trajectory:
+        """Return the trajectory over the window, and over what the last :meth:`forget` let go of."""
+        assert self._solved is not None  # noqa: S101 (only called while following)
+        if self._trajectory is None:
+            knots, factor = self._solved
+            self._trajectory = Trajectory(knots, self._prior, *factor.marginals())
+        return self._trajectory
+
+    def _keep(self, rows: NDArray[np.bool_]) -> None:
+        assert self.observations is not None  # noqa: S101 (only called with some)
+        self.observations = self.observations.select(rows)
+        self.residuals_m = self.residuals_m[rows]
+
+    def _begin(self, observations: Observations) -> None:
+        """Find the trajectory of all measurements of the window, knowing nothing else."""
+        self._settled = False
+        if np.count_nonzero(np.bincount(observations.prism) >= 2) < 3:
+            raise GeometryError("to begin with, three prisms have to be measured twice")
+        guess = first_guess(observations, knot_times(observations.time_s))
+        self._anchor = start_anchor(guess.select(slice(0, 1)), self._prior)
+        self._search(guess)
+        if self._settled:
+            assert self._knots is not None  # noqa: S101 (it is settled)
+            self._anchor = Anchor(self._knots.select(slice(0, 1)), np.diag(_AS_GOOD_AS_NOTHING**-2.0))
+
+    def _followed(self, held: Observations, new: Observations) -> bool:
+        """Add measurements to the trajectory found before; return whether that is still good to follow."""
+        assert self.observations is not None  # noqa: S101 (that has been set)
+        assert self._knots is not None  # noqa: S101 (it is settled)
+        assert self._anchor is not None  # noqa: S101 (it is settled)
+        knots = _with_knots_at(self._knots, new.time_s, self._prior)
+        steps = Steps.of(knots.time_s, self._prior)
+        knots = knots.moved(_first_move(held, new, knots, steps, self._anchor))
+        at = nearest(knots.time_s, self.observations.time_s)
+        for _ in range(MOST_STEPS):
+            system = assemble(self.observations, at, knots, steps, self._anchor)
+            factor = factorise(system.diagonal, system.beside)
+            move = factor.solve(-system.gradient)
+            gain = -float(np.vdot(move, system.gradient))
+            knots = knots.moved(move)
+            if gain < SETTLED:
+                self._take(knots, factor, system)
+                return self._settled
+        self._search(knots)
+        return self._settled
+
+    def _search(self, guess: Knots) -> None:
+        """Find the trajectory however far it is from a guess."""
+        assert self.observations is not None  # noqa: S101 (only called with some)
+        found = solve(self.observations, guess, self._prior, anchor=self._anchor)
+        self._take(found.knots, found.factor, found)
+
+    def _take(self, knots: Knots, factor: BlockFactor, found: System | Solution) -> None:
+        self._knots, self._solved, self._trajectory = knots, (knots, factor), None
+        self.residuals_m = found.linearised.residuals_m
+        inverse = np.linalg.inv(factor.last())
+        covariance = inverse.T @ inverse
+        self._end = Trajectory(
+            knots.select(slice(-1, None)), self._prior, covariance[None], np.empty((0, STATE, STATE))
+        )
+        sigma_rad = float(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1]))
+        fits = float(np.median(found.distances)) < OUTLYING**2
+        self._settled = fits and sigma_rad < (LOST_RAD if self._settled else SURE_RAD)
+
+
+def _first_move(
+    held: Observations, new: Observations, knots: Knots, steps: Steps, anchor: Anchor
+) -> FloatArray:
+    """Step towards the trajectory of all measurements, the new ones weighed by how far they are from the others' one."""
+    system = assemble(held, nearest(knots.time_s, held.time_s), knots, steps, anchor)
+    at, seen = nearest(knots.time_s, new.time_s), linearise(new, knots, nearest(knots.time_s, new.time_s))
+    noise = seen.covariance(new)
+    rows = np.arange(len(new))
+    right = np.zeros((len(knots), STATE, 3 * len(new) + 1))
+    right[:, :, -1] = -system.gradient
+    for row in rows:
+        right[at[row], :, 3 * row : 3 * row + 3] = seen.jacobian[row].T
+    found = factorise(system.diagonal, system.beside).solve(right)
+    by_state = np.stack([found[at[row], :, 3 * row : 3 * row + 3] for row in rows])
+    off = seen.residuals_m + (seen.jacobian @ found[at, :, -1:])[..., 0]
+    expected = noise + seen.jacobian @ by_state
+    distances = np.einsum("ij,ij->i", off, np.linalg.solve(expected, off[..., None])[..., 0])
+    weights = np.where(distances > OUTLYING**2, OUTLYING**2 / np.maximum(distances, OUTLYING**2), 1.0)
+    weighted = np.swapaxes(seen.jacobian, 1, 2) @ (np.linalg.inv(noise) * weights[:, None, None])
+    np.add.at(system.diagonal, at, weighted @ seen.jacobian)
+    np.add.at(system.gradient, at, (weighted @ seen.residuals_m[..., None])[..., 0])
+    return factorise(system.diagonal, system.beside).solve(-system.gradient)
+
+
+def _with_knots_at(knots: Knots, time_s: FloatArray, prior: MotionPrior) -> Knots:
+    """Add knots where measurements have none near; their states are what those before them predict."""
+    for instant_s in time_s:
+        if np.min(np.abs(knots.time_s - instant_s)) > 0.5 * LEAST_STEP_S:
+            after = int(np.searchsorted(knots.time_s, instant_s))
+            added = _predicted(knots.select(slice(after - 1, after)), instant_s, prior)
+            knots = joined([knots.select(slice(after)), added, knots.select(slice(after, None))])
+    return knots
+
+
+def _predicted(start: Knots, time_s: float, prior: MotionPrior) -> Knots:
+    phi = transition(time_s - start.time_s[:, None], axis_times_s(prior))
+    velocity = np.concatenate([start.velocity, start.angular_velocity], axis=1)
+    acceleration = np.concatenate([start.acceleration, start.angular_acceleration], axis=1)
+    moved, fast, faster = np.moveaxis(
+        (phi @ np.stack([np.zeros_like(velocity), velocity, acceleration], axis=-1)[..., None])[..., 0], -1, 0
+    )
+    return Knots(
+        np.array([time_s]),
+        start.position + moved[:, :3],
+        start.rotation @ exp_so3(moved[:, 3:]),
+        fast[:, :3],
+        fast[:, 3:],
+        faster[:, :3],
+        faster[:, 3:],
+    )
+
+
+def _merged(held: Observations | None, new: Observations) -> Observations:
+    """Put measurements together in the order of time, those of one instant in the order of the prisms."""
+    if held is None:
+        return new
+    names = [field.name for field in fields(Observations) if field.name not in ("frames", "layout")]
+    both = replace(
+        held, **{name: np.concatenate([getattr(held, name), getattr(new, name)]) for name in names}
+    )
+    return both.select(np.lexsort((both.station, both.prism, both.time_s)))

@@ -33,6 +33,8 @@ bench: $(VENV)/.test
 	$(BIN)/python benchmarks/beacon_clock.py
 	$(BIN)/python benchmarks/instrument_time.py
 	$(BIN)/python benchmarks/instrument.py
+	$(BIN)/python benchmarks/nees.py
+	$(BIN)/python benchmarks/continuous.py
 
 # Schemas, field tables and the command reference come from the code; a test fails when they are stale.
 generated: $(VENV)/.test

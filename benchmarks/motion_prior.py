@@ -1,0 +1,138 @@
+"""Which motion prior explains a recording best: white noise on acceleration, white noise on jerk, or what lies between.
+
+For each recording and each prior, its sigmas and the noise's scale are tuned on the same stretches of the recording. The
+table has the log evidence less that of white noise on acceleration, and by how much measurements that were left out are
+missed (folds as `tsgt evaluate` has them; the prior has seen none of what it predicts).
+
+    python benchmarks/motion_prior.py RECORDING...
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.optimize import minimize
+
+from tsgt.analysis.held_out import FOLDS, folds, hold_out, missed_by_lines, missed_by_trajectory, never_out
+from tsgt.geometry.fit import fit
+from tsgt.geometry.tuning import _evidence, _logarithms, _meaning, _stretches
+from tsgt.master.observations import build_observations
+from tsgt.model import MotionPrior
+from tsgt.recording import load_recording
+
+if TYPE_CHECKING:
+    from tsgt.analysis.held_out import Fold
+    from tsgt.geometry import FloatArray, Observations
+
+# An acceleration that lasts a millisecond is white at any rate of measuring; one of a minute, over the steps between
+# measurements and over their neighbours', is the sum of white jerk.
+CORRELATION_TIMES_S: dict[str, float | None] = {
+    "white acceleration": 1e-3,
+    "white jerk": 60.0,
+    "tuned correlation": None,
+}
+FREE_TIME_S = (0.03, 10.0)
+SIGMAS = (1e-3, 1e3)
+SCALES = (0.5, 20.0)
+_TIMES = (2, 5)
+_SCALE = 6
+
+
+@dataclass(frozen=True)
+class Found:
+    """A prior tuned to a recording."""
+
+    prior: MotionPrior
+    noise_scale: float
+    log_evidence: float
+
+
+def tuned(observations: Observations, time_s: float | None) -> Found:
+    """Tune sigmas and noise with a given correlation time, or with the best."""
+    stretches = _stretches(observations)
+    start = _logarithms(MotionPrior(), 1.0)
+    limits = [SIGMAS] * 6 + [SCALES]
+    for row in _TIMES:
+        limits[row] = FREE_TIME_S if time_s is None else (time_s, time_s)
+        if time_s is not None:
+            # So that a step of 0.1 s has the same noise in its velocity to begin with.
+            own_s = np.exp(start[row])
+            gain = np.sqrt(own_s / time_s) if time_s < own_s else np.sqrt(time_s / own_s)
+            start[row - 2 : row] += np.log(gain)
+            start[row] = np.log(time_s)
+
+    share = 1.0 / sum(len(stretch.observations) for stretch in stretches)
+
+    def negative(parameters: FloatArray) -> tuple[float, FloatArray]:
+        parts = [_evidence(stretch, parameters) for stretch in stretches]
+        return -share * sum(value for value, _ in parts), -share * np.sum([part for _, part in parts], axis=0)
+
+    found = minimize(
+        negative,
+        start,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=[(float(np.log(least)), float(np.log(most))) for least, most in limits],
+        options={"maxiter": 60, "ftol": 1e-6},
+    )
+    prior, scale = _meaning(found.x)
+    return Found(prior, scale, -float(found.fun) / share)
+
+
+def missed_m(observations: Observations, time_s: float | None) -> FloatArray:
+    """By how much measurements that were left out are missed, in m, without those at gaps."""
+    seen = [tuned(observations.select(never_out(observations, number)), time_s) for number in range(FOLDS)]
+
+    def by_fold(fold: Fold) -> FloatArray:
+        own = seen[fold.number]
+        kept = fit(observations.select(fold.kept), prior=own.prior, noise_scale=own.noise_scale)
+        return missed_by_trajectory(kept.trajectory, observations.select(fold.out))
+
+    held_out = hold_out(folds(observations), by_fold)
+    return held_out.missed_m[~held_out.at_gap]
+
+
+def row(name: str, evidence: str, missed: FloatArray, more: str = "") -> str:
+    """One line of the table."""
+    mean, p95 = 1e3 * missed.mean(), 1e3 * np.percentile(missed, 95)
+    return f"  {name:20} {evidence:>9} {mean:8.1f} {p95:8.1f}  {more}"
+
+
+def main() -> None:
+    """Print one table per recording."""
+    for path in sys.argv[1:]:
+        recording = load_recording(Path(path))
+        origin_ns = min(measurement.stamp_ns for measurement in recording.measurements)
+        observations, _ = build_observations(
+            recording.parameters, recording.measurements, origin_ns=origin_ns
+        )
+        print(f"{path}: {len(observations)} measurements, {np.ptp(observations.time_s):.0f} s")
+        print(f"  {'prior':20} {'evidence':>9} {'mean mm':>8} {'p95 mm':>8}  tuned")
+        least = np.nan
+        for name, time_s in CORRELATION_TIMES_S.items():
+            found = tuned(observations, time_s)
+            least = found.log_evidence if np.isnan(least) else least
+            prior = found.prior
+            sigmas = ", ".join(
+                f"{sigma:.3g}"
+                for sigma in (
+                    *prior.acceleration_sigma_mps2[1:],
+                    *prior.angular_acceleration_sigma_radps2[1:],
+                )
+            )
+            more = (
+                f"{sigmas}; {prior.acceleration_time_s:.2g} and {prior.angular_acceleration_time_s:.2g} s; "
+                f"noise x {found.noise_scale:.2f}"
+            )
+            evidence = f"{found.log_evidence - least:+.0f}"
+            print(row(name, evidence, missed_m(observations, time_s), more), flush=True)
+        lines = hold_out(folds(observations), lambda fold: missed_by_lines(observations, fold))  # noqa: B023
+        print(row("linear", "", lines.missed_m[~lines.at_gap]), flush=True)
+
+
+if __name__ == "__main__":
+    main()

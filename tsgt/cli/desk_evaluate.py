@@ -28,6 +28,7 @@ from tsgt.cli.desk_input import (
     prisms_option,
     progress,
 )
+from tsgt.cli.evaluate_report import report_evaluation
 from tsgt.cli.options import json_option, keep_going_option, path_type, recording_argument
 from tsgt.cli.output import print_json, print_table
 from tsgt.errors import GeometryError, RecordingError
@@ -63,8 +64,15 @@ LISTED_OUTLIERS = 10
 @click.option(
     "--held-out/--no-held-out",
     "with_held_out",
-    default=True,
-    help="Leave measurements out and predict them, which takes most of the time.  [default: do]",
+    default=None,
+    help="Leave measurements out and predict them, which takes most of the time.  "
+    "[default: do; in a report of more than 10 min do not]",
+)
+@click.option(
+    "--report",
+    "report_folder",
+    type=path_type,
+    help="Folder for a report with figures: one HTML page, and PNG and PDF beside it.",
 )
 @frames_option
 @prisms_option
@@ -75,7 +83,8 @@ def evaluate(
     recording: Path,
     estimator: Estimator | None,
     reference_path: Path | None,
-    with_held_out: bool,
+    with_held_out: bool | None,
+    report_folder: Path | None,
     frames: Path | None,
     prisms: Path | None,
     keep_going: bool,
@@ -88,6 +97,11 @@ def evaluate(
     """
     loaded = load(recording, keep_going=keep_going, estimator=estimator, frames=frames, prisms=prisms)
     reference = None if reference_path is None else read_tum(reference_path)
+    if report_folder is not None:
+        report_evaluation(
+            loaded, recording, report_folder, reference=reference, with_held_out=with_held_out, as_json=as_json
+        )
+        return
     parameters = loaded.parameters
     with progress("fitting") as on_progress:
         continuous = smoothed(loaded, path=recording, on_progress=on_progress)
@@ -96,7 +110,7 @@ def evaluate(
     else:
         poses = process(loaded, path=recording)
     found = inter_prism(parameters, build_tracks(parameters, loaded.measurements))
-    left_out = _held_out(loaded, continuous, recording) if with_held_out else None
+    left_out = _held_out(loaded, continuous, recording) if with_held_out is not False else None
     strays = outliers(continuous.fit, continuous.sources)
     residuals = residual_figures(continuous.fit, continuous.sources)
     compared = {} if reference is None else _compared(loaded, continuous, reference, recording)

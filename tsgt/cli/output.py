@@ -17,7 +17,12 @@ CHECK_FAILED = 3
 
 def print_json(data: Mapping[str, Any]) -> None:
     """Print one JSON object; a number that is not finite becomes null, as JSON has none."""
-    click.echo(json.dumps(_finite(data), indent=2, allow_nan=False))
+    click.echo(json_text(data))
+
+
+def json_text(data: Mapping[str, Any]) -> str:
+    """Return what :func:`print_json` prints."""
+    return json.dumps(_finite(data), indent=2, allow_nan=False)
 
 
 def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

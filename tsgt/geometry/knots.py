@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.geometry.motion_prior import axis_sigmas, process_information, transition
-from tsgt.geometry.rigid import FloatArray, dot, exp_so3, log_so3, skew
-from tsgt.geometry.so3 import inverse_right_jacobian
+from tsgt.geometry.rigid import FloatArray, dot, exp_so3, skew
+from tsgt.geometry.so3 import cross, inverse_right_jacobian, log_of_steps
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -74,7 +74,7 @@ class Knots:
         return np.concatenate(
             [
                 self.position - other.position,
-                log_so3(np.swapaxes(other.rotation, 1, 2) @ self.rotation),
+                log_of_steps(np.swapaxes(other.rotation, 1, 2) @ self.rotation),
                 self.velocity - other.velocity,
                 self.angular_velocity - other.angular_velocity,
                 self.acceleration - other.acceleration,
@@ -160,7 +160,7 @@ def linearise_steps(knots: Knots, steps: Steps) -> LinearisedSteps:
         np.concatenate([knots.acceleration[:-1], knots.angular_acceleration[:-1]], axis=1),
     )
     later = _stacked(
-        np.concatenate([np.diff(knots.position, axis=0), turn - wander * np.cross(before, after)], axis=1),
+        np.concatenate([np.diff(knots.position, axis=0), turn - wander * cross(before, after)], axis=1),
         np.concatenate([knots.velocity[1:], after], axis=1),
         np.concatenate([knots.acceleration[1:], knots.angular_acceleration[1:]], axis=1),
     )
@@ -180,7 +180,7 @@ def turn_between(before: Knots, after: Knots) -> FloatArray:
     A robot that goes on turning while nothing is seen of it comes back farther round than the shortest way. Less than
     0.3 rad from where it was it may have made a whole turn or none: then the shortest way stands.
     """
-    turn = log_so3(np.swapaxes(before.rotation, 1, 2) @ after.rotation)
+    turn = log_of_steps(np.swapaxes(before.rotation, 1, 2) @ after.rotation)
     dt_s = (after.time_s - before.time_s)[:, None]
     expected = 0.5 * dt_s * (before.angular_velocity + after.angular_velocity)
     angle = np.sqrt(dot(turn, turn))[:, None]

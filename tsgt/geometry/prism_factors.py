@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.geometry.rigid import FloatArray, dot, exp_so3, rotate, skew
-from tsgt.geometry.so3 import right_jacobian
+from tsgt.geometry.so3 import cross, right_jacobian
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -136,7 +136,7 @@ def linearise(observations: Observations, knots: Knots, at: NDArray[np.intp]) ->
         + rotate(rotation, arm)
     )
     rate = knots.angular_velocity[at] + knots.angular_acceleration[at] * delta_s
-    velocity = knots.velocity[at] + knots.acceleration[at] * delta_s + rotate(rotation, np.cross(rate, arm))
+    velocity = knots.velocity[at] + knots.acceleration[at] * delta_s + rotate(rotation, cross(rate, arm))
     residuals, by_point = _compared(observations, point)
     jacobian = np.empty((len(observations), 3, 18))
     by_rotation_then = -by_point @ rotation @ skew(arm)

@@ -15,7 +15,7 @@ import numpy as np
 from tsgt.geometry.knots import STATE, Knots, joined, spread, turn_between
 from tsgt.geometry.motion_prior import axis_sigmas, axis_times_s, between, process_noise, transition
 from tsgt.geometry.rigid import FloatArray, exp_so3, skew
-from tsgt.geometry.so3 import inverse_right_jacobian, right_jacobian
+from tsgt.geometry.so3 import cross, inverse_right_jacobian, right_jacobian
 
 if TYPE_CHECKING:
     from tsgt.model import MotionPrior
@@ -81,7 +81,7 @@ class Trajectory:
         moved = phi @ np.stack([zero, _velocities(start), _accelerations(start)], axis=-1)[..., None]
         moved = moved[..., 0]
         wander, before, here = (dt_s**2 / 12)[:, None], start.angular_velocity, moved[:, 3:, 1]
-        turn = moved[:, 3:, 0] + wander * np.cross(before, here)
+        turn = moved[:, 3:, 0] + wander * cross(before, here)
         states = _states(time_s, start.position + moved[:, :3, 0], start.rotation @ exp_so3(turn), moved)
         to_error = _to_error(turn, wander, before)
         by_start = to_error @ spread(phi)
@@ -97,7 +97,7 @@ class Trajectory:
         from_earlier, from_later, left = between(dt_s[:, None], (step_s - dt_s)[:, None], times_s)
         wander, rate, later_rate = (step_s**2 / 12)[:, None], before.angular_velocity, after.angular_velocity
         full_turn = turn_between(before, after)
-        turn = full_turn - wander * np.cross(rate, later_rate)
+        turn = full_turn - wander * cross(rate, later_rate)
         zero = np.zeros((len(time_s), 3))
         earlier = np.stack(
             [np.concatenate([before.position, zero], axis=1), _velocities(before), _accelerations(before)],
@@ -109,7 +109,7 @@ class Trajectory:
         )
         found = (from_earlier @ earlier[..., None] + from_later @ at_later[..., None])[..., 0]
         wander_here, here = (dt_s**2 / 12)[:, None], found[:, 3:, 1]
-        found_turn = found[:, 3:, 0] + wander_here * np.cross(rate, here)
+        found_turn = found[:, 3:, 0] + wander_here * cross(rate, here)
         states = _states(time_s, found[:, :3, 0], before.rotation @ exp_so3(found_turn), found)
         by_earlier, by_later = spread(from_earlier), spread(from_later)
         # The later rotation enters by the turn from the earlier one, less its wander; the result's by the turn to it.
@@ -123,12 +123,12 @@ class Trajectory:
         by_earlier[:, 3:6, 9:12] -= to_error[:, 3:6, 3:6] @ (wander_here[..., None] * skew(here))
         by_earlier[:, 3:6, 3:6] += exp_so3(-found_turn)
         added = to_error @ spread(left * (axis_sigmas(self.prior) ** 2)[:, None, None])
-        cross = by_earlier @ self.beside[later - 1] @ np.swapaxes(by_later, 1, 2)
+        mixed = by_earlier @ self.beside[later - 1] @ np.swapaxes(by_later, 1, 2)
         covariance = (
             by_earlier @ self.covariance[later - 1] @ np.swapaxes(by_earlier, 1, 2)
             + by_later @ self.covariance[later] @ np.swapaxes(by_later, 1, 2)
-            + cross
-            + np.swapaxes(cross, 1, 2)
+            + mixed
+            + np.swapaxes(mixed, 1, 2)
         )
         return states, _symmetric(covariance + added @ np.swapaxes(to_error, 1, 2))
 

@@ -38,9 +38,9 @@ _DISTANCE_ROUNDING_M = 0.0501e-3
 # More than any station's latency, which is taken off the stamps.
 _LATENCY_NS = 5_000_000_000
 _RESIDUAL_TOLERANCE_M = 1e-6
-# In m and rad. A robot that does what its motion prior thinks unlikely is now and then off by more than sigmas allow.
-_STATE_TOLERANCE = 0.02
-_STATE_SIGMAS = 6.0
+# Squared error of a pose in its sigmas, six degrees of freedom. A robot that does what its motion prior thinks unlikely is
+# now and then off by more than honest sigmas would allow in a lifetime: in them, 60 has a chance of 5e-11.
+_MOST_NEES = 60.0
 # Ten digits behind the point are on the line.
 _LINE_ROUNDING = 1e-9
 # A stamp is less than this before or after the measurement: the slowest answer against the fastest, when few have come.
@@ -222,15 +222,14 @@ def wrong_states(session: Session, run: Run) -> Iterator[Violation]:
     truth = run.world.pose_at((poses.stamp_ns - run.start_ns) / 1e9)
     turned = rotation_from_quaternion(poses.orientation_xyzw) @ np.swapaxes(truth[:, :3, :3], 1, 2)
     errors = np.concatenate([poses.position_m - truth[:, :3, 3], log_so3(turned)], axis=1)
-    for name, part in (("m", slice(3)), ("rad", slice(3, None))):
-        off = np.linalg.norm(errors[:, part], axis=1)
-        sigma = np.sqrt(np.linalg.eigvalsh(poses.covariance[:, part, part])[:, -1])
-        for index in np.flatnonzero(off > _STATE_TOLERANCE + _STATE_SIGMAS * sigma).tolist():
-            yield Violation(
-                "pose",
-                f"the {poses.kind[index]} pose at {poses.stamp_ns[index]} ns is called valid and off by "
-                f"{off[index]:.4f} {name}, where its sigma is said to be {sigma[index]:.4f} {name}",
-            )
+    nees = np.einsum("ni,ni->n", errors, np.linalg.solve(poses.covariance, errors[..., None])[..., 0])
+    off = np.linalg.norm(errors.reshape(-1, 2, 3), axis=2)
+    for index in np.flatnonzero(nees > _MOST_NEES).tolist():
+        yield Violation(
+            "pose",
+            f"the {poses.kind[index]} pose at {poses.stamp_ns[index]} ns is called valid and off by "
+            f"{off[index, 0]:.4f} m and {off[index, 1]:.4f} rad; its squared error in sigmas is {nees[index]:.0f}",
+        )
 
 
 def replayed_otherwise(session: Session) -> Iterator[Violation]:

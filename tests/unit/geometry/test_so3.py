@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from tsgt.geometry import exp_so3, log_so3
-from tsgt.geometry.so3 import inverse_right_jacobian, right_jacobian
+from tsgt.geometry.so3 import cross, inverse_right_jacobian, log_of_steps, right_jacobian
 
 AXES = [(1.0, 0.0, 0.0), (0.6, 0.0, -0.8), (-2 / 3, 1 / 3, 2 / 3)]
 ANGLES_RAD = [0.0, 1e-300, 1e-12, 1e-6, 9.9e-3, 1.01e-2, 0.3, 2.0, 3.1]
@@ -54,3 +54,20 @@ def test_nothing_jumps_where_the_series_ends() -> None:
         np.testing.assert_allclose(
             function((1e-2 - 1e-13) * axis), function((1e-2 + 1e-13) * axis), atol=1e-12
         )
+
+
+@pytest.mark.parametrize("largest_rad", [1e-12, 1e-3, 0.9, 3.0])
+def test_the_fast_logarithm_is_the_logarithm(largest_rad: float) -> None:
+    """To the last digits, and for turns beyond a right angle as well."""
+    rng = np.random.default_rng(2)
+    turns = rng.normal(size=(50, 3))
+    turns *= largest_rad * rng.uniform(size=(50, 1)) / np.linalg.norm(turns, axis=1, keepdims=True)
+    np.testing.assert_allclose(log_of_steps(exp_so3(turns)), turns, rtol=1e-9, atol=1e-15)
+
+
+def test_the_fast_cross_product_is_the_cross_product() -> None:
+    """One vector with many, and many with many."""
+    rng = np.random.default_rng(3)
+    a, b = rng.normal(size=(2, 20, 3))
+    np.testing.assert_allclose(cross(a, b), np.cross(a, b), atol=1e-15)
+    np.testing.assert_allclose(cross(a, b[0]), np.cross(a, b[0]), atol=1e-15)

@@ -22,8 +22,10 @@ types: $(VENV)/.test
 layers: $(VENV)/.test
 	$(BIN)/lint-imports
 
+# Those that run real processes in real time have the machine to themselves.
 pytest: $(VENV)/.test
-	$(BIN)/pytest
+	$(BIN)/pytest --numprocesses auto --dist loadfile --ignore tests/process --ignore tests/interop
+	$(BIN)/pytest tests/process tests/interop
 
 bench: $(VENV)/.test
 	$(BIN)/python benchmarks/alignment.py

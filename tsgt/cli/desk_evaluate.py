@@ -66,13 +66,19 @@ LISTED_OUTLIERS = 10
     "with_held_out",
     default=None,
     help="Leave measurements out and predict them, which takes most of the time.  "
-    "[default: do; in a report of more than 10 min do not]",
+    "[default: do; in a report of more than 15 min do not]",
 )
 @click.option(
     "--report",
     "report_folder",
     type=path_type,
     help="Folder for a report with figures: one HTML page, and PNG and PDF beside it.",
+)
+@click.option(
+    "--odometry",
+    type=path_type,
+    help="With --report: when the robot stood still, from CSV lines of time_s,linear_mps,angular_radps.  "
+    "[default: from the measurements]",
 )
 @frames_option
 @prisms_option
@@ -85,6 +91,7 @@ def evaluate(
     reference_path: Path | None,
     with_held_out: bool | None,
     report_folder: Path | None,
+    odometry: Path | None,
     frames: Path | None,
     prisms: Path | None,
     keep_going: bool,
@@ -95,11 +102,19 @@ def evaluate(
     The distances between its prisms cannot change; each measurement should be what the others predict; no residual
     should be larger than the noise that makes it.
     """
+    if odometry is not None and report_folder is None:
+        raise click.UsageError("--odometry is for a report; add --report")
     loaded = load(recording, keep_going=keep_going, estimator=estimator, frames=frames, prisms=prisms)
     reference = None if reference_path is None else read_tum(reference_path)
     if report_folder is not None:
         report_evaluation(
-            loaded, recording, report_folder, reference=reference, with_held_out=with_held_out, as_json=as_json
+            loaded,
+            recording,
+            report_folder,
+            reference=reference,
+            odometry=odometry,
+            with_held_out=with_held_out,
+            as_json=as_json,
         )
         return
     parameters = loaded.parameters

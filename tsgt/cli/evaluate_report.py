@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from tsgt.analysis.odometry import read_still_intervals
 from tsgt.analysis.report import figures_of, find
 from tsgt.analysis.report_page import page
 from tsgt.analysis.report_verdicts import verdicts
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from tsgt.analysis.report import Findings
     from tsgt.recording import Recording
 
-HELD_OUT_UP_TO_S = 600.0
+HELD_OUT_UP_TO_S = 900.0
 """Predicting the measurements of a longer recording takes minutes, and is left to those who ask for it."""
 
 PAGE_NAME = "report.html"
@@ -34,6 +35,7 @@ def report_evaluation(
     folder: Path,
     *,
     reference: Reference | None,
+    odometry: Path | None,
     with_held_out: bool | None,
     as_json: bool,
 ) -> None:
@@ -49,6 +51,8 @@ def report_evaluation(
         Where the report goes; made if it is not there.
     reference
         What to compare poses with, if anything.
+    odometry
+        File that tells when the robot stood still; None: the measurements tell it.
     with_held_out
         Whether to leave measurements out and predict them; None: if the recording is short.
     as_json
@@ -57,9 +61,15 @@ def report_evaluation(
     stamps = [m.stamp_ns for m in recording.measurements]
     if with_held_out is None:
         with_held_out = not stamps or max(stamps) - min(stamps) <= HELD_OUT_UP_TO_S * 1e9
+    still_ns = None if odometry is None else read_still_intervals(odometry)
     with progress("evaluating") as on_progress:
         findings = find(
-            recording, path, reference=reference, with_held_out=with_held_out, on_progress=on_progress
+            recording,
+            path,
+            reference=reference,
+            with_held_out=with_held_out,
+            still_ns=still_ns,
+            on_progress=on_progress,
         )
     with progress("drawing") as on_progress:
         write_report(findings, folder, on_progress=on_progress)

@@ -86,7 +86,12 @@ def _point(point: PointMeasurement) -> str:
 
 
 def _pose(pose: PoseRecord) -> str:
-    parts = [clock_time(pose.stamp_ns), "pose", pose.kind, "valid" if pose.valid else f"invalid ({pose.reason})"]
+    parts = [
+        clock_time(pose.stamp_ns),
+        "pose",
+        pose.kind,
+        "valid" if pose.valid else f"invalid ({pose.reason})",
+    ]
     if pose.position_m is not None and pose.orientation_xyzw is not None:
         yaw, pitch, roll = yaw_pitch_roll_deg(pose.orientation_xyzw)
         parts.append(f"{_vector(pose.position_m)} m")

@@ -46,8 +46,9 @@ if TYPE_CHECKING:
 SURE_RAD = 0.1
 """One sigma of the rotation: known so well, the robot is followed from one measurement to the next."""
 
-LOST_RAD = 0.5
-"""One sigma of the rotation: not known so well any more, it has to be guessed anew; straight lines would not do."""
+LOST_RAD = 0.2
+"""One sigma of the rotation: not known so well any more, it has to be guessed anew. What two prisms do not tell of it is
+another axis for each attitude: following further than linearisation holds would make knowledge of none."""
 
 SETTLED = 1.0
 """In squared sigmas of the whole window: a step that is to gain less is the last one."""
@@ -179,6 +180,8 @@ class FixedLag:
         assert self.observations is not None  # noqa: S101 (that has been set)
         assert self._knots is not None  # noqa: S101 (it is settled)
         assert self._anchor is not None  # noqa: S101 (it is settled)
+        if new.time_s[0] < self._knots.time_s[0] - 0.5 * LEAST_STEP_S:
+            return False  # in the first window, before anything that had come
         knots = _with_knots_at(self._knots, new.time_s, self._prior)
         steps = Steps.of(knots.time_s, self._prior)
         knots = knots.moved(_first_move(held, new, knots, steps, self._anchor))

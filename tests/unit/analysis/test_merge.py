@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -219,13 +220,16 @@ def test_a_computer_that_wakes_up_in_the_same_hour(tmp_path: Path) -> None:
 
 
 def test_errors_are_merged_too(tmp_path: Path) -> None:
-    """A tilted instrument is the reason why there are no poses; with its journal the desk knows."""
+    """A tilted instrument is the reason why ``linear`` has no poses; with its journal the desk knows."""
     scenario = ScenarioConfig(faults=(StatusFaultConfig(station=2, status="tilt", start_s=15.0, end_s=25.0),))
     run = mission(tmp_path / "m", scenario, duration_s=40.0, outages=(Outage((1, 2, 3), 10.0, 20.0),))
     path = tmp_path / "r.jsonl"
     added = added_to(run, path)
     assert any(m.station == 2 and m.status is Status.TILT for m in added)
-    poses = process(load_recording(path), path=path)
+    recorded = load_recording(path)
+    pipeline = replace(recorded.parameters.pipeline, estimator="linear")
+    recorded = replace(recorded, parameters=replace(recorded.parameters, pipeline=pipeline))
+    poses = process(recorded, path=path)
     tilted = (poses.stamp_ns > run.start_ns + 17 * S) & (poses.stamp_ns < run.start_ns + 24 * S)
     assert set(poses.reason[tilted].tolist()) == {Reason.STATION_STATUS}
     assert merge(path, journals(run)).added == 0

@@ -86,14 +86,11 @@ def test_the_layout_is_written_only_if_it_was_sought(tsgt: Tsgt, recording: Path
     assert tsgt("calibrate", "motion", recording, "--prism-output", tmp_path / "prisms.toml").code == 2
 
 
-@pytest.mark.parametrize(("segment", "p95"), [(".", 0.55), ("segment2", 0.65)])
-def test_published_drives_are_predicted_better(
-    tsgt: Tsgt, field_data: Path, tmp_path: Path, segment: str, p95: float
-) -> None:
+def test_a_published_drive_is_predicted_better(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
     """What the calibration has not seen is missed by at most 0.6 of what straight lines miss it by, at gaps 0.45."""
     day = field_data / "20220314"
     path = tmp_path / "r.jsonl"
-    tracks = [day / segment / f"trimble{k}.csv" for k in (1, 2, 3)]
+    tracks = [day / f"trimble{k}.csv" for k in (1, 2, 3)]
     done = tsgt(
         "import", "rts", "--tracks", *tracks, "--prisms", day / "sensor_positions.csv",
         "--targets", day / "GCP.txt", "--output", path,
@@ -106,5 +103,5 @@ def test_published_drives_are_predicted_better(
     assert linear["n"] == before["n"] == after["n"]
     assert after["mean"] < 0.6 * linear["mean"]
     assert after["mean"] < before["mean"]
-    assert after["p95"] < p95 * linear["p95"]
+    assert after["p95"] < 0.55 * linear["p95"]
     assert after["gaps"]["mean"] < 0.45 * linear["gaps"]["mean"]

@@ -129,7 +129,8 @@ def test_what_was_measured_long_before_the_beginning_is_too_late(scene: Scene) -
     """A backlog of an hour, which a station sends first, makes no window of an hour."""
     measurements = every(scene, 8.0)
     old = [
-        replace(m, stamp_ns=m.stamp_ns - 3600 * SECOND, sequence=m.sequence + 10_000) for m in measurements[:6]
+        replace(m, stamp_ns=m.stamp_ns - 3600 * SECOND, sequence=m.sequence + 10_000)
+        for m in measurements[:6]
     ]
     pipeline = ContinuousPipeline(scene.parameters)
     for measurement in (*old, *measurements):

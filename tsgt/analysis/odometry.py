@@ -1,0 +1,99 @@
+"""When a robot stood still, by its own odometry: a CSV file of time, linear and angular speed."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from tsgt.errors import InputFileError
+from tsgt.model import check_instants
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+STILL_MPS = 0.01
+STILL_RADPS = 0.01
+"""Below both a robot stands: encoders at rest count next to nothing."""
+
+STILL_DURATION_NS = 3_000_000_000
+SILENCE_NS = 1_000_000_000
+"""Nobody knows what the robot did between two lines further apart than this."""
+
+
+def read_still_intervals(path: Path) -> list[tuple[int, int]]:
+    """Read when a robot stood still for 3 s or more.
+
+    Parameters
+    ----------
+    path
+        Lines of ``time_s,linear_mps,angular_radps``: Unix time in s, speed in m/s, angular speed in rad/s. The first line may
+        name the columns; ``#`` stands before comments.
+
+    Returns
+    -------
+    list of (int, int)
+        Start and end of each interval in Unix ns, in the order of time.
+
+    Raises
+    ------
+    InputFileError
+        It cannot be read, or a line is not three finite numbers; times must increase.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputFileError(f"cannot be read: {error.strerror}", path=path) from error
+    except UnicodeDecodeError as error:
+        raise InputFileError("is no text", path=path) from error
+    found: list[tuple[int, int]] = []
+    begun: int | None = None
+    last: int | None = None
+    first = True
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split("#", maxsplit=1)[0].replace(",", " ").replace(";", " ").split()
+        if not words:
+            continue
+        if first and not _is_number(words[0]):
+            first = False
+            continue
+        first = False
+        stamp_ns, still = _sample(words, path, number)
+        if last is not None and stamp_ns <= last:
+            raise InputFileError(
+                "its time is not after that of the line before; sort the lines", path=path, line=number
+            )
+        if begun is not None and last is not None and (not still or stamp_ns - last > SILENCE_NS):
+            found.append((begun, last))
+            begun = None
+        if still and begun is None:
+            begun = stamp_ns
+        last = stamp_ns
+    if begun is not None and last is not None:
+        found.append((begun, last))
+    if last is None:
+        raise InputFileError("holds no lines of odometry", path=path)
+    return [(start, end) for start, end in found if end - start >= STILL_DURATION_NS]
+
+
+def _sample(words: list[str], path: Path, number: int) -> tuple[int, bool]:
+    """Read one line: its time, and whether the robot stands."""
+    try:
+        # A float would hold a Unix time to a quarter of a microsecond, which is enough for this.
+        time_s, linear_mps, angular_radps = map(float, words)
+        stamp_ns = round(time_s * 1e9)
+        check_instants(stamp_ns)
+        if not (math.isfinite(linear_mps) and math.isfinite(angular_radps)):
+            raise ValueError("not finite")
+    except (ValueError, OverflowError) as error:
+        raise InputFileError(
+            "is no odometry; expected: time_s,linear_mps,angular_radps", path=path, line=number
+        ) from error
+    return stamp_ns, abs(linear_mps) <= STILL_MPS and abs(angular_radps) <= STILL_RADPS
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True

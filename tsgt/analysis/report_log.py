@@ -1,0 +1,160 @@
+"""What a recording tells beside its measurements, for a report: the radio, the stations' clocks, events."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tsgt.errors import RecordingError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from tsgt.geometry import FloatArray
+
+_TYPES = (b'"status"', b'"clock"', b'"event"')
+
+
+@dataclass(frozen=True, slots=True)
+class RadioSeries:
+    """How a station was heard over time, (N,) each; NaN where nothing was recorded.
+
+    Attributes
+    ----------
+    stamp_ns
+        Times of the status records on the master's Unix clock.
+    rssi_dbm, snr_db
+        Of its last radio message.
+    loss
+        Share of its last requests that it did not answer, 0 to 1.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    rssi_dbm: FloatArray
+    snr_db: FloatArray
+    loss: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class ClockSeries:
+    """A station's clock against the master's over time, (N,) each.
+
+    Attributes
+    ----------
+    stamp_ns
+        Times of the synchronisations on the master's Unix clock.
+    offset_ns
+        Positive: the station is ahead.
+    bound_ns
+        The offset is within this of the truth.
+    restarted
+        Whether all that was known before was thrown away then.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    offset_ns: NDArray[np.int64]
+    bound_ns: NDArray[np.int64]
+    restarted: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Log:
+    """What stands in a recording beside measurements and poses.
+
+    Attributes
+    ----------
+    radio, clocks
+        By station; empty without records.
+    events
+        (stamp_ns, message) in the order of the file.
+    protocol
+        That of the last status; None without a radio.
+    authenticated
+        Whether a key kept others from taking part; None without a radio.
+    """
+
+    radio: dict[int, RadioSeries]
+    clocks: dict[int, ClockSeries]
+    events: tuple[tuple[int, str], ...]
+    protocol: str | None
+    authenticated: bool | None
+
+
+def read_log(path: Path) -> Log:
+    """Read the lines of a recording that are neither measurements nor poses; lines that cannot be read are passed over.
+
+    They only illustrate: what is computed comes from :func:`tsgt.recording.load_recording`, which checks each line.
+
+    Raises
+    ------
+    RecordingError
+        The file cannot be read.
+    """
+    statuses: list[dict[str, Any]] = []
+    clocks: dict[int, list[dict[str, Any]]] = defaultdict(list)
+    events: list[tuple[int, str]] = []
+    try:
+        with path.open("rb") as file:
+            for raw in file:
+                # Poses are most of a file: to parse them for nothing would take longer than all the rest.
+                if not any(kind in raw for kind in _TYPES):
+                    continue
+                record = _parsed(raw)
+                match record.get("type"):
+                    case "status":
+                        statuses.append(record)
+                    case "clock":
+                        clocks[record["station"]].append(record)
+                    case "event":
+                        events.append((record["stamp_ns"], str(record.get("message", ""))))
+    except OSError as error:
+        raise RecordingError(f"cannot be read ({error.strerror})", path=path) from error
+    last = statuses[-1] if statuses else {}
+    return Log(
+        radio=_radio(statuses),
+        clocks={station: _clock(records) for station, records in sorted(clocks.items())},
+        events=tuple(events),
+        protocol=last.get("protocol"),
+        authenticated=last.get("authenticated"),
+    )
+
+
+def _parsed(raw: bytes) -> dict[str, Any]:
+    try:
+        record = json.loads(raw)
+    except ValueError:
+        return {}
+    return record if isinstance(record, dict) and isinstance(record.get("stamp_ns"), int) else {}
+
+
+def _radio(statuses: list[dict[str, Any]]) -> dict[int, RadioSeries]:
+    rows: dict[int, list[tuple[int, dict[str, Any]]]] = defaultdict(list)
+    for status in statuses:
+        for station in status.get("stations", ()):
+            rows[station["id"]].append((status["stamp_ns"], station))
+    return {
+        number: RadioSeries(
+            np.array([stamp_ns for stamp_ns, _ in found], dtype=np.int64),
+            *(
+                np.array([np.nan if s.get(key) is None else s[key] for _, s in found], dtype=np.float64)
+                for key in ("rssi_dbm", "snr_db", "loss")
+            ),
+        )
+        for number, found in sorted(rows.items())
+    }
+
+
+def _clock(records: list[dict[str, Any]]) -> ClockSeries:
+    return ClockSeries(
+        *(
+            np.array([r[key] for r in records], dtype=np.int64)
+            for key in ("stamp_ns", "offset_ns", "bound_ns")
+        ),
+        np.array([r["restarted"] for r in records], dtype=np.bool_),
+    )

@@ -11,6 +11,7 @@ from tsgt.analysis.report_axes import curve, dots, hatch, plain_log, shade, stro
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -56,7 +57,7 @@ def draw_gaps(figure: Figure, stations: Sequence[StationRecord], clock: Clock, o
     axes[0].set_ylim(min(low, 0.15), max(high, 3.0))
     figure.supylabel("time since the usable measurement before (s)", fontsize=8)
     axes[-1].set_xlabel(clock.label)
-    _legend_above(figure, axes)
+    _legend_above(figure, list(axes))
 
 
 def draw_radio(figure: Figure, radio: Mapping[int, RadioSeries], clock: Clock) -> None:
@@ -72,7 +73,7 @@ def draw_radio(figure: Figure, radio: Mapping[int, RadioSeries], clock: Clock) -
     top = max(5.0, axes[2].get_ylim()[1])
     axes[2].set_ylim(-0.05 * top, top)
     axes[2].set_xlabel(clock.label)
-    _legend_above(figure, axes[:1])
+    _legend_above(figure, [axes[0]])
 
 
 def draw_clocks(
@@ -104,20 +105,20 @@ def draw_clocks(
         panel.set_ylabel("offset less\nthe first (ms)")
     if bounded:
         panel = next(places)
-        for row, station in enumerate(stations):
-            known = np.isfinite(station.bound_ns)
+        for row, record in enumerate(stations):
+            known = np.isfinite(record.bound_ns)
             curve(
                 panel,
-                clock.of(station.stamp_ns[known]),
-                station.bound_ns[known] / 1e6,
+                clock.of(record.stamp_ns[known]),
+                record.bound_ns[known] / 1e6,
                 row,
-                label=f"station {station.station}",
+                label=f"station {record.station}",
             )
         panel.set_ylabel("bound of each\nstamp (ms)")
         # The first ones, before a clock is known well, are larger by a hundred times.
         plain_log(panel.yaxis)
     panels[-1].set_xlabel(clock.label)
-    _legend_above(figure, panels)
+    _legend_above(figure, list(panels))
 
 
 def draw_histograms(figure: Figure, found: InterPrism) -> None:
@@ -136,7 +137,7 @@ def draw_histograms(figure: Figure, found: InterPrism) -> None:
                 axes[row, column].set_ylabel(f"{name}\nshare (%)")
         axes[0, column].set_title(f"prisms {static.name}, layout {1e3 * static.reference_m:.1f} mm")
     figure.supxlabel("measured distance less that of the layout (mm)", fontsize=8)
-    _legend_above(figure, axes.ravel())
+    _legend_above(figure, list(axes.ravel()))
 
 
 def _histogram(panel: Axes, pair: PairDistances, reach_mm: float, row: int) -> None:
@@ -147,7 +148,7 @@ def _histogram(panel: Axes, pair: PairDistances, reach_mm: float, row: int) -> N
         return
     panel.hist(
         np.clip(error_mm, -reach_mm, reach_mm),
-        bins=np.linspace(-reach_mm, reach_mm, 51),
+        bins=np.linspace(-reach_mm, reach_mm, 51).tolist(),
         weights=np.full(len(error_mm), 100.0 / len(error_mm)),
         color="#c6dbef" if row == 0 else "#ececec",
         edgecolor="#404040",
@@ -288,10 +289,10 @@ def draw_statuses(figure: Figure, stations: Sequence[StationRecord]) -> None:
 
 def _legend_above(figure: Figure, axes: Sequence[Axes]) -> None:
     """One legend for all panels, each name once."""
-    found = {}
+    found: dict[str, Artist] = {}
     for panel in axes:
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
-            found.setdefault(label, handle)
+            found.setdefault(str(label), handle)
     if found:
         columns = min(len(found), 6)
         figure.legend(list(found.values()), list(found), loc="outside upper center", ncols=columns)

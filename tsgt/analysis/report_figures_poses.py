@@ -61,7 +61,8 @@ def draw_map(figure: Figure, poses: PoseBatch, stations: Mapping[int, FloatArray
             color=stroke(2).color,
             label="station" if row == 0 else None,
         )
-        panel.annotate(str(number), position[:2], textcoords="offset points", xytext=(5, 3), fontsize=7)
+        x, y = position[:2].tolist()
+        panel.annotate(str(number), (x, y), textcoords="offset points", xytext=(5, 3), fontsize=7)
     panel.set_aspect("equal", adjustable="datalim")
     panel.set_xlabel("x in frame station1 (m)")
     panel.set_ylabel("y in frame station1 (m)")

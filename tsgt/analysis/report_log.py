@@ -151,10 +151,9 @@ def _radio(statuses: list[dict[str, Any]]) -> dict[int, RadioSeries]:
 
 
 def _clock(records: list[dict[str, Any]]) -> ClockSeries:
+    stamp_ns, offset_ns, bound_ns = (
+        np.array([r[key] for r in records], dtype=np.int64) for key in ("stamp_ns", "offset_ns", "bound_ns")
+    )
     return ClockSeries(
-        *(
-            np.array([r[key] for r in records], dtype=np.int64)
-            for key in ("stamp_ns", "offset_ns", "bound_ns")
-        ),
-        np.array([r["restarted"] for r in records], dtype=np.bool_),
+        stamp_ns, offset_ns, bound_ns, np.array([r["restarted"] for r in records], dtype=np.bool_)
     )

@@ -60,7 +60,7 @@ def estimators(f: Findings, clock: Clock) -> Section:
             "--held-out does it, and takes several times as long."
         )
     if f.compared:
-        rows = [
+        compared = [
             (
                 name,
                 str(e.compared),
@@ -79,7 +79,9 @@ def estimators(f: Findings, clock: Clock) -> Section:
             "NEES (6 is right)",
             "above 95 % (5 % is right)",
         )
-        tables.append(Table("Against the reference, unaligned, at the prisms' centroid", header, tuple(rows)))
+        tables.append(
+            Table("Against the reference, unaligned, at the prisms' centroid", header, tuple(compared))
+        )
         if f.reference is not None and not any(e.compared for e in f.compared.values()):
             text.append(
                 f"The reference has no time in common with valid poses: it goes from {utc(int(f.reference.stamp_ns[0]))} to "

@@ -36,14 +36,15 @@ class Arrivals:
         time_ns
             When it was made; like all instants here on the master's Unix clock in ns.
         """
-        newer = time_ns > max(self._complete_ns, max((at_ns for _, at_ns in self._beyond), default=0))
-        if self._next is None or sequence == self._next or (sequence < self._next and newer):
-            if self._next is not None and sequence < self._next:
-                self._beyond.clear()
-            self._take(sequence, time_ns)
-            self._close()
-        elif sequence > self._next:
+        if self._next is not None and sequence > self._next:
             heapq.heappush(self._beyond, (sequence, time_ns))
+            return
+        if self._next is not None and sequence < self._next:
+            if time_ns <= max(self._complete_ns, max((at_ns for _, at_ns in self._beyond), default=0)):
+                return
+            self._beyond.clear()
+        self._take(sequence, time_ns)
+        self._close()
 
     def complete_ns(self, now_ns: int) -> int:
         """Return the time of the last measurement before which none is waited for any more; 0 before the first one."""

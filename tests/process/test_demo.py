@@ -109,11 +109,13 @@ def _end(demo: Demo, timeout_s: float) -> dict[str, object]:
     return result
 
 
-@pytest.mark.parametrize("protocol", ["superframe", "classic"])
-def test_demo_streams_records_and_sums_up(start: Start, tmp_path: Path, protocol: str) -> None:
+@pytest.mark.parametrize(("protocol", "duration_s"), [("superframe", 10), ("classic", 20)])
+def test_demo_streams_records_and_sums_up(
+    start: Start, tmp_path: Path, protocol: str, duration_s: int
+) -> None:
     """A reader gets live poses; at the end the result says how good they were and where the recording is."""
     output = tmp_path / "kept.jsonl"
-    demo = start("--protocol", protocol, "--duration", "10", "--output", str(output))
+    demo = start("--protocol", protocol, "--duration", str(duration_s), "--output", str(output))
     demo.wait_for_poses(0)
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
         connection.connect(os.fspath(tmp_path / "poses.sock"))

@@ -17,10 +17,8 @@ if TYPE_CHECKING:
 
     from matplotlib.figure import Figure
 
-COLUMN_MM = 88.0
-"""Width of a column in most journals."""
 PAGE_MM = 180.0
-"""Width of both columns."""
+"""Width of both columns of most journals."""
 
 FORMATS = (".png", ".pdf", ".svg")
 

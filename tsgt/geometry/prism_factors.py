@@ -105,6 +105,20 @@ class Linearised:
             covariance[:, axis, axis] += observations.sigmas_m[:, axis] ** 2
         return covariance
 
+    def whitened(self, observations: Observations) -> FloatArray:
+        """Residuals and their derivatives in sigmas, (M, 3, 19), the residuals last.
+
+        The covariance is a diagonal one plus the outer product of one vector, whose inverse root has a closed form.
+        """
+        deviation_m = observations.sigmas_m
+        along = rotate(self.by_point, self.velocity_mps) * (observations.time_sigma_s[:, None] / deviation_m)
+        root = np.sqrt(1.0 + dot(along, along))
+        found = np.empty((len(along), 3, 19))
+        np.divide(self.jacobian, deviation_m[:, :, None], out=found[:, :, :18])
+        np.divide(self.residuals_m, deviation_m, out=found[:, :, 18])
+        found -= (along / (root * (root + 1.0))[:, None])[:, :, None] * (along[:, None] @ found)
+        return found
+
 
 def linearise(observations: Observations, knots: Knots, at: NDArray[np.intp]) -> Linearised:
     """Compare measurements with a trajectory.

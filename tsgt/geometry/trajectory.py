@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.geometry.knots import STATE, Knots, joined, spread, turn_between
-from tsgt.geometry.motion_prior import axis_sigmas, axis_times_s, between, process_noise, transition
+from tsgt.geometry.motion_prior import axis_sigmas, between, process_noise, transition
 from tsgt.geometry.rigid import FloatArray, exp_so3, skew
 from tsgt.geometry.so3 import cross, inverse_right_jacobian, right_jacobian
 
@@ -44,34 +44,52 @@ class Trajectory:
     covariance: FloatArray
     beside: FloatArray
 
-    def at(self, time_s: FloatArray) -> tuple[Knots, FloatArray]:
-        """Return the states at N instants, in any order, and the covariance of their errors, (N, 18, 18)."""
-        parts = [self._at(time_s[i : i + _AT_ONCE]) for i in range(0, len(time_s), _AT_ONCE)]
-        if not parts:
-            return self.knots.select(slice(0, 0)), np.empty((0, STATE, STATE))
-        return joined([states for states, _ in parts]), np.concatenate([found for _, found in parts])
+    def at(self, time_s: FloatArray, *, parts: int = STATE) -> tuple[Knots, FloatArray]:
+        """Return the states at N instants, in any order, and the covariance of their errors.
 
-    def _at(self, time_s: FloatArray) -> tuple[Knots, FloatArray]:
+        Parameters
+        ----------
+        time_s
+            (N,).
+        parts
+            So many of the first parts of the errors are told of: all 18, or 6 for poses, which is much faster.
+
+        Returns
+        -------
+        states : Knots
+        covariance : FloatArray
+            (N, parts, parts).
+        """
+        found = [self._at(time_s[i : i + _AT_ONCE], parts) for i in range(0, len(time_s), _AT_ONCE)]
+        if len(found) == 1:
+            return found[0]
+        if not found:
+            return self.knots.select(slice(0, 0)), np.empty((0, parts, parts))
+        return joined([states for states, _ in found]), np.concatenate(
+            [covariance for _, covariance in found]
+        )
+
+    def _at(self, time_s: FloatArray, parts: int) -> tuple[Knots, FloatArray]:
         later = np.searchsorted(self.knots.time_s, time_s, side="left")
         inside = (later > 0) & (later < len(self.knots))
         if inside.all():
-            return self._between(time_s, later)
-        states, covariance = self._beyond(time_s, np.clip(later - 1, 0, None))
+            return self._between(time_s, later, parts)
+        states, covariance = self._beyond(time_s, np.clip(later - 1, 0, None), parts)
         if inside.any():
-            some, some_covariance = self._between(time_s[inside], later[inside])
+            some, some_covariance = self._between(time_s[inside], later[inside], parts)
             for name in Knots.__slots__:
                 getattr(states, name)[inside] = getattr(some, name)
             covariance[inside] = some_covariance
         return states, covariance
 
-    def _beyond(self, time_s: FloatArray, knot: np.ndarray) -> tuple[Knots, FloatArray]:
+    def _beyond(self, time_s: FloatArray, knot: np.ndarray, parts: int) -> tuple[Knots, FloatArray]:
         """Predict from one knot, forwards or backwards: the prior's process looks the same either way."""
         start = self.knots.select(knot)
         dt_s = time_s - start.time_s
         ahead_s = np.abs(dt_s)[:, None]
-        times_s, sigmas = axis_times_s(self.prior), axis_sigmas(self.prior)
-        phi = transition(ahead_s, times_s)
-        noise = process_noise(ahead_s, times_s) * (sigmas**2)[:, None, None]
+        times_s, sigmas = self._times_s(), axis_sigmas(self.prior)
+        phi = np.repeat(transition(ahead_s, times_s), 3, axis=1)
+        noise = np.repeat(process_noise(ahead_s, times_s), 3, axis=1) * (sigmas**2)[:, None, None]
         # Backwards a velocity has the other sign, and with it what couples it with position and acceleration.
         flip = np.where(dt_s < 0, -1.0, 1.0)[:, None]
         for row, column in ((0, 1), (1, 0), (1, 2), (2, 1)):
@@ -87,14 +105,18 @@ class Trajectory:
         by_start = to_error @ spread(phi)
         by_start[:, 3:6, 9:12] -= to_error[:, 3:6, 3:6] @ (wander[..., None] * skew(here))
         by_start[:, 3:6, 3:6] = exp_so3(-turn)
+        by_start, to_error = by_start[:, :parts], to_error[:, :parts]
         covariance = by_start @ self.covariance[knot] @ np.swapaxes(by_start, 1, 2)
         return states, _symmetric(covariance + to_error @ spread(noise) @ np.swapaxes(to_error, 1, 2))
 
-    def _between(self, time_s: FloatArray, later: np.ndarray) -> tuple[Knots, FloatArray]:
+    def _between(self, time_s: FloatArray, later: np.ndarray, parts: int) -> tuple[Knots, FloatArray]:
         before, after = self.knots.select(later - 1), self.knots.select(later)
         dt_s, step_s = time_s - before.time_s, after.time_s - before.time_s
-        times_s = axis_times_s(self.prior)
-        from_earlier, from_later, left = between(dt_s[:, None], (step_s - dt_s)[:, None], times_s)
+        # Both kinds of axes, each for its three.
+        from_earlier, from_later, left = (
+            np.repeat(matrix, 3, axis=1)
+            for matrix in between(dt_s[:, None], (step_s - dt_s)[:, None], self._times_s())
+        )
         wander, rate, later_rate = (step_s**2 / 12)[:, None], before.angular_velocity, after.angular_velocity
         full_turn = turn_between(before, after)
         turn = full_turn - wander * cross(rate, later_rate)
@@ -119,8 +141,10 @@ class Trajectory:
         by_earlier[:, :, 3:6] = -by_turn @ inverse_right_jacobian(-full_turn)
         by_earlier[:, :, 9:12] += by_turn @ (wander[..., None] * skew(later_rate))
         to_error = _to_error(found_turn, wander_here, rate)
+        turned = to_error[:, 3:6, 3:6]
+        to_error = to_error[:, :parts]
         by_earlier, by_later = to_error @ by_earlier, to_error @ by_later
-        by_earlier[:, 3:6, 9:12] -= to_error[:, 3:6, 3:6] @ (wander_here[..., None] * skew(here))
+        by_earlier[:, 3:6, 9:12] -= turned @ (wander_here[..., None] * skew(here))
         by_earlier[:, 3:6, 3:6] += exp_so3(-found_turn)
         added = to_error @ spread(left * (axis_sigmas(self.prior) ** 2)[:, None, None])
         mixed = by_earlier @ self.beside[later - 1] @ np.swapaxes(by_later, 1, 2)
@@ -131,6 +155,10 @@ class Trajectory:
             + np.swapaxes(mixed, 1, 2)
         )
         return states, _symmetric(covariance + added @ np.swapaxes(to_error, 1, 2))
+
+    def _times_s(self) -> FloatArray:
+        """Correlation times of both kinds of axes in s, shape (2,)."""
+        return np.array([self.prior.acceleration_time_s, self.prior.angular_acceleration_time_s])
 
 
 def _to_error(turn: FloatArray, wander: FloatArray, rate: FloatArray) -> FloatArray:

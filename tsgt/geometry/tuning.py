@@ -18,8 +18,8 @@ from scipy.optimize import minimize
 from tsgt.errors import GeometryError
 from tsgt.geometry.continuous import knot_times, log_evidence, solve
 from tsgt.geometry.first_guess import first_guess
-from tsgt.geometry.knots import STATE, Steps, linearise_steps, spread
-from tsgt.geometry.motion_prior import axis_sigmas, axis_times_s, prior_of, process_information, transition
+from tsgt.geometry.knots import linearise_steps
+from tsgt.geometry.motion_prior import axis_sigmas, prior_of, process_information, transition
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:
@@ -110,13 +110,38 @@ def tune(
     GeometryError
         No stretch has enough measurements of three prisms.
     """
-    stretches = _stretches(observations)
-    at = _logarithms(MotionPrior() if start is None else start, 1.0 if noise_scale is None else noise_scale)
+    at = logarithms(MotionPrior() if start is None else start, 1.0 if noise_scale is None else noise_scale)
     least, most = np.minimum(_LEAST, at), np.maximum(_MOST, at)
     if noise_scale is not None:
         least[_SCALE] = most[_SCALE] = at[_SCALE]
     if fixed:
         least[:_SCALE] = most[:_SCALE] = at[:_SCALE]
+    return search(observations, at, least, most, on_progress=on_progress)
+
+
+def search(
+    observations: Observations,
+    start: FloatArray,
+    least: FloatArray,
+    most: FloatArray,
+    *,
+    on_progress: Callable[[int], None] | None = None,
+) -> Tuned:
+    """Find the parameters within limits.
+
+    Parameters
+    ----------
+    observations, on_progress
+        As for :func:`tune`.
+    start, least, most
+        Where to begin and what to keep to, (7,) each, as :func:`logarithms` gives them.
+
+    Raises
+    ------
+    GeometryError
+        No stretch has enough measurements of three prisms.
+    """
+    stretches = _stretches(observations)
     evaluations = 0
     # In units in which the first step of the search is of the size of one: a factor of e in some parameter.
     share = 1.0 / sum(len(stretch.observations) for stretch in stretches)
@@ -131,7 +156,7 @@ def tune(
 
     found = minimize(
         negative,
-        at,
+        start,
         jac=True,
         method="L-BFGS-B",
         bounds=list(zip(least, most, strict=True)),
@@ -169,7 +194,8 @@ def _stretches(observations: Observations) -> list[_Stretch]:
     return found
 
 
-def _logarithms(prior: MotionPrior, scale: float) -> FloatArray:
+def logarithms(prior: MotionPrior, scale: float) -> FloatArray:
+    """Parameters as they are searched for: acceleration sigmas x and z, its time, the same of the rotation, noise's scale."""
     sigmas = axis_sigmas(prior)
     x, _, z, roll, _, yaw = sigmas
     return np.log([x, z, prior.acceleration_time_s, roll, yaw, prior.angular_acceleration_time_s, scale])
@@ -190,11 +216,9 @@ def _evidence(stretch: _Stretch, parameters: FloatArray) -> tuple[float, FloatAr
     covariance, beside = solution.factor.marginals()
     gradient = np.zeros(len(parameters))
     gradient[_SCALE] = _by_scale(solution, observations, covariance)
-    time_s = solution.knots.time_s
-    steps = _expected_steps(solution.knots, prior, covariance, beside)
-    sigmas = axis_sigmas(prior)
-    dt_s = np.diff(time_s)[:, None]
-    energies = _energy(steps, dt_s, axis_times_s(prior)) / sigmas**2
+    steps = _expected_steps(solution, covariance, beside)
+    sigmas, dt_s = axis_sigmas(prior), np.diff(solution.knots.time_s)
+    energies = _energy(steps, solution.steps.phi, solution.steps.information)
     for axis, row in enumerate(_ROWS):
         gradient[row] += float(energies[:, axis].sum()) - 3.0 * len(energies)
     for axes, row, time in zip(
@@ -216,58 +240,67 @@ def _by_scale(solution: Solution, observations: Observations, covariance: FloatA
     """Differentiate by the logarithm of the noise's scale: expected squared distances less how many there are."""
     linearised = solution.linearised
     information = np.linalg.inv(linearised.covariance(observations))
-    spread_m2 = linearised.jacobian @ covariance[solution.at] @ np.swapaxes(linearised.jacobian, 1, 2)
+    by_state = linearised.jacobian
+    spread_m2 = by_state @ covariance[solution.at] @ np.swapaxes(by_state, 1, 2)
     expected = solution.distances + np.einsum("mij,mji->m", information, spread_m2)
     # What an uncertain time adds does not grow with the instrument's noise.
-    share = np.einsum("mij,mji->m", information, _diagonal(observations.sigmas_m**2)) / 3.0
+    share = np.einsum("mii,mi->m", information, observations.sigmas_m**2) / 3.0
     return float((share * (solution.weights * expected - 3.0)).sum())
-
-
-def _diagonal(values: FloatArray) -> FloatArray:
-    return values[:, :, None] * np.eye(values.shape[1])
 
 
 _Moments = tuple["FloatArray", "FloatArray", "FloatArray"]
 
 
-def _expected_steps(knots: Knots, prior: MotionPrior, covariance: FloatArray, beside: FloatArray) -> _Moments:
+def _expected_steps(solution: Solution, covariance: FloatArray, beside: FloatArray) -> _Moments:
     """Second moments of what each step connects, by axis, (K - 1, 6, 3, 3): later with later, with earlier, earlier with it."""
-    between = linearise_steps(knots, Steps.of(knots.time_s, prior))
-    # A step is later - Phi earlier; the earlier one counts from its own position.
-    phi = transition(np.diff(knots.time_s)[:, None], axis_times_s(prior))
-    phi[..., :, 0] = 0.0
-    by_earlier, by_later = between.by_earlier + spread(phi), between.by_later
-    with_earlier = by_earlier @ covariance[:-1] + by_later @ np.swapaxes(beside, 1, 2)
-    with_later = by_earlier @ beside + by_later @ covariance[1:]
-    own = with_earlier @ np.swapaxes(by_earlier, 1, 2) + with_later @ np.swapaxes(by_later, 1, 2)
+    between = linearise_steps(solution.knots, solution.steps)
+    count = len(beside)
     earlier, later = between.earlier, between.later
-    moments = _by_axis(own) + later[..., :, None] * later[..., None, :]
-    crossed = _by_axis(with_earlier) + later[..., :, None] * earlier[..., None, :]
-    before = _by_axis(covariance[:-1]) + earlier[..., :, None] * earlier[..., None, :]
+    moments = later[..., :, None] * later[..., None, :]
+    crossed = later[..., :, None] * earlier[..., None, :]
+    before = earlier[..., :, None] * earlier[..., None, :]
+    # A step is later - Phi earlier; place and turn count from the earlier knot's.
+    by_earlier, by_later = np.zeros((2, count, 9, 9)), np.zeros((2, count, 9, 9))
+    by_earlier[0, :, range(3), range(3)] = -1.0
+    by_earlier[1, :, :3, :6] = between.turn_by_earlier
+    by_later[:, :, range(9), range(9)] = 1.0
+    by_later[1, :, :3, :6] = between.turn_by_later
+    for kind, axes in ((0, slice(0, 3)), (1, slice(3, 6))):
+        first, last, shared = (
+            matrix.reshape(count, 3, 2, 3, 3, 2, 3)[:, :, kind, :, :, kind].reshape(count, 9, 9)
+            for matrix in (covariance[:-1], covariance[1:], beside)
+        )
+        with_earlier = by_earlier[kind] @ first + by_later[kind] @ np.swapaxes(shared, 1, 2)
+        with_later = by_earlier[kind] @ shared + by_later[kind] @ last
+        own = with_earlier @ np.swapaxes(by_earlier[kind], 1, 2) + with_later @ np.swapaxes(
+            by_later[kind], 1, 2
+        )
+        moments[:, axes] += _by_axis(own)
+        crossed[:, axes] += _by_axis(with_earlier)
+        before[:, axes] += _by_axis(first)
     crossed[..., :, 0] = 0.0
     before[..., :, 0] = before[..., 0, :] = 0.0
     return moments, crossed, before
 
 
 def _by_axis(matrix: FloatArray) -> FloatArray:
-    """(N, 6, 3, 3) what belongs to one axis of (N, 18, 18)."""
-    axes = np.arange(6)
-    by_order = matrix.reshape(-1, STATE // 6, 6, STATE // 6, 6)
-    return by_order[:, :, axes, :, axes].transpose(1, 0, 2, 3)
+    """(N, 3, 3, 3) what belongs to one axis of (N, 9, 9)."""
+    by_axis: FloatArray = np.einsum("niaja->naij", matrix.reshape(-1, 3, 3, 3, 3))
+    return by_axis
 
 
-def _energy(steps: _Moments, dt_s: FloatArray, times_s: FloatArray) -> FloatArray:
-    """(K - 1, A) expected squared length of the steps, in units of an acceleration sigma of 1."""
+def _energy(steps: _Moments, phi: FloatArray, information: FloatArray) -> FloatArray:
+    """(K - 1, A) expected squared length of the steps, whose transition and information are (K - 1, A or 1, 3, 3)."""
     moments, crossed, before = steps
-    phi = transition(dt_s, times_s)
-    to = np.swapaxes(phi, -1, -2)
-    left = moments - crossed @ to - phi @ np.swapaxes(crossed, -1, -2) + phi @ before @ to
-    energy: FloatArray = np.einsum("kaij,kaji->ka", process_information(dt_s, times_s), left)
+    mixed = phi @ np.swapaxes(crossed, -1, -2)
+    left = moments - mixed - np.swapaxes(mixed, -1, -2) + phi @ before @ np.swapaxes(phi, -1, -2)
+    energy: FloatArray = (information * left).sum(axis=(2, 3))
     return energy
 
 
 def _expected_log_density(steps: _Moments, dt_s: FloatArray, time_s: float, sigmas: FloatArray) -> float:
     """Give the expected log density of all steps of some axes, as far as it depends on their correlation time."""
-    energies = _energy(steps, dt_s, np.full(len(sigmas), time_s)) / sigmas**2
-    _, logdet = np.linalg.slogdet(process_information(dt_s[:, 0], np.full(len(dt_s), time_s)))
+    phi, information = transition(dt_s, time_s), process_information(dt_s, time_s)
+    energies = _energy(steps, phi[:, None], information[:, None]) / sigmas**2
+    _, logdet = np.linalg.slogdet(information)
     return -0.5 * float(energies.sum()) + 0.5 * len(sigmas) * float(logdet.sum())

@@ -30,7 +30,10 @@ if TYPE_CHECKING:
 
 SMOOTHED_EVERY_NS = 500_000_000
 
-_NONE = np.empty((0, 18, 18))
+_POSE = 6
+"""Parts of a state's error that poses tell of."""
+
+_NONE = np.empty((0, _POSE, _POSE))
 
 
 class ContinuousPipeline:
@@ -149,7 +152,7 @@ class ContinuousPipeline:
         states: Knots | None = None
         covariance = _NONE
         if self._window.following:
-            states, covariance = self._window.predict((epoch_ns - self._origin_ns) / 1e9)
+            states, covariance = self._window.predict((epoch_ns - self._origin_ns) / 1e9, parts=_POSE)
         stamp_ns = np.array([epoch_ns], dtype=np.int64)
         return continuous_poses(self._parameters, Kind.PREDICTED, stamp_ns, self._seen, states, covariance)
 
@@ -161,7 +164,7 @@ class ContinuousPipeline:
         states: Knots | None = None
         covariance = _NONE
         if self._window.following:
-            states, covariance = self._window.trajectory().at((stamp_ns - self._origin_ns) / 1e9)
+            states, covariance = self._window.trajectory().at((stamp_ns - self._origin_ns) / 1e9, parts=_POSE)
         poses = continuous_poses(self._parameters, Kind.SMOOTHED, stamp_ns, self._seen, states, covariance)
         self._next_smoothed_ns = int(stamp_ns[-1]) + self._limits.period_ns
         self._forget()

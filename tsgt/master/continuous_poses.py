@@ -71,7 +71,8 @@ def continuous_poses(
     seen
         Measurements.
     states, covariance
-        The trajectory at the epochs, and the covariance of its errors, (N, 18, 18); None where there is none.
+        The trajectory at the epochs, and the covariance of the errors of its place and rotation, (N, 6, 6) or more of
+        them; None where there is none.
 
     Returns
     -------

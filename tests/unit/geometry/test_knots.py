@@ -12,7 +12,17 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tsgt.geometry import exp_so3
-from tsgt.geometry.knots import STATE, Knots, Steps, joined, linearise_steps, spread, turn_between
+from tsgt.geometry.knots import (
+    STATE,
+    Knots,
+    LinearisedSteps,
+    Steps,
+    add_steps,
+    joined,
+    linearise_steps,
+    spread,
+    turn_between,
+)
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:
@@ -84,13 +94,54 @@ def test_derivatives_of_steps_are_exact(seed: int) -> None:
     """By the earlier and by the later state, for any attitudes, turns and velocities, they are the numerical ones."""
     knots = wild_knots(seed)
     steps = Steps.of(knots.time_s, PRIOR)
-    found = linearise_steps(knots, steps)
+    by_earlier, by_later = whole_derivatives(linearise_steps(knots, steps), steps)
     for row in range(len(knots)):
         by_row = numerical(knots, steps, row)
         if row < len(knots) - 1:
-            np.testing.assert_allclose(found.by_earlier[row], by_row[row], atol=2e-8)
+            np.testing.assert_allclose(by_earlier[row], by_row[row], atol=2e-8)
         if row > 0:
-            np.testing.assert_allclose(found.by_later[row - 1], by_row[row - 1], atol=2e-8)
+            np.testing.assert_allclose(by_later[row - 1], by_row[row - 1], atol=2e-8)
+
+
+def whole_derivatives(found: LinearisedSteps, steps: Steps) -> tuple[FloatArray, FloatArray]:
+    """Give derivatives of all residuals by the errors of both knots, (N, 18, 18) each."""
+    by_earlier, by_later = -spread(steps.phi), np.tile(np.eye(STATE), (len(steps.phi), 1, 1))
+    by_earlier[:, 3:6, 3:6] = found.turn_by_earlier[:, :, :3]
+    by_earlier[:, 3:6, 9:12] += found.turn_by_earlier[:, :, 3:]
+    by_later[:, 3:6, 3:6] = found.turn_by_later[:, :, :3]
+    by_later[:, 3:6, 9:12] = found.turn_by_later[:, :, 3:]
+    return by_earlier, by_later
+
+
+@settings(derandomize=True, max_examples=20)
+@given(st.integers(0, 10**6))
+def test_steps_enter_the_normal_equations_as_squares(seed: int) -> None:
+    """What is added to the system is that of the derivatives, the information and the residuals as whole matrices."""
+    knots = wild_knots(seed)
+    steps = Steps.of(knots.time_s, PRIOR)
+    found = linearise_steps(knots, steps)
+    count, weights = len(knots), spread(steps.information)
+    jacobian = np.zeros((count - 1, STATE, count * STATE))
+    for row, (earlier, later) in enumerate(zip(*whole_derivatives(found, steps), strict=True)):
+        jacobian[row, :, row * STATE : (row + 2) * STATE] = np.concatenate([earlier, later], axis=1)
+    expected = np.einsum("nia,nij,njb->ab", jacobian, weights, jacobian)
+    diagonal, beside = np.zeros((count, STATE, STATE)), np.zeros((count - 1, STATE, STATE))
+    gradient = np.zeros((count, STATE))
+    cost = add_steps(found, steps, diagonal, beside, gradient)
+    for row in range(count):
+        here, following = (slice(k * STATE, (k + 1) * STATE) for k in (row, row + 1))
+        np.testing.assert_allclose(
+            diagonal[row], expected[here, here], rtol=1e-9, atol=1e-12 * expected.max()
+        )
+        if row < count - 1:
+            np.testing.assert_allclose(
+                beside[row], expected[here, following], rtol=1e-9, atol=1e-12 * expected.max()
+            )
+    pulled = np.einsum("nij,nj->ni", weights, found.residuals)
+    np.testing.assert_allclose(
+        gradient.ravel(), np.einsum("nia,ni->a", jacobian, pulled), rtol=1e-7, atol=1e-6
+    )
+    assert cost == pytest.approx(float(np.vdot(pulled, found.residuals)))
 
 
 def test_a_step_as_the_prior_expects_has_no_residual() -> None:

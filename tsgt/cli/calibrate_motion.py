@@ -196,6 +196,7 @@ def _json(
         "outliers": calibration.outliers,
         "noise_scale": calibration.noise_scale,
         "disagreement": calibration.disagreement,
+        "wander_ms": 1e3 * calibration.wander_s,
         "motion": asdict(calibration.prior),
         "linear": None if judged is None else _figures(judged.linear),
         "before": None if judged is None or judged.before is None else _figures(judged.before),
@@ -219,6 +220,8 @@ def _print(
         f"noise {calibration.noise_scale:.2f} times the stated one; sigmas times {calibration.disagreement:.2f}, "
         "as parts of the recording contradict each other"
     )
+    if len(calibration.unknowns.latencies):
+        click.echo(f"time stamps of a station wander by {1e3 * calibration.wander_s:.2f} ms")
     rows = []
     for station, each in stations.items():
         for axis, name in enumerate("xyz"):

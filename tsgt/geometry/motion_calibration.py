@@ -19,6 +19,7 @@ from tsgt.geometry.continuous import LEAST_STEP_S, knot_times, solve
 from tsgt.geometry.first_guess import first_guess
 from tsgt.geometry.knots import STATE
 from tsgt.geometry.motion_unknowns import Setup, Unknowns, UnknownSetup, bends
+from tsgt.geometry.motion_wander import Part, allowed_for, likely_wander_s
 from tsgt.geometry.rigid import rotate
 from tsgt.geometry.tuning import scaled, tune
 from tsgt.model import MotionPrior
@@ -35,6 +36,10 @@ PIECE_S = 40.0
 """A recording is taken as trajectories of this length: memory stays bounded, and pieces that contradict each other show.
 Their ends tell a little less."""
 
+MOST_GAP_S = 5.0
+"""Where all stations are silent for longer, a piece ends: nothing of a robot's motion lasts that long, and a trajectory that
+nothing holds may not be found at all."""
+
 LEAST_MEASUREMENTS = 30
 """A piece with fewer is left out."""
 
@@ -44,10 +49,6 @@ SETTLED = 1e-3
 
 COARSE_SCALES = (20.0, 4.0)
 """Noise is taken to be so many times larger at first, so that a wrong set-up does not make everything an outlier."""
-
-MOST_NOISE_SCALE = 2.0
-"""Real recordings have bumps that no stationary motion has, which would pass for noise far above the data sheet; predictions
-of measurements left out are worse then."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,8 +67,11 @@ class MotionCalibration:
         (G, G) of the unknowns in their order, given all measurements and what was known beforehand, times the square of
         ``disagreement``.
     disagreement
-        1, or how many times more than noise explains the pieces of the recording contradict each other: time stamps
-        that wander, a tripod that sinks.
+        1, or how many times more than noise and wandering time stamps explain the pieces of the recording contradict each
+        other: a tripod that sinks.
+    wander_s
+        One sigma of how much later or earlier than its latency each station's stamps are from one piece of the recording
+        to the next; it is in the covariance.
     prior
         How the robot moves.
     noise_scale
@@ -81,6 +85,7 @@ class MotionCalibration:
     unknowns: UnknownSetup
     covariance: FloatArray
     disagreement: float
+    wander_s: float
     prior: MotionPrior
     noise_scale: float
     measurements: int
@@ -108,7 +113,7 @@ class _System(NamedTuple):
     cost: float
     measurements: int
     outliers: int
-    parts: list[tuple[FloatArray, FloatArray]]
+    parts: list[Part]
 
 
 @dataclass(slots=True)
@@ -161,10 +166,17 @@ def calibrate_motion(
         setup, _ = _search(_pieces(scaled(observations, scale)), unknowns, setup, coarse)
     if prior is None:
         tell("how the robot moves")
-        prior, noise_scale = _tuned(setup.applied(observations), noise_scale)
+        tuned = tune(setup.applied(observations), noise_scale=noise_scale)
+        prior, noise_scale = tuned.prior, tuned.noise_scale
     noise_scale = 1.0 if noise_scale is None else noise_scale
     tell("fine")
-    setup, system = _search(_pieces(scaled(observations, noise_scale)), unknowns, setup, prior)
+    pieces = _pieces(scaled(observations, noise_scale))
+    setup, system = _search(pieces, unknowns, setup, prior)
+    beforehand = _known(unknowns, unknowns.away(setup))
+    wander_s = likely_wander_s(system.parts, beforehand, unknowns.latencies)
+    if wander_s > 0:
+        tell(f"time stamps that wander by {1e3 * wander_s:.1f} ms")
+        setup, system = _search(pieces, unknowns, setup, prior, wander_s=wander_s)
     disagreement = _disagreement(system.parts, unknowns)
     covariance = np.asarray(np.linalg.inv(system.information), np.float64)
     return MotionCalibration(
@@ -173,6 +185,7 @@ def calibrate_motion(
         unknowns,
         covariance * disagreement**2,
         disagreement,
+        wander_s,
         prior,
         noise_scale,
         system.measurements,
@@ -180,7 +193,7 @@ def calibrate_motion(
     )
 
 
-def _disagreement(parts: list[tuple[FloatArray, FloatArray]], unknowns: UnknownSetup) -> float:
+def _disagreement(parts: list[Part], unknowns: UnknownSetup) -> float:
     """Ratio of what pieces contradict each other by to what noise explains (R. T. Birge, Physical Review 40, 1932)."""
     count = len(unknowns.sigmas)
     squared, expected = 0.0, -float(count)
@@ -192,18 +205,11 @@ def _disagreement(parts: list[tuple[FloatArray, FloatArray]], unknowns: UnknownS
     return max(1.0, float(np.sqrt(squared / expected))) if expected >= count else 1.0
 
 
-def _tuned(observations: Observations, noise_scale: float | None) -> tuple[MotionPrior, float]:
-    tuned = tune(observations, noise_scale=noise_scale)
-    if noise_scale is None and tuned.noise_scale > MOST_NOISE_SCALE:
-        tuned = tune(observations, start=tuned.prior, noise_scale=MOST_NOISE_SCALE)
-    return tuned.prior, tuned.noise_scale
-
-
 def _search(
-    pieces: list[_Piece], unknowns: UnknownSetup, setup: Setup, prior: MotionPrior
+    pieces: list[_Piece], unknowns: UnknownSetup, setup: Setup, prior: MotionPrior, *, wander_s: float = 0.0
 ) -> tuple[Setup, _System]:
     """Gauss and Newton's method with Levenberg's damping."""
-    system = _assemble(pieces, unknowns, setup, prior)
+    system = _assemble(pieces, unknowns, setup, prior, wander_s)
     damping = 0.0
     for _ in range(MOST_STEPS):
         information = system.information + damping * np.diag(np.diag(system.information))
@@ -211,7 +217,7 @@ def _search(
         if float(move @ system.information @ move) < SETTLED:
             break
         following = unknowns.moved(setup, move)
-        tried = _assemble(pieces, unknowns, following, prior)
+        tried = _assemble(pieces, unknowns, following, prior, wander_s)
         # Which knots there are changes with the latencies, and with it the cost, by next to nothing.
         if tried.cost <= system.cost + 1e-4 * abs(system.cost) + 0.1:
             setup, system = following, tried
@@ -227,7 +233,8 @@ def _pieces(observations: Observations) -> list[_Piece]:
     time_s = observations.time_s
     count = max(1, round(float(time_s[-1] - time_s[0]) / PIECE_S)) if len(time_s) else 0
     edges = np.linspace(time_s[0], time_s[-1], count + 1)[1:-1] if count else ()
-    rows = np.split(np.arange(len(time_s)), np.searchsorted(time_s, edges))
+    ends = np.concatenate([np.searchsorted(time_s, edges), np.flatnonzero(np.diff(time_s) > MOST_GAP_S) + 1])
+    rows = np.split(np.arange(len(time_s)), np.unique(ends).astype(np.intp))
     found = [_Piece(observations.select(some)) for some in rows if len(some) >= LEAST_MEASUREMENTS]
     usable = [piece for piece in found if len(np.unique(piece.observations.prism)) >= 3]
     if not usable:
@@ -238,10 +245,16 @@ def _pieces(observations: Observations) -> list[_Piece]:
     return usable
 
 
-def _assemble(pieces: list[_Piece], unknowns: UnknownSetup, setup: Setup, prior: MotionPrior) -> _System:
+def _known(unknowns: UnknownSetup, away: FloatArray) -> Part:
+    """Give what is known beforehand of a set-up that is so far away from that."""
+    return Part(np.diag(unknowns.sigmas**-2.0), away / unknowns.sigmas**2)
+
+
+def _assemble(
+    pieces: list[_Piece], unknowns: UnknownSetup, setup: Setup, prior: MotionPrior, wander_s: float
+) -> _System:
     away = unknowns.away(setup)
-    information = np.diag(unknowns.sigmas**-2.0)
-    gradient = away / unknowns.sigmas**2
+    information, gradient = _known(unknowns, away)
     cost, measurements, outliers = float(away @ gradient), 0, 0
     parts = []
     for piece in pieces:
@@ -250,9 +263,13 @@ def _assemble(pieces: list[_Piece], unknowns: UnknownSetup, setup: Setup, prior:
         by_setup = unknowns.jacobian(observations, solution.linearised, setup)
         own, mixed, slope = _normal_equations(observations, solution, by_setup)
         told = own - np.tensordot(mixed, solution.factor.solve(mixed), axes=((0, 1), (0, 1)))
-        parts.append((told, slope))
-        information += told
-        gradient += slope
+        part = Part(told, slope)
+        if wander_s > 0:
+            part, gained, _ = allowed_for(part, unknowns.latencies, wander_s)
+            cost -= 2.0 * gained
+        parts.append(part)
+        information += part.information
+        gradient += part.gradient
         cost += solution.cost
         measurements += len(observations)
         outliers += int(np.count_nonzero(solution.weights < 1.0))

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from support.published import write_prisms, write_targets, write_tracks
 
+from tsgt.analysis.motion_calibration import calibrate_recording
 from tsgt.config import load_station_frames, load_station_latencies
+from tsgt.geometry import exp_so3
+from tsgt.geometry.motion_unknowns import Unknowns
+from tsgt.recording import load_recording
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from support.cli import Tsgt
     from support.scene import Motion
-
-from tsgt.geometry import exp_so3
 
 
 def winding(time_s: float) -> Motion:
@@ -58,6 +61,24 @@ def test_exact_measurements_need_no_correction(tsgt: Tsgt, recording: Path, tmp_
     assert latencies[3] == round(1e6 * found["stations"]["3"]["latency_ms"])
 
 
+def test_what_a_layout_counts_from_does_not_matter(recording: Path) -> None:
+    """With the robot's origin some metres off the prisms the same frames and the same motion come out."""
+    near = load_recording(recording)
+    prisms = tuple(
+        replace(each, position_m=(each.position_m[0] + 3.0, each.position_m[1] - 1.0, each.position_m[2]))
+        for each in near.parameters.prisms
+    )
+    far = replace(near, parameters=replace(near.parameters, prisms=prisms))
+    known = Unknowns(shift_sigma_m=0.02, turn_sigma_rad=0.002, latency_sigma_s=0.1)
+    one, other = (calibrate_recording(each, known, held_out=False) for each in (near, far))
+    for found, given in zip(other.parameters.prisms, prisms, strict=True):
+        assert found.position_m == pytest.approx(given.position_m)
+    assert other.calibration.setup.frames == pytest.approx(one.calibration.setup.frames, abs=1e-6)
+    assert other.calibration.prior.angular_acceleration_sigma_radps2 == pytest.approx(
+        one.calibration.prior.angular_acceleration_sigma_radps2, rel=1e-2
+    )
+
+
 def test_text_names_the_stations(tsgt: Tsgt, recording: Path) -> None:
     """Without --json a table for people comes."""
     done = tsgt(
@@ -87,7 +108,7 @@ def test_the_layout_is_written_only_if_it_was_sought(tsgt: Tsgt, recording: Path
 
 
 def test_a_published_drive_is_predicted_better(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
-    """What the calibration has not seen is missed by at most 0.6 of what straight lines miss it by, at gaps 0.45."""
+    """What the calibration has not seen is missed by at most 0.45 of what straight lines miss it by, at gaps 0.35."""
     day = field_data / "20220314"
     path = tmp_path / "r.jsonl"
     tracks = [day / f"trimble{k}.csv" for k in (1, 2, 3)]
@@ -101,7 +122,7 @@ def test_a_published_drive_is_predicted_better(tsgt: Tsgt, field_data: Path, tmp
     found = done.json()
     linear, before, after = found["linear"], found["before"], found["after"]
     assert linear["n"] == before["n"] == after["n"]
-    assert after["mean"] < 0.6 * linear["mean"]
+    assert after["mean"] < 0.45 * linear["mean"]
     assert after["mean"] < before["mean"]
-    assert after["p95"] < 0.55 * linear["p95"]
-    assert after["gaps"]["mean"] < 0.45 * linear["gaps"]["mean"]
+    assert after["p95"] < 0.45 * linear["p95"]
+    assert after["gaps"]["mean"] < 0.35 * linear["gaps"]["mean"]

@@ -86,6 +86,13 @@ def wrong(observations: Observations) -> Observations:
     return replace(observations, frames=moved, time_s=time_s).select(np.argsort(time_s, kind="stable"))
 
 
+def wandering(observations: Observations, *, sigma_s: float, piece_s: float, seed: int) -> Observations:
+    """Stamps of each station that are late by some time of its own in each stretch of a drive."""
+    late_s = np.random.default_rng(seed).normal(0.0, sigma_s, (3, 100))
+    time_s = observations.time_s + late_s[observations.station, (observations.time_s // piece_s).astype(int)]
+    return replace(observations, time_s=time_s).select(np.argsort(time_s, kind="stable"))
+
+
 def surprise(
     found_from: Observations, known: Unknowns, start: Setup | None = None
 ) -> tuple[float, int, FloatArray]:
@@ -109,6 +116,35 @@ def test_uncertainties_are_neither_too_small_nor_too_large() -> None:
     """Over eight drives the mean of chi squared stays in its 99 % band about the number of unknowns."""
     distances = [surprise(wrong(drive(60.0, seed=seed)), REFINE)[0] for seed in range(8)]
     assert 9.6 < np.mean(distances) < 19.3
+
+
+def test_stamps_that_wander_are_found_and_allowed_for() -> None:
+    """Where stamps wander by 3 ms every 40 s, that is found, and chi squared is as with white noise: in its 99 % band."""
+    distances, wander_s = [], []
+    for seed in range(2):
+        observations = wandering(wrong(drive(160.0, seed=seed)), sigma_s=3e-3, piece_s=40.0, seed=seed)
+        found = calibrate_motion(observations, REFINE, prior=PRIOR, noise_scale=1.0)
+        true = Setup(frames(), np.array([0.0, 0.03, 0.0]), LAYOUT)
+        error = found.unknowns.away(found.setup) - found.unknowns.away(true)
+        distances.append(float(error @ np.linalg.solve(found.covariance, error)))
+        wander_s.append(found.wander_s)
+    assert 1.5e-3 < np.mean(wander_s) < 5e-3
+    assert 6.2 < np.mean(distances) < 25.5
+
+
+def test_stamps_that_do_not_wander_are_not_said_to() -> None:
+    """Less than half a millisecond is found in white noise."""
+    assert calibrate_motion(drive(), REFINE, prior=PRIOR, noise_scale=1.0).wander_s < 5e-4
+
+
+def test_a_silence_of_all_stations_does_no_harm() -> None:
+    """Nothing is carried over half a minute without measurements: both sides of it agree."""
+    observations = wrong(drive())
+    heard = observations.select((observations.time_s < 20.0) | (observations.time_s > 52.0))
+    found = calibrate_motion(heard, REFINE, prior=PRIOR, noise_scale=1.0)
+    assert found.measurements == len(heard)
+    assert found.outliers < 5
+    assert found.disagreement < 1.5
 
 
 def test_levelled_stations_have_four_degrees_of_freedom() -> None:

@@ -1,0 +1,104 @@
+"""Whether `tsgt calibrate motion` is as good as it says: errors planted into simulated drives, and what is left of them.
+
+    tsgt simulate dynamic --seed 3 --output r3.jsonl
+    python benchmarks/motion_calibration.py r3.jsonl ... [--length 300]
+
+Takes recordings whose frames and latencies are true, cuts them into drives of that many seconds, makes station 2 wrong by
+5 mm, 0.5 mrad (each in some direction) and 30 ms, and calibrates. Prints, by drive, the largest error of the shifts (mm), turns
+(mrad) and latencies (ms), the largest error in stated sigmas, and chi-square of all unknowns together.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from tsgt.analysis.motion_calibration import calibrate_recording
+from tsgt.geometry.motion_unknowns import Setup, Unknowns
+from tsgt.geometry.rigid import exp_so3
+from tsgt.recording import load_recording
+
+if TYPE_CHECKING:
+    from tsgt.geometry import FloatArray
+    from tsgt.model import Matrix4
+    from tsgt.recording import Recording
+
+KNOWN = Unknowns(shift_sigma_m=0.02, turn_sigma_rad=0.002, latency_sigma_s=0.1)
+SHIFT_M, TURN_RAD, LATE_S = 0.005, 0.0005, 0.03
+
+
+def planted(frame: Matrix4, rng: np.random.Generator) -> Matrix4:
+    """Move and turn a frame."""
+    shift, turn = rng.normal(size=3), rng.normal(size=3)
+    wrong = np.array(frame)
+    wrong[:3, :3] = exp_so3(turn * TURN_RAD / np.linalg.norm(turn)) @ wrong[:3, :3]
+    wrong[:3, 3] += shift * SHIFT_M / np.linalg.norm(shift)
+    return cast("Matrix4", tuple(map(tuple, wrong.tolist())))
+
+
+def judge(name: str, recording: Recording, rng: np.random.Generator) -> tuple[float, FloatArray]:
+    """Chi-square of a drive, and each unknown's error in stated sigmas; prints both."""
+    stations = list(recording.parameters.stations)
+    stations[1] = replace(
+        stations[1],
+        T_station1_station=planted(stations[1].T_station1_station, rng),
+        latency_ns=stations[1].latency_ns - round(1e9 * LATE_S),
+    )
+    wrong = replace(recording, parameters=replace(recording.parameters, stations=tuple(stations)))
+    found = calibrate_recording(wrong, KNOWN, held_out=False).calibration
+    frames = np.array([*(each.T_station1_station for each in recording.parameters.stations), np.eye(4)])
+    late_s = np.zeros(len(frames))
+    late_s[1] = LATE_S
+    unknowns = found.unknowns
+    error = unknowns.away(found.setup) - unknowns.away(Setup(frames, late_s, found.setup.layout))
+    sigmas = error / np.sqrt(np.diag(found.covariance))
+    squared = float(error @ np.linalg.solve(found.covariance, error))
+    largest = [1e3 * np.abs(error[at]).max() for at in (unknowns.shifts, unknowns.turns, unknowns.latencies)]
+    print(
+        name,
+        "{:.2f} mm {:.3f} mrad {:.2f} ms".format(*largest),
+        f"largest {np.abs(sigmas).max():.1f} sigma, chi-square {squared:.1f} of {len(error)},",
+        f"noise {found.noise_scale:.2f}, wander {1e3 * found.wander_s:.2f} ms, disagreement {found.disagreement:.2f}",
+        "in sigmas",
+        " ".join(f"{each:.1f}" for each in sigmas),
+        flush=True,
+    )
+    return squared, np.asarray(sigmas, np.float64)
+
+
+def main() -> None:
+    """Judge all drives."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("recordings", nargs="+", type=Path)
+    parser.add_argument("--length", type=float, default=300.0)
+    chosen = parser.parse_args()
+    rng = np.random.default_rng(0)
+    judged = []
+    for path in chosen.recordings:
+        recording = load_recording(path)
+        first_ns = min(each.stamp_ns for each in recording.measurements)
+        last_ns = max(each.stamp_ns for each in recording.measurements)
+        count = max(round((last_ns - first_ns) / 1e9 / chosen.length), 1)
+        edges_ns = np.linspace(first_ns, last_ns + 1, count + 1)
+        for drive in range(count):
+            inside = [
+                each
+                for each in recording.measurements
+                if edges_ns[drive] <= each.stamp_ns < edges_ns[drive + 1]
+            ]
+            judged.append(judge(f"{path.stem} {drive + 1}", replace(recording, measurements=inside), rng))
+    squared = np.array([each for each, _ in judged])
+    sigmas = np.concatenate([each for _, each in judged])
+    print(
+        f"{len(judged)} drives: chi-square {squared.mean():.1f} on average ({squared.min():.1f} to {squared.max():.1f}); "
+        f"errors over 2 sigmas {100 * np.mean(np.abs(sigmas) > 2):.1f} %, over 3 {100 * np.mean(np.abs(sigmas) > 3):.1f} %, "
+        f"largest {np.abs(sigmas).max():.1f}"
+    )
+
+
+if __name__ == "__main__":
+    main()

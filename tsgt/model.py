@@ -284,6 +284,33 @@ TARGET_NOISE = InstrumentNoise(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class TargetResidual:
+    """How well one target fits the frame that was solved from all of them.
+
+    Attributes
+    ----------
+    target
+        Number of the target.
+    residual_m
+        Distance between where the station, in its solved frame, and where station 1 sees it, in m; null for a rejected
+        one.
+    left_out_m
+        The same with the frame solved from the other targets alone, in m; null where these were too few.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
+
+    target: int
+    residual_m: float | None
+    left_out_m: float | None
+
+    def __post_init__(self) -> None:
+        """Refuse what no calibration finds."""
+        _check_limits(self, target=(1, LARGEST_NUMBER))
+        check_finite(self.residual_m or 0.0, self.left_out_m or 0.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class StationParameters:
     """What is needed to turn one station's raw measurements into positions in the frame ``station1``.
 
@@ -303,6 +330,8 @@ class StationParameters:
         From the measurement to its host stamp, in ns; taken off the stamp. Positive: the stamp is late.
     noise
         Noise of one measurement.
+    targets
+        From which targets the frame was solved, and how well they fit; empty where that is not known, and for station 1.
     """
 
     __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
@@ -314,6 +343,7 @@ class StationParameters:
     atmospheric_ppm: float = 0.0
     latency_ns: int = 0
     noise: InstrumentNoise = TRACKING_NOISE
+    targets: tuple[TargetResidual, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse what no station can have."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,7 +11,7 @@ from tsgt.errors import DegenerateGeometryError, InputFileError
 from tsgt.geometry import check_layout, corrected_distance, measurement_covariance, polar_to_cartesian
 from tsgt.geometry.calibration import calibrate_frame, calibrate_prisms
 from tsgt.geometry.frame_fit import PointSet
-from tsgt.model import TARGET_NOISE
+from tsgt.model import TARGET_NOISE, TargetResidual
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -69,6 +70,25 @@ def solve_stations(
                 f"{file.path}: station {station} against station 1: {error}"
             ) from error
     return frames
+
+
+def target_residuals(frame: FrameCalibration) -> tuple[TargetResidual, ...]:
+    """Tell how well each target fits a station's solved frame; the rejected ones come last."""
+    used = zip(frame.used, frame.residuals_m.tolist(), frame.leave_one_out_m.tolist(), strict=True)
+    return (
+        *(
+            TargetResidual(
+                target=int(name),
+                residual_m=residual_m,
+                left_out_m=left_out_m if math.isfinite(left_out_m) else None,
+            )
+            for name, residual_m, left_out_m in used
+        ),
+        *(
+            TargetResidual(target=int(bad.name), residual_m=None, left_out_m=float(bad.miss_m))
+            for bad in frame.rejected
+        ),
+    )
 
 
 def solve_prisms(file: PrismFile, *, target_constant_m: float, prism_constant_m: float) -> PrismCalibration:

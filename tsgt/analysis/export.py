@@ -29,6 +29,7 @@ MEASUREMENT_COLUMNS = (
     *("type", "station", "prism", "sequence", "stamp_ns", "received_ns", "status"),
     *("horizontal_angle_rad", "zenith_angle_rad", "slope_distance_m"),
     *("x_m", "y_m", "z_m"),
+    *("stamp_sigma_ns", "stamp_bound_ns", "raw_status", "host_time_ns", "instrument_time_ns"),
 )
 
 
@@ -92,12 +93,14 @@ def measurement_csv(measurements: Iterable[Measurement]) -> Iterator[str]:
     for m in measurements:
         polar: Sequence[float | None] = [None] * 3
         position: Sequence[float | None] = [None] * 3
+        times: Sequence[int | None] = [None] * 5
         if isinstance(m, PointMeasurement):
             position = m.position_m
         else:
             polar = (m.horizontal_angle_rad, m.zenith_angle_rad, m.slope_distance_m)
+            times = (m.stamp_sigma_ns, m.stamp_bound_ns, m.raw_status, m.host_time_ns, m.instrument_time_ns)
         who = (m.type, m.station, m.prism, m.sequence, m.stamp_ns, m.received_ns, m.status.value)
-        yield _line((*who, *polar, *position))
+        yield _line((*who, *polar, *position, *times))
 
 
 def _line(row: Iterable[object]) -> str:

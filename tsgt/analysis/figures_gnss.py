@@ -99,10 +99,12 @@ def draw_gnss(
             shift = 0.2 * ((len(receivers) - 1) / 2 - number)
             rows = _rows(receivers)[receiver.quality[inside]] + shift
             quality.plot((seen_ns - start_ns) / 1e9, rows, color=stroke.color, marker="|", ms=2, ls="none")
-        satellites.set(ylabel="satellites", ylim=(0, None))
+        satellites.set(ylabel="satellites", ylim=(0, 1.1 * satellites.get_ylim()[1]))
         names = [QUALITIES[q] for q in _seen(receivers)]
         quality.set(
-            xlabel="time (s)", ylim=(-0.6, len(names) - 0.4), xlim=(0, max((end_ns - start_ns) / 1e9, 0.1))
+            xlabel="time from the first distance (s)",
+            ylim=(-0.6, len(names) - 0.4),
+            xlim=(0, max((end_ns - start_ns) / 1e9, 0.1)),
         )
         quality.set_yticks(range(len(names)), names)
         for axes in (errors, satellites):

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tsgt.analysis.gnss import Distances
-from tsgt.analysis.inter_prism import EPOCH_NS
+from tsgt.analysis.inter_prism import at_epochs
 from tsgt.errors import RecordingError
-from tsgt.geometry import interpolate
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -37,27 +35,21 @@ def prism_pairs(parameters: Parameters, tracks: Mapping[int, Track], path: Path)
     RecordingError
         A prism was not measured, or the layout has one prism only.
     """
-    layout = {prism.prism: np.array(prism.position_m) for prism in parameters.prisms}
-    missing = [prism for prism in layout if not len(tracks[prism])]
-    if missing or len(layout) < 2:
+    missing = [prism.prism for prism in parameters.prisms if not len(tracks[prism.prism])]
+    if missing or len(parameters.prisms) < 2:
         what = f"prism {missing[0]} was not measured" if missing else "it has one prism only"
         raise RecordingError(f"no distances between prisms: {what}", path=path)
-    start_ns = max(int(tracks[prism].times_ns[0]) for prism in layout)
-    end_ns = min(int(tracks[prism].times_ns[-1]) for prism in layout)
-    epochs = np.arange(-(-start_ns // EPOCH_NS), end_ns // EPOCH_NS + 1, dtype=np.int64) * EPOCH_NS
-    limit_ns = parameters.pipeline.outage_limit_ns
-    at_epochs = {p: interpolate(tracks[p].times_ns, tracks[p].points_m, epochs, limit_ns) for p in layout}
-    valid = np.logical_and.reduce([at_epochs[prism].valid for prism in layout])
+    found = at_epochs(parameters, tracks)
     return tuple(
         Distances(
             name=f"{a}-{b}",
-            times_ns=epochs[valid],
-            distances_m=np.linalg.norm(at_epochs[a].points - at_epochs[b].points, axis=1)[valid],
-            reference_m=float(np.linalg.norm(layout[a] - layout[b])),
+            times_ns=found.stamp_ns[found.valid],
+            distances_m=distances_m[found.valid],
+            reference_m=found.references_m[a, b],
             quality=None,
-            invalid_ns=epochs[~valid],
+            invalid_ns=found.stamp_ns[~found.valid],
         )
-        for a, b in combinations(layout, 2)
+        for (a, b), distances_m in found.distances_m.items()
     )
 
 

@@ -115,18 +115,68 @@ class InterPrism:
         How many 20 Hz epochs lie in the span that all tracks cover.
     invalid_epochs
         At how many of them a track's neighbours are further apart than the outage limit.
-    still_s
-        For how long the robot stood still, in s.
+    still_ns
+        Start and end of the intervals in which the robot stood still, in the order of time.
     """
 
     dynamic: tuple[PairDistances, ...]
     static: tuple[PairDistances, ...]
     epochs: int
     invalid_epochs: int
-    still_s: float
+    still_ns: tuple[tuple[int, int], ...]
+
+    @property
+    def still_s(self) -> float:
+        """For how long the robot stood still, in s."""
+        return sum(end - start for start, end in self.still_ns) / 1e9
 
 
-def inter_prism(parameters: Parameters, tracks: Mapping[int, Track]) -> InterPrism:
+@dataclass(frozen=True, slots=True)
+class Epochs:
+    """Distances between all prisms at 20 Hz, from interpolated tracks.
+
+    Attributes
+    ----------
+    stamp_ns
+        (N,) whole multiples of 50 ms in Unix time, in the time that all tracks cover.
+    valid
+        (N,) no track has a gap there. It takes all of them, so that the pairs are compared over the same stretches.
+    distances_m
+        By pair of prisms, (N,); NaN where not valid.
+    references_m
+        By pair of prisms, the distance in the prism layout.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    valid: NDArray[np.bool_]
+    distances_m: dict[tuple[int, int], NDArray[np.float64]]
+    references_m: dict[tuple[int, int], float]
+
+
+def at_epochs(parameters: Parameters, tracks: Mapping[int, Track]) -> Epochs:
+    """Measure the distances between all prisms at 20 Hz; arguments as for :func:`inter_prism`."""
+    layout = {prism.prism: np.array(prism.position_m) for prism in parameters.prisms}
+    start, end = _common_span([tracks[prism] for prism in layout])
+    epochs = np.arange(-(-start // EPOCH_NS), end // EPOCH_NS + 1, dtype=np.int64) * EPOCH_NS
+    limit_ns = parameters.pipeline.outage_limit_ns
+    found = {p: interpolate(tracks[p].times_ns, tracks[p].points_m, epochs, limit_ns) for p in layout}
+    valid = np.logical_and.reduce([found[prism].valid for prism in layout])
+    pairs = list(combinations(layout, 2))
+    apart = {(a, b): np.linalg.norm(found[a].points - found[b].points, axis=-1) for a, b in pairs}
+    return Epochs(
+        stamp_ns=epochs,
+        valid=valid,
+        distances_m={pair: np.where(valid, distances, np.nan) for pair, distances in apart.items()},
+        references_m={(a, b): float(np.linalg.norm(layout[a] - layout[b])) for a, b in pairs},
+    )
+
+
+def inter_prism(
+    parameters: Parameters,
+    tracks: Mapping[int, Track],
+    still_ns: Sequence[tuple[int, int]] | None = None,
+    found: Epochs | None = None,
+) -> InterPrism:
     """Measure the distances between all prisms, moving and standing.
 
     Parameters
@@ -135,34 +185,36 @@ def inter_prism(parameters: Parameters, tracks: Mapping[int, Track]) -> InterPri
         The prism layout (the reference distances) and the outage limit.
     tracks
         One track per prism of the layout, in frame ``station1``, none of them empty.
+    still_ns
+        When the robot stood still, if something else than the tracks tells it; what of it lies before the first and after
+        the last measurement does not count.
+    found
+        From :func:`at_epochs`, if it is known already.
 
     Returns
     -------
     InterPrism
         Without epochs where the tracks have no time in common.
     """
-    layout = {prism.prism: np.array(prism.position_m) for prism in parameters.prisms}
-    outage_limit_ns = parameters.pipeline.outage_limit_ns
-    epochs = _common_epochs([tracks[prism] for prism in layout])
-    found = {
-        prism: interpolate(t.times_ns, t.points_m, epochs, outage_limit_ns) for prism, t in tracks.items()
-    }
-    # All tracks must be valid at an epoch, so that the pairs are compared over the same stretches of the way.
-    valid = np.logical_and.reduce([found[prism].valid for prism in layout])
-    still = still_intervals([tracks[prism] for prism in layout], outage_limit_ns)
+    chosen = [tracks[prism.prism] for prism in parameters.prisms]
+    found = at_epochs(parameters, tracks) if found is None else found
+    if still_ns is None:
+        still = still_intervals(chosen, parameters.pipeline.outage_limit_ns)
+    else:
+        start, end = min(int(t.times_ns[0]) for t in chosen), max(int(t.times_ns[-1]) for t in chosen)
+        still = [(max(a, start), min(b, end)) for a, b in still_ns if max(a, start) < min(b, end)]
+    invalid = int(np.sum(~found.valid))
     dynamic, static = [], []
-    for a, b in combinations(layout, 2):
-        reference_m = float(np.linalg.norm(layout[a] - layout[b]))
-        moving = np.linalg.norm(found[a].points - found[b].points, axis=-1)[valid]
-        dynamic.append(PairDistances((a, b), moving, reference_m, int(np.sum(~valid))))
-        standing = _raw_distances(tracks[a], tracks[b], still)
-        static.append(PairDistances((a, b), standing, reference_m, 0))
+    for pair, reference_m in found.references_m.items():
+        dynamic.append(PairDistances(pair, found.distances_m[pair][found.valid], reference_m, invalid))
+        standing = _raw_distances(tracks[pair[0]], tracks[pair[1]], still)
+        static.append(PairDistances(pair, standing, reference_m, 0))
     return InterPrism(
         dynamic=tuple(dynamic),
         static=tuple(static),
-        epochs=len(epochs),
-        invalid_epochs=int(np.sum(~valid)),
-        still_s=sum(end - start for start, end in still) / 1e9,
+        epochs=len(found.stamp_ns),
+        invalid_epochs=invalid,
+        still_ns=tuple(still),
     )
 
 
@@ -206,11 +258,6 @@ def still_intervals(tracks: Sequence[Track], outage_limit_ns: int) -> list[tuple
 
 def _common_span(tracks: Sequence[Track]) -> tuple[int, int]:
     return max(int(t.times_ns[0]) for t in tracks), min(int(t.times_ns[-1]) for t in tracks)
-
-
-def _common_epochs(tracks: Sequence[Track]) -> NDArray[np.int64]:
-    start, end = _common_span(tracks)
-    return np.arange(-(-start // EPOCH_NS), end // EPOCH_NS + 1, dtype=np.int64) * EPOCH_NS
 
 
 def _raw_distances(a: Track, b: Track, intervals: Sequence[tuple[int, int]]) -> NDArray[np.float64]:

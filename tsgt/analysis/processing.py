@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tsgt.master.pose_batch import PoseBatch
-    from tsgt.model import Matrix4, Measurement, Parameters, Vector3
+    from tsgt.model import Matrix4, Measurement, Parameters, TargetResidual, Vector3
     from tsgt.recording import Recording
 
 Estimator = Literal["linear", "continuous"]
@@ -100,7 +100,16 @@ def with_frames(parameters: Parameters, frames: Mapping[int, Matrix4], *, path: 
         raise ConfigError(
             f"{path}: stations.{missing[0]}: missing; the recording has this station", path=path
         )
-    stations = (dataclasses.replace(s, T_station1_station=frames[s.station]) for s in parameters.stations)
+    # Whatever targets the recorded frames were solved from, these come from elsewhere.
+    stations = (
+        dataclasses.replace(s, T_station1_station=frames[s.station], targets=()) for s in parameters.stations
+    )
+    return dataclasses.replace(parameters, stations=tuple(stations))
+
+
+def with_targets(parameters: Parameters, targets: Mapping[int, tuple[TargetResidual, ...]]) -> Parameters:
+    """Replace what is known of the targets that the stations' frames were solved from, by station number."""
+    stations = (dataclasses.replace(s, targets=targets.get(s.station, ())) for s in parameters.stations)
     return dataclasses.replace(parameters, stations=tuple(stations))
 
 

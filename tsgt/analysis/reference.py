@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from tsgt.analysis.aligned import aligned_figures
 from tsgt.analysis.metrics import PoseFigures, inner_part
 from tsgt.errors import InputFileError
 from tsgt.geometry import rotation_from_quaternion, transform_from
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from tsgt.analysis.aligned import Align, AlignedFigures
     from tsgt.geometry import FloatArray
     from tsgt.master.pose_batch import PoseBatch
 
@@ -117,6 +119,22 @@ def _pose(words: list[str], path: Path, number: int) -> tuple[int, list[float]]:
     return stamp_ns, row
 
 
+def paired(poses: PoseBatch, reference: Reference) -> tuple[NDArray[np.intp], FloatArray]:
+    """Find the valid poses that have a reference, from 2 s after its start to 2 s before its end.
+
+    Returns
+    -------
+    rows
+        (N,) of the poses.
+    true
+        (N, 4, 4) ``T_station1_robot`` of the reference at their instants.
+    """
+    ends_ns = int(reference.stamp_ns[0]), int(reference.stamp_ns[-1])
+    rows = np.flatnonzero(poses.valid & inner_part(poses.stamp_ns, *ends_ns))
+    true, known = reference.at(poses.stamp_ns[rows])
+    return rows[known], true[known]
+
+
 def compare(poses: PoseBatch, reference: Reference, point_m: FloatArray) -> PoseFigures:
     """Compare the valid poses with a reference, unaligned, from 2 s after its start to 2 s before its end.
 
@@ -129,13 +147,17 @@ def compare(poses: PoseBatch, reference: Reference, point_m: FloatArray) -> Pose
     point_m
         The point of the robot whose position is compared, (3,): the centroid of the prisms.
     """
-    ends_ns = int(reference.stamp_ns[0]), int(reference.stamp_ns[-1])
-    rows = np.flatnonzero(poses.valid & inner_part(poses.stamp_ns, *ends_ns))
-    true, known = reference.at(poses.stamp_ns[rows])
-    rows = rows[known]
-    return PoseFigures.of(
-        transform_from(rotation_from_quaternion(poses.orientation_xyzw[rows]), poses.position_m[rows]),
-        poses.covariance[rows],
-        true[known],
-        point_m,
-    )
+    rows, true = paired(poses, reference)
+    return PoseFigures.of(_transforms(poses, rows), poses.covariance[rows], true, point_m)
+
+
+def compare_aligned(
+    poses: PoseBatch, reference: Reference, point_m: FloatArray, mode: Align
+) -> AlignedFigures:
+    """Compare the same poses as :func:`compare` once they are aligned; see :func:`tsgt.analysis.aligned.aligned_figures`."""
+    rows, true = paired(poses, reference)
+    return aligned_figures(_transforms(poses, rows), true, point_m, mode)
+
+
+def _transforms(poses: PoseBatch, rows: NDArray[np.intp]) -> FloatArray:
+    return transform_from(rotation_from_quaternion(poses.orientation_xyzw[rows]), poses.position_m[rows])

@@ -2,34 +2,34 @@
 
 from __future__ import annotations
 
-import dataclasses
-import math
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from tsgt.analysis.consistency import normalised_residuals, outliers, residual_figures
 from tsgt.analysis.evaluation import held_out
-from tsgt.analysis.inter_prism import inter_prism
+from tsgt.analysis.inter_prism import at_epochs, inter_prism
 from tsgt.analysis.perturbation import Perturbation, equivalent, first_order_sigmas, perturbation_study
 from tsgt.analysis.processing import process, with_estimator
-from tsgt.analysis.reference import compare
+from tsgt.analysis.reference import compare, compare_aligned
 from tsgt.analysis.refusals import believed
 from tsgt.analysis.report_log import Log, read_log
-from tsgt.analysis.report_motion import ride, standing
+from tsgt.analysis.report_motion import ride
 from tsgt.analysis.report_stations import station_figures, station_records
 from tsgt.analysis.smoothing import smoothed
+from tsgt.analysis.standing import standing_errors
 from tsgt.errors import GeometryError, RecordingError
 from tsgt.geometry import check_layout, log_so3, rotation_from_quaternion
 from tsgt.master.observations import build_observations
-from tsgt.master.pose_batch import Kind
 from tsgt.master.tracks import build_tracks
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
+    from tsgt.analysis.aligned import Align, AlignedFigures
     from tsgt.analysis.consistency import AxisFigures, Outlier
     from tsgt.analysis.held_out import HeldOut
     from tsgt.analysis.inter_prism import InterPrism
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from tsgt.analysis.report_motion import Ride
     from tsgt.analysis.report_stations import StationFigures, StationRecord
     from tsgt.analysis.smoothing import Smoothed
+    from tsgt.analysis.standing import StandingFigures
     from tsgt.geometry import FloatArray
     from tsgt.master.pose_batch import PoseBatch
     from tsgt.recording import Recording
@@ -104,6 +105,8 @@ class Findings:
         What each station measured, and in figures by its number.
     inter_prism, ride
         Distances between prisms; None where a prism is missing.
+    odometry_ns
+        When the robot stood still by its odometry, within the recording or not; None without odometry.
     continuous, linear
         Poses of both estimators; None where one has none.
     difference
@@ -114,6 +117,10 @@ class Findings:
         Of the continuous trajectory; empty without it.
     compared
         Against the reference, by estimator; empty without one.
+    aligned
+        The same after an alignment, where one was asked for and could be found.
+    stops
+        The mean pose of each stop against the reference, by estimator.
     reference
         The reference.
     pose_noise
@@ -131,6 +138,7 @@ class Findings:
     station_figures: dict[int, StationFigures]
     inter_prism: InterPrism | None
     ride: Ride | None
+    odometry_ns: tuple[tuple[int, int], ...] | None
     continuous: Smoothed | None
     linear: PoseBatch | None
     difference: Difference | None
@@ -139,6 +147,8 @@ class Findings:
     outliers: list[Outlier]
     normalised: FloatArray
     compared: dict[Estimator, PoseFigures]
+    aligned: dict[Estimator, AlignedFigures]
+    stops: dict[Estimator, StandingFigures]
     reference: Reference | None
     pose_noise: PoseNoise | None
     problems: dict[str, str]
@@ -146,11 +156,15 @@ class Findings:
     @property
     def poses(self) -> PoseBatch | None:
         """The poses that the report shows: those of the estimator of the recording, else of the other one."""
+        both = self.both
+        return both.get(self.recording.parameters.pipeline.estimator) or next(iter(both.values()), None)
+
+    @property
+    def both(self) -> dict[Estimator, PoseBatch]:
+        """The poses of each estimator that has some."""
         continuous = None if self.continuous is None else self.continuous.poses
-        chosen = (continuous, self.linear)
-        if self.recording.parameters.pipeline.estimator == "linear":
-            chosen = (self.linear, continuous)
-        return next((poses for poses in chosen if poses is not None), None)
+        found: dict[Estimator, PoseBatch | None] = {"linear": self.linear, "continuous": continuous}
+        return {name: poses for name, poses in found.items() if poses is not None}
 
     @property
     def duration_s(self) -> float:
@@ -164,6 +178,7 @@ def find(
     *,
     reference: Reference | None,
     with_held_out: bool,
+    align: Align | None = None,
     still_ns: Sequence[tuple[int, int]] | None = None,
     on_progress: Callable[[float], None] | None = None,
 ) -> Findings:
@@ -179,6 +194,8 @@ def find(
         What to compare poses with, if anything.
     with_held_out
         Whether to leave measurements out and predict them.
+    align
+        How poses are aligned with the reference besides, if at all.
     still_ns
         When the robot stood still, if something else than the measurements tells it.
     on_progress
@@ -218,13 +235,8 @@ def find(
     if unseen:
         names = " and ".join(f"prism {prism}" for prism in unseen)
         problems["inter_prism"] = f"nothing usable was measured of {names}"
-    distances = None if unseen else inter_prism(parameters, tracks)
-    if distances is not None and still_ns is not None:
-        distances = dataclasses.replace(
-            distances,
-            static=standing(parameters, tracks, still_ns),
-            still_s=sum(end - start for start, end in still_ns) / 1e9,
-        )
+    epochs = None if unseen else at_epochs(parameters, tracks)
+    distances = None if epochs is None else inter_prism(parameters, tracks, still_ns, epochs)
     moved = continuous.poses if continuous is not None else linear
     left_out = None
     if with_held_out and continuous is not None:
@@ -243,8 +255,18 @@ def find(
         ("continuous", None if continuous is None else continuous.poses),
     )
     compared: dict[Estimator, PoseFigures] = {}
+    aligned: dict[Estimator, AlignedFigures] = {}
+    stops: dict[Estimator, StandingFigures] = {}
     if reference is not None:
         compared = {name: compare(poses, reference, centroid_m) for name, poses in both if poses is not None}
+        stood_ns = () if distances is None else distances.still_ns
+        for name, poses in both:
+            if poses is None:
+                continue
+            stops[name] = standing_errors(poses, reference, stood_ns, centroid_m).summary()
+            if align is not None and compared[name].compared:
+                left = attempt("aligned", partial(compare_aligned, poses, reference, centroid_m, align))
+                aligned |= {} if left is None else {name: left}
     return Findings(
         recording=recording,
         path=path,
@@ -257,7 +279,8 @@ def find(
             for each in stations
         },
         inter_prism=distances,
-        ride=None if unseen else ride(parameters, tracks, moved, still_ns),
+        ride=None if epochs is None else ride(parameters, epochs, moved),
+        odometry_ns=None if still_ns is None else tuple(still_ns),
         continuous=continuous,
         linear=linear,
         difference=None
@@ -268,6 +291,8 @@ def find(
         outliers=[] if continuous is None else outliers(continuous.fit, continuous.sources),
         normalised=np.empty((0, 3)) if continuous is None else normalised_residuals(continuous.fit),
         compared=compared,
+        aligned=aligned,
+        stops=stops,
         reference=reference,
         pose_noise=attempt("pose_noise", lambda: _pose_noise(recording, distances)),
         problems=problems,
@@ -319,58 +344,7 @@ def _pose_noise(recording: Recording, distances: InterPrism | None) -> PoseNoise
     )
 
 
-def figures_of(findings: Findings) -> dict[str, Any]:
-    """All numbers of a report, for ``--json``; those of ``tsgt evaluate`` have the same names."""
-    f = findings
-    poses = f.poses
-    found: dict[str, Any] = {
-        "estimator": None if poses is None else Kind(poses.kind[0]).estimator,
-        "measured_s": f.duration_s,
-        "duration_s": math.nan if poses is None else int(poses.stamp_ns[-1] - poses.stamp_ns[0]) / 1e9,
-        "poses": 0 if poses is None else len(poses),
-        "valid_poses": 0 if poses is None else int(np.count_nonzero(poses.valid)),
-        "invalid": {} if poses is None else poses.invalid_counts(),
-        "stations": {number: dataclasses.asdict(each) for number, each in f.station_figures.items()},
-        "problems": f.problems,
-    }
-    if f.inter_prism is not None:
-        for key, pairs in (
-            ("inter_prism_mm", f.inter_prism.dynamic),
-            ("inter_prism_static_mm", f.inter_prism.static),
-        ):
-            found[key] = {pair.name: dataclasses.asdict(pair.summary()) for pair in pairs}
-        found |= {
-            "epochs": f.inter_prism.epochs,
-            "invalid_epochs": f.inter_prism.invalid_epochs,
-            "still_s": f.inter_prism.still_s,
-        }
-    if f.held_out is not None:
-        found["held_out_mm"] = {
-            name: {**dataclasses.asdict(each.figures), "gaps": dataclasses.asdict(each.gaps)}
-            for name, each in f.held_out.items()
-        }
-    if f.continuous is not None:
-        motion = f.continuous.motion
-        found |= {
-            "motion": dataclasses.asdict(motion.prior),
-            "noise_scale": motion.noise_scale,
-            "motion_tuned": motion.tuned,
-            "residuals": {
-                station: {axis: dataclasses.asdict(each) for axis, each in axes.items()}
-                for station, axes in f.residuals.items()
-            },
-            "outliers": [dataclasses.asdict(stray) for stray in f.outliers],
-        }
-    if f.compared:
-        found["estimators"] = {name: dataclasses.asdict(each) for name, each in f.compared.items()}
-        chosen = f.compared.get(f.recording.parameters.pipeline.estimator)
-        found |= {} if chosen is None else dataclasses.asdict(chosen)
-    if f.pose_noise is not None and f.pose_noise.as_measured is not None:
-        noise = f.pose_noise.as_measured
-        found["perturbation"] = {
-            "inter_prism_mean_mm": 1e3 * noise.inter_prism_mean_m,
-            "noise_mm": 1e3 * noise.noise_m,
-            "position_norm_mean_mm": 1e3 * noise.position_norm_mean_m,
-            "rotation_norm_mean_rad": noise.rotation_norm_mean_rad,
-        }
-    return found
+def position_sigma_mm(poses: PoseBatch) -> FloatArray:
+    """Give the sigma of the position per axis (root mean square of the three) that each valid pose states, in mm."""
+    covariance = poses.covariance[poses.valid, :3, :3]
+    return np.asarray(1e3 * np.sqrt(np.einsum("nii->n", covariance) / 3))

@@ -29,13 +29,33 @@ def panels_height_mm(rows: int) -> float:
     return 18.0 + _PANEL_MM * rows
 
 
-def draw_gaps(figure: Figure, stations: Sequence[StationRecord], clock: Clock, outage_limit_s: float) -> None:
-    """Draw for each station how long before each measurement the last usable one was, and which are not usable."""
+def draw_gaps(
+    figure: Figure, stations: Sequence[StationRecord], clock: Clock, outage_limit_s: float, end_ns: int
+) -> None:
+    """Draw for each station how long before each measurement the last usable one was, and which are not usable.
+
+    A station that begins late or ends early has a gap there too: from the first measurement of any to its own first one,
+    and from its last one to ``end_ns``, the last measurement of any.
+    """
     axes = figure.subplots(len(stations), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
     for panel, station in zip(axes, stations, strict=True):
         times = station.stamp_ns[station.usable]
         if len(times) > 1:
             dots(panel, clock.of(times[1:]), np.diff(times) / 1e9, 1, label="usable measurement")
+        if len(times):
+            edges_ns = np.array([times[0], end_ns])
+            waits_s = np.array([times[0] - clock.origin_ns, end_ns - times[-1]]) / 1e9
+            long = waits_s > outage_limit_s
+            if long.any():
+                panel.plot(
+                    clock.of(edges_ns[long]),
+                    waits_s[long],
+                    linestyle="none",
+                    marker="D",
+                    markerfacecolor="white",
+                    markeredgecolor="black",
+                    label="gap at start or end",
+                )
         bad = station.stamp_ns[~station.usable]
         if len(bad):
             # At the foot of the panel, whatever the scale.
@@ -54,7 +74,8 @@ def draw_gaps(figure: Figure, stations: Sequence[StationRecord], clock: Clock, o
         if not len(station.stamp_ns):
             panel.text(0.5, 0.5, "no measurements", transform=panel.transAxes, ha="center", va="center")
     low, high = axes[0].get_ylim()
-    axes[0].set_ylim(min(low, 0.15), max(high, 3.0))
+    # The highest mark is a gap, the one to be seen best: it stands clear of the edge.
+    axes[0].set_ylim(min(low, 0.15), max(1.4 * high, 3.0))
     figure.supylabel("time since the usable measurement before (s)", fontsize=8)
     axes[-1].set_xlabel(clock.label)
     _legend_above(figure, list(axes))
@@ -81,7 +102,7 @@ def draw_clocks(
 ) -> None:
     """Draw how the stations' clocks wander, where synchronisations were recorded, and the bounds of all stamps."""
     bounded = [s for s in stations if np.isfinite(s.bound_ns).any()]
-    panels = figure.subplots(bool(clocks) + bool(bounded), 1, sharex=True, squeeze=False)[:, 0]
+    panels = figure.subplots(bool(clocks) + len(bounded), 1, sharex=True, squeeze=False)[:, 0]
     places = iter(panels)
     if clocks:
         panel = next(places)
@@ -103,21 +124,23 @@ def draw_clocks(
                     label=f"station {station}" if run == runs[0] else None,
                 )
         panel.set_ylabel("offset less\nthe first (ms)")
+    for panel, record in zip(places, bounded, strict=True):
+        # Each in a panel of its own, and as points: bounds jump to and fro between the same few values.
+        known = np.isfinite(record.bound_ns)
+        dots(panel, clock.of(record.stamp_ns[known]), record.bound_ns[known] / 1e6, 1)
+        panel.set_ylabel(f"station {record.station}\nbound (ms)")
     if bounded:
-        panel = next(places)
-        for row, record in enumerate(stations):
-            known = np.isfinite(record.bound_ns)
-            curve(
-                panel,
-                clock.of(record.stamp_ns[known]),
-                record.bound_ns[known] / 1e6,
-                row,
-                label=f"station {record.station}",
-            )
-        panel.set_ylabel("bound of each\nstamp (ms)")
-        # The first ones, before a clock is known well, are larger by a hundred times.
-        plain_log(panel.yaxis)
+        below = panels[bool(clocks) :]
+        known = np.concatenate([s.bound_ns[np.isfinite(s.bound_ns)] for s in bounded]) / 1e6
+        least, most = float(known.min()), float(known.max())
+        # The first ones, before a clock is known well, may be larger by a hundred times.
+        wide = least > 0.0 and most > 5 * least
+        for panel in below:
+            if wide:
+                plain_log(panel.yaxis)
+            panel.set_ylim(least / 1.2 if wide else 0.0, max(1.2 * most, 1e-3))
     panels[-1].set_xlabel(clock.label)
+    figure.align_ylabels(panels)
     _legend_above(figure, list(panels))
 
 
@@ -145,6 +168,7 @@ def _histogram(panel: Axes, pair: PairDistances, reach_mm: float, row: int) -> N
     panel.axvline(0.0, color="black", linewidth=1.2, label="layout")
     if not len(error_mm):
         panel.text(0.25, 0.5, "no\ndistances", transform=panel.transAxes, ha="center", va="center")
+        panel.set_yticks([])
         return
     panel.hist(
         np.clip(error_mm, -reach_mm, reach_mm),
@@ -167,12 +191,12 @@ def _histogram(panel: Axes, pair: PairDistances, reach_mm: float, row: int) -> N
     )
 
 
-def draw_ride(figure: Figure, ride: Ride, clock: Clock) -> None:
-    """Draw the error of each distance over time, and below it how the robot moved."""
+def draw_ride(figure: Figure, ride: Ride, still_ns: Sequence[tuple[int, int]], clock: Clock) -> None:
+    """Draw the error of each distance over time, and below it how the robot moved; shade where it stood."""
     pairs = list(ride.error_m.items())
     axes = figure.subplots(len(pairs) + 2, 1, sharex=True)
     time = clock.of(ride.stamp_ns)
-    still = [(float(clock.of(a)), float(clock.of(b))) for a, b in ride.still_ns]
+    still = [(float(clock.of(a)), float(clock.of(b))) for a, b in still_ns]
     known = [1e3 * e[np.isfinite(e)] for _, e in pairs]
     reach = max((float(np.percentile(np.abs(e), 99.8)) for e in known if len(e)), default=1.0)
     for panel, (name, error_m) in zip(axes, pairs, strict=False):
@@ -229,6 +253,8 @@ def draw_bins(figure: Figure, bins: Sequence[tuple[str, Bins | None]]) -> None:
         below.set_yscale("log")
         below.locator_params(axis="x", nbins=5)
     axes[0, 0].set_ylim(bottom=0.0)
+    # From one on, so that the heights of bars can be compared; last, since it fixes the top of all.
+    axes[1, 0].set_ylim(bottom=1.0)
     axes[0, 0].set_ylabel("|distance error| (mm)")
     axes[1, 0].set_ylabel("distances")
     _legend_above(figure, axes[0])

@@ -113,10 +113,11 @@ def draw_held_out(figure: Figure, misses: Mapping[Estimator, HeldOut]) -> None:
             panel.set_xlim(0.0, reach_mm)
         else:
             panel.text(0.5, 0.5, "none", transform=panel.transAxes, ha="center", va="center")
+            panel.set_xticks([])
         panel.set_title(title, loc="left")
         panel.set_xlabel("missed by (mm)")
     axes[0].set_ylabel("share missed by less (%)")
-    axes[0].set_ylim(0, 100)
+    axes[0].set_ylim(0, 101)  # a curve at 100 % is seen
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
 
 

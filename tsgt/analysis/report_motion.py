@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.inter_prism import EPOCH_NS, PairDistances, still_intervals
-from tsgt.geometry import interpolate, rotate, rotation_from_quaternion
+from tsgt.geometry import rotate, rotation_from_quaternion
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     from numpy.typing import NDArray
 
+    from tsgt.analysis.inter_prism import Epochs
     from tsgt.geometry import FloatArray
     from tsgt.master.pose_batch import PoseBatch
-    from tsgt.master.tracks import Track
     from tsgt.model import Parameters
 
 BINS = 8
@@ -62,14 +58,11 @@ class Ride:
         By pair's name, (N,) measured distance less that of the layout; NaN where one of the tracks has a gap.
     motion
         How the robot moved then.
-    still_ns
-        Start and end of the intervals in which it stood still.
     """
 
     stamp_ns: NDArray[np.int64]
     error_m: dict[str, FloatArray]
     motion: Motion
-    still_ns: tuple[tuple[int, int], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,72 +106,24 @@ class Grid:
     counts: NDArray[np.int64]
 
 
-def ride(
-    parameters: Parameters,
-    tracks: Mapping[int, Track],
-    poses: PoseBatch | None,
-    still_ns: Sequence[tuple[int, int]] | None = None,
-) -> Ride:
-    """Measure the distances over time; as for :func:`tsgt.analysis.inter_prism.inter_prism`.
+def ride(parameters: Parameters, found: Epochs, poses: PoseBatch | None) -> Ride:
+    """Put the errors of the distances beside the robot's motion.
 
     Parameters
     ----------
     parameters
-        The prism layout and the outage limit.
-    tracks
-        One per prism of the layout, none of them empty.
+        The prism layout.
+    found
+        Distances over time.
     poses
         What tells how the robot moved; None where there are none.
-    still_ns
-        When it stood still; found from the tracks if this is None.
     """
-    layout = {prism.prism: np.array(prism.position_m) for prism in parameters.prisms}
-    limit_ns = parameters.pipeline.outage_limit_ns
-    chosen = [tracks[prism] for prism in layout]
-    start, end = max(int(t.times_ns[0]) for t in chosen), min(int(t.times_ns[-1]) for t in chosen)
-    epochs = np.arange(-(-start // EPOCH_NS), end // EPOCH_NS + 1, dtype=np.int64) * EPOCH_NS
-    found = {p: interpolate(tracks[p].times_ns, tracks[p].points_m, epochs, limit_ns) for p in layout}
-    valid = np.logical_and.reduce([found[p].valid for p in layout])
-    error_m = {}
-    for a, b in combinations(layout, 2):
-        distance = np.linalg.norm(found[a].points - found[b].points, axis=-1)
-        error_m[f"{a}-{b}"] = np.where(valid, distance - np.linalg.norm(layout[a] - layout[b]), np.nan)
-    centroid_m = np.mean(list(layout.values()), axis=0)
-    motion = Motion.unknown(len(epochs)) if poses is None else _motion(poses, centroid_m, epochs)
-    if still_ns is None:
-        still_ns = still_intervals(chosen, limit_ns)
-    return Ride(epochs, error_m, motion, tuple(still_ns))
-
-
-def standing(
-    parameters: Parameters, tracks: Mapping[int, Track], still_ns: Sequence[tuple[int, int]]
-) -> tuple[PairDistances, ...]:
-    """Measure the distances in given intervals, from raw positions of both prisms that are nearest in time.
-
-    Parameters
-    ----------
-    parameters, tracks
-        As for :func:`ride`.
-    still_ns
-        Start and end of the intervals.
-    """
-    layout = {prism.prism: np.array(prism.position_m) for prism in parameters.prisms}
-    found = []
-    for a, b in combinations(layout, 2):
-        distances = [np.empty(0)]
-        for start, end in still_ns:
-            one, other = (_within(tracks[prism], start, end) for prism in (a, b))
-            if len(one) and len(other):
-                nearest = np.searchsorted((other.times_ns[1:] + other.times_ns[:-1]) // 2, one.times_ns)
-                distances.append(np.linalg.norm(one.points_m - other.points_m[nearest], axis=-1))
-        reference_m = float(np.linalg.norm(layout[a] - layout[b]))
-        found.append(PairDistances((a, b), np.concatenate(distances), reference_m, 0))
-    return tuple(found)
-
-
-def _within(track: Track, start_ns: int, end_ns: int) -> Track:
-    first, last = np.searchsorted(track.times_ns, (start_ns, end_ns + 1))
-    return track.select(slice(int(first), int(last)))
+    centroid_m = np.mean([prism.position_m for prism in parameters.prisms], axis=0)
+    error_m = {f"{a}-{b}": m - found.references_m[a, b] for (a, b), m in found.distances_m.items()}
+    unknown = Motion.unknown(len(found.stamp_ns))
+    return Ride(
+        found.stamp_ns, error_m, unknown if poses is None else _motion(poses, centroid_m, found.stamp_ns)
+    )
 
 
 def _motion(poses: PoseBatch, centroid_m: FloatArray, epochs: NDArray[np.int64]) -> Motion:

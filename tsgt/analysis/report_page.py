@@ -24,7 +24,9 @@ caption { text-align: left; padding: .3rem 0; } th, td { padding: .2rem .7rem; t
 th:first-child, td:first-child { text-align: left; } thead th { border-bottom: 2px solid #333; }
 figure { margin: 1.5rem 0; break-inside: avoid; } img { max-width: 100%; height: auto; } figcaption { color: #333; font-size: .9rem; }
 ul.verdicts { list-style: none; padding: 0; } ul.verdicts li { margin: .4rem 0; padding: .3rem .7rem; border-left: 6px solid; }
-li.good { border-color: #009e73; } li.care { border-color: #e69f00; } li.bad { border-color: #000; background: #eee; }
+ul.verdicts li.good { border-color: #009e73; } ul.verdicts li.care { border-color: #e69f00; }
+ul.verdicts li.bad { border-color: #000; background: #eee; }
+table.facts { border-top: 2px solid #333; } table.facts td { text-align: left; overflow-wrap: anywhere; }
 @media print { nav { display: none; } body { max-width: none; margin: 0; } }
 """
 
@@ -37,7 +39,7 @@ _MARK = {
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A table; the first column names the row."""
+    """A table; the first column names the row. Without a header it lists facts, in words."""
 
     caption: str
     header: tuple[str, ...]
@@ -108,7 +110,7 @@ def page(
     named = [(f"s{number}", section) for number, section in enumerate(sections, start=1)]
     links = "".join(f'<a href="#{anchor}">{escape(section.title)}</a>' for anchor, section in named)
     trust = "".join(
-        f'<li class="{_MARK[v.level][0]}"><strong>{_MARK[v.level][1]} {escape(v.level.value)}:</strong> {escape(v.text)}</li>'
+        f'<li class="{_MARK[v.level][0]}"><strong>{_MARK[v.level][1]} {escape(v.level.value)}:</strong> {_prose(v.text)}</li>'
         for v in judged
     )
     body = "".join(_section(anchor, section, images) for anchor, section in named)
@@ -122,7 +124,7 @@ def page(
 
 
 def _section(anchor: str, section: Section, images: Mapping[str, bytes]) -> str:
-    text = "".join(f"<p>{escape(paragraph)}</p>\n" for paragraph in section.text)
+    text = "".join(f"<p>{_prose(paragraph)}</p>\n" for paragraph in section.text)
     tables = "".join(_table(table) for table in section.tables)
     plots = "".join(_plot(plot, images[plot.name]) for plot in section.plots)
     return f'<h2 id="{anchor}">{escape(section.title)}</h2>\n{text}{tables}{plots}'
@@ -134,7 +136,15 @@ def _table(table: Table) -> str:
         "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>\n" for row in table.rows
     )
     caption = f"<caption>{escape(table.caption)}</caption>" if table.caption else ""
-    return f"<table>{caption}<thead><tr>{head}</tr></thead>\n<tbody>{rows}</tbody></table>\n"
+    above = f"<thead><tr>{head}</tr></thead>\n" if table.header else ""
+    kind = "" if table.header else ' class="facts"'
+    return f"<table{kind}>{caption}{above}<tbody>{rows}</tbody></table>\n"
+
+
+def _prose(text: str) -> str:
+    """Write a sentence; what it has between backticks is what one types."""
+    parts = escape(text).split("`")
+    return "".join(f"<code>{part}</code>" if i % 2 else part for i, part in enumerate(parts))
 
 
 def _plot(plot: Plot, image: bytes) -> str:

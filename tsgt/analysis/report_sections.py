@@ -8,6 +8,7 @@ import numpy as np
 
 from tsgt.analysis import report_figures as draw
 from tsgt.analysis.report_axes import Clock
+from tsgt.analysis.report_calibration import calibration
 from tsgt.analysis.report_motion import binned, gridded
 from tsgt.analysis.report_page import Plot, Section, Table
 from tsgt.analysis.report_parts import LISTED, median, number, utc, wide
@@ -33,6 +34,7 @@ def sections(f: Findings) -> list[Section]:
         estimators(f, clock),
         trajectory(f, clock),
         residuals(f, clock),
+        calibration(f.recording),
         perturbation(f),
     ]
 
@@ -43,7 +45,7 @@ def facts(f: Findings) -> Table:
     rows = [
         ("file", f.path.name),
         ("written by", f"{f.recording.header.software}, {f.recording.header.source}"),
-        ("first measurement", utc(f.start_ns)),
+        ("first measurement", f"{utc(f.start_ns)} UTC"),
         ("duration", f"{f.duration_s:.1f} s"),
         ("stations, prisms", f"{len(parameters.stations)}, {len(parameters.prisms)}"),
         ("measurements", f"{sum(e.measurements for e in f.station_figures.values())}"),
@@ -54,7 +56,7 @@ def facts(f: Findings) -> Table:
         ),
         ("events recorded", f"{len(f.log.events)}"),
     ]
-    return Table("", ("", ""), tuple(rows))
+    return Table("", (), tuple(rows))
 
 
 def _stations(f: Findings, clock: Clock) -> Section:
@@ -93,9 +95,10 @@ def _stations(f: Findings, clock: Clock) -> Section:
         wide(
             "gaps",
             "Time from each usable measurement to the one before, and measurements that are not usable (crosses at the "
-            "foot). Even rows of points low down are good; what is above the dotted line makes poses invalid.",
+            "foot). Even rows of points low down are good; what is above the dotted line makes poses invalid. Diamonds: a "
+            "station began so much later, or ended so much earlier, than the first and the last of all.",
             draw.panels_height_mm(n),
-            lambda figure: draw.draw_gaps(figure, f.stations, clock, outage_limit_s),
+            lambda figure: draw.draw_gaps(figure, f.stations, clock, outage_limit_s, f.end_ns),
         ),
         wide(
             "statuses",
@@ -147,7 +150,7 @@ def _clocks(f: Findings, clock: Clock) -> Section:
         "its bound. Below: by how much the time of each measurement may be wrong at most. A millisecond is a millimetre at "
         "1 m/s."
     )
-    rows = 1 + bool(f.log.clocks and bounded)
+    rows = bool(f.log.clocks) + sum(bool(np.isfinite(s.bound_ns).any()) for s in f.stations)
     plot = wide(
         "clocks",
         caption,
@@ -167,12 +170,17 @@ def _distances(f: Findings, clock: Clock) -> Section:
     text = [
         (
             f"{found.epochs - found.invalid_epochs} of {found.epochs} epochs at 20 Hz have no gap in any track. The robot stood "
-            f"still for {found.still_s:.1f} s in {len(ride.still_ns)} intervals (shaded below)."
+            f"still for {found.still_s:.1f} s in {len(found.still_ns)} intervals (shaded below)."
         )
     ]
-    if not ride.still_ns:
+    if not found.still_ns:
         text.append(
             "There is no interval of 3 s or more in which it stood still, so nothing is told of standing."
+        )
+    if f.odometry_ns and not found.still_ns:
+        text.append(
+            f"The odometry has the robot standing from {utc(f.odometry_ns[0][0])} to {utc(f.odometry_ns[-1][1])} UTC, before "
+            "or after this recording: is it of this drive, and were both clocks right?"
         )
     if not np.isfinite(ride.motion.speed_mps).any():
         text.append("How it moved is not known, since there are no poses.")
@@ -195,7 +203,7 @@ def _distances(f: Findings, clock: Clock) -> Section:
             "The same over time, interpolated, with the robot's speed and angular rate. Errors that grow with speed are "
             "time's; peaks at starts and stops come from straight lines between measurements.",
             height_mm,
-            lambda figure: draw.draw_ride(figure, ride, clock),
+            lambda figure: draw.draw_ride(figure, ride, found.still_ns, clock),
         ),
     )
     return Section(title, tuple(text), tables, plots)

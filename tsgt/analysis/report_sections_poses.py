@@ -10,8 +10,10 @@ import numpy as np
 from tsgt.analysis import report_figures_poses as draw
 from tsgt.analysis.figures_perturbation import draw_perturbation
 from tsgt.analysis.report_figures import panels_height_mm
+from tsgt.analysis.report_numbers import apart, of_poses
 from tsgt.analysis.report_page import Plot, Section, Table
 from tsgt.analysis.report_parts import LISTED, number, utc, wide
+from tsgt.analysis.report_reference import reference_tables
 from tsgt.master.pose_batch import Kind
 from tsgt.model import PolarMeasurement
 
@@ -31,6 +33,8 @@ def estimators(f: Findings, clock: Clock) -> Section:
         if name in f.problems
     ]
     tables, plots = [], []
+    if f.both:
+        tables.append(_poses_of(f))
     if f.held_out is not None:
         rows = [
             (label, str(m.n), number(m.mean), number(m.median), number(m.p95))
@@ -82,6 +86,7 @@ def estimators(f: Findings, clock: Clock) -> Section:
         tables.append(
             Table("Against the reference, unaligned, at the prisms' centroid", header, tuple(compared))
         )
+        tables += reference_tables(f)
         if f.reference is not None and not any(e.compared for e in f.compared.values()):
             text.append(
                 f"The reference has no time in common with valid poses: it goes from {utc(int(f.reference.stamp_ns[0]))} to "
@@ -89,21 +94,37 @@ def estimators(f: Findings, clock: Clock) -> Section:
                 "(all UTC); 2 s at both ends do not count."
             )
     if f.difference is not None and len(f.difference.stamp_ns):
-        apart = f.difference
+        difference = f.difference
+        told = apart(difference)
+        mm, deg = told["position_mm"], told["rotation_deg"]
         text.append(
-            f"Where both are valid ({len(apart.stamp_ns)} epochs), they are {1e3 * np.median(apart.position_m):.1f} mm and "
-            f"{math.degrees(np.median(apart.rotation_rad)):.2f} degrees apart (median), {1e3 * np.percentile(apart.position_m, 95):.1f} "
-            f"mm and {math.degrees(np.percentile(apart.rotation_rad, 95)):.2f} degrees (95 %)."
+            f"Where both are valid ({told['epochs']} epochs), they are {mm['median']:.1f} mm and {deg['median']:.2f} degrees "
+            f"apart (median), {mm['p95']:.1f} mm and {deg['p95']:.2f} degrees (95 %)."
         )
         plots.append(
             wide(
                 "estimators_apart",
                 "How far the poses of linear and continuous are apart, position at the prisms' centroid.",
                 panels_height_mm(2),
-                lambda figure: draw.draw_difference(figure, apart, clock),
+                lambda figure: draw.draw_difference(figure, difference, clock),
             )
         )
     return Section("Both estimators", tuple(text), tuple(tables), tuple(plots))
+
+
+def _poses_of(f: Findings) -> Table:
+    rows = []
+    for name, poses in f.both.items():
+        told = of_poses(poses)
+        sigma = told["position_sigma_mm"]
+        why = ", ".join(f"{reason} {n}" for reason, n in told["invalid"].items()) or "-"
+        counts = str(told["poses"]), str(told["valid_poses"]), why
+        rows.append((name, *counts, number(sigma["median"]), number(sigma["p95"])))
+    return Table(
+        "Poses, and the sigma per axis of the position that the valid ones state",
+        ("estimator", "poses", "valid", "not valid", "median sigma (mm)", "95 % sigma (mm)"),
+        tuple(rows),
+    )
 
 
 def trajectory(f: Findings, clock: Clock) -> Section:
@@ -180,10 +201,10 @@ def residuals(f: Findings, clock: Clock) -> Section:
         panels_height_mm(len(np.unique(numbers))),
         lambda figure: draw.draw_residuals(figure, f.normalised, stamps, numbers, clock),
     )
-    scale = f.continuous.motion.noise_scale
-    text = (
-        f"The measurements scatter by {scale:.2f} times the noise that the parameters state for the instruments.",
-    )
+    motion = f.continuous.motion
+    found = f"The measurements scatter by {motion.noise_scale:.2f} times the noise that the parameters state for the instruments."
+    taken = f"{motion.noise_scale:.2f} times the noise that the parameters state is taken as recorded: too few measurements to tell."
+    text = (found if motion.tuned else taken,)
     return Section("Residuals", text, tuple(tables), (plot,))
 
 

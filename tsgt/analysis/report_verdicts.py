@@ -12,6 +12,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tsgt.analysis.report import position_sigma_mm
+from tsgt.master.pose_batch import Kind
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
@@ -20,6 +23,8 @@ if TYPE_CHECKING:
 _VALID_SHARE = 0.95
 _IN_GAPS = 0.05
 _STATIC_BIAS_MM = 3.0
+_MOVING_MM = 10.0
+_SIGMA_MM = 10.0
 _TIMING_SHARE = 2.0
 _BOUND_MM = 3.0
 _RESIDUAL_MEAN = 0.5
@@ -70,13 +75,17 @@ def _poses(f: Findings) -> Iterator[Verdict]:
         return
     share = float(np.mean(poses.valid))
     level = Level.GOOD if share >= _VALID_SHARE else Level.CARE
+    estimator = Kind(poses.kind[0]).estimator
     why = ", ".join(f"{reason} {n}" for reason, n in poses.invalid_counts().items())
     yield Verdict(
-        level, f"{share:.1%} of the poses are valid{f' (not valid: {why})' if why else ''}. Use no other."
+        level,
+        # Rounded down: 100.0 % is all of them.
+        f"{math.floor(1e3 * share) / 10:.1f}% of the poses of {estimator} are valid"
+        f"{f' (not valid: {why})' if why else ''}. Use no other.",
     )
-    sigma_mm = 1e3 * np.sqrt(np.einsum("nii->n", poses.covariance[poses.valid, :3, :3]) / 3)
+    sigma_mm = position_sigma_mm(poses)
     yield Verdict(
-        Level.GOOD,
+        Level.GOOD if np.median(sigma_mm) <= _SIGMA_MM else Level.CARE,
         f"The valid poses state {np.median(sigma_mm):.1f} mm (median) and "
         f"{np.percentile(sigma_mm, 95):.1f} mm (95 %) as the sigma of their position per axis; an error that all "
         "prisms share, as of a station's frame, is not in it.",
@@ -91,8 +100,8 @@ def _stations(f: Findings) -> Iterator[Verdict]:
         elif each.in_gaps > _IN_GAPS:
             yield Verdict(
                 Level.CARE,
-                f"Station {number} has {each.gaps} gaps longer than {limit_s:g} s, {each.in_gaps:.0%} of the time; "
-                f"the longest lasts {each.longest_gap_s:.1f} s.",
+                f"Station {number} has {each.gaps} gap{'s' * (each.gaps > 1)} longer than {limit_s:g} s, {each.in_gaps:.0%} of "
+                f"the time; the longest lasts {each.longest_gap_s:.1f} s.",
             )
     if f.log.authenticated is False:
         yield Verdict(
@@ -100,24 +109,31 @@ def _stations(f: Findings) -> Iterator[Verdict]:
         )
 
 
-def _times(f: Findings) -> Iterator[Verdict]:
-    if f.ride is None or not np.isfinite(f.ride.motion.speed_mps).any():
-        return
-    fast = float(np.nanpercentile(f.ride.motion.speed_mps, 95))
+def bound_and_speed(f: Findings) -> tuple[float, float]:
+    """Median bound of the stamps in ms, and the speed in m/s below which the robot is 95 % of the time; NaN: not known."""
     bounds = [s.bound_ns[np.isfinite(s.bound_ns)] for s in f.stations]
     known = np.concatenate(bounds) if bounds else np.empty(0)
-    if not len(known):
+    speed_mps = np.empty(0) if f.ride is None else f.ride.motion.speed_mps
+    speed_mps = speed_mps[np.isfinite(speed_mps)]
+    return (
+        float(np.median(known)) / 1e6 if len(known) else math.nan,
+        float(np.percentile(speed_mps, 95)) if len(speed_mps) else math.nan,
+    )
+
+
+def _times(f: Findings) -> Iterator[Verdict]:
+    bound_ms, fast_mps = bound_and_speed(f)
+    if math.isnan(bound_ms):
         yield Verdict(
             Level.CARE, "No bound of the time stamps was recorded; how well the clocks agreed is not known."
         )
-        return
-    bound_ms = float(np.median(known)) / 1e6
-    reach_mm = bound_ms * fast
-    yield Verdict(
-        Level.GOOD if reach_mm <= _BOUND_MM else Level.CARE,
-        f"Stamps are within {bound_ms:.2f} ms (median bound): {reach_mm:.1f} mm at {fast:.1f} m/s (95 % of the "
-        "speed).",
-    )
+    elif not math.isnan(fast_mps):
+        reach_mm = bound_ms * fast_mps
+        yield Verdict(
+            Level.GOOD if reach_mm <= _BOUND_MM else Level.CARE,
+            f"Stamps are within {bound_ms:.2f} ms (median bound): {reach_mm:.1f} mm at {fast_mps:.1f} m/s (95 % of the "
+            "speed).",
+        )
 
 
 def _distances(f: Findings) -> Iterator[Verdict]:
@@ -126,11 +142,18 @@ def _distances(f: Findings) -> Iterator[Verdict]:
         return
     standing = [pair.summary() for pair in f.inter_prism.static if len(pair.distances_m)]
     moving = [pair.summary() for pair in f.inter_prism.dynamic if len(pair.distances_m)]
+    if not moving:
+        yield Verdict(Level.BAD, "At no time were all prisms measured without a gap.")
+        return
     if not standing:
+        why = "The robot never stood still for 3 s"
+        if f.odometry_ns:
+            why = "By the odometry, the robot stood still before or after this recording only"
+        elif f.odometry_ns is not None:
+            why = "By the odometry, the robot never stood still for 3 s"
         yield Verdict(
             Level.CARE,
-            "The robot never stood still for 3 s: errors of layout, frames and prism constants cannot be told from "
-            "those of time.",
+            f"{why}: errors of layout, frames and prism constants cannot be told from those of time.",
         )
     for pair in f.inter_prism.static:
         figures = pair.summary()
@@ -141,12 +164,10 @@ def _distances(f: Findings) -> Iterator[Verdict]:
                 f"Standing still, the distance {pair.name} is {bias_mm:+.1f} mm off the layout: look at the prism "
                 "layout, the prism constants, the stations' frames.",
             )
-    if not moving:
-        yield Verdict(Level.BAD, "At no time were all prisms measured without a gap.")
-        return
     moving_mm = float(np.mean([figures.mean_abs_error for figures in moving]))
     yield Verdict(
-        Level.GOOD, f"On average, distances between prisms are {moving_mm:.1f} mm off over the whole way."
+        Level.GOOD if moving_mm <= _MOVING_MM else Level.CARE,
+        f"On average, distances between prisms are {moving_mm:.1f} mm off over the whole way.",
     )
     if standing:
         standing_mm = float(np.mean([figures.std for figures in standing]))
@@ -163,10 +184,16 @@ def _residuals(f: Findings) -> Iterator[Verdict]:
     if f.continuous is None:
         return
     scale = f.continuous.motion.noise_scale
-    if not _NOISE_SCALE[0] <= scale <= _NOISE_SCALE[1]:
+    if not f.continuous.motion.tuned:
+        yield Verdict(
+            Level.CARE,
+            "The measurements are too few to tell how the robot moves and how much they scatter: both are as recorded.",
+        )
+    elif not _NOISE_SCALE[0] <= scale <= _NOISE_SCALE[1]:
         yield Verdict(
             Level.CARE, f"The measurements scatter by {scale:.2g} times what the instruments' noise says."
         )
+    judged = [each for axes in f.residuals.values() for each in axes.values() if each.n >= _LEAST_RESIDUALS]
     strange = [
         f"station {station} {axis.replace('_', ' ')} (mean {each.mean:+.1f}, std {each.std:.1f})"
         for station, axes in f.residuals.items()
@@ -178,7 +205,7 @@ def _residuals(f: Findings) -> Iterator[Verdict]:
             Level.CARE,
             f"Residuals are not what noise makes: {', '.join(strange)}. A mean is a frame or a latency.",
         )
-    elif f.residuals:
+    elif judged:
         yield Verdict(Level.GOOD, "The residuals of all stations are what their noise makes.")
     n = len(f.continuous.sources)
     if len(f.outliers) > _OUTLIERS * n:

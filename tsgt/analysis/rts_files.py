@@ -108,7 +108,7 @@ def read_tracks(paths: Sequence[Path]) -> tuple[PublishedTrack, ...]:
     return tracks
 
 
-def read_prisms(path: Path) -> tuple[PrismPosition, ...]:
+def read_prisms(path: Path, numbers: Sequence[int] = (1, 2, 3)) -> tuple[PrismPosition, ...]:
     """Read the prism positions on the robot.
 
     Parameters
@@ -117,11 +117,13 @@ def read_prisms(path: Path) -> tuple[PrismPosition, ...]:
         The authors' ``sensor_positions.csv``: separated by spaces, rows 1 to 3 are the prisms 1 to 3, and each
         row starts with x, y, z in m in the robot frame; what follows (other sensors, covariances) is not used.
         Or, by its ending ``.toml``, our own set-up file of kind ``prism_layout``.
+    numbers
+        Which prisms are tracked; others are left out.
 
     Returns
     -------
     tuple[PrismPosition, ...]
-        Prisms 1 to 3.
+        Those, in this order.
 
     Raises
     ------
@@ -131,12 +133,13 @@ def read_prisms(path: Path) -> tuple[PrismPosition, ...]:
         The set-up file cannot be used.
     """
     positions = load_prism_layout(path) if path.suffix == ".toml" else _read_sensor_positions(path)
-    missing = [prism for prism in range(1, PRISMS + 1) if prism not in positions]
+    missing = [prism for prism in numbers if prism not in positions]
     if missing:
         raise InputFileError(
-            f"has no position of prism {missing[0]}; the tracks are those of 1 to 3", path=path
+            f"has no position of prism {missing[0]}; the tracks are those of {', '.join(map(str, numbers))}",
+            path=path,
         )
-    prisms = tuple(PrismPosition(prism=prism, position_m=positions[prism]) for prism in range(1, PRISMS + 1))
+    prisms = tuple(PrismPosition(prism=prism, position_m=positions[prism]) for prism in numbers)
     try:
         check_layout([prism.position_m for prism in prisms])
     except DegenerateGeometryError as error:

@@ -9,19 +9,18 @@ measured; without them the positions stay Cartesian.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from tsgt.analysis.calibration import solve_stations
-from tsgt.analysis.rts_files import PRISMS
+from tsgt.analysis.calibration import solve_stations, target_residuals
 from tsgt.analysis.target_file import read_target_file
 from tsgt.errors import GeometryError, InputFileError
 from tsgt.geometry import cartesian_to_polar, invert, raw_distance, transform_points
 from tsgt.model import IDENTITY4, PointMeasurement, PolarMeasurement, StationParameters
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -30,9 +29,13 @@ if TYPE_CHECKING:
     from tsgt.model import Matrix4, Measurement
 
 
+AS_PUBLISHED: Final[Mapping[int, int]] = {1: 1, 2: 2, 3: 3}
+"""Which prism each of their stations tracks."""
+
+
 @dataclass(frozen=True, slots=True)
 class SolvedStations:
-    """Where stations 1 to 3 stood.
+    """Where the stations stood.
 
     Attributes
     ----------
@@ -46,7 +49,13 @@ class SolvedStations:
     notes: tuple[str, ...]
 
 
-def stations_from_targets(path: Path, *, target_constant_m: float, prism_constant_m: float) -> SolvedStations:
+def stations_from_targets(
+    path: Path,
+    *,
+    target_constant_m: float,
+    prism_constant_m: float,
+    tracked: Mapping[int, int] = AS_PUBLISHED,
+) -> SolvedStations:
     """Solve where the stations stood from the targets of the day, weighted by the instrument's noise.
 
     Parameters
@@ -57,6 +66,8 @@ def stations_from_targets(path: Path, *, target_constant_m: float, prism_constan
         Added to the slope distances of the targets, in m.
     prism_constant_m
         The prism constant that the stations get, in m.
+    tracked
+        By station number: which prism it tracks.
 
     Raises
     ------
@@ -68,7 +79,9 @@ def stations_from_targets(path: Path, *, target_constant_m: float, prism_constan
     measured = read_target_file(path)
     solved = solve_stations(measured, target_constant_m=target_constant_m)
     notes = list(measured.skipped)
-    for station in range(2, PRISMS + 1):
+    for station in tracked:
+        if station == 1:
+            continue
         if station not in solved:
             raise InputFileError(
                 f"holds no targets of station {station}; its frame cannot be solved", path=path
@@ -88,8 +101,14 @@ def stations_from_targets(path: Path, *, target_constant_m: float, prism_constan
             )
     frames = {1: IDENTITY4} | {station: _matrix4(frame.T) for station, frame in solved.items()}
     stations = (
-        StationParameters(station=k, prism=k, T_station1_station=frames[k], prism_constant_m=prism_constant_m)
-        for k in range(1, PRISMS + 1)
+        StationParameters(
+            station=station,
+            prism=prism,
+            T_station1_station=frames[station],
+            prism_constant_m=prism_constant_m,
+            targets=target_residuals(solved[station]) if station in solved else (),
+        )
+        for station, prism in tracked.items()
     )
     return SolvedStations(tuple(stations), tuple(notes))
 

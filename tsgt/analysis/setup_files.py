@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 from tsgt.recording import write_atomically
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
     from tsgt.geometry import FloatArray
+    from tsgt.model import TargetResidual
 
 
 def write_station_frames(
@@ -20,6 +21,7 @@ def write_station_frames(
     *,
     comment: str,
     latencies_ms: Mapping[int, float] | None = None,
+    targets: Mapping[int, Sequence[TargetResidual]] | None = None,
 ) -> None:
     """Write a file of kind ``station_frames``.
 
@@ -35,6 +37,8 @@ def write_station_frames(
         Where the frames come from; one line on top of the file.
     latencies_ms
         From the measurement to its stamp by station number, where they were found too.
+    targets
+        How well the targets fit by station number, where the frames come from targets.
 
     Raises
     ------
@@ -46,7 +50,8 @@ def write_station_frames(
         rows = ",\n".join(f"  {_numbers(row)}" for row in T)
         rms = f"rms_mm = {1e3 * rms_m[station]:.3f}\n" if station in rms_m else ""
         late = "" if latencies_ms is None else f"latency_ms = {latencies_ms[station]:.6f}\n"
-        tables.append(f"[stations.{station}]\nT_station1_station = [\n{rows},\n]\n{rms}{late}")
+        fits = "".join(_target(station, target) for target in (targets or {}).get(station, ()))
+        tables.append(f"[stations.{station}]\nT_station1_station = [\n{rows},\n]\n{rms}{late}{fits}")
     _write(path, "station_frames", tables, comment)
 
 
@@ -76,6 +81,13 @@ def write_prism_layout(
         for prism, position in sorted(positions_m.items())
     ]
     _write(path, "prism_layout", tables, comment)
+
+
+def _target(station: int, fit: TargetResidual) -> str:
+    """Table of one target's fit, to the micrometre."""
+    lengths_m = (("residual_mm", fit.residual_m), ("left_out_mm", fit.left_out_m))
+    keys = "".join(f"{key} = {1e3 * value:.3f}\n" for key, value in lengths_m if value is not None)
+    return f"[[stations.{station}.targets]]\ntarget = {fit.target}\n{keys}"
 
 
 def _numbers(values: FloatArray) -> str:

@@ -5,28 +5,24 @@ Both formats and the authors' marker file are described in docs/reference/target
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from tsgt.analysis.csv_table import HORIZONTAL, ZENITH, read_table
 from tsgt.errors import InputFileError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
+    from tsgt.analysis.csv_table import Row
     from tsgt.model import Vector3
-
-RAD_PER_UNIT = {"rad": 1.0, "deg": math.pi / 180, "gon": math.pi / 200}
 
 MARKER_COLUMNS = (
     "theodolite_number", "marker_number", "status", "elevation", "azimuth", "distance", "sec", "nsec",
 )  # fmt: skip
 """Header of the authors' marker file. Their ``elevation`` is a zenith angle; angles are in rad."""
 
-_HORIZONTAL = [f"horizontal_angle_{unit}" for unit in RAD_PER_UNIT]
-_ZENITH = [f"zenith_angle_{unit}" for unit in RAD_PER_UNIT]
-_SIGHT = [_HORIZONTAL, _ZENITH, ["slope_distance_m"]]
+_SIGHT = [HORIZONTAL, ZENITH, ["slope_distance_m"]]
 _CAD = ("x_m", "y_m", "z_m")
 
 
@@ -133,12 +129,12 @@ def read_some_targets(path: Path) -> TargetFile:
     InputFileError
         The file cannot be read, is empty, or has a wrong column or number.
     """
-    header, rows = _table(path)
+    header, rows = read_table(path)
     sights: dict[int, dict[int, list[Sight]]] = {}
     skipped: list[str] = []
     is_marker_file = tuple(header.names) == MARKER_COLUMNS
     if not is_marker_file:
-        header.expect([["station"], ["target"], *_SIGHT], "constant_mm")
+        header.expect([["station"], ["target"], *_SIGHT], ["constant_mm"])
     for row in rows:
         station = row.positive_integer("theodolite_number" if is_marker_file else "station")
         target = row.positive_integer("marker_number" if is_marker_file else "target")
@@ -148,7 +144,7 @@ def read_some_targets(path: Path) -> TargetFile:
                 f"the instrument reported status {row.cells['status']}"
             )
             continue
-        sight = row.sight("azimuth", "elevation", "distance") if is_marker_file else row.sight()
+        sight = _sight(row, "azimuth", "elevation", "distance") if is_marker_file else _sight(row)
         sights.setdefault(station, {}).setdefault(target, []).append(sight)
     return TargetFile(path, dict(sorted(sights.items())), tuple(skipped))
 
@@ -171,8 +167,8 @@ def read_prism_file(path: Path) -> PrismFile:
     InputFileError
         The file cannot be read, is empty, has a wrong column or number, or holds no prism or no body point.
     """
-    header, rows = _table(path)
-    header.expect([["point"], ["kind"], *_SIGHT, *([name] for name in _CAD)], "constant_mm")
+    header, rows = read_table(path)
+    header.expect([["point"], ["kind"], *_SIGHT, *([name] for name in _CAD)], ["constant_mm"])
     prisms: dict[int, list[Sight]] = {}
     body: dict[str, list[Sight]] = {}
     cad_m: dict[str, Vector3] = {}
@@ -183,7 +179,7 @@ def read_prism_file(path: Path) -> PrismFile:
                 raise row.error(
                     "a prism has no place from CAD, it is what is looked for; leave x_m, y_m, z_m empty"
                 )
-            prisms.setdefault(row.positive_integer("point"), []).append(row.sight())
+            prisms.setdefault(row.positive_integer("point"), []).append(_sight(row))
         elif kind == "body":
             name = row.cells["point"]
             if not name:
@@ -191,7 +187,7 @@ def read_prism_file(path: Path) -> PrismFile:
             place = (row.number("x_m"), row.number("y_m"), row.number("z_m"))
             if cad_m.setdefault(name, place) != place:
                 raise row.error(f"body point {name} has another x_m, y_m, z_m further up; keep one of them")
-            body.setdefault(name, []).append(row.sight())
+            body.setdefault(name, []).append(_sight(row))
         else:
             raise row.error(f"kind is {kind!r}; it is prism or body")
     if not prisms:
@@ -201,114 +197,15 @@ def read_prism_file(path: Path) -> PrismFile:
     return PrismFile(path, dict(sorted(prisms.items())), body, cad_m)
 
 
-@dataclass(frozen=True, slots=True)
-class _Header:
-    """The column names of a file."""
-
-    path: Path
-    line: int
-    names: list[str]
-
-    def expect(self, columns: Sequence[Sequence[str]], optional: str) -> None:
-        """Refuse a header that lacks a column (of each, one of its alternatives), or has an unknown one."""
-        known = {optional, *(name for alternatives in columns for name in alternatives)}
-        for name in self.names:
-            if name not in known:
-                asked = ", ".join("|".join(alternatives) for alternatives in columns)
-                raise self.error(f"unknown column {name!r}; expected {asked} and maybe {optional}")
-        for alternatives in (*columns, [optional]):
-            found = [name for name in self.names if name in alternatives]
-            if len(found) > 1 or (not found and optional not in alternatives):
-                raise self.error(
-                    f"expected one column {' or '.join(alternatives)}, got {' and '.join(found) or 'none'}"
-                )
-
-    def error(self, message: str) -> InputFileError:
-        return InputFileError(message, path=self.path, line=self.line)
-
-
-@dataclass(frozen=True, slots=True)
-class _Row:
-    """One line of a file: its cells by column name."""
-
-    path: Path
-    line: int
-    cells: dict[str, str]
-
-    def error(self, message: str) -> InputFileError:
-        return InputFileError(message, path=self.path, line=self.line)
-
-    def number(self, column: str) -> float:
-        try:
-            value = float(self.cells[column])
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            raise self.error(f"{column} is {self.cells[column]!r}; expected a finite number")
-        return value
-
-    def positive_integer(self, column: str) -> int:
-        text = self.cells[column]
-        if not (text.isascii() and text.isdigit() and 0 < len(text) <= 6 and int(text) > 0):
-            raise self.error(f"{column} is {text!r}; expected a whole number from 1 to 999999")
-        return int(text)
-
-    def sight(
-        self, horizontal: str | None = None, zenith: str | None = None, distance: str = "slope_distance_m"
-    ) -> Sight:
-        """Read the measurement; without column names those of our own format."""
-        horizontal = horizontal or next(name for name in _HORIZONTAL if name in self.cells)
-        zenith = zenith or next(name for name in _ZENITH if name in self.cells)
-        horizontal_rad = self.number(horizontal) * RAD_PER_UNIT.get(horizontal.rpartition("_")[2], 1.0)
-        zenith_rad = self.number(zenith) * RAD_PER_UNIT.get(zenith.rpartition("_")[2], 1.0)
-        distance_m = self.number(distance)
-        if abs(horizontal_rad) > 2 * math.pi:
-            raise self.error(
-                f"{horizontal} {self.cells[horizontal]} is more than a full circle; is the unit right?"
-            )
-        if not 0 <= zenith_rad <= 2 * math.pi:
-            raise self.error(
-                f"{zenith} {self.cells[zenith]} is outside 0 to a full circle; it counts from straight up, "
-                "not from the horizon"
-            )
-        if distance_m <= 0:
-            raise self.error(
-                f"{distance} is {self.cells[distance]}; expected more than zero, remove the line"
-            )
-        return Sight(
-            horizontal_angle_rad=horizontal_rad,
-            zenith_angle_rad=zenith_rad,
-            slope_distance_m=distance_m,
-            constant_m=self.number("constant_mm") / 1e3 if self.cells.get("constant_mm") else None,
-            line=self.line,
-        )
-
-
-def _table(path: Path) -> tuple[_Header, Iterator[_Row]]:
-    """Header and rows of a comma-separated file; blank lines and those that start with # do not count."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")  # spreadsheets write a byte order mark
-    except UnicodeDecodeError as error:
-        raise InputFileError("is not a text file", path=path) from error
-    except OSError as error:
-        raise InputFileError(error.strerror or str(error), path=path) from error
-    lines = [
-        (number, [cell.strip() for cell in line.split(",")])
-        for number, line in enumerate(text.splitlines(), start=1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
-    if not lines:
-        raise InputFileError("is empty; expected a header line and one line per measurement", path=path)
-    if len(lines) == 1:
-        raise InputFileError("holds a header but no measurements", path=path)
-    header = _Header(path, *lines[0])
-    return header, _rows(header, lines[1:])
-
-
-def _rows(header: _Header, lines: list[tuple[int, list[str]]]) -> Iterator[_Row]:
-    """Cells by column name, line by line, so that a bad header is reported before bad lines."""
-    for number, cells in lines:
-        row = _Row(header.path, number, dict(zip(header.names, cells, strict=False)))
-        if len(cells) != len(header.names):
-            raise row.error(f"expected {len(header.names)} columns as in the header, got {len(cells)}")
-        yield row
+def _sight(
+    row: Row, horizontal: str | None = None, zenith: str | None = None, distance: str = "slope_distance_m"
+) -> Sight:
+    """Read the measurement of a line; without column names those of our own format."""
+    horizontal_rad, zenith_rad = row.angles_rad(horizontal, zenith)
+    return Sight(
+        horizontal_angle_rad=horizontal_rad,
+        zenith_angle_rad=zenith_rad,
+        slope_distance_m=row.distance_m(distance),
+        constant_m=row.number("constant_mm") / 1e3 if row.cells.get("constant_mm") else None,
+        line=row.line,
+    )

@@ -20,7 +20,7 @@ from tsgt.analysis.gnss import (
 from tsgt.analysis.gnss_files import QUALITIES, read_pos
 from tsgt.analysis.gnss_prisms import common_part, prism_pairs, span
 from tsgt.cli.analyse_options import figure_option
-from tsgt.cli.desk_input import load
+from tsgt.cli.desk_input import load, progress
 from tsgt.cli.options import json_option, keep_going_option, path_type
 from tsgt.cli.output import print_json, print_table
 from tsgt.cli.render import clock_time
@@ -81,7 +81,13 @@ def gnss(
     receivers on it do not change, nor do those between its prisms: how far they stray tells how good either is.
     """
     references_m = _references_m(files, references_mm)
-    found = receivers([read_pos(path) for path in files])
+    solutions = []
+    with progress("reading") as on_progress:
+        for number, path in enumerate(files, start=1):
+            solutions.append(read_pos(path))
+            if on_progress is not None:
+                on_progress(number / len(files))
+    found = receivers(solutions)
     pairs = receiver_pairs(found, references_m)
     if span(pairs) is None:
         raise InputFileError(

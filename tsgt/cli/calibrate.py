@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
-from tsgt.analysis.calibration import solve_prisms, solve_stations
+from tsgt.analysis.calibration import solve_prisms, solve_stations, target_residuals
 from tsgt.analysis.setup_files import write_prism_layout, write_station_frames
 from tsgt.analysis.target_file import read_prism_file, read_target_file
 from tsgt.cli.calibrate_motion import motion
@@ -109,6 +109,7 @@ def targets(
             {1: np.eye(4)} | {station: frame.T for station, frame in frames.items()},
             {station: frame.rms_m for station, frame in frames.items()},
             comment=f"written by tsgt calibrate targets {file} {options}",
+            targets={station: target_residuals(frame) for station, frame in frames.items()},
         )
     return _exit_code(frames.values())
 

@@ -14,6 +14,7 @@ from tsgt.analysis.export import tum_lines, valid_rows
 from tsgt.analysis.processing import process as process_recording
 from tsgt.analysis.smoothing import smoothed
 from tsgt.cli.desk_input import (
+    TUNING,
     duration_s,
     estimator_option,
     frames_option,
@@ -108,7 +109,7 @@ def _processed(loaded: Recording, path: Path) -> tuple[PoseBatch, Parameters, Mo
     parameters = loaded.parameters
     if parameters.pipeline.estimator == "linear":
         return process_recording(loaded, path=path), parameters, None
-    with progress("fitting") as on_progress:
+    with progress("fitting", first=TUNING) as on_progress:
         found = smoothed(loaded, path=path, on_progress=on_progress)
     pipeline = dataclasses.replace(
         parameters.pipeline, motion=found.motion.prior, noise_scale=found.motion.noise_scale

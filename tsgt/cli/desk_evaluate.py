@@ -5,18 +5,18 @@ from __future__ import annotations
 import dataclasses
 import math
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
-import numpy as np
 
 from tsgt.analysis.consistency import outliers, residual_figures
 from tsgt.analysis.evaluation import held_out
 from tsgt.analysis.inter_prism import inter_prism
-from tsgt.analysis.processing import process, with_estimator
-from tsgt.analysis.reference import compare, read_tum
+from tsgt.analysis.processing import process
+from tsgt.analysis.reference import read_tum
 from tsgt.analysis.smoothing import smoothed
 from tsgt.cli.desk_input import (
+    TUNING,
     duration_s,
     estimator_option,
     frames_option,
@@ -28,25 +28,25 @@ from tsgt.cli.desk_input import (
     prisms_option,
     progress,
 )
+from tsgt.cli.evaluate_reference import against, print_against
 from tsgt.cli.evaluate_report import report_evaluation
 from tsgt.cli.options import json_option, keep_going_option, path_type, recording_argument
 from tsgt.cli.output import print_json, print_table
 from tsgt.errors import GeometryError, RecordingError
 from tsgt.master.observations import build_observations
-from tsgt.master.pose_batch import PoseBatch
 from tsgt.master.tracks import build_tracks
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    from tsgt.analysis.aligned import Align
     from tsgt.analysis.consistency import Outlier
     from tsgt.analysis.held_out import HeldOut
     from tsgt.analysis.inter_prism import PairDistances
-    from tsgt.analysis.metrics import PoseFigures
     from tsgt.analysis.processing import Estimator
-    from tsgt.analysis.reference import Reference
     from tsgt.analysis.smoothing import Smoothed
+    from tsgt.cli.evaluate_reference import Against
     from tsgt.recording import Recording
 
 LISTED_OUTLIERS = 10
@@ -60,6 +60,13 @@ LISTED_OUTLIERS = 10
     "reference_path",
     type=path_type,
     help="Trajectory to compare with: TUM, of the robot's frame in the frame of station 1.",
+)
+@click.option(
+    "--align",
+    type=click.Choice(["none", "translation", "rigid"]),
+    default="none",
+    show_default=True,
+    help="With --reference: align as well, and tell what that hides; unaligned errors are told in any case.",
 )
 @click.option(
     "--held-out/--no-held-out",
@@ -89,6 +96,7 @@ def evaluate(
     recording: Path,
     estimator: Estimator | None,
     reference_path: Path | None,
+    align: Literal["none", "translation", "rigid"],
     with_held_out: bool | None,
     report_folder: Path | None,
     odometry: Path | None,
@@ -104,6 +112,9 @@ def evaluate(
     """
     if odometry is not None and report_folder is None:
         raise click.UsageError("--odometry is for a report; add --report")
+    aligning: Align | None = None if align == "none" else align
+    if aligning is not None and reference_path is None:
+        raise click.UsageError("--align is for a comparison; add --reference")
     loaded = load(recording, keep_going=keep_going, estimator=estimator, frames=frames, prisms=prisms)
     reference = None if reference_path is None else read_tum(reference_path)
     if report_folder is not None:
@@ -112,13 +123,14 @@ def evaluate(
             recording,
             report_folder,
             reference=reference,
+            align=aligning,
             odometry=odometry,
             with_held_out=with_held_out,
             as_json=as_json,
         )
         return
     parameters = loaded.parameters
-    with progress("fitting") as on_progress:
+    with progress("fitting", first=TUNING) as on_progress:
         continuous = smoothed(loaded, path=recording, on_progress=on_progress)
     if parameters.pipeline.estimator == "continuous":
         poses = continuous.poses
@@ -128,7 +140,10 @@ def evaluate(
     left_out = _held_out(loaded, continuous, recording) if with_held_out is not False else None
     strays = outliers(continuous.fit, continuous.sources)
     residuals = residual_figures(continuous.fit, continuous.sources)
-    compared = {} if reference is None else _compared(loaded, continuous, reference, recording)
+    compared: dict[Estimator, Against] = {}
+    if reference is not None and reference_path is not None:
+        paths = (recording, reference_path)
+        compared = against(loaded, continuous, reference, paths, still_ns=found.still_ns, align=aligning)
     if as_json:
         chosen = compared.get(parameters.pipeline.estimator)
         print_json(
@@ -148,11 +163,9 @@ def evaluate(
                     for station, axes in residuals.items()
                 },
                 "outliers": [dataclasses.asdict(stray) for stray in strays],
-                **({} if chosen is None else dataclasses.asdict(chosen)),
+                **({} if chosen is None else chosen.keys()),
                 **(
-                    {"estimators": {name: dataclasses.asdict(each) for name, each in compared.items()}}
-                    if compared
-                    else {}
+                    {"estimators": {name: each.keys() for name, each in compared.items()}} if compared else {}
                 ),
             }
         )
@@ -182,9 +195,8 @@ def evaluate(
     ]
     print_table(["station", "n", "mean", "std", "beyond 3"], rows)
     _print_outliers(strays)
-    if compared:
-        click.echo(f"\nAgainst {reference_path}")
-        _print_compared(compared)
+    if compared and reference_path is not None:
+        print_against(compared, reference_path, aligning)
 
 
 def _held_out(loaded: Recording, continuous: Smoothed, path: Path) -> dict[Estimator, HeldOut]:
@@ -203,21 +215,6 @@ def _held_out_keys(left_out: dict[Estimator, HeldOut]) -> dict[str, Any]:
     return {
         name: {**dataclasses.asdict(each.figures), "gaps": dataclasses.asdict(each.gaps)}
         for name, each in left_out.items()
-    }
-
-
-def _compared(
-    loaded: Recording, continuous: Smoothed, reference: Reference, path: Path
-) -> dict[Estimator, PoseFigures]:
-    centroid_m = np.mean([prism.position_m for prism in loaded.parameters.prisms], axis=0)
-    try:
-        linear = process(with_estimator(loaded, "linear"), path=path)
-    except RecordingError:
-        # It has no valid pose, which is a result as well.
-        linear = PoseBatch.blank(np.empty(0, np.int64), continuous.poses.prisms)
-    return {
-        "linear": compare(linear, reference, centroid_m),
-        "continuous": compare(continuous.poses, reference, centroid_m),
     }
 
 
@@ -261,19 +258,6 @@ def _print_outliers(strays: Sequence[Outlier]) -> None:
     print_table(["time (UTC)", "station", "prism", "mm", "sigmas"], rows)
     if len(strays) > LISTED_OUTLIERS:
         click.echo(f"... and {len(strays) - LISTED_OUTLIERS} more; --json has all")
-
-
-def _print_compared(compared: dict[Estimator, PoseFigures]) -> None:
-    rows = [
-        [
-            name,
-            str(f.compared),
-            *_numbers(f.position_rms_mm, f.orientation_rms_deg, f.nees.mean, f.nees.max),
-            "-" if math.isnan(f.nees.above_95) else f"{f.nees.above_95:.1%}",
-        ]
-        for name, f in compared.items()
-    ]
-    print_table(["estimator", "n", "rms mm", "rms deg", "NEES (6)", "largest", "above 95 %"], rows)
 
 
 def _numbers(*figures: float) -> list[str]:

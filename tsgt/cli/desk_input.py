@@ -16,10 +16,16 @@ from tsgt.analysis.processing import (
     with_frames,
     with_latencies,
     with_layout,
+    with_targets,
 )
 from tsgt.cli.options import path_type
 from tsgt.cli.recordings import report_problem
-from tsgt.config import load_prism_layout, load_station_frames, load_station_latencies
+from tsgt.config import (
+    load_prism_layout,
+    load_station_frames,
+    load_station_latencies,
+    load_target_residuals,
+)
 from tsgt.recording import load_recording
 
 if TYPE_CHECKING:
@@ -66,20 +72,40 @@ def load(
             )
         parameters = with_frames(parameters, load_station_frames(frames), path=frames)
         parameters = with_latencies(parameters, load_station_latencies(frames))
+        parameters = with_targets(parameters, load_target_residuals(frames))
     if prisms is not None:
         parameters = with_layout(parameters, load_prism_layout(prisms), path=prisms)
     recording = dataclasses.replace(recording, parameters=parameters)
     return recording if estimator is None else with_estimator(recording, estimator)
 
 
+TUNING = "finding how the robot moves"
+"""What takes a while before the first share of a fit is known: nobody can say how many steps it will need."""
+
+
 @contextmanager
-def progress(label: str) -> Iterator[Callable[[float], None] | None]:
-    """Give what shows the share of a long computation that is done, where somebody looks at it."""
+def progress(label: str, *, first: str | None = None) -> Iterator[Callable[[float], None] | None]:
+    """Give what shows the share of a long computation that is done, where somebody looks at it.
+
+    Parameters
+    ----------
+    label
+        What is being done.
+    first
+        What is being done until the first share is told, if that is something else.
+    """
     if not sys.stderr.isatty():
         yield None
         return
-    with click.progressbar(length=1000, label=label, file=sys.stderr) as bar:
-        yield lambda share: bar.update(round(1000 * share) - bar.pos)
+    with click.progressbar(length=1000, label=first or label, file=sys.stderr) as bar:
+
+        def show(share: float) -> None:
+            if bar.label != label:
+                bar.label = label
+                bar.render_progress()
+            bar.update(round(1000 * share) - bar.pos)
+
+        yield show
 
 
 def pose_counts(poses: PoseBatch) -> dict[str, Any]:

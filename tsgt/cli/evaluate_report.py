@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 import click
 
 from tsgt.analysis.odometry import read_still_intervals
-from tsgt.analysis.report import figures_of, find
+from tsgt.analysis.report import find
+from tsgt.analysis.report_numbers import figures_of
 from tsgt.analysis.report_page import page
 from tsgt.analysis.report_verdicts import verdicts
-from tsgt.cli.desk_input import progress
+from tsgt.cli.desk_input import TUNING, progress
 from tsgt.cli.output import json_text, print_json
 from tsgt.errors import OutputFileError
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    from tsgt.analysis.aligned import Align
     from tsgt.analysis.reference import Reference
     from tsgt.analysis.report import Findings
     from tsgt.recording import Recording
@@ -35,6 +37,7 @@ def report_evaluation(
     folder: Path,
     *,
     reference: Reference | None,
+    align: Align | None = None,
     odometry: Path | None,
     with_held_out: bool | None,
     as_json: bool,
@@ -51,6 +54,8 @@ def report_evaluation(
         Where the report goes; made if it is not there.
     reference
         What to compare poses with, if anything.
+    align
+        How poses are aligned with it besides, if at all.
     odometry
         File that tells when the robot stood still; None: the measurements tell it.
     with_held_out
@@ -62,11 +67,12 @@ def report_evaluation(
     if with_held_out is None:
         with_held_out = not stamps or max(stamps) - min(stamps) <= HELD_OUT_UP_TO_S * 1e9
     still_ns = None if odometry is None else read_still_intervals(odometry)
-    with progress("evaluating") as on_progress:
+    with progress("evaluating", first=TUNING) as on_progress:
         findings = find(
             recording,
             path,
             reference=reference,
+            align=align,
             with_held_out=with_held_out,
             still_ns=still_ns,
             on_progress=on_progress,

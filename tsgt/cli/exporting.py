@@ -13,7 +13,7 @@ from tsgt.analysis.export import measurement_csv, pose_csv, tum_lines, valid_rec
 from tsgt.analysis.export_mcap import messages, write_mcap
 from tsgt.analysis.processing import process
 from tsgt.analysis.reference import read_tum
-from tsgt.cli.desk_input import load, progress
+from tsgt.cli.desk_input import TUNING, load, progress
 from tsgt.cli.options import keep_going_option, path_type, recording_argument
 from tsgt.cli.recordings import refuse_to_replace, report_problem, write_lines
 from tsgt.errors import CorruptLineError, RecordingError
@@ -128,7 +128,7 @@ def _poses_of(
             f"holds no {kind} poses; leave --kind out to take or compute what there is", path=path
         )
     click.echo(f"{path} holds no poses; processing its measurements", err=True)
-    with progress("fitting") as on_progress:
+    with progress("fitting", first=TUNING) as on_progress:
         batch = process(loaded or load(path, keep_going=keep_going), path=path, on_progress=on_progress)
     yield from batch.records()
 

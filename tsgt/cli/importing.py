@@ -2,24 +2,45 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING
 
 import click
 
+from tsgt.analysis.polar_files import check_tracks, read_polar_tracks, station_prisms
+from tsgt.analysis.processing import with_frames, with_latencies, with_targets
 from tsgt.analysis.rts_files import read_prisms, read_tracks
 from tsgt.analysis.rts_import import point_measurements, polar_measurements, stations_from_targets
 from tsgt.cli.options import finite, json_option, path_type
 from tsgt.cli.output import print_json
 from tsgt.cli.recordings import refuse_to_replace, write_recording
+from tsgt.config import load_station_frames, load_station_latencies, load_target_residuals
 from tsgt.model import Parameters, StationParameters
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
+
+    from tsgt.analysis.rts_import import SolvedStations
+    from tsgt.model import Measurement
 
 
 @click.group("import")
 def import_group() -> None:
     """Bring other people's data into a recording."""
+
+
+target_constant_option = click.option(
+    "--target-constant-mm",
+    type=float,
+    callback=finite,
+    default=10.0,
+    show_default=True,
+    help="Added to the distances of the targets.",
+)
+output_option = click.option(
+    "--output", type=path_type, required=True, help="The recording to write; replaced if it exists."
+)
 
 
 @import_group.command("rts")
@@ -35,14 +56,7 @@ def import_group() -> None:
 @click.option(
     "--targets", type=path_type, help="Targets of the same day: solve the stations, go back to raw angles."
 )
-@click.option(
-    "--target-constant-mm",
-    type=float,
-    callback=finite,
-    default=10.0,
-    show_default=True,
-    help="Added to the distances of the targets.",
-)
+@target_constant_option
 @click.option(
     "--prism-constant-mm",
     type=float,
@@ -51,9 +65,7 @@ def import_group() -> None:
     show_default=True,
     help="Taken off the distances to the prisms on the way back to raw measurements.",
 )
-@click.option(
-    "--output", type=path_type, required=True, help="The recording to write; replaced if it exists."
-)
+@output_option
 @json_option
 def import_rts(
     *,
@@ -82,9 +94,7 @@ def import_rts(
         solved = stations_from_targets(
             targets, target_constant_m=target_constant_mm / 1e3, prism_constant_m=prism_constant_mm / 1e3
         )
-        stations = solved.stations
-        for note in solved.notes:
-            click.echo(f"note: {note}", err=True)
+        stations = _told(solved)
         measurements = polar_measurements(published, stations)
     write_recording(
         output,
@@ -92,8 +102,101 @@ def import_rts(
         parameters=Parameters(stations=stations, prisms=layout),
         records=measurements,
     )
-    duration_s = (measurements[-1].stamp_ns - measurements[0].stamp_ns) / 1e9
-    per_station = {k: len(track.stamps_ns) for k, track in enumerate(published, start=1)}
+    _tell(output, measurements, as_json=as_json)
+
+
+@import_group.command("polar")
+@click.option(
+    "--tracks",
+    type=path_type,
+    multiple=True,
+    required=True,
+    help="CSV of raw measurements; once for a file of all stations, or once for each.",
+)
+@click.option(
+    "--prisms",
+    type=path_type,
+    required=True,
+    help="A prism layout (.toml), or the authors' sensor_positions.csv.",
+)
+@click.option("--frames", type=path_type, help="Where the stations stand (set-up file).")
+@click.option("--targets", type=path_type, help="Targets of the same day instead: solve the stations.")
+@target_constant_option
+@click.option(
+    "--prism-constant-mm",
+    type=float,
+    callback=finite,
+    default=0.0,
+    show_default=True,
+    help="What the distances to the prisms lack: added to them whenever poses are computed.",
+)
+@output_option
+@json_option
+def import_polar(
+    *,
+    tracks: tuple[Path, ...],
+    prisms: Path,
+    frames: Path | None,
+    targets: Path | None,
+    target_constant_mm: float,
+    prism_constant_mm: float,
+    output: Path,
+    as_json: bool,
+) -> None:
+    """Import raw measurements of total stations: time, horizontal angle, zenith angle, slope distance.
+
+    A track is a CSV file whose first line names the columns, with their units: those of `tsgt export --format csv
+    --records measurements`, or fewer. Needed are stamp_ns or time_s (Unix time), horizontal_angle_rad, _deg or _gon,
+    zenith_angle_rad, _deg or _gon, and slope_distance_m. Without a column station the first file is that of station 1, and
+    so on; without a column prism each station tracks the prism of its own number.
+    """
+    if (frames is None) == (targets is None):
+        raise click.UsageError("where the stations stand has to be known: give --frames or --targets")
+    sources = [*tracks, prisms, *(path for path in (frames, targets) if path is not None)]
+    refuse_to_replace(sources, output)
+    measurements = read_polar_tracks(tracks)
+    check_tracks(measurements, tracks)
+    tracked = station_prisms(measurements)
+    layout = read_prisms(prisms, sorted({m.prism for m in measurements}))
+    constant_m = prism_constant_mm / 1e3
+    if targets is not None:
+        solved = stations_from_targets(
+            targets,
+            target_constant_m=target_constant_mm / 1e3,
+            prism_constant_m=constant_m,
+            tracked=tracked,
+        )
+        parameters = Parameters(stations=_told(solved), prisms=layout)
+    else:
+        assert frames is not None  # noqa: S101 (one of them is given)
+        stations = (
+            StationParameters(station=k, prism=p, prism_constant_m=constant_m) for k, p in tracked.items()
+        )
+        parameters = Parameters(stations=tuple(stations), prisms=layout)
+        parameters = with_frames(parameters, load_station_frames(frames), path=frames)
+        parameters = with_latencies(parameters, load_station_latencies(frames))
+        parameters = with_targets(parameters, load_target_residuals(frames))
+    write_recording(
+        output,
+        source=f"import polar: {' '.join(path.name for path in sources)}",
+        parameters=parameters,
+        records=measurements,
+    )
+    _tell(output, measurements, as_json=as_json)
+
+
+def _told(solved: SolvedStations) -> tuple[StationParameters, ...]:
+    """Take the solved stations, and say what the user should know of the targets."""
+    for note in solved.notes:
+        click.echo(f"note: {note}", err=True)
+    return solved.stations
+
+
+def _tell(output: Path, measurements: Sequence[Measurement], *, as_json: bool) -> None:
+    """Say what has been imported."""
+    stamps = [m.stamp_ns for m in measurements]
+    duration_s = (max(stamps) - min(stamps)) / 1e9
+    per_station = dict(sorted(Counter(m.station for m in measurements).items()))
     if as_json:
         print_json({"measurements": len(measurements), "duration_s": duration_s, "stations": per_station})
         return

@@ -13,6 +13,7 @@ from tsgt.config.files import (
     load_prism_layout,
     load_station_frames,
     load_station_latencies,
+    load_target_residuals,
 )
 from tsgt.config.master import MasterConfig, StationConfig
 from tsgt.config.models import KINDS
@@ -39,6 +40,7 @@ __all__ = [
     "load_prism_layout",
     "load_station_frames",
     "load_station_latencies",
+    "load_target_residuals",
     "parameters",
     "scenario_parameters",
 ]

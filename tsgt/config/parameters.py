@@ -5,7 +5,12 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from tsgt.config.files import load_prism_layout, load_station_frames, load_station_latencies
+from tsgt.config.files import (
+    load_prism_layout,
+    load_station_frames,
+    load_station_latencies,
+    load_target_residuals,
+)
 from tsgt.errors import ConfigError
 from tsgt.model import (
     ARCSECOND_RAD,
@@ -40,6 +45,7 @@ def parameters(config: MasterConfig) -> Parameters:
     """
     frames = load_station_frames(config.setup.station_frames)
     latencies_ns = load_station_latencies(config.setup.station_frames)
+    targets = load_target_residuals(config.setup.station_frames)
     layout = load_prism_layout(config.setup.prism_layout)
     for station in config.stations:
         if station.station not in frames:
@@ -71,6 +77,7 @@ def parameters(config: MasterConfig) -> Parameters:
                 atmospheric_ppm=station.atmospheric_ppm,
                 latency_ns=latencies_ns.get(station.station, round(station.latency_ms * 1e6)),
                 noise=noise(station.noise),
+                targets=targets.get(station.station, ()),
             )
             for station in config.stations
         ),

@@ -14,6 +14,8 @@ from tsgt.model import Vector3
 class MotionConfig(Model):
     """How the simulated robot drives; the defaults are the reference scenario ``dynamic``."""
 
+    start_after_s: NotNegative = 0.0
+    """It stands for so long before the first speed is commanded: time to synchronise, where a protocol has to."""
     interval_min_s: Positive = 3.0
     """A new speed is commanded after at least this time ..."""
     interval_max_s: Positive = 8.0

@@ -6,8 +6,19 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
-from tsgt.config.base import Model, NotNegative, NumberKey, rigid
+from tsgt.config.base import Model, NotNegative, Number, NumberKey, rigid
 from tsgt.model import Matrix4, Vector3
+
+
+class TargetFit(Model):
+    """How well one target fits the solved frame."""
+
+    target: Number
+    """Number of the target."""
+    residual_mm: NotNegative | None = None
+    """Where the station sees it less where station 1 does, in the solved frame; a rejected target has none."""
+    left_out_mm: NotNegative | None = None
+    """The same with the frame solved from the other targets alone; none where these were too few."""
 
 
 class StationFrame(Model):
@@ -17,6 +28,8 @@ class StationFrame(Model):
     """Rigid transform, 4x4 row by row, from the station's frame to that of station 1, in m."""
     rms_mm: NotNegative | None = None
     """By how much its targets missed those of station 1, root mean square, as the calibration found it."""
+    targets: tuple[TargetFit, ...] = ()
+    """The targets that it was solved from, for reports."""
     latency_ms: Annotated[float, Field(ge=-1e6, le=1e6)] | None = None
     """From the measurement to its time stamp, as ``tsgt calibrate motion`` found it; instead of the configuration's."""
 

@@ -8,6 +8,7 @@ optimum has a closed form, which :func:`align_triplets` evaluates; :func:`align_
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -219,17 +220,7 @@ def align_triplets(layout: ArrayLike, points: ArrayLike) -> BatchAlignment:
     if len(layout) != 3:
         raise GeometryError(f"the closed form is for 3 points, the layout has {len(layout)}")
     batch = _batch(points, 3)
-    check_spread(layout, "layout points")
-
-    layout_mean = (layout[0] + layout[1] + layout[2]) / 3
-    layout_normal = np.cross(layout[1] - layout[0], layout[2] - layout[0])
-    double_area = float(np.linalg.norm(layout_normal))
-    b3 = layout_normal / double_area
-    # b1 along the edge 0-1, so that both ends have the same v.
-    b1 = layout[1] - layout[0]
-    b1 = b1 / np.linalg.norm(b1)
-    b2 = np.cross(b3, b1)
-    u, v = (layout - layout_mean) @ b1, (layout - layout_mean) @ b2
+    layout_mean, double_area, (b1, b2, b3), u, v = _triangle(layout.tobytes())
 
     # Coordinates first and items last: each step below is a few passes over contiguous rows.
     p = np.ascontiguousarray(batch.transpose(1, 2, 0))
@@ -263,6 +254,22 @@ def align_triplets(layout: ArrayLike, points: ArrayLike) -> BatchAlignment:
         residuals_m=np.ascontiguousarray(residuals.transpose(2, 0, 1)),
         degenerate=degenerate,
     )
+
+
+@lru_cache(maxsize=16)
+def _triangle(points: bytes) -> tuple[FloatArray, float, FloatArray, FloatArray, FloatArray]:
+    """Return a layout's centroid, twice its area, its axes in rows, and its points along the first two of them."""
+    layout = np.frombuffer(points).reshape(3, 3)
+    check_spread(layout, "layout points")
+    mean = (layout[0] + layout[1] + layout[2]) / 3
+    normal = np.cross(layout[1] - layout[0], layout[2] - layout[0])
+    double_area = float(np.linalg.norm(normal))
+    b3 = normal / double_area
+    # b1 along the edge 0-1, so that both ends have the same v.
+    b1 = layout[1] - layout[0]
+    b1 = b1 / np.linalg.norm(b1)
+    b2 = np.cross(b3, b1)
+    return mean, double_area, np.array([b1, b2, b3]), (layout - mean) @ b1, (layout - mean) @ b2
 
 
 def align_many(layout: ArrayLike, points: ArrayLike) -> BatchAlignment:
@@ -363,7 +370,13 @@ def _batch(points: ArrayLike, count: int) -> FloatArray:
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
     """Cross products of vectors along the first axis."""
-    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    cross = np.empty_like(a)
+    cross[0], cross[1], cross[2] = (
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    )
+    return cross
 
 
 def _norm(a: FloatArray) -> FloatArray:

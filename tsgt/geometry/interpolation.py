@@ -85,7 +85,7 @@ def interpolate(
         )
     if not np.isfinite(points).all():
         raise GeometryError("sample positions are finite numbers, got NaN or infinity")
-    if np.any(np.diff(times_ns) <= 0):
+    if (times_ns[1:] <= times_ns[:-1]).any():
         raise GeometryError("sample times increase strictly: sort the samples and drop repeats first")
 
     after = np.searchsorted(times_ns, epochs_ns, side="left")

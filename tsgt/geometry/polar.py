@@ -198,4 +198,7 @@ def _direction(horizontal_angle_rad: ArrayLike, zenith_angle_rad: ArrayLike) -> 
     h, z = np.broadcast_arrays(
         np.asarray(horizontal_angle_rad, dtype=np.float64), np.asarray(zenith_angle_rad, dtype=np.float64)
     )
-    return np.stack([np.sin(z) * np.cos(h), -np.sin(z) * np.sin(h), np.cos(z)], axis=-1)
+    direction = np.empty((*h.shape, 3))
+    sin_z = np.sin(z)
+    direction[..., 0], direction[..., 1], direction[..., 2] = sin_z * np.cos(h), -sin_z * np.sin(h), np.cos(z)
+    return direction

@@ -7,6 +7,7 @@ ROS: (x, y, z of the robot's origin, rotation about the world's fixed axes x, y,
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -107,12 +108,13 @@ def pose_covariance(layout: FloatArray, rotation: FloatArray, prism_covariances:
     FloatArray
         Shape (N, 6, 6), symmetric: (x, y, z of the robot's origin in m, rotation about the world's axes in rad).
     """
-    to_robot = np.swapaxes(rotation, 1, 2)
-    covariance = np.zeros((len(rotation), 6, 6))
-    for i, gain in enumerate(_layout_gain(layout)):
-        # The gain is constant in the robot frame; displacements go there, translation and rotation come back.
-        in_world = np.concatenate([rotation @ gain[:3] @ to_robot, rotation @ gain[3:] @ to_robot], axis=1)
-        covariance += in_world @ prism_covariances[:, i] @ np.swapaxes(in_world, 1, 2)
+    from_robot, to_robot = rotation[:, None], np.swapaxes(rotation, 1, 2)[:, None]
+    gain = _layout_gain(layout)
+    # The gain is constant in the robot frame; displacements go there, translation and rotation come back.
+    in_world = np.concatenate(
+        [from_robot @ gain[:, :3] @ to_robot, from_robot @ gain[:, 3:] @ to_robot], axis=2
+    )
+    covariance = _over_prisms(in_world @ prism_covariances @ np.swapaxes(in_world, 2, 3))
     return 0.5 * (covariance + np.swapaxes(covariance, 1, 2))
 
 
@@ -149,11 +151,11 @@ def unseen_motion_covariance(
     FloatArray
         Shape (N, 6, 6), in the order and axes of :func:`pose_covariance`, to which it adds.
     """
-    arms = skew(layout - layout.mean(axis=0))
-    straight, turning = np.zeros((2, len(rotation), 6, 3))
-    for i, gain in enumerate(_layout_gain(layout)):
-        straight += unseen[:, i, None, None] * gain
-        turning += unseen[:, i, None, None] * (gain @ arms[i])
+    unseen = unseen[:, :, None, None]
+    straight, turning = (
+        _over_prisms(unseen * _layout_gain(layout)),
+        _over_prisms(unseen * _turning_gain(layout)),
+    )
     covariance = np.zeros((len(rotation), 6, 6))
     for sigma, effect in (
         (acceleration_sigma_mps2, straight),
@@ -186,13 +188,9 @@ def twists(
     angular_velocity_radps : FloatArray
         Angular velocity in the robot frame in rad/s, shape (N, 3).
     """
-    to_robot = np.swapaxes(rotation, 1, 2)
-    velocity_mps, angular_velocity_radps = np.zeros((2, len(rotation), 3))
-    for i, gain in enumerate(_layout_gain(layout)):
-        in_robot = rotate(to_robot, prism_velocities_mps[:, i])
-        velocity_mps += rotate(gain[:3], in_robot)
-        angular_velocity_radps += rotate(gain[3:], in_robot)
-    return rotate(rotation, velocity_mps), angular_velocity_radps
+    in_robot = rotate(np.swapaxes(rotation, 1, 2)[:, None], prism_velocities_mps)
+    twist = _over_prisms(rotate(_layout_gain(layout), in_robot))
+    return rotate(rotation, twist[:, :3]), twist[:, 3:]
 
 
 def check_layout(layout: ArrayLike, names: Sequence[object] | None = None) -> None:
@@ -238,7 +236,26 @@ def check_layout(layout: ArrayLike, names: Sequence[object] | None = None) -> No
         )
 
 
+def _over_prisms(terms: FloatArray) -> FloatArray:
+    """Sum over the second axis, one by one: a sum over an axis may group its terms differently for one pose and for many."""
+    return sum((terms[:, i] for i in range(terms.shape[1])), start=np.zeros_like(terms[:, 0]))
+
+
 def _layout_gain(layout: FloatArray) -> FloatArray:
     """Gain of each prism in the unweighted fit, in the robot frame; shape (P, 6, 3)."""
-    layout = np.asarray(layout, dtype=np.float64)
-    return fit_gain(layout, np.ones(len(layout)))
+    return _gains(np.asarray(layout, dtype=np.float64).tobytes())[0]
+
+
+def _turning_gain(layout: FloatArray) -> FloatArray:
+    """Gain of the robot's angular acceleration by way of each prism, in the robot frame; shape (P, 6, 3)."""
+    return _gains(np.asarray(layout, dtype=np.float64).tobytes())[1]
+
+
+@lru_cache(maxsize=16)
+def _gains(layout: bytes) -> tuple[FloatArray, FloatArray]:
+    """Both gains of a layout; a robot keeps its own for years, and they cost more than all else of a single pose."""
+    prisms = np.frombuffer(layout).reshape(-1, 3)
+    gain = fit_gain(prisms, np.ones(len(prisms)))
+    turning = gain @ skew(prisms - prisms.mean(axis=0))
+    gain.flags.writeable = turning.flags.writeable = False
+    return gain, turning

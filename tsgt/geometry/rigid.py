@@ -103,18 +103,17 @@ def quaternion_from_rotation(R: FloatArray) -> FloatArray:
     xx, yy, zz = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
     xy, xz, yz = R[..., 0, 1] + R[..., 1, 0], R[..., 0, 2] + R[..., 2, 0], R[..., 1, 2] + R[..., 2, 1]
     xw, yw, zw = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
-    diagonal = np.stack([1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz, 1 + xx + yy + zz], axis=-1)
     # Four times the outer product of the quaternion with itself: each row is the quaternion, scaled.
-    rows = np.stack(
-        [
-            np.stack([diagonal[..., 0], xy, xz, xw], axis=-1),
-            np.stack([xy, diagonal[..., 1], yz, yw], axis=-1),
-            np.stack([xz, yz, diagonal[..., 2], zw], axis=-1),
-            np.stack([xw, yw, zw, diagonal[..., 3]], axis=-1),
-        ],
-        axis=-2,
-    )
-    largest = np.argmax(diagonal, axis=-1)[..., None, None]
+    rows = np.empty((*xx.shape, 4, 4))
+    rows[..., 0, 0], rows[..., 1, 1] = 1 + xx - yy - zz, 1 - xx + yy - zz
+    rows[..., 2, 2], rows[..., 3, 3] = 1 - xx - yy + zz, 1 + xx + yy + zz
+    rows[..., 0, 1] = rows[..., 1, 0] = xy
+    rows[..., 0, 2] = rows[..., 2, 0] = xz
+    rows[..., 1, 2] = rows[..., 2, 1] = yz
+    rows[..., 0, 3] = rows[..., 3, 0] = xw
+    rows[..., 1, 3] = rows[..., 3, 1] = yw
+    rows[..., 2, 3] = rows[..., 3, 2] = zw
+    largest = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), axis=-1)[..., None, None]
     q: FloatArray = np.take_along_axis(rows, largest, axis=-2)[..., 0, :]
     length = np.sqrt(q[..., 0] ** 2 + q[..., 1] ** 2 + q[..., 2] ** 2 + q[..., 3] ** 2)
     return q / np.where(q[..., 3] < 0, -length, length)[..., None]

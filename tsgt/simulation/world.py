@@ -213,7 +213,8 @@ def _route_commands(motion: MotionConfig, n: int, generator: np.random.Generator
     end_m = _path(motion)[0][-1]
     weights = np.array(motion.speed_weights) / sum(motion.speed_weights)
     speeds = np.zeros(n)
-    driven_m = speed = next_draw = 0.0
+    driven_m = speed = 0.0
+    next_draw = motion.start_after_s
     for step in range(n):
         if step * STEP_S >= next_draw:
             speed = float(generator.choice(motion.speeds_mps, p=weights))
@@ -233,7 +234,7 @@ def _commands(
     fastest_turn = max(abs(rate) for rate in motion.yaw_rates_radps)
     commands = np.empty((n, 2))
     x = y = 0.0  # from the centre of the area
-    yaw, speed, drawn_rate, next_draw = start_yaw, 0.0, 0.0, 0.0
+    yaw, speed, drawn_rate, next_draw = start_yaw, 0.0, 0.0, motion.start_after_s
     for step in range(n):
         if step * STEP_S >= next_draw:
             speed = float(generator.choice(motion.speeds_mps, p=weights))
@@ -274,11 +275,13 @@ def _rotation(
         np.cos(roll),
         np.sin(roll),
     )
-    return np.stack(
-        [
-            np.stack([cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr], axis=-1),
-            np.stack([sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr], axis=-1),
-            np.stack([-sp, cp * sr, cp * cr], axis=-1),
-        ],
-        axis=-2,
+    rotation = np.empty((*yaw.shape, 3, 3))
+    rows = (
+        (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
+        (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
+        (-sp, cp * sr, cp * cr),
     )
+    for i, row in enumerate(rows):
+        for j, column in enumerate(row):
+            rotation[..., i, j] = column
+    return rotation

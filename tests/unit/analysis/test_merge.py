@@ -183,7 +183,7 @@ def test_sessions_and_runs(tmp_path: Path) -> None:
 
     async def set_clock(mission: Mission) -> None:
         await mission.sleep_until(50.0)
-        mission.clocks[2].step(3_000_000_000)
+        mission.computers["station2"].clock.step(3_000_000_000)
 
     run = mission(
         tmp_path / "m",
@@ -208,7 +208,7 @@ def test_a_computer_that_wakes_up_in_the_same_hour(tmp_path: Path) -> None:
 
     async def reboot(mission: Mission) -> None:
         await mission.sleep_until(39.0)
-        mission.clocks[2].step(-35 * S)  # only the next run sees it
+        mission.computers["station2"].clock.step(-35 * S)  # only the next run sees it
         await mission.reboot(2, 40.0, 15.0)
 
     run = mission(tmp_path / "m", duration_s=90.0, script=reboot)

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from support.scene import SECOND, START, Scene, driving, standing_scene
 
+from tsgt.analysis.inter_prism import at_epochs, inter_prism
 from tsgt.analysis.report_axes import BUCKETS, Clock, thinned
-from tsgt.analysis.report_motion import BINS, binned, gridded, ride, standing
+from tsgt.analysis.report_motion import BINS, binned, gridded, ride
 from tsgt.master.tracks import Track, build_tracks
 
 
@@ -24,30 +25,46 @@ def tracks_of(scene: Scene, *, duration_s: float = 8.0) -> dict[int, Track]:
 def test_a_standing_robot_has_no_errors_and_one_interval() -> None:
     """Exact measurements give the distances of the layout at each epoch."""
     scene = standing_scene()
-    found = ride(scene.parameters, tracks_of(scene), None)
+    tracks = tracks_of(scene)
+    found = ride(scene.parameters, at_epochs(scene.parameters, tracks), None)
     assert list(found.error_m) == ["1-2", "1-3", "2-3"]
     for error_m in found.error_m.values():
         np.testing.assert_allclose(error_m, 0.0, atol=1e-9)
-    assert len(found.still_ns) == 1
+    assert len(inter_prism(scene.parameters, tracks).still_ns) == 1
     assert np.isnan(found.motion.speed_mps).all()
 
 
 def test_straight_lines_cut_a_bend() -> None:
     """A driving robot's distances are off where tracks are interpolated, and no interval is still."""
     scene = standing_scene().moving(driving)
-    found = ride(scene.parameters, tracks_of(scene), None)
+    tracks = tracks_of(scene)
+    found = ride(scene.parameters, at_epochs(scene.parameters, tracks), None)
     assert max(np.abs(error_m).max() for error_m in found.error_m.values()) > 1e-4
-    assert found.still_ns == ()
+    assert inter_prism(scene.parameters, tracks).still_ns == ()
 
 
 def test_distances_are_taken_in_the_given_intervals() -> None:
     """Somebody else may know better when the robot stood; outside nothing counts."""
     scene = standing_scene()
-    found = standing(scene.parameters, tracks_of(scene), [(START + SECOND, START + 3 * SECOND)])
-    assert [pair.name for pair in found] == ["1-2", "1-3", "2-3"]
-    for pair in found:
+    found = inter_prism(scene.parameters, tracks_of(scene), [(START + SECOND, START + 3 * SECOND)])
+    assert found.still_s == 2.0
+    assert [pair.name for pair in found.static] == ["1-2", "1-3", "2-3"]
+    for pair in found.static:
         assert len(pair.distances_m) == 5
         np.testing.assert_allclose(pair.distances_m, pair.reference_m, atol=1e-9)
+
+
+def test_standing_before_and_after_the_recording_does_not_count() -> None:
+    """Odometry runs longer than stations measure; of another day nothing is left."""
+    scene = standing_scene()
+    tracks = tracks_of(scene)
+    hour = 3600 * SECOND
+    last_s = 0.4 * 19 + 0.33
+    found = inter_prism(scene.parameters, tracks, [(START - hour, START + hour)])
+    assert found.still_s == pytest.approx(last_s - 0.11)
+    other_day = inter_prism(scene.parameters, tracks, [(START - 2 * hour, START - hour)])
+    assert other_day.still_ns == ()
+    assert all(not len(pair.distances_m) for pair in other_day.static)
 
 
 def test_errors_are_sorted_by_size_into_their_bins() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import html
 import io
 import json
 import re
@@ -14,20 +15,22 @@ from support.scene import driving, standing
 
 from tsgt.analysis.odometry import read_still_intervals
 from tsgt.analysis.reference import read_tum
-from tsgt.analysis.report import Findings, figures_of, find
+from tsgt.analysis.report import Findings, find
+from tsgt.analysis.report_numbers import figures_of
 from tsgt.analysis.report_sections import sections
 from tsgt.analysis.report_verdicts import verdicts
 from tsgt.cli.main import cli, run
 from tsgt.recording import load_recording
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from support.cli import Tsgt
     from support.scene import Motion
 
 FIGURES = {
+    "calibration",
     "distances",
     "distances_over_time",
     "errors_by_motion",
@@ -41,6 +44,10 @@ FIGURES = {
     "statuses",
     "trajectory",
 }
+
+
+CONSTANTS = {"1", "3", "20", "95"}
+"""Seconds of a gap and of standing, Hz, and percent, which sentences name."""
 
 
 class Made(NamedTuple):
@@ -126,6 +133,43 @@ def test_json_has_the_numbers_of_the_report_and_of_evaluate(made: Made) -> None:
     assert set(printed["held_out_mm"]) == {"linear", "continuous"}
 
 
+def test_every_number_of_the_page_is_in_its_json(made: Made) -> None:
+    """Those of all tables and sentences, as they are rounded there; figures draw what these sum up."""
+    page = (made.folder / "report.html").read_text(encoding="utf-8")
+    printed = json.loads(made.out)
+    assert [
+        html.unescape(re.sub("<[^>]*>", "", v)).split(": ", 1)[1] for v in re.findall("<li .*?</li>", page)
+    ] == [v["text"].replace("`", "") for v in printed["verdicts"]]
+    known = [v for number in numbers_in(printed) for v in (number, 100 * number)]
+    shown = re.findall(r"<td>(.*?)</td>|<p>(.*?)</p>", page.split("What to trust", 1)[1], flags=re.DOTALL)
+    checked = 0
+    for text in map("".join, shown):
+        for word in re.findall(r"(?<![\w.:-])[-+]?\d+(?:\.\d+)?(?![\w:-])", text):
+            digits = len(word.partition(".")[2])
+            assert word in CONSTANTS or any(f"{v:.{digits}f}" == word for v in known), (word, text)
+            checked += 1
+    assert checked > 100
+
+
+def numbers_in(value: Any) -> Iterator[float]:
+    """All numbers of a JSON value; those of keys too, which name stations."""
+    if isinstance(value, dict):
+        yield from (float(key) for key in value if key.isdigit())
+        value = list(value.values())
+    if isinstance(value, list):
+        for item in value:
+            yield from numbers_in(item)
+    elif isinstance(value, int | float):
+        yield float(value)
+
+
+def test_the_colour_of_a_verdict_is_not_overruled(made: Made) -> None:
+    """A rule for all of the list's lines is more particular than one for a class alone."""
+    page = (made.folder / "report.html").read_text(encoding="utf-8")
+    for level in ("good", "care", "bad"):
+        assert f"ul.verdicts li.{level} {{ border-color: #" in page
+
+
 def test_one_station_only_is_said(tsgt: Tsgt, tmp_path: Path) -> None:
     """There are no poses and no distances; what there is of the station is shown."""
     recording = recorded(tmp_path, keep="1")
@@ -134,7 +178,9 @@ def test_one_station_only_is_said(tsgt: Tsgt, tmp_path: Path) -> None:
     assert "do not trust: No poses by continuous and linear: prism 2 has no usable measurement" in outcome.out
     page = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
     assert "nothing usable was measured of prism 2 and prism 3" in page
-    assert {path.stem for path in (tmp_path / "report").glob("*.png")} == {"gaps", "perturbation", "statuses"}
+    assert {path.stem for path in (tmp_path / "report").glob("*.png")} == {
+        *("calibration", "gaps", "perturbation", "statuses")
+    }
 
 
 def test_no_static_interval_is_said(tmp_path: Path) -> None:
@@ -165,10 +211,51 @@ def test_a_reference_of_another_day_is_said(tmp_path: Path) -> None:
 def test_odometry_says_when_the_robot_stood(tmp_path: Path) -> None:
     """Distances of standing are then from its intervals."""
     odometry = tmp_path / "odometry.csv"
-    odometry.write_text("".join(f"{1_700_000_000 + i / 10},0,0\n" for i in range(41)), encoding="utf-8")
+    odometry.write_text("".join(f"{1_700_000_000.05 + i / 10},0,0\n" for i in range(41)), encoding="utf-8")
     found = figures_of(findings(recorded(tmp_path), still_ns=read_still_intervals(odometry)))
     assert found["still_s"] == pytest.approx(4.0)
     assert found["inter_prism_static_mm"]["1-2"]["valid"] == 10
+
+
+def test_odometry_of_another_day_is_said(tmp_path: Path) -> None:
+    """It says nothing of this drive, and what it says is not taken for standing."""
+    other_day = (1_600_000_000_000_000_000, 1_600_000_100_000_000_000)
+    found = findings(recorded(tmp_path), still_ns=[other_day])
+    assert "By the odometry, the robot stood still before or after this recording only" in told(found)
+    assert "standing from 2020-09-13" in told(found)
+    assert figures_of(found)["still_s"] == 0.0
+
+
+def test_a_short_recording_is_not_called_good(tmp_path: Path) -> None:
+    """From a few residuals nobody can tell what noise makes, nor how the robot moves."""
+    recording = recorded(tmp_path)
+    lines = recording.read_text(encoding="utf-8").splitlines(keepends=True)
+    late_ns = 1_700_000_003_000_000_000
+    kept = [line for line in lines if json.loads(line).get("stamp_ns", 0) < late_ns or "sequence" not in line]
+    recording.write_text("".join(kept), encoding="utf-8")
+    said = told(findings(recording))
+    assert "too few to tell how the robot moves" in said
+    assert "what their noise makes" not in said
+
+
+def test_stations_that_never_measure_together_are_not_called_driving(tmp_path: Path) -> None:
+    """Whether the robot stood cannot be told then, and nothing is."""
+    recording = recorded(tmp_path, standing)
+    lines = recording.read_text(encoding="utf-8").splitlines(keepends=True)
+    begins_s = {1: 0, 2: 3, 3: 6}
+    kept = [
+        line
+        for line in lines
+        for record in (json.loads(line),)
+        if record.get("type") != "measurement"
+        or begins_s[record["station"]]
+        <= (record["stamp_ns"] - 1_700_000_000_000_000_000) / 1e9
+        < begins_s[record["station"]] + 3
+    ]
+    recording.write_text("".join(kept), encoding="utf-8")
+    said = told(findings(recording))
+    assert "At no time were all prisms measured without a gap" in said
+    assert "never stood still" not in said
 
 
 def test_odometry_without_a_report_is_refused(tsgt: Tsgt, tmp_path: Path) -> None:

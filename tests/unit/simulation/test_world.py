@@ -156,6 +156,15 @@ def test_a_robot_that_only_stands() -> None:
 ROUTE = MotionConfig(route_m=((0.0, 0.0, 0.0), (30.0, 0.0, 3.0), (30.0, 40.0, 3.0)))
 
 
+@pytest.mark.parametrize("route", [(), ((5.0, 5.0, 0.0), (300.0, 5.0, 0.0))])
+def test_it_may_stand_before_it_drives(route: tuple[tuple[float, float, float], ...]) -> None:
+    """With a route and without one: it stands still, and has driven off soon after."""
+    motion = MotionConfig(start_after_s=30.0, speeds_mps=(1.0,), speed_weights=(1.0,), route_m=route)
+    position = _world(duration_s=60.0, motion=motion).pose_at(np.array([0.0, 28.0, 33.0]))[:, :3, 3]
+    assert np.linalg.norm(position[1] - position[0]) < 1e-6
+    assert np.linalg.norm(position[2] - position[0]) > 1.0
+
+
 def test_a_route_is_driven_to_its_end() -> None:
     """The robot starts at the first way point, ends at the last one and stands there."""
     poses = _world(duration_s=300.0, motion=ROUTE).pose_at(np.array([0.0, 299.0, 300.0]))

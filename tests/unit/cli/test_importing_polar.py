@@ -1,0 +1,115 @@
+"""``tsgt import polar``: measurements as CSV become a recording again; calibration residuals come along."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import pytest
+from support.published import write_prisms, write_targets, write_tracks
+
+from tsgt.recording import load_recording
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from support.cli import Tsgt
+
+
+@pytest.fixture
+def recording(tsgt: Tsgt, tmp_path: Path) -> Path:
+    """Raw measurements of a drive, with frames solved from targets."""
+    path = tmp_path / "drive.jsonl"
+    sources = ("--prisms", write_prisms(tmp_path), "--targets", write_targets(tmp_path))
+    outcome = tsgt("import", "rts", "--tracks", *write_tracks(tmp_path), *sources, "--output", path)
+    assert outcome.code == 0, outcome.err
+    return path
+
+
+def exported(tsgt: Tsgt, recording: Path) -> Path:
+    """Write its measurements as CSV."""
+    path = recording.with_name("measurements.csv")
+    outcome = tsgt("export", recording, "--format", "csv", "--records", "measurements", "--output", path)
+    assert outcome.code == 0, outcome.err
+    return path
+
+
+def imported(tsgt: Tsgt, tracks: Path, *where: object, constant_mm: float = 10.0) -> Path:
+    """Read them back."""
+    path = tracks.with_name("again.jsonl")
+    prisms = tracks.with_name("sensor_positions.csv")
+    options = ("--prisms", prisms, "--prism-constant-mm", constant_mm, *where)
+    outcome = tsgt("import", "polar", "--tracks", tracks, *options, "--output", path, "--json")
+    assert outcome.code == 0, outcome.err
+    assert outcome.json()["measurements"] == 75
+    return path
+
+
+def test_with_targets_it_is_the_same_recording(tsgt: Tsgt, recording: Path) -> None:
+    """Measurements, frames, prisms and residuals of the targets: all that the way back has to keep."""
+    targets = recording.with_name("GCP.txt")
+    again = imported(tsgt, exported(tsgt, recording), "--targets", targets)
+    first, second = (load_recording(path, keep_going=False) for path in (recording, again))
+    assert second.measurements == first.measurements
+    assert second.parameters == first.parameters
+    assert [target.target for target in second.parameters.stations[1].targets] == [1, 2, 3, 4, 5]
+
+
+def test_with_frames_of_a_calibration(tsgt: Tsgt, recording: Path) -> None:
+    """The file that ``tsgt calibrate targets`` writes holds the frames, and how well the targets fitted, to a micrometre."""
+    frames = recording.with_name("frames.toml")
+    targets = recording.with_name("GCP.txt")
+    solving = ("--target-constant-mm", 10, "--output", frames)
+    assert tsgt("calibrate", "targets", targets, *solving).code == 0
+    again = load_recording(imported(tsgt, exported(tsgt, recording), "--frames", frames), keep_going=False)
+    wanted = load_recording(recording, keep_going=False).parameters
+    for found, station in zip(again.parameters.stations, wanted.stations, strict=True):
+        assert found.T_station1_station == station.T_station1_station
+        assert [t.target for t in found.targets] == [t.target for t in station.targets]
+        for a, b in zip(found.targets, station.targets, strict=True):
+            assert a.residual_m == pytest.approx(b.residual_m, abs=1e-6)
+            assert a.left_out_m == pytest.approx(b.left_out_m, abs=1e-6)
+
+
+def test_frames_replaced_at_the_desk_have_their_own_residuals(tsgt: Tsgt, recording: Path) -> None:
+    """Those of the recording are not shown for frames that come from elsewhere."""
+    frames, poses = recording.with_name("frames.toml"), recording.with_name("poses.jsonl")
+    parameters = json.loads(recording.read_text(encoding="utf-8").splitlines()[1])
+    tables = [
+        f"[stations.{s['station']}]\nT_station1_station = {json.dumps(s['T_station1_station'])}\n"
+        for s in parameters["stations"]
+    ]
+    frames.write_text("\n".join(['kind = "station_frames"', *tables]), encoding="utf-8")
+    outcome = tsgt("process", recording, "--estimator", "linear", "--frames", frames, "--output", poses)
+    assert outcome.code == 0, outcome.err
+    assert all(not s.targets for s in load_recording(poses, keep_going=False).parameters.stations)
+
+
+@pytest.mark.parametrize("given", [(), ("--frames", "frames.toml", "--targets", "GCP.txt")])
+def test_where_the_stations_stand_is_told_once(tsgt: Tsgt, recording: Path, given: tuple[str, ...]) -> None:
+    """Neither and both are refused."""
+    options = ("--prisms", recording.with_name("sensor_positions.csv"), *given)
+    out = recording.with_name("no.jsonl")
+    outcome = tsgt("import", "polar", "--tracks", exported(tsgt, recording), *options, "--output", out)
+    assert outcome.code == 2
+    assert "give --frames or --targets" in outcome.err
+    assert not out.exists()
+
+
+def test_a_bad_line_is_named(tsgt: Tsgt, recording: Path) -> None:
+    """One line on stderr with file and line; no recording is made."""
+    tracks = exported(tsgt, recording)
+    lines = tracks.read_text(encoding="utf-8").splitlines()
+    lines[3] = lines[3].replace(",ok,", ",good,")
+    tracks.write_text("\n".join(lines), encoding="utf-8")
+    out = recording.with_name("no.jsonl")
+    sources = (
+        "--prisms",
+        recording.with_name("sensor_positions.csv"),
+        "--targets",
+        recording.with_name("GCP.txt"),
+    )
+    outcome = tsgt("import", "polar", "--tracks", tracks, *sources, "--output", out)
+    assert outcome.code == 1
+    assert outcome.err.splitlines()[-1].startswith(f"error: {tracks}, line 4: status is 'good'")
+    assert not out.exists()

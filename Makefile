@@ -5,7 +5,12 @@ VENV ?= .venv
 DURATION ?= 30
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint types layers pytest bench generated format clean
+# Property tests of what takes bytes from outside.
+FUZZED := $(addprefix tests/property/test_,$(addsuffix .py,air bridge classic damaged_files damaged_recordings \
+	damaged_replies forgery geocom gnss_files hostile_radio hostile_sockets radio recording \
+	superframe_messages tum))
+
+.PHONY: demo test lint types layers pytest fuzz bench generated format clean
 
 demo: $(VENV)/.runtime
 	$(BIN)/tsgt demo --duration $(DURATION)
@@ -27,10 +32,16 @@ pytest: $(VENV)/.test
 	$(BIN)/pytest --numprocesses auto --dist loadfile --ignore tests/process --ignore tests/interop
 	$(BIN)/pytest tests/process tests/interop
 
+# Forty times the examples of `make test`, on two cores; what is not done after 15 minutes is given up, and said.
+# A failing example is kept in .hypothesis: `pytest` with the name of its test makes it small and shows it.
+fuzz: $(VENV)/.test
+	timeout --signal=INT 15m $(BIN)/pytest --hypothesis-profile=fuzz --numprocesses 2 --dist worksteal $(FUZZED)
+
 bench: $(VENV)/.test
 	$(BIN)/python benchmarks/alignment.py
 	$(BIN)/python benchmarks/process.py
 	$(BIN)/python benchmarks/air.py
+	$(BIN)/python benchmarks/simulation_speed.py
 	$(BIN)/python benchmarks/clock_scenarios.py
 	$(BIN)/python benchmarks/beacon_clock.py
 	$(BIN)/python benchmarks/instrument_time.py

@@ -2,9 +2,10 @@
 
     python benchmarks/instrument_time.py
 
-The clock fit only, without lines and drivers: instrument times in whole ms, a crystal that is off and wanders, answers
-that are late by chance. As in the driver, exchanges for the time alone are what is fitted: 12 at the beginning, one for
-each of the next 32 distances, then two a second. The error is that of the newest distance, with the exchanges before it.
+The first table is of the whole driver with a simulated instrument (20 ppm) and line, by the number of the distance since
+it was connected. The second is of the clock fit only, without lines and drivers: instrument times in whole ms, a crystal that is off and wanders, answers
+that are late by chance. Exchanges for the time alone are what is fitted: 12 at the beginning, one for each of the next 32
+distances, then two a second, which is what a driver does without idle time. The error is that of the newest distance, with the exchanges before it.
 What the fastest way itself needs is taken off, for the fit cannot see it. The figures stand in
 docs/explanation/instrument-time.md.
 """
@@ -12,11 +13,22 @@ docs/explanation/instrument-time.md.
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from tsgt.config import ScenarioConfig
+from tsgt.config.client import LeicaInstrumentConfig
+from tsgt.config.scenario import InstrumentModelConfig, SimulatedStation
+from tsgt.simulation.clocks import VirtualClock
+from tsgt.simulation.event_loop import run_virtual
+from tsgt.simulation.serial_line import SimulatedLine
+from tsgt.simulation.timeline import VirtualTimeline
+from tsgt.simulation.total_station import SimulatedTotalStation
+from tsgt.simulation.world import scenario_world
 from tsgt.station.instrument_clock import InstrumentClock
+from tsgt.station.leica import LeicaInstrument
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -24,6 +36,9 @@ if TYPE_CHECKING:
 RUNS = 40
 FASTEST_MS = 20.0
 DURATION_S = 900.0
+
+DRIVER_RUNS = 30
+NUMBERS = ((1, 1), (2, 10), (11, 30), (31, 100), (101, 400))
 
 PERIODS_S = ((0, 5), (5, 60), (60, 300), (300, 900))
 
@@ -89,8 +104,76 @@ def errors(case: Case, seed: int) -> list[tuple[float, float, float]]:
     return found
 
 
+class Driven(NamedTuple):
+    """An instrument and a line for the whole driver."""
+
+    rate_hz: float
+    processing_ms: tuple[float, float] = (20.0, 60.0)
+    baud: int = 115_200
+
+
+DRIVEN = (Driven(2.5), Driven(2.5, (5.0, 10.0)), Driven(2.5, baud=9600), Driven(7.0), Driven(20.0))
+
+
+async def driven(case: Driven, seed: int, timeline: VirtualTimeline) -> list[float]:
+    """Return the errors in ms of the first distances of one run."""
+    fastest_ms, slowest_ms = case.processing_ms
+    model = InstrumentModelConfig(processing_min_ms=fastest_ms, processing_max_ms=slowest_ms, baud=case.baud)
+    station = SimulatedStation(
+        station=1, prism=1, position_m=(0.0, 0.0, 0.0), rate_hz=case.rate_hz, instrument=model
+    )
+    scenario = ScenarioConfig(stations=(station,))
+    last = NUMBERS[-1][1]
+    world = scenario_world(scenario, last / case.rate_hz + 60, np.random.default_rng(1))
+    clock = VirtualClock(0)
+    far_end = SimulatedTotalStation(station, scenario, world, timeline, np.random.default_rng(seed))
+    config = LeicaInstrumentConfig(
+        kind="leica",
+        port=Path("/dev/simulated"),
+        baud=case.baud,
+        prism_type="user",
+        prism_constant_mm=0.0,
+        latency_ms=fastest_ms,
+    )
+    driver = LeicaInstrument(config, SimulatedLine(far_end, timeline, clock).open, clock)
+    await driver.connect()
+    await driver.track(1)
+    found: list[float] = []
+    while len(found) < last:
+        reading = await driver.read()
+        if reading.slope_distance_m is not None:
+            found.append((reading.at_ns - far_end.offered[-1].true_ns) / 1e6)
+    await driver.close()
+    return found
+
+
+def drivers() -> None:
+    """Print a table of whole drivers."""
+    numbers = " | ".join(f"{first} to {last}" if first != last else f"{first}" for first, last in NUMBERS)
+    print(f"| distances per s, answers after, baud; error in ms: rms / largest | {numbers} |")
+    print("|---" * (len(NUMBERS) + 1) + "|")
+    for case in DRIVEN:
+        runs = []
+        for seed in range(DRIVER_RUNS):
+            timeline = VirtualTimeline()
+
+            async def run(
+                case: Driven = case, seed: int = seed, timeline: VirtualTimeline = timeline
+            ) -> list[float]:
+                return await driven(case, seed, timeline)
+
+            runs.append(run_virtual(run, timeline))
+        table = np.array(runs)
+        parts = [table[:, first - 1 : last] for first, last in NUMBERS]
+        cells = " | ".join(f"{np.sqrt(np.mean(part**2)):.2f} / {np.abs(part).max():.1f}" for part in parts)
+        fastest_ms, slowest_ms = case.processing_ms
+        print(f"| {case.rate_hz:g}, {fastest_ms:g} to {slowest_ms:g} ms, {case.baud} | {cells} |", flush=True)
+    print()
+
+
 def main() -> None:
-    """Print a table."""
+    """Print the tables."""
+    drivers()
     periods = " | ".join(f"{begin} to {end} s" for begin, end in PERIODS_S)
     print(f"| error in ms: median / largest | {periods} | bound, median | outside it |")
     print("|---" * (len(PERIODS_S) + 3) + "|")

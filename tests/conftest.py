@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 import structlog
-from hypothesis import settings
+from hypothesis import Phase, settings
 
 from tsgt.simulation.event_loop import run_virtual
 
@@ -19,8 +19,13 @@ if TYPE_CHECKING:
 FIELD_DATA = Path(__file__).parents[2] / "shared" / "data" / "rts"
 
 # How long an example takes says how busy the machine is, no more.
-settings.register_profile("tsgt", deadline=None)
-settings.load_profile("tsgt")
+settings.register_profile("ci", deadline=None)
+# For `make fuzz`. What fails stays in .hypothesis as it is: the next run without this profile makes it small, which
+# may take longer than all the rest.
+settings.register_profile(
+    "fuzz", deadline=None, max_examples=4000, phases=(Phase.explicit, Phase.reuse, Phase.generate)
+)
+settings.load_profile("ci")
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -31,6 +31,14 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from pathlib import Path
 
+_QUOTED_CHARACTERS = 60
+
+
+def quoted(text: str) -> str:
+    """Quote what an input says, as far as there is room for it in one line of an error."""
+    shown = repr(text)
+    return shown if len(shown) <= _QUOTED_CHARACTERS else f"{shown[: _QUOTED_CHARACTERS - 3]}..."
+
 
 class TsgtError(Exception):
     """Base of all errors that tsgt raises on purpose; its text is one line for the user."""

@@ -13,7 +13,7 @@ from typing import Literal
 
 import structlog
 
-Level = Literal["debug", "info", "warning", "error"]
+Level = Literal["debug", "info", "warning", "error", "critical"]
 
 
 def configure_logging(level: Level = "info") -> None:

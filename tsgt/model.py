@@ -105,7 +105,8 @@ class PolarMeasurement:
         Time of the measurement on the master's Unix clock in ns: the host stamp put on that clock. The
         station's latency is not taken off; whoever computes with it does that.
     stamp_sigma_ns
-        One sigma of ``stamp_ns`` in ns, without the instrument's latency.
+        One sigma of ``stamp_ns`` in ns, without the instrument's latency: in a journal of the instrument's time on the
+        station's clock, in a recording of that clock on the master's; of both in what was merged from a journal.
     stamp_bound_ns
         ``stamp_ns`` is within this of the truth, in ns; null where nobody can say.
     received_ns
@@ -364,7 +365,7 @@ class MotionPrior:
     Attributes
     ----------
     acceleration_sigma_mps2
-        One sigma of the acceleration of the robot's origin along x, y, z of frame ``station1``.
+        One sigma of the acceleration of the prisms' middle (centroid) along x, y, z of frame ``station1``.
     acceleration_time_s
         How long an acceleration lasts in s: after this its correlation has fallen to 1/e.
     angular_acceleration_sigma_radps2

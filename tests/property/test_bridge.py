@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from structlog.testing import capture_logs
 from support.bridge import HELLO, measured
+from support.damage import Damage, damages, examples
 
 from tsgt.simulation.clocks import VirtualClock
 from tsgt.simulation.event_loop import run_virtual
@@ -83,3 +84,45 @@ def test_readings_are_what_can_have_been_measured(
         assert reading.slope_distance_m > 0
         assert reading.received_ns is not None
         assert 0 <= reading.received_ns - reading.at_ns <= OLDEST_NS
+
+
+TRANSCRIPT = [
+    b"".join(
+        json.dumps(record).encode() + b"\n"
+        for record in (
+            HELLO | {"stamps": "arrival"},
+            measured(),
+            measured() | {"type": "status", "status": "tracking"},
+            measured() | {"type": "shot", "id": 1},
+            {"type": "done", "id": 1},
+            {"type": "settings", "prism_constant_m": 0.03, "atmospheric_ppm": 8.0},
+            measured(),
+        )
+    )
+]
+
+
+@examples(60)
+@given(damage=damages, cuts=st.lists(st.integers(0, 2000), max_size=5))
+def test_damaged_output_does_no_harm(damage: Damage, cuts: list[int]) -> None:
+    """What a real program prints, damaged: nothing is raised, and a usable reading can be one."""
+    readings: deque[Reading] = deque()
+    output = damage.to(TRANSCRIPT)
+
+    async def main() -> None:
+        clock = VirtualClock(0)
+        run = BridgeRun("bridge", clock, Stamper(0), readings, Refusals(clock))
+        now_ns = 20 * 10**9
+        run.switch(tracking=1)
+        for begin, end in pairwise(sorted({0, len(output), *(cut for cut in cuts if cut < len(output))})):
+            now_ns += 10**6
+            run.said(output[begin:end], now_ns)
+        run.said(b"\n", now_ns)
+
+    with capture_logs():
+        run_virtual(main)
+    for reading in readings:
+        if reading.status.usable:
+            assert 0 <= reading.horizontal_angle_rad <= 2 * math.pi
+            assert reading.slope_distance_m is not None
+            assert 0 < reading.slope_distance_m < math.inf

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from typing import cast, get_args
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from support.damage import examples
 from support.radios import MS, PAPER
 
 from tsgt.model import Status
@@ -117,7 +118,7 @@ def test_a_station_survives_every_packet(events: list[tuple[bytes, int]]) -> Non
             under_way = None
 
 
-@settings(max_examples=300)
+@examples(300)
 @given(
     turn=st.sampled_from(["poll", "shot", "order", "synchronisation"]),
     answers=st.lists(st.lists(st.tuples(packets, st.integers(54 * MS, 300 * MS)), max_size=3), max_size=60),
@@ -146,7 +147,7 @@ def test_every_turn_ends(turn: str, answers: list[list[tuple[bytes, int]]]) -> N
                 subject.timed_out()
 
 
-@settings(max_examples=300)
+@examples(300)
 @given(data=st.data(), cycles=st.integers(1, 12))
 def test_late_and_lost_packets_never_make_a_wrong_sample(data: st.DataObject, cycles: int) -> None:
     """A station that answers in order, however late, over a link that loses packets: each sample's bounds hold."""

@@ -7,8 +7,9 @@ import itertools
 import re
 
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
+from support.damage import examples
 from support.geocom_line import (
     REQUEST,
     Cable,
@@ -181,7 +182,7 @@ steps = st.lists(
 )
 
 
-@settings(max_examples=200)
+@examples(200)
 @given(script=steps, checksum=st.booleans())
 def test_no_reply_is_taken_for_another(
     script: list[tuple[str, list[Fault], float]],

@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support.chips import Bench
+from support.damage import examples
 from support.radios import PAPER, make_side, running_timeline
 
 from tsgt.simulation.air import Air
@@ -48,7 +49,7 @@ bus_actions = st.one_of(
 )
 
 
-@settings(max_examples=200)
+@examples(200)
 @given(actions=st.lists(bus_actions, min_size=5, max_size=40))
 def test_arbitrary_bus_traffic_never_breaks_the_chip(actions: list[tuple[str, object]]) -> None:
     """Whatever is done to bus and reset, every register still reads, and a reset brings a working chip back."""
@@ -195,7 +196,7 @@ air_actions = st.one_of(
 )
 
 
-@settings(max_examples=150)
+@examples(150)
 @given(actions=st.lists(air_actions, min_size=3, max_size=25))
 def test_arbitrary_packets_never_break_the_driver(actions: list[Sent | OwnPacket]) -> None:
     """After any packets, bursts and collisions the driver receives a good one; what it delivered was sent."""

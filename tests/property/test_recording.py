@@ -5,8 +5,9 @@ import tempfile
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from support.damage import examples
 from support.records import HEADER, PARAMETERS, POINT, POSE, STATUS, measurement, recording_bytes
 
 from tsgt.errors import CorruptLineError, RecordingError
@@ -53,7 +54,7 @@ def test_cut_anywhere_can_be_continued(tmp_path: Path, monkeypatch: pytest.Monke
         assert load_recording(path).measurements[-1] == measurement(7)
 
 
-@settings(max_examples=200)
+@examples(200)
 @given(at=st.integers(0, len(WHOLE) - 2), bits=st.integers(1, 255))
 def test_flipped_byte_is_found_or_harmless(at: int, bits: int) -> None:
     """A flipped byte gives an error with the number of its line, or another valid value."""

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from support.damage import examples
 
 from tsgt.errors import MessageError
 from tsgt.model import Status
@@ -165,7 +166,7 @@ def test_beacons_come_back(beacon: Beacon) -> None:
     assert decode_beacon(encode_beacon(beacon)) == beacon
 
 
-@settings(max_examples=200)
+@examples(200)
 @given(replies | plain_replies)
 def test_replies_come_back(reply: Reply) -> None:
     """What is sent is what is understood, to the last bit of every measurement."""
@@ -185,7 +186,7 @@ def test_every_damaged_beacon_is_refused_or_means_what_it_says(beacon: Beacon, d
         _check_beacon((int.from_bytes(content, "big") ^ 1 << bit).to_bytes(len(content), "big"))
 
 
-@settings(max_examples=50)
+@examples(50)
 @given(replies | plain_replies, st.data())
 def test_every_damaged_reply_is_refused_or_means_what_it_says(reply: Reply, data: st.DataObject) -> None:
     """Cut off anywhere, lengthened, or with a bit flipped: there is one form in bytes for each reply."""
@@ -198,7 +199,7 @@ def test_every_damaged_reply_is_refused_or_means_what_it_says(reply: Reply, data
         _check_reply((int.from_bytes(content, "big") ^ 1 << bit).to_bytes(len(content), "big"))
 
 
-@settings(max_examples=500)
+@examples(500)
 @given(st.binary(max_size=LONGEST_PACKET_BYTES), st.integers(0, 15))
 def test_foreign_packets_break_nothing(content: bytes, start: int) -> None:
     """Whatever comes over the air, also with a beginning like ours, is refused or has one meaning."""

@@ -141,6 +141,13 @@ def test_folders_are_those_of_the_configuration(unit: Path) -> None:
     assert service["RuntimeDirectoryPreserve"] == "yes"
 
 
+@each_unit
+def test_folders_are_for_the_group_only(unit: Path) -> None:
+    """Whoever may open the folder of the sockets could lock it, and keep a daemon from starting."""
+    service = Lines(unit)["Service"]
+    assert service["StateDirectoryMode"] == service["RuntimeDirectoryMode"] == "0750"
+
+
 def test_units_differ_only_in_names() -> None:
     """What is shut away from one daemon is shut away from the other."""
     bodies = {

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import json
+from contextlib import redirect_stderr, redirect_stdout
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
@@ -25,6 +27,17 @@ class Outcome(NamedTuple):
     def json(self) -> Any:
         """Parse what it printed as JSON."""
         return json.loads(self.out)
+
+
+def called(*arguments: object) -> Outcome:
+    """Run ``tsgt`` with the given arguments, in a test that calls it more than once for each of its fixtures."""
+    # Bytes below the text, as a terminal and a pipe have: what cannot be written in UTF-8 fails here, too.
+    out, err = (io.TextIOWrapper(io.BytesIO(), encoding="utf-8", write_through=True) for _ in range(2))
+    with redirect_stdout(out), redirect_stderr(err), pytest.raises(SystemExit) as ending:
+        run(cli, [str(argument) for argument in arguments])
+    assert isinstance(ending.value.code, int)
+    said, complained = (stream.buffer.getvalue().decode() for stream in (out, err))
+    return Outcome(ending.value.code, said, complained)
 
 
 @pytest.fixture

@@ -88,6 +88,15 @@ class Scene:
         return replace(self, parameters=replace(self.parameters, pipeline=pipeline))
 
 
+def counted_from(parameters: Parameters, origin_m: NDArray[np.float64]) -> Parameters:
+    """Return parameters whose robot frame has its origin elsewhere, (3,) in the robot frame that it had."""
+    prisms = tuple(
+        replace(prism, position_m=tuple((np.array(prism.position_m) - origin_m).tolist()))
+        for prism in parameters.prisms
+    )
+    return replace(parameters, prisms=prisms)
+
+
 def standing_scene() -> Scene:
     """Three stations around the origin, each with its own yaw, and a standing robot."""
     return Scene(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from typing import TYPE_CHECKING
 
-from tsgt.errors import InputFileError
+from tsgt.errors import InputFileError, quoted
 from tsgt.model import LAST_INSTANT_NS
 
 if TYPE_CHECKING:
@@ -34,7 +34,9 @@ class Header:
         for name in self.names:
             if name not in known:
                 asked = ", ".join("|".join(alternatives) for alternatives in columns)
-                raise self.error(f"unknown column {name!r}; expected {asked} and maybe {', '.join(optional)}")
+                raise self.error(
+                    f"unknown column {quoted(name)}; expected {asked} and maybe {', '.join(optional)}"
+                )
         for alternatives in (*columns, *([name] for name in optional)):
             found = [name for name in self.names if name in alternatives]
             if len(found) > 1 or (not found and alternatives[0] not in optional):
@@ -66,21 +68,23 @@ class Row:
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise self.error(f"{column} is {self.cells[column]!r}; expected a finite number")
+            raise self.error(f"{column} is {quoted(self.cells[column])}; expected a finite number")
         return value
 
     def positive_integer(self, column: str) -> int:
         """Read a number of a station, a prism or a target."""
         text = self.cells[column]
         if not (text.isascii() and text.isdigit() and 0 < len(text) <= 6 and int(text) > 0):
-            raise self.error(f"{column} is {text!r}; expected a whole number from 1 to 999999")
+            raise self.error(f"{column} is {quoted(text)}; expected a whole number from 1 to 999999")
         return int(text)
 
     def whole(self, column: str) -> int:
         """Read a whole number from 0 on that fits into 64 bits: counts, and times in ns."""
         text = self.cells[column]
         if not (text.isascii() and text.isdigit() and len(text) <= 19 and int(text) <= LAST_INSTANT_NS):
-            raise self.error(f"{column} is {text!r}; expected a whole number from 0 to {LAST_INSTANT_NS}")
+            raise self.error(
+                f"{column} is {quoted(text)}; expected a whole number from 0 to {LAST_INSTANT_NS}"
+            )
         return int(text)
 
     def seconds_ns(self, column: str) -> int:
@@ -92,7 +96,7 @@ class Row:
         except InvalidOperation:
             inside = False
         if not inside:
-            raise self.error(f"{column} is {self.cells[column]!r}; expected a Unix time in s")
+            raise self.error(f"{column} is {quoted(self.cells[column])}; expected a Unix time in s")
         return int(time_s.scaleb(9).to_integral_value())
 
     def angles_rad(self, horizontal: str | None = None, zenith: str | None = None) -> tuple[float, float]:

@@ -33,7 +33,7 @@ def held_out(
     observations
         In the order of time, with the stated noise.
     pipeline
-        How the robot moves if the measurements are too few to tell.
+        How the robot moves if the measurements are too few to tell, and how lively it is at least.
     on_progress
         Called now and then with the share of the work that is done, 0 to 1.
 
@@ -55,7 +55,12 @@ def held_out(
         report(0.5 + 0.5 * done / len(parts))
         done += 1
         motion = motions[fold.number]
-        found = fit(observations.select(fold.kept), prior=motion.prior, noise_scale=motion.noise_scale)
+        found = fit(
+            observations.select(fold.kept),
+            prior=motion.prior,
+            while_hidden=pipeline.motion,
+            noise_scale=motion.noise_scale,
+        )
         return missed_by_trajectory(found.trajectory, observations.select(fold.out))
 
     result: dict[Estimator, HeldOut] = {

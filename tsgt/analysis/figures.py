@@ -41,6 +41,8 @@ STROKES = (
     Stroke("#56B4E9", (0, (3, 1, 1, 1, 1, 1)), "P"),
 )
 
+_DPI = 200
+
 _STYLE: dict[Any, Any] = {
     "font.size": 8,
     "axes.labelsize": 8,
@@ -57,7 +59,7 @@ _STYLE: dict[Any, Any] = {
     "lines.linewidth": 1.2,
     "lines.markersize": 4,
     "legend.frameon": False,
-    "savefig.dpi": 200,
+    "savefig.dpi": _DPI,
     "svg.hashsalt": "tsgt",
     "pdf.fonttype": 42,  # letters stay letters: searchable, and what publishers ask for
 }
@@ -83,7 +85,7 @@ def drawing(*, width_mm: float, height_mm: float) -> Iterator[Figure]:
     except ImportError as error:
         raise MissingExtraError("figures", library="matplotlib", extra="report") from error
     with mpl.rc_context(_STYLE):
-        yield Figure(figsize=(width_mm / 25.4, height_mm / 25.4), layout="constrained")
+        yield Figure(figsize=(width_mm / 25.4, height_mm / 25.4), dpi=_DPI, layout="constrained")
 
 
 def save(figure: Figure, path: Path) -> None:
@@ -98,6 +100,12 @@ def save(figure: Figure, path: Path) -> None:
         raise OutputFileError(f"figures end in {', '.join(FORMATS)}", path=path)
     # Without a date, so that the same numbers give the same file.
     metadata = {".png": None, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}[path.suffix]
+    layout = figure.get_layout_engine()
+    if layout is not None:
+        # All formats have the same layout, and finding it takes as long as drawing; with one left in place,
+        # each file would be drawn twice.
+        layout.execute(figure)
+        figure.set_layout_engine(None)
     try:
         figure.savefig(path, metadata=metadata)
     except OSError as error:

@@ -23,7 +23,7 @@ _UNITS = ("position error (mm)", "rotation error (rad)")
 
 
 def draw_perturbation(
-    study: Sequence[Perturbation], first_order_per_mm: tuple[FloatArray, FloatArray], path: Path
+    study: Sequence[Perturbation], first_order_per_mm: tuple[FloatArray, FloatArray], paths: Sequence[Path]
 ) -> None:
     """Draw mean and spread of the pose's errors over the noise, axis by axis, and of their lengths.
 
@@ -33,13 +33,13 @@ def draw_perturbation(
         What the noises did, in their order.
     first_order_per_mm
         Sigmas of position (m) and rotation (rad) for 1 mm of noise, shape (3,) each.
-    path
-        The file: PNG, PDF or SVG.
+    paths
+        The files: PNG, PDF or SVG.
 
     Raises
     ------
     MissingExtraError, OutputFileError
-        matplotlib is not installed; the file cannot be written.
+        matplotlib is not installed; a file cannot be written.
     """
     noise_mm = np.array([1e3 * each.noise_m for each in study])
     position_mm = 1e3 * np.array(
@@ -74,7 +74,8 @@ def draw_perturbation(
         figure.supxlabel("noise of each prism coordinate, one sigma (mm)", fontsize=8)
         handles, labels = axes[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=3)
-        save(figure, path)
+        for path in paths:
+            save(figure, path)
 
 
 def _band(panel: Axes, noise_mm: FloatArray, mean: FloatArray, std: FloatArray) -> None:

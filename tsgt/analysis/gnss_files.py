@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
-from tsgt.errors import InputFileError
+from tsgt.errors import InputFileError, quoted
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -208,7 +208,9 @@ def _columns(words: Sequence[str], place: _Place) -> _Columns | None:
     first, (coordinates, sexagesimal) = kinds[0]
     system = " ".join(names[:first])
     if system not in get_args(TimeSystem):
-        raise place.error(f"expected the time system GPST, UTC or JST before the columns, got {system!r}")
+        raise place.error(
+            f"expected the time system GPST, UTC or JST before the columns, got {quoted(system)}"
+        )
     names = names[first:]
     if "Q" not in names[3:] or "ns" not in names[3:]:
         raise place.error("names no columns Q and ns; let RTKLIB write them")
@@ -269,7 +271,7 @@ def _geodetic(words: Sequence[str], place: _Place, *, sexagesimal: bool) -> tupl
 def _sexagesimal(words: Sequence[str], place: _Place) -> float:
     degrees, minutes, seconds = (_number(word, place) for word in words)
     if not (0 <= minutes < 60 and 0 <= seconds <= 60):  # seconds are rounded up to 60
-        raise place.error(f"expected degrees, minutes and seconds, got {' '.join(words)!r}")
+        raise place.error(f"expected degrees, minutes and seconds, got {quoted(' '.join(words))}")
     size = abs(degrees) + minutes / 60 + seconds / 3600
     return -size if words[0].startswith("-") else size  # the sign of -0 counts too
 
@@ -287,13 +289,13 @@ def _number(word: str, place: _Place) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise place.error(f"expected a finite number, got {word!r}")
+        raise place.error(f"expected a finite number, got {quoted(word)}")
     return value
 
 
 def _whole(word: str, name: str, largest: int, place: _Place) -> int:
     if not (word.isascii() and word.isdigit() and len(word) < 4 and int(word) <= largest):
-        raise place.error(f"column {name}: expected 0 to {largest}, got {word!r}")
+        raise place.error(f"column {name}: expected 0 to {largest}, got {quoted(word)}")
     return int(word)
 
 
@@ -313,7 +315,9 @@ def _time_ns(words: Sequence[str], place: _Place) -> int:
         week, second = int(found[1]), int(found[2])
         if week <= _LAST_WEEK and second * SECOND_NS < WEEK_NS:
             return GPS_EPOCH_NS + week * WEEK_NS + second * SECOND_NS + _fraction(found[3])
-    raise place.error(f"expected a time (2022/03/14 14:47:49.000, or GPS week and seconds), got {text!r}")
+    raise place.error(
+        f"expected a time (2022/03/14 14:47:49.000, or GPS week and seconds), got {quoted(text)}"
+    )
 
 
 def _fraction(digits: str | None) -> int:

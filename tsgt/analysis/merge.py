@@ -7,6 +7,7 @@ is not added again. So a merge that was killed is simply done once more.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections import defaultdict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
@@ -16,7 +17,7 @@ from tsgt.analysis.merge_runs import Boot, Run, better
 from tsgt.errors import RecordingError
 from tsgt.model import LAST_INSTANT_NS, PolarMeasurement
 from tsgt.recording import RecordingWriter, encode_line, read_lines, write_atomically
-from tsgt.recording.journal import load_journal
+from tsgt.recording.journal import is_only_begun, load_journal
 from tsgt.recording.merged import MergedRecord
 
 if TYPE_CHECKING:
@@ -128,7 +129,8 @@ def merge(
     keep_going
         Skip lines that cannot be read instead of raising.
     on_problem
-        Told of every line that is skipped: a torn last line always, others with ``keep_going``.
+        Told of every line that is skipped: a torn last line always, others with ``keep_going``; and of a journal that was
+        only begun.
 
     Raises
     ------
@@ -136,7 +138,12 @@ def merge(
         A file cannot be read or is another one than it should be, none of the journals belongs to the recording, or
         another program is writing it.
     """
-    paths = list({path.resolve(): path for path in journals}.values())
+    paths = []
+    for path in {path.resolve(): path for path in journals}.values():
+        if not is_only_begun(path):
+            paths.append(path)
+        elif on_problem is not None:
+            on_problem(RecordingError("was only begun and holds nothing; it is passed over", path=path))
     loaded = [load_journal(path, keep_going=keep_going, on_problem=on_problem) for path in paths]
     if output is not None:
         recorded = read_recorded(recording, keep_going=keep_going, on_problem=on_problem)
@@ -258,7 +265,7 @@ def _record(entry: Entry, time: MasterTime, path: Path) -> MergedRecord:
     measurement: PolarMeasurement = dataclasses.replace(
         entry.measurement,
         stamp_ns=time.unix_ns,
-        stamp_sigma_ns=time.sigma_ns,
+        stamp_sigma_ns=round(math.hypot(time.sigma_ns, entry.measurement.stamp_sigma_ns)),
         stamp_bound_ns=time.bound_ns,
         received_ns=time.unix_ns,
     )

@@ -101,10 +101,6 @@ def calibrate_recording(
         raise GeometryError("the recording has no measurements")
     origin_ns = min(measurement.stamp_ns for measurement in recording.measurements)
     observations, _ = build_observations(recording.parameters, recording.measurements, origin_ns=origin_ns)
-    # A robot that tilts swings a far origin about, which no prior on that origin's motion expects. What a layout counts from
-    # is anybody's choice; the prisms are on the robot.
-    middle = observations.layout.mean(axis=0)
-    observations = replace(observations, layout=observations.layout - middle)
     tell = on_progress or (lambda _: None)
 
     def calibrated(some: Observations, title: str) -> MotionCalibration:
@@ -134,7 +130,7 @@ def calibrate_recording(
             before,
             _predicted(observations, parts, {n: (c.setup, c.prior, c.noise_scale) for n, c in found.items()}),
         )
-    return CalibratedRecording(whole, _with_setup(recording.parameters, whole.setup, middle), judgement)
+    return CalibratedRecording(whole, _with_setup(recording.parameters, whole), judgement)
 
 
 def _predicted(
@@ -149,7 +145,9 @@ def _predicted(
     return hold_out(parts, missed_m)
 
 
-def _with_setup(parameters: Parameters, setup: Setup, middle: FloatArray) -> Parameters:
+def _with_setup(parameters: Parameters, calibration: MotionCalibration) -> Parameters:
+    setup = calibration.setup
+    bent_m = setup.layout - calibration.was.layout
     stations = tuple(
         replace(
             station,
@@ -159,7 +157,7 @@ def _with_setup(parameters: Parameters, setup: Setup, middle: FloatArray) -> Par
         for row, station in enumerate(parameters.stations)
     )
     prisms = tuple(
-        replace(prism, position_m=cast("Vector3", tuple(map(float, setup.layout[row] + middle))))
+        replace(prism, position_m=cast("Vector3", tuple(map(float, prism.position_m + bent_m[row]))))
         for row, prism in enumerate(parameters.prisms)
     )
     return replace(parameters, stations=stations, prisms=prisms)

@@ -226,7 +226,7 @@ def draw_bins(figure: Figure, bins: Sequence[tuple[str, Bins | None]]) -> None:
     for column, (label, found) in enumerate(bins):
         above, below = axes[:, column]
         below.set_xlabel(label)
-        if found is None:
+        if found is None or not found.counts.any():  # the logarithmic axis below cannot show nothing
             above.text(0.5, 0.5, "not known", transform=above.transAxes, ha="center", va="center")
             continue
         middle = (found.edges[1:] + found.edges[:-1]) / 2

@@ -31,8 +31,6 @@ def wide(name: str, caption: str, height_mm: float, fill: Callable[[Figure], Non
             fill(figure)
             for path in paths:
                 save(figure, path)
-                # All formats have the same layout, and finding it takes as long as drawing.
-                figure.set_layout_engine("none")
 
     return Plot(name, caption, write)
 

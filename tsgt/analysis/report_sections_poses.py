@@ -227,8 +227,7 @@ def perturbation(f: Findings) -> Section:
         )
 
     def write(paths: Sequence[Path]) -> None:
-        for path in paths:
-            draw_perturbation(noise.study, noise.first_order_per_mm, path)
+        draw_perturbation(noise.study, noise.first_order_per_mm, paths)
 
     caption = (
         "Errors of the pose over noise on the prisms, for this layout: mean and spread per axis, and of the length. Dotted: "

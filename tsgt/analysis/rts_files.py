@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.config import load_prism_layout
-from tsgt.errors import DegenerateGeometryError, InputFileError
+from tsgt.errors import DegenerateGeometryError, InputFileError, quoted
 from tsgt.geometry import check_layout
 from tsgt.model import PrismPosition
 
@@ -179,7 +179,7 @@ def _number(text: str, path: Path, line: int) -> float:
     except ValueError:
         value = float("nan")
     if not np.isfinite(value):
-        raise InputFileError(f"expected a finite number, got {text!r}", path=path, line=line)
+        raise InputFileError(f"expected a finite number, got {quoted(text)}", path=path, line=line)
     return value
 
 
@@ -190,5 +190,5 @@ def _nanoseconds(text: str, path: Path, line: int) -> int:
     except InvalidOperation:
         stamp = Decimal("nan")
     if not stamp.is_finite() or not 0 <= stamp <= Decimal(NS_MAX).scaleb(-9):
-        raise InputFileError(f"expected a Unix time in s, got {text!r}", path=path, line=line)
+        raise InputFileError(f"expected a Unix time in s, got {quoted(text)}", path=path, line=line)
     return int(stamp.scaleb(9).to_integral_value())

@@ -11,10 +11,11 @@ from tsgt.analysis.refusals import believed, check_measured, check_span, why_non
 from tsgt.errors import GeometryError, RecordingError
 from tsgt.geometry import check_layout
 from tsgt.geometry.fit import fit
+from tsgt.geometry.liveliness import CALMEST, at_least
 from tsgt.geometry.tuning import tune
-from tsgt.master.continuous_poses import Seen, continuous_poses
+from tsgt.master.continuous_poses import ContinuousPoses, Seen
 from tsgt.master.observations import build_observations
-from tsgt.master.pose_batch import Kind, PoseBatch
+from tsgt.master.pose_batch import PoseBatch
 from tsgt.master.tracks import measured_at_ns, usable
 
 if TYPE_CHECKING:
@@ -82,8 +83,9 @@ def smoothed(
 ) -> Smoothed:
     """Fit a smooth trajectory to all measurements of a recording.
 
-    How the robot moves is found from the measurements themselves; the recording's own motion parameters, with which the
-    live stream was computed, count only where there are too few of them.
+    How the robot moves is found from the measurements themselves. The recording's own motion parameters, with which the
+    live stream was computed, say how lively it must be taken to be: a third of that at least, and all of that while it is
+    hidden.
 
     Parameters
     ----------
@@ -112,7 +114,13 @@ def smoothed(
     observations, sources = build_observations(parameters, measurements, origin_ns=origin_ns)
     motion = motion_of(observations, parameters.pipeline)
     try:
-        found = fit(observations, prior=motion.prior, noise_scale=motion.noise_scale, on_progress=on_progress)
+        found = fit(
+            observations,
+            prior=motion.prior,
+            while_hidden=parameters.pipeline.motion,
+            noise_scale=motion.noise_scale,
+            on_progress=on_progress,
+        )
     except GeometryError as error:
         raise RecordingError(str(error), path=path) from error
     poses = _poses(found, parameters, measurements, sources, origin_ns)
@@ -122,12 +130,12 @@ def smoothed(
 
 
 def motion_of(observations: Observations, pipeline: PipelineParameters) -> Motion:
-    """Find how the robot moves; where the measurements are too few to tell, as the parameters say."""
+    """Find how the robot moves; where the measurements are too few to tell, and at least about as lively, as the parameters say."""
     try:
         tuned = tune(observations)
     except GeometryError:
         return Motion(pipeline.motion, pipeline.noise_scale, tuned=False)
-    return Motion(tuned.prior, tuned.noise_scale, tuned=True)
+    return Motion(at_least(tuned.prior, pipeline.motion, CALMEST), tuned.noise_scale, tuned=True)
 
 
 def _poses(
@@ -158,9 +166,9 @@ def _poses(
     period_ns = parameters.pipeline.period_ns
     first, last = -(-int(seen.times_ns[0]) // period_ns), int(seen.times_ns[-1]) // period_ns
     epochs_ns = np.arange(first, last + 1, dtype=np.int64) * period_ns
-    chunks = []
+    chunks, poses = [], ContinuousPoses(parameters)
     for start in range(0, max(len(epochs_ns), 1), _EPOCHS_AT_ONCE):
         some_ns = epochs_ns[start : start + _EPOCHS_AT_ONCE]
         states, covariance = found.trajectory.at((some_ns - origin_ns) / 1e9, parts=_POSE)
-        chunks.append(continuous_poses(parameters, Kind.SMOOTHED, some_ns, seen, states, covariance))
+        chunks.append(poses.smoothed(some_ns, seen, states, covariance))
     return PoseBatch.concatenated(chunks)

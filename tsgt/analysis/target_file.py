@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from tsgt.analysis.csv_table import HORIZONTAL, ZENITH, read_table
-from tsgt.errors import InputFileError
+from tsgt.errors import InputFileError, quoted
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -189,7 +189,7 @@ def read_prism_file(path: Path) -> PrismFile:
                 raise row.error(f"body point {name} has another x_m, y_m, z_m further up; keep one of them")
             body.setdefault(name, []).append(_sight(row))
         else:
-            raise row.error(f"kind is {kind!r}; it is prism or body")
+            raise row.error(f"kind is {quoted(kind)}; it is prism or body")
     if not prisms:
         raise InputFileError("holds no prism; add lines of kind prism", path=path)
     if not body:

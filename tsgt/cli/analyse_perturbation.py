@@ -120,7 +120,7 @@ def perturbation_command(
     if figure is not None:
         from tsgt.analysis.figures_perturbation import draw_perturbation  # noqa: PLC0415 (needs an extra)
 
-        draw_perturbation(study, per_mm, figure)
+        draw_perturbation(study, per_mm, [figure])
     if as_json:
         print_json(
             {

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 import click
 
 from tsgt.cli.options import DEFAULT_CLIENT_SOCKET, json_option, path_type
+from tsgt.cli.output import harmless
 from tsgt.cli.status import setting_lines
 from tsgt.errors import InstrumentError, StreamError
 from tsgt.recording import decode, encode_line
-from tsgt.recording.format import Typed
+from tsgt.recording.format import MAX_LINE_BYTES, Typed
 from tsgt.station.requests import Answer, AtmosphereRequest
 
 if TYPE_CHECKING:
@@ -47,8 +48,8 @@ def atmosphere(temperature_c: float, pressure_hpa: float, socket_path: Path, *, 
         click.echo(encode_line(answer))
         return 1 if answer.problem else 0
     if answer.problem:
-        raise InstrumentError(f"{socket_path}: {answer.problem}")
-    lines = [] if answer.settings is None else setting_lines(answer.settings)
+        raise InstrumentError(f"{socket_path}: {harmless(answer.problem)}")
+    lines = [] if answer.settings is None else [*map(harmless, setting_lines(answer.settings))]
     click.echo("\n".join(["set; distances are measured with", *lines] if lines else ["set"]))
     return 0
 
@@ -61,7 +62,7 @@ def _asked(path: Path, request: bytes) -> Answer:
             connection.connect(str(path))
             connection.sendall(request)
             with connection.makefile("rb") as file:
-                status, answer = file.readline(), file.readline()
+                status, answer = file.readline(MAX_LINE_BYTES), file.readline(MAX_LINE_BYTES)
         except TimeoutError as error:
             raise StreamError(
                 f"{path}: no answer within {TIMEOUT_S:g} s; the client is stuck, see its log"

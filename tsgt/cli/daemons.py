@@ -27,9 +27,11 @@ def client(config_path: Path) -> None:
     from tsgt.cli.composition import make_instrument, radio_key, radio_opener  # noqa: PLC0415
     from tsgt.clock import SystemClock, boot_id  # noqa: PLC0415
     from tsgt.config import ClientConfig, load  # noqa: PLC0415
+    from tsgt.config.trust import check_trust  # noqa: PLC0415
     from tsgt.radio.from_config import lora_settings  # noqa: PLC0415
     from tsgt.station.daemon import run_client  # noqa: PLC0415
 
+    check_trust(config_path)
     config = load(config_path, ClientConfig)
     clock = SystemClock()
     settings = lora_settings(config.radio, config_path)
@@ -58,10 +60,14 @@ def master(config_path: Path) -> None:
     from tsgt.cli.composition import radio_key, radio_opener  # noqa: PLC0415
     from tsgt.clock import SystemClock  # noqa: PLC0415
     from tsgt.config import MasterConfig, load, parameters  # noqa: PLC0415
+    from tsgt.config.trust import check_trust  # noqa: PLC0415
     from tsgt.master.daemon import run_master  # noqa: PLC0415
     from tsgt.radio.from_config import lora_settings  # noqa: PLC0415
 
+    check_trust(config_path)
     config = load(config_path, MasterConfig)
+    check_trust(config.setup.station_frames)
+    check_trust(config.setup.prism_layout)
     in_force = parameters(config)
     settings = lora_settings(config.radio, config_path)
     key = radio_key(config.protocol)

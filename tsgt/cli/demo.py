@@ -21,6 +21,7 @@ from tsgt.cli.options import finite, json_option
 from tsgt.cli.output import print_json, require_new_file
 from tsgt.clock import SystemClock, UnixTimeline
 from tsgt.config import ScenarioConfig, load
+from tsgt.config.trust import check_trust
 from tsgt.errors import OutputFileError, StreamError
 from tsgt.log import configure_logging
 from tsgt.service import MAX_SOCKET_PATH_BYTES
@@ -109,6 +110,7 @@ def demo(
     socket_path = socket_path or folder / "poses.sock"
     if len(str(folder.absolute() / "instrument1.sock")) > MAX_SOCKET_PATH_BYTES:
         raise StreamError(f"{folder}: the path is too long for sockets; set TMPDIR to a shorter one")
+    check_trust(folder)  # the daemons would not start, and say so in their logs only
     configure_logging("warning")  # what is worth telling stands in the progress
     # Tried here: that the master cannot open it would only stand in the master's log.
     listener = service.UnixListener(socket_path.absolute(), 0o600)

@@ -11,6 +11,7 @@ import click
 
 from tsgt import service
 from tsgt.cli.options import a_number, keep_going_option, recording_argument, socket_option
+from tsgt.cli.output import harmless
 from tsgt.cli.recordings import report_problem
 from tsgt.cli.render import render
 from tsgt.clock import SystemClock
@@ -18,7 +19,7 @@ from tsgt.errors import RecordingError, StreamError
 from tsgt.master.stream import StreamServer
 from tsgt.master.stream_records import HelloRecord
 from tsgt.recording import decode, encode_line
-from tsgt.recording.format import Typed
+from tsgt.recording.format import MAX_LINE_BYTES, Typed
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -41,7 +42,7 @@ def listen(socket_path: Path, *, as_json: bool, count: int | None) -> None:
             click.echo(f"a line cannot be shown: {error}", err=True)
         else:
             if text is not None:
-                click.echo(text)
+                click.echo(harmless(text))
 
 
 @click.command()
@@ -100,4 +101,9 @@ def _lines(socket_path: Path) -> Iterator[bytes]:
             ) from error
         # A server that gives up on us, because we were too slow at its end, resets the connection.
         with connection.makefile("rb") as file, contextlib.suppress(ConnectionResetError):
-            yield from file
+            while line := file.readline(MAX_LINE_BYTES):
+                if len(line) == MAX_LINE_BYTES and not line.endswith(b"\n"):
+                    raise StreamError(
+                        f"{socket_path}: what it says is no stream of tsgt: a line is longer than {MAX_LINE_BYTES} bytes"
+                    )
+                yield line

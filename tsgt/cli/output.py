@@ -36,6 +36,11 @@ def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         click.echo("  ".join(cells).rstrip())
 
 
+def harmless(text: str) -> str:
+    """Return a line with text from outside as one that only writes to a terminal and does not steer it."""
+    return "".join(sign if sign.isprintable() else "?" for sign in text)
+
+
 def _finite(value: Any) -> Any:
     if isinstance(value, dict):
         return {str(key): _finite(item) for key, item in value.items()}

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
+import shlex
 import shutil
 import sys
 import tempfile
 import time
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 import numpy as np
+from click.core import ParameterSource
 
 from tsgt.analysis.export import tum_lines
 from tsgt.cli.options import finite, json_option
@@ -24,6 +26,7 @@ from tsgt.geometry import quaternion_from_rotation
 from tsgt.log import configure_logging
 from tsgt.recording import write_atomically
 from tsgt.simulation.checkers import Violation, violations
+from tsgt.simulation.faults import CALM_S, QUICK_CYCLES, SETTLE_S, FaultKind, parse_faults
 from tsgt.simulation.options import Options, Outage, Restart
 from tsgt.simulation.scenario import simulate
 from tsgt.simulation.scenario_files import MOST_STATIONS, find_scenario, with_stations
@@ -124,6 +127,19 @@ LISTED_VIOLATIONS = 20
     help="Packets per second of somebody else: noise, and what it has heard, as it was, cut or changed.",
 )
 @click.option(
+    "--faults",
+    "faults_text",
+    metavar="NAMES",
+    default="none",
+    show_default=True,
+    help=f"Let things go wrong, drawn from the seed: all, or names with commas of {', '.join(FaultKind)}.",
+)
+@click.option(
+    "--estimator",
+    type=click.Choice(["linear", "continuous"]),
+    help="How the master makes its poses.  [default: what the scenario says]",
+)
+@click.option(
     "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Another seed, another run."
 )
 @click.option("--output", type=click.Path(path_type=Path), help="Keep the master's recording here.")
@@ -145,6 +161,8 @@ def simulate_command(
     outage_texts: tuple[str, ...],
     restart_texts: tuple[str, ...],
     foreign_per_s: float,
+    faults_text: str,
+    estimator: Any,
     seed: int,
     output: Path | None,
     truth: Path | None,
@@ -169,6 +187,9 @@ def simulate_command(
     scenario = find_scenario(scenario_name)
     if stations is not None:
         scenario = with_stations(scenario, stations)
+    if estimator is not None:
+        pipeline = scenario.pipeline.model_copy(update={"estimator": estimator})
+        scenario = scenario.model_copy(update={"pipeline": pipeline})
     numbers = tuple(station.station for station in scenario.stations)
     for number in numbers:
         if number > LARGEST_NUMBERS[protocol]:
@@ -176,6 +197,7 @@ def simulate_command(
     if loss is not None:
         radio = scenario.radio.model_copy(update={"loss_probability": loss})
         scenario = scenario.model_copy(update={"radio": radio})
+    faults = parse_faults(faults_text)
     options = Options(
         duration_s=scenario.duration_s if duration_s is None else duration_s,
         drift_ppm=drift_ppm,
@@ -185,14 +207,16 @@ def simulate_command(
         node=node,
         protocol=SuperframeMasterConfig(kind="superframe")
         if protocol == "superframe"
-        else ClassicMasterConfig(kind="classic", clock_filter=clock_filter or "regression"),
+        else _classic(clock_filter, often_anew=bool(faults)),
         authenticated=not no_key,
         outages=tuple(Outage.parse(text, numbers) for text in outage_texts),
         restarts=tuple(Restart.parse(text, numbers) for text in restart_texts),
         foreign_per_s=foreign_per_s,
+        faults=faults,
     )
     _check_times(options)
-    configure_logging("error")  # what happens on the way stands in the figures
+    configure_logging("critical" if faults else "error")  # what happens on the way stands in the figures
+    again = _again(click.get_current_context())
     began_s = time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="tsgt-simulate-") as folder:
         run = _simulate(scenario, options, Path(folder))
@@ -203,6 +227,8 @@ def simulate_command(
             "node": node,
             "clock_filter": (clock_filter or "regression") if protocol == "classic" else None,
             "seed": seed,
+            "again": again,
+            "faults": {str(kind): count for kind, count in sorted(run.faults.items())},
             **figures(run),
             "violations": len(found),
             "violations_listed": [f"{v.check}: {v.detail}" for v in found[:LISTED_VIOLATIONS]],
@@ -219,8 +245,35 @@ def simulate_command(
     return CHECK_FAILED if found else 0
 
 
+def _classic(clock_filter: Literal["regression", "paper"] | None, *, often_anew: bool) -> ClassicMasterConfig:
+    """Return the protocol's settings."""
+    config = ClassicMasterConfig(kind="classic", clock_filter=clock_filter or "regression")
+    return config.model_copy(update={"initial_cycles": QUICK_CYCLES}) if often_anew else config
+
+
+def _again(context: click.Context) -> str:
+    """Write the command that gives the same run again, without what it writes."""
+    words = ["tsgt simulate"]
+    for parameter in context.command.params:
+        name, value = parameter.name or "", context.params.get(parameter.name or "")
+        if name in {"output", "truth", "as_json"}:
+            continue
+        if name != "seed" and context.get_parameter_source(name) is not ParameterSource.COMMANDLINE:
+            continue
+        for each in value if isinstance(value, tuple) else (value,):
+            if isinstance(parameter, click.Argument):
+                words.append(shlex.quote(str(each)))
+            else:
+                words += [parameter.opts[0], *([] if each is True else [shlex.quote(str(each))])]
+    return " ".join(words)
+
+
 def _check_times(options: Options) -> None:
     """Refuse what would happen after the end of the run: it would look as if nothing came of it."""
+    if options.faults and options.duration_s < CALM_S + 2 * SETTLE_S:
+        raise click.UsageError(
+            f"--faults needs a --duration of at least {CALM_S + 2 * SETTLE_S:g} s: the last {CALM_S:g} s are without any"
+        )
     starts_s = [("--outage", outage.start_s) for outage in options.outages]
     starts_s += [("--restart", restart.at_s) for restart in options.restarts]
     for option, start_s in starts_s:
@@ -266,10 +319,10 @@ def _keep_recording(run: Run, output: Path) -> None:
 def _write_truth(run: Run, truth: Path) -> None:
     """Write the true poses at the epochs of the stream, from the start to the end of the run."""
     period_ns = run.parameters.pipeline.period_ns
-    stamps_ns = np.arange(
-        -(-run.start_ns // period_ns) * period_ns, run.end_ns + 1, period_ns, dtype=np.int64
-    )
-    poses = run.world.pose_at((stamps_ns - run.start_ns) / 1e9)
+    zero_ns = run.sessions[-1].zero_ns  # on the clock of the recording that is kept
+    end_ns = zero_ns + run.end_ns - run.start_ns
+    stamps_ns = np.arange(-(-zero_ns // period_ns) * period_ns, end_ns + 1, period_ns, dtype=np.int64)
+    poses = run.world.pose_at((stamps_ns - zero_ns) / 1e9)
     columns = (stamps_ns, poses[:, :3, 3], quaternion_from_rotation(poses[:, :3, :3]))
     with write_atomically(truth) as file:
         file.writelines(line.encode() for line in tum_lines(zip(*(c.tolist() for c in columns), strict=True)))
@@ -327,7 +380,11 @@ def _print(result: dict[str, Any], found: list[Violation]) -> None:
     inter_prism_mm = next(iter(result["estimators"].values()))["inter_prism_mean_mm"]
     click.echo(f"\ninter-prism  {_figure(inter_prism_mm, 1)} mm mean error of the distances")
     click.echo(f"\nairtime      {result['airtime_fraction']:.1%} of the time")
+    if result["faults"]:
+        click.echo("faults       " + ", ".join(f"{count} {kind}" for kind, count in result["faults"].items()))
     click.echo(f"violations   {len(found)}")
+    if found:
+        click.echo(f"  again with: {result['again']}")
     for line in result["violations_listed"]:
         click.echo(f"  {line}")
     if len(found) > LISTED_VIOLATIONS:

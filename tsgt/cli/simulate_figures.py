@@ -133,9 +133,9 @@ def _station(run: Run, witness: StationWitness) -> _Station:
             seen.add(true_ns)
             delivery = _Delivery(
                 measured_ns=true_ns,
-                received_ns=measurement.received_ns - run.start_ns,
-                arrived_ns=arrived_ns - run.start_ns,
-                error_ns=measurement.stamp_ns - run.start_ns - true_ns,
+                received_ns=measurement.received_ns - session.zero_ns,
+                arrived_ns=arrived_ns,
+                error_ns=measurement.stamp_ns - session.zero_ns - true_ns,
             )
             deliveries.setdefault(true_ns, delivery)
     measured_ns = [true_ns for true_ns in witness.stamps_ns.values() if true_ns <= end_ns]
@@ -147,7 +147,7 @@ def _counted_from_ns(run: Run, stations: dict[int, _Station]) -> int | None:
     first_ns: dict[int, int] = {}
     for session in run.sessions:
         for clock in session.clocks:
-            first_ns.setdefault(clock.station, clock.stamp_ns - run.start_ns)
+            first_ns.setdefault(clock.station, clock.stamp_ns - session.zero_ns)
     for number, station in stations.items():
         if run.superframe and station.deliveries:
             first_ns[number] = min(delivery.received_ns for delivery in station.deliveries.values())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -62,7 +62,7 @@ def pose_keys(run: Run) -> dict[str, Any]:
 
 def estimator_figures(run: Run) -> dict[Estimator, EstimatorFigures]:
     """Compare what each estimator makes of all that reached the pipeline with the truth."""
-    measurements: list[Measurement] = [m for session in run.sessions for m in session.measurements]
+    measurements = _measurements(run)
     recording = Recording(
         header=RecordingHeader(software="", created_ns=run.start_ns, source="simulate"),
         parameters=run.parameters,
@@ -70,6 +70,20 @@ def estimator_figures(run: Run) -> dict[Estimator, EstimatorFigures]:
         end_ns=max((m.received_ns for m in measurements), default=None),
     )
     return {name: _processed_figures(run, with_estimator(recording, name)) for name in get_args(Estimator)}
+
+
+def _measurements(run: Run) -> list[Measurement]:
+    """Return all measurements as if nobody had set the master's clock between two of its sessions."""
+    found: list[Measurement] = []
+    for session in run.sessions:
+        later_ns = run.start_ns - session.zero_ns
+        found += [
+            replace(m, stamp_ns=m.stamp_ns + later_ns, received_ns=m.received_ns + later_ns)
+            if later_ns
+            else m
+            for m in session.measurements
+        ]
+    return found
 
 
 def _processed_figures(run: Run, recording: Recording) -> EstimatorFigures:
@@ -98,9 +112,13 @@ def live_figures(run: Run) -> dict[Kind, EstimatorFigures]:
     found = {}
     for kind, count in sorted(counts.items()):
         some = [poses.select(poses.kind == kind) for poses in streamed]
-        names = ("stamp_ns", "position_m", "orientation_xyzw", "covariance")
+        stamp_ns = [
+            poses.stamp_ns + run.start_ns - session.zero_ns
+            for session, poses in zip(run.sessions, some, strict=True)
+        ]
+        names = ("position_m", "orientation_xyzw", "covariance")
         columns = (np.concatenate([getattr(poses, name) for poses in some]) for name in names)
-        found[kind] = _pose_figures(run, count, *columns)
+        found[kind] = _pose_figures(run, count, np.concatenate(stamp_ns), *columns)
     return found
 
 
@@ -138,8 +156,7 @@ def _pose_figures(
 
 def _inter_prism_mean_mm(run: Run) -> float:
     """Return the mean over all pairs of how far their interpolated distances are from those of the layout."""
-    measurements = [measurement for session in run.sessions for measurement in session.measurements]
-    tracks = build_tracks(run.parameters, measurements)
+    tracks = build_tracks(run.parameters, _measurements(run))
     if not all(len(track) for track in tracks.values()):
         return math.nan
     pairs = inter_prism(run.parameters, tracks).dynamic

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING
 import click
 
 from tsgt.cli.options import DEFAULT_CLIENT_SOCKET, DEFAULT_SOCKET, path_type
-from tsgt.cli.output import CHECK_FAILED
+from tsgt.cli.output import CHECK_FAILED, harmless
 from tsgt.cli.render import clock_time
 from tsgt.errors import StreamError
 from tsgt.master.stream_records import HelloRecord, StationStatus, StatusRecord
 from tsgt.model import Status
 from tsgt.recording import decode
-from tsgt.recording.format import Typed
+from tsgt.recording.format import MAX_LINE_BYTES, Typed
 from tsgt.station.status import ClientStatus
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ def status(socket_path: Path | None, *, as_json: bool) -> int:
         text, well = client_text(record)
     else:
         text, well = master_text(record)
-    click.echo(line.rstrip() if as_json else "\n".join(text))
+    click.echo(line.rstrip() if as_json else "\n".join(map(harmless, text)))
     return 0 if well else CHECK_FAILED
 
 
@@ -299,13 +299,20 @@ def _lines(path: Path) -> Iterator[bytes]:
             while chunk := connection.recv(65536):
                 *lines, received = (received + chunk).split(b"\n")
                 yield from lines
+                if len(received) > MAX_LINE_BYTES:
+                    break
                 # For the whole, or one that sends something else now and then would hold us for ever.
                 if (left_s := deadline_s - time.monotonic()) <= 0:
                     raise TimeoutError
                 connection.settimeout(left_s)
+            else:
+                return
         except TimeoutError as error:
             raise StreamError(
                 f"{path}: no status within {TIMEOUT_S:g} s; the daemon is stuck, see its log"
             ) from error
         except OSError as error:
             raise StreamError(f"{path}: nobody answers ({error.strerror or error})") from error
+    raise StreamError(
+        f"{path}: what it says is no stream of tsgt: a line is longer than {MAX_LINE_BYTES} bytes"
+    )

@@ -13,6 +13,7 @@ from tsgt.config.base import Model
 from tsgt.config.models import KINDS, Config
 from tsgt.config.setup import PrismLayoutFile, StationFramesFile
 from tsgt.errors import ConfigError
+from tsgt.model import TargetResidual
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -73,6 +74,21 @@ def load_station_latencies(path: Path) -> dict[int, int]:
     }
 
 
+def load_target_residuals(path: Path) -> dict[int, tuple[TargetResidual, ...]]:
+    """Read how well the targets fitted, by station number, of those in the file that have some; raises as :func:`load`."""
+    stations = load(path, StationFramesFile).stations
+    return {
+        int(number): tuple(
+            TargetResidual(
+                target=fit.target, residual_m=_metres(fit.residual_mm), left_out_m=_metres(fit.left_out_mm)
+            )
+            for fit in entry.targets
+        )
+        for number, entry in stations.items()
+        if entry.targets
+    }
+
+
 def load_prism_layout(path: Path) -> dict[int, Vector3]:
     """Read where the prisms sit on the robot, in m, by prism number; raises as :func:`load`."""
     prisms = load(path, PrismLayoutFile).prisms
@@ -84,6 +100,10 @@ def json_schema(kind: str | None = None) -> dict[str, Any]:
     if kind is not None:
         return KINDS[kind].model_json_schema()
     return TypeAdapter[Any](Config).json_schema()
+
+
+def _metres(length_mm: float | None) -> float | None:
+    return None if length_mm is None else length_mm / 1e3
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -15,7 +15,7 @@ class MotionConfig(Model):
     """How the robot moves, as the estimator ``continuous`` expects it; `tsgt process` prints what suits a recording."""
 
     acceleration_sigma_mps2: PerAxis = (0.4, 0.4, 0.2)
-    """One sigma of the acceleration along x, y, z of station 1."""
+    """One sigma of the acceleration of the prisms' middle along x, y, z of station 1."""
     acceleration_time_s: Positive = 0.8
     """How long an acceleration lasts."""
     angular_acceleration_sigma_radps2: PerAxis = (0.15, 0.15, 0.2)

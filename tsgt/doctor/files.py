@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from tsgt.config import ClientConfig, MasterConfig, load, load_any, parameters
 from tsgt.config.radio import SuperframeConfig
 from tsgt.config.setup import PrismLayoutFile, StationFramesFile
+from tsgt.config.trust import check_trust
 from tsgt.doctor.computer import EARLIEST, is_installed, may_write
 from tsgt.doctor.finding import failed, note, ok, skipped
 from tsgt.errors import ConfigError, GeometryError
@@ -49,6 +50,7 @@ VOLATILE = {"tmpfs", "ramfs", "overlay"}
 def check_configuration(path: Path) -> tuple[Finding, Daemon | None]:
     """Tell whether a daemon takes this configuration, and return it."""
     try:
+        check_trust(path)
         content = load_any(path)
         if not isinstance(content, ClientConfig | MasterConfig):
             return failed("configuration", f"{path}: is not the configuration of a client or a master"), None
@@ -138,6 +140,7 @@ def _check_layout(config: MasterConfig) -> None:
 
 def _judge_setup(machine: Machine, name: str, path: Path) -> Finding:
     try:
+        check_trust(path)
         quality = _frames_quality(path) if name == "station_frames" else _layout_quality(path)
         head = path.read_text(encoding="utf-8").partition("\n")[0]
         written_ns = path.stat().st_mtime_ns

@@ -20,7 +20,7 @@ from tsgt.geometry.interpolation import (
     interpolated_covariance,
     unseen_s2,
 )
-from tsgt.geometry.knots import Knots
+from tsgt.geometry.knots import Knots, joined
 from tsgt.geometry.polar import (
     cartesian_jacobian,
     cartesian_to_polar,
@@ -52,7 +52,7 @@ from tsgt.geometry.rigid import (
     transform_from,
     transform_points,
 )
-from tsgt.geometry.trajectory import Trajectory, point_covariance, ros_covariance
+from tsgt.geometry.trajectory import Trajectory, of_point, ros_covariance
 
 __all__ = [
     "NO_GAP_NS",
@@ -77,9 +77,10 @@ __all__ = [
     "interpolate",
     "interpolated_covariance",
     "invert",
+    "joined",
     "log_so3",
     "measurement_covariance",
-    "point_covariance",
+    "of_point",
     "polar_jacobian",
     "polar_to_cartesian",
     "pose_covariance",

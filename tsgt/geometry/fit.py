@@ -16,15 +16,17 @@ import numpy as np
 from tsgt.geometry.continuous import knot_times, nearest, solve
 from tsgt.geometry.first_guess import first_guess
 from tsgt.geometry.knots import joined
+from tsgt.geometry.liveliness import CALMEST, at_least, hidden
+from tsgt.geometry.motion_prior import axis_sigmas
 from tsgt.geometry.trajectory import Trajectory
 from tsgt.geometry.tuning import scaled, tune
+from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from tsgt.geometry.prism_factors import Observations
     from tsgt.geometry.rigid import FloatArray
-    from tsgt.model import MotionPrior
 
 KNOTS_AT_ONCE = 1024
 """About two minutes of 3 stations at 2.5 Hz: their blocks fit into a cache."""
@@ -77,6 +79,7 @@ def fit(
     observations: Observations,
     *,
     prior: MotionPrior | None = None,
+    while_hidden: MotionPrior | None = None,
     noise_scale: float | None = None,
     on_progress: Callable[[float], None] | None = None,
 ) -> Fit:
@@ -88,6 +91,8 @@ def fit(
         In the order of time, with the stated noise of the instruments.
     prior
         How the robot moves; found from the measurements when not given.
+    while_hidden
+        How lively it is at least while fewer than three prisms are seen; no other than ``prior`` when only that is given.
     noise_scale
         By what their stated noise is multiplied; found from the measurements when not given.
     on_progress
@@ -101,10 +106,14 @@ def fit(
     report = on_progress or (lambda _: None)
     if prior is None or noise_scale is None:
         tuned = tune(observations, start=prior, noise_scale=noise_scale, fixed=prior is not None)
-        prior, noise_scale = tuned.prior, tuned.noise_scale
+        noise_scale = tuned.noise_scale
+        if prior is None:
+            prior = at_least(tuned.prior, MotionPrior(), CALMEST)
+            while_hidden = while_hidden or MotionPrior()
     observations = scaled(observations, noise_scale)
     times_s = knot_times(observations.time_s)
     at = nearest(times_s, observations.time_s)
+    sigmas = _sigmas(observations, times_s, prior, while_hidden or prior)
     pieces = _pieces(len(times_s))
     knots, covariances, besides, residuals_m, distances, weights = [], [], [], [], [], []
     for done, piece in enumerate(pieces):
@@ -113,7 +122,8 @@ def fit(
             *np.searchsorted(at, (piece.solved.start, piece.solved.stop)),
         )
         guess = first_guess(observations, times_s[piece.solved])
-        solution = solve(observations.select(rows), guess, prior)
+        between = slice(piece.solved.start, piece.solved.stop - 1)
+        solution = solve(observations.select(rows), guess, prior, sigmas=sigmas[between])
         covariance, beside = solution.factor.marginals()
         inner = slice(piece.kept.start - piece.solved.start, piece.kept.stop - piece.solved.start)
         knots.append(solution.knots.select(inner))
@@ -126,7 +136,7 @@ def fit(
         weights.append(solution.weights[kept])
     report(1.0)
     trajectory = Trajectory(
-        joined(knots), prior, np.concatenate(covariances), np.concatenate(besides)[: len(times_s) - 1]
+        joined(knots), prior, np.concatenate(covariances), np.concatenate(besides)[: len(times_s) - 1], sigmas
     )
     return Fit(
         trajectory,
@@ -136,6 +146,14 @@ def fit(
         np.concatenate(distances),
         np.concatenate(weights),
     )
+
+
+def _sigmas(
+    observations: Observations, times_s: FloatArray, prior: MotionPrior, while_hidden: MotionPrior
+) -> FloatArray:
+    """(K - 1, 6) one sigma of the acceleration of each axis, from knot to knot."""
+    unseen = hidden(observations.time_s, observations.prism, 0.5 * (times_s[:-1] + times_s[1:]))
+    return np.where(unseen[:, None], axis_sigmas(at_least(prior, while_hidden)), axis_sigmas(prior))
 
 
 def _pieces(count: int) -> list[_Piece]:

@@ -7,7 +7,7 @@ parts of axis i are i, 6 + i and 12 + i.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,7 +35,7 @@ class Knots:
     time_s
         (K,) strictly increasing, from the trajectory's origin of time.
     position, velocity, acceleration
-        (K, 3) of the robot's origin in frame ``station1``: m, m/s, m/s^2.
+        (K, 3) of that point of the robot from which its prisms are counted, in frame ``station1``: m, m/s, m/s^2.
     rotation
         (K, 3, 3) ``R_station1_robot``.
     angular_velocity, angular_acceleration
@@ -55,7 +55,15 @@ class Knots:
 
     def select(self, rows: slice | NDArray[np.intp]) -> Knots:
         """Return some of them."""
-        return Knots(*(getattr(self, field.name)[rows] for field in fields(self)))
+        return Knots(
+            self.time_s[rows],
+            self.position[rows],
+            self.rotation[rows],
+            self.velocity[rows],
+            self.angular_velocity[rows],
+            self.acceleration[rows],
+            self.angular_acceleration[rows],
+        )
 
     def moved(self, error: FloatArray) -> Knots:
         """Return the states with errors, shape (K, 18), added."""
@@ -86,7 +94,7 @@ class Knots:
 
 def joined(parts: list[Knots]) -> Knots:
     """Return the states of all parts in their order."""
-    return Knots(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Knots)))
+    return Knots(*(np.concatenate([getattr(part, name) for part in parts]) for name in Knots.__slots__))
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,15 +113,15 @@ class Steps:
     information: FloatArray
 
     @classmethod
-    def of(cls, time_s: FloatArray, prior: MotionPrior) -> Steps:
-        """Make them for K instants."""
+    def of(cls, time_s: FloatArray, prior: MotionPrior, sigmas: FloatArray | None = None) -> Steps:
+        """Make them for K instants; ``sigmas``, (K - 1, 6), are those of the accelerations in each step, if not the prior's."""
         dt_s = np.diff(time_s)[:, None]
         times_s = np.array([prior.acceleration_time_s, prior.angular_acceleration_time_s])
         two_phi, two_information = transition(dt_s, times_s), process_information(dt_s, times_s)
-        weights = 1.0 / axis_sigmas(prior) ** 2
+        weights = (axis_sigmas(prior)[None] if sigmas is None else sigmas) ** -2.0
         return cls(
             np.repeat(two_phi, 3, axis=1),
-            np.repeat(two_information, 3, axis=1) * weights[:, None, None],
+            np.repeat(two_information, 3, axis=1) * weights[:, :, None, None],
         )
 
 

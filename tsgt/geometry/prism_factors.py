@@ -43,7 +43,7 @@ class Observations:
     frames
         (S, 4, 4) ``T_station1_station``.
     layout
-        (P, 3) prisms in the robot frame in m.
+        (P, 3) prisms in m, along the axes of the robot, from the point whose motion is looked for.
     """
 
     time_s: FloatArray

@@ -7,20 +7,21 @@ the last one it predicts, and the covariance grows as it honestly must.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tsgt.geometry.knots import STATE, Knots, joined, spread, turn_between
 from tsgt.geometry.motion_prior import axis_sigmas, between, process_noise, transition
-from tsgt.geometry.rigid import FloatArray, exp_so3, skew
+from tsgt.geometry.rigid import FloatArray, exp_so3, rotate, skew
 from tsgt.geometry.so3 import cross, inverse_right_jacobian, right_jacobian
 
 if TYPE_CHECKING:
     from tsgt.model import MotionPrior
 
-_AT_ONCE = 4096
+_AT_ONCE = 512
+"""What is made of so many instants stays in the cache: a third faster than eight times as many."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,12 +38,15 @@ class Trajectory:
         (K, 18, 18) of the states' errors.
     beside
         (K - 1, 18, 18) covariance of each state's error (rows) with the next one's (columns).
+    sigmas
+        (K - 1, 6) one sigma of the acceleration of each axis in each step, where it is not that of ``prior``.
     """
 
     knots: Knots
     prior: MotionPrior
     covariance: FloatArray
     beside: FloatArray
+    sigmas: FloatArray | None = None
 
     def at(self, time_s: FloatArray, *, parts: int = STATE) -> tuple[Knots, FloatArray]:
         """Return the states at N instants, in any order, and the covariance of their errors.
@@ -146,7 +150,8 @@ class Trajectory:
         by_earlier, by_later = to_error @ by_earlier, to_error @ by_later
         by_earlier[:, 3:6, 9:12] -= turned @ (wander_here[..., None] * skew(here))
         by_earlier[:, 3:6, 3:6] += exp_so3(-found_turn)
-        added = to_error @ spread(left * (axis_sigmas(self.prior) ** 2)[:, None, None])
+        sigmas = axis_sigmas(self.prior)[None] if self.sigmas is None else self.sigmas[later - 1]
+        added = to_error @ spread(left * (sigmas**2)[:, :, None, None])
         mixed = by_earlier @ self.beside[later - 1] @ np.swapaxes(by_later, 1, 2)
         covariance = (
             by_earlier @ self.covariance[later - 1] @ np.swapaxes(by_earlier, 1, 2)
@@ -206,8 +211,34 @@ def ros_covariance(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
     return _symmetric(turned @ covariance[:, :6, :6] @ np.swapaxes(turned, 1, 2))
 
 
-def point_covariance(rotation: FloatArray, covariance: FloatArray, arm: FloatArray) -> FloatArray:
-    """Covariance, (N, 3, 3), of where a point at ``arm`` (3,) in the robot frame is in frame ``station1``, in m^2."""
-    by_error = np.concatenate([np.broadcast_to(np.eye(3), rotation.shape), -rotation @ skew(arm)], axis=2)
-    found: FloatArray = by_error @ covariance[:, :6, :6] @ np.swapaxes(by_error, 1, 2)
-    return found
+def of_point(states: Knots, covariance: FloatArray, arm: FloatArray) -> tuple[Knots, FloatArray]:
+    """Tell the motion of another point of the robot.
+
+    Parameters
+    ----------
+    states
+        N states.
+    covariance
+        Of their errors, (N, 18, 18), or of the first six parts of them.
+    arm
+        (3,) from the point that the states are of to the other one, in the robot frame, in m.
+
+    Returns
+    -------
+    states : Knots
+        Of the other point; the rotation is that of the whole robot.
+    covariance : FloatArray
+        (N, 6, 6) of the errors of its position and of the rotation.
+    """
+    rotation, rate = states.rotation, states.angular_velocity
+    swing = cross(rate, arm)
+    moved = replace(
+        states,
+        position=states.position + rotate(rotation, arm),
+        velocity=states.velocity + rotate(rotation, swing),
+        acceleration=states.acceleration
+        + rotate(rotation, cross(states.angular_acceleration, arm) + cross(rate, swing)),
+    )
+    by_error = np.broadcast_to(np.eye(6), (len(states), 6, 6)).copy()
+    by_error[:, :3, 3:] = -rotation @ skew(arm)
+    return moved, _symmetric(by_error @ covariance[:, :6, :6] @ np.swapaxes(by_error, 1, 2))

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.geometry import FixedLag, check_layout
-from tsgt.master.continuous_poses import Seen, continuous_poses
+from tsgt.geometry import FixedLag, check_layout, joined
+from tsgt.master.continuous_poses import ContinuousPoses, Seen
 from tsgt.master.observations import build_observations
 from tsgt.master.pose_batch import Kind, PoseBatch
 from tsgt.master.tracks import believable, measured_at_ns, usable
@@ -61,6 +61,7 @@ class ContinuousPipeline:
         self._columns = {prism.prism: column for column, prism in enumerate(parameters.prisms)}
         check_layout([prism.position_m for prism in parameters.prisms], names=tuple(self._columns))
         self._stations = {station.station: station for station in parameters.stations}
+        self._poses = ContinuousPoses(parameters)
         self._window = FixedLag(self._limits.motion)
         self._pending: list[Measurement] = []
         none = np.empty(0, np.int64)
@@ -70,6 +71,7 @@ class ContinuousPipeline:
         self._next_epoch_ns: int | None = None
         self._next_smoothed_ns = 0
         self.too_late: Counter[int] = Counter()
+        self._none = PoseBatch.blank(none, tuple(self._columns), Kind.PREDICTED)
 
     def begin_at(self, now_ns: int) -> None:
         """Make poses from an instant on."""
@@ -92,15 +94,18 @@ class ContinuousPipeline:
 
     def advance(self, now_ns: int) -> PoseBatch:
         """Return the poses of all epochs up to now that were not returned before, and those that are smoothed with them."""
-        batches = [PoseBatch.blank(np.empty(0, np.int64), tuple(self._columns), Kind.PREDICTED)]
+        batches: list[PoseBatch] = []
         while self._next_epoch_ns is not None and self._next_epoch_ns <= now_ns:
-            epoch_ns = self._next_epoch_ns
+            epoch_ns, period_ns = self._next_epoch_ns, self._limits.period_ns
             self._take_pending()
-            if epoch_ns // SMOOTHED_EVERY_NS != (epoch_ns - self._limits.period_ns) // SMOOTHED_EVERY_NS:
+            if epoch_ns // SMOOTHED_EVERY_NS != (epoch_ns - period_ns) // SMOOTHED_EVERY_NS:
                 batches.append(self._smoothed_until(epoch_ns - self._limits.lag_ns))
-            batches.append(self._predicted(epoch_ns))
-            self._next_epoch_ns = epoch_ns + self._limits.period_ns
-        return PoseBatch.concatenated(batches)
+            # Up to where the next ones are smoothed they rest on the same.
+            next_smoothing_ns = (epoch_ns // SMOOTHED_EVERY_NS + 1) * SMOOTHED_EVERY_NS
+            due_ns = range(epoch_ns, min(now_ns + 1, next_smoothing_ns), period_ns)
+            batches.append(self._predicted(due_ns))
+            self._next_epoch_ns = due_ns[-1] + period_ns
+        return PoseBatch.concatenated(batches or [self._none])
 
     def next_deadline_ns(self) -> int | None:
         """Return when the next pose is due; None before the first measurement."""
@@ -148,24 +153,28 @@ class ContinuousPipeline:
             seen.unusable_ns,
         )
 
-    def _predicted(self, epoch_ns: int) -> PoseBatch:
-        states: Knots | None = None
-        covariance = _NONE
-        if self._window.following:
-            states, covariance = self._window.predict((epoch_ns - self._origin_ns) / 1e9, parts=_POSE)
-        stamp_ns = np.array([epoch_ns], dtype=np.int64)
-        return continuous_poses(self._parameters, Kind.PREDICTED, stamp_ns, self._seen, states, covariance)
+    def _predicted(self, epochs_ns: range) -> PoseBatch:
+        if not self._window.following:
+            return self._poses.predicted(epochs_ns, self._seen, None, _NONE)
+        found = [
+            self._window.predict((epoch_ns - self._origin_ns) / 1e9, parts=_POSE) for epoch_ns in epochs_ns
+        ]
+        if len(found) == 1:
+            return self._poses.predicted(epochs_ns, self._seen, *found[0])
+        states = joined([state for state, _ in found])
+        covariance = np.concatenate([each for _, each in found])
+        return self._poses.predicted(epochs_ns, self._seen, states, covariance)
 
     def _smoothed_until(self, last_ns: int) -> PoseBatch:
         """Return the smoothed poses of the epochs up to an instant, and let go of what they needed."""
         stamp_ns = np.arange(self._next_smoothed_ns, last_ns + 1, self._limits.period_ns, dtype=np.int64)
         if not len(stamp_ns):
-            return PoseBatch.blank(stamp_ns, tuple(self._columns), Kind.SMOOTHED)
+            return self._none
         states: Knots | None = None
         covariance = _NONE
         if self._window.following:
             states, covariance = self._window.trajectory().at((stamp_ns - self._origin_ns) / 1e9, parts=_POSE)
-        poses = continuous_poses(self._parameters, Kind.SMOOTHED, stamp_ns, self._seen, states, covariance)
+        poses = self._poses.smoothed(stamp_ns, self._seen, states, covariance)
         self._next_smoothed_ns = int(stamp_ns[-1]) + self._limits.period_ns
         self._forget()
         return poses

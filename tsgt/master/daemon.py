@@ -69,6 +69,7 @@ async def run_master(
     key: bytes | None = None,
     random_bits: Callable[[int], int] = secrets.randbits,
     observe: Callable[[object], None] = lambda _record: None,
+    write: Callable[[int, memoryview], int] | None = None,
 ) -> None:
     """Collect, compute, stream and record until cancelled.
 
@@ -90,6 +91,8 @@ async def run_master(
         Returns so many random bits: for nonces.
     observe
         Sees every record that goes out, in their order: for simulations and tests.
+    write
+        See :class:`~tsgt.recording.RecordingWriter`.
 
     Raises
     ------
@@ -101,7 +104,7 @@ async def run_master(
     timeline = UnixTimeline.fixed_now(clock)
     start_ns = timeline.unix_ns(clock.monotonic_ns())
     path = new_recording_path(config.recording.directory, "master", start_ns)
-    with RecordingWriter(path) as writer:
+    with RecordingWriter(path, write=write) as writer:
         recorder = Recorder(writer)
         disk = Disk(recorder)
 

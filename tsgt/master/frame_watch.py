@@ -11,6 +11,7 @@ number of stations that moved as one. docs/how-to/calibrate.md has the figures.
 
 from __future__ import annotations
 
+import bisect
 import math
 import statistics
 from collections import deque
@@ -58,6 +59,11 @@ class _Sample:
     limit_mm: float
     by_station_mm: dict[int, float]
 
+    @property
+    def ratio(self) -> float:
+        """By how many times what is allowed the prisms miss their layout."""
+        return self.residual_mm / self.limit_mm
+
 
 class FrameWatch:
     """Watches how well the prisms fit their layout.
@@ -75,6 +81,7 @@ class FrameWatch:
         self._window_ns = round(settings.window_s * 1e9)
         self._fewest = max(1, math.ceil(WINDOW_FILLED * self._window_ns / period_ns))
         self._samples: deque[_Sample] = deque()
+        self._ratios: list[float] = []  # theirs, in the order of size
         self._suspect = False
 
     def pose(self, record: PoseRecord, now_ns: int) -> list[EventRecord]:
@@ -91,13 +98,14 @@ class FrameWatch:
         shares = {
             share.id: 1e3 * share.residual_m for share in record.stations if share.residual_m is not None
         }
-        self._samples.append(_Sample(record.stamp_ns, 1e3 * record.residual_m, limit_mm, shares))
+        sample = _Sample(record.stamp_ns, 1e3 * record.residual_m, limit_mm, shares)
+        self._samples.append(sample)
+        bisect.insort(self._ratios, sample.ratio)
         while self._samples[0].stamp_ns <= record.stamp_ns - self._window_ns:
-            self._samples.popleft()
+            del self._ratios[bisect.bisect_left(self._ratios, self._samples.popleft().ratio)]
         if len(self._samples) < self._fewest:
             return []
-        ratios = sorted(sample.residual_mm / sample.limit_mm for sample in self._samples)
-        ratio = ratios[len(ratios) // QUARTILE]
+        ratio = self._ratios[len(self._ratios) // QUARTILE]
         if ratio > 1.0 and not self._suspect:
             self._suspect = True
             return [self._alarm(now_ns)]

@@ -178,7 +178,7 @@ class _Station:
             self._hold(message, received_ns)
             return Arrival(doubtful=back)
         # By the clock as it is now: carried back to a time of years ago its bound would excuse anything.
-        stamp_ns, timed = message.time_ns - present.offset_ns, status in (Status.OK, Status.ANGLE_ONLY)
+        stamp_ns, timed = message.time_ns - present.offset_ns, _timed(message)
         possible = self._check.check(
             stamp_ns, requested_ns=requested_ns, received_ns=received_ns, bound_ns=present.bound_ns
         )
@@ -231,8 +231,11 @@ class _Station:
         known = self._offset_ns is not None
         if known and self._doubtful and not self._agrees(newest):
             self._clock.forget()  # the paper's filter would go there a tenth of the way
-        self._heard_ns, self.missed, self._doubtful, self._had_nothing = now_ns, False, False, False
+        missed, self.missed = self.missed, False
+        self._heard_ns, self._doubtful, self._had_nothing = now_ns, False, False
         updated = self._clock.update(samples)
+        if missed and (updated.restarted or not known):
+            self._let_go()
         stepped = updated.restarted and known
         self._offset_ns = newest.station_ns - newest.sent_ns - newest.forward_ns
         # The first, rough offset says when "now" is over there.
@@ -253,6 +256,15 @@ class _Station:
         released = [self._released(message, received_ns, estimate) for message, received_ns in self._held]
         self._held.clear()
         return Synchronised(record, [m for m in released if m is not None], stepped)
+
+    def _let_go(self) -> None:
+        """Forget the times of what is held: its program may have been started again since, with another clock.
+
+        The clock that has been found says nothing of the one before; the station's journal has the measurements.
+        """
+        self._held = deque(
+            ((message, at_ns) for message, at_ns in self._held if not _timed(message)), maxlen=HELD_MEASUREMENTS
+        )
 
     def _agrees(self, sample: ClockSample) -> bool:
         """Whether an exchange is possible with the clock as it is known."""
@@ -283,7 +295,7 @@ class _Station:
         stamp_ns = message.time_ns - present.offset_ns
         if received_ns - 2 * STALE_NS <= stamp_ns <= received_ns + present.bound_ns:
             return self._measurement(message, received_ns)
-        if status_of(message) in (Status.OK, Status.ANGLE_ONLY):
+        if _timed(message):
             return None  # nobody knows when it was; the station's journal has it
         return self._record(message, received_ns, received_ns, UNTIMED_SIGMA_NS)
 
@@ -318,3 +330,8 @@ class _Station:
             raw_status=message.status,
             host_time_ns=message.time_ns,
         )
+
+
+def _timed(message: MeasurementMessage) -> bool:
+    """Whether every node has a time for it: an authors' node has none for its errors."""
+    return status_of(message) in (Status.OK, Status.ANGLE_ONLY)

@@ -78,6 +78,7 @@ class Pipeline:
         self._not_before_ns = 0
         self._next_epoch_ns: int | None = None
         self._started = False
+        self._none = PoseBatch.blank(np.empty(0, np.int64), self._prisms)
 
     def begin_at(self, now_ns: int) -> None:
         """Make no poses for what lies before an instant less the transport limit.
@@ -122,9 +123,9 @@ class Pipeline:
         start = self._next_epoch_ns
         decided = min(self._decided_until_ns(prism, now_ns) for prism in self._prisms)
         if start is None or decided < start:
-            return PoseBatch.blank(np.empty(0, np.int64), self._prisms)
+            return self._none
         epochs = np.arange(start, decided + 1, period, dtype=np.int64)
-        chunks = np.split(epochs, range(_EPOCHS_AT_ONCE, len(epochs), _EPOCHS_AT_ONCE))
+        chunks = [epochs[at : at + _EPOCHS_AT_ONCE] for at in range(0, len(epochs), _EPOCHS_AT_ONCE)]
         poses = PoseBatch.concatenated([self._poses(chunk) for chunk in chunks])
         self._started = True
         self._next_epoch_ns = int(epochs[-1]) + period
@@ -154,7 +155,7 @@ class Pipeline:
         complete_ns = (self._arrivals[station].complete_ns(now_ns) for station in self._trackers[prism])
         known_ns = max(arrived_ns, min(complete_ns, default=0))
         times = self._tracks[prism].times_ns
-        before = int(np.searchsorted(times, known_ns, side="right"))
+        before = int(times.searchsorted(known_ns, side="right"))
         if not before:
             return arrived_ns
         last_ns = int(times[before - 1])
@@ -218,16 +219,14 @@ class Pipeline:
 
     def _fit(self, batch: PoseBatch, rows: NDArray[np.intp], interpolated: Sequence[Interpolated]) -> None:
         """Fit the layout to the prisms at the rows where all of them are known."""
-        points = np.stack([i.points[rows] for i in interpolated], axis=1)
-        velocities = np.stack([i.velocities_mps[rows] for i in interpolated], axis=1)
-        covariances = np.stack(
-            [
-                self._prism_covariance(self._tracks[prism], i, rows)
-                for prism, i in zip(self._prisms, interpolated, strict=True)
-            ],
-            axis=1,
-        )
-        unseen = np.stack([unseen_s2(i.fraction[rows], i.gap_ns[rows]) for i in interpolated], axis=1)
+        shape = len(rows), len(self._prisms)
+        points, velocities = np.empty((2, *shape, 3))
+        covariances, unseen = np.empty((*shape, 3, 3)), np.empty(shape)
+        for column, (prism, between) in enumerate(zip(self._prisms, interpolated, strict=True)):
+            points[:, column] = between.points[rows]
+            velocities[:, column] = between.velocities_mps[rows]
+            covariances[:, column] = self._prism_covariance(self._tracks[prism], between, rows)
+            unseen[:, column] = unseen_s2(between.fraction[rows], between.gap_ns[rows])
         poses = poses_from_prisms(self._layout, points)
         batch.reason[rows[poses.degenerate]] = Reason.DEGENERATE_GEOMETRY
         fitted = ~poses.degenerate

@@ -140,9 +140,10 @@ class PoseBatch:
     @classmethod
     def concatenated(cls, batches: Sequence[PoseBatch]) -> PoseBatch:
         """Join batches in the order given; at least one."""
-        if len(batches) == 1:
-            return batches[0]
-        arrays = {f.name: np.concatenate([getattr(b, f.name) for b in batches]) for f in fields(cls)[:-1]}
+        some = [batch for batch in batches if len(batch)]
+        if len(some) <= 1:
+            return (some or batches)[0]
+        arrays = {f.name: np.concatenate([getattr(b, f.name) for b in some]) for f in fields(cls)[:-1]}
         return cls(**arrays, prisms=batches[0].prisms)
 
     def select(self, rows: NDArray[np.bool_]) -> PoseBatch:
@@ -166,6 +167,8 @@ class PoseBatch:
 
     def records(self) -> Iterable[stream_records.PoseRecord]:
         """Yield each pose as it leaves the program; numbers that were not computed are None."""
+        if not len(self):
+            return
         computed = np.isfinite(self.position_m[:, 0])
         # One conversion to Python numbers per array, not per element.
         rows = zip(

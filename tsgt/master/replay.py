@@ -66,8 +66,7 @@ def replayed(
             elif line.type == "pose" and feed is not None:
                 # One that was not made yet was due by the timer, with nothing arriving any more.
                 missing_poses += 1
-                due_ns = feed.next_deadline_ns()
-                if missing_poses > 0 and due_ns is not None:
+                if missing_poses > 0 and (due_ns := feed.next_deadline_ns()) is not None:
                     poses = [encode_line(pose) for pose in feed.advance(due_ns)]
                     missing_poses -= len(poses)
                     yield due_ns, poses

@@ -40,6 +40,9 @@ _SPACING_NS = 5_000_000_000
 _LARGEST_PAUSE = 20
 """Times that a fruitless turn took: a station that is gone gets a twentieth of the time."""
 
+_OUTAGE_SHARE = 4
+"""A station that is silent for some time is looked for again within a quarter of that time."""
+
 _STUCK_EVERY = 4
 """Every fourth turn of a silent station is a synchronisation, but not among the first."""
 
@@ -142,22 +145,36 @@ class Scheduler:
             )
             station.silent, station.tracks = turn.ok is None, bool(turn.ok) and sure
             station.agreed = bool(turn.ok)
+            if turn.ok is not None:
+                station.silent_since_ns = None
             station.may_answer_ns = now_ns + LATEST_ANSWER_NS if turn.ok is None else 0
             # A refusal costs little and a lost packet a lot: the latter is not multiplied by how often it was refused.
             station.refused = 0 if turn.ok else station.refused + (turn.ok is False)
             station.unanswered = station.unanswered + 1 if turn.ok is None else 0
             failures = station.unanswered if turn.ok is None else station.refused
-            station.not_before_ns = now_ns + _pause_ns(failures, took_ns)
+            pause_ns = _pause_ns(failures, took_ns)
+            station.not_before_ns = now_ns + (
+                self._at_most(station, pause_ns, now_ns) if turn.ok is None else pause_ns
+            )
             return
         station.silent = not turn.answered
+        if turn.answered:
+            station.silent_since_ns = None
         fruitful = turn.answered if isinstance(turn, Poll) else bool(turn.samples)
         station.fruitless = 0 if fruitful else station.fruitless + 1
-        station.not_before_ns = now_ns + _pause_ns(station.fruitless, took_ns)
+        pause_ns = _pause_ns(station.fruitless, took_ns)
+        station.not_before_ns = now_ns + self._at_most(station, pause_ns, now_ns)
         if isinstance(turn, Synchronisation):
             if fruitful:
                 self._synchronised(station, now_ns)
             elif station.synchronisations:  # the clock that is known will do a little longer
                 station.due_ns = now_ns + self._cadence.first_interval_ns
+
+    def _at_most(self, station: _Station, pause_ns: int, now_ns: int) -> int:
+        """Return a pause that is short beside the silence that it follows: outages are mostly as long as they are already."""
+        if station.silent_since_ns is None:
+            station.silent_since_ns = self._began_ns
+        return min(pause_ns, (now_ns - station.silent_since_ns) // _OUTAGE_SHARE)
 
     def resynchronise(self, station: int, now_ns: int) -> None:
         """Synchronise a station before anything else: its clock has been found to be another one.
@@ -219,8 +236,8 @@ class _Station:
     ----------
     tracks
         It has said that it tracks.
-    silent
-        It did not answer last.
+    silent, silent_since_ns
+        It did not answer last; since when, None: it did.
     agreed
         It said so in answer to the last order; see ``tracks``.
     may_answer_ns
@@ -239,6 +256,7 @@ class _Station:
     plan: StationPlan
     tracks: bool = False
     silent: bool = False
+    silent_since_ns: int | None = None
     agreed: bool = False
     may_answer_ns: int = 0
     fruitless: int = 0

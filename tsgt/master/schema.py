@@ -35,6 +35,7 @@ from tsgt.model import (
     PolarMeasurement,
     PrismPosition,
     StationParameters,
+    TargetResidual,
 )
 from tsgt.recording import FORMAT_VERSION, RecordingHeader
 from tsgt.recording.journal import (
@@ -86,6 +87,7 @@ PAGES: dict[Path, tuple[type, ...]] = {
         RecordingHeader,
         Parameters,
         StationParameters,
+        TargetResidual,
         InstrumentNoise,
         PrismPosition,
         PipelineParameters,

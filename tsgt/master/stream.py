@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 
 QUEUE_LINES = 2000
 
+MOST_READERS = 64
+"""More at a time are let go at once: each costs memory, and a file descriptor that the radio may need."""
+
 CLOSE_TIMEOUT_S = 0.5
 """How long readers have, at the end, to take what is waiting for them."""
 
@@ -207,6 +210,10 @@ class _Reader(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.WriteTransport)  # noqa: S101 (asyncio's promise for a stream socket)
         self._transport = transport
+        if len(self._readers) >= MOST_READERS:
+            log.warning("reader_refused", readers=len(self._readers))
+            self.abort()
+            return
         self._transport.write(self._hello + b"\n")
         self._readers.add(self)
         self._changed.set()
@@ -235,6 +242,8 @@ class _Reader(asyncio.Protocol):
         self._changed.set()
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 (a reader may go as it likes)
+        if self not in self._readers:
+            return  # one too many
         self._readers.discard(self)
         self._changed.set()
         log.info("reader_disconnected", readers=len(self._readers))

@@ -7,7 +7,7 @@ measurement stays as it is.
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -67,22 +67,33 @@ class Track:
         A station that has nothing new may send its last measurement again, with the same instant. Which of two
         stations wins must not depend on which came first, or a replay and the desk would differ.
         """
-        names = [field.name for field in fields(Track)]
+        if not len(self) and len(other) <= 1:
+            return other
         joined = Track(
-            **{name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in names}
+            np.concatenate([self.times_ns, other.times_ns]),
+            np.concatenate([self.points_m, other.points_m]),
+            np.concatenate([self.covariances_m2, other.covariances_m2]),
+            np.concatenate([self.time_sigmas_ns, other.time_sigmas_ns]),
+            np.concatenate([self.stations, other.stations]),
         )
-        if np.all(np.diff(joined.times_ns) > 0):
+        if (joined.times_ns[1:] > joined.times_ns[:-1]).all():
             return joined
         ordered = joined.select(np.lexsort((joined.stations, joined.times_ns)))
         return ordered.select(np.unique(ordered.times_ns, return_index=True)[1])
 
     def since(self, time_ns: int) -> Track:
         """Return the part that later epochs need: from the last position before an instant on."""
-        return self.select(slice(max(0, int(np.searchsorted(self.times_ns, time_ns)) - 1), None))
+        return self.select(slice(max(0, int(self.times_ns.searchsorted(time_ns)) - 1), None))
 
     def select(self, rows: slice | NDArray[np.intp]) -> Track:
         """Return the given positions, by a slice or by their indices."""
-        return Track(**{field.name: getattr(self, field.name)[rows] for field in fields(Track)})
+        return Track(
+            self.times_ns[rows],
+            self.points_m[rows],
+            self.covariances_m2[rows],
+            self.time_sigmas_ns[rows],
+            self.stations[rows],
+        )
 
 
 FARTHEST_M = 100_000.0

@@ -1,7 +1,7 @@
 """The file with the key that all radios of a mission share: 64 hexadecimal digits in a line of text.
 
 Nobody but its owner may read it, and its owner is the user who runs the daemon: anything else is refused, as ssh does,
-because nobody would notice it otherwise.
+because nobody would notice it otherwise. Nor may it lie where everybody could put another one into its place.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import secrets
 import stat
 from typing import TYPE_CHECKING
 
+from tsgt.config.trust import check_trust
 from tsgt.errors import ConfigError, OutputFileError
 from tsgt.radio.authentication import KEY_BYTES
 from tsgt.recording.files import sync_folder
@@ -37,13 +38,14 @@ def read_key(path: Path, *, owner: int | None = None) -> bytes:
     Raises
     ------
     ConfigError
-        There is no such file, somebody else may read or write it, it belongs to somebody else, or it is no key.
+        There is no such file, somebody else may read, write or replace it, it belongs to somebody else, or it is no key.
     """
     try:
         # A pipe must not be waited for.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         try:
             check_access(path, os.fstat(descriptor), os.geteuid() if owner is None else owner)
+            check_trust(path, user=owner)
             content = os.read(descriptor, _MOST_BYTES)
         finally:
             os.close(descriptor)

@@ -21,6 +21,7 @@ from tsgt.radio.messages import (
 )
 from tsgt.radio.order_codec import order_part
 from tsgt.radio.orders import MeasureOrder, SearchOrder
+from tsgt.radio.reply_packing import NARROW_AGE_NS
 from tsgt.radio.rhythm import Beat, Rhythm
 
 if TYPE_CHECKING:
@@ -245,6 +246,16 @@ class Peer:
         """Return the full number of the first measurement of a reply; 0 where there is none."""
         return self._newest(reply.runs[0], reply) if reply.runs else 0
 
+    def may_be_older(self, reply: Reply, at: Reception) -> bool:
+        """Tell whether a reply has come so late that a time in it may be 2.1 s older than it looks.
+
+        A station tells by the start of its slot whether a measurement is too old for a narrow run. What leaves much later,
+        because its computer stood still or somebody held it back, may have grown too old meanwhile; or it has been made
+        meanwhile. Nobody can tell, and it will be sent again.
+        """
+        oldest_us = self._session_us(at.slot_ns) - NARROW_AGE_NS // 1000 - LATEST_US
+        return any(self._newest_us(run, at) - _span_us(run) >= oldest_us for run in reply.runs)
+
     def take(self, reply: Reply, at: Reception) -> Heard:
         """Take a reply that is known to be this station's.
 
@@ -364,10 +375,7 @@ class Peer:
 
     def _timed(self, run: Run, newest_number: int, prism: int, at: Reception) -> list[TimedSighting]:
         newest = run.sightings[0]
-        span_us = TIME_UNIT_US << (WIDE_TIME_BITS if run.wide else TIME_BITS)
-        end_us = self._session_us(at.slot_ns + max(at.lateness_ns, 0)) + LATEST_US
-        origin_us = self._session_us(at.sent_ns) if run.direct else 0
-        newest_us = end_us - (end_us - origin_us - TIME_UNIT_US * newest.time) % span_us
+        newest_us = self._newest_us(run, at)
         claimed_ns = 1000 * quality_bound_us(run.quality)
         if run.direct:  # a beacon that somebody held back makes its reply late by as much
             usual_ns = 2 * (self._trip.link_ns - self._trip.nominal_ns)
@@ -396,8 +404,19 @@ class Peer:
             )
         return timed
 
+    def _newest_us(self, run: Run, at: Reception) -> int:
+        """Return the newest time of a run; narrow ones repeat, and it is the last before the reply has begun."""
+        end_us = self._session_us(at.slot_ns + max(at.lateness_ns, 0)) + LATEST_US
+        origin_us = self._session_us(at.sent_ns) if run.direct else 0
+        return end_us - (end_us - origin_us - TIME_UNIT_US * run.sightings[0].time) % _span_us(run)
+
     def _session_us(self, monotonic_ns: int) -> int:
         return (monotonic_ns - self._zero_ns + 500) // 1000
+
+
+def _span_us(run: Run) -> int:
+    """Return after how long a run's times repeat."""
+    return TIME_UNIT_US << (WIDE_TIME_BITS if run.wide else TIME_BITS)
 
 
 def _is_plain(run: Run) -> bool:

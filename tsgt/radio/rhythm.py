@@ -100,10 +100,11 @@ def _beat(times_us: list[int]) -> Beat | None:
         for number, time in zip(numbers, times_us, strict=True)
     ]
     fit = _line(points)
-    limit_us = max(_OUTLYING * median(_misses(points, fit)), _LEAST_OUTLYING_US)
-    kept = [point for point, miss in zip(points, _misses(points, fit), strict=True) if miss <= limit_us]
+    misses = _misses(points, fit)
+    limit_us = max(_OUTLYING * median(misses), _LEAST_OUTLYING_US)
+    kept = [point for point, miss in zip(points, misses, strict=True) if miss <= limit_us]
     phase_us, period_us = fit = _line(kept)
-    spread_us = fmean(miss * miss for miss in _misses(kept, fit)) ** 0.5
+    spread_us = fmean([miss * miss for miss in _misses(kept, fit)]) ** 0.5
     if spread_us > LARGEST_SPREAD * period_us:
         return None
     return Beat(period_us, times_us[-1] + phase_us, spread_us)
@@ -116,8 +117,8 @@ def _misses(points: list[tuple[int, float]], fit: tuple[float, float]) -> list[f
 
 def _line(points: list[tuple[int, float]]) -> tuple[float, float]:
     """Return value at number 0, and slope."""
-    middle, mean = fmean(number for number, _ in points), fmean(time for _, time in points)
-    slope = sum((number - middle) * (time - mean) for number, time in points) / sum(
-        (number - middle) ** 2 for number, _ in points
+    middle, mean = fmean([number for number, _ in points]), fmean([time for _, time in points])
+    slope = sum([(number - middle) * (time - mean) for number, time in points]) / sum(
+        [(number - middle) ** 2 for number, _ in points]
     )
     return mean - slope * middle, slope

@@ -287,20 +287,20 @@ class SuperframeMaster:
             return None
         slot_ns = sent_ns - TX_DONE_NS + span.start_ns
         airtime_ns = self._timing.airtime_ns(len(payload))
-        heard = frame.open.pop(index).take(
-            reply,
-            Reception(
-                counter=frame.counter,
-                sent_ns=sent_ns,
-                sent_sigma_ns=frame.sent_sigma_ns,
-                slot_ns=slot_ns,
-                received_ns=received_ns,
-                received_sigma_ns=sigma_ns,
-                lateness_ns=received_ns - slot_ns - airtime_ns - self._timing.reception_ns,
-                payload_bytes=len(payload),
-                granted_bytes=span.reply_bytes,
-            ),
+        at = Reception(
+            counter=frame.counter,
+            sent_ns=sent_ns,
+            sent_sigma_ns=frame.sent_sigma_ns,
+            slot_ns=slot_ns,
+            received_ns=received_ns,
+            received_sigma_ns=sigma_ns,
+            lateness_ns=received_ns - slot_ns - airtime_ns - self._timing.reception_ns,
+            payload_bytes=len(payload),
+            granted_bytes=span.reply_bytes,
         )
+        if frame.open[index].may_be_older(reply, at):
+            return None
+        heard = frame.open.pop(index).take(reply, at)
         if self._lock is not None:
             self._lock.answered(index)
             for sighting in heard.sightings:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from tsgt.errors import CorruptLineError, RecordingError
 from tsgt.model import PolarMeasurement, Status, check_finite, check_instants
-from tsgt.recording.format import RecordingHeader, decode_line
+from tsgt.recording.format import HEADER_START, MAX_LINE_BYTES, RecordingHeader, decode_line
 from tsgt.recording.reader import read_lines
 
 if TYPE_CHECKING:
@@ -219,6 +219,22 @@ class Journal:
     def station(self) -> int:
         """Number of the station."""
         return self.head.station
+
+
+def is_only_begun(path: Path) -> bool:
+    """Tell whether a program has ended between making a journal and its first lines: it is empty, or ends in its head.
+
+    Raises
+    ------
+    RecordingError
+        The file cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            first, second = (file.readline(MAX_LINE_BYTES) for _ in range(2))
+    except OSError as error:
+        raise RecordingError(f"cannot be read ({error.strerror})", path=path) from error
+    return (HEADER_START.startswith(first) or first.startswith(HEADER_START)) and not second.endswith(b"\n")
 
 
 def load_journal(

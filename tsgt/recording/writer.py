@@ -22,6 +22,7 @@ from tsgt.recording.format import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
 
@@ -36,6 +37,9 @@ class RecordingWriter:
     path
         A new file, or a recording that is to be continued. Every session begins with a header line and a
         parameters line, which the caller writes.
+    write
+        Hands bytes to the kernel, None: :func:`os.write`; another one for simulations, whose disks fill up and whose programs are
+        killed in the middle of a line.
 
     Attributes
     ----------
@@ -50,8 +54,9 @@ class RecordingWriter:
         It is a recording of another version.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, write: Callable[[int, memoryview], int] | None = None) -> None:
         self._path = path
+        self._write_bytes = write
         self._sync_lock = threading.Lock()  # a sync may be under way in a thread when the owner closes
         self._unsynced = True
         try:
@@ -131,8 +136,9 @@ class RecordingWriter:
         rest = memoryview(data)
         try:
             # Once round, unless the disk fills up within the line: then the second round says so.
+            write = self._write_bytes or os.write
             while rest:
-                rest = rest[os.write(self._fd, rest) :]
+                rest = rest[write(self._fd, rest) :]
         except OSError:
             self._torn_at = size
             with suppress(OSError):  # a failing disk may refuse that too; the next line tries again

@@ -22,6 +22,7 @@ from tsgt.simulation.chip_memory import (
     FIRST_PAGED,
     READ_ONLY,
     REG_IMAGE_CAL,
+    REGISTERS,
     ChipMemory,
 )
 from tsgt.simulation.chip_modem import ChipTiming, Modem
@@ -105,6 +106,10 @@ class SX1276Chip:
             warn=self._warn,
             timing=self._timing,
         )
+        self._measured: dict[int, Callable[[], int]] = {
+            Register.RSSI_VALUE: self._modem.rssi_register,
+            Register.RSSI_WIDEBAND: self._modem.random_byte,
+        }
         self._address: int | None = None  # of the next data byte; None before the address byte
         self._writing = False
         self._selected = False
@@ -115,6 +120,7 @@ class SX1276Chip:
         self._oscillator_ns = timeline.now_ns()
         self._pll_locked_ns = timeline.now_ns()
         self._fsk_page = True
+        self._booting = False
         self._watched: dict[int, list[Callable[[int, bool], None]]] = {}
         self._levels: dict[int, bool] = {}
         self._writers: list[Callable[[int], None] | None] = [None] * 0x80
@@ -133,8 +139,10 @@ class SX1276Chip:
         """NSS falls: an access begins."""
         self._selected = True
         self._address = None
-        if self._timeline.now_ns() < self._booted_ns:
-            self._warn("SPI access within 5 ms after the end of a reset")
+        if self._booting:
+            self._booting = self._timeline.now_ns() < self._booted_ns
+            if self._booting:
+                self._warn("SPI access within 5 ms after the end of a reset")
 
     def deselect(self) -> None:
         """NSS rises: the access is over."""
@@ -162,7 +170,7 @@ class SX1276Chip:
     def transfer(self, data: bytes) -> bytes:
         """Exchange bytes in one window of NSS."""
         self.select()
-        answer = bytes(map(self.exchange, data))
+        answer = self._access(data) if self._well(data) else bytes(map(self.exchange, data))
         self.deselect()
         return answer
 
@@ -184,6 +192,7 @@ class SX1276Chip:
                 self._warn("NRESET low for less than 100 us")
             self._reset_since_ns = None
             self._booted_ns = now_ns + BOOT_NS
+            self._booting = True
 
     def dio(self, n: int) -> bool:
         """Level of DIO0 to DIO5 at this moment."""
@@ -235,11 +244,8 @@ class SX1276Chip:
     def _read(self, address: int) -> int:
         if self._fsk_page and FIRST_PAGED <= address < FIRST_AFTER_PAGED:
             return self._memory.fsk[address]
-        if address == Register.RSSI_VALUE:
-            return self._modem.rssi_register()
-        if address == Register.RSSI_WIDEBAND:
-            return self._modem.random_byte()
-        return self._memory.lora[address]
+        measured = self._measured.get(address)
+        return self._memory.lora[address] if measured is None else measured()
 
     def _write(self, address: int, value: int) -> None:
         if self._fsk_page and FIRST_PAGED <= address < FIRST_AFTER_PAGED:
@@ -253,20 +259,52 @@ class SX1276Chip:
         else:
             writer(value)
 
+    def _well(self, data: bytes) -> bool:
+        """Whether an access needs no look at every byte: to the LoRa page of a chip that works, not beyond its end."""
+        return not (
+            self._fsk_page
+            or self._hung
+            or self._reset_since_ns is not None
+            or self._dead_bus_level is not None
+            or (data[0] & ~reg.WRITE) + len(data) > REGISTERS
+        )
+
+    def _access(self, data: bytes) -> bytes:
+        """Do at once what :meth:`exchange` does byte by byte."""
+        address, count = data[0] & ~reg.WRITE, len(data) - 1
+        if address == Register.FIFO:
+            return b"\0" + self._access_fifo(count, data[1:] if data[0] >= reg.WRITE else None)
+        if data[0] >= reg.WRITE:
+            before = bytearray(1)
+            for register, byte in enumerate(data[1:], address):
+                before.append(self._read(register))
+                self._write(register, byte)
+            return bytes(before)
+        end = address + count
+        answer = bytearray(1) + self._memory.lora[address:end]
+        if address <= Register.RSSI_WIDEBAND and end > Register.RSSI_VALUE:
+            for register, measured in self._measured.items():
+                if address <= register < end:
+                    answer[1 + register - address] = measured()
+        return bytes(answer)
+
     def _exchange_fifo(self, byte: int) -> int:
-        """Read or write where RegFifoAddrPtr points, and move it on."""
+        return self._access_fifo(1, bytes([byte]) if self._writing else None)[0]
+
+    def _access_fifo(self, count: int, written: bytes | None) -> bytes:
+        """Read or write where RegFifoAddrPtr points, and move it on; return what was there."""
         lora = self._memory.lora
         op_mode = lora[Register.OP_MODE]
         if not op_mode & reg.LONG_RANGE_MODE or not op_mode & reg.MODE_MASK:
             self._warn("FIFO access in SLEEP or FSK mode")
-            return 0x00
+            return bytes(count)
         pointer = lora[Register.FIFO_ADDR_PTR]
-        value = self._memory.fifo[pointer]
+        before = self._memory.read_fifo(pointer, count)
         if not self._hung:
-            if self._writing:
-                self._memory.fifo[pointer] = byte
-            lora[Register.FIFO_ADDR_PTR] = (pointer + 1) % FIFO_BYTES
-        return value
+            if written is not None:
+                self._memory.write_fifo(pointer, written)
+            lora[Register.FIFO_ADDR_PTR] = (pointer + count) % FIFO_BYTES
+        return before
 
     def _write_op_mode(self, value: int) -> None:
         """Change mode by the rule of facts/radio.md 3.1: LongRangeMode changes in SLEEP only."""

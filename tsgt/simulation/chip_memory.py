@@ -15,7 +15,8 @@ FIRST_AFTER_PAGED = 0x40
 REG_IMAGE_CAL = 0x3B
 """RegImageCal of the FSK page: bit 6 starts a calibration, bit 5 tells that it runs."""
 
-_REGISTERS = 0x80
+REGISTERS = 0x80
+"""How many addresses there are."""
 
 # Data sheet table 41 and section 6.4; those that it calls reserved are as drivers have found them
 # (facts/radio.md 2.1, 2.2).
@@ -84,16 +85,16 @@ class ChipMemory:
     """
 
     def __init__(self) -> None:
-        self.lora = bytearray(_REGISTERS)
-        self.fsk = bytearray(_REGISTERS)
+        self.lora = bytearray(REGISTERS)
+        self.fsk = bytearray(REGISTERS)
         self.fifo = bytearray(FIFO_BYTES)
         self.frf = 0
         self.reset()
 
     def reset(self) -> None:
         """Set everything as it is after power-on; the FIFO keeps what chance left in it."""
-        self.lora[:] = bytes(_REGISTERS)
-        self.fsk[:] = bytes(_REGISTERS)
+        self.lora[:] = bytes(REGISTERS)
+        self.fsk[:] = bytes(REGISTERS)
         for address, value in (_COMMON_RESET | _LORA_RESET).items():
             self.lora[address] = value
         for address, value in _FSK_RESET.items():
@@ -116,10 +117,15 @@ class ChipMemory:
 
     def read_fifo(self, start: int, length: int) -> bytes:
         """Copy bytes out of the FIFO, whose addresses wrap."""
-        return bytes((self.fifo + self.fifo)[start : start + length])
+        end = start + length
+        return bytes(self.fifo[start:end] if end <= FIFO_BYTES else (self.fifo + self.fifo)[start:end])
 
     def write_fifo(self, start: int, data: bytes) -> int:
         """Copy bytes into the FIFO and return the address after the last."""
-        for address, byte in enumerate(data, start):
-            self.fifo[address % FIFO_BYTES] = byte
-        return (start + len(data)) % FIFO_BYTES
+        end = start + len(data)
+        if end <= FIFO_BYTES:
+            self.fifo[start:end] = data
+        else:
+            for address, byte in enumerate(data, start):
+                self.fifo[address % FIFO_BYTES] = byte
+        return end % FIFO_BYTES

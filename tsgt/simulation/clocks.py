@@ -49,6 +49,10 @@ class VirtualClock:
         """Sleep on the event loop; an instant that has passed still lets other tasks run once."""
         await asyncio.sleep(max(0, monotonic_ns - self.monotonic_ns()) / 1e9)
 
+    def step(self, by_ns: int) -> None:
+        """Set the Unix clock, as an operator or NTP does; CLOCK_MONOTONIC goes on. Positive: forward."""
+        self._unix_at_zero_ns += by_ns
+
     def local_ns(self, true_ns: int) -> int:
         """Return the same: this clock is the truth."""
         return true_ns
@@ -111,6 +115,11 @@ class DriftingClock:
     def step(self, by_ns: int) -> None:
         """Set the Unix clock, as an operator or NTP does; CLOCK_MONOTONIC goes on. Positive: forward."""
         self._offset_ns += by_ns
+
+    def warm(self, by_ppm: float) -> None:
+        """Run faster by so much from now on, in 1e-6."""
+        now_ns, ppm = self._true.monotonic_ns(), self._stretches[-1].ppm + by_ppm
+        self._stretches.append(_Stretch(now_ns, self.local_ns(now_ns), ppm))
 
     def local_ns(self, true_ns: int) -> int:
         """Return what CLOCK_MONOTONIC shows at a true time, both in nanoseconds."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from tsgt.errors import StreamError
 from tsgt.simulation.air_server import AirServer
-from tsgt.simulation.mission import scenario_link
+from tsgt.simulation.mission_configs import scenario_link
 from tsgt.simulation.processes import Process
 from tsgt.simulation.pty_line import PtyLine
 from tsgt.simulation.timeline import LoopTimeline

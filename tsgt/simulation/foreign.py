@@ -43,7 +43,12 @@ class ForeignRadio:
 
     async def run(self, open_radio: OpenRadio) -> None:
         """Listen and send until cancelled."""
-        async with open_radio() as radio, asyncio.TaskGroup() as group:
+        async with open_radio() as radio:
+            await self.use(radio)
+
+    async def use(self, radio: Radio) -> None:
+        """Listen and send with a radio that is open, until cancelled."""
+        async with asyncio.TaskGroup() as group:
             group.create_task(self._listen(radio))
             group.create_task(self._send(radio))
 

@@ -148,10 +148,15 @@ class LogDistanceLoss:
             if name not in self.positions_m:
                 raise ValueError(f"radio {name!r} has no position in the link model")
         distance_m = math.dist(self.positions_m[sender], self.positions_m[receiver])
-        pair = "\0".join(sorted((sender, receiver)))
-        shadowing_db = self.shadowing_sigma_db * normal(uniforms(self.seed, "shadowing", pair)[0])
+        shadowing_db = self.shadowing_sigma_db * _shadowing(self.seed, *sorted((sender, receiver)))
         over_distance_db = path_loss_db(distance_m, frequency_hz, self.exponent)
         return over_distance_db + shadowing_db - 2 * self.antenna_gain_db
+
+
+@lru_cache(maxsize=1024)
+def _shadowing(seed: int, one: str, other: str) -> float:
+    """Return the shadowing between two radios, their names in order, in its sigmas."""
+    return normal(uniforms(seed, "shadowing", f"{one}\0{other}")[0])
 
 
 @dataclass(kw_only=True, slots=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,18 +22,19 @@ from tsgt.recording import decode
 from tsgt.simulation.air import Air
 from tsgt.simulation.authors_node import AuthorsNode
 from tsgt.simulation.clocks import DriftingClock, VirtualClock, ramped
+from tsgt.simulation.computer import Computer
 from tsgt.simulation.foreign import ForeignRadio
-from tsgt.simulation.link import LinkModel, LogDistanceLoss
 from tsgt.simulation.mission_configs import (
     STATUS_SOCKET,
     client_config,
     instrument_config,
     master_config,
     radio_config,
+    scenario_link,
     station_name,
 )
 from tsgt.simulation.options import MASTER
-from tsgt.simulation.radios import HostDelay, StampJitter, opener
+from tsgt.simulation.radios import StampJitter, opener
 from tsgt.simulation.serial_line import SimulatedLine
 from tsgt.simulation.total_station import SimulatedTotalStation
 from tsgt.simulation.witness import Session, StationWitness, WatchedInstrument
@@ -45,9 +47,8 @@ if TYPE_CHECKING:
     from collections.abc import Coroutine
 
     from tsgt.config import ScenarioConfig
-    from tsgt.config.scenario import ScenarioRadioConfig, SimulatedStation
+    from tsgt.config.scenario import SimulatedStation
     from tsgt.radio.base import OpenRadio
-    from tsgt.simulation.clocks import SimulatedClock
     from tsgt.simulation.options import Options, Outage
     from tsgt.simulation.timeline import Timeline
     from tsgt.simulation.world import World
@@ -89,8 +90,16 @@ class Mission:
     ----------
     world
         The truth; its time is the true time.
-    clocks, instruments, lines
-        The stations' clocks, total stations, and the cables between, by station number; they outlive the clients.
+    clock
+        The master's.
+    computers
+        By the names of their daemons.
+    instruments, lines, prisms
+        The total stations, their cables, and the prisms that they are to follow, by station number.
+    warming
+        Numbers of the stations whose crystals get warmer, or colder, at the moment.
+    superframe
+        Whether that protocol is spoken.
     sessions
         What the master sent out, one entry for each time that it was started.
     witnesses
@@ -109,33 +118,37 @@ class Mission:
         self._scenario = scenario
         self._options = options
         self._folder = folder
-        self._clock = VirtualClock(START_UNIX_NS)
+        self._true = VirtualClock(START_UNIX_NS)
+        self.clock = VirtualClock(START_UNIX_NS)
         self._settings = lora_settings(
             radio_config(scenario, MASTER, folder), Path(f"scenario {scenario.name}")
         )
         numbers = [s.station for s in scenario.stations]
         names = [MASTER, *map(station_name, numbers)]
-        self._rngs = dict(zip(names, [master_rng, *station_rngs], strict=True))
-        self._jitter_rngs = dict(zip(names, jitter_rngs, strict=True))
+        rngs = dict(zip(names, [master_rng, *station_rngs], strict=True))
         authenticated = options.authenticated and isinstance(options.protocol, SuperframeMasterConfig)
         self._key = key_rng.bytes(_KEY_BYTES) if authenticated else None
-        self._tasks: dict[str, asyncio.Task[None]] = {}
         self.parameters = scenario_parameters(scenario)
         until_s = options.duration_s + 2 * DRAIN_S
         self.world: World = scenario_world(scenario, until_s, world_rng)
         self._places = {station_name(s.station): s.position_m for s in scenario.stations}
         self._places[FOREIGN] = _FOREIGN_PLACE_M
         self.air = Air(timeline, air_rng, scenario_link(scenario.radio, self._places, air_rng))
-        # A Pi has no battery clock: it wakes up in the past.
-        self.clocks = {
-            number: self._station_clock(number, offset_ns=-int(clock_rng.integers(3 * _YEAR_NS)))
-            for number in numbers
-        }
         self._timeline = timeline
+        # A Pi has no battery clock: it wakes up in the past.
+        clocks: list[VirtualClock | DriftingClock] = [self.clock]
+        clocks += [self._station_clock(n, offset_ns=-int(clock_rng.integers(3 * _YEAR_NS))) for n in numbers]
+        self.computers = {
+            name: Computer(name, clock, self.air, self._settings, rngs[name], self._jitter(jitter_rng))
+            for name, clock, jitter_rng in zip(names, clocks, jitter_rngs, strict=True)
+        }
         self.instruments = {s.station: self._instrument(s) for s in scenario.stations}
         self.lines = {number: self._line(number) for number in numbers}
         self._boots = dict.fromkeys(numbers, 1)
         self.sessions: list[Session] = []
+        self.prisms = {s.station: s.prism for s in scenario.stations}
+        self.warming: set[int] = set()
+        self.superframe = isinstance(options.protocol, SuperframeMasterConfig)
         self.witnesses = {
             number: StationWitness(
                 number,
@@ -151,7 +164,7 @@ class Mission:
         drift_ppm, ramp_ppm_per_min = sign * options.drift_ppm, sign * options.drift_ramp_ppm_per_min
         steps = ramped(drift_ppm, ramp_ppm_per_min, round((options.duration_s + 2 * DRAIN_S) * 1e9))
         return DriftingClock(
-            self._clock,
+            self._true,
             offset_ns=offset_ns,
             drift_ppm=drift_ppm,
             drift_steps=steps if ramp_ppm_per_min else (),
@@ -159,14 +172,16 @@ class Mission:
         )
 
     def _instrument(self, entry: SimulatedStation) -> SimulatedTotalStation:
-        rng = self._rngs[station_name(entry.station)].spawn(1)[0]
+        rng = self._computer(entry.station).rng.spawn(1)[0]
         return SimulatedTotalStation(
             self._entry(entry.station), self._scenario, self.world, self._timeline, rng
         )
 
     def _line(self, station: int) -> SimulatedLine:
         name = f"{station_name(station)}'s cable"
-        return SimulatedLine(self.instruments[station], self._timeline, self.clocks[station], name=name)
+        return SimulatedLine(
+            self.instruments[station], self._timeline, self._computer(station).clock, name=name
+        )
 
     def _entry(self, station: int) -> SimulatedStation:
         """Return what the scenario says of a station; the authors' instrument calls their node at once."""
@@ -176,13 +191,20 @@ class Mission:
         model = entry.instrument.model_copy(update={"processing_min_ms": 0.0, "processing_max_ms": 1.0})
         return entry.model_copy(update={"instrument": model})
 
+    def _jitter(self, rng: np.random.Generator) -> StampJitter | None:
+        sigma_ns = round(self._options.stamp_jitter_us * 1e3)
+        return StampJitter(sigma_ns, rng) if sigma_ns else None
+
+    def _computer(self, station: int) -> Computer:
+        return self.computers[station_name(station)]
+
     def _index(self, station: int) -> int:
         return [s.station for s in self._scenario.stations].index(station)
 
     @property
     def now_s(self) -> float:
         """The true time, from the start."""
-        return self._clock.monotonic_ns() / 1e9
+        return self._true.monotonic_ns() / 1e9
 
     async def until(self, time_s: float) -> None:
         """Let it run until then; the robot's radio moves with the robot.
@@ -195,9 +217,11 @@ class Mission:
         while self.now_s < time_s:
             self._places[MASTER] = tuple(self.world.pose_at(np.array([self.now_s]))[0, :3, 3].tolist())
             step_s = min(1.0, time_s - self.now_s)
-            ended, _ = await asyncio.wait(
-                self._tasks.values(), timeout=step_s, return_when=asyncio.FIRST_EXCEPTION
-            )
+            tasks = [computer.task for computer in self.computers.values() if computer.task is not None]
+            if not tasks:  # all of them are away
+                await asyncio.sleep(step_s)
+                continue
+            ended, _ = await asyncio.wait(tasks, timeout=step_s, return_when=asyncio.FIRST_EXCEPTION)
             errors = [
                 error
                 for task in ended
@@ -205,29 +229,32 @@ class Mission:
             ]
             if errors:
                 raise ExceptionGroup("a daemon has ended", errors)
+            await asyncio.sleep(0)  # one that was killed is about to be taken away
 
     async def sleep_until(self, time_s: float) -> None:
         """Return at a true time, from the start; for whoever acts beside the daemons."""
-        await self._clock.sleep_until(round(time_s * 1e9))
+        await self._true.sleep_until(round(time_s * 1e9))
 
     def start_master(self) -> None:
         """Start the master, with a recording of its own."""
         folder = self._folder / f"master{len(self.sessions)}"
-        session = Session(folder, self._clock.realtime_ns)
+        zero_ns = self.clock.realtime_ns() - self.clock.monotonic_ns()
+        session = Session(folder, self._true.monotonic_ns, zero_ns)
         self.sessions.append(session)
         config = master_config(self._scenario, self._options, folder)
         folder.mkdir()
-        self._start(
-            MASTER,
+        computer = self.computers[MASTER]
+        computer.start(
             run_master(
                 config,
                 self.parameters,
                 self._settings,
-                open_radio=self._opener(MASTER, self._clock, HostDelay()),
-                clock=self._clock,
+                open_radio=computer.radio(),
+                clock=self.clock,
                 key=self._key,
                 random_bits=self._random_bits,
                 observe=session.take,
+                write=computer.new_program(),
             ),
         )
 
@@ -235,70 +262,99 @@ class Mission:
         """Start a station's client, with a journal of its own beside the earlier ones, or the authors' node."""
         entry = self._entry(station)
         authors = self._options.node == "authors"
-        self._start(station_name(station), self._authors_node(entry) if authors else self._client(entry))
+        self._computer(station).start(self._authors_node(entry) if authors else self._client(entry))
 
-    def start_foreign(self) -> None:
-        """Let somebody else use the channel."""
-        radio = ForeignRadio(self._clock, self._foreign_rng, self._options.foreign_per_s)
-        self._rngs[FOREIGN] = self._foreign_rng
-        self._start(FOREIGN, radio.run(self._opener(FOREIGN, self._clock)))
+    async def be_foreign(self) -> None:
+        """Use the channel as somebody else, until cancelled."""
+        radio = ForeignRadio(self._true, self._foreign_rng, self._options.foreign_per_s)
+        await radio.run(self.stranger(FOREIGN))
+
+    def stranger(self, name: str, gain_db: float = 0.0, sync_word: int | None = None) -> OpenRadio:
+        """Return what opens a radio that does not belong to the mission.
+
+        Parameters
+        ----------
+        name
+            Its own.
+        gain_db
+            By how much everybody hears it better than from its place.
+        sync_word
+            That of its packets; None: the mission's.
+        """
+        self._places[name] = _FOREIGN_PLACE_M
+        for other in self.computers:
+            self.air.link.attenuate(name, other, -gain_db)
+        settings = self._settings if sync_word is None else replace(self._settings, sync_word=sync_word)
+        return opener(self.air, name, self._true, self._foreign_rng, settings)
 
     def _random_bits(self, count: int) -> int:
         return int.from_bytes(self._bits_rng.bytes(-(-count // 8))) >> -count % 8
 
-    def _opener(self, name: str, clock: SimulatedClock, delay: HostDelay | None = None) -> OpenRadio:
-        jitter = None
-        if self._options.stamp_jitter_us and name in self._jitter_rngs:
-            jitter = StampJitter(round(self._options.stamp_jitter_us * 1e3), self._jitter_rngs[name])
-        return opener(self.air, name, clock, self._rngs[name], self._settings, delay, jitter)
-
     def _client(self, entry: SimulatedStation) -> Coroutine[None, None, None]:
         station = entry.station
-        witness, clock = self.witnesses[station], self.clocks[station]
+        witness, computer = self.witnesses[station], self._computer(station)
+        clock = computer.clock
         folder = self._folder / station_name(station)
         folder.mkdir(exist_ok=True)
         unix_at_zero_ns = clock.realtime_ns() - clock.monotonic_ns()
 
         def watch(reading: Reading) -> None:
             witness.stamps_ns[unix_at_zero_ns + reading.at_ns] = clock.true_ns(reading.at_ns)
+            witness.read_ns[unix_at_zero_ns + reading.at_ns] = self._true.monotonic_ns()
 
         return run_client(
             client_config(self._scenario, entry, self._options, folder),
             self._settings,
             instrument=WatchedInstrument(self._driver(entry), watch),
-            open_radio=self._opener(station_name(station), clock, HostDelay()),
+            open_radio=computer.radio(),
             clock=clock,
             key=self._key,
             random_bits=self._random_bits,
             boot=f"{station_name(station)}-{self._boots[station]}",
+            write=computer.new_program(),
         )
 
     def _driver(self, entry: SimulatedStation) -> LeicaInstrument:
         config = instrument_config(entry, self._folder / station_name(entry.station))
-        return LeicaInstrument(config, self.lines[entry.station].open, self.clocks[entry.station])
+        return LeicaInstrument(config, self.lines[entry.station].open, self._computer(entry.station).clock)
 
     async def _authors_node(self, entry: SimulatedStation) -> None:
         station = entry.station
-        witness, clock, rng = self.witnesses[station], self.clocks[station], self._rngs[station_name(station)]
+        witness, computer = self.witnesses[station], self._computer(station)
+        clock = computer.clock
 
         def watch(_reading: Reading) -> None:
-            witness.stamps_ns[clock.realtime_ns()] = self._clock.monotonic_ns()  # stamped on arrival
+            witness.stamps_ns[clock.realtime_ns()] = self._true.monotonic_ns()  # stamped on arrival
 
         instrument = WatchedInstrument(self._driver(entry), watch)
-        async with self._opener(station_name(station), clock)() as radio:
-            await AuthorsNode(station, radio, clock, instrument, entry.prism, rng).run()
-
-    def _start(self, name: str, daemon: Coroutine[None, None, None]) -> None:
-        self._tasks[name] = asyncio.create_task(daemon, name=name)
+        async with computer.radio(slow=False)() as radio:
+            await AuthorsNode(station, radio, clock, instrument, entry.prism, computer.rng).run()
 
     async def kill(self, name: str) -> None:
-        """End a daemon (``master``, ``station1``, ...) in the middle of whatever it does."""
+        """End a daemon (``master``, ``station1``, ...) in the middle of whatever it does, as systemd does."""
         await self._ask(name)
-        task = self._tasks.pop(name)
-        task.cancel()
-        await asyncio.wait([task])
-        if not task.cancelled() and (error := task.exception()) is not None:
-            raise error
+        await self.computers[name].end()
+
+    async def crash(self, name: str, *, away_s: float) -> None:
+        """Kill a daemon as ``kill -9`` does, and start it again; nothing happens to one that is away already."""
+        computer = self.computers[name]
+        if computer.away:
+            return
+        computer.away = True
+        await computer.crash()
+        if name == MASTER:
+            self.sessions[-1].crashed = True
+        else:
+            self._excuse(computer)
+        await asyncio.sleep(away_s)
+        computer.away = False
+        self._start_again(name)
+
+    def _excuse(self, computer: Computer) -> None:
+        """Note that what a client has read before it was ended need not be on its disk."""
+        now_ns = self._true.monotonic_ns()
+        witness = self.witnesses[self._station(computer.name)]
+        witness.crashed_ns.append((computer.disk.unwritten_since_ns(now_ns), now_ns))
 
     async def _ask(self, name: str) -> None:
         """Note what a client says of itself, as people ask it; the authors' node says nothing."""
@@ -314,24 +370,40 @@ class Mission:
         await self.sleep_until(at_s)
         await self.kill(MASTER if station is None else station_name(station))
         await self.sleep_until(at_s + RESTART_S)
-        if station is None:
+        self._start_again(MASTER if station is None else station_name(station))
+
+    def _start_again(self, name: str) -> None:
+        if name == MASTER:
             self.start_master()
         else:
-            self.start_station(station)
+            self.start_station(self._station(name))
+
+    def _station(self, name: str) -> int:
+        return next(number for number in self.witnesses if station_name(number) == name)
 
     async def reboot(self, station: int, at_s: float, off_s: float) -> None:
         """Switch a station's computer off, and on again: its clocks begin anew, where its files end."""
         await self.sleep_until(at_s)
-        await self.kill(station_name(station))
-        unix_ns = self.clocks[station].realtime_ns()
+        computer = self._computer(station)
+        if computer.away:
+            return
+        computer.away = True
+        await self.kill(computer.name)
+        self._excuse(computer)
+        unix_ns = computer.clock.realtime_ns()
         await self.sleep_until(at_s + off_s)
-        now_ns = self._clock.monotonic_ns()
-        self.clocks[station] = self._station_clock(
-            station, offset_ns=unix_ns - START_UNIX_NS, booted_ns=now_ns
-        )
+        computer.away = False
+        now_ns = self._true.monotonic_ns()
+        computer.clock = self._station_clock(station, offset_ns=unix_ns - START_UNIX_NS, booted_ns=now_ns)
         self.lines[station] = self._line(station)
         self._boots[station] += 1
         self.start_station(station)
+
+    def stream_socket(self) -> Path:
+        """Return the socket of the master that runs, or ran last."""
+        return master_config(
+            self._scenario, self._options, self._folder / f"master{len(self.sessions) - 1}"
+        ).stream.socket
 
     async def interrupt(self, outage: Outage) -> None:
         """Put a hill between the master and some stations, and take it away."""
@@ -343,23 +415,6 @@ class Mission:
 
     async def end(self) -> None:
         """End everything that still runs: the master first, so that no station seems lost to it."""
-        for name in [MASTER, *[name for name in self._tasks if name != MASTER]]:
-            if name in self._tasks:
+        for name in self.computers:
+            if self.computers[name].task is not None:
                 await self.kill(name)
-
-
-def scenario_link(
-    radio: ScenarioRadioConfig, places: dict[str, tuple[float, float, float]], rng: np.random.Generator
-) -> LinkModel:
-    """Make what lies between the radios of a scenario; ``places`` by radio, in m, may change meanwhile."""
-    return LinkModel(
-        path_loss=LogDistanceLoss(
-            positions_m=places,
-            exponent=radio.path_loss_exponent,
-            shadowing_sigma_db=radio.shadowing_sigma_db,
-            antenna_gain_db=radio.antenna_gain_db,
-            seed=int(rng.integers(2**31)),
-        ),
-        rayleigh_fading=radio.rayleigh_fading,
-        loss_probability=radio.loss_probability,
-    )

@@ -14,14 +14,17 @@ from tsgt.config.radio import (
     SuperframeConfig,
 )
 from tsgt.simulation.authors_node import AUTHORS_STAMP_DELAY_MS
+from tsgt.simulation.link import LinkModel, LogDistanceLoss
 from tsgt.simulation.options import MASTER
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    import numpy as np
+
     from tsgt.config import ScenarioConfig
     from tsgt.config.client import Baud
-    from tsgt.config.scenario import SimulatedStation
+    from tsgt.config.scenario import ScenarioRadioConfig, SimulatedStation
     from tsgt.simulation.options import Options
 
 STATUS_SOCKET = "client.sock"
@@ -104,4 +107,21 @@ def instrument_config(entry: SimulatedStation, port: Path) -> LeicaInstrumentCon
         prism_constant_mm=0.0,
         latency_ms=model.processing_min_ms,
         angle_delay_ms=model.angle_delay_ms,
+    )
+
+
+def scenario_link(
+    radio: ScenarioRadioConfig, places: dict[str, tuple[float, float, float]], rng: np.random.Generator
+) -> LinkModel:
+    """Make what lies between the radios of a scenario; ``places`` by radio, in m, may change meanwhile."""
+    return LinkModel(
+        path_loss=LogDistanceLoss(
+            positions_m=places,
+            exponent=radio.path_loss_exponent,
+            shadowing_sigma_db=radio.shadowing_sigma_db,
+            antenna_gain_db=radio.antenna_gain_db,
+            seed=int(rng.integers(2**31)),
+        ),
+        rayleigh_fading=radio.rayleigh_fading,
+        loss_probability=radio.loss_probability,
     )

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from tsgt.config.radio import SuperframeMasterConfig
 from tsgt.errors import ConfigError
+from tsgt.simulation.faults import FaultKind  # noqa: TC001
 
 if TYPE_CHECKING:
     from tsgt.config.radio import ClassicMasterConfig
@@ -128,6 +129,8 @@ class Options:
         What goes wrong.
     foreign_per_s
         How many packets a second somebody else sends on the same channel, on average.
+    faults
+        Kinds of faults that are drawn from the seed.
     """
 
     duration_s: float
@@ -143,3 +146,4 @@ class Options:
     outages: tuple[Outage, ...] = ()
     restarts: tuple[Restart, ...] = ()
     foreign_per_s: float = 0.0
+    faults: frozenset[FaultKind] = frozenset()

@@ -11,7 +11,7 @@ from tsgt.simulation.chip import SX1276Chip
 from tsgt.simulation.hal import SimulatedHal
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator
+    from collections.abc import AsyncGenerator, Callable
 
     import numpy as np
 
@@ -59,6 +59,19 @@ class HostDelay(NamedTuple):
         return round(self.wake_median_ms * 1e6 * math.exp(self.wake_sigma * rng.standard_normal()))
 
 
+class RadioHardware(NamedTuple):
+    """What is behind an open radio.
+
+    Attributes
+    ----------
+    chip, hal
+        The chip, and the host's bus and pins.
+    """
+
+    chip: SX1276Chip
+    hal: SimulatedHal
+
+
 class StampJitter(NamedTuple):
     """What a host's stamps of its radio's interrupts are off by.
 
@@ -101,15 +114,26 @@ def simulated_radio(
     jitter
         Of the host's stamps; None: they are as good as the chip.
     """
+    return SX127x(_hardware(air, name, timeline, clock, rng, jitter).hal, clock)
+
+
+def _hardware(
+    air: Air,
+    name: str,
+    timeline: Timeline,
+    clock: SimulatedClock,
+    rng: np.random.Generator,
+    jitter: StampJitter | None,
+) -> RadioHardware:
     chip = SX1276Chip(timeline, lambda antenna: air.join(antenna, name), rng)
     if jitter is None:
-        return SX127x(SimulatedHal(chip, local_ns=clock.local_ns), clock)
+        return RadioHardware(chip, SimulatedHal(chip, local_ns=clock.local_ns))
 
     def stamped_ns(true_ns: int) -> int:
         return clock.local_ns(true_ns) + round(jitter.sigma_ns * jitter.rng.standard_normal())
 
     sigma_ns = round(math.hypot(CHIP_SIGMA_NS, jitter.sigma_ns))
-    return SX127x(SimulatedHal(chip, stamp_sigma_ns=sigma_ns, local_ns=stamped_ns), clock)
+    return RadioHardware(chip, SimulatedHal(chip, stamp_sigma_ns=sigma_ns, local_ns=stamped_ns))
 
 
 def opener(
@@ -120,6 +144,7 @@ def opener(
     settings: LoRaSettings,
     host_delay: HostDelay | None = None,
     jitter: StampJitter | None = None,
+    on_open: Callable[[RadioHardware], None] = lambda _: None,
 ) -> OpenRadio:
     """Return what opens a radio on the air, as a daemon does; it can be opened again after it was closed.
 
@@ -131,11 +156,15 @@ def opener(
         Of the modem.
     host_delay
         The time that the host takes before it sends; None: none, as virtual hosts are.
+    on_open
+        Told each time what is behind the radio.
     """
 
     @asynccontextmanager
     async def open_radio() -> AsyncGenerator[Radio]:
-        radio = simulated_radio(air, name, air.timeline, clock, rng, jitter)
+        hardware = _hardware(air, name, air.timeline, clock, rng, jitter)
+        on_open(hardware)
+        radio = SX127x(hardware.hal, clock)
         try:
             await radio.start(settings)
             yield radio if host_delay is None else _SlowHost(radio, clock, host_delay, rng)

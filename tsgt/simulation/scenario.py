@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import math
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from tsgt.config.radio import SuperframeMasterConfig
 from tsgt.simulation.event_loop import run_virtual
+from tsgt.simulation.fault_acts import act, see_to_instruments
+from tsgt.simulation.faults import CALM_S, draw_faults
+from tsgt.simulation.memory import overgrown
 from tsgt.simulation.mission import DRAIN_S, START_UNIX_NS, Mission
 from tsgt.simulation.timeline import VirtualTimeline
 
@@ -18,9 +24,14 @@ if TYPE_CHECKING:
 
     from tsgt.config import ScenarioConfig
     from tsgt.model import Parameters
+    from tsgt.simulation.faults import FaultKind
     from tsgt.simulation.options import Options, Outage
     from tsgt.simulation.witness import Session, StationWitness
     from tsgt.simulation.world import World
+
+
+MEMORY_CHECK_S = 60
+"""How often the memory of the daemons is looked at."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +56,14 @@ class Run:
         Whether that protocol was spoken.
     outages
         When who did not hear whom.
+    faults
+        How many of each kind there were.
+    calm_s
+        When they were over, in s from the start; None: there were none.
+    rate_hz
+        How often each instrument measures, by station number.
+    overgrown
+        What was longer in memory than it should be.
     start_ns
         Unix time of the start on the master's clock, in ns.
     """
@@ -57,6 +76,10 @@ class Run:
     airtime_s: float
     superframe: bool
     outages: tuple[Outage, ...] = ()
+    faults: Counter[FaultKind] = field(default_factory=Counter)
+    calm_s: float | None = None
+    rate_hz: dict[int, float] = field(default_factory=dict)
+    overgrown: tuple[str, ...] = ()
     start_ns: int = START_UNIX_NS
 
     @property
@@ -98,28 +121,38 @@ def simulate(
         for station in scenario.stations:
             mission.start_station(station.station)
         mission.start_master()
-        if options.foreign_per_s:
-            mission.start_foreign()
+        faults = draw_faults(
+            options.faults,
+            np.random.default_rng([options.seed, 0xFA]),  # whatever else is drawn
+            duration_s=options.duration_s,
+            stations=list(mission.witnesses),
+        )
         acts = [
             *([script(mission)] if script is not None else []),
             *(mission.interrupt(outage) for outage in options.outages),
             *(mission.restart(restart.station, restart.at_s) for restart in options.restarts),
+            *(act(mission, fault) for fault in faults),
+            *([mission.be_foreign()] if options.foreign_per_s else []),
+            *([see_to_instruments(mission, options.duration_s - CALM_S)] if faults else []),
         ]
-        acting = [asyncio.create_task(act) for act in acts]
+        acting = [asyncio.create_task(each) for each in acts]
+        grown: set[str] = set()
         try:
             for second in range(1, math.ceil(options.duration_s) + 1):
                 await mission.until(min(second, options.duration_s))
                 progress(mission.now_s)
+                if second % MEMORY_CHECK_S == 0:
+                    grown.update(overgrown())
             airtime_s = mission.air.airtime_ns / 1e9
             await mission.until(options.duration_s + DRAIN_S)
             if script is not None:
                 await acting[0]
-            for act in acting:
-                if act.done():
-                    act.result()
+            for acted in acting:
+                if acted.done():
+                    acted.result()
         finally:
-            for act in acting:
-                act.cancel()
+            for acted in acting:
+                acted.cancel()
             await asyncio.gather(*acting, return_exceptions=True)
             await mission.end()
         return Run(
@@ -131,6 +164,10 @@ def simulate(
             airtime_s=airtime_s,
             superframe=isinstance(options.protocol, SuperframeMasterConfig),
             outages=options.outages,
+            faults=Counter(fault.kind for fault in faults),
+            calm_s=options.duration_s - CALM_S if faults else None,
+            rate_hz={station.station: station.rate_hz for station in scenario.stations},
+            overgrown=tuple(sorted(grown)),
         )
 
-    return run_virtual(run, timeline)
+    return run_virtual(run, timeline, alone=True)

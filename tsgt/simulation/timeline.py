@@ -76,7 +76,8 @@ class VirtualTimeline:
         itself advance the time; what it jumps over is called on the way.
         """
         heap = self._heap
-        until_ns = max(until_ns, self._now_ns)
+        if until_ns < self._now_ns:
+            until_ns = self._now_ns
         while heap and heap[0][0] <= until_ns:
             at_ns, _, event = heapq.heappop(heap)
             callback = event.callback
@@ -84,9 +85,11 @@ class VirtualTimeline:
                 self._cancelled -= 1
                 continue
             event.callback = None
-            self._now_ns = max(at_ns, self._now_ns)
+            if at_ns > self._now_ns:
+                self._now_ns = at_ns
             callback()
-        self._now_ns = max(until_ns, self._now_ns)
+        if until_ns > self._now_ns:
+            self._now_ns = until_ns
 
     def _sweep(self) -> None:
         """Forget cancelled events, so that time-outs which never expire do not pile up."""

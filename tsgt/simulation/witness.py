@@ -5,7 +5,6 @@ from __future__ import annotations
 from array import array
 from collections import Counter
 from dataclasses import dataclass, field, fields
-from hashlib import blake2b
 from typing import TYPE_CHECKING, get_args
 
 import numpy as np
@@ -27,6 +26,8 @@ if TYPE_CHECKING:
     from tsgt.station.instrument import Atmosphere, Condition, Instrument, Reading
     from tsgt.station.status import ClientStatus
 
+
+_HEAD_LINES = 2
 
 _KINDS: tuple[Kind, ...] = get_args(Kind)
 
@@ -79,25 +80,34 @@ class Session:
     folder
         Where the master keeps its recording, the only file there.
     now_ns
-        Tells the Unix time in ns.
+        Tells the true time, in ns from the start of the run.
+    zero_ns
+        What the master's Unix clock showed at the start of the run, in ns, as it stands now: somebody may have set it.
 
     Attributes
     ----------
     measurements, clocks, statuses
         The records of these types.
     arrived_ns
-        When each of the measurements was handed out, Unix time in ns.
+        When each of the measurements was handed out, true time in ns from the start.
     poses
         How many poses, valid or not, by kind.
     frames, framed_ns
         How many frames there have been from the first beacon to the last, and how long they took.
-    digest
-        Hash of all lines.
+    lines
+        Hash of each line.
+    crashed
+        Whether it was killed.
+    number
+        Of the session in its last beacon; None: there was none.
     """
 
-    def __init__(self, folder: Path, now_ns: Callable[[], int]) -> None:
+    def __init__(self, folder: Path, now_ns: Callable[[], int], zero_ns: int) -> None:
         self._folder = folder
         self._now_ns = now_ns
+        self.zero_ns = zero_ns
+        self.crashed = False
+        self.number: int | None = None
         self.measurements: list[PolarMeasurement] = []
         self.arrived_ns: list[int] = []
         self.clocks: list[ClockRecord] = []
@@ -106,7 +116,7 @@ class Session:
         self.frames = 0
         self.framed_ns = 0
         self._first_beacon: BeaconRecord | None = None
-        self.digest = blake2b()
+        self.lines = array("q")
         self._pose_stamps = array("q")
         self._pose_after = array("q")
         self._pose_kinds = array("b")
@@ -114,7 +124,7 @@ class Session:
 
     def take(self, record: object) -> None:
         """Take a record that goes out."""
-        self.digest.update(encode_line(record) + b"\n")
+        self.lines.append(hash(encode_line(record)))
         if isinstance(record, PolarMeasurement):
             self.measurements.append(record)
             self.arrived_ns.append(self._now_ns())
@@ -128,6 +138,7 @@ class Session:
                 self._take_pose(record)
         elif isinstance(record, BeaconRecord):
             first = self._first_beacon = self._first_beacon or record
+            self.number = record.session
             self.frames, self.framed_ns = record.counter - first.counter, record.stamp_ns - first.stamp_ns
 
     def _take_pose(self, pose: PoseRecord) -> None:
@@ -174,6 +185,10 @@ class StationWitness:
         Every distance that its instrument has answered with.
     stamps_ns
         By the host time of each reading in ns: the true time of that instant, in ns from the start.
+    read_ns
+        By the same: the true time at which the client had it.
+    crashed_ns
+        True times between which a client has read what it may not have written, as it was killed at the later one.
     statuses
         What it said of itself each time before it ended.
     """
@@ -182,7 +197,19 @@ class StationWitness:
     folder: Path | None
     offered: Sequence[Offered] = ()
     stamps_ns: dict[int, int] = field(default_factory=dict)
+    read_ns: dict[int, int] = field(default_factory=dict)
+    crashed_ns: list[tuple[int, int]] = field(default_factory=list)
     statuses: list[ClientStatus] = field(default_factory=list)
+
+    def may_be_unwritten(self, true_ns: int, before_ns: int = 0) -> bool:
+        """Whether a client was killed after that time, in ns from the start, before it can have written what it had read.
+
+        Parameters
+        ----------
+        true_ns
+            When it was read, in ns from the start; or at most ``before_ns`` before that.
+        """
+        return any(from_ns - before_ns <= true_ns <= to_ns for from_ns, to_ns in self.crashed_ns)
 
     @property
     def journals(self) -> list[Path]:
@@ -207,8 +234,16 @@ class Measured:
     """
 
     def __init__(self, witness: StationWitness) -> None:
+        self.witness = witness
         self._true_ns = witness.stamps_ns
-        self.journalled = [m for path in witness.journals for m in load_journal(path).measurements]
+        journals = [load_journal(path) for path in witness.journals if _begun(path)]
+        self.journalled = [m for journal in journals for m in journal.measurements]
+        self._boots = {m.sequence: journal.head.boot for journal in journals for m in journal.measurements}
+        self._heard: dict[str, set[int]] = {}
+        for journal in journals:
+            heard = self._heard.setdefault(journal.head.boot, set())
+            heard.update(reception.session for reception in journal.receptions)
+        self._boot = max(journals, key=lambda journal: journal.head.run_start).head.boot if journals else ""
         self._by_sequence = {m.sequence: m for m in self.journalled}
         self._by_host_time = {m.host_time_ns: m for m in self.journalled}
 
@@ -224,6 +259,27 @@ class Measured:
         if host_time_ns is None and (journalled := self.in_journal(measurement)) is not None:
             host_time_ns = journalled.host_time_ns
         return None if host_time_ns is None else self._true_ns.get(host_time_ns)
+
+    def timeless(self, sequence: int, session: int | None) -> bool:
+        """Whether no time of a master's session can be told of a measurement.
+
+        Its computer has been started again since, without having heard of that session before.
+
+        Parameters
+        ----------
+        sequence
+            Number of a measurement that is in the journals.
+        session
+            Number of the master's session; None: of none.
+        """
+        boot = self._boots[sequence]
+        return boot != self._boot and session not in self._heard[boot]
+
+
+def _begun(path: Path) -> bool:
+    """Whether there is more in a journal than what a client that is killed at once leaves."""
+    with path.open("rb") as file:
+        return [file.readline()[-1:] for _ in range(_HEAD_LINES)] == [b"\n"] * _HEAD_LINES
 
 
 class WatchedInstrument:

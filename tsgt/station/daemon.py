@@ -59,6 +59,7 @@ async def run_client(
     key: bytes | None = None,
     random_bits: Callable[[int], int] = secrets.randbits,
     boot: str = "",
+    write: Callable[[int, memoryview], int] | None = None,
 ) -> None:
     """Run a station's client until it is cancelled.
 
@@ -83,6 +84,8 @@ async def run_client(
     boot
         Which start of this computer its clock counts from; empty where unknown, and then no other run's clock is
         taken for this one.
+    write
+        See :class:`~tsgt.recording.RecordingWriter`.
 
     Raises
     ------
@@ -100,7 +103,7 @@ async def run_client(
     if superframe and lineage is None:
         lineage = random_bits(LINEAGE_BITS)
     path = new_recording_path(config.journal.directory, f"station{config.station}", now_ns)
-    with RecordingWriter(path) as writer:
+    with RecordingWriter(path, write=write) as writer:
         recorder = Recorder(writer)
         # To a classic master, which asks for the newest measurement only, one that has waited is worth nothing.
         journal = JournalQueue(recorder, patience_s=None if superframe else PATIENCE_S)

@@ -259,9 +259,9 @@ def decode_reply(line: bytes, *, checksum: bool = False) -> ReplyLine:
         It is no reply, or damaged.
     """
     stripped = line.rstrip(b"\r\n")
-    if any(not 0x20 <= byte <= 0x7E for byte in stripped):
+    text = stripped.decode("ascii", errors="replace")
+    if not (text.isascii() and text.isprintable()):
         raise MessageError(f"a reply with bytes that GeoCOM does not use: {line!r}")
-    text = stripped.decode("ascii")
     header = _HEADER.match(text)
     if header is None:
         raise MessageError(f"no reply of GeoCOM: {line!r}")

@@ -69,6 +69,8 @@ class Reading:
         The instrument's own stamp, None where it has none.
     received_ns
         When its first byte reached the host, on the same clock as ``at_ns``; None where no line tells.
+    sigma_ns
+        One standard error of ``at_ns``, as far as the instrument's times tell; 0 where nothing does.
     """
 
     at_ns: int
@@ -80,6 +82,7 @@ class Reading:
     raw_status: int = 0
     instrument_time_ns: int | None = None
     received_ns: int | None = None
+    sigma_ns: int = 0
 
     def __post_init__(self) -> None:
         """Refuse what no instrument can have measured."""

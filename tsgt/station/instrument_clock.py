@@ -13,10 +13,9 @@ import math
 from collections import deque
 from dataclasses import dataclass
 from statistics import median
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable
+from tsgt.station.lower_line import line_below, lowest
 
 ENOUGH = 8
 """So many samples make an envelope."""
@@ -35,9 +34,6 @@ _KEPT = 30
 _STEADY_NS = 120e9
 """A rate that was found over a longer span than this is kept over a power cycle."""
 
-_SLOPE = 1.5
-"""Error of the slope, as a multiple of the envelope's error over its length."""
-
 _MOST_RATE = 300e-6
 _UNKNOWN_RATE = 60e-6
 _KNOWN_RATE = 5e-6
@@ -45,7 +41,16 @@ _KNOWN_RATE = 5e-6
 _WANDER = 1e-6
 
 _RESOLUTION_NS = 1e6
-"""Instruments tell their time in whole ms; whether rounded or cut off is not known."""
+_ROUNDING_NS = 0.3e6
+"""Instruments tell their time in whole ms; whether rounded or cut off is not known, and makes no difference here: what is
+added to one of their times is missing in what the envelope's height was found from."""
+
+_MORE = 1.05
+"""By so much there are to be more samples before it is worth fitting again without other news."""
+
+_LEAST_SHARE = 0.01
+_LATE = 4.0
+"""An answer that is later than so many times the mean counts for so much: it stalled, and tells nothing of the others."""
 
 _FEW = 3
 _AGREE_NS = 100e6
@@ -109,11 +114,11 @@ class InstrumentClock:
         self._first = samples
         self._bins: deque[_Bin] = deque()
         self._x0 = self._y0 = 0
-        self._a = self._b = 0.0
-        self._above = self._excess = 0.0
+        self._a = self._b = self._lift = 0.0
+        self._above = self._excess = self._sigma = 0.0
         self._rate_sigma = self._known_sigma
         self._newest = self._middle = 0.0
-        self._samples = 0
+        self._samples = self._fitted = 0
         self._doubted: deque[tuple[int, int, int]] = deque(maxlen=_FEW)
 
     @property
@@ -130,6 +135,12 @@ class InstrumentClock:
     def rate_ppm(self) -> float:
         """By how much the host's clock gains on the instrument's, in 1e-6."""
         return self._b * 1e6
+
+    @property
+    def sigma_ns(self) -> float:
+        """One standard error of the newest times; infinite while none are told."""
+        drift = self._rate_sigma * abs(self._newest - self._middle)
+        return math.hypot(self._sigma, drift) if self.stands else math.inf
 
     def add(self, instrument_ms: int, arrived_ns: int) -> bool:
         """Take a sample: an instrument time, and when the first byte of the answer with it arrived.
@@ -159,8 +170,8 @@ class InstrumentClock:
             return None
         x = float(instrument_ms * 1_000_000 - self._x0)
         drift = self._rate_sigma * abs(x - self._middle)
-        host_ns = self._x0 + self._y0 + round(x + self._a + self._b * x)
-        sigma_ns = math.hypot(0.3 * _RESOLUTION_NS, self._excess, drift)
+        host_ns = self._x0 + self._y0 + round(x + self._a + self._lift + self._b * x)
+        sigma_ns = math.hypot(self._sigma, drift)
         return HostTime(host_ns, round(sigma_ns), round(_RESOLUTION_NS + 8 * self._excess + 3 * drift))
 
     def stamp(self, instrument_ms: int, arrived_ns: int) -> HostTime | None:
@@ -182,9 +193,9 @@ class InstrumentClock:
         else:
             self.add(instrument_ms, arrived_ns)
         time = self.at(instrument_ms)
-        if self.doubts or time is None or not time.host_ns <= arrived_ns <= time.host_ns + LATEST_NS:
+        if self.doubts or time is None or not arrived_ns <= time.host_ns + LATEST_NS:
             return None
-        return time
+        return time._replace(host_ns=min(time.host_ns, arrived_ns))
 
     # --- Samples ----------------------------------------------------------------------------------------------
 
@@ -214,7 +225,9 @@ class InstrumentClock:
         self._x0 = kept[0][0] * 1_000_000
         self._y0 = kept[0][1] - self._x0
         self._b = self._known_rate
-        self._a = math.inf
+        placed = [self._place(*sample)[1] for sample in kept]
+        self._a = min(placed)
+        self._above = median(placed) - self._a
         for ms, arrived_ns in kept:
             self._put(*self._place(ms, arrived_ns))
         self._first = []
@@ -225,7 +238,8 @@ class InstrumentClock:
         return _RESOLUTION_NS + 10 * self._excess + 3 * self._rate_sigma * abs(x - self._middle)
 
     def _take(self, x: float, y: float) -> None:
-        if self._put(x, y) or y < self._a + self._b * x:
+        new = self._put(x, y)
+        if new or y < self._a + self._b * x or self._samples > _MORE * self._fitted:
             self._fit()
 
     def _put(self, x: float, y: float) -> bool:
@@ -242,7 +256,7 @@ class InstrumentClock:
             place.x, place.y = x, y
         place.count += 1
         place.sum_x += x
-        place.sum_y += y
+        place.sum_y += min(y, self._a + self._b * x + _LATE * max(self._above, _RESOLUTION_NS))
         self._samples += 1
         self._newest = max(self._newest, x)
         return new
@@ -275,51 +289,30 @@ class InstrumentClock:
     # --- The fit ----------------------------------------------------------------------------------------------
 
     def _fit(self) -> None:
-        """Lay a line under all samples, with the slope from early ones to late ones as far as that is well known."""
+        """Lay the line below all samples, with as much of the rate from them as they tell."""
         bins = self._bins
         mean_x = sum(bin_.sum_x for bin_ in bins) / self._samples
         mean_y = sum(bin_.sum_y for bin_ in bins) / self._samples
-        slope, length = self._slope()
-        if length > 0:
-            slope_sigma = _SLOPE * max(3 * self._above / self._samples, 0.1 * _RESOLUTION_NS) / length
-            weight = self._known_sigma**2 / (self._known_sigma**2 + slope_sigma**2)
-            slope = min(max(slope, -_MOST_RATE), _MOST_RATE)
-            self._b = self._known_rate + weight * (slope - self._known_rate)
-            self._rate_sigma = math.sqrt(weight) * slope_sigma + _WANDER
-            if length > _STEADY_NS:
-                self._known_rate, self._known_sigma = self._b, _KNOWN_RATE
-        self._a = min(bin_.y - self._b * bin_.x for bin_ in bins)
-        above = mean_y - self._a - self._b * mean_x
+        envelope = min(bin_.y - self._b * (bin_.x - mean_x) for bin_ in bins)
+        above = mean_y - envelope
         self._above = above if self._samples >= _KEPT else max(above, self._above)
+        share = max(2 * above / max(self._samples - 1, 1) / _RESOLUTION_NS, _LEAST_SHARE)
+        height = lowest(share)
+        line = line_below(
+            [(bin_.x, bin_.y) for bin_ in bins],
+            middle=mean_x,
+            scale=height.sigma * _RESOLUTION_NS,
+            known=(self._known_rate, self._known_sigma),
+            most=_MOST_RATE,
+        )
+        self._b = line.slope
+        self._rate_sigma = line.slope_sigma + _WANDER
+        if bins[-1].x - bins[0].x > _STEADY_NS:
+            self._known_rate, self._known_sigma = self._b, _KNOWN_RATE
+        self._a = min(bin_.y - self._b * bin_.x for bin_ in bins)
+        # The time is told in whole ms: a distance was taken within the one that follows, on average half of it later.
+        self._lift = line.height - self._a + (0.5 - height.mean) * _RESOLUTION_NS
         self._excess = 2 * self._above / self._samples
-        self._middle = mean_x
-
-    def _slope(self) -> tuple[float, float]:
-        """Return the slope from the lowest of the first third of the samples to that of the last third, and how far that is.
-
-        Both are as many, so that on average they are as high above the envelope. What is lowest depends on the slope.
-        """
-        first = _third(self._bins, self._samples)
-        last = _third(reversed(self._bins), self._samples)
-        b = self._b
-        for _ in range(3):
-            left, right = (min(part, key=lambda bin_: bin_.y - b * bin_.x) for part in (first, last))
-            if right.x <= left.x:
-                return 0.0, 0.0
-            slope = (right.y - left.y) / (right.x - left.x)
-            if abs(slope - b) > _MOST_RATE:
-                break
-            b = slope
-        return slope, right.x - left.x
-
-
-def _third(bins: Iterable[_Bin], samples: int) -> list[_Bin]:
-    """Return the first bins that hold a third of the samples."""
-    part: list[_Bin] = []
-    count = 0
-    for bin_ in bins:
-        part.append(bin_)
-        count += bin_.count
-        if 3 * count >= samples:
-            break
-    return part
+        self._sigma = math.hypot(_ROUNDING_NS, height.sigma * _RESOLUTION_NS, line.pivot_sigma)
+        self._middle = line.pivot
+        self._fitted = self._samples

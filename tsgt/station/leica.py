@@ -205,8 +205,10 @@ class LeicaInstrument:
         await self._read_back(line)
 
     async def check(self) -> None:
-        """See whether it is still there, and how it is fed."""
-        await self._check_power(self._connected())
+        """See whether it is still there, how it is fed, and what its clock shows, so that the rate is known later."""
+        line = self._connected()
+        await self._check_power(line)
+        await self._times.exchange(line)
 
     async def _set_target(self, line: GeoComConnection) -> None:
         if self._config.target == "foil":
@@ -234,9 +236,9 @@ class LeicaInstrument:
             shot = await shoot(line, self._clock)
         else:
             shot = await shoot_in_two_faces(line, self._clock, at_prism=finder is not None)
-        at_ns = self._times.stamp(shot)
+        stamp = self._times.stamp(shot)
         return Reading(
-            at_ns=shot.first_byte_ns if at_ns is None else at_ns,
+            at_ns=shot.first_byte_ns if stamp is None else stamp.at_ns,
             prism=None,
             horizontal_angle_rad=shot.horizontal_angle_rad,
             zenith_angle_rad=shot.zenith_angle_rad,

@@ -33,6 +33,13 @@ STATUS: Final = {
 """Verdicts that answer the question for a measurement, in the common vocabulary; any other is an error."""
 
 
+class Stamp(NamedTuple):
+    """When a distance was taken, on the host's clock, and one sigma of that."""
+
+    at_ns: int
+    sigma_ns: int
+
+
 class FullMeasurement(NamedTuple):
     """What TMC_GetFullMeas gave.
 
@@ -104,10 +111,10 @@ class Readings:
         self._given: Status | None = None
         self._given_ns = 0
 
-    def with_distance(self, measured: FullMeasurement, at_ns: int) -> Reading:
+    def with_distance(self, measured: FullMeasurement, stamp: Stamp) -> Reading:
         """Return the reading of a distance that was taken at a time."""
         self._given = measured.status
-        return self._reading(measured, at_ns)
+        return self._reading(measured, stamp)
 
     def without(self, measured: FullMeasurement) -> Reading | None:
         """Return the reading that tells why there is no distance; None if that was told just now."""
@@ -115,11 +122,12 @@ class Readings:
             return None
         self._given, self._given_ns = measured.status, measured.first_byte_ns
         measured = measured._replace(distance_m=None, time_ms=None)
-        return self._reading(measured, max(measured.first_byte_ns - self.latency_ns, 0))
+        return self._reading(measured, Stamp(max(measured.first_byte_ns - self.latency_ns, 0), 0))
 
-    def _reading(self, measured: FullMeasurement, at_ns: int) -> Reading:
+    def _reading(self, measured: FullMeasurement, stamp: Stamp) -> Reading:
         return Reading(
-            at_ns=at_ns,
+            at_ns=stamp.at_ns,
+            sigma_ns=stamp.sigma_ns,
             prism=self.prism,
             horizontal_angle_rad=measured.horizontal_angle_rad,
             zenith_angle_rad=measured.zenith_angle_rad,

@@ -9,9 +9,10 @@ import structlog
 from tsgt.station.geocom import Rpc
 from tsgt.station.instrument_clock import InstrumentClock
 from tsgt.station.leica_identity import numbers
-from tsgt.station.leica_measurement import MOST_MS
+from tsgt.station.leica_measurement import MOST_MS, Stamp
 
 if TYPE_CHECKING:
+    from tsgt.clock import Clock
     from tsgt.station.geocom_connection import GeoComConnection
     from tsgt.station.leica_measurement import FullMeasurement
 
@@ -20,12 +21,27 @@ log = structlog.get_logger()
 _FEWEST_EXCHANGES: Final = 4
 _FIRST_EXCHANGES: Final = 12
 _MOST_EXCHANGES: Final = 24
+_MEETING_NS: Final = 1_000_000_000
+_GOOD_NS: Final = 1_000_000
+"""At the beginning there are some exchanges, and more until times are known this well, or this long has passed."""
 
 _REFUSALS: Final = 3
 """One answer without a time may be an accident of the moment."""
 
+_EVERY_NS: Final = 500_000_000
+"""Between two exchanges for the time alone, whose answers are the fastest; twice that where they take others' time."""
+
+_FINE_NS: Final = 400_000
+_MORE_NS: Final = 150_000
 _SOON: Final = 40
-"""Until the envelope rests on so many samples, pauses are used to take some more: it is worth some ms at the start."""
+"""Until times are known this well, idle time is used for more: at first all of it, and the longer, the less, after each
+exchange so long for each that there has been. Where there is none, the first few come twice as often."""
+
+_TAKES_NS: Final = 120_000_000
+_STALLS_NS: Final = 200_000_000
+_SPARE_NS: Final = 10_000_000
+"""How long an exchange takes before any is known, how long it takes at most unless the instrument pauses, and what is to
+be left of idle time after it."""
 
 _OLDER_MS: Final = 60_000
 """A distance that is older than the last one by less than this comes for the second time."""
@@ -52,16 +68,14 @@ class InstrumentTimes:
         self._fit = InstrumentClock()
         self._last_ms: int | None = None
         self._logged_ns: int | None = None
+        self._asked_ns = self._answered_ns = 0
+        self._takes_ns = _TAKES_NS
+        self._refused = False
 
     @property
     def stands(self) -> bool:
         """Whether times can be told; distances alone would tell them worse, for their answers come late."""
         return self._fit.stands
-
-    @property
-    def wants_more(self) -> bool:
-        """Whether another exchange would make times noticeably better."""
-        return self._fit.samples < _SOON
 
     def other_instrument(self) -> None:
         """Forget everything: it is not the one that it was."""
@@ -76,18 +90,56 @@ class InstrumentTimes:
         InstrumentError
             It does not answer.
         """
-        fewest = _FEWEST_EXCHANGES if self._fit.stands else _FIRST_EXCHANGES
+        fit = self._fit
+        met = fit.stands
+        fewest = _FEWEST_EXCHANGES if met else _FIRST_EXCHANGES
         refused = 0
+        begun_ns: int | None = None
         for number in range(1, _MOST_EXCHANGES + 1):
             refused += not await self.exchange(line)
             if refused == _REFUSALS:
                 return
-            if number >= fewest and self._fit.stands and not self._fit.doubts:
+            begun_ns = self._answered_ns if begun_ns is None else begun_ns
+            enough = met or fit.sigma_ns < _GOOD_NS or self._answered_ns - begun_ns > _MEETING_NS
+            if number >= fewest and fit.stands and not fit.doubts and enough:
+                return
+
+    async def keep_known(self, line: GeoComConnection, clock: Clock, until_ns: int) -> None:
+        """Exchange times now and then, and in all idle time for as long as that makes them noticeably better.
+
+        Parameters
+        ----------
+        line, clock
+            To the instrument, and of the host.
+        until_ns
+            Nothing else is to be asked before.
+
+        Raises
+        ------
+        InstrumentError
+            It does not answer.
+        """
+        while True:
+            now_ns = clock.monotonic_ns()
+            room = until_ns - now_ns >= self._takes_ns + _SPARE_NS
+            every_ns = _EVERY_NS if room else 2 * _EVERY_NS
+            if room and not self._refused and self._fit.sigma_ns > _FINE_NS:
+                every_ns = min(every_ns, _MORE_NS * self._fit.samples)
+            elif not self._refused and self._fit.samples < _SOON:
+                every_ns = _EVERY_NS if self._fit.stands else 0
+            if now_ns - self._asked_ns < every_ns:
+                return
+            self._asked_ns = now_ns
+            self._refused = not await self.exchange(line)
+            took_ns = min(clock.monotonic_ns() - now_ns, _STALLS_NS)
+            self._takes_ns = max(took_ns, self._takes_ns - (self._takes_ns - took_ns) // 64)
+            if not room:
                 return
 
     async def exchange(self, line: GeoComConnection) -> bool:
         """Ask for the time of an angle; return whether there was one. An instrument that is not level gives none."""
         reply = await line.call(Rpc.TMC_GET_ANGLE1, 1)
+        self._answered_ns = reply.first_byte_ns
         values = numbers(reply, 4)
         if values is None or not 0 < abs(values[3]) <= MOST_MS:
             return False
@@ -104,8 +156,8 @@ class InstrumentTimes:
         """Note that it has been."""
         self._last_ms = time_ms
 
-    def stamp(self, measured: FullMeasurement) -> int | None:
-        """Return when a distance was taken, on the host's clock; None where that is not known or is doubted."""
+    def stamp(self, measured: FullMeasurement) -> Stamp | None:
+        """Return when a distance was taken; None where that is not known or is doubted."""
         if measured.time_ms is None:
             return None
         began = self._fit.began
@@ -115,7 +167,7 @@ class InstrumentTimes:
             if self._fit.stands and self._is_worth_a_line(measured.first_byte_ns):
                 log.warning("distance_time_doubted", instrument_ms=measured.time_ms)
             return None
-        return max(time.host_ns - self.latency_ns, 0)
+        return Stamp(max(time.host_ns - self.latency_ns, 0), time.sigma_ns)
 
     def _note(self, began: int) -> None:
         if self._fit.began != began:

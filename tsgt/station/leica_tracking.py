@@ -42,7 +42,6 @@ WAIT_MS: Final = 100
 
 _POLL_S: Final = 1.5  # instruments pause for 0.7 s now and then
 _LOCK_NS: Final = 2_000_000_000  # between two looks at the lock, while distances come
-_TIME_NS: Final = 500_000_000  # between two exchanges for the time alone, whose answers are the fastest
 _LOST_LOCK_NS: Final = 250_000_000  # and while they do not
 _STALE_NS: Final = 1_500_000_000  # the same distance for longer than this is no tracking
 _GAP_NS: Final = 600_000_000
@@ -99,7 +98,7 @@ class Tracking:
         self.tilted = False
         self._pace = Pace()
         self._lock = Lock.OUT
-        self._lock_asked_ns = self._time_asked_ns = 0
+        self._lock_asked_ns = 0
         self._good_from_ns = 0
         self._lost_ns: int | None = None
         self._handover: Handover | None = None
@@ -219,7 +218,13 @@ class Tracking:
 
     async def _poll(self) -> Reading | None:
         now_ns = self._clock.monotonic_ns()
-        await self._ask_besides(now_ns, room=self._next_ns - now_ns >= _ROOM_NS)
+        # Now and then, while no distance can be there; or else less often.
+        lock_ns = _LOCK_NS if self._next_ns - now_ns >= _ROOM_NS else 2 * _LOCK_NS
+        if self.finder is not None and now_ns - self._lock_asked_ns >= lock_ns:
+            await self._ask_lock(self.finder)
+        else:
+            await self._times.keep_known(self._line, self._clock, self._next_ns)
+        now_ns = self._clock.monotonic_ns()
         if self._next_ns - now_ns > 1_000_000:
             await self._clock.sleep_until(self._next_ns)
         reply = await self._line.call(Rpc.TMC_GET_FULL_MEAS, WAIT_MS, 1, timeout_s=_POLL_S)
@@ -247,7 +252,7 @@ class Tracking:
             if measured.first_byte_ns - self._last_new_ns < max(_STALE_NS, 3 * (self._pace.interval_ns or 0)):
                 return None
             return await self._without(measured._replace(status=Status.NO_TARGET))
-        at_ns = self._times.stamp(measured)
+        stamp = self._times.stamp(measured)
         # After a gap the prism may be gone, and another one cross the line of sight.
         gap = measured.first_byte_ns - self._last_new_ns > max(_GAP_NS, 3 * (self._pace.interval_ns or 0))
         if self.finder is not None and (gap or self._lock is not Lock.IN) and self._handover is None:
@@ -255,15 +260,15 @@ class Tracking:
         self._times.given(time_ms)
         self._pace.distance(time_ms)
         self._last_new_ns = measured.first_byte_ns
-        if at_ns is None:
+        if stamp is None:
             return None
         if self._handover is not None or (self.finder is not None and self._lock is not Lock.IN):
             return await self._without(measured._replace(status=Status.NO_TARGET))
-        if at_ns < self._good_from_ns:
+        if stamp.at_ns < self._good_from_ns:
             return None
-        self._next_ns = self._pace.next_ns(at_ns + self._times.latency_ns, self._round_trip_ns)
+        self._next_ns = self._pace.next_ns(stamp.at_ns + self._times.latency_ns, self._round_trip_ns)
         self._found(Pointing(measured.horizontal_angle_rad, measured.zenith_angle_rad))
-        return self._readings.with_distance(measured, at_ns)
+        return self._readings.with_distance(measured, stamp)
 
     async def _without(self, measured: FullMeasurement) -> Reading | None:
         """Do what is to be done without a distance, and tell why there is none, unless that was told just now."""
@@ -285,18 +290,6 @@ class Tracking:
         if starting and status in (Status.ANGLE_ONLY, Status.NO_TARGET):
             return None
         return self._readings.without(measured._replace(status=status))
-
-    async def _ask_besides(self, now_ns: int, *, room: bool) -> None:
-        """Ask what is to be asked now and then: while no distance can be there, or else less often."""
-        slower = 1 if room else 2
-        time_ns = _TIME_NS
-        if self._times.wants_more:
-            time_ns = 0 if room or not self._times.stands else _TIME_NS // 2
-        if self.finder is not None and now_ns - self._lock_asked_ns >= slower * _LOCK_NS:
-            await self._ask_lock(self.finder)
-        elif now_ns - self._time_asked_ns >= slower * time_ns:
-            self._time_asked_ns = now_ns
-            await self._times.exchange(self._line)
 
     # --- The lock ---------------------------------------------------------------------------------------------
 

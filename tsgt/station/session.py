@@ -69,6 +69,7 @@ class Session:
             prism=self.prism if reading.prism is None else reading.prism,
             sequence=self._run_start + self._measurements,
             stamp_ns=stamp_ns,
+            stamp_sigma_ns=reading.sigma_ns,
             received_ns=stamp_ns + received_ns - reading.at_ns,
             horizontal_angle_rad=reading.horizontal_angle_rad,
             zenith_angle_rad=reading.zenith_angle_rad,

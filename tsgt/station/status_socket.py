@@ -26,6 +26,9 @@ PATIENCE_S = 1.0
 
 MAX_REQUEST_BYTES = 4096
 
+MOST_TALKS = 32
+"""More at a time are let go at once, so that file descriptors are left for instrument and radio."""
+
 
 class StatusSocket:
     """The open socket; it is removed with the end of its block.
@@ -68,12 +71,18 @@ class StatusSocket:
         """
         loop = asyncio.get_running_loop()
         listener = self._listener.socket
+        talking: set[asyncio.Task[None]] = set()
 
         def let_in() -> None:
             with suppress(OSError):  # who asked is gone already
                 connection, _ = listener.accept()
+                if len(talking) >= MOST_TALKS:
+                    connection.close()
+                    return
                 connection.setblocking(False)
                 talk = talks.create_task(_talk(connection, status, request))
+                talking.add(talk)
+                talk.add_done_callback(talking.discard)
                 talk.add_done_callback(lambda _: connection.close())
 
         async with asyncio.TaskGroup() as talks:

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from support.scene import LAYOUT, SECOND, START, Motion, standing_scene
+from support.scene import LAYOUT, SECOND, START, Motion, counted_from, standing_scene
 
 from tsgt.analysis.evaluation import held_out
 from tsgt.analysis.held_out import FOLDS
 from tsgt.analysis.processing import process, with_estimator
 from tsgt.analysis.smoothing import smoothed
 from tsgt.errors import RecordingError
-from tsgt.geometry import exp_so3
+from tsgt.geometry import exp_so3, rotate, rotation_from_quaternion, skew
 from tsgt.master.observations import build_observations
 from tsgt.master.pose_batch import Kind, Reason
 from tsgt.model import Status
@@ -179,6 +179,26 @@ def test_no_measurements_are_refused() -> None:
     blind = [replace(m, status=Status.NO_TARGET) if m.station == 1 else m for m in drive()]
     with pytest.raises(RecordingError, match="prism 1 has no usable measurement"):
         smoothed(recording_of(blind), path=PATH)
+
+
+def test_where_a_layout_counts_from_does_not_matter() -> None:
+    """With the origin metres off the prisms the poses are the same ones of another point, and so is how sure they are."""
+    arm = np.array([-3.0, 1.0, -1.5])
+    near = smoothed(recording_of(drive()), path=PATH)
+    far = smoothed(recording_of(drive(), counted_from(SCENE.parameters, arm)), path=PATH)
+    assert far.motion.noise_scale == pytest.approx(near.motion.noise_scale, rel=1e-4)
+    rotation = rotation_from_quaternion(near.poses.orientation_xyzw)
+    spoke = rotation @ arm
+    np.testing.assert_allclose(far.poses.orientation_xyzw, near.poses.orientation_xyzw, atol=1e-6)
+    np.testing.assert_allclose(far.poses.position_m, near.poses.position_m + spoke, atol=1e-6)
+    turning = np.cross(rotate(rotation, near.poses.angular_velocity_radps), spoke)
+    np.testing.assert_allclose(far.poses.velocity_mps, near.poses.velocity_mps + turning, atol=1e-5)
+    # About fixed axes an error of rotation moves the other point by its cross product with the way there.
+    by_error = np.tile(np.eye(6), (len(spoke), 1, 1))
+    by_error[:, :3, 3:] = -skew(spoke)
+    expected = by_error @ near.poses.covariance @ np.swapaxes(by_error, 1, 2)
+    np.testing.assert_allclose(far.poses.covariance, expected, atol=1e-4 * np.abs(expected).max())
+    np.testing.assert_array_equal(far.poses.reason, near.poses.reason)
 
 
 def test_what_is_held_out_was_not_seen() -> None:

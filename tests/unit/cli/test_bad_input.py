@@ -32,6 +32,10 @@ TRACK_EDITS: dict[str, tuple[Callable[[list[str]], list[str]], str]] = {
         "line 5: expected a finite",
     ),
     "text": (lambda lines: ["time x y z", *lines], "line 1: expected a Unix time"),
+    "a giant word": (
+        lambda lines: [*lines[:4], _with_last(lines[4], "9" * 100_000), *lines[5:]],
+        f"line 5: expected a finite number, got '{'9' * 56}...\n",
+    ),
     "unsorted time stamps": (lambda lines: [lines[1], lines[0], *lines[2:]], "line 2: time runs backwards"),
     "repeated time stamps": (
         lambda lines: [lines[0], *lines],

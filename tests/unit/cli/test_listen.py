@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from support.records import EVENT, HELLO, NO_POSE, POINT, POSE, STATUS, measurement
@@ -49,6 +50,14 @@ def serving(path: Path, data: bytes) -> Iterator[None]:
             yield
         finally:
             thread.join()
+
+
+def test_text_from_outside_does_not_steer_the_terminal(tsgt: Tsgt, tmp_path: Path) -> None:
+    """A recording of somebody else's may hold any characters."""
+    steering = replace(EVENT, message="\x1b]0;owned\x07\x1b[2J\r\nnext \u202e\u009b1m end")
+    with serving(tmp_path / "s", encode_line(steering) + b"\n"):
+        outcome = tsgt("listen", "--socket", tmp_path / "s")
+    assert outcome.out.endswith(": ?]0;owned??[2J??next ??1m end\n")
 
 
 def test_every_type_is_shown_on_one_line(tsgt: Tsgt, tmp_path: Path) -> None:

@@ -72,6 +72,19 @@ def test_a_skipped_journal_is_a_warning(tsgt: Tsgt, run: Run, tmp_path: Path) ->
     assert told.err.startswith(f"error: {path}: none of the journals can be merged; {other}: is of station 9")
 
 
+@pytest.mark.parametrize("content", [b"", b'{"type":"recor', b'{"type":"recording","version":1}\n{"ty'])
+def test_a_journal_that_was_only_begun_is_passed_over(
+    tsgt: Tsgt, run: Run, tmp_path: Path, content: bytes
+) -> None:
+    """A client that is killed as it starts leaves one; the others are merged all the same."""
+    path, begun = recording(run, tmp_path / "r.jsonl"), tmp_path / "station1-begun.jsonl"
+    begun.write_bytes(content)
+    told = tsgt("merge", path, *journals(run), begun)
+    assert told.code == 0
+    assert f"{begun}: was only begun" in told.err
+    assert "0 measurements added" in tsgt("merge", path, begun).out
+
+
 def test_a_torn_line_is_told(tsgt: Tsgt, run: Run, tmp_path: Path) -> None:
     """The recording of a master that was killed ends in one, and has to be whole before anything follows."""
     path = recording(run, tmp_path / "r.jsonl")

@@ -141,6 +141,15 @@ def test_binary_file(tmp_path: Path) -> None:
         load(path, MasterConfig)
 
 
+@pytest.mark.parametrize("text", ["x = " + 5000 * "[", "x = " + 5000 * "9", "x = " + 5000 * "{a="])
+def test_what_has_no_end(text: str, tmp_path: Path) -> None:
+    """Neither nesting nor digits break the reader."""
+    path = tmp_path / "a.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=r"a\.toml: not TOML: "):
+        load_any(path)
+
+
 def test_a_file_of_another_kind(tmp_path: Path) -> None:
     """Handing the prism layout where the scenario belongs says what was expected."""
     path = tmp_path / "scenario.toml"

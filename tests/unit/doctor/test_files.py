@@ -50,6 +50,19 @@ async def test_configuration_of_something_else_fails(tmp_path: Path) -> None:
     assert "no such file" in (await made_up.examine("nothing.toml"))["configuration"].detail
 
 
+@pytest.mark.parametrize(
+    ("file", "finding"),
+    [("master.toml", "configuration"), ("frames.toml", "station_frames"), ("layout.toml", "prism_layout")],
+)
+async def test_file_that_everybody_may_write_fails(tmp_path: Path, file: str, finding: str) -> None:
+    """The master would not start with it; the finding has the command that mends it."""
+    made_up = MadeUpMachine(tmp_path)
+    (tmp_path / file).chmod(0o666)
+    found = (await made_up.examine("master.toml"))[finding]
+    assert found.ok is False
+    assert f"chmod o-w {tmp_path / file}" in found.detail
+
+
 async def test_missing_key_file_fails(tmp_path: Path) -> None:
     """The daemon would not start."""
     made_up = MadeUpMachine(tmp_path)

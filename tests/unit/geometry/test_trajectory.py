@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 from support.prior_motion import STEP_S, draw_motions, in_time, measure, rows_at
-from support.scene import LAYOUT
 
 from tsgt.geometry import exp_so3, log_so3
 from tsgt.geometry.continuous import Anchor, knot_times, solve, start_anchor
 from tsgt.geometry.first_guess import first_guess
 from tsgt.geometry.knots import STATE, Knots, joined
-from tsgt.geometry.trajectory import Trajectory, point_covariance, ros_covariance
+from tsgt.geometry.trajectory import Trajectory, ros_covariance
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:
@@ -187,8 +186,8 @@ def test_the_order_of_instants_is_irrelevant(case: Case) -> None:
     assert no_covariance.shape == (0, STATE, STATE)
 
 
-def test_covariance_of_a_point_and_about_fixed_axes() -> None:
-    """A point's covariance and the rotation about the fixed axes are those of drawn errors."""
+def test_covariance_about_fixed_axes() -> None:
+    """That of the rotation about the fixed axes is that of drawn errors."""
     rng = np.random.default_rng(15)
     rotation = exp_so3(rng.normal(size=3))
     root = rng.normal(size=(6, 6)) * 1e-4
@@ -196,13 +195,10 @@ def test_covariance_of_a_point_and_about_fixed_axes() -> None:
     covariance[:6, :6] = root @ root.T
     errors = rng.normal(size=(200_000, 6)) @ root.T
     drawn = rotation @ exp_so3(errors[:, 3:])
-    points = errors[:, :3] + (drawn - rotation) @ LAYOUT[1]
     about_fixed = log_so3(drawn @ rotation.T)
     expected = np.cov(np.concatenate([errors[:, :3], about_fixed], axis=1).T)
     found = ros_covariance(rotation[None], covariance[None])[0]
     np.testing.assert_allclose(found, expected, atol=0.02 * np.abs(expected).max())
-    of_point = point_covariance(rotation[None], covariance[None], LAYOUT[1])[0]
-    np.testing.assert_allclose(of_point, np.cov(points.T), atol=0.02 * np.abs(of_point).max())
 
 
 # What follows is about one hundred robots that move as the prior says, each measured for so long:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.scene import SECOND, START, Scene, driving, standing, standing_scene
+from support.scene import SECOND, START, Scene, counted_from, driving, standing, standing_scene
 
 from tsgt.errors import DegenerateGeometryError
 from tsgt.geometry import exp_so3, log_so3, rotation_from_quaternion
@@ -84,6 +84,20 @@ def test_what_is_predicted_and_smoothed_is_what_the_robot_does(scene: Scene) -> 
     late = smoothed.stamp_ns > START + SECOND
     assert smoothed.valid[late].all()
     assert off(scene, smoothed.select(late)) < (0.001, 0.001)
+
+
+def test_where_a_layout_counts_from_does_not_matter(scene: Scene) -> None:
+    """With the origin metres off the prisms, live poses are the same ones of another point of the robot."""
+    arm = np.array([-3.0, 1.0, -1.5])
+    measurements = every(scene, 8.0)
+    far = replace(scene, parameters=counted_from(scene.parameters, arm))
+    for here, there in zip(stream(scene, measurements, 8.0), stream(far, measurements, 8.0), strict=True):
+        np.testing.assert_array_equal(there.reason, here.reason)
+        spoke = rotation_from_quaternion(here.orientation_xyzw[here.valid]) @ arm
+        np.testing.assert_allclose(
+            there.position_m[here.valid], here.position_m[here.valid] + spoke, atol=1e-6
+        )
+        np.testing.assert_allclose(there.orientation_xyzw, here.orientation_xyzw, atol=1e-7)
 
 
 def test_predictions_rest_on_what_was_added_before(scene: Scene) -> None:

@@ -317,6 +317,20 @@ def test_a_fence_runs_its_command(tmp_path: Path) -> None:
     assert (tmp_path / "said").read_text() == "fence_left yard\n"
 
 
+def test_no_name_of_a_fence_is_a_command(tmp_path: Path) -> None:
+    """There is no shell between the master and the program, and no name among its arguments."""
+    name = f'";touch {tmp_path}/owned;$(touch {tmp_path}/owned)`touch {tmp_path}/owned`'
+
+    async def commands() -> None:
+        script = f'printf %s "$TSGT_FENCE" > {tmp_path}/said'
+        await run_fence_command(("sh", "-c", script), event="fence_left", fence=name)
+        await run_fence_command(("touch", f"{tmp_path}/$TSGT_FENCE"), event="fence_left", fence=name)
+
+    run(commands)
+    assert (tmp_path / "said").read_text() == name
+    assert {each.name for each in tmp_path.iterdir()} == {"said", "$TSGT_FENCE"}
+
+
 async def test_a_master_whose_turns_stand_still_is_not_kept_alive(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

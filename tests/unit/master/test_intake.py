@@ -296,6 +296,25 @@ def test_what_was_held_before_a_restart_gets_no_time_of_the_clock_after_it(step_
     assert found.measurements == []
 
 
+@pytest.mark.parametrize("known", [True, False])
+def test_what_was_held_while_the_station_may_have_got_another_clock_is_let_go(known: bool) -> None:  # noqa: FBT001
+    """Half a second apart, both clocks explain it; only without a lost request it is certain which one it is of."""
+    master = Master(synchronised=known)
+    master.intake.unanswered(1)
+    master.poll(8000, message(START + 7800 * MS + AHEAD_NS))
+    master.intake.unanswered(1)
+    assert master.synchronise(20_000, AHEAD_NS + 500 * MS).measurements == []
+
+
+def test_what_was_held_is_used_if_the_clock_is_the_same_after_lost_requests() -> None:
+    """The clock that was known goes on: there is but one that it can be of."""
+    master = Master()
+    master.intake.unanswered(1)
+    master.poll(8000, message(START + 7800 * MS + AHEAD_NS))
+    master.intake.unanswered(1)
+    assert len(master.synchronise(20_000).measurements) == 1
+
+
 def test_what_is_played_back_is_no_measurement_and_no_step() -> None:
     """An answer of before, received again, is known; the station's own next one is taken as ever."""
     master = Master()

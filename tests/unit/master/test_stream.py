@@ -14,7 +14,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from tsgt.errors import StreamError
-from tsgt.master.stream import CLOSE_TIMEOUT_S, StreamServer
+from tsgt.master.stream import CLOSE_TIMEOUT_S, MOST_READERS, StreamServer
 
 HELLO = b'{"type":"hello"}'
 BIG = 50_000
@@ -236,6 +236,25 @@ async def test_half_closed_reader_gets_lines(path: Path) -> None:
         client = await Client.connect(path)
         client.writer.write_eof()
         await settle()
+        server.publish(line(1))
+        assert (await client.record())["number"] == 1
+        await client.close()
+
+
+async def test_one_reader_too_many_is_let_go(path: Path) -> None:
+    """Also of those that come at once; when one of the others leaves, there is room again."""
+    async with StreamServer(path, HELLO) as server:
+        crowd = [socket.socket(socket.AF_UNIX) for _ in range(MOST_READERS + 20)]
+        with capture_logs() as logs:
+            for connection in crowd:
+                connection.connect(str(path))
+            await settle()
+        assert server.readers == MOST_READERS
+        assert [entry["event"] for entry in logs].count("reader_refused") == 20
+        for connection in crowd:
+            connection.close()
+        await settle()
+        client = await Client.connect(path)
         server.publish(line(1))
         assert (await client.record())["number"] == 1
         await client.close()

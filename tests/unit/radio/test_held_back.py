@@ -86,6 +86,30 @@ def test_less_than_chips_may_differ_by_is_not_noticed_from_the_start() -> None:
     assert 140_000 < max(abs(errors_ns[k]) for k in errors_ns if k > 40) < 200_000
 
 
+@pytest.mark.parametrize("late_ns", [500_000, 900_000, 1_000_000])
+def test_what_a_delay_below_a_millisecond_shifts_times_by(late_ns: int) -> None:
+    """From the start on, times are off by half of it and a little, which no bound says; beyond a millisecond it is noticed."""
+    exchange = exchange_of()
+    told = hold_back(exchange, late_ns, 150, range(150))
+    errors_ns = exchange.members[2].errors_ns()
+    assert max(abs(errors_ns[k]) for k in errors_ns if k > 40) < 650_000
+    assert bool(told) == (late_ns >= MS)
+
+
+@pytest.mark.parametrize("step_ns", [1_000, 10_000, 25_000])
+def test_a_delay_that_grows_is_noticed_and_bounded_to_half_a_millisecond(step_ns: int) -> None:
+    """It looks like a clock that runs fast; times are off by no more than that beyond what is stated of them."""
+    exchange = exchange_of(60)
+    told = []
+    for frame in range(300):
+        exchange.frame(late_ns={2: min(frame * step_ns, 3 * MS)})
+        heard = exchange.heard.get(2)
+        if heard is not None and (heard.link_doubted or heard.doubted_beacons):
+            told.append(frame)
+    assert min(told) * step_ns < 400_000
+    assert max(beyond_bound(exchange.members[2]).values(), default=0) < 500_000
+
+
 @pytest.mark.parametrize("backlog_s", [0, 20])
 @pytest.mark.parametrize("which", [[0], [0, 1], [1], [2], [0, 1, 2], [3, 4], [0, 1, 2, 3, 4, 5, 6, 7]])
 @pytest.mark.parametrize("late_ns", DELAYS_NS)
@@ -153,3 +177,27 @@ def test_a_session_of_yesterday_played_back() -> None:
     assert set(member.made_ns) - set(member.received) <= set(
         range(len(member.made_ns) - 3, len(member.made_ns))
     )
+
+
+@pytest.mark.parametrize("earlier_ms", [40, 140])
+@pytest.mark.parametrize("late_ms", [50, 100, 220])
+def test_a_reply_with_an_old_measurement_is_held_back(earlier_ms: int, late_ms: int) -> None:
+    """Times that repeat after 2.1 s are not taken for the next ones, and nothing is acknowledged that was not taken."""
+    exchange = exchange_of(60)
+    member = exchange.members[2]
+    made = len(member.made_ns)
+    member.next_ns -= earlier_ms * MS
+    for frame in range(8):
+        exchange.begin()
+        for number in exchange.members:
+            received_ns = exchange.hear(number)
+            if number == 2 and frame == 3 and received_ns is not None:
+                exchange.deliver(2, received_ns + late_ms * MS)
+        if len(member.made_ns) > made:
+            member.next_ns = exchange.now_ns + 60_000 * MS  # the prism is out of sight
+        exchange.end()
+    for _ in range(20):
+        exchange.frame()
+    assert beyond_bound(member) == {}
+    assert max(map(abs, member.errors_ns().values())) < 100_000
+    assert set(member.received) == set(member.made_ns)

@@ -67,6 +67,13 @@ def test_a_key_that_others_may_use_is_refused(key: Path, mode: int) -> None:
         read_key(key)
 
 
+def test_a_key_that_everybody_may_replace_is_refused(key: Path) -> None:
+    """Its own mode helps nothing where everybody may rename files."""
+    key.parent.chmod(0o777)
+    with pytest.raises(ConfigError, match=rf"`chmod o-w {key.parent}`"):
+        read_key(key)
+
+
 def test_a_key_that_cannot_be_changed_is_good(key: Path) -> None:
     """Read-only for its owner is stricter still."""
     key.chmod(0o400)

@@ -4,7 +4,7 @@ import json
 import math
 
 import pytest
-from support.records import EVENT, HEADER, HELLO, NO_POSE, PARAMETERS, POINT, POSE, STATUS, measurement
+from support.records import CLOCK, EVENT, HEADER, HELLO, NO_POSE, PARAMETERS, POINT, POSE, STATUS, measurement
 
 from tsgt.model import PointMeasurement, PolarMeasurement
 from tsgt.recording import decode, encode_line
@@ -62,3 +62,11 @@ def test_an_instant_that_no_clock_shows_is_refused(stamp_ns: int) -> None:
     line = b'{"type":"point","station":1,"prism":1,"sequence":0,"stamp_ns":%d,"received_ns":1,"position_m":[0,0,0]}'
     with pytest.raises(ValueError, match="outside what a clock can show"):
         decode(PointMeasurement, line % stamp_ns)
+
+
+@pytest.mark.parametrize("field", ["offset_ns", "bound_ns", "station"])
+def test_a_whole_number_beyond_64_bits_is_refused(field: str) -> None:
+    """Whoever computes with it would fail: a float cannot hold it, nor can an array."""
+    record = json.loads(encode_line(CLOCK)) | {field: 10**400}
+    with pytest.raises(ValueError, match=f"field {field}: "):
+        decode(type(CLOCK), json.dumps(record).encode())

@@ -7,6 +7,8 @@ import time
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from support.chips import (
     CAD,
     FSRX,
@@ -47,6 +49,20 @@ def test_one_access_may_come_in_pieces(bench: Bench) -> None:
     bench.chip.deselect()
     assert bench.read(0x39) == 0x34
     assert bench.read(0x3A) == 0x99
+
+
+@given(st.lists(st.binary(min_size=1, max_size=20), min_size=1, max_size=12))
+def test_a_window_is_the_same_as_its_bytes(windows: list[bytes]) -> None:
+    """Whatever is written and read, also across the ends of registers and FIFO: at once or byte by byte."""
+    at_once, one_by_one = Bench(), Bench()
+    for bench in (at_once, one_by_one):
+        bench.enter_lora()
+    for data in windows:
+        one_by_one.chip.select()
+        expected = bytes(map(one_by_one.chip.exchange, data))
+        one_by_one.chip.deselect()
+        assert at_once.chip.transfer(data) == expected
+        assert at_once.chip.warnings == one_by_one.chip.warnings
 
 
 def test_nothing_is_exchanged_without_chip_select(bench: Bench) -> None:

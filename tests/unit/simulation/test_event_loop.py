@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import socket
 import threading
 import time
 from typing import TYPE_CHECKING
@@ -243,6 +244,57 @@ def test_time_stands_still_for_threads() -> None:
         return asyncio.get_running_loop().time()
 
     assert run_virtual(main) == 0.0
+
+
+def test_alone_work_is_done_at_once() -> None:
+    """A loop that is alone does the executor's work in its own, and hands over result and error alike."""
+
+    async def main() -> tuple[bool, float]:
+        own = await asyncio.to_thread(threading.current_thread) is threading.current_thread()
+        with pytest.raises(ZeroDivisionError):
+            await asyncio.to_thread(lambda: 1 // 0)
+        return own, asyncio.get_running_loop().time()
+
+    assert run_virtual(main, alone=True) == (True, 0.0)
+
+
+def test_alone_a_cancelled_caller_hears_nothing() -> None:
+    """The executor's work is done, but whoever was cancelled while it waited for it ends as cancelled."""
+    done: list[str] = []
+
+    async def main() -> None:
+        task = asyncio.create_task(asyncio.to_thread(done.append, "work"))
+        await asyncio.sleep(0)
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+
+    run_virtual(main, alone=True)
+    assert done == ["work"]
+
+
+def test_a_stranger_is_let_in_while_time_passes(tmp_path: Path) -> None:
+    """A listening socket, which not every round asks, is still answered while timers keep the loop from waiting."""
+    answers: list[bytes] = []
+
+    def ask() -> None:
+        with socket.socket(socket.AF_UNIX) as client:
+            client.connect(str(tmp_path / "socket"))
+            answers.append(client.recv(10))
+
+    async def greet(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(b"hello")
+        writer.close()
+
+    async def main() -> None:
+        async with await asyncio.start_unix_server(greet, tmp_path / "socket"):
+            stranger = threading.Thread(target=ask)
+            stranger.start()
+            while stranger.is_alive():  # noqa: ASYNC110 (it is the passing of time that must not keep him out)
+                await asyncio.sleep(1)
+
+    run_virtual(main, alone=True)
+    assert answers == [b"hello"]
 
 
 def test_nothing_scheduled_waits_for_a_socket_for_real() -> None:

@@ -37,14 +37,14 @@ def test_nothing_is_told_before_there_are_enough_samples() -> None:
     assert clock.stands
     time = clock.at(1000)
     assert time is not None
-    assert time.host_ns == pytest.approx(arrived_ns(1000), abs=1000)
+    assert 0 <= time.host_ns - arrived_ns(1000) < MS  # it was taken within the ms that it is told in
 
 
 def test_the_fastest_answers_decide() -> None:
     """Late ones change nothing: they are late on one side only."""
     time = standing().at(5_079_600)
     assert time is not None
-    assert abs(time.host_ns - arrived_ns(5_079_600)) < 100_000
+    assert abs(time.host_ns - arrived_ns(5_079_600)) < MS / 2
     assert time.bound_ns < 5 * MS
 
 
@@ -63,7 +63,8 @@ def test_a_power_cycle_begins_anew(start_ms: int) -> None:
     """The count begins near 0, or anywhere: three answers that agree say so, and old times are not told any more."""
     clock = standing()
     results = [
-        clock.add(start_ms + 100 * n, arrived_ns(5_200_000 + 100 * n, late_ms=7 * n)) for n in range(ENOUGH)
+        clock.add(start_ms + 100 * n, arrived_ns(5_200_000 + 100 * n, late_ms=7 * (n % 8)))
+        for n in range(8 * ENOUGH)
     ]
     assert results.count(False) == 1
     assert clock.stands
@@ -76,16 +77,18 @@ def test_the_wrap_of_the_count_begins_anew() -> None:
     """After 24.8 days a count of 32 bits goes negative."""
     start_ms = 2**31 - 400 * 100
     clock = InstrumentClock()
-    told = []
-    for number in range(200):
+    told, outside = [], 0
+    for number in range(300):
         ms = start_ms + 400 * number
         wrapped = ms - 2**32 if ms >= 2**31 else ms
         clock.add(wrapped, arrived_ns(ms, 10.0 * (number % 4)))
         time = clock.stamp(wrapped, arrived_ns(ms, 50.0))
         if time is not None:
             told.append(abs(time.host_ns - arrived_ns(ms)))
-    assert len(told) > 200 - 2 * ENOUGH - 2
-    assert max(told) < 2 * MS
+            outside += told[-1] > time.bound_ns
+    assert len(told) > 300 - 2 * ENOUGH - 2
+    assert outside == 0
+    assert max(told[-150:]) < MS
 
 
 def test_one_damaged_time_is_doubted() -> None:
@@ -175,8 +178,8 @@ def test_times_lie_within_their_bounds(seed: int, rate_ppm: float, spread_ms: fl
         true_ms = 1_000_000 + number * period_ms + random.normal(0, 4)
         arrived = arrived_ns(true_ms, random.uniform(0, spread_ms), rate_ppm * 1e-6)
         clock.add(int(true_ms), arrived)
-        time = clock.at(int(true_ms))
-        if time is None or clock.doubts:
+        time = None if clock.doubts else clock.stamp(int(true_ms), arrived)
+        if time is None:
             continue
         told += 1
         assert last_ns < time.host_ns <= arrived

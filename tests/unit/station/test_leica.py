@@ -52,14 +52,14 @@ async def test_hardly_a_tick_of_a_fast_instrument_is_missed() -> None:
 
 
 async def test_times_are_those_of_the_distances() -> None:
-    """After half a minute a stamp is off by the fastest way of an answer, 20 ms here, and hardly by anything more."""
+    """After half a minute a stamp without the fastest way of an answer, 20 ms here, is hardly off."""
     async with leica_bench(leica_config(latency_ms=20.0)) as day:
         await day.begin()
         await day.read_for(30.0)
         readings = await day.read_for(60.0)
     true_ns = {offered.instrument_ms: offered.true_ns for offered in day.station.offered}
     errors_ms = [(r.at_ns - true_ns[(r.instrument_time_ns or 0) // 1_000_000]) / 1e6 for r in readings]
-    assert np.median(errors_ms) == pytest.approx(0.9, abs=0.9)
+    assert np.median(errors_ms) == pytest.approx(0.0, abs=0.9)
     assert max(errors_ms) - min(errors_ms) < 5
     assert all(r.received_ns is not None and r.received_ns > r.at_ns for r in readings)
 

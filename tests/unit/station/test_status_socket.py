@@ -19,6 +19,7 @@ from tsgt.simulation.clocks import VirtualClock
 from tsgt.station.daemon import run_client
 from tsgt.station.instrument import Condition
 from tsgt.station.requests import AtmosphereRequest
+from tsgt.station.status_socket import MOST_TALKS
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
@@ -68,6 +69,19 @@ def journalled(folder: Path, kind: str) -> list[dict[str, Any]]:
     """Return the lines of a kind in the only journal."""
     (path,) = (folder / "journals").iterdir()
     return [json.loads(line.data) for line in read_lines(path) if line.type == kind]
+
+
+async def test_a_crowd_is_let_go(tmp_path: Path) -> None:
+    """So many are let in and the others not; a second later there is room again."""
+    async with client(tmp_path):
+        crowd = [await asyncio.open_unix_connection(tmp_path / "client.sock") for _ in range(MOST_TALKS + 5)]
+        async with asyncio.timeout(0.01):
+            lines = [await reader.readline() for reader, _ in crowd]
+        assert [bool(line) for line in lines] == [True] * MOST_TALKS + [False] * 5
+        await asyncio.sleep(1.1)
+        assert len(await talk(tmp_path, b"?\n")) == 2
+        for _, writer in crowd:
+            writer.close()
 
 
 async def test_who_says_nothing_gets_the_status_and_soon_the_end(tmp_path: Path) -> None:

@@ -1,0 +1,110 @@
+"""What tuning does not see: batch poses of the paper's drives, simulated, with motion as found and as lively as it must be taken.
+
+For each drive: squared errors in sigmas (NEES) of valid poses, their errors, and how many are valid; once with what has the
+most evidence throughout, once as `tsgt process` does it, once with the configured motion throughout.
+
+    python benchmarks/hidden_bends.py [NAME:SEED]...
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from tsgt.analysis.metrics import inner_part
+from tsgt.analysis.refusals import believed
+from tsgt.analysis.smoothing import motion_of
+from tsgt.config.radio import SuperframeMasterConfig
+from tsgt.geometry import log_so3, point_covariance
+from tsgt.geometry.fit import fit
+from tsgt.geometry.tuning import tune
+from tsgt.log import configure_logging
+from tsgt.master.observations import build_observations
+from tsgt.model import PipelineParameters
+from tsgt.recording import load_recording
+from tsgt.simulation.options import Options
+from tsgt.simulation.scenario import simulate
+from tsgt.simulation.scenario_files import find_scenario
+
+DRIVES = (
+    "quarry:0",
+    "ski-trail:0",
+    "ski-trail:1",
+    "ski-trail:2",
+    "snowmobile:0",
+    "snowmobile:1",
+    "snowmobile:2",
+)
+LIMITS = (22.46, 60.0)
+ACCEPTED = PipelineParameters()
+
+
+def drive(name: str, seed: int) -> None:
+    """Print the lines of one drive."""
+    scenario = find_scenario(name)
+    scenario = scenario.model_copy(
+        update={"pipeline": scenario.pipeline.model_copy(update={"estimator": "linear"})}
+    )
+    options = Options(
+        duration_s=scenario.duration_s,
+        seed=seed,
+        node="ours",
+        protocol=SuperframeMasterConfig(kind="superframe"),
+    )
+    with tempfile.TemporaryDirectory(prefix="tsgt-hidden-") as folder:
+        run = simulate(scenario, options, folder=Path(folder))
+        path = run.sessions[-1].recording()
+        if path is None:
+            raise RuntimeError(f"{name}: the master made no recording")
+        recording = load_recording(path)
+    observations, _ = build_observations(recording.parameters, believed(recording), origin_ns=run.start_ns)
+    first_ns, last_ns = (round(1e9 * observations.time_s[row]) + run.start_ns for row in (0, -1))
+    stamp_ns = np.arange(run.start_ns, run.end_ns, 50_000_000, dtype=np.int64)
+    stamp_ns = stamp_ns[inner_part(stamp_ns, run.start_ns, run.end_ns)]
+    stamp_ns = stamp_ns[(stamp_ns >= first_ns) & (stamp_ns <= last_ns)]
+    at_s = (stamp_ns - run.start_ns) / 1e9
+    truth, middle_m = run.world.pose_at(at_s), run.world.prisms_m.mean(axis=0)
+    configured, motion = (
+        recording.parameters.pipeline.motion,
+        motion_of(observations, recording.parameters.pipeline),
+    )
+    for label, prior, while_hidden in (
+        ("as found", tune(observations).prior, None),
+        ("as processed", motion.prior, configured),
+        ("as configured", configured, None),
+    ):
+        found = fit(observations, prior=prior, while_hidden=while_hidden, noise_scale=motion.noise_scale)
+        states, covariance = found.trajectory.at(at_s, parts=6)
+        off_m = truth[:, :3, 3] - states.position
+        turned = log_so3(np.swapaxes(states.rotation, 1, 2) @ truth[:, :3, :3])
+        error = np.concatenate([off_m, turned], axis=1)
+        nees = np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[..., None])[..., 0])
+        spread = point_covariance(states.rotation, covariance, middle_m)
+        valid = (np.linalg.eigvalsh(spread)[:, -1] < ACCEPTED.position_sigma_limit_m**2) & (
+            np.linalg.eigvalsh(covariance[:, 3:, 3:])[:, -1] < ACCEPTED.rotation_sigma_limit_rad**2
+        )
+        off_m = off_m + ((truth[:, :3, :3] - states.rotation) @ middle_m[:, None])[..., 0]
+        shares = " | ".join(f"{1e3 * np.mean(nees[valid] > limit):.1f}" for limit in LIMITS)
+        rms_mm = 1e3 * np.sqrt(np.mean(np.sum(off_m[valid] ** 2, axis=1)))
+        rms_deg = np.degrees(np.sqrt(np.mean(np.sum(turned[valid] ** 2, axis=1))))
+        print(
+            f"| {name} {seed} | {label} | {nees[valid].mean():.1f} | {nees[valid].max():.0f} | {shares} "
+            f"| {rms_mm:.1f} mm, {rms_deg:.2f}° | {valid.mean():.0%} |",
+            flush=True,
+        )
+
+
+def main() -> None:
+    """Print a table."""
+    configure_logging("error")
+    print("| drive | motion | NEES, mean | largest | above 22.5 in 1000 | above 60 in 1000 | rms | valid |")
+    for each in sys.argv[1:] or DRIVES:
+        name, _, seed = each.partition(":")
+        drive(name, int(seed))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,78 @@
+"""A whole mission on virtual time: simulated seconds per second of CPU, split in simulation and checkers.
+
+The scenario ``dynamic`` with each protocol and each estimator: the real daemons, chips at register level, instruments
+that speak GeoCOM, and afterwards every checker. CPU time is that of the whole process, the least of the runs; on a
+machine that is busy with other things it grows, so compare figures of one sitting only. The five seconds of the drain
+at the end of a run are simulated and not counted.
+
+Run ``python benchmarks/simulation_speed.py [SECONDS] [RUNS]``.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+from tsgt.config.radio import ClassicMasterConfig, SuperframeMasterConfig
+from tsgt.log import configure_logging
+from tsgt.simulation.checkers import violations
+from tsgt.simulation.options import Options
+from tsgt.simulation.scenario import simulate
+from tsgt.simulation.scenario_files import find_scenario
+
+if TYPE_CHECKING:
+    from tsgt.config import ScenarioConfig
+
+DURATION_S = 120.0
+RUNS = 2
+SEED = 3
+PROTOCOLS = (ClassicMasterConfig(kind="classic"), SuperframeMasterConfig(kind="superframe"))
+ESTIMATORS = ("linear", "continuous")
+
+
+def main(duration_s: float = DURATION_S, runs: int = RUNS) -> None:
+    """Print a row for each protocol and estimator."""
+    configure_logging("error")
+    scenario = find_scenario("dynamic")
+    print(f"dynamic, {duration_s:g} simulated seconds, seed {SEED}; CPU time is the least of {runs} runs")
+    print(f"{'':24}{'simulation CPU s':>18}{'checkers CPU s':>16}{'simulated s per CPU s':>23}")
+    for protocol in PROTOCOLS:
+        for estimator in ESTIMATORS:
+            settings = scenario.pipeline.model_copy(update={"estimator": estimator})
+            chosen = scenario.model_copy(update={"pipeline": settings})
+            options = Options(duration_s=duration_s, protocol=protocol, seed=SEED)
+            simulation_s, checkers_s = min((timed(chosen, options) for _ in range(runs)), key=sum)
+            rate = duration_s / (simulation_s + checkers_s)
+            print(
+                f"{f'{protocol.kind}, {estimator}':24}{simulation_s:18.2f}{checkers_s:16.2f}{rate:23.1f}",
+                flush=True,
+            )
+
+
+def timed(scenario: ScenarioConfig, options: Options) -> tuple[float, float]:
+    """Return the CPU time of a run and of its checkers, in s.
+
+    Raises
+    ------
+    SystemExit
+        A checker has found something: a run that is wrong has no speed.
+    """
+    with TemporaryDirectory() as folder:
+        began_s = time.process_time()
+        run = simulate(scenario, options, folder=Path(folder))
+        simulated_s = time.process_time()
+        found = violations(run)
+        if found:
+            sys.exit(f"{found[0].check}: {found[0].detail}")
+        return simulated_s - began_s, time.process_time() - simulated_s
+
+
+if __name__ == "__main__":
+    arguments = [float(argument) for argument in sys.argv[1:]]
+    main(
+        arguments[0] if arguments else DURATION_S,
+        int(arguments[1]) if len(arguments) > 1 else RUNS,
+    )

@@ -1,0 +1,236 @@
+"""Many simulated missions with faults of all kinds, each from one seed, and what must never happen counted in all of them.
+
+    python benchmarks/soak.py [--minutes M] [--first SEED] [--seeds N] [--jobs J] [--json FILE]
+
+Protocol, estimator, losses and drifts change from seed to seed, and with them how often which faults come
+(`tsgt/simulation/faults.py`). A line for each violation says how to get the same run again. `make soak` runs it for a
+quarter of an hour. With `--json` the sums are kept, and a later call with the same file adds to them and goes on after
+the last seed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import sys
+import tempfile
+import time
+from collections import Counter
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from tsgt.config.radio import ClassicMasterConfig, SuperframeMasterConfig
+from tsgt.geometry import log_so3, rotation_from_quaternion
+from tsgt.log import configure_logging
+from tsgt.simulation.checkers import violations
+from tsgt.simulation.faults import QUICK_CYCLES, FaultKind
+from tsgt.simulation.options import Options
+from tsgt.simulation.scenario import Run, simulate
+from tsgt.simulation.scenario_files import find_scenario
+
+DURATION_S = 220.0
+LIMITS = (22.46, 38.26, 60.0)
+"""What squared errors in sigmas, six degrees of freedom, exceed once in a thousand, in a million, in 2e10 honest poses."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mission:
+    """What a seed stands for."""
+
+    seed: int
+    protocol: Literal["superframe", "classic"]
+    estimator: Literal["linear", "continuous"]
+    loss: float
+    drift_ppm: float
+
+    @classmethod
+    def of(cls, seed: int) -> Mission:
+        """Draw it; a quarter of the missions have the continuous estimator, which takes most of the time."""
+        rng = np.random.default_rng([seed, 0x50AC])
+        protocol: Literal["superframe", "classic"] = "superframe" if rng.random() < 0.5 else "classic"
+        return cls(
+            seed,
+            protocol,
+            "continuous" if rng.random() < 0.25 else "linear",
+            # With one packet in ten lost, classic has too few measurements for `linear` even without faults.
+            float(rng.choice([0.0, 0.02, 0.1] if protocol == "superframe" else [0.0, 0.02])),
+            round(float(rng.uniform(-50, 50)), 1),
+        )
+
+    @property
+    def command(self) -> str:
+        """The command that runs it again."""
+        return (
+            f"tsgt simulate dynamic --protocol {self.protocol} --duration {DURATION_S:g} --loss {self.loss} "
+            f"--drift-ppm {self.drift_ppm} --faults all --estimator {self.estimator} --seed {self.seed}"
+        )
+
+
+@dataclass(slots=True)
+class Sums:
+    """What has come of many missions.
+
+    Attributes
+    ----------
+    next_seed
+        The first that has not been run.
+    missions
+        How many, by protocol and estimator.
+    simulated_s, cpu_s
+        Simulated seconds and seconds of CPU, likewise; checkers included.
+    faults
+        How many of each kind.
+    measurements, poses
+        What was delivered, and how many poses were called valid.
+    above
+        How many valid poses of the continuous estimator exceed each of :data:`LIMITS`, and all of them, by kind.
+    violations
+        What must not happen and did: how to get it again, and what it was.
+    """
+
+    next_seed: int = 0
+    missions: Counter[str] = field(default_factory=Counter)
+    simulated_s: Counter[str] = field(default_factory=Counter)
+    cpu_s: Counter[str] = field(default_factory=Counter)
+    faults: Counter[str] = field(default_factory=Counter)
+    measurements: int = 0
+    poses: int = 0
+    above: Counter[str] = field(default_factory=Counter)
+    violations: list[str] = field(default_factory=list)
+
+    def add(self, other: Sums) -> None:
+        """Add those of other missions."""
+        for name in ("missions", "simulated_s", "cpu_s", "faults", "above"):
+            getattr(self, name).update(getattr(other, name))
+        self.measurements += other.measurements
+        self.poses += other.poses
+        self.violations += other.violations
+        self.next_seed = max(self.next_seed, other.next_seed)
+
+
+def run(seed: int) -> Sums:
+    """Run a mission and check it."""
+    configure_logging("critical")
+    logging.disable(logging.CRITICAL)  # asyncio's, of daemons that are killed
+    mission = Mission.of(seed)
+    kind = f"{mission.protocol}, {mission.estimator}"
+    sums = Sums(next_seed=seed + 1, missions=Counter({kind: 1}))
+    scenario = find_scenario("dynamic")
+    pipeline = scenario.pipeline.model_copy(update={"estimator": mission.estimator})
+    radio = scenario.radio.model_copy(update={"loss_probability": mission.loss})
+    scenario = scenario.model_copy(update={"pipeline": pipeline, "radio": radio})
+    options = Options(
+        duration_s=DURATION_S,
+        drift_ppm=mission.drift_ppm,
+        seed=seed,
+        protocol=SuperframeMasterConfig(kind="superframe")
+        if mission.protocol == "superframe"
+        else ClassicMasterConfig(kind="classic", initial_cycles=QUICK_CYCLES),
+        faults=frozenset(FaultKind),
+    )
+    began_s = time.process_time()
+    with tempfile.TemporaryDirectory(prefix="tsgt-soak-") as folder:
+        try:
+            done = simulate(scenario, options, folder=Path(folder))
+            found = [f"{each.check}: {each.detail}" for each in violations(done)]
+            _count(done, sums)
+        except Exception as error:  # noqa: BLE001 (whatever it is, it is a finding)
+            found = [f"died: {error!r}"]
+    sums.violations = [f"{mission.command}\n    {each[:400]}" for each in found[:3]]
+    sums.simulated_s[kind] = round(DURATION_S)
+    sums.cpu_s[kind] = round(1000 * (time.process_time() - began_s))
+    return sums
+
+
+def _count(done: Run, sums: Sums) -> None:
+    sums.faults.update({str(kind): count for kind, count in done.faults.items()})
+    for session in done.sessions:
+        poses = session.valid_poses()
+        sums.measurements += len(session.measurements)
+        sums.poses += len(poses.stamp_ns)
+        for kind in ("predicted", "smoothed"):
+            some = poses.select(poses.kind == kind)
+            if not len(some.stamp_ns):
+                continue
+            truth = done.world.pose_at((some.stamp_ns - session.zero_ns) / 1e9)
+            turned = rotation_from_quaternion(some.orientation_xyzw) @ np.swapaxes(truth[:, :3, :3], 1, 2)
+            errors = np.concatenate([some.position_m - truth[:, :3, 3], log_so3(turned)], axis=1)
+            nees = np.einsum("ni,ni->n", errors, np.linalg.solve(some.covariance, errors[..., None])[..., 0])
+            sums.above[f"{kind}, all"] += len(nees)
+            sums.above[f"{kind}, sum"] += round(float(nees.sum()))
+            for limit in LIMITS:
+                sums.above[f"{kind}, above {limit:g}"] += int(np.count_nonzero(nees > limit))
+
+
+def report(sums: Sums) -> None:
+    """Print what has come of it."""
+    hours = sum(sums.simulated_s.values()) / 3600
+    print(f"{sum(sums.missions.values())} missions, {hours:.1f} h, {len(sums.violations)} violations listed")
+    for kind in sorted(sums.missions):
+        speed = sums.simulated_s[kind] / max(1e-3, sums.cpu_s[kind] / 1000)
+        print(
+            f"  {kind:24} {sums.missions[kind]:5} missions {sums.simulated_s[kind] / 3600:6.1f} h "
+            f"{speed:5.1f} simulated s per s of CPU"
+        )
+    print(f"  {sums.measurements} measurements delivered, {sums.poses} valid poses")
+    for kind in ("predicted", "smoothed"):
+        if count := sums.above[f"{kind}, all"]:
+            shares = ", ".join(
+                f"{sums.above[f'{kind}, above {limit:g}']} above {limit:g}" for limit in LIMITS
+            )
+            mean = sums.above[f"{kind}, sum"] / count
+            print(f"  squared errors in sigmas, {kind}: mean {mean:.2f} of 6; of {count} poses {shares}")
+    print("  " + ", ".join(f"{count} {kind}" for kind, count in sorted(sums.faults.items())))
+
+
+def main() -> int:
+    """Run missions for some time, or so many."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--minutes", type=float, default=15.0, help="how long (default: 15)")
+    parser.add_argument("--first", type=int, default=0, help="first seed (default: 0)")
+    parser.add_argument("--seeds", type=int, help="how many; default: as many as there is time for")
+    parser.add_argument(
+        "--jobs", type=int, default=os.cpu_count(), help="how many at once (default: all cores)"
+    )
+    parser.add_argument("--json", type=Path, help="keep the sums here, and go on from them")
+    arguments = parser.parse_args()
+    sums = Sums(next_seed=arguments.first)
+    if arguments.json is not None and arguments.json.exists():
+        kept: dict[str, Any] = json.loads(arguments.json.read_text())
+        counters = ("missions", "simulated_s", "cpu_s", "faults", "above")
+        for name, value in kept.items():
+            setattr(sums, name, Counter(value) if name in counters else value)
+    last = None if arguments.seeds is None else sums.next_seed + arguments.seeds
+    seed, ends_s, told_s = sums.next_seed, time.monotonic() + 60 * arguments.minutes, time.monotonic()
+    with ProcessPoolExecutor(arguments.jobs, max_tasks_per_child=50) as pool:
+        running: set[Future[Sums]] = set()
+        while running or (time.monotonic() < ends_s and seed != last):
+            while len(running) < arguments.jobs and time.monotonic() < ends_s and seed != last:
+                running.add(pool.submit(run, seed))
+                seed += 1
+            done, running = wait(running, return_when=FIRST_COMPLETED)
+            for each in done:
+                found = each.result()
+                sums.add(found)
+                for violation in found.violations:
+                    print(violation, flush=True)
+            if time.monotonic() > told_s + 60 and sys.stderr.isatty():
+                told_s = time.monotonic()
+                print(f"{sum(sums.missions.values())} missions", file=sys.stderr)
+            if arguments.json is not None:
+                arguments.json.write_text(json.dumps({each.name: getattr(sums, each.name) for each in fields(sums)}))
+    report(sums)
+    return 3 if sums.violations else 0
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    sys.exit(main())

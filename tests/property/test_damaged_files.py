@@ -1,0 +1,147 @@
+"""Damaged files of all other kinds at the desk: a result, or one line that says what is wrong; never half a file."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from support.cli import called
+from support.damage import UNHARMED, Damage, Samples, damages, examples
+from support.harmless import Files, check
+from support.pos_files import SECOND, write_pos
+from support.published import write_prisms, write_targets, write_tracks
+
+ROOT = Path(__file__).parents[2]
+CONFIGS = ROOT / "configs"
+EXAMPLES = [path.read_bytes() for path in sorted(CONFIGS.rglob("*.toml"))]
+LAYOUT = (CONFIGS / "prism_layout.example.toml").read_bytes()
+FRAMES = (CONFIGS / "station_frames.example.toml").read_bytes()
+MASTERS = [path.read_bytes() for path in sorted(CONFIGS.glob("master*.toml"))]
+SCENARIOS = [path.read_bytes() for path in sorted((CONFIGS / "scenarios").glob("*.toml"))]
+DOCUMENTED = [
+    example.encode()
+    for example in re.findall(
+        r"```csv\n(.*?)```", (ROOT / "docs" / "reference" / "target-file.md").read_text("utf-8"), re.DOTALL
+    )
+]
+KEY = b"0123456789abcdef" * 4 + b"\n"
+SETUP = {"prism_layout.example.toml": LAYOUT, "station_frames.example.toml": FRAMES, "radio.key": KEY}
+START_S = 1_700_000_000
+"""When the authors' tracks begin."""
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Samples:
+    """One good file of each kind."""
+    folder = tmp_path_factory.mktemp("good")
+    tracks = write_tracks(folder, duration_s=6.0)
+    write_prisms(folder)
+    write_targets(folder)
+    assert (
+        called(
+            *("import", "rts", "--tracks", *tracks, "--prisms", folder / "sensor_positions.csv"),
+            *("--targets", folder / "GCP.txt", "--output", folder / "r.jsonl"),
+        ).code
+        == 0
+    )
+    frames = folder / "frames.toml"
+    assert called("calibrate", "targets", folder / "GCP.txt", "--output", frames).code == 0
+    assert called("process", folder / "r.jsonl", "--output", folder / "r.tum").code == 0
+    (folder / "polar.csv").write_text(
+        called("export", folder / "r.jsonl", "--format", "csv", "--records", "measurements").out
+    )
+    times_ns = [START_S * SECOND + k * SECOND // 2 for k in range(12)]
+    for number in (1, 2):
+        places = np.array([[k, number, 2.0] for k in range(len(times_ns))])
+        write_pos(folder / f"{number}.pos", times_ns, places)
+    odometry = "time_s,linear_mps,angular_radps\n" + "".join(f"{START_S + k / 2},0.0,0.0\n" for k in range(9))
+    (folder / "odometry.csv").write_text(odometry)
+    return Samples({path.name: path.read_bytes() for path in folder.iterdir()} | SETUP)
+
+
+IMPORT = ("import", "rts", "--tracks", "@trimble1.csv", "@trimble2.csv", "@trimble3.csv")
+EVALUATE = ("evaluate", "@r.jsonl", "--estimator", "linear", "--json")
+COMMANDS: dict[str, tuple[tuple[str, ...], str, str]] = {
+    "tracks": ((*IMPORT, "--prisms", "@sensor_positions.csv"), "trimble2.csv", "o.jsonl"),
+    "published prisms": ((*IMPORT, "--prisms", "@sensor_positions.csv"), "sensor_positions.csv", "o.jsonl"),
+    "published targets": (
+        (*IMPORT, "--prisms", "@sensor_positions.csv", "--targets", "@GCP.txt"),
+        "GCP.txt",
+        "o.jsonl",
+    ),
+    "raw measurements": (
+        (
+            *("import", "polar", "--tracks", "@polar.csv", "--prisms", "@sensor_positions.csv"),
+            *("--frames", "@frames.toml"),
+        ),
+        "polar.csv",
+        "o.jsonl",
+    ),
+    "marker file": (("calibrate", "targets", "@GCP.txt"), "GCP.txt", "o.toml"),
+    "receivers": (("analyse", "gnss", "@1.pos", "@2.pos", "--recording", "@r.jsonl"), "2.pos", ""),
+    "reference": ((*EVALUATE, "--reference", "@r.tum"), "r.tum", ""),
+    "reference exported": (
+        ("export", "@r.jsonl", "--format", "mcap", "--reference", "@r.tum"),
+        "r.tum",
+        "o.mcap",
+    ),
+    "frames": (("process", "@r.jsonl", "--frames", "@frames.toml"), "", "o.tum"),
+    "layout": (("process", "@r.jsonl", "--prisms", "@prism_layout.example.toml"), "", "o.tum"),
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@examples(3)
+@given(damage=damages)
+@example(damage=UNHARMED)
+def test_data_files(good: Samples, command: str, damage: Damage) -> None:
+    """What others have written, and set-up files: each command works on a damaged one or refuses it."""
+    arguments, name, output = COMMANDS[command]
+    name = name or arguments[-1].removeprefix("@")
+    with Files({**good.of, name: damage.to([good.of[name]])}) as files:
+        outcome = check(files, arguments, output=output)
+    assert damage.edits or outcome.code == 0, outcome
+
+
+@examples(15)
+@given(damage=damages, command=st.sampled_from(["targets", "prisms"]), levelled=st.booleans())
+def test_target_files(damage: Damage, command: str, levelled: bool) -> None:  # noqa: FBT001 (given by hypothesis)
+    """Our CSV and the authors' marker file, in all forms of the reference page."""
+    with Files({"measured.csv": damage.to(DOCUMENTED)}) as files:
+        extra = ("--levelled",) * (levelled and command == "targets")
+        check(files, ("calibrate", command, "@measured.csv"), output="o.toml", extra=extra)
+
+
+@examples(40)
+@given(damage=damages)
+def test_configurations(damage: Damage) -> None:
+    """Every example file of a configuration, damaged, is a configuration or one line of error."""
+    with Files({**SETUP, "c.toml": damage.to(EXAMPLES)}) as files:
+        check(files, ("config", "check", "@c.toml"))
+
+
+@examples(15)
+@given(damage=damages, master=st.sampled_from(MASTERS), name=st.sampled_from(sorted(SETUP)))
+def test_what_a_configuration_names(damage: Damage, master: bytes, name: str) -> None:
+    """A good configuration that names a damaged set-up file is checked together with that."""
+    with Files({**SETUP, name: damage.to([SETUP[name]]), "c.toml": master}) as files:
+        check(files, ("config", "check", "@c.toml"))
+
+
+@examples(1)
+@given(damage=damages)
+def test_studies(damage: Damage) -> None:
+    """A damaged layout or scenario is studied or refused."""
+    content = damage.to([LAYOUT, *SCENARIOS])
+    with Files({"f.toml": content}) as files:
+        if b'kind = "scenario"' in content:
+            check(files, ("analyse", "layout", "--scenario", "@f.toml"))
+        else:
+            check(
+                files, ("analyse", "perturbation", "--step-mm", "200", "--draws", "3", "--prisms", "@f.toml")
+            )
+            check(files, ("analyse", "layout", "@f.toml"))

@@ -1,0 +1,134 @@
+"""Damaged recordings and journals at the desk: a result, or one line that says what is wrong; never half a file."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from support.cli import called
+from support.damage import UNHARMED, Damage, Samples, damages, examples
+from support.harmless import Files, check
+from support.merging import journals, recording
+from support.missions import QUICK, SUPERFRAME, mission
+from support.published import write_prisms, write_targets, write_tracks
+
+KEPT_OF_A_TYPE = 40
+"""Lines of a recording; a damaged one among thousands of poses would show the same."""
+
+
+def shortened(content: bytes) -> bytes:
+    """Leave out most of the lines of which there are many."""
+    seen: Counter[str] = Counter()
+    kept = []
+    for line in content.splitlines(keepends=True):
+        kind = json.loads(line)["type"]
+        seen[kind] += 1
+        if kind == "measurement" or seen[kind] <= KEPT_OF_A_TYPE:
+            kept.append(line)
+    return b"".join(kept)
+
+
+@pytest.fixture(scope="module")
+def missions(tmp_path_factory: pytest.TempPathFactory) -> tuple[Samples, ...]:
+    """Twelve seconds over each protocol; the second recording lacks what the radio might not have carried."""
+    samples = []
+    for protocol in (SUPERFRAME, QUICK):
+        folder = tmp_path_factory.mktemp(protocol.kind)
+        run = mission(folder, duration_s=12.0, protocol=protocol)
+        path = folder / "r.jsonl"
+        contents = {
+            "recording": recording(run, path).read_bytes(),
+            "thinned": recording(run, path, without=4).read_bytes(),
+        }
+        contents |= {f"journal {path.parent.name}": path.read_bytes() for path in journals(run)}
+        samples.append(Samples({name: shortened(content) for name, content in contents.items()}))
+    return tuple(samples)
+
+
+@pytest.fixture(scope="module")
+def recordings(missions: tuple[Samples, ...], tmp_path_factory: pytest.TempPathFactory) -> Samples:
+    """Return recordings of all kinds: of missions, merged ones, and what the authors published, as points and as angles."""
+    folder = tmp_path_factory.mktemp("recordings")
+    found = [sample.all[0] for sample in missions]
+    for sample in missions:
+        paths = [folder / f"{number}.jsonl" for number in range(len(sample.all) - 1)]
+        for path, content in zip(paths, sample.all[1:], strict=True):
+            path.write_bytes(content)
+        assert called("merge", *paths).code == 0
+        found.append(paths[0].read_bytes())
+    tracks = ("--tracks", *write_tracks(folder), "--prisms", write_prisms(folder))
+    for targets in ((), ("--targets", write_targets(folder))):
+        path = folder / "imported.jsonl"
+        assert called("import", "rts", *tracks, *targets, "--output", path).code == 0
+        found.append(path.read_bytes())
+    return Samples({f"recording {number}": content for number, content in enumerate(found)})
+
+
+COMMANDS: dict[str, tuple[tuple[str, ...], str]] = {
+    "process": (("process", "@input", "--estimator", "linear"), "o.tum"),
+    "process continuous": (("process", "@input", "--estimator", "continuous"), "o.jsonl"),
+    "evaluate": (("evaluate", "@input", "--estimator", "linear", "--json"), ""),
+    "export tum": (("export", "@input", "--format", "tum"), "o.tum"),
+    "export csv": (("export", "@input", "--format", "csv", "--records", "measurements"), "o.csv"),
+    "export mcap": (("export", "@input", "--format", "mcap"), "o.mcap"),
+    "replay": (("replay", "@input", "--no-wait", "--speed", "inf", "--socket", "@socket"), ""),
+    "calibrate motion": (("calibrate", "motion", "@input", "--no-held-out"), "o.toml"),
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@examples(2)
+@given(damage=damages, keep_going=st.booleans())
+@example(damage=UNHARMED, keep_going=False)
+def test_at_the_desk(
+    recordings: Samples,
+    command: str,
+    damage: Damage,
+    keep_going: bool,  # noqa: FBT001 (given by hypothesis)
+) -> None:
+    """Each command works on a damaged recording or refuses it; its output is there as a whole or not at all."""
+    arguments, output = COMMANDS[command]
+    with Files({"input": damage.to(recordings.all)}) as files:
+        outcome = check(files, arguments, output=output, extra=("--keep-going",) * keep_going)
+    assert damage.edits or outcome.code in (0, 3), outcome
+
+
+@examples(2)
+@given(of=st.integers(0, 1), recording_damage=damages, journal_damage=damages, keep_going=st.booleans())
+def test_merging(
+    missions: tuple[Samples, ...],
+    of: int,
+    recording_damage: Damage,
+    journal_damage: Damage,
+    keep_going: bool,  # noqa: FBT001 (as above)
+) -> None:
+    """Damaged journals into a damaged recording: a new recording, or an error."""
+    _, recording, *journals = missions[of].all
+    contents = {
+        "recording": recording_damage.to([recording]),
+        "one": journal_damage.to(journals),
+        "two": journals[1],
+    }
+    with Files(contents) as files:
+        extra = ("--keep-going",) * keep_going
+        check(files, ("merge", "@recording", "@one", "@two"), output="merged.jsonl", extra=extra)
+
+
+ODOMETRY = [
+    b"time_s,linear_mps,angular_radps\n" + b"".join(b"%d.5,0.0,0.0\n" % (1_700_000_000 + k) for k in range(9))
+]
+
+
+@examples(1)
+@given(damage=damages, odometry_damage=damages)
+@example(damage=UNHARMED, odometry_damage=UNHARMED)
+def test_a_report(recordings: Samples, damage: Damage, odometry_damage: Damage) -> None:
+    """The page of a damaged recording, with damaged odometry, is written or it is not."""
+    with Files({"input": damage.to(recordings.all), "odometry": odometry_damage.to(ODOMETRY)}) as files:
+        odometry = ("--odometry", "@odometry") if damage.sample % 2 else ()
+        arguments = ("evaluate", "@input", "--estimator", "linear", "--no-held-out", "--report", "@report")
+        outcome = check(files, (*arguments, *odometry), output="report")
+    assert damage.edits or outcome.code == 0, outcome

@@ -1,0 +1,208 @@
+"""Somebody who sends damaged packets to both sides of a protocol: nobody falls over, and it goes on as soon as he stops."""
+
+from __future__ import annotations
+
+import asyncio
+import tempfile
+from collections import deque
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
+from structlog.testing import capture_logs
+from support.damage import Damage, damages, examples
+from support.frames import KEY, TIMING, counted
+from support.missions import QUICK, SUPERFRAME, mission
+
+from tsgt.errors import MessageError
+from tsgt.radio.authentication import CODE_BYTES, Authenticator
+from tsgt.radio.message_codec import decode_reply
+from tsgt.simulation.exchange import Exchange
+
+if TYPE_CHECKING:
+    from tsgt.radio.base import Radio
+    from tsgt.simulation.mission import Mission
+    from tsgt.simulation.scenario import Run
+
+REMEMBERED = 50
+SETTLING_FRAMES = 15
+STATIONS = (1, 2, 3)
+
+
+class Channel(RuleBasedStateMachine):
+    """A master and three stations; between their packets come others: theirs, damaged, with a right code or a wrong one.
+
+    The measurements that are made after the last of them have to arrive. Without a key anybody can make a right code:
+    what he sends may be believed, numbers of measurements included, so that nothing is asked there but that nobody
+    falls over.
+    """
+
+    authenticated = True
+
+    @initialize(joined=st.booleans())
+    def begin(self, joined: bool) -> None:  # noqa: FBT001 (given by hypothesis)
+        """Begin, before the stations have joined or after."""
+        self.authenticator = Authenticator(KEY if self.authenticated else None)
+        self.exchange = Exchange(TIMING, self.authenticator, counted(), stations=STATIONS)
+        self.beacons: deque[bytes] = deque(maxlen=REMEMBERED)
+        self.replies: deque[bytes] = deque(maxlen=REMEMBERED)
+        for _ in range(4 * joined):
+            self.frame()
+
+    def frame(self) -> None:
+        """Run a frame to which nothing happens."""
+        self.exchange.frame()
+        self.beacons.append(self.exchange.beacon)
+        self.replies.extend(self.exchange.replies.values())
+
+    @rule(count=st.integers(1, 5))
+    def frames(self, count: int) -> None:
+        """Leave them alone for a while."""
+        for _ in range(count):
+            self.frame()
+
+    @rule(
+        damage=damages,
+        station=st.sampled_from(STATIONS),
+        late_ns=st.integers(-(10**6), 10**9),
+        right=st.booleans(),
+    )
+    def to_a_station(self, damage: Damage, station: int, late_ns: int, right: bool) -> None:  # noqa: FBT001 (as above)
+        """Send a station something like a beacon, or like another one's reply."""
+        self.exchange.begin()
+        packet = damage.to([*self.beacons, *self.replies, self.exchange.beacon])
+        master = self.exchange.master
+        if right:
+            content = packet[:-CODE_BYTES]
+            code = Authenticator(None).beacon_code(
+                session=master.session, counter=master.counter, content=content
+            )
+            packet = content + code
+        core = self.exchange.members[station].core
+        heard = core.received(self.exchange.packet(station, packet[:255], late_ns=late_ns))
+        if self.authenticated:
+            assert heard is None or packet == self.exchange.beacon or packet in self.beacons
+        if core.next_order() is not None:
+            core.executed(ok=damage.sample % 2 == 0)
+        self.exchange.end()
+
+    @rule(
+        damage=damages, station=st.sampled_from(STATIONS), after_ns=st.integers(0, 10**9), right=st.booleans()
+    )
+    def to_the_master(self, damage: Damage, station: int, after_ns: int, right: bool) -> None:  # noqa: FBT001 (as above)
+        """Send the master something like a reply, or like a beacon, while it waits."""
+        exchange = self.exchange
+        packet = damage.to([*self.replies, *self.beacons] or [b""])
+        exchange.begin()
+        if right:
+            content = packet[:-CODE_BYTES]
+            try:
+                peer = exchange.master.peer(station)
+                packet = content + Authenticator(None).reply_code(
+                    session=exchange.master.session,
+                    station=station,
+                    station_nonce=peer.nonce or 0,
+                    counter=exchange.master.counter,
+                    beacon_code=exchange.beacon[-CODE_BYTES:],
+                    sequence=peer.first_number(decode_reply(content)),
+                    content=content,
+                )
+            except MessageError:
+                pass
+        heard = exchange.master.received(packet[:255], exchange.done_ns + after_ns, 3000)
+        if heard is not None:
+            assert not self.authenticated
+            exchange.master.peer(heard.station).inbox.written([got.sequence for got in heard.sightings])
+        exchange.end()
+
+    def teardown(self) -> None:
+        """Leave them alone: soon all that is measured from then on arrives, with its true time."""
+        if not hasattr(self, "exchange"):
+            return
+        for _ in range(SETTLING_FRAMES):
+            self.frame()
+        exchange = self.exchange
+        before = {number: set(member.made_ns) for number, member in exchange.members.items()}
+        for _ in range(10):
+            self.frame()
+        for number, member in exchange.members.items():
+            new = set(member.made_ns) - before[number]
+            arrived = new & set(member.received)
+            errors = member.errors_ns()
+            if self.authenticated:
+                assert len(arrived) >= len(new) - 3, f"station {number}: {len(arrived)} of {len(new)}"
+                assert all(abs(errors[sequence]) < 1_000_000 for sequence in arrived)
+
+
+class OpenChannel(Channel):
+    """The same without a key."""
+
+    authenticated = False
+
+
+_SETTINGS = settings(examples(4), stateful_step_count=20)
+TestWithAKey = Channel.TestCase
+TestWithAKey.settings = _SETTINGS
+TestWithoutAKey = OpenChannel.TestCase
+TestWithoutAKey.settings = _SETTINGS
+
+
+# --- Whole daemons, with radios
+
+HOSTILE_S = (2.0, 5.0)
+"""By then the stations have joined, or not quite; a classic master is still setting their clocks."""
+
+END_S = 9.0
+pauses_ms = st.sampled_from([0, 1, 20, 60, 150, 300])
+
+
+async def attack(mission: Mission, script: list[tuple[Damage, int]]) -> None:
+    """Hear what is on the air and send damaged packets, for some seconds."""
+    heard: deque[bytes] = deque(maxlen=REMEMBERED)
+
+    async def listen(radio: Radio) -> None:
+        while True:
+            heard.append((await radio.receive()).payload)
+
+    await mission.sleep_until(0.5)
+    async with mission.stranger("attacker")() as radio:
+        listening = asyncio.create_task(listen(radio))
+        try:
+            await mission.sleep_until(HOSTILE_S[0])
+            for damage, pause_ms in script:
+                if mission.now_s > HOSTILE_S[1]:
+                    break
+                await asyncio.sleep(pause_ms / 1e3)
+                await radio.transmit((damage.to(list(heard)[::-1] or [b"x"]) or b"x")[:255])
+        finally:
+            listening.cancel()
+            await asyncio.wait([listening])
+
+
+def delivered(run: Run, since_s: float) -> int:
+    """Count the measurements that were made since then and reached the pipeline."""
+    since_ns = run.start_ns + round(since_s * 1e9)
+    return sum(
+        measurement.stamp_ns >= since_ns for session in run.sessions for measurement in session.measurements
+    )
+
+
+@pytest.mark.parametrize("protocol", ["classic", "superframe", "superframe without a key"])
+@examples(1)
+@given(script=st.lists(st.tuples(damages, pauses_ms), min_size=20, max_size=80))
+def test_daemons_go_on(protocol: str, script: list[tuple[Damage, int]]) -> None:
+    """Master and clients live through it, and measure at their rate when it is over."""
+    with tempfile.TemporaryDirectory() as folder, capture_logs():
+        run = mission(
+            Path(folder),
+            duration_s=END_S,
+            protocol=QUICK if protocol == "classic" else SUPERFRAME,
+            authenticated=protocol == "superframe",
+            script=lambda running: attack(running, script),
+        )
+    # Three stations at 2.5 Hz over the superframe; about half of that over classic.
+    least = 10 if protocol == "classic" else 40
+    assert delivered(run, END_S - 3.0) >= least

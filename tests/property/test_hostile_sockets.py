@@ -1,0 +1,280 @@
+"""Whoever sits at the other end of a socket may say what he likes: nobody falls over, and the others are served."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import tempfile
+import threading
+import unicodedata
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from structlog.testing import capture_logs
+from support.air import RecordingAntenna, frame
+from support.cli import called
+from support.client import client_config
+from support.damage import Damage, damages, examples
+from support.radios import PAPER, running_timeline
+from support.records import CLOCK, EVENT, HELLO, NO_POSE, POINT, POSE, STATUS, measurement
+from support.shots import ScriptedInstrument
+
+from tsgt.errors import RadioError, StreamError
+from tsgt.master.stream import StreamServer
+from tsgt.recording import encode_line
+from tsgt.recording.format import MAX_LINE_BYTES
+from tsgt.recording.journal import InstrumentRecord
+from tsgt.simulation.air_client import AirClient
+from tsgt.simulation.air_lines import FrameLine, Incoming, Join, Left, Stop, Stopped, Transmit, Welcome
+from tsgt.simulation.air_server import AirServer
+from tsgt.simulation.clocks import VirtualClock
+from tsgt.simulation.event_loop import run_virtual
+from tsgt.simulation.link import FixedLoss, LinkModel
+from tsgt.station.daemon import run_client
+from tsgt.station.requests import Answer, AtmosphereRequest
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from contextlib import AbstractAsyncContextManager
+
+    from tsgt.radio.base import Radio
+
+FRAME = FrameLine.of(frame())
+SETTINGS = InstrumentRecord(make="Leica", prism_type="round", prism_constant_m=0.0, atmospheric_ppm=8.1)
+
+
+def _lines(*records: object) -> bytes:
+    return b"".join(encode_line(record) + b"\n" for record in records)
+
+
+STREAM = _lines(HELLO, measurement(0), POINT, POSE, NO_POSE, STATUS, CLOCK, EVENT)
+STATUS_STREAM = _lines(HELLO, POSE, STATUS)
+REQUESTS = [_lines(AtmosphereRequest(temperature_c=25.0, pressure_hpa=1000.0)), STREAM]
+TO_AIR = [_lines(Join(name="x"), Transmit(frame=FRAME), Stop(at_ns=5_000_000), Transmit(frame=FRAME))]
+FROM_AIR = [
+    _lines(
+        Welcome(seed=3, noise_figure_db=6.0),
+        Incoming(sender="a", crystal_ppm=1.0, loss_db=80.0, loss_probability=0.0, frame=FRAME),
+        Stopped(sender="a", at_ns=30_000_000),
+        Incoming(sender="b", crystal_ppm=1.0, loss_db=80.0, loss_probability=0.0, frame=FRAME),
+        Left(sender="b"),
+    )
+]
+closings = st.sampled_from(["reads on", "says no more", "goes"])
+
+
+async def settle() -> None:
+    """Let the event loop do everything that it can do without waiting."""
+    for _ in range(30):
+        await asyncio.sleep(0)
+
+
+@contextmanager
+def connected(path: Path, content: bytes, closing: str) -> Iterator[None]:
+    """Say something to a server, and go then, or stay."""
+    with socket.socket(socket.AF_UNIX) as connection:
+        connection.connect(str(path))
+        connection.setblocking(False)
+        with suppress(OSError):  # it has had enough
+            connection.send(content)
+        if closing == "goes":
+            connection.close()
+        elif closing == "says no more":
+            connection.shutdown(socket.SHUT_WR)
+        yield
+
+
+@examples(20)
+@given(strangers=st.lists(st.tuples(damages, closings), min_size=1, max_size=4))
+def test_readers_of_the_stream(strangers: list[tuple[Damage, str]]) -> None:
+    """What a reader sends is passed over: another one gets every line."""
+
+    async def run(folder: Path) -> None:
+        path = folder / "s"
+        async with StreamServer(path, b"hello") as server:
+            reader, writer = await asyncio.open_unix_connection(path)
+            with ExitStack() as stack:
+                for number, (damage, closing) in enumerate(strangers):
+                    stack.enter_context(connected(path, damage.to([STREAM, *REQUESTS]), closing))
+                    await settle()
+                    server.publish(b"%d" % number)
+            server.publish(b"end")
+            for expected in (b"hello", *(b"%d" % number for number in range(len(strangers))), b"end"):
+                assert await reader.readline() == expected + b"\n"
+            writer.close()
+            await settle()
+
+    _in_folder(run)
+
+
+def _no_radio() -> AbstractAsyncContextManager[Radio]:
+    raise RadioError("no chip")
+
+
+@examples(15)
+@given(strangers=st.lists(st.tuples(damages, closings), min_size=1, max_size=4))
+def test_the_clients_socket(strangers: list[tuple[Damage, str]]) -> None:
+    """Whatever was said to a client before, the next one gets its status, and is done what it asks for."""
+
+    async def run(folder: Path) -> None:
+        clock = VirtualClock(1_700_000_000_000_000_000)
+        instrument = ScriptedInstrument(clock)
+        config = client_config(folder)
+        path = folder / "client.sock"
+        running = asyncio.create_task(
+            run_client(config, PAPER, instrument=instrument, open_radio=_no_radio, clock=clock)
+        )
+        await asyncio.sleep(2.0)
+        with ExitStack() as stack:
+            for damage, closing in strangers:
+                stack.enter_context(connected(path, damage.to(REQUESTS), closing))
+                await settle()
+            reader, writer = await asyncio.open_unix_connection(path)
+            writer.write(REQUESTS[0])
+            instrument.give()
+            status, answer = (await reader.read()).splitlines()
+            writer.close()
+        assert json.loads(status)["type"] == "client_status"
+        assert json.loads(answer)["problem"] in ("", "another request came after this one")
+        running.cancel()
+        await asyncio.wait([running])
+        assert running.cancelled() or running.exception() is None
+
+    _in_folder(run)
+
+
+@examples(20)
+@given(strangers=st.lists(st.tuples(damages, closings), min_size=1, max_size=3))
+def test_strangers_at_the_air_server(strangers: list[tuple[Damage, str]]) -> None:
+    """Two radios of the demo hear each other, whoever else is connected and whatever he says."""
+
+    async def run(folder: Path) -> None:
+        path = folder / "air"
+        timeline = running_timeline()
+        link = LinkModel(path_loss=FixedLoss(default_db=80.0))
+        server = AirServer(path, link, np.random.default_rng(1), now_ns=timeline.now_ns)
+        async with (
+            server,
+            AirClient(path, "tx", timeline) as sender,
+            AirClient(path, "rx", timeline) as receiver,
+        ):
+            port = sender.join(RecordingAntenna())
+            receiver.join(RecordingAntenna())
+            with ExitStack() as stack:
+                for damage, closing in strangers:
+                    stack.enter_context(connected(path, damage.to(TO_AIR), closing))
+                    await settle()
+                assert {"tx", "rx"} <= server.names
+                port.transmit(frame(start_ns=timeline.now_ns()))
+                await settle()
+                assert {"tx", "rx"} <= server.names
+
+    _in_folder(run)
+
+
+@examples(20)
+@given(damage=damages)
+def test_a_client_of_a_hostile_air_server(damage: Damage) -> None:
+    """A radio of the demo joins, is told that it cannot, or that the air is gone; nothing else."""
+
+    async def run(folder: Path) -> None:
+        path = folder / "air"
+        content = damage.to(FROM_AIR)
+
+        async def serve(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            with suppress(OSError):
+                writer.write(content)
+                await writer.drain()
+            writer.close()
+
+        server = await asyncio.start_unix_server(serve, path)
+        timeline = running_timeline()
+        with suppress(StreamError):
+            async with AirClient(path, "rx", timeline) as client:
+                client.join(RecordingAntenna())
+                await asyncio.sleep(0.5)
+                await client.wait_lost()
+        server.close()
+        await settle()
+
+    _in_folder(run)
+
+
+def _in_folder(run: object) -> None:
+    problems: list[dict[str, object]] = []
+    with tempfile.TemporaryDirectory() as folder, capture_logs():
+
+        async def watched() -> None:
+            asyncio.get_running_loop().set_exception_handler(lambda _, context: problems.append(context))
+            await run(Path(folder))  # type: ignore[operator]
+
+        run_virtual(watched)
+    assert problems == []
+
+
+# --- Commands that read from a socket
+
+
+@contextmanager
+def serving(path: Path, content: bytes) -> Iterator[None]:
+    """Say something to whoever comes first, and hang up."""
+
+    def serve() -> None:
+        connection, _ = listener.accept()
+        with connection, suppress(OSError):
+            connection.sendall(content)
+
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(path))
+        listener.listen()
+        thread = threading.Thread(target=serve, daemon=True)
+        thread.start()
+        yield
+        with suppress(OSError), socket.socket(socket.AF_UNIX) as last:
+            last.connect(str(path))  # for a server that nobody has come to
+        thread.join()
+
+
+COMMANDS = {
+    "listen": (("listen",), [STREAM]),
+    "status": (("status",), [STATUS_STREAM, STREAM]),
+    "atmosphere": (
+        ("atmosphere", "20", "1000"),
+        [b'{"type":"client_status"}\n' + _lines(Answer(settings=SETTINGS))],
+    ),
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@examples(25)
+@given(damage=damages)
+def test_commands_at_a_hostile_server(command: str, damage: Damage) -> None:
+    """The commands that people look at show lines or one error, and send nothing to the terminal but text."""
+    arguments, samples = COMMANDS[command]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "s"
+        with serving(path, damage.to(samples)):
+            outcome = called(*arguments, "--socket", path)
+    assert outcome.code in (0, 1, 3)
+    assert (outcome.code == 1) == outcome.err.startswith("error: ") or command == "listen"
+    for character in outcome.out + outcome.err:
+        assert character == "\n" or unicodedata.category(character) != "Cc", repr(character)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_line_without_end_does_not_fill_the_memory(command: str) -> None:
+    """The commands take so many bytes for a line, and no more."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "s"
+        with serving(path, b"x" * (3 * MAX_LINE_BYTES)):
+            outcome = called(*COMMANDS[command][0], "--socket", path)
+    assert outcome.code == 1
+    assert outcome.out == ""
+    assert outcome.err.startswith("error: ")
+    assert len(outcome.err) < 1000

@@ -1,0 +1,87 @@
+"""A trajectory is that of one point of the robot; what it says of any other point is exactly that point's motion."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from tsgt.geometry import exp_so3, of_point
+from tsgt.geometry.knots import Knots
+
+same_every_time = settings(derandomize=True, max_examples=50)
+STEP = 1e-4
+
+
+def vectors(limit: float) -> st.SearchStrategy[np.ndarray]:
+    """3-vectors with coordinates up to the limit."""
+    return arrays(np.float64, (3,), elements=st.floats(-limit, limit))
+
+
+states = st.builds(
+    lambda *parts: Knots(
+        np.zeros(1), parts[0][None], exp_so3(parts[1])[None], *(part[None] for part in parts[2:])
+    ),
+    *map(vectors, (100.0, 3.0, 3.0, 2.0, 2.0, 2.0)),
+)
+arms = vectors(5.0)
+covariances = arrays(np.float64, (1, 18, 18), elements=st.floats(-1.0, 1.0)).map(
+    lambda root: root @ np.swapaxes(root, 1, 2)
+)
+NONE = np.zeros((1, 18, 18))
+
+
+def later(state: Knots, dt_s: float) -> Knots:
+    """Carry a robot on with steady accelerations; rotations to the third order of the time."""
+    rate, faster = state.angular_velocity, state.angular_acceleration
+    turn = rate * dt_s + faster * dt_s**2 / 2 + np.cross(rate, faster) * dt_s**3 / 12
+    return Knots(
+        state.time_s + dt_s,
+        state.position + state.velocity * dt_s + state.acceleration * dt_s**2 / 2,
+        state.rotation @ exp_so3(turn),
+        state.velocity + state.acceleration * dt_s,
+        rate + faster * dt_s,
+        state.acceleration,
+        faster,
+    )
+
+
+@same_every_time
+@given(states, arms)
+def test_another_points_velocity_and_acceleration_are_those_of_its_place(
+    state: Knots, arm: np.ndarray
+) -> None:
+    """As differences of where it is and how fast a little before and after."""
+    point, before, after = (of_point(later(state, dt_s), NONE, arm)[0] for dt_s in (0.0, -STEP, STEP))
+    seen = state.position[0] + state.rotation[0] @ arm
+    np.testing.assert_allclose(point.position[0], seen, atol=1e-12)
+    np.testing.assert_allclose(point.velocity, (after.position - before.position) / (2 * STEP), atol=1e-5)
+    np.testing.assert_allclose(point.acceleration, (after.velocity - before.velocity) / (2 * STEP), atol=1e-5)
+
+
+@same_every_time
+@given(states, arms, covariances)
+def test_another_points_covariance_is_that_of_its_errors(
+    state: Knots, arm: np.ndarray, covariance: np.ndarray
+) -> None:
+    """With the derivatives of its error by each part of the state's, as differences."""
+    point, found = of_point(state, covariance, arm)
+    by_error = np.empty((6, 18))
+    for part in range(18):
+        error = np.zeros((1, 18))
+        error[0, part] = STEP
+        more, less = (of_point(state.moved(sign * error), NONE, arm)[0] for sign in (1, -1))
+        by_error[:, part] = (more.error_from(point) - less.error_from(point))[0, :6] / (2 * STEP)
+    np.testing.assert_allclose(found[0], by_error @ covariance[0] @ by_error.T, atol=1e-5)
+    np.testing.assert_array_equal(of_point(state, covariance[:, :6, :6], arm)[1], found)
+
+
+@same_every_time
+@given(states, arms, covariances)
+def test_there_and_back_is_where_it_was(state: Knots, arm: np.ndarray, covariance: np.ndarray) -> None:
+    """The same motion, and the same covariance."""
+    there, between = of_point(state, covariance, arm)
+    back, found = of_point(there, between, -arm)
+    np.testing.assert_allclose(back.error_from(state), 0.0, atol=1e-12)
+    np.testing.assert_allclose(found, covariance[:, :6, :6], atol=1e-10)

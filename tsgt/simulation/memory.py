@@ -1,0 +1,34 @@
+"""Whether anything in the daemons' memory grows without a bound that is stated."""
+
+from __future__ import annotations
+
+import gc
+from collections import deque
+
+from tsgt.master.stream import QUEUE_LINES
+
+MOST_ENTRIES = 500
+"""A list, queue or table of a daemon has at most so many entries, if nothing else is stated."""
+
+STATED = {("_Reader", "_queue"): QUEUE_LINES}
+"""Those with a bound of their own: class and attribute, and how many entries it may have."""
+
+_SIZED = (list, deque, dict, set, bytearray, tuple)
+_PACKAGES = ("tsgt.master.", "tsgt.radio.", "tsgt.station.", "tsgt.recording.", "tsgt.geometry.")
+
+
+def overgrown() -> tuple[str, ...]:
+    """Look at all objects of the daemons that live in this process, one line for each that has too much in it."""
+    found = []
+    for thing in gc.get_objects():
+        kind = type(thing)
+        if not str(kind.__module__).startswith(_PACKAGES):
+            continue
+        names = getattr(thing, "__dict__", None) or [
+            name for base in kind.__mro__ for name in getattr(base, "__slots__", ())
+        ]
+        for name in names:
+            value = getattr(thing, name, None)
+            if isinstance(value, _SIZED) and len(value) > STATED.get((kind.__name__, name), MOST_ENTRIES):
+                found.append(f"{kind.__module__}.{kind.__name__}.{name} has {len(value)} entries")
+    return tuple(sorted(set(found)))

@@ -11,6 +11,7 @@ from __future__ import annotations
 import sys
 import tempfile
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,16 +19,20 @@ from tsgt.analysis.metrics import inner_part
 from tsgt.analysis.refusals import believed
 from tsgt.analysis.smoothing import motion_of
 from tsgt.config.radio import SuperframeMasterConfig
-from tsgt.geometry import log_so3, point_covariance
+from tsgt.geometry import log_so3
 from tsgt.geometry.fit import fit
 from tsgt.geometry.tuning import tune
 from tsgt.log import configure_logging
-from tsgt.master.observations import build_observations
+from tsgt.master.observations import build_observations, middle_m
 from tsgt.model import PipelineParameters
 from tsgt.recording import load_recording
 from tsgt.simulation.options import Options
 from tsgt.simulation.scenario import simulate
 from tsgt.simulation.scenario_files import find_scenario
+
+if TYPE_CHECKING:
+    from tsgt.recording import Recording
+    from tsgt.simulation.world import World
 
 DRIVES = (
     "quarry:0",
@@ -59,14 +64,19 @@ def drive(name: str, seed: int) -> None:
         path = run.sessions[-1].recording()
         if path is None:
             raise RuntimeError(f"{name}: the master made no recording")
-        recording = load_recording(path)
-    observations, _ = build_observations(recording.parameters, believed(recording), origin_ns=run.start_ns)
-    first_ns, last_ns = (round(1e9 * observations.time_s[row]) + run.start_ns for row in (0, -1))
-    stamp_ns = np.arange(run.start_ns, run.end_ns, 50_000_000, dtype=np.int64)
-    stamp_ns = stamp_ns[inner_part(stamp_ns, run.start_ns, run.end_ns)]
+        judge(f"{name} {seed}", load_recording(path), run.world, run.start_ns, run.end_ns)
+
+
+def judge(name: str, recording: Recording, world: World, start_ns: int, end_ns: int) -> None:
+    """Print the lines of one recording."""
+    observations, _ = build_observations(recording.parameters, believed(recording), origin_ns=start_ns)
+    first_ns, last_ns = (round(1e9 * observations.time_s[row]) + start_ns for row in (0, -1))
+    stamp_ns = np.arange(start_ns, end_ns, 50_000_000, dtype=np.int64)
+    stamp_ns = stamp_ns[inner_part(stamp_ns, start_ns, end_ns)]
     stamp_ns = stamp_ns[(stamp_ns >= first_ns) & (stamp_ns <= last_ns)]
-    at_s = (stamp_ns - run.start_ns) / 1e9
-    truth, middle_m = run.world.pose_at(at_s), run.world.prisms_m.mean(axis=0)
+    at_s = (stamp_ns - start_ns) / 1e9
+    truth = world.pose_at(at_s)
+    place_m = truth[:, :3, 3] + truth[:, :3, :3] @ middle_m(recording.parameters)
     configured, motion = (
         recording.parameters.pipeline.motion,
         motion_of(observations, recording.parameters.pipeline),
@@ -78,20 +88,18 @@ def drive(name: str, seed: int) -> None:
     ):
         found = fit(observations, prior=prior, while_hidden=while_hidden, noise_scale=motion.noise_scale)
         states, covariance = found.trajectory.at(at_s, parts=6)
-        off_m = truth[:, :3, 3] - states.position
+        off_m = place_m - states.position
         turned = log_so3(np.swapaxes(states.rotation, 1, 2) @ truth[:, :3, :3])
         error = np.concatenate([off_m, turned], axis=1)
         nees = np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[..., None])[..., 0])
-        spread = point_covariance(states.rotation, covariance, middle_m)
-        valid = (np.linalg.eigvalsh(spread)[:, -1] < ACCEPTED.position_sigma_limit_m**2) & (
+        valid = (np.linalg.eigvalsh(covariance[:, :3, :3])[:, -1] < ACCEPTED.position_sigma_limit_m**2) & (
             np.linalg.eigvalsh(covariance[:, 3:, 3:])[:, -1] < ACCEPTED.rotation_sigma_limit_rad**2
         )
-        off_m = off_m + ((truth[:, :3, :3] - states.rotation) @ middle_m[:, None])[..., 0]
         shares = " | ".join(f"{1e3 * np.mean(nees[valid] > limit):.1f}" for limit in LIMITS)
         rms_mm = 1e3 * np.sqrt(np.mean(np.sum(off_m[valid] ** 2, axis=1)))
         rms_deg = np.degrees(np.sqrt(np.mean(np.sum(turned[valid] ** 2, axis=1))))
         print(
-            f"| {name} {seed} | {label} | {nees[valid].mean():.1f} | {nees[valid].max():.0f} | {shares} "
+            f"| {name} | {label} | {nees[valid].mean():.1f} | {nees[valid].max():.0f} | {shares} "
             f"| {rms_mm:.1f} mm, {rms_deg:.2f}° | {valid.mean():.0%} |",
             flush=True,
         )

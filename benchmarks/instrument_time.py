@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from tsgt.config import ScenarioConfig
-from tsgt.config.client import LeicaInstrumentConfig
+from tsgt.config.client import Baud, LeicaInstrumentConfig
 from tsgt.config.scenario import InstrumentModelConfig, SimulatedStation
 from tsgt.simulation.clocks import VirtualClock
 from tsgt.simulation.event_loop import run_virtual
@@ -109,7 +109,7 @@ class Driven(NamedTuple):
 
     rate_hz: float
     processing_ms: tuple[float, float] = (20.0, 60.0)
-    baud: int = 115_200
+    baud: Baud = 115_200
 
 
 DRIVEN = (Driven(2.5), Driven(2.5, (5.0, 10.0)), Driven(2.5, baud=9600), Driven(7.0), Driven(20.0))

@@ -6,7 +6,7 @@ import json
 from collections import Counter
 
 import pytest
-from hypothesis import example, given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from support.cli import called
 from support.damage import UNHARMED, Damage, Samples, damages, examples
@@ -14,6 +14,9 @@ from support.harmless import Files, check
 from support.merging import journals, recording
 from support.missions import QUICK, SUPERFRAME, mission
 from support.published import write_prisms, write_targets, write_tracks
+
+FUZZ_EXAMPLES = 1000
+"""Of a test that does not say how many it wants: what tells `make fuzz` from `make test`."""
 
 KEPT_OF_A_TYPE = 40
 """Lines of a recording; a damaged one among thousands of poses would show the same."""
@@ -122,6 +125,7 @@ ODOMETRY = [
 ]
 
 
+@pytest.mark.skipif(settings().max_examples < FUZZ_EXAMPLES, reason="takes seconds each time; for make fuzz")
 @examples(1)
 @given(damage=damages, odometry_damage=damages)
 @example(damage=UNHARMED, odometry_damage=UNHARMED)

@@ -57,6 +57,7 @@ def check(files: Files, arguments: Sequence[str], *, output: str = "", extra: Se
         # What was skipped, or is doubtful, may stand before it.
         *_, last = outcome.err.splitlines()
         assert re.match(r"[Ee]rror: \S", last), outcome.err
+        assert last.isprintable(), outcome
         assert len(last) < LONGEST_ERROR + len(str(files.folder)), outcome.err
         assert len(re.findall("^[Ee]rror: ", outcome.err, re.MULTILINE)) == 1
     left = set(files.folder.iterdir()) - set(files.contents)

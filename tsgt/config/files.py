@@ -171,8 +171,14 @@ def _key(location: tuple[int | str, ...]) -> str:
     for part in location:
         if part == "[key]":  # pydantic's mark that a table's name is meant, not its content
             continue
-        key += f"[#{part + 1}]" if isinstance(part, int) else f".{part}" if key else part
+        key += f"[#{part + 1}]" if isinstance(part, int) else f".{_name(part)}" if key else _name(part)
     return key
+
+
+def _name(key: str) -> str:
+    """Return a key as it can stand in a line; between quotes a file may call it what it likes."""
+    name = key if key.isprintable() else json.dumps(key)
+    return name if len(name) <= _SHOWN_CHARACTERS else f"{name[: _SHOWN_CHARACTERS - 3]}..."
 
 
 def _without_tags(location: tuple[int | str, ...], raw: Any) -> tuple[int | str, ...]:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 CALMEST = 1.0 / 3.0
 """No axis of a tuned prior is calmer than this share of the configured one's."""
 
-OUTAGE_S = 1.0
+OUTAGE_S = 2.0
 """A prism that was not measured for longer is hidden."""
 
 _LEAST_PRISMS = 3

@@ -159,7 +159,6 @@ class _Station:
         self.missed = False
 
     def answered(self, message: MeasurementMessage, requested_ns: int, received_ns: int) -> Arrival:
-        status = status_of(message)
         missed = self.missed
         back = self._is_back(received_ns)
         if message.time_ns == 0:

@@ -36,6 +36,8 @@ class SimulatedDisk:
 
     def refuse(self, error: int, since_ns: int, until_ns: int) -> None:
         """Refuse everything with an error; when that is to end is for :meth:`unwritten_since_ns` alone."""
+        if self._refused_ns is not None and since_ns <= self._refused_ns[1] + RECOVERY_NS:
+            since_ns, until_ns = self._refused_ns[0], max(until_ns, self._refused_ns[1])
         self.refuses = error
         self._refused_ns = (since_ns, until_ns)
 

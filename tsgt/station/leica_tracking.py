@@ -48,6 +48,7 @@ _GAP_NS: Final = 600_000_000
 _RESTART_NS: Final = 3_000_000_000
 _STARTING_NS: Final = 600_000_000
 _SURE: Final = 3  # an answer that nothing can be done about is asked for again
+_UNSAID: Final = 12  # asked so often, an instrument that never says whether it is locked in is taken at not
 _ROOM_NS: Final = 120_000_000
 _ADJUST = 2 * NARROWEST_RAD
 
@@ -98,6 +99,7 @@ class Tracking:
         self.tilted = False
         self._pace = Pace()
         self._lock = Lock.OUT
+        self._lock_unsaid = _UNSAID
         self._lock_asked_ns = 0
         self._good_from_ns = 0
         self._lost_ns: int | None = None
@@ -279,7 +281,7 @@ class Tracking:
         elif self.finder is not None:
             if now_ns - self._lock_asked_ns >= _LOST_LOCK_NS:
                 await self._ask_lock(self.finder)
-            if measured.status is not Status.TILT:
+            if measured.status is not Status.TILT and not self._lock_unsaid:
                 await self._look(self.finder)
         if self._search is None and now_ns - self._last_new_ns > _RESTART_NS:
             await self.measure()
@@ -297,6 +299,7 @@ class Tracking:
         lock = await finder.lock()
         if lock is not None:  # what was so is still so: a search would end a lock
             self._lock = lock
+        self._lock_unsaid = max(self._lock_unsaid - 1, 0) if lock is None else 0
         self._lock_asked_ns = self._clock.monotonic_ns()
         if self._lock is Lock.IN:
             self.call_for = ""

@@ -167,6 +167,19 @@ def test_a_long_value_is_cut(tmp_path: Path) -> None:
     assert len(str(error.value)) < 200
 
 
+@pytest.mark.parametrize("key", ["x" * 3000, "a\\nb\\u001b[2J"], ids=["long", "of two lines"])
+def test_an_odd_key_stays_in_its_line(key: str, tmp_path: Path) -> None:
+    """A key between quotes may be anything; of a long one the beginning is shown."""
+    path = tmp_path / "c.toml"
+    path.write_text(f'kind = "prism_layout"\n"{key}" = 1\n')
+    with pytest.raises(ConfigError) as caught:
+        load_any(path)
+    message = str(caught.value)
+    assert message.isprintable()
+    assert len(message) < len(str(path)) + 200
+    assert "unknown key" in message
+
+
 def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
     """A configuration works from any working folder; an absolute path stays as it is."""
     path = tmp_path / "master.toml"

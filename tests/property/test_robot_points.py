@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from tsgt.geometry import exp_so3, of_point
+from tsgt.geometry import exp_so3, of_point, with_curvature
 from tsgt.geometry.knots import Knots
+from tsgt.geometry.rigid import skew
 
 same_every_time = settings(derandomize=True, max_examples=50)
 STEP = 1e-4
@@ -85,3 +87,22 @@ def test_there_and_back_is_where_it_was(state: Knots, arm: np.ndarray, covarianc
     back, found = of_point(there, between, -arm)
     np.testing.assert_allclose(back.error_from(state), 0.0, atol=1e-12)
     np.testing.assert_allclose(found, covariance[:, :6, :6], atol=1e-10)
+
+
+def test_a_point_that_turns_about_a_line_comes_nearer_to_it() -> None:
+    """The mean square towards the line is that of a sample, which linear errors do not have at all."""
+    random = np.random.default_rng(0)
+    rotation, axis = exp_so3(np.array([0.3, -0.2, 0.5])), np.array([0.0, 0.6, 0.8])
+    arm, sigma_rad = np.array([0.4, 0.3, -0.2]), 0.1
+    by_turn = np.vstack([-rotation @ skew(arm), np.eye(3)])
+    turns = sigma_rad**2 * np.outer(axis, axis) + 1e-10 * np.eye(3)
+    covariance = (by_turn @ turns @ by_turn.T)[None]
+    to_line = rotation @ (axis * (axis @ arm) - arm)
+    to_line /= np.linalg.norm(to_line)
+    sample = [
+        to_line @ rotation @ (exp_so3(angle * axis) @ arm - arm)
+        for angle in random.normal(0, sigma_rad, 20_000)
+    ]
+    found = with_curvature(rotation[None], covariance)[0, :3, :3]
+    assert to_line @ found @ to_line == pytest.approx(np.mean(np.square(sample)), rel=0.05)
+    assert to_line @ covariance[0, :3, :3] @ to_line < 1e-3 * np.mean(np.square(sample))

@@ -52,7 +52,7 @@ from tsgt.geometry.rigid import (
     transform_from,
     transform_points,
 )
-from tsgt.geometry.trajectory import Trajectory, of_point, ros_covariance
+from tsgt.geometry.trajectory import Trajectory, of_point, ros_covariance, with_curvature
 
 __all__ = [
     "NO_GAP_NS",
@@ -96,4 +96,5 @@ __all__ = [
     "twists",
     "unseen_motion_covariance",
     "unseen_s2",
+    "with_curvature",
 ]

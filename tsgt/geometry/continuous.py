@@ -11,7 +11,7 @@ docs/explanation/continuous-trajectory.md derives it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -65,14 +65,18 @@ class Anchor:
 
     Attributes
     ----------
-    mean
-        One knot.
+    near
+        One knot, where its error counts from; close to where the trajectory is.
     information
-        (18, 18) inverse covariance of its error.
+        (18, 18) inverse covariance of that error.
+    expected
+        (18,) its mean. What is known only with what comes later may be far off here, metres and radians in a direction of
+        which the information is next to nothing: as an error it stays in that direction, as another knot it would not.
     """
 
-    mean: Knots
+    near: Knots
     information: FloatArray
+    expected: FloatArray = field(default_factory=lambda: np.zeros(STATE))
 
 
 class Solution(NamedTuple):
@@ -297,9 +301,10 @@ def assemble(
         between = linearise_steps(knots.select(ends), few)
         cost += add_steps(between, few, diagonal[ends], beside[some], gradient[ends])
 
-    error = knots.select(slice(0, 1)).error_from(anchor.mean)[0]
+    error = knots.select(slice(0, 1)).error_from(anchor.near)[0]
     by_error = np.eye(STATE)
     by_error[3:6, 3:6] = inverse_right_jacobian(error[3:6])
+    error -= anchor.expected
     pull = by_error.T @ anchor.information
     diagonal[0] += pull @ by_error
     gradient[0] += pull @ error

@@ -52,6 +52,11 @@ LOST_RAD = 0.2
 """One sigma of the rotation: not known so well any more, it has to be guessed anew. What two prisms do not tell of it is
 another axis for each attitude: following further than linearisation holds would make knowledge of none."""
 
+SOME_FIT = 0.5
+NEARLY_ALL_FIT = 0.9
+"""Share of the measurements that are no outliers. A trajectory that is followed bears a station on the wrong prism; one that
+is found from nothing bears next to none, as with some left out another robot, metres away, may fit the rest."""
+
 SETTLED = 0.01
 """In squared sigmas of the whole window: a step that is to gain less is the last one. Beside an outlier, whose say changes
 with each step, one of less than 1 left predictions up to 0.6 sigmas from those of a full search."""
@@ -109,6 +114,11 @@ class FixedLag:
         """Whether there is a trajectory."""
         return self._solved is not None
 
+    @property
+    def settled(self) -> bool:
+        """Whether it can be believed: it is known well enough, and explains what was measured."""
+        return self._settled
+
     def update(self, new: Observations) -> None:
         """Take measurements, in the order of time, none before :attr:`horizon_s`."""
         held, self.observations = self.observations, _merged(self.observations, new)
@@ -147,8 +157,8 @@ class FixedLag:
         )
         factor = factorise(system.diagonal, system.beside)
         left = factor.last()
-        mean = knots.select(slice(first, None)).moved(factor.solve(-system.gradient)[first:])
-        self._anchor = Anchor(mean, left @ left.T)
+        expected = factor.solve(-system.gradient)[first]
+        self._anchor = Anchor(knots.select(slice(first, None)), left @ left.T, expected)
         self._knots = self._knots.select(slice(first, None))
         self._horizon_s = float(self._knots.time_s[0])
         self._keep(~past)
@@ -224,7 +234,8 @@ class FixedLag:
         covariance = inverse.T @ inverse
         self._end = Ahead(knots.select(slice(-1, None)), covariance, self._prior)
         sigma_rad = float(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1]))
-        fits = float(np.median(found.distances)) < OUTLYING**2
+        fitting = float(np.mean(found.distances < OUTLYING**2))
+        fits = fitting > (SOME_FIT if self._settled else NEARLY_ALL_FIT)
         self._settled = fits and sigma_rad < (LOST_RAD if self._settled else SURE_RAD)
 
 

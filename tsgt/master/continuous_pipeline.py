@@ -160,10 +160,10 @@ class ContinuousPipeline:
             self._window.predict((epoch_ns - self._origin_ns) / 1e9, parts=_POSE) for epoch_ns in epochs_ns
         ]
         if len(found) == 1:
-            return self._poses.predicted(epochs_ns, self._seen, *found[0])
+            return self._poses.predicted(epochs_ns, self._seen, *found[0], settled=self._window.settled)
         states = joined([state for state, _ in found])
         covariance = np.concatenate([each for _, each in found])
-        return self._poses.predicted(epochs_ns, self._seen, states, covariance)
+        return self._poses.predicted(epochs_ns, self._seen, states, covariance, settled=self._window.settled)
 
     def _smoothed_until(self, last_ns: int) -> PoseBatch:
         """Return the smoothed poses of the epochs up to an instant, and let go of what they needed."""
@@ -174,7 +174,7 @@ class ContinuousPipeline:
         covariance = _NONE
         if self._window.following:
             states, covariance = self._window.trajectory().at((stamp_ns - self._origin_ns) / 1e9, parts=_POSE)
-        poses = self._poses.smoothed(stamp_ns, self._seen, states, covariance)
+        poses = self._poses.smoothed(stamp_ns, self._seen, states, covariance, settled=self._window.settled)
         self._next_smoothed_ns = int(stamp_ns[-1]) + self._limits.period_ns
         self._forget()
         return poses

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from tsgt.geometry import of_point, quaternion_from_rotation, ros_covariance
+from tsgt.geometry import of_point, quaternion_from_rotation, ros_covariance, with_curvature
 from tsgt.master.observations import middle_m
 from tsgt.master.pose_batch import Kind, PoseBatch, Reason
 
@@ -105,7 +105,13 @@ class ContinuousPoses:
         self._to_origin_m = -middle_m(parameters)
 
     def predicted(
-        self, stamps_ns: Sequence[int], seen: Seen, states: Knots | None, covariance: NDArray[np.float64]
+        self,
+        stamps_ns: Sequence[int],
+        seen: Seen,
+        states: Knots | None,
+        covariance: NDArray[np.float64],
+        *,
+        settled: bool = True,
     ) -> PoseBatch:
         """Make poses from measurements before their epochs; arguments and result as those of :meth:`smoothed`.
 
@@ -120,10 +126,16 @@ class ContinuousPoses:
                     batch.prism_residual_m[row, column],
                     batch.prism_reason[row, column],
                 ) = self._latest(seen.of_prisms[column], home_station, stamp_ns)
-        return self._judged(batch, states, covariance)
+        return self._judged(batch, states, covariance, settled=settled)
 
     def smoothed(
-        self, stamp_ns: NDArray[np.int64], seen: Seen, states: Knots | None, covariance: NDArray[np.float64]
+        self,
+        stamp_ns: NDArray[np.int64],
+        seen: Seen,
+        states: Knots | None,
+        covariance: NDArray[np.float64],
+        *,
+        settled: bool = True,
     ) -> PoseBatch:
         """Make poses from measurements on both sides of their epochs.
 
@@ -136,6 +148,8 @@ class ContinuousPoses:
         states, covariance
             The trajectory of the prisms' middle at the epochs, and the covariance of the errors of its place and
             rotation, (N, 6, 6) or more of them; None where there is none.
+        settled
+            Whether the trajectory can be believed; no pose is valid of one that cannot.
 
         Returns
         -------
@@ -148,7 +162,7 @@ class ContinuousPoses:
         batch = PoseBatch.blank(stamp_ns, self._prisms, Kind.SMOOTHED)
         for column in range(len(self._prisms)):
             self._describe(batch, column, seen)
-        return self._judged(batch, states, covariance)
+        return self._judged(batch, states, covariance, settled=settled)
 
     def _latest(self, prism: OfPrism, home_station: int, epoch_ns: int) -> tuple[int, float, float, Reason]:
         """Look up what is known of a prism: station and age of its last measurement, residual, what is amiss."""
@@ -193,7 +207,9 @@ class ContinuousPoses:
         near = rows[np.clip(nearest[~out, None] + np.arange(-1, 2), 0, len(rows) - 1)]
         batch.prism_residual_m[~out, column] = np.median(seen.residuals_m[near], axis=1)
 
-    def _judged(self, batch: PoseBatch, states: Knots | None, covariance: NDArray[np.float64]) -> PoseBatch:
+    def _judged(
+        self, batch: PoseBatch, states: Knots | None, covariance: NDArray[np.float64], *, settled: bool
+    ) -> PoseBatch:
         """Fill in the poses of which anything is known, and say which may not be used, and why."""
         missing = batch.prism_reason.max(axis=1)
         if states is None:
@@ -203,6 +219,7 @@ class ContinuousPoses:
         sigma_rad = _worst_sigma(covariance[:, 3:6, 3:6])
         sigma_m = _worst_sigma(covariance[:, :3, :3])
         states, covariance = of_point(states, covariance, self._to_origin_m)
+        covariance = with_curvature(rotation, covariance)
         unknown = ~(sigma_rad < NO_IDEA_RAD)
         batch.position_m[:] = states.position
         batch.orientation_xyzw[:] = quaternion_from_rotation(rotation)
@@ -222,6 +239,8 @@ class ContinuousPoses:
         uncertain |= sigma_rad > limits.rotation_sigma_limit_rad
         batch.reason[rotation[:, 2, 2] <= math.cos(limits.tilt_limit_rad)] = Reason.TILT
         batch.reason[batch.residual_m > limits.residual_limit_m] = Reason.RESIDUAL
+        if not settled:
+            batch.reason[batch.reason == Reason.VALID] = Reason.UNCERTAIN
         if uncertain.any():
             batch.reason[uncertain] = np.where(missing, missing, Reason.UNCERTAIN)[uncertain]
         return batch

@@ -262,7 +262,8 @@ class _Station:
         The clock that has been found says nothing of the one before; the station's journal has the measurements.
         """
         self._held = deque(
-            ((message, at_ns) for message, at_ns in self._held if not _timed(message)), maxlen=HELD_MEASUREMENTS
+            ((message, at_ns) for message, at_ns in self._held if not _timed(message)),
+            maxlen=HELD_MEASUREMENTS,
         )
 
     def _agrees(self, sample: ClockSample) -> bool:

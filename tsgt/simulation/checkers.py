@@ -6,6 +6,7 @@ Each check goes its own way to what it checks: journals are read from disk, pose
 from __future__ import annotations
 
 import math
+from statistics import median
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -48,6 +49,12 @@ _STATE_TOLERANCE = 0.02
 _LINE_ROUNDING = 1e-9
 # A stamp is less than this before or after the measurement: the slowest answer against the fastest, when few have come.
 _STAMP_LIMIT_NS = 40_000_000
+# Of so many stamps of a station half are less than this off, on either side: a whole run's are within 1 ms.
+_FEWEST_STAMPS = 40
+_MIDDLE_STAMP_NS = 5_000_000
+# Of so many poses (half a minute) half have a squared error below this. What is honest has half of them below 5.3.
+_FEWEST_POSES = 600
+_MIDDLE_NEES = 12.0
 
 
 class Violation(NamedTuple):
@@ -71,7 +78,8 @@ def violations(run: Run) -> list[Violation]:
     What a client has read is in its journal, once, as its instrument gave it and with the time at which it was measured;
     and as it is there it was delivered; none is delivered twice; over the
     protocol ``superframe`` all that was not delivered still waits; none has a time stamp off by more than its bound; no
-    valid pose rests on an unusable measurement; a replay of the recording gives the stream again.
+    valid pose rests on an unusable measurement; poses are where the robot was, as well as they say; a replay of the
+    recording gives the stream again.
     """
     found: list[Violation] = []
     measured = {number: Measured(witness) for number, witness in run.witnesses.items()}
@@ -87,6 +95,7 @@ def violations(run: Run) -> list[Violation]:
         found += beyond_bound(session, measured, start_ns=session.zero_ns)
         found += wrong_poses(session, run.parameters)
         found += wrong_states(session, run)
+        found += too_sure(session, run)
         found += replayed_otherwise(session)
     found += (Violation("stuck", what) for what in stuck(run, measured))
     found += (Violation("memory", what) for what in run.overgrown)
@@ -107,9 +116,7 @@ def altered(witness: StationWitness, measured: Measured, sessions: Sequence[Sess
             if measurement.station != witness.station:
                 continue
             journalled = measured.in_journal(measurement)
-            if journalled is None and witness.may_be_unwritten(
-                measurement.stamp_ns - session.zero_ns, before_ns=_LATENCY_NS
-            ):
+            if journalled is None and _may_be_lost(witness, measurement, session.zero_ns):
                 continue
             if journalled is None or not _same_content(journalled, measurement):
                 yield Violation(
@@ -117,9 +124,20 @@ def altered(witness: StationWitness, measured: Measured, sessions: Sequence[Sess
                 )
 
 
+def _may_be_lost(witness: StationWitness, delivered: PolarMeasurement, start_ns: int) -> bool:
+    """Whether what was delivered need not be in a journal, because its client was killed soon after.
+
+    Over ``superframe``, which has no host times, a measurement waits for the disk to take or to refuse it.
+    """
+    return witness.may_be_unwritten(
+        delivered.stamp_ns - start_ns, before_ns=_LATENCY_NS, refused=delivered.host_time_ns is None
+    )
+
+
 def misread(witness: StationWitness, measured: Measured) -> Iterator[Violation]:
     """Compare the distances in a station's journals with those that its instrument has answered with."""
     seen: set[Offered] = set()
+    off_ns: list[int] = []
     offered: dict[int, list[Offered]] = {}
     for each in witness.offered:
         offered.setdefault(each.instrument_ms, []).append(each)
@@ -135,12 +153,21 @@ def misread(witness: StationWitness, measured: Measured) -> Iterator[Violation]:
             yield Violation("read", f"in the journals of station {witness.station} twice: {journalled}")
         seen.add(truth)
         stamp_ns = measured.true_ns(journalled)
-        if stamp_ns is not None and abs(stamp_ns - truth.true_ns) > _STAMP_LIMIT_NS:
+        if stamp_ns is None:
+            continue
+        off_ns.append(stamp_ns - truth.true_ns)
+        if abs(off_ns[-1]) > _STAMP_LIMIT_NS:
             yield Violation(
                 "read",
-                f"station {witness.station} has stamped a measurement {(stamp_ns - truth.true_ns) / 1e6:.1f} ms after "
+                f"station {witness.station} has stamped a measurement {off_ns[-1] / 1e6:.1f} ms after "
                 f"it was made: {journalled}",
             )
+    if len(off_ns) >= _FEWEST_STAMPS and abs(middle_ns := median(off_ns)) > _MIDDLE_STAMP_NS:
+        yield Violation(
+            "read",
+            f"station {witness.station} stamps its measurements {middle_ns / 1e6:.1f} ms after they were made, "
+            f"half of {len(off_ns)} by more than that",
+        )
 
 
 def _same_values(offered: Offered, journalled: PolarMeasurement) -> bool:
@@ -203,8 +230,7 @@ def beyond_bound(session: Session, measured: Mapping[int, Measured], *, start_ns
             continue  # an error without a time of its own claims none
         true_ns = measured[measurement.station].true_ns(measurement)
         if true_ns is None:
-            witness = measured[measurement.station].witness
-            if witness.may_be_unwritten(measurement.stamp_ns - start_ns, before_ns=_LATENCY_NS):
+            if _may_be_lost(measured[measurement.station].witness, measurement, start_ns):
                 continue
             yield Violation("time", f"nobody has read this measurement: {measurement}")
             continue
@@ -244,10 +270,7 @@ def wrong_states(session: Session, run: Run) -> Iterator[Violation]:
     """Compare each valid pose of the estimator ``continuous`` with the truth and with the uncertainty that it states."""
     poses = session.valid_poses()
     poses = poses.select(poses.kind != "interpolated")
-    truth = run.world.pose_at((poses.stamp_ns - session.zero_ns) / 1e9)
-    turned = rotation_from_quaternion(poses.orientation_xyzw) @ np.swapaxes(truth[:, :3, :3], 1, 2)
-    errors = np.concatenate([poses.position_m - truth[:, :3, 3], log_so3(turned)], axis=1)
-    nees = np.einsum("ni,ni->n", errors, np.linalg.solve(poses.covariance, errors[..., None])[..., 0])
+    errors, nees = _errors(poses, session, run)
     off = np.linalg.norm(errors.reshape(-1, 2, 3), axis=2)
     for index in np.flatnonzero((nees > _MOST_NEES) & (off.max(axis=1) > _STATE_TOLERANCE)).tolist():
         yield Violation(
@@ -255,6 +278,33 @@ def wrong_states(session: Session, run: Run) -> Iterator[Violation]:
             f"the {poses.kind[index]} pose at {poses.stamp_ns[index]} ns is called valid and off by "
             f"{off[index, 0]:.4f} m and {off[index, 1]:.4f} rad; its squared error in sigmas is {nees[index]:.0f}",
         )
+
+
+def too_sure(session: Session, run: Run) -> Iterator[Violation]:
+    """Compare all valid poses of a kind with the truth, and how far they are off with what they state.
+
+    A single pose has to be far off before chance is no excuse; half of them need not be.
+    """
+    every = session.valid_poses()
+    for kind in ("interpolated", "predicted", "smoothed"):
+        poses = every.select(every.kind == kind)
+        if len(poses.stamp_ns) < _FEWEST_POSES:
+            continue
+        _, nees = _errors(poses, session, run)
+        if np.median(nees) > _MIDDLE_NEES:
+            yield Violation(
+                "pose",
+                f"half of {len(nees)} {kind} poses have a squared error in sigmas above {np.median(nees):.1f}: they "
+                "are not where they should be, or state too little uncertainty",
+            )
+
+
+def _errors(poses: ValidPoses, session: Session, run: Run) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(N, 6) errors in place and rotation in m and rad, and (N,) their squares in the sigmas that the poses state."""
+    truth = run.world.pose_at((poses.stamp_ns - session.zero_ns) / 1e9)
+    turned = rotation_from_quaternion(poses.orientation_xyzw) @ np.swapaxes(truth[:, :3, :3], 1, 2)
+    errors = np.concatenate([poses.position_m - truth[:, :3, 3], log_so3(turned)], axis=1)
+    return errors, np.einsum("ni,ni->n", errors, np.linalg.solve(poses.covariance, errors[..., None])[..., 0])
 
 
 def replayed_otherwise(session: Session) -> Iterator[Violation]:

@@ -27,6 +27,10 @@ now and then stops to synchronise, gets 0.55 to 0.65 in half a minute of a run w
 VALID_SHARE = {"superframe": 0.8, "classic": 0.4}
 """Of the poses that the time has room for, at least so many are valid; while classic synchronises there are none."""
 
+ACKNOWLEDGED_S = 20.0
+"""So long after a measurement has reached the master, its station waits for an acknowledgement no more. A beacon brings
+that within a second or two; the journal tells of it every five."""
+
 
 def stuck(run: Run, measured: Mapping[int, Measured]) -> Iterator[str]:
     """Look for what does not work any more at the end of a run with faults.
@@ -70,9 +74,25 @@ def stuck(run: Run, measured: Mapping[int, Measured]) -> Iterator[str]:
                 f"of {read} measurements that station {number} has read in the {seconds:g} s from {from_s:g} s on, "
                 f"{delivered[number]} have reached the master"
             )
+    yield from unacknowledged(run, measured)
     poses = session.valid_poses()
     at_s = (poses.stamp_ns[poses.kind != "smoothed"] - session.zero_ns) / 1e9
     valid = np.count_nonzero((from_s <= at_s) & (at_s < to_s))
     room = seconds * 1e9 / run.parameters.pipeline.period_ns
     if valid < VALID_SHARE[protocol] * room:
         yield f"{valid} of {room:.0f} poses in the {seconds:g} s from {from_s:g} s on are valid"
+
+
+def unacknowledged(run: Run, measured: Mapping[int, Measured]) -> Iterator[str]:
+    """Look for measurements that the master has, and that wait in their stations' queues all the same."""
+    session = run.sessions[-1]
+    if not run.superframe:
+        return
+    oldest = {number: measured[number].oldest_queued() for number in run.witnesses}
+    for measurement, arrived_ns in zip(session.measurements, session.arrived_ns, strict=False):
+        waited_s = run.duration_s - arrived_ns / 1e9
+        if measurement.sequence == oldest[measurement.station] and waited_s > ACKNOWLEDGED_S:
+            yield (
+                f"station {measurement.station} still waits for the acknowledgement of number {measurement.sequence}, "
+                f"which has reached the master {waited_s:.0f} s before the end"
+            )

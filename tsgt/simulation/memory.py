@@ -5,12 +5,18 @@ from __future__ import annotations
 import gc
 from collections import deque
 
+from tsgt.master.intake import KNOWN_MEASUREMENTS
 from tsgt.master.stream import QUEUE_LINES
+from tsgt.recording.recorder import HUNG_FACTOR, WAITING_LINES
 
 MOST_ENTRIES = 500
 """A list, queue or table of a daemon has at most so many entries, if nothing else is stated."""
 
-STATED = {("_Reader", "_queue"): QUEUE_LINES}
+STATED = {
+    ("_Reader", "_queue"): QUEUE_LINES,
+    ("_Station", "_known"): KNOWN_MEASUREMENTS,
+    ("Recorder", "_waiting"): HUNG_FACTOR * WAITING_LINES,
+}
 """Those with a bound of their own: class and attribute, and how many entries it may have."""
 
 _SIZED = (list, deque, dict, set, bytearray, tuple)

@@ -11,8 +11,9 @@ import numpy as np
 
 from tsgt.master.stream_records import BeaconRecord, ClockRecord, Kind, PoseRecord, StatusRecord
 from tsgt.model import PolarMeasurement
-from tsgt.recording import encode_line
-from tsgt.recording.journal import load_journal
+from tsgt.recording import decode_line, encode_line, read_lines
+from tsgt.recording.journal import AcknowledgedRecord, JournalRecord, load_journal
+from tsgt.simulation.disk import UNWRITTEN_NS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -201,15 +202,20 @@ class StationWitness:
     crashed_ns: list[tuple[int, int]] = field(default_factory=list)
     statuses: list[ClientStatus] = field(default_factory=list)
 
-    def may_be_unwritten(self, true_ns: int, before_ns: int = 0) -> bool:
+    def may_be_unwritten(self, true_ns: int, before_ns: int = 0, *, refused: bool = False) -> bool:
         """Whether a client was killed after that time, in ns from the start, before it can have written what it had read.
 
         Parameters
         ----------
         true_ns
             When it was read, in ns from the start; or at most ``before_ns`` before that.
+        refused
+            Only a disk that refused to be written to is an excuse.
         """
-        return any(from_ns - before_ns <= true_ns <= to_ns for from_ns, to_ns in self.crashed_ns)
+        return any(
+            from_ns - before_ns <= true_ns <= to_ns and not (refused and to_ns - from_ns == UNWRITTEN_NS)
+            for from_ns, to_ns in self.crashed_ns
+        )
 
     @property
     def journals(self) -> list[Path]:
@@ -259,6 +265,21 @@ class Measured:
         if host_time_ns is None and (journalled := self.in_journal(measurement)) is not None:
             host_time_ns = journalled.host_time_ns
         return None if host_time_ns is None else self._true_ns.get(host_time_ns)
+
+    def oldest_queued(self) -> int | None:
+        """Return the lowest number that waits for an acknowledgement, as its last journal says; None: it does not say.
+
+        A client says so every 5 s at most, if it is another one.
+        """
+        oldest: dict[int, int] = {}
+        for path in filter(_begun, self.witness.journals):
+            run_start = 0
+            for line in read_lines(path):
+                if line.type == "journal":
+                    run_start = decode_line(JournalRecord, line, path).run_start
+                elif line.type == "acknowledged":
+                    oldest[run_start] = decode_line(AcknowledgedRecord, line, path).oldest
+        return oldest[max(oldest)] if oldest else None
 
     def timeless(self, sequence: int, session: int | None) -> bool:
         """Whether no time of a master's session can be told of a measurement.

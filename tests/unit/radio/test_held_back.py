@@ -179,6 +179,20 @@ def test_a_session_of_yesterday_played_back() -> None:
     )
 
 
+def test_a_session_of_yesterday_played_to_a_station_that_was_just_started() -> None:
+    """It draws another nonce for each session, so that the confirmation of yesterday's is not one of today's."""
+    yesterday, today = exchange_of(), Exchange(TIMING, Authenticator(KEY), Random(3).getrandbits)  # noqa: S311 (as above)
+    recorded = []
+    for _ in range(20):
+        yesterday.frame()
+        recorded.append(yesterday.beacon)
+    assert yesterday.members[2].core.joined
+    for beacon in recorded:
+        today.frame(deaf=[1, 2, 3])
+        today.hear(2, beacon=beacon, late_ns=200 * MS)
+        assert not today.members[2].core.joined
+
+
 @pytest.mark.parametrize("earlier_ms", [40, 140])
 @pytest.mark.parametrize("late_ms", [50, 100, 220])
 def test_a_reply_with_an_old_measurement_is_held_back(earlier_ms: int, late_ms: int) -> None:

@@ -6,21 +6,30 @@ import copy
 import dataclasses
 import json
 import math
+from array import array
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
 from support.missions import QUICK, SUPERFRAME, mission
 
 from tsgt.config import ScenarioConfig
 from tsgt.master.stream_records import EventRecord
 from tsgt.model import Status
+from tsgt.recording import encode_line
+from tsgt.recording.journal import AcknowledgedRecord
+from tsgt.simulation import checkers
 from tsgt.simulation.checkers import misread, violations
+from tsgt.simulation.disk import UNWRITTEN_NS
+from tsgt.simulation.liveness import unacknowledged
 from tsgt.simulation.witness import Measured
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from tsgt.simulation.scenario import Run
+    from tsgt.simulation.witness import StationWitness
 
 
 @pytest.fixture(scope="module", params=["classic", "superframe"])
@@ -144,6 +153,61 @@ def test_a_reading_that_is_stamped_wrongly(run: Run, off_ms: int) -> None:
     assert [found.check for found in misread(witness, Measured(witness))] == ["read"] * (abs(off_ms) > 40)
 
 
+def test_stamps_that_are_all_late(run: Run) -> None:
+    """An instrument's latency that nobody takes off is less than one stamp may be off by, and not what half of them may."""
+    witness = run.witnesses[1]
+    for late_ns, found in ((0, []), (20_000_000, ["read"])):
+        stamps_ns = {host_ns: true_ns + late_ns for host_ns, true_ns in witness.stamps_ns.items()}
+        late = dataclasses.replace(witness, stamps_ns=stamps_ns)
+        assert [violation.check for violation in misread(late, Measured(late))] == found
+
+
+def _spoilt_journal(
+    witness: StationWitness, folder: Path, spoil: Callable[[list[bytes]], None]
+) -> StationWitness:
+    """Return a witness with a copy of its only journal, whose lines have been spoilt."""
+    (path,) = witness.journals
+    lines = path.read_bytes().splitlines(keepends=True)
+    spoil(lines)
+    (folder / path.name).write_bytes(b"".join(lines))
+    return dataclasses.replace(witness, folder=folder)
+
+
+@pytest.mark.parametrize("full", [False, True])
+def test_a_measurement_that_is_delivered_and_not_journalled(run: Run, tmp_path: Path, full: bool) -> None:  # noqa: FBT001
+    """That a client was killed soon after is no excuse over ``superframe``, which delivers what the disk took or refused."""
+    witness = run.witnesses[1]
+    delivered = [m for m in run.sessions[0].measurements if m.station == 1][20]
+    journalled = Measured(witness).in_journal(delivered)
+    assert journalled is not None
+    assert journalled.host_time_ns is not None
+    read_ns = witness.read_ns[journalled.host_time_ns]
+    since_ns = read_ns - 1 if full else read_ns + 50_000_000 - UNWRITTEN_NS
+
+    def leave_out(lines: list[bytes]) -> None:
+        lines[:] = [line for line in lines if b'"host_time_ns":%d' % journalled.host_time_ns not in line]
+
+    witness = _spoilt_journal(witness, tmp_path, leave_out)
+    witness = dataclasses.replace(witness, crashed_ns=[(since_ns, read_ns + 50_000_000)])
+    found = _checks(dataclasses.replace(run, witnesses=run.witnesses | {1: witness}))
+    assert ("journal" in found) == (run.superframe and not full)
+
+
+def test_what_has_reached_the_master_and_still_waits(run: Run, tmp_path: Path) -> None:
+    """A station whose lowest number the master has had for twenty seconds is not told so."""
+    arrived = zip(run.sessions[0].measurements, run.sessions[0].arrived_ns, strict=True)
+    first = next(m.sequence for m, at_ns in arrived if m.station == 2 and at_ns > 5_000_000_000)
+    for oldest, count in ((first, 1), (first + 10_000, 0)):
+        record = encode_line(AcknowledgedRecord(stamp_ns=1, oldest=oldest)) + b"\n"
+        witness = _spoilt_journal(
+            run.witnesses[2], tmp_path, lambda lines, record=record: lines.append(record)
+        )
+        witnesses = run.witnesses | {2: witness}
+        measured = {number: Measured(each) for number, each in witnesses.items()}
+        spoilt = dataclasses.replace(run, witnesses=witnesses)
+        assert len(list(unacknowledged(spoilt, measured))) == count * run.superframe
+
+
 def test_what_is_acknowledged_and_lost(run: Run, tmp_path: Path) -> None:
     """Over ``superframe`` a measurement that is in no recording has to wait in a queue still."""
     session = run.sessions[0]
@@ -194,6 +258,21 @@ def test_a_pose_that_is_somewhere_else(run: Run) -> None:
     linear = run.parameters.pipeline.estimator == "linear"
     run.sessions[0]._pose_numbers[45 * 100] += 1e-3 if linear else 1.0
     assert _checks(run) == {"pose"}
+
+
+@pytest.mark.parametrize("part", [slice(9, 45), slice(0, 3)], ids=["covariance", "position"])
+def test_poses_that_state_too_little(run: Run, part: slice, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Poses with a sixteenth of the covariance, or all of them 10 mm beside the truth, are more certain than they may be."""
+    monkeypatch.setattr(checkers, "_FEWEST_POSES", 300)
+    session = run.sessions[0]
+    assert list(checkers.too_sure(session, run)) == []
+    numbers = np.array(session._pose_numbers).reshape(-1, 45)
+    if part.start:
+        numbers[:, part] /= 16
+    else:
+        numbers[:, part] += 0.01
+    session._pose_numbers = array("d", numbers.ravel())
+    assert {violation.check for violation in checkers.too_sure(session, run)} == {"pose"}
 
 
 def test_a_line_that_was_streamed_but_not_recorded(run: Run) -> None:

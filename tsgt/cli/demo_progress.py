@@ -5,7 +5,9 @@ from __future__ import annotations
 import shutil
 import sys
 import time
+from array import array
 from collections import Counter, defaultdict
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import click
@@ -28,8 +30,23 @@ LINE_INTERVAL_S = 5.0
 """How often there is a line where the output is no terminal."""
 
 
+_COMPARED_AT_ONCE = 100
+"""A day brings 3.5 million poses, so each is compared once, and only its stamp and its errors are kept."""
+
+
+@dataclass(slots=True)
+class _Valid:
+    """Valid poses of one kind: the newest, those to be compared with the truth, and what the others have come to."""
+
+    newest: PoseRecord | None = None
+    waiting: list[PoseRecord] = field(default_factory=list)
+    stamps_ns: array[int] = field(default_factory=lambda: array("q"))
+    position_m: array[float] = field(default_factory=lambda: array("d"))
+    rotation_rad: array[float] = field(default_factory=lambda: array("d"))
+
+
 class Progress:
-    """Keeps the poses of a demonstration and tells how it goes, with every status line of the master.
+    """Compares the poses of a demonstration with the truth and tells how it goes, with every status line of the master.
 
     Parameters
     ----------
@@ -49,7 +66,7 @@ class Progress:
     def __init__(self, demo: Demo, timeline: UnixTimeline) -> None:
         self._demo = demo
         self._start_ns = timeline.unix_ns(demo.start_ns)
-        self._valid: defaultdict[Kind, list[PoseRecord]] = defaultdict(list)
+        self._valid: defaultdict[Kind, _Valid] = defaultdict(_Valid)
         self._on_terminal = sys.stderr.isatty()
         self._block_lines = 0
         self._shown_at_s = 0.0
@@ -75,29 +92,42 @@ class Progress:
 
     def valid_stamps_ns(self, kind: Kind) -> NDArray[np.int64]:
         """Return the times of the valid poses of a kind, Unix time in ns."""
-        return np.array([pose.stamp_ns for pose in self._valid[kind]], dtype=np.int64)
+        return np.array(self._compared(kind).stamps_ns, dtype=np.int64)
 
     def errors(self, kind: Kind, counts: NDArray[np.bool_] | None = None) -> PoseErrors:
-        """Compare valid poses of a kind with the truth: all of them, or those that count."""
-        poses = self._valid[kind]
-        if counts is not None:
-            poses = [pose for pose, counted in zip(poses, counts, strict=True) if counted]
+        """Tell how far valid poses of a kind are from the truth: all of them, or those that count."""
+        compared = self._compared(kind)
+        chosen = slice(None) if counts is None else counts
+        return PoseErrors(np.array(compared.position_m)[chosen], np.array(compared.rotation_rad)[chosen])
+
+    def _compared(self, kind: Kind) -> _Valid:
+        """Compare the poses that wait for it."""
+        valid = self._valid[kind]
+        poses, valid.waiting = valid.waiting, []
         stamps_ns = np.array([pose.stamp_ns for pose in poses], dtype=np.int64)
         positions = np.array([pose.position_m for pose in poses], dtype=np.float64).reshape(-1, 3)
         quaternions = np.array([pose.orientation_xyzw for pose in poses], dtype=np.float64).reshape(-1, 4)
         world = self._demo.world
-        return pose_errors(
+        errors = pose_errors(
             transform_from(rotation_from_quaternion(quaternions), positions),
             world.pose_at((stamps_ns - self._start_ns) / 1e9),
             world.prisms_m.mean(axis=0),
         )
+        valid.stamps_ns.extend(stamps_ns.tolist())
+        valid.position_m.extend(errors.position_m.tolist())
+        valid.rotation_rad.extend(errors.rotation_rad.tolist())
+        return valid
 
     def _pose(self, pose: PoseRecord) -> None:
         self.first_ns = self.first_ns or pose.stamp_ns
         self.last_ns = max(self.last_ns, pose.stamp_ns)
         self.poses[pose.kind] += 1
         if pose.valid:
-            self._valid[pose.kind].append(pose)
+            valid = self._valid[pose.kind]
+            valid.newest = pose
+            valid.waiting.append(pose)
+            if len(valid.waiting) == _COMPARED_AT_ONCE:
+                self._compared(pose.kind)
 
     def _status(self, status: StatusRecord) -> None:
         starts = sum(process.starts for process in self._demo.processes)
@@ -110,11 +140,11 @@ class Progress:
             return
         self._shown_at_s = now_s
         elapsed_s = (status.stamp_ns - self._start_ns) / 1e9
-        valid = self._valid[self.kind]
-        text = f"{elapsed_s:5.0f} s  {len(valid)}/{self.poses[self.kind]} poses valid"
-        if valid:
-            position = " ".join(f"{value:6.2f}" for value in valid[-1].position_m or ())
-            text += f"  at {position} m  off {self.errors(self.kind).position_rms_mm:.1f} mm rms"
+        newest, errors = self._valid[self.kind].newest, self.errors(self.kind)
+        text = f"{elapsed_s:5.0f} s  {len(errors.position_m)}/{self.poses[self.kind]} poses valid"
+        if newest is not None:
+            position = " ".join(f"{value:6.2f}" for value in newest.position_m or ())
+            text += f"  at {position} m  off {errors.position_rms_mm:.1f} mm rms"
         lines = [text]
         for station in status.stations:
             word, _ = station_word(station)

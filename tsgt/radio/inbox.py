@@ -7,6 +7,7 @@ has received but not yet written is known too: it must not be handed on twice.
 from __future__ import annotations
 
 from bisect import bisect_right
+from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,9 @@ RESTART_SKIP = 1000
 """A station that starts again leaves out so many numbers: those that a torn journal may have lost."""
 
 NARROW_BITS = 8
+
+KNOWN_LINEAGES = 8
+"""So many are remembered: a station whose disk took nothing when it started has one of its own until it starts again."""
 
 _start = attrgetter("start")
 
@@ -86,6 +90,15 @@ class Numbers:
             self._gaps.insert(bisect_right(self._gaps, number, key=_start), range(number, number + 1))
 
 
+@dataclass(slots=True)
+class _Lineage:
+    """What has come of one lineage of numbers: received, in the recording, and on the way there."""
+
+    received: Numbers
+    written: Numbers
+    waiting: set[int] = field(default_factory=set)
+
+
 class Inbox:
     """What has come from one station.
 
@@ -98,46 +111,60 @@ class Inbox:
     def __init__(self) -> None:
         self.lineage: int | None = None
         self._run_start = 0
-        self._received = Numbers(0)
-        self._written = Numbers(0)
-        self._waiting: set[int] = set()
+        self._present = _Lineage(Numbers(0), Numbers(0))
+        self._known: dict[int, _Lineage] = {}
 
     @property
     def cumulative(self) -> int:
         """Up to this number, itself included, nothing is missing in the recording; -1 at the beginning."""
-        return self._written.cumulative
+        return self._present.written.cumulative
 
     @property
     def missing(self) -> int:
         """How many measurements are known to have been made and have not come."""
-        return self._received.missing
+        return self._present.received.missing
 
     @property
     def unwritten(self) -> int:
         """How many have come and are not written yet."""
-        return len(self._waiting)
+        return len(self._present.waiting)
 
     def introduced(self, introduction: Introduction) -> None:
         """Take what a station says of its numbers after a start, its own or the master's."""
-        another_run = introduction.run_start != self._run_start
-        # A station that lost more than its last numbers gives some of them again.
-        again = another_run and introduction.run_start <= self._received.highest
-        if introduction.lineage != self.lineage or again:
-            self.lineage = introduction.lineage
-            self._received = Numbers(introduction.oldest)
-            self._written = Numbers(introduction.oldest)
-            self._waiting.clear()
+        if introduction.lineage != self.lineage:
+            self._turn_to(introduction)
+        elif (
+            introduction.run_start != self._run_start
+            and introduction.run_start <= self._present.received.highest
+        ):
+            # A station that lost more than its last numbers gives some of them again.
+            self._begin(introduction)
         self._run_start = introduction.run_start
         never_given = range(max(introduction.run_start - RESTART_SKIP, 0), introduction.run_start)
-        for numbers in (self._received, self._written):
+        for numbers in (self._present.received, self._present.written):
             numbers.add(range(introduction.oldest))
             numbers.add(never_given)
-        for number in self._waiting:
-            self._written.remove(number)
+        for number in self._present.waiting:
+            self._present.written.remove(number)
+
+    def _turn_to(self, introduction: Introduction) -> None:
+        """Go on with a lineage that is another one than before, but may be one of before that."""
+        self.lineage = introduction.lineage
+        known = self._known.pop(introduction.lineage, None)
+        if known is None or introduction.run_start <= known.received.highest:
+            self._begin(introduction)
+        else:
+            self._present = self._known[introduction.lineage] = known
+        while len(self._known) > KNOWN_LINEAGES:
+            del self._known[next(iter(self._known))]
+
+    def _begin(self, introduction: Introduction) -> None:
+        self._present = _Lineage(Numbers(introduction.oldest), Numbers(introduction.oldest))
+        self._known[introduction.lineage] = self._present
 
     def unwrapped(self, low_bits: int, introduction: Introduction | None = None) -> int:
         """Return the number with these low bits that is nearest to those that have come, or were announced."""
-        near = self._received.highest
+        near = self._present.received.highest
         if introduction is not None:
             known = near if introduction.lineage == self.lineage else -1
             near = max(known, introduction.oldest, introduction.run_start)
@@ -147,26 +174,28 @@ class Inbox:
 
     def take(self, number: int) -> bool:
         """Take a measurement; return whether it is new."""
-        if number in self._received:
+        if number in self._present.received:
             return False
-        self._received.add(range(number, number + 1))
-        self._waiting.add(number)
+        self._present.received.add(range(number, number + 1))
+        self._present.waiting.add(number)
         return True
 
     def written(self, numbers: Iterable[int]) -> None:
         """Take note that measurements are in the recording."""
         for number in numbers:
-            if number in self._waiting:
-                self._waiting.remove(number)
-                self._written.add(range(number, number + 1))
+            for lineage in self._known.values() or (self._present,):
+                if number in lineage.waiting:
+                    lineage.waiting.remove(number)
+                    lineage.written.add(range(number, number + 1))
 
     def lost(self, numbers: Iterable[int]) -> None:
         """Take note that measurements will never be in the recording: they may come again."""
         for number in numbers:
-            if number in self._waiting:
-                self._waiting.remove(number)
-                self._received.remove(number)
+            for lineage in self._known.values() or (self._present,):
+                if number in lineage.waiting:
+                    lineage.waiting.remove(number)
+                    lineage.received.remove(number)
 
     def is_written(self, numbers: Iterable[int]) -> bool:
         """Tell whether all of these measurements are in the recording."""
-        return all(number in self._written for number in numbers)
+        return all(number in self._present.written for number in numbers)

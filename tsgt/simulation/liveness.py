@@ -24,7 +24,7 @@ DELIVERED_SHARE = {"superframe": 0.9, "classic": 0.35}
 """Of what a client has read, at least so much has reached the master. Classic, which asks one station after the other and
 now and then stops to synchronise, gets 0.55 to 0.65 in half a minute of a run without faults, with 2 % loss."""
 
-VALID_SHARE = {"superframe": 0.8, "classic": 0.4}
+VALID_SHARE = {"superframe": 0.7, "classic": 0.4}
 """Of the poses that the time has room for, at least so many are valid; while classic synchronises there are none."""
 
 ACKNOWLEDGED_S = 20.0

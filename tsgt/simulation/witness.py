@@ -244,12 +244,14 @@ class Measured:
         self._true_ns = witness.stamps_ns
         journals = [load_journal(path) for path in witness.journals if _begun(path)]
         self.journalled = [m for journal in journals for m in journal.measurements]
-        self._boots = {m.sequence: journal.head.boot for journal in journals for m in journal.measurements}
+        self._heads = {m.sequence: journal.head for journal in journals for m in journal.measurements}
         self._heard: dict[str, set[int]] = {}
         for journal in journals:
             heard = self._heard.setdefault(journal.head.boot, set())
             heard.update(reception.session for reception in journal.receptions)
-        self._boot = max(journals, key=lambda journal: journal.head.run_start).head.boot if journals else ""
+        # Their names tell the order as well as the stations' Unix clocks do.
+        last = max(witness.journals, key=lambda path: path.stat().st_mtime_ns, default=None)
+        self._last = load_journal(last).head if last is not None and _begun(last) else None
         self._by_sequence = {m.sequence: m for m in self.journalled}
         self._by_host_time = {m.host_time_ns: m for m in self.journalled}
 
@@ -284,7 +286,8 @@ class Measured:
     def timeless(self, sequence: int, session: int | None) -> bool:
         """Whether no time of a master's session can be told of a measurement.
 
-        Its computer has been started again since, without having heard of that session before.
+        Its computer has been started again since, without having heard of that session before; or its program was, on a disk
+        that took nothing, and has begun to number anew.
 
         Parameters
         ----------
@@ -293,8 +296,10 @@ class Measured:
         session
             Number of the master's session; None: of none.
         """
-        boot = self._boots[sequence]
-        return boot != self._boot and session not in self._heard[boot]
+        head = self._heads[sequence]
+        if self._last is None or head.lineage != self._last.lineage:
+            return True
+        return head.boot != self._last.boot and session not in self._heard[head.boot]
 
 
 def _begun(path: Path) -> bool:

@@ -21,7 +21,7 @@ from tsgt.radio.orders import MeasureOrder, Order
 from tsgt.radio.outbox import Outbox
 from tsgt.radio.superframe_station import SuperframeStation
 from tsgt.radio.supervised import keep_radio
-from tsgt.recording import RecordingHeader, RecordingWriter, decode, new_recording_path
+from tsgt.recording import RecordingHeader, RecordingWriter, decode, encode_line, new_recording_path
 from tsgt.recording.journal import InstrumentRecord, JournalRecord
 from tsgt.recording.recorder import Recorder
 from tsgt.station.backlog import LINEAGE_BITS, Backlog, read_backlog
@@ -45,6 +45,9 @@ if TYPE_CHECKING:
     from tsgt.station.instrument import Instrument, Reading
     from tsgt.station.link import Link
     from tsgt.station.status import ClientStatus
+
+_SKIP_BITS = 22
+"""So many random bits of the 32 of a sequence number: a run of a thousand measurements meets another one in 4000."""
 
 log = structlog.get_logger()
 
@@ -107,22 +110,30 @@ async def run_client(
         recorder = Recorder(writer)
         # To a classic master, which asks for the newest measurement only, one that has waited is worth nothing.
         journal = JournalQueue(recorder, patience_s=None if superframe else PATIENCE_S)
-        session = Session(config.station, config.prism, backlog.run_start)
-        client = _Client(session, instrument, clock, timeline, recorder, journal, path)
-        client.write(
-            RecordingHeader(
-                software=f"tsgt {tsgt.__version__}",
-                created_ns=now_ns,
-                source=f"tsgt-client, station {config.station}",
-            )
+        header = RecordingHeader(
+            software=f"tsgt {tsgt.__version__}",
+            created_ns=now_ns,
+            source=f"tsgt-client, station {config.station}",
         )
+        recorder.write_line(encode_line(header))
+        run_start = backlog.run_start
+        if superframe and recorder.failing:
+            # Where nothing can be written, the next run would not know which numbers this one has given away. So this one
+            # begins anew, with numbers of its own, and leaves what earlier runs have left to the next one.
+            backlog, lineage, run_start = (
+                Backlog(),
+                random_bits(LINEAGE_BITS),
+                run_start + random_bits(_SKIP_BITS),
+            )
+        session = Session(config.station, config.prism, run_start)
+        client = _Client(session, instrument, clock, timeline, recorder, journal, path)
         client.write(
             JournalRecord(
                 station=config.station,
                 unix_at_zero_ns=timeline.unix_at_zero_ns,
                 boot=boot,
                 lineage=lineage,
-                run_start=backlog.run_start,
+                run_start=run_start,
             )
         )
         # The next run goes on from here, even if the power goes before the first regular sync: otherwise it would
@@ -134,7 +145,7 @@ async def run_client(
             client.link = ClassicLink(session, clock, timeline, on_order=client.give, begin=client.begin)
         else:
             authenticator = Authenticator(key)
-            outbox = Outbox(backlog.run_start, backlog.queued)
+            outbox = Outbox(run_start, backlog.queued)
             station = SuperframeStation(
                 config.station,
                 settings,

@@ -138,6 +138,18 @@ def test_another_lineage_begins_anew() -> None:
     assert inbox.cumulative == -1
 
 
+def test_a_lineage_that_comes_back_is_known() -> None:
+    """What has come of it is no news; what was on its way to the disk meanwhile counts as written."""
+    inbox = inbox_with(range(5))
+    inbox.written(range(3))
+    inbox.introduced(introduced(lineage=8, run_start=700_000))
+    assert inbox.take(700_000)
+    inbox.written([3, 4])
+    inbox.introduced(introduced(run_start=1005))
+    assert not any(inbox.take(number) for number in range(5))
+    assert inbox.cumulative == 1004
+
+
 def test_a_station_that_gives_numbers_again_is_believed() -> None:
     """Its journal lost more than a restart leaves out; what it measures now must not pass for what has come."""
     inbox = inbox_with(range(5000))

@@ -7,6 +7,7 @@ import dataclasses
 import json
 import math
 from array import array
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -162,6 +163,10 @@ def test_stamps_that_are_all_late(run: Run) -> None:
         assert [violation.check for violation in misread(late, Measured(late))] == found
 
 
+def _append(line: bytes, lines: list[bytes]) -> None:
+    lines.append(line)
+
+
 def _spoilt_journal(
     witness: StationWitness, folder: Path, spoil: Callable[[list[bytes]], None]
 ) -> StationWitness:
@@ -180,12 +185,13 @@ def test_a_measurement_that_is_delivered_and_not_journalled(run: Run, tmp_path: 
     delivered = [m for m in run.sessions[0].measurements if m.station == 1][20]
     journalled = Measured(witness).in_journal(delivered)
     assert journalled is not None
-    assert journalled.host_time_ns is not None
-    read_ns = witness.read_ns[journalled.host_time_ns]
+    host_time_ns = journalled.host_time_ns
+    assert host_time_ns is not None
+    read_ns = witness.read_ns[host_time_ns]
     since_ns = read_ns - 1 if full else read_ns + 50_000_000 - UNWRITTEN_NS
 
     def leave_out(lines: list[bytes]) -> None:
-        lines[:] = [line for line in lines if b'"host_time_ns":%d' % journalled.host_time_ns not in line]
+        lines[:] = [line for line in lines if b'"host_time_ns":%d' % host_time_ns not in line]
 
     witness = _spoilt_journal(witness, tmp_path, leave_out)
     witness = dataclasses.replace(witness, crashed_ns=[(since_ns, read_ns + 50_000_000)])
@@ -199,9 +205,7 @@ def test_what_has_reached_the_master_and_still_waits(run: Run, tmp_path: Path) -
     first = next(m.sequence for m, at_ns in arrived if m.station == 2 and at_ns > 5_000_000_000)
     for oldest, count in ((first, 1), (first + 10_000, 0)):
         record = encode_line(AcknowledgedRecord(stamp_ns=1, oldest=oldest)) + b"\n"
-        witness = _spoilt_journal(
-            run.witnesses[2], tmp_path, lambda lines, record=record: lines.append(record)
-        )
+        witness = _spoilt_journal(run.witnesses[2], tmp_path, partial(_append, record))
         witnesses = run.witnesses | {2: witness}
         measured = {number: Measured(each) for number, each in witnesses.items()}
         spoilt = dataclasses.replace(run, witnesses=witnesses)

@@ -1,0 +1,79 @@
+"""Faults that are drawn from a seed: the same ones each time, over in time, and none of them does what must never be."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from support.missions import QUICK, SUPERFRAME, mission
+
+from tsgt.config import ScenarioConfig
+from tsgt.errors import ConfigError
+from tsgt.simulation.checkers import violations
+from tsgt.simulation.faults import CALM_S, SETTLE_S, FaultKind, draw_faults, parse_faults
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+DURATION_S = 60.0
+
+
+def test_a_seed_gives_the_same_faults() -> None:
+    """And another one others."""
+    one, same, other = (
+        draw_faults(FaultKind, np.random.default_rng(seed), duration_s=3600.0, stations=[1, 2, 3])
+        for seed in (1, 1, 2)
+    )
+    assert one == same != other
+    assert list(one) == sorted(one)
+
+
+def test_all_are_over_before_the_end() -> None:
+    """What they break has to work again by then."""
+    faults = draw_faults(FaultKind, np.random.default_rng(0), duration_s=3600.0, stations=[1, 2, 3])
+    assert min(fault.at_s for fault in faults) >= SETTLE_S
+    assert max(fault.at_s + fault.seconds for fault in faults) <= 3600.0 - CALM_S + 1e-9
+
+
+def test_each_kind_comes_alone() -> None:
+    """One that is asked for by its name is never left out."""
+    for kind in FaultKind:
+        faults = draw_faults([kind], np.random.default_rng(0), duration_s=36_000.0, stations=[1, 2, 3])
+        assert {fault.kind for fault in faults} == {kind}
+
+
+def test_names_are_read() -> None:
+    """None, all, or some."""
+    assert parse_faults("none") == frozenset()
+    assert parse_faults("all") == frozenset(FaultKind)
+    assert parse_faults("loss,disk-full") == {FaultKind.LOSS, FaultKind.DISK_FULL}
+    with pytest.raises(ConfigError, match="there is no such fault"):
+        parse_faults("loss,gremlins")
+
+
+@pytest.mark.parametrize(
+    ("protocol", "estimator", "seed"),
+    [
+        (SUPERFRAME, "linear", 11),
+        (QUICK, "linear", 12),
+        (SUPERFRAME, "continuous", 13),
+        (QUICK, "continuous", 14),
+    ],
+    ids=lambda value: getattr(value, "kind", str(value)),
+)
+def test_nothing_that_must_never_be(tmp_path: Path, protocol: object, estimator: str, seed: int) -> None:
+    """With faults of all kinds: nothing lost, altered, twice, mistimed, or stuck, and no pose called valid that is not."""
+    plain = ScenarioConfig()
+    pipeline = plain.pipeline.model_copy(update={"estimator": estimator})
+    scenario = plain.model_copy(update={"pipeline": pipeline})
+    run = mission(
+        tmp_path,
+        scenario,
+        protocol=protocol,
+        duration_s=DURATION_S,
+        seed=seed,
+        faults=frozenset(FaultKind),
+    )
+    assert sum(run.faults.values()) > 3
+    assert violations(run) == []

@@ -1,0 +1,55 @@
+"""The defects of `benchmarks/planted_defects.py` can be planted, seen, and taken out again."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from support.defects import Planting
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+SCRIPT = Path(__file__).parents[3] / "benchmarks" / "planted_defects.py"
+
+
+@pytest.fixture(scope="module")
+def script() -> ModuleType:
+    """Return the benchmark."""
+    spec = importlib.util.spec_from_file_location("planted_defects", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # where dataclasses look for it
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize(("key", "check"), [("angle", "journal"), ("offset", "time"), ("order", "replay")])
+def test_a_defect_is_seen_and_gone_again(script: ModuleType, key: str, check: str) -> None:
+    """Eight seconds are enough for the quickest; the program is whole afterwards."""
+    defect: Any = dataclasses.replace(script.DEFECTS[key], duration_s=8.0)
+    planting = Planting()
+    defect.plant(planting)
+    places = planting.planted[:]
+    planting.undo()
+    assert check in script.hunt(defect, seeds=1).checks
+    assert all(owner.__dict__[name] is right for owner, name, right in places)
+
+
+def test_every_defect_has_its_place(script: ModuleType) -> None:
+    """What is replaced is there, and there again afterwards; what has a test names one that exists."""
+    for defect in script.DEFECTS.values():
+        planting = Planting()
+        defect.plant(planting)
+        places = [(owner, name, getattr(owner, name)) for owner, name, _ in planting.planted]
+        planting.undo()
+        assert places
+        assert all(owner.__dict__[name] is not wrong for owner, name, wrong in places)
+        if defect.test:
+            path, _, test = defect.test.partition("::")
+            assert f"def {test}(" in (script.TESTS / path).read_text()

@@ -10,7 +10,7 @@ FUZZED := $(addprefix tests/property/test_,$(addsuffix .py,air bridge classic da
 	damaged_replies forgery geocom gnss_files hostile_radio hostile_sockets radio recording \
 	superframe_messages tum))
 
-.PHONY: demo test lint types layers pytest fuzz bench generated format clean
+.PHONY: demo test lint types layers pytest fuzz soak bench generated format clean
 
 demo: $(VENV)/.runtime
 	$(BIN)/tsgt demo --duration $(DURATION)
@@ -36,6 +36,10 @@ pytest: $(VENV)/.test
 # A failing example is kept in .hypothesis: `pytest` with the name of its test makes it small and shows it.
 fuzz: $(VENV)/.test
 	timeout --signal=INT 15m $(BIN)/pytest --hypothesis-profile=fuzz --numprocesses 2 --dist worksteal $(FUZZED)
+
+# Simulated missions with faults of all kinds for a quarter of an hour; what must never happen and does is printed.
+soak: $(VENV)/.test
+	$(BIN)/python benchmarks/soak.py --minutes 15
 
 bench: $(VENV)/.test
 	$(BIN)/python benchmarks/alignment.py

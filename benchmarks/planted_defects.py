@@ -18,6 +18,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import traceback
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,8 +30,9 @@ from tsgt.config import ScenarioConfig
 from tsgt.config.radio import ClassicMasterConfig, SuperframeMasterConfig
 from tsgt.log import configure_logging
 from tsgt.simulation.checkers import violations
+from tsgt.simulation.disk import FULL
 from tsgt.simulation.faults import QUICK_CYCLES, FaultKind
-from tsgt.simulation.options import Options
+from tsgt.simulation.options import MASTER, Options
 from tsgt.simulation.scenario import simulate
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -60,7 +62,7 @@ class Defect:
         Does it.
     faults
         Kinds of faults with which it shows.
-    protocol, estimator, duration_s
+    protocol, estimator, duration_s, drift_ppm
         Of the missions.
     script
         Runs beside the daemons.
@@ -74,6 +76,7 @@ class Defect:
     protocol: Literal["superframe", "classic"] = "superframe"
     estimator: Literal["linear", "continuous"] = "linear"
     duration_s: float = 60.0
+    drift_ppm: float = 10.0
     script: Callable[[Mission], Coroutine[None, None, None]] | None = None
     test: str = ""
 
@@ -97,6 +100,16 @@ class Found:
     simulated_s: float = 0.0
 
 
+async def killed_with_a_full_disk(mission: Mission) -> None:
+    """Kill the master while its disk takes nothing."""
+    disk = mission.computers[MASTER].disk
+    await mission.sleep_until(20.0)
+    disk.refuse(FULL, 20 * 10**9, 27 * 10**9)
+    await mission.sleep_until(25.0)
+    await mission.crash(MASTER, away_s=2.0)
+    disk.refuses = None
+
+
 async def sleeping_reader(mission: Mission) -> None:
     """Connect to the stream and read nothing, to the end."""
     await mission.sleep_until(2.0)
@@ -116,8 +129,7 @@ DEFECTS: Final = {
     "ack-early": Defect(
         "the master acknowledges what is not written yet",
         defects.acknowledged_before_written,
-        (F.DISK_FULL, F.MASTER_CRASH),
-        duration_s=150,
+        script=killed_with_a_full_disk,
     ),
     "ack-highest": Defect(
         "the master acknowledges all up to the highest number",
@@ -128,7 +140,7 @@ DEFECTS: Final = {
     "deleted": Defect(
         "a station deletes what it has sent", defects.deleted_when_sent, (F.LOSS,), duration_s=80
     ),
-    "repeats": Defect("the master hands on repeats", defects.repeats_kept, (F.DISK_FULL,), duration_s=100),
+    "repeats": Defect("the master hands on repeats", defects.repeats_kept, script=killed_with_a_full_disk),
     "repeats-classic": Defect(
         "the master does not know repeats, classic",
         defects.repeats_kept_classic,
@@ -146,7 +158,11 @@ DEFECTS: Final = {
     ),
     "offset": Defect("the clock's offset is added, classic", defects.offset_added, protocol="classic"),
     "frequency": Defect(
-        "the clock's frequency is reversed, classic", defects.frequency_reversed, protocol="classic"
+        "the clock's frequency is reversed, classic",
+        defects.frequency_reversed,
+        protocol="classic",
+        duration_s=120,
+        drift_ppm=50,
     ),
     "beacon": Defect("a beacon's time is taken for that of the next", defects.beacon_beside),
     "slot": Defect(
@@ -197,7 +213,11 @@ def hunt(defect: Defect, seeds: int = SEEDS) -> Found:
     planting = Planting()
     for seed in range(seeds):
         options = Options(
-            duration_s=defect.duration_s, seed=seed, protocol=protocol, faults=frozenset(defect.faults)
+            duration_s=defect.duration_s,
+            drift_ppm=defect.drift_ppm,
+            seed=seed,
+            protocol=protocol,
+            faults=frozenset(defect.faults),
         )
         found.simulated_s += defect.duration_s
         with tempfile.TemporaryDirectory(prefix="tsgt-planted-") as folder:
@@ -205,7 +225,9 @@ def hunt(defect: Defect, seeds: int = SEEDS) -> Found:
                 defect.plant(planting)
                 run = simulate(scenario, options, folder=Path(folder), script=defect.script)
                 seen = violations(run)
-            except Exception as error:  # noqa: BLE001 (a daemon or a checker that falls over is seen as well)
+            except Exception as error:  # (a daemon or a checker that falls over is seen as well)
+                if _is_ours(error):
+                    raise
                 found.checks["died"] += 1
                 found.example = repr(error)
                 return found
@@ -216,6 +238,14 @@ def hunt(defect: Defect, seeds: int = SEEDS) -> Found:
             found.example = seen[0].detail
             return found
     return found
+
+
+def _is_ours(error: BaseException) -> bool:
+    """Whether it is the planting that fell over."""
+    if isinstance(error, BaseExceptionGroup):
+        return any(map(_is_ours, error.exceptions))
+    frames = traceback.extract_tb(error.__traceback__)
+    return bool(frames) and frames[-1].filename == defects.__file__
 
 
 def fails(key: str) -> bool:

@@ -226,7 +226,9 @@ def main() -> int:
                 told_s = time.monotonic()
                 print(f"{sum(sums.missions.values())} missions", file=sys.stderr)
             if arguments.json is not None:
-                arguments.json.write_text(json.dumps({each.name: getattr(sums, each.name) for each in fields(sums)}))
+                arguments.json.write_text(
+                    json.dumps({each.name: getattr(sums, each.name) for each in fields(sums)})
+                )
     report(sums)
     return 3 if sums.violations else 0
 

@@ -18,7 +18,7 @@ from tsgt.master.clock_line import Line
 from tsgt.master.disk import Disk
 from tsgt.model import Status
 from tsgt.radio import session_keeper, superframe_master
-from tsgt.radio.inbox import Inbox
+from tsgt.radio.inbox import Inbox, Numbers
 from tsgt.radio.messages import TIME_UNIT_US
 from tsgt.radio.outbox import Delivery
 from tsgt.radio.peer import Peer
@@ -80,7 +80,7 @@ def acknowledged_before_written(planting: Planting) -> None:
 
 def acknowledged_to_the_highest(planting: Planting) -> None:
     """Acknowledge what is missing below the highest number."""
-    planting.put(Inbox, "cumulative", lambda _: property(lambda inbox: inbox._written.highest))
+    planting.put(Numbers, "cumulative", lambda _: property(lambda numbers: numbers.highest))
 
 
 def deleted_when_sent(planting: Planting) -> None:

@@ -33,7 +33,7 @@ _SLEWED_SIGMA_PPM = 200.0
 _FEWEST_RIVALS = 5
 """So many pairs in a row that agree with each other outvote the fit that they do not agree with."""
 
-_MOST_PAIRS = 10_000
+MOST_PAIRS = 10_000
 _FORGOTTEN = 1_000
 """An hour and more at the usual rate; let go of in large parts."""
 
@@ -295,7 +295,7 @@ class BeaconClock:
 
     def _forget(self) -> None:
         """Let go of the oldest pairs when there are too many."""
-        if self.pairs <= _MOST_PAIRS:
+        if self.pairs <= MOST_PAIRS:
             return
         oldest = self._stretches[0]
         if len(oldest) > _FORGOTTEN:

@@ -9,29 +9,24 @@ import math
 from statistics import median
 from typing import TYPE_CHECKING, NamedTuple
 
-import numpy as np
-
 from tsgt.errors import RecordingError
-from tsgt.geometry import log_so3, rotation_from_quaternion
 from tsgt.master.intake import UNTIMED_SIGMA_NS
 from tsgt.master.replay import replayed
-from tsgt.master.tracks import build_tracks, usable
+from tsgt.master.tracks import usable
 from tsgt.model import Status
 from tsgt.recording import load_recording
 from tsgt.simulation.liveness import stuck
+from tsgt.simulation.pose_checks import doubtful_poses
 from tsgt.simulation.witness import Measured
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
-    from tsgt.master.tracks import Track
-    from tsgt.model import Parameters, PolarMeasurement
+    from tsgt.model import PolarMeasurement
     from tsgt.simulation.geocom_answers import Offered
     from tsgt.simulation.scenario import Run
-    from tsgt.simulation.witness import Session, StationWitness, ValidPoses
+    from tsgt.simulation.witness import Session, StationWitness
 
 _ROUNDING_NS = 1_000
 # Half of a unit on the air, and what is lost in the sums on either side.
@@ -39,13 +34,6 @@ _ANGLE_ROUNDING_RAD = math.tau / 2**25 * 1.001
 _DISTANCE_ROUNDING_M = 0.0501e-3
 # More than any station's latency, which is taken off the stamps.
 _LATENCY_NS = 5_000_000_000
-_RESIDUAL_TOLERANCE_M = 1e-6
-# Squared error of a pose in its sigmas, six degrees of freedom. A robot that does what its motion prior thinks unlikely is
-# now and then off by more than honest sigmas would allow in a lifetime: in them, 60 has a chance of 5e-11.
-_MOST_NEES = 60.0
-# In m and rad. Times of an instrument's first seconds, and those of the authors' nodes, are off by milliseconds that no
-# sigma states; of a moving robot that is millimetres.
-_STATE_TOLERANCE = 0.02
 # Ten digits behind the point are on the line.
 _LINE_ROUNDING = 1e-9
 # A stamp is less than this before or after the measurement: the slowest answer against the fastest, when few have come.
@@ -53,11 +41,6 @@ _STAMP_LIMIT_NS = 40_000_000
 # Of so many stamps of a station half are less than this off, on either side: a whole run's are within 1 ms.
 _FEWEST_STAMPS = 40
 _MIDDLE_STAMP_NS = 5_000_000
-# Of so many poses (half a minute) half have a squared error below this. What is honest has half of them below 5.3.
-_FEWEST_POSES = 600
-_MIDDLE_NEES = 12.0
-# In m and rad: what they are off by in the middle of all, in each direction. Noise leaves a tenth of that.
-_MIDDLE_ERROR = 0.005
 
 
 class Violation(NamedTuple):
@@ -96,9 +79,7 @@ def violations(run: Run) -> list[Violation]:
     for session in run.sessions:
         found += delivered_twice(session)
         found += beyond_bound(session, measured, start_ns=session.zero_ns)
-        found += wrong_poses(session, run.parameters)
-        found += wrong_states(session, run)
-        found += too_sure(session, run)
+        found += (Violation("pose", what) for what in doubtful_poses(session, run))
         found += replayed_otherwise(session)
     found += (Violation("stuck", what) for what in stuck(run, measured))
     found += (Violation("memory", what) for what in run.overgrown)
@@ -249,74 +230,6 @@ def beyond_bound(session: Session, measured: Mapping[int, Measured], *, start_ns
             )
 
 
-def wrong_poses(session: Session, parameters: Parameters) -> Iterator[Violation]:
-    """Fit the prisms of each valid pose of the estimator ``linear`` again, from usable measurements alone."""
-    poses = session.valid_poses()
-    poses = poses.select(poses.kind == "interpolated")
-    tracks = build_tracks(parameters, [m for m in session.measurements if usable(m)])
-    missed = np.flatnonzero(~_explained(poses, slice(None), tracks, parameters))
-    stamps_ns = np.array([m.stamp_ns for m in session.measurements], dtype=np.int64)
-    around_ns = parameters.pipeline.outage_limit_ns + _LATENCY_NS
-    for index in missed.tolist():
-        # Later measurements may have come between those that the pose was made from: look at the past alone.
-        before = stamps_ns[: poses.after[index]]
-        near = np.flatnonzero(np.abs(before - poses.stamp_ns[index]) <= around_ns).tolist()
-        tracks = build_tracks(parameters, [m for i in near if usable(m := session.measurements[i])])
-        if not _explained(poses, [index], tracks, parameters)[0]:
-            yield Violation(
-                "pose",
-                f"the pose at {poses.stamp_ns[index]} ns is called valid, but no usable measurements explain it",
-            )
-
-
-def wrong_states(session: Session, run: Run) -> Iterator[Violation]:
-    """Compare each valid pose of the estimator ``continuous`` with the truth and with the uncertainty that it states."""
-    poses = session.valid_poses()
-    poses = poses.select(poses.kind != "interpolated")
-    errors, nees = _errors(poses, session, run)
-    off = np.linalg.norm(errors.reshape(-1, 2, 3), axis=2)
-    for index in np.flatnonzero((nees > _MOST_NEES) & (off.max(axis=1) > _STATE_TOLERANCE)).tolist():
-        yield Violation(
-            "pose",
-            f"the {poses.kind[index]} pose at {poses.stamp_ns[index]} ns is called valid and off by "
-            f"{off[index, 0]:.4f} m and {off[index, 1]:.4f} rad; its squared error in sigmas is {nees[index]:.0f}",
-        )
-
-
-def too_sure(session: Session, run: Run) -> Iterator[Violation]:
-    """Compare all valid poses of a kind with the truth, and how far they are off with what they state.
-
-    A single pose has to be far off before chance is no excuse; half of them need not be. In the middle of half a minute
-    noise has no direction, as the robot turns this way and that: what is left is a wrong set-up.
-    """
-    every = session.valid_poses()
-    for kind in ("interpolated", "predicted", "smoothed"):
-        poses = every.select(every.kind == kind)
-        if len(poses.stamp_ns) < _FEWEST_POSES:
-            continue
-        errors, nees = _errors(poses, session, run)
-        beside_m, beside_rad = np.linalg.norm(np.median(errors, axis=0).reshape(2, 3), axis=1)
-        if beside_m > _MIDDLE_ERROR or beside_rad > _MIDDLE_ERROR:
-            yield Violation(
-                "pose",
-                f"the {len(nees)} {kind} poses are {beside_m:.4f} m and {beside_rad:.4f} rad beside the truth in the middle",
-            )
-        if np.median(nees) > _MIDDLE_NEES:
-            yield Violation(
-                "pose",
-                f"half of {len(nees)} {kind} poses have a squared error in sigmas above {np.median(nees):.1f}: they "
-                "are not where they should be, or state too little uncertainty",
-            )
-
-
-def _errors(poses: ValidPoses, session: Session, run: Run) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(N, 6) errors in place and rotation in m and rad, and (N,) their squares in the sigmas that the poses state."""
-    truth = run.world.pose_at((poses.stamp_ns - session.zero_ns) / 1e9)
-    turned = rotation_from_quaternion(poses.orientation_xyzw) @ np.swapaxes(truth[:, :3, :3], 1, 2)
-    errors = np.concatenate([poses.position_m - truth[:, :3, 3], log_so3(turned)], axis=1)
-    return errors, np.einsum("ni,ni->n", errors, np.linalg.solve(poses.covariance, errors[..., None])[..., 0])
-
-
 def replayed_otherwise(session: Session) -> Iterator[Violation]:
     """Compare the lines of the stream with those of a replay of the recording."""
     path = session.recording()
@@ -371,33 +284,3 @@ def _same_content(journalled: PolarMeasurement, delivered: PolarMeasurement) -> 
     if distances_m[0] is None or distances_m[1] is None:
         return distances_m[0] is distances_m[1]
     return abs(distances_m[0] - distances_m[1]) <= _DISTANCE_ROUNDING_M
-
-
-def _explained(
-    poses: ValidPoses,
-    rows: slice | list[int],
-    tracks: dict[int, Track],
-    parameters: Parameters,
-) -> NDArray[np.bool_]:
-    """Tell, for the given poses, whether the prisms lie where measurements put them, to the residual stated."""
-    stamps = poses.stamp_ns[rows]
-    rotation = rotation_from_quaternion(poses.orientation_xyzw[rows])
-    explained = np.ones(len(stamps), dtype=np.bool_)
-    squares = np.zeros(len(stamps))
-    for prism in parameters.prisms:
-        track = tracks[prism.prism]
-        if len(track) == 0:
-            return np.zeros(len(stamps), dtype=np.bool_)
-        after = np.searchsorted(track.times_ns, stamps).clip(1, max(1, len(track) - 1))
-        before = after - 1
-        after = np.minimum(after, len(track) - 1)
-        from_ns, to_ns = track.times_ns[before], track.times_ns[after]
-        explained &= (from_ns <= stamps) & (stamps <= to_ns)
-        explained &= to_ns - from_ns <= parameters.pipeline.outage_limit_ns
-        fraction = (stamps - from_ns) / np.maximum(to_ns - from_ns, 1)
-        seen = track.points_m[before] + fraction[:, None] * (track.points_m[after] - track.points_m[before])
-        placed = poses.position_m[rows] + rotation @ np.array(prism.position_m)
-        squares += np.sum((placed - seen) ** 2, axis=1)
-    residual_m = np.sqrt(squares / len(parameters.prisms))
-    explained &= np.abs(residual_m - poses.residual_m[rows]) <= _RESIDUAL_TOLERANCE_M
-    return explained

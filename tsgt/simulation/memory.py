@@ -7,6 +7,8 @@ from collections import deque
 
 from tsgt.master.intake import KNOWN_MEASUREMENTS
 from tsgt.master.stream import QUEUE_LINES
+from tsgt.radio.beacon_clock import MOST_PAIRS
+from tsgt.radio.outbox import MOST_QUEUED
 from tsgt.recording.recorder import HUNG_FACTOR, WAITING_LINES
 
 MOST_ENTRIES = 500
@@ -16,6 +18,8 @@ STATED = {
     ("_Reader", "_queue"): QUEUE_LINES,
     ("_Station", "_known"): KNOWN_MEASUREMENTS,
     ("Recorder", "_waiting"): HUNG_FACTOR * WAITING_LINES,
+    ("Outbox", "_queue"): MOST_QUEUED,
+    **dict.fromkeys((("Stretch", name) for name in ("_before", "_pairs", "_received_ns")), MOST_PAIRS),
 }
 """Those with a bound of their own: class and attribute, and how many entries it may have."""
 

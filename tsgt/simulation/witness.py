@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 
 _HEAD_LINES = 2
+# What is left of a program that is killed lives on for an instant.
+_LAST_NS = 5_000_000
 
 _KINDS: tuple[Kind, ...] = get_args(Kind)
 
@@ -213,7 +215,8 @@ class StationWitness:
             Only a disk that refused to be written to is an excuse.
         """
         return any(
-            from_ns - before_ns <= true_ns <= to_ns and not (refused and to_ns - from_ns == UNWRITTEN_NS)
+            from_ns - before_ns <= true_ns <= to_ns + _LAST_NS
+            and not (refused and to_ns - from_ns == UNWRITTEN_NS)
             for from_ns, to_ns in self.crashed_ns
         )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import suppress
 from typing import TYPE_CHECKING, NoReturn
 
 from tsgt.recording import encode_line
@@ -15,6 +16,10 @@ if TYPE_CHECKING:
 PATIENCE_S = 0.05
 """A card takes a millisecond for a line, but now and then a second, while it tidies up. A measurement that waits for
 that is worth nothing to a robot that drives, and the master would take the station's clock for another one."""
+
+
+RETRY_S = 1.0
+"""A disk that refuses lines is tried again so often."""
 
 
 class JournalQueue:
@@ -44,7 +49,10 @@ class JournalQueue:
     async def keep_writing(self) -> NoReturn:
         """Write whatever there is, for ever."""
         while True:
-            await self._pending.wait()
+            with suppress(TimeoutError):
+                # A disk that takes lines again need not wait for the next measurement.
+                async with asyncio.timeout(RETRY_S if self._recorder.failing else None):
+                    await self._pending.wait()
             self._pending.clear()
             followed, self._followed = self._followed, []
             writing = asyncio.ensure_future(asyncio.to_thread(self._recorder.flush))

@@ -238,7 +238,7 @@ def test_a_pair_must_be_newer() -> None:
 
 def test_the_oldest_pairs_are_let_go_of(monkeypatch: pytest.MonkeyPatch) -> None:
     """What the clock remembers is limited, and what it knows of now does not suffer."""
-    monkeypatch.setattr(beacon_clock, "_MOST_PAIRS", 100)
+    monkeypatch.setattr(beacon_clock, "MOST_PAIRS", 100)
     monkeypatch.setattr(beacon_clock, "_FORGOTTEN", 20)
     clock = taught(500, ppm=50, jitter_us=28)
     assert 80 <= clock.pairs <= 100
@@ -251,7 +251,7 @@ def test_the_oldest_pairs_are_let_go_of(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_old_stretches_are_let_go_of(monkeypatch: pytest.MonkeyPatch) -> None:
     """A stretch with few pairs goes as a whole."""
-    monkeypatch.setattr(beacon_clock, "_MOST_PAIRS", 100)
+    monkeypatch.setattr(beacon_clock, "MOST_PAIRS", 100)
     clock = taught(10)
     for k in range(20, 200):
         clock.add(received_ns(sent_us(k) + 2_000), sent_us(k), SIGMA_NS)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -62,7 +62,7 @@ def test_names_are_read() -> None:
     ],
     ids=lambda value: getattr(value, "kind", str(value)),
 )
-def test_nothing_that_must_never_be(tmp_path: Path, protocol: object, estimator: str, seed: int) -> None:
+def test_nothing_that_must_never_be(tmp_path: Path, protocol: Any, estimator: str, seed: int) -> None:
     """With faults of all kinds: nothing lost, altered, twice, mistimed, or stuck, and no pose called valid that is not."""
     plain = ScenarioConfig()
     pipeline = plain.pipeline.model_copy(update={"estimator": estimator})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import asynccontextmanager, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -23,7 +24,6 @@ from tsgt.simulation.clocks import VirtualClock
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Sequence
-    from pathlib import Path
 
     from support.client import Field
     from support.hand_master import Answered
@@ -198,8 +198,8 @@ async def test_a_run_whose_disk_takes_nothing_has_numbers_of_its_own(
     assert len(air.master.received) >= len(day.read) - 4
 
 
-def _refuse(writer: RecordingWriter, line: bytes) -> None:
-    raise RecordingError("no room")
+def _refuse(_: RecordingWriter, __: bytes) -> None:
+    raise RecordingError("no room", path=Path("journal"))
 
 
 async def test_what_the_disk_holds_up_is_not_delivered(

@@ -11,7 +11,7 @@ import numpy as np
 
 from tsgt.simulation.clocks import DriftingClock
 from tsgt.simulation.disk import FULL, READ_ONLY
-from tsgt.simulation.faults import FaultKind
+from tsgt.simulation.faults import AFTER_BOOT_S, FaultKind
 from tsgt.simulation.foreign import LONGEST_NOISE_BYTES, ForeignRadio
 from tsgt.simulation.line_faults import LineFault
 from tsgt.simulation.mission_configs import station_name
@@ -29,7 +29,6 @@ _JAMMER_GAIN_DB = -40.0
 _JAMMING_BYTES = 200
 _PER_S = 3.0
 _ANSWERS_PER_S = 60
-_AFTER_BOOT_S = (5.5, 12.0)
 # What the clocks of both protocols are made for: 0.01 ppm each second, and ten times as much.
 _RAMP_PPM_PER_S = {True: 0.1, False: 0.01}
 _STEP_S: Final = (-3600.0, 3600.0)
@@ -197,7 +196,7 @@ async def _power(mission: Mission, fault: Fault, rng: np.random.Generator) -> No
     instrument.switch_off()
     await asyncio.sleep(fault.seconds)
     instrument.switch_on()
-    await asyncio.sleep(rng.uniform(*_AFTER_BOOT_S))
+    await asyncio.sleep(rng.uniform(*AFTER_BOOT_S))
     _lock_by_hand(mission, _number(fault))
 
 

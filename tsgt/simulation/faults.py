@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 CALM_S = 40.0
 """Before the end of a run all faults are over for so long: what they broke has to work again by then."""
 
+AFTER_BOOT_S = (5.5, 8.0)
+"""When a person locks an instrument that was switched on: it takes five seconds to start."""
+
 SETTLE_S = 5.0
 """Before any fault."""
 
@@ -201,7 +204,8 @@ def draw_faults(
             if left_out and len(ordered) > 1:
                 continue
             for _ in range(count):
-                at_s = rng.uniform(SETTLE_S, end_s)
+                until_s = end_s - AFTER_BOOT_S[1] if kind == FaultKind.POWER else end_s
+                at_s = rng.uniform(SETTLE_S, max(SETTLE_S, until_s))
                 shortest, longest = habit.seconds
                 # Short ones as often as long ones.
                 seconds = shortest and math.exp(rng.uniform(math.log(shortest), math.log(longest)))
@@ -211,7 +215,7 @@ def draw_faults(
                         float(at_s),
                         kind,
                         station,
-                        float(min(seconds, end_s - at_s)),
+                        float(max(0.0, min(seconds, until_s - at_s))),
                         int(rng.integers(2**63)),
                     )
                 )

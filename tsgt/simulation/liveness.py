@@ -25,7 +25,8 @@ DELIVERED_SHARE = {"superframe": 0.9, "classic": 0.35}
 now and then stops to synchronise, gets 0.55 to 0.65 in half a minute of a run without faults, with 2 % loss."""
 
 VALID_SHARE = {"superframe": 0.7, "classic": 0.4}
-"""Of the poses that the time has room for, at least so many are valid; while classic synchronises there are none."""
+"""Of the poses that the time has room for, at least so many are valid; while classic synchronises there are none.
+Predicted ones do not count: how long they are certain enough hangs on how old the newest measurement is."""
 
 ACKNOWLEDGED_S = 20.0
 """So long after a measurement has reached the master, its station waits for an acknowledgement no more. A beacon brings
@@ -76,7 +77,7 @@ def stuck(run: Run, measured: Mapping[int, Measured]) -> Iterator[str]:
             )
     yield from unacknowledged(run, measured)
     poses = session.valid_poses()
-    at_s = (poses.stamp_ns[poses.kind != "smoothed"] - session.zero_ns) / 1e9
+    at_s = (poses.stamp_ns[poses.kind != "predicted"] - session.zero_ns) / 1e9
     valid = np.count_nonzero((from_s <= at_s) & (at_s < to_s))
     room = seconds * 1e9 / run.parameters.pipeline.period_ns
     if valid < VALID_SHARE[protocol] * room:

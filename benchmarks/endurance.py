@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
-import multiprocessing
 import os
 import signal
 import sys
@@ -29,12 +28,11 @@ from endurance_watch import (  # type: ignore[import-not-found]  # the script be
     Sample,
     Stream,
     beacons_ns,
+    lossy_scenario,
     memory_slope,
-    serve_air,
 )
 
 from tsgt.clock import SystemClock
-from tsgt.config import ScenarioConfig
 from tsgt.log import configure_logging
 from tsgt.simulation.aftermath import aftermath
 from tsgt.simulation.checkers import Violation
@@ -88,9 +86,8 @@ class Endurance:
     def __init__(self, folder: Path, *, minutes: float, loss: float, seed: int) -> None:
         self._duration_s = 60 * minutes
         self._seed = seed
-        scenario = ScenarioConfig()
-        radio = scenario.radio.model_copy(update={"loss_probability": loss})
-        self._scenario = scenario.model_copy(update={"radio": radio})
+        self._loss = loss
+        self._scenario = lossy_scenario(loss)
         self._files = write_demo_files(folder, self._scenario, folder / "poses.sock")
         world_s = self._duration_s + JOIN_LIMIT_S + DRAIN_LIMIT_S
         self._demo = Demo(self._scenario, self._files, duration_s=world_s, seed=seed, clock=SystemClock())
@@ -109,16 +106,18 @@ class Endurance:
         """Run it all; return what was found."""
         instrument_rngs = np.random.default_rng(self._seed).spawn(len(self._files.stations))
         timeline = LoopTimeline(asyncio.get_running_loop())
-        air = multiprocessing.get_context("spawn").Process(
-            target=serve_air, args=(self._files.air_socket, self._scenario, self._seed), daemon=True
+        air = await asyncio.create_subprocess_exec(
+            sys.executable,
+            str(Path(__file__).with_name("endurance_watch.py")),
+            *map(str, (self._files.air_socket, self._loss, self._seed)),
+            stdin=asyncio.subprocess.PIPE,
         )
-        air.start()
-        self._air_pid = air.pid or 0
+        self._air_pid = air.pid
         while not self._files.air_socket.exists():  # noqa: ASYNC110 (another process makes it)
             await asyncio.sleep(0.1)
         lines = []
         async with AsyncExitStack() as stack:
-            stack.callback(air.terminate)
+            stack.push_async_callback(air.communicate)  # closes its standard input, and waits
             for station, rng in zip(self._scenario.stations, instrument_rngs, strict=True):
                 instrument = SimulatedTotalStation(
                     station, self._scenario, self._demo.world, timeline, rng, start_ns=self._demo.start_ns
@@ -134,11 +133,12 @@ class Endurance:
                 for task in watching:
                     task.cancel()
                 queued = await self._drain(lines)
+                air_ended = air.returncode is not None
             finally:
                 for task in (*daemons, *watching):
                     task.cancel()
                 await asyncio.wait([*daemons, *watching])
-        return self._result(queued)
+        return self._result(queued, air_ended=air_ended)
 
     # --- While it runs ----------------------------------------------------------------------------------------
 
@@ -243,7 +243,7 @@ class Endurance:
 
     # --- Afterwards -------------------------------------------------------------------------------------------
 
-    def _result(self, queued: dict[int, int]) -> dict[str, Any]:
+    def _result(self, queued: dict[int, int], *, air_ended: bool) -> dict[str, Any]:
         recordings = sorted(self._files.recordings.glob("*.jsonl"))
         found = aftermath(
             recordings,
@@ -252,6 +252,8 @@ class Endurance:
             queued,
         )
         found.violations += self._wrong_ends(queued)
+        if air_ended:
+            found.violations.append(Violation("ended", "the air server has ended"))
         stream, period_ns = self._streams[-1], round(1e9 / self._scenario.pipeline.rate_hz)
         return {
             "minutes": self._duration_s / 60,

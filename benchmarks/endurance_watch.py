@@ -6,9 +6,9 @@ import asyncio
 import json
 import os
 import re
+import sys
 import time
 from collections import Counter, defaultdict
-from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -16,14 +16,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tsgt.config import ScenarioConfig
 from tsgt.log import configure_logging
 from tsgt.simulation.air_server import AirServer
 from tsgt.simulation.mission_configs import scenario_link
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-    from tsgt.config import ScenarioConfig
 
 _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
@@ -105,19 +104,19 @@ class Stream:
         )
 
 
-def serve_air(path: Path, scenario: ScenarioConfig, seed: int) -> None:
-    """Be the air between the radios until terminated."""
-    configure_logging("error")
+def lossy_scenario(loss: float) -> ScenarioConfig:
+    """Return the reference scenario with a share of packets that nobody hears."""
+    scenario = ScenarioConfig()
+    return scenario.model_copy(update={"radio": scenario.radio.model_copy(update={"loss_probability": loss})})
+
+
+async def serve_air(path: Path, loss: float, seed: int) -> None:
+    """Be the air between the radios until standard input ends: with the program that has started this one."""
+    scenario, rng = lossy_scenario(loss), np.random.default_rng(seed)
     places = {f"station{s.station}": s.position_m for s in scenario.stations}
     places["master"] = scenario.motion.area_centre_m
-    rng = np.random.default_rng(seed)
-
-    async def serve() -> None:
-        async with AirServer(path, scenario_link(scenario.radio, places, rng), rng):
-            await asyncio.Event().wait()
-
-    with suppress(KeyboardInterrupt):
-        asyncio.run(serve())
+    async with AirServer(path, scenario_link(scenario.radio, places, rng), rng):
+        await asyncio.to_thread(sys.stdin.read)
 
 
 def memory_slope(samples: Sequence[Sample]) -> float:
@@ -135,3 +134,8 @@ def beacons_ns(recordings: Sequence[Path]) -> list[int]:
         for line in path.read_bytes().splitlines()
         if line.startswith(b'{"type":"beacon"')
     ]
+
+
+if __name__ == "__main__":
+    configure_logging("error")
+    asyncio.run(serve_air(Path(sys.argv[1]), float(sys.argv[2]), int(sys.argv[3])))

@@ -261,7 +261,7 @@ class SX1276Chip:
 
     def _well(self, data: bytes) -> bool:
         """Whether an access needs no look at every byte: to the LoRa page of a chip that works, not beyond its end."""
-        return not (
+        return bool(data) and not (
             self._fsk_page
             or self._hung
             or self._reset_since_ns is not None

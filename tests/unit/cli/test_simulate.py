@@ -33,7 +33,7 @@ def test_the_keys_that_others_rely_on(tsgt: Tsgt) -> None:
     assert station.keys() >= {"age_ms", "within_2s", "queued", "late_slots"}
     assert station["time_error_us"].keys() == {"p50", "p99", "max"}
     assert station["age_ms"].keys() == {"p50", "p99"}
-    assert station["measured"] == 45  # connecting takes two seconds
+    assert station["measured"] in {44, 45}  # connecting takes two seconds
     assert found["estimators"].keys() == {"linear", "continuous"}
     for estimator in found["estimators"].values():
         assert estimator.keys() >= {

@@ -180,28 +180,6 @@ async def test_orders_are_carried_out_and_answered(tmp_path: Path) -> None:
         assert {measurement.prism for measurement in usable} == {1, 2}
 
 
-async def test_a_run_whose_disk_takes_nothing_has_numbers_of_its_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The next run cannot know which ones were given away, so no two measurements have the same."""
-    async with superframe_day(tmp_path) as (day, air):
-        await air.frames(6.0)
-        await day.kill()
-        with monkeypatch.context() as patch:
-            patch.setattr(RecordingWriter, "write_line", _refuse)
-            day.start()
-            await air.frames(8.0)
-            await day.kill()
-        day.start()
-        await air.frames(8.0)
-        await air.drained(day)
-    assert len(air.master.received) >= len(day.read) - 4
-
-
-def _refuse(_: RecordingWriter, __: bytes) -> None:
-    raise RecordingError("no room", path=Path("journal"))
-
-
 async def test_what_the_disk_holds_up_is_not_delivered(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -147,9 +147,10 @@ class Stamper:
         time_ms, rest_ns = divmod(line.instrument_time_ns, 1_000_000)
         mapped = self._clock.at(time_ms)
         assert mapped is not None  # noqa: S101 (the clock stands)
-        # The line that is nearest to the envelope lies on it, but for rounding.
+        # The clock is that of instruments which tell whole ms, and half of one is added: nearest to the envelope that is
+        # after the arrival.
         host_ns = mapped.host_ns + rest_ns
-        at_ns = arrived_ns if 0 < host_ns - arrived_ns < 1000 else host_ns
+        at_ns = arrived_ns if 0 < host_ns - arrived_ns < 1_000_000 else host_ns
         return self._checked(line, prism, at_ns, arrived_ns, LATEST_NS)
 
     def _checked(

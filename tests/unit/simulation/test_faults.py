@@ -55,10 +55,8 @@ def test_names_are_read() -> None:
 @pytest.mark.parametrize(
     ("protocol", "estimator", "seed"),
     [
-        (SUPERFRAME, "linear", 11),
         (QUICK, "linear", 12),
         (SUPERFRAME, "continuous", 13),
-        (QUICK, "continuous", 14),
     ],
     ids=lambda value: getattr(value, "kind", str(value)),
 )

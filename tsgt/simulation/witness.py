@@ -12,7 +12,7 @@ import numpy as np
 from tsgt.master.stream_records import BeaconRecord, ClockRecord, Kind, PoseRecord, StatusRecord
 from tsgt.model import PolarMeasurement
 from tsgt.recording import decode_line, encode_line, read_lines
-from tsgt.recording.journal import AcknowledgedRecord, JournalRecord, load_journal
+from tsgt.recording.journal import AcknowledgedRecord, load_journal
 from tsgt.simulation.disk import UNWRITTEN_NS
 
 if TYPE_CHECKING:
@@ -254,7 +254,8 @@ class Measured:
             heard.update(reception.session for reception in journal.receptions)
         # Their names tell the order as well as the stations' Unix clocks do.
         last = max(witness.journals, key=lambda path: path.stat().st_mtime_ns, default=None)
-        self._last = load_journal(last).head if last is not None and _begun(last) else None
+        self._last_journal = last if last is not None and _begun(last) else None
+        self._last = load_journal(self._last_journal).head if self._last_journal is not None else None
         self._by_sequence = {m.sequence: m for m in self.journalled}
         self._by_host_time = {m.host_time_ns: m for m in self.journalled}
 
@@ -276,15 +277,10 @@ class Measured:
 
         A client says so every 5 s at most, if it is another one.
         """
-        oldest: dict[int, int] = {}
-        for path in filter(_begun, self.witness.journals):
-            run_start = 0
-            for line in read_lines(path):
-                if line.type == "journal":
-                    run_start = decode_line(JournalRecord, line, path).run_start
-                elif line.type == "acknowledged":
-                    oldest[run_start] = decode_line(AcknowledgedRecord, line, path).oldest
-        return oldest[max(oldest)] if oldest else None
+        if (path := self._last_journal) is None:
+            return None
+        told = [line for line in read_lines(path) if line.type == "acknowledged"]
+        return decode_line(AcknowledgedRecord, told[-1], path).oldest if told else None
 
     def timeless(self, sequence: int, session: int | None) -> bool:
         """Whether no time of a master's session can be told of a measurement.

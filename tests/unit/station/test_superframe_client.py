@@ -16,6 +16,7 @@ from unit.station.test_daemon import asked
 from tsgt.clock import UnixTimeline
 from tsgt.config.radio import SuperframeConfig
 from tsgt.errors import RecordingError
+from tsgt.radio.inbox import RESTART_SKIP
 from tsgt.radio.messages import AnswerPart, OrderPart
 from tsgt.recording import RecordingWriter, read_lines
 from tsgt.recording.journal import load_journal
@@ -178,6 +179,29 @@ async def test_orders_are_carried_out_and_answered(tmp_path: Path) -> None:
         assert len(load_journal(path).targets) == 1
         usable = [measurement for measurement in journalled(tmp_path) if measurement.status.usable]
         assert {measurement.prism for measurement in usable} == {1, 2}
+
+
+async def test_a_run_whose_disk_takes_nothing_at_its_start_has_numbers_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Were it killed, the next run would not know which ones it had given away."""
+
+    def refuse(_: RecordingWriter, __: bytes) -> None:
+        raise RecordingError("no room", path=tmp_path)
+
+    async with superframe_day(tmp_path) as (day, air):
+        await air.frames(4.0)
+        await day.kill()
+        with monkeypatch.context() as patch:
+            patch.setattr(RecordingWriter, "write_line", refuse)
+            day.start()
+            await asyncio.sleep(3.0)
+        await asyncio.sleep(3.0)
+        await day.kill()
+    heads = [load_journal(path).head for path in (tmp_path / "journals").iterdir()]
+    before, after = sorted(heads, key=lambda head: head.run_start)
+    assert after.lineage != before.lineage
+    assert after.run_start > before.run_start + 2 * RESTART_SKIP
 
 
 async def test_what_the_disk_holds_up_is_not_delivered(

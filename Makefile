@@ -29,7 +29,7 @@ layers: $(VENV)/.test
 
 # Those that run real processes in real time have the machine to themselves.
 pytest: $(VENV)/.test
-	$(BIN)/pytest --numprocesses auto --dist loadfile --ignore tests/process --ignore tests/interop
+	$(BIN)/pytest --numprocesses auto --dist worksteal --ignore tests/process --ignore tests/interop
 	$(BIN)/pytest tests/process tests/interop
 
 # Forty times the examples of `make test`, on two cores; what is not done after 15 minutes is given up, and said.

@@ -11,6 +11,7 @@ import pytest
 import structlog
 from hypothesis import Phase, settings
 
+import tsgt.cli  # noqa: F401 (sets how many threads numpy has, before it is loaded)
 from tsgt.simulation.event_loop import run_virtual
 
 if TYPE_CHECKING:

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
 
+PATIENCE_S = 60.0
+"""How long a slow machine may take for what takes a few seconds."""
+
 RADIO = """
 [radio]
 kind = "simulated"
@@ -135,7 +138,8 @@ def folder(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]:
 def wait_for_mode(folder: Path, mode: str) -> None:
     """Ask the client until its instrument is connected and does that."""
     found = None
-    for _ in range(400):
+    deadline_s = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline_s:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
             if connection.connect_ex(str(folder / "client.sock")) == 0:
                 with connection.makefile("rb") as file:
@@ -162,9 +166,9 @@ def test_ctrl_c_leaves_what_was_measured_and_a_station_that_tracks(folder: Path,
         assert collect.stdin is not None
         collect.stdin.write(b"\n" if waiting else b"\n\n")
         collect.stdin.flush()
-        for _ in range(400):
-            if path.exists() and len(path.read_text().splitlines()) == 2:
-                break
+        deadline_s = time.monotonic() + PATIENCE_S
+        while not (path.exists() and len(path.read_text().splitlines()) == 2):
+            assert time.monotonic() < deadline_s
             time.sleep(0.05)
         wait_for_mode(folder, "direct")
         time.sleep(0.5)  # into the second measurement, which takes at least a second

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import NoReturn
 
@@ -53,8 +52,6 @@ def master(config_path: Path) -> None:
 
     Runs until SIGTERM or Ctrl-C. Stations, radio and disk may fail and come back meanwhile.
     """
-    # Before numpy is loaded: its matrices are small here, and a second thread would cost more than it computes.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Only here, as `--help` needs none of it.
     from tsgt import service  # noqa: PLC0415
     from tsgt.cli.composition import radio_key, radio_opener  # noqa: PLC0415

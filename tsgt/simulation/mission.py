@@ -341,11 +341,11 @@ class Mission:
         if computer.away:
             return
         computer.away = True
-        await computer.crash()
         if name == MASTER:
             self.sessions[-1].crashed = True
         else:
             self._excuse(computer)
+        await computer.crash()  # which takes time of its own, in which nothing is written
         await asyncio.sleep(away_s)
         computer.away = False
         self._start_again(name)

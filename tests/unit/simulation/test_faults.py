@@ -16,6 +16,8 @@ from tsgt.simulation.faults import CALM_S, SETTLE_S, FaultKind, draw_faults, par
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from tsgt.simulation.mission import Mission
+
 DURATION_S = 60.0
 
 
@@ -50,6 +52,21 @@ def test_names_are_read() -> None:
     assert parse_faults("loss,disk-full") == {FaultKind.LOSS, FaultKind.DISK_FULL}
     with pytest.raises(ConfigError, match="there is no such fault"):
         parse_faults("loss,gremlins")
+
+
+def test_a_crash_is_when_it_happens(tmp_path: Path) -> None:
+    """What a client has just read need not be on its disk, however long its last breath takes."""
+    killed_s = []
+
+    async def crash(run: Mission) -> None:
+        await run.sleep_until(10.2)
+        run.instruments[1].blocked = True  # while it searches, it answers late
+        await run.sleep_until(13.2)
+        killed_s.append(run.now_s)
+        await run.crash("station1", away_s=1.0)
+
+    ((_, crashed_ns),) = mission(tmp_path, duration_s=15.0, script=crash).witnesses[1].crashed_ns
+    assert crashed_ns / 1e9 == pytest.approx(killed_s[0], abs=1e-6)
 
 
 @pytest.mark.parametrize(

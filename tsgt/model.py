@@ -10,7 +10,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 Vector3 = tuple[float, float, float]
 Row4 = tuple[float, float, float, float]
@@ -37,6 +40,15 @@ LARGEST_NUMBER = 2**31 - 1
 """For numbers of stations and prisms."""
 
 
+LARGEST_COORDINATE_M = 1e8
+"""Of any place: coordinates of maps (UTM: 1e7) and from the Earth's centre are smaller. What is beyond is garbage, whose
+squares no number holds."""
+
+
+_ROTATION_TOLERANCE = 1e-3
+"""More than what is lost where a matrix is written with four digits."""
+
+
 def check_instants(*times_ns: int) -> None:
     """Refuse times that do not fit into 64 bits or lie before 1970.
 
@@ -61,6 +73,26 @@ def check_finite(*numbers: float) -> None:
     for number in numbers:
         if not math.isfinite(number):
             raise ValueError(f"{number} is not a finite number")
+
+
+def _check_coordinates(what: str, coordinates: Iterable[float]) -> None:
+    """Refuse places that are not near the Earth."""
+    for coordinate in coordinates:
+        if not abs(coordinate) <= LARGEST_COORDINATE_M:
+            raise ValueError(f"{what} holds {coordinate:g}, expected at most {LARGEST_COORDINATE_M:g} m")
+
+
+def _dot(a: tuple[float, ...], b: tuple[float, ...]) -> float:
+    return sum(x * y for x, y in zip(a, b, strict=True))
+
+
+def _check_rotation(what: str, matrix: Matrix4) -> None:
+    """Refuse a matrix whose first three rows and columns are no rotation, nor nearly one."""
+    x, y, z = (row[:3] for row in matrix[:3])
+    lengths = (math.hypot(*x) - 1, math.hypot(*y) - 1, math.hypot(*z) - 1)
+    cosines = (_dot(x, y), _dot(y, z), _dot(z, x))
+    if not all(abs(off) < _ROTATION_TOLERANCE for off in (*lengths, *cosines)):
+        raise ValueError(f"{what} holds {x}, {y}, {z}, which is no rotation")
 
 
 def _check_limits(record: object, **limits: tuple[float, float]) -> None:
@@ -106,7 +138,8 @@ class PolarMeasurement:
         station's latency is not taken off; whoever computes with it does that.
     stamp_sigma_ns
         One sigma of ``stamp_ns`` in ns, without the instrument's latency: in a journal of the instrument's time on the
-        station's clock, in a recording of that clock on the master's; of both in what was merged from a journal.
+        station's clock, in a recording of that clock on the master's; in what was merged from a journal also of what the
+        instrument's time is less certain than usual.
     stamp_bound_ns
         ``stamp_ns`` is within this of the truth, in ns; null where nobody can say.
     received_ns
@@ -308,7 +341,9 @@ class TargetResidual:
     def __post_init__(self) -> None:
         """Refuse what no calibration finds."""
         _check_limits(self, target=(1, LARGEST_NUMBER))
-        check_finite(self.residual_m or 0.0, self.left_out_m or 0.0)
+        for residual_m in (self.residual_m or 0.0, self.left_out_m or 0.0):
+            if not 0 <= residual_m <= 1e6:
+                raise ValueError(f"a residual is {residual_m:g}, expected 0 to 1e+06 m")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -356,6 +391,8 @@ class StationParameters:
             atmospheric_ppm=(-1e4, 1e4),
             latency_ns=(-(10**12), 10**12),
         )
+        _check_rotation("T_station1_station", self.T_station1_station)
+        _check_coordinates("T_station1_station", (row[3] for row in self.T_station1_station))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -478,6 +515,10 @@ class PrismPosition:
 
     prism: int
     position_m: Vector3
+
+    def __post_init__(self) -> None:
+        """Refuse what is no place."""
+        _check_coordinates("position_m", self.position_m)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

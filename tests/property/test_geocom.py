@@ -168,13 +168,15 @@ faults = st.one_of(
     st.just(doubled),
     st.floats(0.001, 4.0).map(late),
     st.integers(0, 30).map(cut),
-    st.builds(torn, st.integers(1, 30), st.floats(0.001, 3.0)),
+    # Within the call's time: a rest that came later could make a whole of the next reply, if that is cut; and without a
+    # checksum nobody could tell.
+    st.builds(torn, st.integers(1, 30), st.floats(0.001, 0.9)),
     rubbish.map(garbage_before),
     st.sampled_from([3074, 3080, 3087, 3093, 3100, 3101, 3107, 3108, 3109]).map(not_taken),
 )
 steps = st.lists(
     st.tuples(
-        st.sampled_from(["call", "call", "call", "cancel", "pause", "attention", "abort"]),
+        st.sampled_from(["call", "call", "call", "cancel", "pause", "abort"]),
         st.lists(faults, max_size=3),
         st.floats(0.0, 1.5),
     ),
@@ -215,8 +217,6 @@ def test_no_reply_is_taken_for_another(
                             await ask(number)
                     case "pause":
                         await asyncio.sleep(for_s)
-                    case "attention":
-                        await connection.attention()
                     case "abort":
                         await connection.abort()
             except (InstrumentError, TimeoutError):
@@ -224,7 +224,6 @@ def test_no_reply_is_taken_for_another(
             assert loop.time() - began_s < 20.0
         instrument.faults.clear()
         await asyncio.sleep(10.0)
-        await connection.attention()
         await ask(1000)
 
     run_virtual(run)

@@ -8,6 +8,7 @@ from decimal import Decimal, InvalidOperation
 from typing import TYPE_CHECKING
 
 from tsgt.errors import InputFileError, quoted
+from tsgt.master.tracks import FARTHEST_M
 from tsgt.model import LAST_INSTANT_NS
 
 if TYPE_CHECKING:
@@ -71,6 +72,13 @@ class Row:
             raise self.error(f"{column} is {quoted(self.cells[column])}; expected a finite number")
         return value
 
+    def within(self, column: str, least: float, most: float) -> float:
+        """Read a number between limits, both of which are allowed."""
+        value = self.number(column)
+        if not least <= value <= most:
+            raise self.error(f"{column} is {quoted(self.cells[column])}; expected {least:g} to {most:g}")
+        return value
+
     def positive_integer(self, column: str) -> int:
         """Read a number of a station, a prism or a target."""
         text = self.cells[column]
@@ -121,6 +129,8 @@ class Row:
         distance_m = self.number(column)
         if distance_m <= 0:
             raise self.error(f"{column} is {self.cells[column]}; expected more than zero, remove the line")
+        if distance_m > FARTHEST_M:
+            raise self.error(f"{column} is {quoted(self.cells[column])}; expected at most {FARTHEST_M:g} m")
         return distance_m
 
 

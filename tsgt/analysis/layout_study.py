@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
     from tsgt.model import InstrumentNoise
 
+FARTHEST_POINT_M = 10_000.0
+"""No point of a robot is further from its prisms."""
+
 HEADINGS = 8
 """So many headings of the robot at each place, evenly around the circle."""
 
@@ -146,7 +149,7 @@ def pose_covariances(
     Raises
     ------
     GeometryError
-        A layout from which no pose follows, or a prism that nobody tracks.
+        A layout from which no pose follows, a prism that nobody tracks, or a point that is none of the robot.
     """
     check_layout(layout)
     untracked = set(range(len(layout))) - {station.slot for station in stations}
@@ -154,6 +157,9 @@ def pose_covariances(
         raise GeometryError(
             f"the layout has {len(layout)} prisms for {len(stations)} stations: each prism needs a station of its own"
         )
+    away_m = float(np.linalg.norm(point_m - layout.mean(axis=0)))
+    if away_m > FARTHEST_POINT_M:
+        raise GeometryError(f"the point is {away_m:g} m from the prisms; give one of the robot, in its frame")
     information = sum(
         prism_information(layout[slot : slot + 1], slot, stations, stances, point_m)[0]
         for slot in range(len(layout))

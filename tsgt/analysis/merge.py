@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from tsgt.analysis.merge_recording import Recorded, identity, read_recorded
 from tsgt.analysis.merge_runs import Boot, Run, better
 from tsgt.errors import RecordingError
+from tsgt.master.observations import instrument_time_sigma_s
 from tsgt.model import LAST_INSTANT_NS, PolarMeasurement
 from tsgt.recording import RecordingWriter, encode_line, read_lines, write_atomically
 from tsgt.recording.journal import is_only_begun, load_journal
@@ -262,10 +263,13 @@ def _sort(
 
 
 def _record(entry: Entry, time: MasterTime, path: Path) -> MergedRecord:
+    # What is usual of instruments counts whenever poses are computed, of what was delivered as well.
+    usual_ns = 1e9 * instrument_time_sigma_s(entry.measurement.sequence)
+    beyond_ns = math.sqrt(max(entry.measurement.stamp_sigma_ns**2 - usual_ns**2, 0.0))
     measurement: PolarMeasurement = dataclasses.replace(
         entry.measurement,
         stamp_ns=time.unix_ns,
-        stamp_sigma_ns=round(math.hypot(time.sigma_ns, entry.measurement.stamp_sigma_ns)),
+        stamp_sigma_ns=round(math.hypot(time.sigma_ns, beyond_ns)),
         stamp_bound_ns=time.bound_ns,
         received_ns=time.unix_ns,
     )

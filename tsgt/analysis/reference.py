@@ -14,7 +14,7 @@ from tsgt.analysis.aligned import aligned_figures
 from tsgt.analysis.metrics import PoseFigures, inner_part
 from tsgt.errors import InputFileError
 from tsgt.geometry import rotation_from_quaternion, transform_from
-from tsgt.model import check_instants
+from tsgt.model import LARGEST_COORDINATE_M, check_instants
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -114,7 +114,8 @@ def _pose(words: list[str], path: Path, number: int) -> tuple[int, list[float]]:
             "is not a pose; expected: stamp_s x y z qx qy qz qw", path=path, line=number
         ) from error
     # A quaternion far from unit length is none: columns of something else.
-    if len(row) != 7 or not np.isfinite(row).all() or not 1e-3 < math.hypot(*row[3:]) < 1e3:
+    near = all(abs(coordinate) <= LARGEST_COORDINATE_M for coordinate in row[:3])  # which no NaN is
+    if len(row) != 7 or not near or not 1e-3 < math.hypot(*row[3:]) < 1e3:
         raise InputFileError("is not a pose; expected: stamp_s x y z qx qy qz qw", path=path, line=number)
     return stamp_ns, row
 

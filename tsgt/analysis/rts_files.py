@@ -11,7 +11,7 @@ import numpy as np
 from tsgt.config import load_prism_layout
 from tsgt.errors import DegenerateGeometryError, InputFileError, quoted
 from tsgt.geometry import check_layout
-from tsgt.model import PrismPosition
+from tsgt.model import LARGEST_COORDINATE_M, PrismPosition
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -156,7 +156,7 @@ def _read_sensor_positions(path: Path) -> dict[int, Vector3]:
                 path=path,
                 line=number,
             )
-        x, y, z = (_number(text, path, number) for text in row[:3])
+        x, y, z = (_coordinate(text, path, number) for text in row[:3])
         positions[len(positions) + 1] = (x, y, z)
     return positions
 
@@ -180,6 +180,15 @@ def _number(text: str, path: Path, line: int) -> float:
         value = float("nan")
     if not np.isfinite(value):
         raise InputFileError(f"expected a finite number, got {quoted(text)}", path=path, line=line)
+    return value
+
+
+def _coordinate(text: str, path: Path, line: int) -> float:
+    value = _number(text, path, line)
+    if abs(value) > LARGEST_COORDINATE_M:
+        raise InputFileError(
+            f"expected at most {LARGEST_COORDINATE_M:g} m, got {quoted(text)}", path=path, line=line
+        )
     return value
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from tsgt.analysis.csv_table import HORIZONTAL, ZENITH, read_table
 from tsgt.errors import InputFileError, quoted
+from tsgt.model import LARGEST_COORDINATE_M
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -184,7 +185,7 @@ def read_prism_file(path: Path) -> PrismFile:
             name = row.cells["point"]
             if not name:
                 raise row.error("a body point needs a name in the column point")
-            place = (row.number("x_m"), row.number("y_m"), row.number("z_m"))
+            place = (_place(row, "x_m"), _place(row, "y_m"), _place(row, "z_m"))
             if cad_m.setdefault(name, place) != place:
                 raise row.error(f"body point {name} has another x_m, y_m, z_m further up; keep one of them")
             body.setdefault(name, []).append(_sight(row))
@@ -197,6 +198,10 @@ def read_prism_file(path: Path) -> PrismFile:
     return PrismFile(path, dict(sorted(prisms.items())), body, cad_m)
 
 
+def _place(row: Row, column: str) -> float:
+    return row.within(column, -LARGEST_COORDINATE_M, LARGEST_COORDINATE_M)
+
+
 def _sight(
     row: Row, horizontal: str | None = None, zenith: str | None = None, distance: str = "slope_distance_m"
 ) -> Sight:
@@ -206,6 +211,6 @@ def _sight(
         horizontal_angle_rad=horizontal_rad,
         zenith_angle_rad=zenith_rad,
         slope_distance_m=row.distance_m(distance),
-        constant_m=row.number("constant_mm") / 1e3 if row.cells.get("constant_mm") else None,
+        constant_m=row.within("constant_mm", -1e4, 1e4) / 1e3 if row.cells.get("constant_mm") else None,
         line=row.line,
     )

@@ -23,6 +23,7 @@ from tsgt.cli.options import finite, json_option, path_type
 from tsgt.cli.output import print_json, print_table
 from tsgt.config import MasterConfig, load, parameters, scenario_parameters
 from tsgt.errors import ConfigError
+from tsgt.model import LARGEST_COORDINATE_M
 from tsgt.simulation.scenario_files import find_scenario
 
 if TYPE_CHECKING:
@@ -127,8 +128,13 @@ def layout_command(
     with the others. Then the stations move: how does the pose of the first-ranked layout depend on their distance, and
     on whether they stand together or around the robot?
     """
-    if not np.isfinite([*(area or ()), *(envelope or ()), *point_m]).all():
-        raise click.UsageError("--area, --envelope and --point need finite numbers")
+    # No NaN is less than anything.
+    if not all(
+        abs(number_m) <= LARGEST_COORDINATE_M for number_m in (*(area or ()), *(envelope or ()), *point_m)
+    ):
+        raise click.UsageError(
+            f"--area, --envelope and --point need finite numbers, at most {LARGEST_COORDINATE_M:g} m"
+        )
     known, places, source = _setting(scenario_name, config_path, area)
     slots = {prism: slot for slot, prism in enumerate(sorted({s.prism for s in known.stations}))}
     stations = tuple(

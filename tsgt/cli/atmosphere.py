@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import time
 from typing import TYPE_CHECKING
 
 import click
@@ -18,8 +19,14 @@ from tsgt.station.requests import Answer, AtmosphereRequest
 if TYPE_CHECKING:
     from pathlib import Path
 
-TIMEOUT_S = 30.0
+STATUS_S = 5.0
+"""A client says at once how it does; one that has not by then is stuck."""
+
+ANSWER_S = 30.0
 """An instrument that measures a target in two faces listens when it has done that."""
+
+QUIET_S = 2.0
+"""Whoever waits longer than this is told what for."""
 
 
 # A negative temperature looks like an option otherwise.
@@ -49,7 +56,7 @@ def atmosphere(temperature_c: float, pressure_hpa: float, socket_path: Path, *, 
         return 1 if answer.problem else 0
     if answer.problem:
         raise InstrumentError(f"{socket_path}: {harmless(answer.problem)}")
-    lines = [] if answer.settings is None else [*map(harmless, setting_lines(answer.settings))]
+    lines = [] if answer.settings is None else setting_lines(answer.settings)
     click.echo("\n".join(["set; distances are measured with", *lines] if lines else ["set"]))
     return 0
 
@@ -57,23 +64,61 @@ def atmosphere(temperature_c: float, pressure_hpa: float, socket_path: Path, *, 
 def _asked(path: Path, request: bytes) -> Answer:
     """Say something to a client, whose first line is its status; return its answer."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
-        connection.settimeout(TIMEOUT_S)
+        received = bytearray()
         try:
+            connection.settimeout(STATUS_S)
             connection.connect(str(path))
             connection.sendall(request)
-            with connection.makefile("rb") as file:
-                status, answer = file.readline(MAX_LINE_BYTES), file.readline(MAX_LINE_BYTES)
+            status = _line(connection, received, time.monotonic() + STATUS_S)
         except TimeoutError as error:
             raise StreamError(
-                f"{path}: no answer within {TIMEOUT_S:g} s; the client is stuck, see its log"
+                f"{path}: no status within {STATUS_S:g} s; the client is stuck, see its log"
             ) from error
         except OSError as error:
             raise StreamError(
                 f"{path}: nobody answers ({error.strerror or error}); start tsgt-client, or give --socket"
             ) from error
+        try:
+            if decode(Typed, status).type != "client_status":
+                raise ValueError("that is a master; give the socket of a client")
+            return decode(Answer, _answer(connection, received, path))
+        except ValueError as error:
+            raise StreamError(f"{path}: it does not answer as a client does ({error})") from error
+
+
+def _answer(connection: socket.socket, received: bytearray, path: Path) -> bytes:
+    """Wait for the second line, which comes when the instrument is free."""
+    began_s = time.monotonic()
     try:
-        if decode(Typed, status).type != "client_status":
-            raise ValueError("that is a master; give the socket of a client")
-        return decode(Answer, answer)
-    except ValueError as error:
-        raise StreamError(f"{path}: it does not answer as a client does ({error})") from error
+        try:
+            return _line(connection, received, began_s + QUIET_S)
+        except TimeoutError:
+            click.echo(f"waiting for the instrument, which is busy; {ANSWER_S:g} s at most", err=True)
+            return _line(connection, received, began_s + ANSWER_S)
+    except TimeoutError as error:
+        raise StreamError(
+            f"{path}: the instrument has not been free for {ANSWER_S:g} s; it is told as soon as it is, "
+            "`tsgt status` shows the air"
+        ) from error
+    except OSError as error:
+        raise StreamError(f"{path}: the client ended ({error.strerror or error}); see its log") from error
+
+
+def _line(connection: socket.socket, received: bytearray, until_s: float) -> bytes:
+    """Return the next line, or what there is of it at the end; what comes after it stays in what was received.
+
+    Raises
+    ------
+    TimeoutError
+        It is not whole by that time on the monotonic clock, however many bytes have come.
+    """
+    while b"\n" not in received and len(received) < MAX_LINE_BYTES:
+        if (left_s := until_s - time.monotonic()) <= 0:
+            raise TimeoutError
+        connection.settimeout(left_s)
+        if not (data := connection.recv(65536)):
+            break
+        received += data
+    line, _, rest = bytes(received).partition(b"\n")
+    received[:] = rest
+    return line

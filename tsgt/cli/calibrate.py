@@ -15,7 +15,7 @@ from tsgt.analysis.target_file import read_prism_file, read_target_file
 from tsgt.cli.calibrate_motion import motion
 from tsgt.cli.check import check
 from tsgt.cli.collect import collect
-from tsgt.cli.options import finite, json_option
+from tsgt.cli.options import constant_type, finite, json_option
 from tsgt.cli.output import CHECK_FAILED, print_json, print_table
 from tsgt.cli.recordings import refuse_to_replace
 from tsgt.geometry import cartesian_to_polar
@@ -30,7 +30,7 @@ file_argument = click.argument("file", type=click.Path(path_type=Path))
 
 target_constant_option = click.option(
     "--target-constant-mm",
-    type=float,
+    type=constant_type,
     callback=finite,
     default=0.0,
     show_default=True,
@@ -119,7 +119,7 @@ def targets(
 @target_constant_option
 @click.option(
     "--prism-constant-mm",
-    type=float,
+    type=constant_type,
     callback=finite,
     default=0.0,
     show_default=True,

@@ -11,7 +11,7 @@ from tsgt.analysis.calibration import mean_points
 from tsgt.analysis.station_check import check_station
 from tsgt.analysis.target_file import read_some_targets
 from tsgt.cli.operator import Terminal
-from tsgt.cli.options import finite, json_option, master_config_option, path_type
+from tsgt.cli.options import constant_type, finite, json_option, master_config_option, path_type
 from tsgt.cli.output import CHECK_FAILED, print_json
 from tsgt.cli.target_session import shot, target_session
 from tsgt.clock import SystemClock
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--target-constant-mm",
-    type=float,
+    type=constant_type,
     callback=finite,
     default=0.0,
     show_default=True,

@@ -9,7 +9,7 @@ import click
 
 from tsgt.analysis.target_collection import TargetCollection
 from tsgt.cli.operator import Terminal
-from tsgt.cli.options import finite, master_config_option, path_type
+from tsgt.cli.options import constant_type, finite, master_config_option, path_type
 from tsgt.cli.output import print_table
 from tsgt.cli.target_session import shot, target_session
 from tsgt.clock import SystemClock
@@ -54,7 +54,7 @@ KEYS = "Enter measures, s skips, r redoes the last one (r 3: target 3, r 2 3: of
 )
 @click.option(
     "--target-constant-mm",
-    type=float,
+    type=constant_type,
     callback=finite,
     default=0.0,
     show_default=True,

@@ -11,7 +11,7 @@ from tsgt.analysis.polar_files import check_tracks, read_polar_tracks, station_p
 from tsgt.analysis.processing import with_frames, with_latencies, with_targets
 from tsgt.analysis.rts_files import read_prisms, read_tracks
 from tsgt.analysis.rts_import import point_measurements, polar_measurements, stations_from_targets
-from tsgt.cli.options import finite, json_option, path_type
+from tsgt.cli.options import constant_type, finite, json_option, path_type
 from tsgt.cli.output import print_json
 from tsgt.cli.recordings import refuse_to_replace, write_recording
 from tsgt.config import load_station_frames, load_station_latencies, load_target_residuals
@@ -32,7 +32,7 @@ def import_group() -> None:
 
 target_constant_option = click.option(
     "--target-constant-mm",
-    type=float,
+    type=constant_type,
     callback=finite,
     default=10.0,
     show_default=True,
@@ -59,7 +59,7 @@ output_option = click.option(
 @target_constant_option
 @click.option(
     "--prism-constant-mm",
-    type=float,
+    type=constant_type,
     callback=finite,
     default=10.0,
     show_default=True,
@@ -124,7 +124,7 @@ def import_rts(
 @target_constant_option
 @click.option(
     "--prism-constant-mm",
-    type=float,
+    type=constant_type,
     callback=finite,
     default=0.0,
     show_default=True,

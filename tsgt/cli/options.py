@@ -27,6 +27,9 @@ def a_number(_context: click.Context, _parameter: click.Parameter, value: float 
     return value
 
 
+constant_type = click.FloatRange(-10_000, 10_000)
+"""For constants of reflectors in mm: no reflector adds ten metres. With ``finite`` for the ``callback``: NaN is in any range."""
+
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
 
 socket_option = click.option(

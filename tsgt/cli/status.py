@@ -74,7 +74,7 @@ def status(socket_path: Path | None, *, as_json: bool) -> int:
         text, well = client_text(record)
     else:
         text, well = master_text(record)
-    click.echo(line.rstrip() if as_json else "\n".join(map(harmless, text)))
+    click.echo(line.rstrip() if as_json else "\n".join(text))
     return 0 if well else CHECK_FAILED
 
 
@@ -159,7 +159,7 @@ def client_text(record: ClientStatus) -> tuple[list[str], bool]:
         lines.append(f"  {record.journal_waiting} lines not written yet")
     if record.journal_lost:
         lines.append(f"  {record.journal_lost} lines lost")
-    lines.append(f"  {Path(record.journal).name}")
+    lines.append(f"  {harmless(Path(record.journal).name)}")
     if record.master_heard_s is None:
         lines.append("master not heard yet")
     else:
@@ -186,7 +186,7 @@ def setting_lines(settings: InstrumentRecord) -> list[str]:
     """Say in lines of at most 40 characters what an instrument adds to a distance, as far as it is known."""
     lines = []
     if settings.prism_constant_m is not None:
-        lines.append(f"  prism {settings.prism_type} {1e3 * settings.prism_constant_m:+.1f} mm")
+        lines.append(f"  prism {harmless(settings.prism_type)} {1e3 * settings.prism_constant_m:+.1f} mm")
     if settings.atmospheric_ppm is not None:
         air = f"  air {settings.atmospheric_ppm:+.1f} ppm"
         if settings.temperature_c is not None and settings.pressure_hpa is not None:
@@ -196,7 +196,12 @@ def setting_lines(settings: InstrumentRecord) -> list[str]:
 
 
 def _wrapped(text: str, indent: str = "") -> list[str]:
-    return textwrap.wrap(text, WIDTH, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False)
+    """Break a text from outside into lines that do not steer the terminal."""
+    lines = textwrap.wrap(
+        text, WIDTH, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False
+    )
+    # Before it is styled: afterwards our own codes would be made harmless, too.
+    return [harmless(line) for line in lines]
 
 
 def _why_not_heard(record: ClientStatus) -> list[str]:

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo
 
-from tsgt.model import LARGEST_NUMBER, Matrix4
+from tsgt.model import LARGEST_COORDINATE_M, LARGEST_NUMBER, Matrix4
 
 # A calibration writes 17 digits; a matrix typed off a report has seven or so.
 RIGID_TOLERANCE = 1e-6
@@ -20,6 +20,8 @@ Number = Annotated[int, Field(ge=1, le=LARGEST_NUMBER)]
 NumberKey = Annotated[str, Field(pattern=r"^[1-9][0-9]{0,8}$")]
 Positive = Annotated[float, Field(gt=0, le=1e6)]
 NotNegative = Annotated[float, Field(ge=0, le=1e6)]
+Coordinate = Annotated[float, Field(ge=-LARGEST_COORDINATE_M, le=LARGEST_COORDINATE_M)]
+Place = tuple[Coordinate, Coordinate, Coordinate]
 
 
 def _beside_the_file(path: Path, info: ValidationInfo) -> Path:
@@ -33,6 +35,11 @@ def rigid(T: Matrix4) -> Matrix4:
     """Refuse what is not a rotation and a translation; in plain Python, as geometry lies in a layer above."""
     if T[3] != (0.0, 0.0, 0.0, 1.0):
         raise ValueError("the last row of a rigid transform is [0, 0, 0, 1]")
+    for coordinate in (row[3] for row in T[:3]):
+        if abs(coordinate) > LARGEST_COORDINATE_M:
+            raise ValueError(
+                f"it puts the station {coordinate:g} m away, at most {LARGEST_COORDINATE_M:g} m are allowed"
+            )
     x, y, z = (row[:3] for row in T[:3])
     products = [(_dot(a, b), i == j) for i, a in enumerate((x, y, z)) for j, b in enumerate((x, y, z))]
     off = max(abs(product - same) for product, same in products)

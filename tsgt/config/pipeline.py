@@ -8,7 +8,10 @@ from pydantic import Field
 
 from tsgt.config.base import Model, NotNegative, Positive
 
-PerAxis = tuple[Positive, Positive, Positive]
+# No narrower and no wider than what the estimator takes: see MotionPrior.
+Acceleration = Annotated[float, Field(ge=1e-6, le=1e6)]
+PerAxis = tuple[Acceleration, Acceleration, Acceleration]
+Lasting = Annotated[float, Field(ge=1e-3, le=1e4)]
 
 
 class MotionConfig(Model):
@@ -16,11 +19,11 @@ class MotionConfig(Model):
 
     acceleration_sigma_mps2: PerAxis = (0.4, 0.4, 0.2)
     """One sigma of the acceleration of the prisms' middle along x, y, z of station 1."""
-    acceleration_time_s: Positive = 0.8
+    acceleration_time_s: Lasting = 0.8
     """How long an acceleration lasts."""
     angular_acceleration_sigma_radps2: PerAxis = (0.15, 0.15, 0.2)
     """One sigma of the angular acceleration about x, y, z of the robot."""
-    angular_acceleration_time_s: Positive = 0.4
+    angular_acceleration_time_s: Lasting = 0.4
     """How long an angular acceleration lasts."""
 
 

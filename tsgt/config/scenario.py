@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import math
+from itertools import pairwise
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from tsgt.config.base import Model, NoiseConfig, NotNegative, Number, Positive, no_two_share
+from tsgt.config.base import Model, NoiseConfig, NotNegative, Number, Place, Positive, no_two_share
 from tsgt.config.pipeline import PipelineConfig
-from tsgt.model import Vector3
+
+# Of the Gaussians: below a step of the simulation they smooth nothing, and far above a run they take for ever.
+Smoothing = Annotated[float, Field(ge=0.01, le=1000)]
+
+YawRate = Annotated[float, Field(ge=-100, le=100)]
+
+LONGEST_ROUTE_M = 200_000.0
+"""As far as a robot gets in the longest run; every 5 cm of it are kept."""
 
 
 class MotionConfig(Model):
@@ -16,7 +25,7 @@ class MotionConfig(Model):
 
     start_after_s: NotNegative = 0.0
     """It stands for so long before the first speed is commanded: time to synchronise, where a protocol has to."""
-    interval_min_s: Positive = 3.0
+    interval_min_s: Annotated[float, Field(ge=0.01, le=1e6)] = 3.0
     """A new speed is commanded after at least this time ..."""
     interval_max_s: Positive = 8.0
     """... and at most this."""
@@ -24,24 +33,24 @@ class MotionConfig(Model):
     """Speeds to draw from."""
     speed_weights: tuple[NotNegative, ...] = (3.0, 2.0, 3.0, 2.0)
     """How often each of them is drawn, relative to the others."""
-    yaw_rates_radps: Annotated[tuple[float, ...], Field(min_length=1)] = (0.0, 0.0, 0.3, -0.3, 0.5, -0.5)
+    yaw_rates_radps: Annotated[tuple[YawRate, ...], Field(min_length=1)] = (0.0, 0.0, 0.3, -0.3, 0.5, -0.5)
     """Yaw rates to draw from with each speed above zero, equally often; positive turns left."""
-    command_smoothing_s: Positive = 0.35
+    command_smoothing_s: Smoothing = 0.35
     """Sigma of the Gaussian that smooths commanded speed and yaw rate."""
     tilt_rms_deg: NotNegative = 1.5
     """Roll and pitch on rough ground while moving, root mean square of each."""
     heave_rms_mm: NotNegative = 20.0
     """Up and down on rough ground while moving, root mean square."""
-    shaking_smoothing_s: Positive = 0.5
+    shaking_smoothing_s: Smoothing = 0.5
     """Sigma of the Gaussian that smooths white noise into roll, pitch and heave."""
-    area_centre_m: Vector3 = (60.0, 45.0, -1.0)
+    area_centre_m: Place = (60.0, 45.0, -1.0)
     """Where the robot starts and stays around, in the frame of station 1."""
     area_radius_m: Positive = 40.0
     """Further from the centre than this the robot is steered back."""
-    route_m: tuple[Vector3, ...] = ()
+    route_m: tuple[Place, ...] = ()
     """Way points to drive along at the speeds drawn, in the frame of station 1; at the last one the robot stops. The
     yaw rates and the area are for a robot without a route."""
-    corner_smoothing_m: Positive = 2.0
+    corner_smoothing_m: Smoothing = 2.0
     """Sigma of the Gaussian that rounds the corners of the route."""
 
     @model_validator(mode="after")
@@ -56,6 +65,9 @@ class MotionConfig(Model):
             raise ValueError("all speed_weights are 0")
         if len(self.route_m) == 1:
             raise ValueError("route_m has one way point; a route has at least two")
+        length_m = sum(math.dist(*legs) for legs in pairwise(self.route_m))
+        if length_m > LONGEST_ROUTE_M:
+            raise ValueError(f"route_m is {length_m:g} m long; at most {LONGEST_ROUTE_M:g} m are simulated")
         return self
 
 
@@ -140,11 +152,11 @@ class SimulatedStation(Model):
     """Number of the station."""
     prism: Number
     """Number of the prism that it tracks."""
-    position_m: Vector3
+    position_m: Place
     """Where it stands, in the frame of station 1."""
-    yaw_deg: float = 0.0
+    yaw_deg: Annotated[float, Field(ge=-1e4, le=1e4)] = 0.0
     """Direction of its circle's zero in the frame of station 1, positive to the left of its x axis."""
-    rate_hz: Annotated[float, Field(gt=0, le=100)] = 2.5
+    rate_hz: Annotated[float, Field(ge=0.001, le=100)] = 2.5
     """Measurements per second; the first one comes at a random moment of the first period."""
     prism_constant_mm: Annotated[float, Field(ge=-10_000, le=10_000)] = 10.0
     """What the instrument's slope distance lacks to the prism's centre."""
@@ -159,7 +171,7 @@ class SimulatedPrism(Model):
 
     prism: Number
     """Number of the prism."""
-    position_m: Vector3
+    position_m: Place
     """Its centre in the frame of the robot."""
 
 
@@ -201,7 +213,7 @@ class ScenarioConfig(Model):
     """One entry per prism on the robot."""
     occlusions: tuple[OcclusionConfig, ...] = ()
     """What hides the prisms from the stations now and then; nothing by default."""
-    targets_m: tuple[Vector3, ...] = ()
+    targets_m: tuple[Place, ...] = ()
     """Targets on foil, numbered from 1, for single measurements; in the frame of station 1."""
     faults: tuple[StatusFaultConfig, ...] = ()
     """When instruments say that something is wrong; never by default."""

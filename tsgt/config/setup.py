@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
-from tsgt.config.base import Model, NotNegative, Number, NumberKey, rigid
-from tsgt.model import Matrix4, Vector3
+from tsgt.config.base import Model, NotNegative, Number, NumberKey, Place, rigid
+from tsgt.model import Matrix4
 
 
 class TargetFit(Model):
@@ -46,9 +46,9 @@ class StationFramesFile(Model):
 class PrismEntry(Model):
     """Where one prism sits on the robot."""
 
-    position_m: Vector3
+    position_m: Place
     """Its centre in the frame of the robot, [x, y, z]."""
-    sigma_m: Vector3 | None = None
+    sigma_m: tuple[NotNegative, NotNegative, NotNegative] | None = None
     """One sigma of each coordinate, as the calibration found it."""
 
 

@@ -116,9 +116,13 @@ def _time_sigma_s(measurement: Measurement) -> float:
     stamp_sigma_s = getattr(measurement, "stamp_sigma_ns", 0) / 1e9
     if not stamp_sigma_s:  # imported: its time is taken at its word
         return 0.0
-    number = min(max(measurement.sequence, 0), 1_000_000)  # a damaged file may say anything
-    found_s = FIRST_TIME_SIGMA_S / math.sqrt(1 + number / FIRST_TIMES)
-    return math.hypot(stamp_sigma_s, INSTRUMENT_TIME_SIGMA_S, found_s)
+    return math.hypot(stamp_sigma_s, instrument_time_sigma_s(measurement.sequence))
+
+
+def instrument_time_sigma_s(sequence: int) -> float:
+    """Return one sigma in s of an instrument's time on its station's clock, by the measurement's running number."""
+    number = min(max(sequence, 0), 1_000_000)  # a damaged file may say anything
+    return math.hypot(INSTRUMENT_TIME_SIGMA_S, FIRST_TIME_SIGMA_S / math.sqrt(1 + number / FIRST_TIMES))
 
 
 def _layout(parameters: Parameters) -> FloatArray:

@@ -18,6 +18,11 @@ OLDEST_NS = 10_000_000_000
 UNUSABLE_EVERY_NS = 500_000_000
 """That there still is no target is worth a reading so often."""
 
+_MS_NS = 1_000_000
+
+_SLACK_NS = 1_000
+"""A time in whole ms that a program has had as seconds in a floating-point number is off by less than this."""
+
 _NONE_UNUSABLE = ("", 0)
 
 _HELD_MAX = 64
@@ -131,7 +136,10 @@ class Stamper:
         """Put the instrument's time on the host's clock, as soon as enough lines have told how the two lie."""
         if line.instrument_time_ns is None:
             return ["it has no instrument_time_ns, which hello has promised"]
-        time_ms, rest_ns = divmod(line.instrument_time_ns, 1_000_000)
+        time_ms, rest_ns = divmod(line.instrument_time_ns, _MS_NS)
+        # One is enough: an instrument that counts finer than in ms has few whole ones. Of what is held nothing is told yet.
+        if _SLACK_NS <= rest_ns < _MS_NS - _SLACK_NS:
+            self._clock.expect_parts()
         self._clock.add(time_ms, arrived_ns - rest_ns)
         self._held.append((line, prism, arrived_ns))
         if not self._clock.stands:
@@ -144,13 +152,12 @@ class Stamper:
 
     def _mapped(self, line: MeasurementLine, prism: int, arrived_ns: int) -> Stamped | str:
         assert line.instrument_time_ns is not None  # noqa: S101 (only such lines are held)
-        time_ms, rest_ns = divmod(line.instrument_time_ns, 1_000_000)
+        time_ms, rest_ns = divmod(line.instrument_time_ns, _MS_NS)
         mapped = self._clock.at(time_ms)
         assert mapped is not None  # noqa: S101 (the clock stands)
-        # The clock is that of instruments which tell whole ms, and half of one is added: nearest to the envelope that is
-        # after the arrival.
+        # To whole ms half of one is added: nearest to the envelope that is after the arrival.
         host_ns = mapped.host_ns + rest_ns
-        at_ns = arrived_ns if 0 < host_ns - arrived_ns < 1_000_000 else host_ns
+        at_ns = arrived_ns if 0 < host_ns - arrived_ns < _MS_NS else host_ns
         return self._checked(line, prism, at_ns, arrived_ns, LATEST_NS)
 
     def _checked(

@@ -194,17 +194,6 @@ class GeoComConnection:
             f"{self.port.name}: {what} from the instrument to {rpc.name} within {timeout_s:g} s; check cable and plugs"
         )
 
-    async def attention(self) -> None:
-        """Bring both sides in step: what is under way is forgotten, and the instrument has answered afterwards.
-
-        Raises
-        ------
-        InstrumentError
-            The line is gone, the instrument does not answer, or it cannot do checksums.
-        """
-        async with self._turn:
-            await self._attend()
-
     async def abort(self) -> None:
         """End a search or another long procedure, whose caller was cancelled or still waits, and let it answer.
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from statistics import median
 from typing import NamedTuple
 
-from tsgt.station.lower_line import line_below, lowest
+from tsgt.station.lower_line import Lowest, line_below, lowest
 
 ENOUGH = 8
 """So many samples make an envelope."""
@@ -103,6 +103,7 @@ class InstrumentClock:
     """
 
     def __init__(self) -> None:
+        self._whole_ms = True
         self._known_rate = 0.0  # of the host against the instrument, less 1; outlives a power cycle
         self._known_sigma = _UNKNOWN_RATE
         self._seen = 0
@@ -141,6 +142,13 @@ class InstrumentClock:
         """One standard error of the newest times; infinite while none are told."""
         drift = self._rate_sigma * abs(self._newest - self._middle)
         return math.hypot(self._sigma, drift) if self.stands else math.inf
+
+    def expect_parts(self) -> None:
+        """Take it that times are told finer than in whole ms: an arrival is less by the part, and so is what is told."""
+        if self._whole_ms:
+            self._whole_ms = False
+            if self.stands:
+                self._fit()
 
     def add(self, instrument_ms: int, arrived_ns: int) -> bool:
         """Take a sample: an instrument time, and when the first byte of the answer with it arrived.
@@ -297,7 +305,8 @@ class InstrumentClock:
         above = mean_y - envelope
         self._above = above if self._samples >= _KEPT else max(above, self._above)
         share = max(2 * above / max(self._samples - 1, 1) / _RESOLUTION_NS, _LEAST_SHARE)
-        height = lowest(share)
+        # The lowest of answers of which nothing is cut off is above the line as a wait is long: mean and sigma are the same.
+        height = lowest(share) if self._whole_ms else Lowest(share, share)
         line = line_below(
             [(bin_.x, bin_.y) for bin_ in bins],
             middle=mean_x,
@@ -310,9 +319,11 @@ class InstrumentClock:
         if bins[-1].x - bins[0].x > _STEADY_NS:
             self._known_rate, self._known_sigma = self._b, _KNOWN_RATE
         self._a = min(bin_.y - self._b * bin_.x for bin_ in bins)
-        # The time is told in whole ms: a distance was taken within the one that follows, on average half of it later.
-        self._lift = line.height - self._a + (0.5 - height.mean) * _RESOLUTION_NS
+        # Of a time in whole ms: a distance was taken within the one that follows, on average half of it later.
+        cut_off = 0.5 if self._whole_ms else 0.0
+        self._lift = line.height - self._a + (cut_off - height.mean) * _RESOLUTION_NS
         self._excess = 2 * self._above / self._samples
-        self._sigma = math.hypot(_ROUNDING_NS, height.sigma * _RESOLUTION_NS, line.pivot_sigma)
+        rounding_ns = _ROUNDING_NS if self._whole_ms else 0.0
+        self._sigma = math.hypot(rounding_ns, height.sigma * _RESOLUTION_NS, line.pivot_sigma)
         self._middle = line.pivot
         self._fitted = self._samples

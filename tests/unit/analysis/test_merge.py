@@ -18,6 +18,7 @@ from tsgt.analysis.processing import process
 from tsgt.config import ScenarioConfig
 from tsgt.config.scenario import StatusFaultConfig
 from tsgt.errors import CorruptLineError, RecordingError
+from tsgt.master.observations import build_observations, instrument_time_sigma_s
 from tsgt.master.pose_batch import Reason
 from tsgt.master.replay import replayed
 from tsgt.model import PolarMeasurement, Status
@@ -278,6 +279,22 @@ def test_what_the_disk_of_the_master_lost(frames: Run, tmp_path: Path) -> None:
     assert kept // 2 - 5 < len(inside) <= kept // 2 + 5
     assert np.median([m.stamp_bound_ns for m in inside if m.stamp_bound_ns is not None]) < 500_000
     assert len(load_recording(path).measurements) == sum(journalled(frames).values())
+
+
+def test_the_instruments_time_counts_once(frames: Run, tmp_path: Path) -> None:
+    """A time that was merged is as sure as one that was delivered, or as its journal says if that is less."""
+    path = tmp_path / "r.jsonl"
+    added = added_to(frames, path)
+    parameters = load_recording(path).parameters
+    stated_s = {
+        (m.station, m.sequence): m.stamp_sigma_ns / 1e9
+        for journal in journals(frames)
+        for m in load_journal(journal).measurements
+    }
+    observations, sources = build_observations(parameters, added, origin_ns=frames.start_ns)
+    for sigma_s, source in zip(observations.time_sigma_s, sources, strict=True):
+        known_s = max(instrument_time_sigma_s(source.sequence), stated_s[source.station, source.sequence])
+        assert known_s - 1e-9 <= sigma_s < 1.2 * known_s
 
 
 def test_runs_and_boots_over_superframe(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import socket
 import threading
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
 import pytest
@@ -27,8 +27,11 @@ SETTINGS = InstrumentRecord(
 
 
 @contextmanager
-def client(path: Path, *lines: bytes) -> Iterator[list[bytes]]:
-    """Play a client that says these lines to whoever comes; collect what it is told."""
+def client(path: Path, *lines: bytes, drip: bytes = b"") -> Iterator[list[bytes]]:
+    """Play a client that says these lines to whoever comes, and then a bit of one again and again, for as long as it is heard.
+
+    What it is told is collected.
+    """
     told: list[bytes] = []
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     listener.bind(str(path))
@@ -39,12 +42,17 @@ def client(path: Path, *lines: bytes) -> Iterator[list[bytes]]:
         with connection, connection.makefile("rb") as file:
             told.append(file.readline())
             connection.sendall(b"".join(line + b"\n" for line in lines))
+            with suppress(OSError):
+                while drip and not over.wait(0.02):
+                    connection.sendall(drip)
 
+    over = threading.Event()
     thread = threading.Thread(target=answer)
     thread.start()
     try:
         yield told
     finally:
+        over.set()
         thread.join()
         listener.close()
 
@@ -99,6 +107,35 @@ def test_nobody_at_the_socket(tsgt: Tsgt, tmp_path: Path) -> None:
     outcome = tsgt("atmosphere", "20", "1000", "--socket", tmp_path / "nobody")
     assert outcome.code == 1
     assert "nobody answers" in outcome.err
+
+
+def test_a_client_that_says_nothing_whole_is_not_waited_for(
+    tsgt: Tsgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The time limit is for its status as a whole, not for the next byte, and not that of an instrument."""
+    monkeypatch.setattr("tsgt.cli.atmosphere.STATUS_S", 0.2)
+    with client(tmp_path / "s", drip=b"x"):
+        outcome = tsgt("atmosphere", "20", "1000", "--socket", tmp_path / "s")
+    assert outcome.code == 1
+    assert outcome.err.splitlines() == [
+        f"error: {tmp_path / 's'}: no status within 0.2 s; the client is stuck, see its log"
+    ]
+
+
+def test_an_instrument_that_is_busy_is_waited_for_and_that_is_said(
+    tsgt: Tsgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """First that it is waited for, and in the end that the air is not forgotten."""
+    monkeypatch.setattr("tsgt.cli.atmosphere.QUIET_S", 0.05)
+    monkeypatch.setattr("tsgt.cli.atmosphere.ANSWER_S", 0.2)
+    with client(tmp_path / "s", STATUS, drip=b" "):
+        outcome = tsgt("atmosphere", "20", "1000", "--socket", tmp_path / "s")
+    assert outcome.code == 1
+    waiting, error = outcome.err.splitlines()
+    assert waiting == "waiting for the instrument, which is busy; 0.2 s at most"
+    assert error.startswith(
+        f"error: {tmp_path / 's'}: the instrument has not been free for 0.2 s; it is told as"
+    )
 
 
 def test_a_typing_mistake_is_a_usage_error(tsgt: Tsgt) -> None:

@@ -180,6 +180,14 @@ def test_a_client_says_what_its_instrument_does_and_how_it_is_set() -> None:
     )
 
 
+def test_a_line_without_terminal_has_no_trace_of_its_headline(tsgt: Tsgt, tmp_path: Path) -> None:
+    """Neither codes nor what stands in their place."""
+    serving = _serve(tmp_path / "s", encode_line(CLIENT))
+    outcome = tsgt("status", "--socket", tmp_path / "s")
+    serving.join()
+    assert outcome.out.startswith("STATION 3  OK\n")
+
+
 def test_a_client_says_what_the_disk_has_lost() -> None:
     """Also when the disk is well again; then nobody needs to do anything."""
     lines, well = client_text(dataclasses.replace(CLIENT, journal_lost=3))
@@ -240,6 +248,31 @@ def test_a_master_is_asked_over_its_stream(tsgt: Tsgt, tmp_path: Path) -> None:
     serving.join()
     assert outcome.code == 0, outcome.err
     assert outcome.out.startswith("MASTER  22:13:20")
+
+
+def test_a_terminal_shows_a_headline_and_obeys_no_text_from_outside(
+    tsgt: Tsgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What needs somebody is bold and reverse; whatever a text of the client's holds, it is only written."""
+    monkeypatch.setattr("click.utils.should_strip_ansi", lambda *_: False)
+    steering = "\x1b]0;owned\x07\x1b[2J"
+    settings = InstrumentRecord(make="Leica", prism_type=steering, prism_constant_m=0.03)
+    record = dataclasses.replace(
+        CLIENT,
+        instrument=steering,
+        activity=steering,
+        problem=steering,
+        journal=steering,
+        settings=settings,
+    )
+    serving = _serve(tmp_path / "s", encode_line(record))
+    outcome = tsgt("status", "--socket", tmp_path / "s")
+    serving.join()
+    first, *others = outcome.out.splitlines()
+    assert first == "\x1b[1m\x1b[7mSTATION 3  SEE TO THE INSTRUMENT\x1b[0m"
+    assert others[0] == "\x1b[1m\x1b[7m?]0;owned??[2J\x1b[0m"
+    assert sum("?]0;owned??[2J" in line for line in others) == 5
+    assert not any("\x1b" in line or "?[" in line.replace("??[2J", "") for line in others[1:])
 
 
 def test_a_client_is_asked_at_its_own_socket(tsgt: Tsgt, tmp_path: Path) -> None:

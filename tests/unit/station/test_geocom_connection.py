@@ -125,7 +125,6 @@ async def test_a_late_reply_is_not_taken_for_the_next() -> None:
         await connection.call(Rpc.TMC_GET_FULL_MEAS, 1, timeout_s=1.0)
     assert now_s() == pytest.approx(4.0)
     await asyncio.sleep(0.495)
-    await connection.attention()
     await echoed(connection, 2)
 
 

@@ -106,3 +106,17 @@ def test_a_point_that_turns_about_a_line_comes_nearer_to_it() -> None:
     found = with_curvature(rotation[None], covariance)[0, :3, :3]
     assert to_line @ found @ to_line == pytest.approx(np.mean(np.square(sample)), rel=0.05)
     assert to_line @ covariance[0, :3, :3] @ to_line < 1e-3 * np.mean(np.square(sample))
+
+
+def test_a_point_that_turns_about_another_comes_nearer_to_it() -> None:
+    """With one prism seen two turns are unknown at once, and both take the point the same way: their squares add."""
+    random = np.random.default_rng(0)
+    rotation, arm = exp_so3(np.array([0.3, -0.2, 0.5])), np.array([0.0, 0.0, -0.9])
+    sigmas_rad = np.array([0.1, 0.08, 0.02])
+    by_turn = np.vstack([-rotation @ skew(arm), np.eye(3)])
+    covariance = (by_turn @ np.diag(sigmas_rad**2) @ by_turn.T)[None]
+    to_point = rotation @ arm / np.linalg.norm(arm)
+    turns = random.normal(size=(20_000, 3)) * sigmas_rad
+    sample = (rotation @ (exp_so3(turns) @ arm - arm).T).T @ to_point
+    found = with_curvature(rotation[None], covariance)[0, :3, :3]
+    assert to_point @ found @ to_point == pytest.approx(np.mean(np.square(sample)), rel=0.05)

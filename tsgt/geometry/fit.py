@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from tsgt.geometry.continuous import knot_times, nearest, solve
-from tsgt.geometry.first_guess import first_guess
+from tsgt.geometry.first_guess import Tracks
 from tsgt.geometry.knots import joined
 from tsgt.geometry.liveliness import CALMEST, at_least, hidden
 from tsgt.geometry.motion_prior import axis_sigmas
@@ -115,13 +115,14 @@ def fit(
     at = nearest(times_s, observations.time_s)
     sigmas = _sigmas(observations, times_s, prior, while_hidden or prior)
     pieces = _pieces(len(times_s))
+    tracks = Tracks.of(observations)
     knots, covariances, besides, residuals_m, distances, weights = [], [], [], [], [], []
     for done, piece in enumerate(pieces):
         report(done / len(pieces))
         rows = slice(
             *np.searchsorted(at, (piece.solved.start, piece.solved.stop)),
         )
-        guess = first_guess(observations, times_s[piece.solved])
+        guess = tracks.guess(times_s[piece.solved])
         between = slice(piece.solved.start, piece.solved.stop - 1)
         solution = solve(observations.select(rows), guess, prior, sigmas=sigmas[between])
         covariance, beside = solution.factor.marginals()

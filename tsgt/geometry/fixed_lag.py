@@ -21,6 +21,7 @@ from tsgt.geometry.ahead import Ahead, kick
 from tsgt.geometry.block_tridiagonal import BlockFactor, factorise
 from tsgt.geometry.continuous import (
     LEAST_STEP_S,
+    MOST_ITERATIONS,
     OUTLYING,
     Anchor,
     Solution,
@@ -66,6 +67,9 @@ LITTLE_RAD = 0.005
 """All states moved by less, derivatives stay what they are: at 20 m the line of sight bends by 0.06 mm over the one, and a
 prism 1.5 m away is 0.02 mm off the tangent of the other. The next measurement is linearised where the trajectory then is.
 With twice as much, predictions of a robot that turns by a rad per second were up to 0.4 sigmas from those of a full search."""
+
+BEGINNING_ITERATIONS = 10
+"""Those that settle take six at most. What does not (a station on another robot) is tried again with each measurement."""
 
 MOST_STEPS = 5
 """Where these do not settle it, every step is tried before it is taken, as in :func:`tsgt.geometry.continuous.solve`."""
@@ -190,7 +194,7 @@ class FixedLag:
             raise GeometryError("to begin with, three prisms have to be measured twice")
         guess = first_guess(observations, knot_times(observations.time_s))
         self._anchor = start_anchor(guess.select(slice(0, 1)), self._prior)
-        self._search(guess)
+        self._search(guess, BEGINNING_ITERATIONS)
         if self._settled:
             assert self._knots is not None  # noqa: S101 (it is settled)
             self._anchor = Anchor(self._knots.select(slice(0, 1)), np.diag(_AS_GOOD_AS_NOTHING**-2.0))
@@ -200,7 +204,8 @@ class FixedLag:
         assert self.observations is not None  # noqa: S101 (that has been set)
         assert self._knots is not None  # noqa: S101 (it is settled)
         assert self._anchor is not None  # noqa: S101 (it is settled)
-        if new.time_s[0] < self._knots.time_s[0] - 0.5 * LEAST_STEP_S:
+        # Compared as where knots are added: rounding must not find it near here and far there.
+        if self._knots.time_s[0] - new.time_s[0] > 0.5 * LEAST_STEP_S:
             return False  # in the first window, before anything that had come
         knots = _with_knots_at(self._knots, new.time_s, self._prior)
         steps = Steps.of(knots.time_s, self._prior)
@@ -218,14 +223,17 @@ class FixedLag:
                 self._take(knots, factor, nudged(system, at, move))
                 return self._settled
             system = assemble(self.observations, at, knots, steps, self._anchor)
-        self._search(knots)
+        self._search(knots, MOST_ITERATIONS)
         return self._settled
 
-    def _search(self, guess: Knots) -> None:
+    def _search(self, guess: Knots, most_iterations: int) -> None:
         """Find the trajectory however far it is from a guess."""
         assert self.observations is not None  # noqa: S101 (only called with some)
-        found = solve(self.observations, guess, self._prior, anchor=self._anchor)
+        found = solve(
+            self.observations, guess, self._prior, anchor=self._anchor, most_iterations=most_iterations
+        )
         self._take(found.knots, found.factor, found)
+        self._settled &= found.iterations < most_iterations
 
     def _take(self, knots: Knots, factor: BlockFactor, found: System | Solution) -> None:
         self._knots, self._solved, self._trajectory = knots, (knots, factor), None

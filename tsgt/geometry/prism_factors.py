@@ -177,10 +177,11 @@ def _compared(observations: Observations, point: FloatArray) -> tuple[FloatArray
         axes, measured_m = line_of_sight_axes(measured[polar])
         seen = predicted[polar]
         distance_m = np.sqrt(dot(seen, seen))
-        direction = seen / distance_m[:, None]
+        away_m = np.where(distance_m > 0, distance_m, 1.0)
+        direction = seen / away_m[:, None]
         residuals[polar, 0] = distance_m - measured_m
         residuals[polar, 1:] = measured_m[:, None] * rotate(axes, direction)[:, 1:]
-        shrink = (measured_m / distance_m)[:, None, None]
+        shrink = (measured_m / away_m)[:, None, None]
         away = axes[:, 1:] - (axes[:, 1:] @ direction[:, :, None]) * direction[:, None, :]
         by_predicted[polar, 0] = direction
         by_predicted[polar, 1:] = shrink * away
@@ -203,7 +204,9 @@ def line_of_sight_axes(points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         (M,).
     """
     distance_m = np.sqrt(dot(points_m, points_m))
-    along = points_m / distance_m[:, None]
+    # A distance that the prism constant makes zero has no direction; any will do, but the numbers must stay numbers.
+    there = distance_m[:, None] > 0
+    along = np.where(there, points_m, [1.0, 0.0, 0.0]) / np.where(there, distance_m[:, None], 1.0)
     flat = np.hypot(along[:, 0], along[:, 1])
     safe = np.where(flat > 0, flat, 1.0)
     cosine, sine = np.where(flat > 0, along[:, 0] / safe, 1.0), np.where(flat > 0, along[:, 1] / safe, 0.0)

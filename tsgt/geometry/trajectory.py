@@ -7,7 +7,6 @@ the last one it predicts, and the covariance grows as it honestly must.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -246,11 +245,12 @@ def of_point(states: Knots, covariance: FloatArray, arm: FloatArray) -> tuple[Kn
 
 
 def with_curvature(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Add what linear errors leave out of a position that turns with the robot about a line.
+    """Add what linear errors leave out of a position that turns with the robot about a line or a point.
 
     What two prisms do not tell is a turn by some angle θ about the line through them: it moves a point at the distance r
     from that line by rθ along its circle, and by rθ²/2 towards the line, where the sigma of the position is perhaps a
-    millimetre. That is squared on average 3 σ⁴ r² / 4, with σ² the variance of θ.
+    millimetre. That is squared on average 3 σ⁴ r² / 4, with σ² the variance of θ. One prism alone leaves turns about
+    three axes, each of which takes the point nearer; of two, the products are on average σ₁² σ₂² / 4.
 
     Parameters
     ----------
@@ -264,10 +264,11 @@ def with_curvature(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
     FloatArray
         (N, 6, 6).
     """
-    variance, axes = np.linalg.eigh(covariance[:, 3:, 3:])
-    largest, axis = variance[:, -1, None], axes[:, :, -1:]
-    along = (covariance[:, :3, 3:] @ axis)[:, :, 0] / largest
-    towards = math.sqrt(0.75) * largest * np.cross(along, (rotation @ axis)[:, :, 0])
+    _, axes = np.linalg.eigh(covariance[:, 3:, 3:])
+    # What a turn moves the point by is its covariance with that over the variance, which stands before the square anyway.
+    towards = np.cross(covariance[:, :3, 3:] @ axes, rotation @ axes, axis=1)
+    all_turns = towards.sum(axis=2, keepdims=True)
     curved: FloatArray = covariance.copy()
-    curved[:, :3, :3] += towards[:, :, None] * towards[:, None, :]
+    curved[:, :3, :3] += 0.5 * (towards @ np.swapaxes(towards, 1, 2))
+    curved[:, :3, :3] += 0.25 * (all_turns @ np.swapaxes(all_turns, 1, 2))
     return curved

@@ -235,7 +235,8 @@ class ContinuousPoses:
                 numbers[unknown] = np.nan
             for numbers in (batch.velocity_mps, batch.angular_velocity_radps, batch.residual_m):
                 numbers[unknown] = np.nan
-        uncertain = unknown | (sigma_m > limits.position_sigma_limit_m)
+        # A covariance that rounding has spoilt has no sigma, which is below no limit.
+        uncertain = unknown | ~(sigma_m <= limits.position_sigma_limit_m)
         uncertain |= sigma_rad > limits.rotation_sigma_limit_rad
         batch.reason[rotation[:, 2, 2] <= math.cos(limits.tilt_limit_rad)] = Reason.TILT
         batch.reason[batch.residual_m > limits.residual_limit_m] = Reason.RESIDUAL
@@ -247,6 +248,7 @@ class ContinuousPoses:
 
 
 def _worst_sigma(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N,) one sigma in the direction in which it is largest."""
-    sigma: NDArray[np.float64] = np.sqrt(np.linalg.eigvalsh(covariance)[:, -1])
+    """(N,) one sigma in the direction in which it is largest; NaN where no direction has one."""
+    variance = np.linalg.eigvalsh(covariance)[:, -1]
+    sigma: NDArray[np.float64] = np.sqrt(np.where(variance >= 0, variance, np.nan))
     return sigma

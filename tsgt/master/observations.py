@@ -29,6 +29,9 @@ FIRST_TIMES = 5
 station's first measurements, from when it falls with the root of their number. It is found from answers that come late
 (docs/explanation/instrument-time.md), and is off the same way for many measurements, so this is on the cautious side."""
 
+LEAST_SIGMA_M = 1e-5
+"""A tenth of the last digit that instruments give. A configuration may state no noise at all, but nothing can be weighed by it."""
+
 
 def middle_m(parameters: Parameters) -> FloatArray:
     """(3,) middle (centroid) of the prisms in the robot frame, whose motion is what observations tell of; in m."""
@@ -100,7 +103,7 @@ def build_observations(
             time_s=np.array([time_ns - origin_ns for (time_ns, _), _ in ordered], dtype=np.int64) / 1e9,
             time_sigma_s=np.array([_time_sigma_s(m) for m in sources], dtype=np.float64),
             points_m=points,
-            sigmas_m=sigmas,
+            sigmas_m=np.maximum(sigmas, LEAST_SIGMA_M),
             polar=~is_point,
             station=np.where(is_point, len(parameters.stations), station_rows),
             prism=np.array([prisms[m.prism] for m in sources], dtype=np.intp),

@@ -194,6 +194,17 @@ def test_axes_across_the_line_of_sight_are_where_angles_grow(seed: int) -> None:
         np.testing.assert_allclose(axes[:, row], moved / np.linalg.norm(moved, axis=1)[:, None], atol=1e-8)
 
 
+@pytest.mark.parametrize("measured_m", [0.0, 1e-200, 20.0])
+@pytest.mark.parametrize("predicted_m", [0.0, 1e-200, 20.0])
+def test_a_prism_in_the_station_itself_has_finite_residuals(measured_m: float, predicted_m: float) -> None:
+    """A distance that the prism constant has made zero is an outlier, not a number that spoils all others."""
+    observations, knots = seen_at(np.array([[measured_m, 0.0, 0.0]]))
+    there = replace(knots, position=np.array([[predicted_m, 0.0, 0.0]]))
+    found = linearise(observations, there, np.zeros(1, np.intp))
+    np.testing.assert_allclose(found.residuals_m, [[predicted_m - measured_m, 0.0, 0.0]], atol=1e-12)
+    assert np.isfinite(found.whitened(observations)).all()
+
+
 def test_an_uncertain_time_counts_along_the_prisms_motion() -> None:
     """A stamp that may be wrong by 10 ms makes a prism at 2 m/s uncertain by 20 mm along its way, and nowhere else."""
     observations, knots = seen_at(np.array([[40.0, 0.0, 0.0]]))

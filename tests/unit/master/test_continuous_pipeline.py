@@ -154,6 +154,32 @@ def test_what_was_measured_long_before_the_beginning_is_too_late(scene: Scene) -
     assert pipeline.advance(START + 8 * SECOND).valid.all()
 
 
+@pytest.mark.parametrize("before_ns", [9_000_000, 10_000_000, 11_000_000])
+@pytest.mark.parametrize("begun_s", [0.0, 0.082, 0.123, 1.0])
+def test_one_from_just_before_the_first_may_come_late(scene: Scene, before_ns: int, begun_s: float) -> None:
+    """Also as far before it as measurements share a knot, where rounding decides whether they do."""
+    measurements = every(scene, 4.0)
+    first_s = (measurements[0].stamp_ns - START - before_ns) / SECOND
+    late = scene.measure(2, first_s, delay_s=1.9)
+    pipeline = ContinuousPipeline(scene.parameters)
+    pipeline.begin_at(START - round(begun_s * SECOND))
+    for measurement in sorted([*measurements, late], key=lambda m: m.received_ns):
+        pipeline.advance(measurement.received_ns)
+        pipeline.add(measurement)
+    assert pipeline.advance(START + 4 * SECOND).valid.all()
+
+
+def test_a_distance_that_is_nothing_does_nothing(scene: Scene) -> None:
+    """A raw distance that the prism constant makes zero is an outlier like another; poses go on."""
+    stations = tuple(replace(station, prism_constant_m=-0.03) for station in scene.parameters.stations)
+    scene = replace(scene, parameters=replace(scene.parameters, stations=stations))
+    measurements = every(scene, 6.0)
+    measurements[30] = replace(measurements[30], slope_distance_m=0.03)
+    predicted, smoothed = stream(scene, measurements, 6.0)
+    assert predicted.valid[-20:].all()
+    assert smoothed.valid[-20:].all()
+
+
 def test_a_measurement_that_comes_again_counts_once(scene: Scene) -> None:
     """A station that has nothing new may send its last measurement again."""
     measurements = every(scene, 6.0)

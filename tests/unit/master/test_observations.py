@@ -8,8 +8,13 @@ from support.scene import START, Motion, standing_scene
 
 from tsgt.geometry import exp_so3, log_so3
 from tsgt.geometry.fit import fit
-from tsgt.master.observations import INSTRUMENT_TIME_SIGMA_S, build_observations, middle_m
-from tsgt.model import MotionPrior
+from tsgt.master.observations import (
+    INSTRUMENT_TIME_SIGMA_S,
+    LEAST_SIGMA_M,
+    build_observations,
+    middle_m,
+)
+from tsgt.model import InstrumentNoise, MotionPrior, PointMeasurement
 
 
 def fast(time_s: float) -> Motion:
@@ -28,6 +33,24 @@ def test_no_time_is_surer_than_an_instruments(stated_ns: int) -> None:
     observations, _ = build_observations(SCENE.parameters, [measured], origin_ns=START)
     expected_s = np.hypot(stated_ns / 1e9, INSTRUMENT_TIME_SIGMA_S)
     assert observations.time_sigma_s == pytest.approx([expected_s], rel=1e-2)
+
+
+def test_no_measurement_is_without_noise() -> None:
+    """Of an instrument whose stated noise is zero hundredths of a millimetre are believed, which can be divided by."""
+    none = InstrumentNoise(range_sigma_m=0.0, range_sigma_ppm=0.0, angle_sigma_rad=0.0, pointing_sigma_m=0.0)
+    stations = tuple(replace(station, noise=none) for station in SCENE.parameters.stations)
+    parameters = replace(SCENE.parameters, stations=stations)
+    polar = SCENE.measure(1, 1.0)
+    point = PointMeasurement(
+        station=2,
+        prism=2,
+        sequence=0,
+        stamp_ns=polar.stamp_ns,
+        received_ns=polar.received_ns,
+        position_m=(1.0, 2.0, 3.0),
+    )
+    observations, _ = build_observations(parameters, [polar, point], origin_ns=START)
+    assert observations.sigmas_m.tolist() == [[LEAST_SIGMA_M] * 3] * 2
 
 
 def test_a_time_that_is_imported_is_taken_at_its_word() -> None:

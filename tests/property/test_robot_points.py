@@ -103,7 +103,9 @@ def test_a_point_that_turns_about_a_line_comes_nearer_to_it() -> None:
         to_line @ rotation @ (exp_so3(angle * axis) @ arm - arm)
         for angle in random.normal(0, sigma_rad, 20_000)
     ]
-    found = with_curvature(rotation[None], covariance)[0, :3, :3]
+    curved, found_sigma_rad = with_curvature(rotation[None], covariance)
+    found = curved[0, :3, :3]
+    assert found_sigma_rad == pytest.approx(sigma_rad)
     assert to_line @ found @ to_line == pytest.approx(np.mean(np.square(sample)), rel=0.05)
     assert to_line @ covariance[0, :3, :3] @ to_line < 1e-3 * np.mean(np.square(sample))
 
@@ -118,5 +120,5 @@ def test_a_point_that_turns_about_another_comes_nearer_to_it() -> None:
     to_point = rotation @ arm / np.linalg.norm(arm)
     turns = random.normal(size=(20_000, 3)) * sigmas_rad
     sample = (rotation @ (exp_so3(turns) @ arm - arm).T).T @ to_point
-    found = with_curvature(rotation[None], covariance)[0, :3, :3]
+    found = with_curvature(rotation[None], covariance)[0][0, :3, :3]
     assert to_point @ found @ to_point == pytest.approx(np.mean(np.square(sample)), rel=0.05)

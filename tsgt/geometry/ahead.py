@@ -27,7 +27,7 @@ _SERIES_BELOW = 2.0
 _TERMS = 32
 _POWERS = np.arange(_TERMS, dtype=np.float64)
 
-_IDENTITY = np.eye(3)
+_IDENTITY, _EYE = np.eye(3), np.eye(STATE)
 
 _Vector = tuple[float, float, float]
 
@@ -74,7 +74,7 @@ class Ahead:
             start.acceleration * slow[2],
             start.angular_acceleration * turning[2],
         )
-        by_start, by_noise = np.eye(STATE), np.eye(STATE)
+        by_start, by_noise = _EYE.copy(), _EYE.copy()
         for rows, columns, places, turns in (
             (0, 6, dt_s, 0.0),
             (0, 12, slow[0], 0.0),

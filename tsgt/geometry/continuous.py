@@ -20,6 +20,7 @@ from tsgt.geometry.block_tridiagonal import BlockFactor, factorise
 from tsgt.geometry.knots import STATE, Knots, Steps, add_steps, linearise_steps
 from tsgt.geometry.motion_prior import axis_sigmas
 from tsgt.geometry.prism_factors import linearise
+from tsgt.geometry.rigid import dot
 from tsgt.geometry.so3 import inverse_right_jacobian
 
 if TYPE_CHECKING:
@@ -158,10 +159,11 @@ def knot_times(time_s: FloatArray, *, least_step_s: float = LEAST_STEP_S) -> Flo
 
 def nearest(knots_s: FloatArray, time_s: FloatArray) -> NDArray[np.intp]:
     """(M,) which knot is nearest in time."""
-    after = np.clip(np.searchsorted(knots_s, time_s), 1, max(len(knots_s) - 1, 1))
     if len(knots_s) == 1:
         return np.zeros(len(time_s), np.intp)
-    return after - (time_s - knots_s[after - 1] < knots_s[after] - time_s)
+    after = np.minimum(np.maximum(np.searchsorted(knots_s, time_s), 1), len(knots_s) - 1)
+    found: NDArray[np.intp] = after - (time_s - knots_s[after - 1] < knots_s[after] - time_s)
+    return found
 
 
 def start_anchor(first: Knots, prior: MotionPrior) -> Anchor:
@@ -284,7 +286,7 @@ def assemble(
     """
     linearised = linearise(observations, knots, at)
     rows = linearised.whitened(observations)
-    distances = np.einsum("ij,ij->i", rows[:, :, 18], rows[:, :, 18])
+    distances = dot(rows[:, :, 18], rows[:, :, 18])
     ratio = np.maximum(distances / OUTLYING**2, 1.0)
     weights = 1.0 / ratio
     capped = np.minimum(distances, OUTLYING**2) + OUTLYING**2 * np.log(ratio)
@@ -297,7 +299,7 @@ def assemble(
     cost = float(capped.sum())
     for start in range(0, len(beside), _STEPS_AT_ONCE):
         some, ends = slice(start, start + _STEPS_AT_ONCE), slice(start, start + _STEPS_AT_ONCE + 1)
-        few = Steps(steps.phi[some], steps.information[some])
+        few = steps.select(some)
         between = linearise_steps(knots.select(ends), few)
         cost += add_steps(between, few, diagonal[ends], beside[some], gradient[ends])
 
@@ -316,16 +318,17 @@ def add_rows(
     rows: FloatArray, weights: FloatArray, at: NDArray[np.intp], diagonal: FloatArray, gradient: FloatArray
 ) -> None:
     """Add measurements, (M, 3, 19) as in :class:`System`, to normal equations, in which each counts its weight, (M,)."""
+    by_knot = np.argsort(at, kind="stable")
     for start in range(0, len(at), _ROWS_AT_ONCE):
-        some = slice(start, start + _ROWS_AT_ONCE)
-        normal, near = np.swapaxes(rows[some] * weights[some, None, None], 1, 2) @ rows[some], at[some]
-        left = np.arange(len(near))
-        while len(left):
-            # Most knots have one measurement: the first of each knot at once, then the second ones.
-            here, first = np.unique(near[left], return_index=True)
-            diagonal[here] += normal[left[first], :STATE, :STATE]
-            gradient[here] += normal[left[first], :STATE, STATE]
-            left = np.delete(left, first)
+        some = by_knot[start : start + _ROWS_AT_ONCE]
+        few, near = rows[some], at[some]
+        normal = np.swapaxes(few * weights[some, None, None], 1, 2) @ few
+        # Most knots have one measurement: the first of each knot at once, then the second ones.
+        place = np.arange(len(near)) - np.searchsorted(near, near)
+        for each in range(int(place.max()) + 1):
+            now = place == each
+            diagonal[near[now]] += normal[now, :STATE, :STATE]
+            gradient[near[now]] += normal[now, :STATE, STATE]
 
 
 def nudged(system: System, at: NDArray[np.intp], move: FloatArray) -> System:
@@ -337,7 +340,7 @@ def nudged(system: System, at: NDArray[np.intp], move: FloatArray) -> System:
     linearised = system.linearised
     residuals_m = linearised.residuals_m + (linearised.jacobian @ moves)[:, :, 0]
     off = system.rows[:, :, 18] + (system.rows[:, :, :18] @ moves)[:, :, 0]
-    distances = np.einsum("ij,ij->i", off, off)
+    distances = dot(off, off)
     return system._replace(
         linearised=replace(linearised, residuals_m=residuals_m),
         distances=distances,

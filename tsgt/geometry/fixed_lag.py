@@ -37,7 +37,7 @@ from tsgt.geometry.continuous import (
 from tsgt.geometry.first_guess import first_guess
 from tsgt.geometry.knots import STATE, Knots, Steps, joined
 from tsgt.geometry.prism_factors import Observations
-from tsgt.geometry.rigid import exp_so3
+from tsgt.geometry.rigid import IDENTITY, exp_so3
 from tsgt.geometry.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -100,6 +100,7 @@ class FixedLag:
         self._prior = prior
         self._horizon_s = -np.inf
         self._knots: Knots | None = None
+        self._steps: Steps | None = None
         self._anchor: Anchor | None = None
         self._settled = False
         self._solved: tuple[Knots, BlockFactor] | None = None
@@ -130,7 +131,7 @@ class FixedLag:
             if not self._settled or held is None or not self._followed(held, new):
                 self._begin(self.observations)
         except GeometryError:  # not determined, or not yet
-            self._settled, self._knots, self._solved = False, None, None
+            self._settled, self._knots, self._steps, self._solved = False, None, None, None
             self.residuals_m = np.full((len(self.observations), 3), np.nan)
 
     def forget(self, before_s: float) -> None:
@@ -150,20 +151,23 @@ class FixedLag:
         """Leave of the past one Gaussian on the last knot that is not after an instant."""
         assert self.observations is not None  # noqa: S101 (it is settled)
         assert self._knots is not None  # noqa: S101 (it is settled)
+        assert self._steps is not None  # noqa: S101 (it is settled)
         assert self._anchor is not None  # noqa: S101 (it is settled)
         first = int(np.searchsorted(self._knots.time_s, before_s, side="right")) - 1
         if first <= 0:
             return
         at = nearest(self._knots.time_s, self.observations.time_s)
         past, knots = at < first, self._knots.select(slice(first + 1))
-        system = assemble(
-            self.observations.select(past), at[past], knots, Steps.of(knots.time_s, self._prior), self._anchor
-        )
+        steps = self._steps.select(slice(first))
+        system = assemble(self.observations.select(past), at[past], knots, steps, self._anchor)
         factor = factorise(system.diagonal, system.beside)
         left = factor.last()
         expected = factor.solve(-system.gradient)[first]
         self._anchor = Anchor(knots.select(slice(first, None)), left @ left.T, expected)
-        self._knots = self._knots.select(slice(first, None))
+        self._knots, self._steps = (
+            self._knots.select(slice(first, None)),
+            self._steps.select(slice(first, None)),
+        )
         self._horizon_s = float(self._knots.time_s[0])
         self._keep(~past)
 
@@ -203,12 +207,13 @@ class FixedLag:
         """Add measurements to the trajectory found before; return whether that is still good to follow."""
         assert self.observations is not None  # noqa: S101 (that has been set)
         assert self._knots is not None  # noqa: S101 (it is settled)
+        assert self._steps is not None  # noqa: S101 (it is settled)
         assert self._anchor is not None  # noqa: S101 (it is settled)
         # Compared as where knots are added: rounding must not find it near here and far there.
         if self._knots.time_s[0] - new.time_s[0] > 0.5 * LEAST_STEP_S:
             return False  # in the first window, before anything that had come
         knots = _with_knots_at(self._knots, new.time_s, self._prior)
-        steps = Steps.of(knots.time_s, self._prior)
+        steps = self._steps if knots is self._knots else Steps.of(knots.time_s, self._prior)
         at = nearest(knots.time_s, self.observations.time_s)
         unheard = _order(held, new) >= len(held)
         system = assemble(self.observations, at, knots, steps, self._anchor, unheard=unheard)
@@ -220,7 +225,7 @@ class FixedLag:
             gain = -float(np.vdot(move, system.gradient))
             knots = knots.moved(move)
             if gain < SETTLED or (np.all(weights == 1.0) and _is_little(move)):
-                self._take(knots, factor, nudged(system, at, move))
+                self._take(knots, steps, factor, nudged(system, at, move))
                 return self._settled
             system = assemble(self.observations, at, knots, steps, self._anchor)
         self._search(knots, MOST_ITERATIONS)
@@ -232,17 +237,17 @@ class FixedLag:
         found = solve(
             self.observations, guess, self._prior, anchor=self._anchor, most_iterations=most_iterations
         )
-        self._take(found.knots, found.factor, found)
+        self._take(found.knots, found.steps, found.factor, found)
         self._settled &= found.iterations < most_iterations
 
-    def _take(self, knots: Knots, factor: BlockFactor, found: System | Solution) -> None:
-        self._knots, self._solved, self._trajectory = knots, (knots, factor), None
+    def _take(self, knots: Knots, steps: Steps, factor: BlockFactor, found: System | Solution) -> None:
+        self._knots, self._steps, self._solved, self._trajectory = knots, steps, (knots, factor), None
         self.residuals_m = found.linearised.residuals_m
         inverse = np.linalg.inv(factor.last())
         covariance = inverse.T @ inverse
         self._end = Ahead(knots.select(slice(-1, None)), covariance, self._prior)
         sigma_rad = float(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1]))
-        fitting = float(np.mean(found.distances < OUTLYING**2))
+        fitting = int(np.count_nonzero(found.distances < OUTLYING**2)) / len(found.distances)
         fits = fitting > (SOME_FIT if self._settled else NEARLY_ALL_FIT)
         self._settled = fits and sigma_rad < (LOST_RAD if self._settled else SURE_RAD)
 
@@ -259,7 +264,7 @@ def _weights_of_new(system: System, at: NDArray[np.intp], new: NDArray[np.intp])
     for place, row in enumerate(new):
         by_state, here = rows[place, :, :STATE], found[at[row]]
         off = rows[place, :, STATE] + by_state @ here[:, -1]
-        expected = np.eye(3) + by_state @ here[:, 3 * place : 3 * place + 3]
+        expected = IDENTITY + by_state @ here[:, 3 * place : 3 * place + 3]
         distances[place] = off @ np.linalg.solve(expected, off)
     return 1.0 / np.maximum(distances / OUTLYING**2, 1.0)
 

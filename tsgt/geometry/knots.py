@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.geometry.motion_prior import axis_sigmas, process_information, transition
-from tsgt.geometry.rigid import FloatArray, dot, exp_so3, rotate, skew
-from tsgt.geometry.so3 import cross, inverse_right_jacobian, log_of_steps
+from tsgt.geometry.rigid import FloatArray, dot, exp_so3, skew
+from tsgt.geometry.so3 import apply, cross, inverse_right_jacobian, log_of_steps
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -115,7 +115,7 @@ class Steps:
     @classmethod
     def of(cls, time_s: FloatArray, prior: MotionPrior, sigmas: FloatArray | None = None) -> Steps:
         """Make them for K instants; ``sigmas``, (K - 1, 6), are those of the accelerations in each step, if not the prior's."""
-        dt_s = np.diff(time_s)[:, None]
+        dt_s = (time_s[1:] - time_s[:-1])[:, None]
         times_s = np.array([prior.acceleration_time_s, prior.angular_acceleration_time_s])
         two_phi, two_information = transition(dt_s, times_s), process_information(dt_s, times_s)
         weights = (axis_sigmas(prior)[None] if sigmas is None else sigmas) ** -2.0
@@ -123,6 +123,10 @@ class Steps:
             np.repeat(two_phi, 3, axis=1),
             np.repeat(two_information, 3, axis=1) * weights[:, :, None, None],
         )
+
+    def select(self, rows: slice) -> Steps:
+        """Return some of them."""
+        return Steps(self.phi[rows], self.information[rows])
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +165,7 @@ def linearise_steps(knots: Knots, steps: Steps) -> LinearisedSteps:
     count = len(knots) - 1
     turn = turn_between(knots.select(slice(None, -1)), knots.select(slice(1, None)))
     before, after = knots.angular_velocity[:-1], knots.angular_velocity[1:]
-    wander = (np.diff(knots.time_s) ** 2 / 12)[:, None]
+    wander = ((knots.time_s[1:] - knots.time_s[:-1]) ** 2 / 12)[:, None]
     states = np.empty((count + 1, 6, 3))
     states[:, :3, 1], states[:, 3:, 1] = knots.velocity, knots.angular_velocity
     states[:, :3, 2], states[:, 3:, 2] = knots.acceleration, knots.angular_acceleration
@@ -175,7 +179,7 @@ def linearise_steps(knots: Knots, steps: Steps) -> LinearisedSteps:
     by_earlier[:, :, :3], by_later[:, :, :3] = -np.swapaxes(by_turn, 1, 2), by_turn
     by_earlier[:, :, 3:] = skew(wander * after)
     by_later[:, :, 3:] = skew(-wander * before)
-    residuals = np.swapaxes(later - rotate(steps.phi, earlier), 1, 2).reshape(count, STATE)
+    residuals = np.swapaxes(later - apply(steps.phi, earlier), 1, 2).reshape(count, STATE)
     return LinearisedSteps(earlier, later, residuals, by_earlier, by_later)
 
 
@@ -207,18 +211,18 @@ def add_steps(
     _place_by_axis(beside)[...] -= weighed
     residuals = between.residuals.reshape(count, 3, 2, 3)
     off = np.swapaxes(residuals[:, :, 0], 1, 2)
-    pull = rotate(information, off)
+    pull = apply(information, off)
     cost = float((pull * off).sum())
     by_order = gradient.reshape(-1, 3, 2, 3)
     by_order[1:, :, 0] += np.swapaxes(pull, 1, 2)
-    by_order[:-1, :, 0] -= np.swapaxes(rotate(np.swapaxes(phi, 2, 3), pull), 1, 2)
+    by_order[:-1, :, 0] -= np.swapaxes(apply(np.swapaxes(phi, 2, 3), pull), 1, 2)
 
     # Turn, angular velocity and acceleration by the errors of both knots, 9 each, and the residuals beside them.
     jacobian = np.zeros((count, 9, 19))
     turning = jacobian[:, :, :9].reshape(count, 3, 3, 3, 3)
     np.einsum("niaja->naij", turning)[...] = -steps.phi[:, 3:]
     jacobian[:, :3, :3] = 0.0
-    jacobian[:, np.arange(3, 9), np.arange(12, 18)] = 1.0
+    np.einsum("nii->ni", jacobian[:, 3:, 12:18])[...] = 1.0
     jacobian[:, :3, :6] += between.turn_by_earlier
     jacobian[:, :3, 9:15] = between.turn_by_later
     jacobian[:, :, 18] = residuals[:, :, 1].reshape(count, 9)
@@ -253,6 +257,8 @@ def turn_between(before: Knots, after: Knots) -> FloatArray:
     dt_s = (after.time_s - before.time_s)[:, None]
     expected = 0.5 * dt_s * (before.angular_velocity + after.angular_velocity)
     angle = np.sqrt(dot(turn, turn))[:, None]
+    if not (angle > _LEAST_LONG_WAY_RAD).any():
+        return turn
     the_other_way = turn * (1.0 - 2 * np.pi / np.maximum(angle, _LEAST_LONG_WAY_RAD))
     off, other_off = turn - expected, the_other_way - expected
     longer = (angle[:, 0] > _LEAST_LONG_WAY_RAD) & (dot(other_off, other_off) < dot(off, off))

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tsgt.geometry.rigid import TINY
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(10)
 _NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
+_ORDERS = np.array([2.0, 1.0, 0.0])
+"""Powers of time that position, velocity and acceleration grow with."""
+_WEIGHED_NODES = np.sqrt(_WEIGHTS)[:, None] * _NODES[:, None] ** _ORDERS
 
 _SERIES_BELOW = 1e-2
 _QUADRATURE_BELOW = 2.0
@@ -68,14 +72,12 @@ def transition(dt_s: ArrayLike, time_s: ArrayLike) -> FloatArray:
     FloatArray
         Shape (..., 3, 3), for (position, velocity, acceleration).
     """
-    dt_s, time_s = np.broadcast_arrays(np.asarray(dt_s, np.float64), np.asarray(time_s, np.float64))
-    s = dt_s / time_s
-    phi = np.zeros((*dt_s.shape, 3, 3))
+    dt_s = np.asarray(dt_s, np.float64)
+    s = dt_s / np.asarray(time_s, np.float64)
+    phi = np.zeros((*s.shape, 3, 3))
     phi[..., 0, 0] = phi[..., 1, 1] = 1.0
     phi[..., 0, 1] = dt_s
-    phi[..., 0, 2] = dt_s**2 * _second(s)
-    phi[..., 1, 2] = dt_s * _first(s)
-    phi[..., 2, 2] = np.exp(-s)
+    phi[..., 2] = _kicked(s) * dt_s[..., None] ** _ORDERS
     return phi
 
 
@@ -92,8 +94,8 @@ def process_noise(dt_s: ArrayLike, time_s: ArrayLike) -> FloatArray:
     FloatArray
         Shape (..., 3, 3), symmetric, for (position, velocity, acceleration).
     """
-    dt_s, time_s = np.broadcast_arrays(np.asarray(dt_s, np.float64), np.asarray(time_s, np.float64))
-    return _scaled(_noise_in_units_of_dt(dt_s / time_s), dt_s)
+    dt_s = np.asarray(dt_s, np.float64)
+    return _scaled(_noise_in_units_of_dt(dt_s / np.asarray(time_s, np.float64)), dt_s)
 
 
 def process_information(dt_s: ArrayLike, time_s: ArrayLike) -> FloatArray:
@@ -101,9 +103,9 @@ def process_information(dt_s: ArrayLike, time_s: ArrayLike) -> FloatArray:
 
     ``dt_s`` must be above zero.
     """
-    dt_s, time_s = np.broadcast_arrays(np.asarray(dt_s, np.float64), np.asarray(time_s, np.float64))
-    information = np.asarray(np.linalg.inv(_noise_in_units_of_dt(dt_s / time_s)), np.float64)
-    return _scaled(information, 1.0 / dt_s)
+    dt_s = np.asarray(dt_s, np.float64)
+    information = np.linalg.inv(_noise_in_units_of_dt(dt_s / np.asarray(time_s, np.float64)))
+    return _scaled(np.asarray(information, np.float64), 1.0 / dt_s)
 
 
 def between(
@@ -128,42 +130,45 @@ def between(
     from_earlier, from_later, left : FloatArray
         Shape (..., 3, 3) each.
     """
+    dts_s = np.stack([before_s, after_s, before_s + after_s])
     q = process_noise(before_s, time_s)
-    to_later = transition(after_s, time_s)
-    gain = q @ np.swapaxes(to_later, -1, -2) @ process_information(before_s + after_s, time_s)
-    from_earlier = transition(before_s, time_s) - gain @ transition(before_s + after_s, time_s)
+    phi, to_later, all_the_way = transition(dts_s, time_s)
+    gain = q @ np.swapaxes(to_later, -1, -2) @ process_information(dts_s[2], time_s)
+    from_earlier = phi - gain @ all_the_way
     left = q - gain @ to_later @ q
     return from_earlier, gain, 0.5 * (left + np.swapaxes(left, -1, -2))
 
 
-def _first(s: FloatArray) -> FloatArray:
-    """Return (1 - exp(-s)) / s, 1 at 0."""
-    safe = np.where(s > 0, s, 1.0)
-    return np.where(s > 0, -np.expm1(-safe) / safe, 1.0)
+def _kicked(s: FloatArray) -> FloatArray:
+    """Position, velocity and acceleration a time s after a kick, in units of that time, (..., 3).
 
-
-def _second(s: FloatArray) -> FloatArray:
-    """Return (exp(-s) - 1 + s) / s^2, 1/2 at 0."""
-    large = s >= _SERIES_BELOW
-    safe = np.where(large, s, 1.0)
+    They are (exp(-s) - 1 + s) / s^2, (1 - exp(-s)) / s and exp(-s); 1/2, 1 and 1 at 0.
+    """
+    above_zero = np.maximum(s, TINY)
+    lost = -np.expm1(-above_zero)
     series = 0.5 - s / 6 * (1 - s / 4 * (1 - s / 5 * (1 - s / 6)))
-    return np.where(large, (np.expm1(-safe) + safe) / safe**2, series)
+    kicked = np.empty((*s.shape, 3))
+    kicked[..., 0] = np.where(s >= _SERIES_BELOW, (s - lost) / above_zero / above_zero, series)
+    kicked[..., 1] = lost / above_zero
+    kicked[..., 2] = np.exp(-s)
+    return kicked
 
 
 def _noise_in_units_of_dt(s: FloatArray) -> FloatArray:
     """Return Q for dt = 1 and an acceleration sigma of 1, where s is 1 in correlation times; shape (..., 3, 3)."""
-    q = np.empty((*s.shape, 3, 3))
     short = s < _QUADRATURE_BELOW
+    if short.all():
+        return _by_quadrature(s)
+    q = np.empty((*s.shape, 3, 3))
     q[short] = _by_quadrature(s[short])
     q[~short] = _closed(s[~short])
     return q
 
 
 def _by_quadrature(s: FloatArray) -> FloatArray:
-    u = s[..., None] * _NODES
     # Effect of a kick at a fraction 1 - node of the way: on position, velocity, acceleration.
-    effect = np.stack([_NODES**2 * _second(u), _NODES * _first(u), np.exp(-u)], axis=-1)
-    q: FloatArray = 2.0 * s[..., None, None] * np.einsum("...n,...ni,...nj->...ij", _WEIGHTS, effect, effect)
+    effect = _kicked(s[..., None] * _NODES) * _WEIGHED_NODES
+    q: FloatArray = 2.0 * s[..., None, None] * (np.swapaxes(effect, -1, -2) @ effect)
     return q
 
 
@@ -180,6 +185,6 @@ def _closed(s: FloatArray) -> FloatArray:
 
 
 def _scaled(matrix: FloatArray, dt_s: FloatArray) -> FloatArray:
-    scale = np.stack([dt_s**2, dt_s, np.ones_like(dt_s)], axis=-1)
+    scale = dt_s[..., None] ** _ORDERS
     scaled: FloatArray = scale[..., :, None] * matrix * scale[..., None, :]
     return scaled

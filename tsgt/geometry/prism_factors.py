@@ -8,13 +8,13 @@ nor the direction straight up is a special case.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.geometry.rigid import FloatArray, dot, exp_so3, rotate, skew
-from tsgt.geometry.so3 import cross, right_jacobian
+from tsgt.geometry.rigid import IDENTITY, FloatArray, dot, skew
+from tsgt.geometry.so3 import apply, cross, exp_and_right_jacobian
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -61,15 +61,22 @@ class Observations:
 
     def select(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Observations:
         """Return some of them."""
-        kept = {
-            f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name not in ("frames", "layout")
-        }
-        return replace(self, **kept)
+        return Observations(
+            self.time_s[rows],
+            self.time_sigma_s[rows],
+            self.points_m[rows],
+            self.sigmas_m[rows],
+            self.polar[rows],
+            self.station[rows],
+            self.prism[rows],
+            self.frames,
+            self.layout,
+        )
 
     def in_world(self) -> FloatArray:
         """(M, 3) measured points in frame ``station1``, in m."""
         frames = self.frames[self.station]
-        return rotate(frames[:, :3, :3], self.points_m) + frames[:, :3, 3]
+        return apply(frames[:, :3, :3], self.points_m) + frames[:, :3, 3]
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +106,7 @@ class Linearised:
 
     def covariance(self, observations: Observations) -> FloatArray:
         """(M, 3, 3) covariance of the residuals in m^2: the instrument's noise, and uncertain times on a moving prism."""
-        moved = rotate(self.by_point, self.velocity_mps) * observations.time_sigma_s[:, None]
+        moved = apply(self.by_point, self.velocity_mps) * observations.time_sigma_s[:, None]
         covariance: FloatArray = moved[:, :, None] * moved[:, None, :]
         for axis in range(3):
             covariance[:, axis, axis] += observations.sigmas_m[:, axis] ** 2
@@ -111,7 +118,7 @@ class Linearised:
         The covariance is a diagonal one plus the outer product of one vector, whose inverse root has a closed form.
         """
         deviation_m = observations.sigmas_m
-        along = rotate(self.by_point, self.velocity_mps) * (observations.time_sigma_s[:, None] / deviation_m)
+        along = apply(self.by_point, self.velocity_mps) * (observations.time_sigma_s[:, None] / deviation_m)
         root = np.sqrt(1.0 + dot(along, along))
         found = np.empty((len(along), 3, 19))
         np.divide(self.jacobian, deviation_m[:, :, None], out=found[:, :, :18])
@@ -140,21 +147,18 @@ def linearise(observations: Observations, knots: Knots, at: NDArray[np.intp]) ->
     delta_s = (observations.time_s - knots.time_s[at])[:, None]
     half = 0.5 * delta_s**2
     arm = observations.layout[observations.prism]
-    turn = knots.angular_velocity[at] * delta_s + knots.angular_acceleration[at] * half
-    turned = exp_so3(turn)
-    rotation = knots.rotation[at] @ turned
-    point = (
-        knots.position[at]
-        + knots.velocity[at] * delta_s
-        + knots.acceleration[at] * half
-        + rotate(rotation, arm)
+    near = knots.select(at)
+    turned, by_turned = exp_and_right_jacobian(
+        near.angular_velocity * delta_s + near.angular_acceleration * half
     )
-    rate = knots.angular_velocity[at] + knots.angular_acceleration[at] * delta_s
-    velocity = knots.velocity[at] + knots.acceleration[at] * delta_s + rotate(rotation, cross(rate, arm))
+    rotation = near.rotation @ turned
+    point = near.position + near.velocity * delta_s + near.acceleration * half + apply(rotation, arm)
+    rate = near.angular_velocity + near.angular_acceleration * delta_s
+    velocity = near.velocity + near.acceleration * delta_s + apply(rotation, cross(rate, arm))
     residuals, by_point = _compared(observations, point)
     jacobian = np.empty((len(observations), 3, 18))
     by_rotation_then = -by_point @ rotation @ skew(arm)
-    by_turn = by_rotation_then @ right_jacobian(turn)
+    by_turn = by_rotation_then @ by_turned
     jacobian[:, :, 0:3] = by_point
     jacobian[:, :, 3:6] = by_rotation_then @ np.swapaxes(turned, 1, 2)
     jacobian[:, :, 6:9] = by_point * delta_s[:, None]
@@ -168,19 +172,19 @@ def _compared(observations: Observations, point: FloatArray) -> tuple[FloatArray
     """Residuals of predicted points in frame ``station1``, (M, 3), and their derivatives by these, (M, 3, 3)."""
     frames = observations.frames[observations.station]
     to_station = np.swapaxes(frames[:, :3, :3], 1, 2)
-    predicted = rotate(to_station, point - frames[:, :3, 3])
+    predicted = apply(to_station, point - frames[:, :3, 3])
     measured = observations.points_m
     residuals = predicted - measured
-    by_predicted = np.broadcast_to(np.eye(3), (len(point), 3, 3)).copy()
-    polar = observations.polar
-    if polar.any():
+    by_predicted = np.repeat(IDENTITY[None], len(point), axis=0)
+    polar = slice(None) if observations.polar.all() else observations.polar
+    if observations.polar.any():
         axes, measured_m = line_of_sight_axes(measured[polar])
         seen = predicted[polar]
         distance_m = np.sqrt(dot(seen, seen))
         away_m = np.where(distance_m > 0, distance_m, 1.0)
         direction = seen / away_m[:, None]
         residuals[polar, 0] = distance_m - measured_m
-        residuals[polar, 1:] = measured_m[:, None] * rotate(axes, direction)[:, 1:]
+        residuals[polar, 1:] = measured_m[:, None] * apply(axes, direction)[:, 1:]
         shrink = (measured_m / away_m)[:, None, None]
         away = axes[:, 1:] - (axes[:, 1:] @ direction[:, :, None]) * direction[:, None, :]
         by_predicted[polar, 0] = direction
@@ -208,10 +212,12 @@ def line_of_sight_axes(points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
     there = distance_m[:, None] > 0
     along = np.where(there, points_m, [1.0, 0.0, 0.0]) / np.where(there, distance_m[:, None], 1.0)
     flat = np.hypot(along[:, 0], along[:, 1])
-    safe = np.where(flat > 0, flat, 1.0)
-    cosine, sine = np.where(flat > 0, along[:, 0] / safe, 1.0), np.where(flat > 0, along[:, 1] / safe, 0.0)
-    zero = np.zeros_like(flat)
+    upright = flat == 0
+    safe = flat + upright
+    cosine, sine = along[:, 0] / safe + upright, along[:, 1] / safe
+    axes = np.zeros((len(along), 3, 3))
+    axes[:, 0] = along
     # Horizontal angles grow clockwise, seen from above.
-    horizontal = np.stack([sine, -cosine, zero], axis=-1)
-    downward = np.stack([along[:, 2] * cosine, along[:, 2] * sine, -flat], axis=-1)
-    return np.stack([along, horizontal, downward], axis=1), distance_m
+    axes[:, 1, 0], axes[:, 1, 1] = sine, -cosine
+    axes[:, 2, 0], axes[:, 2, 1], axes[:, 2, 2] = along[:, 2] * cosine, along[:, 2] * sine, -flat
+    return axes, distance_m

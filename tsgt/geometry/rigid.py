@@ -21,6 +21,20 @@ FloatArray = NDArray[np.float64]
 RIGID_TOLERANCE = 1e-6
 """How far a rotation matrix may be from orthonormal: six decimals, as people type them into a file."""
 
+TINY = 1e-300
+"""Added to a square, it changes none but zero, which may then be divided by."""
+
+IDENTITY = np.eye(3)
+
+_ACROSS = np.array(
+    [
+        [0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0],
+        [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0],
+        [0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+    ]
+)
+"""Matrices of the cross products with the three axes, a row each."""
+
 
 def skew(v: FloatArray) -> FloatArray:
     """Matrix of the cross product: ``skew(v) @ p`` is ``v`` x ``p``.
@@ -36,9 +50,8 @@ def skew(v: FloatArray) -> FloatArray:
         Skew-symmetric matrices, shape (..., 3, 3).
     """
     v = np.asarray(v, dtype=np.float64)
-    matrix = np.zeros((*v.shape, 3))
-    matrix[..., 0, 1], matrix[..., 0, 2], matrix[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    matrix[..., 1, 0], matrix[..., 2, 0], matrix[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    # Each element is one of the vector's or zero, so that nothing is rounded.
+    matrix: FloatArray = (v @ _ACROSS).reshape(*v.shape, 3)
     return matrix
 
 
@@ -56,12 +69,14 @@ def exp_so3(w: FloatArray) -> FloatArray:
         Rotation matrices, shape (..., 3, 3).
     """
     w = np.asarray(w, dtype=np.float64)
-    angle_rad = np.sqrt(dot(w, w))[..., None, None]
-    # sin(a)/a and (1 - cos(a))/a^2, the latter by the half angle: smooth through zero without a branch.
-    first = np.sinc(angle_rad / np.pi)
-    second = 0.5 * np.sinc(angle_rad / (2 * np.pi)) ** 2
-    outer = w[..., :, None] * w[..., None, :]
-    return np.eye(3) + first * skew(w) + second * (outer - angle_rad**2 * np.eye(3))
+    # sin(a)/a and (1 - cos(a))/a^2, both by the half angle: smooth through zero without a branch.
+    half_rad = 0.5 * np.sqrt(dot(w, w) + TINY)[..., None, None]
+    ratio = np.sin(half_rad) / half_rad
+    across = skew(w)
+    matrix: FloatArray = (
+        IDENTITY + ratio * np.cos(half_rad) * across + 0.5 * ratio * ratio * (across @ across)
+    )
+    return matrix
 
 
 def log_so3(R: FloatArray) -> FloatArray:
@@ -113,8 +128,9 @@ def quaternion_from_rotation(R: FloatArray) -> FloatArray:
     rows[..., 0, 3] = rows[..., 3, 0] = xw
     rows[..., 1, 3] = rows[..., 3, 1] = yw
     rows[..., 2, 3] = rows[..., 3, 2] = zw
-    largest = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), axis=-1)[..., None, None]
-    q: FloatArray = np.take_along_axis(rows, largest, axis=-2)[..., 0, :]
+    flat = rows.reshape(-1, 4, 4)
+    largest = flat.diagonal(axis1=1, axis2=2).argmax(axis=1)
+    q: FloatArray = flat[np.arange(len(flat)), largest].reshape(*xx.shape, 4)
     length = np.sqrt(q[..., 0] ** 2 + q[..., 1] ** 2 + q[..., 2] ** 2 + q[..., 3] ** 2)
     return q / np.where(q[..., 3] < 0, -length, length)[..., None]
 

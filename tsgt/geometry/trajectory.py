@@ -14,14 +14,16 @@ import numpy as np
 
 from tsgt.geometry.knots import STATE, Knots, joined, spread, turn_between
 from tsgt.geometry.motion_prior import axis_sigmas, between, process_noise, transition
-from tsgt.geometry.rigid import FloatArray, exp_so3, rotate, skew
-from tsgt.geometry.so3 import cross, inverse_right_jacobian, right_jacobian
+from tsgt.geometry.rigid import IDENTITY, FloatArray, skew
+from tsgt.geometry.so3 import apply, cross, exp_and_right_jacobian, inverse_right_jacobian
 
 if TYPE_CHECKING:
     from tsgt.model import MotionPrior
 
 _AT_ONCE = 512
 """What is made of so many instants stays in the cache: a third faster than eight times as many."""
+
+_EYE = np.eye(STATE)[None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,11 +106,12 @@ class Trajectory:
         moved = moved[..., 0]
         wander, before, here = (dt_s**2 / 12)[:, None], start.angular_velocity, moved[:, 3:, 1]
         turn = moved[:, 3:, 0] + wander * cross(before, here)
-        states = _states(time_s, start.position + moved[:, :3, 0], start.rotation @ exp_so3(turn), moved)
-        to_error = _to_error(turn, wander, before)
+        turned, by_turn = exp_and_right_jacobian(turn)
+        states = _states(time_s, start.position + moved[:, :3, 0], start.rotation @ turned, moved)
+        to_error = _to_error(by_turn, wander, before)
         by_start = to_error @ spread(phi)
-        by_start[:, 3:6, 9:12] -= to_error[:, 3:6, 3:6] @ (wander[..., None] * skew(here))
-        by_start[:, 3:6, 3:6] = exp_so3(-turn)
+        by_start[:, 3:6, 9:12] -= by_turn @ (wander[..., None] * skew(here))
+        by_start[:, 3:6, 3:6] = np.swapaxes(turned, 1, 2)
         by_start, to_error = by_start[:, :parts], to_error[:, :parts]
         covariance = by_start @ self.covariance[knot] @ np.swapaxes(by_start, 1, 2)
         return states, _symmetric(covariance + to_error @ spread(noise) @ np.swapaxes(to_error, 1, 2))
@@ -136,20 +139,20 @@ class Trajectory:
         found = (from_earlier @ earlier[..., None] + from_later @ at_later[..., None])[..., 0]
         wander_here, here = (dt_s**2 / 12)[:, None], found[:, 3:, 1]
         found_turn = found[:, 3:, 0] + wander_here * cross(rate, here)
-        states = _states(time_s, found[:, :3, 0], before.rotation @ exp_so3(found_turn), found)
+        turned, by_found_turn = exp_and_right_jacobian(found_turn)
+        states = _states(time_s, found[:, :3, 0], before.rotation @ turned, found)
         by_earlier, by_later = spread(from_earlier), spread(from_later)
         # The later rotation enters by the turn from the earlier one, less its wander; the result's by the turn to it.
-        by_turn = by_later[:, :, 3:6].copy()
-        by_later[:, :, 3:6] = by_turn @ inverse_right_jacobian(full_turn)
+        by_turn, turn_by_later = by_later[:, :, 3:6].copy(), inverse_right_jacobian(full_turn)
+        by_later[:, :, 3:6] = by_turn @ turn_by_later
         by_later[:, :, 9:12] -= by_turn @ (wander[..., None] * skew(rate))
-        by_earlier[:, :, 3:6] = -by_turn @ inverse_right_jacobian(-full_turn)
+        # Of the opposite turn it is the transpose.
+        by_earlier[:, :, 3:6] = -by_turn @ np.swapaxes(turn_by_later, 1, 2)
         by_earlier[:, :, 9:12] += by_turn @ (wander[..., None] * skew(later_rate))
-        to_error = _to_error(found_turn, wander_here, rate)
-        turned = to_error[:, 3:6, 3:6]
-        to_error = to_error[:, :parts]
+        to_error = _to_error(by_found_turn, wander_here, rate)[:, :parts]
         by_earlier, by_later = to_error @ by_earlier, to_error @ by_later
-        by_earlier[:, 3:6, 9:12] -= turned @ (wander_here[..., None] * skew(here))
-        by_earlier[:, 3:6, 3:6] += exp_so3(-found_turn)
+        by_earlier[:, 3:6, 9:12] -= by_found_turn @ (wander_here[..., None] * skew(here))
+        by_earlier[:, 3:6, 3:6] += np.swapaxes(turned, 1, 2)
         sigmas = axis_sigmas(self.prior)[None] if self.sigmas is None else self.sigmas[later - 1]
         added = to_error @ spread(left * (sigmas**2)[:, :, None, None])
         mixed = by_earlier @ self.beside[later - 1] @ np.swapaxes(by_later, 1, 2)
@@ -166,11 +169,11 @@ class Trajectory:
         return np.array([self.prior.acceleration_time_s, self.prior.angular_acceleration_time_s])
 
 
-def _to_error(turn: FloatArray, wander: FloatArray, rate: FloatArray) -> FloatArray:
+def _to_error(by_turn: FloatArray, wander: FloatArray, rate: FloatArray) -> FloatArray:
     """How errors in what the prior is linear in, turn less wander among it, become errors of a state; (N, 18, 18)."""
-    matrix = np.broadcast_to(np.eye(STATE), (len(turn), STATE, STATE)).copy()
-    matrix[:, 3:6, 3:6] = right_jacobian(turn)
-    matrix[:, 3:6, 9:12] = matrix[:, 3:6, 3:6] @ (wander[..., None] * skew(rate))
+    matrix = np.repeat(_EYE, len(by_turn), axis=0)
+    matrix[:, 3:6, 3:6] = by_turn
+    matrix[:, 3:6, 9:12] = by_turn @ (wander[..., None] * skew(rate))
     return matrix
 
 
@@ -206,7 +209,7 @@ def ros_covariance(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
         (N, 6, 6): x, y, z, rotation about the fixed axes x, y, z of ``station1``.
     """
     turned = np.zeros((len(rotation), 6, 6))
-    turned[:, :3, :3] = np.eye(3)
+    turned[:, :3, :3] = IDENTITY
     turned[:, 3:, 3:] = rotation
     return _symmetric(turned @ covariance[:, :6, :6] @ np.swapaxes(turned, 1, 2))
 
@@ -234,17 +237,17 @@ def of_point(states: Knots, covariance: FloatArray, arm: FloatArray) -> tuple[Kn
     swing = cross(rate, arm)
     moved = replace(
         states,
-        position=states.position + rotate(rotation, arm),
-        velocity=states.velocity + rotate(rotation, swing),
+        position=states.position + apply(rotation, arm),
+        velocity=states.velocity + apply(rotation, swing),
         acceleration=states.acceleration
-        + rotate(rotation, cross(states.angular_acceleration, arm) + cross(rate, swing)),
+        + apply(rotation, cross(states.angular_acceleration, arm) + cross(rate, swing)),
     )
-    by_error = np.broadcast_to(np.eye(6), (len(states), 6, 6)).copy()
+    by_error = np.repeat(_EYE[:, :6, :6], len(states), axis=0)
     by_error[:, :3, 3:] = -rotation @ skew(arm)
     return moved, _symmetric(by_error @ covariance[:, :6, :6] @ np.swapaxes(by_error, 1, 2))
 
 
-def with_curvature(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
+def with_curvature(rotation: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Add what linear errors leave out of a position that turns with the robot about a line or a point.
 
     What two prisms do not tell is a turn by some angle θ about the line through them: it moves a point at the distance r
@@ -261,14 +264,17 @@ def with_curvature(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
 
     Returns
     -------
-    FloatArray
+    covariance : FloatArray
         (N, 6, 6).
+    sigma_rad : FloatArray
+        (N,) one sigma of θ, the rotation in the direction in which it is known worst; NaN where rounding has spoilt it.
     """
-    _, axes = np.linalg.eigh(covariance[:, 3:, 3:])
+    variance, axes = np.linalg.eigh(covariance[:, 3:, 3:])
     # What a turn moves the point by is its covariance with that over the variance, which stands before the square anyway.
-    towards = np.cross(covariance[:, :3, 3:] @ axes, rotation @ axes, axis=1)
-    all_turns = towards.sum(axis=2, keepdims=True)
+    moved = np.swapaxes(covariance[:, :3, 3:] @ axes, 1, 2)
+    towards = cross(moved, np.swapaxes(rotation @ axes, 1, 2))
+    all_turns = towards.sum(axis=1)
     curved: FloatArray = covariance.copy()
-    curved[:, :3, :3] += 0.5 * (towards @ np.swapaxes(towards, 1, 2))
-    curved[:, :3, :3] += 0.25 * (all_turns @ np.swapaxes(all_turns, 1, 2))
-    return curved
+    curved[:, :3, :3] += 0.5 * (np.swapaxes(towards, 1, 2) @ towards)
+    curved[:, :3, :3] += 0.25 * all_turns[:, :, None] * all_turns[:, None, :]
+    return curved, np.sqrt(np.where(variance[:, -1] >= 0, variance[:, -1], np.nan))

@@ -126,7 +126,8 @@ class ContinuousPipeline:
         taken = ~late & ~np.array(again, dtype=bool)
         if not taken.any():
             return
-        observations = observations.select(taken)
+        if not taken.all():
+            observations = observations.select(taken)
         self._window.update(replace(observations, sigmas_m=observations.sigmas_m * self._limits.noise_scale))
         self._see(times_ns[taken], stations[taken], observations.prism)
 

@@ -204,8 +204,11 @@ class ContinuousPoses:
             spoilt = out & (newest >= 0) & (unusable_ns[newest] > since_ns)
             batch.prism_reason[spoilt, column] = Reason.STATION_STATUS
         # One alone that does not fit is an outlier; two of three are the robot's, or the set-up is wrong.
-        near = rows[np.clip(nearest[~out, None] + np.arange(-1, 2), 0, len(rows) - 1)]
-        batch.prism_residual_m[~out, column] = np.median(seen.residuals_m[near], axis=1)
+        near = rows[np.minimum(np.maximum(nearest[~out] + np.arange(-1, 2)[:, None], 0), len(rows) - 1)]
+        first, second, last = seen.residuals_m[near]
+        batch.prism_residual_m[~out, column] = np.maximum(
+            np.minimum(first, second), np.minimum(np.maximum(first, second), last)
+        )
 
     def _judged(
         self, batch: PoseBatch, states: Knots | None, covariance: NDArray[np.float64], *, settled: bool
@@ -216,10 +219,10 @@ class ContinuousPoses:
             batch.reason[:] = np.where(missing, missing, Reason.DEGENERATE_GEOMETRY)
             return batch
         limits, rotation = self._limits, states.rotation
-        sigma_rad = _worst_sigma(covariance[:, 3:6, 3:6])
-        sigma_m = _worst_sigma(covariance[:, :3, :3])
+        variance_m2 = np.linalg.eigvalsh(covariance[:, :3, :3])[:, -1]
+        sigma_m = np.sqrt(np.where(variance_m2 >= 0, variance_m2, np.nan))
         states, covariance = of_point(states, covariance, self._to_origin_m)
-        covariance = with_curvature(rotation, covariance)
+        covariance, sigma_rad = with_curvature(rotation, covariance)
         unknown = ~(sigma_rad < NO_IDEA_RAD)
         batch.position_m[:] = states.position
         batch.orientation_xyzw[:] = quaternion_from_rotation(rotation)
@@ -245,10 +248,3 @@ class ContinuousPoses:
         if uncertain.any():
             batch.reason[uncertain] = np.where(missing, missing, Reason.UNCERTAIN)[uncertain]
         return batch
-
-
-def _worst_sigma(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N,) one sigma in the direction in which it is largest; NaN where no direction has one."""
-    variance = np.linalg.eigvalsh(covariance)[:, -1]
-    sigma: NDArray[np.float64] = np.sqrt(np.where(variance >= 0, variance, np.nan))
-    return sigma

@@ -96,6 +96,7 @@ def build_observations(
     sources = [measurement for _, measurement in ordered]
     is_point = np.array([isinstance(m, PointMeasurement) for m in sources], dtype=bool)
     # Cartesian points are in frame 1 already, whichever station they came from: the row after the stations' frames.
+    layout = _layout(parameters)
     frames = np.array([*(s.T_station1_station for s in parameters.stations), np.eye(4)])
     station_rows = np.array([row for (_, row), _ in ordered], dtype=np.intp)
     return (
@@ -108,7 +109,7 @@ def build_observations(
             station=np.where(is_point, len(parameters.stations), station_rows),
             prism=np.array([prisms[m.prism] for m in sources], dtype=np.intp),
             frames=frames,
-            layout=_layout(parameters) - middle_m(parameters),
+            layout=layout - layout.mean(axis=0),
         ),
         sources,
     )

@@ -103,6 +103,7 @@ class FixedLag:
         self._steps: Steps | None = None
         self._anchor: Anchor | None = None
         self._settled = False
+        self._doubted: frozenset[int] = frozenset()
         self._solved: tuple[Knots, BlockFactor] | None = None
         self._trajectory: Trajectory | None = None
         self._end: Ahead | None = None
@@ -123,6 +124,21 @@ class FixedLag:
     def settled(self) -> bool:
         """Whether it can be believed: it is known well enough, and explains what was measured."""
         return self._settled
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the last measurements contradict each other or what was before.
+
+        One that is far from what was predicted is wrong, or the robot has done the unexpected. Which it is the next ones tell:
+        those of another prism that are as predicted. Until then it is not known where the robot goes.
+        """
+        return bool(self._doubted)
+
+    def _doubt(self, prisms: NDArray[np.intp], weights: FloatArray) -> None:
+        """Take note of which prisms' new measurements are as predicted, of weight 1, and which are not."""
+        for prism, weight in zip(prisms.tolist(), weights.tolist(), strict=True):
+            # A station on a wrong prism soon agrees with itself, which says nothing.
+            self._doubted = self._doubted | {prism} if weight < 1.0 else self._doubted & {prism}
 
     def update(self, new: Observations) -> None:
         """Take measurements, in the order of time, none before :attr:`horizon_s`."""
@@ -159,7 +175,8 @@ class FixedLag:
         at = nearest(self._knots.time_s, self.observations.time_s)
         past, knots = at < first, self._knots.select(slice(first + 1))
         steps = self._steps.select(slice(first))
-        system = assemble(self.observations.select(past), at[past], knots, steps, self._anchor)
+        heard = np.zeros(int(past.sum()), np.bool_)
+        system = assemble(self.observations.select(past), at[past], knots, steps, self._anchor, heard=heard)
         factor = factorise(system.diagonal, system.beside)
         left = factor.last()
         expected = factor.solve(-system.gradient)[first]
@@ -193,7 +210,7 @@ class FixedLag:
 
     def _begin(self, observations: Observations) -> None:
         """Find the trajectory of all measurements of the window, knowing nothing else."""
-        self._settled = False
+        self._settled, self._doubted = False, frozenset()
         if np.count_nonzero(np.bincount(observations.prism) >= 2) < 3:
             raise GeometryError("to begin with, three prisms have to be measured twice")
         guess = first_guess(observations, knot_times(observations.time_s))
@@ -216,8 +233,9 @@ class FixedLag:
         steps = self._steps if knots is self._knots else Steps.of(knots.time_s, self._prior)
         at = nearest(knots.time_s, self.observations.time_s)
         unheard = _order(held, new) >= len(held)
-        system = assemble(self.observations, at, knots, steps, self._anchor, unheard=unheard)
+        system = assemble(self.observations, at, knots, steps, self._anchor, unheard=unheard, heard=unheard)
         weights = _weights_of_new(system, at, np.flatnonzero(unheard))
+        self._doubt(new.prism, weights)
         add_rows(system.rows[unheard], weights, at[unheard], system.diagonal, system.gradient)
         for _ in range(MOST_STEPS):
             factor = factorise(system.diagonal, system.beside)
@@ -227,7 +245,7 @@ class FixedLag:
             if gain < SETTLED or (np.all(weights == 1.0) and _is_little(move)):
                 self._take(knots, steps, factor, nudged(system, at, move))
                 return self._settled
-            system = assemble(self.observations, at, knots, steps, self._anchor)
+            system = assemble(self.observations, at, knots, steps, self._anchor, heard=unheard)
         self._search(knots, MOST_ITERATIONS)
         return self._settled
 

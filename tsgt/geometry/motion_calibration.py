@@ -282,7 +282,7 @@ def _solved(piece: _Piece, observations: Observations, setup: Setup, prior: Moti
     if knots is None or np.abs(setup.latencies_s - piece.latencies_s).max() > LEAST_STEP_S / 2:
         knots = first_guess(observations, knot_times(observations.time_s))
         piece.latencies_s = setup.latencies_s
-    solution = solve(observations, knots, prior)
+    solution = solve(observations, knots, prior, hopeless_heard=True)
     piece.knots = solution.knots
     return solution
 

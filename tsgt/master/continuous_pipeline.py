@@ -157,14 +157,15 @@ class ContinuousPipeline:
     def _predicted(self, epochs_ns: range) -> PoseBatch:
         if not self._window.following:
             return self._poses.predicted(epochs_ns, self._seen, None, _NONE)
+        settled = self._window.settled and not self._window.doubtful
         found = [
             self._window.predict((epoch_ns - self._origin_ns) / 1e9, parts=_POSE) for epoch_ns in epochs_ns
         ]
         if len(found) == 1:
-            return self._poses.predicted(epochs_ns, self._seen, *found[0], settled=self._window.settled)
+            return self._poses.predicted(epochs_ns, self._seen, *found[0], settled=settled)
         states = joined([state for state, _ in found])
         covariance = np.concatenate([each for _, each in found])
-        return self._poses.predicted(epochs_ns, self._seen, states, covariance, settled=self._window.settled)
+        return self._poses.predicted(epochs_ns, self._seen, states, covariance, settled=settled)
 
     def _smoothed_until(self, last_ns: int) -> PoseBatch:
         """Return the smoothed poses of the epochs up to an instant, and let go of what they needed."""

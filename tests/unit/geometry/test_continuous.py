@@ -14,8 +14,9 @@ from support.prior_motion import SIGMAS_M, STEP_S, as_points, draw_motions, in_t
 from support.scene import FRAMES, LAYOUT
 
 from tsgt.errors import GeometryError
-from tsgt.geometry import Observations, cartesian_to_polar, exp_so3
+from tsgt.geometry import Observations, Trajectory, cartesian_to_polar, exp_so3
 from tsgt.geometry.continuous import (
+    HOPELESS,
     LEAST_STEP_S,
     OUTLYING,
     SETTLED,
@@ -214,7 +215,7 @@ def test_good_measurements_are_three_sigmas_squared_away_less_what_they_fit(
 
 @pytest.mark.parametrize("miss_m", [0.1, 0.5, 30.0])
 def test_outliers_are_named(observations: Observations, miss_m: float) -> None:
-    """A reflection that is off by so much gets next to no weight, alone does so, and bends nothing."""
+    """A reflection that is off by so much gets next to no weight, far off none; it alone does so, and bends nothing."""
     clean = solve(observations, guess_of(observations), PRIOR)
     wrong = len(observations) // 2
     points = observations.points_m.copy()
@@ -222,7 +223,8 @@ def test_outliers_are_named(observations: Observations, miss_m: float) -> None:
     found = solve(replace(observations, points_m=points), guess_of(observations), PRIOR)
     assert np.argmin(found.weights) == wrong
     assert found.weights[wrong] < 16 / (miss_m / 0.01) ** 2
-    assert found.weights[wrong] == pytest.approx(OUTLYING**2 / found.distances[wrong])
+    little = OUTLYING**2 / found.distances[wrong]
+    assert found.weights[wrong] == pytest.approx(0.0 if found.distances[wrong] > HOPELESS**2 else little)
     assert np.count_nonzero((found.weights < 1.0) & (clean.weights == 1.0)) == 1
     arm = LAYOUT.mean(axis=0)
     centroid, clean_centroid = (s.knots.position + s.knots.rotation @ arm for s in (found, clean))
@@ -241,6 +243,27 @@ def test_a_lock_on_the_wrong_prism_is_named(observations: Observations) -> None:
     clean = solve(observations, guess_of(observations), PRIOR)
     named = np.flatnonzero((found.weights < 1.0) & (clean.weights == 1.0))
     np.testing.assert_array_equal(named, wrong)
+
+
+def test_a_station_that_stays_on_the_wrong_prism_turns_nothing() -> None:
+    """What two prisms do not tell is not told by many outliers together either: it stays as uncertain as without them."""
+    (motion,) = draw_motions(PRIOR, count=1, duration_s=8.0, seed=4)
+    observations = in_time(measure(motion, until_s=6.0, seed=4))
+    wrong = (observations.prism == 0) & (observations.time_s > 3.0)
+    truth = motion.select(rows_at(observations.time_s[wrong]))
+    world = truth.position + truth.rotation @ LAYOUT[1]
+    points = observations.points_m.copy()
+    points[wrong] = np.einsum("ij,mi->mj", FRAMES[0, :3, :3], world - FRAMES[0, :3, 3])
+    others = observations.select(~wrong)
+    (state, covariance), (expected, expected_covariance) = (
+        Trajectory(solution.knots, PRIOR, *solution.factor.marginals()).at(np.array([4.0]))
+        for solution in (
+            solve(each, guess_of(others), PRIOR) for each in (replace(observations, points_m=points), others)
+        )
+    )
+    sigmas = np.sqrt(np.diagonal(expected_covariance, axis1=1, axis2=2))
+    assert np.abs(state.error_from(expected) / sigmas).max() < 2.0
+    assert np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)) == pytest.approx(sigmas, rel=0.1)
 
 
 def test_a_solution_from_points_is_near_that_from_polar_ones(observations: Observations) -> None:

@@ -124,6 +124,23 @@ def test_an_outlier_does_little(observations: Observations, off_m: float) -> Non
     assert np.abs(state.error_from(expected) / sigmas)[:, :6].max() < 1.0
 
 
+def test_what_contradicts_is_doubtful_until_other_prisms_agree(observations: Observations) -> None:
+    """A wrong measurement, and one like it, which cannot clear it; then good ones of all prisms."""
+    rows = np.flatnonzero(observations.time_s < 6.0)
+    window = followed(observations.select(rows))
+    assert not window.doubtful
+    later = observations.select(slice(len(rows), None))
+    at = int(np.flatnonzero(later.prism == 0)[0])
+    wrong = later.select(slice(at, at + 1))
+    for after_s in (0.0, 0.1):
+        points = wrong.points_m + np.array([0.5, 0.0, 0.0])
+        window.update(replace(wrong, points_m=points, time_s=wrong.time_s + after_s))
+        assert window.doubtful
+    for row in np.flatnonzero(later.time_s > wrong.time_s[0] + 0.1):
+        window.update(later.select(slice(row, row + 1)))
+    assert not window.doubtful
+
+
 def test_it_begins_anew_after_an_outage(observations: Observations) -> None:
     """After half a minute without measurements it is found again within a second."""
     later = drawn(2, 3.0)

@@ -386,7 +386,7 @@ class Field:
             clock=clock,
             key=key,
             random_bits=lambda bits: int(self.rng.integers(1 << bits)),
-            observe=self.records.append,
+            observe=lambda record, _line: self.records.append(record),
         )
 
     def of(self, cls: type[T]) -> list[T]:

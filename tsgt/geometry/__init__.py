@@ -17,6 +17,7 @@ from tsgt.geometry.interpolation import (
     NO_GAP_NS,
     Interpolated,
     interpolate,
+    interpolate_prisms,
     interpolated_covariance,
     unseen_s2,
 )
@@ -75,6 +76,7 @@ __all__ = [
     "corrected_distance",
     "exp_so3",
     "interpolate",
+    "interpolate_prisms",
     "interpolated_covariance",
     "invert",
     "joined",

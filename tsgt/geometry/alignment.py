@@ -216,9 +216,10 @@ def align_triplets(layout: ArrayLike, points: ArrayLike) -> BatchAlignment:
     image r1 of b1 maximises U·r1 + V·(n x r1) = r1·(U - n x V), so r1 is the direction of U - n x V: neither
     trigonometry nor a decomposition is needed.
     """
-    layout = _points(layout, "layout")
-    if len(layout) != 3:
-        raise GeometryError(f"the closed form is for 3 points, the layout has {len(layout)}")
+    layout = np.asarray(layout, dtype=np.float64)
+    if layout.shape != (3, 3):
+        count = len(_points(layout, "layout"))
+        raise GeometryError(f"the closed form is for 3 points, the layout has {count}")
     batch = _batch(points, 3)
     layout_mean, double_area, (b1, b2, b3), u, v = _triangle(layout.tobytes())
 
@@ -240,12 +241,9 @@ def align_triplets(layout: ArrayLike, points: ArrayLike) -> BatchAlignment:
         for axis, body_axis in ((r1, b1), (r2, b2), (normal, b3)):
             axis[:, degenerate] = body_axis[:, None]
 
-    R = np.empty((3, 3, len(batch)))
-    for column in range(3):
-        R[:, column] = b1[column] * r1 + b2[column] * r2 + b3[column] * normal
-    residuals = np.empty_like(p)
-    for point in range(3):
-        residuals[point] = p[point] - mean - (u[point] * r1 + v[point] * r2)
+    # Each row of r1 with each of b1, and so on; each point with its two coordinates.
+    R = b1[:, None] * r1[:, None] + b2[:, None] * r2[:, None] + b3[:, None] * normal[:, None]
+    residuals = p - mean - (u[:, None, None] * r1 + v[:, None, None] * r2)
     translation = mean - (layout_mean[0] * R[:, 0] + layout_mean[1] * R[:, 1] + layout_mean[2] * R[:, 2])
     # Contiguous, as a matrix product may round otherwise for another layout in memory, which depends on N here.
     return BatchAlignment(
@@ -259,7 +257,7 @@ def align_triplets(layout: ArrayLike, points: ArrayLike) -> BatchAlignment:
 @lru_cache(maxsize=16)
 def _triangle(points: bytes) -> tuple[FloatArray, float, FloatArray, FloatArray, FloatArray]:
     """Return a layout's centroid, twice its area, its axes in rows, and its points along the first two of them."""
-    layout = np.frombuffer(points).reshape(3, 3)
+    layout = _points(np.frombuffer(points).reshape(3, 3), "layout")
     check_spread(layout, "layout points")
     mean = (layout[0] + layout[1] + layout[2]) / 3
     normal = np.cross(layout[1] - layout[0], layout[2] - layout[0])
@@ -370,12 +368,9 @@ def _batch(points: ArrayLike, count: int) -> FloatArray:
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
     """Cross products of vectors along the first axis."""
-    cross = np.empty_like(a)
-    cross[0], cross[1], cross[2] = (
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    )
+    # Twice over, so that what comes one and two coordinates later is a slice.
+    a, b = np.concatenate([a, a]), np.concatenate([b, b])
+    cross: FloatArray = a[1:4] * b[2:5] - a[2:5] * b[1:4]
     return cross
 
 

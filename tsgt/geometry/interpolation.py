@@ -6,6 +6,7 @@ Paper section III-D: linear interpolation of each prism to common epochs, invali
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,6 +14,8 @@ import numpy as np
 from tsgt.errors import GeometryError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import ArrayLike, NDArray
 
     from tsgt.geometry.rigid import FloatArray
@@ -23,7 +26,7 @@ NO_GAP_NS = -1
 
 @dataclass(frozen=True, slots=True)
 class Interpolated:
-    """One prism at N epochs.
+    """One prism at N epochs, or several.
 
     Attributes
     ----------
@@ -90,20 +93,67 @@ def interpolate(
 
     after = np.searchsorted(times_ns, epochs_ns, side="left")
     bracketed = (after > 0) & (after < len(times_ns))
-    end = after[bracketed]
-    start = end - 1
-    gap_ns = np.full(len(epochs_ns), NO_GAP_NS)
-    gap_ns[bracketed] = times_ns[end] - times_ns[start]
+    return _on_lines(times_ns, points, epochs_ns, after, bracketed, outage_limit_ns)
+
+
+def interpolate_prisms(
+    times_ns: NDArray[np.int64],
+    points: FloatArray,
+    counts: Sequence[int],
+    epochs_ns: NDArray[np.int64],
+    outage_limit_ns: int,
+) -> Interpolated:
+    """Do for P prisms at once what :func:`interpolate` does for one, and trust that the samples are in order.
+
+    Parameters
+    ----------
+    times_ns
+        Times of all samples in ns, prism after prism, those of each strictly increasing, shape (M,).
+    points
+        Positions of the samples in m, shape (M, 3).
+    counts
+        How many each of the P prisms has.
+    epochs_ns
+        Times to interpolate to in ns, shape (N,), in any order.
+    outage_limit_ns
+        As for one.
+
+    Returns
+    -------
+    Interpolated
+        Shapes have a P after the N. ``after`` counts the samples of all prisms, one prism after the other.
+    """
+    after = np.empty((len(epochs_ns), len(counts)), dtype=np.int64)
+    bounds = list(accumulate(counts, initial=0))
+    for column, (start, end) in enumerate(pairwise(bounds)):
+        after[:, column] = start + times_ns[start:end].searchsorted(epochs_ns)
+    bracketed = (after > bounds[:-1]) & (after < bounds[1:])
+    return _on_lines(times_ns, points, epochs_ns[:, None], after, bracketed, outage_limit_ns)
+
+
+def _on_lines(
+    times_ns: NDArray[np.int64],
+    points: FloatArray,
+    epochs_ns: NDArray[np.int64],
+    after: NDArray[np.int64],
+    bracketed: NDArray[np.bool_],
+    outage_limit_ns: int,
+) -> Interpolated:
+    """Interpolate between each epoch's two samples, where it has them."""
+    # Where one is missing, any two stand in: nothing of them is kept.
+    if not len(times_ns):
+        times_ns, points = np.zeros(1, dtype=np.int64), np.zeros((1, 3))
+    start, end = np.where(bracketed, (after - 1, after), 0)
+    start_ns = times_ns[start]
+    gap_ns = np.where(bracketed, times_ns[end] - start_ns, NO_GAP_NS)
     # Differences of integers first: a Unix time in ns is beyond what a float64 resolves.
-    fraction = np.zeros(len(epochs_ns))
-    fraction[bracketed] = (epochs_ns[bracketed] - times_ns[start]) / gap_ns[bracketed]
+    fraction = np.where(bracketed, (epochs_ns - start_ns) / gap_ns, 0.0)
     valid = bracketed & (gap_ns <= outage_limit_ns)
 
-    end, before = after[valid], points[after[valid] - 1]
+    before = points[start]
     steps = points[end] - before
-    at_epochs, velocities_mps = np.zeros((2, len(epochs_ns), 3))
-    at_epochs[valid] = before + fraction[valid, None] * steps
-    velocities_mps[valid] = steps / (gap_ns[valid, None] * 1e-9)
+    at_epochs = np.where(valid[..., None], before + fraction[..., None] * steps, 0.0)
+    velocities_mps = np.where(valid[..., None], steps / (gap_ns[..., None] * 1e-9), 0.0)
     return Interpolated(at_epochs, velocities_mps, after, fraction, gap_ns, valid)
 
 
@@ -115,16 +165,16 @@ def interpolated_covariance(
     Parameters
     ----------
     cov_before, cov_after
-        Covariances of the two samples in m^2, shape (N, 3, 3).
+        Covariances of the two samples in m^2, shape (..., 3, 3).
     fraction
-        Where the epoch lies between them, 0 to 1, shape (N,).
+        Where the epoch lies between them, 0 to 1, shape (...).
 
     Returns
     -------
     FloatArray
-        Shape (N, 3, 3), in m^2.
+        Shape (..., 3, 3), in m^2.
     """
-    f = fraction[:, None, None]
+    f = fraction[..., None, None]
     covariance: FloatArray = (1 - f) ** 2 * cov_before + f**2 * cov_after
     return covariance
 
@@ -135,14 +185,14 @@ def unseen_s2(fraction: FloatArray, gap_ns: NDArray[np.int64]) -> FloatArray:
     Parameters
     ----------
     fraction
-        Where the epoch lies between two samples, 0 to 1, shape (N,).
+        Where the epoch lies between two samples, 0 to 1, of any shape.
     gap_ns
-        Time between the two in ns, shape (N,).
+        Time between the two in ns, of the same shape.
 
     Returns
     -------
     FloatArray
-        Shape (N,), in m per m/s^2, for an acceleration that is constant between the samples.
+        Of the same shape, in m per m/s^2, for an acceleration that is constant between the samples.
     """
     gap_s = np.asarray(gap_ns) * 1e-9
     missed: FloatArray = (fraction * gap_s) * ((1 - fraction) * gap_s) / 2

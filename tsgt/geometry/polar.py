@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.errors import GeometryError
+from tsgt.geometry.rigid import IDENTITY
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -189,16 +190,16 @@ def measurement_covariance(
     along = noise.range_sigma_m**2 + (noise.range_sigma_ppm * 1e-6 * distance_m) ** 2
     across = (noise.angle_sigma_rad * distance_m) ** 2
     outer = direction[..., :, None] * direction[..., None, :]
-    isotropic = (across + noise.pointing_sigma_m**2)[..., None, None] * np.eye(3)
+    isotropic = (across + noise.pointing_sigma_m**2)[..., None, None] * IDENTITY
     return isotropic + (along - across)[..., None, None] * outer
 
 
 def _direction(horizontal_angle_rad: ArrayLike, zenith_angle_rad: ArrayLike) -> FloatArray:
     """Give the unit vector of the line of sight in the station frame, shape (..., 3)."""
-    h, z = np.broadcast_arrays(
-        np.asarray(horizontal_angle_rad, dtype=np.float64), np.asarray(zenith_angle_rad, dtype=np.float64)
-    )
-    direction = np.empty((*h.shape, 3))
+    h = np.asarray(horizontal_angle_rad, dtype=np.float64)
+    z = np.asarray(zenith_angle_rad, dtype=np.float64)
     sin_z = np.sin(z)
-    direction[..., 0], direction[..., 1], direction[..., 2] = sin_z * np.cos(h), -sin_z * np.sin(h), np.cos(z)
+    x = sin_z * np.cos(h)
+    direction = np.empty((*x.shape, 3))
+    direction[..., 0], direction[..., 1], direction[..., 2] = x, -sin_z * np.sin(h), np.cos(z)
     return direction

@@ -108,14 +108,12 @@ def pose_covariance(layout: FloatArray, rotation: FloatArray, prism_covariances:
     FloatArray
         Shape (N, 6, 6), symmetric: (x, y, z of the robot's origin in m, rotation about the world's axes in rad).
     """
-    from_robot, to_robot = rotation[:, None], np.swapaxes(rotation, 1, 2)[:, None]
-    gain = _layout_gain(layout)
+    from_robot = rotation[:, None, None]
+    gain = _layout_gain(layout).reshape(-1, 2, 3, 3)  # that of the translation, that of the rotation
     # The gain is constant in the robot frame; displacements go there, translation and rotation come back.
-    in_world = np.concatenate(
-        [from_robot @ gain[:, :3] @ to_robot, from_robot @ gain[:, 3:] @ to_robot], axis=2
-    )
-    covariance = _over_prisms(in_world @ prism_covariances @ np.swapaxes(in_world, 2, 3))
-    return 0.5 * (covariance + np.swapaxes(covariance, 1, 2))
+    in_world = (from_robot @ gain @ from_robot.swapaxes(-2, -1)).reshape(*prism_covariances.shape[:2], 6, 3)
+    covariance = _over_prisms(in_world @ prism_covariances @ in_world.swapaxes(2, 3))
+    return 0.5 * (covariance + covariance.swapaxes(1, 2))
 
 
 def unseen_motion_covariance(
@@ -151,19 +149,14 @@ def unseen_motion_covariance(
     FloatArray
         Shape (N, 6, 6), in the order and axes of :func:`pose_covariance`, to which it adds.
     """
-    unseen = unseen[:, :, None, None]
-    straight, turning = (
-        _over_prisms(unseen * _layout_gain(layout)),
-        _over_prisms(unseen * _turning_gain(layout)),
-    )
+    effects = _over_prisms(unseen[:, :, None, None, None] * _acceleration_gains(layout))
+    # From the robot frame, in which the gains are constant, to the world: translation and rotation, each by itself.
+    blocks = effects.reshape(-1, 2, 2, 3, 3)
+    in_world = (rotation[:, None, None] @ blocks).reshape(effects.shape)
+    covariances = in_world @ np.ascontiguousarray(in_world.swapaxes(2, 3))
     covariance = np.zeros((len(rotation), 6, 6))
-    for sigma, effect in (
-        (acceleration_sigma_mps2, straight),
-        (angular_acceleration_sigma_radps2, turning),
-    ):
-        # From the robot frame, in which the gains are constant, to the world.
-        in_world = np.concatenate([rotation @ effect[:, :3], rotation @ effect[:, 3:]], axis=1)
-        covariance += sigma**2 * (in_world @ np.ascontiguousarray(np.swapaxes(in_world, 1, 2)))
+    covariance += acceleration_sigma_mps2**2 * covariances[:, 0]
+    covariance += angular_acceleration_sigma_radps2**2 * covariances[:, 1]
     return covariance
 
 
@@ -246,16 +239,17 @@ def _layout_gain(layout: FloatArray) -> FloatArray:
     return _gains(np.asarray(layout, dtype=np.float64).tobytes())[0]
 
 
-def _turning_gain(layout: FloatArray) -> FloatArray:
-    """Gain of the robot's angular acceleration by way of each prism, in the robot frame; shape (P, 6, 3)."""
+def _acceleration_gains(layout: FloatArray) -> FloatArray:
+    """Gains of the robot's acceleration and of its angular acceleration by way of each prism, in the robot frame; shape (P, 2, 6, 3)."""
     return _gains(np.asarray(layout, dtype=np.float64).tobytes())[1]
 
 
 @lru_cache(maxsize=16)
 def _gains(layout: bytes) -> tuple[FloatArray, FloatArray]:
-    """Both gains of a layout; a robot keeps its own for years, and they cost more than all else of a single pose."""
+    """All gains of a layout; a robot keeps its own for years, and they cost more than all else of a single pose."""
     prisms = np.frombuffer(layout).reshape(-1, 3)
     gain = fit_gain(prisms, np.ones(len(prisms)))
     turning = gain @ skew(prisms - prisms.mean(axis=0))
-    gain.flags.writeable = turning.flags.writeable = False
-    return gain, turning
+    both = np.stack([gain, turning], axis=1)
+    gain.flags.writeable = both.flags.writeable = False
+    return gain, both

@@ -185,7 +185,7 @@ def transform_from(R: FloatArray, t: FloatArray) -> FloatArray:
         Transforms, shape (..., 4, 4): ``p_a = R p_b + t``.
     """
     R, t = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64)
-    T = np.zeros((*np.broadcast_shapes(R.shape[:-2], t.shape[:-1]), 4, 4))
+    T = np.zeros((*np.broadcast(R[..., 0, 0], t[..., 0]).shape, 4, 4))
     T[..., :3, :3] = R
     T[..., :3, 3] = t
     T[..., 3, 3] = 1.0

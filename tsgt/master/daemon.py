@@ -68,7 +68,7 @@ async def run_master(
     clock: Clock,
     key: bytes | None = None,
     random_bits: Callable[[int], int] = secrets.randbits,
-    observe: Callable[[object], None] = lambda _record: None,
+    observe: Callable[[object, bytes], None] = lambda _record, _line: None,
     write: Callable[[int, memoryview], int] | None = None,
 ) -> None:
     """Collect, compute, stream and record until cancelled.
@@ -90,7 +90,7 @@ async def run_master(
     random_bits
         Returns so many random bits: for nonces.
     observe
-        Sees every record that goes out, in their order: for simulations and tests.
+        Sees every record that goes out with its line, in their order: for simulations and tests.
     write
         See :class:`~tsgt.recording.RecordingWriter`.
 
@@ -111,7 +111,7 @@ async def run_master(
         def hand_out(record: object, line: bytes) -> None:
             disk.put(line)
             server.publish(line)
-            observe(record)
+            observe(record, line)
 
         header = RecordingHeader(
             software=f"tsgt {tsgt.__version__}", created_ns=start_ns, source="tsgt-master"
@@ -289,13 +289,17 @@ class _FrameWatcher:
 
     def __init__(self, config: FrameWatchConfig, parameters: Parameters) -> None:
         self._watch = FrameWatch(config, parameters.pipeline.period_ns)
-        pipeline = replace(parameters.pipeline, estimator="linear")
-        self._linear = Feed(replace(parameters, pipeline=pipeline))
+        self._linear: Feed | None = None  # of its own, unless those that go out are the same
+        if parameters.pipeline.estimator != "linear":
+            pipeline = replace(parameters.pipeline, estimator="linear")
+            self._linear = Feed(replace(parameters, pipeline=pipeline))
 
-    def pose(self, record: PoseRecord, now_ns: int) -> Sequence[EventRecord]:  # noqa: ARG002 (it has its own)
-        return ()
+    def pose(self, record: PoseRecord, now_ns: int) -> Sequence[EventRecord]:
+        return self._watch.pose(record, now_ns) if self._linear is None else ()
 
     def measurement(self, record: Measurement) -> Sequence[EventRecord]:
+        if self._linear is None:
+            return ()
         poses = (found for found in self._linear.measurement(record) if isinstance(found, PoseRecord))
         return [event for pose in poses for event in self._watch.pose(pose, record.received_ns)]
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from tsgt.geometry import (
     check_layout,
-    interpolate,
+    interpolate_prisms,
     interpolated_covariance,
     pose_covariance,
     poses_from_prisms,
@@ -188,45 +188,46 @@ class Pipeline:
 
     def _poses(self, epochs_ns: NDArray[np.int64]) -> PoseBatch:
         batch = PoseBatch.blank(epochs_ns, self._prisms)
-        interpolated = []
-        for column, prism in enumerate(self._prisms):
-            track = self._tracks[prism]
-            between = interpolate(track.times_ns, track.points_m, epochs_ns, self._limits.outage_limit_ns)
-            interpolated.append(between)
-            self._describe(batch, column, prism, between)
+        tracks = [self._tracks[prism] for prism in self._prisms]
+        samples = Track.joined(tracks)
+        between = interpolate_prisms(
+            samples.times_ns,
+            samples.points_m,
+            [len(track) for track in tracks],
+            epochs_ns,
+            self._limits.outage_limit_ns,
+        )
+        self._describe(batch, tracks, between)
         batch.reason[:] = batch.prism_reason.max(axis=1)
 
-        usable_rows = np.flatnonzero(batch.reason == Reason.VALID)
+        usable_rows = np.flatnonzero(batch.valid)
         if len(usable_rows):
-            self._fit(batch, usable_rows, interpolated)
+            self._fit(batch, usable_rows, samples, between)
         return batch
 
-    def _describe(self, batch: PoseBatch, column: int, prism: int, between: Interpolated) -> None:
-        """Fill in what one prism's track says: its reason, its station, the age of its last measurement."""
-        track, epochs_ns = self._tracks[prism], batch.stamp_ns
-        latest = np.searchsorted(track.times_ns, epochs_ns, side="right") - 1
-        seen = latest >= 0
-        batch.station[:, column] = self._home_station.get(prism, 0)
-        batch.station[seen, column] = track.stations[latest[seen]]
-        batch.age_s[seen, column] = (epochs_ns[seen] - track.times_ns[latest[seen]]) / 1e9
-        batch.prism_reason[~between.valid, column] = Reason.OUTAGE
-        if self._unusable_ns[prism]:
-            unusable_ns = np.sort(np.array(self._unusable_ns[prism], dtype=np.int64))
-            newest = np.searchsorted(unusable_ns, epochs_ns, side="right") - 1
-            since_ns = np.where(seen, track.times_ns[latest] if len(track) else 0, -(2**63))
-            spoilt = ~between.valid & (newest >= 0) & (unusable_ns[newest] > since_ns)
-            batch.prism_reason[spoilt, column] = Reason.STATION_STATUS
+    def _describe(self, batch: PoseBatch, tracks: Sequence[Track], between: Interpolated) -> None:
+        """Fill in what each prism's track says: its reason, its station, the age of its last measurement."""
+        epochs_ns = batch.stamp_ns
+        batch.prism_reason[~between.valid] = Reason.OUTAGE
+        for column, (prism, track) in enumerate(zip(self._prisms, tracks, strict=True)):
+            latest = track.times_ns.searchsorted(epochs_ns, side="right") - 1
+            seen = latest >= 0
+            batch.station[:, column] = self._home_station.get(prism, 0)
+            batch.station[seen, column] = track.stations[latest[seen]]
+            batch.age_s[seen, column] = (epochs_ns[seen] - track.times_ns[latest[seen]]) / 1e9
+            lost = ~between.valid[:, column]
+            if self._unusable_ns[prism] and lost.any():
+                unusable_ns = np.sort(np.array(self._unusable_ns[prism], dtype=np.int64))
+                newest = np.searchsorted(unusable_ns, epochs_ns, side="right") - 1
+                since_ns = np.where(seen, track.times_ns[latest] if len(track) else 0, -(2**63))
+                spoilt = lost & (newest >= 0) & (unusable_ns[newest] > since_ns)
+                batch.prism_reason[spoilt, column] = Reason.STATION_STATUS
 
-    def _fit(self, batch: PoseBatch, rows: NDArray[np.intp], interpolated: Sequence[Interpolated]) -> None:
+    def _fit(self, batch: PoseBatch, rows: NDArray[np.intp], samples: Track, between: Interpolated) -> None:
         """Fit the layout to the prisms at the rows where all of them are known."""
-        shape = len(rows), len(self._prisms)
-        points, velocities = np.empty((2, *shape, 3))
-        covariances, unseen = np.empty((*shape, 3, 3)), np.empty(shape)
-        for column, (prism, between) in enumerate(zip(self._prisms, interpolated, strict=True)):
-            points[:, column] = between.points[rows]
-            velocities[:, column] = between.velocities_mps[rows]
-            covariances[:, column] = self._prism_covariance(self._tracks[prism], between, rows)
-            unseen[:, column] = unseen_s2(between.fraction[rows], between.gap_ns[rows])
+        points, velocities = between.points[rows], between.velocities_mps[rows]
+        covariances = _interpolated_covariances(samples, between, rows)
+        unseen = unseen_s2(between.fraction[rows], between.gap_ns[rows])
         poses = poses_from_prisms(self._layout, points)
         batch.reason[rows[poses.degenerate]] = Reason.DEGENERATE_GEOMETRY
         fitted = ~poses.degenerate
@@ -250,15 +251,19 @@ class Pipeline:
         batch.reason[rows[rotation[:, 2, 2] <= math.cos(self._limits.tilt_limit_rad)]] = Reason.TILT
         batch.reason[rows[residual > self._limits.residual_limit_m]] = Reason.RESIDUAL
 
-    def _prism_covariance(
-        self, track: Track, between: Interpolated, rows: NDArray[np.intp]
-    ) -> NDArray[np.float64]:
-        """(R, 3, 3) covariance of interpolated positions: noise of the instruments and uncertain instants."""
-        after, fraction = between.after[rows], between.fraction[rows]
-        covariance = interpolated_covariance(
-            track.covariances_m2[after - 1], track.covariances_m2[after], fraction
-        )
-        sigmas_s = track.time_sigmas_ns / 1e9
-        time_variance = (1.0 - fraction) ** 2 * sigmas_s[after - 1] ** 2 + fraction**2 * sigmas_s[after] ** 2
-        velocity = between.velocities_mps[rows]
-        return np.add(covariance, time_variance[:, None, None] * velocity[:, :, None] * velocity[:, None, :])
+
+def _interpolated_covariances(
+    samples: Track, between: Interpolated, rows: NDArray[np.intp]
+) -> NDArray[np.float64]:
+    """(R, P, 3, 3) covariances of interpolated positions: noise of the instruments and uncertain instants."""
+    after, fraction = between.after[rows], between.fraction[rows]
+    before = after - 1
+    covariance = interpolated_covariance(
+        samples.covariances_m2[before], samples.covariances_m2[after], fraction
+    )
+    sigmas_s = samples.time_sigmas_ns / 1e9
+    time_variance = (1.0 - fraction) ** 2 * sigmas_s[before] ** 2 + fraction**2 * sigmas_s[after] ** 2
+    velocity = between.velocities_mps[rows]
+    return np.add(
+        covariance, time_variance[..., None, None] * velocity[..., :, None] * velocity[..., None, :]
+    )

@@ -122,7 +122,7 @@ class PoseBatch:
         n, p = len(stamp_ns), len(prisms)
         return cls(
             stamp_ns=stamp_ns,
-            kind=np.full(n, kind, np.int8),
+            kind=np.full(n, int(kind), np.int8),
             reason=np.zeros(n, np.int8),
             position_m=np.full((n, 3), np.nan),
             orientation_xyzw=np.full((n, 4), np.nan),
@@ -158,7 +158,7 @@ class PoseBatch:
     @property
     def valid(self) -> NDArray[np.bool_]:
         """(N,) whether a pose may be used."""
-        return np.equal(self.reason, Reason.VALID)
+        return np.equal(self.reason, int(Reason.VALID))
 
     def invalid_counts(self) -> dict[str, int]:
         """Count the poses that are not valid, by the word of their reason, the commonest first."""

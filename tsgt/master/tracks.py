@@ -58,6 +58,17 @@ class Track:
         none = np.empty(0, dtype=np.int64)
         return cls(none, np.empty((0, 3)), np.empty((0, 3, 3)), none, none)
 
+    @classmethod
+    def joined(cls, tracks: Sequence[Track]) -> Track:
+        """Put tracks one after the other, at least one; only in the order given."""
+        return cls(
+            np.concatenate([track.times_ns for track in tracks]),
+            np.concatenate([track.points_m for track in tracks]),
+            np.concatenate([track.covariances_m2 for track in tracks]),
+            np.concatenate([track.time_sigmas_ns for track in tracks]),
+            np.concatenate([track.stations for track in tracks]),
+        )
+
     def __len__(self) -> int:
         return len(self.times_ns)
 
@@ -69,13 +80,7 @@ class Track:
         """
         if not len(self) and len(other) <= 1:
             return other
-        joined = Track(
-            np.concatenate([self.times_ns, other.times_ns]),
-            np.concatenate([self.points_m, other.points_m]),
-            np.concatenate([self.covariances_m2, other.covariances_m2]),
-            np.concatenate([self.time_sigmas_ns, other.time_sigmas_ns]),
-            np.concatenate([self.stations, other.stations]),
-        )
+        joined = Track.joined([self, other])
         if (joined.times_ns[1:] > joined.times_ns[:-1]).all():
             return joined
         ordered = joined.select(np.lexsort((joined.stations, joined.times_ns)))
@@ -95,6 +100,8 @@ class Track:
             self.stations[rows],
         )
 
+
+_EMPTY = Track.empty()
 
 FARTHEST_M = 100_000.0
 """No total station measures so far, and no robot drives there: numbers beyond are garbage."""
@@ -143,7 +150,7 @@ def build_tracks(parameters: Parameters, measurements: Iterable[Measurement]) ->
         One track per prism of the layout, an empty one where nothing was measured.
     """
     stations = {station.station: station for station in parameters.stations}
-    tracks = {prism.prism: Track.empty() for prism in parameters.prisms}
+    tracks = dict.fromkeys((prism.prism for prism in parameters.prisms), _EMPTY)
     groups: dict[tuple[int, int, type], list[Measurement]] = defaultdict(list)
     for measurement in measurements:
         station = stations.get(measurement.station)
@@ -168,14 +175,15 @@ def _track_of(station: StationParameters, measurements: Sequence[Measurement]) -
         np.array([m.stamp_sigma_ns for m in polar] or [0] * len(measurements), dtype=np.int64),
         np.full(len(measurements), station.station, dtype=np.int64),
     )
-    return Track.empty().merged(track)
+    return _EMPTY.merged(track)
 
 
 def _from_polar(
     station: StationParameters, measurements: Sequence[PolarMeasurement]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    raw = np.array([(m.horizontal_angle_rad, m.zenith_angle_rad, m.slope_distance_m) for m in measurements])
-    horizontal, zenith, slope = (np.ascontiguousarray(column) for column in raw.T)
+    horizontal = np.array([m.horizontal_angle_rad for m in measurements])
+    zenith = np.array([m.zenith_angle_rad for m in measurements])
+    slope = np.array([m.slope_distance_m for m in measurements], dtype=np.float64)
     distance = corrected_distance(slope, constant_m=station.prism_constant_m, ppm=station.atmospheric_ppm)
     frame = np.array(station.T_station1_station)
     rotation = frame[:3, :3]

@@ -34,6 +34,10 @@ RESET_WAIT_NS = 10_000_000
 MODE_WAIT_NS = 1_000_000
 """From a change of mode until it is checked; the oscillator takes 0.25 ms to start."""
 
+# Plain integers: members of IntFlag are slow to combine.
+_RX_DONE = int(Irq.RX_DONE)
+_TX_DONE = int(Irq.TX_DONE)
+_CRC_ERROR = int(Irq.PAYLOAD_CRC_ERROR)
 _ABSENT = 0xFF  # what an open MISO line reads as; no state of the chip has all flags set
 
 
@@ -158,11 +162,11 @@ class Chip:
 
     def packet_sent(self) -> bool:
         """Whether TxDone is set."""
-        return bool(self._flags() & Irq.TX_DONE)
+        return bool(self._flags() & _TX_DONE)
 
     def packet_waits(self) -> bool:
         """Whether RxDone is set."""
-        return bool(self._flags() & Irq.RX_DONE)
+        return bool(self._flags() & _RX_DONE)
 
     def take_packet(self) -> Arrival | None:
         """Read the packet that waits, if there is one, and clear its flags."""
@@ -173,7 +177,7 @@ class Chip:
             return status[register - first]
 
         flags = value(Register.IRQ_FLAGS)
-        if flags == _ABSENT or not flags & Irq.RX_DONE:
+        if flags == _ABSENT or not flags & _RX_DONE:
             return None
         self._registers.write(Register.IRQ_FLAGS, flags)
         self._registers.write(Register.FIFO_ADDR_PTR, value(Register.FIFO_RX_CURRENT_ADDR))
@@ -185,7 +189,7 @@ class Chip:
         return Arrival(
             payload=self._registers.read_burst(Register.FIFO, value(Register.RX_NB_BYTES)),
             has_crc=bool(value(Register.HOP_CHANNEL) & reg.CRC_ON_PAYLOAD),
-            crc_wrong=bool(flags & Irq.PAYLOAD_CRC_ERROR),
+            crc_wrong=bool(flags & _CRC_ERROR),
             rssi_dbm=rssi_dbm,
             snr_db=snr_db,
         )

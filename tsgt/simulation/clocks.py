@@ -123,16 +123,20 @@ class DriftingClock:
 
     def local_ns(self, true_ns: int) -> int:
         """Return what CLOCK_MONOTONIC shows at a true time, both in nanoseconds."""
-        index = bisect_right(self._stretches, true_ns, key=itemgetter(0)) - 1
-        stretch = self._stretches[max(0, index)]
+        stretch = self._stretches[-1]
+        if true_ns < stretch.true_ns:  # seldom
+            index = bisect_right(self._stretches, true_ns, key=itemgetter(0)) - 1
+            stretch = self._stretches[max(0, index)]
         passed_ns = true_ns - stretch.true_ns
         # The product alone is rounded: times of days keep their nanoseconds.
         return stretch.local_ns + passed_ns + round(passed_ns * stretch.ppm * 1e-6)
 
     def true_ns(self, local_ns: int) -> int:
         """Return the first true time at which CLOCK_MONOTONIC shows at least this, both in nanoseconds."""
-        index = bisect_right(self._stretches, local_ns, key=itemgetter(1)) - 1
-        stretch = self._stretches[max(0, index)]
+        stretch = self._stretches[-1]
+        if local_ns < stretch.local_ns:
+            index = bisect_right(self._stretches, local_ns, key=itemgetter(1)) - 1
+            stretch = self._stretches[max(0, index)]
         passed_ns = local_ns - stretch.local_ns
         gained_ns = passed_ns * stretch.ppm * 1e-6 / (1 + stretch.ppm * 1e-6)
         true_ns = stretch.true_ns + passed_ns - round(gained_ns)

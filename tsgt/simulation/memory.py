@@ -30,9 +30,13 @@ _PACKAGES = ("tsgt.master.", "tsgt.radio.", "tsgt.station.", "tsgt.recording.", 
 def overgrown() -> tuple[str, ...]:
     """Look at all objects of the daemons that live in this process, one line for each that has too much in it."""
     found = []
+    kinds: dict[type, bool] = {}  # whether it is one of a daemon's
     for thing in gc.get_objects():
         kind = type(thing)
-        if not str(kind.__module__).startswith(_PACKAGES):
+        ours = kinds.get(kind)
+        if ours is None:
+            ours = kinds[kind] = str(kind.__module__).startswith(_PACKAGES)
+        if not ours:
             continue
         names = getattr(thing, "__dict__", None) or [
             name for base in kind.__mro__ for name in getattr(base, "__slots__", ())

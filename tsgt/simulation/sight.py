@@ -112,7 +112,7 @@ class Sight:
         return None
 
     def _points(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        inside_s = np.clip(times_s, 0.0, self._world.duration_s)
+        inside_s = np.minimum(np.maximum(times_s, 0.0), self._world.duration_s)
         return transform_points(self._T_station_station1, self._world.prism_at(inside_s, self._row))
 
     def _block(self, step: int) -> _Block:

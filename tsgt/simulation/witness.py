@@ -11,7 +11,7 @@ import numpy as np
 
 from tsgt.master.stream_records import BeaconRecord, ClockRecord, Kind, PoseRecord, StatusRecord
 from tsgt.model import PolarMeasurement
-from tsgt.recording import decode_line, encode_line, read_lines
+from tsgt.recording import decode_line, read_lines
 from tsgt.recording.journal import AcknowledgedRecord, load_journal
 from tsgt.simulation.disk import UNWRITTEN_NS
 
@@ -125,9 +125,9 @@ class Session:
         self._pose_kinds = array("b")
         self._pose_numbers = array("d")
 
-    def take(self, record: object) -> None:
-        """Take a record that goes out."""
-        self.lines.append(hash(encode_line(record)))
+    def take(self, record: object, line: bytes) -> None:
+        """Take a record that goes out, and its line."""
+        self.lines.append(hash(line))
         if isinstance(record, PolarMeasurement):
             self.measurements.append(record)
             self.arrived_ns.append(self._now_ns())

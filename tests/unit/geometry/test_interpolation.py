@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tsgt.errors import GeometryError
-from tsgt.geometry import NO_GAP_NS, interpolate, interpolated_covariance, unseen_s2
+from tsgt.geometry import NO_GAP_NS, interpolate, interpolate_prisms, interpolated_covariance, unseen_s2
 
 SECOND_NS = 1_000_000_000
 START_NS = 1_647_269_269_671_000_000
@@ -80,6 +80,20 @@ def test_fewer_than_two_samples_bracket_nothing(count: int) -> None:
     found = interpolate(TIMES_NS[:count], POINTS[:count], TIMES_NS, SECOND_NS)
     assert not found.valid.any()
     assert (found.gap_ns == NO_GAP_NS).all()
+
+
+@pytest.mark.parametrize("counts", [(5, 2, 3), (0, 5, 1), (0, 0, 0)])
+def test_several_prisms_at_once_are_each_as_alone(counts: tuple[int, ...]) -> None:
+    """Prisms with samples of their own, some with none, come out bit for bit as one by one."""
+    epochs_ns = np.sort(np.concatenate([TIMES_NS, TIMES_NS + 1, TIMES_NS - 1]))
+    times_ns = np.concatenate([TIMES_NS[:count] for count in counts])
+    points = np.concatenate([POINTS[:count] * (number + 1) for number, count in enumerate(counts)])
+    together = interpolate_prisms(times_ns, points, counts, epochs_ns, SECOND_NS)
+    for number, count in enumerate(counts):
+        alone = interpolate(TIMES_NS[:count], POINTS[:count] * (number + 1), epochs_ns, SECOND_NS)
+        for name in ("points", "velocities_mps", "fraction", "gap_ns", "valid"):
+            np.testing.assert_array_equal(getattr(together, name)[:, number], getattr(alone, name))
+        np.testing.assert_array_equal(together.after[:, number] - sum(counts[:number]), alone.after)
 
 
 def test_no_epochs_give_nothing() -> None:

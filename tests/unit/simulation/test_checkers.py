@@ -281,5 +281,6 @@ def test_poses_that_state_too_little(run: Run, part: slice, monkeypatch: pytest.
 
 def test_a_line_that_was_streamed_but_not_recorded(run: Run) -> None:
     """The replay of a recording that lacks a line is not the stream."""
-    run.sessions[0].take(EventRecord(stamp_ns=1, event="planted", message="not in the recording"))
+    planted = EventRecord(stamp_ns=1, event="planted", message="not in the recording")
+    run.sessions[0].take(planted, encode_line(planted))
     assert _checks(run) == {"replay"}

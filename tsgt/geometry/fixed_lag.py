@@ -104,6 +104,7 @@ class FixedLag:
         self._anchor: Anchor | None = None
         self._settled = False
         self._doubted: frozenset[int] = frozenset()
+        self._begun_s = np.inf
         self._solved: tuple[Knots, BlockFactor] | None = None
         self._trajectory: Trajectory | None = None
         self._end: Ahead | None = None
@@ -124,6 +125,15 @@ class FixedLag:
     def settled(self) -> bool:
         """Whether it can be believed: it is known well enough, and explains what was measured."""
         return self._settled
+
+    @property
+    def begun_s(self) -> float:
+        """When the last measurement was made from which a trajectory was found anew, infinite before the first one.
+
+        Where each prism was seen once or twice, the robot may lie the other way about the line through two of them and move
+        otherwise. What comes later tells that for what comes later, not for what was before a gap.
+        """
+        return self._begun_s
 
     @property
     def doubtful(self) -> bool:
@@ -210,7 +220,7 @@ class FixedLag:
 
     def _begin(self, observations: Observations) -> None:
         """Find the trajectory of all measurements of the window, knowing nothing else."""
-        self._settled, self._doubted = False, frozenset()
+        self._settled, self._doubted = False, frozenset(observations.prism.tolist())
         if np.count_nonzero(np.bincount(observations.prism) >= 2) < 3:
             raise GeometryError("to begin with, three prisms have to be measured twice")
         guess = first_guess(observations, knot_times(observations.time_s))
@@ -219,6 +229,7 @@ class FixedLag:
         if self._settled:
             assert self._knots is not None  # noqa: S101 (it is settled)
             self._anchor = Anchor(self._knots.select(slice(0, 1)), np.diag(_AS_GOOD_AS_NOTHING**-2.0))
+            self._begun_s = float(observations.time_s[-1])
 
     def _followed(self, held: Observations, new: Observations) -> bool:
         """Add measurements to the trajectory found before; return whether that is still good to follow."""

@@ -157,7 +157,7 @@ class ContinuousPipeline:
     def _predicted(self, epochs_ns: range) -> PoseBatch:
         if not self._window.following:
             return self._poses.predicted(epochs_ns, self._seen, None, _NONE)
-        settled = self._window.settled and not self._window.doubtful
+        settled = np.full(len(epochs_ns), self._window.settled and not self._window.doubtful)
         found = [
             self._window.predict((epoch_ns - self._origin_ns) / 1e9, parts=_POSE) for epoch_ns in epochs_ns
         ]
@@ -176,7 +176,8 @@ class ContinuousPipeline:
         covariance = _NONE
         if self._window.following:
             states, covariance = self._window.trajectory().at((stamp_ns - self._origin_ns) / 1e9, parts=_POSE)
-        poses = self._poses.smoothed(stamp_ns, self._seen, states, covariance, settled=self._window.settled)
+        settled = self._window.settled & ((stamp_ns - self._origin_ns) / 1e9 >= self._window.begun_s)
+        poses = self._poses.smoothed(stamp_ns, self._seen, states, covariance, settled=settled)
         self._next_smoothed_ns = int(stamp_ns[-1]) + self._limits.period_ns
         self._forget()
         return poses

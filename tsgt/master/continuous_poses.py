@@ -111,7 +111,7 @@ class ContinuousPoses:
         states: Knots | None,
         covariance: NDArray[np.float64],
         *,
-        settled: bool = True,
+        settled: NDArray[np.bool_] | None = None,
     ) -> PoseBatch:
         """Make poses from measurements before their epochs; arguments and result as those of :meth:`smoothed`.
 
@@ -135,7 +135,7 @@ class ContinuousPoses:
         states: Knots | None,
         covariance: NDArray[np.float64],
         *,
-        settled: bool = True,
+        settled: NDArray[np.bool_] | None = None,
     ) -> PoseBatch:
         """Make poses from measurements on both sides of their epochs.
 
@@ -149,7 +149,7 @@ class ContinuousPoses:
             The trajectory of the prisms' middle at the epochs, and the covariance of the errors of its place and
             rotation, (N, 6, 6) or more of them; None where there is none.
         settled
-            Whether the trajectory can be believed; no pose is valid of one that cannot.
+            (N,) whether the trajectory can be believed there; no pose is valid where not. Everywhere when not given.
 
         Returns
         -------
@@ -211,7 +211,12 @@ class ContinuousPoses:
         )
 
     def _judged(
-        self, batch: PoseBatch, states: Knots | None, covariance: NDArray[np.float64], *, settled: bool
+        self,
+        batch: PoseBatch,
+        states: Knots | None,
+        covariance: NDArray[np.float64],
+        *,
+        settled: NDArray[np.bool_] | None = None,
     ) -> PoseBatch:
         """Fill in the poses of which anything is known, and say which may not be used, and why."""
         missing = batch.prism_reason.max(axis=1)
@@ -243,8 +248,8 @@ class ContinuousPoses:
         uncertain |= sigma_rad > limits.rotation_sigma_limit_rad
         batch.reason[rotation[:, 2, 2] <= math.cos(limits.tilt_limit_rad)] = Reason.TILT
         batch.reason[batch.residual_m > limits.residual_limit_m] = Reason.RESIDUAL
-        if not settled:
-            batch.reason[batch.reason == Reason.VALID] = Reason.UNCERTAIN
+        if settled is not None:
+            batch.reason[~settled & (batch.reason == Reason.VALID)] = Reason.UNCERTAIN
         if uncertain.any():
             batch.reason[uncertain] = np.where(missing, missing, Reason.UNCERTAIN)[uncertain]
         return batch

@@ -8,7 +8,7 @@ until the reply has come or cannot come any more.
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum, auto
 from typing import TYPE_CHECKING, Final
 
@@ -35,6 +35,7 @@ _TRIES: Final = 3
 _ATTENTION_S: Final = 1.0  # above the longest pause of an instrument that does well, 0.7 s
 _PROBE_S: Final = 0.5  # two in turn, so that the wanted speed is tried every second
 _ABORT_S: Final = 5.0  # a telescope that turns has to stop
+_BEHIND_S: Final = 4.0  # hardly anything but a search takes longer
 _PAUSE_S: Final = 0.05
 _WAKING_S: Final = 0.5
 
@@ -104,15 +105,18 @@ class Reply:
 class _Failure(Enum):
     SILENCE = auto()
     DAMAGE = auto()
+    LOST = auto()
 
 
 @dataclass(slots=True)
 class _Pending:
-    """A request whose reply has not come."""
+    """A request whose reply has not come, and the numbers of those that were sent behind it to see whether it still can."""
 
     transaction: int
     sent_ns: int
     until_s: float  # on the event loop's clock
+    ask_s: float  # likewise
+    behind: list[int] = field(default_factory=list)
 
 
 class GeoComConnection:
@@ -189,6 +193,11 @@ class GeoComConnection:
                 self.port.write(_CLEAR)
         if isinstance(got, Reply):
             return got
+        if got is _Failure.LOST:
+            raise InstrumentError(
+                f"{self.port.name}: the instrument's answer to {rpc.name} was lost, or it was switched off and on meanwhile;"
+                " check cable and plugs"
+            )
         what = "no answer" if got is _Failure.SILENCE else "only damaged answers"
         raise InstrumentError(
             f"{self.port.name}: {what} from the instrument to {rpc.name} within {timeout_s:g} s; check cable and plugs"
@@ -256,37 +265,52 @@ class GeoComConnection:
     async def _exchange(
         self, rpc: Rpc, parameters: Sequence[Parameter], timeout_s: float
     ) -> Reply | _Failure:
+        request, now_s = self._request(rpc, parameters), _now_s()
+        sent_ns = self._clock.monotonic_ns()
+        self._pending = _Pending(self._transaction, sent_ns, now_s + timeout_s, now_s + _BEHIND_S)
+        self.port.write(request)
+        return await self._answer(self._pending)
+
+    def _request(self, rpc: Rpc, parameters: Sequence[Parameter]) -> bytes:
         self._transaction = self._transaction % MAX_TRANSACTION + 1
-        request = encode_request(
+        return encode_request(
             rpc,
             parameters,
             transaction=self._transaction,
             checksum=self._checksum,
             decimals=self.decimals,
         )
-        self._pending = _Pending(self._transaction, self._clock.monotonic_ns(), _now_s() + timeout_s)
-        self.port.write(request)
-        return await self._answer(self._pending)
+
+    def _ask_behind(self, pending: _Pending) -> None:
+        """Send a request behind one that takes long. Answers come in turn: once this has its own, the other's is lost."""
+        pending.ask_s = _now_s() + _BEHIND_S
+        self.port.write(_CLEAR + self._request(Rpc.COM_NULL_PROC, ()))
+        pending.behind.append(self._transaction)
 
     async def _answer(self, pending: _Pending) -> Reply | _Failure:
         """Return the reply to a request; it is pending no more then. Nothing is lost when this is cancelled."""
-        try:
-            async with asyncio.timeout_at(pending.until_s):
-                while True:
-                    for line in self._lines.push(await self.port.read()):
-                        got = self._reply(line, pending)
-                        if got is not None:
-                            self._pending = None
-                            return got
-        except TimeoutError:
-            self._pending = None
-            return _Failure.SILENCE
+        while True:
+            try:
+                async with asyncio.timeout_at(min(pending.until_s, pending.ask_s)):
+                    while True:
+                        for line in self._lines.push(await self.port.read()):
+                            got = self._reply(line, pending)
+                            if got is not None:
+                                self._pending = None
+                                return got
+            except TimeoutError:
+                if pending.until_s <= pending.ask_s:  # not by the clock: a timeout may come a little early
+                    self._pending = None
+                    return _Failure.SILENCE
+                self._ask_behind(pending)
 
     def _reply(self, line: StampedLine, pending: _Pending) -> Reply | _Failure | None:
         try:
             reply = decode_reply(line.data, checksum=self._checksum)
         except MessageError:
             return _Failure.DAMAGE
+        if reply.transaction in pending.behind:
+            return _Failure.LOST if not reply.com_code else None
         if reply.transaction != pending.transaction and not (reply.com_code and reply.transaction == 0):
             return None  # it is late, or a second one
         # A line over USB alone has no pace: what comes faster than the stated speed allows still came after the request.

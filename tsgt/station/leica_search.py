@@ -35,11 +35,17 @@ class Finder:
         To the instrument.
     power_search
         Whether it has PowerSearch; else the target recognition looks in the same windows, which takes longer.
+
+    Attributes
+    ----------
+    has_found
+        Whether the search has come upon a prism, and only has to lock in.
     """
 
     def __init__(self, line: GeoComConnection, *, power_search: bool) -> None:
         self._line = line
         self._power_search = power_search
+        self.has_found = False
 
     async def lock(self) -> Lock | None:
         """Ask whether the instrument is locked in on a prism; None where it does not say."""
@@ -71,6 +77,7 @@ class Finder:
         InstrumentError
             It does not answer.
         """
+        self.has_found = False
         await self._ask(Rpc.AUS_SET_USER_LOCK_STATE, 0)
         await self._ask(Rpc.AUS_SET_USER_ATR_STATE, 1)
         if look.sweep and self._power_search:
@@ -86,8 +93,10 @@ class Finder:
                 if not done(await self._ask(Rpc.AUT_SEARCH, *area, timeout_s=_WINDOW_S)):
                     return False
                 width_rad = height_rad = NARROWEST_RAD
+        self.has_found = look.sweep
         if not done(await self._ask(Rpc.AUT_FINE_ADJUST, width_rad, height_rad, 0, timeout_s=_ADJUST_S)):
             return False
+        self.has_found = True
         await self._ask(Rpc.AUS_SET_USER_LOCK_STATE, 1)
         await self._ask(Rpc.AUT_LOCK_IN, timeout_s=_ADJUST_S)
         return await self.lock() is Lock.IN

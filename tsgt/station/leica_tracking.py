@@ -152,7 +152,8 @@ class Tracking:
         if self._lock is Lock.IN and await self._points_at(towards):
             return
         again = self._sequence.restart(towards, self._clock.monotonic_ns())
-        if not again:
+        # While it locks in, it is not sent elsewhere: with an order every few seconds it might never come to an end.
+        if not again and not (self.finder is not None and self.finder.has_found):
             await self.stop_search()
         if self._lock is Lock.IN:
             await self._let_go()

@@ -292,3 +292,14 @@ def test_memory_is_bounded(scene: Scene) -> None:
         pipeline.add(measurement)
         sizes.append(len(pipeline._seen.times_ns))
     assert max(sizes[75:]) <= max(sizes[:75])
+
+
+def test_what_was_before_a_trajectory_began_is_not_valid(scene: Scene) -> None:
+    """From each prism seen twice a robot may be made that lies the other way about; what comes later does not tell."""
+    measurements = every(scene, 8.0)
+    _, smoothed = stream(scene, measurements, 8.0)
+    twice_ns = max([m.stamp_ns for m in measurements if m.prism == prism][1] for prism in (1, 2, 3))
+    assert smoothed.stamp_ns[smoothed.valid].min() >= twice_ns
+    told = np.isfinite(smoothed.position_m[:, 0]) & (smoothed.stamp_ns < twice_ns)
+    assert told.any()
+    assert (smoothed.reason[told] != Reason.VALID).all()

@@ -248,13 +248,39 @@ async def test_an_abortion_that_is_not_answered_brings_the_line_into_step() -> N
         await task
     await connection.abort()
     await echoed(connection, 2)
-    assert now_s() == pytest.approx(6.0 + 2 * ANSWER_S)
+    assert now_s() == pytest.approx(4.0 + 2 * ANSWER_S)
 
 
 async def test_an_abortion_of_nothing_does_no_harm() -> None:
     """The instrument's question mark is nobody's reply."""
     connection, _ = await connected()
     await connection.abort()
+    await echoed(connection, 2)
+
+
+async def test_a_search_whose_answer_was_lost_is_not_waited_for() -> None:
+    """The answer to what was asked behind it comes without the search's own: that will not come any more."""
+    connection, instrument = await connected()
+    instrument.faults.append(silent)
+    with pytest.raises(InstrumentError, match="AUT_PS_SEARCH_WINDOW was lost"):
+        await connection.call(Rpc.AUT_PS_SEARCH_WINDOW, timeout_s=90.0)
+    assert now_s() == pytest.approx(4.0 + ANSWER_S)
+    await echoed(connection, 2)
+
+
+async def test_a_search_that_takes_long_is_waited_for() -> None:
+    """While the instrument searches it answers nothing; what was asked behind it is answered afterwards."""
+    connection, instrument = await connected()
+    port: MemoryPort = connection.port  # type: ignore[assignment]
+    instrument.busy = True
+    task = asyncio.create_task(connection.call(Rpc.AUT_PS_SEARCH_WINDOW, timeout_s=90.0))
+    await asyncio.sleep(20.5)
+    instrument.busy = False
+    asked = [line.split(b",")[2].rstrip(b":").decode() for line in instrument.heard]
+    assert len(asked) == 6
+    for number, transaction in enumerate(asked):
+        port.come(number * ANSWER_S, f"%R1P,0,{transaction}:0\r\n".encode())
+    assert (await task).code == 0
     await echoed(connection, 2)
 
 

@@ -152,6 +152,23 @@ async def test_the_master_says_where_to_look() -> None:
     assert found.prism == 1
 
 
+async def test_an_order_leaves_a_search_alone_that_has_found_the_prism() -> None:
+    """One that comes while the instrument locks in does not send the telescope elsewhere."""
+    async with leica_bench(leica_config(search_window_deg=10.0)) as day:
+        await day.begin()
+        reading = await day.instrument.read()
+        day.station.blocked = True
+        await day.read_until(Status.NO_TARGET, within_s=5.0)
+        await day.read_for(4.0)
+        day.station.blocked = False
+        elsewhere = Direction(reading.horizontal_angle_rad + 1.0, reading.zenith_angle_rad, 0.05)
+        while not day.instrument.condition.activity.startswith("looking") or not day.station.settings.lock:
+            await day.read_for(0.05)
+        await day.instrument.track(1, elsewhere)
+        found = await day.read_until(Status.OK, within_s=2.0)
+    assert found.prism == 1
+
+
 async def test_a_person_is_called_when_nothing_helps() -> None:
     """After all searches it beeps and says what is to be done; locked in by hand, it goes on."""
     async with leica_bench(faults=[hidden(5.0, 200.0)]) as day:

@@ -12,6 +12,7 @@ from support.leica import leica_bench, leica_config
 from tsgt.errors import InstrumentError
 from tsgt.simulation.geocom_server import Forced
 from tsgt.simulation.line_faults import LineFault
+from tsgt.simulation.total_station import BOOT_NS
 from tsgt.station.geocom import Rpc
 from tsgt.station.geocom_codes import ReturnCode
 
@@ -122,6 +123,20 @@ async def test_a_silent_line_raises() -> None:
         day.line.faults.mute = False
         await day.begin()
         assert (await day.instrument.read()).status.usable
+
+
+async def test_a_search_that_was_switched_off_is_not_waited_for() -> None:
+    """Its answer never comes. The driver notices within 4 s of the instrument being there again, not after the search's 90."""
+    async with leica_bench() as day:
+        await day.begin()
+        day.station.blocked = True
+        while "searching" not in day.instrument.condition.activity:
+            await day.instrument.read()
+        await day.read_for(0.7)
+        day.station.switch_off()
+        day.station.switch_on()
+        with pytest.raises(InstrumentError, match="switched off and on"):
+            await day.read_for(BOOT_NS / 1e9 + 4.1)
 
 
 async def test_another_speed_is_found() -> None:

@@ -71,6 +71,9 @@ With twice as much, predictions of a robot that turns by a rad per second were u
 BEGINNING_ITERATIONS = 10
 """Those that settle take six at most. What does not (a station on another robot) is tried again with each measurement."""
 
+DOUBT_BACK_S = 1.5
+"""So long before a measurement that contradicts, what it may bend is not known either: a few measurements of each prism."""
+
 MOST_STEPS = 5
 """Where these do not settle it, every step is tried before it is taken, as in :func:`tsgt.geometry.continuous.solve`."""
 
@@ -104,7 +107,7 @@ class FixedLag:
         self._anchor: Anchor | None = None
         self._settled = False
         self._doubted: frozenset[int] = frozenset()
-        self._begun_s = np.inf
+        self._begun_s = self._contradicted_s = np.inf
         self._solved: tuple[Knots, BlockFactor] | None = None
         self._trajectory: Trajectory | None = None
         self._end: Ahead | None = None
@@ -144,9 +147,18 @@ class FixedLag:
         """
         return bool(self._doubted)
 
-    def _doubt(self, prisms: NDArray[np.intp], weights: FloatArray) -> None:
+    @property
+    def doubtful_from_s(self) -> float:
+        """From when on it is not known where the robot was, infinite while nothing is doubtful."""
+        return self._contradicted_s - DOUBT_BACK_S if self._doubted else np.inf
+
+    def _doubt(self, new: Observations, weights: FloatArray) -> None:
         """Take note of which prisms' new measurements are as predicted, of weight 1, and which are not."""
-        for prism, weight in zip(prisms.tolist(), weights.tolist(), strict=True):
+        for time_s, prism, weight in zip(
+            new.time_s.tolist(), new.prism.tolist(), weights.tolist(), strict=True
+        ):
+            if not self._doubted:
+                self._contradicted_s = time_s
             # A station on a wrong prism soon agrees with itself, which says nothing.
             self._doubted = self._doubted | {prism} if weight < 1.0 else self._doubted & {prism}
 
@@ -229,7 +241,7 @@ class FixedLag:
         if self._settled:
             assert self._knots is not None  # noqa: S101 (it is settled)
             self._anchor = Anchor(self._knots.select(slice(0, 1)), np.diag(_AS_GOOD_AS_NOTHING**-2.0))
-            self._begun_s = float(observations.time_s[-1])
+            self._begun_s = self._contradicted_s = float(observations.time_s[-1])
 
     def _followed(self, held: Observations, new: Observations) -> bool:
         """Add measurements to the trajectory found before; return whether that is still good to follow."""
@@ -246,7 +258,7 @@ class FixedLag:
         unheard = _order(held, new) >= len(held)
         system = assemble(self.observations, at, knots, steps, self._anchor, unheard=unheard, heard=unheard)
         weights = _weights_of_new(system, at, np.flatnonzero(unheard))
-        self._doubt(new.prism, weights)
+        self._doubt(new, weights)
         add_rows(system.rows[unheard], weights, at[unheard], system.diagonal, system.gradient)
         for _ in range(MOST_STEPS):
             factor = factorise(system.diagonal, system.beside)

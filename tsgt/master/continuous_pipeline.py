@@ -176,8 +176,11 @@ class ContinuousPipeline:
         covariance = _NONE
         if self._window.following:
             states, covariance = self._window.trajectory().at((stamp_ns - self._origin_ns) / 1e9, parts=_POSE)
-        settled = self._window.settled & ((stamp_ns - self._origin_ns) / 1e9 >= self._window.begun_s)
-        poses = self._poses.smoothed(stamp_ns, self._seen, states, covariance, settled=settled)
+        time_s = (stamp_ns - self._origin_ns) / 1e9
+        sure = (time_s >= self._window.begun_s) & (time_s < self._window.doubtful_from_s)
+        poses = self._poses.smoothed(
+            stamp_ns, self._seen, states, covariance, settled=sure & self._window.settled
+        )
         self._next_smoothed_ns = int(stamp_ns[-1]) + self._limits.period_ns
         self._forget()
         return poses

@@ -11,6 +11,7 @@ from support.prior_motion import draw_motions, in_time, measure, rows_at
 from tsgt.geometry import FixedLag, FloatArray, Observations, Trajectory
 from tsgt.geometry.continuous import knot_times, solve
 from tsgt.geometry.first_guess import first_guess
+from tsgt.geometry.fixed_lag import DOUBT_BACK_S
 from tsgt.model import MotionPrior
 
 PRIOR = MotionPrior()
@@ -136,9 +137,11 @@ def test_what_contradicts_is_doubtful_until_other_prisms_agree(observations: Obs
         points = wrong.points_m + np.array([0.5, 0.0, 0.0])
         window.update(replace(wrong, points_m=points, time_s=wrong.time_s + after_s))
         assert window.doubtful
+        assert window.doubtful_from_s == wrong.time_s[0] - DOUBT_BACK_S
     for row in np.flatnonzero(later.time_s > wrong.time_s[0] + 0.1):
         window.update(later.select(slice(row, row + 1)))
     assert not window.doubtful
+    assert window.doubtful_from_s == np.inf
 
 
 def test_it_begins_anew_after_an_outage(observations: Observations) -> None:

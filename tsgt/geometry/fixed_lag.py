@@ -71,6 +71,9 @@ With twice as much, predictions of a robot that turns by a rad per second were u
 BEGINNING_ITERATIONS = 10
 """Those that settle take six at most. What does not (a station on another robot) is tried again with each measurement."""
 
+TELLING, GAP_S = 3, 1.25
+"""So many measurements of each prism, none longer after the one before, tell which way a robot lies without any from before."""
+
 DOUBT_BACK_S = 1.5
 """So long before a measurement that contradicts, what it may bend is not known either: a few measurements of each prism."""
 
@@ -131,7 +134,7 @@ class FixedLag:
 
     @property
     def begun_s(self) -> float:
-        """When the last measurement was made from which a trajectory was found anew, infinite before the first one.
+        """From when on a trajectory that was found anew can be believed, infinite before the first one.
 
         Where each prism was seen once or twice, the robot may lie the other way about the line through two of them and move
         otherwise. What comes later tells that for what comes later, not for what was before a gap.
@@ -241,7 +244,8 @@ class FixedLag:
         if self._settled:
             assert self._knots is not None  # noqa: S101 (it is settled)
             self._anchor = Anchor(self._knots.select(slice(0, 1)), np.diag(_AS_GOOD_AS_NOTHING**-2.0))
-            self._begun_s = self._contradicted_s = float(observations.time_s[-1])
+            self._contradicted_s = float(observations.time_s[-1])
+            self._begun_s = _told_from_s(observations)
 
     def _followed(self, held: Observations, new: Observations) -> bool:
         """Add measurements to the trajectory found before; return whether that is still good to follow."""
@@ -291,6 +295,18 @@ class FixedLag:
         fitting = int(np.count_nonzero(found.distances < OUTLYING**2)) / len(found.distances)
         fits = fitting > (SOME_FIT if self._settled else NEARLY_ALL_FIT)
         self._settled = fits and sigma_rad < (LOST_RAD if self._settled else SURE_RAD)
+
+
+def _told_from_s(observations: Observations) -> float:
+    """From when on measurements tell the trajectory by themselves; when the last one was made if they do not."""
+    begun_s = [
+        each_s[np.flatnonzero(np.diff(each_s, prepend=-np.inf) > GAP_S)[-1]]
+        for prism in np.unique(observations.prism)
+        for each_s in [observations.time_s[observations.prism == prism]]
+    ]
+    counts = np.bincount(observations.prism[observations.time_s >= max(begun_s)])
+    told = np.count_nonzero(counts >= TELLING) >= 3
+    return float(max(begun_s) if told else observations.time_s[-1])
 
 
 def _weights_of_new(system: System, at: NDArray[np.intp], new: NDArray[np.intp]) -> FloatArray:

@@ -136,11 +136,9 @@ def test_what_contradicts_is_doubtful_until_other_prisms_agree(observations: Obs
     for after_s in (0.0, 0.1):
         points = wrong.points_m + np.array([0.5, 0.0, 0.0])
         window.update(replace(wrong, points_m=points, time_s=wrong.time_s + after_s))
-        assert window.doubtful
         assert window.doubtful_from_s == wrong.time_s[0] - DOUBT_BACK_S
     for row in np.flatnonzero(later.time_s > wrong.time_s[0] + 0.1):
         window.update(later.select(slice(row, row + 1)))
-    assert not window.doubtful
     assert window.doubtful_from_s == np.inf
 
 
@@ -186,3 +184,18 @@ def test_covariances_are_honest() -> None:
 
 def _nees(error: FloatArray, covariance: FloatArray) -> float:
     return float(error[0] @ np.linalg.solve(covariance[0], error[0]))
+
+
+def test_what_was_before_a_gap_is_not_believed_when_it_begins_anew(observations: Observations) -> None:
+    """But for that, it is from the first measurements on that three of each prism have told how the robot lies."""
+    early = observations.select(observations.time_s < 2.0)
+    begun = FixedLag(PRIOR)
+    begun.update(early)
+    assert begun.settled
+    assert begun.begun_s == max(early.time_s[early.prism == prism][0] for prism in range(3))
+    few = FixedLag(PRIOR)
+    gap = (observations.time_s < 1.0) | ((observations.time_s > 2.6) & (observations.time_s < 3.2))
+    some = observations.select(gap)
+    few.update(some)
+    assert few.settled
+    assert few.begun_s == some.time_s[-1]

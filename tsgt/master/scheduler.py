@@ -3,7 +3,8 @@
 Problem: all stations share the channel, and a station that does not answer takes a whole time-out of the others'
 time. Idea: turns go round; in its turn a station gets the one thing that it needs most. A turn that brings nothing
 is paid for: the station is left alone for a multiple of the time that it took. So a dead station costs the others
-a twentieth of theirs, whatever a turn lasts, and one that lost a single packet is asked again at once.
+a twentieth of theirs, whatever a turn lasts. The first poll that brings nothing is repeated before anybody else's turn:
+most often it is a single packet that was lost.
 
 A station is told to track its prism, then synchronised, then polled. While it is silent after that, polls go on as
 the cheapest way to find out that it is back. Polls and measuring on a target begin with the same letter, so
@@ -164,6 +165,10 @@ class Scheduler:
         station.fruitless = 0 if fruitful else station.fruitless + 1
         pause_ns = _pause_ns(station.fruitless, took_ns)
         station.not_before_ns = now_ns + self._at_most(station, pause_ns, now_ns)
+        if station.fruitless == 1 and isinstance(turn, Poll):
+            # A round later there would be a gap in its track that nothing is interpolated over.
+            self._round.remove(station)
+            self._round.insert(0, station)
         if isinstance(turn, Synchronisation):
             if fruitful:
                 self._synchronised(station, now_ns)

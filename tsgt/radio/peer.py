@@ -7,7 +7,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
-from tsgt.radio.grants import UNKNOWN_GRANT, Demand, expected, grant
+from tsgt.radio.grants import MOST_MEASUREMENTS, UNKNOWN_GRANT, Demand, expected, grant
 from tsgt.radio.heard import Heard, TimedSighting
 from tsgt.radio.inbox import Inbox
 from tsgt.radio.message_codec import angle_rad, distance_m
@@ -150,6 +150,7 @@ class Peer:
         self._heard_us: int | None = None
         self._newest_ages_us: deque[int] = deque(maxlen=AGES_KEPT)
         self._withheld = 0
+        self._repeats = False
         self._plain = False
 
     def forget_session(self) -> None:
@@ -230,8 +231,9 @@ class Peer:
         )
         # What was received before all that a beacon tells may come again: the acknowledgement may have been missed.
         unknown = len(self._replies[max(self._replies)]) if self.silent >= HISTORY and self._replies else 0
+        repeated = MOST_MEASUREMENTS if self._repeats else 0
         demand = Demand(
-            measurements=new + missing + self.inbox.unwritten + unknown,
+            measurements=new + missing + self.inbox.unwritten + unknown + repeated,
             scattered=missing > 0,
             plain=self._plain,
             extended=calibrates,
@@ -288,9 +290,11 @@ class Peer:
         self.silent = 0
         # One that sends nothing may have had no room: a measurement that is worse than most takes more.
         self._plain = bool(reply.runs) and _is_plain(reply.runs[0])
+        has_room = at.granted_bytes - at.payload_bytes >= ANY_RUN_BYTES
+        self._repeats = self._repeats and not has_room
         if self.inbox.missing < missing:
             self._withheld = 0  # it sends what was missing; the next may have needed a run of its own
-        elif at.granted_bytes - at.payload_bytes >= ANY_RUN_BYTES:
+        elif has_room:
             self._withheld = self.inbox.missing  # there was room for any of them
         self._withheld = min(self._withheld, self.inbox.missing)
         order, answer, shot = self._answered(reply)
@@ -326,6 +330,8 @@ class Peer:
             self._state, self._exchange = None, None
             self._replies.clear()
         self.nonce = self._confirm = introduction.nonce
+        # It cannot know what has come of that which an earlier run has left, and sends all of it again.
+        self._repeats = introduction.oldest < introduction.run_start
         self.inbox.introduced(introduction)
         return joined
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import TYPE_CHECKING, NamedTuple
 
 import structlog
@@ -44,7 +45,7 @@ class Backlog:
     queued
         What has not been acknowledged, oldest first.
     receptions
-        Of beacons, in the order in which they were made.
+        Of beacons; those by one clock in the order in which they were made.
     """
 
     lineage: int | None = None
@@ -102,7 +103,9 @@ def read_backlog(directory: Path, station: int) -> Backlog:
     oldest, last = 0, runs[0][0].run_start - 1
     measurements: list[Queued] = []
     receptions: list[Reception] = []
+    unread = dict(reversed([(path, head) for head, path in journals]))
     for head, path in runs:
+        del unread[path]
         tail = _tail(head, path)
         measurements = tail.measurements + measurements
         receptions = tail.receptions + receptions
@@ -113,11 +116,16 @@ def read_backlog(directory: Path, station: int) -> Backlog:
     undelivered = [each for each in measurements if each.sequence >= oldest]
     if len(undelivered) > MOST_MEASUREMENTS:
         log.warning("backlog_left_behind", measurements=len(undelivered) - MOST_MEASUREMENTS)
+    # A run that has heard no master leaves measurements whose time rests on what the runs before it have heard.
+    boots = {each.boot for each in undelivered}
+    for path, head in unread.items():
+        if head.boot in boots and len(receptions) < MOST_MEASUREMENTS:
+            receptions = _tail(head, path).receptions + receptions
     return Backlog(
         lineage=lineage,
         run_start=last + 1 + RESTART_SKIP,
         queued=tuple(undelivered[-MOST_MEASUREMENTS:]),
-        receptions=tuple(receptions[-MOST_MEASUREMENTS:]),
+        receptions=tuple(sorted(receptions[-MOST_MEASUREMENTS:], key=attrgetter("received_ns"))),
     )
 
 

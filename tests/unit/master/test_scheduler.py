@@ -172,7 +172,7 @@ def test_a_station_is_found_again_soon(outage_s: float, found_s: float) -> None:
 
 
 def test_one_lost_packet_costs_no_more_than_itself() -> None:
-    """After a single time-out the station has its next turn in the next round."""
+    """After a single time-out the stations have their turns one after the other as before."""
     channel = Channel()
     channel.run(60)
     channel.dead.add(1)
@@ -184,6 +184,17 @@ def test_one_lost_packet_costs_no_more_than_itself() -> None:
         [2, 3, 1] * 3,
         [3, 1, 2] * 3,
     )
+
+
+def test_a_poll_without_an_answer_is_repeated_at_once_but_only_once() -> None:
+    """The packet may have been lost; a round later, the gap between two measurements would be twice as long."""
+    channel = Channel()
+    channel.run(60)
+    channel.dead.add(2)
+    channel.run(62)
+    stations = [turn.station for _, turn in channel.of(Poll)]
+    unanswered = next(place for place, (_, turn) in enumerate(channel.of(Poll)) if not turn.answered)
+    assert stations[unanswered : unanswered + 4] == [2, 2, 3, 1]
 
 
 def test_a_station_that_refuses_to_track_is_told_again_and_never_polled() -> None:

@@ -349,6 +349,28 @@ def test_what_is_not_written_yet_comes_again() -> None:
     assert granted(frames) >= 26
 
 
+def test_what_an_earlier_run_has_left_comes_again() -> None:
+    """A station that has started again cannot know what of it has come; until it leaves room, it has more of it."""
+    frames = settled()
+    station = frames.stations[1]
+    last = station.sequence - 1
+    station.nonce, station.oldest, station.run_start = 0xF00D, last - 9, last + 1001
+    station.sequence = station.run_start
+    frames.begin()
+    frames.measure(1, introduce=True)
+    frames.end()
+    frames.begin()
+    newest = sighting(last, slot_us(frames) - 10_000_000, wide=True)
+    run = Run(sightings=(newest, *(older(newest, back) for back in (1, 2, 3))), wide=True)
+    assert frames.answer(1, Reply(runs=(run,)), sequence=last).repeated == 4
+    frames.end()
+    assert granted(frames) == 71
+    frames.begin()
+    frames.measure(1)  # and it had room for more
+    frames.end()
+    assert granted(frames) <= 26
+
+
 def test_a_measurement_of_a_worse_quality_gets_the_room_that_it_takes() -> None:
     """As soon as one has come, or none has though there should be one."""
     frames = settled()

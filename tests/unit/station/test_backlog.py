@@ -49,6 +49,13 @@ def acknowledged(oldest: int) -> AcknowledgedRecord:
     return AcknowledgedRecord(stamp_ns=5, oldest=oldest)
 
 
+def reception(counter: int, *, received_ns: int = 8_000) -> ReceptionRecord:
+    """Say that this beacon was heard then, on the computer's clock."""
+    return ReceptionRecord(
+        stamp_ns=ZERO_NS + received_ns, stamp_sigma_ns=3, session=77, counter=counter, sent_us=400
+    )
+
+
 def measured(*sequences: int) -> list[PolarMeasurement]:
     """Make measurements with these numbers."""
     return [measurement(sequence) for sequence in sequences]
@@ -92,11 +99,50 @@ def test_several_runs_are_left_in_order(tmp_path: Path) -> None:
 
 def test_receptions_of_beacons_come_back(tmp_path: Path) -> None:
     """On the computer's own clock, with what names its start."""
-    record = ReceptionRecord(stamp_ns=9_000, stamp_sigma_ns=3, session=77, counter=5, sent_us=400)
-    journal(tmp_path, "station1-a", head(0), record)
+    journal(tmp_path, "station1-a", head(0), reception(5))
     assert read_backlog(tmp_path, 1).receptions == (
         Reception(session=77, counter=5, received_ns=8_000, sigma_ns=3, sent_us=400, boot="b"),
     )
+
+
+def test_receptions_go_as_far_back_as_the_clock_of_what_is_left(tmp_path: Path) -> None:
+    """A run that has heard nobody leaves measurements whose time rests on what earlier ones have heard."""
+    journal(tmp_path, "station1-a", head(0, boot="a"), reception(1), *measured(0))
+    journal(tmp_path, "station1-b", head(1001), reception(2, received_ns=500), *measured(1001))
+    journal(tmp_path, "station1-c", head(2002), acknowledged(2002), *measured(2002))
+    backlog = read_backlog(tmp_path, 1)
+    assert numbers(backlog) == [2002]
+    assert [each.counter for each in backlog.receptions] == [2]
+
+
+def test_receptions_of_one_clock_are_in_order_whatever_the_names_say(tmp_path: Path) -> None:
+    """Also those of a run that had numbers of its own, as its disk took nothing at first."""
+    journal(tmp_path, "station1-a", head(500, lineage=8), reception(3, received_ns=700), *measured(500))
+    journal(tmp_path, "station1-b", head(0), reception(2, received_ns=500), *measured(0))
+    journal(tmp_path, "station1-c", head(1001), acknowledged(1001), *measured(1001))
+    assert [each.counter for each in read_backlog(tmp_path, 1).receptions] == [2, 3]
+
+
+def test_what_has_been_heard_is_not_sought_without_need(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A computer that runs for weeks leaves many journals."""
+    read = []
+    tail = backlog_module._tail
+
+    def noted(head: JournalRecord, path: Path) -> object:
+        read.append(path.stem)
+        return tail(head, path)
+
+    monkeypatch.setattr(backlog_module, "MOST_MEASUREMENTS", 2)
+    monkeypatch.setattr(backlog_module, "_tail", noted)
+    journal(tmp_path, "station1-a", head(0), reception(1), *measured(0))
+    journal(tmp_path, "station1-b", head(1001), reception(2), reception(3, received_ns=9_000))
+    journal(tmp_path, "station1-c", head(2002), acknowledged(2002), *measured(2002))
+    assert [each.counter for each in read_backlog(tmp_path, 1).receptions] == [2, 3]
+    journal(tmp_path, "station1-d", head(3003), acknowledged(3003))
+    assert read_backlog(tmp_path, 1).receptions == ()
+    assert read == ["station1-c", "station1-b", "station1-d"]
 
 
 def test_runs_of_unknown_starts_of_the_computer_share_no_clock(tmp_path: Path) -> None:

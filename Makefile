@@ -27,10 +27,10 @@ types: $(VENV)/.test
 layers: $(VENV)/.test
 	$(BIN)/lint-imports
 
-# Those that run real processes in real time wait more than they compute, and have the machine to themselves.
+# Those that run real processes in real time have the machine to themselves.
 pytest: $(VENV)/.test
 	$(BIN)/pytest --numprocesses auto --dist worksteal --ignore tests/process --ignore tests/interop
-	$(BIN)/pytest --numprocesses 3 --dist worksteal tests/process tests/interop
+	$(BIN)/pytest tests/process tests/interop
 
 # Forty times the examples of `make test`, on two cores; what is not done after 15 minutes is given up, and said.
 # A failing example is kept in .hypothesis: `pytest` with the name of its test makes it small and shows it.

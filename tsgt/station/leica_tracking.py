@@ -372,13 +372,15 @@ class Tracking:
         except LicenceMissing:
             locked = False
             self._give_up_searching()
+        now_ns = self._clock.monotonic_ns()
         self._lock = Lock.IN if locked else Lock.OUT
-        self._lock_asked_ns = self._clock.monotonic_ns()
+        # One that has found nothing does not tell whether a person has locked in meanwhile: the next would undo that.
+        self._lock_asked_ns = now_ns if locked else 0
         if locked:
             self._take_over()
         elif self._handover is not None:
             # It may have been turned by itself: only from here on it is a person who turns it.
-            self._handover = Handover(await pointing(self._line), self._lock_asked_ns)
+            self._handover = Handover(await pointing(self._line), now_ns)
             await self._call(f"point the telescope at prism {self.prism}")
         await self.measure()
         return None

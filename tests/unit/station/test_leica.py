@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -18,7 +19,11 @@ from tsgt.station.geocom import Rpc
 from tsgt.station.geocom_codes import ReturnCode
 from tsgt.station.instrument import Atmosphere
 from tsgt.station.keeper import InstrumentKeeper
+from tsgt.station.leica_search import Finder
 from tsgt.station.session import Session
+
+if TYPE_CHECKING:
+    from tsgt.station.leica_lock import Look
 
 
 def hidden(start_s: float, end_s: float) -> StatusFaultConfig:
@@ -167,6 +172,26 @@ async def test_an_order_leaves_a_search_alone_that_has_found_the_prism() -> None
         await day.instrument.track(1, elsewhere)
         found = await day.read_until(Status.OK, within_s=2.0)
     assert found.prism == 1
+
+
+async def test_a_lock_by_hand_during_a_search_that_fails_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next search would begin with letting go of it."""
+    looks = []
+    async with leica_bench() as day:
+
+        async def fail(_: Finder, look: Look) -> bool:
+            looks.append(look)
+            day.station.blocked = False
+            day.station.lock_by_hand(1)
+            return False
+
+        monkeypatch.setattr(Finder, "look", fail)
+        await day.begin()
+        await day.read_for(3.0)
+        day.station.blocked = True
+        await day.read_until(Status.NO_TARGET, within_s=5.0)
+        await day.read_until(Status.OK, within_s=20.0)
+    assert len(looks) == 1
 
 
 async def test_a_person_is_called_when_nothing_helps() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import inspect
+import signal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,10 @@ from tsgt.simulation.event_loop import run_virtual
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+# What is started in the background of a script ignores Ctrl-C, and so would all programs that are tested.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 FIELD_DATA = Path(__file__).parents[2] / "shared" / "data" / "rts"
 

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -260,7 +261,10 @@ def test_a_client_whose_program_is_killed_again_and_again(tmp_path: Path) -> Non
     ) as client:
         try:
             for runs in (1, 2, 3):
-                os.kill(last_started(notes, runs), signal.SIGKILL)
+                with suppress(
+                    ProcessLookupError
+                ):  # its client has just ended it: it is slow on a busy machine
+                    os.kill(last_started(notes, runs), signal.SIGKILL)
             pid = last_started(notes, 4)
         finally:
             client.terminate()

@@ -303,8 +303,8 @@ def smoothed_now(planting: Planting) -> None:
     """Stamp smoothed poses with the time at which they are made."""
 
     def smoothed(right: Any) -> Any:
-        def wrong(poses: Any, stamp_ns: Any, *arguments: Any) -> Any:
-            batch = right(poses, stamp_ns, *arguments)
+        def wrong(poses: Any, stamp_ns: Any, *arguments: Any, **options: Any) -> Any:
+            batch = right(poses, stamp_ns, *arguments, **options)
             return replace(batch, stamp_ns=batch.stamp_ns + poses._limits.lag_ns)
 
         return wrong

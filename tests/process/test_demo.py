@@ -10,6 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -59,12 +60,34 @@ class Demo:
             assert self.process.poll() is None, "".join(self.said)
             time.sleep(0.1)
 
+    def connect(self, path: Path) -> socket.socket:
+        """Return a connection to its poses, as soon as its master listens."""
+        deadline_s = time.monotonic() + PATIENCE_S
+        while True:
+            connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+            try:
+                connection.connect(os.fspath(path))
+            except OSError:
+                connection.close()
+            else:
+                return connection
+            assert time.monotonic() < deadline_s, "".join(self.said)
+            assert self.process.poll() is None, "".join(self.said)
+            time.sleep(0.1)
+
 
 Start = Callable[..., Demo]
 
 
 @pytest.fixture
-def start(tmp_path: Path) -> Iterator[Start]:
+def folder() -> Iterator[Path]:
+    """Return a folder whose path leaves room for names of sockets: pytest's own is too long with several processes."""
+    with tempfile.TemporaryDirectory(prefix="demo-") as path:
+        yield Path(path)
+
+
+@pytest.fixture
+def start(folder: Path) -> Iterator[Start]:
     """Return a function that starts a demo with further arguments."""
     with ExitStack() as stack:
 
@@ -76,7 +99,7 @@ def start(tmp_path: Path) -> Iterator[Start]:
                 "demo",
                 "--json",
                 "--socket",
-                str(tmp_path / "poses.sock"),
+                str(folder / "poses.sock"),
             ]
             process = stack.enter_context(
                 subprocess.Popen(
@@ -84,7 +107,7 @@ def start(tmp_path: Path) -> Iterator[Start]:
                     stdout=subprocess.PIPE,
                     stderr=subprocess.PIPE,
                     text=True,
-                    env={**os.environ, "TMPDIR": str(tmp_path)},
+                    env={**os.environ, "TMPDIR": str(folder)},
                 )
             )
             demo = Demo(process)
@@ -106,16 +129,12 @@ def _end(demo: Demo, timeout_s: float) -> dict[str, object]:
     return result
 
 
-@pytest.mark.parametrize(("protocol", "duration_s"), [("superframe", 10), ("classic", 20)])
-def test_demo_streams_records_and_sums_up(
-    start: Start, tmp_path: Path, protocol: str, duration_s: int
-) -> None:
+@pytest.mark.parametrize("protocol", ["superframe", "classic"])
+def test_demo_streams_records_and_sums_up(start: Start, folder: Path, protocol: str) -> None:
     """A reader gets live poses; at the end the result says how good they were and where the recording is."""
-    output = tmp_path / "kept.jsonl"
-    demo = start("--protocol", protocol, "--duration", str(duration_s), "--output", str(output))
-    demo.wait_for_poses(0)
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
-        connection.connect(os.fspath(tmp_path / "poses.sock"))
+    output = folder / "kept.jsonl"
+    demo = start("--protocol", protocol, "--duration", "20", "--output", str(output))
+    with demo.connect(folder / "poses.sock") as connection:
         lines = [json.loads(line) for line in connection.makefile()]
     result = _end(demo, 20)
     assert {
@@ -136,7 +155,7 @@ def test_demo_streams_records_and_sums_up(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
-def test_demo_ends_cleanly_on_a_signal(start: Start, tmp_path: Path, number: signal.Signals) -> None:
+def test_demo_ends_cleanly_on_a_signal(start: Start, folder: Path, number: signal.Signals) -> None:
     """Ctrl-C and kill end it and its daemons, with the result so far, exit 0, and no socket left behind."""
     demo = start("--duration", "60")
     deadline_s = time.monotonic() + PATIENCE_S
@@ -148,7 +167,7 @@ def test_demo_ends_cleanly_on_a_signal(start: Start, tmp_path: Path, number: sig
     result = _end(demo, 10)
     assert "Traceback" not in "".join(demo.said)
     assert isinstance(result["poses"], int)
-    assert not (tmp_path / "poses.sock").exists()
+    assert not (folder / "poses.sock").exists()
     assert not any(Path(f"/proc/{pid}").exists() for pid in pids.values())
 
 
@@ -161,10 +180,10 @@ def test_demo_ends_cleanly_on_a_signal(start: Start, tmp_path: Path, number: sig
     ],
 )
 def test_what_cannot_be_is_said_at_once(
-    start: Start, tmp_path: Path, arguments: tuple[str, str], reason: str
+    start: Start, folder: Path, arguments: tuple[str, str], reason: str
 ) -> None:
     """Neither after a minute without poses nor after the whole run."""
-    demo = start(arguments[0], arguments[1].format(tmp_path))
+    demo = start(arguments[0], arguments[1].format(folder))
     assert demo.process.wait(20) in {1, 2}
     assert demo.process.stdout is not None
     assert not demo.process.stdout.read()
@@ -215,7 +234,7 @@ def _journalled(folder: Path, station: int) -> dict[int, int]:
     }
 
 
-def test_killed_daemons_come_back_and_nothing_read_is_lost(start: Start, tmp_path: Path) -> None:
+def test_killed_daemons_come_back_and_nothing_read_is_lost(start: Start, folder: Path) -> None:
     """Kill -9 of each daemon in turn: poses come back by themselves, and what the clients had read is delivered."""
     demo = start("--duration", "120")
     demo.wait_for_poses(20)
@@ -223,24 +242,24 @@ def test_killed_daemons_come_back_and_nothing_read_is_lost(start: Start, tmp_pat
         before = demo.valid_poses()
         os.kill(demo.pids()[name], signal.SIGKILL)
         demo.wait_for_poses(before + 60)
-    (folder,) = tmp_path.glob("tsgt-demo-*")
-    read_by_then = {(station, number) for station in (1, 2, 3) for number in _journalled(folder, station)}
+    (made,) = folder.glob("tsgt-demo-*")
+    read_by_then = {(station, number) for station in (1, 2, 3) for number in _journalled(made, station)}
     deadline_s = time.monotonic() + PATIENCE_S
-    while not read_by_then <= _delivered(folder):
-        assert time.monotonic() < deadline_s, sorted(read_by_then - _delivered(folder))
+    while not read_by_then <= _delivered(made):
+        assert time.monotonic() < deadline_s, sorted(read_by_then - _delivered(made))
         time.sleep(0.5)
     demo.process.send_signal(signal.SIGINT)
     result = _end(demo, 20)
-    assert Path(str(result["folder"])) == folder
+    assert Path(str(result["folder"])) == made
     assert result["restarts"] == 2
-    assert len(list((folder / "recordings").glob("master-*.jsonl"))) == 2
+    assert len(list((made / "recordings").glob("master-*.jsonl"))) == 2
     read = set()
     for station, journals in ((1, 1), (2, 2), (3, 1)):
-        assert len(list((folder / f"journals{station}").glob("*.jsonl"))) == journals
-        stamps_ns = _journalled(folder, station)
+        assert len(list((made / f"journals{station}").glob("*.jsonl"))) == journals
+        stamps_ns = _journalled(made, station)
         read |= {(station, number) for number in stamps_ns}
         gaps_s = [(after - before) / 1e9 for before, after in itertools.pairwise(sorted(stamps_ns.values()))]
         # 2.5 Hz; the only long gap is the time in which there was no client, whatever else this machine is doing.
         assert sum(gap_s > 3.0 for gap_s in gaps_s) == journals - 1
-    assert _delivered(folder) <= read
+    assert _delivered(made) <= read
     assert len(read_by_then) > 60

@@ -233,8 +233,8 @@ class _Station:
         missed, self.missed = self.missed, False
         self._heard_ns, self._doubtful, self._had_nothing = now_ns, False, False
         updated = self._clock.update(samples)
-        if missed and (updated.restarted or not known):
-            self._let_go()
+        # Its program may have been started again since what is held was measured, with another clock.
+        another = missed and (updated.restarted or not known)
         stepped = updated.restarted and known
         self._offset_ns = newest.station_ns - newest.sent_ns - newest.forward_ns
         # The first, rough offset says when "now" is over there.
@@ -252,19 +252,9 @@ class _Station:
             samples=tuple(samples),
             rejected=updated.rejected,
         )
-        released = [self._released(message, received_ns, estimate) for message, received_ns in self._held]
+        released = [self._released(*held, None if another else estimate) for held in self._held]
         self._held.clear()
         return Synchronised(record, [m for m in released if m is not None], stepped)
-
-    def _let_go(self) -> None:
-        """Forget the times of what is held: its program may have been started again since, with another clock.
-
-        The clock that has been found says nothing of the one before; the station's journal has the measurements.
-        """
-        self._held = deque(
-            ((message, at_ns) for message, at_ns in self._held if not _timed(message)),
-            maxlen=HELD_MEASUREMENTS,
-        )
 
     def _agrees(self, sample: ClockSample) -> bool:
         """Whether an exchange is possible with the clock as it is known."""
@@ -289,12 +279,13 @@ class _Station:
         return self._record(message, received_ns, received_ns, UNTIMED_SIGMA_NS)
 
     def _released(
-        self, message: MeasurementMessage, received_ns: int, present: ClockEstimate
+        self, message: MeasurementMessage, received_ns: int, present: ClockEstimate | None
     ) -> PolarMeasurement | None:
         """Stamp what was held, if it can be of the clock that has been found and not of one before that."""
-        stamp_ns = message.time_ns - present.offset_ns
-        if received_ns - 2 * STALE_NS <= stamp_ns <= received_ns + present.bound_ns:
-            return self._measurement(message, received_ns)
+        if present is not None:
+            stamp_ns = message.time_ns - present.offset_ns
+            if received_ns - 2 * STALE_NS <= stamp_ns <= received_ns + present.bound_ns:
+                return self._measurement(message, received_ns)
         if _timed(message):
             return None  # nobody knows when it was; the station's journal has it
         return self._record(message, received_ns, received_ns, UNTIMED_SIGMA_NS)

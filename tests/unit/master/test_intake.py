@@ -306,6 +306,17 @@ def test_what_was_held_while_the_station_may_have_got_another_clock_is_let_go(kn
     assert master.synchronise(20_000, AHEAD_NS + 500 * MS).measurements == []
 
 
+def test_an_error_that_was_held_while_the_station_may_have_got_another_clock_has_no_time() -> None:
+    """It is told, but with the time of its arrival: 11 ms apart, the clock that was found explains it just as well."""
+    master = Master()
+    master.intake.unanswered(1)
+    master.poll(8000, message(START + 7800 * MS + AHEAD_NS, status=3, distance_m=-1.0))
+    master.intake.unanswered(1)
+    (measurement,) = master.synchronise(9000, AHEAD_NS + 11 * MS).measurements
+    assert measurement.stamp_ns == START + 8000 * MS
+    assert measurement.stamp_sigma_ns == UNTIMED_SIGMA_NS
+
+
 def test_what_was_held_is_used_if_the_clock_is_the_same_after_lost_requests() -> None:
     """The clock that was known goes on: there is but one that it can be of."""
     master = Master()

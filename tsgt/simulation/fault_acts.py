@@ -16,6 +16,7 @@ from tsgt.simulation.foreign import LONGEST_NOISE_BYTES, ForeignRadio
 from tsgt.simulation.line_faults import LineFault
 from tsgt.simulation.mission_configs import station_name
 from tsgt.simulation.options import MASTER
+from tsgt.simulation.telescope import Lock
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
@@ -37,6 +38,7 @@ _MASTER_STEP_S: Final = (-30.0, 30.0)
 _CLASSIC_LENGTHS = frozenset({2, 3, 9, 34})
 _LINE_FAULTS = tuple(fault for fault in LineFault if fault not in (LineFault.NONE, LineFault.DIGIT))
 _TURNS = 40
+_LOOKS_AFTER_S: Final = (2.0, 4.0, 6.0)
 
 
 async def act(mission: Mission, fault: Fault) -> None:
@@ -56,10 +58,13 @@ def _number(fault: Fault) -> int:
 
 
 async def see_to_instruments(mission: Mission, at_s: float) -> None:
-    """Let people lock all instruments on their prisms, when the faults are over."""
-    await mission.sleep_until(at_s)
-    for number in mission.instruments:
-        _lock_by_hand(mission, number)
+    """Let people lock all instruments on their prisms, when the faults are over, and look again whether they are."""
+    for look_s in (at_s, *(at_s + after_s for after_s in _LOOKS_AFTER_S)):
+        await mission.sleep_until(look_s)
+        for number, instrument in mission.instruments.items():
+            instrument.advance()
+            if look_s == at_s or instrument.telescope.lock is not Lock.IN:
+                _lock_by_hand(mission, number)
 
 
 def _lock_by_hand(mission: Mission, number: int) -> None:

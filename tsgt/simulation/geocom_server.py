@@ -129,8 +129,16 @@ class GeoComServer:
         self._buffer, self._request, self._job, self._event = b"", None, None, None
         self._waiting.clear()
 
+    def interrupt_movement(self) -> None:
+        """End what moves the telescope, because a person has taken it over; its answer says that it was ended."""
+        if self._request is not None and self._request.rpc in LICENSED:
+            self._end_job()
+
     def _abort(self) -> None:
         self.on_send(b"?\r\n")
+        self._end_job()
+
+    def _end_job(self) -> None:
         if self._job is not None and self._event is not None:
             self._event.cancel()
             self._job.close()

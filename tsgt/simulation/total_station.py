@@ -211,7 +211,8 @@ class SimulatedTotalStation:
         self.point_at_prism(prism)
 
     def lock_by_hand(self, prism: int) -> None:
-        """Let it follow a prism, as a person does with the instrument's own keys: no licence is needed."""
+        """Let it follow a prism, as a person does with the instrument's own keys: no licence, and it ends a search."""
+        self._server.interrupt_movement()
         self.advance()
         self.settings.atr = self.settings.lock = True
         self._choose(prism)

@@ -131,8 +131,8 @@ class LossSequence:
     def restart(self, towards: Direction | None, now_ns: int) -> bool:
         """Look at once, from the beginning, and where the master believes the prism to be if it says so.
 
-        One that points to about where the one before it did only puts that right: a search that it has interrupted
-        counts as done, so that orders every few seconds cannot keep the later searches from being reached.
+        One that points to where the one before it did, as far as that was sure, only puts that right: a search that it
+        has interrupted counts as done, so that orders every few seconds cannot keep the later searches from being reached.
 
         Returns
         -------
@@ -183,8 +183,8 @@ class LossSequence:
 
     def _near(self, towards: Direction) -> bool:
         before = self._towards
-        return before is not None and apart_rad(pointing_at(before), pointing_at(towards)) <= (
-            before.spread_rad + towards.spread_rad
+        return (
+            before is not None and apart_rad(pointing_at(before), pointing_at(towards)) <= before.spread_rad
         )
 
     def _looks(self, now_ns: int) -> list[Look]:

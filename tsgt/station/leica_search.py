@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 from tsgt.station.geocom import Rpc
 from tsgt.station.geocom_codes import ReturnCode, Verdict, verdict
 from tsgt.station.leica_identity import done, numbers
-from tsgt.station.leica_lock import NARROWEST_RAD, Lock, Look, Pointing
+from tsgt.station.leica_lock import NARROWEST_RAD, WIDEST_ADJUST_RAD, Lock, Look, Pointing
 
 if TYPE_CHECKING:
     from tsgt.station.geocom import Parameter
@@ -20,6 +20,9 @@ _ADJUST_S: Final = 15.0  # it gives up by itself after 5 s
 _WINDOW_S: Final = 90.0
 _ROUND_S: Final = 120.0
 _CLOCKWISE, _WITH_SWING = 1, 1
+_CHASES: Final = 3
+_HERE: Final = Look("pointing at it", False, None, NARROWEST_RAD, NARROWEST_RAD)
+_NEARBY: Final = Look("searching where it was found", True, None, WIDEST_ADJUST_RAD, WIDEST_ADJUST_RAD)
 
 
 class LicenceMissing(Exception):  # noqa: N818 (it is no error: there is another way to go on)
@@ -80,26 +83,31 @@ class Finder:
         self.has_found = False
         await self._ask(Rpc.AUS_SET_USER_LOCK_STATE, 0)
         await self._ask(Rpc.AUS_SET_USER_ATR_STATE, 1)
-        if look.sweep and self._power_search:
-            if not done(await self._sweep(look)):
-                return False
-            width_rad = height_rad = NARROWEST_RAD
-        else:
-            if look.centre is not None:
-                await self.position(look.centre)
-            width_rad, height_rad = min(look.width_rad, math.pi), look.height_rad
-            if look.sweep:
-                area = width_rad, height_rad, 0
-                if not done(await self._ask(Rpc.AUT_SEARCH, *area, timeout_s=_WINDOW_S)):
-                    return False
-                width_rad = height_rad = NARROWEST_RAD
-        self.has_found = look.sweep
-        if not done(await self._ask(Rpc.AUT_FINE_ADJUST, width_rad, height_rad, 0, timeout_s=_ADJUST_S)):
+        if look.centre is not None and not (look.sweep and self._power_search):
+            await self.position(look.centre)
+        if not await (self._sweep_and_adjust(look) if look.sweep else self._adjust(look)):
             return False
         self.has_found = True
         await self._ask(Rpc.AUS_SET_USER_LOCK_STATE, 1)
         await self._ask(Rpc.AUT_LOCK_IN, timeout_s=_ADJUST_S)
         return await self.lock() is Lock.IN
+
+    async def _sweep_and_adjust(self, look: Look) -> bool:
+        """Sweep, and point at what was found; a robot that has driven on before that is looked for nearby, at once."""
+        sweeping = look
+        for _ in range(_CHASES):
+            if not done(await self._sweep(sweeping)):
+                return False
+            self.has_found = True
+            if await self._adjust(_HERE):
+                return True
+            sweeping = _NEARBY
+        self.has_found = False
+        return False
+
+    async def _adjust(self, look: Look) -> bool:
+        area = look.width_rad, look.height_rad, 0
+        return done(await self._ask(Rpc.AUT_FINE_ADJUST, *area, timeout_s=_ADJUST_S))
 
     async def position(self, to: Pointing) -> None:
         """Turn the telescope there; a lock is let go.
@@ -130,14 +138,16 @@ class Finder:
             It may not be moved.
         """
         await self._ask(Rpc.AUS_SET_USER_ATR_STATE, 1)
-        await self._ask(Rpc.AUT_FINE_ADJUST, NARROWEST_RAD, NARROWEST_RAD, 0, timeout_s=_ADJUST_S)
+        await self._adjust(_HERE)
 
     async def _sweep(self, look: Look) -> Reply:
+        if not self._power_search:
+            area = min(look.width_rad, math.pi), look.height_rad, 0
+            return await self._ask(Rpc.AUT_SEARCH, *area, timeout_s=_WINDOW_S)
         if look.is_round:
             return await self._ask(Rpc.AUT_PS_SEARCH_NEXT, _CLOCKWISE, _WITH_SWING, timeout_s=_ROUND_S)
         centre = look.centre or await self._here()
-        area = *centre, look.width_rad, look.height_rad, 1
-        await self._ask(Rpc.AUT_SET_SEARCH_AREA, *area)
+        await self._ask(Rpc.AUT_SET_SEARCH_AREA, *centre, look.width_rad, look.height_rad, 1)
         return await self._ask(Rpc.AUT_PS_SEARCH_WINDOW, timeout_s=_WINDOW_S)
 
     async def _here(self) -> Pointing:

@@ -194,6 +194,42 @@ async def test_a_lock_by_hand_during_a_search_that_fails_is_kept(monkeypatch: py
     assert len(looks) == 1
 
 
+async def test_a_lock_by_hand_during_a_search_ends_that() -> None:
+    """The instrument's answer that it was ended is no reason to search on."""
+    async with leica_bench() as day:
+        await day.begin()
+        await day.read_for(3.0)
+        day.station.blocked = True
+        while not (
+            day.instrument.condition.activity.startswith("searching") and day.station.telescope.moving
+        ):
+            await day.instrument.read()
+        day.station.blocked = False
+        day.station.lock_by_hand(1)
+        await day.read_until(Status.OK, within_s=2.0)
+
+
+@pytest.mark.parametrize(
+    ("misses", "last"), [(1, "searching around its last direction"), (3, "searching wide")]
+)
+async def test_a_robot_that_drives_on_after_a_sweep_is_swept_for_again(misses: int, last: str) -> None:
+    """It cannot be far, so that is done before any other search; but not for ever."""
+    activities = []
+    async with leica_bench() as day:
+        await day.begin()
+        await day.read_for(3.0)
+        day.station.blocked = True
+        while not day.instrument.condition.activity.startswith("searching around"):
+            await day.instrument.read()
+        day.station.blocked = False
+        day.station.server.forced.append(
+            Forced(code=ReturnCode.AUT_NO_TARGET, rpc=Rpc.AUT_FINE_ADJUST, times=misses)
+        )
+        while (await day.instrument.read()).status is not Status.OK:
+            activities.append(day.instrument.condition.activity)
+    assert activities[-1] == last
+
+
 async def test_a_person_is_called_when_nothing_helps() -> None:
     """After all searches it beeps and says what is to be done; locked in by hand, it goes on."""
     async with leica_bench(faults=[hidden(5.0, 200.0)]) as day:

@@ -124,6 +124,17 @@ def test_repeated_orders_do_not_begin_again() -> None:
     assert not look.sweep
 
 
+def test_an_order_that_follows_a_robot_begins_again() -> None:
+    """The prism may be where nobody has looked: beyond what the order before left open."""
+    searches = sequence()
+    searches.restart(Direction(2.0, 1.5, 0.02), 0)
+    assert searches.next(Lock.OUT, 0) is not None
+    assert not searches.restart(Direction(2.03, 1.5, 0.03), 5 * S)
+    look = searches.next(Lock.OUT, 5 * S)
+    assert look is not None
+    assert (look.sweep, look.centre) == (False, Pointing(2.03, 1.5))
+
+
 def test_a_telescope_that_was_turned_away_goes_back_first() -> None:
     """After single measurements it points at the last target."""
     searches = sequence()

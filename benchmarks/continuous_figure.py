@@ -112,8 +112,8 @@ def main() -> None:
         axes.set_ylim(0, None)
         axes.grid(alpha=0.25, lw=0.5)
         axes.spines[["top", "right"]].set_visible(False)
-    above.legend(loc="upper right", ncols=3, frameon=False)
-    middle.legend(loc="upper right", ncols=3, frameon=False)
+    above.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=3, frameon=False)
+    middle.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=3, frameon=False)
     below.set_xlim(FROM_S, UNTIL_S)
     figure.savefig(output, metadata={"Date": None})
     if output.suffix == ".svg":

@@ -14,11 +14,13 @@ import argparse
 import json
 import logging
 import os
+import signal
 import sys
 import tempfile
 import time
 from collections import Counter
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
@@ -210,7 +212,9 @@ def main() -> int:
             setattr(sums, name, Counter(value) if name in counters else value)
     last = None if arguments.seeds is None else sums.next_seed + arguments.seeds
     seed, ends_s, told_s = sums.next_seed, time.monotonic() + 60 * arguments.minutes, time.monotonic()
-    with ProcessPoolExecutor(arguments.jobs, max_tasks_per_child=50) as pool:
+    # Asked to end, it does not leave its workers behind, but waits for the missions that they are in.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with suppress(KeyboardInterrupt), ProcessPoolExecutor(arguments.jobs, max_tasks_per_child=50) as pool:
         running: set[Future[Sums]] = set()
         while running or (time.monotonic() < ends_s and seed != last):
             while len(running) < arguments.jobs and time.monotonic() < ends_s and seed != last:

@@ -11,6 +11,7 @@ it first counts is judged by its distance in sigmas of the prediction, not in th
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING
 
@@ -20,6 +21,7 @@ from tsgt.errors import GeometryError
 from tsgt.geometry.ahead import Ahead, kick
 from tsgt.geometry.block_tridiagonal import BlockFactor, factorise
 from tsgt.geometry.continuous import (
+    HOPELESS,
     LEAST_STEP_S,
     MOST_ITERATIONS,
     OUTLYING,
@@ -77,6 +79,11 @@ TELLING, GAP_S = 3, 1.25
 DOUBT_BACK_S = 1.5
 """So long before a measurement that contradicts, what it may bend is not known either: a few measurements of each prism."""
 
+SURPRISES, SURPRISED = 6, 2.0
+"""So many measurements of late, and how far they were from their predictions in the mean, squared and in sigmas of one
+dimension, from which on predictions are taken to be as much worse. Driving is not Gaussian: a robot that starts and turns
+at once goes on with that. Of robots as the prior has them it is so once in 140 times (chi-square, 18 degrees of freedom)."""
+
 MOST_STEPS = 5
 """Where these do not settle it, every step is tried before it is taken, as in :func:`tsgt.geometry.continuous.solve`."""
 
@@ -114,6 +121,7 @@ class FixedLag:
         self._solved: tuple[Knots, BlockFactor] | None = None
         self._trajectory: Trajectory | None = None
         self._end: Ahead | None = None
+        self._surprises: deque[float] = deque(maxlen=SURPRISES)
         self.observations: Observations | None = None
         self.residuals_m: FloatArray = np.empty((0, 3))
 
@@ -214,10 +222,15 @@ class FixedLag:
         self._keep(~past)
 
     def predict(self, time_s: float, *, parts: int = STATE) -> tuple[Knots, FloatArray]:
-        """Return the state at an instant, with its covariance as :meth:`Trajectory.at` does, by all measurements so far."""
+        """Return the state at an instant, with its covariance as :meth:`Trajectory.at` does, by all measurements so far.
+
+        Beyond the last of them the covariance is as much larger as the last ones were farther off than was to be expected.
+        """
         assert self._end is not None  # noqa: S101 (only called while following)
         if time_s >= self._end.time_s:
-            return self._end.at(time_s, parts=parts)
+            state, covariance = self._end.at(time_s, parts=parts)
+            surprise = sum(self._surprises) / (3 * len(self._surprises)) if self._surprises else 0.0
+            return state, covariance * surprise if surprise > SURPRISED else covariance
         return self.trajectory().at(np.array([time_s]), parts=parts)
 
     def trajectory(self) -> Trajectory:
@@ -236,6 +249,7 @@ class FixedLag:
     def _begin(self, observations: Observations) -> None:
         """Find the trajectory of all measurements of the window, knowing nothing else."""
         self._settled, self._doubted = False, frozenset(observations.prism.tolist())
+        self._surprises.clear()
         if np.count_nonzero(np.bincount(observations.prism) >= 2) < 3:
             raise GeometryError("to begin with, three prisms have to be measured twice")
         guess = first_guess(observations, knot_times(observations.time_s))
@@ -261,7 +275,10 @@ class FixedLag:
         at = nearest(knots.time_s, self.observations.time_s)
         unheard = _order(held, new) >= len(held)
         system = assemble(self.observations, at, knots, steps, self._anchor, unheard=unheard, heard=unheard)
-        weights = _weights_of_new(system, at, np.flatnonzero(unheard))
+        distances = _distances_of_new(system, at, np.flatnonzero(unheard))
+        weights = 1.0 / np.maximum(distances / OUTLYING**2, 1.0)
+        # What is hopelessly off says nothing of how the robot moves, and no other more than an outlier does.
+        self._surprises.extend(min(each, OUTLYING**2) for each in distances.tolist() if each < HOPELESS**2)
         self._doubt(new, weights)
         add_rows(system.rows[unheard], weights, at[unheard], system.diagonal, system.gradient)
         for _ in range(MOST_STEPS):
@@ -309,8 +326,8 @@ def _told_from_s(observations: Observations) -> float:
     return float(max(begun_s) if told else observations.time_s[-1])
 
 
-def _weights_of_new(system: System, at: NDArray[np.intp], new: NDArray[np.intp]) -> FloatArray:
-    """Weigh new measurements, rows that have no say in a system, by how far they are from the others' trajectory."""
+def _distances_of_new(system: System, at: NDArray[np.intp], new: NDArray[np.intp]) -> FloatArray:
+    """Tell how far new measurements, rows that have no say in a system, are from the others' trajectory: squared sigmas."""
     rows = system.rows[new]
     right = np.zeros((*system.gradient.shape, 3 * len(new) + 1))
     right[:, :, -1] = -system.gradient
@@ -323,7 +340,7 @@ def _weights_of_new(system: System, at: NDArray[np.intp], new: NDArray[np.intp])
         off = rows[place, :, STATE] + by_state @ here[:, -1]
         expected = IDENTITY + by_state @ here[:, 3 * place : 3 * place + 3]
         distances[place] = off @ np.linalg.solve(expected, off)
-    return 1.0 / np.maximum(distances / OUTLYING**2, 1.0)
+    return distances
 
 
 def _is_little(move: FloatArray) -> bool:

@@ -11,7 +11,7 @@ from support.prior_motion import draw_motions, in_time, measure, rows_at
 from tsgt.geometry import FixedLag, FloatArray, Observations, Trajectory
 from tsgt.geometry.continuous import knot_times, solve
 from tsgt.geometry.first_guess import first_guess
-from tsgt.geometry.fixed_lag import DOUBT_BACK_S
+from tsgt.geometry.fixed_lag import DOUBT_BACK_S, SURPRISED
 from tsgt.model import MotionPrior
 
 PRIOR = MotionPrior()
@@ -123,6 +123,37 @@ def test_an_outlier_does_little(observations: Observations, off_m: float) -> Non
     expected, _ = without.predict(at_s)
     sigmas = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     assert np.abs(state.error_from(expected) / sigmas)[:, :6].max() < 1.0
+
+
+def test_a_robot_that_does_the_unexpected_is_predicted_with_less_certainty(
+    observations: Observations,
+) -> None:
+    """From one measurement to the next it moves twice as fast, and each of the next ones says so."""
+    hurried_s = np.where(
+        observations.time_s < 6.0, observations.time_s, 6.0 + (observations.time_s - 6.0) / 2.0
+    )
+    ratios = []
+    for time_s in (observations.time_s, hurried_s):
+        window = followed(replace(observations, time_s=time_s).select(time_s < 6.4))
+        at_s = float(time_s[time_s < 6.4][-1]) + 0.3
+        _, covariance = window.predict(at_s)
+        _, as_the_prior_has_it = window.trajectory().at(np.array([at_s]))
+        ratios.append(float(np.trace(covariance[0]) / np.trace(as_the_prior_has_it[0])))
+    assert ratios[0] == pytest.approx(1.0)
+    assert ratios[1] > SURPRISED
+
+
+def test_an_outlier_leaves_predictions_as_they_are(observations: Observations) -> None:
+    """It says nothing of how the robot moves, however far off it is."""
+    row = len(observations) - 3
+    for off_m in (0.3, 30.0):
+        points = observations.points_m.copy()
+        points[row] *= 1 + off_m / np.linalg.norm(points[row])
+        window = followed(replace(observations, points_m=points))
+        at_s = float(observations.time_s[-1]) + 0.3
+        np.testing.assert_allclose(
+            window.predict(at_s)[1], window.trajectory().at(np.array([at_s]))[1], rtol=1e-6
+        )
 
 
 def test_what_contradicts_is_doubtful_until_other_prisms_agree(observations: Observations) -> None:

@@ -110,15 +110,22 @@ class ClassicLink:
             prism = self._prisms[station]
             reports.monitor.tracks(station, prism if turn.ok else None)
             reports.events(reports.alerts.ordered(station, prism, now_ns, tracks=bool(turn.ok)))
-        elif isinstance(turn, Synchronisation) and turn.samples:
-            found = self._intake.synchronised(station, turn.samples, now_ns)
-            if found.stepped:
-                reports.events(reports.alerts.stepped(station, now_ns))
-            reports.outlet.put(found.record)
-            for measurement in found.measurements:
-                reports.measured(measurement)
+        elif isinstance(turn, Synchronisation):
+            if turn.unanswered:
+                self._intake.unanswered(station)
+            if turn.samples:
+                self._synchronised(turn, now_ns)
         elif isinstance(turn, Poll):
             self._polled(turn, collector.last, collector.requested_ns)
+
+    def _synchronised(self, turn: Synchronisation, now_ns: int) -> None:
+        reports, station = self._reports, turn.station
+        found = self._intake.synchronised(station, turn.samples, now_ns)
+        if found.stepped:
+            reports.events(reports.alerts.stepped(station, now_ns))
+        reports.outlet.put(found.record)
+        for measurement in found.measurements:
+            reports.measured(measurement)
 
     def _polled(self, poll: Poll, packet: Packet, requested_ns: int) -> None:
         reports = self._reports

@@ -31,6 +31,9 @@ SILENCE_NS = 5_000_000_000
 """A station that was silent for longer may have been switched off and on, and have another clock; no computer that
 a station client runs on starts faster."""
 
+RESTART_NS = 500_000_000
+"""No client is started again within this. It may have another clock then: that of its computer was set meanwhile."""
+
 STALE_NS = 1_000_000_000
 """Instruments that track measure more often than this. A new measurement that looks older may be one of a clock that
 stood still, or was set back, while nobody asked the station."""
@@ -84,7 +87,7 @@ class Intake:
 
     def unanswered(self, station: int) -> None:
         """Take note that a station did not answer."""
-        self._stations[station].missed = True
+        self._stations[station].unanswered()
 
     def synchronised(self, station: int, samples: Sequence[ClockSample], now_ns: int) -> Synchronised:
         """Take the exchanges of a synchronisation, at least one; what was held is stamped and let go."""
@@ -156,10 +159,16 @@ class _Station:
         self._heard_ns: int | None = None
         self._doubtful = False
         self._had_nothing = False
-        self.missed = False
+        self._missed = False
+        self._held_of_before = False
+        """Its program may have been started again since what is held was measured, with another clock."""
+
+    def unanswered(self) -> None:
+        self._missed = True
+        self._held_of_before = bool(self._held)
 
     def answered(self, message: MeasurementMessage, requested_ns: int, received_ns: int) -> Arrival:
-        missed = self.missed
+        missed = self._missed
         back = self._is_back(received_ns)
         if message.time_ns == 0:
             self._check.nothing_new(requested_ns)
@@ -212,6 +221,7 @@ class _Station:
         """
         anew, self._last = missed or self._last is not None, None
         self._doubtful = self._doubtful or anew
+        self._held_of_before = self._held_of_before or (anew and bool(self._held))
         return anew
 
     def _is_back(self, received_ns: int) -> bool:
@@ -220,21 +230,22 @@ class _Station:
         What it says then cannot be judged by its time alone: a clock that has stood still meanwhile makes a new
         measurement look like one from before.
         """
-        silent = self.missed and self._heard_ns is not None and received_ns - self._heard_ns > SILENCE_NS
-        self._heard_ns, self.missed = received_ns, False
+        silent = self._missed and self._heard_ns is not None and received_ns - self._heard_ns > SILENCE_NS
+        self._heard_ns, self._missed = received_ns, False
         self._doubtful = self._doubtful or silent
         return silent
 
     def synchronised(self, samples: Sequence[ClockSample], now_ns: int) -> Synchronised:
         newest = samples[-1]
+        if self._heard_ns is None or samples[0].sent_ns - self._heard_ns > RESTART_NS:
+            self._held_of_before = bool(self._held)
         known = self._offset_ns is not None
         if known and self._doubtful and not self._agrees(newest):
             self._clock.forget()  # the paper's filter would go there a tenth of the way
-        missed, self.missed = self.missed, False
+        self._missed = False
         self._heard_ns, self._doubtful, self._had_nothing = now_ns, False, False
         updated = self._clock.update(samples)
-        # Its program may have been started again since what is held was measured, with another clock.
-        another = missed and (updated.restarted or not known)
+        another = self._held_of_before and (updated.restarted or not known)
         stepped = updated.restarted and known
         self._offset_ns = newest.station_ns - newest.sent_ns - newest.forward_ns
         # The first, rough offset says when "now" is over there.
@@ -254,6 +265,7 @@ class _Station:
         )
         released = [self._released(*held, None if another else estimate) for held in self._held]
         self._held.clear()
+        self._held_of_before = False
         return Synchronised(record, [m for m in released if m is not None], stepped)
 
     def _agrees(self, sample: ClockSample) -> bool:

@@ -64,6 +64,8 @@ class Synchronisation:
         One for each good cycle, all of which agree with each other.
     answered
         Whether the station has answered anything.
+    unanswered
+        How many requests it has not answered.
     """
 
     SILENT = 3
@@ -81,6 +83,7 @@ class Synchronisation:
         self.station = station
         self.samples: list[ClockSample] = []
         self.answered = False
+        self.unanswered = 0
         self._cycles = cycles
         self._timing = timing
         self._back_ns = timing.airtime_ns(PING_REPLY_BYTES) + timing.rx_done_ns
@@ -135,6 +138,7 @@ class Synchronisation:
     def timed_out(self) -> None:
         """See :meth:`Turn.timed_out`."""
         self._silent += 1
+        self.unanswered += 1
         if self._silent >= self.SILENT:
             self._end()
         elif (

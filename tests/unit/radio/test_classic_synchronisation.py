@@ -92,7 +92,7 @@ def test_four_messages_a_cycle() -> None:
     link, turn = Link(), Synchronisation(1, 2, TIMING)
     link.run(turn)
     assert link.sent == [b"p1", b"e1", b"s1", b"e1", b"s1", b"c1", b"c1"]
-    assert turn.answered
+    assert (turn.answered, turn.unanswered) == (True, 0)
 
 
 def test_a_sample_has_what_is_known() -> None:
@@ -120,7 +120,7 @@ def test_a_silent_station_is_given_up() -> None:
     link, turn = Link(deaf), Synchronisation(1, 50, TIMING)
     link.run(turn)
     assert link.sent == [b"p1", b"e1", b"p1", b"s1", b"p1", b"s1", b"c1", b"c1"]
-    assert (turn.answered, turn.samples) == (False, [])
+    assert (turn.answered, turn.unanswered, turn.samples) == (False, 3, [])
 
 
 def test_a_lost_ping_is_made_up_for() -> None:
@@ -145,6 +145,7 @@ def test_a_lost_stamp_is_asked_for_again() -> None:
     link, turn = Link(after=lossy), Synchronisation(1, 1, TIMING)
     link.run(turn)
     assert link.sent == [b"p1", b"e1", b"s1", b"s1", b"c1", b"c1"]
+    assert turn.unanswered == 1
     assert _offsets_ns(turn) == [OFFSET_NS]
 
 

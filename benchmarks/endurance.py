@@ -117,7 +117,7 @@ class Endurance:
             await asyncio.sleep(0.1)
         lines = []
         async with AsyncExitStack() as stack:
-            stack.push_async_callback(air.communicate)  # closes its standard input, and waits
+            stack.push_async_callback(air.communicate, b"")  # closes its standard input, and waits
             for station, rng in zip(self._scenario.stations, instrument_rngs, strict=True):
                 instrument = SimulatedTotalStation(
                     station, self._scenario, self._demo.world, timeline, rng, start_ns=self._demo.start_ns

@@ -99,7 +99,8 @@ class Finder:
             if not done(await self._sweep(sweeping)):
                 return False
             self.has_found = True
-            if await self._adjust(_HERE):
+            # A person may have locked in meanwhile, which a sweep would undo.
+            if await self._adjust(_HERE) or await self.lock() is Lock.IN:
                 return True
             sweeping = _NEARBY
         self.has_found = False

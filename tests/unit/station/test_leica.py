@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pytest
@@ -17,13 +17,15 @@ from tsgt.radio.orders import Direction
 from tsgt.simulation.geocom_server import Forced
 from tsgt.station.geocom import Rpc
 from tsgt.station.geocom_codes import ReturnCode
+from tsgt.station.geocom_connection import Reply
 from tsgt.station.instrument import Atmosphere
 from tsgt.station.keeper import InstrumentKeeper
+from tsgt.station.leica_lock import Look
 from tsgt.station.leica_search import Finder
 from tsgt.station.session import Session
 
 if TYPE_CHECKING:
-    from tsgt.station.leica_lock import Look
+    from tsgt.station.geocom_connection import GeoComConnection
 
 
 def hidden(start_s: float, end_s: float) -> StatusFaultConfig:
@@ -224,6 +226,28 @@ async def test_a_robot_that_drives_on_after_a_sweep_is_swept_for_again(misses: i
         )
         await day.read_until(Status.OK, within_s=60.0)
         assert bool(day.station.beeps) == called
+
+
+class LockedByHand:
+    """A line to an instrument that finds the prism; before it can point at it, a person ends that and locks in."""
+
+    def __init__(self) -> None:
+        self.asked: list[Rpc] = []
+
+    async def call(self, rpc: Rpc, *_: object, **__: object) -> Reply:
+        """Answer as that instrument does."""
+        self.asked.append(rpc)
+        values = (int(Rpc.AUT_FINE_ADJUST in self.asked),) if rpc is Rpc.MOT_READ_LOCK_STATUS else ()
+        code = ReturnCode.ABORT if rpc is Rpc.AUT_FINE_ADJUST else ReturnCode.OK
+        return Reply(code, values, 0, 1)
+
+
+async def test_a_lock_by_hand_after_a_sweep_is_kept() -> None:
+    """A prism that could not be pointed at is swept for again only while nobody has locked in on it."""
+    line = LockedByHand()
+    finder = Finder(cast("GeoComConnection", line), power_search=True)
+    assert await finder.look(Look("searching", sweep=True, centre=None, width_rad=0.1, height_rad=0.1))
+    assert line.asked.count(Rpc.AUT_PS_SEARCH_WINDOW) == 1
 
 
 async def test_a_person_is_called_when_nothing_helps() -> None:

@@ -39,8 +39,12 @@ _FORGOTTEN = 1_000
 
 _UNIQUE_US = 30_000.0
 """Within half of 2^16 us the low bits of a time tell which it is; a little is left for stamps."""
+_LOW_BITS_US = 65_536.0
 _SURE_US = 5_000.0
-"""An offset that seems to have jumped by more than this may have jumped by a multiple of 2^16 us more."""
+"""An offset that seems to have jumped by more than this may have jumped by 2^16 us more."""
+
+_FEWEST_IN_FULL = 2
+"""A single beacon may have been held back by any time. Two in a row by the same would be worse luck than there is."""
 
 
 class Instant(NamedTuple):
@@ -127,11 +131,14 @@ class BeaconClock:
         When the newest pair was received that has been believed.
     pairs
         How many the fit rests on.
+    known
+        Two pairs in full have agreed; before that there is no time.
     """
 
     def __init__(self) -> None:
         self._jitter = _Jitter()
         self._stretches: list[Stretch] = []
+        self._in_full = 0  # pairs of the first stretch
         self._rival: Stretch | None = None
         self._rival_in_full = False  # whether its times are known to 2^40 us, and not just to 2^16
         self._rival_live = False
@@ -145,6 +152,11 @@ class BeaconClock:
     def pairs(self) -> int:
         """See the class."""
         return sum(map(len, self._stretches))
+
+    @property
+    def known(self) -> bool:
+        """See the class."""
+        return self._in_full >= _FEWEST_IN_FULL
 
     def add(
         self, received_ns: int, sent_us: int, sigma_ns: int, *, in_full: bool = False, live: bool = True
@@ -171,17 +183,16 @@ class BeaconClock:
             explain: a beacon that was held up, or a clock that somebody has touched. The fit keeps away from it, but
             its bound contains it until there is one that agrees. Five in a row that agree with each other instead
             begin the fit anew, if one of them was live; if they are off by more than 5 ms, one of them has to be known
-            in full as well.
+            in full as well. Before there is a time, only pairs in full are taken, and the newer of two that do not agree
+            is kept.
         """
         sent_ns = 1000 * sent_us
         newest_ns = self._rival.last_ns if self._rival else self.last_received_ns
         if newest_ns is not None and received_ns <= newest_ns:
             return False
         pair = Pair(received_ns, sent_ns, sigma_ns, self._jitter.variance_us2(sigma_ns))
-        if not self._stretches:
-            self._jitter.add(pair)
-            self._stretches.append(Stretch(pair, 0.0, _RATE_SIGMA_PPM))
-            return True
+        if not self.known:
+            return in_full and self._begin(pair)
         stretch = self._stretches[-1]
         agrees, unknown = stretch.agrees(pair), not self._jitter.known
         if agrees or self._rival is not None:
@@ -211,7 +222,7 @@ class BeaconClock:
         int | None
             In us; None where there is more than one that it can be.
         """
-        if not self._stretches:
+        if not self.known:
             return None
         rival = self._rival
         # A single beacon that was held back must not keep the next ones from being understood.
@@ -222,16 +233,16 @@ class BeaconClock:
         return near_us + (low16 - near_us + 0x8000) % 0x10000 - 0x8000
 
     def at(self, local_ns: int) -> Instant | None:
-        """Return the session time at an instant of this computer's clock, between and beyond pairs; None without."""
-        return self._at(local_ns) if self._stretches else None
+        """Return the session time at an instant of this computer's clock, between and beyond pairs; None if not known."""
+        return self._at(local_ns) if self.known else None
 
     def elapsed(self, from_ns: int, to_ns: int) -> Instant:
         """Return how long it was by the master's clock between two instants of this computer's.
 
-        Without any pair both clocks are taken to run alike, and the bound says what they can differ by.
+        As long as there is no time both clocks are taken to run alike, and the bound says what they can differ by.
         """
         local_us = (to_ns - from_ns) / 1000
-        if not self._stretches:
+        if not self.known:
             return _duration(local_us, 0.0, _RATE_SIGMA_PPM, UNKNOWN_RATE_PPM)
         start, end = self._at(from_ns), self._at(to_ns)
         by_ends = Instant(
@@ -248,7 +259,7 @@ class BeaconClock:
         fits, _ = stretch.at((from_ns + to_ns) // 2)
         bound_ppm = rate_bound_ppm(fits)
         if self._rival is not None and newest and later_ns > stretch.last_ns:
-            bound_ppm += abs(self._off_us(self._rival)) / ((self._rival.first_ns - stretch.last_ns) / 1e9)
+            bound_ppm += self._doubt_us(self._rival) / ((self._rival.first_ns - stretch.last_ns) / 1e9)
         by_rate = _duration(local_us, fits.slow.rate_ppm, math.sqrt(fits.slow.rate_variance), bound_ppm)
         return by_ends if by_ends.bound_us < by_rate.bound_us else by_rate
 
@@ -267,11 +278,24 @@ class BeaconClock:
         # The rate may have changed right after the last pair.
         share = (local_ns - stretch.last_ns) / (self._rival.first_ns - stretch.last_ns)
         share = max(share, 1.0) if outvoted else share
-        return instant._replace(bound_us=instant.bound_us + abs(self._off_us(self._rival)) * share)
+        return instant._replace(bound_us=instant.bound_us + self._doubt_us(self._rival) * share)
 
     def _index(self, local_ns: int) -> int:
         """Return which stretch an instant is in; those between two belong to the earlier one."""
         return max(bisect_right(self._stretches, local_ns, key=lambda stretch: stretch.first_ns) - 1, 0)
+
+    def _begin(self, pair: Pair) -> bool:
+        """Take a pair in full before there is a time; return whether it agrees with those before it."""
+        alone = not self._stretches
+        agrees = not alone and self._stretches[0].agrees(pair)
+        if agrees:
+            self._stretches[0].add(pair)
+        else:
+            self._jitter = _Jitter()
+            self._stretches, self._in_full = [Stretch(pair, 0.0, _RATE_SIGMA_PPM)], 0
+        self._jitter.add(pair)
+        self._in_full += 1
+        return agrees or alone
 
     def _doubt(self, pair: Pair, stretch: Stretch, *, in_full: bool, live: bool) -> None:
         """Hold a pair that does not agree with the fit against others of its kind."""
@@ -282,8 +306,7 @@ class BeaconClock:
         self._rival.add(pair)
         self._rival_in_full = self._rival_in_full or in_full
         self._rival_live = self._rival_live or live
-        sure = self._rival_in_full or abs(self._off_us(self._rival)) <= _SURE_US
-        if sure and self._rival_live and len(self._rival) >= _FEWEST_RIVALS:
+        if self._is_sure(self._rival) and self._rival_live and len(self._rival) >= _FEWEST_RIVALS:
             self._stretches.append(self._rival)
             self._rival = None
 
@@ -292,6 +315,14 @@ class BeaconClock:
         stretch = self._stretches[-1]
         fits, _ = stretch.at(rival.first_ns)
         return (rival.base_ns - stretch.base_ns) / 1000 - fits.slow.offset_us
+
+    def _is_sure(self, rival: Stretch) -> bool:
+        """Whether it is known which multiple of 2^16 us its times contain."""
+        return self._rival_in_full or abs(self._off_us(rival)) <= _SURE_US
+
+    def _doubt_us(self, rival: Stretch) -> float:
+        """Return how far the fit is off if a rival is right."""
+        return abs(self._off_us(rival)) + (0.0 if self._is_sure(rival) else _LOW_BITS_US)
 
     def _forget(self) -> None:
         """Let go of the oldest pairs when there are too many."""

@@ -42,6 +42,12 @@ EXCHANGE_EVERY = 32
 EXCHANGE_STEP = 5
 """From the frame of one station's to that of the next one's: long replies are not to follow each other closely."""
 
+TIME_AT_START = 3
+"""In so many frames a station that has joined is told the time in full: it needs two that agree."""
+
+UNNOTICED_NS = 30_000_000
+"""A beacon that was held back for longer may agree with others, as far as the low bits of their times tell."""
+
 MISSING_EVERY = 32
 """How often a station is asked again, in frames, for measurements that it did not send though it could have."""
 
@@ -102,6 +108,30 @@ class _Pending:
     order: Order
 
 
+class _HeldBack:
+    """Whether somebody holds beacons back from a station for longer than it can notice by the low bits of their times.
+
+    Attributes
+    ----------
+    by_ns
+        By how much, at most, since it began; 0 from the second reply in a row on that was on time: the station has heard
+        the time in full of a beacon that came when it should.
+    """
+
+    def __init__(self) -> None:
+        self.by_ns = 0
+        self._on_time: int | None = None
+
+    def add(self, counter: int, late_ns: int) -> None:
+        """Take by how much the reply to a frame was late."""
+        if late_ns > UNNOTICED_NS:
+            self.by_ns, self._on_time = max(self.by_ns, late_ns), None
+            return
+        if self._on_time == counter - 1:
+            self.by_ns = 0
+        self._on_time = counter
+
+
 class Peer:
     """What the master knows of one station.
 
@@ -122,6 +152,8 @@ class Peer:
         Of its introduction to this session; None: it has not joined.
     introducing
         Its last reply still held its introduction.
+    lacks_time
+        It tells what it measures by how long before or after the frame's beacon it was, and not in session time.
     silent
         For how many frames in which it had a slot it has not been heard.
     late, doubted
@@ -133,6 +165,7 @@ class Peer:
         self.inbox = Inbox()
         self.nonce: int | None = None
         self.introducing = False
+        self.lacks_time = False
         self.silent = 0
         self.late = 0
         self.doubted = 0
@@ -141,6 +174,8 @@ class Peer:
         self._zero_ns = zero_ns
         self._pace = pace
         self._confirm: int | None = None
+        self._joined_at = 0
+        self._held_back = _HeldBack()
         self._state: StatePart | None = None
         self._ticket = 0
         self._pending: _Pending | None = None
@@ -196,6 +231,11 @@ class Peer:
     def confirmation(self) -> Confirmation | None:
         """What the next beacon says to a station that has introduced itself."""
         return None if self._confirm is None else Confirmation(self.number, self._confirm)
+
+    def wants_time(self, counter: int) -> bool:
+        """Tell whether this beacon has to say the time in full: it has just joined, or its beacons came late."""
+        joins = self.nonce is not None and counter - self._joined_at <= TIME_AT_START
+        return joins or self._held_back.by_ns > 0
 
     def confirmed(self) -> None:
         """Take note that the confirmation has gone out."""
@@ -269,6 +309,11 @@ class Peer:
             When it came.
         """
         joined = self._introduced(reply)
+        if joined:
+            self._joined_at = at.counter
+        if reply.runs:
+            self.lacks_time = reply.runs[0].direct
+        self._held_back.add(at.counter, self._late_ns(at))
         prism = self._prism_of(reply)
         missing = self.inbox.missing
         numbers: list[int] = []
@@ -384,8 +429,9 @@ class Peer:
         newest_us = self._newest_us(run, at)
         claimed_ns = 1000 * quality_bound_us(run.quality)
         if run.direct:  # a beacon that somebody held back makes its reply late by as much
-            usual_ns = 2 * (self._trip.link_ns - self._trip.nominal_ns)
-            claimed_ns += max(at.lateness_ns - usual_ns, 0) + SIGMAS * at.sent_sigma_ns
+            claimed_ns += self._late_ns(at) + SIGMAS * at.sent_sigma_ns
+        else:
+            claimed_ns += self._held_back.by_ns
         sigma_ns = math.hypot(claimed_ns / SIGMAS, _ROUNDING_NS / math.sqrt(3), self._trip.sigma_ns)
         bound_ns = claimed_ns + _ROUNDING_NS + self._trip.bound_ns + self._trip.delay_ns
         timed = []
@@ -409,6 +455,10 @@ class Peer:
                 )
             )
         return timed
+
+    def _late_ns(self, at: Reception) -> int:
+        usual_ns = 2 * (self._trip.link_ns - self._trip.nominal_ns)
+        return max(at.lateness_ns - usual_ns, 0)
 
     def _newest_us(self, run: Run, at: Reception) -> int:
         """Return the newest time of a run; narrow ones repeat, and it is the last before the reply has begun."""

@@ -228,8 +228,12 @@ class StationSession:
     # --- Time -------------------------------------------------------------------------------------------------
 
     def can_time(self, queued: Queued) -> bool:
-        """Whether this master's time of a measurement can be told: not if it is of another start of this computer."""
-        return queued.boot in self._clocks
+        """Whether this master's time of a measurement can be told, now or soon.
+
+        Not if it is of another start of this computer, which had not learnt this master's time.
+        """
+        clock = self._clocks.get(queued.boot)
+        return clock is not None and (queued.boot == self._boot or clock.known)
 
     def timed(self, queued: Queued, slot_ns: int, newest: Timed | None = None) -> Timed | None:
         """Return a measurement with its time for a slot that begins then; None where nothing useful is known.

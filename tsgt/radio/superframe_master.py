@@ -341,13 +341,13 @@ class SuperframeMaster:
             sent_us += not sent_us % (1 << 16)  # 0 stands for not known
         peers = self._peers.values()
         wanted = any(
-            peer.nonce is None or peer.introducing or peer.silent > WANTED_AFTER_FRAMES for peer in peers
+            peer.nonce is None or peer.introducing or peer.lacks_time or peer.silent > WANTED_AFTER_FRAMES
+            for peer in peers
         )
-        # A station that is confirmed wants the time in full at once.
-        confirms = any(peer.confirmation is not None for peer in peers)
+        at_once = any(peer.wants_time(counter) for peer in peers)
         at_the_start = wanted and counter < SESSION_AT_START
         invites = (
-            confirms or at_the_start or counter % (SESSION_EVERY_WANTED if wanted else SESSION_EVERY) == 0
+            at_once or at_the_start or counter % (SESSION_EVERY_WANTED if wanted else SESSION_EVERY) == 0
         )
         session = SessionPart(
             nonce=self.session,

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from tsgt.radio.beacon_clock import BeaconClock, Instant
 from tsgt.radio.clock_stretch import SIGMAS
 from tsgt.radio.messages import TIME_UNIT_US
+from tsgt.radio.peer import TIME_AT_START
+from tsgt.radio.superframe_master import SESSION_EVERY, SESSION_EVERY_WANTED
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -34,7 +36,6 @@ _BATCH = 8
 _LIVE_S = 1.0
 _DIRECT_EXTRA_US = 2000.0
 """A time from a single beacon must be surer by this than one from the fit."""
-_SESSION_PART_FRAMES = 32
 
 _GRID_S = 0.05
 """The rate of a clock is constant for so long."""
@@ -235,7 +236,8 @@ class _Station:
 
     def learn(self, frame: int, received_ns: int, sent_us: int) -> None:
         """Take a pair, if the time is known in full."""
-        in_full = frame % _SESSION_PART_FRAMES == 0 or not self._clock.pairs
+        every = SESSION_EVERY if self._clock.known else SESSION_EVERY_WANTED
+        in_full = frame < TIME_AT_START or frame % every == 0
         full_us = sent_us if in_full else self._clock.unwrap(received_ns, sent_us & 0xFFFF)
         if full_us is not None:
             self.refused += not self._clock.add(received_ns, full_us, self._sigma_ns, in_full=in_full)

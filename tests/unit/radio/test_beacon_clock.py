@@ -23,7 +23,7 @@ def taught(pairs: int, *, ppm: float = 0.0, jitter_us: float = 0.0, seed: int = 
     clock, rng = BeaconClock(), np.random.default_rng(seed)
     for k in range(pairs):
         late_ns = round(1000 * rng.normal(0.0, jitter_us)) if jitter_us else 0
-        assert clock.add(received_ns(sent_us(k), ppm) + late_ns, sent_us(k), SIGMA_NS)
+        assert clock.add(received_ns(sent_us(k), ppm) + late_ns, sent_us(k), SIGMA_NS, in_full=k < 2)
     return clock
 
 
@@ -42,15 +42,55 @@ def test_without_pairs_it_knows_nothing_but_durations() -> None:
     assert clock.elapsed(START_NS, START_NS + FRAME_NS)[::2] == pytest.approx((400_000.0, 48.0))
 
 
-def test_one_pair_gives_a_time_with_an_honest_bound() -> None:
-    """One pair may be off by what the master's stamp can be, and tells nothing of the rate."""
+def test_one_pair_gives_no_time() -> None:
+    """Its beacon may have been held back by anything; and so the low bits of others are not completed by it."""
     clock = taught(1)
-    at, later = clock.at(received_ns(sent_us(0))), clock.at(received_ns(sent_us(0) + 60e6, ppm=100))
+    assert clock.at(received_ns(sent_us(0))) is None
+    assert clock.unwrap(received_ns(sent_us(1)), sent_us(1) & 0xFFFF) is None
+    assert clock.elapsed(START_NS, START_NS + FRAME_NS)[::2] == pytest.approx((400_000.0, 48.0))
+
+
+def test_two_pairs_give_a_time_with_an_honest_bound() -> None:
+    """They may be off by what the master's stamp can be, and tell little of the rate."""
+    clock = taught(2)
+    at, later = clock.at(received_ns(sent_us(1))), clock.at(received_ns(sent_us(1) + 60e6, ppm=100))
     assert at is not None
     assert later is not None
-    assert at.time_us == pytest.approx(sent_us(0))
-    assert at.bound_us == pytest.approx(5_000, rel=0.01)
-    assert abs(later.time_us - sent_us(0) - 60e6) < later.bound_us < 20_000
+    assert at.time_us == pytest.approx(sent_us(1))
+    assert at.bound_us == pytest.approx(3_540, rel=0.01)
+    assert abs(later.time_us - sent_us(1) - 60e6) < later.bound_us < 20_000
+
+
+def test_of_two_first_pairs_that_do_not_agree_neither_is_a_time() -> None:
+    """One of them was held back by 248 ms. The third decides which."""
+    for held in (0, 1):
+        clock = BeaconClock()
+        taken = []
+        for k in range(4):
+            late_us = 248_000 if k == held else 0
+            taken.append(clock.add(received_ns(sent_us(k) + late_us), sent_us(k), SIGMA_NS, in_full=True))
+            if k == 1:
+                assert clock.at(received_ns(sent_us(1))) is None
+        at = clock.at(received_ns(sent_us(0)))
+        assert at is not None
+        assert abs(at.time_us - sent_us(0)) <= at.bound_us
+        assert taken.count(False) == 1 + held
+
+
+def test_pairs_that_are_not_in_full_give_no_time() -> None:
+    """However many there are."""
+    clock = BeaconClock()
+    assert not any(clock.add(received_ns(sent_us(k)), sent_us(k), SIGMA_NS) for k in range(10))
+    assert clock.at(received_ns(sent_us(5))) is None
+
+
+def test_what_low_bits_do_not_tell_is_in_the_bound() -> None:
+    """A pair that seems to be 14 ms off may be 65.5 ms more off."""
+    clock = taught(150)
+    clock.add(received_ns(sent_us(150) + 14_000), sent_us(150), SIGMA_NS)
+    at = clock.at(received_ns(sent_us(150) + 14_000))
+    assert at is not None
+    assert at.bound_us > 14_000 + 65_536
 
 
 @pytest.mark.parametrize("ppm", [-100.0, 0.0, 100.0])
@@ -135,11 +175,12 @@ def test_recordings_of_long_ago_never_outvote_the_fit() -> None:
     assert abs(at.time_us - sent_us(230)) < 1000
 
 
-def test_a_first_pair_that_is_outvoted_says_nothing_surely() -> None:
-    """Neither of its own time nor of what was before it."""
+def test_first_pairs_that_are_outvoted_say_nothing_surely() -> None:
+    """Neither of their own time nor of what was before them."""
     clock = BeaconClock()
-    clock.add(received_ns(sent_us(0) + 30_000), sent_us(0), SIGMA_NS)
-    for k in range(1, 10):
+    for k in range(2):
+        clock.add(received_ns(sent_us(k) + 30_000), sent_us(k), SIGMA_NS, in_full=True)
+    for k in range(2, 10):
         clock.add(received_ns(sent_us(k)), sent_us(k), SIGMA_NS, in_full=True)
         for early_us in (sent_us(0) - 20_000_000, sent_us(0)):
             at = clock.at(received_ns(early_us))
@@ -213,7 +254,7 @@ def taught_coarsely(seed: int) -> BeaconClock:
     """Return a clock whose stamps scatter by 1 ms; some of its pairs are refused."""
     clock, rng = BeaconClock(), np.random.default_rng(seed)
     for k in range(30):
-        clock.add(received_ns(sent_us(k) + rng.normal(0, 1_000)), sent_us(k), SIGMA_NS)
+        clock.add(received_ns(sent_us(k) + rng.normal(0, 1_000)), sent_us(k), SIGMA_NS, in_full=k < 4)
     return clock
 
 
@@ -252,6 +293,7 @@ def test_the_oldest_pairs_are_let_go_of(monkeypatch: pytest.MonkeyPatch) -> None
 def test_old_stretches_are_let_go_of(monkeypatch: pytest.MonkeyPatch) -> None:
     """A stretch with few pairs goes as a whole."""
     monkeypatch.setattr(beacon_clock, "MOST_PAIRS", 100)
+    monkeypatch.setattr(beacon_clock, "_FORGOTTEN", 20)
     clock = taught(10)
     for k in range(20, 200):
         clock.add(received_ns(sent_us(k) + 2_000), sent_us(k), SIGMA_NS)

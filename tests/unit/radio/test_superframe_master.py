@@ -31,6 +31,7 @@ from tsgt.radio.messages import (
     Towards,
 )
 from tsgt.radio.orders import Direction, DirectOrder, MeasureOrder, SearchOrder, TrackOrder
+from tsgt.radio.peer import TIME_AT_START
 
 if TYPE_CHECKING:
     from tsgt.radio.orders import Order
@@ -115,10 +116,42 @@ def test_a_beacon_that_failed_leaves_nothing_behind(frames: Frames) -> None:
 
 def test_how_to_join_is_told_more_often_while_somebody_is_missing(frames: Frames) -> None:
     """In each fourth beacon while a station has not joined or is silent, otherwise in each thirty-second."""
-    assert sessions(frames, 70) == [32, 64]
+    assert [number for number in sessions(frames, 70) if number > TIME_AT_START] == [32, 64]
     assert [number % 4 for number in sessions(frames, 21, silent=(2,))] == [0, 0, 0, 0]
     unjoined = frames_of()
     assert sessions(unjoined, 21, silent=(1, 2, 3)) == [*range(12), 12, 16, 20]
+
+
+def test_a_station_that_has_joined_is_told_the_time_in_full_at_once() -> None:
+    """Twice and once more: it believes no time that is not confirmed."""
+    frames = frames_of((1,))
+    frames.run(20, silent=(1,))
+    joined = frames.begin().frame
+    frames.answer(1, Reply(introduction=frames.stations[1].introduction))
+    frames.end()
+    told = sessions(frames, 10)
+    assert [number for number in told if number <= joined + 3] == [joined + 1, joined + 2, joined + 3]
+
+
+@pytest.mark.parametrize(("direct", "often"), [(True, 4), (False, 32)])
+def test_a_station_that_does_not_know_the_time_is_told_it_in_full_more_often(
+    *, direct: bool, often: int
+) -> None:
+    """It tells what it measures by the beacon that it has heard."""
+    frames = frames_of((1,))
+    frames.join()
+    frames.run(12)
+    told = []
+    for number in range(13, 13 + 2 * often):
+        session = frames.begin().session
+        if session is not None:
+            told.append(frames.master.counter)
+        origin_us = frames.sent_us if direct else 0
+        measured = sighting(number, frames.sent_us + 10_000, origin_us=origin_us, wide=True)
+        frames.answer(1, Reply(runs=(Run(sightings=(measured,), wide=True, direct=direct),)), sequence=number)
+        frames.end()
+    assert len(told) == 2
+    assert told[1] - told[0] == often
 
 
 def test_stations_may_have_any_numbers() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from array import array
 from collections import Counter
 from dataclasses import dataclass, field, fields
+from itertools import combinations
 from typing import TYPE_CHECKING, get_args
 
 import numpy as np
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 _HEAD_LINES = 2
 # What is left of a program that is killed lives on for an instant.
 _LAST_NS = 5_000_000
+# Two beacons agree to within this, whatever the clock of a station did in between.
+_APART_US = 20_000
 
 _KINDS: tuple[Kind, ...] = get_args(Kind)
 
@@ -248,10 +251,11 @@ class Measured:
         journals = [load_journal(path) for path in witness.journals if _begun(path)]
         self.journalled = [m for journal in journals for m in journal.measurements]
         self._heads = {m.sequence: journal.head for journal in journals for m in journal.measurements}
-        self._heard: dict[str, set[int]] = {}
+        self._offsets_us: dict[tuple[str, int], list[int]] = {}
         for journal in journals:
-            heard = self._heard.setdefault(journal.head.boot, set())
-            heard.update(reception.session for reception in journal.receptions)
+            for told in journal.receptions:
+                offsets_us = self._offsets_us.setdefault((journal.head.boot, told.session), [])
+                offsets_us.append(told.sent_us - told.stamp_ns // 1000)
         # Their names tell the order as well as the stations' Unix clocks do.
         last = max(witness.journals, key=lambda path: path.stat().st_mtime_ns, default=None)
         self._last_journal = last if last is not None and _begun(last) else None
@@ -285,8 +289,8 @@ class Measured:
     def timeless(self, sequence: int, session: int | None) -> bool:
         """Whether no time of a master's session can be told of a measurement.
 
-        Its computer has been started again since, without having heard of that session before; or its program was, on a disk
-        that took nothing, and has begun to number anew.
+        Its computer has been started again since, without having learnt the time of that session before; or its program was,
+        on a disk that took nothing, and has begun to number anew.
 
         Parameters
         ----------
@@ -298,7 +302,11 @@ class Measured:
         head = self._heads[sequence]
         if self._last is None or head.lineage != self._last.lineage:
             return True
-        return head.boot != self._last.boot and session not in self._heard[head.boot]
+        if head.boot == self._last.boot:
+            return False
+        offsets_us = self._offsets_us.get((head.boot, session), []) if session is not None else []
+        # One beacon may have been held back; two that agree have not.
+        return all(abs(b - a) > _APART_US for a, b in combinations(offsets_us, 2))
 
 
 def _begun(path: Path) -> bool:

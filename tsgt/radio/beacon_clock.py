@@ -132,15 +132,16 @@ class BeaconClock:
     pairs
         How many the fit rests on.
     known
-        Two pairs in full have agreed; before that there is no time.
+        Two pairs in full have agreed, one of them live; before that there is no time.
     """
 
     def __init__(self) -> None:
         self._jitter = _Jitter()
         self._stretches: list[Stretch] = []
-        self._in_full = 0  # pairs of the first stretch
+        self._begun_live = False
+        self._known = False
         self._rival: Stretch | None = None
-        self._rival_in_full = False  # whether its times are known to 2^40 us, and not just to 2^16
+        self._rival_in_full = False  # a live one has told its times to 2^40 us, and not just to 2^16
         self._rival_live = False
 
     @property
@@ -156,7 +157,7 @@ class BeaconClock:
     @property
     def known(self) -> bool:
         """See the class."""
-        return self._in_full >= _FEWEST_IN_FULL
+        return self._known
 
     def add(
         self, received_ns: int, sent_us: int, sigma_ns: int, *, in_full: bool = False, live: bool = True
@@ -182,8 +183,8 @@ class BeaconClock:
             False: this cannot be. It is more than 200 us off the fit, and more than jitter and the clocks can
             explain: a beacon that was held up, or a clock that somebody has touched. The fit keeps away from it, but
             its bound contains it until there is one that agrees. Five in a row that agree with each other instead
-            begin the fit anew, if one of them was live; if they are off by more than 5 ms, one of them has to be known
-            in full as well. Before there is a time, only pairs in full are taken, and the newer of two that do not agree
+            begin the fit anew, if one of them was live; if they are off by more than 5 ms, a live one has to be known in
+            full. Before there is a time, only pairs in full are taken, and the newer of two that do not agree
             is kept.
         """
         sent_ns = 1000 * sent_us
@@ -192,7 +193,7 @@ class BeaconClock:
             return False
         pair = Pair(received_ns, sent_ns, sigma_ns, self._jitter.variance_us2(sigma_ns))
         if not self.known:
-            return in_full and self._begin(pair)
+            return in_full and self._begin(pair, live=live)
         stretch = self._stretches[-1]
         agrees, unknown = stretch.agrees(pair), not self._jitter.known
         if agrees or self._rival is not None:
@@ -284,7 +285,7 @@ class BeaconClock:
         """Return which stretch an instant is in; those between two belong to the earlier one."""
         return max(bisect_right(self._stretches, local_ns, key=lambda stretch: stretch.first_ns) - 1, 0)
 
-    def _begin(self, pair: Pair) -> bool:
+    def _begin(self, pair: Pair, *, live: bool) -> bool:
         """Take a pair in full before there is a time; return whether it agrees with those before it."""
         alone = not self._stretches
         agrees = not alone and self._stretches[0].agrees(pair)
@@ -292,19 +293,20 @@ class BeaconClock:
             self._stretches[0].add(pair)
         else:
             self._jitter = _Jitter()
-            self._stretches, self._in_full = [Stretch(pair, 0.0, _RATE_SIGMA_PPM)], 0
+            self._stretches, self._begun_live = [Stretch(pair, 0.0, _RATE_SIGMA_PPM)], False
         self._jitter.add(pair)
-        self._in_full += 1
+        self._begun_live = self._begun_live or live
+        self._known = self._begun_live and len(self._stretches[0]) >= _FEWEST_IN_FULL
         return agrees or alone
 
     def _doubt(self, pair: Pair, stretch: Stretch, *, in_full: bool, live: bool) -> None:
         """Hold a pair that does not agree with the fit against others of its kind."""
         if self._rival is None or not self._rival.agrees(pair):
             self._rival = Stretch(pair, stretch.rate_ppm, _SLEWED_SIGMA_PPM)
-            self._rival_in_full, self._rival_live = in_full, live
+            self._rival_in_full, self._rival_live = in_full and live, live
             return
         self._rival.add(pair)
-        self._rival_in_full = self._rival_in_full or in_full
+        self._rival_in_full = self._rival_in_full or (in_full and live)
         self._rival_live = self._rival_live or live
         if self._is_sure(self._rival) and self._rival_live and len(self._rival) >= _FEWEST_RIVALS:
             self._stretches.append(self._rival)

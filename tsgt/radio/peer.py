@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from tsgt.radio.grants import MOST_MEASUREMENTS, UNKNOWN_GRANT, Demand, expected, grant
 from tsgt.radio.heard import Heard, TimedSighting
+from tsgt.radio.held_back import HeldBack
 from tsgt.radio.inbox import Inbox
 from tsgt.radio.message_codec import angle_rad, distance_m
 from tsgt.radio.messages import (
@@ -43,10 +44,7 @@ EXCHANGE_STEP = 5
 """From the frame of one station's to that of the next one's: long replies are not to follow each other closely."""
 
 TIME_AT_START = 3
-"""In so many frames a station that has joined is told the time in full: it needs two that agree."""
-
-UNNOTICED_NS = 30_000_000
-"""A beacon that was held back for longer may agree with others, as far as the low bits of their times tell."""
+"""In so many frames a station that has introduced itself is told the time in full: it needs two that agree."""
 
 MISSING_EVERY = 32
 """How often a station is asked again, in frames, for measurements that it did not send though it could have."""
@@ -108,30 +106,6 @@ class _Pending:
     order: Order
 
 
-class _HeldBack:
-    """Whether somebody holds beacons back from a station for longer than it can notice by the low bits of their times.
-
-    Attributes
-    ----------
-    by_ns
-        By how much, at most, since it began; 0 from the second reply in a row on that was on time: the station has heard
-        the time in full of a beacon that came when it should.
-    """
-
-    def __init__(self) -> None:
-        self.by_ns = 0
-        self._on_time: int | None = None
-
-    def add(self, counter: int, late_ns: int) -> None:
-        """Take by how much the reply to a frame was late."""
-        if late_ns > UNNOTICED_NS:
-            self.by_ns, self._on_time = max(self.by_ns, late_ns), None
-            return
-        if self._on_time == counter - 1:
-            self.by_ns = 0
-        self._on_time = counter
-
-
 class Peer:
     """What the master knows of one station.
 
@@ -174,8 +148,8 @@ class Peer:
         self._zero_ns = zero_ns
         self._pace = pace
         self._confirm: int | None = None
-        self._joined_at = 0
-        self._held_back = _HeldBack()
+        self._introduced_at = 0
+        self._held_back = HeldBack()
         self._state: StatePart | None = None
         self._ticket = 0
         self._pending: _Pending | None = None
@@ -234,7 +208,7 @@ class Peer:
 
     def wants_time(self, counter: int) -> bool:
         """Tell whether this beacon has to say the time in full: it has just joined, or its beacons came late."""
-        joins = self.nonce is not None and counter - self._joined_at <= TIME_AT_START
+        joins = self.nonce is not None and counter - self._introduced_at <= TIME_AT_START
         return joins or self._held_back.by_ns > 0
 
     def confirmed(self) -> None:
@@ -309,8 +283,8 @@ class Peer:
             When it came.
         """
         joined = self._introduced(reply)
-        if joined:
-            self._joined_at = at.counter
+        if reply.introduction is not None:
+            self._introduced_at = at.counter
         if reply.runs:
             self.lacks_time = reply.runs[0].direct
         self._held_back.add(at.counter, self._late_ns(at))

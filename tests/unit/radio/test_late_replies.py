@@ -1,0 +1,32 @@
+"""Replies that come late, and what they say of the beacons before them."""
+
+from __future__ import annotations
+
+from support.radios import MS
+
+from tsgt.radio.held_back import HeldBack
+
+
+def by_ms(*late_ms: int | None) -> list[int]:
+    """Return what is thought after each frame, by how late its reply came; None: there was none."""
+    held, found = HeldBack(), []
+    for counter, late in enumerate(late_ms, start=7):
+        if late is not None:
+            held.add(counter, late * MS)
+        found.append(held.by_ns // MS)
+    return found
+
+
+def test_replies_that_are_as_late_as_a_computer_makes_them_say_nothing() -> None:
+    """Some ms, and more."""
+    assert by_ms(0, 5, 29, 0) == [0, 0, 0, 0]
+
+
+def test_the_longest_delay_counts_until_two_in_a_row_are_on_time() -> None:
+    """The first of them answers a beacon of which the station has not been told yet when it left."""
+    assert by_ms(0, 80, 120, 80, 0, 0) == [0, 80, 120, 120, 120, 0]
+
+
+def test_two_that_are_not_in_a_row_do_not_count() -> None:
+    """A beacon whose successor is lost tells no time."""
+    assert by_ms(80, 0, None, 0, 80, 0, 0) == [80, 80, 80, 80, 80, 80, 0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-from tsgt.simulation.disk import ProgramWrites, SimulatedDisk
+from tsgt.simulation.disk import Killed, ProgramWrites, SimulatedDisk
 from tsgt.simulation.radios import HostDelay, opener
 
 if TYPE_CHECKING:
@@ -102,13 +102,14 @@ class Computer:
         Raises
         ------
         BaseException
-            With what it has ended before, or now.
+            With what it has ended before, or now, unless it was killed in the middle of a line.
         """
         task, self.task = self.task, None
         if task is not None:
             task.cancel()
             await asyncio.wait([task])
-            if not task.cancelled() and (error := task.exception()) is not None:
+            error = None if task.cancelled() else task.exception()
+            if error is not None and not _is_killed(error):
                 raise error
 
     async def crash(self) -> None:
@@ -129,3 +130,10 @@ class Computer:
         # Programs that are no more fail to write in whatever they do last: that is no Exception.
         if not task.cancelled() and isinstance(error := task.exception(), Exception):
             raise error
+
+
+def _is_killed(error: BaseException) -> bool:
+    """Whether nothing else has happened to a program."""
+    if isinstance(error, BaseExceptionGroup):
+        return all(map(_is_killed, error.exceptions))
+    return isinstance(error, Killed)

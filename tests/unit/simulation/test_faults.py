@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from tsgt.simulation.faults import CALM_S, SETTLE_S, FaultKind, draw_faults, par
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from tsgt.simulation.computer import Computer
     from tsgt.simulation.mission import Mission
 
 DURATION_S = 60.0
@@ -52,6 +54,39 @@ def test_names_are_read() -> None:
     assert parse_faults("loss,disk-full") == {FaultKind.LOSS, FaultKind.DISK_FULL}
     with pytest.raises(ConfigError, match="there is no such fault"):
         parse_faults("loss,gremlins")
+
+
+def test_a_program_that_is_killed_while_it_ends_has_ended(tmp_path: Path) -> None:
+    """What it writes last tears, alone or in a task of its own; a program that fails while it ends is told of."""
+
+    async def write_last(computer: Computer, fails: type[Exception] | None) -> None:
+        write = computer.new_program()
+        assert computer.writes is not None
+        computer.writes.tear(0.0, lambda: None)
+        try:
+            await asyncio.Event().wait()
+        finally:
+            if fails is not None:
+                raise fails
+            write(-1, memoryview(b"line"))
+
+    async def write_in_task(computer: Computer) -> None:
+        async with asyncio.TaskGroup() as group:
+            group.create_task(write_last(computer, None))
+
+    async def end_programs(run: Mission) -> None:
+        await run.kill("station1")
+        computer = run.computers["station1"]
+        for program in (write_last(computer, None), write_in_task(computer)):
+            computer.start(program)
+            await run.sleep_until(run.now_s + 0.1)
+            await computer.end()
+        computer.start(write_last(computer, OSError))
+        await run.sleep_until(run.now_s + 0.1)
+        with pytest.raises(OSError):  # noqa: PT011 (it has no text)
+            await computer.end()
+
+    mission(tmp_path, duration_s=1.0, script=end_programs)
 
 
 def test_a_crash_is_when_it_happens(tmp_path: Path) -> None:

@@ -142,7 +142,9 @@ def run(seed: int) -> Sums:
             done = simulate(scenario, options, folder=Path(folder))
             found = [f"{each.check}: {each.detail}" for each in violations(done)]
             _count(done, sums)
-        except Exception as error:  # noqa: BLE001 (whatever it is, it is a finding)
+        except (KeyboardInterrupt, SystemExit):
+            raise
+        except BaseException as error:  # noqa: BLE001 (whatever it is, it is a finding)
             found = [f"died: {error!r}"]
     sums.violations = [f"{mission.command}\n    {each[:400]}" for each in found[:3]]
     sums.simulated_s[kind] = round(DURATION_S)

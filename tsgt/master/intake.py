@@ -7,6 +7,7 @@ that was synchronised: then it waits, with all that follow, for the next synchro
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
@@ -240,10 +241,12 @@ class _Station:
         if self._heard_ns is None or samples[0].sent_ns - self._heard_ns > RESTART_NS:
             self._held_of_before = bool(self._held)
         known = self._offset_ns is not None
-        if known and self._doubtful and not self._agrees(newest):
+        forgotten = known and self._doubtful and not self._agrees(newest)
+        if forgotten:
             self._clock.forget()  # the paper's filter would go there a tenth of the way
         self._missed = False
         self._heard_ns, self._doubtful, self._had_nothing = now_ns, False, False
+        before = self._by_the_clock_before() if known and not forgotten else {}
         updated = self._clock.update(samples)
         another = self._held_of_before and (updated.restarted or not known)
         stepped = updated.restarted and known
@@ -263,10 +266,18 @@ class _Station:
             samples=tuple(samples),
             rejected=updated.rejected,
         )
-        released = [self._released(*held, None if another else estimate) for held in self._held]
+        released = [
+            self._released(*held, None if another else estimate, before.get(held[0].time_ns))
+            for held in self._held
+        ]
         self._held.clear()
         self._held_of_before = False
         return Synchronised(record, [m for m in released if m is not None], stepped)
+
+    def _by_the_clock_before(self) -> dict[int, int]:
+        """Return the offset in ns of each that is held, if it may be of the clock that was known so far."""
+        held = self._held if self._held_of_before else ()
+        return {message.time_ns: self._clock.at(message.time_ns).offset_ns for message, _ in held}
 
     def _agrees(self, sample: ClockSample) -> bool:
         """Whether an exchange is possible with the clock as it is known."""
@@ -291,22 +302,36 @@ class _Station:
         return self._record(message, received_ns, received_ns, UNTIMED_SIGMA_NS)
 
     def _released(
-        self, message: MeasurementMessage, received_ns: int, present: ClockEstimate | None
+        self,
+        message: MeasurementMessage,
+        received_ns: int,
+        present: ClockEstimate | None,
+        before_ns: int | None,
     ) -> PolarMeasurement | None:
-        """Stamp what was held, if it can be of the clock that has been found and not of one before that."""
+        """Stamp what was held, if it can be of the clock that has been found and not of one before that.
+
+        ``before_ns`` is the offset by the clock that was known so far, where it may be of that one: it may have stepped by
+        less than exchanges tell.
+        """
         if present is not None:
             stamp_ns = message.time_ns - present.offset_ns
             if received_ns - 2 * STALE_NS <= stamp_ns <= received_ns + present.bound_ns:
-                return self._measurement(message, received_ns)
+                return self._measurement(message, received_ns, before_ns)
         if _timed(message):
             return None  # nobody knows when it was; the station's journal has it
         return self._record(message, received_ns, received_ns, UNTIMED_SIGMA_NS)
 
-    def _measurement(self, message: MeasurementMessage, received_ns: int) -> PolarMeasurement:
+    def _measurement(
+        self, message: MeasurementMessage, received_ns: int, before_ns: int | None = None
+    ) -> PolarMeasurement:
         estimate = self._clock.at(message.time_ns)
-        bound_ns = estimate.bound_ns + self._stamp_delay_ns
+        stepped_ns = 0 if before_ns is None else abs(estimate.offset_ns - before_ns)
         return self._record(
-            message, received_ns, message.time_ns - estimate.offset_ns, estimate.sigma_ns, bound_ns
+            message,
+            received_ns,
+            message.time_ns - estimate.offset_ns,
+            round(math.hypot(estimate.sigma_ns, stepped_ns)),
+            estimate.bound_ns + self._stamp_delay_ns + stepped_ns,
         )
 
     def _record(

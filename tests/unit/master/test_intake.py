@@ -25,12 +25,12 @@ AIR_NS = 55 * MS
 AHEAD_NS = 7200 * SECOND
 
 
-def samples(at_ns: int, ahead_ns: int = AHEAD_NS, count: int = 5) -> list[ClockSample]:
-    """Exchanges without error, 0.25 s apart, the last of which ends at an instant."""
+def samples(at_ns: int, ahead_ns: int = AHEAD_NS, count: int = 5, *, late_ns: int = 0) -> list[ClockSample]:
+    """Exchanges 0.25 s apart, the last of which ends at an instant; the station answers so late."""
     return [
         ClockSample(
-            sent_ns=received_ns - 2 * AIR_NS,
-            station_ns=received_ns - AIR_NS + ahead_ns,
+            sent_ns=received_ns - late_ns - 2 * AIR_NS,
+            station_ns=received_ns - late_ns - AIR_NS + ahead_ns,
             received_ns=received_ns,
             forward_ns=AIR_NS,
             back_ns=AIR_NS,
@@ -66,10 +66,10 @@ class Master:
         if synchronised:
             self.synchronise(0)
 
-    def synchronise(self, at_ms: int, ahead_ns: int = AHEAD_NS) -> Synchronised:
+    def synchronise(self, at_ms: int, ahead_ns: int = AHEAD_NS, *, late_ns: int = 0) -> Synchronised:
         """Take a synchronisation whose last exchange ends at an instant."""
         at_ns = START + at_ms * MS
-        return self.intake.synchronised(1, samples(at_ns, ahead_ns), at_ns)
+        return self.intake.synchronised(1, samples(at_ns, ahead_ns, late_ns=late_ns), at_ns)
 
     def poll(self, at_ms: int, answer: MeasurementMessage) -> Arrival:
         """Take an answer that has been received at an instant, 194 ms after the request for it began."""
@@ -336,6 +336,24 @@ def test_what_was_held_is_used_if_the_clock_is_the_same_after_lost_requests() ->
     master.poll(8000, message(START + 7800 * MS + AHEAD_NS))
     master.intake.unanswered(1)
     assert len(master.synchronise(20_000).measurements) == 1
+
+
+def test_what_was_held_may_be_of_the_clock_before_or_of_the_one_after_a_small_step() -> None:
+    """A station that answers late may have stepped by as much, unnoticed: the bound contains both."""
+    master, step_ns = Master(synchronised=False), 5 * MS
+    master.synchronise(0, late_ns=5 * MS)
+    master.intake.unanswered(1)
+    held = message(START + 23_000 * MS + AHEAD_NS)
+    assert master.poll(23_200, held).doubtful
+    master.intake.unanswered(1)
+    found = master.synchronise(25_000, AHEAD_NS + step_ns, late_ns=5 * MS)
+    assert not found.record.restarted
+    (measurement,) = found.measurements
+    truths_ns = START + 23_000 * MS, START + 23_000 * MS - step_ns
+    assert measurement.stamp_bound_ns is not None
+    for truth_ns in truths_ns:
+        assert abs(measurement.stamp_ns - truth_ns) <= measurement.stamp_bound_ns
+        assert abs(measurement.stamp_ns - truth_ns) <= 3 * measurement.stamp_sigma_ns
 
 
 def test_what_is_played_back_is_no_measurement_and_no_step() -> None:

@@ -35,7 +35,7 @@ pytest: $(VENV)/.test
 # Forty times the examples of `make test`, on two cores; what is not done after 15 minutes is given up, and said.
 # A failing example is kept in .hypothesis: `pytest` with the name of its test makes it small and shows it.
 fuzz: $(VENV)/.test
-	timeout --signal=INT 15m $(BIN)/pytest --hypothesis-profile=fuzz --numprocesses 2 --dist worksteal $(FUZZED)
+	timeout --foreground --signal=INT 15m $(BIN)/pytest --hypothesis-profile=fuzz --numprocesses 2 --dist worksteal $(FUZZED)
 
 # Simulated missions with faults of all kinds for a quarter of an hour; what must never happen and does is printed.
 soak: $(VENV)/.test

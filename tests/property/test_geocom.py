@@ -184,8 +184,25 @@ steps = st.lists(
 )
 
 
+def text_of(values: tuple[int | float | str, ...]) -> str:
+    """Return values as a reply has them."""
+    return ",".join(map(str, values))
+
+
 @examples(200)
 @given(script=steps, checksum=st.booleans())
+@example(
+    script=[
+        ("call", [garbage_before(b"x"), silent, garbage_before(b"\r\n")], 0.8),
+        ("pause", [], 0.1),
+        ("cancel", [late(3.2), damaged, garbage_before(b"x")], 1.1),
+        ("abort", [doubled, silent, torn(11, 0.3)], 0.3),
+        *[("call", list[Fault](), 0.5)] * 2,
+        ("call", [cut(11)], 1.2),
+        *[("call", list[Fault](), 0.5)] * 2,
+    ],
+    checksum=False,
+)
 def test_no_reply_is_taken_for_another(
     script: list[tuple[str, list[Fault], float]],
     checksum: bool,  # noqa: FBT001 (a parameter of hypothesis)
@@ -202,7 +219,11 @@ def test_no_reply_is_taken_for_another(
             began_ns = clock.monotonic_ns()
             reply = await connection.call(Rpc.TMC_GET_FULL_MEAS, number, number + 0.5, timeout_s=1.0)
             if reply.code == 0:
-                assert reply.values == (number, number + 0.5)
+                right = (number, number + 0.5)
+                # Without a checksum a reply that was cut is a whole one if something else ends its line.
+                assert reply.values == right or (
+                    not checksum and text_of(right).startswith(text_of(reply.values))
+                )
                 assert began_ns <= reply.sent_ns <= reply.first_byte_ns < clock.monotonic_ns()
 
         for number, (step, to_come, for_s) in enumerate(script):

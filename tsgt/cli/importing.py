@@ -25,6 +25,16 @@ if TYPE_CHECKING:
     from tsgt.model import Measurement
 
 
+def _three_files(
+    _context: click.Context, _parameter: click.Parameter, value: tuple[Path, Path, Path]
+) -> tuple[Path, Path, Path]:
+    """Refuse options among the files: click takes the next three words, whatever they are."""
+    for path in value:
+        if str(path).startswith("--"):
+            raise click.BadParameter(f"takes three files, one after the other, but {path} stands between them")
+    return value
+
+
 @click.group("import")
 def import_group() -> None:
     """Bring other people's data into a recording."""
@@ -45,7 +55,12 @@ output_option = click.option(
 
 @import_group.command("rts")
 @click.option(
-    "--tracks", type=path_type, nargs=3, required=True, help="Published tracks of prisms 1, 2 and 3."
+    "--tracks",
+    type=path_type,
+    nargs=3,
+    required=True,
+    callback=_three_files,
+    help="Published tracks of prisms 1, 2 and 3.",
 )
 @click.option(
     "--prisms",

@@ -81,6 +81,15 @@ def assert_refused(tsgt: Tsgt, arguments: list[object], output: Path, expected: 
     assert {path: path.stat().st_mtime_ns for path in output.parent.iterdir()} == before
 
 
+def test_the_option_of_the_tracks_said_three_times_is_refused(tsgt: Tsgt, files: dict[str, Path]) -> None:
+    """``import polar`` takes its option once for each file, ``import rts`` once for all: the message says so."""
+    tracks = [word for k in (1, 2, 3) for word in ("--tracks", files[f"track{k}"])]
+    outcome = tsgt("import", "rts", *tracks, "--prisms", files["prisms"], "--output", files["recording"])
+    assert outcome.code == 2
+    assert "takes three files, one after the other, but --prisms stands between them" in outcome.err
+    assert not files["recording"].exists()
+
+
 @pytest.mark.parametrize("case", TRACK_EDITS)
 def test_a_bad_track_is_refused(tsgt: Tsgt, files: dict[str, Path], case: str) -> None:
     """A track that cannot be used is named with the line and what is wrong in it."""

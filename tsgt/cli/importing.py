@@ -31,7 +31,9 @@ def _three_files(
     """Refuse options among the files: click takes the next three words, whatever they are."""
     for path in value:
         if str(path).startswith("--"):
-            raise click.BadParameter(f"takes three files, one after the other, but {path} stands between them")
+            raise click.BadParameter(
+                f"takes three files, one after the other, but {path} stands between them"
+            )
     return value
 
 

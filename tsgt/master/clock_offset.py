@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 # A crystal outlives the step or restart of the clock that counts its beats, its temperature does not.
 _KEPT_FREQUENCY_SIGMA = 3 * PPM
+_UNKNOWN_FREQUENCY = Frequency(0.0, UNKNOWN_FREQUENCY_SIGMA)
 
 # One hour of re-synchronisations every 300 s. What is older says nothing about the clock's frequency now.
 _MOST_BATCHES = 12
@@ -183,7 +184,7 @@ class RegressionFilter:
 
     def __init__(self) -> None:
         self.name = "regression"
-        self._prior = Frequency(0.0, UNKNOWN_FREQUENCY_SIGMA)
+        self._prior = _UNKNOWN_FREQUENCY
         self._batches: list[Batch] = []
         self._line: Line | None = None
         self._noise_ns: float | None = None
@@ -221,10 +222,15 @@ class RegressionFilter:
         )
 
     def forget(self) -> None:
-        """Forget the offset but remember the frequency: the crystal is still the same."""
+        """Forget the offset but remember the frequency: the crystal is still the same.
+
+        The last synchronisation may have missed the line before because the clock had been set by less than anybody
+        can tell; the frequency found over that step is no crystal's.
+        """
         if self._line is not None:
-            sigma = math.hypot(math.sqrt(self._line.variances[2]), _KEPT_FREQUENCY_SIGMA)
-            self._prior = Frequency(self._line.frequency, min(sigma, UNKNOWN_FREQUENCY_SIGMA))
+            sigma = math.hypot(math.sqrt(self._line.variances[2]), _KEPT_FREQUENCY_SIGMA, self._line.bend)
+            known = sigma < UNKNOWN_FREQUENCY_SIGMA
+            self._prior = Frequency(self._line.frequency, sigma) if known else _UNKNOWN_FREQUENCY
         self._batches = []
         self._line = None
 

@@ -23,6 +23,8 @@ MOST_QUEUED = 100_000
 
 _LOW_BITS = 8
 
+Gaps = tuple[tuple[int, int], ...]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Queued:
@@ -63,12 +65,12 @@ class Extent(NamedTuple):
     ----------
     oldest
         The lowest.
-    gap
-        First and last number after it that will never come; None without any. A gap may hold others that do come.
+    gaps
+        First and last number of each stretch after it that will never come, in their order.
     """
 
     oldest: int
-    gap: tuple[int, int] | None
+    gaps: Gaps
 
 
 class Outbox:
@@ -149,8 +151,7 @@ class Outbox:
                 gaps += [(first, min(last, self.run_start - RESTART_SKIP - 1)), (self.run_start, last)]
             else:
                 gaps.append((first, last))
-        gaps = [(first, last) for first, last in gaps if first <= last]
-        return Extent(numbers[0], (gaps[0][0], gaps[-1][1]) if gaps else None)
+        return Extent(numbers[0], tuple((first, last) for first, last in gaps if first <= last))
 
 
 class Delivery:
@@ -161,7 +162,8 @@ class Delivery:
     delivered than what is. What the master is certain to have reached is everything below the oldest number in the
     outbox, unless numbers are missing that the master waits for and that never come: delivered to an earlier master,
     or lost. Then nothing beyond such a gap counts, until the gap lies behind and the station introduces itself anew,
-    with a higher oldest number, below which everything is settled.
+    with a higher oldest number, below which everything is settled. It does so at once behind what a restart has left
+    out, and else when all gaps lie behind.
 
     Parameters
     ----------
@@ -183,7 +185,7 @@ class Delivery:
         self._wanted = wanted
         self._acknowledged: int | None = None
         self._highest_sent = outbox.run_start - 1  # earlier runs may have sent all of these
-        self.oldest, self._gap = outbox.extent(wanted)
+        self.oldest, self._gaps = outbox.extent(wanted)
         self._settled = self.oldest  # as far as the master knows
         self.introducing = False
         self._reached = self.oldest - 1
@@ -193,13 +195,15 @@ class Delivery:
     @property
     def outdated(self) -> bool:
         """Whether the master waits for numbers that never come, and another introduction tells it so."""
-        gap = self._gap_now()
-        return gap is not None and self._outbox.oldest > gap[1]
+        gaps = self._gaps_now()
+        behind = [(first, last) for first, last in gaps if last < self._outbox.oldest]
+        all_behind = bool(behind) and len(behind) == len(gaps)
+        return all_behind or any(last - first >= RESTART_SKIP - 1 for first, last in behind)
 
     def introduce(self) -> None:
         """Set :attr:`oldest` to what is true now; the master does not know yet."""
-        self.oldest, gap = self._outbox.extent(self._wanted)
-        self._gap = _union(self._gap_now(), gap)
+        self.oldest, gaps = self._outbox.extent(self._wanted)
+        self._gaps = _union(self._gaps_now(), gaps)
         self.introducing = True
 
     def introduced(self, oldest: int) -> None:
@@ -207,9 +211,7 @@ class Delivery:
         self._settled = max(self._settled, oldest)
         self.introducing = False
         self._reached = max(self._reached, oldest - 1)
-        if self._gap is not None:
-            first, last = self._gap
-            self._gap = (max(first, oldest), last) if last >= oldest else None
+        self._gaps = tuple((max(first, oldest), last) for first, last in self._gaps if last >= oldest)
 
     # --- Sequence numbers -------------------------------------------------------------------------------------
 
@@ -244,21 +246,25 @@ class Delivery:
     def delivered_through(self, low_bits: int) -> None:
         """Take the low bits of the number up to which the master has everything."""
         certain = self._outbox.oldest - 1
-        if (gap := self._gap_now()) is not None:
-            certain = min(certain, gap[0] - 1)
+        if gaps := self._gaps_now():
+            certain = min(certain, gaps[0][0] - 1)
         self._reached = max(self._reached, certain)
         number = self._reached + (low_bits - self._reached) % (1 << _LOW_BITS)
         if number <= self._highest_sent:
             self._reached = number
             self._outbox.remove_through(number)
 
-    def _gap_now(self) -> tuple[int, int] | None:
-        """Return the gap, with what has left the outbox since."""
+    def _gaps_now(self) -> Gaps:
+        """Return the gaps, with what has left the outbox since."""
         left = self._outbox.left_through
-        return self._gap if left < self._settled else _union(self._gap, (self._settled, left))
+        return self._gaps if left < self._settled else _union(self._gaps, ((self._settled, left),))
 
 
-def _union(one: tuple[int, int] | None, other: tuple[int, int] | None) -> tuple[int, int] | None:
-    if one is None or other is None:
-        return one or other
-    return min(one[0], other[0]), max(one[1], other[1])
+def _union(one: Gaps, other: Gaps) -> Gaps:
+    joined: list[tuple[int, int]] = []
+    for first, last in sorted((*one, *other)):
+        if joined and first <= joined[-1][1] + 1:
+            joined[-1] = (joined[-1][0], max(joined[-1][1], last))
+        else:
+            joined.append((first, last))
+    return tuple(joined)

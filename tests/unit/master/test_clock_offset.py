@@ -278,6 +278,21 @@ def test_frequency_is_remembered_when_the_offset_is_forgotten() -> None:
     assert abs(error_ns(found, 1000, -3600 * SECOND + 40e3 * 1000)) < 0.1 * MS
 
 
+@pytest.mark.parametrize("step_ms", [1.4, -1.4, 0.3])
+def test_a_frequency_that_may_be_a_small_step_is_not_remembered(step_ms: float) -> None:
+    """A clock that was set by less than its bound seems to run at another frequency, which its next restart may end."""
+    found = clock_filter("regression")
+    found.update(synchronisation(0, drifting(0, -20), cycles=8, turn_round_ns=3 * MS))
+    found.update(synchronisation(14, drifting(step_ms * MS, -20), turn_round_ns=3 * MS))
+    assert abs(found.at(START_NS + 15 * SECOND).frequency_ppm + 20) > 10
+    clock = drifting(-3600 * SECOND, -20)
+    assert found.update(synchronisation(30, clock)).restarted
+    for true_s in (31, 40, 60, 120):
+        stamped_ns = START_NS + true_s * SECOND + round(clock(true_s * SECOND))
+        ways_ns = exchange(0, clock).excess_ns  # what all stamps share is not what this is about
+        assert abs(error_ns(found, true_s, clock(true_s * SECOND))) < found.at(stamped_ns).bound_ns - ways_ns
+
+
 def test_another_crystal_is_believed_after_a_long_synchronisation() -> None:
     """A station computer that was exchanged is not held to the frequency of the old one."""
     found = clock_filter("regression")

@@ -71,16 +71,16 @@ def test_the_oldest_leaves_when_there_are_too_many(monkeypatch: pytest.MonkeyPat
 @pytest.mark.parametrize(
     ("numbers", "run_start", "backlog", "expected"),
     [
-        ([], 0, [], Extent(0, None)),
-        ([0, 1, 2], 0, [], Extent(0, None)),
-        ([1, 2, 5], 0, [], Extent(1, (3, 4))),
-        ([1, 3, 9], 0, [], Extent(1, (2, 8))),
+        ([], 0, [], Extent(0, ())),
+        ([0, 1, 2], 0, [], Extent(0, ())),
+        ([1, 2, 5], 0, [], Extent(1, ((3, 4),))),
+        ([1, 3, 9], 0, [], Extent(1, ((2, 2), (4, 8)))),
         # Numbers that the restart has left out are known to be missing, those beyond are not.
-        ([1007], 1007, [6], Extent(6, None)),
-        ([1007], 1007, [5], Extent(5, (6, 6))),
-        ([], 1007, [5], Extent(5, (6, 6))),
-        ([1009], 1007, [5], Extent(5, (6, 1008))),
-        ([1009], 1007, [6], Extent(6, (1007, 1008))),
+        ([1007], 1007, [6], Extent(6, ())),
+        ([1007], 1007, [5], Extent(5, ((6, 6),))),
+        ([], 1007, [5], Extent(5, ((6, 6),))),
+        ([1009], 1007, [5], Extent(5, ((6, 6), (1007, 1008)))),
+        ([1009], 1007, [6], Extent(6, ((1007, 1008),))),
     ],
 )
 def test_what_a_master_waits_for(
@@ -128,6 +128,36 @@ def test_a_gap_stops_the_cumulative_number_until_the_master_knows_of_it() -> Non
     assert [*told, delivery.outdated] == [True, True, False]
     delivery.delivered_through(350 % 256)
     assert box.oldest == 351
+
+
+def test_a_restart_that_lies_behind_is_told_before_those_that_do_not() -> None:
+    """What a run in between has left, and the master has, need not come again until its restart lies behind as well."""
+    box = of([5315], run_start=5315, backlog=[*range(2140, 2148), *range(3148, 3166), *range(4166, 4314)])
+    delivery = Delivery(box, anything)
+    delivery.sent([5315])
+    delivery.delivered_through(2147 % 256)
+    assert box.oldest == 3148
+    assert delivery.outdated
+    delivery.introduce()
+    delivery.introduced(delivery.oldest)
+    for _ in range(2):  # of a master that has all of it
+        delivery.delivered_through(5315 % 256)
+    assert box.oldest == 4166
+    delivery.introduce()
+    delivery.introduced(delivery.oldest)
+    delivery.delivered_through(5315 % 256)
+    assert box.oldest > 4166
+
+
+def test_a_small_gap_behind_is_not_told_as_long_as_there_are_others() -> None:
+    """A backlog that goes out with losses has many, and an introduction takes the room of measurements."""
+    box = of([*range(10), *range(20, 30), *range(40, 50)])
+    delivery = Delivery(box, anything)
+    delivery.sent(range(50))
+    delivery.delivered(range(10))
+    assert not delivery.outdated
+    delivery.delivered(range(20, 30))
+    assert delivery.outdated
 
 
 def test_what_had_to_leave_is_a_gap_too(monkeypatch: pytest.MonkeyPatch) -> None:

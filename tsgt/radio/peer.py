@@ -287,7 +287,7 @@ class Peer:
             self._introduced_at = at.counter
         if reply.runs:
             self.lacks_time = reply.runs[0].direct
-        self._held_back.add(at.counter, self._late_ns(at))
+        self._held_back.add(at.counter, self._late_ns(at) + SIGMAS * at.sent_sigma_ns)
         prism = self._prism_of(reply)
         missing = self.inbox.missing
         numbers: list[int] = []
@@ -431,17 +431,22 @@ class Peer:
         return timed
 
     def _late_ns(self, at: Reception) -> int:
+        """Return by how much more than usual a reply may have been late; the master may not have seen its end."""
         usual_ns = 2 * (self._trip.link_ns - self._trip.nominal_ns)
-        return max(at.lateness_ns - usual_ns, 0)
+        return max(_latest_ns(at) - usual_ns, 0)
 
     def _newest_us(self, run: Run, at: Reception) -> int:
         """Return the newest time of a run; narrow ones repeat, and it is the last before the reply has begun."""
-        end_us = self._session_us(at.slot_ns + max(at.lateness_ns, 0)) + LATEST_US
+        end_us = self._session_us(at.slot_ns + max(_latest_ns(at), 0)) + LATEST_US
         origin_us = self._session_us(at.sent_ns) if run.direct else 0
         return end_us - (end_us - origin_us - TIME_UNIT_US * run.sightings[0].time) % _span_us(run)
 
     def _session_us(self, monotonic_ns: int) -> int:
         return (monotonic_ns - self._zero_ns + 500) // 1000
+
+
+def _latest_ns(at: Reception) -> int:
+    return at.lateness_ns + SIGMAS * at.received_sigma_ns
 
 
 def _span_us(run: Run) -> int:

@@ -200,12 +200,20 @@ class Exchange:
         )
         return done_ns + self.timing.link_ns
 
-    def deliver(self, number: int, received_ns: int) -> Heard | None:
-        """Hand a station's reply to the master, if it still waits for one."""
+    def deliver(self, number: int, received_ns: int, *, sigma_ns: int = _STAMP_SIGMA_NS) -> Heard | None:
+        """Hand a station's reply to the master, if it still waits for one.
+
+        Parameters
+        ----------
+        number
+            Of the station.
+        received_ns, sigma_ns
+            RxDone as the master knows it, and one sigma.
+        """
         until_ns = self.master.waits_until_ns
         if until_ns is None or received_ns > until_ns:
             return None
-        heard = self.master.received(self.replies[number], received_ns, _STAMP_SIGMA_NS)
+        heard = self.master.received(self.replies[number], received_ns, sigma_ns)
         self.now_ns = max(self.now_ns, received_ns)
         if heard is not None:
             self.heard[number] = heard

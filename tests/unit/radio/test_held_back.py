@@ -128,6 +128,23 @@ def test_the_first_beacons_of_a_station(late_ns: int, which: list[int], backlog_
     )
 
 
+@pytest.mark.parametrize("frames", [0, 60])
+@pytest.mark.parametrize("late_ns", LONG_DELAYS_NS)
+@pytest.mark.parametrize("off_ms", [-49, 49])
+def test_a_reply_whose_end_the_master_has_not_seen_to_the_moment(
+    off_ms: int, late_ns: int, frames: int
+) -> None:
+    """An interrupt was lost and the reply found by looking, at best within 50 ms: by so much it may have been later."""
+    exchange = exchange_of(frames)
+    for _ in range(3):
+        exchange.begin()
+        received_ns = exchange.hear(2, late_ns=late_ns)
+        assert received_ns is not None
+        exchange.deliver(2, received_ns + off_ms * MS, sigma_ns=29 * MS)
+        exchange.end()
+    assert beyond_bound(exchange.members[2]) == {}
+
+
 def test_what_five_in_a_row_that_were_held_back_leave_behind() -> None:
     """They are a clock that was touched: what was measured before and is told afterwards is off by as much, unsaid."""
     exchange = exchange_of()

@@ -144,8 +144,10 @@ class Inbox:
         for numbers in (self._present.received, self._present.written):
             numbers.add(range(introduction.oldest))
             numbers.add(never_given)
+        # What the station has no more need not wait for the disk; all else must, lest the station deletes it.
         for number in self._present.waiting:
-            self._present.written.remove(number)
+            if number >= introduction.oldest and number not in never_given:
+                self._present.written.remove(number)
 
     def _turn_to(self, introduction: Introduction) -> None:
         """Go on with a lineage that is another one than before, but may be one of before that."""
@@ -189,12 +191,13 @@ class Inbox:
                     lineage.written.add(range(number, number + 1))
 
     def lost(self, numbers: Iterable[int]) -> None:
-        """Take note that measurements will never be in the recording: they may come again."""
+        """Take note that measurements will never be in the recording: they may come again, if the station has them."""
         for number in numbers:
             for lineage in self._known.values() or (self._present,):
                 if number in lineage.waiting:
                     lineage.waiting.remove(number)
-                    lineage.received.remove(number)
+                    if number not in lineage.written:
+                        lineage.received.remove(number)
 
     def is_written(self, numbers: Iterable[int]) -> bool:
         """Tell whether all of these measurements are in the recording."""

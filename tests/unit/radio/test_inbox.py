@@ -111,13 +111,31 @@ def test_a_restart_leaves_numbers_out() -> None:
     assert inbox.take(1004)
 
 
-def test_what_came_last_before_a_restart_is_still_to_be_written() -> None:
-    """Even if it is one of the numbers that a torn journal may have lost."""
+def test_what_a_station_still_has_is_to_be_written_after_a_restart() -> None:
+    """It deletes what is acknowledged."""
     inbox = inbox_with(range(5))
-    inbox.introduced(introduced(run_start=1002, oldest=1002))
-    assert inbox.cumulative == -1
+    inbox.introduced(introduced(run_start=1005, oldest=1))
+    assert inbox.cumulative == 0
     inbox.written(range(5))
-    assert inbox.cumulative == 1001
+    assert inbox.cumulative == 1004
+
+
+@pytest.mark.parametrize(("run_start", "oldest"), [(1002, 0), (1002, 1002), (1005, 5)])
+def test_what_a_station_has_no_more_does_not_wait_for_the_disk(run_start: int, oldest: int) -> None:
+    """It takes all below its oldest and all that its restart left out for settled, and reads the number accordingly."""
+    inbox = inbox_with(range(5))
+    inbox.written([0, 1])
+    inbox.introduced(introduced(run_start=run_start, oldest=oldest))
+    assert inbox.cumulative == run_start - 1
+
+
+def test_what_the_disk_lost_is_not_waited_for_if_the_station_has_it_no_more() -> None:
+    """It was on the air, but not in the journal when the station was killed."""
+    inbox = inbox_with(range(5))
+    inbox.written([0, 1])
+    inbox.introduced(introduced(run_start=1002))
+    inbox.lost([2, 3, 4])
+    assert (inbox.missing, inbox.cumulative, inbox.unwritten) == (0, 1001, 0)
 
 
 def test_what_a_station_does_not_have_any_more_is_not_waited_for() -> None:

@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 from support.hand_master import queued
 
 from tsgt.radio import outbox as outbox_module
+from tsgt.radio.inbox import Inbox
+from tsgt.radio.messages import Introduction
 from tsgt.radio.outbox import RESTART_SKIP, Delivery, Extent, Outbox
 
 if TYPE_CHECKING:
@@ -186,60 +188,142 @@ def test_a_number_is_narrow_only_if_it_can_be_nothing_else() -> None:
     assert delivery.may_be_narrow(200, 200)
 
 
-class Model:
-    """A master that knows nothing but what it is told, with sets instead of ranges."""
+class Station:
+    """A client that is killed now and then, with a disk that at times takes nothing."""
 
     def __init__(self) -> None:
-        self.received: set[int] = set()
-        self.settled: set[int] = set()
+        self.box = Outbox(0)
+        self._next = 0
+        self._journalled = -1
+        self.disk = True
 
-    def introduced(self, oldest: int, run_start: int) -> None:
+    def has(self, number: int) -> bool:
+        """Whether it is in the journal."""
+        return number <= self._journalled
+
+    def measure(self, count: int) -> None:
+        """Add so many measurements; what the disk does not take is delivered all the same."""
+        for _ in range(count):
+            self.box.add(queued(self._next, 0))
+            self._next += 1
+        if self.disk:
+            self._journalled = self._next - 1
+
+    def restart(self) -> None:
+        """Go on from what the disk has."""
+        backlog = [each for each in self.box.newest_first() if each.sequence <= self._journalled]
+        self._next = self._journalled + 1 + RESTART_SKIP
+        self._journalled = self._next - 1
+        self.box = Outbox(self._next, backlog[::-1])
+
+
+class Master:
+    """One whose disk takes what has come at once, later, or never."""
+
+    def __init__(self, recorded: Iterable[int] = ()) -> None:
+        self.inbox = Inbox()
+        self.recorded = set(recorded)
+        self._waiting: list[int] = []
+
+    def introduced(self, delivery: Delivery, box: Outbox) -> None:
         """Take an introduction."""
-        self.settled |= {*range(oldest), *range(max(run_start - RESTART_SKIP, 0), run_start)}
+        self.inbox.introduced(
+            Introduction(nonce=1, lineage=7, run_start=box.run_start, oldest=delivery.oldest)
+        )
 
-    @property
-    def cumulative(self) -> int:
-        """Up to here nothing is missing."""
-        number = 0
-        while number in self.received or number in self.settled:
-            number += 1
-        return number - 1
+    def receive(self, batch: Iterable[int]) -> None:
+        """Take measurements."""
+        self._waiting += [number for number in batch if self.inbox.take(number)]
+
+    def settle(self, disk: str) -> None:
+        """Hear of the disk, which takes, waits or refuses."""
+        if disk == "waits":
+            return
+        if disk == "takes":
+            self.recorded |= set(self._waiting)
+            self.inbox.written(self._waiting)
+        else:
+            self.inbox.lost(self._waiting)
+        self._waiting = []
+
+
+class Exchange:
+    """Frames of one run with one master."""
+
+    def __init__(self, station: Station, master: Master) -> None:
+        self._box, self._master = station.box, master
+        self._delivery = Delivery(station.box, anything)
+        self._introduces = True
+        self._joined = False
+
+    def frame(self, *, heard: bool, disk: str, acknowledged: bool, cumulative: bool) -> None:
+        """Send the newest; the master hears it or not, and what its next beacon says comes or not."""
+        box, master, delivery = self._box, self._master, self._delivery
+        if delivery.outdated and not self._introduces:
+            delivery.introduce()
+            self._introduces = True
+        batch = [each.sequence for each, _ in zip(box.newest_first(), range(12), strict=False)]
+        narrow = [number for number in batch if delivery.may_be_narrow(number, max(batch))]
+        delivery.sent(batch)
+        if heard:
+            if self._introduces:
+                master.introduced(delivery, box)
+            assert [master.inbox.unwrapped(number % 256) for number in narrow] == narrow
+            master.receive(batch)
+        master.settle(disk)
+        self._joined = self._joined or (heard and acknowledged)
+        if not self._joined:
+            return
+        if heard and acknowledged and master.inbox.is_written(batch):
+            delivery.delivered(batch)
+            if self._introduces:
+                delivery.introduced(delivery.oldest)
+                self._introduces = False
+        if cumulative:
+            delivery.delivered_through(master.inbox.cumulative % 256)
 
 
 @given(st.data())
-@settings(max_examples=60)
-def test_nothing_is_deleted_that_the_master_does_not_have(data: st.DataObject) -> None:
-    """Whatever is lost, whoever restarts: a measurement leaves the queue when a master has it, and not before."""
-    numbers = iter(range(10_000))
-    box = of([])
-    recorded: set[int] = set()
-    for _ in range(data.draw(st.integers(1, 3), label="masters and runs")):
+@settings(max_examples=150)
+def test_nothing_is_deleted_that_the_master_has_not_recorded(data: st.DataObject) -> None:
+    """Whatever is lost, whoever restarts, whichever disk is full."""
+    station, master = Station(), Master()
+    for _ in range(data.draw(st.integers(1, 5), label="masters and runs")):
         if data.draw(st.booleans(), label="the station restarts"):
-            backlog = list(box.newest_first())[::-1]
-            start = next(numbers) + RESTART_SKIP
-            numbers = iter(range(start, 100_000))
-            box = Outbox(start, backlog)
-        model, delivery = Model(), Delivery(box, anything)
-        model.introduced(delivery.oldest, box.run_start)
-        delivery.introduced(delivery.oldest)
-        for _ in range(data.draw(st.integers(1, 40), label="frames")):
-            for _ in range(data.draw(st.sampled_from([0, 1, 1, 1, 2, 90]), label="new")):
-                box.add(queued(next(numbers), 0))
-            batch = [each.sequence for each, _ in zip(box.newest_first(), range(12), strict=False)]
-            introduces = delivery.outdated
-            if introduces:
-                delivery.introduce()
-            delivery.sent(batch)
-            if data.draw(st.booleans(), label="heard"):
-                if introduces:
-                    model.introduced(delivery.oldest, box.run_start)
-                model.received |= set(batch)
-                recorded |= set(batch)
-                if data.draw(st.booleans(), label="acknowledged"):
-                    delivery.delivered(batch)
-                    if introduces:
-                        delivery.introduced(delivery.oldest)
-            before = set(left(box))
-            if data.draw(st.booleans(), label="cumulative"):
-                delivery.delivered_through(model.cumulative % 256)
-            assert before - set(left(box)) <= recorded
+            station.restart()
+        if data.draw(st.sampled_from([False, False, True]), label="the master restarts"):
+            master = Master(master.recorded)
+        exchange = Exchange(station, master)
+        for _ in range(data.draw(st.integers(1, 6), label="stretches")):
+            station.disk = data.draw(st.booleans(), label="the station's disk takes what there is")
+            disk = data.draw(st.sampled_from(["takes", "waits", "refuses"]), label="the master's disk")
+            heard = data.draw(st.sampled_from([(True,), (False,), (True, False, False)]), label="heard")
+            for frame in range(data.draw(st.integers(1, 12), label="frames")):
+                station.measure(data.draw(st.sampled_from([0, 1, 2, 40]), label="new"))
+                before = {each.sequence for each in station.box.newest_first() if station.has(each.sequence)}
+                exchange.frame(
+                    heard=heard[frame % len(heard)],
+                    disk=disk,
+                    acknowledged=data.draw(st.booleans(), label="acknowledged"),
+                    cumulative=data.draw(st.booleans(), label="cumulative"),
+                )
+                assert before - set(left(station.box)) <= master.recorded
+
+
+def test_numbers_on_the_air_but_on_no_disk_before_a_restart_do_not_spoil_the_cumulative_number() -> None:
+    """The master has some that it cannot write, and the station takes them for settled."""
+    station, master = Station(), Master()
+    first = Exchange(station, master)
+    station.measure(3)
+    first.frame(heard=True, disk="takes", acknowledged=True, cumulative=True)
+    station.disk = False
+    station.measure(3)
+    first.frame(heard=True, disk="waits", acknowledged=False, cumulative=False)
+    station.restart()
+    station.disk = True
+    second = Exchange(station, master)
+    second.frame(heard=True, disk="waits", acknowledged=True, cumulative=True)
+    for _ in range(60):
+        station.measure(5)
+        second.frame(heard=False, disk="waits", acknowledged=False, cumulative=True)
+    assert len(station.box) == 300

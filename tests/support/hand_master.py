@@ -15,6 +15,7 @@ from tsgt.radio.conversation import Situation
 from tsgt.radio.message_codec import decode_reply, encode_beacon
 from tsgt.radio.messages import (
     GRANT_BYTES,
+    RESTART_SKIP,
     TIME_BITS,
     TIME_UNIT_US,
     WIDE_TIME_BITS,
@@ -24,7 +25,7 @@ from tsgt.radio.messages import (
     SlotOrder,
     StationEntry,
 )
-from tsgt.radio.outbox import RESTART_SKIP, Outbox, Queued
+from tsgt.radio.outbox import Outbox, Queued
 from tsgt.radio.superframe import GUARD_UNIT_NS, FrameTiming
 from tsgt.radio.superframe_station import SuperframeStation
 

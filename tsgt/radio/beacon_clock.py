@@ -127,12 +127,14 @@ class BeaconClock:
 
     Attributes
     ----------
-    last_received_ns
-        When the newest pair was received that has been believed.
+    first_received_ns, last_received_ns
+        When the first and the newest pair were received that have been believed.
     pairs
         How many the fit rests on.
     known
         Two pairs in full have agreed, one of them live; before that there is no time.
+    settled
+        So many pairs agree that held-back beacons would have been outvoted.
     """
 
     def __init__(self) -> None:
@@ -143,6 +145,12 @@ class BeaconClock:
         self._rival: Stretch | None = None
         self._rival_in_full = False  # a live one has told its times to 2^40 us, and not just to 2^16
         self._rival_live = False
+        self._rival_agrees = False  # with the fit, though only because nothing was heard for long
+
+    @property
+    def first_received_ns(self) -> int | None:
+        """See the class."""
+        return self._stretches[0].first_ns if self._stretches else None
 
     @property
     def last_received_ns(self) -> int | None:
@@ -158,6 +166,11 @@ class BeaconClock:
     def known(self) -> bool:
         """See the class."""
         return self._known
+
+    @property
+    def settled(self) -> bool:
+        """See the class."""
+        return self._known and len(self._stretches[-1]) >= _FEWEST_RIVALS
 
     def add(
         self, received_ns: int, sent_us: int, sigma_ns: int, *, in_full: bool = False, live: bool = True
@@ -185,7 +198,8 @@ class BeaconClock:
             its bound contains it until there is one that agrees. Five in a row that agree with each other instead
             begin the fit anew, if one of them was live; if they are off by more than 5 ms, a live one has to be known in
             full. Before there is a time, only pairs in full are taken, and the newer of two that do not agree
-            is kept.
+            is kept. One that jitter does not explain, but a clock that nothing was heard of for long, is kept away from
+            the fit, too, until five agree with each other.
         """
         sent_ns = 1000 * sent_us
         newest_ns = self._rival.last_ns if self._rival else self.last_received_ns
@@ -201,6 +215,8 @@ class BeaconClock:
         if not agrees:
             self._doubt(pair, stretch, in_full=in_full, live=live)
             return abs(stretch.missed_us(pair)) <= DOUBTED_US
+        if self._is_alone(pair, stretch, live=live):
+            return True
         stretch.add(pair)
         if unknown and self._jitter.known:
             self._stretches[-1] = stretch.weighed_anew(self._jitter.variance_us2)
@@ -302,7 +318,7 @@ class BeaconClock:
     def _doubt(self, pair: Pair, stretch: Stretch, *, in_full: bool, live: bool) -> None:
         """Hold a pair that does not agree with the fit against others of its kind."""
         if self._rival is None or not self._rival.agrees(pair):
-            self._rival = Stretch(pair, stretch.rate_ppm, _SLEWED_SIGMA_PPM)
+            self._rival, self._rival_agrees = Stretch(pair, stretch.rate_ppm, _SLEWED_SIGMA_PPM), False
             self._rival_in_full, self._rival_live = in_full and live, live
             return
         self._rival.add(pair)
@@ -311,6 +327,23 @@ class BeaconClock:
         if self._is_sure(self._rival) and self._rival_live and len(self._rival) >= _FEWEST_RIVALS:
             self._stretches.append(self._rival)
             self._rival = None
+
+    def _is_alone(self, pair: Pair, stretch: Stretch, *, live: bool) -> bool:
+        """Whether a pair that agrees with the fit has to wait for others, as it may have been held back.
+
+        After an outage a clock may be off by more than that, and a single pair would be all that tells.
+        """
+        if self._rival is not None and self._rival_agrees and self._rival.agrees(pair):
+            if len(self._rival) + 1 >= _FEWEST_RIVALS:
+                stretch.add_all(self._rival)
+                return False
+            self._rival.add(pair)
+            return True
+        if stretch.agrees_closely(pair) or abs(stretch.missed_us(pair)) <= DOUBTED_US:
+            return False
+        self._rival, self._rival_agrees = Stretch(pair, stretch.rate_ppm, _SLEWED_SIGMA_PPM), True
+        self._rival_in_full, self._rival_live = True, live  # it agrees, so its low bits tell which it is
+        return True
 
     def _off_us(self, rival: Stretch) -> float:
         """Return how far the first pair of a rival is off the fit."""

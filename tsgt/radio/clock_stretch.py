@@ -129,15 +129,26 @@ class Stretch:
 
     def agrees(self, pair: Pair) -> bool:
         """Tell whether jitter and what clocks do can explain a new pair."""
-        allowed_us = SIGMAS * math.sqrt(self._expected(pair).offset_variance + pair.variance_us2)
+        return abs(self.missed_us(pair)) <= self._allowed_us(pair, self._expected(pair))
+
+    def agrees_closely(self, pair: Pair) -> bool:
+        """Tell whether jitter can explain a new pair, however long ago the one before it was."""
+        return abs(self.missed_us(pair)) <= self._allowed_us(pair, self._before[-1].quick)
+
+    def _allowed_us(self, pair: Pair, expected: Estimate) -> float:
         sudden_us = _SUDDEN_PPM * min(_seconds(pair.received_ns - self.last_ns), _SUDDEN_S)
-        return abs(self.missed_us(pair)) <= allowed_us + sudden_us
+        return SIGMAS * math.sqrt(expected.offset_variance + pair.variance_us2) + sudden_us
 
     def add(self, pair: Pair) -> None:
         """Take a pair that is newer than all before."""
         self._before.append(self._step(self._before[-1], self._pairs[-1], pair))
         self._pairs.append(pair)
         self._received_ns.append(pair.received_ns)
+
+    def add_all(self, other: Stretch) -> None:
+        """Take the pairs of another stretch, all newer than all before."""
+        for pair in other._pairs:
+            self.add(pair)
 
     def weighed_anew(self, variance_us2: Callable[[int], float]) -> Stretch:
         """Return the fit through the same pairs with other variances, given for each ``sigma_ns``."""

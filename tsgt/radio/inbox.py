@@ -11,13 +11,12 @@ from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import TYPE_CHECKING
 
+from tsgt.radio.messages import RESTART_SKIP
+
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from tsgt.radio.messages import Introduction
-
-RESTART_SKIP = 1000
-"""A station that starts again leaves out so many numbers: those that a torn journal may have lost."""
 
 NARROW_BITS = 8
 

@@ -30,6 +30,10 @@ SESSION_TIME_BITS = 40
 SINGLE_QUALITY = 3
 """A reply of the form ``single`` claims this quality: within 128 us."""
 
+RESTART_SKIP = 20_000
+"""A station that starts again leaves out so many numbers: those that were on the air and on no disk. With 20 measurements
+a second its disk may have taken none for a quarter of an hour."""
+
 TURN_ROUND_BITS = 22
 """A turn-round goes over the air in us: 4.2 s at most."""
 
@@ -236,7 +240,7 @@ class Introduction:
     lineage
         16 bits: as long as it stays the same, sequence numbers go on across restarts of the station.
     run_start
-        32 bits: number of the first measurement of this run of the client. Some numbers before it were never given.
+        32 bits: number of the first measurement of this run of the client. :data:`RESTART_SKIP` before it are not its own.
     oldest
         32 bits: the lowest number that is still to be delivered, or the next to be given.
     """

@@ -10,13 +10,12 @@ from dataclasses import dataclass
 from itertools import pairwise, takewhile
 from typing import TYPE_CHECKING, NamedTuple
 
+from tsgt.radio.messages import RESTART_SKIP
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from tsgt.model import Status
-
-RESTART_SKIP = 1000
-"""A restarted station leaves out so many numbers: those that were on the air but, when the power went, not on disk."""
 
 MOST_QUEUED = 100_000
 """Eleven hours of measurements, and some 30 MB."""

@@ -287,7 +287,8 @@ class Peer:
             self._introduced_at = at.counter
         if reply.runs:
             self.lacks_time = reply.runs[0].direct
-        self._held_back.add(at.counter, self._late_ns(at) + SIGMAS * at.sent_sigma_ns)
+        late_ns = self._late_ns(at) + SIGMAS * at.sent_sigma_ns
+        self._held_back.add(at.counter, late_ns, told=at.sent_sigma_ns <= EXACT_SIGMA_NS)
         prism = self._prism_of(reply)
         missing = self.inbox.missing
         numbers: list[int] = []

@@ -29,6 +29,9 @@ _SENT_BITS = 16
 _DIRECT_EXTRA_US = 2000.0
 """A time that rests on one beacon is worse than it looks, by as much as the reply may start late."""
 
+_REACH_NS = int(4.4 * 3600e9)
+"""What was measured longer before the first beacon gets no time to half a second, however many beacons come."""
+
 _SIGMAS = 4
 """A bound is so many sigma."""
 
@@ -150,12 +153,14 @@ class StationSession:
         self._before: HeardBeacon | None = None
         self.timing = _timing(settings, part)
         self._boot = boot
+        self._outbox = outbox
         self._clocks = dict(clocks)
         self.clock = self._clocks.setdefault(boot, BeaconClock())
         self.delivery = Delivery(outbox, self.can_time)
         self.conversation = Conversation()
         self.last_reply: SentReply | None = None
         self._unanswered: deque[SentReply] = deque(maxlen=HISTORY)
+        self._sifted = False
 
     # --- Beacons ----------------------------------------------------------------------------------------------
 
@@ -230,10 +235,31 @@ class StationSession:
     def can_time(self, queued: Queued) -> bool:
         """Whether this master's time of a measurement can be told, now or soon.
 
-        Not if it is of another start of this computer, which had not learnt this master's time.
+        Not if it is so far from all beacons that no quality is bad enough. Nor if it is of another start of this computer,
+        which had not learnt this master's time, or only just: what could have shown that the first beacons were held back
+        did not come any more.
         """
         clock = self._clocks.get(queued.boot)
-        return clock is not None and (queued.boot == self._boot or clock.known)
+        if clock is None:
+            return False
+        if queued.boot == self._boot:
+            first_ns = clock.first_received_ns
+            return first_ns is None or first_ns - queued.at_ns <= _REACH_NS
+        time = clock.at(queued.at_ns) if clock.settled else None
+        return time is not None and quality_of(time.bound_us) is not None
+
+    def sift(self) -> int:
+        """Leave behind what will never have a time, once that is known; return how many measurements that were.
+
+        It would wait for ever, and the master for it.
+        """
+        if self._sifted or not self.confirmed or not self.clock.settled:
+            return 0
+        self._sifted = True
+        left = self._outbox.keep(self.can_time)
+        if left:
+            self.delivery.introduce()
+        return left
 
     def timed(self, queued: Queued, slot_ns: int, newest: Timed | None = None) -> Timed | None:
         """Return a measurement with its time for a slot that begins then; None where nothing useful is known.

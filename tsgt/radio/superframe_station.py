@@ -185,6 +185,7 @@ class SuperframeStation:
             if session.heard.counter % len(beacon.stations) == mine:
                 session.delivery.delivered_through(beacon.cumulative)
             session.conversation.take(order for order in beacon.orders if order.station == self._station)
+        left_behind += session.sift()
         self._slot = self._slot_of(session)
         return Heard(
             slot_ns=None if self._slot is None else self._slot.start_ns,

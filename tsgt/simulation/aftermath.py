@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from tsgt.errors import RecordingError
 from tsgt.model import PolarMeasurement
-from tsgt.radio.inbox import RESTART_SKIP
+from tsgt.radio.messages import RESTART_SKIP
 from tsgt.recording import decode, load_recording
 from tsgt.recording.format import Typed
 from tsgt.recording.journal import load_journal

@@ -146,13 +146,13 @@ class Exchange:
         self.replies: dict[int, bytes] = {}
         self.heard: dict[int, Heard] = {}
 
-    def begin(self) -> bytes:
-        """Send a beacon; return it."""
+    def begin(self, *, sigma_ns: int = _STAMP_SIGMA_NS) -> bytes:
+        """Send a beacon, of whose TxDone the master knows one sigma; return it."""
         start_ns = self.master.prepare(self.now_ns)
         self.beacon = self.master.compose()
         self.done_ns = start_ns + self.timing.airtime_ns(len(self.beacon)) + TX_DONE_NS
         self.now_ns = self.done_ns
-        self.master.sent(self.done_ns, _STAMP_SIGMA_NS)
+        self.master.sent(self.done_ns, sigma_ns)
         self.replies, self.heard = {}, {}
         return self.beacon
 

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import structlog
 
 from tsgt.model import PolarMeasurement
+from tsgt.radio.inbox import KNOWN_LINEAGES
 from tsgt.radio.message_codec import angle_code
-from tsgt.radio.outbox import RESTART_SKIP, Queued
+from tsgt.radio.messages import RESTART_SKIP
+from tsgt.radio.outbox import Queued
 from tsgt.radio.station_session import Reception
 from tsgt.recording import decode
 from tsgt.recording.format import MAX_LINE_BYTES, Typed
@@ -25,7 +27,9 @@ MOST_MEASUREMENTS = 10_000
 LINEAGE_BITS = 16
 
 _TAIL_BYTES = 8_000_000
-"""So many measurements take at most so much of a journal, with the beacons between them."""
+_MORE = 4
+"""So many measurements take at most so much of a journal, with the beacons between them. Where there are fewer it is read
+from further back: beacons alone fill so much in six hours."""
 
 _HEAD_LINES = 2
 
@@ -93,8 +97,49 @@ def read_backlog(directory: Path, station: int) -> Backlog:
     ]
     if not journals:
         return Backlog()
+    # A run that began while the disk took nothing has a lineage of its own, and what was left before is still left.
+    lineages = list(dict.fromkeys(head.lineage for head, _ in reversed(journals)))[:KNOWN_LINEAGES]
+    left = max((_left(journals, lineage) for lineage in lineages), key=lambda each: len(each.undelivered))
+    undelivered, receptions = left.undelivered, left.receptions
+    if len(undelivered) > MOST_MEASUREMENTS:
+        log.warning("backlog_left_behind", measurements=len(undelivered) - MOST_MEASUREMENTS)
+    # A run that has heard no master leaves measurements whose time rests on what the runs before it have heard.
+    boots = {each.boot for each in undelivered}
+    for head, path in reversed(journals):
+        if path not in left.read and head.boot in boots and len(receptions) < MOST_MEASUREMENTS:
+            receptions = _tail(head, path).receptions + receptions
+    return Backlog(
+        lineage=left.lineage,
+        run_start=left.last + 1 + RESTART_SKIP,
+        queued=tuple(undelivered[-MOST_MEASUREMENTS:]),
+        receptions=tuple(sorted(receptions[-MOST_MEASUREMENTS:], key=attrgetter("received_ns"))),
+    )
+
+
+class _Left(NamedTuple):
+    """What the runs of one lineage have left.
+
+    Attributes
+    ----------
+    lineage
+        Of the sequence numbers.
+    last
+        The highest of them.
+    undelivered, receptions
+        In the order of the runs.
+    read
+        The journals that had to be read for that.
+    """
+
+    lineage: int | None
+    last: int
+    undelivered: list[Queued]
+    receptions: list[Reception]
+    read: set[Path]
+
+
+def _left(journals: list[tuple[JournalRecord, Path]], lineage: int | None) -> _Left:
     # The names tell the order only as well as the computer's Unix clock; the numbers do, within a lineage.
-    lineage = journals[-1][0].lineage
     runs = sorted(
         (journal for journal in journals if journal[0].lineage == lineage),
         key=lambda journal: journal[0].run_start,
@@ -103,10 +148,10 @@ def read_backlog(directory: Path, station: int) -> Backlog:
     oldest, last = 0, runs[0][0].run_start - 1
     measurements: list[Queued] = []
     receptions: list[Reception] = []
-    unread = dict(reversed([(path, head) for head, path in journals]))
+    read: set[Path] = set()
     for head, path in runs:
-        del unread[path]
         tail = _tail(head, path)
+        read.add(path)
         measurements = tail.measurements + measurements
         receptions = tail.receptions + receptions
         last = max((last, *(each.sequence for each in tail.measurements[-1:])))
@@ -114,19 +159,7 @@ def read_backlog(directory: Path, station: int) -> Backlog:
         if oldest >= head.run_start or len(measurements) > MOST_MEASUREMENTS:
             break
     undelivered = [each for each in measurements if each.sequence >= oldest]
-    if len(undelivered) > MOST_MEASUREMENTS:
-        log.warning("backlog_left_behind", measurements=len(undelivered) - MOST_MEASUREMENTS)
-    # A run that has heard no master leaves measurements whose time rests on what the runs before it have heard.
-    boots = {each.boot for each in undelivered}
-    for path, head in unread.items():
-        if head.boot in boots and len(receptions) < MOST_MEASUREMENTS:
-            receptions = _tail(head, path).receptions + receptions
-    return Backlog(
-        lineage=lineage,
-        run_start=last + 1 + RESTART_SKIP,
-        queued=tuple(undelivered[-MOST_MEASUREMENTS:]),
-        receptions=tuple(sorted(receptions[-MOST_MEASUREMENTS:], key=attrgetter("received_ns"))),
-    )
+    return _Left(lineage, last, undelivered, receptions, read)
 
 
 def _head(path: Path, station: int) -> JournalRecord | None:
@@ -159,11 +192,23 @@ class _Tail(NamedTuple):
 
 
 def _tail(head: JournalRecord, path: Path) -> _Tail:
-    tail = _Tail([], [], 0)
+    """Read a journal from as far back as it takes to know its last number and what is acknowledged."""
+    back = _TAIL_BYTES
+    while True:
+        tail, enough = _read_last(back, head, path)
+        if enough:
+            return tail
+        back *= _MORE
+
+
+def _read_last(back: int, head: JournalRecord, path: Path) -> tuple[_Tail, bool]:
+    """Return what so many bytes at the end of a journal hold, and whether there is no use in reading more of it."""
+    tail, acknowledged = _Tail([], [], 0), False
     zero_ns = head.unix_at_zero_ns
     try:
         with path.open("rb") as file:
-            file.seek(max(0, path.stat().st_size - _TAIL_BYTES))
+            place = max(0, path.stat().st_size - back)
+            file.seek(place)
             for line in file:
                 try:
                     match decode(Typed, line).type:
@@ -176,11 +221,14 @@ def _tail(head: JournalRecord, path: Path) -> _Tail:
                             )
                         case "acknowledged":
                             tail = tail._replace(oldest=decode(AcknowledgedRecord, line).oldest)
+                            acknowledged = True
                 except ValueError:
                     continue  # torn, or the rest of a line that begins before the tail
     except OSError as error:
         log.warning("journal_unreadable", path=str(path), error=error.strerror or str(error))
-    return tail
+        return tail, True
+    told = acknowledged and len(tail.measurements) > 0
+    return tail, told or place == 0 or len(tail.measurements) > MOST_MEASUREMENTS
 
 
 def _reception(record: ReceptionRecord, zero_ns: int, boot: str) -> Reception:

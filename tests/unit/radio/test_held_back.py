@@ -145,6 +145,45 @@ def test_a_reply_whose_end_the_master_has_not_seen_to_the_moment(
     assert beyond_bound(exchange.members[2]) == {}
 
 
+@pytest.mark.parametrize("many", [1, 4])
+@pytest.mark.parametrize(("away_s", "late_us"), [(60, 1_500), (120, 3_000), (300, 8_000)])
+def test_the_first_beacons_after_an_outage(away_s: int, late_us: int, many: int) -> None:
+    """A clock may have run off by so much meanwhile; but what a few beacons alone say is no reason to believe it."""
+    exchange = exchange_of(60)
+    member, until_ns = exchange.members[2], exchange.now_ns + away_s * 1000 * MS
+    while exchange.now_ns < until_ns:
+        exchange.frame(deaf=[2])
+    while many:
+        before_ns = member.core.heard_ns
+        exchange.frame(late_ns={2: 1000 * late_us})
+        many -= member.core.heard_ns != before_ns
+    for _ in range(120):
+        exchange.frame()
+    assert beyond_bound(member) == {}
+
+
+@pytest.mark.parametrize("late_ms", [65, 80])
+def test_an_interrupt_that_the_master_loses_after_it(late_ms: int) -> None:
+    """It cannot say when that beacon left, so that the station cannot find out that those before it were late."""
+    exchange = exchange_of()
+    for _ in range(40):
+        exchange.frame(deaf=[2])
+    member = exchange.members[2]
+    member.made_ns.clear()
+    member.next_ns = exchange.now_ns - 130_000 * MS
+    member.measure(exchange.now_ns - 90_000 * MS)
+    member.next_ns = exchange.now_ns + 1_000_000 * MS  # it has lost its prism
+    hold_back(exchange, 0, 1, ())
+    hold_back(exchange, late_ms * MS, 2, range(2))
+    exchange.begin(sigma_ns=MS)
+    received_ns = exchange.hear(2)
+    assert received_ns is not None
+    exchange.deliver(2, received_ns)
+    exchange.end()
+    hold_back(exchange, 0, 60, ())
+    assert beyond_bound(member) == {}
+
+
 def test_what_five_in_a_row_that_were_held_back_leave_behind() -> None:
     """They are a clock that was touched: what was measured before and is told afterwards is off by as much, unsaid."""
     exchange = exchange_of()

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tsgt.radio.inbox import Inbox, Numbers
-from tsgt.radio.messages import Introduction
+from tsgt.radio.messages import RESTART_SKIP, Introduction
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -103,28 +103,29 @@ def test_a_restart_leaves_numbers_out() -> None:
     """A thousand before its first are never given, unless they have come; what was missing before them still is."""
     inbox = inbox_with([0, 1, 3])
     inbox.written([0, 1, 3])
-    inbox.introduced(introduced(run_start=1004, oldest=2))
+    inbox.introduced(introduced(run_start=4 + RESTART_SKIP, oldest=2))
     assert (inbox.cumulative, inbox.missing) == (1, 1)
     assert inbox.take(2)
     inbox.written([2])
-    assert inbox.cumulative == 1003
-    assert inbox.take(1004)
+    assert inbox.cumulative == 3 + RESTART_SKIP
+    assert inbox.take(4 + RESTART_SKIP)
 
 
 def test_what_a_station_still_has_is_to_be_written_after_a_restart() -> None:
     """It deletes what is acknowledged."""
     inbox = inbox_with(range(5))
-    inbox.introduced(introduced(run_start=1005, oldest=1))
+    inbox.introduced(introduced(run_start=5 + RESTART_SKIP, oldest=1))
     assert inbox.cumulative == 0
     inbox.written(range(5))
-    assert inbox.cumulative == 1004
+    assert inbox.cumulative == 4 + RESTART_SKIP
 
 
-@pytest.mark.parametrize(("run_start", "oldest"), [(1002, 0), (1002, 1002), (1005, 5)])
-def test_what_a_station_has_no_more_does_not_wait_for_the_disk(run_start: int, oldest: int) -> None:
+@pytest.mark.parametrize(("lost_from", "oldest"), [(2, 0), (2, 2), (5, 5)])
+def test_what_a_station_has_no_more_does_not_wait_for_the_disk(lost_from: int, oldest: int) -> None:
     """It takes all below its oldest and all that its restart left out for settled, and reads the number accordingly."""
     inbox = inbox_with(range(5))
     inbox.written([0, 1])
+    run_start = lost_from + RESTART_SKIP
     inbox.introduced(introduced(run_start=run_start, oldest=oldest))
     assert inbox.cumulative == run_start - 1
 
@@ -133,9 +134,9 @@ def test_what_the_disk_lost_is_not_waited_for_if_the_station_has_it_no_more() ->
     """It was on the air, but not in the journal when the station was killed."""
     inbox = inbox_with(range(5))
     inbox.written([0, 1])
-    inbox.introduced(introduced(run_start=1002))
+    inbox.introduced(introduced(run_start=2 + RESTART_SKIP))
     inbox.lost([2, 3, 4])
-    assert (inbox.missing, inbox.cumulative, inbox.unwritten) == (0, 1001, 0)
+    assert (inbox.missing, inbox.cumulative, inbox.unwritten) == (0, 1 + RESTART_SKIP, 0)
 
 
 def test_what_a_station_does_not_have_any_more_is_not_waited_for() -> None:
@@ -163,14 +164,14 @@ def test_a_lineage_that_comes_back_is_known() -> None:
     inbox.introduced(introduced(lineage=8, run_start=700_000))
     assert inbox.take(700_000)
     inbox.written([3, 4])
-    inbox.introduced(introduced(run_start=1005))
+    inbox.introduced(introduced(run_start=5 + RESTART_SKIP))
     assert not any(inbox.take(number) for number in range(5))
-    assert inbox.cumulative == 1004
+    assert inbox.cumulative == 4 + RESTART_SKIP
 
 
 def test_a_station_that_gives_numbers_again_is_believed() -> None:
     """Its journal lost more than a restart leaves out; what it measures now must not pass for what has come."""
-    inbox = inbox_with(range(5000))
+    inbox = inbox_with(range(2 * RESTART_SKIP))
     inbox.introduced(introduced(run_start=3000, oldest=3000))
     assert inbox.take(3000)
 
@@ -178,10 +179,10 @@ def test_a_station_that_gives_numbers_again_is_believed() -> None:
 def test_an_introduction_that_is_repeated_changes_nothing() -> None:
     """Until it is confirmed each reply holds it."""
     inbox = inbox_with([0, 1])
-    inbox.introduced(introduced(run_start=1002, oldest=0))
-    assert inbox.take(1002)
-    inbox.introduced(introduced(run_start=1002, oldest=0))
-    assert not inbox.take(1002)
+    inbox.introduced(introduced(run_start=2 + RESTART_SKIP, oldest=0))
+    assert inbox.take(2 + RESTART_SKIP)
+    inbox.introduced(introduced(run_start=2 + RESTART_SKIP, oldest=0))
+    assert not inbox.take(2 + RESTART_SKIP)
     assert inbox.unwritten == 3
 
 

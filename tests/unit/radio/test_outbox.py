@@ -11,13 +11,17 @@ from support.hand_master import queued
 
 from tsgt.radio import outbox as outbox_module
 from tsgt.radio.inbox import Inbox
-from tsgt.radio.messages import Introduction
-from tsgt.radio.outbox import RESTART_SKIP, Delivery, Extent, Outbox
+from tsgt.radio.messages import RESTART_SKIP, Introduction
+from tsgt.radio.outbox import Delivery, Extent, Outbox
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from tsgt.radio.outbox import Queued
+
+
+START = 7 + RESTART_SKIP
+"""Of a run after one whose last number was 6."""
 
 
 def of(numbers: Iterable[int], *, run_start: int = 0, backlog: Iterable[int] = ()) -> Outbox:
@@ -78,11 +82,11 @@ def test_the_oldest_leaves_when_there_are_too_many(monkeypatch: pytest.MonkeyPat
         ([1, 2, 5], 0, [], Extent(1, ((3, 4),))),
         ([1, 3, 9], 0, [], Extent(1, ((2, 2), (4, 8)))),
         # Numbers that the restart has left out are known to be missing, those beyond are not.
-        ([1007], 1007, [6], Extent(6, ())),
-        ([1007], 1007, [5], Extent(5, ((6, 6),))),
-        ([], 1007, [5], Extent(5, ((6, 6),))),
-        ([1009], 1007, [5], Extent(5, ((6, 6), (1007, 1008)))),
-        ([1009], 1007, [6], Extent(6, ((1007, 1008),))),
+        ([START], START, [6], Extent(6, ())),
+        ([START], START, [5], Extent(5, ((6, 6),))),
+        ([], START, [5], Extent(5, ((6, 6),))),
+        ([START + 2], START, [5], Extent(5, ((6, 6), (START, START + 1)))),
+        ([START + 2], START, [6], Extent(6, ((START, START + 1),))),
     ],
 )
 def test_what_a_master_waits_for(
@@ -134,21 +138,23 @@ def test_a_gap_stops_the_cumulative_number_until_the_master_knows_of_it() -> Non
 
 def test_a_restart_that_lies_behind_is_told_before_those_that_do_not() -> None:
     """What a run in between has left, and the master has, need not come again until its restart lies behind as well."""
-    box = of([5315], run_start=5315, backlog=[*range(2140, 2148), *range(3148, 3166), *range(4166, 4314)])
+    first, second, third = (start + n * RESTART_SKIP for n, start in enumerate((2148, 2166, 2314), 1))
+    left_before = [*range(2140, 2148), *range(first, first + 18), *range(second, second + 148)]
+    box = of([third], run_start=third, backlog=left_before)
     delivery = Delivery(box, anything)
-    delivery.sent([5315])
+    delivery.sent([third])
     delivery.delivered_through(2147 % 256)
-    assert box.oldest == 3148
+    assert box.oldest == first
     assert delivery.outdated
     delivery.introduce()
     delivery.introduced(delivery.oldest)
     for _ in range(2):  # of a master that has all of it
-        delivery.delivered_through(5315 % 256)
-    assert box.oldest == 4166
+        delivery.delivered_through(third % 256)
+    assert box.oldest == second
     delivery.introduce()
     delivery.introduced(delivery.oldest)
-    delivery.delivered_through(5315 % 256)
-    assert box.oldest > 4166
+    delivery.delivered_through(third % 256)
+    assert box.oldest > second
 
 
 def test_a_small_gap_behind_is_not_told_as_long_as_there_are_others() -> None:

@@ -24,9 +24,9 @@ from tsgt.model import Status
 from tsgt.radio.authentication import Authenticator
 from tsgt.radio.base import Transmitted
 from tsgt.radio.conversation import Situation
-from tsgt.radio.messages import GRANT_BYTES, AnswerPart, OrderPart, ShotPart, quality_bound_us
+from tsgt.radio.messages import GRANT_BYTES, RESTART_SKIP, AnswerPart, OrderPart, ShotPart, quality_bound_us
 from tsgt.radio.orders import DirectOrder, MeasureOrder, SearchOrder, TrackOrder
-from tsgt.radio.outbox import RESTART_SKIP, Outbox
+from tsgt.radio.outbox import Outbox
 
 if TYPE_CHECKING:
     from support.hand_master import Answered
@@ -550,6 +550,61 @@ def test_a_restart_of_the_computer_keeps_times_that_can_be_told() -> None:
         master.frame(station)
     assert {each.sequence for each in old} <= set(master.received)
     assert len(again) == 0
+
+
+@pytest.mark.parametrize(("beacons", "expected"), [(4, set()), (5, {1000})])
+def test_a_clock_of_a_few_beacons_does_not_outlive_a_restart_of_the_computer(
+    beacons: int, expected: set[int]
+) -> None:
+    """They may have been held back, and what would have shown that was not heard any more."""
+    outbox = Outbox(0)
+    master, instrument = HandMaster(session_every=1), Instrument(outbox)
+    source = counted()
+    station = make_station(outbox, random_bits=source)
+    receptions = collect(master, station, instrument, 12)[:beacons]
+    left = [replace(queued(1000, receptions[-1].received_ns), boot="old")]
+    again = Outbox(RESTART_SKIP + 1001, left)
+    moved = [replace(reception, boot="old") for reception in receptions]
+    station = make_station(again, boot="new", receptions=moved, random_bits=source)
+    for _ in range(5):
+        master.frame(station)
+    assert {1000} & set(master.received) == expected
+    assert len(again) == 0
+
+
+def test_what_can_be_timed_does_not_wait_behind_what_cannot() -> None:
+    """Of another start of the computer: minutes after the last beacon then, and hours."""
+    outbox = Outbox(0)
+    master, instrument = HandMaster(session_every=4), Instrument(outbox)
+    source = counted()
+    station = make_station(outbox, random_bits=source)
+    moved = [replace(each, boot="old") for each in collect(master, station, instrument, 60)]
+    now_ns = master.now_ns
+    near = [queued(1000 + n, now_ns + n * SECOND, boot="old") for n in range(5)]
+    far = [queued(1005 + n, now_ns + (6 * 3600 + n) * SECOND, boot="old") for n in range(30)]
+    again = Outbox(RESTART_SKIP + 1035, [*near, *far])
+    station = make_station(again, boot="new", receptions=moved, random_bits=source)
+    for _ in range(40):
+        master.frame(station)
+    assert set(master.received) & {each.sequence for each in (*near, *far)} == {
+        each.sequence for each in near
+    }
+    assert len(again) == 0
+
+
+def test_what_was_measured_long_before_the_master_came_is_left_behind() -> None:
+    """Its time could not be told to half a second; what is younger is delivered, and the master waits for nothing else."""
+    outbox = Outbox(0)
+    master = HandMaster(session_every=4, now_ns=6 * 3600 * SECOND)
+    for number in range(20):
+        outbox.add(queued(number, number * SECOND))
+    for number in range(20, 40):
+        outbox.add(queued(number, (2 * 3600 + number) * SECOND))
+    station = make_station(outbox)
+    for _ in range(100):
+        master.frame(station)
+    assert len(outbox) == 0
+    assert set(master.received) == set(range(20, 40))
 
 
 def test_a_few_old_measurements_do_not_wait_for_ever() -> None:

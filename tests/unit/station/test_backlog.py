@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from structlog.testing import capture_logs
 from support.records import HEADER, measurement
 
-from tsgt.radio.outbox import RESTART_SKIP
+from tsgt.radio.messages import RESTART_SKIP
 from tsgt.radio.station_session import Reception
 from tsgt.recording import encode_line
 from tsgt.recording.journal import AcknowledgedRecord, JournalRecord, ReceptionRecord
@@ -188,7 +188,45 @@ def test_what_is_too_much_stays_in_the_journal(tmp_path: Path, monkeypatch: pyte
 def test_of_a_long_journal_the_end_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A client that ran for days starts as fast as any other."""
     monkeypatch.setattr(backlog_module, "_TAIL_BYTES", 1000)
-    journal(tmp_path, "station1-a", head(0), *measured(*range(100)))
+    journal(tmp_path, "station1-a", head(0), *measured(*range(99)), acknowledged(5), *measured(99))
     backlog = read_backlog(tmp_path, 1)
     assert 1 <= len(backlog.queued) < 10
     assert backlog.run_start == 100 + RESTART_SKIP
+
+
+def test_numbers_go_on_however_long_beacons_were_heard_after_the_last_measurement(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A night without instruments: their end of the journal holds nothing else."""
+    monkeypatch.setattr(backlog_module, "_TAIL_BYTES", 1000)
+    heard = [reception(number, received_ns=8_000 + number) for number in range(50)]
+    journal(tmp_path, "station1-a", head(0), *measured(*range(3000)), acknowledged(3000), *heard)
+    backlog = read_backlog(tmp_path, 1)
+    assert (numbers(backlog), backlog.run_start) == ([], 3000 + RESTART_SKIP)
+
+
+def test_what_was_delivered_long_ago_is_not_left_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However long ago that was said."""
+    monkeypatch.setattr(backlog_module, "_TAIL_BYTES", 1000)
+    heard = [reception(number, received_ns=8_000 + number) for number in range(50)]
+    journal(tmp_path, "station1-a", head(0), acknowledged(0), *measured(0, 1, 2))
+    journal(tmp_path, "station1-b", head(1003), *measured(1003, 1004), acknowledged(1005), *heard)
+    assert numbers(read_backlog(tmp_path, 1)) == []
+
+
+def test_what_was_left_before_a_run_with_numbers_of_its_own_is_still_left(tmp_path: Path) -> None:
+    """It began while the disk took nothing, and later the disk took its journal all the same."""
+    journal(tmp_path, "station1-a", head(0), acknowledged(0), *measured(0, 1, 2))
+    anew = head(700_000, lineage=8)
+    journal(tmp_path, "station1-b", anew, *measured(700_000, 700_001), acknowledged(700_001))
+    backlog = read_backlog(tmp_path, 1)
+    assert (backlog.lineage, numbers(backlog)) == (7, [0, 1, 2])
+    assert backlog.run_start == 3 + RESTART_SKIP
+
+
+def test_numbers_that_are_on_the_air_and_on_no_disk_are_not_given_again(tmp_path: Path) -> None:
+    """Even if a disk has taken nothing for a quarter of an hour, 20 times a second."""
+    journal(tmp_path, "station1-a", head(0), acknowledged(0), *measured(*range(10)))
+    assert read_backlog(tmp_path, 1).run_start > 10 + 15 * 60 * 20

@@ -16,8 +16,7 @@ from unit.station.test_daemon import asked
 from tsgt.clock import UnixTimeline
 from tsgt.config.radio import SuperframeConfig
 from tsgt.errors import RecordingError
-from tsgt.radio.inbox import RESTART_SKIP
-from tsgt.radio.messages import AnswerPart, OrderPart
+from tsgt.radio.messages import RESTART_SKIP, AnswerPart, OrderPart
 from tsgt.recording import RecordingWriter, read_lines
 from tsgt.recording.journal import load_journal
 from tsgt.simulation.clocks import VirtualClock

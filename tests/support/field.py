@@ -23,6 +23,7 @@ from tsgt.radio.classic import ClassicStation
 from tsgt.radio.classic_messages import MeasurementMessage, raw_status
 from tsgt.radio.conversation import Situation
 from tsgt.radio.message_codec import angle_code
+from tsgt.radio.messages import RESTART_SKIP
 from tsgt.radio.orders import DirectOrder, SearchOrder, TrackOrder
 from tsgt.radio.outbox import Outbox, Queued
 from tsgt.radio.superframe_station import SuperframeStation
@@ -200,7 +201,8 @@ class Notebook:
     def start(self) -> None:
         """Leave out the numbers that a torn journal may have lost."""
         if self.made_ns:
-            self.outbox = Outbox(max(self.made_ns) + 1001, reversed(list(self.outbox.newest_first())))
+            run_start = max(self.made_ns) + 1 + RESTART_SKIP
+            self.outbox = Outbox(run_start, reversed(list(self.outbox.newest_first())))
 
 
 async def superframe_client(

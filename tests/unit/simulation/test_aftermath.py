@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 from support.records import HEADER, PARAMETERS, measurement
 
+from tsgt.radio.messages import RESTART_SKIP
 from tsgt.recording import encode_line
 from tsgt.recording.journal import JournalRecord
 from tsgt.simulation.aftermath import aftermath
@@ -41,6 +42,9 @@ def made(number: int) -> PolarMeasurement:
     )
 
 
+SECOND_RUN = 5 + RESTART_SKIP
+
+
 def delivered(number: int, *, late_ns: int = 0) -> PolarMeasurement:
     """Return it as the master records it, whose Unix clock is ahead by a minute."""
     stamp_ns = made(number).stamp_ns + 60_000 * MS + late_ns
@@ -57,9 +61,9 @@ class Left:
         self.journals.mkdir()
         self.recordings.mkdir()
         self.journal("a", 0, range(5))
-        self.journal("b", 1005, range(1005, 1010))
+        self.journal("b", SECOND_RUN, range(SECOND_RUN, SECOND_RUN + 5))
         self.recording("a", [delivered(number) for number in range(4)])
-        self.recording("b", [delivered(number) for number in (3, 4, *range(1005, 1010))])
+        self.recording("b", [delivered(number) for number in (3, 4, *range(SECOND_RUN, SECOND_RUN + 5))])
 
     def journal(self, name: str, run_start: int, numbers: Sequence[int], *, lineage: int = 7) -> Path:
         """Write one."""
@@ -78,7 +82,7 @@ class Left:
 
     def found(self, *, queued: int = 0) -> Found:
         """Check it."""
-        numbers = (*range(5), *range(1005, 1010))
+        numbers = (*range(5), *range(SECOND_RUN, SECOND_RUN + 5))
         offered = [
             Offered(
                 instrument_ms=400 * number,
@@ -138,7 +142,7 @@ def test_a_line_that_is_json_but_not_whole_is_found(left: Left) -> None:
 
 def test_what_is_lost_is_found(left: Left) -> None:
     """Unless it waits in the queue."""
-    left.recording("b", [delivered(number) for number in range(1005, 1009)])
+    left.recording("b", [delivered(number) for number in range(SECOND_RUN, SECOND_RUN + 4)])
     assert left.checks(queued=2) == set()
     assert left.checks(queued=1) == {"lost"}
 
@@ -151,11 +155,13 @@ def test_what_is_recorded_twice_is_found(left: Left) -> None:
 
 def test_a_number_that_is_given_again_is_found(left: Left) -> None:
     """By a run that goes on too early, or begins anew, or leaves one out."""
-    left.journal("b", 1004, range(1005, 1010))
+    left.journal("b", SECOND_RUN - 1, range(SECOND_RUN, SECOND_RUN + 5))
     assert "number" in left.checks()
-    left.journal("b", 1005, range(1005, 1010), lineage=8)
+    left.journal("b", SECOND_RUN, range(SECOND_RUN, SECOND_RUN + 5), lineage=8)
     assert left.checks() == {"number"}
-    left.journal("b", 1005, (1005, 1007, 1006, 1008, 1009))
+    left.journal(
+        "b", SECOND_RUN, (SECOND_RUN, SECOND_RUN + 2, SECOND_RUN + 1, SECOND_RUN + 3, SECOND_RUN + 4)
+    )
     assert left.checks() == {"number"}
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from tsgt.master.clock_offset import clock_filter
 from tsgt.master.collector import Collector
-from tsgt.master.intake import Intake
+from tsgt.master.intake import RESTART_NS, Intake
 from tsgt.master.scheduler import Cadence, Scheduler, StationPlan
 from tsgt.radio.classic import Ordered, Poll, Synchronisation, Timing
 
@@ -115,6 +115,9 @@ class ClassicLink:
                 self._intake.unanswered(station)
             if turn.samples:
                 self._synchronised(turn, now_ns)
+            if _leaves_doubt(turn) and self._intake.clock(station, now_ns) is not None:
+                self._intake.doubt(station)
+                self._scheduler.doubted(station, now_ns)
         elif isinstance(turn, Poll):
             self._polled(turn, collector.last, collector.requested_ns)
 
@@ -143,6 +146,14 @@ class ClassicLink:
             self._scheduler.resynchronise(poll.station, reports.now_ns())
         if arrival.stepped:
             reports.events(reports.alerts.stepped(poll.station, reports.now_ns()))
+
+
+def _leaves_doubt(turn: Synchronisation) -> bool:
+    """Whether the station may have another clock than that of the samples.
+
+    It tells of a restart until it is pinged. If that was done here, and what it answered was lost, nothing else will tell.
+    """
+    return turn.unanswered > 0 and (not turn.samples or turn.silence_ns > RESTART_NS)
 
 
 def _cadence(protocol: ClassicMasterConfig) -> Cadence:

@@ -91,8 +91,16 @@ class ClockFilter(Protocol):
 
     name: str
 
-    def update(self, samples: Sequence[ClockSample]) -> Updated:
-        """Take the exchanges of one synchronisation, at least one, in the order of time."""
+    def update(self, samples: Sequence[ClockSample], *, anew: bool = False) -> Updated:
+        """Take the exchanges of one synchronisation.
+
+        Parameters
+        ----------
+        samples
+            At least one, in the order of time.
+        anew
+            The station's program may have been started again since the synchronisation before, with another clock.
+        """
         ...
 
     def at(self, station_ns: int) -> ClockEstimate:
@@ -135,8 +143,9 @@ class PaperFilter:
         self._sigma_ns = 0.0
         self._bound_ns = 0.0
 
-    def update(self, samples: Sequence[ClockSample]) -> Updated:
-        """Take the mean whole the first time, later a tenth of it."""
+    def update(self, samples: Sequence[ClockSample], *, anew: bool = False) -> Updated:
+        """Take the mean whole the first time, later a tenth of it; ``anew`` is nothing that the paper knows of."""
+        del anew
         first = self._offset_ns is None
         # Twice the midpoint offset, less that of the first sample: whole numbers, and small ones.
         twice_ns = [2 * s.station_ns - s.sent_ns - s.received_ns for s in samples]
@@ -189,13 +198,18 @@ class RegressionFilter:
         self._line: Line | None = None
         self._noise_ns: float | None = None
 
-    def update(self, samples: Sequence[ClockSample]) -> Updated:
-        """Add a synchronisation; let go of old ones when the line no longer passes through all of them."""
+    def update(self, samples: Sequence[ClockSample], *, anew: bool = False) -> Updated:
+        """Add a synchronisation; let go of old ones when the line no longer passes through all of them.
+
+        No line reaches over what may have been a restart: two small steps, one after the other, would pass for a frequency.
+        """
         frequency = self._prior.mean if self._line is None else self._line.frequency
         batch = sift(samples, frequency, self._noise_ns)
         if self._line is not None and not self._line.consistent_with(batch):
             self.forget()
         restarted = self._line is None
+        if anew and self._line is not None:
+            self.forget()
         bend = 0.0 if self._line is None else self._line.bend
         if self._line is not None and batch.doubt_ns == 0:
             bend = self._line.missed_ns(batch) / gap_s([*confirmed(self._batches), batch])

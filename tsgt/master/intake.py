@@ -90,6 +90,10 @@ class Intake:
         """Take note that a station did not answer."""
         self._stations[station].unanswered()
 
+    def doubt(self, station: int) -> None:
+        """Hold a station's measurements until it is synchronised: it may have been restarted, with another clock."""
+        self._stations[station].doubt()
+
     def synchronised(self, station: int, samples: Sequence[ClockSample], now_ns: int) -> Synchronised:
         """Take the exchanges of a synchronisation, at least one; what was held is stamped and let go."""
         return self._stations[station].synchronised(samples, now_ns)
@@ -168,6 +172,9 @@ class _Station:
         self._missed = True
         self._held_of_before = bool(self._held)
 
+    def doubt(self) -> None:
+        self._doubtful = True
+
     def answered(self, message: MeasurementMessage, requested_ns: int, received_ns: int) -> Arrival:
         missed = self._missed
         back = self._is_back(received_ns)
@@ -193,7 +200,11 @@ class _Station:
         )
         stale = stamp_ns < requested_ns - present.bound_ns - STALE_NS
         if not timed and (stale or not possible):  # an authors' node has no time for its errors
-            return Arrival(self._untimed(message, received_ns))
+            told = self._untimed(message, received_ns)
+            if told is not None and not _has_no_values(message):
+                # It has a time of its own, by which it would be told again after the next synchronisation.
+                self._known.append(message.time_ns)
+            return Arrival(told)
         if not possible:
             self._offset_ns = None
             self._clock.forget()
@@ -241,13 +252,14 @@ class _Station:
         if self._heard_ns is None or samples[0].sent_ns - self._heard_ns > RESTART_NS:
             self._held_of_before = bool(self._held)
         known = self._offset_ns is not None
-        forgotten = known and self._doubtful and not self._agrees(newest)
+        doubtful = self._doubtful
+        forgotten = known and doubtful and not self._agrees(newest)
         if forgotten:
             self._clock.forget()  # the paper's filter would go there a tenth of the way
         self._missed = False
         self._heard_ns, self._doubtful, self._had_nothing = now_ns, False, False
         before = self._by_the_clock_before() if known and not forgotten else {}
-        updated = self._clock.update(samples)
+        updated = self._clock.update(samples, anew=doubtful)
         another = self._held_of_before and (updated.restarted or not known)
         stepped = updated.restarted and known
         self._offset_ns = newest.station_ns - newest.sent_ns - newest.forward_ns
@@ -358,6 +370,11 @@ class _Station:
             raw_status=message.status,
             host_time_ns=message.time_ns,
         )
+
+
+def _has_no_values(message: MeasurementMessage) -> bool:
+    """Whether this is an error of an authors' node: -1 for all values, and a time that means nothing."""
+    return message.zenith_angle_rad < 0
 
 
 def _timed(message: MeasurementMessage) -> bool:

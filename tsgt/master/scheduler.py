@@ -41,6 +41,10 @@ _SPACING_NS = 5_000_000_000
 _LARGEST_PAUSE = 20
 """Times that a fruitless turn took: a station that is gone gets a twentieth of the time."""
 
+_ANSWERING_PAUSE = 3
+"""A station that answers, but without samples or leaving its clock in doubt, gets up to a third: it may be well again with
+the next packet."""
+
 _OUTAGE_SHARE = 4
 """A station that is silent for some time is looked for again within a quarter of that time."""
 
@@ -164,7 +168,13 @@ class Scheduler:
         fruitful = turn.answered if isinstance(turn, Poll) else bool(turn.samples)
         station.fruitless = 0 if fruitful else station.fruitless + 1
         pause_ns = _pause_ns(station.fruitless, took_ns)
-        station.not_before_ns = now_ns + self._at_most(station, pause_ns, now_ns)
+        station.not_before_ns = now_ns + (
+            min(pause_ns, _ANSWERING_PAUSE * took_ns)
+            if turn.answered
+            else self._at_most(station, pause_ns, now_ns)
+        )
+        if isinstance(turn, Poll):
+            station.doubted = 0
         if station.fruitless == 1 and isinstance(turn, Poll):
             # A round later there would be a gap in its track that nothing is interpolated over.
             self._round.remove(station)
@@ -191,6 +201,18 @@ class Scheduler:
         found.tracks = found.agreed = False
         found.due_ns = now_ns
         found.synchronisations = min(found.synchronisations, 1)
+
+    def doubted(self, station: int, now_ns: int) -> None:
+        """Synchronise a station once more: it may have got another clock during the synchronisation that has just ended.
+
+        From the second time in a row on it has to wait, for others have only what it leaves.
+        """
+        self.resynchronise(station, now_ns)
+        found = self._station(station)
+        found.doubted += 1
+        took_ns = now_ns - self._began_ns
+        pause_ns = min(_pause_ns(found.doubted, took_ns), _ANSWERING_PAUSE * took_ns)
+        found.not_before_ns = max(found.not_before_ns, now_ns + pause_ns)
 
     def _turn(self, station: _Station, now_ns: int) -> Task:
         plan = station.plan
@@ -250,6 +272,8 @@ class _Station:
     fruitless, refused, unanswered
         Polls and synchronisations in a row that brought nothing; orders that were refused since one was carried out,
         and orders in a row without an answer.
+    doubted
+        Synchronisations in a row that left it open which clock the station has now.
     synchronisations
         How many there were since it was first heard or its clock was found to be another one.
     due_ns, urgent
@@ -267,6 +291,7 @@ class _Station:
     fruitless: int = 0
     refused: int = 0
     unanswered: int = 0
+    doubted: int = 0
     synchronisations: int = 0
     due_ns: int = 0
     urgent: bool = False

@@ -12,11 +12,12 @@ from tsgt.radio.classic_messages import (
 )
 from tsgt.radio.orders import DirectOrder, MeasureOrder, TrackOrder
 
-_INTRODUCTIONS = 3
+_INTRODUCTIONS = 8
 """So many requests are answered as if there were no measurement yet, unless the station is synchronised before.
 
 A master that knew the station before its restart cannot see from a measurement that its clock may be another one. One
-that is told that there is none can."""
+that is told that there is none can. It may not hear the first answers; but after five seconds of silence it doubts the
+clock by itself, and into these fit about six of its requests."""
 
 
 ClassicOrder = TrackOrder | DirectOrder | MeasureOrder

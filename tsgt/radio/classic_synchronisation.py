@@ -66,6 +66,9 @@ class Synchronisation:
         Whether the station has answered anything.
     unanswered
         How many requests it has not answered.
+    silence_ns
+        Since the last sample: the longest time between two answers with a request unanswered in between, in ns. The
+        station may have been restarted meanwhile, and pinged afterwards.
     """
 
     SILENT = 3
@@ -84,6 +87,8 @@ class Synchronisation:
         self.samples: list[ClockSample] = []
         self.answered = False
         self.unanswered = 0
+        self.silence_ns = 0
+        self._heard_ns: int | None = None
         self._cycles = cycles
         self._timing = timing
         self._back_ns = timing.airtime_ns(PING_REPLY_BYTES) + timing.rx_done_ns
@@ -120,19 +125,20 @@ class Synchronisation:
         if isinstance(reply, PingReply) and self._step is _Step.PING:
             if reply.station != self.station or received_ns < self._earliest_ns(sent_ns):
                 return False
+            self._heard(received_ns)
             self._ping_ns = (sent_ns, received_ns)
             self._step = _Step.STAMP if exact else self._next_cycle()
         elif isinstance(reply, TimeReply) and self._step is _Step.FLUSH:
+            self._heard(received_ns)
             self._stamps_ns.add(reply.time_ns)
             self._flush = False
             self._step = _Step.PING
         elif isinstance(reply, TimeReply) and self._step is _Step.STAMP:
+            self._heard(received_ns)
             self._take(reply.time_ns)
             self._step = self._next_cycle()
         else:
             return False
-        self.answered = True
-        self._silent = 0
         return True
 
     def timed_out(self) -> None:
@@ -147,6 +153,13 @@ class Synchronisation:
             self._flush = True
             self._step = _Step.ENTER if self._cycles_left() else self._end()
 
+    def _heard(self, received_ns: int) -> None:
+        if self._silent and self._heard_ns is not None:
+            self.silence_ns = max(self.silence_ns, received_ns - self._heard_ns)
+        self._heard_ns = received_ns
+        self.answered = True
+        self._silent = 0
+
     def _ask(self, letter: Letter, reply_timeout_ns: int) -> Request:
         return Request(Command(letter, self.station).to_bytes(), reply_timeout_ns)
 
@@ -159,6 +172,7 @@ class Synchronisation:
             self._flush = True
             return
         self._stamps_ns.add(station_ns)
+        self.silence_ns = 0  # a program that was started anew would not have this stamp
         sent_ns, received_ns = self._ping_ns
         sample = ClockSample(
             sent_ns=sent_ns,

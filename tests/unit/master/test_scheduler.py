@@ -28,13 +28,15 @@ PAPERS = Cadence(initial_cycles=50, resync_cycles=5, interval_ns=300 * SECOND)
 
 @dataclass
 class Channel:
-    """Carries turns out: stations answer, are dead, or refuse orders."""
+    """Carries turns out: stations answer, are dead, refuse orders, give no stamps, or leave their clock open."""
 
     cadence: Cadence = PAPERS
     stations: int = 3
     now_ns: int = 0
     dead: set[int] = field(default_factory=set)
     refusing: set[int] = field(default_factory=set)
+    stampless: set[int] = field(default_factory=set)
+    doubted: set[int] = field(default_factory=set)
     turns: list[tuple[int, Task]] = field(default_factory=list)
     spent_ns: Counter[int] = field(default_factory=Counter)
 
@@ -59,6 +61,8 @@ class Channel:
             self.spent_ns[turn.station] += took_ns
             self.now_ns += took_ns
             self.scheduler.finished(turn, self.now_ns)
+            if isinstance(turn, Synchronisation) and turn.station in self.doubted:
+                self.scheduler.doubted(turn.station, self.now_ns)
 
     def _carry_out(self, turn: Task) -> int:
         dead = turn.station in self.dead
@@ -71,6 +75,8 @@ class Channel:
         turn.answered = not dead
         if dead:
             return FRAME_NS + 3 * TIMEOUT_NS
+        if turn.station in self.stampless:
+            return FRAME_NS + 2 * turn._cycles * CYCLE_NS
         turn.samples = [SAMPLE] * turn._cycles
         return FRAME_NS + turn._cycles * CYCLE_NS
 
@@ -234,6 +240,62 @@ def test_a_station_with_another_clock_is_synchronised_before_anything_else() -> 
     channel.run(400)
     following = [at / SECOND for at, t in channel.of(Synchronisation, since_s=91) if t.station == 2]
     assert following[0] < 190  # its frequency is learnt anew
+
+
+def test_a_station_whose_synchronisation_leaves_doubt_is_synchronised_again_at_once() -> None:
+    """As one whose clock was found to be another one; its measurements wait meanwhile."""
+    channel = Channel(doubted={2})
+    channel.run(44)
+    channel.doubted.clear()
+    kinds = [type(turn) for _, turn in channel.turns if turn.station == 2]
+    assert kinds[:4] == [Ordered, Synchronisation] * 2
+    channel.run(100)
+    assert channel.rate_hz(2, 80) == pytest.approx(channel.rate_hz(1, 80), rel=0.1)
+
+
+@pytest.mark.parametrize("samples", [True, False])
+def test_a_station_whose_synchronisations_always_leave_doubt_gets_no_more_than_its_share(
+    *, samples: bool
+) -> None:
+    """Each leads to the next, but others have their turns in between."""
+    channel = Channel()
+    channel.run(60)
+    channel.doubted.add(2)
+    if not samples:
+        channel.stampless.add(2)
+    channel.scheduler.doubted(2, channel.now_ns)
+    channel.run(180)
+    spent_ns = channel.spent_ns[2]
+    channel.run(1080)
+    assert (channel.spent_ns[2] - spent_ns) / (900 * SECOND) < 0.34
+    channel.doubted.clear()
+    channel.stampless.clear()
+    channel.run(1200)
+    assert channel.rate_hz(2, 1150) == pytest.approx(channel.rate_hz(1, 1150), rel=0.1)
+
+
+def test_doubts_that_are_far_apart_cost_no_pause() -> None:
+    """Only those count that come one after the other, without a poll in between."""
+    channel = Channel()
+    channel.run(60)
+    for until_s in range(70, 130, 10):
+        before_ns = channel.now_ns
+        channel.scheduler.doubted(2, before_ns)
+        channel.run(until_s)
+        at_once = [turn for at, turn in channel.turns if at >= before_ns][:2]
+        assert [(type(turn), turn.station) for turn in at_once] == [(Ordered, 2), (Synchronisation, 2)]
+
+
+def test_a_station_that_answers_but_has_no_stamps_gets_no_more_than_its_share() -> None:
+    """Its clock was found to be another one, and no synchronisation says which."""
+    channel = Channel()
+    channel.run(60)
+    channel.stampless.add(2)
+    channel.scheduler.resynchronise(2, channel.now_ns)
+    channel.run(180)
+    spent_ns = channel.spent_ns[2]
+    channel.run(1080)
+    assert (channel.spent_ns[2] - spent_ns) / (900 * SECOND) < 0.34
 
 
 def test_a_late_yes_of_one_station_is_not_taken_for_another_ones() -> None:

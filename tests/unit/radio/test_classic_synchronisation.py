@@ -333,6 +333,29 @@ def test_guessed_instants_make_no_sample() -> None:
     assert len(turn.samples) == 4
 
 
+@pytest.mark.parametrize(
+    ("unheard", "lost", "samples", "silence_ms"),
+    [({7, 9}, {12}, 3, 840), ({7, 9}, set[int](), 4, 0), (set(range(7, 30)), set[int](), 3, 0)],
+    ids=["before its last answers", "before its last sample", "at the end"],
+)
+def test_a_silence_that_no_sample_has_followed_is_told(
+    unheard: set[int], lost: set[int], samples: int, silence_ms: int
+) -> None:
+    """The station may have been started anew in it and pinged after it; at the end nobody has pinged it any more."""
+
+    def unheard_there(exchange: Exchange) -> None:
+        exchange.heard = exchange.number not in unheard
+
+    def lost_here(exchange: Exchange) -> None:
+        if exchange.number in lost:
+            exchange.replies.clear()
+
+    link, turn = Link(unheard_there, lost_here), Synchronisation(1, 5, TIMING)
+    link.run(turn)
+    assert len(turn.samples) == samples
+    assert turn.silence_ns / MS == pytest.approx(silence_ms, abs=40)
+
+
 def test_a_sample_that_is_alone_does_not_count() -> None:
     """Somebody plays back a stamp, and nothing else arrives that could contradict it."""
 

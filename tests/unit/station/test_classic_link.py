@@ -13,7 +13,7 @@ from tsgt.clock import UnixTimeline
 from tsgt.errors import RadioError
 from tsgt.model import PolarMeasurement, Status
 from tsgt.radio.base import Packet, Transmitted
-from tsgt.radio.classic_messages import Acknowledgement, MeasurementMessage, decode_reply
+from tsgt.radio.classic_messages import Acknowledgement, MeasurementMessage, TimeReply, decode_reply
 from tsgt.radio.orders import DirectOrder, MeasureOrder, SearchOrder, TrackOrder
 from tsgt.recording.journal import TargetRecord
 from tsgt.simulation.clocks import VirtualClock
@@ -179,6 +179,26 @@ async def test_what_the_disk_held_up_is_not_offered_as_another_prism() -> None:
         made.session.executed(DirectOrder())
         made.link.offer(made.measure(START + 2 * MS, prism=2))
         assert (await made.poll()).time_ns == START + MS
+
+
+@pytest.mark.parametrize(("sigma_ns", "stamp_ms"), [(MS, -40), (29 * MS, 0)])
+async def test_a_ping_that_was_found_without_its_interrupt_is_not_stamped_too_early(
+    sigma_ns: int, stamp_ms: int
+) -> None:
+    """The driver's guess may lie 50 ms before the packet's end; the master's bounds rest on stamps that are never early."""
+    async with client() as made:
+        found_ns = made.clock.monotonic_ns()
+        made.air.arriving.put_nowait(
+            Packet(
+                payload=b"e3",
+                rssi_dbm=-80.0,
+                snr_db=9.0,
+                received_at_ns=found_ns - 40 * MS,
+                stamp_sigma_ns=sigma_ns,
+            )
+        )
+        assert await made.answer() is not None
+        assert await made.ask(b"s3") == TimeReply(START + found_ns + stamp_ms * MS)
 
 
 async def test_a_shot_is_answered_whatever_becomes_of_it() -> None:

@@ -145,7 +145,9 @@ class FixedLag:
         """From when on a trajectory that was found anew can be believed, infinite before the first one.
 
         Where each prism was seen once or twice, the robot may lie the other way about the line through two of them and move
-        otherwise. What comes later tells that for what comes later, not for what was before a gap.
+        otherwise. What comes later tells that for what comes later, not for what was before a gap. And the first measurement
+        of a prism, which nothing before it contradicts, may be of a wrong one: the robot would just seem to have come from
+        there. So it is the instant at which each of three prisms has been seen a second time.
         """
         return self._begun_s
 
@@ -254,12 +256,12 @@ class FixedLag:
             raise GeometryError("to begin with, three prisms have to be measured twice")
         guess = first_guess(observations, knot_times(observations.time_s))
         self._anchor = start_anchor(guess.select(slice(0, 1)), self._prior)
-        self._search(guess, BEGINNING_ITERATIONS)
+        fitting = self._search(guess, BEGINNING_ITERATIONS)
         if self._settled:
             assert self._knots is not None  # noqa: S101 (it is settled)
             self._anchor = Anchor(self._knots.select(slice(0, 1)), np.diag(_AS_GOOD_AS_NOTHING**-2.0))
             self._contradicted_s = float(observations.time_s[-1])
-            self._begun_s = _told_from_s(observations)
+            self._begun_s = _told_from_s(observations.select(fitting))
 
     def _followed(self, held: Observations, new: Observations) -> bool:
         """Add measurements to the trajectory found before; return whether that is still good to follow."""
@@ -293,14 +295,15 @@ class FixedLag:
         self._search(knots, MOST_ITERATIONS)
         return self._settled
 
-    def _search(self, guess: Knots, most_iterations: int) -> None:
-        """Find the trajectory however far it is from a guess."""
+    def _search(self, guess: Knots, most_iterations: int) -> NDArray[np.bool_]:
+        """Find the trajectory however far it is from a guess; return which measurements are no outliers."""
         assert self.observations is not None  # noqa: S101 (only called with some)
         found = solve(
             self.observations, guess, self._prior, anchor=self._anchor, most_iterations=most_iterations
         )
         self._take(found.knots, found.steps, found.factor, found)
         self._settled &= found.iterations < most_iterations
+        return found.distances < OUTLYING**2
 
     def _take(self, knots: Knots, steps: Steps, factor: BlockFactor, found: System | Solution) -> None:
         self._knots, self._steps, self._solved, self._trajectory = knots, steps, (knots, factor), None
@@ -316,14 +319,15 @@ class FixedLag:
 
 def _told_from_s(observations: Observations) -> float:
     """From when on measurements tell the trajectory by themselves; when the last one was made if they do not."""
-    begun_s = [
-        each_s[np.flatnonzero(np.diff(each_s, prepend=-np.inf) > GAP_S)[-1]]
+    since_gap = [
+        each_s[np.flatnonzero(np.diff(each_s, prepend=-np.inf) > GAP_S)[-1] :]
         for prism in np.unique(observations.prism)
         for each_s in [observations.time_s[observations.prism == prism]]
     ]
-    counts = np.bincount(observations.prism[observations.time_s >= max(begun_s)])
-    told = np.count_nonzero(counts >= TELLING) >= 3
-    return float(max(begun_s) if told else observations.time_s[-1])
+    counts = np.bincount(observations.prism[observations.time_s >= max(each_s[0] for each_s in since_gap)])
+    if np.count_nonzero(counts >= TELLING) < 3:
+        return float(observations.time_s[-1])
+    return float(max(each_s[:2][-1] for each_s in since_gap))
 
 
 def _distances_of_new(system: System, at: NDArray[np.intp], new: NDArray[np.intp]) -> FloatArray:

@@ -43,14 +43,18 @@ class Ahead:
         (18, 18) of its error.
     prior
         How the robot moves from there.
+    livelier
+        Factor on the variance of its accelerations.
     """
 
-    def __init__(self, start: Knots, covariance: FloatArray, prior: MotionPrior) -> None:
+    def __init__(
+        self, start: Knots, covariance: FloatArray, prior: MotionPrior, *, livelier: float = 1.0
+    ) -> None:
         self.time_s = float(start.time_s[0])
         self._start = start
         self._covariance = covariance
         self._times_s = np.array([prior.acceleration_time_s, prior.angular_acceleration_time_s])
-        self._variances = axis_sigmas(prior) ** 2
+        self._variances = livelier * axis_sigmas(prior) ** 2
 
     def at(self, time_s: float, *, parts: int = STATE) -> tuple[Knots, FloatArray]:
         """Return the state at an instant not before its own, and the covariance of the first parts of its error.

@@ -11,7 +11,6 @@ it first counts is judged by its distance in sigmas of the prediction, not in th
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING
 
@@ -79,10 +78,13 @@ TELLING, GAP_S = 3, 1.25
 DOUBT_BACK_S = 1.5
 """So long before a measurement that contradicts, what it may bend is not known either: a few measurements of each prism."""
 
-SURPRISES, SURPRISED = 6, 2.0
-"""So many measurements of late, and how far they were from their predictions in the mean, squared and in sigmas of one
-dimension, from which on predictions are taken to be as much worse. Driving is not Gaussian: a robot that starts and turns
-at once goes on with that. Of robots as the prior has them it is so once in 140 times (chi-square, 18 degrees of freedom)."""
+LIVELIER_AHEAD = 2.0
+"""How much livelier, in the variance of its accelerations, a robot is taken to be where nothing was measured yet. Driving is
+not Gaussian: for minutes nothing happens, and then the robot speeds up and turns the other way at once."""
+
+SURPRISED = 4.0
+"""So far was the newest measurement from its prediction, squared and in its sigmas, from which on predictions are taken to be
+as much worse: who has begun to turn goes on with that. Of robots as the prior has them it is so once in four times."""
 
 MOST_STEPS = 5
 """Where these do not settle it, every step is tried before it is taken, as in :func:`tsgt.geometry.continuous.solve`."""
@@ -121,7 +123,7 @@ class FixedLag:
         self._solved: tuple[Knots, BlockFactor] | None = None
         self._trajectory: Trajectory | None = None
         self._end: Ahead | None = None
-        self._surprises: deque[float] = deque(maxlen=SURPRISES)
+        self._surprise = 0.0
         self.observations: Observations | None = None
         self.residuals_m: FloatArray = np.empty((0, 3))
 
@@ -226,13 +228,12 @@ class FixedLag:
     def predict(self, time_s: float, *, parts: int = STATE) -> tuple[Knots, FloatArray]:
         """Return the state at an instant, with its covariance as :meth:`Trajectory.at` does, by all measurements so far.
 
-        Beyond the last of them the covariance is as much larger as the last ones were farther off than was to be expected.
+        Beyond the last of them the covariance is that of a livelier robot, and as much larger as the last one was farther off.
         """
         assert self._end is not None  # noqa: S101 (only called while following)
         if time_s >= self._end.time_s:
             state, covariance = self._end.at(time_s, parts=parts)
-            surprise = sum(self._surprises) / (3 * len(self._surprises)) if self._surprises else 0.0
-            return state, covariance * surprise if surprise > SURPRISED else covariance
+            return state, covariance * max(1.0, self._surprise / SURPRISED)
         return self.trajectory().at(np.array([time_s]), parts=parts)
 
     def trajectory(self) -> Trajectory:
@@ -251,7 +252,7 @@ class FixedLag:
     def _begin(self, observations: Observations) -> None:
         """Find the trajectory of all measurements of the window, knowing nothing else."""
         self._settled, self._doubted = False, frozenset(observations.prism.tolist())
-        self._surprises.clear()
+        self._surprise = 0.0
         if np.count_nonzero(np.bincount(observations.prism) >= 2) < 3:
             raise GeometryError("to begin with, three prisms have to be measured twice")
         guess = first_guess(observations, knot_times(observations.time_s))
@@ -280,7 +281,8 @@ class FixedLag:
         distances = _distances_of_new(system, at, np.flatnonzero(unheard))
         weights = 1.0 / np.maximum(distances / OUTLYING**2, 1.0)
         # What is hopelessly off says nothing of how the robot moves, and no other more than an outlier does.
-        self._surprises.extend(min(each, OUTLYING**2) for each in distances.tolist() if each < HOPELESS**2)
+        surprises = [min(each, OUTLYING**2) for each in distances.tolist() if each < HOPELESS**2]
+        self._surprise = (surprises or [self._surprise])[-1]
         self._doubt(new, weights)
         add_rows(system.rows[unheard], weights, at[unheard], system.diagonal, system.gradient)
         for _ in range(MOST_STEPS):
@@ -310,7 +312,7 @@ class FixedLag:
         self.residuals_m = found.linearised.residuals_m
         inverse = np.linalg.inv(factor.last())
         covariance = inverse.T @ inverse
-        self._end = Ahead(knots.select(slice(-1, None)), covariance, self._prior)
+        self._end = Ahead(knots.select(slice(-1, None)), covariance, self._prior, livelier=LIVELIER_AHEAD)
         sigma_rad = float(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1]))
         fitting = int(np.count_nonzero(found.distances < OUTLYING**2)) / len(found.distances)
         fits = fitting > (SOME_FIT if self._settled else NEARLY_ALL_FIT)

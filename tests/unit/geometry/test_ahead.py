@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -39,3 +41,16 @@ def test_it_is_what_a_trajectory_predicts(rate_radps: float, ahead_s: float) -> 
         sigmas = np.sqrt(np.diagonal(expected_spread[0]))
         scale = sigmas[:, None] * sigmas
         np.testing.assert_allclose(spread / scale, expected_spread / scale, rtol=0, atol=1e-12)
+
+
+def test_a_livelier_robot_is_one_of_a_prior_with_larger_sigmas() -> None:
+    """Twice the variance of the accelerations, the same state."""
+    state, covariance = turning(0.3)
+    sigma_mps2, sigma_radps2 = PRIOR.acceleration_sigma_mps2, PRIOR.angular_acceleration_sigma_radps2
+    x, y, z, roll, pitch, yaw = (float(np.sqrt(2.0)) * each for each in (*sigma_mps2, *sigma_radps2))
+    lively = replace(
+        PRIOR, acceleration_sigma_mps2=(x, y, z), angular_acceleration_sigma_radps2=(roll, pitch, yaw)
+    )
+    _, found = Ahead(state, covariance, PRIOR, livelier=2.0).at(7.6)
+    _, expected = Ahead(state, covariance, lively).at(7.6)
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-15)

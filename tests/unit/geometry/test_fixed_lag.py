@@ -11,7 +11,7 @@ from support.prior_motion import draw_motions, in_time, measure, rows_at
 from tsgt.geometry import FixedLag, FloatArray, Observations, Trajectory
 from tsgt.geometry.continuous import knot_times, solve
 from tsgt.geometry.first_guess import first_guess
-from tsgt.geometry.fixed_lag import DOUBT_BACK_S, SURPRISED
+from tsgt.geometry.fixed_lag import DOUBT_BACK_S
 from tsgt.model import MotionPrior
 
 PRIOR = MotionPrior()
@@ -48,7 +48,7 @@ def followed(observations: Observations, *, lag_s: float = LAG_S) -> FixedLag:
 def test_the_end_is_that_of_the_whole_trajectory(observations: Observations) -> None:
     """What the window has let go of is not forgotten: state and covariance at the end are those of all measurements."""
     at_s = np.array([observations.time_s[-1] + 0.3])
-    state, covariance = followed(observations).predict(float(at_s[0]))
+    state, covariance = followed(observations).trajectory().at(at_s)
     expected, expected_covariance = batch(observations).at(at_s)
     sigmas = np.sqrt(np.diagonal(expected_covariance, axis1=1, axis2=2))
     assert np.abs(state.error_from(expected) / sigmas).max() < 0.05
@@ -86,9 +86,9 @@ def test_a_late_measurement_counts(observations: Observations) -> None:
     late = len(order) - 8
     order = np.concatenate([order[:late], order[late + 1 :], [late]])
     in_order, out_of_order = followed(observations), followed(observations.select(order))
-    at_s = float(observations.time_s[-1])
-    state, covariance = out_of_order.predict(at_s)
-    expected, expected_covariance = in_order.predict(at_s)
+    at_s = observations.time_s[-1:]
+    state, covariance = out_of_order.trajectory().at(at_s)
+    expected, expected_covariance = in_order.trajectory().at(at_s)
     sigmas = np.sqrt(np.diagonal(expected_covariance, axis1=1, axis2=2))
     assert np.abs(state.error_from(expected) / sigmas).max() < 0.05
     np.testing.assert_allclose(covariance, expected_covariance, rtol=0.02, atol=1e-3 * sigmas.max() ** 2)
@@ -123,37 +123,6 @@ def test_an_outlier_does_little(observations: Observations, off_m: float) -> Non
     expected, _ = without.predict(at_s)
     sigmas = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     assert np.abs(state.error_from(expected) / sigmas)[:, :6].max() < 1.0
-
-
-def test_a_robot_that_does_the_unexpected_is_predicted_with_less_certainty(
-    observations: Observations,
-) -> None:
-    """From one measurement to the next it moves twice as fast, and each of the next ones says so."""
-    hurried_s = np.where(
-        observations.time_s < 6.0, observations.time_s, 6.0 + (observations.time_s - 6.0) / 2.0
-    )
-    ratios = []
-    for time_s in (observations.time_s, hurried_s):
-        window = followed(replace(observations, time_s=time_s).select(time_s < 6.4))
-        at_s = float(time_s[time_s < 6.4][-1]) + 0.3
-        _, covariance = window.predict(at_s)
-        _, as_the_prior_has_it = window.trajectory().at(np.array([at_s]))
-        ratios.append(float(np.trace(covariance[0]) / np.trace(as_the_prior_has_it[0])))
-    assert ratios[0] == pytest.approx(1.0)
-    assert ratios[1] > SURPRISED
-
-
-def test_an_outlier_leaves_predictions_as_they_are(observations: Observations) -> None:
-    """It says nothing of how the robot moves, however far off it is."""
-    row = len(observations) - 3
-    for off_m in (0.3, 30.0):
-        points = observations.points_m.copy()
-        points[row] *= 1 + off_m / np.linalg.norm(points[row])
-        window = followed(replace(observations, points_m=points))
-        at_s = float(observations.time_s[-1]) + 0.3
-        np.testing.assert_allclose(
-            window.predict(at_s)[1], window.trajectory().at(np.array([at_s]))[1], rtol=1e-6
-        )
 
 
 def test_what_contradicts_is_doubtful_until_other_prisms_agree(observations: Observations) -> None:

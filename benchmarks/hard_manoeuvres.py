@@ -1,0 +1,93 @@
+"""Predicted poses of a robot that does the hardest things: how far off they are, squared and in their sigmas (NEES).
+
+Robots as that of the scenario `dynamic`, told another speed and yaw rate at an instant that nobody knows. Three stations
+at 2.5 Hz; measurements come together, 0.4 s apart and 0.15 to 0.3 s old. Twenty times a second the pose is predicted, once
+as a trajectory goes on by the prior alone, once as the live estimator says it; what is less certain than its default limits
+(0.1 m, 5 degrees) is left out, and so is what is more than 1.2 s from the manoeuvre.
+
+    python benchmarks/hard_manoeuvres.py [ROBOTS]
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from tsgt.geometry import FixedLag
+from tsgt.model import MotionPrior
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from support.manoeuvre import speeding_up_and_turning_back
+from support.prior_motion import in_time, measure, rows_at
+
+MANOEUVRES = {
+    "turns back and speeds up": ((0.5, 1.5), (-0.5, 0.5)),
+    "turns back and slows down": ((1.5, 0.5), (-0.5, 0.5)),
+    "turns back at full speed": ((1.5, 1.5), (-0.5, 0.5)),
+    "starts and turns": ((0.0, 1.5), (0.0, 0.5)),
+    "stops in a turn": ((1.5, 0.0), (0.5, 0.0)),
+}
+TOLD_S, UNTIL_S = 9.0, 11.0
+BATCH_S, LAG_S, PERIOD_S = 0.4, 3.0, 0.05
+NEAR_S = 1.2
+LIMIT_M, LIMIT_RAD = 0.1, np.radians(5.0)
+ABOVE = (22.46, 38.26, 60.0)
+
+
+def predicted(name: str, seed: int) -> np.ndarray:
+    """Return NEES of the poses near a manoeuvre, (N, 2), by the prior alone and as the live estimator says; NaN if unsure."""
+    speeds_mps, rates_radps = MANOEUVRES[name]
+    motion = speeding_up_and_turning_back(
+        duration_s=UNTIL_S + 0.1, at_s=TOLD_S, speeds_mps=speeds_mps, rates_radps=rates_radps
+    )
+    measured = in_time(measure(motion, until_s=UNTIL_S, seed=seed))
+    random = np.random.default_rng([seed, 1])
+    phase_s, delay_s = random.uniform(0, BATCH_S), random.uniform(0.15, 0.3)
+    come_s = phase_s + BATCH_S * np.ceil((measured.time_s + delay_s - phase_s) / BATCH_S)
+    window, taken, rows = FixedLag(MotionPrior()), 0, []
+    for now_s in np.arange(1.0, TOLD_S + NEAR_S, PERIOD_S):
+        here = int(np.searchsorted(come_s, now_s, side="right"))
+        if here > taken:
+            window.update(measured.select(slice(taken, here)))
+            window.forget(now_s - LAG_S)
+            taken = here
+        if now_s < TOLD_S - NEAR_S or not window.settled or window.doubtful:
+            continue
+        at_s = np.array([now_s])
+        truth = motion.select(rows_at(at_s))
+        ways = (window.trajectory().at(at_s, parts=6), window.predict(now_s, parts=6))
+        rows.append([_nees(state.error_from(truth)[0, :6], covariance[0]) for state, covariance in ways])
+    return np.array(rows).reshape(-1, 2)
+
+
+def _nees(error: np.ndarray, covariance: np.ndarray) -> float:
+    sigma_m, sigma_rad = (
+        float(np.sqrt(np.linalg.eigvalsh(part)[-1])) for part in (covariance[:3, :3], covariance[3:, 3:])
+    )
+    if sigma_m > LIMIT_M or sigma_rad > LIMIT_RAD:
+        return np.nan
+    return float(error @ np.linalg.solve(covariance, error))
+
+
+def main() -> None:
+    """Print a table."""
+    robots = int(sys.argv[1]) if len(sys.argv) > 1 else 500
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    print(
+        "manoeuvre, way: sure enough, largest NEES, how many in a million above " + ", ".join(map(str, ABOVE))
+    )
+    with ProcessPoolExecutor() as pool:
+        for name in MANOEUVRES:
+            every = np.concatenate(list(pool.map(predicted, [name] * robots, range(robots), chunksize=5)))
+            for way, nees in zip(("by the prior alone", "as predicted"), every.T, strict=True):
+                sure = nees[~np.isnan(nees)]
+                above = ", ".join(f"{1e6 * np.mean(sure > limit):.0f}" for limit in ABOVE)
+                print(f"{name}, {way}: {len(sure) / len(nees):.0%}, {sure.max():.0f}, {above}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -113,6 +113,8 @@ class ClassicLink:
         elif isinstance(turn, Synchronisation):
             if turn.unanswered:
                 self._intake.unanswered(station)
+            if turn.restarted:
+                self._intake.doubt(station)
             if turn.samples:
                 self._synchronised(turn, now_ns)
             if _leaves_doubt(turn) and self._intake.clock(station, now_ns) is not None:
@@ -152,8 +154,9 @@ def _leaves_doubt(turn: Synchronisation) -> bool:
     """Whether the station may have another clock than that of the samples.
 
     It tells of a restart until it is pinged. If that was done here, and what it answered was lost, nothing else will tell.
+    One that was restarted here may track another prism besides.
     """
-    return turn.unanswered > 0 and (not turn.samples or turn.silence_ns > RESTART_NS)
+    return turn.restarted or (turn.unanswered > 0 and (not turn.samples or turn.silence_ns > RESTART_NS))
 
 
 def _cadence(protocol: ClassicMasterConfig) -> Cadence:

@@ -176,7 +176,8 @@ class _Station:
         self._doubtful = True
 
     def answered(self, message: MeasurementMessage, requested_ns: int, received_ns: int) -> Arrival:
-        missed = self._missed
+        unasked = self._heard_ns is not None and received_ns - self._heard_ns > SILENCE_NS
+        missed = self._missed or unasked
         back = self._is_back(received_ns)
         if message.time_ns == 0:
             self._check.nothing_new(requested_ns)
@@ -229,7 +230,8 @@ class _Station:
     def _begins_anew(self, *, missed: bool) -> bool:
         """Tell whether the program of a station without a measurement was started again.
 
-        It was if there was a measurement before, and may have been if a request was lost.
+        It was if there was a measurement before, and may have been if a request was lost, or if it was not asked for so
+        long that it can have come back unnoticed.
         """
         anew, self._last = missed or self._last is not None, None
         self._doubtful = self._doubtful or anew

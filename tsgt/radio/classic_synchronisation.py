@@ -43,9 +43,10 @@ class Synchronisation:
     - both instants of the master are edges and no guesses.
 
     A sample bounds the clock's offset from both sides. If the bounds of two samples exclude each other, one of them
-    is wrong or the station's clock was set between them, and all before the second are dropped. Cycles that brought
-    no sample are repeated until there are samples for half of them, but at most as many again. A sample that is alone
-    at the end does not count.
+    is wrong or the station's clock was set between them, and all before the second are dropped. They are dropped as well
+    when the station, having answered a ping, says that it has heard none: its program was started again. Cycles that
+    brought no sample are repeated until there are samples for half of them, but at most as many again. A sample that is
+    alone at the end does not count.
 
     Parameters
     ----------
@@ -69,6 +70,8 @@ class Synchronisation:
     silence_ns
         Since the last sample: the longest time between two answers with a request unanswered in between, in ns. The
         station may have been restarted meanwhile, and pinged afterwards.
+    restarted
+        Whether its program was started again meanwhile, by its own word; all samples are from after that.
     """
 
     SILENT = 3
@@ -88,6 +91,7 @@ class Synchronisation:
         self.answered = False
         self.unanswered = 0
         self.silence_ns = 0
+        self.restarted = False
         self._heard_ns: int | None = None
         self._cycles = cycles
         self._timing = timing
@@ -130,11 +134,13 @@ class Synchronisation:
             self._step = _Step.STAMP if exact else self._next_cycle()
         elif isinstance(reply, TimeReply) and self._step is _Step.FLUSH:
             self._heard(received_ns)
+            self._look_for_restart(reply)
             self._stamps_ns.add(reply.time_ns)
             self._flush = False
             self._step = _Step.PING
         elif isinstance(reply, TimeReply) and self._step is _Step.STAMP:
             self._heard(received_ns)
+            self._look_for_restart(reply)
             self._take(reply.time_ns)
             self._step = self._next_cycle()
         else:
@@ -166,6 +172,12 @@ class Synchronisation:
     def _earliest_ns(self, sent_ns: int) -> int:
         tolerance_ns = self.SLACK_NS + self._timing.symbol_ns // 4
         return sent_ns + self._forward_ns + self._back_ns - tolerance_ns
+
+    def _look_for_restart(self, reply: TimeReply) -> None:
+        """Drop what there is when a station that has answered a ping knows of none; its clock may be another one."""
+        if reply.time_ns == 0 and self._ping_ns != (0, 0):
+            self.restarted = True
+            self.samples.clear()
 
     def _take(self, station_ns: int) -> None:
         if station_ns in self._stamps_ns:

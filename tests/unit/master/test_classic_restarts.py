@@ -67,6 +67,28 @@ async def test_a_restart_within_a_synchronisation_is_learnt_of(step_ns: int) -> 
     assert abs(field.clocks[-1].frequency_ppm) < 5
 
 
+async def test_samples_of_before_a_restart_do_not_count() -> None:
+    """Four of the five cycles are of before, and what is ahead by 3 ms looks like a late stamp beside them."""
+    died_ns: list[int] = []
+    async with lone_station() as field:
+
+        def before(payload: bytes) -> int:
+            now_ns = field.clock.monotonic_ns()
+            # 50 cycles at the start, then four of the second synchronisation.
+            if payload == b"s1" and field.count(b"e1") == 54 and not died_ns:
+                died_ns.append(now_ns)
+                field.station = None
+            elif field.station is None and now_ns - died_ns[0] > 600 * MS:
+                field.restart(3 * MS)
+            return 0
+
+        field.before = before
+        await asyncio.sleep(60.0)
+    assert died_ns
+    assert outside(field) == []
+    assert field.count(b"n11") == 2
+
+
 async def test_a_restart_before_a_synchronisation_without_samples_is_learnt_of() -> None:
     """The new program's first ping is answered, then everything is lost for a second."""
     answers = count()

@@ -88,6 +88,25 @@ def test_no_line_reaches_over_what_may_have_been_a_restart() -> None:
     assert abs(anew.at(at_ns).frequency_ppm) < 2
 
 
+@pytest.mark.parametrize("apart_s", [28, 60])
+def test_a_station_that_had_nothing_yet_was_restarted_while_nobody_asked_it(apart_s: int) -> None:
+    """The others were synchronised meanwhile; no line reaches over the step, though there was no measurement before."""
+    master = Master()
+    master.synchronise(0)
+    master.ahead_ns += 1_800_000
+    now_ns = START_NS + apart_s * SECOND
+    answer = no_measurement_yet(1)
+    assert master.intake.answered(answer, requested_ns=now_ns - 194 * MS, received_ns=now_ns).doubtful
+    master.synchronise(apart_s + 0.5)
+    for number in range(170):
+        at_s = apart_s + 3 + number / 2
+        found = master.poll(at_s)
+        assert found is not None
+        stamp_ns, bound_ns = found
+        assert bound_ns is not None
+        assert abs(stamp_ns - (START_NS + round(at_s * SECOND) - 244 * MS)) <= bound_ns
+
+
 def test_the_papers_filter_takes_a_tenth_all_the_same() -> None:
     """It is as the paper has it."""
     plain, anew = clock_filter("paper"), clock_filter("paper")

@@ -369,3 +369,33 @@ def test_a_sample_that_is_alone_does_not_count() -> None:
     link.run(turn)
     assert turn.samples == []
     assert turn.answered
+
+
+@pytest.mark.parametrize("asked", [b"s1", b"e1"])
+def test_what_was_sampled_before_a_restart_is_dropped(asked: bytes) -> None:
+    """A station that has answered pings and knows of none is another program, whatever else its clock shows."""
+
+    def meddle(exchange: Exchange) -> None:
+        if link.sent.count(b"e1") == 3 and exchange.payload == asked and link.station is before:
+            exchange.heard = False
+            link.station = ClassicStation(1)
+            link.offset_ns += MS
+
+    link, turn = Link(meddle), Synchronisation(1, 5, TIMING)
+    before = link.station
+    link.run(turn)
+    assert turn.restarted
+    assert len(turn.samples) >= 3
+    assert set(_offsets_ns(turn)) == {OFFSET_NS + MS}
+
+
+def test_a_station_that_has_heard_no_ping_yet_was_not_restarted() -> None:
+    """The first ping was lost; of pings before this synchronisation it need not know."""
+
+    def meddle(exchange: Exchange) -> None:
+        exchange.heard = exchange.number != 1
+
+    link, turn = Link(meddle), Synchronisation(1, 3, TIMING)
+    link.run(turn)
+    assert not turn.restarted
+    assert len(turn.samples) == 2

@@ -331,17 +331,24 @@ class BeaconClock:
     def _is_alone(self, pair: Pair, stretch: Stretch, *, live: bool) -> bool:
         """Whether a pair that agrees with the fit has to wait for others, as it may have been held back.
 
-        After an outage a clock may be off by more than that, and a single pair would be all that tells.
+        After an outage a clock may be off by more than that, and a single pair would be all that tells. One that agrees with
+        those that wait only because nothing was heard for long again does not count together with them: they may have been
+        held back. But it tells of the rate.
         """
-        if self._rival is not None and self._rival_agrees and self._rival.agrees(pair):
-            if len(self._rival) + 1 >= _FEWEST_RIVALS:
-                stretch.add_all(self._rival)
+        waiting = self._rival if self._rival_agrees else None
+        if waiting is not None and _is_near(waiting, pair):
+            if len(waiting) + 1 >= _FEWEST_RIVALS:
+                stretch.add_all(waiting)
                 return False
-            self._rival.add(pair)
+            waiting.add(pair)
             return True
-        if stretch.agrees_closely(pair) or abs(stretch.missed_us(pair)) <= DOUBTED_US:
+        if _is_near(stretch, pair):
             return False
-        self._rival, self._rival_agrees = Stretch(pair, stretch.rate_ppm, _SLEWED_SIGMA_PPM), True
+        rate_ppm = stretch.rate_ppm
+        if waiting is not None and waiting.agrees(pair):
+            waiting.add(pair)
+            rate_ppm = waiting.rate_ppm
+        self._rival, self._rival_agrees = Stretch(pair, rate_ppm, _SLEWED_SIGMA_PPM), True
         self._rival_in_full, self._rival_live = True, live  # it agrees, so its low bits tell which it is
         return True
 
@@ -368,6 +375,11 @@ class BeaconClock:
             oldest.forget(_FORGOTTEN)
         else:
             del self._stretches[0]
+
+
+def _is_near(stretch: Stretch, pair: Pair) -> bool:
+    """Whether jitter explains a pair, or it is off by no more than is honest."""
+    return stretch.agrees_closely(pair) or abs(stretch.missed_us(pair)) <= DOUBTED_US
 
 
 def _instant(stretch: Stretch, local_ns: int) -> Instant:

@@ -120,6 +120,10 @@ class Outbox:
             self.left_through = self.oldest
             del self._queue[self.left_through]
 
+    def oldest_first(self) -> Iterator[Queued]:
+        """Go through what is queued; nothing may change meanwhile."""
+        return iter(self._queue.values())
+
     def newest_first(self) -> Iterator[Queued]:
         """Go through what is queued; nothing may change meanwhile."""
         return reversed(self._queue.values())

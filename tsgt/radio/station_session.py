@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from itertools import takewhile
 from typing import TYPE_CHECKING, NamedTuple
 
 from tsgt.radio.beacon_clock import BeaconClock
@@ -30,7 +31,10 @@ _DIRECT_EXTRA_US = 2000.0
 """A time that rests on one beacon is worse than it looks, by as much as the reply may start late."""
 
 _REACH_NS = int(4.4 * 3600e9)
-"""What was measured longer before the first beacon gets no time to half a second, however many beacons come."""
+"""What was measured longer before the first beacon gets no time to half a second, however well they tell the rate."""
+
+_TOLD_NS = 60_000_000_000
+"""Beacons that come later than this after an instant tell no more of its time."""
 
 _SIGMAS = 4
 """A bound is so many sigma."""
@@ -249,27 +253,40 @@ class StationSession:
         return time is not None and quality_of(time.bound_us) is not None
 
     def sift(self) -> int:
-        """Leave behind what will never have a time, once that is known; return how many measurements that were.
+        """Leave behind what will never have a time, as soon as that is known; return how many measurements that were.
 
-        It would wait for ever, and the master for it.
+        It would wait for ever, and the master for it. How far back times reach depends on what the first beacons told of
+        the rate, which takes a minute to know. The oldest go: the newest are told first, so what can be told behind them is.
         """
-        if self._sifted or not self.confirmed or not self.clock.settled:
+        if not self.confirmed or not self.clock.settled:
             return 0
+        left = 0 if self._sifted else self._outbox.keep(self.can_time)
         self._sifted = True
-        left = self._outbox.keep(self.can_time)
+        hopeless = [queued.sequence for queued in takewhile(self._is_hopeless, self._outbox.oldest_first())]
+        self._outbox.remove(hopeless)
+        left += len(hopeless)
         if left:
             self.delivery.introduce()
         return left
+
+    def _is_hopeless(self, queued: Queued) -> bool:
+        """Whether nothing useful is known of when a measurement was made, and no beacon will tell."""
+        first_ns, last_ns = self.clock.first_received_ns, self.clock.last_received_ns
+        if queued.boot != self._boot or first_ns is None or last_ns is None:
+            return False
+        told = last_ns - max(first_ns, queued.at_ns) > _TOLD_NS
+        return told and self.timed(queued, self.heard.received_ns) is None
 
     def timed(self, queued: Queued, slot_ns: int, newest: Timed | None = None) -> Timed | None:
         """Return a measurement with its time for a slot that begins then; None where nothing useful is known.
 
         A change between direct times and others costs a run of its own, so it keeps to what ``newest`` in the reply has,
-        unless it is better otherwise.
+        unless it is better otherwise. As long as held-back beacons would not have been outvoted there are direct times only:
+        to those the master adds by how much the reply came late.
         """
         clock = self._clocks[queued.boot]
         live = queued.boot == self._boot
-        time = clock.at(queued.at_ns)
+        time = clock.at(queued.at_ns) if clock.settled else None
         direct = False
         extra_us = 0.0 if newest is not None and newest.direct else _DIRECT_EXTRA_US
         if newest is not None and not newest.direct:

@@ -158,6 +158,24 @@ def test_a_beacon_that_was_held_up_is_refused() -> None:
     assert after.bound_us < 128
 
 
+@pytest.mark.parametrize("late_us", [500, 1_000, 2_000, 4_000, 6_000])
+@pytest.mark.parametrize(("away_s", "again_s"), [(60, 30), (180, 30), (180, 120), (300, 120)])
+def test_a_single_beacon_in_a_long_outage_may_have_been_held_back(
+    away_s: int, again_s: int, late_us: int
+) -> None:
+    """So much later anything agrees with it, and so it does not count together with those that come then."""
+    clock, alone = taught(150), 150 + round(2.5 * away_s)
+    back = alone + round(2.5 * again_s)
+    clock.add(received_ns(sent_us(alone)) + 1000 * late_us, sent_us(alone), SIGMA_NS)
+    for k in range(back, back + 10):
+        assert clock.add(received_ns(sent_us(k)), sent_us(k), SIGMA_NS)
+        for before in range(150, k, 10):
+            at = clock.at(received_ns(sent_us(before)))
+            assert at is not None
+            assert abs(at.time_us - sent_us(before)) <= at.bound_us
+    assert clock.pairs == 160
+
+
 def test_a_beacon_that_was_held_up_for_long_does_not_keep_others_from_being_understood() -> None:
     """Its pair is 40 ms off; the low bits of the next ones are completed all the same."""
     clock = taught(150)

@@ -283,3 +283,40 @@ def test_a_reply_with_an_old_measurement_is_held_back(earlier_ms: int, late_ms: 
     assert beyond_bound(member) == {}
     assert max(map(abs, member.errors_ns().values())) < 100_000
     assert set(member.received) == set(member.made_ns)
+
+
+@pytest.mark.parametrize("which", [[0, 1], [1, 2], [0, 1, 2], [1, 2, 3], [1, 2, 3, 4]])
+@pytest.mark.parametrize("away_s", [0, 20, 60])
+@pytest.mark.parametrize("late_ms", [10, 20, 29])
+def test_what_was_measured_before_is_not_told_by_first_beacons_that_were_held_back_alike(
+    late_ms: int, away_s: int, which: list[int]
+) -> None:
+    """The prism was out of sight when the station joined: what it tells is old, and two beacons that agree are no clock yet."""
+    exchange = exchange_of()
+    member = exchange.members[2]
+    member.next_ns = exchange.now_ns - (away_s + 40) * 1000 * MS
+    member.measure(exchange.now_ns - away_s * 1000 * MS)
+    member.next_ns = exchange.now_ns + 1_000_000 * MS
+    hold_back(exchange, late_ms * MS, 60, which)
+    assert beyond_bound(member) == {}
+    assert set(member.received) == set(member.made_ns)
+
+
+@pytest.mark.parametrize(("late_ms", "which"), [(2, [1, 2]), (3, [3, 4]), (5, [3])])
+def test_what_cannot_be_told_to_half_a_second_does_not_wait_for_ever(late_ms: int, which: list[int]) -> None:
+    """The master comes three hours late, and the first beacons tell the rate badly: nothing more is known of what is oldest."""
+    exchange = exchange_of()
+    member = exchange.members[2]
+    for minutes in range(180, 0, -1):
+        member.next_ns = exchange.now_ns - minutes * 60_000 * MS
+        member.measure(member.next_ns)
+    member.next_ns = exchange.now_ns
+    hold_back(exchange, late_ms * MS, 300, which)
+    assert beyond_bound(member) == {}
+    left = (
+        set(member.made_ns) - set(member.received) - set(range(len(member.made_ns) - 3, len(member.made_ns)))
+    )
+    assert 10 < len(left) < 130
+    assert left == set(range(len(left)))
+    assert exchange.master.peer(2).inbox.missing == 0
+    assert member.outbox.oldest > max(left)

@@ -35,10 +35,11 @@ from tsgt.geometry.continuous import (
     solve,
     start_anchor,
 )
+from tsgt.geometry.doubt import Doubt
 from tsgt.geometry.first_guess import first_guess
 from tsgt.geometry.knots import STATE, Knots, Steps, joined
 from tsgt.geometry.prism_factors import Observations
-from tsgt.geometry.rigid import IDENTITY, exp_so3
+from tsgt.geometry.rigid import exp_so3
 from tsgt.geometry.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -74,9 +75,6 @@ BEGINNING_ITERATIONS = 10
 
 TELLING, GAP_S = 3, 1.25
 """So many measurements of each prism, none longer after the one before, tell which way a robot lies without any from before."""
-
-DOUBT_BACK_S = 1.5
-"""So long before a measurement that contradicts, what it may bend is not known either: a few measurements of each prism."""
 
 LIVELIER_AHEAD = 2.0
 """How much livelier, in the variance of its accelerations, a robot is taken to be where nothing was measured yet. Driving is
@@ -118,8 +116,8 @@ class FixedLag:
         self._steps: Steps | None = None
         self._anchor: Anchor | None = None
         self._settled = False
-        self._doubted: frozenset[int] = frozenset()
-        self._begun_s = self._contradicted_s = np.inf
+        self._doubt = Doubt()
+        self._begun_s = np.inf
         self._solved: tuple[Knots, BlockFactor] | None = None
         self._trajectory: Trajectory | None = None
         self._end: Ahead | None = None
@@ -155,27 +153,17 @@ class FixedLag:
 
     @property
     def doubtful(self) -> bool:
-        """Whether the last measurements contradict each other or what was before.
-
-        One that is far from what was predicted is wrong, or the robot has done the unexpected. Which it is the next ones tell:
-        those of another prism that are as predicted. Until then it is not known where the robot goes.
-        """
-        return bool(self._doubted)
+        """Whether the last measurements contradict each other or what was before: it is not known where the robot goes."""
+        return bool(self._doubt.prisms)
 
     @property
     def doubtful_from_s(self) -> float:
         """From when on it is not known where the robot was, infinite while nothing is doubtful."""
-        return self._contradicted_s - DOUBT_BACK_S if self._doubted else np.inf
+        return self._doubt.from_s
 
-    def _doubt(self, new: Observations, weights: FloatArray) -> None:
-        """Take note of which prisms' new measurements are as predicted, of weight 1, and which are not."""
-        for time_s, prism, weight in zip(
-            new.time_s.tolist(), new.prism.tolist(), weights.tolist(), strict=True
-        ):
-            if not self._doubted:
-                self._contradicted_s = time_s
-            # A station on a wrong prism soon agrees with itself, which says nothing.
-            self._doubted = self._doubted | {prism} if weight < 1.0 else self._doubted & {prism}
+    def contested(self, time_s: FloatArray) -> NDArray[np.bool_]:
+        """Whether it will never be known where the robot was at some instants, (N,) in s; see :class:`Doubt`."""
+        return self._doubt.contested(time_s)
 
     def update(self, new: Observations) -> None:
         """Take measurements, in the order of time, none before :attr:`horizon_s`."""
@@ -186,9 +174,11 @@ class FixedLag:
         except GeometryError:  # not determined, or not yet
             self._settled, self._knots, self._steps, self._solved = False, None, None, None
             self.residuals_m = np.full((len(self.observations), 3), np.nan)
+            self._doubt.begin(self.observations)
 
     def forget(self, before_s: float) -> None:
         """Let go of what was before an instant; states from then on can still be asked for, and no others."""
+        self._doubt.forget(before_s)
         if self.observations is None:
             return
         if self._settled:
@@ -248,21 +238,22 @@ class FixedLag:
         assert self.observations is not None  # noqa: S101 (only called with some)
         self.observations = self.observations.select(rows)
         self.residuals_m = self.residuals_m[rows]
+        self._doubt.keep(rows)
 
     def _begin(self, observations: Observations) -> None:
         """Find the trajectory of all measurements of the window, knowing nothing else."""
-        self._settled, self._doubted = False, frozenset(observations.prism.tolist())
-        self._surprise = 0.0
+        self._settled, self._surprise = False, 0.0
+        self._doubt.begin(observations)
         if np.count_nonzero(np.bincount(observations.prism) >= 2) < 3:
             raise GeometryError("to begin with, three prisms have to be measured twice")
         guess = first_guess(observations, knot_times(observations.time_s))
         self._anchor = start_anchor(guess.select(slice(0, 1)), self._prior)
-        fitting = self._search(guess, BEGINNING_ITERATIONS)
+        outlying = self._search(guess, BEGINNING_ITERATIONS)
         if self._settled:
             assert self._knots is not None  # noqa: S101 (it is settled)
             self._anchor = Anchor(self._knots.select(slice(0, 1)), np.diag(_AS_GOOD_AS_NOTHING**-2.0))
-            self._contradicted_s = float(observations.time_s[-1])
-            self._begun_s = _told_from_s(observations.select(fitting))
+            self._doubt.begun(float(observations.time_s[-1]))
+            self._begun_s = _told_from_s(observations.select(~outlying))
 
     def _followed(self, held: Observations, new: Observations) -> bool:
         """Add measurements to the trajectory found before; return whether that is still good to follow."""
@@ -278,12 +269,11 @@ class FixedLag:
         at = nearest(knots.time_s, self.observations.time_s)
         unheard = _order(held, new) >= len(held)
         system = assemble(self.observations, at, knots, steps, self._anchor, unheard=unheard, heard=unheard)
-        distances = _distances_of_new(system, at, np.flatnonzero(unheard))
+        distances, in_turn = _distances_of_new(system, at, np.flatnonzero(unheard))
         weights = 1.0 / np.maximum(distances / OUTLYING**2, 1.0)
         # What is hopelessly off says nothing of how the robot moves, and no other more than an outlier does.
-        surprises = [min(each, OUTLYING**2) for each in distances.tolist() if each < HOPELESS**2]
+        surprises = [min(each, OUTLYING**2) for each in in_turn.tolist() if each < HOPELESS**2]
         self._surprise = (surprises or [self._surprise])[-1]
-        self._doubt(new, weights)
         add_rows(system.rows[unheard], weights, at[unheard], system.diagonal, system.gradient)
         for _ in range(MOST_STEPS):
             factor = factorise(system.diagonal, system.beside)
@@ -291,32 +281,38 @@ class FixedLag:
             gain = -float(np.vdot(move, system.gradient))
             knots = knots.moved(move)
             if gain < SETTLED or (np.all(weights == 1.0) and _is_little(move)):
-                self._take(knots, steps, factor, nudged(system, at, move))
-                return self._settled
+                outlying = self._take(knots, steps, factor, nudged(system, at, move))
+                break
             system = assemble(self.observations, at, knots, steps, self._anchor, heard=unheard)
-        self._search(knots, MOST_ITERATIONS)
+        else:
+            outlying = self._search(knots, MOST_ITERATIONS)
+        self._doubt.hear(self.observations, unheard, in_turn > OUTLYING**2, outlying)
         return self._settled
 
     def _search(self, guess: Knots, most_iterations: int) -> NDArray[np.bool_]:
-        """Find the trajectory however far it is from a guess; return which measurements are no outliers."""
+        """Find the trajectory however far it is from a guess; return which measurements are outliers."""
         assert self.observations is not None  # noqa: S101 (only called with some)
         found = solve(
             self.observations, guess, self._prior, anchor=self._anchor, most_iterations=most_iterations
         )
-        self._take(found.knots, found.steps, found.factor, found)
+        outlying = self._take(found.knots, found.steps, found.factor, found)
         self._settled &= found.iterations < most_iterations
-        return found.distances < OUTLYING**2
+        return outlying
 
-    def _take(self, knots: Knots, steps: Steps, factor: BlockFactor, found: System | Solution) -> None:
+    def _take(
+        self, knots: Knots, steps: Steps, factor: BlockFactor, found: System | Solution
+    ) -> NDArray[np.bool_]:
+        """Make it the trajectory; return which measurements are outliers."""
         self._knots, self._steps, self._solved, self._trajectory = knots, steps, (knots, factor), None
         self.residuals_m = found.linearised.residuals_m
         inverse = np.linalg.inv(factor.last())
         covariance = inverse.T @ inverse
         self._end = Ahead(knots.select(slice(-1, None)), covariance, self._prior, livelier=LIVELIER_AHEAD)
         sigma_rad = float(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1]))
-        fitting = int(np.count_nonzero(found.distances < OUTLYING**2)) / len(found.distances)
-        fits = fitting > (SOME_FIT if self._settled else NEARLY_ALL_FIT)
+        outlying: NDArray[np.bool_] = found.distances >= OUTLYING**2
+        fits = float(np.mean(~outlying)) > (SOME_FIT if self._settled else NEARLY_ALL_FIT)
         self._settled = fits and sigma_rad < (LOST_RAD if self._settled else SURE_RAD)
+        return outlying
 
 
 def _told_from_s(observations: Observations) -> float:
@@ -332,21 +328,34 @@ def _told_from_s(observations: Observations) -> float:
     return float(max(each_s[:2][-1] for each_s in since_gap))
 
 
-def _distances_of_new(system: System, at: NDArray[np.intp], new: NDArray[np.intp]) -> FloatArray:
-    """Tell how far new measurements, rows that have no say in a system, are from the others' trajectory: squared sigmas."""
+def _distances_of_new(
+    system: System, at: NDArray[np.intp], new: NDArray[np.intp]
+) -> tuple[FloatArray, FloatArray]:
+    """Tell how far new measurements, rows that have no say in a system, are from the others' trajectory: squared sigmas.
+
+    Once each by itself, and once as if they came one by one: by what those before it say as well that are no outliers.
+    """
     rows = system.rows[new]
     right = np.zeros((*system.gradient.shape, 3 * len(new) + 1))
     right[:, :, -1] = -system.gradient
     for place, row in enumerate(new):
         right[at[row], :, 3 * place : 3 * place + 3] = rows[place, :, :STATE].T
     found = factorise(system.diagonal, system.beside).solve(right)
-    distances = np.empty(len(new))
-    for place, row in enumerate(new):
-        by_state, here = rows[place, :, :STATE], found[at[row]]
-        off = rows[place, :, STATE] + by_state @ here[:, -1]
-        expected = IDENTITY + by_state @ here[:, 3 * place : 3 * place + 3]
-        distances[place] = off @ np.linalg.solve(expected, off)
-    return distances
+    seen = rows[:, :, :STATE] @ found[at[new]]
+    off = rows[:, :, STATE] + seen[:, :, -1]
+    expected = np.eye(3 * len(new)) + seen[:, :, :-1].reshape(3 * len(new), 3 * len(new))
+    alone = np.empty(len(new))
+    for place in range(len(new)):
+        own = slice(3 * place, 3 * place + 3)
+        alone[place] = off[place] @ np.linalg.solve(expected[own, own], off[place])
+    in_turn, fitting = alone.copy(), np.flatnonzero(alone < OUTLYING**2)
+    its = (3 * fitting[:, None] + np.arange(3)).ravel()
+    try:
+        root = np.linalg.cholesky(expected[np.ix_(its, its)])
+    except np.linalg.LinAlgError:  # by rounding alone
+        raise GeometryError("the measurements do not determine the trajectory") from None
+    in_turn[fitting] = (np.linalg.solve(root, off[fitting].ravel()).reshape(-1, 3) ** 2).sum(axis=1)
+    return alone, in_turn
 
 
 def _is_little(move: FloatArray) -> bool:

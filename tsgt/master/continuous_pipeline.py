@@ -178,6 +178,7 @@ class ContinuousPipeline:
             states, covariance = self._window.trajectory().at((stamp_ns - self._origin_ns) / 1e9, parts=_POSE)
         time_s = (stamp_ns - self._origin_ns) / 1e9
         sure = (time_s >= self._window.begun_s) & (time_s < self._window.doubtful_from_s)
+        sure &= ~self._window.contested(time_s)
         poses = self._poses.smoothed(
             stamp_ns, self._seen, states, covariance, settled=sure & self._window.settled
         )

@@ -10,8 +10,8 @@ from support.prior_motion import draw_motions, in_time, measure, rows_at
 
 from tsgt.geometry import FixedLag, FloatArray, Observations, Trajectory
 from tsgt.geometry.continuous import knot_times, solve
+from tsgt.geometry.doubt import DOUBT_BACK_S
 from tsgt.geometry.first_guess import first_guess
-from tsgt.geometry.fixed_lag import DOUBT_BACK_S
 from tsgt.model import MotionPrior
 
 PRIOR = MotionPrior()
@@ -223,3 +223,53 @@ def test_a_first_measurement_of_another_prism_bends_nothing_that_is_believed(see
 def in_steps(from_s: float, until_s: float) -> FloatArray:
     """Return multiples of 50 ms between two instants."""
     return 0.05 * np.arange(np.ceil(20 * from_s), np.floor(20 * until_s) + 1)
+
+
+@pytest.mark.parametrize("seed", [1, 19, 44])
+def test_measurements_that_come_together_may_contradict_each_other(seed: int) -> None:
+    """Each of them is near enough to where the robot could have gone by then, but not all at once: one is a reflection."""
+    (motion,) = draw_motions(PRIOR, count=1, duration_s=6.0, seed=seed)
+    measured = in_time(measure(motion, until_s=6.0, seed=seed))
+    wrong, row = reflected(measured, seed)
+    window = FixedLag(PRIOR)
+    for until_s in np.arange(0.7, 6.0, 0.4):
+        here = (wrong.time_s >= until_s - 0.4) & (wrong.time_s < until_s)
+        window.update(wrong.select(here if until_s > 0.7 else wrong.time_s < until_s))
+        window.forget(until_s - LAG_S)
+        if until_s > wrong.time_s[row]:
+            break
+    at_s = np.round(until_s + 0.1, 2)
+    state, covariance = window.predict(at_s, parts=6)
+    error = state.error_from(motion.select(rows_at(np.array([at_s]))))[:, :6]
+    assert window.doubtful or _nees(error, covariance) < 60.0
+
+
+@pytest.mark.parametrize("seed", [0, 10, 19, 36, 38])
+def test_where_a_reflection_was_believed_is_contested(seed: int) -> None:
+    """By the next measurements, which it makes seem wrong, or which the trajectory bends to pass by as well."""
+    (motion,) = draw_motions(PRIOR, count=1, duration_s=10.0, seed=seed)
+    measured = in_time(measure(motion, until_s=9.8, rate_hz=1.2, seed=seed))
+    wrong, row = reflected(measured, seed)
+    window = FixedLag(PRIOR)
+    for each in range(int(np.searchsorted(wrong.time_s, wrong.time_s[row] + 2.5))):
+        window.update(wrong.select(slice(each, each + 1)))
+        window.forget(wrong.time_s[each] - LAG_S)
+    at_s = in_steps(float(wrong.time_s[row]) - 0.4, float(wrong.time_s[row]) + 0.4)
+    believed = at_s[~window.contested(at_s) & (at_s < window.doubtful_from_s)]
+    states, covariance = window.trajectory().at(believed, parts=6)
+    errors = states.error_from(motion.select(rows_at(believed)))[:, :6]
+    assert (
+        max([_nees(errors[i : i + 1], covariance[i : i + 1]) for i in range(len(believed))], default=0.0)
+        < 60.0
+    )
+
+
+def reflected(measured: Observations, seed: int) -> tuple[Observations, int]:
+    """Put one measurement, made about five seconds after the first, 4 to 30 cm off; tell which."""
+    random = np.random.default_rng(seed)
+    row = int(np.searchsorted(measured.time_s, 4.8)) + int(random.integers(3))
+    off_m = random.normal(size=3)
+    off_m *= np.exp(random.uniform(np.log(0.04), np.log(0.3))) / np.linalg.norm(off_m)
+    points_m = measured.points_m.copy()
+    points_m[row] += off_m
+    return replace(measured, points_m=points_m), row

@@ -303,3 +303,23 @@ def test_what_was_before_a_trajectory_began_is_not_valid(scene: Scene) -> None:
     told = np.isfinite(smoothed.position_m[:, 0]) & (smoothed.stamp_ns < twice_ns)
     assert told.any()
     assert (smoothed.reason[told] != Reason.VALID).all()
+
+
+@pytest.mark.parametrize(
+    ("wrong_m", "station", "sequence"), [(-0.12, 3, 5), (0.13, 2, 6), (0.05, 3, 5), (0.07, 1, 5)]
+)
+def test_where_a_single_reflection_was_believed_no_smoothed_pose_is_valid(
+    scene: Scene, wrong_m: float, station: int, sequence: int
+) -> None:
+    """It is near enough to where the robot could be; the next measurements contradict, but the bend remains."""
+    measured = []
+    for each in every(scene, 10.0, step_s=0.83):
+        later = scene.measure(each.station, 0.83 * each.sequence + 0.27 * each.station)
+        distance_m = later.slope_distance_m
+        assert distance_m is not None
+        if (each.station, each.sequence) == (station, sequence):
+            distance_m += wrong_m
+        measured.append(replace(later, sequence=each.sequence, slope_distance_m=distance_m))
+    _, smoothed = stream(scene, measured, 10.0)
+    assert smoothed.valid.mean() > 0.3
+    assert off(scene, smoothed)[0] < 0.01

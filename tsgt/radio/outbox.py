@@ -206,7 +206,9 @@ class Delivery:
     def introduce(self) -> None:
         """Set :attr:`oldest` to what is true now; the master does not know yet."""
         self.oldest, gaps = self._outbox.extent(self._wanted)
-        self._gaps = _union(self._gaps_now(), gaps)
+        # Until it does, it waits for what was left behind, if anything was.
+        behind = ((self._settled, self.oldest - 1),) if self.oldest > self._settled else ()
+        self._gaps = _union(self._gaps_now(), (*behind, *gaps))
         self.introducing = True
 
     def introduced(self, oldest: int) -> None:

@@ -181,6 +181,20 @@ def test_what_had_to_leave_is_a_gap_too(monkeypatch: pytest.MonkeyPatch) -> None
     assert [*told, delivery.outdated] == [False, True, False]
 
 
+def test_what_is_left_behind_is_a_gap_until_the_master_knows_of_it() -> None:
+    """It waits for the first number, and what it says of that is not of one that is 256 higher."""
+    box = of(range(1000))
+    delivery = Delivery(box, anything)
+    delivery.sent(range(900, 1000))
+    box.keep(lambda each: each.sequence >= 300)
+    delivery.introduce()
+    delivery.delivered_through(-1 % 256)
+    assert box.oldest == 300
+    delivery.introduced(delivery.oldest)
+    delivery.delivered_through(310 % 256)
+    assert box.oldest == 311
+
+
 def test_a_number_is_narrow_only_if_it_can_be_nothing_else() -> None:
     """Next to anything that the master may have as its highest."""
     delivery = Delivery(of(range(1000)), anything)
@@ -262,6 +276,13 @@ class Exchange:
         self._introduces = True
         self._joined = False
 
+    def leave(self, count: int) -> None:
+        """Leave so many of the oldest in the journal, undelivered."""
+        left = [each.sequence for each, _ in zip(self._box.oldest_first(), range(count), strict=False)]
+        self._box.remove(left)
+        self._delivery.introduce()
+        self._introduces = True
+
     def frame(self, *, heard: bool, disk: str, acknowledged: bool, cumulative: bool) -> None:
         """Send the newest; the master hears it or not, and what its next beacon says comes or not."""
         box, master, delivery = self._box, self._master, self._delivery
@@ -292,7 +313,7 @@ class Exchange:
 @given(st.data())
 @settings(max_examples=150)
 def test_nothing_is_deleted_that_the_master_has_not_recorded(data: st.DataObject) -> None:
-    """Whatever is lost, whoever restarts, whichever disk is full."""
+    """Whatever is lost, whoever restarts, whichever disk is full, and whatever is left behind."""
     station, master = Station(), Master()
     for _ in range(data.draw(st.integers(1, 5), label="masters and runs")):
         if data.draw(st.booleans(), label="the station restarts"):
@@ -304,6 +325,8 @@ def test_nothing_is_deleted_that_the_master_has_not_recorded(data: st.DataObject
             station.disk = data.draw(st.booleans(), label="the station's disk takes what there is")
             disk = data.draw(st.sampled_from(["takes", "waits", "refuses"]), label="the master's disk")
             heard = data.draw(st.sampled_from([(True,), (False,), (True, False, False)]), label="heard")
+            if leaves := data.draw(st.sampled_from([0, 0, 0, 5, 60]), label="left behind"):
+                exchange.leave(leaves)
             for frame in range(data.draw(st.integers(1, 12), label="frames")):
                 station.measure(data.draw(st.sampled_from([0, 1, 2, 40]), label="new"))
                 before = {each.sequence for each in station.box.newest_first() if station.has(each.sequence)}

@@ -122,6 +122,7 @@ F: Final = FaultKind
 _YESTERDAY = (
     "unit/radio/test_held_back.py::test_a_session_of_yesterday_played_to_a_station_that_was_just_started"
 )
+_BEACONS = "unit/radio/test_held_back.py::test_a_single_beacon_shifts_no_time"
 _ERROR_STATUS = "unit/master/test_pipeline.py::test_an_error_status_is_named_as_the_reason"
 
 DEFECTS: Final = {
@@ -164,7 +165,7 @@ DEFECTS: Final = {
         duration_s=120,
         drift_ppm=50,
     ),
-    "beacon": Defect("a beacon's time is taken for that of the next", defects.beacon_beside),
+    "beacon": Defect("a beacon's time is taken for that of the next", defects.beacon_beside, test=_BEACONS),
     "slot": Defect(
         "a station replies in the slot after its own", defects.slot_beside, (F.LOSS,), duration_s=80
     ),

@@ -38,6 +38,23 @@ async def test_a_restart_is_learnt_of_although_the_first_answers_after_it_are_lo
     assert outside(field) == []
 
 
+def restart_at(field: LoneStation, request: bytes, *, cycle: int, step_ns: int) -> list[int]:
+    """Kill the station before a request of a cycle, and start it 0.6 s later with its clock set; return when it died."""
+    died_ns: list[int] = []
+
+    def before(payload: bytes) -> int:
+        now_ns = field.clock.monotonic_ns()
+        if payload == request and field.count(b"e1") == cycle and not died_ns:
+            died_ns.append(now_ns)
+            field.station = None
+        elif field.station is None and now_ns - died_ns[0] > 600 * MS:
+            field.restart(step_ns)
+        return 0
+
+    field.before = before
+    return died_ns
+
+
 @pytest.mark.parametrize("step_ns", [STEP_NS, 1_500_000])
 async def test_a_restart_within_a_synchronisation_is_learnt_of(step_ns: int) -> None:
     """The new program is pinged, so it does not introduce itself, but that answer is lost: all samples are of before.
@@ -45,20 +62,9 @@ async def test_a_restart_within_a_synchronisation_is_learnt_of(step_ns: int) -> 
     Its prism is ordered again and a third synchronisation follows at once; not even a step that exchanges do not tell
     passes for a frequency.
     """
-    died_ns: list[int] = []
     async with lone_station() as field:
-
-        def before(payload: bytes) -> int:
-            now_ns = field.clock.monotonic_ns()
-            # 50 cycles at the start, then three of the second synchronisation.
-            if payload == b"e1" and field.count(b"e1") == 53 and not died_ns:
-                died_ns.append(now_ns)
-                field.station = None
-            elif field.station is None and now_ns - died_ns[0] > 600 * MS:
-                field.restart(step_ns)
-            return 0
-
-        field.before = before
+        # 50 cycles at the start, then three of the second synchronisation.
+        died_ns = restart_at(field, b"e1", cycle=53, step_ns=step_ns)
         field.lost = lambda payload: payload == b"e1" and field.count(b"e1") == 55
         await asyncio.sleep(60.0)
     assert died_ns
@@ -69,20 +75,9 @@ async def test_a_restart_within_a_synchronisation_is_learnt_of(step_ns: int) -> 
 
 async def test_samples_of_before_a_restart_do_not_count() -> None:
     """Four of the five cycles are of before, and what is ahead by 3 ms looks like a late stamp beside them."""
-    died_ns: list[int] = []
     async with lone_station() as field:
-
-        def before(payload: bytes) -> int:
-            now_ns = field.clock.monotonic_ns()
-            # 50 cycles at the start, then four of the second synchronisation.
-            if payload == b"s1" and field.count(b"e1") == 54 and not died_ns:
-                died_ns.append(now_ns)
-                field.station = None
-            elif field.station is None and now_ns - died_ns[0] > 600 * MS:
-                field.restart(3 * MS)
-            return 0
-
-        field.before = before
+        # 50 cycles at the start, then four of the second synchronisation.
+        died_ns = restart_at(field, b"s1", cycle=54, step_ns=3 * MS)
         await asyncio.sleep(60.0)
     assert died_ns
     assert outside(field) == []

@@ -15,12 +15,12 @@ import numpy as np
 
 from tsgt.radio.airtime import airtime_us
 from tsgt.radio.base import LoRaSettings
-from tsgt.simulation.air import Air
-from tsgt.simulation.clocks import VirtualClock
-from tsgt.simulation.event_loop import run_virtual
-from tsgt.simulation.link import LinkModel
-from tsgt.simulation.radios import simulated_radio
-from tsgt.simulation.timeline import VirtualTimeline
+from tsgt.simulation.kernel.clocks import VirtualClock
+from tsgt.simulation.kernel.event_loop import run_virtual
+from tsgt.simulation.kernel.timeline import VirtualTimeline
+from tsgt.simulation.lora.air import Air
+from tsgt.simulation.lora.link import LinkModel
+from tsgt.simulation.lora.radios import simulated_radio
 
 RADIOS = 4
 DURATION_S = 600

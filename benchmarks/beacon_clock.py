@@ -16,14 +16,14 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
+from harness.beacon_scenarios import BEACON_SCENARIOS, run_beacon_scenario
 
-from tsgt.radio.beacon_clock import BeaconClock
-from tsgt.simulation.beacon_scenarios import BEACON_SCENARIOS, run_beacon_scenario
+from tsgt.timesync.beacon_clock import BeaconClock
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from tsgt.simulation.beacon_scenarios import BeaconScenario, Told
+    from harness.beacon_scenarios import BeaconScenario, Told
 
 SETTLED_S = 5.0
 """Live figures are of what is measured after this."""

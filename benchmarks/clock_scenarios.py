@@ -12,10 +12,10 @@ import time
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
-from tsgt.simulation.clock_scenarios import SCENARIOS, run_clock_scenario
+from harness.clock_scenarios import SCENARIOS, run_clock_scenario
 
 if TYPE_CHECKING:
-    from tsgt.simulation.clock_scenarios import ClockOutcome
+    from harness.clock_scenarios import ClockOutcome
 
 
 def main() -> None:

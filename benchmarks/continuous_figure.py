@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import matplotlib as mpl
 import numpy as np
 
+from tsgt.analysis.evaluation.reference import read_tum
 from tsgt.analysis.processing import process, with_estimator
-from tsgt.analysis.reference import read_tum
 from tsgt.geometry import log_so3, rotation_from_quaternion
 from tsgt.recording import load_recording
 

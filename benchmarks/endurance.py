@@ -31,21 +31,21 @@ from endurance_watch import (  # type: ignore[import-not-found]  # the script be
     lossy_scenario,
     memory_slope,
 )
+from harness.aftermath import aftermath
 
 from tsgt.clock import SystemClock
 from tsgt.log import configure_logging
-from tsgt.simulation.aftermath import aftermath
-from tsgt.simulation.checkers import Violation
-from tsgt.simulation.demo import Demo
-from tsgt.simulation.demo_files import write_demo_files
-from tsgt.simulation.pty_line import PtyLine
-from tsgt.simulation.timeline import LoopTimeline
-from tsgt.simulation.total_station import SimulatedTotalStation
+from tsgt.simulation.checks.invariants import Violation
+from tsgt.simulation.demo.config_files import write_demo_files
+from tsgt.simulation.demo.demo import Demo
+from tsgt.simulation.instrument.pty import PtyLine
+from tsgt.simulation.instrument.total_station import SimulatedTotalStation
+from tsgt.simulation.kernel.timeline import LoopTimeline
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from tsgt.simulation.processes import Process
+    from tsgt.simulation.demo.processes import Process
 
 WARM_UP_S = 300.0
 """What the daemons take in this time, or in a sixth of a shorter run, does not count as growth."""

@@ -21,8 +21,8 @@ from tsgt.geometry import FixedLag
 from tsgt.model import MotionPrior
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from support.manoeuvre import speeding_up_and_turning_back
-from support.prior_motion import in_time, measure, rows_at
+from harness.manoeuvre import speeding_up_and_turning_back
+from harness.prior_motion import in_time, measure, rows_at
 
 MANOEUVRES = {
     "turns back and speeds up": ((0.5, 1.5), (-0.5, 0.5)),

@@ -24,24 +24,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from harness.aftermath import Found, aftermath
 
 from tsgt.clock import SystemClock
 from tsgt.config import ScenarioConfig
 from tsgt.log import configure_logging
-from tsgt.simulation.aftermath import Found, aftermath
-from tsgt.simulation.air_server import AirServer
-from tsgt.simulation.checkers import Violation
-from tsgt.simulation.demo import Demo
-from tsgt.simulation.demo_files import write_demo_files
-from tsgt.simulation.mission_configs import scenario_link
-from tsgt.simulation.pty_line import PtyLine
-from tsgt.simulation.timeline import LoopTimeline
-from tsgt.simulation.total_station import SimulatedTotalStation
+from tsgt.simulation.checks.invariants import Violation
+from tsgt.simulation.demo.config_files import write_demo_files
+from tsgt.simulation.demo.demo import Demo
+from tsgt.simulation.instrument.pty import PtyLine
+from tsgt.simulation.instrument.total_station import SimulatedTotalStation
+from tsgt.simulation.kernel.timeline import LoopTimeline
+from tsgt.simulation.lora.air_server import AirServer
+from tsgt.simulation.mission.mission import scenario_link
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from tsgt.simulation.processes import Process
+    from tsgt.simulation.demo.processes import Process
 
 YOUNG_S = 5.0
 OLD_S = 30.0

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from tsgt.analysis.motion_calibration import calibrate_recording
-from tsgt.geometry.motion_unknowns import Setup, Unknowns
+from tsgt.analysis.calibration.motion import calibrate_recording
+from tsgt.geometry.calibration.motion_parameters import Setup, Unknowns
 from tsgt.geometry.rigid import exp_so3
 from tsgt.recording import load_recording
 

@@ -15,17 +15,24 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.held_out import FOLDS, folds, hold_out, missed_by_lines, missed_by_trajectory, never_out
-from tsgt.geometry.fit import fit
-from tsgt.geometry.tuning import logarithms, search
-from tsgt.master.observations import build_observations
+from tsgt.analysis.evaluation.held_out import (
+    FOLDS,
+    folds,
+    hold_out,
+    missed_by_lines,
+    missed_by_trajectory,
+    never_out,
+)
+from tsgt.estimation.observations import build_observations
+from tsgt.geometry.trajectory.batch import fit
+from tsgt.geometry.trajectory.hyperparameters import logarithms, search
 from tsgt.model import MotionPrior
 from tsgt.recording import load_recording
 
 if TYPE_CHECKING:
-    from tsgt.analysis.held_out import Fold
+    from tsgt.analysis.evaluation.held_out import Fold
     from tsgt.geometry import FloatArray, Observations
-    from tsgt.geometry.tuning import Tuned
+    from tsgt.geometry.trajectory.hyperparameters import Tuned
 
 # An acceleration that lasts a millisecond is white at any rate of measuring; one of a minute, over the steps between
 # measurements and over their neighbours', is the sum of white jerk.

@@ -15,13 +15,13 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import chi2
 
-from tsgt.geometry.continuous import knot_times, solve
-from tsgt.geometry.first_guess import first_guess
-from tsgt.geometry.trajectory import Trajectory
+from tsgt.geometry.trajectory.gauss_newton import knot_times, solve
+from tsgt.geometry.trajectory.initialisation import first_guess
+from tsgt.geometry.trajectory.query import Trajectory
 from tsgt.model import MotionPrior
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from support.prior_motion import STEP_S, draw_motions, in_time, measure, rows_at
+from harness.prior_motion import STEP_S, draw_motions, in_time, measure, rows_at
 
 ROBOTS = 400
 UNTIL_S = 20.0

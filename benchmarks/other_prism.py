@@ -17,12 +17,12 @@ import numpy as np
 
 from tsgt.config import ScenarioConfig
 from tsgt.config.scenario import InstrumentModelConfig
-from tsgt.simulation.clocks import VirtualClock
-from tsgt.simulation.event_loop import run_virtual
-from tsgt.simulation.serial_line import SimulatedLine
-from tsgt.simulation.telescope import Lock
-from tsgt.simulation.timeline import VirtualTimeline
-from tsgt.simulation.total_station import SimulatedTotalStation
+from tsgt.simulation.instrument.serial_line import SimulatedLine
+from tsgt.simulation.instrument.telescope import Lock
+from tsgt.simulation.instrument.total_station import SimulatedTotalStation
+from tsgt.simulation.kernel.clocks import VirtualClock
+from tsgt.simulation.kernel.event_loop import run_virtual
+from tsgt.simulation.kernel.timeline import VirtualTimeline
 from tsgt.simulation.world import scenario_world
 
 TIMES = 120

@@ -25,19 +25,19 @@ from typing import Any
 import click
 import numpy as np
 
-from tsgt.analysis.inter_prism import PairDistances, at_epochs, inter_prism
-from tsgt.analysis.metrics import PoseErrors, inner_part, pose_errors
+from tsgt.analysis.evaluation.inter_prism import PairDistances, at_epochs, inter_prism
+from tsgt.analysis.evaluation.metrics import PoseErrors, inner_part, pose_errors
+from tsgt.analysis.evaluation.reference import Reference
+from tsgt.analysis.evaluation.stationary import StandingErrors, standing_errors
 from tsgt.analysis.processing import process, with_estimator
-from tsgt.analysis.reference import Reference
-from tsgt.analysis.standing import StandingErrors, standing_errors
 from tsgt.cli.output import print_json
 from tsgt.config.radio import ClassicMasterConfig, SuperframeMasterConfig
+from tsgt.estimation.tracks import build_tracks
 from tsgt.geometry import quaternion_from_rotation, rotation_from_quaternion, transform_from
 from tsgt.log import configure_logging
-from tsgt.master.tracks import build_tracks
 from tsgt.recording import load_recording
+from tsgt.simulation.mission.runner import Run, simulate
 from tsgt.simulation.options import Options
-from tsgt.simulation.scenario import Run, simulate
 from tsgt.simulation.scenario_files import find_scenario
 
 EXPERIMENTS = {"quarry": (0,), "ski-trail": (0, 1, 2), "snowmobile": (0,)}

@@ -29,20 +29,20 @@ import pytest
 from tsgt.config import ScenarioConfig
 from tsgt.config.radio import ClassicMasterConfig, SuperframeMasterConfig
 from tsgt.log import configure_logging
-from tsgt.simulation.checkers import violations
-from tsgt.simulation.disk import FULL
-from tsgt.simulation.faults import QUICK_CYCLES, FaultKind
+from tsgt.simulation.checks.invariants import violations
+from tsgt.simulation.faults.catalogue import QUICK_CYCLES, FaultKind
+from tsgt.simulation.mission.disk import FULL
+from tsgt.simulation.mission.runner import simulate
 from tsgt.simulation.options import MASTER, Options
-from tsgt.simulation.scenario import simulate
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from support import defects
-from support.defects import Planting
+from harness import defects
+from harness.defects import Planting
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
 
-    from tsgt.simulation.mission import Mission
+    from tsgt.simulation.mission.mission import Mission
 
 TESTS = Path(__file__).parents[1] / "tests"
 

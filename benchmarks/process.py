@@ -22,16 +22,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.config import ScenarioConfig, scenario_parameters
-from tsgt.master.pipeline import Pipeline
+from tsgt.estimation.linear import Pipeline
 from tsgt.recording import RecordingHeader, RecordingWriter
-from tsgt.simulation.clocks import VirtualClock
-from tsgt.simulation.event_loop import run_virtual
-from tsgt.simulation.mission_configs import instrument_config
-from tsgt.simulation.serial_line import SimulatedLine
-from tsgt.simulation.timeline import VirtualTimeline
-from tsgt.simulation.total_station import SimulatedTotalStation
+from tsgt.simulation.instrument.serial_line import SimulatedLine
+from tsgt.simulation.instrument.total_station import SimulatedTotalStation
+from tsgt.simulation.kernel.clocks import VirtualClock
+from tsgt.simulation.kernel.event_loop import run_virtual
+from tsgt.simulation.kernel.timeline import VirtualTimeline
+from tsgt.simulation.mission.mission import instrument_config
 from tsgt.simulation.world import scenario_world
-from tsgt.station.leica import LeicaInstrument
+from tsgt.station.leica.instrument import LeicaInstrument
 from tsgt.station.session import Session
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def main() -> None:
             measurements = pool.submit(write_recording, recording).result()
         process_s, memory = best("-m", "tsgt", "process", str(recording), "--output", str(poses))
         start_s, start_memory = best(
-            "-c", "import tsgt.analysis.processing, tsgt.analysis.export, tsgt.cli.desk"
+            "-c", "import tsgt.analysis.processing, tsgt.analysis.formats.export, tsgt.cli.desk.process"
         )
         json_s = min(read_with_json(recording) for _ in range(REPEATS))
         pose_lines = len(poses.read_text().splitlines())

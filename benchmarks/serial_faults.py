@@ -10,8 +10,7 @@ import sys
 import time
 
 import structlog
-
-from tsgt.simulation.serial_scripts import Outcome, Script, all_scripts, run_script
+from harness.serial_scripts import Outcome, Script, all_scripts, run_script
 
 
 def main() -> None:

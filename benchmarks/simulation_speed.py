@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING
 
 from tsgt.config.radio import ClassicMasterConfig, SuperframeMasterConfig
 from tsgt.log import configure_logging
-from tsgt.simulation.checkers import violations
+from tsgt.simulation.checks.invariants import violations
+from tsgt.simulation.mission.runner import simulate
 from tsgt.simulation.options import Options
-from tsgt.simulation.scenario import simulate
 from tsgt.simulation.scenario_files import find_scenario
 
 if TYPE_CHECKING:

@@ -3,7 +3,7 @@
     python benchmarks/soak.py [--minutes M] [--first SEED] [--seeds N] [--jobs J] [--json FILE]
 
 Protocol, estimator, losses and drifts change from seed to seed, and with them how often which faults come
-(`tsgt/simulation/faults.py`). A line for each violation says how to get the same run again. `make soak` runs it for a
+(`tsgt/simulation/faults/catalogue.py`). A line for each violation says how to get the same run again. `make soak` runs it for a
 quarter of an hour. With `--json` the sums are kept, and a later call with the same file adds to them and goes on after
 the last seed.
 """
@@ -30,10 +30,10 @@ import numpy as np
 from tsgt.config.radio import ClassicMasterConfig, SuperframeMasterConfig
 from tsgt.geometry import log_so3, rotation_from_quaternion
 from tsgt.log import configure_logging
-from tsgt.simulation.checkers import violations
-from tsgt.simulation.faults import QUICK_CYCLES, FaultKind
+from tsgt.simulation.checks.invariants import violations
+from tsgt.simulation.faults.catalogue import QUICK_CYCLES, FaultKind
+from tsgt.simulation.mission.runner import Run, simulate
 from tsgt.simulation.options import Options
-from tsgt.simulation.scenario import Run, simulate
 from tsgt.simulation.scenario_files import find_scenario
 
 DURATION_S = 220.0

@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from support.bridge import ServedInstrument
-from support.leica import leica_bench
+from harness.bridge import ServedInstrument
+from harness.leica import leica_bench
 
 from tsgt.config.client import BridgeInstrumentConfig
 from tsgt.errors import InstrumentError
 from tsgt.model import Status
-from tsgt.station.bridge import BridgeInstrument
+from tsgt.station.bridge.instrument import BridgeInstrument
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
 
-    from support.leica import LeicaBench
+    from harness.leica import LeicaBench
 
     from tsgt.station.instrument import Instrument
 

@@ -6,14 +6,14 @@ import asyncio
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from support.blocking import ACCESS_S
-from support.lab import SIZES, lab, payload
-from support.peripherals import CircuitPythonPin, CircuitPythonSpi, circuit_python_modules, import_driver
+from harness.blocking import ACCESS_S
+from harness.lab import SIZES, lab, payload
+from harness.peripherals import CircuitPythonPin, CircuitPythonSpi, circuit_python_modules, import_driver
 
 from tsgt.radio.base import LoRaSettings
 
 if TYPE_CHECKING:
-    from support.lab import Lab
+    from harness.lab import Lab
 
 HEADER = b"\xff\xff\x00\x00"
 """What RadioHead's drivers put before each payload: to all, from nobody, number, flags."""

@@ -10,15 +10,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from support.radios import MS, running_timeline
-from support.shots import READING, ScriptedInstrument
+from harness.radios import MS, running_timeline
+from harness.shots import READING, ScriptedInstrument
 
 from tsgt.clock import UnixTimeline
 from tsgt.errors import InstrumentError
-from tsgt.master.collector import Collector
+from tsgt.master.classic.transport import Collector
 from tsgt.model import Status
 from tsgt.radio.base import LoRaSettings
-from tsgt.radio.classic import (
+from tsgt.radio.classic.messages import Command, MeasurementMessage, raw_status, status_of
+from tsgt.radio.classic.transactions import (
     ClassicStation,
     Ordered,
     Poll,
@@ -26,19 +27,18 @@ from tsgt.radio.classic import (
     Synchronisation,
     Timing,
 )
-from tsgt.radio.classic_messages import Command, MeasurementMessage, raw_status, status_of
-from tsgt.radio.orders import MeasureOrder
-from tsgt.simulation.air import Air
-from tsgt.simulation.authors_node import AUTHORS_STAMP_DELAY_MS, AuthorsMaster, AuthorsNode
-from tsgt.simulation.clocks import DriftingClock, VirtualClock
-from tsgt.simulation.link import LinkModel
-from tsgt.simulation.radios import opener
+from tsgt.radio.commands import MeasureOrder
+from tsgt.simulation.kernel.clocks import DriftingClock, VirtualClock
+from tsgt.simulation.lora.air import Air
+from tsgt.simulation.lora.link import LinkModel
+from tsgt.simulation.lora.radios import opener
+from tsgt.simulation.mission.authors_node import AUTHORS_STAMP_DELAY_MS, AuthorsMaster, AuthorsNode
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Coroutine
 
     from tsgt.radio.base import Radio
-    from tsgt.radio.classic_station import ClassicOrder
+    from tsgt.radio.classic.station import ClassicOrder
     from tsgt.station.instrument import Reading
 
 SECOND = 1000 * MS

@@ -6,13 +6,13 @@ import asyncio
 from typing import TYPE_CHECKING
 
 import pytest
-from support.cpp_node import CppNode
-from support.lab import lab, payload
+from harness.cpp_node import CppNode
+from harness.lab import lab, payload
 
 from tsgt.radio.base import LoRaSettings
 
 if TYPE_CHECKING:
-    from support.lab import Lab
+    from harness.lab import Lab
 
 MEASUREMENT_BYTES = 34
 spreading_factors = pytest.mark.parametrize("spreading_factor", [8, 9])

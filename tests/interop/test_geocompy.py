@@ -17,9 +17,9 @@ from geocompy.geo.gcdata import Adjust, ATRLock, EDMModeV2, Measurement, PowerSo
 from geocompy.geo.gctypes import GeoComCode
 
 from tsgt.config import ScenarioConfig
-from tsgt.simulation.pty_line import PtyLine
-from tsgt.simulation.timeline import LoopTimeline
-from tsgt.simulation.total_station import SimulatedTotalStation
+from tsgt.simulation.instrument.pty import PtyLine
+from tsgt.simulation.instrument.total_station import SimulatedTotalStation
+from tsgt.simulation.kernel.timeline import LoopTimeline
 from tsgt.simulation.world import scenario_world
 
 if TYPE_CHECKING:

@@ -6,13 +6,13 @@ import asyncio
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from support.lab import SIZES, lab, payload
-from support.peripherals import RaspberryPi, import_driver
+from harness.lab import SIZES, lab, payload
+from harness.peripherals import RaspberryPi, import_driver
 
 from tsgt.radio.base import LoRaSettings
 
 if TYPE_CHECKING:
-    from support.lab import Lab
+    from harness.lab import Lab
 
 POLLING, WITH_DIO0 = -1, 4
 RESET_PIN = 17

@@ -17,8 +17,8 @@ import asyncio, sys
 from pathlib import Path
 import numpy as np
 from tsgt.log import configure_logging
-from tsgt.simulation.air_server import AirServer
-from tsgt.simulation.link import LinkModel
+from tsgt.simulation.lora.air_server import AirServer
+from tsgt.simulation.lora.link import LinkModel
 
 async def main():
     async with AirServer(Path(sys.argv[1]), LinkModel(), np.random.default_rng(0)):
@@ -36,11 +36,11 @@ import numpy as np
 from tsgt.clock import SystemClock
 from tsgt.log import configure_logging
 from tsgt.radio.base import LoRaSettings
-from tsgt.radio.sx127x import SX127x
-from tsgt.simulation.air_client import AirClient
-from tsgt.simulation.chip import SX1276Chip
-from tsgt.simulation.hal import SimulatedHal
-from tsgt.simulation.timeline import LoopTimeline
+from tsgt.radio.sx127x.driver import SX127x
+from tsgt.simulation.lora.air_client import AirClient
+from tsgt.simulation.lora.chip import SX1276Chip
+from tsgt.simulation.lora.hal import SimulatedHal
+from tsgt.simulation.kernel.timeline import LoopTimeline
 
 SETTINGS = LoRaSettings(frequency_hz=905_000_000, spreading_factor=7, bandwidth_hz=250_000, coding_rate=6)
 

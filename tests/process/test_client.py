@@ -51,11 +51,11 @@ import numpy as np
 from tsgt.config import ScenarioConfig
 from tsgt.config.scenario import InstrumentModelConfig
 from tsgt.log import configure_logging
-from tsgt.simulation.air_server import AirServer
-from tsgt.simulation.link import LinkModel
-from tsgt.simulation.pty_line import PtyLine
-from tsgt.simulation.timeline import LoopTimeline
-from tsgt.simulation.total_station import SimulatedTotalStation
+from tsgt.simulation.lora.air_server import AirServer
+from tsgt.simulation.lora.link import LinkModel
+from tsgt.simulation.instrument.pty import PtyLine
+from tsgt.simulation.kernel.timeline import LoopTimeline
+from tsgt.simulation.instrument.total_station import SimulatedTotalStation
 from tsgt.simulation.world import scenario_world
 
 async def main(folder):

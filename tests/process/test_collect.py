@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from tsgt.analysis.target_file import read_some_targets
+from tsgt.analysis.formats.target_file import read_some_targets
 from tsgt.radio.key_file import write_key
 
 if TYPE_CHECKING:
@@ -78,12 +78,12 @@ import numpy as np
 from tsgt.config import ScenarioConfig
 from tsgt.config.scenario import InstrumentModelConfig
 from tsgt.log import configure_logging
-from tsgt.simulation.air_server import AirServer
-from tsgt.simulation.distance_meter import WITHOUT_PRISM
-from tsgt.simulation.link import LinkModel
-from tsgt.simulation.pty_line import PtyLine
-from tsgt.simulation.timeline import LoopTimeline
-from tsgt.simulation.total_station import SimulatedTotalStation
+from tsgt.simulation.lora.air_server import AirServer
+from tsgt.simulation.instrument.edm import WITHOUT_PRISM
+from tsgt.simulation.lora.link import LinkModel
+from tsgt.simulation.instrument.pty import PtyLine
+from tsgt.simulation.kernel.timeline import LoopTimeline
+from tsgt.simulation.instrument.total_station import SimulatedTotalStation
 from tsgt.simulation.world import scenario_world
 
 async def main(folder):

@@ -8,12 +8,12 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from support.made_up_machine import CLIENT
+from harness.made_up_machine import CLIENT
 
 from tsgt.config import ScenarioConfig
-from tsgt.simulation.pty_line import PtyLine
-from tsgt.simulation.timeline import LoopTimeline
-from tsgt.simulation.total_station import SimulatedTotalStation
+from tsgt.simulation.instrument.pty import PtyLine
+from tsgt.simulation.instrument.total_station import SimulatedTotalStation
+from tsgt.simulation.kernel.timeline import LoopTimeline
 from tsgt.simulation.world import scenario_world
 
 if TYPE_CHECKING:

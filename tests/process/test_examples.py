@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from support.records import EVENT, HELLO, NO_POSE, POSE, measurement
+from harness.records import EVENT, HELLO, NO_POSE, POSE, measurement
 
 from tsgt.recording import encode_line
 

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from harness.air import RecordingAntenna, frame, modulation
 from hypothesis import given
 from hypothesis import strategies as st
-from support.air import RecordingAntenna, frame, modulation
 
-from tsgt.simulation.air import Air
-from tsgt.simulation.frames import Frame, Listening, Modulation
-from tsgt.simulation.link import FixedLoss, LinkModel
-from tsgt.simulation.timeline import VirtualTimeline
+from tsgt.simulation.kernel.timeline import VirtualTimeline
+from tsgt.simulation.lora.air import Air
+from tsgt.simulation.lora.frames import Frame, Listening, Modulation
+from tsgt.simulation.lora.link import FixedLoss, LinkModel
 
 NAMES = ("a", "b", "c")
 

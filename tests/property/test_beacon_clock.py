@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from harness.beacon_scenarios import BeaconScenario, run_beacon_scenario
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from tsgt.simulation.beacon_scenarios import BeaconScenario, run_beacon_scenario
 
 
 @settings(max_examples=150)

@@ -8,17 +8,17 @@ from collections import deque
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
+from harness.bridge import HELLO, measured
+from harness.damage import Damage, damages, examples
 from hypothesis import given
 from hypothesis import strategies as st
 from structlog.testing import capture_logs
-from support.bridge import HELLO, measured
-from support.damage import Damage, damages, examples
 
-from tsgt.simulation.clocks import VirtualClock
-from tsgt.simulation.event_loop import run_virtual
-from tsgt.station.bridge_lines import LineCutter
-from tsgt.station.bridge_run import BridgeRun, Refusals
-from tsgt.station.bridge_times import OLDEST_NS, Stamper
+from tsgt.simulation.kernel.clocks import VirtualClock
+from tsgt.simulation.kernel.event_loop import run_virtual
+from tsgt.station.bridge.messages import LineCutter
+from tsgt.station.bridge.run import BridgeRun, Refusals
+from tsgt.station.bridge.timing import OLDEST_NS, Stamper
 
 if TYPE_CHECKING:
     from tsgt.station.instrument import Reading

@@ -5,22 +5,13 @@ from __future__ import annotations
 import math
 from typing import cast, get_args
 
+from harness.damage import examples
+from harness.radios import MS, PAPER
 from hypothesis import given
 from hypothesis import strategies as st
-from support.damage import examples
-from support.radios import MS, PAPER
 
 from tsgt.model import Status
-from tsgt.radio.classic import (
-    ClassicStation,
-    Ordered,
-    Poll,
-    Shot,
-    Synchronisation,
-    Timing,
-    Turn,
-)
-from tsgt.radio.classic_messages import (
+from tsgt.radio.classic.messages import (
     LAST_TIME_NS,
     Acknowledgement,
     Command,
@@ -33,7 +24,16 @@ from tsgt.radio.classic_messages import (
     no_measurement_yet,
     status_of,
 )
-from tsgt.radio.orders import MeasureOrder
+from tsgt.radio.classic.transactions import (
+    ClassicStation,
+    Ordered,
+    Poll,
+    Shot,
+    Synchronisation,
+    Timing,
+    Turn,
+)
+from tsgt.radio.commands import MeasureOrder
 
 TIMING = Timing.of(PAPER, 250 * MS)
 

@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 import pytest
+from harness.clock_exchanges import SECOND, START_NS, exchange
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.clock_exchanges import SECOND, START_NS, exchange
 
-from tsgt.master.clock_offset import clock_filter
+from tsgt.timesync.two_way import clock_filter
 
 MS = 1_000_000
 

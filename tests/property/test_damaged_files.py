@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from harness.cli import called
+from harness.damage import UNHARMED, Damage, Samples, damages, examples
+from harness.harmless import Files, check
+from harness.pos_files import SECOND, write_pos
+from harness.published import write_prisms, write_targets, write_tracks
 from hypothesis import example, given
 from hypothesis import strategies as st
-from support.cli import called
-from support.damage import UNHARMED, Damage, Samples, damages, examples
-from support.harmless import Files, check
-from support.pos_files import SECOND, write_pos
-from support.published import write_prisms, write_targets, write_tracks
 
 ROOT = Path(__file__).parents[2]
 CONFIGS = ROOT / "configs"

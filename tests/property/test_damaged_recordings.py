@@ -6,14 +6,14 @@ import json
 from collections import Counter
 
 import pytest
+from harness.cli import called
+from harness.damage import UNHARMED, Damage, Samples, damages, examples
+from harness.harmless import Files, check
+from harness.merging import journals, recording
+from harness.missions import QUICK, SUPERFRAME, mission
+from harness.published import write_prisms, write_targets, write_tracks
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from support.cli import called
-from support.damage import UNHARMED, Damage, Samples, damages, examples
-from support.harmless import Files, check
-from support.merging import journals, recording
-from support.missions import QUICK, SUPERFRAME, mission
-from support.published import write_prisms, write_targets, write_tracks
 
 FUZZ_EXAMPLES = 1000
 """Of a test that does not say how many it wants: what tells `make fuzz` from `make test`."""

@@ -7,16 +7,16 @@ import math
 from collections import deque
 from dataclasses import dataclass, field
 
+from harness.damage import Damage, damages, examples
+from harness.leica import LeicaBench, leica_bench, leica_config
 from hypothesis import given
 from hypothesis import strategies as st
 from structlog.testing import capture_logs
-from support.damage import Damage, damages, examples
-from support.leica import LeicaBench, leica_bench, leica_config
 
 from tsgt.errors import InstrumentError
 from tsgt.model import Status
-from tsgt.simulation.event_loop import run_virtual
-from tsgt.simulation.line_faults import LineFaults
+from tsgt.simulation.instrument.serial_line import LineFaults
+from tsgt.simulation.kernel.event_loop import run_virtual
 
 HOSTILE_S = 20.0
 BACK_S = 30.0

@@ -7,13 +7,15 @@ from dataclasses import replace
 from unittest.mock import patch
 
 import numpy as np
-from support.frames import KEY, TIMING
+from harness.exchange import Exchange
+from harness.forgery import KINDS, forge, state
+from harness.frames import KEY, TIMING
 
 from tsgt.errors import MessageError
 from tsgt.model import Status
-from tsgt.radio.authentication import CODE_BYTES, Authenticator
-from tsgt.radio.message_codec import decode_reply, encode_beacon, encode_reply
-from tsgt.radio.messages import (
+from tsgt.radio.superframe.wire.authentication import CODE_BYTES, Authenticator
+from tsgt.radio.superframe.wire.codec import decode_reply, encode_beacon, encode_reply
+from tsgt.radio.superframe.wire.messages import (
     AnswerPart,
     Beacon,
     Confirmation,
@@ -28,8 +30,6 @@ from tsgt.radio.messages import (
     StatePart,
     StationEntry,
 )
-from tsgt.simulation.exchange import Exchange
-from tsgt.simulation.forgery import KINDS, forge, state
 
 
 def test_no_forged_packet_has_an_effect() -> None:

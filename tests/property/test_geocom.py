@@ -7,10 +7,8 @@ import itertools
 import re
 
 import pytest
-from hypothesis import example, given
-from hypothesis import strategies as st
-from support.damage import examples
-from support.geocom_line import (
+from harness.damage import examples
+from harness.geocom_line import (
     REQUEST,
     Cable,
     FakeInstrument,
@@ -25,15 +23,25 @@ from support.geocom_line import (
     silent,
     torn,
 )
+from hypothesis import example, given
+from hypothesis import strategies as st
 
 from tsgt.errors import InstrumentError, MessageError
-from tsgt.simulation.clocks import VirtualClock
-from tsgt.simulation.event_loop import run_virtual
-from tsgt.station.geocom import MAX_TRANSACTION, Byte, ReplyLine, Rpc, crc16_arc, decode_reply, encode_request
-from tsgt.station.geocom_codes import Verdict, name_of, verdict
-from tsgt.station.geocom_connection import GeoComConnection
-from tsgt.station.geocom_lines import ReplyLines, StampedLine
-from tsgt.station.port import Chunk
+from tsgt.simulation.kernel.clocks import VirtualClock
+from tsgt.simulation.kernel.event_loop import run_virtual
+from tsgt.station.geocom.codec import (
+    MAX_TRANSACTION,
+    Byte,
+    ReplyLine,
+    Rpc,
+    crc16_arc,
+    decode_reply,
+    encode_request,
+)
+from tsgt.station.geocom.codes import Verdict, name_of, verdict
+from tsgt.station.geocom.connection import GeoComConnection
+from tsgt.station.geocom.framing import ReplyLines, StampedLine
+from tsgt.station.serial.base import Chunk
 
 latin = st.text(st.characters(max_codepoint=0xFF), max_size=20)
 reals = st.floats(-1e6, 1e6)

@@ -6,12 +6,12 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from harness.pos_files import SECOND, Variant, write_pos
 from hypothesis import given
 from hypothesis import strategies as st
-from support.pos_files import SECOND, Variant, write_pos
 
-from tsgt.analysis.gnss import receivers
-from tsgt.analysis.gnss_files import read_pos
+from tsgt.analysis.formats.rtklib import read_pos
+from tsgt.analysis.gnss.baselines import receivers
 from tsgt.errors import InputFileError
 
 FIRST = 1_483_228_800  # 2017-01-01, from when on GPS is 18 s ahead of UTC

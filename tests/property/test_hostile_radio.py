@@ -9,23 +9,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from harness.damage import Damage, damages, examples
+from harness.exchange import Exchange
+from harness.frames import KEY, TIMING, counted
+from harness.missions import QUICK, SUPERFRAME, mission
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
 from structlog.testing import capture_logs
-from support.damage import Damage, damages, examples
-from support.frames import KEY, TIMING, counted
-from support.missions import QUICK, SUPERFRAME, mission
 
 from tsgt.errors import MessageError
-from tsgt.radio.authentication import CODE_BYTES, Authenticator
-from tsgt.radio.message_codec import decode_reply
-from tsgt.simulation.exchange import Exchange
+from tsgt.radio.superframe.wire.authentication import CODE_BYTES, Authenticator
+from tsgt.radio.superframe.wire.codec import decode_reply
 
 if TYPE_CHECKING:
     from tsgt.radio.base import Radio
-    from tsgt.simulation.mission import Mission
-    from tsgt.simulation.scenario import Run
+    from tsgt.simulation.mission.mission import Mission
+    from tsgt.simulation.mission.runner import Run
 
 REMEMBERED = 50
 SETTLING_FRAMES = 15

@@ -14,30 +14,39 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from harness.air import RecordingAntenna, frame
+from harness.cli import called
+from harness.client import client_config
+from harness.damage import Damage, damages, examples
+from harness.radios import PAPER, running_timeline
+from harness.records import CLOCK, EVENT, HELLO, NO_POSE, POINT, POSE, STATUS, measurement
+from harness.shots import ScriptedInstrument
 from hypothesis import given
 from hypothesis import strategies as st
 from structlog.testing import capture_logs
-from support.air import RecordingAntenna, frame
-from support.cli import called
-from support.client import client_config
-from support.damage import Damage, damages, examples
-from support.radios import PAPER, running_timeline
-from support.records import CLOCK, EVENT, HELLO, NO_POSE, POINT, POSE, STATUS, measurement
-from support.shots import ScriptedInstrument
 
 from tsgt.errors import RadioError, StreamError
-from tsgt.master.stream import StreamServer
+from tsgt.master.stream_server import StreamServer
 from tsgt.recording import encode_line
 from tsgt.recording.format import MAX_LINE_BYTES
 from tsgt.recording.journal import InstrumentRecord
-from tsgt.simulation.air_client import AirClient
-from tsgt.simulation.air_lines import FrameLine, Incoming, Join, Left, Stop, Stopped, Transmit, Welcome
-from tsgt.simulation.air_server import AirServer
-from tsgt.simulation.clocks import VirtualClock
-from tsgt.simulation.event_loop import run_virtual
-from tsgt.simulation.link import FixedLoss, LinkModel
+from tsgt.simulation.kernel.clocks import VirtualClock
+from tsgt.simulation.kernel.event_loop import run_virtual
+from tsgt.simulation.lora.air_client import AirClient
+from tsgt.simulation.lora.air_messages import (
+    FrameLine,
+    Incoming,
+    Join,
+    Left,
+    Stop,
+    Stopped,
+    Transmit,
+    Welcome,
+)
+from tsgt.simulation.lora.air_server import AirServer
+from tsgt.simulation.lora.link import FixedLoss, LinkModel
+from tsgt.station.control_socket import Answer, AtmosphereRequest
 from tsgt.station.daemon import run_client
-from tsgt.station.requests import Answer, AtmosphereRequest
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -6,18 +6,18 @@ import time
 from typing import TYPE_CHECKING
 
 import pytest
-from support.pos_files import Variant
-from support.records import POSE, STATUS, measurement, recording_bytes
+from harness.pos_files import Variant
+from harness.records import POSE, STATUS, measurement, recording_bytes
 
-from tsgt.analysis.gnss_files import read_pos
-from tsgt.analysis.odometry import read_still_intervals
-from tsgt.analysis.reference import read_tum
-from tsgt.analysis.target_file import read_target_file
+from tsgt.analysis.evaluation.reference import read_tum
+from tsgt.analysis.formats.odometry import read_still_intervals
+from tsgt.analysis.formats.rtklib import read_pos
+from tsgt.analysis.formats.target_file import read_target_file
 from tsgt.config import load_any
 from tsgt.errors import ConfigError, InputFileError, RecordingError
 from tsgt.recording import load_recording
 from tsgt.recording.format import MAX_LINE_BYTES
-from tsgt.station.bridge_lines import LineCutter
+from tsgt.station.bridge.messages import LineCutter
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -9,27 +9,27 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import hypothesis.strategies as st
+from harness.records import CLOCK, EVENT, HEADER, STATUS
+from harness.scene import START, driving, standing_scene
 from hypothesis import given, settings
-from support.records import CLOCK, EVENT, HEADER, STATUS
-from support.scene import START, driving, standing_scene
 
 from tsgt.config.master import GeofenceConfig
-from tsgt.master.feed import Feed
+from tsgt.estimation.linear import Pipeline
+from tsgt.estimation.live import Feed
 from tsgt.master.geofence import Geofence
-from tsgt.master.monitor import Monitor
-from tsgt.master.outlet import Outlet
-from tsgt.master.pipeline import Pipeline
+from tsgt.master.publisher import Outlet
 from tsgt.master.replay import replayed
+from tsgt.master.statistics import Monitor
 from tsgt.model import Status
 from tsgt.recording import encode_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from support.scene import Scene
+    from harness.scene import Scene
 
-    from tsgt.master.stream_records import ClockRecord, EventRecord, PoseRecord, StatusRecord
     from tsgt.model import Measurement, PolarMeasurement
+    from tsgt.recording.stream_records import ClockRecord, EventRecord, PoseRecord, StatusRecord
 
 TRANSPORT_NS = 2_000_000_000
 SCENE = standing_scene().moving(driving)

@@ -6,11 +6,11 @@ import math
 from itertools import pairwise
 
 import numpy as np
+from harness.clock_exchanges import SECOND, START_NS, exchange
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.clock_exchanges import SECOND, START_NS, exchange
 
-from tsgt.analysis.merge_times import by_synchronisations
+from tsgt.analysis.merge.timing import by_synchronisations
 
 MS = 1_000_000
 LARGEST_SWING_PPM = 10.0

@@ -7,18 +7,18 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from harness.chips import Bench
+from harness.damage import examples
+from harness.radios import PAPER, make_side, running_timeline
 from hypothesis import given
 from hypothesis import strategies as st
-from support.chips import Bench
-from support.damage import examples
-from support.radios import PAPER, make_side, running_timeline
 
-from tsgt.simulation.air import Air
-from tsgt.simulation.chip import SX1276Chip
-from tsgt.simulation.event_loop import run_virtual
-from tsgt.simulation.frames import Frame, Header, Modulation, Reception
-from tsgt.simulation.link import LinkModel
-from tsgt.simulation.timeline import VirtualTimeline
+from tsgt.simulation.kernel.event_loop import run_virtual
+from tsgt.simulation.kernel.timeline import VirtualTimeline
+from tsgt.simulation.lora.air import Air
+from tsgt.simulation.lora.chip import SX1276Chip
+from tsgt.simulation.lora.frames import Frame, Header, Modulation, Reception
+from tsgt.simulation.lora.link import LinkModel
 
 MS = 1_000_000
 

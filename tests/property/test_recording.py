@@ -5,10 +5,10 @@ import tempfile
 from pathlib import Path
 
 import pytest
+from harness.damage import examples
+from harness.records import HEADER, PARAMETERS, POINT, POSE, STATUS, measurement, recording_bytes
 from hypothesis import given
 from hypothesis import strategies as st
-from support.damage import examples
-from support.records import HEADER, PARAMETERS, POINT, POSE, STATUS, measurement, recording_bytes
 
 from tsgt.errors import CorruptLineError, RecordingError
 from tsgt.model import PointMeasurement

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from harness.damage import examples
 from hypothesis import given
 from hypothesis import strategies as st
-from support.damage import examples
 
 from tsgt.errors import MessageError
 from tsgt.model import Status
-from tsgt.radio.message_codec import decode_beacon, decode_reply, encode_beacon, encode_reply, reply_bytes
-from tsgt.radio.messages import (
+from tsgt.radio.superframe.wire.codec import (
+    decode_beacon,
+    decode_reply,
+    encode_beacon,
+    encode_reply,
+    reply_bytes,
+)
+from tsgt.radio.superframe.wire.messages import (
     SINGLE_QUALITY,
     AnswerPart,
     Beacon,

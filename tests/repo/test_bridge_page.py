@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tsgt.config.client import BridgeInstrumentConfig
-from tsgt.station.bridge_lines import (
+from tsgt.station.bridge.messages import (
     AtmosphereCommand,
     Command,
     DirectCommand,

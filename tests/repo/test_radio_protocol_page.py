@@ -11,10 +11,8 @@ from typing import NamedTuple
 import pytest
 
 from tsgt.model import Status
-from tsgt.radio.authentication import Authenticator
 from tsgt.radio.base import LoRaSettings
-from tsgt.radio.classic import Timing
-from tsgt.radio.classic_messages import (
+from tsgt.radio.classic.messages import (
     Acknowledgement,
     MeasurementMessage,
     PingReply,
@@ -24,9 +22,24 @@ from tsgt.radio.classic_messages import (
     raw_status,
     status_of,
 )
-from tsgt.radio.message_codec import decode_beacon, encode_beacon, encode_reply
-from tsgt.radio.message_codec import decode_reply as decode_superframe_reply
-from tsgt.radio.messages import (
+from tsgt.radio.classic.transactions import Timing
+from tsgt.radio.commands import Direction, DirectOrder, MeasureOrder, SearchOrder, TrackOrder
+from tsgt.radio.superframe.wire.authentication import Authenticator
+from tsgt.radio.superframe.wire.block_codec import (
+    DISTANCE_WIDTHS,
+    HORIZONTAL_WIDTHS,
+    TIME_WIDTHS,
+    ZENITH_WIDTHS,
+)
+from tsgt.radio.superframe.wire.codec import (
+    decode_beacon,
+    encode_beacon,
+    encode_reply,
+    order_part,
+    spread_rad,
+)
+from tsgt.radio.superframe.wire.codec import decode_reply as decode_superframe_reply
+from tsgt.radio.superframe.wire.messages import (
     GRANT_BYTES,
     AnswerPart,
     Beacon,
@@ -43,9 +56,6 @@ from tsgt.radio.messages import (
     StationEntry,
     Towards,
 )
-from tsgt.radio.order_codec import order_part, spread_rad
-from tsgt.radio.orders import Direction, DirectOrder, MeasureOrder, SearchOrder, TrackOrder
-from tsgt.radio.run_codec import DISTANCE_WIDTHS, HORIZONTAL_WIDTHS, TIME_WIDTHS, ZENITH_WIDTHS
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "radio-protocol.md").read_text()
 

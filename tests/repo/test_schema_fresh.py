@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import pytest
-from jsonschema import Draft202012Validator
-from support.records import (
+from harness.records import (
     CLOCK,
     EVENT,
     HEADER,
@@ -19,6 +18,7 @@ from support.records import (
     STATUS,
     measurement,
 )
+from jsonschema import Draft202012Validator
 
 from tsgt.master import schema
 from tsgt.recording import encode_line

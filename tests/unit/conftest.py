@@ -2,4 +2,4 @@
 
 from __future__ import annotations
 
-from support.cli import tsgt  # noqa: F401 (a fixture)
+from harness.cli import tsgt  # noqa: F401 (a fixture)

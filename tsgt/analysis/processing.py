@@ -5,18 +5,18 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, Literal
 
-from tsgt.analysis.refusals import EPOCHS_MAX, believed, check_measured, check_span, why_none_is_valid
 from tsgt.analysis.smoothing import smoothed
+from tsgt.analysis.validation import EPOCHS_MAX, believed, check_measured, check_span, why_none_is_valid
 from tsgt.errors import ConfigError, DegenerateGeometryError, RecordingError
+from tsgt.estimation.linear import Pipeline
 from tsgt.geometry import check_layout
-from tsgt.master.pipeline import Pipeline
 from tsgt.model import PolarMeasurement, PrismPosition
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
-    from tsgt.master.pose_batch import PoseBatch
+    from tsgt.estimation.pose_batch import PoseBatch
     from tsgt.model import Matrix4, Measurement, Parameters, TargetResidual, Vector3
     from tsgt.recording import Recording
 

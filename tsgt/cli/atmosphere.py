@@ -14,7 +14,7 @@ from tsgt.cli.status import setting_lines
 from tsgt.errors import InstrumentError, StreamError
 from tsgt.recording import decode, encode_line
 from tsgt.recording.format import MAX_LINE_BYTES, Typed
-from tsgt.station.requests import Answer, AtmosphereRequest
+from tsgt.station.control_socket import Answer, AtmosphereRequest
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 from tsgt.config.client import BridgeInstrumentConfig, LeicaInstrumentConfig
 from tsgt.config.radio import HardwareRadioConfig, SimulatedRadioConfig, SuperframeConfig
-from tsgt.radio.from_config import wiring
-from tsgt.radio.hal import open_hal
 from tsgt.radio.key_file import read_key
-from tsgt.radio.sx127x import SX127x
+from tsgt.radio.planning.from_config import wiring
+from tsgt.radio.sx127x.driver import SX127x
+from tsgt.radio.sx127x.hal import open_hal
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
@@ -37,12 +37,12 @@ def make_instrument(config: InstrumentConfig, clock: Clock) -> Instrument:
     # Each only where it is needed: a client is small, and whoever has no serial port needs no package for one.
     match config:
         case LeicaInstrumentConfig():
-            from tsgt.station.leica import LeicaInstrument  # noqa: PLC0415
-            from tsgt.station.serial_port import open_serial_port  # noqa: PLC0415
+            from tsgt.station.leica.instrument import LeicaInstrument  # noqa: PLC0415
+            from tsgt.station.serial.serial_port import open_serial_port  # noqa: PLC0415
 
             return LeicaInstrument(config, partial(open_serial_port, config.port, clock=clock), clock)
         case BridgeInstrumentConfig():
-            from tsgt.station.bridge import BridgeInstrument  # noqa: PLC0415
+            from tsgt.station.bridge.instrument import BridgeInstrument  # noqa: PLC0415
 
             return BridgeInstrument(config, clock)
 
@@ -68,7 +68,7 @@ def radio_opener(config: RadioConfig, settings: LoRaSettings, clock: Clock) -> O
     config
         What stands under ``[radio]``.
     settings
-        Those of :func:`~tsgt.radio.from_config.lora_settings`.
+        Those of :func:`~tsgt.radio.planning.from_config.lora_settings`.
     clock
         The machine's.
     """
@@ -96,10 +96,10 @@ def _simulated(config: SimulatedRadioConfig, settings: LoRaSettings, clock: Cloc
         # Only here, so that a daemon in the field does not load the simulation.
         import numpy as np  # noqa: PLC0415
 
-        from tsgt.simulation.air_client import AirClient  # noqa: PLC0415
-        from tsgt.simulation.chip import SX1276Chip  # noqa: PLC0415
-        from tsgt.simulation.hal import SimulatedHal  # noqa: PLC0415
-        from tsgt.simulation.timeline import LoopTimeline  # noqa: PLC0415
+        from tsgt.simulation.kernel.timeline import LoopTimeline  # noqa: PLC0415
+        from tsgt.simulation.lora.air_client import AirClient  # noqa: PLC0415
+        from tsgt.simulation.lora.chip import SX1276Chip  # noqa: PLC0415
+        from tsgt.simulation.lora.hal import SimulatedHal  # noqa: PLC0415
 
         timeline = LoopTimeline(asyncio.get_running_loop())
         async with AirClient(config.air_socket, config.name, timeline) as air:

@@ -14,14 +14,14 @@ from tsgt import service
 from tsgt.cli.options import json_option, path_type
 from tsgt.cli.output import CHECK_FAILED, print_json
 from tsgt.clock import SystemClock
-from tsgt.doctor.examination import examine
+from tsgt.doctor.checklist import examine
 from tsgt.doctor.finding import Finding, Outcome
 from tsgt.doctor.machine import Machine, current_user, find_user, free_bytes, group_name, run_command
 from tsgt.log import configure_logging
-from tsgt.radio.hal import open_hal
+from tsgt.radio.sx127x.hal import open_hal
 
 if TYPE_CHECKING:
-    from tsgt.station.port import OpenPort, Port
+    from tsgt.station.serial.base import OpenPort, Port
     from tsgt.station.status import ClientStatus
 
 USUAL = (Path("/etc/tsgt/client.toml"), Path("/etc/tsgt/master.toml"))
@@ -81,17 +81,17 @@ def this_machine() -> Machine:
     clock = SystemClock()
 
     def port_holder(path: Path) -> str | None:
-        from tsgt.station import serial_port  # noqa: PLC0415 (only where there is a line)
+        from tsgt.station.serial import serial_port
 
         return serial_port.port_holder(path)
 
     def latency_timer_ms(path: Path) -> int | None:
-        from tsgt.station import serial_port  # noqa: PLC0415 (as above)
+        from tsgt.station.serial import serial_port
 
         return serial_port.latency_timer_ms(path)
 
     def open_port(path: Path) -> OpenPort:
-        from tsgt.station import serial_port  # noqa: PLC0415 (as above)
+        from tsgt.station.serial import serial_port
 
         async def at(baud: int) -> Port:
             return await serial_port.open_serial_port(path, baud, clock)

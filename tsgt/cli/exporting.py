@@ -9,22 +9,21 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tsgt.analysis.export import measurement_csv, pose_csv, tum_lines, valid_records
-from tsgt.analysis.export_mcap import messages, write_mcap
+from tsgt.analysis.evaluation.reference import read_tum
+from tsgt.analysis.formats.export import measurement_csv, pose_csv, tum_lines, valid_records
+from tsgt.analysis.formats.mcap import messages, write_mcap
 from tsgt.analysis.processing import process
-from tsgt.analysis.reference import read_tum
-from tsgt.cli.desk_input import TUNING, load, progress
 from tsgt.cli.options import keep_going_option, path_type, recording_argument
-from tsgt.cli.recordings import refuse_to_replace, report_problem, write_lines
+from tsgt.cli.recordings import TUNING, load, progress, refuse_to_replace, report_problem, write_lines
 from tsgt.errors import CorruptLineError, RecordingError
-from tsgt.master.stream_records import PoseRecord
 from tsgt.recording import decode_line, read_lines, write_atomically
+from tsgt.recording.stream_records import PoseRecord
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from tsgt.master.stream_records import Kind
     from tsgt.recording import Recording
+    from tsgt.recording.stream_records import Kind
 
 STDOUT = Path("-")
 

@@ -16,10 +16,10 @@ from tsgt.cli.recordings import report_problem
 from tsgt.cli.render import render
 from tsgt.clock import SystemClock
 from tsgt.errors import RecordingError, StreamError
-from tsgt.master.stream import StreamServer
-from tsgt.master.stream_records import HelloRecord
+from tsgt.master.stream_server import StreamServer
 from tsgt.recording import decode, encode_line
 from tsgt.recording.format import MAX_LINE_BYTES, Typed
+from tsgt.recording.stream_records import HelloRecord
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -19,22 +19,22 @@ from tsgt.log import configure_logging
 # Where each command lives. A command's module is imported only when it is called or asked for help, so that
 # `tsgt listen` on a small computer does not load scipy.
 COMMANDS = {
-    "analyse": "tsgt.cli.analyse:analyse",
+    "analyse": "tsgt.cli.analyse.group:analyse",
     "atmosphere": "tsgt.cli.atmosphere:atmosphere",
-    "calibrate": "tsgt.cli.calibrate:calibrate",
+    "calibrate": "tsgt.cli.calibrate.group:calibrate",
     "config": "tsgt.cli.config:config",
-    "demo": "tsgt.cli.demo:demo",
+    "demo": "tsgt.cli.simulate.demo:demo",
     "doctor": "tsgt.cli.doctor:doctor",
-    "evaluate": "tsgt.cli.desk_evaluate:evaluate",
+    "evaluate": "tsgt.cli.desk.evaluate:evaluate",
     "export": "tsgt.cli.exporting:export",
     "import": "tsgt.cli.importing:import_group",
     "listen": "tsgt.cli.live:listen",
     "merge": "tsgt.cli.merge:merge",
-    "process": "tsgt.cli.desk:process",
-    "radio": "tsgt.cli.radio:radio",
+    "process": "tsgt.cli.desk.process:process",
+    "radio": "tsgt.cli.radio.group:radio",
     "replay": "tsgt.cli.live:replay",
     "status": "tsgt.cli.status:status",
-    "simulate": "tsgt.cli.simulate:simulate_command",
+    "simulate": "tsgt.cli.simulate.command:simulate_command",
 }
 
 

@@ -6,7 +6,9 @@ import math
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-from tsgt.master.stream_records import (
+from tsgt.model import PointMeasurement, PolarMeasurement
+from tsgt.recording import decode
+from tsgt.recording.stream_records import (
     PROTOCOL_VERSION,
     ClockRecord,
     EventRecord,
@@ -15,8 +17,6 @@ from tsgt.master.stream_records import (
     StationStatus,
     StatusRecord,
 )
-from tsgt.model import PointMeasurement, PolarMeasurement
-from tsgt.recording import decode
 
 if TYPE_CHECKING:
     from tsgt.model import Row4

@@ -16,10 +16,10 @@ from tsgt.cli.options import DEFAULT_CLIENT_SOCKET, DEFAULT_SOCKET, path_type
 from tsgt.cli.output import CHECK_FAILED, harmless
 from tsgt.cli.render import clock_time
 from tsgt.errors import StreamError
-from tsgt.master.stream_records import HelloRecord, StationStatus, StatusRecord
 from tsgt.model import Status
 from tsgt.recording import decode
 from tsgt.recording.format import MAX_LINE_BYTES, Typed
+from tsgt.recording.stream_records import HelloRecord, StationStatus, StatusRecord
 from tsgt.station.status import ClientStatus
 
 if TYPE_CHECKING:

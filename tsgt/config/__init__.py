@@ -15,8 +15,8 @@ from tsgt.config.files import (
     load_station_latencies,
     load_target_residuals,
 )
+from tsgt.config.instrument_models import KINDS
 from tsgt.config.master import MasterConfig, StationConfig
-from tsgt.config.models import KINDS
 from tsgt.config.parameters import parameters, scenario_parameters
 from tsgt.config.pipeline import PipelineConfig
 from tsgt.config.scenario import MotionConfig, ScenarioConfig

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from tsgt.config.base import Model
-from tsgt.config.models import KINDS, Config
+from tsgt.config.instrument_models import KINDS, Config
 from tsgt.config.setup import PrismLayoutFile, StationFramesFile
 from tsgt.errors import ConfigError
 from tsgt.model import TargetResidual

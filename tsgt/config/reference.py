@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tsgt.config.files import json_schema
-from tsgt.config.models import KINDS
+from tsgt.config.instrument_models import KINDS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tsgt.config import ClientConfig, MasterConfig, load, load_any, parameters
+from tsgt.config.permissions import check_trust
 from tsgt.config.radio import SuperframeConfig
 from tsgt.config.setup import PrismLayoutFile, StationFramesFile
-from tsgt.config.trust import check_trust
 from tsgt.doctor.computer import EARLIEST, is_installed, may_write
 from tsgt.doctor.finding import failed, note, ok, skipped
 from tsgt.errors import ConfigError, GeometryError
-from tsgt.radio.from_config import lora_settings
 from tsgt.radio.key_file import check_access, read_key
+from tsgt.radio.planning.from_config import lora_settings
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from tsgt.clock import Clock
-    from tsgt.radio.hal import Hal, Wiring
-    from tsgt.station.port import OpenPort
+    from tsgt.radio.sx127x.hal import Hal, Wiring
+    from tsgt.station.serial.base import OpenPort
     from tsgt.station.status import ClientStatus
 
 COMMAND_TIMEOUT_S = 5.0

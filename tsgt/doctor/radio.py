@@ -9,12 +9,12 @@ from tsgt.config import MasterConfig
 from tsgt.config.radio import ClassicConfig, ClassicMasterConfig, HardwareRadioConfig, SuperframeMasterConfig
 from tsgt.doctor.finding import failed, note, ok, skipped
 from tsgt.doctor.serial_line import no_right
-from tsgt.radio.from_config import lora_settings, planned_cycle, wiring
-from tsgt.radio.limits import DIPOLE_DBI, Use, exceeded
-from tsgt.radio.plan import Load
-from tsgt.radio.register_access import RegisterAccess
-from tsgt.radio.registers import Register
-from tsgt.radio.sx127x_chip import Chip
+from tsgt.radio.planning.capacity import Load
+from tsgt.radio.planning.from_config import lora_settings, planned_cycle, wiring
+from tsgt.radio.planning.regulations import DIPOLE_DBI, Use, exceeded
+from tsgt.radio.sx127x.chip import Chip
+from tsgt.radio.sx127x.register_io import RegisterAccess
+from tsgt.radio.sx127x.registers import Register
 
 if TYPE_CHECKING:
     from tsgt.config import ClientConfig

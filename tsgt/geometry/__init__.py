@@ -12,7 +12,6 @@ so that a live stream, its replay and later processing agree exactly.
 from __future__ import annotations
 
 from tsgt.geometry.alignment import Alignment, BatchAlignment, align, align_many, align_triplets
-from tsgt.geometry.fixed_lag import FixedLag
 from tsgt.geometry.interpolation import (
     NO_GAP_NS,
     Interpolated,
@@ -21,7 +20,6 @@ from tsgt.geometry.interpolation import (
     interpolated_covariance,
     unseen_s2,
 )
-from tsgt.geometry.knots import Knots, joined
 from tsgt.geometry.polar import (
     cartesian_jacobian,
     cartesian_to_polar,
@@ -39,7 +37,6 @@ from tsgt.geometry.pose import (
     twists,
     unseen_motion_covariance,
 )
-from tsgt.geometry.prism_factors import Observations
 from tsgt.geometry.rigid import (
     FloatArray,
     check_transform,
@@ -53,7 +50,10 @@ from tsgt.geometry.rigid import (
     transform_from,
     transform_points,
 )
-from tsgt.geometry.trajectory import Trajectory, of_point, ros_covariance, with_curvature
+from tsgt.geometry.trajectory.fixed_lag import FixedLag
+from tsgt.geometry.trajectory.measurement_factors import Observations
+from tsgt.geometry.trajectory.query import Trajectory, of_point, ros_covariance, with_curvature
+from tsgt.geometry.trajectory.states import Knots, joined
 
 __all__ = [
     "NO_GAP_NS",

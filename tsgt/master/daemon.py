@@ -1,8 +1,8 @@
 """The master's daemon: radio in, poses out.
 
 One task group holds everything: the radio with its link to the stations, the timer of the poses, the status of each
-second, the disk. What is spoken over the radio is a matter of the link (:mod:`tsgt.master.classic_link`,
-:mod:`tsgt.master.superframe_link`), what leaves the program one of :mod:`tsgt.master.outlet`; here they are connected
+second, the disk. What is spoken over the radio is a matter of the link (:mod:`tsgt.master.classic.link`,
+:mod:`tsgt.master.superframe.link`), what leaves the program one of :mod:`tsgt.master.publisher`; here they are connected
 with radio, socket, disk and time.
 """
 
@@ -21,24 +21,22 @@ from tsgt import service
 from tsgt.clock import UnixTimeline
 from tsgt.config.radio import ClassicMasterConfig
 from tsgt.errors import RadioError, StreamError
-from tsgt.master.alerts import Alerts
-from tsgt.master.classic_link import ClassicLink
-from tsgt.master.disk import Disk
-from tsgt.master.feed import Feed
-from tsgt.master.fence_command import run_fence_command
-from tsgt.master.frame_watch import FrameWatch
-from tsgt.master.geofence import Geofence
-from tsgt.master.monitor import Monitor
-from tsgt.master.outlet import Outlet
-from tsgt.master.reports import Reports
-from tsgt.master.searches import Searches
-from tsgt.master.stream import StreamServer
-from tsgt.master.stream_records import EventRecord, HelloRecord, PoseRecord
-from tsgt.master.superframe_link import SuperframeLink
-from tsgt.radio.supervised import keep_radio
+from tsgt.estimation.live import Feed
+from tsgt.master.classic.link import ClassicLink
+from tsgt.master.geofence import Geofence, run_fence_command
+from tsgt.master.layout_monitor import FrameWatch
+from tsgt.master.publisher import Outlet, Reports
+from tsgt.master.reacquisition_hints import Searches
+from tsgt.master.recording_thread import Disk
+from tsgt.master.station_events import Alerts
+from tsgt.master.statistics import Monitor
+from tsgt.master.stream_server import StreamServer
+from tsgt.master.superframe.link import SuperframeLink
+from tsgt.radio.supervisor import keep_radio
 from tsgt.recording import RecordingHeader, RecordingWriter, encode_line
 from tsgt.recording.files import new_recording_path
 from tsgt.recording.recorder import Recorder
+from tsgt.recording.stream_records import EventRecord, HelloRecord, PoseRecord
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable, Sequence
@@ -46,10 +44,10 @@ if TYPE_CHECKING:
     from tsgt.clock import Clock
     from tsgt.config import MasterConfig
     from tsgt.config.master import FrameWatchConfig, GeofenceConfig
-    from tsgt.master.outlet import Watcher
-    from tsgt.master.stream_records import StatusRecord
+    from tsgt.master.publisher import Watcher
     from tsgt.model import Measurement, Parameters
     from tsgt.radio.base import LoRaSettings, OpenRadio, Radio
+    from tsgt.recording.stream_records import StatusRecord
 
 STATUS_PERIOD_NS = 1_000_000_000
 

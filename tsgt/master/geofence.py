@@ -3,22 +3,30 @@
 Pure: poses and instants come in, events go out. A fence is armed by the first valid pose. From then on the robot
 counts as gone in two cases, each of which is enough: its position, at as many standard deviations as configured,
 lies on the wrong side of the boundary; or nobody has known for a while where it is.
+
+Runs the command that a geo-fence is configured with.
 """
 
 from __future__ import annotations
 
+import asyncio
 import math
+import os
+import signal
+from contextlib import suppress
 from typing import TYPE_CHECKING, Protocol
 
-from tsgt.master.stream_records import EventRecord
+import structlog
+
 from tsgt.polygon import contains, distance_to_edge, edges
+from tsgt.recording.stream_records import EventRecord
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from tsgt.master.stream_records import PoseRecord
     from tsgt.model import Measurement
     from tsgt.polygon import Point
+    from tsgt.recording.stream_records import PoseRecord
 
 
 class FenceSettings(Protocol):
@@ -145,3 +153,58 @@ class Geofence:
     def _event(now_ns: int, event: str, message: str) -> EventRecord:
         # Stamped when it is noticed, not with the pose: a replay puts it after the poses that were due by then.
         return EventRecord(stamp_ns=now_ns, event=event, message=message)
+
+
+TIMEOUT_S = 10.0
+"""How long it may take before it is killed, with what it has started."""
+
+KILL_TIMEOUT_S = 0.5
+"""How long is waited for it to be gone then: one that may not be killed must not keep the master from ending."""
+
+log = structlog.get_logger()
+
+
+async def run_fence_command(command: Sequence[str], *, event: str, fence: str) -> None:
+    """Run a command at a crossing; what becomes of it is told in the log, and nowhere else.
+
+    Parameters
+    ----------
+    command
+        Program and arguments.
+    event, fence
+        Put into its environment as ``TSGT_EVENT`` and ``TSGT_FENCE``.
+    """
+    problem = await _problem(command, os.environ | {"TSGT_EVENT": event, "TSGT_FENCE": fence})
+    if problem:
+        log.error("fence_command_failed", fence=fence, command=command[0], error=problem)
+    else:
+        log.info("fence_command_done", fence=fence, command=command[0])
+
+
+async def _problem(command: Sequence[str], environment: dict[str, str]) -> str:
+    """Run it; say what went wrong, or nothing."""
+    environment.pop("NOTIFY_SOCKET", None)  # it is not a part of the service, and must not speak for it
+    try:
+        process = await asyncio.create_subprocess_exec(
+            *command,
+            env=environment,
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.DEVNULL,
+            start_new_session=True,
+        )
+    except (OSError, ValueError) as error:  # ValueError: a zero byte among the arguments
+        return f"cannot be started ({error})"
+    try:
+        async with asyncio.timeout(TIMEOUT_S):
+            status = await process.wait()
+    except TimeoutError:
+        return f"killed after {TIMEOUT_S:g} s"
+    else:
+        return f"exit status {status}" if status else ""
+    finally:
+        if process.returncode is None:
+            with suppress(ProcessLookupError, PermissionError):  # it may have become another user's
+                os.killpg(process.pid, signal.SIGKILL)
+            with suppress(TimeoutError):
+                async with asyncio.timeout(KILL_TIMEOUT_S):
+                    await process.wait()

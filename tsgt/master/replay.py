@@ -6,17 +6,17 @@ import math
 from typing import TYPE_CHECKING
 
 from tsgt.errors import CorruptLineError, RecordingError
-from tsgt.master.feed import Feed
-from tsgt.master.stream_records import BeaconRecord, ClockRecord, EventRecord, StatusRecord
+from tsgt.estimation.live import Feed
 from tsgt.model import Measurement, Parameters, PointMeasurement, PolarMeasurement
 from tsgt.recording import decode_line, encode_line, read_lines
+from tsgt.recording.stream_records import BeaconRecord, ClockRecord, EventRecord, StatusRecord
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from tsgt.clock import Clock
-    from tsgt.master.stream import StreamServer
+    from tsgt.master.stream_server import StreamServer
     from tsgt.recording import Line
 
 # What came from outside; headers and parameters are not on the stream.

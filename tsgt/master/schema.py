@@ -14,17 +14,6 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from tsgt.master.stream_records import (
-    PROTOCOL_VERSION,
-    BeaconRecord,
-    ClockRecord,
-    EventRecord,
-    HelloRecord,
-    PoseRecord,
-    StationShare,
-    StationStatus,
-    StatusRecord,
-)
 from tsgt.model import (
     ClockSample,
     InstrumentNoise,
@@ -46,6 +35,17 @@ from tsgt.recording.journal import (
     TargetRecord,
 )
 from tsgt.recording.merged import MergedRecord
+from tsgt.recording.stream_records import (
+    PROTOCOL_VERSION,
+    BeaconRecord,
+    ClockRecord,
+    EventRecord,
+    HelloRecord,
+    PoseRecord,
+    StationShare,
+    StationStatus,
+    StatusRecord,
+)
 
 Line = (
     HelloRecord

@@ -13,9 +13,9 @@ import secrets
 import stat
 from typing import TYPE_CHECKING
 
-from tsgt.config.trust import check_trust
+from tsgt.config.permissions import check_trust
 from tsgt.errors import ConfigError, OutputFileError
-from tsgt.radio.authentication import KEY_BYTES
+from tsgt.radio.superframe.wire.authentication import KEY_BYTES
 from tsgt.recording.files import sync_folder
 
 if TYPE_CHECKING:

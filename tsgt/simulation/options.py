@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from tsgt.config.radio import SuperframeMasterConfig
 from tsgt.errors import ConfigError
-from tsgt.simulation.faults import FaultKind  # noqa: TC001
+from tsgt.simulation.faults.catalogue import FaultKind  # noqa: TC001
 
 if TYPE_CHECKING:
     from tsgt.config.radio import ClassicMasterConfig
@@ -113,7 +113,7 @@ class Options:
     drift_ppm
         Of the stations' clocks against the master's: plus this for the first, minus this for the second, and so on.
     drift_ramp_ppm_per_min
-        By how much that drift grows, and falls again, see :func:`~tsgt.simulation.clocks.ramped`; signs in turn as well.
+        By how much that drift grows, and falls again, see :func:`~tsgt.simulation.kernel.clocks.ramped`; signs in turn as well.
     stamp_jitter_us
         One sigma of what every computer's stamp of an interrupt of its radio is off by, in us, besides the chip's own
         3 us.

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import structlog
 
 from tsgt.model import PolarMeasurement
-from tsgt.radio.inbox import KNOWN_LINEAGES
-from tsgt.radio.message_codec import angle_code
-from tsgt.radio.messages import RESTART_SKIP
-from tsgt.radio.outbox import Queued
-from tsgt.radio.station_session import Reception
+from tsgt.radio.superframe.receive_window import KNOWN_LINEAGES
+from tsgt.radio.superframe.send_queue import Queued
+from tsgt.radio.superframe.session import Reception
+from tsgt.radio.superframe.wire.codec import angle_code
+from tsgt.radio.superframe.wire.messages import RESTART_SKIP
 from tsgt.recording import decode
 from tsgt.recording.format import MAX_LINE_BYTES, Typed
 from tsgt.recording.journal import AcknowledgedRecord, JournalRecord, ReceptionRecord

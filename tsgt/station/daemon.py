@@ -15,24 +15,23 @@ import tsgt
 from tsgt import service
 from tsgt.clock import UnixTimeline
 from tsgt.errors import RecordingError
-from tsgt.radio.authentication import Authenticator
-from tsgt.radio.conversation import Situation
-from tsgt.radio.orders import MeasureOrder, Order
-from tsgt.radio.outbox import Outbox
-from tsgt.radio.superframe_station import SuperframeStation
-from tsgt.radio.supervised import keep_radio
+from tsgt.radio.commands import MeasureOrder, Order
+from tsgt.radio.superframe.command_exchange import Situation
+from tsgt.radio.superframe.send_queue import Outbox
+from tsgt.radio.superframe.station import SuperframeStation
+from tsgt.radio.superframe.wire.authentication import Authenticator
+from tsgt.radio.supervisor import keep_radio
 from tsgt.recording import RecordingHeader, RecordingWriter, decode, encode_line, new_recording_path
 from tsgt.recording.journal import InstrumentRecord, JournalRecord
 from tsgt.recording.recorder import Recorder
 from tsgt.station.backlog import LINEAGE_BITS, Backlog, read_backlog
-from tsgt.station.classic_link import ClassicLink
+from tsgt.station.control_socket import Answer, AtmosphereRequest, StatusSocket
 from tsgt.station.instrument import Atmosphere
+from tsgt.station.instrument_supervisor import Done, InstrumentKeeper
 from tsgt.station.journal import PATIENCE_S, JournalQueue
-from tsgt.station.keeper import Done, InstrumentKeeper
-from tsgt.station.requests import Answer, AtmosphereRequest
+from tsgt.station.links.classic import ClassicLink
+from tsgt.station.links.superframe import SuperframeLink
 from tsgt.station.session import Session
-from tsgt.station.status_socket import StatusSocket
-from tsgt.station.superframe_link import SuperframeLink
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
@@ -43,7 +42,7 @@ if TYPE_CHECKING:
     from tsgt.config import ClientConfig
     from tsgt.radio.base import LoRaSettings, OpenRadio, Radio
     from tsgt.station.instrument import Instrument, Reading
-    from tsgt.station.link import Link
+    from tsgt.station.links.base import Link
     from tsgt.station.status import ClientStatus
 
 _SKIP_BITS = 22

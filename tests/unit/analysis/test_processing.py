@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from support.scene import START, driving, standing_scene
+from harness.scene import START, driving, standing_scene
 
 from tsgt.analysis.processing import has_raw_angles, process, with_frames, with_layout
 from tsgt.errors import ConfigError, RecordingError

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from support.cli import called
-from support.harmless import Files, check
-from support.published import write_prisms, write_targets, write_tracks
+from harness.cli import called
+from harness.harmless import Files, check
+from harness.published import write_prisms, write_targets, write_tracks
 
 if TYPE_CHECKING:
-    from support.cli import Tsgt
+    from harness.cli import Tsgt
 
 ROOT = Path(__file__).parents[3]
 CONFIGS = ROOT / "configs"

@@ -12,13 +12,13 @@ import pytest
 
 from tsgt.recording import encode_line
 from tsgt.recording.journal import InstrumentRecord
-from tsgt.station.requests import Answer
+from tsgt.station.control_socket import Answer
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from support.cli import Tsgt
+    from harness.cli import Tsgt
 
 STATUS = b'{"type":"client_status"}'
 SETTINGS = InstrumentRecord(

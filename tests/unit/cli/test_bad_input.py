@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from support.published import write_prisms, write_targets, write_tracks
-from support.scene import LAYOUT
+from harness.published import write_prisms, write_targets, write_tracks
+from harness.scene import LAYOUT
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from harness.cli import Tsgt
     from numpy.typing import NDArray
-    from support.cli import Tsgt
 
 TRACK_EDITS: dict[str, tuple[Callable[[list[str]], list[str]], str]] = {
     "empty file": (lambda _: [], "holds no positions"),

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from support.cli import tsgt  # noqa: F401 (a fixture)
+from harness.cli import tsgt  # noqa: F401 (a fixture)
 
 from tsgt.config import KINDS, json_schema
 
 if TYPE_CHECKING:
-    from support.cli import Tsgt
+    from harness.cli import Tsgt
 
 EXAMPLES = Path(__file__).parents[3] / "configs"
 

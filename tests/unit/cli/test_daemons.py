@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from click.testing import CliRunner
-from support.made_up_machine import MadeUpMachine
+from harness.made_up_machine import MadeUpMachine
 
 from tsgt.cli.daemons import client, master
 from tsgt.errors import ConfigError

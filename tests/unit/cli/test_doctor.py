@@ -7,7 +7,7 @@ import socket
 from typing import TYPE_CHECKING
 
 import pytest
-from support.made_up_machine import ADAPTER, MadeUpMachine
+from harness.made_up_machine import ADAPTER, MadeUpMachine
 
 from tsgt.cli import doctor
 from tsgt.cli.doctor import this_machine
@@ -15,7 +15,7 @@ from tsgt.cli.doctor import this_machine
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from support.cli import Tsgt
+    from harness.cli import Tsgt
 
 
 @pytest.fixture

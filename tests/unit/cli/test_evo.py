@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from support.published import write_prisms, write_tracks
-from support.scene import LAYOUT
+from harness.published import write_prisms, write_tracks
+from harness.scene import LAYOUT
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from support.cli import Tsgt
+    from harness.cli import Tsgt
 
 
 @pytest.mark.parametrize("estimator", ["linear", "continuous"])

@@ -8,15 +8,15 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from harness.records import EVENT, NO_POSE, POSE, START, measurement, recording_bytes
 from rosbags.highlevel import AnyReader
-from support.records import EVENT, NO_POSE, POSE, START, measurement, recording_bytes
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from support.cli import Outcome, Tsgt
+    from harness.cli import Outcome, Tsgt
 
-    from tsgt.master.stream_records import Kind, PoseRecord
+    from tsgt.recording.stream_records import Kind, PoseRecord
 
 PERIOD_NS = 50_000_000
 

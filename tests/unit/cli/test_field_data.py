@@ -11,7 +11,7 @@ import pytest
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from support.cli import Tsgt
+    from harness.cli import Tsgt
 
 
 class Expected(NamedTuple):

@@ -6,14 +6,14 @@ import json
 from typing import TYPE_CHECKING
 
 import pytest
-from support.published import write_prisms, write_targets, write_tracks
+from harness.published import write_prisms, write_targets, write_tracks
 
 from tsgt.recording import load_recording
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from support.cli import Tsgt
+    from harness.cli import Tsgt
 
 
 @pytest.fixture

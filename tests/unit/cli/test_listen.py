@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from support.records import EVENT, HELLO, NO_POSE, POINT, POSE, STATUS, measurement
+from harness.records import EVENT, HELLO, NO_POSE, POINT, POSE, STATUS, measurement
 
 from tsgt.recording import encode_line
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from support.cli import Tsgt
+    from harness.cli import Tsgt
 
 LINES = [encode_line(record) for record in (HELLO, measurement(0), POINT, POSE, NO_POSE, STATUS, EVENT)]
 

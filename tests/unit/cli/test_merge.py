@@ -6,15 +6,15 @@ import json
 from typing import TYPE_CHECKING
 
 import pytest
-from support.merging import journals, recording
-from support.missions import mission
+from harness.merging import journals, recording
+from harness.missions import mission
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from support.cli import Tsgt
+    from harness.cli import Tsgt
 
-    from tsgt.simulation.scenario import Run
+    from tsgt.simulation.mission.runner import Run
 
 
 @pytest.fixture(scope="module")

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from harness.records import CLOCK, EVENT, STATUS, measurement
 from scipy.spatial.transform import Rotation
-from support.records import CLOCK, EVENT, STATUS, measurement
 
 from tsgt.cli.render import render, yaw_pitch_roll_deg
 from tsgt.recording import encode_line

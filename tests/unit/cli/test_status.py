@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tsgt.cli.status import client_text, duration, master_text, station_word
-from tsgt.master.stream_records import HelloRecord, StationStatus, StatusRecord
 from tsgt.model import Status
 from tsgt.recording import encode_line
 from tsgt.recording.journal import InstrumentRecord
+from tsgt.recording.stream_records import HelloRecord, StationStatus, StatusRecord
 from tsgt.station.status import ClientStatus, LastMeasurement
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from support.cli import Tsgt
+    from harness.cli import Tsgt
 
 NOW_NS = 1_700_000_000_000_000_000
 WIDTH = 40

@@ -6,7 +6,7 @@ import os
 from typing import TYPE_CHECKING
 
 import pytest
-from support.made_up_machine import MadeUpMachine
+from harness.made_up_machine import MadeUpMachine
 
 from tsgt.doctor.finding import Outcome
 from tsgt.doctor.machine import User, current_user, find_user, group_name, run_command

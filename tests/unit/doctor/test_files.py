@@ -6,7 +6,7 @@ import os
 from typing import TYPE_CHECKING
 
 import pytest
-from support.made_up_machine import NOW_NS, MadeUpMachine
+from harness.made_up_machine import NOW_NS, MadeUpMachine
 
 from tsgt.doctor.finding import Outcome
 from tsgt.doctor.machine import User

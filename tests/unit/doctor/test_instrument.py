@@ -6,25 +6,25 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from support.made_up_machine import NOW_NS, MadeUpMachine
-from support.radios import running_timeline
+from harness.made_up_machine import NOW_NS, MadeUpMachine
+from harness.radios import running_timeline
 
 from tsgt.config import ScenarioConfig
 from tsgt.config.client import LeicaInstrumentConfig
 from tsgt.doctor.finding import Outcome
 from tsgt.doctor.instrument import judge_identity
 from tsgt.errors import InstrumentError, StreamError
-from tsgt.simulation.clocks import VirtualClock
-from tsgt.simulation.serial_line import SimulatedLine
-from tsgt.simulation.total_station import SimulatedTotalStation
+from tsgt.simulation.instrument.serial_line import SimulatedLine
+from tsgt.simulation.instrument.total_station import SimulatedTotalStation
+from tsgt.simulation.kernel.clocks import VirtualClock
 from tsgt.simulation.world import scenario_world
-from tsgt.station.leica_identity import Identity
+from tsgt.station.leica.identity import Identity
 from tsgt.station.status import ClientStatus
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tsgt.station.port import Port
+    from tsgt.station.serial.base import Port
 
 NAMES = ("instrument", "licence", "battery", "level")
 

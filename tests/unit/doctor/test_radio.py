@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from support.made_up_machine import MadeUpMachine
+from harness.made_up_machine import MadeUpMachine
 
 from tsgt.doctor.finding import Outcome
 from tsgt.doctor.machine import User

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import pytest
-from support.made_up_machine import ADAPTER, MadeUpMachine
+from harness.made_up_machine import ADAPTER, MadeUpMachine
 
 from tsgt.doctor.finding import Outcome
 from tsgt.doctor.machine import User

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from tsgt.geometry import exp_so3, log_so3, rotate, skew
-from tsgt.geometry.so3 import apply, cross, exp_and_right_jacobian, inverse_right_jacobian, log_of_steps
+from tsgt.geometry.rigid import apply, cross, exp_and_right_jacobian, inverse_right_jacobian, log_of_steps
 
 AXES = [(1.0, 0.0, 0.0), (0.6, 0.0, -0.8), (-2 / 3, 1 / 3, 2 / 3)]
 ANGLES_RAD = [0.0, 1e-300, 1e-12, 1e-6, 9.9e-3, 1.01e-2, 0.3, 2.0, 3.1]

@@ -11,26 +11,26 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from support.field import STATIONS, TRUE, field_of, running
-from support.radios import PAPER
-from support.scene import START, driving, standing_scene
+from harness.field import STATIONS, TRUE, field_of, running
+from harness.radios import PAPER
+from harness.scene import START, driving, standing_scene
 
 from tsgt.config.master import GeofenceConfig
 from tsgt.errors import RadioError
 from tsgt.geometry import rotation_from_quaternion
-from tsgt.master.fence_command import run_fence_command
+from tsgt.master.geofence import run_fence_command
 from tsgt.master.replay import replayed
-from tsgt.master.stream_records import ClockRecord, EventRecord, PoseRecord, StatusRecord
 from tsgt.model import PolarMeasurement, Status
 from tsgt.recording import encode_line, read_lines
+from tsgt.recording.stream_records import ClockRecord, EventRecord, PoseRecord, StatusRecord
 from tsgt.service import run
-from tsgt.simulation.radios import opener
+from tsgt.simulation.lora.radios import opener
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
     from pathlib import Path
 
-    from support.field import Field
+    from harness.field import Field
 
     from tsgt.radio.base import Radio, Transmitted
 

@@ -7,15 +7,15 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
-from support.records import EVENT, HEADER
-from support.scene import START, standing_scene
+from harness.records import EVENT, HEADER
+from harness.scene import START, standing_scene
 
 from tsgt.errors import CorruptLineError, RecordingError
-from tsgt.master.feed import Feed
+from tsgt.estimation.live import Feed
 from tsgt.master.replay import replay, replayed
-from tsgt.master.stream import StreamServer
+from tsgt.master.stream_server import StreamServer
 from tsgt.recording import RecordingWriter, encode_line
-from tsgt.simulation.clocks import VirtualClock
+from tsgt.simulation.kernel.clocks import VirtualClock
 
 if TYPE_CHECKING:
     from pathlib import Path

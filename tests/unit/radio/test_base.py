@@ -3,7 +3,7 @@ from __future__ import annotations
 from dataclasses import asdict
 
 import pytest
-from support.radios import PAPER
+from harness.radios import PAPER
 
 from tsgt.errors import RadioSettingsError
 from tsgt.radio.base import LoRaSettings

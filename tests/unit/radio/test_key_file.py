@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from tsgt.errors import ConfigError, OutputFileError
-from tsgt.radio.authentication import KEY_BYTES
 from tsgt.radio.key_file import read_key, write_key
+from tsgt.radio.superframe.wire.authentication import KEY_BYTES
 
 
 @pytest.fixture

@@ -5,10 +5,10 @@ from contextlib import aclosing, asynccontextmanager
 from typing import TYPE_CHECKING
 
 import pytest
-from support.plain_radio import AIRTIME_NS, PlainRadio
+from harness.plain_radio import AIRTIME_NS, PlainRadio
 
 from tsgt.radio.ping import Answer, Exchange, Strength, answer, ping, summarise, summarise_answers
-from tsgt.simulation.clocks import VirtualClock
+from tsgt.simulation.kernel.clocks import VirtualClock
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable

@@ -4,7 +4,7 @@ import json
 import math
 
 import pytest
-from support.records import CLOCK, EVENT, HEADER, HELLO, NO_POSE, PARAMETERS, POINT, POSE, STATUS, measurement
+from harness.records import CLOCK, EVENT, HEADER, HELLO, NO_POSE, PARAMETERS, POINT, POSE, STATUS, measurement
 
 from tsgt.model import PointMeasurement, PolarMeasurement
 from tsgt.recording import decode, encode_line

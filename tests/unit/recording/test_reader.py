@@ -4,7 +4,7 @@ import json
 from typing import TYPE_CHECKING
 
 import pytest
-from support.records import (
+from harness.records import (
     EVENT,
     HEADER,
     NO_POSE,

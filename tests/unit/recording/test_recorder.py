@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import pytest
+from harness.records import HEADER
 from structlog.testing import capture_logs
-from support.records import HEADER
 
 from tsgt.errors import RecordingError
 from tsgt.recording import RecordingWriter, encode_line

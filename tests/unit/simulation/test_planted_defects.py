@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from support.defects import Planting
+from harness.defects import Planting
 
 if TYPE_CHECKING:
     from types import ModuleType

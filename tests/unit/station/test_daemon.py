@@ -9,15 +9,15 @@ from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from harness.client import OFFSET_NS, SCENARIO, START_NS, client_config, field_day
+from harness.radios import PAPER
+from harness.shots import ScriptedInstrument
 from structlog.testing import capture_logs
-from support.client import OFFSET_NS, SCENARIO, START_NS, client_config, field_day
-from support.radios import PAPER
-from support.shots import ScriptedInstrument
 
 from tsgt.config.scenario import StatusFaultConfig
 from tsgt.errors import RadioError, RecordingError, StreamError
 from tsgt.model import Status
-from tsgt.radio.classic_messages import Acknowledgement, MeasurementMessage, PingReply, TimeReply
+from tsgt.radio.classic.messages import Acknowledgement, MeasurementMessage, PingReply, TimeReply
 from tsgt.recording import RecordingWriter, read_lines
 from tsgt.recording.journal import load_journal
 from tsgt.station.daemon import run_client

@@ -7,11 +7,11 @@ from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
 import pytest
+from harness.client import client_config
+from harness.leica import LeicaBench, leica_bench
+from harness.radios import PAPER
 from structlog.testing import capture_logs
-from support.client import client_config
-from support.leica import LeicaBench, leica_bench
-from support.radios import PAPER
-from unit.station.test_status_socket import WARM, journalled, no_radio, talk
+from unit.station.test_control_socket import WARM, journalled, no_radio, talk
 
 from tsgt.recording.journal import load_journal
 from tsgt.station.daemon import run_client

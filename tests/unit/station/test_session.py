@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from tsgt.model import PolarMeasurement, Status
-from tsgt.radio.orders import DirectOrder, MeasureOrder, SearchOrder, TrackOrder
+from tsgt.radio.commands import DirectOrder, MeasureOrder, SearchOrder, TrackOrder
 from tsgt.recording.journal import InstrumentRecord
 from tsgt.station.instrument import Condition, Reading
 from tsgt.station.session import Session

@@ -7,26 +7,26 @@ from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING
 
 import pytest
+from harness.client import START_NS, field_day
+from harness.hand_master import KEY, TIMING, HandMaster
+from harness.radios import MS
 from structlog.testing import capture_logs
-from support.client import START_NS, field_day
-from support.hand_master import KEY, TIMING, HandMaster
-from support.radios import MS
 from unit.station.test_daemon import asked
 
 from tsgt.clock import UnixTimeline
 from tsgt.config.radio import SuperframeConfig
 from tsgt.errors import RecordingError
-from tsgt.radio.messages import RESTART_SKIP, AnswerPart, OrderPart
+from tsgt.radio.superframe.wire.messages import RESTART_SKIP, AnswerPart, OrderPart
 from tsgt.recording import RecordingWriter, read_lines
 from tsgt.recording.journal import load_journal
-from tsgt.simulation.clocks import VirtualClock
+from tsgt.simulation.kernel.clocks import VirtualClock
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Sequence
     from pathlib import Path
 
-    from support.client import Field
-    from support.hand_master import Answered
+    from harness.client import Field
+    from harness.hand_master import Answered
 
     from tsgt.model import PolarMeasurement
 

@@ -1,0 +1,243 @@
+"""Bridge programs in memory: one that says what a test wants, and one that serves any instrument."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+from tsgt.errors import InstrumentError
+from tsgt.radio.commands import Direction
+from tsgt.station.instrument import Atmosphere
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from tsgt.clock import Clock
+    from tsgt.station.bridge.process import Listener
+    from tsgt.station.instrument import Instrument, Reading
+
+HELLO = {"type": "hello", "bridge": 1, "make": "Fake", "stamps": "host"}
+COMMANDS = ["track", "direct", "measure", "atmosphere"]
+
+
+class FakeProgram:
+    """A program that says what it is made to say, and answers ``done`` to every command unless told otherwise.
+
+    Attributes
+    ----------
+    commands
+        What it has been told.
+    on_command
+        Answers a command.
+    ended
+        Whether it has been ended.
+    """
+
+    def __init__(self, listener: Listener, clock: Clock) -> None:
+        self._listener = listener
+        self._clock = clock
+        self.commands: list[dict[str, Any]] = []
+        self.on_command: Callable[[dict[str, Any]], None] = self.done
+        self.ended = False
+
+    def say(self, *records: dict[str, Any] | bytes) -> None:
+        """Print lines, all at once."""
+        self.print(b"".join(_line(record) + b"\n" for record in records))
+
+    def print(self, data: bytes) -> None:
+        """Print bytes."""
+        if not self.ended:
+            self._listener.said(data, self._clock.monotonic_ns())
+
+    def measure(self, distance_m: float = 10.0, **more: Any) -> None:
+        """Print a measurement that was made just now."""
+        self.say(self.measurement(distance_m, **more))
+
+    def measurement(self, distance_m: float = 10.0, **more: Any) -> dict[str, Any]:
+        """Make the line of a measurement that was made just now."""
+        now_ns = self._clock.monotonic_ns()
+        return measured(distance_m, host_time_ns=now_ns) | more
+
+    def done(self, command: dict[str, Any], error: str = "") -> None:
+        """Say that a command was carried out, or not."""
+        self.say({"type": "done", "id": command["id"], "error": error})
+
+    def exit(self, how: str = "exit status 1") -> None:
+        """End."""
+        self.ended = True
+        self._listener.ended(how)
+
+    # --- Program ----------------------------------------------------------------------------------------------
+
+    def write(self, data: bytes) -> None:
+        """Take commands."""
+        for line in data.splitlines():
+            command = json.loads(line)
+            self.commands.append(command)
+            self.on_command(command)
+
+    def kill(self) -> None:
+        """End."""
+        self.ended = True
+
+    async def end(self) -> None:
+        """End."""
+        self.ended = True
+
+
+class FakeStart:
+    """Starts fake programs.
+
+    Parameters
+    ----------
+    clock
+        Theirs.
+    first_words
+        What each says at once.
+
+    Attributes
+    ----------
+    programs
+        Those that were started.
+    """
+
+    def __init__(self, clock: Clock, *first_words: dict[str, Any] | bytes) -> None:
+        self._clock = clock
+        self._first_words = first_words
+        self.programs: list[FakeProgram] = []
+
+    async def __call__(self, command: Sequence[str], listener: Listener) -> FakeProgram:
+        """Start one."""
+        del command
+        program = FakeProgram(listener, self._clock)
+        self.programs.append(program)
+        program.say(*self._first_words)
+        return program
+
+
+class ServedInstrument:
+    """A program that serves an instrument, as a program with a maker's library would.
+
+    Parameters
+    ----------
+    instrument
+        What it serves.
+    """
+
+    def __init__(self, instrument: Instrument, clock: Clock) -> None:
+        self._instrument = instrument
+        self._clock = clock
+
+    async def __call__(self, command: Sequence[str], listener: Listener) -> _Serving:
+        """Start it; a StartProgram."""
+        del command
+        return _Serving(self._instrument, listener, self._clock)
+
+
+class _Serving:
+    """It runs."""
+
+    def __init__(self, instrument: Instrument, listener: Listener, clock: Clock) -> None:
+        self._instrument = instrument
+        self._listener = listener
+        self._clock = clock
+        self._commands: asyncio.Queue[bytes] = asyncio.Queue()
+        self._reading: asyncio.Task[None] | None = None
+        self._task = asyncio.create_task(self._run())
+
+    def write(self, data: bytes) -> None:
+        """Take a command."""
+        self._commands.put_nowait(data)
+
+    def kill(self) -> None:
+        """End."""
+        self._task.cancel()
+
+    async def end(self) -> None:
+        """End."""
+        self._task.cancel()
+        await asyncio.wait([self._task])
+
+    async def _run(self) -> None:
+        try:
+            name = await self._instrument.connect()
+            self._say(HELLO | {"make": name, "commands": COMMANDS})
+            while True:
+                command = json.loads(await self._commands.get())
+                if command["type"] != "atmosphere":
+                    await self._stop()
+                await self._do(command)
+        except InstrumentError as error:
+            self._listener.ended(f"exit status 1: {error}")
+        finally:
+            await self._stop()
+            await self._instrument.close()
+
+    async def _do(self, command: dict[str, Any]) -> None:
+        instrument, tracked = self._instrument, False
+        try:
+            match command:
+                case {"type": "track", "prism": prism, "towards": None}:
+                    await instrument.track(prism)
+                    tracked = True
+                case {"type": "track", "prism": prism, "towards": towards}:
+                    await instrument.track(prism, Direction(**towards))
+                    tracked = True
+                case {"type": "direct"}:
+                    await instrument.direct()
+                case {"type": "measure", "id": number}:
+                    shot = _fields(await instrument.measure())
+                    self._say({"type": "shot", "id": number} | shot)
+                    return
+                case {"type": "atmosphere", "temperature_c": temperature_c, "pressure_hpa": pressure_hpa}:
+                    await instrument.set_atmosphere(
+                        Atmosphere(temperature_c=temperature_c, pressure_hpa=pressure_hpa)
+                    )
+        except InstrumentError as error:
+            self._say({"type": "done", "id": command["id"], "error": str(error)})
+            return
+        self._say({"type": "done", "id": command["id"]})
+        if tracked:
+            self._reading = asyncio.create_task(self._read())
+
+    async def _read(self) -> None:
+        try:
+            while True:
+                reading = await self._instrument.read()
+                self._say({"type": "measurement", "prism": reading.prism} | _fields(reading))
+        except InstrumentError as error:
+            self._listener.ended(f"exit status 1: {error}")
+
+    async def _stop(self) -> None:
+        task, self._reading = self._reading, None
+        if task is not None:
+            task.cancel()
+            with suppress(asyncio.CancelledError):
+                await task
+
+    def _say(self, record: dict[str, Any]) -> None:
+        self._listener.said(_line(record) + b"\n", self._clock.monotonic_ns())
+
+
+def measured(distance_m: float = 10.0, **more: Any) -> dict[str, Any]:
+    """Make the line of a measurement."""
+    values = {"horizontal_angle_rad": 1.0, "zenith_angle_rad": 1.5, "slope_distance_m": distance_m}
+    return {"type": "measurement", "status": "ok"} | values | more
+
+
+def _fields(reading: Reading) -> dict[str, Any]:
+    return {
+        "horizontal_angle_rad": reading.horizontal_angle_rad,
+        "zenith_angle_rad": reading.zenith_angle_rad,
+        "slope_distance_m": reading.slope_distance_m,
+        "status": reading.status,
+        "raw_status": reading.raw_status,
+        "host_time_ns": reading.at_ns,
+        "instrument_time_ns": reading.instrument_time_ns,
+    }
+
+
+def _line(record: dict[str, Any] | bytes) -> bytes:
+    return record if isinstance(record, bytes) else json.dumps(record).encode()

@@ -1,0 +1,184 @@
+"""A station's client between a simulated total station and a master that a test plays, on virtual time."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from harness.radios import PAPER, make_side, running_timeline
+
+from tsgt.config import ClientConfig, ScenarioConfig
+from tsgt.config.client import JournalConfig, LeicaInstrumentConfig
+from tsgt.config.radio import ClassicConfig, SimulatedRadioConfig
+from tsgt.radio.classic.messages import MeasurementMessage, decode_reply
+from tsgt.recording.journal import load_journal
+from tsgt.simulation.instrument.serial_line import SimulatedLine
+from tsgt.simulation.instrument.total_station import SimulatedTotalStation
+from tsgt.simulation.kernel.clocks import DriftingClock, VirtualClock
+from tsgt.simulation.lora.air import Air
+from tsgt.simulation.lora.link import LinkModel
+from tsgt.simulation.lora.radios import opener
+from tsgt.simulation.mission.mission import instrument_config
+from tsgt.simulation.mission.run_log import WatchedInstrument
+from tsgt.simulation.world import scenario_world
+from tsgt.station.daemon import run_client
+from tsgt.station.leica.instrument import LeicaInstrument
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator
+    from pathlib import Path
+
+    from harness.radios import Side
+
+    from tsgt.config.radio import ProtocolConfig
+    from tsgt.model import PolarMeasurement
+    from tsgt.radio.base import OpenRadio
+    from tsgt.radio.classic.messages import Reply
+    from tsgt.station.instrument import Reading
+
+START_NS = 1_700_000_000_000_000_000
+OFFSET_NS = -3_600_000_000_000
+"""The station's computer believes that it is an hour earlier."""
+
+SCENARIO = ScenarioConfig(targets_m=((20.0, 5.0, 0.5), (0.5, 0.0, 0.0)))
+
+
+def client_config(
+    folder: Path, *, station: int = 1, prism: int = 1, protocol: ProtocolConfig | None = None
+) -> ClientConfig:
+    """Make a configuration whose instrument and radio are not read; of the protocol classic."""
+    return ClientConfig(
+        kind="client",
+        station=station,
+        prism=prism,
+        instrument=instrument_config(SCENARIO.stations[0], folder / "instrument.tty"),
+        radio=SimulatedRadioConfig(
+            kind="simulated",
+            air_socket=folder / "air.sock",
+            name=f"station{station}",
+            frequency_mhz=905.0,
+            spreading_factor=9,
+        ),
+        protocol=protocol or ClassicConfig(kind="classic"),
+        journal=JournalConfig(directory=folder / "journals"),
+        status_socket=folder / "client.sock",
+    )
+
+
+@dataclass
+class Field:
+    """One station and a master's radio.
+
+    Attributes
+    ----------
+    instrument, line
+        The total station, and the cable to it.
+    read
+        What the clients have read from it.
+    protocol
+        What the client speaks; None: classic.
+    key, boot
+        As the client gets them.
+    """
+
+    folder: Path
+    instrument: SimulatedTotalStation
+    line: SimulatedLine
+    clock: DriftingClock
+    master: Side
+    open_radio: OpenRadio
+    read: list[Reading]
+    protocol: ProtocolConfig | None = None
+    key: bytes | None = None
+    boot: str = "boot"
+    client: asyncio.Task[None] | None = None
+
+    def start(self) -> None:
+        """Start the client."""
+        config = client_config(self.folder, protocol=self.protocol)
+        assert isinstance(config.instrument, LeicaInstrumentConfig)
+        driver = LeicaInstrument(config.instrument, self.line.open, self.clock)
+        self.client = asyncio.create_task(
+            run_client(
+                config,
+                PAPER,
+                instrument=WatchedInstrument(driver, self.read.append),
+                open_radio=self.open_radio,
+                clock=self.clock,
+                key=self.key,
+                boot=self.boot,
+            )
+        )
+
+    async def measuring(self) -> None:
+        """Return when a client that has just been started has read something, which takes two seconds."""
+        before = len(self.read)
+        while len(self.read) == before:  # noqa: ASYNC110 (time has to pass meanwhile)
+            await asyncio.sleep(0.01)
+
+    async def kill(self) -> None:
+        """Cancel the client wherever it is."""
+        if self.client is not None:
+            self.client.cancel()
+            await asyncio.wait([self.client])
+            self.client = None
+
+    async def ask(self, payload: bytes, timeout_s: float = 0.25) -> Reply | None:
+        """Send a request and return the reply; None when there is none in time after the request's end."""
+        await self.master.radio.transmit(payload)
+        with suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s):
+                return decode_reply((await self.master.radio.receive()).payload)
+        return None
+
+    async def poll(self) -> MeasurementMessage:
+        """Ask for data and insist; ping first, for the station has to have been synchronised once."""
+        await self.ask(b"e1")
+        reply = await self.ask(b"t1")
+        assert isinstance(reply, MeasurementMessage), reply
+        return reply
+
+    def journals(self) -> list[list[PolarMeasurement]]:
+        """Return what stands in each journal, in the order of the client's starts."""
+        paths = sorted((self.folder / "journals").iterdir(), key=lambda path: path.stat().st_mtime_ns)
+        return [load_journal(path).measurements for path in paths]
+
+
+@asynccontextmanager
+async def field_day(
+    folder: Path,
+    scenario: ScenarioConfig = SCENARIO,
+    *,
+    protocol: ProtocolConfig | None = None,
+    key: bytes | None = None,
+) -> AsyncGenerator[Field]:
+    """Set up a station that measures and a master's radio; end both with the block."""
+    timeline = running_timeline()
+    rng = np.random.default_rng(7)
+    air = Air(timeline, np.random.default_rng(0), LinkModel())
+    clock = DriftingClock(VirtualClock(START_NS), offset_ns=OFFSET_NS, drift_ppm=10.0)
+    world = scenario_world(scenario, 600.0, np.random.default_rng(3))
+    master = make_side(air, "master")
+    await master.radio.start(PAPER)
+    instrument = SimulatedTotalStation(scenario.stations[0], scenario, world, timeline, rng)
+    day = Field(
+        folder=folder,
+        instrument=instrument,
+        line=SimulatedLine(instrument, timeline, clock),
+        clock=clock,
+        master=master,
+        open_radio=opener(air, "station1", clock, rng, PAPER),
+        read=[],
+        protocol=protocol,
+        key=key,
+    )
+    try:
+        day.start()
+        await day.measuring()
+        yield day
+    finally:
+        await day.kill()
+        await master.radio.close()

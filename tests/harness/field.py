@@ -1,0 +1,446 @@
+"""A master among stations on one simulated air, on virtual time: three of them see the robot of a scene."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NoReturn, TypeVar
+
+import numpy as np
+from harness.radios import PAPER, running_timeline
+from harness.scene import START, standing_scene
+
+from tsgt.clock import UnixTimeline
+from tsgt.config import MasterConfig
+from tsgt.config.master import RecordingConfig, SetupConfig, StationConfig, StreamConfig
+from tsgt.config.radio import ClassicMasterConfig, SimulatedRadioConfig, SuperframeMasterConfig
+from tsgt.errors import InstrumentError
+from tsgt.master.daemon import run_master
+from tsgt.model import Status
+from tsgt.radio.classic.messages import MeasurementMessage, raw_status
+from tsgt.radio.classic.transactions import ClassicStation
+from tsgt.radio.commands import DirectOrder, SearchOrder, TrackOrder
+from tsgt.radio.superframe.command_exchange import Situation
+from tsgt.radio.superframe.send_queue import Outbox, Queued
+from tsgt.radio.superframe.station import SuperframeStation
+from tsgt.radio.superframe.wire.authentication import Authenticator
+from tsgt.radio.superframe.wire.codec import angle_code
+from tsgt.radio.superframe.wire.messages import RESTART_SKIP
+from tsgt.simulation.kernel.clocks import DriftingClock, VirtualClock
+from tsgt.simulation.lora.air import Air
+from tsgt.simulation.lora.link import LinkModel
+from tsgt.simulation.lora.radios import opener
+from tsgt.simulation.mission.authors_node import AUTHORS_STAMP_DELAY_MS, AuthorsNode
+from tsgt.station.instrument import Condition, Reading
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator, Coroutine
+    from pathlib import Path
+    from typing import Any
+
+    from harness.scene import Scene
+
+    from tsgt.clock import Clock
+    from tsgt.radio.base import OpenRadio, Packet, Radio
+    from tsgt.radio.commands import Direction
+    from tsgt.radio.superframe.session import Reception
+    from tsgt.recording.journal import InstrumentRecord
+    from tsgt.station.instrument import Atmosphere
+
+T = TypeVar("T")
+
+STATIONS = (1, 2, 3)
+PERIOD_NS = 400_000_000
+KEY = bytes(range(32))
+TRUE = VirtualClock(START)
+"""The true time, which the master's clock shows; zero of the loop is the start of the scene."""
+
+
+class SceneInstrument:
+    """A total station that sees its prism of the scene without error, 2.5 times in a second.
+
+    Attributes
+    ----------
+    status
+        What it says of its measurements.
+    refuses
+        It does not track when it is told to.
+    direct_mode
+        It was told to measure single targets.
+    sought
+        Where it was told to look for its prism, with the true time.
+    """
+
+    def __init__(self, scene: Scene, station: int, clock: DriftingClock) -> None:
+        self._scene = scene
+        self._station = station
+        self._clock = clock
+        self.status = Status.OK
+        self.refuses = False
+        self.direct_mode = False
+        self.sought: list[tuple[int, Direction]] = []
+
+    async def connect(self) -> str:
+        """Say what it is."""
+        return "scene"
+
+    async def track(self, prism: int, towards: Direction | None = None) -> None:
+        """Track, or refuse to."""
+        if towards is not None:
+            self.sought.append((TRUE.monotonic_ns(), towards))
+        if self.refuses:
+            raise InstrumentError(f"no prism {prism}")
+        self.direct_mode = False
+
+    async def read(self) -> Reading:
+        """Wait for the next measurement."""
+        true_ns = (TRUE.monotonic_ns() // PERIOD_NS + 1) * PERIOD_NS + self._station
+        await TRUE.sleep_until(true_ns)
+        return self._reading(true_ns)
+
+    async def direct(self) -> None:
+        """Stop tracking."""
+        self.direct_mode = True
+
+    async def measure(self) -> Reading:
+        """Measure once."""
+        await asyncio.sleep(2.0)
+        return self._reading(TRUE.monotonic_ns())
+
+    async def check(self) -> None:
+        """Be there."""
+
+    async def close(self) -> None:
+        """Do nothing."""
+
+    async def set_atmosphere(self, atmosphere: Atmosphere) -> None:
+        """Do nothing: there is none."""
+
+    @property
+    def condition(self) -> Condition:
+        """Nobody asks."""
+        return Condition()
+
+    @property
+    def record(self) -> InstrumentRecord | None:
+        """Nobody writes one."""
+        return None
+
+    def _reading(self, true_ns: int) -> Reading:
+        seen = self._scene.measure(self._station, true_ns / 1e9)
+        return Reading(
+            at_ns=self._clock.local_ns(true_ns),
+            prism=self._station,
+            horizontal_angle_rad=seen.horizontal_angle_rad,
+            zenith_angle_rad=seen.zenith_angle_rad,
+            slope_distance_m=seen.slope_distance_m,
+            status=self.status,
+        )
+
+
+async def classic_client(station: int, radio: Radio, clock: DriftingClock, tool: SceneInstrument) -> NoReturn:
+    """Answer as a station's client does; the timeline is fixed now, as at a start."""
+    timeline = UnixTimeline.fixed_now(clock)
+    session = ClassicStation(station)
+
+    async def read() -> NoReturn:
+        while True:
+            reading = await tool.read()
+            session.measured(message(reading))
+
+    def message(reading: Reading) -> MeasurementMessage:
+        return MeasurementMessage(
+            station=station,
+            status=raw_status(reading.status),
+            zenith_angle_rad=reading.zenith_angle_rad,
+            horizontal_angle_rad=reading.horizontal_angle_rad,
+            slope_distance_m=reading.slope_distance_m or 0.0,
+            time_ns=timeline.unix_ns(reading.at_ns),
+        )
+
+    async def reply(packet: Packet) -> bytes | None:
+        answer = session.received(packet.payload, timeline.unix_ns(packet.received_at_ns))
+        if answer is None or isinstance(answer, bytes):
+            return answer
+        if isinstance(answer, TrackOrder):
+            try:
+                await tool.track(answer.prism or station)
+            except InstrumentError:
+                return session.executed(answer, ok=False)
+            return session.executed(answer, ok=True)
+        if isinstance(answer, DirectOrder):
+            await tool.direct()
+            return session.executed(answer, ok=True)
+        return session.shot(message(await tool.measure()))
+
+    async with asyncio.TaskGroup() as group:
+        group.create_task(read())
+        while True:
+            answer = await reply(await radio.receive())
+            if answer is not None:
+                await radio.transmit(answer)
+
+
+class Notebook:
+    """What a station of the superframe keeps across its starts, as a journal does: measurements, and times of beacons.
+
+    Attributes
+    ----------
+    outbox
+        What is not acknowledged.
+    made_ns
+        True time of each measurement, by its number.
+    """
+
+    def __init__(self) -> None:
+        self.outbox = Outbox(0)
+        self.made_ns: dict[int, int] = {}
+        self.receptions: list[Reception] = []
+
+    def start(self) -> None:
+        """Leave out the numbers that a torn journal may have lost."""
+        if self.made_ns:
+            run_start = max(self.made_ns) + 1 + RESTART_SKIP
+            self.outbox = Outbox(run_start, reversed(list(self.outbox.newest_first())))
+
+
+async def superframe_client(
+    number: int,
+    radio: Radio,
+    clock: DriftingClock,
+    tool: SceneInstrument,
+    notes: Notebook,
+    rng: np.random.Generator,
+) -> NoReturn:
+    """Answer beacons as a station's client does."""
+    notes.start()
+    outbox = notes.outbox
+    situation = Situation(prism=number, direct=tool.direct_mode, connected=True)
+    station = SuperframeStation(
+        number,
+        PAPER,
+        Authenticator(KEY),
+        outbox,
+        lineage=number,
+        boot="boot",
+        receptions=notes.receptions,
+        random_bits=lambda bits: int(rng.integers(1 << bits)),
+    )
+
+    async def read() -> NoReturn:
+        sequence = outbox.run_start
+        while True:
+            reading = await tool.read()
+            outbox.add(
+                Queued(
+                    sequence=sequence,
+                    at_ns=reading.at_ns,
+                    boot="boot",
+                    prism=reading.prism or number,
+                    status=reading.status,
+                    horizontal=angle_code(reading.horizontal_angle_rad),
+                    zenith=angle_code(reading.zenith_angle_rad),
+                    distance_m=reading.slope_distance_m,
+                )
+            )
+            notes.made_ns[sequence] = TRUE.realtime_ns() - (TRUE.realtime_ns() - number) % PERIOD_NS
+            sequence += 1
+
+    async def obey() -> None:
+        nonlocal situation
+        order = station.next_order()
+        if isinstance(order, TrackOrder | SearchOrder):
+            prism = (order.prism if isinstance(order, TrackOrder) else None) or situation.prism
+            try:
+                await tool.track(prism, order.towards if isinstance(order, SearchOrder) else None)
+            except InstrumentError:
+                station.executed(ok=False)
+            else:
+                situation = situation._replace(prism=prism, direct=False)
+                station.executed(ok=True)
+        elif isinstance(order, DirectOrder):
+            await tool.direct()
+            situation = situation._replace(direct=True)
+            station.executed(ok=True)
+
+    async with asyncio.TaskGroup() as group:
+        group.create_task(read())
+        while True:
+            heard = station.received(await radio.receive())
+            if heard is not None and heard.reception is not None:
+                notes.receptions.append(heard.reception)
+            await obey()
+            if heard is None or heard.slot_ns is None:
+                continue
+            await clock.sleep_until(heard.slot_ns - 6_000_000)
+            reply = station.compose(situation, clock.monotonic_ns())
+            if reply is not None:
+                station.sent(await radio.transmit(reply, at_ns=heard.slot_ns))
+
+
+@dataclass
+class Station:
+    """A station of the field, which can be killed and started.
+
+    Attributes
+    ----------
+    clock
+        Its computer's: seconds to hours off the master's, and 10 ppm fast.
+    notes
+        What it keeps, on the superframe.
+    """
+
+    number: int
+    air: Air
+    scene: Scene
+    authors: bool
+    clock: DriftingClock
+    superframe: bool = False
+    notes: Notebook = field(default_factory=Notebook)
+    _task: asyncio.Task[None] | None = None
+    _starts: int = 0
+    instrument: SceneInstrument = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.instrument = SceneInstrument(self.scene, self.number, self.clock)
+
+    def start(self) -> None:
+        """Start its program."""
+        self._starts += 1
+        self._task = asyncio.create_task(self._run(), name=f"station-{self.number}")
+
+    async def kill(self) -> None:
+        """Stop its program."""
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.wait([self._task])
+            self._task = None
+
+    async def _run(self) -> None:
+        rng = np.random.default_rng((self.number, self._starts))
+        async with opener(self.air, f"station-{self.number}", self.clock, rng, PAPER)() as radio:
+            if self.authors:
+                await AuthorsNode(self.number, radio, self.clock, self.instrument, self.number, rng).run()
+            if self.superframe:
+                await superframe_client(self.number, radio, self.clock, self.instrument, self.notes, rng)
+            await classic_client(self.number, radio, self.clock, self.instrument)
+
+
+@dataclass
+class Field:
+    """A master and three stations."""
+
+    folder: Path
+    air: Air
+    scene: Scene
+    stations: dict[int, Station]
+    records: list[Any] = field(default_factory=list)
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(11))
+
+    def config(self, **changes: Any) -> MasterConfig:
+        """Make the master's configuration; with a short first synchronisation, or frames without a lock."""
+        changed = changes.pop("protocol", {})
+        protocol: ClassicMasterConfig | SuperframeMasterConfig
+        if self.stations[1].superframe:
+            protocol = SuperframeMasterConfig(kind="superframe", **{"phase_lock": False} | changed)
+        else:
+            protocol = ClassicMasterConfig(kind="classic", **{"initial_cycles": 5} | changed)
+        delay_ms = AUTHORS_STAMP_DELAY_MS if self.stations[1].authors else 0.0
+        return MasterConfig(
+            kind="master",
+            setup=SetupConfig(station_frames=self.folder / "frames", prism_layout=self.folder / "prisms"),
+            stations=tuple(
+                StationConfig(station=n, prism=n, prism_constant_mm=10.0, stamp_delay_ms=delay_ms)
+                for n in STATIONS
+            ),
+            radio=SimulatedRadioConfig(
+                kind="simulated",
+                air_socket=self.folder / "air.sock",
+                name="master",
+                frequency_mhz=905.0,
+                spreading_factor=9,
+            ),
+            protocol=protocol,
+            stream=StreamConfig(socket=self.folder / "poses.sock"),
+            recording=RecordingConfig(directory=self.folder / "recordings"),
+            **changes,
+        )
+
+    def open_radio(self) -> OpenRadio:
+        """Return what opens the master's radio."""
+        return opener(self.air, "master", TRUE, np.random.default_rng(100), PAPER)
+
+    async def master(
+        self,
+        config: MasterConfig | None = None,
+        *,
+        open_radio: OpenRadio | None = None,
+        clock: Clock = TRUE,
+        key: bytes | None = KEY,
+    ) -> None:
+        """Run the master until cancelled; what goes out is kept in :attr:`records`."""
+        await run_master(
+            config or self.config(),
+            self.scene.parameters,
+            PAPER,
+            open_radio=open_radio or self.open_radio(),
+            clock=clock,
+            key=key,
+            random_bits=lambda bits: int(self.rng.integers(1 << bits)),
+            observe=lambda record, _line: self.records.append(record),
+        )
+
+    def of(self, cls: type[T]) -> list[T]:
+        """Return what went out of one type."""
+        return [record for record in self.records if isinstance(record, cls)]
+
+    def recording(self) -> Path:
+        """Return the one recording, or the last one."""
+        return max((self.folder / "recordings").iterdir())
+
+
+@asynccontextmanager
+async def field_of(
+    folder: Path,
+    scene: Scene | None = None,
+    *,
+    authors: bool = False,
+    superframe: bool = False,
+    link: LinkModel | None = None,
+) -> AsyncGenerator[Field]:
+    """Start three stations, and stop what is left of them at the end."""
+    air = Air(running_timeline(), np.random.default_rng(7), link or LinkModel())
+    scene = scene or standing_scene()
+    offsets_s = {1: 0.3, 2: -7200.0, 3: 86_400.0}
+    stations = {
+        n: Station(
+            n,
+            air,
+            scene,
+            authors,
+            DriftingClock(TRUE, offset_ns=int(offsets_s[n] * 1e9), drift_ppm=10.0),
+            superframe=superframe,
+        )
+        for n in STATIONS
+    }
+    for station in stations.values():
+        station.start()
+    try:
+        yield Field(folder, air, scene, stations)
+    finally:
+        for station in stations.values():
+            await station.kill()
+
+
+@asynccontextmanager
+async def running(coroutine: Coroutine[Any, Any, None]) -> AsyncGenerator[asyncio.Task[None]]:
+    """Run something beside the test, and cancel it at the end."""
+    task = asyncio.create_task(coroutine)
+    try:
+        yield task
+    finally:
+        task.cancel()
+        await asyncio.wait([task])
+        if not task.cancelled():
+            task.result()

@@ -1,0 +1,297 @@
+"""A master of the superframe that a test plays by hand, frame by frame, against the pure core of a station."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from harness.radios import MS, PAPER
+
+from tsgt.model import Status
+from tsgt.radio.airtime import TX_DONE_NS
+from tsgt.radio.base import Packet, Transmitted
+from tsgt.radio.superframe.command_exchange import Situation
+from tsgt.radio.superframe.send_queue import Outbox, Queued
+from tsgt.radio.superframe.slots import GUARD_UNIT_NS, FrameTiming
+from tsgt.radio.superframe.station import SuperframeStation
+from tsgt.radio.superframe.wire.authentication import CODE_BYTES, Authenticator
+from tsgt.radio.superframe.wire.codec import decode_reply, encode_beacon
+from tsgt.radio.superframe.wire.messages import (
+    GRANT_BYTES,
+    RESTART_SKIP,
+    TIME_BITS,
+    TIME_UNIT_US,
+    WIDE_TIME_BITS,
+    Beacon,
+    Confirmation,
+    SessionPart,
+    SlotOrder,
+    StationEntry,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from tsgt.radio.superframe.session import Reception
+    from tsgt.radio.superframe.station import Heard
+    from tsgt.radio.superframe.wire.messages import OrderPart, Reply, Run
+
+SECOND = 1_000_000_000
+KEY = bytes(range(32))
+AUTHENTICATOR = Authenticator(KEY)
+TIMING = FrameTiming(PAPER, 20 * GUARD_UNIT_NS, 32 * GUARD_UNIT_NS)
+TRACKING = Situation(prism=1, direct=False, connected=True)
+
+OFFSET_NS = 777 * SECOND
+DRIFT_PPM = 30
+
+
+def local_ns(true_ns: int) -> int:
+    """Return what the station's clock shows; the true time is that of the master's clock."""
+    return OFFSET_NS + true_ns + true_ns * DRIFT_PPM // 1_000_000
+
+
+def counted() -> Callable[[int], int]:
+    """Return a source of numbers that are not random, and never the same."""
+    numbers = iter(range(1_000_000, 2_000_000))
+    return lambda bits: next(numbers) % (1 << bits)
+
+
+def make_station(
+    outbox: Outbox,
+    *,
+    boot: str = "boot",
+    receptions: Sequence[Reception] = (),
+    authenticator: Authenticator = AUTHENTICATOR,
+    random_bits: Callable[[int], int] | None = None,
+) -> SuperframeStation:
+    """Make station 2 of 3."""
+    return SuperframeStation(
+        2,
+        PAPER,
+        authenticator,
+        outbox,
+        lineage=9,
+        boot=boot,
+        receptions=receptions,
+        random_bits=random_bits or counted(),
+    )
+
+
+def queued(sequence: int, true_ns: int, *, prism: int = 1, boot: str = "boot") -> Queued:
+    """Make a measurement of a robot that moves on."""
+    return Queued(
+        sequence=sequence,
+        at_ns=local_ns(true_ns),
+        boot=boot,
+        prism=prism,
+        status=Status.OK,
+        horizontal=(1000 * sequence) % (1 << 24),
+        zenith=4_000_000,
+        distance_m=40.0 + 0.001 * sequence,
+    )
+
+
+@dataclass(frozen=True)
+class Answered:
+    """A reply whose code was right.
+
+    Attributes
+    ----------
+    reply
+        As decoded.
+    sequences, times_ns
+        Of its measurements, the times true ones as the master would tell them.
+    payload_bytes
+        Its length.
+    """
+
+    reply: Reply
+    sequences: tuple[int, ...]
+    times_ns: dict[int, int]
+    payload_bytes: int
+
+
+@dataclass
+class HandMaster:
+    """Sends beacons to one station and keeps what it answers. Nothing is lost unless the test loses it."""
+
+    session: int = 0xABCDEF
+    authenticator: Authenticator = AUTHENTICATOR
+    stations: int = 3
+    station: int = 2
+    grant: int = len(GRANT_BYTES) - 1
+    session_every: int = 1
+    frame_ns: int = 400 * MS
+    counter: int = -1
+    now_ns: int = 5 * SECOND
+    zero_ns: int = 0
+    nonce: int | None = None
+    highest: int = -1
+    received: dict[int, int] = field(default_factory=dict)
+    written: set[int] = field(default_factory=set)
+    replies: dict[int, tuple[int, ...]] = field(default_factory=dict)
+    settled: set[int] = field(default_factory=set)
+    confirm: bool = True
+    sent_us: int = 0
+    beacon_done_ns: int = 0
+    code: bytes = b""
+    _confirmation: int | None = None
+
+    @property
+    def cumulative(self) -> int:
+        """The number up to which, itself included, nothing is missing."""
+        number = 0
+        while number in self.written or number in self.settled:
+            number += 1
+        return number - 1
+
+    def beacon(self, *, orders: Sequence[OrderPart] = (), session: bool | None = None) -> bytes:
+        """Begin the next frame; return its beacon."""
+        self.counter += 1
+        self.now_ns += self.frame_ns
+        with_session = self.counter % self.session_every == 0 if session is None else session
+        confirmations = (
+            () if self._confirmation is None else (Confirmation(self.station, self._confirmation),)
+        )
+        self._confirmation = None
+        history = sum(
+            1 << j
+            for j in range(4)
+            if self.counter - 1 - j in self.replies
+            and self.written.issuperset(self.replies[self.counter - 1 - j])
+        )
+        content = encode_beacon(
+            Beacon(
+                frame=self.counter % 256,
+                sent=self.sent_us % (1 << 16),
+                cumulative=self.cumulative % 256,
+                order=SlotOrder(),
+                stations=tuple(
+                    StationEntry(history, self.grant) if index == self.station - 1 else StationEntry(0, 2)
+                    for index in range(self.stations)
+                ),
+                session=SessionPart(
+                    nonce=self.session,
+                    counter_high=self.counter >> 8,
+                    sent_high=self.sent_us >> 16,
+                    guard=20,
+                    turn_round=32,
+                )
+                if with_session
+                else None,
+                confirmations=confirmations,
+                orders=tuple(orders),
+            )
+        )
+        self.code = self.authenticator.beacon_code(
+            session=self.session, counter=self.counter, content=content
+        )
+        payload = content + self.code
+        self._left(self.now_ns + TIMING.airtime_ns(len(payload)) + TX_DONE_NS)
+        return payload
+
+    def left(self, transmitted: Transmitted) -> None:
+        """Take it that the beacon was sent by a radio."""
+        self.now_ns = transmitted.started_at_ns
+        self._left(transmitted.done_at_ns)
+
+    def _left(self, done_ns: int) -> None:
+        self.beacon_done_ns = done_ns
+        self.sent_us = (done_ns - self.zero_ns) // 1000
+        self.sent_us += not self.sent_us % (1 << 16)
+
+    def packet(self, payload: bytes, *, late_ns: int = 0, sigma_ns: int = 20_000) -> Packet:
+        """Return a beacon as the station receives it."""
+        return Packet(
+            payload=payload,
+            rssi_dbm=-80.4,
+            snr_db=9.0,
+            received_at_ns=local_ns(self.beacon_done_ns + TIMING.link_ns + late_ns),
+            stamp_sigma_ns=sigma_ns,
+        )
+
+    def frame(
+        self,
+        station: SuperframeStation,
+        situation: Situation = TRACKING,
+        *,
+        orders: Sequence[OrderPart] = (),
+        beacon_lost: bool = False,
+        reply_lost: bool = False,
+        not_written: bool = False,
+        late_ns: int = 0,
+        session: bool | None = None,
+    ) -> Answered | None:
+        """Play a frame; return the reply, None where there is none or it is lost."""
+        payload = self.beacon(orders=orders, session=session)
+        if beacon_lost:
+            return None
+        heard = station.received(self.packet(payload, late_ns=late_ns))
+        if heard is None or heard.slot_ns is None:
+            return None
+        reply = self.compose(station, heard, situation)
+        return None if reply is None or reply_lost else self.take(reply, not_written=not_written)
+
+    def compose(
+        self, station: SuperframeStation, heard: Heard, situation: Situation = TRACKING
+    ) -> bytes | None:
+        """Let the station answer in time."""
+        assert heard.slot_ns is not None
+        reply = station.compose(situation, heard.slot_ns - 6 * MS)
+        if reply is not None:
+            done_ns = heard.slot_ns + TIMING.airtime_ns(len(reply)) + TX_DONE_NS
+            station.sent(Transmitted(started_at_ns=heard.slot_ns, done_at_ns=done_ns, stamp_sigma_ns=20_000))
+        return reply
+
+    def take(self, payload: bytes, *, not_written: bool = False) -> Answered:
+        """Check a reply, and take it."""
+        assert len(payload) <= GRANT_BYTES[self.grant]
+        content, code = payload[:-CODE_BYTES], payload[-CODE_BYTES:]
+        reply = decode_reply(content)
+        introduction = reply.introduction
+        if introduction is not None:
+            start = introduction.run_start
+            self.settled |= {*range(introduction.oldest), *range(max(0, start - RESTART_SKIP), start)}
+            self.nonce = introduction.nonce
+            self._confirmation = introduction.nonce if self.confirm else None
+        assert self.nonce is not None
+        times_ns: dict[int, int] = {}
+        for run in reply.runs:
+            times_ns |= self._times_ns(run)
+        sequences = tuple(times_ns)
+        right = self.authenticator.reply_code(
+            session=self.session,
+            station=self.station,
+            station_nonce=self.nonce,
+            counter=self.counter,
+            beacon_code=self.code,
+            sequence=sequences[0] if sequences else 0,
+            content=content,
+        )
+        assert code == right
+        self.replies[self.counter] = sequences
+        self.received |= times_ns
+        self.highest = max(self.highest, *sequences, -1)
+        if not not_written:
+            self.written |= set(sequences)
+        return Answered(reply, sequences, times_ns, len(payload))
+
+    def _times_ns(self, run: Run) -> dict[int, int]:
+        newest = run.sightings[0]
+        number = newest.sequence
+        if not run.wide:
+            number = self.highest + (number - self.highest + 128) % 256 - 128
+        span_us = TIME_UNIT_US << (WIDE_TIME_BITS if run.wide else TIME_BITS)
+        sent_us = (self.beacon_done_ns - self.zero_ns) // 1000
+        time_us = TIME_UNIT_US * newest.time + (sent_us if run.direct else 0)
+        end_us = sent_us + 700_000  # later than any slot of three stations
+        time_us = end_us - (end_us - time_us) % span_us
+        result = {number: time_us}
+        for older in run.sightings[1:]:
+            back = newest.sequence - older.sequence
+            result[number - back] = time_us + TIME_UNIT_US * (older.time - newest.time)
+        return {
+            sequence: self.zero_ns + 1000 * instant_us + TIMING.link_ns
+            for sequence, instant_us in result.items()
+        }

@@ -1,0 +1,52 @@
+"""Our driver on its chip, a second chip for a driver by others, and one air."""
+
+from __future__ import annotations
+
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from harness.blocking import BlockingProgram
+from harness.radios import make_side, running_timeline
+
+from tsgt.simulation.lora.air import Air
+from tsgt.simulation.lora.chip import SX1276Chip
+from tsgt.simulation.lora.link import LinkModel
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator
+
+    from tsgt.radio.base import LoRaSettings
+    from tsgt.radio.sx127x.driver import SX127x
+
+SIZES = (5, 17, 34, 251)
+"""Payloads for all drivers: Adafruit's takes 5 to 251 bytes."""
+
+
+@dataclass(frozen=True)
+class Lab:
+    """What a test of interoperation needs: our radio, and the other chip with a program to drive it."""
+
+    radio: SX127x
+    chip: SX1276Chip
+    program: BlockingProgram
+
+
+@asynccontextmanager
+async def lab(settings: LoRaSettings) -> AsyncGenerator[Lab]:
+    """Start our radio, and close it at the end."""
+    timeline = running_timeline()
+    air = Air(timeline, np.random.default_rng(0), LinkModel())
+    ours = make_side(air, "ours")
+    peer = SX1276Chip(timeline, lambda antenna: air.join(antenna, "peer"), np.random.default_rng(2))
+    await ours.radio.start(settings)
+    try:
+        yield Lab(ours.radio, peer, BlockingProgram())
+    finally:
+        await ours.radio.close()
+
+
+def payload(size: int) -> bytes:
+    """Return bytes that differ from place to place and from size to size."""
+    return bytes((size + 7 * place) % 256 for place in range(size))

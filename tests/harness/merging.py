@@ -1,0 +1,61 @@
+"""What tests of merging look at: recordings, journals and merged lines of simulated missions."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from tsgt.recording import decode_line, read_lines
+from tsgt.recording.merged import MergedRecord
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tsgt.model import PolarMeasurement
+    from tsgt.simulation.mission.runner import Run
+
+
+def journals(run: Run) -> list[Path]:
+    """Return the journals of all stations."""
+    return [path for witness in run.witnesses.values() for path in witness.journals]
+
+
+def recording(run: Run, path: Path, *, without: int = 0) -> Path:
+    """Put the recordings of all sessions of the master into one file.
+
+    Parameters
+    ----------
+    run
+        The mission.
+    path
+        The file.
+    without
+        Leave out each so manieth measurement, as if the radio had not carried it; 0: none.
+    """
+    kept, measurements = [], 0
+    for session in run.sessions:
+        recorded = session.recording()
+        assert recorded is not None
+        for line in recorded.read_bytes().splitlines(keepends=True):
+            measurements += (measurement := line.startswith(b'{"type":"measurement"'))
+            if not (measurement and without and measurements % without == 0):
+                kept.append(line)
+    path.write_bytes(b"".join(kept))
+    return path
+
+
+def merged_in(path: Path) -> list[PolarMeasurement]:
+    """Return what has been merged into a recording."""
+    return [
+        decode_line(MergedRecord, line, path).measurement
+        for line in read_lines(path)
+        if line.type == "merged"
+    ]
+
+
+def assert_true(run: Run, measurements: list[PolarMeasurement]) -> None:
+    """Compare the times of merged measurements with the truth, each with the bound that it states."""
+    for measurement in measurements:
+        assert measurement.host_time_ns is not None
+        assert measurement.stamp_bound_ns is not None
+        true_ns = run.witnesses[measurement.station].stamps_ns[measurement.host_time_ns]
+        assert abs(measurement.stamp_ns - run.start_ns - true_ns) <= measurement.stamp_bound_ns

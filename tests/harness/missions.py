@@ -1,0 +1,35 @@
+"""Short simulated missions for tests."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from tsgt.config import ScenarioConfig
+from tsgt.config.radio import ClassicMasterConfig, SuperframeMasterConfig
+from tsgt.simulation.mission.runner import Run, simulate
+from tsgt.simulation.options import Options
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine
+    from pathlib import Path
+
+    from tsgt.simulation.mission.mission import Mission
+
+QUICK = ClassicMasterConfig(kind="classic", initial_cycles=5)
+"""The protocol with a short synchronisation at the start: 1.2 s for each station."""
+
+SUPERFRAME = SuperframeMasterConfig(kind="superframe")
+
+
+def mission(
+    folder: Path,
+    scenario: ScenarioConfig | None = None,
+    *,
+    script: Callable[[Mission], Coroutine[None, None, None]] | None = None,
+    protocol: ClassicMasterConfig | SuperframeMasterConfig = QUICK,
+    **options: Any,
+) -> Run:
+    """Run half a minute of the reference scenario, or what else is asked for."""
+    settings: dict[str, Any] = {"duration_s": 30.0, "protocol": protocol} | options
+    folder.mkdir(parents=True, exist_ok=True)
+    return simulate(scenario or ScenarioConfig(), Options(**settings), folder=folder, script=script)

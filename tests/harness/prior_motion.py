@@ -1,0 +1,136 @@
+"""Robots that move as the motion prior says, and what total stations measure of them; no code of the estimator is used."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from harness.scene import FRAMES, LAYOUT
+from scipy.signal import lfilter
+
+from tsgt.geometry import (
+    Observations,
+    cartesian_to_polar,
+    exp_so3,
+    invert,
+    polar_to_cartesian,
+    transform_points,
+)
+from tsgt.geometry.trajectory.states import Knots
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from tsgt.geometry import FloatArray
+    from tsgt.model import MotionPrior
+
+STEP_S = 0.005
+SIGMAS_M = np.array([0.0025, 0.0012, 0.0012])
+TIME_SIGMA_S = 0.0005
+PLACE_M = np.array([60.0, 45.0, -1.0])
+
+
+def draw_motions(prior: MotionPrior, *, count: int, duration_s: float, seed: int) -> list[Knots]:
+    """Draw motions from the prior on a grid of ``STEP_S``, beginning anywhere and in any direction.
+
+    The accelerations at the grid are exact draws of the process; between them they are taken as straight lines, and
+    rotations are multiplied up step by step.
+    """
+    rng = np.random.default_rng(seed)
+    times = np.arange(round(duration_s / STEP_S) + 1, dtype=np.float64) * STEP_S
+    parts = []
+    for sigmas, time_s in (
+        (prior.acceleration_sigma_mps2, prior.acceleration_time_s),
+        (prior.angular_acceleration_sigma_radps2, prior.angular_acceleration_time_s),
+    ):
+        kept = np.exp(-STEP_S / time_s)
+        kicks = rng.normal(size=(count, len(times), 3))
+        kicks[:, 1:] *= np.sqrt(1 - kept**2)
+        parts.append(np.array(sigmas) * lfilter([1.0], [1.0, -kept], kicks, axis=1))
+    acceleration, angular_acceleration = parts
+    velocity = _summed(acceleration) + rng.normal(size=(count, 1, 3))
+    position = _summed(velocity) + PLACE_M + rng.normal(size=(count, 1, 3))
+    angular_velocity = _summed(angular_acceleration) + rng.normal(scale=0.2, size=(count, 1, 3))
+    rotation = np.empty((count, len(times), 3, 3))
+    rotation[:, 0] = exp_so3(rng.normal(scale=2.0, size=(count, 3)))
+    turns = exp_so3(0.5 * STEP_S * (angular_velocity[:, 1:] + angular_velocity[:, :-1]))
+    for step in range(len(times) - 1):
+        rotation[:, step + 1] = rotation[:, step] @ turns[:, step]
+    return [
+        Knots(
+            times,
+            *(part[i] for part in (position, rotation, velocity, angular_velocity)),
+            *(part[i] for part in parts),
+        )
+        for i in range(count)
+    ]
+
+
+def rows_at(time_s: FloatArray) -> NDArray[np.intp]:
+    """Which rows of a drawn motion are at these instants."""
+    return np.round(np.asarray(time_s) / STEP_S).astype(np.intp)
+
+
+def measure(motion: Knots, *, until_s: float, rate_hz: float = 2.5, seed: int) -> Observations:
+    """Measure each prism by its own station, with noise in range, both angles and time."""
+    rng = np.random.default_rng(seed)
+    times: list[FloatArray] = []
+    which: list[NDArray[np.intp]] = []
+    for row in range(len(LAYOUT)):
+        phase_s = rng.uniform(0, 1 / rate_hz)
+        mine = np.arange(phase_s, until_s, 1 / rate_hz)
+        times.append(np.round(mine / STEP_S) * STEP_S)
+        which.append(np.full(len(mine), row))
+    time_s, prism = np.concatenate(times), np.concatenate(which)
+    order = np.argsort(time_s, kind="stable")
+    time_s, prism = time_s[order], prism[order]
+    truth = motion.select(rows_at(time_s))
+    world = truth.position + (truth.rotation @ LAYOUT[prism][:, :, None])[:, :, 0]
+    seen = transform_points(invert(FRAMES)[prism], world)
+    noisy = add_polar_noise(seen, SIGMAS_M, rng)
+    count = len(time_s)
+    return Observations(
+        time_s=time_s + rng.normal(scale=TIME_SIGMA_S, size=count),
+        time_sigma_s=np.full(count, TIME_SIGMA_S),
+        points_m=noisy,
+        sigmas_m=np.tile(SIGMAS_M, (count, 1)),
+        polar=np.ones(count, dtype=bool),
+        station=prism,
+        prism=prism,
+        frames=FRAMES,
+        layout=LAYOUT,
+    )
+
+
+def in_time(observations: Observations) -> Observations:
+    """Put measurements in the order of time, which uncertain stamps may have upset."""
+    return observations.select(np.argsort(observations.time_s, kind="stable"))
+
+
+def add_polar_noise(points_m: FloatArray, sigmas_m: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Points with noise in range and both angles, given as lengths at the point."""
+    horizontal_rad, zenith_rad, distance_m = cartesian_to_polar(points_m)
+    noise = rng.normal(size=(len(points_m), 3)) * sigmas_m
+    return polar_to_cartesian(
+        horizontal_rad + noise[:, 1] / (distance_m * np.sin(zenith_rad)),
+        zenith_rad + noise[:, 2] / distance_m,
+        distance_m + noise[:, 0],
+    )
+
+
+def as_points(observations: Observations) -> Observations:
+    """Take the same measurements for Cartesian ones in frame ``station1``, alike in all directions."""
+    return replace(
+        observations,
+        points_m=observations.in_world(),
+        sigmas_m=np.full((len(observations), 3), SIGMAS_M[0]),
+        polar=np.zeros(len(observations), dtype=bool),
+        station=np.full(len(observations), len(FRAMES)),
+        frames=np.concatenate([FRAMES, np.eye(4)[None]]),
+    )
+
+
+def _summed(rates: FloatArray) -> FloatArray:
+    means = 0.5 * STEP_S * (rates[:, 1:] + rates[:, :-1])
+    return np.concatenate([np.zeros_like(rates[:, :1]), np.cumsum(means, axis=1)], axis=1)

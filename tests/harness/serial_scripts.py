@@ -1,0 +1,315 @@
+"""Two hundred scripts of what goes wrong between a client and its instrument, and what has to hold in each.
+
+A script lets the real driver and its keeper measure with a simulated Leica on virtual time, does something to line or
+instrument, and ends it at a known instant. Every distance that is given must be one that the instrument has answered with,
+once, with the time at which it was measured; and the first one after the end must come within the time stated for the
+kind of fault. ``python benchmarks/serial_faults.py`` runs all of them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from tsgt.config import ScenarioConfig
+from tsgt.config.client import LeicaInstrumentConfig
+from tsgt.simulation.instrument.geocom.server import Forced
+from tsgt.simulation.instrument.serial_line import LineFault, SimulatedLine
+from tsgt.simulation.instrument.total_station import SimulatedTotalStation
+from tsgt.simulation.kernel.clocks import DriftingClock, VirtualClock
+from tsgt.simulation.kernel.event_loop import run_virtual
+from tsgt.simulation.kernel.timeline import VirtualTimeline
+from tsgt.simulation.world import scenario_world
+from tsgt.station.geocom.codec import Rpc
+from tsgt.station.geocom.codes import ReturnCode
+from tsgt.station.instrument_supervisor import InstrumentKeeper
+from tsgt.station.leica.instrument import LeicaInstrument
+from tsgt.station.session import Session
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterable
+
+    from tsgt.simulation.instrument.geocom.answers import Offered
+    from tsgt.station.instrument import Reading
+
+SETTLE_S: Final = 10.0
+"""Before the fault: connecting takes two seconds."""
+
+AFTER_S: Final = 20.0
+"""Watched after the end of the fault."""
+
+STAMP_LIMIT_NS: Final = 25_000_000
+"""A stamp is less than this from the measurement: answers take 20 to 60 ms, of which 20 are taken off."""
+
+_DRIFT_PPM: Final = 15.0
+_LATENCY_MS: Final = 20.0
+_ROUNDING: Final = 1e-9
+
+
+@dataclass(slots=True)
+class Bench:
+    """What a script has in its hands.
+
+    Attributes
+    ----------
+    station, line
+        The instrument, and its cable.
+    rng
+        Its own.
+    """
+
+    station: SimulatedTotalStation
+    line: SimulatedLine
+    rng: np.random.Generator
+
+
+@dataclass(frozen=True, slots=True)
+class Script:
+    """Something that goes wrong.
+
+    Attributes
+    ----------
+    kind
+        Which kind of fault.
+    seed
+        Of everything that is drawn.
+    limit_s
+        From the end of the fault to the next distance it takes no longer than this.
+    act
+        Does it, and returns at its end.
+    checksum
+        Whether the line has checksums.
+    """
+
+    kind: str
+    seed: int
+    limit_s: float
+    act: Callable[[Bench], Awaitable[None]]
+    checksum: bool = False
+
+
+@dataclass(slots=True)
+class Outcome:
+    """What came of a script.
+
+    Attributes
+    ----------
+    offered, given
+        How many distances the instrument has answered with, and how many of them the client was given.
+    wrong
+        What must not happen: values that were never offered, or twice, and times that lie.
+    recovery_s
+        From the end of the fault to the next distance; infinite if there was none.
+    """
+
+    offered: int = 0
+    given: int = 0
+    wrong: list[str] = field(default_factory=list)
+    recovery_s: float = float("inf")
+
+
+def run_script(script: Script) -> Outcome:
+    """Run a script on virtual time."""
+    timeline = VirtualTimeline()
+    return run_virtual(partial(_run, script, timeline), timeline)
+
+
+async def _run(script: Script, timeline: VirtualTimeline) -> Outcome:
+    world_rng, station_rng, script_rng = np.random.default_rng(script.seed).spawn(3)
+    scenario = ScenarioConfig()
+    world = scenario_world(scenario, 200.0, world_rng)
+    clock = DriftingClock(VirtualClock(0), drift_ppm=_DRIFT_PPM)
+    station = SimulatedTotalStation(scenario.stations[0], scenario, world, timeline, station_rng)
+    line = SimulatedLine(station, timeline, clock, name="cable")
+    config = LeicaInstrumentConfig(
+        kind="leica",
+        port=Path("cable"),
+        checksum=script.checksum,
+        prism_type="user",
+        prism_constant_mm=0.0,
+        latency_ms=_LATENCY_MS,
+    )
+    readings: list[tuple[int, Reading]] = []
+    keeper = InstrumentKeeper(
+        LeicaInstrument(config, line.open, clock),
+        Session(1, 1),
+        clock,
+        on_reading=lambda reading: readings.append((timeline.now_ns(), reading)),
+        on_record=_ignore,
+        on_done=_ignore,
+    )
+    keeping = asyncio.create_task(keeper.keep())
+    try:
+        await asyncio.sleep(SETTLE_S)
+        await script.act(Bench(station, line, script_rng))
+        ended_ns = timeline.now_ns()
+        await asyncio.sleep(AFTER_S)
+    finally:
+        keeping.cancel()
+        await asyncio.wait([keeping])
+    outcome = Outcome(offered=len(station.offered))
+    _judge(outcome, [reading for _, reading in readings if reading.status.usable], station, clock)
+    usable_ns = [at_ns for at_ns, reading in readings if reading.status.usable and at_ns >= ended_ns]
+    if usable_ns:
+        outcome.recovery_s = (usable_ns[0] - ended_ns) / 1e9
+    if outcome.recovery_s > script.limit_s:
+        outcome.wrong.append(f"no distance for {outcome.recovery_s:.1f} s after the end of the fault")
+    return outcome
+
+
+def _ignore(_: object) -> None:
+    """Nobody wants to know."""
+
+
+def _judge(
+    outcome: Outcome, usable: Iterable[Reading], station: SimulatedTotalStation, clock: DriftingClock
+) -> None:
+    """Compare what was given with what was offered."""
+    seen: set[Offered] = set()
+    offered: dict[int, list[Offered]] = {}
+    for each in station.offered:
+        offered.setdefault(each.instrument_ms, []).append(each)
+    for reading in usable:
+        outcome.given += 1
+        if reading.instrument_time_ns is None or reading.slope_distance_m is None:
+            outcome.wrong.append(f"usable, but without time or distance: {reading}")
+            continue
+        candidates = offered.get(reading.instrument_time_ns // 1_000_000, [])
+        truth = next((each for each in candidates if _same(each, reading)), None)
+        if truth is None:
+            outcome.wrong.append(f"never offered: {reading}")
+            continue
+        if truth in seen:
+            outcome.wrong.append(f"given twice: {reading}")
+        seen.add(truth)
+        late_ns = clock.true_ns(reading.at_ns) - truth.true_ns
+        if abs(late_ns) > STAMP_LIMIT_NS:
+            outcome.wrong.append(f"stamped {late_ns / 1e6:.1f} ms after it was measured: {reading}")
+
+
+def _same(offered: Offered, reading: Reading) -> bool:
+    pairs = (
+        (offered.horizontal_angle_rad, reading.horizontal_angle_rad),
+        (offered.zenith_angle_rad, reading.zenith_angle_rad),
+        (offered.distance_m, reading.slope_distance_m),
+    )
+    return all(value is not None and abs(given - value) < _ROUNDING for given, value in pairs)
+
+
+# --- The scripts ----------------------------------------------------------------------------------------------
+
+
+def all_scripts() -> list[Script]:
+    """Return the two hundred scripts, those of one kind together; the same in every run."""
+    kinds: list[tuple[int, str, float, Callable[[Bench], Awaitable[None]], bool]] = [
+        *((8, f"answers {fault}", 3.0, partial(_spoil, (fault,), 0.1), False) for fault in _LINE_FAULTS),
+        (16, "all of these", 3.0, partial(_spoil, _LINE_FAULTS, 0.05), False),
+        (16, "all of these, with checksums", 3.0, partial(_spoil, _LINE_FAULTS, 0.05), True),
+        (8, "answers with other digits, with checksums", 3.0, _change_digits, True),
+        *((4, f"codes of {name}", 3.0, partial(_force, codes), False) for name, codes in _families().items()),
+        (12, "no answers", 5.0, partial(_silence, "mute"), False),
+        (8, "nothing reaches the instrument", 5.0, partial(_silence, "deaf"), False),
+        (20, "unplugged", 3.0, _unplug, False),
+        (12, "switched off and on, locked by hand", 3.0, _switch_off, False),
+        (4, "another speed", 12.0, _change_baud, False),
+    ]
+    scripts: list[Script] = []
+    for count, kind, limit_s, act, checksum in kinds:
+        scripts += [Script(kind, len(scripts) + i, limit_s, act, checksum) for i in range(count)]
+    return scripts
+
+
+_LINE_FAULTS: Final = tuple(fault for fault in LineFault if fault not in (LineFault.NONE, LineFault.DIGIT))
+
+_FAMILY_NAMES: Final = {
+    0: "TPS",
+    1: "ANG",
+    2: "ATA",
+    3: "EDM",
+    4: "GMF",
+    5: "TMC",
+    7: "MOT",
+    9: "BMM",
+    12: "COM",
+    34: "AUT",
+    36: "BAP",
+    49: "KDM",
+    51: "FTR",
+}
+
+
+def _families() -> dict[str, list[ReturnCode]]:
+    families: dict[str, list[ReturnCode]] = {}
+    for code in sorted(set(ReturnCode) - {ReturnCode.OK}):
+        families.setdefault(_FAMILY_NAMES.get(code >> 8, str(code >> 8)), []).append(code)
+    return families
+
+
+async def _spoil(faults: tuple[LineFault, ...], share: float, bench: Bench) -> None:
+    """Let a share of all answers go wrong for 15 s."""
+    script = bench.line.faults.script
+    for _ in range(15):
+        for _ in range(60):
+            hit = bench.rng.random() < share
+            script.append(faults[bench.rng.integers(len(faults))] if hit else LineFault.NONE)
+        await asyncio.sleep(1.0)
+        script.clear()
+    # What is late is still on its way.
+    await asyncio.sleep(bench.line.faults.late_s)
+
+
+async def _change_digits(bench: Bench) -> None:
+    """Let one digit in ten answers be another one for 15 s."""
+    bench.line.faults.script.clear()
+    for _ in range(15):
+        bench.line.faults.script.extend(
+            LineFault.DIGIT if bench.rng.random() < 0.1 else LineFault.NONE for _ in range(60)
+        )
+        await asyncio.sleep(1.0)
+        bench.line.faults.script.clear()
+
+
+async def _force(codes: list[ReturnCode], bench: Bench) -> None:
+    """Answer with codes of a family now and then for 15 s, whatever was asked for."""
+    for _ in range(15):
+        code = codes[bench.rng.integers(len(codes))]
+        com = code >> 8 == ReturnCode.COM_TIMEDOUT >> 8
+        for rpc in (Rpc.TMC_GET_FULL_MEAS, Rpc.MOT_READ_LOCK_STATUS, None):
+            if bench.rng.random() < 0.5:
+                times = int(bench.rng.integers(1, 4))
+                forced = Forced(code=0 if com else code, com_code=code if com else 0, rpc=rpc, times=times)
+                bench.station.server.forced.append(forced)
+        await asyncio.sleep(1.0)
+    bench.station.server.forced.clear()
+
+
+async def _silence(which: str, bench: Bench) -> None:
+    setattr(bench.line.faults, which, True)
+    await asyncio.sleep(bench.rng.uniform(0.2, 30.0))
+    setattr(bench.line.faults, which, False)
+
+
+async def _unplug(bench: Bench) -> None:
+    for _ in range(3):
+        bench.line.plugged = False
+        await asyncio.sleep(bench.rng.uniform(0.05, 20.0))
+        bench.line.plugged = True
+        if bench.rng.random() < 0.5:  # a loose contact
+            await asyncio.sleep(bench.rng.uniform(0.05, 2.0))
+
+
+async def _switch_off(bench: Bench) -> None:
+    bench.station.switch_off()
+    await asyncio.sleep(bench.rng.uniform(0.5, 30.0))
+    bench.station.switch_on()
+    await asyncio.sleep(bench.rng.uniform(5.5, 8.0))
+    bench.station.lock_by_hand(1)
+
+
+async def _change_baud(bench: Bench) -> None:
+    bench.station.baud = int(bench.rng.choice([9600, 19_200, 38_400, 57_600]))

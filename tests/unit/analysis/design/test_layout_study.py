@@ -1,0 +1,176 @@
+"""How well a pose is known, by layout, stations and noise."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from tsgt.analysis.design.layout_study import (
+    HEADINGS,
+    LayoutFigures,
+    Stances,
+    Station,
+    pose_covariances,
+    together_or_around,
+)
+from tsgt.config import ScenarioConfig
+from tsgt.errors import DegenerateGeometryError, GeometryError
+from tsgt.geometry import (
+    cartesian_to_polar,
+    exp_so3,
+    measurement_covariance,
+    pose_covariance,
+    rotate,
+)
+from tsgt.model import ARCSECOND_RAD, InstrumentNoise
+
+LAYOUT = np.array([prism.position_m for prism in ScenarioConfig().prisms])
+NOISE = InstrumentNoise(
+    range_sigma_m=0.002, range_sigma_ppm=2.0, angle_sigma_rad=ARCSECOND_RAD, pointing_sigma_m=0.001
+)
+EVEN = InstrumentNoise(range_sigma_m=0.0, range_sigma_ppm=0.0, angle_sigma_rad=0.0, pointing_sigma_m=0.003)
+"""Alike in all directions and at all distances."""
+PLACES = [(0.0, 0.0, 0.0), (2.0, -1.5, 0.1), (-1.5, 2.5, -0.2)]
+STANCES = Stances.at([[60.0, 45.0, -1.0], [20.0, 10.0, -1.0]])
+ORIGIN = np.zeros(3)
+
+
+def _stations(
+    noise: InstrumentNoise, places: list[tuple[float, float, float]] = PLACES
+) -> tuple[Station, ...]:
+    return tuple(Station(np.array(place), noise, slot % 3) for slot, place in enumerate(places))
+
+
+def test_even_noise_is_what_the_unweighted_fit_propagates() -> None:
+    """With the same noise everywhere weights do not matter: the covariance is that of ``linear``, in the robot's axes."""
+    found = pose_covariances(LAYOUT, _stations(EVEN), STANCES, ORIGIN)
+    prisms = np.broadcast_to(0.003**2 * np.eye(3), (1, 3, 3, 3))
+    (expected,) = pose_covariance(LAYOUT, np.eye(3)[None], prisms)
+    np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), rtol=1e-9, atol=1e-15)
+
+
+def test_weighing_is_never_worse_than_not_weighing() -> None:
+    """The unweighted fit of the same measurements has a covariance that is larger, in every direction."""
+    found = pose_covariances(LAYOUT, _stations(NOISE), STANCES, ORIGIN)
+    points = rotate(STANCES.rotation[:, None], LAYOUT) + STANCES.position_m[:, None]
+    prisms = np.stack(
+        [
+            measurement_covariance(*cartesian_to_polar(points[:, i] - place), NOISE)
+            for i, place in enumerate(PLACES)
+        ],
+        axis=1,
+    )
+    unweighted = pose_covariance(LAYOUT, STANCES.rotation, prisms)
+    to_robot = np.zeros((len(found), 6, 6))
+    to_robot[:, :3, :3] = to_robot[:, 3:, 3:] = np.swapaxes(STANCES.rotation, 1, 2)
+    unweighted = to_robot @ unweighted @ np.swapaxes(to_robot, 1, 2)
+    assert (np.linalg.eigvalsh(unweighted - found) > -1e-12).all()
+    assert np.trace(unweighted - found, axis1=1, axis2=2).max() > 1e-9
+
+
+def test_polar_measurements_differentiated_numerically() -> None:
+    """The information in two angles and a distance of each prism, from differences of what would be measured."""
+    noise = dataclasses.replace(NOISE, pointing_sigma_m=0.0, angle_sigma_rad=20 * ARCSECOND_RAD)
+    stance = Stances.at([[50.0, -30.0, 2.0]], [0.7])
+    R, origin = stance.rotation[0], stance.position_m[0]
+    point = np.array([0.2, -0.1, 0.4])
+
+    def measured(error: np.ndarray) -> np.ndarray:
+        """Angles and distances (3, 3) of a robot that is moved and turned a little about the point."""
+        robot = point + error[:3] + rotate(exp_so3(error[3:]), LAYOUT - point)
+        prisms = rotate(R, robot) + origin
+        return np.stack(cartesian_to_polar(prisms - np.array(PLACES)))
+
+    _, z, d = measured(np.zeros(6))
+    sigmas = np.stack(
+        [
+            noise.angle_sigma_rad / np.sin(z),
+            np.full(3, noise.angle_sigma_rad),
+            np.hypot(noise.range_sigma_m, noise.range_sigma_ppm * 1e-6 * d),
+        ]
+    )
+    step = 1e-6
+    jacobian = np.stack(
+        [((measured(e) - measured(-e)) / (2 * step) / sigmas).ravel() for e in step * np.eye(6)], axis=1
+    )
+    (found,) = pose_covariances(LAYOUT, _stations(noise), stance, point)
+    expected = np.linalg.inv(jacobian.T @ jacobian)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
+
+
+def test_a_second_station_on_each_prism_halves_the_variance() -> None:
+    """Six stations, two at each place, tell twice as much as three."""
+    one = pose_covariances(LAYOUT, _stations(NOISE), STANCES, ORIGIN)
+    two = pose_covariances(LAYOUT, _stations(NOISE, PLACES * 2), STANCES, ORIGIN)
+    np.testing.assert_allclose(2 * two, one, rtol=1e-9)
+
+
+def test_the_rotation_is_known_better_with_larger_layouts() -> None:
+    """Twice as large is twice as good; the position of the centroid does not change."""
+    centroid = LAYOUT.mean(axis=0)
+    one, two = (
+        LayoutFigures.of(
+            pose_covariances(centroid + scale * (LAYOUT - centroid), _stations(EVEN), STANCES, centroid)
+        )
+        for scale in (1, 2)
+    )
+    assert two.rotation_rad == pytest.approx(one.rotation_rad / 2)
+    assert two.position_m == pytest.approx(one.position_m)
+    assert one.position_m == pytest.approx(0.003)
+
+
+def test_figures_are_root_mean_squares_and_worst() -> None:
+    """Over the stances, of the summed variances."""
+    covariance = np.array([np.diag([1.0, 4, 4, 1, 0, 0]), np.diag([1.0, 0, 0, 0, 0, 3])])
+    found = LayoutFigures.of(covariance)
+    assert found.position_m == pytest.approx(math.sqrt(5))
+    assert found.worst_position_m == pytest.approx(3)
+    assert found.rotation_rad == pytest.approx(math.sqrt(2))
+    assert found.worst_rotation_rad == pytest.approx(math.sqrt(3))
+    np.testing.assert_allclose(found.position_axes_m, np.sqrt([1, 2, 2]))
+
+
+def test_stances_go_round_at_each_place() -> None:
+    """Place by place, with all headings evenly around the circle."""
+    assert len(STANCES.position_m) == 2 * HEADINGS
+    np.testing.assert_array_equal(STANCES.position_m[HEADINGS], [20, 10, -1])
+    np.testing.assert_allclose(STANCES.rotation[1], exp_so3(np.array([0, 0, 2 * math.pi / HEADINGS])))
+
+
+def test_stations_together_and_around() -> None:
+    """All at the distance; on one side in the direction of the first, or evenly around."""
+    centre = np.array([60.0, 45.0, -1.0])
+    found = together_or_around(_stations(NOISE), centre, 75.0)
+    for stations in found.values():
+        for station, before in zip(stations, PLACES, strict=True):
+            assert math.dist(station.position_m[:2], centre[:2]) == pytest.approx(75)
+            assert station.position_m[2] == before[2]
+    np.testing.assert_allclose(found["together"][0].position_m, [0, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(found["together"][2].position_m[:2], [0, 0], atol=1e-9)
+    np.testing.assert_allclose(np.mean([s.position_m[:2] for s in found["around"]], axis=0), centre[:2])
+
+
+def test_a_prism_that_nobody_tracks_is_refused() -> None:
+    """Four prisms need four stations."""
+    four = np.vstack([LAYOUT, [0.3, 0.3, 0.7]])
+    with pytest.raises(GeometryError, match="4 prisms for 3 stations"):
+        pose_covariances(four, _stations(NOISE), STANCES, ORIGIN)
+
+
+def test_prisms_in_a_line_are_refused() -> None:
+    """No pose follows from them."""
+    with pytest.raises(DegenerateGeometryError, match="nearly in a line"):
+        pose_covariances(np.outer([0, 1, 2], [1.0, 0, 0]), _stations(NOISE), STANCES, ORIGIN)
+
+
+@pytest.mark.parametrize(("range_sigma_m", "angle_sigma_rad"), [(0.0, 1e-5), (0.002, 0.0)])
+def test_instruments_without_noise_are_refused(range_sigma_m: float, angle_sigma_rad: float) -> None:
+    """Their measurements would outweigh all others."""
+    noise = InstrumentNoise(
+        range_sigma_m=range_sigma_m, range_sigma_ppm=0, angle_sigma_rad=angle_sigma_rad, pointing_sigma_m=0
+    )
+    with pytest.raises(GeometryError, match="without noise"):
+        _stations(noise)

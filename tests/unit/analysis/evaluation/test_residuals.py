@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from harness.prior_motion import as_points, draw_motions, in_time, measure
+
+from tsgt.analysis.evaluation.residuals import outliers, residual_figures
+from tsgt.geometry.trajectory.batch import fit
+from tsgt.model import MotionPrior, PolarMeasurement
+
+if TYPE_CHECKING:
+    from tsgt.geometry import Observations
+    from tsgt.geometry.trajectory.batch import Fit
+
+PRIOR = MotionPrior()
+
+
+@pytest.fixture(scope="module")
+def observations() -> Observations:
+    """Measure a robot that moves as the prior says for a minute, with the noise that is stated."""
+    (motion,) = draw_motions(PRIOR, count=1, duration_s=61.0, seed=4)
+    return in_time(measure(motion, until_s=60.0, seed=5))
+
+
+def fitted(observations: Observations) -> Fit:
+    """Fit it with what is true of it."""
+    return fit(observations, prior=PRIOR, noise_scale=1.0)
+
+
+def sources(observations: Observations) -> list[PolarMeasurement]:
+    """Give each observation a measurement of a station of its own for each prism."""
+    return [
+        PolarMeasurement(
+            station=10 + prism,
+            prism=prism + 1,
+            sequence=row,
+            stamp_ns=row,
+            received_ns=row,
+            horizontal_angle_rad=0.0,
+            zenith_angle_rad=1.5,
+            slope_distance_m=10.0,
+            host_time_ns=row,
+        )
+        for row, prism in enumerate(observations.prism.tolist())
+    ]
+
+
+def test_residuals_are_as_large_as_they_should_be(observations: Observations) -> None:
+    """Where motion and noise are as supposed, normalised residuals have a mean of 0 and a standard deviation of 1."""
+    found = residual_figures(fitted(observations), sources(observations))
+    assert list(found) == [10, 11, 12]
+    for axes in found.values():
+        assert list(axes) == ["range", "horizontal_angle", "zenith_angle"]
+        for figures in axes.values():
+            assert figures.n == pytest.approx(150, abs=3)
+            assert figures.mean == pytest.approx(0.0, abs=0.3)
+            assert figures.std == pytest.approx(1.0, abs=0.2)
+            assert figures.beyond_3_sigma < 0.03
+
+
+def test_a_noisy_axis_shows(observations: Observations) -> None:
+    """Ranges of one station that scatter by four times the stated noise have a standard deviation of about four."""
+    along = np.random.default_rng(6).normal(size=len(observations)) * 0.01
+    worse = np.where(observations.prism == 1, along, 0.0)[:, None]
+    distance_m = np.linalg.norm(observations.points_m, axis=1)[:, None]
+    spoilt = replace(observations, points_m=observations.points_m * (1 + worse / distance_m))
+    found = residual_figures(fitted(spoilt), sources(spoilt))
+    assert found[11]["range"].std > 2.5
+    assert found[11]["horizontal_angle"].std < 1.5
+    assert found[10]["range"].std < 1.7
+
+
+def test_cartesian_points_have_their_own_axes(observations: Observations) -> None:
+    """Nobody knows along which line they were measured."""
+    found = residual_figures(fitted(as_points(observations)), sources(observations))
+    assert list(found[10]) == ["x", "y", "z"]
+
+
+def test_outliers_are_named(observations: Observations) -> None:
+    """A prism that was measured half a metre off is found, with by how much; good measurements are not."""
+    assert len(outliers(fitted(observations), sources(observations))) <= 2
+    points = observations.points_m.copy()
+    points[200] += (0.3, 0.0, 0.4)
+    strays = outliers(fitted(replace(observations, points_m=points)), sources(observations))
+    worst = strays[0]
+    assert (worst.stamp_ns, worst.prism) == (200, int(observations.prism[200]) + 1)
+    assert worst.station == worst.prism + 9
+    assert worst.missed_mm == pytest.approx(500.0, abs=15.0)
+    assert worst.sigmas > 100
+    assert all(stray.sigmas < 6 for stray in strays[1:])

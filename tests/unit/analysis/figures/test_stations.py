@@ -1,0 +1,57 @@
+"""Figures of a report: that what they are to show lies within their axes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("matplotlib")
+
+from tsgt.analysis.figures.axes import Clock
+from tsgt.analysis.figures.stations import draw_clocks, draw_gaps
+from tsgt.analysis.figures.style import drawing
+from tsgt.analysis.report.stations import StationRecord
+
+SECOND = 1_000_000_000
+
+
+def record(station: int, first_s: float, last_s: float, bound_ms: float) -> StationRecord:
+    """Measured twice a second, each stamp within the same bound."""
+    stamps = np.round(np.arange(first_s, last_s + 0.1, 0.5) * SECOND).astype(np.int64)
+    return StationRecord(
+        station=station,
+        prisms=(station,),
+        stamp_ns=stamps,
+        usable=np.ones(len(stamps), np.bool_),
+        bound_ns=np.full(len(stamps), 1e6 * bound_ms),
+        delay_s=np.zeros(len(stamps)),
+        statuses={"ok": len(stamps)},
+        distance_m=(10.0, 20.0),
+    )
+
+
+def test_the_bounds_of_all_stations_are_on_one_scale_that_holds_them() -> None:
+    """Each station has its panel; a scale that fits the first alone would cut the others off."""
+    stations = [record(1, 0.0, 9.0, 1.0), record(2, 0.0, 9.0, 0.02), record(3, 0.0, 9.0, 40.0)]
+    with drawing(width_mm=100, height_mm=100) as figure:
+        draw_clocks(figure, {}, stations, Clock.over(0, 9 * SECOND))
+        limits = {panel.get_ylim() for panel in figure.axes}
+        assert len(figure.axes) == 3
+        assert len(limits) == 1
+        low, high = limits.pop()
+        assert low < 0.02
+        assert high > 40.0
+
+
+def test_a_station_that_ends_early_has_its_gap_in_the_figure() -> None:
+    """It is the longest one in the table, so it must be seen: from the last measurement to the end of all."""
+    stations = [record(1, 0.0, 20.0, 1.0), record(2, 0.0, 8.0, 1.0)]
+    with drawing(width_mm=100, height_mm=100) as figure:
+        draw_gaps(figure, stations, Clock.over(0, 20 * SECOND), 1.0, 20 * SECOND)
+        marks = [
+            [line.get_xydata() for line in panel.lines if line.get_label() == "gap at start or end"]
+            for panel in figure.axes
+        ]
+        assert marks[0] == []
+        assert np.asarray(marks[1][0]).tolist() == [[20.0, 12.0]]
+        assert figure.axes[1].get_ylim()[1] > 12.0

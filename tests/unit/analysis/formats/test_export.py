@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from harness.scene import START, driving, standing_scene
+
+from tsgt.analysis.formats.export import (
+    MEASUREMENT_COLUMNS,
+    POSE_COLUMNS,
+    measurement_csv,
+    pose_csv,
+    tum_lines,
+    valid_records,
+    valid_rows,
+)
+from tsgt.estimation.linear import Pipeline
+from tsgt.model import PointMeasurement
+
+if TYPE_CHECKING:
+    from tsgt.estimation.pose_batch import PoseBatch
+
+DOCUMENT = Path(__file__).parents[4] / "docs" / "reference" / "csv.md"
+
+
+@pytest.fixture
+def poses() -> PoseBatch:
+    """Process some seconds of a driving robot; the first epochs are invalid."""
+    scene = standing_scene().moving(driving)
+    pipeline = Pipeline(scene.parameters)
+    for step in range(10):
+        for station in (1, 2, 3):
+            pipeline.add(scene.measure(station, 0.4 * step + 0.11 * station))
+    return pipeline.advance(START + 3_900_000_000)
+
+
+def test_tum_stamps_are_exact() -> None:
+    """Nine decimals of an integer, with the zeros that a float would drop or invent."""
+    stamps = [1_647_269_269_000_000_001, 5, 1_647_269_269_950_000_000]
+    lines = tum_lines((stamp, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)) for stamp in stamps)
+    assert [line.split()[0] for line in lines] == [
+        "1647269269.000000001",
+        "0.000000005",
+        "1647269269.950000000",
+    ]
+
+
+def test_tum_holds_the_valid_poses(poses: PoseBatch) -> None:
+    """One line of eight numbers per valid pose, to the nanometre."""
+    rows = np.array([line.split() for line in tum_lines(valid_rows(poses))], dtype=np.float64)
+    assert 0 < len(rows) < len(poses)
+    np.testing.assert_allclose(rows[:, 1:4], poses.position_m[poses.valid], atol=1e-9)
+    np.testing.assert_allclose(rows[:, 4:], poses.orientation_xyzw[poses.valid], atol=1e-12)
+
+
+def test_tum_of_records_is_tum_of_arrays(poses: PoseBatch) -> None:
+    """Exporting recorded poses gives what processing gives, character by character."""
+    assert list(tum_lines(valid_records(poses.records()))) == list(tum_lines(valid_rows(poses)))
+
+
+def test_pose_csv_holds_all_poses(poses: PoseBatch) -> None:
+    """Invalid poses stand in it with their reason and empty cells; numbers come back exactly."""
+    rows = list(csv.DictReader(pose_csv(poses.records())))
+    assert [int(row["stamp_ns"]) for row in rows] == poses.stamp_ns.tolist()
+    assert [row["valid"] == "1" for row in rows] == poses.valid.tolist()
+    first, last = rows[0], next(row for row in reversed(rows) if row["valid"] == "1")
+    assert (first["reason"], first["x_m"], first["sigma_rz_rad"], first["residual_m"]) == (
+        "outage",
+        "",
+        "",
+        "",
+    )
+    index = poses.stamp_ns.tolist().index(int(last["stamp_ns"]))
+    assert [float(last[c]) for c in ("x_m", "y_m", "z_m")] == poses.position_m[index].tolist()
+    assert float(last["sigma_ry_rad"]) == pytest.approx(np.sqrt(poses.covariance[index, 4, 4]))
+    assert float(last["wz_radps"]) == poses.angular_velocity_radps[index, 2]
+
+
+def test_measurement_csv_keeps_raw_values_and_points_apart() -> None:
+    """A polar measurement has no position in it, a point no angles, and neither is computed."""
+    polar = standing_scene().measure(2, 0.25)
+    point = PointMeasurement(
+        station=3, prism=3, sequence=7, stamp_ns=1, received_ns=2, position_m=(1.5, -2.0, 0.1)
+    )
+    first, second = csv.DictReader(measurement_csv([polar, point]))
+    assert float(first["horizontal_angle_rad"]) == polar.horizontal_angle_rad
+    assert float(first["slope_distance_m"]) == polar.slope_distance_m
+    assert (first["type"], first["status"], first["x_m"]) == ("measurement", "ok", "")
+    assert (second["type"], second["horizontal_angle_rad"]) == ("point", "")
+    assert (second["sequence"], second["x_m"], second["y_m"], second["z_m"]) == ("7", "1.5", "-2.0", "0.1")
+
+
+@pytest.mark.parametrize("columns", [POSE_COLUMNS, MEASUREMENT_COLUMNS])
+def test_every_column_is_documented(columns: tuple[str, ...]) -> None:
+    """Each column has its own row or its place in a row of docs/reference/csv.md."""
+    text = DOCUMENT.read_text(encoding="utf-8")
+    assert [column for column in columns if f"`{column}`" not in text] == []

@@ -1,0 +1,439 @@
+"""Merging the journals of simulated missions: everything is there once, at its true time, and nothing else."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from harness.merging import assert_true, journals, merged_in, recording
+from harness.missions import SUPERFRAME, mission
+
+from tsgt.analysis.merge.merge import MARGIN_NS, WORST_BOUND_NS, merge
+from tsgt.analysis.merge.recording_index import identity
+from tsgt.analysis.processing import process
+from tsgt.config import ScenarioConfig
+from tsgt.config.scenario import StatusFaultConfig
+from tsgt.errors import CorruptLineError, RecordingError
+from tsgt.estimation.observations import build_observations, instrument_time_sigma_s
+from tsgt.estimation.pose_batch import Reason
+from tsgt.master.replay import replayed
+from tsgt.model import PolarMeasurement, Status
+from tsgt.recording import RecordingWriter, load_recording
+from tsgt.recording.journal import load_journal
+from tsgt.simulation.options import Outage, Restart
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tsgt.simulation.mission.mission import Mission
+    from tsgt.simulation.mission.runner import Run
+
+S = 1_000_000_000
+
+
+@pytest.fixture(scope="module")
+def outage(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Over classic, two minutes in which no station hears the master."""
+    return mission(
+        tmp_path_factory.mktemp("outage"),
+        duration_s=240.0,
+        drift_ppm=20.0,
+        drift_ramp_ppm_per_min=0.3,
+        outages=(Outage((1, 2, 3), 60.0, 120.0),),
+    )
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Over classic, some seconds."""
+    return mission(tmp_path_factory.mktemp("short"), duration_s=12.0)
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Over superframe; from half a minute before the end on nobody hears anybody."""
+    return mission(
+        tmp_path_factory.mktemp("frames"),
+        protocol=SUPERFRAME,
+        duration_s=60.0,
+        stamp_jitter_us=20.0,
+        outages=(Outage((1, 2, 3), 30.0, 60.0),),
+    )
+
+
+def measured(path: Path) -> Counter[object]:
+    """Count what a recording holds, each measurement by what no two share."""
+    return Counter(
+        identity(measurement)
+        for measurement in load_recording(path).measurements
+        if isinstance(measurement, PolarMeasurement)
+    )
+
+
+def journalled(run: Run) -> Counter[object]:
+    """Count what the journals hold, likewise."""
+    return Counter(
+        identity(measurement) for path in journals(run) for measurement in load_journal(path).measurements
+    )
+
+
+def added_to(run: Run, path: Path, *, without: int = 0) -> list[PolarMeasurement]:
+    """Merge all journals of a mission into its recording, and return what was added, which must be true."""
+    recording(run, path, without=without)
+    merged = merge(path, journals(run))
+    added = merged_in(path)
+    assert merged.added == len(added) > 0
+    assert_true(run, added)
+    return added
+
+
+# --- Classic ----------------------------------------------------------------------------------------------------------
+
+
+def test_an_outage_is_closed(outage: Run, tmp_path: Path) -> None:
+    """Poses that the recording alone cannot have are there after a merge, and are where the robot was."""
+    path = recording(outage, tmp_path / "r.jsonl")
+    before = process(load_recording(path), path=path)
+    added_to(outage, path)
+    after = process(load_recording(path), path=path)
+    missing, closed = (
+        np.count_nonzero((poses.stamp_ns > gap_ns[0]) & (poses.stamp_ns < gap_ns[1]) & poses.valid)
+        for gap_ns in [(outage.start_ns + 62 * S, outage.start_ns + 180 * S)]
+        for poses in (before, after)
+    )
+    assert missing == 0
+    assert closed > 117 * 20
+    truth_m = outage.world.pose_at((after.stamp_ns[after.valid] - outage.start_ns) / 1e9)[:, :3, 3]
+    error_m = np.linalg.norm(after.position_m[after.valid] - truth_m, axis=1)
+    assert np.sqrt(np.mean(error_m**2)) < 0.05
+
+
+def test_everything_is_there_once(outage: Run, tmp_path: Path) -> None:
+    """Over classic the radio carries the newest measurements only; afterwards all of them are in the recording."""
+    path = recording(outage, tmp_path / "r.jsonl")
+    merged = merge(path, journals(outage))
+    assert measured(path) == journalled(outage)
+    assert max(measured(path).values()) == 1
+    assert merged.added + merged.already_there == sum(journal.measurements for journal in merged.journals)
+    assert merged.bounds_ns[-1] < 5_000_000
+
+
+def test_a_second_merge_adds_nothing(outage: Run, tmp_path: Path) -> None:
+    """Neither the same journals nor copies of them bring anything that is there."""
+    path = recording(outage, tmp_path / "r.jsonl")
+    first = merge(path, journals(outage))
+    content = path.read_bytes()
+    copy = tmp_path / "copy.jsonl"
+    copy.write_bytes(journals(outage)[0].read_bytes())
+    again = merge(path, [*journals(outage), copy])
+    assert path.read_bytes() == content
+    assert (again.added, again.already_there) == (
+        0,
+        first.already_there + first.added + again.journals[3].measurements,
+    )
+
+
+def test_a_copy_of_a_journal_adds_nothing(short: Run, tmp_path: Path) -> None:
+    """Also when it is given along with the journal the first time."""
+    path = recording(short, tmp_path / "r.jsonl")
+    copy = tmp_path / "copy.jsonl"
+    copy.write_bytes(journals(short)[0].read_bytes())
+    merge(path, [copy, *journals(short), journals(short)[0]])
+    assert measured(path) == journalled(short)
+
+
+def test_a_replay_is_the_stream_as_it_was(outage: Run, tmp_path: Path) -> None:
+    """What was merged was not on the stream."""
+    path = recording(outage, tmp_path / "r.jsonl")
+    before = list(replayed(path))
+    merge(path, journals(outage))
+    assert list(replayed(path)) == before
+
+
+def test_an_output_of_its_own(short: Run, tmp_path: Path) -> None:
+    """It is the recording with what would have been appended, and the recording stays as it was."""
+    path, output = recording(short, tmp_path / "r.jsonl"), tmp_path / "o.jsonl"
+    content = path.read_bytes()
+    merge(path, journals(short), output=output)
+    assert path.read_bytes() == content
+    merge(path, journals(short))
+    assert output.read_bytes() == path.read_bytes()
+
+
+def test_killed_at_any_byte(short: Run, tmp_path: Path) -> None:
+    """Once more, and everything is there once, whatever the kill has left of the last line."""
+    path = recording(short, tmp_path / "r.jsonl")
+    size = path.stat().st_size
+    merge(path, journals(short))
+    whole = path.read_bytes()
+    for left in np.linspace(size, len(whole), 25).astype(int).tolist():
+        path.write_bytes(whole[:left])
+        merged = merge(path, journals(short))
+        assert merged.cut_bytes == (
+            0 if whole[left - 1 : left] == b"\n" else left - whole.rfind(b"\n", 0, left) - 1
+        )
+        assert measured(path) == journalled(short)
+
+
+def test_sessions_and_runs(tmp_path: Path) -> None:
+    """The master is started again; a station too, in an outage, and meanwhile somebody has set its Unix clock."""
+
+    async def set_clock(mission: Mission) -> None:
+        await mission.sleep_until(50.0)
+        mission.computers["station2"].clock.step(3_000_000_000)
+
+    run = mission(
+        tmp_path / "m",
+        duration_s=110.0,
+        drift_ppm=40.0,
+        outages=(Outage((1, 2, 3), 30.0, 30.0),),
+        restarts=(Restart(2, 40.0), Restart(2, 55.0), Restart(None, 80.0)),
+        script=set_clock,
+    )
+    assert len(run.sessions) == 2
+    assert len(run.witnesses[2].journals) == 3
+    path = tmp_path / "r.jsonl"
+    # The run from 42 to 55 s was never heard; it shares the computer's clock with the others.
+    added = added_to(run, path)
+    silent = load_journal(run.witnesses[2].journals[1]).measurements
+    assert {identity(m) for m in silent} <= {identity(m) for m in added}
+    assert measured(path) == journalled(run)
+
+
+def test_a_computer_that_wakes_up_in_the_same_hour(tmp_path: Path) -> None:
+    """Without a battery clock, times of two journals overlap; what the radio carried tells which is which."""
+
+    async def reboot(mission: Mission) -> None:
+        await mission.sleep_until(39.0)
+        mission.computers["station2"].clock.step(-35 * S)  # only the next run sees it
+        await mission.reboot(2, 40.0, 15.0)
+
+    run = mission(tmp_path / "m", duration_s=90.0, script=reboot)
+    first, last = (load_journal(path).measurements for path in run.witnesses[2].journals)
+    assert first[-1].stamp_ns > last[0].stamp_ns
+    path = tmp_path / "r.jsonl"
+    added_to(run, path)
+    assert measured(path) == journalled(run)
+
+
+def test_errors_are_merged_too(tmp_path: Path) -> None:
+    """A tilted instrument is the reason why ``linear`` has no poses; with its journal the desk knows."""
+    scenario = ScenarioConfig(faults=(StatusFaultConfig(station=2, status="tilt", start_s=15.0, end_s=25.0),))
+    run = mission(tmp_path / "m", scenario, duration_s=40.0, outages=(Outage((1, 2, 3), 10.0, 20.0),))
+    path = tmp_path / "r.jsonl"
+    added = added_to(run, path)
+    assert any(m.station == 2 and m.status is Status.TILT for m in added)
+    recorded = load_recording(path)
+    pipeline = replace(recorded.parameters.pipeline, estimator="linear")
+    recorded = replace(recorded, parameters=replace(recorded.parameters, pipeline=pipeline))
+    poses = process(recorded, path=path)
+    tilted = (poses.stamp_ns > run.start_ns + 17 * S) & (poses.stamp_ns < run.start_ns + 24 * S)
+    assert set(poses.reason[tilted].tolist()) == {Reason.STATION_STATUS}
+    assert merge(path, journals(run)).added == 0
+
+
+def test_what_was_long_before_is_left_out(tmp_path: Path) -> None:
+    """A station that measured before the master came is merged from two minutes before on."""
+
+    async def late_master(mission: Mission) -> None:
+        await mission.sleep_until(1.0)
+        await mission.kill("master")
+        await mission.sleep_until(180.0)
+        mission.start_master()
+
+    run = mission(tmp_path / "m", duration_s=200.0, script=late_master)
+    del run.sessions[0]
+    path = tmp_path / "r.jsonl"
+    recording(run, path)
+    merged = merge(path, journals(run))
+    assert all(journal.outside > 100 for journal in merged.journals)
+    added = merged_in(path)
+    assert_true(run, added)
+    earliest_ns = min(m.stamp_ns for m in added)
+    assert 0 <= earliest_ns - (run.start_ns + 180 * S - MARGIN_NS) < S
+    assert merged.bounds_ns[-1] <= WORST_BOUND_NS
+
+
+# --- Superframe -------------------------------------------------------------------------------------------------------
+
+
+def test_what_was_never_delivered(frames: Run, tmp_path: Path) -> None:
+    """The mission ends out of reach: what waited in the stations' queues is merged, for a while beyond the last beacon."""
+    path = tmp_path / "r.jsonl"
+    added = added_to(frames, path)
+    assert sum(m.stamp_ns > frames.start_ns + 31 * S for m in added) > 3 * 60
+    assert len(load_recording(path).measurements) == sum(journalled(frames).values())
+    assert merge(path, journals(frames)).added == 0
+
+
+def test_what_the_disk_of_the_master_lost(frames: Run, tmp_path: Path) -> None:
+    """Delivered, but not in the file: found missing by number and content, and timed by the beacons around it."""
+    path = tmp_path / "r.jsonl"
+    kept = len(load_recording(recording(frames, path)).measurements)
+    added = added_to(frames, path, without=2)
+    inside = [m for m in added if m.stamp_ns < frames.start_ns + 29 * S]
+    assert kept // 2 - 5 < len(inside) <= kept // 2 + 5
+    assert np.median([m.stamp_bound_ns for m in inside if m.stamp_bound_ns is not None]) < 500_000
+    assert len(load_recording(path).measurements) == sum(journalled(frames).values())
+
+
+def test_the_instruments_time_counts_once(frames: Run, tmp_path: Path) -> None:
+    """A time that was merged is as sure as one that was delivered, or as its journal says if that is less."""
+    path = tmp_path / "r.jsonl"
+    added = added_to(frames, path)
+    parameters = load_recording(path).parameters
+    stated_s = {
+        (m.station, m.sequence): m.stamp_sigma_ns / 1e9
+        for journal in journals(frames)
+        for m in load_journal(journal).measurements
+    }
+    observations, sources = build_observations(parameters, added, origin_ns=frames.start_ns)
+    for sigma_s, source in zip(observations.time_sigma_s, sources, strict=True):
+        known_s = max(instrument_time_sigma_s(source.sequence), stated_s[source.station, source.sequence])
+        assert known_s - 1e-9 <= sigma_s < 1.2 * known_s
+
+
+def test_runs_and_boots_over_superframe(tmp_path: Path) -> None:
+    """Numbers go on over restarts of the client; a restarted computer has another clock, and is timed by itself."""
+
+    async def reboot(mission: Mission) -> None:
+        await mission.reboot(3, 30.0, 10.0)
+
+    run = mission(
+        tmp_path / "m",
+        protocol=SUPERFRAME,
+        duration_s=80.0,
+        drift_ppm=40.0,
+        outages=(Outage((2,), 20.0, 20.0),),
+        restarts=(Restart(2, 30.0), Restart(None, 60.0)),
+        script=reboot,
+    )
+    path = tmp_path / "r.jsonl"
+    added_to(run, path, without=3)
+    # Two sessions of the master may both have what the first one could not acknowledge any more.
+    assert {(m.station, m.sequence) for m in load_recording(path).measurements} == {
+        (m.station, m.sequence) for journal in journals(run) for m in load_journal(journal).measurements
+    }
+
+
+def test_numbers_that_begin_again(tmp_path: Path) -> None:
+    """Somebody empties the folder of journals: the same numbers come again, and mean other measurements."""
+    kept = tmp_path / "kept.jsonl"
+
+    async def emptied(mission: Mission) -> None:
+        await mission.sleep_until(20.0)
+        await mission.kill("station1")
+        mission.witnesses[1].journals[0].rename(kept)
+        mission.start_station(1)
+
+    run = mission(tmp_path / "m", protocol=SUPERFRAME, duration_s=40.0, script=emptied)
+    path = recording(run, tmp_path / "r.jsonl", without=2)
+    of_both = [load_journal(journal).measurements for journal in (kept, *run.witnesses[1].journals)]
+    assert of_both[0][5].sequence == of_both[1][5].sequence
+    before = len(load_recording(path).measurements)
+    merged = merge(path, [kept, *journals(run)])
+    assert_true(run, merged_in(path))
+    assert before + merged.added == sum(journal.measurements for journal in merged.journals)
+
+
+def test_beacons_of_another_master(frames: Run, tmp_path: Path) -> None:
+    """A journal that heard none of this recording's is not taken for one that belongs to it."""
+    path = recording(frames, tmp_path / "r.jsonl")
+    other = tmp_path / "other.jsonl"
+    content = journals(frames)[0].read_bytes().replace(b'"session":', b'"session":7')
+    other.write_bytes(content.replace(b'"boot":"station1-1"', b'"boot":"x"'))
+    merged = merge(path, [*journals(frames), other])
+    assert "knows no beacon" in merged.journals[3].skipped
+    other.write_bytes(
+        b"".join(line for line in content.splitlines(keepends=True) if b"reception" not in line)
+    )
+    with pytest.raises(RecordingError, match="does not say when beacons came"):
+        merge(path, [other])
+
+
+# --- What does not belong together ------------------------------------------------------------------------------------
+
+
+def test_journals_of_another_mission(short: Run, tmp_path: Path) -> None:
+    """They are skipped and the reason is told; if there is nothing else, nothing is done."""
+    other = mission(tmp_path / "other", duration_s=5.0, seed=9)
+    path = recording(short, tmp_path / "r.jsonl")
+    content = path.read_bytes()
+    with pytest.raises(RecordingError, match=r"none of the journals can be merged; .* of another mission"):
+        merge(path, journals(other))
+    assert path.read_bytes() == content
+    foreign = tmp_path / "foreign.jsonl"
+    foreign.write_bytes(journals(other)[1].read_bytes().replace(b'"boot":"station2-1"', b'"boot":"else"'))
+    merged = merge(path, [*journals(short), foreign])
+    assert [bool(journal.skipped) for journal in merged.journals] == [False, False, False, True]
+    assert "another mission" in merged.journals[3].skipped
+    assert measured(path) == journalled(short)
+
+
+def test_another_protocol(short: Run, frames: Run, tmp_path: Path) -> None:
+    """Classic journals have nothing to do with beacons, nor superframe journals with synchronisations."""
+    classic, superframe = recording(short, tmp_path / "c.jsonl"), recording(frames, tmp_path / "s.jsonl")
+    with pytest.raises(
+        RecordingError, match="is of the protocol superframe, and the recording has no beacons"
+    ):
+        merge(classic, journals(frames))
+    with pytest.raises(RecordingError, match="is of the protocol classic, and the recording has no synchron"):
+        merge(superframe, journals(short))
+
+
+def test_another_station(short: Run, tmp_path: Path) -> None:
+    """A station that the recording does not know is told by its number."""
+    path = recording(short, tmp_path / "r.jsonl")
+    seventh = tmp_path / "station7.jsonl"
+    seventh.write_bytes(journals(short)[0].read_bytes().replace(b'"station":1', b'"station":7'))
+    with pytest.raises(RecordingError, match="is of station 7, and the recording has only 1, 2, 3"):
+        merge(path, [seventh])
+
+
+def test_files_in_the_wrong_place(short: Run, tmp_path: Path) -> None:
+    """A journal as recording, a recording as journal, neither: named, and nothing is touched or made."""
+    path, journal = recording(short, tmp_path / "r.jsonl"), journals(short)[0]
+    with pytest.raises(RecordingError, match="is a station's journal; give the master's recording first"):
+        merge(journal, [journal])
+    with pytest.raises(RecordingError, match="is no journal of a station"):
+        merge(path, [path])
+    missing = tmp_path / "missing.jsonl"
+    with pytest.raises(RecordingError, match="cannot be read"):
+        merge(missing, [journal])
+    assert not missing.exists()
+    path.write_bytes(
+        b"".join(line for line in path.read_bytes().splitlines(keepends=True) if b'"clock"' not in line)
+    )
+    with pytest.raises(RecordingError, match="neither synchronisations nor beacons"):
+        merge(path, [journal])
+
+
+def test_a_recording_that_is_being_written(short: Run, tmp_path: Path) -> None:
+    """The master has to end first; a copy can be made meanwhile."""
+    path = recording(short, tmp_path / "r.jsonl")
+    with RecordingWriter(path):
+        with pytest.raises(RecordingError, match="another program is writing it"):
+            merge(path, journals(short))
+        assert merge(path, journals(short), output=tmp_path / "o.jsonl").added > 0
+
+
+def test_damaged_lines(short: Run, tmp_path: Path) -> None:
+    """They are errors, or skipped and told of when that is asked for; the other lines are merged."""
+    path, journal = recording(short, tmp_path / "r.jsonl"), tmp_path / "j.jsonl"
+    lines = journals(short)[0].read_bytes().splitlines(keepends=True)
+    journal.write_bytes(
+        b"".join([*lines[:5], b"rubbish\n", b'{"type":"measurement"}\n', *lines[5:], b'{"ty'])
+    )
+    with pytest.raises(CorruptLineError, match="line 6"):
+        merge(path, [journal])
+    problems: list[RecordingError] = []
+    merged = merge(path, [journal], keep_going=True, on_problem=problems.append)
+    assert [problem.line for problem in problems] == [6, 7, len(lines) + 3]
+    assert merged.added > 0
+    assert dataclasses.replace(merged.journals[0], path=path) == dataclasses.replace(
+        merge(recording(short, path), journals(short)[:1]).journals[0], path=path
+    )

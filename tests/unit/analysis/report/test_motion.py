@@ -1,0 +1,127 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from harness.scene import SECOND, START, Scene, driving, standing_scene
+
+from tsgt.analysis.evaluation.inter_prism import at_epochs, inter_prism
+from tsgt.analysis.figures.axes import BUCKETS, Clock, thinned
+from tsgt.analysis.report.motion import BINS, binned, gridded, ride
+from tsgt.estimation.tracks import Track, build_tracks
+
+
+def tracks_of(scene: Scene, *, duration_s: float = 8.0) -> dict[int, Track]:
+    """Exact measurements at 2.5 Hz, each station with its own phase."""
+    return build_tracks(
+        scene.parameters,
+        [
+            scene.measure(station, 0.4 * step + 0.11 * station)
+            for step in range(int(duration_s / 0.4))
+            for station in (1, 2, 3)
+        ],
+    )
+
+
+def test_a_standing_robot_has_no_errors_and_one_interval() -> None:
+    """Exact measurements give the distances of the layout at each epoch."""
+    scene = standing_scene()
+    tracks = tracks_of(scene)
+    found = ride(scene.parameters, at_epochs(scene.parameters, tracks), None)
+    assert list(found.error_m) == ["1-2", "1-3", "2-3"]
+    for error_m in found.error_m.values():
+        np.testing.assert_allclose(error_m, 0.0, atol=1e-9)
+    assert len(inter_prism(scene.parameters, tracks).still_ns) == 1
+    assert np.isnan(found.motion.speed_mps).all()
+
+
+def test_straight_lines_cut_a_bend() -> None:
+    """A driving robot's distances are off where tracks are interpolated, and no interval is still."""
+    scene = standing_scene().moving(driving)
+    tracks = tracks_of(scene)
+    found = ride(scene.parameters, at_epochs(scene.parameters, tracks), None)
+    assert max(np.abs(error_m).max() for error_m in found.error_m.values()) > 1e-4
+    assert inter_prism(scene.parameters, tracks).still_ns == ()
+
+
+def test_distances_are_taken_in_the_given_intervals() -> None:
+    """Somebody else may know better when the robot stood; outside nothing counts."""
+    scene = standing_scene()
+    found = inter_prism(scene.parameters, tracks_of(scene), [(START + SECOND, START + 3 * SECOND)])
+    assert found.still_s == 2.0
+    assert [pair.name for pair in found.static] == ["1-2", "1-3", "2-3"]
+    for pair in found.static:
+        assert len(pair.distances_m) == 5
+        np.testing.assert_allclose(pair.distances_m, pair.reference_m, atol=1e-9)
+
+
+def test_standing_before_and_after_the_recording_does_not_count() -> None:
+    """Odometry runs longer than stations measure; of another day nothing is left."""
+    scene = standing_scene()
+    tracks = tracks_of(scene)
+    hour = 3600 * SECOND
+    last_s = 0.4 * 19 + 0.33
+    found = inter_prism(scene.parameters, tracks, [(START - hour, START + hour)])
+    assert found.still_s == pytest.approx(last_s - 0.11)
+    other_day = inter_prism(scene.parameters, tracks, [(START - 2 * hour, START - hour)])
+    assert other_day.still_ns == ()
+    assert all(not len(pair.distances_m) for pair in other_day.static)
+
+
+def test_errors_are_sorted_by_size_into_their_bins() -> None:
+    """Each bin has the figures of its own errors; too few are told by nothing."""
+    quantity = np.repeat(np.linspace(0.05, 0.75, BINS), 100)
+    error_m = np.where(np.arange(len(quantity)) % 2, 1.0, -1.0) * quantity
+    error_m[:90] = np.nan
+    found = binned(error_m[None], quantity)
+    assert found is not None
+    assert found.counts.tolist() == [10, *[100] * (BINS - 1)]
+    assert np.isnan(found.median[0])
+    np.testing.assert_allclose(found.median[1:], np.linspace(0.05, 0.75, BINS)[1:])
+    np.testing.assert_allclose(found.p95[1:], found.mean[1:])
+
+
+def test_a_quantity_of_both_signs_has_bins_on_both_sides() -> None:
+    """Slowing down is not gaining speed."""
+    quantity = np.linspace(-2.0, 1.0, 500)
+    found = binned(np.ones((1, 500)), quantity)
+    assert found is not None
+    assert found.edges[0] == -found.edges[-1] < 0.0
+
+
+@pytest.mark.parametrize("quantity", [np.full(100, np.nan), np.zeros(100), np.ones(5)])
+def test_nothing_is_sorted_by_what_is_not_known_or_does_not_differ(quantity: np.ndarray) -> None:
+    """There are no bins then, in one dimension or in two."""
+    errors = np.ones((1, len(quantity)))
+    assert binned(errors, quantity) is None
+    assert gridded(errors, quantity, quantity) is None
+
+
+def test_a_grid_holds_the_mean_of_each_cell() -> None:
+    """Rows are the second quantity, columns the first."""
+    x, y = np.repeat([0.1, 0.9], 200), np.tile([0.1, 0.9], 200)
+    found = gridded((x + 10 * y)[None], x, y)
+    assert found is not None
+    assert found.counts.sum() == 400
+    assert found.mean[0, -1] == pytest.approx(0.9 + 1.0)
+    assert found.mean[-1, 0] == pytest.approx(0.1 + 9.0)
+    assert np.isnan(found.mean[0, 1])
+
+
+def test_a_long_curve_keeps_its_peaks_and_its_gaps() -> None:
+    """Thinned, it looks the same on paper."""
+    x = np.arange(100_000.0)
+    y = np.sin(x / 5000)
+    y[12_345], y[50_000:60_000] = 7.0, np.nan
+    some_x, some_y = thinned(x, y)
+    assert len(some_x) < 3 * BUCKETS
+    assert np.nanmax(some_y) == 7.0
+    assert np.isnan(some_y[(some_x > 50_200) & (some_x < 59_800)]).all()
+    assert (np.diff(some_x) >= 0).all()
+
+
+@pytest.mark.parametrize(("span_s", "unit"), [(100, "(s)"), (3600, "(min)"), (40_000, "(h)")])
+def test_the_axis_of_time_has_small_numbers(span_s: int, unit: str) -> None:
+    """Its unit follows from how long the recording is."""
+    clock = Clock.over(START, START + span_s * SECOND)
+    assert clock.label.endswith(unit)
+    assert float(clock.of(START + span_s * SECOND)) <= 300

@@ -1,0 +1,428 @@
+"""Targets collected and checked over the simulated air: both protocols, and the authors' nodes."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from contextlib import asynccontextmanager
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Literal, NoReturn
+
+import numpy as np
+import pytest
+from harness.client import client_config
+from harness.field import TRUE, SceneInstrument, Station, field_of
+from harness.radios import PAPER
+from harness.scene import FRAMES
+
+from tsgt.analysis.calibration.station_check import check_station
+from tsgt.analysis.calibration.target_collection import TargetCollection
+from tsgt.analysis.calibration.targets import mean_points
+from tsgt.analysis.formats.target_file import read_some_targets, read_target_file
+from tsgt.cli.calibrate.check import measure_again, print_check
+from tsgt.cli.calibrate.collect import collect_targets
+from tsgt.cli.calibrate.session import TargetSession, target_session
+from tsgt.config.client import JournalConfig
+from tsgt.config.radio import SuperframeConfig, SuperframeMasterConfig
+from tsgt.errors import InputFileError, RadioError, TsgtError
+from tsgt.geometry import cartesian_to_polar, invert, transform_points
+from tsgt.model import Status
+from tsgt.simulation.lora.radios import opener
+from tsgt.station.daemon import run_client
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator
+    from pathlib import Path
+
+    from harness.cli import Tsgt
+    from harness.field import Field
+
+    from tsgt.radio.base import OpenRadio
+    from tsgt.station.instrument import Reading
+
+KEY = bytes(range(32))
+TARGETS = np.array([[20.0, 3.0, 0.5], [5.0, 18.0, -0.5], [-14.0, 9.0, 1.0], [-8.0, -16.0, 0.2]])
+STATIONS = (1, 2, 3)
+
+
+class AimedInstrument(SceneInstrument):
+    """One that measures the target it is aimed at, exactly.
+
+    Attributes
+    ----------
+    target
+        Which, from 1.
+    T
+        Where its tripod stands.
+    """
+
+    target = 1
+    T = np.eye(4)
+
+    async def measure(self) -> Reading:
+        """Measure the target; takes five seconds."""
+        reading = await super().measure()
+        await asyncio.sleep(3.0)
+        h, z, d = cartesian_to_polar(transform_points(invert(self.T), TARGETS[self.target - 1]))
+        return replace(
+            reading,
+            prism=None,
+            horizontal_angle_rad=float(h),
+            zenith_angle_rad=float(z),
+            slope_distance_m=float(d) if self.status.usable else None,
+        )
+
+
+class Script:
+    """Someone who aims where the question says and then gives the answers of a list, and Enter when it is used up."""
+
+    def __init__(self, instruments: dict[int, AimedInstrument], *answers: str | None) -> None:
+        self.instruments = instruments
+        self.answers = list(answers)
+        self.questions: list[str] = []
+        self.said: list[str] = []
+
+    async def ask(self, question: str) -> str | None:
+        """Aim and answer."""
+        self.questions.append(question)
+        words = question.replace(",", " ").replace(":", " ").split()
+        if words[0] == "station":
+            self.instruments[int(words[1])].target = int(words[3])
+        return self.answers.pop(0) if self.answers else ""
+
+    def say(self, text: str) -> None:
+        """Remember."""
+        self.said.append(text)
+
+
+Speaks = Literal["classic", "authors", "superframe"]
+"""Our client in either protocol, or a node of the authors."""
+
+BOTH: tuple[Speaks, ...] = ("classic", "superframe")
+
+
+class SuperframeClient(Station):
+    """A station that runs the client's daemon."""
+
+    folder: Path
+
+    async def _run(self) -> None:
+        config = client_config(self.folder, station=self.number, prism=self.number)
+        config = config.model_copy(
+            update={
+                "protocol": SuperframeConfig(kind="superframe"),
+                "journal": JournalConfig(directory=self.folder / f"journals{self.number}"),
+                "status_socket": self.folder / f"client{self.number}.sock",
+            }
+        )
+        rng = np.random.default_rng((self.number, self._starts))
+        await run_client(
+            config,
+            PAPER,
+            instrument=self.instrument,
+            open_radio=opener(self.air, f"station-{self.number}", self.clock, rng, PAPER),
+            clock=self.clock,
+            key=KEY,
+            random_bits=lambda bits: int(rng.integers(1 << bits)),
+            boot="one",
+        )
+
+
+@asynccontextmanager
+async def aimed(
+    folder: Path, speaks: Speaks = "classic"
+) -> AsyncGenerator[tuple[Field, dict[int, AimedInstrument]]]:
+    """Stations with instruments that can be aimed."""
+    async with field_of(folder, authors=speaks == "authors") as field:
+        instruments = {}
+        for number, station in field.stations.items():
+            await station.kill()
+            instruments[number] = AimedInstrument(field.scene, number, station.clock)
+            instruments[number].T = FRAMES[number - 1]
+            if speaks == "superframe":
+                client = SuperframeClient(number, field.air, field.scene, authors=False, clock=station.clock)
+                client.folder = folder
+                field.stations[number] = client
+            field.stations[number].instrument = instruments[number]
+            field.stations[number].start()
+        await asyncio.sleep(1.0)
+        yield field, instruments
+
+
+@asynccontextmanager
+async def session(
+    field: Field, script: Script, open_radio: OpenRadio | None = None
+) -> AsyncGenerator[TargetSession]:
+    """Open the master's radio for targets."""
+    config = field.config()
+    if isinstance(field.stations[1], SuperframeClient):
+        key_file = field.folder / "mission.key"
+        key_file.write_text(KEY.hex() + "\n")
+        key_file.chmod(0o600)
+        protocol = SuperframeMasterConfig(kind="superframe", key_file=key_file)
+        config = config.model_copy(update={"protocol": protocol})
+    async with target_session(
+        config, field.folder / "master.toml", TRUE, script.say, open_radio or field.open_radio()
+    ) as opened:
+        yield opened
+
+
+async def collected(
+    field: Field, script: Script, path: Path, *, targets: int = 4, repeats: int = 1
+) -> TargetCollection:
+    """Collect as the command does."""
+    collection = TargetCollection(path, STATIONS, range(1, targets + 1), repeats=repeats)
+    collection.resume()
+    async with session(field, script) as stations:
+        await collect_targets(collection, stations, script, constant_m=0.01)
+    return collection
+
+
+@pytest.mark.parametrize("speaks", ["classic", "authors", "superframe"])
+async def test_all_targets_are_collected_and_the_frames_come_out(tmp_path: Path, speaks: Speaks) -> None:
+    """Station by station, target by target; the file solves to where the stations stand; all track again."""
+    path = tmp_path / "targets.csv"
+    async with aimed(tmp_path, speaks) as (field, instruments):
+        script = Script(instruments)
+        collection = await collected(field, script, path)
+        assert not [tool for tool in instruments.values() if tool.direct_mode]
+    asked = [question.split(":")[0] for question in script.questions[:-1]]
+    assert asked == [f"station {s}, target {t}" for s in STATIONS for t in (1, 2, 3, 4)]
+    assert script.questions[-1].startswith("nothing is left")
+    file = read_target_file(path)
+    assert {s: list(seen) for s, seen in file.sights.items()} == {s: [1, 2, 3, 4] for s in STATIONS}
+    assert file.sights[2][1][0].constant_m == 0.01
+    # The constant is part of the file; the instruments here need none, so distances are 10 mm long.
+    for station in (2, 3):
+        solved = collection.residuals(station)
+        assert not isinstance(solved, str)
+        assert np.linalg.norm(solved.T[:3, 3] - FRAMES[station - 1][:3, 3]) < 0.01
+
+
+@pytest.mark.parametrize("speaks", BOTH)
+async def test_a_failed_measurement_is_told_in_words_and_asked_for_again(
+    tmp_path: Path, speaks: Speaks
+) -> None:
+    """The status of the instrument, and what to do about it."""
+    async with aimed(tmp_path, speaks) as (field, instruments):
+        instruments[1].status = Status.TILT
+        script = Script(instruments, "", "q")
+        collection = await collected(field, script, tmp_path / "targets.csv")
+    assert "failed: station 1: the instrument is not level" in "\n".join(script.said)
+    assert [question[:19] for question in script.questions] == ["station 1, target 1"] * 2
+    assert collection.count(1, 1) == 0
+
+
+@pytest.mark.parametrize("speaks", BOTH)
+async def test_a_silent_station_is_named(tmp_path: Path, speaks: Speaks) -> None:
+    """The others can go on; at the end it is said that it may not be tracking."""
+    async with aimed(tmp_path, speaks) as (field, instruments):
+        await field.stations[1].kill()
+        script = Script(instruments, "", "q")
+        await collected(field, script, tmp_path / "targets.csv")
+    assert "failed: station 1 does not answer; see that its client runs" in script.said[1]
+    assert script.said[-1].startswith("note: station 1 is not tracking again: it does not answer")
+
+
+@pytest.mark.parametrize("speaks", BOTH)
+async def test_a_station_that_started_anew_measures_the_target_all_the_same(
+    tmp_path: Path, speaks: Speaks
+) -> None:
+    """It tracks its prism after the start; the answer must not be the prism."""
+    async with aimed(tmp_path, speaks) as (field, instruments):
+        script = Script(instruments)
+        collection = TargetCollection(tmp_path / "targets.csv", [1], [1, 2])
+        async with session(field, script) as stations:
+            first = await stations.shoot(1, constant_m=0.0)
+            await field.stations[1].kill()
+            field.stations[1].start()
+            await asyncio.sleep(2.0)
+            second = await stations.shoot(1, constant_m=0.0)
+    assert second.slope_distance_m == pytest.approx(first.slope_distance_m)
+    assert collection.count(1, 1) == 0
+
+
+async def test_measurements_are_left_to_a_master(tmp_path: Path) -> None:
+    """Over the superframe stations send what they measure; nothing is acknowledged that nobody records."""
+    async with aimed(tmp_path, "superframe") as (field, instruments):
+        script = Script(instruments)
+        async with session(field, script) as stations:
+            await asyncio.sleep(8.0)
+            await stations.shoot(1, constant_m=0.0)
+        reader, writer = await asyncio.open_unix_connection(tmp_path / "client2.sock")
+        status = json.loads(await reader.read())
+        writer.close()
+    assert status["joined"]
+    assert status["queued"] == status["measurements"] > 20
+
+
+class BrokenRadio:
+    """A radio whose chip does not answer any more."""
+
+    async def transmit(self, payload: bytes, *, at_ns: int | None = None) -> NoReturn:
+        """Fail."""
+        raise RadioError(f"no answer to {len(payload)} bytes for {at_ns}")
+
+
+@pytest.mark.parametrize("speaks", BOTH)
+async def test_a_radio_that_fails_ends_it_at_once(tmp_path: Path, speaks: Speaks) -> None:
+    """Nobody waits for answers that cannot come; it is said which stations may not be tracking."""
+
+    @asynccontextmanager
+    async def open_radio() -> AsyncGenerator[Any]:
+        yield BrokenRadio()
+
+    async with aimed(tmp_path, speaks) as (field, instruments):
+        script, began_s = Script(instruments), asyncio.get_running_loop().time()
+        with pytest.raises(RadioError, match="no answer"):
+            async with session(field, script, open_radio) as stations:
+                await stations.shoot(1, constant_m=0.0)
+        assert asyncio.get_running_loop().time() - began_s < 1.0
+    assert script.said[-1].startswith("note: station 1 is not tracking again: the radio failed (no answer")
+
+
+async def test_keys(tmp_path: Path) -> None:
+    """Skipped ones come again with the next run; the last one, or any, can be redone; others are refused."""
+    async with aimed(tmp_path) as (field, instruments):
+        script = Script(instruments, "r", "", "s", "", "r", "", "x", "r 1 1", "", "r 9", "q")
+        collection = await collected(field, script, tmp_path / "targets.csv")
+    numbers = [question.split(":")[0] for question in script.questions]
+    assert numbers == [f"station 1, target {t}" for t in (1, 1, 2, 3, 4, 3, 4, 4, 1, 4, 4)]
+    assert [collection.count(1, t) for t in (1, 2, 3, 4)] == [1, 0, 1, 0]
+    assert script.said[0] == "which one? Type r, station and target, for example r 2 5"
+    assert "'x' is none of the keys" in script.said
+    assert "station 1 has not measured target 9 yet" in script.said
+
+
+@pytest.mark.parametrize("speaks", BOTH)
+@pytest.mark.parametrize("stop", ["q", None, "cancel"])
+async def test_it_goes_on_where_it_stopped(tmp_path: Path, stop: str | None, speaks: Speaks) -> None:
+    """After q, the end of the input and Ctrl-C alike: what was measured is in the file, the stations track."""
+    path = tmp_path / "targets.csv"
+    async with aimed(tmp_path, speaks) as (field, instruments):
+        if stop == "cancel":
+            task = asyncio.create_task(collected(field, Script(instruments), path))
+            await asyncio.sleep(
+                13.0 if speaks == "classic" else 17.0
+            )  # in the middle of the third measurement
+            task.cancel()
+            await asyncio.wait([task])
+            assert task.cancelled()
+        else:
+            await collected(field, Script(instruments, "", "", stop), path)
+        assert list(read_some_targets(path).sights[1]) == [1, 2]
+        assert not instruments[1].direct_mode
+        path.write_text("# foil on the wall\n" + path.read_text())
+        script = Script(instruments)
+        await collected(field, script, path)
+    assert script.questions[0].startswith("station 1, target 3:")
+    assert path.read_text().startswith("# foil on the wall\n")
+    assert list(read_target_file(path).sights[3]) == [1, 2, 3, 4]
+
+
+async def test_both_faces(tmp_path: Path) -> None:
+    """With two repeats every target is asked for twice."""
+    async with aimed(tmp_path) as (field, instruments):
+        script = Script(instruments, "", "", "", "q")
+        collection = await collected(field, script, tmp_path / "targets.csv", repeats=2)
+    assert [collection.count(1, t) for t in (1, 2)] == [2, 1]
+
+
+async def test_progress_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What each station has, and the residuals as soon as three targets are common."""
+    async with aimed(tmp_path) as (field, instruments):
+        await collected(
+            field, Script(instruments, "", "", "", "s", "", "", "", "q"), tmp_path / "targets.csv"
+        )
+    out = capsys.readouterr().out.splitlines()
+    assert any("got 2 (1, 2); measure more of them" in line for line in out)
+    header, *rows, verdict = out[-6:]
+    assert header.split("  ")[0] == "target"
+    assert "residual of 2, mm" in header
+    assert rows[0].split() == ["1", "1", "1", "-", "0.1"]
+    assert rows[3].split() == ["4", "X", "-", "-"]
+    assert verdict.startswith("station 2: rms 0.4 mm")
+
+
+@pytest.mark.parametrize("text", ["station,target\n", "junk", ""])
+def test_a_file_of_another_kind_is_not_overwritten(tmp_path: Path, text: str) -> None:
+    """Nor one whose header this program has not written."""
+    path = tmp_path / "targets.csv"
+    path.write_text(text)
+    with pytest.raises(InputFileError, match="was not written by tsgt calibrate collect"):
+        TargetCollection(path, STATIONS, [1, 2, 3]).resume()
+
+
+async def test_a_running_master_is_told_of(tmp_path: Path) -> None:
+    """It owns the radio; the message says how to stop it."""
+    async with aimed(tmp_path) as (field, instruments):
+        server = await asyncio.start_unix_server(lambda _, w: w.close(), field.config().stream.socket)
+        async with server:
+            with pytest.raises(TsgtError, match="systemctl stop tsgt-master"):
+                async with session(field, Script(instruments)):
+                    pass
+
+
+@pytest.mark.parametrize(("moved_m", "code"), [(0.0, 0), (0.02, 3)])
+async def test_a_moved_tripod_is_found(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], moved_m: float, code: int
+) -> None:
+    """Station 2 stands 20 mm further along; the others have not moved."""
+    path = tmp_path / "targets.csv"
+    async with aimed(tmp_path) as (field, instruments):
+        script = Script(instruments)
+        await collected(field, script, path)
+        T = instruments[2].T.copy()
+        T[0, 3] += moved_m
+        instruments[2].T = T
+        before = read_some_targets(path).sights
+        async with session(field, script) as stations:
+            cells = [(s, t) for s in STATIONS for t in (1, 2, 3)]
+            now = await measure_again(cells, before, stations, script, constant_m=0.0)
+    capsys.readouterr()
+    results = {
+        s: check_station(mean_points(path, before[s], 0.0, "{}"), mean_points(path, now[s], 0.0, "{}"))
+        for s in now
+    }
+    assert print_check(results, as_json=True) == code
+    printed = json.loads(capsys.readouterr().out)["stations"]
+    assert [printed[s]["ok"] for s in ("1", "2", "3")] == [True, code == 0, True]
+    assert printed["2"]["moved_mm"] == pytest.approx(1e3 * moved_m, abs=0.1)
+    assert printed["2"]["moved_mrad"] == pytest.approx(0.0, abs=0.01)
+
+
+async def test_check_can_skip_and_quit(tmp_path: Path) -> None:
+    """What was not measured is not in the result."""
+    path = tmp_path / "targets.csv"
+    async with aimed(tmp_path) as (field, instruments):
+        await collected(field, Script(instruments), path)
+        before = read_some_targets(path).sights
+        script = Script(instruments, "s", "z", "", "q")
+        async with session(field, script) as stations:
+            now = await measure_again([(1, 1), (1, 2), (2, 1)], before, stations, script, constant_m=0.0)
+    assert {s: list(seen) for s, seen in now.items()} == {1: [2]}
+
+
+def test_what_cannot_be_checked_is_refused(tsgt: Tsgt, tmp_path: Path) -> None:
+    """A target that was not measured before; a station that is not configured."""
+    config = tmp_path / "master.toml"
+    config.write_text(
+        'kind = "master"\n[setup]\nstation_frames = "a"\nprism_layout = "b"\n'
+        "[[stations]]\nstation = 1\nprism = 1\nprism_constant_mm = 0.0\n"
+        '[radio]\nkind = "simulated"\nair_socket = "air.sock"\nname = "master"\nfrequency_mhz = 905.0\n'
+        'spreading_factor = 9\n[protocol]\nkind = "classic"\n[stream]\nsocket = "poses.sock"\n'
+    )
+    targets = tmp_path / "targets.csv"
+    targets.write_text(
+        "station,target,horizontal_angle_rad,zenith_angle_rad,slope_distance_m,constant_mm\n1,1,0.1,1.5,20.0,0\n"
+    )
+    common = ("calibrate", "check", "--config", config, "--targets-file", targets)
+    done = tsgt(*common, "--target", 7)
+    assert (done.code, "holds no target 7" in done.err) == (1, True)
+    done = tsgt(*common, "--station", 4)
+    assert (done.code, "no station 4" in done.err) == (2, True)
+    # Its radio has no air to be on.
+    done = tsgt(*common)
+    assert (done.code, "stop it first" in done.err) == (1, True)
+    done = tsgt("calibrate", "collect", "--config", config, "--output", tmp_path / "no" / "targets.csv")
+    assert (done.code, "No such" in done.err) == (1, True)

@@ -1,0 +1,251 @@
+"""``tsgt calibrate`` through the real command line, on the authors' field data and on the documented examples."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from tsgt.config import StationFramesFile, load, load_prism_layout, load_station_frames
+
+if TYPE_CHECKING:
+    from harness.cli import Tsgt
+
+REFERENCE = Path(__file__).parents[4] / "docs" / "reference" / "target-file.md"
+HOW_TO = Path(__file__).parents[4] / "docs" / "how-to" / "calibrate.md"
+
+
+@pytest.fixture
+def markers(field_data: Path) -> Path:
+    """Return the authors' targets of 14 March 2022: eight targets, three stations."""
+    return field_data / "20220314" / "GCP.txt"
+
+
+def documented(number: int, folder: Path) -> Path:
+    """Write one of the examples of the reference page to a file."""
+    path = folder / "measured.csv"
+    example = re.findall(r"```csv\n(.*?)```", REFERENCE.read_text(encoding="utf-8"), re.DOTALL)[number]
+    path.write_text(example, encoding="utf-8")
+    return path
+
+
+def falsified(markers: Path, folder: Path, station: int, target: int, extra_m: float) -> Path:
+    """Copy a marker file with one distance changed."""
+    lines = []
+    for line in markers.read_text(encoding="utf-8").splitlines():
+        cells = line.split(" , ")
+        if cells[:2] == [str(station), str(target)]:
+            cells[5] = repr(float(cells[5]) + extra_m)
+        lines.append(" , ".join(cells))
+    path = folder / "falsified.txt"
+    path.write_text("\n".join(lines), encoding="utf-8")
+    return path
+
+
+def only(markers: Path, folder: Path, targets: str) -> Path:
+    """Copy a marker file with these targets only."""
+    lines = markers.read_text(encoding="utf-8").splitlines()
+    path = folder / "some.txt"
+    kept = [line for line in lines[1:] if line.split(" , ")[1] in targets]
+    path.write_text("\n".join([lines[0], *kept]), encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("constant_mm", "rms_mm"),
+    [(10, {"2": 1.458115, "3": 1.094233}), (0, {"2": 1.966181, "3": 2.447351})],
+)
+def test_field_targets_give_the_published_residuals(
+    tsgt: Tsgt, markers: Path, constant_mm: int, rms_mm: dict[str, float]
+) -> None:
+    """Unweighted, all eight targets: the unique optimum, to a nanometre."""
+    done = tsgt(
+        "calibrate", "targets", markers, "--target-constant-mm", constant_mm, "--weights", "none", "--json"
+    )
+    assert done.code == 0
+    stations = done.json()["stations"]
+    assert {number: station["rms_mm"] for number, station in stations.items()} == pytest.approx(
+        rms_mm, abs=1e-6
+    )
+    assert all(station["used"] == [1, 2, 3, 4, 5, 6, 7, 8] for station in stations.values())
+
+
+@pytest.mark.parametrize("day", ["20220314", "20220331-1"])
+@pytest.mark.parametrize("weights", ["model", "none"])
+def test_good_field_data_is_sound(tsgt: Tsgt, field_data: Path, day: str, weights: str) -> None:
+    """No field target is rejected, no frame is weak or contradictory, and no residual exceeds 5 mm."""
+    done = tsgt(
+        "calibrate", "targets", field_data / day / "GCP.txt", "--target-constant-mm", 10, "--weights", weights,
+        "--json",
+    )  # fmt: skip
+    assert done.code == 0
+    assert done.err == ""
+    for station in done.json()["stations"].values():
+        assert station["rejected"] == []
+        assert station["weak"] == []
+        assert station["consistent"] is True
+        assert station["max_mm"] < 5
+
+
+@pytest.mark.parametrize(("weights", "limit_mm"), [("none", 1.6), ("model", 1.6)])
+@pytest.mark.parametrize("station", [1, 2, 3])
+def test_a_falsified_target_is_named_and_rejected(
+    tsgt: Tsgt, markers: Path, tmp_path: Path, station: int, weights: str, limit_mm: float
+) -> None:
+    """Each target, 50 mm too long or too short: it is rejected by every station concerned, the rest stays good."""
+    for target, extra_m in product(range(1, 9), (0.05, -0.05)):
+        done = tsgt(
+            "calibrate", "targets", falsified(markers, tmp_path, station, target, extra_m),
+            "--target-constant-mm", 10, "--weights", weights, "--json",
+        )  # fmt: skip
+        assert done.code == 0
+        for number, solved in done.json()["stations"].items():
+            concerned = station in (1, int(number))
+            assert solved["rejected"] == ([target] if concerned else [])
+            assert (target in solved["used"]) != concerned
+            assert (f"station {number}: target {target} rejected" in done.err) == concerned
+            assert solved["rms_mm"] < limit_mm
+
+
+@pytest.mark.parametrize("targets", ["1234", "1235", "1245", "1345", "2345"])
+def test_four_field_targets_nearly_in_a_line_are_weak(
+    tsgt: Tsgt, markers: Path, tmp_path: Path, targets: str
+) -> None:
+    """The direction of the line is reported, with exit code 3; the frame is still printed."""
+    done = tsgt(
+        "calibrate", "targets", only(markers, tmp_path, targets), "--target-constant-mm", 10, "--json"
+    )
+    assert done.code == 3
+    for station in done.json()["stations"].values():
+        (weak,) = station["weak"]
+        # From station 1 these targets lie at 0.80 to 0.63 rad, the near ones at the larger angle.
+        assert weak["bearing_deg"] == pytest.approx(34, abs=1)
+        assert weak["elevation_deg"] == pytest.approx(0, abs=1)
+        assert 1 < weak["sigma_mrad"] < 10
+    assert "weak" in done.err
+    assert "bearing 3" in done.err
+
+
+def test_a_line_of_targets_is_enough_for_levelled_stations(tsgt: Tsgt, markers: Path, tmp_path: Path) -> None:
+    """With --levelled the same four targets hold the frame."""
+    path = only(markers, tmp_path, "1234")
+    done = tsgt("calibrate", "targets", path, "--target-constant-mm", 10, "--levelled", "--json")
+    assert all(station["weak"] == [] for station in done.json()["stations"].values())
+
+
+def test_the_table_shows_every_target(tsgt: Tsgt, markers: Path, tmp_path: Path) -> None:
+    """Text output has a line per station and per target, the rejected one marked as such."""
+    done = tsgt("calibrate", "targets", falsified(markers, tmp_path, 2, 5, 0.05), "--target-constant-mm", 10)
+    assert "station 2: 7 targets used, rms 1.50 mm" in done.out
+    assert re.search(r"^5 +rejected +50\.\d\d$", done.out, re.MULTILINE)
+    assert "station 3: 8 targets used, rms 1.09 mm" in done.out
+
+
+def test_the_set_up_file_holds_the_frames_bit_for_bit(tsgt: Tsgt, tmp_path: Path) -> None:
+    """What --output writes is read back by the configuration as exactly the printed frames, station 1 included."""
+    output = tmp_path / "frames.toml"
+    done = tsgt("calibrate", "targets", documented(0, tmp_path), "--json", "--output", output)
+    assert done.code == 0
+    frames = load_station_frames(output)
+    assert np.array(frames[2]).tolist() == done.json()["stations"]["2"]["T_station1_station"]
+    np.testing.assert_array_equal(frames[1], np.eye(4))
+    assert output.read_text(encoding="utf-8").startswith("# written by tsgt calibrate targets ")
+    written = load(output, StationFramesFile).stations
+    assert written["1"].rms_mm is None
+    assert written["2"].rms_mm == pytest.approx(done.json()["stations"]["2"]["rms_mm"], abs=1e-3)
+
+
+def test_a_contradiction_is_printed_but_no_file_is_written(tsgt: Tsgt, tmp_path: Path) -> None:
+    """Of four targets one is wrong: exit code 3, the residuals on stdout, the reason on stderr, nothing on disk."""
+    path, output = documented(0, tmp_path), tmp_path / "frames.toml"
+    path.write_text(path.read_text(encoding="utf-8").replace("20.4692", "20.5192"), encoding="utf-8")
+    done = tsgt("calibrate", "targets", path, "--json", "--output", output)
+    assert done.code == 3
+    assert done.json()["stations"]["2"]["consistent"] is False
+    assert "contradict each other" in done.err
+    assert not output.exists()
+
+
+def test_prisms_are_solved_and_written(tsgt: Tsgt, tmp_path: Path) -> None:
+    """The documented example: positions, distances, body residuals, and a layout file with the same bits."""
+    output = tmp_path / "layout.toml"
+    done = tsgt(
+        "calibrate",
+        "prisms",
+        documented(2, tmp_path),
+        "--prism-constant-mm",
+        10,
+        "--json",
+        "--output",
+        output,
+    )
+    assert done.code == 0
+    solved = done.json()
+    assert solved["distances_mm"] == pytest.approx({"1-2": 987.0, "1-3": 681.6, "2-3": 814.7}, abs=1.0)
+    assert solved["rms_mm"] < 1
+    assert solved["used"] == ["front_left", "front_right", "rear_left", "mast"]
+    layout = load_prism_layout(output)
+    assert {str(prism): list(position) for prism, position in layout.items()} == solved["prisms"]
+
+
+def test_prisms_are_listed_for_people(tsgt: Tsgt, tmp_path: Path) -> None:
+    """Text output shows prisms, distances and body points."""
+    done = tsgt("calibrate", "prisms", documented(2, tmp_path), "--prism-constant-mm", 10)
+    assert done.code == 0
+    assert re.search(r"^2 +0\.4838 +-0\.1757 +1\.4171", done.out, re.MULTILINE)
+    assert re.search(r"^1-2 +986\.72$", done.out, re.MULTILINE)
+    assert re.search(r"^mast +0\.24", done.out, re.MULTILINE)
+
+
+def test_a_bad_file_ends_with_one_line_and_writes_nothing(tsgt: Tsgt, tmp_path: Path) -> None:
+    """Exit code 1, one line on stderr, no output file."""
+    path, output = tmp_path / "empty.csv", tmp_path / "frames.toml"
+    path.touch()
+    for command in ("targets", "prisms"):
+        done = tsgt("calibrate", command, path, "--output", output)
+        assert (done.code, done.out) == (1, "")
+        assert done.err.count("\n") == 1
+        assert "is empty" in done.err
+    assert not output.exists()
+
+
+def test_a_file_name_cannot_break_the_set_up_file(tsgt: Tsgt, tmp_path: Path) -> None:
+    """A line break in the measurement file's name does not get into the TOML."""
+    path, output = tmp_path / 'a\nkind = "x"', tmp_path / "frames.toml"
+    documented(0, tmp_path).rename(path)
+    assert tsgt("calibrate", "targets", path, "--output", output).code == 0
+    assert tomllib.loads(output.read_text(encoding="utf-8"))["kind"] == "station_frames"
+
+
+@pytest.mark.parametrize(
+    ("command", "example", "section"),
+    [("targets", 0, "Where the stations"), ("prisms", 2, "Where the prisms")],
+)
+def test_every_json_key_is_documented(
+    tsgt: Tsgt, tmp_path: Path, command: str, example: int, section: str
+) -> None:
+    """Each key of the JSON output stands in the how-to page."""
+    printed: dict[str, Any] = tsgt("calibrate", command, documented(example, tmp_path), "--json").json()
+    keys = (
+        set(printed["stations"]["2"])
+        if command == "targets"
+        else {"prisms", "prism_sigma_mm", "distances_mm"}
+    )
+    page = HOW_TO.read_text(encoding="utf-8")
+    text = page[page.index(section) :]
+    assert [key for key in keys if f"`.{key}" not in text and f"`{key}" not in text] == []
+
+
+def test_levelled_stations_that_are_not_level_are_told(tsgt: Tsgt, markers: Path) -> None:
+    """On the field data station 2 leans by a third of a milliradian: with --levelled that is a failed check."""
+    done = tsgt("calibrate", "targets", markers, "--target-constant-mm", 10, "--levelled", "--json")
+    assert done.code == 3
+    stations = done.json()["stations"]
+    assert stations["2"]["tilt_mrad"] == pytest.approx(0.34, abs=0.03)
+    assert stations["3"]["tilt_mrad"] is None
+    assert "station 2: not level with station 1" in done.err

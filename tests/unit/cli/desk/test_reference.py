@@ -1,0 +1,91 @@
+"""``tsgt evaluate --reference --align``, and a reference of another time."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from harness.published import write_prisms, write_tracks
+from harness.scene import LAYOUT
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from harness.cli import Tsgt
+
+
+@pytest.fixture
+def recording(tsgt: Tsgt, tmp_path: Path) -> Path:
+    """Ten seconds of driving, as points."""
+    path = tmp_path / "drive.jsonl"
+    sources = ("--tracks", *write_tracks(tmp_path), "--prisms", write_prisms(tmp_path))
+    assert tsgt("import", "rts", *sources, "--output", path).code == 0
+    return path
+
+
+def test_evo_aligns_as_we_do(
+    tsgt: Tsgt, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To 1e-6 m and 1e-6 degrees, as evo_ape -a: Umeyama without scale; and the unaligned figures stand beside it."""
+    monkeypatch.setenv("HOME", str(tmp_path))  # evo writes its settings there when it is first imported
+    metrics = pytest.importorskip("evo.core.metrics")
+    sync = pytest.importorskip("evo.core.sync")
+    read = pytest.importorskip("evo.tools.file_interface").read_tum_trajectory_file
+    files: dict[str, Any] = {name: tmp_path / f"{name}.tum" for name in ("linear", "continuous")}
+    for name, path in files.items():
+        assert tsgt("process", recording, "--estimator", name, "--output", path).code == 0
+    arguments = ("--estimator", "linear", "--reference", files["continuous"], "--no-held-out", "--json")
+    unaligned = tsgt("evaluate", recording, *arguments).json()
+    ours = tsgt("evaluate", recording, *arguments, "--align", "rigid").json()
+
+    to_centroid = np.eye(4)
+    to_centroid[:3, 3] = LAYOUT.mean(axis=0)
+    reference, found = read(str(files["continuous"])), read(str(files["linear"]))
+    found.reduce_to_time_range(reference.timestamps[0] + 2.0, reference.timestamps[-1] - 2.0)
+    for trajectory in (reference, found):
+        trajectory.transform(to_centroid, right_mul=True)
+    pair = sync.associate_trajectories(reference, found, max_diff=1e-6)
+    pair[1].align(pair[0])
+
+    def rms(relation: Any) -> float:
+        ape = metrics.APE(relation)
+        ape.process_data(pair)
+        return float(ape.get_statistic(metrics.StatisticsType.rmse))
+
+    aligned = ours["aligned"]
+    assert {key: ours[key] for key in ("position_rms_mm", "orientation_rms_deg")} == {
+        key: unaligned[key] for key in ("position_rms_mm", "orientation_rms_deg")
+    }
+    assert "aligned" not in unaligned
+    assert 0.0 < aligned["position_rms_mm"] < ours["position_rms_mm"]
+    assert aligned["hidden_position_mm"] == pytest.approx(
+        ours["position_rms_mm"] - aligned["position_rms_mm"]
+    )
+    relation = metrics.PoseRelation
+    assert rms(relation.translation_part) == pytest.approx(aligned["position_rms_mm"] / 1e3, abs=1e-6)
+    assert rms(relation.rotation_angle_deg) == pytest.approx(aligned["orientation_rms_deg"], abs=1e-6)
+    text = tsgt("evaluate", recording, *arguments[:-1], "--align", "translation").out
+    assert "unaligned" in text
+    assert (
+        "Aligned (translation): what is left, what was removed, and how much of the error that hides" in text
+    )
+
+
+def test_a_reference_of_another_day_is_an_error(tsgt: Tsgt, recording: Path, tmp_path: Path) -> None:
+    """One line that names both spans; nothing is printed that looks like a figure."""
+    reference = tmp_path / "other.tum"
+    reference.write_text("1600000000 0 0 0 0 0 0 1\n1600000100 0 0 0 0 0 0 1\n", encoding="utf-8")
+    outcome = tsgt("evaluate", recording, "--no-held-out", "--reference", reference, "--json")
+    assert outcome.code == 1
+    assert outcome.out == ""
+    (line,) = outcome.err.splitlines()
+    assert line.startswith(f"error: {reference}: has no pose within 0.1 s of a valid one of {recording}")
+    assert "it goes from 2020-09-13 12:26:40 to 2020-09-13 12:28:20" in line
+
+
+def test_align_needs_a_reference(tsgt: Tsgt, recording: Path) -> None:
+    """There is nothing to align with."""
+    outcome = tsgt("evaluate", recording, "--align", "rigid")
+    assert outcome.code == 2
+    assert "add --reference" in outcome.err

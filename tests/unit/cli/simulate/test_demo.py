@@ -1,0 +1,104 @@
+"""What the demonstration keeps of the poses that it counts."""
+
+from __future__ import annotations
+
+import tracemalloc
+from dataclasses import replace
+from itertools import islice
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from harness.records import POSE
+
+from tsgt.analysis.evaluation.metrics import pose_errors
+from tsgt.cli.simulate.demo import Progress
+from tsgt.clock import SystemClock, UnixTimeline
+from tsgt.config import ScenarioConfig
+from tsgt.geometry import quaternion_from_rotation, rotation_from_quaternion, transform_from
+from tsgt.recording import encode_line
+from tsgt.recording.stream_records import StatusRecord
+from tsgt.simulation.demo.config_files import write_demo_files
+from tsgt.simulation.demo.demo import Demo
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+PERIOD_NS = 50_000_000
+POSES = 1000
+MOST_BYTES = 100
+"""Of a pose that has been compared with the truth."""
+
+
+@pytest.fixture
+def demo(tmp_path: Path) -> Demo:
+    """Return a demonstration that does not run."""
+    scenario = ScenarioConfig()
+    files = write_demo_files(tmp_path, scenario, tmp_path / "poses.sock")
+    return Demo(scenario, files, duration_s=60.0, seed=0, clock=SystemClock())
+
+
+@pytest.fixture
+def timeline() -> UnixTimeline:
+    """Return this computer's."""
+    return UnixTimeline.fixed_now(SystemClock())
+
+
+@pytest.mark.usefixtures("capsys")
+def test_errors_of_all_poses_are_told_and_few_bytes_of_each_are_kept(
+    demo: Demo, timeline: UnixTimeline
+) -> None:
+    """A day has 3.5 million poses, and what they are off is known to the last without keeping them."""
+    start_ns = timeline.unix_ns(demo.start_ns)
+    estimated = _estimated(demo)
+    progress = Progress(demo, timeline)
+    lines = _lines(estimated, start_ns)
+    for line in islice(lines, POSES // 2):
+        progress.line(line)
+    tracemalloc.start()
+    try:
+        for line in lines:
+            progress.line(line)
+        kept_bytes, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert kept_bytes < MOST_BYTES * POSES / 2
+
+    times_s = np.arange(POSES) * PERIOD_NS / 1e9
+    expected = pose_errors(estimated, demo.world.pose_at(times_s), demo.world.prisms_m.mean(axis=0))
+    counts = np.arange(POSES) % 3 == 0
+    assert progress.poses["smoothed"] == POSES
+    assert progress.valid_stamps_ns("smoothed").tolist() == [
+        start_ns + PERIOD_NS * index for index in range(POSES)
+    ]
+    for chosen, found in (
+        (np.ones(POSES, dtype=np.bool_), progress.errors("smoothed")),
+        (counts, progress.errors("smoothed", counts)),
+    ):
+        np.testing.assert_allclose(found.position_m, expected.position_m[chosen], atol=1e-9)
+        np.testing.assert_allclose(found.rotation_rad, expected.rotation_rad[chosen], atol=1e-9)
+
+
+def _estimated(demo: Demo) -> NDArray[np.float64]:
+    """Return poses that are off by more and more."""
+    poses = demo.world.pose_at(np.arange(POSES) * PERIOD_NS / 1e9)
+    turn = rotation_from_quaternion(np.array([0.0, 0.0, 0.01, 1.0]) / np.hypot(0.01, 1.0))
+    poses[:, :3, 3] += np.arange(POSES)[:, None] * 1e-5
+    poses[:, :3, :3] = turn @ poses[:, :3, :3]
+    return transform_from(poses[:, :3, :3], poses[:, :3, 3])
+
+
+def _lines(poses: NDArray[np.float64], start_ns: int) -> Iterator[bytes]:
+    """Yield lines of a stream; the master says how it does once."""
+    for index, pose in enumerate(poses):
+        fields: dict[str, Any] = {
+            "position_m": tuple(pose[:3, 3].tolist()),
+            "orientation_xyzw": tuple(quaternion_from_rotation(pose[:3, :3]).tolist()),
+        }
+        stamp_ns = start_ns + PERIOD_NS * index
+        yield encode_line(replace(POSE, stamp_ns=stamp_ns, kind="smoothed", **fields))
+        if index == POSES // 4:
+            yield encode_line(StatusRecord(stamp_ns=stamp_ns, poses=index, valid_poses=index, stations=()))

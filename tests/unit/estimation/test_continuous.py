@@ -1,0 +1,325 @@
+"""The estimator ``continuous``, live: which poses come when, what they say, and why some are not valid."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from harness.scene import SECOND, START, Scene, counted_from, driving, standing, standing_scene
+
+from tsgt.errors import DegenerateGeometryError
+from tsgt.estimation.continuous import ContinuousPipeline
+from tsgt.estimation.pose_batch import Kind, PoseBatch, Reason
+from tsgt.geometry import exp_so3, log_so3, rotation_from_quaternion
+from tsgt.model import PolarMeasurement, PrismPosition, Status
+
+PERIOD = 50_000_000
+LAG = 3 * SECOND
+
+
+@pytest.fixture
+def scene() -> Scene:
+    """Three stations and a robot that drives a bend."""
+    return standing_scene().moving(driving).with_limits(estimator="continuous")
+
+
+def every(
+    scene: Scene,
+    until_s: float,
+    *,
+    step_s: float = 0.4,
+    stations: tuple[int, ...] = (1, 2, 3),
+    from_s: float = 0.0,
+) -> list[PolarMeasurement]:
+    """Measurements in turn: each station's every so many seconds."""
+    return [
+        replace(scene.measure(station, time_s + 0.1 * station), sequence=number)
+        for number, time_s in enumerate(np.arange(from_s, until_s, step_s).tolist())
+        for station in stations
+    ]
+
+
+def stream(scene: Scene, measurements: list[PolarMeasurement], until_s: float) -> tuple[PoseBatch, PoseBatch]:
+    """Predicted and smoothed poses of a live run."""
+    pipeline = ContinuousPipeline(scene.parameters)
+    batches = []
+    for measurement in sorted(measurements, key=lambda m: m.received_ns):
+        batches.append(pipeline.advance(measurement.received_ns))
+        pipeline.add(measurement)
+    batches.append(pipeline.advance(START + round(until_s * SECOND)))
+    return of_kind(batches, Kind.PREDICTED), of_kind(batches, Kind.SMOOTHED)
+
+
+def of_kind(batches: list[PoseBatch], kind: Kind) -> PoseBatch:
+    """Return the poses of one kind."""
+    return PoseBatch.concatenated(batches).select(PoseBatch.concatenated(batches).kind == kind)
+
+
+def off(scene: Scene, poses: PoseBatch) -> tuple[float, float]:
+    """How far valid poses are off at worst, in m and rad."""
+    poses = poses.select(poses.valid)
+    truth = [scene.motion((stamp - START) / SECOND) for stamp in poses.stamp_ns.tolist()]
+    turned = rotation_from_quaternion(poses.orientation_xyzw) @ np.array([r.T for r, _ in truth])
+    return (
+        float(np.abs(poses.position_m - [p for _, p in truth]).max()),
+        float(np.linalg.norm(log_so3(turned), axis=1).max()),
+    )
+
+
+def test_there_is_a_prediction_for_each_epoch_and_a_smoothed_pose_a_lag_later(scene: Scene) -> None:
+    """No epoch is left out and none is given twice, of either kind; a prediction comes at its epoch."""
+    predicted, smoothed = stream(scene, every(scene, 8.0), 8.0)
+    first = START + 200_000_000 + PERIOD
+    assert predicted.stamp_ns.tolist() == list(range(first, START + 8 * SECOND + 1, PERIOD))
+    assert smoothed.stamp_ns.tolist() == list(range(first, START + 5 * SECOND + 1, PERIOD))
+
+
+def test_what_is_predicted_and_smoothed_is_what_the_robot_does(scene: Scene) -> None:
+    """Exact measurements of a steady bend give poses that are as exact as a prior of unsteady motion allows."""
+    predicted, smoothed = stream(scene, every(scene, 10.0), 10.0)
+    late = predicted.stamp_ns > START + 4 * SECOND
+    assert predicted.valid[late].all()
+    assert off(scene, predicted.select(late))[0] < 0.02
+    late = smoothed.stamp_ns > START + SECOND
+    assert smoothed.valid[late].all()
+    assert off(scene, smoothed.select(late)) < (0.001, 0.001)
+
+
+def test_where_a_layout_counts_from_does_not_matter(scene: Scene) -> None:
+    """With the origin metres off the prisms, live poses are the same ones of another point of the robot."""
+    arm = np.array([-3.0, 1.0, -1.5])
+    measurements = every(scene, 8.0)
+    far = replace(scene, parameters=counted_from(scene.parameters, arm))
+    for here, there in zip(stream(scene, measurements, 8.0), stream(far, measurements, 8.0), strict=True):
+        np.testing.assert_array_equal(there.reason, here.reason)
+        spoke = rotation_from_quaternion(here.orientation_xyzw[here.valid]) @ arm
+        np.testing.assert_allclose(
+            there.position_m[here.valid], here.position_m[here.valid] + spoke, atol=1e-6
+        )
+        np.testing.assert_allclose(there.orientation_xyzw, here.orientation_xyzw, atol=1e-7)
+
+
+def test_predictions_rest_on_what_was_added_before(scene: Scene) -> None:
+    """A measurement changes the predictions from then on, and the smoothed poses that are still to come."""
+    measurements = every(scene, 6.0)
+    wrong = [
+        replace(m, slope_distance_m=(m.slope_distance_m or 0) + 0.03) if i == 30 else m
+        for i, m in enumerate(measurements)
+    ]
+    arrived = sorted(wrong, key=lambda m: m.received_ns).index(wrong[30])
+    received_ns = sorted(wrong, key=lambda m: m.received_ns)[arrived].received_ns
+    right, other = stream(scene, measurements, 6.0)[0], stream(scene, wrong, 6.0)[0]
+    same = np.all(right.position_m == other.position_m, axis=1) | np.isnan(right.position_m[:, 0])
+    before = right.stamp_ns <= received_ns
+    assert same[before].all()
+    assert not same[~before].any()
+
+
+def test_a_late_measurement_within_the_lag_changes_smoothed_poses(scene: Scene) -> None:
+    """What comes two seconds late fills the gap that it has left."""
+    measurements = every(scene, 9.0)
+    gap = [m for m in measurements if m.station == 2 and 4 * SECOND < m.stamp_ns - START < 5 * SECOND]
+    rest = [m for m in measurements if m not in gap]
+    late = [replace(m, received_ns=m.received_ns + 2 * SECOND) for m in gap]
+    without, filled = stream(scene, rest, 9.0)[1], stream(scene, [*rest, *late], 9.0)[1]
+    there = (without.stamp_ns > START + 4.4 * SECOND) & (without.stamp_ns < START + 4.9 * SECOND)
+    variance = [np.trace(poses.covariance[there], axis1=1, axis2=2).mean() for poses in (without, filled)]
+    assert variance[1] < 0.5 * variance[0]
+
+
+def test_what_comes_too_late_is_counted(scene: Scene) -> None:
+    """Measurements from before the window change nothing any more, and are counted by station."""
+    pipeline = ContinuousPipeline(scene.parameters)
+    for measurement in every(scene, 8.0):
+        pipeline.advance(measurement.received_ns)
+        pipeline.add(measurement)
+    pipeline.add(replace(scene.measure(3, 1.05), received_ns=START + 8 * SECOND))
+    pipeline.advance(START + 9 * SECOND)
+    assert pipeline.too_late == {3: 1}
+
+
+def test_what_was_measured_long_before_the_beginning_is_too_late(scene: Scene) -> None:
+    """A backlog of an hour, which a station sends first, makes no window of an hour."""
+    measurements = every(scene, 8.0)
+    old = [
+        replace(m, stamp_ns=m.stamp_ns - 3600 * SECOND, sequence=m.sequence + 10_000)
+        for m in measurements[:6]
+    ]
+    pipeline = ContinuousPipeline(scene.parameters)
+    for measurement in (*old, *measurements):
+        pipeline.add(measurement)
+        pipeline.advance(measurement.received_ns)
+    assert sum(pipeline.too_late.values()) == len(old)
+    assert pipeline.advance(START + 8 * SECOND).valid.all()
+
+
+@pytest.mark.parametrize("before_ns", [9_000_000, 10_000_000, 11_000_000])
+@pytest.mark.parametrize("begun_s", [0.0, 0.082, 0.123, 1.0])
+def test_one_from_just_before_the_first_may_come_late(scene: Scene, before_ns: int, begun_s: float) -> None:
+    """Also as far before it as measurements share a knot, where rounding decides whether they do."""
+    measurements = every(scene, 4.0)
+    first_s = (measurements[0].stamp_ns - START - before_ns) / SECOND
+    late = scene.measure(2, first_s, delay_s=1.9)
+    pipeline = ContinuousPipeline(scene.parameters)
+    pipeline.begin_at(START - round(begun_s * SECOND))
+    for measurement in sorted([*measurements, late], key=lambda m: m.received_ns):
+        pipeline.advance(measurement.received_ns)
+        pipeline.add(measurement)
+    assert pipeline.advance(START + 4 * SECOND).valid.all()
+
+
+def test_a_distance_that_is_nothing_does_nothing(scene: Scene) -> None:
+    """A raw distance that the prism constant makes zero is an outlier like another; poses go on."""
+    stations = tuple(replace(station, prism_constant_m=-0.03) for station in scene.parameters.stations)
+    scene = replace(scene, parameters=replace(scene.parameters, stations=stations))
+    measurements = every(scene, 6.0)
+    measurements[30] = replace(measurements[30], slope_distance_m=0.03)
+    predicted, smoothed = stream(scene, measurements, 6.0)
+    assert predicted.valid[-20:].all()
+    assert smoothed.valid[-20:].all()
+
+
+def test_a_measurement_that_comes_again_counts_once(scene: Scene) -> None:
+    """A station that has nothing new may send its last measurement again."""
+    measurements = every(scene, 6.0)
+    again = [replace(m, received_ns=m.received_ns + 200_000_000) for m in measurements]
+    once, twice = stream(scene, measurements, 6.0), stream(scene, [*measurements, *again], 6.0)
+    np.testing.assert_array_equal(once[1].covariance, twice[1].covariance)
+
+
+def test_before_three_prisms_have_been_measured_there_is_an_outage(scene: Scene) -> None:
+    """The missing prism is named; there are no numbers."""
+    predicted, _ = stream(scene, every(scene, 3.0, stations=(1, 2)), 3.0)
+    assert set(predicted.reason.tolist()) == {Reason.OUTAGE}
+    assert predicted.prism_reason[-1].tolist() == [Reason.VALID, Reason.VALID, Reason.OUTAGE]
+    assert np.isnan(predicted.position_m).all()
+
+
+def test_with_one_prism_less_it_goes_on_as_long_as_it_honestly_can(scene: Scene) -> None:
+    """A station that falls silent is said to at once; the poses stay valid until they are too uncertain for its sake."""
+    measurements = [*every(scene, 6.0), *every(scene, 20.0, stations=(1, 2), from_s=6.0)]
+    predicted, _ = stream(scene, measurements, 20.0)
+    after = predicted.select(predicted.stamp_ns > START + 6 * SECOND)
+    missing = after.prism_reason[:, 2] == Reason.OUTAGE
+    assert missing[25:].all()
+    assert (after.valid & missing).any()
+    assert after.reason[-1] == Reason.OUTAGE
+    spread = np.trace(after.covariance[:, 3:, 3:], axis1=1, axis2=2)[after.valid]
+    assert spread[-1] > 3 * spread[0]
+
+
+def test_a_station_with_an_error_is_the_reason(scene: Scene) -> None:
+    """When a prism is missing because its station reports an error, that is what the pose says."""
+    errors = [scene.measure(3, 6.0 + i, status=Status.TILT) for i in range(15)]
+    measurements = [*every(scene, 6.0), *every(scene, 20.0, stations=(1, 2), from_s=6.0), *errors]
+    predicted, _ = stream(scene, measurements, 20.0)
+    assert predicted.reason[-1] == Reason.STATION_STATUS
+
+
+def test_predictions_end_when_nothing_comes(scene: Scene) -> None:
+    """Without measurements a prediction becomes uncertain, then invalid, and then there is none."""
+    predicted, smoothed = stream(scene, every(scene, 6.0), 30.0)
+    assert predicted.valid[predicted.stamp_ns == START + 6 * SECOND + 2 * PERIOD]
+    assert predicted.reason[-1] == Reason.OUTAGE
+    assert np.isnan(predicted.position_m[-1]).all()
+    assert smoothed.reason[-1] == Reason.OUTAGE
+
+
+def test_a_tight_limit_makes_poses_uncertain(scene: Scene) -> None:
+    """Where no prism is missing but the pose is not known well enough, it is uncertain."""
+    tight = scene.with_limits(position_sigma_limit_m=0.005)
+    predicted, smoothed = stream(tight, every(tight, 8.0), 8.0)
+    assert Reason.UNCERTAIN in predicted.reason[-8:]
+    assert smoothed.valid[-20:].all()
+
+
+def test_prisms_that_miss_their_layout_are_the_reason(scene: Scene) -> None:
+    """A layout that is not the robot's fits no measurements."""
+    wrong = tuple(
+        PrismPosition(
+            prism=p.prism, position_m=(1.5 * p.position_m[0], 1.5 * p.position_m[1], p.position_m[2])
+        )
+        for p in scene.parameters.prisms
+    )
+    other = replace(scene, parameters=replace(scene.parameters, prisms=wrong))
+    predicted, smoothed = stream(other, every(scene, 8.0), 8.0)
+    assert not predicted.valid.any()
+    assert smoothed.reason[-1] == Reason.RESIDUAL
+
+
+def test_a_robot_upside_down_is_refused() -> None:
+    """It leans further than the limit: a mirrored layout, or swapped prisms."""
+    _, position = standing(0.0)
+    scene = standing_scene().with_limits(estimator="continuous")
+    scene = scene.moving(lambda _: (exp_so3(np.array([3.0, 0.0, 0.0])), position))
+    _, smoothed = stream(scene, every(scene, 8.0), 8.0)
+    assert smoothed.reason[-1] == Reason.TILT
+
+
+def test_no_noise_of_the_instruments_without_its_scale(scene: Scene) -> None:
+    """Twice the noise makes the smoothed poses of a well measured robot less certain."""
+    plain = stream(scene, every(scene, 8.0), 8.0)[1]
+    scaled = scene.with_limits(noise_scale=3.0)
+    noisy = stream(scaled, every(scaled, 8.0), 8.0)[1]
+    assert np.trace(noisy.covariance[-1]) > 3 * np.trace(plain.covariance[-1])
+
+
+def test_the_deadline_is_the_next_epoch(scene: Scene) -> None:
+    """Before the first measurement nothing waits; then a pose is due at each epoch."""
+    pipeline = ContinuousPipeline(scene.parameters)
+    assert pipeline.next_deadline_ns() is None
+    pipeline.begin_at(START + 1)
+    pipeline.add(scene.measure(1, 0.0))
+    assert pipeline.next_deadline_ns() == START + PERIOD
+    assert len(pipeline.advance(START + PERIOD - 1)) == 0
+    assert len(pipeline.advance(START + PERIOD)) == 1
+
+
+def test_a_layout_in_a_line_is_refused(scene: Scene) -> None:
+    """No pose can come of it."""
+    line = tuple(PrismPosition(prism=p, position_m=(float(p), 0.0, 0.0)) for p in (1, 2, 3))
+    with pytest.raises(DegenerateGeometryError):
+        ContinuousPipeline(replace(scene.parameters, prisms=line))
+
+
+def test_memory_is_bounded(scene: Scene) -> None:
+    """After a minute it keeps no more than after ten seconds."""
+    pipeline = ContinuousPipeline(scene.parameters)
+    sizes = []
+    for measurement in [*every(scene, 30.0), *(scene.measure(3, 30.0, status=Status.TILT),)]:
+        pipeline.advance(measurement.received_ns)
+        pipeline.add(measurement)
+        sizes.append(len(pipeline._seen.times_ns))
+    assert max(sizes[75:]) <= max(sizes[:75])
+
+
+def test_what_was_before_a_trajectory_began_is_not_valid(scene: Scene) -> None:
+    """From each prism seen twice a robot may be made that lies the other way about; what comes later does not tell."""
+    measurements = every(scene, 8.0)
+    _, smoothed = stream(scene, measurements, 8.0)
+    twice_ns = max([m.stamp_ns for m in measurements if m.prism == prism][1] for prism in (1, 2, 3))
+    assert smoothed.stamp_ns[smoothed.valid].min() >= twice_ns
+    told = np.isfinite(smoothed.position_m[:, 0]) & (smoothed.stamp_ns < twice_ns)
+    assert told.any()
+    assert (smoothed.reason[told] != Reason.VALID).all()
+
+
+@pytest.mark.parametrize(
+    ("wrong_m", "station", "sequence"), [(-0.12, 3, 5), (0.13, 2, 6), (0.05, 3, 5), (0.07, 1, 5)]
+)
+def test_where_a_single_reflection_was_believed_no_smoothed_pose_is_valid(
+    scene: Scene, wrong_m: float, station: int, sequence: int
+) -> None:
+    """It is near enough to where the robot could be; the next measurements contradict, but the bend remains."""
+    measured = []
+    for each in every(scene, 10.0, step_s=0.83):
+        later = scene.measure(each.station, 0.83 * each.sequence + 0.27 * each.station)
+        distance_m = later.slope_distance_m
+        assert distance_m is not None
+        if (each.station, each.sequence) == (station, sequence):
+            distance_m += wrong_m
+        measured.append(replace(later, sequence=each.sequence, slope_distance_m=distance_m))
+    _, smoothed = stream(scene, measured, 10.0)
+    assert smoothed.valid.mean() > 0.3
+    assert off(scene, smoothed)[0] < 0.01

@@ -1,0 +1,333 @@
+"""The pipeline: when a pose is due, what it says, and why it is not valid."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from harness.scene import LAYOUT, SECOND, START, driving, standing, standing_scene
+
+from tsgt.errors import DegenerateGeometryError
+from tsgt.estimation.linear import Pipeline
+from tsgt.estimation.pose_batch import PoseBatch, Reason
+from tsgt.geometry import exp_so3, log_so3, rotation_from_quaternion
+from tsgt.model import TRACKING_NOISE, PrismPosition, Status
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from harness.scene import Motion, Scene
+    from numpy.typing import NDArray
+
+    from tsgt.model import PolarMeasurement
+
+    Vector = NDArray[np.float64]
+
+
+@pytest.fixture
+def scene() -> Scene:
+    """Three stations and a standing robot."""
+    return standing_scene()
+
+
+def poses_of(scene: Scene, measurements: Sequence[PolarMeasurement], until_s: float) -> PoseBatch:
+    """All poses that are decided at so many seconds after the start, everything added at once."""
+    pipeline = Pipeline(scene.parameters)
+    for measurement in measurements:
+        pipeline.add(measurement)
+    return pipeline.advance(START + round(until_s * SECOND))
+
+
+def every(
+    scene: Scene, times_s: list[float], stations: tuple[int, ...] = (1, 2, 3)
+) -> list[PolarMeasurement]:
+    """Measurements of several stations at the same instants."""
+    return [scene.measure(station, time_s) for time_s in times_s for station in stations]
+
+
+def test_a_standing_robot_is_where_it_stands(scene: Scene) -> None:
+    """Exact measurements give the exact pose, at every epoch between the first and the last of them."""
+    poses = poses_of(scene, every(scene, [0.0, 0.4]), until_s=0.4)
+    rotation, position = standing(0.0)
+    assert poses.valid.tolist() == [False] + [True] * 8  # nothing brackets the very first instant
+    np.testing.assert_allclose(poses.position_m[1:], np.broadcast_to(position, (8, 3)), atol=1e-9)
+    quaternion = poses.orientation_xyzw[1]
+    assert 2 * np.arccos(quaternion[3]) == pytest.approx(np.linalg.norm([0.02, -0.01, 0.6]), abs=1e-9)
+    np.testing.assert_allclose(poses.residual_m[1:], 0.0, atol=1e-9)
+    assert np.trace(rotation) == pytest.approx(1 + 2 * np.cos(2 * np.arccos(quaternion[3])))
+
+
+def test_a_driving_robot_has_its_velocity(scene: Scene) -> None:
+    """Velocity comes in the world frame, angular velocity in the robot's."""
+    moving = scene.moving(driving)
+    poses = poses_of(moving, every(moving, [-0.1, 0.1]), until_s=0.1)
+    at_zero = poses.stamp_ns.tolist().index(START)
+    np.testing.assert_allclose(poses.velocity_mps[at_zero], [0.3, 0.0, 0.0], atol=1e-3)
+    np.testing.assert_allclose(poses.angular_velocity_radps[at_zero], [0.0, 0.0, 0.3], atol=1e-3)
+
+
+def test_epochs_are_whole_multiples_of_the_period(scene: Scene) -> None:
+    """Stamps do not depend on when the first measurement was made."""
+    poses = poses_of(scene, every(scene, [0.013, 0.413]), until_s=1.0)
+    assert poses.stamp_ns[0] == START + 50_000_000
+    assert (poses.stamp_ns % 50_000_000 == 0).all()
+
+
+def test_a_pose_waits_for_the_last_station_and_no_longer(scene: Scene) -> None:
+    """Nothing is due while one station may still measure; everything is due with its measurement."""
+    pipeline = Pipeline(scene.parameters)
+    for measurement in [*every(scene, [0.0]), *every(scene, [0.4], stations=(1, 2))]:
+        pipeline.add(measurement)
+    assert len(pipeline.advance(START + SECOND // 2)) == 1  # the first epoch, which nothing precedes
+    pipeline.add(scene.measure(3, 0.25))
+    assert pipeline.advance(START + SECOND // 2).stamp_ns[-1] == START + SECOND // 4
+    pipeline.add(scene.measure(3, 0.4))
+    assert pipeline.advance(START + SECOND // 2).valid.tolist() == [True] * 3
+
+
+def test_a_pose_waits_for_a_measurement_that_is_sent_again(scene: Scene) -> None:
+    """A gap in a station's numbers is not bridged by a straight line while what is missing may still come."""
+    pipeline = Pipeline(scene.parameters)
+    for measurement in every(scene, [0.0, 0.4, 0.8], stations=(1, 2)):
+        pipeline.add(replace(measurement, sequence=round((measurement.stamp_ns - START) / (0.4 * SECOND))))
+    pipeline.add(scene.measure(3, 0.0))
+    pipeline.add(replace(scene.measure(3, 0.8), sequence=2))
+    assert len(pipeline.advance(START + SECOND)) == 1
+    assert pipeline.next_deadline_ns() == START + round(2.8 * SECOND) + 1
+    pipeline.add(replace(scene.measure(3, 0.4), sequence=1))
+    assert len(pipeline.advance(START + SECOND)) == 16
+
+
+@pytest.mark.parametrize(("gap_s", "valid"), [(1.0, True), (1.000000001, False)])
+def test_an_interval_longer_than_the_outage_limit_is_invalid(scene: Scene, gap_s: float, valid: bool) -> None:  # noqa: FBT001
+    """One second is the limit, and belongs to what is still valid."""
+    measurements = [*every(scene, [0.0, 0.5, 1.0, 1.5], stations=(1, 2))]
+    measurements += [scene.measure(3, 0.0), scene.measure(3, gap_s), scene.measure(3, 1.5)]
+    poses = poses_of(scene, measurements, until_s=1.5)
+    in_gap = (poses.stamp_ns > START) & (poses.stamp_ns < START + SECOND)
+    assert (poses.valid[in_gap] == valid).all()
+    assert {Reason(r).word for r in poses.reason[in_gap]} == ({""} if valid else {"outage"})
+    assert poses.valid[poses.stamp_ns > START + 1.05 * SECOND].all()
+
+
+def test_a_silent_station_is_given_up_at_the_deadline(scene: Scene) -> None:
+    """An epoch is called an outage when its last chance has passed, at the instant announced."""
+    pipeline = Pipeline(scene.parameters)
+    for measurement in [*every(scene, [0.0]), *every(scene, [0.5, 1.0, 1.5, 2.0], stations=(1, 2))]:
+        pipeline.add(measurement)
+    pipeline.advance(START + 2 * SECOND)
+    deadline = pipeline.next_deadline_ns()
+    assert deadline == START + 3 * SECOND + 1  # last seen + outage limit + transport limit
+    assert len(pipeline.advance(deadline - 1)) == 0
+    given_up = pipeline.advance(deadline)
+    assert given_up.stamp_ns[-1] == START + SECOND
+    assert (given_up.reason == Reason.OUTAGE).all()
+    (record, *_) = given_up.records()
+    assert [(share.id, share.reason) for share in record.stations] == [(1, ""), (2, ""), (3, "outage")]
+    assert record.position_m is None
+
+
+def test_a_station_never_seen_keeps_poses_invalid(scene: Scene) -> None:
+    """Two of three stations give no pose, and the third is named with no age."""
+    poses = poses_of(scene, every(scene, [0.0, 0.4, 0.8], stations=(1, 2)), until_s=3.0)
+    assert not poses.valid.any()
+    missing = list(poses.records())[-1].stations[2]
+    assert (missing.id, missing.age_s, missing.reason) == (3, None, "outage")
+
+
+def test_an_error_status_is_named_as_the_reason(scene: Scene) -> None:
+    """A measurement with an error status is not used; the gap that it leaves says so."""
+    measurements = every(scene, [0.0, 0.4, 0.8, 1.2, 1.6], stations=(1, 2))
+    measurements += [scene.measure(3, 0.0), scene.measure(3, 0.4, status=Status.TILT), scene.measure(3, 1.59)]
+    poses = poses_of(scene, measurements, until_s=1.6)
+    words = [Reason(r).word for r in poses.reason]
+    assert words == ["outage"] + ["outage"] * 7 + ["station_status"] * 24
+
+
+def test_low_accuracy_is_used(scene: Scene) -> None:
+    """An instrument in motion cannot promise its accuracy; that is no error."""
+    measurements = [replace(m, status=Status.LOW_ACCURACY) for m in every(scene, [0.0, 0.4])]
+    assert poses_of(scene, measurements, until_s=0.4).valid[1:].all()
+
+
+def test_no_distance_is_no_position(scene: Scene) -> None:
+    """A status that claims success does not make a distance of zero one."""
+    measurements = [
+        replace(m, slope_distance_m=0.0) if m.station == 2 else m for m in every(scene, [0.0, 0.4])
+    ]
+    assert not poses_of(scene, measurements, until_s=3.0).valid.any()
+
+
+def test_swapped_prisms_miss_the_layout(scene: Scene) -> None:
+    """Two stations on each other's prism leave a residual, and the pose is not valid."""
+    swap = {1: 2, 2: 1, 3: 3}
+    measurements = [
+        replace(scene.measure(s, t, prism=swap[s]), prism=s) for t in (0.0, 0.4) for s in (1, 2, 3)
+    ]
+    assert poses_of(scene, measurements, until_s=0.4).invalid_counts() == {"residual": 8, "outage": 1}
+
+
+def test_two_stations_on_one_prism_are_no_pose(scene: Scene) -> None:
+    """Measured triangles that collapse are called so rather than fitted."""
+    measurements = [replace(scene.measure(s, t, prism=1), prism=s) for t in (0.0, 0.4) for s in (1, 2, 3)]
+    assert poses_of(scene, measurements, until_s=0.4).invalid_counts() == {
+        "degenerate_geometry": 8,
+        "outage": 1,
+    }
+
+
+def test_a_mirrored_layout_lies_upside_down(scene: Scene) -> None:
+    """A mirrored triangle fits without residual, but only upside down: the tilt gives it away."""
+    mirrored = tuple(
+        PrismPosition(prism=i + 1, position_m=(x, -y, z)) for i, (x, y, z) in enumerate(LAYOUT.tolist())
+    )
+    turned = replace(scene, parameters=replace(scene.parameters, prisms=mirrored))
+    poses = poses_of(turned, every(turned, [0.0, 0.4]), until_s=0.4)
+    assert poses.invalid_counts() == {"tilt": 8, "outage": 1}
+    assert poses.residual_m[1] < 1e-9
+
+
+def test_a_degenerate_layout_is_refused_at_the_start(scene: Scene) -> None:
+    """No pipeline is made for prisms that cannot give a pose."""
+    together = tuple(PrismPosition(prism=i, position_m=(0.0, 0.0, float(i // 3))) for i in (1, 2, 3))
+    with pytest.raises(DegenerateGeometryError, match="prisms 1 and 2"):
+        Pipeline(replace(scene.parameters, prisms=together))
+
+
+def test_latency_is_taken_off_the_stamp(scene: Scene) -> None:
+    """A station whose stamps are late by a known time gives the same poses as one whose stamps are not."""
+    moving = scene.moving(driving)
+    exact = poses_of(moving, every(moving, [0.0, 0.4]), until_s=0.5)
+    stations = tuple(replace(s, latency_ns=70_000_000 * s.station) for s in scene.parameters.stations)
+    late = replace(moving, parameters=replace(scene.parameters, stations=stations))
+    np.testing.assert_array_equal(
+        poses_of(late, every(late, [0.0, 0.4]), until_s=0.5).position_m, exact.position_m
+    )
+
+
+def test_a_repeated_measurement_changes_nothing(scene: Scene) -> None:
+    """A station with nothing new may send its last measurement again."""
+    measurements = every(scene, [0.0, 0.4])
+    repeated = [m for m in measurements for _ in range(3)]
+    once, again = (poses_of(scene, m, until_s=0.4) for m in (measurements, repeated))
+    np.testing.assert_array_equal(once.position_m, again.position_m)
+
+
+def test_foreign_stations_and_prisms_are_passed_over(scene: Scene) -> None:
+    """What the parameters do not name cannot enter a pose, nor stop one."""
+    foreign = [replace(scene.measure(1, 0.2), station=9), replace(scene.measure(1, 0.2), prism=9)]
+    assert poses_of(scene, [*every(scene, [0.0, 0.4]), *foreign], until_s=0.4).valid[1:].all()
+
+
+def test_covariance_grows_where_the_motion_is_not_seen(scene: Scene) -> None:
+    """In the middle between two measurements the unknown acceleration counts most; here it is all of the sigma."""
+    blind = scene.with_limits(acceleration_sigma_mps2=0.5, angular_acceleration_sigma_radps2=0.0)
+    poses = poses_of(blind, every(blind, [0.0, 0.8]), until_s=0.8)
+    sigma_m = np.sqrt(poses.covariance[1:, 0, 0])
+    unseen_m = 0.5 * 0.4 * 0.4 / 2  # acceleration sigma, and both times to the measurements
+    # All three prisms miss by the same vector, so the whole robot does.
+    assert sigma_m[7] == pytest.approx(np.hypot(sigma_m[-1] / np.sqrt(2), unseen_m), rel=0.01)
+
+
+def test_covariance_is_what_an_accelerating_robot_shows(scene: Scene) -> None:
+    """Squared normalised errors of poses average to the number of their degrees of freedom.
+
+    The robot accelerates, and turns faster and faster, as a whole and at random; stations measure at different times.
+    """
+    rng = np.random.default_rng(5)
+    limits = {"acceleration_sigma_mps2": 0.4, "angular_acceleration_sigma_radps2": 0.2}
+    centroid = LAYOUT.mean(axis=0)
+    squared = []
+    for _ in range(400):
+        acceleration, turning = rng.normal(0.0, 0.4, 3), rng.normal(0.0, 0.2, 3)
+
+        def motion(time_s: float, a: Vector = acceleration, alpha: Vector = turning) -> Motion:
+            rotation = exp_so3(alpha * time_s**2 / 2)
+            return rotation, np.array([30.0, 20.0, -1.0]) + a * time_s**2 / 2 - rotation @ centroid
+
+        world = scene.moving(motion).with_limits(**limits)
+        starts = rng.uniform(-0.4, 0.0, 3)
+        measurements = [
+            noisy(world.measure(station, start + step), rng)
+            for station, start in zip((1, 2, 3), starts, strict=True)
+            for step in (0.0, 0.4, 0.8)
+        ]
+        poses = poses_of(world, measurements, until_s=1.3)
+        row = int(np.flatnonzero(poses.valid)[rng.integers(np.count_nonzero(poses.valid))])
+        rotation, position = motion((int(poses.stamp_ns[row]) - START) / SECOND)
+        found = rotation_from_quaternion(poses.orientation_xyzw[row])
+        error = np.concatenate([position - poses.position_m[row], log_so3(rotation @ found.T)])
+        squared.append(error @ np.linalg.solve(poses.covariance[row], error))
+    # The mean of 400 sums of six squares scatters by 0.17.
+    assert np.mean(squared) == pytest.approx(6.0, abs=0.6)
+
+
+def noisy(measurement: PolarMeasurement, rng: np.random.Generator) -> PolarMeasurement:
+    """Add the noise of the tracking mode, by the definition of its sigmas."""
+    noise = TRACKING_NOISE
+    distance_m = measurement.slope_distance_m or 0.0
+    across_rad = np.hypot(noise.angle_sigma_rad, noise.pointing_sigma_m / distance_m)
+    along_m = np.hypot(
+        np.hypot(noise.range_sigma_m, noise.range_sigma_ppm * 1e-6 * distance_m), noise.pointing_sigma_m
+    )
+    horizontal, zenith, slope = rng.normal(size=3)
+    return replace(
+        measurement,
+        horizontal_angle_rad=measurement.horizontal_angle_rad
+        + horizontal * across_rad / np.sin(measurement.zenith_angle_rad),
+        zenith_angle_rad=measurement.zenith_angle_rad + zenith * across_rad,
+        slope_distance_m=distance_m + slope * along_m,
+    )
+
+
+def test_an_uncertain_stamp_counts_along_the_velocity(scene: Scene) -> None:
+    """Ten milliseconds of doubt at 0.3 m/s are 3 mm in the direction of travel."""
+    moving = scene.moving(driving).with_limits(
+        acceleration_sigma_mps2=0.0, angular_acceleration_sigma_radps2=0.0
+    )
+    sharp = every(moving, [-0.01, 0.0])
+    blurred = [replace(m, stamp_sigma_ns=10_000_000) for m in sharp]
+    added = poses_of(moving, blurred, 0.1).covariance[-1] - poses_of(moving, sharp, 0.1).covariance[-1]
+    assert added[0, 0] > (0.3 * 0.01) ** 2 / 3
+    assert added[2, 2] < 1e-9
+
+
+def test_the_tilt_limit_is_a_parameter(scene: Scene) -> None:
+    """What counts as upside down is for the user to say."""
+    leaning = scene.moving(lambda _: (exp_so3(np.array([0.5, 0.0, 0.0])), np.array([30.0, 20.0, -1.0])))
+    strict = leaning.with_limits(tilt_limit_rad=0.4)
+    assert poses_of(leaning, every(leaning, [0.0, 0.4]), 0.4).valid[1:].all()
+    assert poses_of(strict, every(strict, [0.0, 0.4]), 0.4).invalid_counts() == {"tilt": 8, "outage": 1}
+
+
+def test_a_stamp_from_the_future_stops_nothing(scene: Scene) -> None:
+    """One wrong stamp, a day ahead of its arrival, is passed over; the poses go on."""
+    wrong = scene.measure(2, 86_400.0, delay_s=-86_399.8)
+    assert (
+        poses_of(scene, [wrong, *every(scene, [0.0, 0.4])], until_s=0.5).valid.tolist()
+        == [False] + [True] * 8
+    )
+
+
+def test_a_live_run_begins_when_it_begins(scene: Scene) -> None:
+    """A station that begins in another year does not make the live stream begin there."""
+    pipeline = Pipeline(scene.parameters)
+    pipeline.begin_at(START)
+    for measurement in [scene.measure(2, -40_000_000.0, delay_s=40_000_000.0), *every(scene, [0.0, 0.4])]:
+        pipeline.add(measurement)
+    poses = pipeline.advance(START + SECOND // 2)
+    assert poses.stamp_ns[0] == START - 2 * SECOND
+    assert poses.valid[-8:].all()
+
+
+def test_at_one_instant_the_lower_station_counts(scene: Scene) -> None:
+    """Two stations on one prism at the same nanosecond: which one counts does not depend on the order."""
+    stations = (*scene.parameters.stations, replace(scene.parameters.stations[1], station=4, prism=1))
+    two = replace(scene, parameters=replace(scene.parameters, stations=stations))
+    other = replace(two.measure(4, 0.2), slope_distance_m=35.0)
+    measurements = [*every(two, [0.0, 0.2, 0.4]), other, two.measure(4, 0.4)]
+    ahead, behind = (poses_of(two, order, until_s=3.0) for order in (measurements, measurements[::-1]))
+    np.testing.assert_array_equal(ahead.position_m, behind.position_m)
+    assert ahead.station[4, 0] == 1

@@ -1,0 +1,55 @@
+"""The feed: the order of records on stream and recording."""
+
+from __future__ import annotations
+
+from harness.scene import START, standing_scene
+
+from tsgt.estimation.live import Feed
+from tsgt.model import PolarMeasurement
+from tsgt.recording.stream_records import PoseRecord
+
+
+def test_a_measurement_is_followed_by_the_poses_that_it_completes() -> None:
+    """A reader has every measurement that a pose is made of before the pose."""
+    scene = standing_scene()
+    feed = Feed(scene.parameters)
+    records = [
+        r
+        for time_s in (0.0, 0.1)
+        for station in (1, 2, 3)
+        for r in feed.measurement(scene.measure(station, time_s))
+    ]
+    measured = [i for i, r in enumerate(records) if isinstance(r, PolarMeasurement)]
+    poses = [i for i, r in enumerate(records) if isinstance(r, PoseRecord)]
+    assert len(measured) == 6
+    assert poses[-2:] == [measured[-1] + 1, measured[-1] + 2]
+
+
+def test_what_was_due_before_comes_before() -> None:
+    """A pose whose deadline passed before a measurement arrived stands before that measurement."""
+    scene = standing_scene()
+    feed = Feed(scene.parameters)
+    feed.measurement(scene.measure(1, 0.0))
+    late = feed.measurement(scene.measure(1, 10.0))
+    assert isinstance(late[0], PoseRecord)
+    assert isinstance(late[-1], PolarMeasurement)
+
+
+def test_the_record_says_when_the_pipeline_had_it() -> None:
+    """A measurement handed over after a later instant is recorded with that instant, for the replay's sake."""
+    scene = standing_scene()
+    feed = Feed(scene.parameters)
+    feed.advance(START + 5_000_000_000)
+    records = feed.measurement(scene.measure(1, 0.0))
+    assert isinstance(records[0], PolarMeasurement)
+    assert records[0].received_ns == START + 5_000_000_000
+    assert records[0].stamp_ns == START
+
+
+def test_the_deadline_is_that_of_the_pipeline() -> None:
+    """Before the first measurement nothing waits; after it something does."""
+    scene = standing_scene()
+    feed = Feed(scene.parameters)
+    assert feed.next_deadline_ns() is None
+    feed.measurement(scene.measure(1, 0.0))
+    assert feed.next_deadline_ns() == START + 2_000_000_001

@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from harness.scene import START, Motion, standing_scene
+
+from tsgt.estimation.observations import (
+    INSTRUMENT_TIME_SIGMA_S,
+    LEAST_SIGMA_M,
+    build_observations,
+    middle_m,
+)
+from tsgt.geometry import exp_so3, log_so3
+from tsgt.geometry.trajectory.batch import fit
+from tsgt.model import InstrumentNoise, MotionPrior, PointMeasurement
+
+
+def fast(time_s: float) -> Motion:
+    """Rotation and position of a robot at 1.5 m/s, turning on its way across the lines of sight."""
+    yaw = 0.3 * np.sin(0.5 * time_s)
+    return exp_so3(np.array([0.0, 0.0, yaw])), np.array([30.0 - 0.75 * time_s, 15.0 + 1.3 * time_s, -1.0])
+
+
+SCENE = standing_scene().moving(fast)
+
+
+@pytest.mark.parametrize("stated_ns", [1, 30_000, 4_000_000])
+def test_no_time_is_surer_than_an_instruments(stated_ns: int) -> None:
+    """What is stated of a stamp and what nobody states of the instrument's time count together."""
+    measured = replace(SCENE.measure(1, 1.0), stamp_sigma_ns=stated_ns, sequence=10**7)
+    observations, _ = build_observations(SCENE.parameters, [measured], origin_ns=START)
+    expected_s = np.hypot(stated_ns / 1e9, INSTRUMENT_TIME_SIGMA_S)
+    assert observations.time_sigma_s == pytest.approx([expected_s], rel=1e-2)
+
+
+def test_no_measurement_is_without_noise() -> None:
+    """Of an instrument whose stated noise is zero hundredths of a millimetre are believed, which can be divided by."""
+    none = InstrumentNoise(range_sigma_m=0.0, range_sigma_ppm=0.0, angle_sigma_rad=0.0, pointing_sigma_m=0.0)
+    stations = tuple(replace(station, noise=none) for station in SCENE.parameters.stations)
+    parameters = replace(SCENE.parameters, stations=stations)
+    polar = SCENE.measure(1, 1.0)
+    point = PointMeasurement(
+        station=2,
+        prism=2,
+        sequence=0,
+        stamp_ns=polar.stamp_ns,
+        received_ns=polar.received_ns,
+        position_m=(1.0, 2.0, 3.0),
+    )
+    observations, _ = build_observations(parameters, [polar, point], origin_ns=START)
+    assert observations.sigmas_m.tolist() == [[LEAST_SIGMA_M] * 3] * 2
+
+
+def test_a_time_that_is_imported_is_taken_at_its_word() -> None:
+    """Nobody knows what its stamps rest on; its sigma is 0."""
+    observations, _ = build_observations(SCENE.parameters, [SCENE.measure(1, 1.0)], origin_ns=START)
+    assert observations.time_sigma_s.tolist() == [0.0]
+
+
+def test_first_times_are_less_sure_than_later_ones() -> None:
+    """An instrument's time is known the better the more answers there were."""
+    measurements = [replace(SCENE.measure(1, 0.4 * n), sequence=n, stamp_sigma_ns=30_000) for n in range(50)]
+    observations, _ = build_observations(SCENE.parameters, measurements, origin_ns=START)
+    assert np.all(np.diff(observations.time_sigma_s) < 0)
+    assert observations.time_sigma_s[0] > 3e-3
+
+
+def test_times_that_are_off_as_in_an_instruments_first_minute_make_no_pose_over_confident() -> None:
+    """One station's stamps are 4 ms late, and say nothing of it: six millimetres of a robot at 1.5 m/s."""
+    measurements = [
+        replace(m, sequence=step, stamp_sigma_ns=30_000, stamp_ns=m.stamp_ns + 4_000_000 * (m.station == 2))
+        for step in range(20)
+        for m in [SCENE.measure(station, 0.4 * step + 0.13 * station) for station in (1, 2, 3)]
+    ]
+    observations, _ = build_observations(SCENE.parameters, measurements, origin_ns=START)
+    times_s = np.arange(1.0, 7.0, 0.05)
+    states, covariance = fit(observations, prior=MotionPrior(), noise_scale=1.0).trajectory.at(times_s)
+    rotation, position = (np.array(part) for part in zip(*map(fast, times_s.tolist()), strict=True))
+    turned = log_so3(np.swapaxes(states.rotation, 1, 2) @ rotation)
+    middle = position + rotation @ middle_m(SCENE.parameters)
+    errors = np.concatenate([middle - states.position, turned], axis=1)
+    nees = np.einsum("ni,ni->n", errors, np.linalg.solve(covariance[:, :6, :6], errors[..., None])[..., 0])
+    assert nees.max() < 20.0

@@ -1,0 +1,250 @@
+"""Set-ups found from a robot's motion: against a made-up drive whose set-up is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from tsgt.errors import GeometryError
+from tsgt.geometry import Observations, exp_so3, rotate
+from tsgt.geometry.calibration.motion import calibrate_motion
+from tsgt.geometry.calibration.motion_initialisation import frames_from_motion
+from tsgt.geometry.calibration.motion_parameters import Setup, Unknowns, UnknownSetup
+from tsgt.geometry.calibration.observability import undetermined
+from tsgt.geometry.trajectory.gauss_newton import knot_times
+from tsgt.geometry.trajectory.initialisation import first_guess
+from tsgt.geometry.trajectory.measurement_factors import line_of_sight_axes, linearise
+from tsgt.model import MotionPrior
+
+if TYPE_CHECKING:
+    from tsgt.geometry import FloatArray
+
+LAYOUT = np.array([[-0.4559, -0.1759, 1.1167], [0.4844, -0.1759, 1.4167], [-0.0285, 0.3519, 1.0667]])
+PRIOR = MotionPrior(
+    acceleration_sigma_mps2=(0.4, 0.4, 0.1), angular_acceleration_sigma_radps2=(0.05, 0.05, 0.15)
+)
+REFINE = Unknowns(shift_sigma_m=0.05, turn_sigma_rad=0.005, latency_sigma_s=0.1)
+FROM_NOTHING = Unknowns(shift_sigma_m=10.0, turn_sigma_rad=0.2, latency_sigma_s=1.0)
+
+
+def frames() -> FloatArray:
+    """Three stations near each other."""
+    found = np.tile(np.eye(4), (3, 1, 1))
+    for station, (heading, place) in enumerate(
+        [(0.0, (0, 0, 0)), (0.6, (2.0, -1.5, 0.1)), (-1.2, (-1.5, 2.5, -0.2))]
+    ):
+        found[station, :3, :3] = exp_so3(np.array([0.0, 0.0, heading]))
+        found[station, :3, 3] = place
+    return found
+
+
+def drive(
+    duration_s: float = 120.0, *, seed: int = 0, straight: bool = False, still: bool = False
+) -> Observations:
+    """Tracks of a robot that winds its way over uneven ground, 40 m away, with the noise that is stated."""
+    rng = np.random.default_rng(seed)
+    time_s = np.concatenate([np.arange(0.13 * station, duration_s, 0.4) for station in range(3)])
+    station = np.concatenate([np.full(len(np.arange(0.13 * s, duration_s, 0.4)), s) for s in range(3)])
+    order = np.argsort(time_s, kind="stable")
+    time_s, station = time_s[order], station[order]
+    if still:
+        position, turn = np.tile([40.0, 10.0, -1.0], (len(time_s), 1)), np.zeros((len(time_s), 3))
+    elif straight:
+        position = np.stack(
+            [20 + 0.5 * time_s, np.full_like(time_s, 10.0), np.full_like(time_s, -1.0)], axis=1
+        )
+        turn = np.zeros((len(time_s), 3))
+    else:
+        around = 0.1 * time_s
+        position = np.stack(
+            [40 + 12 * np.sin(around), 10 + 8 * np.sin(2 * around), -1 + 0.5 * np.sin(3.1 * around)], axis=1
+        )
+        heading = np.unwrap(np.arctan2(16 * np.cos(2 * around), 12 * np.cos(around)))
+        turn = np.stack([0.05 * np.sin(5 * around), 0.05 * np.cos(4 * around), heading], axis=1)
+    rotation = exp_so3(np.stack([0 * time_s, 0 * time_s, turn[:, 2]], axis=1)) @ exp_so3(turn * [1, 1, 0])
+    seen = frames()[station]
+    world = position + rotate(rotation, LAYOUT[station])
+    points = rotate(np.swapaxes(seen[:, :3, :3], 1, 2), world - seen[:, :3, 3])
+    axes, _ = line_of_sight_axes(points)
+    sigmas = np.tile([0.002, 0.001, 0.001], (len(points), 1))
+    points = points + rotate(np.swapaxes(axes, 1, 2), rng.normal(size=points.shape) * sigmas)
+    everything = np.ones(len(points), np.bool_)
+    return Observations(
+        time_s, np.zeros(len(points)), points, sigmas, everything, station, station, frames(), LAYOUT
+    )
+
+
+def wrong(observations: Observations) -> Observations:
+    """Station 2 moved by 5 mm, turned by 0.5 mrad and stamped 30 ms late."""
+    moved = observations.frames.copy()
+    moved[1, :3, :3] = exp_so3(np.array([3e-4, -1e-4, 4e-4])) @ moved[1, :3, :3]
+    moved[1, :3, 3] += [0.003, -0.002, 0.0035]
+    time_s = observations.time_s + 0.03 * (observations.station == 1)
+    return replace(observations, frames=moved, time_s=time_s).select(np.argsort(time_s, kind="stable"))
+
+
+def wandering(observations: Observations, *, sigma_s: float, piece_s: float, seed: int) -> Observations:
+    """Stamps of each station that are late by some time of its own in each stretch of a drive."""
+    late_s = np.random.default_rng(seed).normal(0.0, sigma_s, (3, 100))
+    time_s = observations.time_s + late_s[observations.station, (observations.time_s // piece_s).astype(int)]
+    return replace(observations, time_s=time_s).select(np.argsort(time_s, kind="stable"))
+
+
+def surprise(
+    found_from: Observations, known: Unknowns, start: Setup | None = None
+) -> tuple[float, int, FloatArray]:
+    """Squared distance of a result from the truth in its own sigmas, how many unknowns, error at the robot in m."""
+    found = calibrate_motion(found_from, known, start=start, prior=PRIOR, noise_scale=1.0)
+    true = Setup(frames(), np.array([0.0, 0.03, 0.0]), LAYOUT)
+    error = found.unknowns.away(found.setup) - found.unknowns.away(true)
+    missed, _ = found.setup.corrections(true, found.unknowns.pivot)
+    return float(error @ np.linalg.solve(found.covariance, error)), len(error), missed
+
+
+def test_a_wrong_frame_and_latency_come_back_within_their_uncertainty() -> None:
+    """5 mm, 0.5 mrad and 30 ms are found to 1 mm at the robot; chi squared is in its 99.9 % band."""
+    distance, unknowns, missed_m = surprise(wrong(drive()), REFINE)
+    assert unknowns == 14
+    assert distance < 36.1
+    assert np.linalg.norm(missed_m, axis=1).max() < 1e-3
+
+
+def test_uncertainties_are_neither_too_small_nor_too_large() -> None:
+    """Over eight drives the mean of chi squared stays in its 99 % band about the number of unknowns."""
+    distances = [surprise(wrong(drive(60.0, seed=seed)), REFINE)[0] for seed in range(8)]
+    assert 9.6 < np.mean(distances) < 19.3
+
+
+def test_stamps_that_wander_are_found_and_allowed_for() -> None:
+    """Where stamps wander by 3 ms every 40 s, that is found, and chi squared is as with white noise: in its 99 % band."""
+    distances, wander_s = [], []
+    for seed in range(2):
+        observations = wandering(wrong(drive(160.0, seed=seed)), sigma_s=3e-3, piece_s=40.0, seed=seed)
+        found = calibrate_motion(observations, REFINE, prior=PRIOR, noise_scale=1.0)
+        true = Setup(frames(), np.array([0.0, 0.03, 0.0]), LAYOUT)
+        error = found.unknowns.away(found.setup) - found.unknowns.away(true)
+        distances.append(float(error @ np.linalg.solve(found.covariance, error)))
+        wander_s.append(found.wander_s)
+    assert 1.5e-3 < np.mean(wander_s) < 5e-3
+    assert 6.2 < np.mean(distances) < 25.5
+
+
+def test_stamps_that_do_not_wander_are_not_said_to() -> None:
+    """Less than half a millisecond is found in white noise."""
+    assert calibrate_motion(drive(), REFINE, prior=PRIOR, noise_scale=1.0).wander_s < 5e-4
+
+
+def test_a_silence_of_all_stations_does_no_harm() -> None:
+    """Nothing is carried over half a minute without measurements: both sides of it agree."""
+    observations = wrong(drive())
+    heard = observations.select((observations.time_s < 20.0) | (observations.time_s > 52.0))
+    found = calibrate_motion(heard, REFINE, prior=PRIOR, noise_scale=1.0)
+    assert found.measurements == len(heard)
+    assert found.outliers < 5
+    assert found.disagreement < 1.5
+
+
+def test_levelled_stations_have_four_degrees_of_freedom() -> None:
+    """Tilts are not touched, and what is found is as certain or better."""
+    observations = drive()
+    free = calibrate_motion(observations, REFINE, prior=PRIOR, noise_scale=1.0)
+    level = calibrate_motion(observations, replace(REFINE, levelled=True), prior=PRIOR, noise_scale=1.0)
+    assert len(level.unknowns.sigmas) == 10
+    assert np.allclose(level.setup.frames[:, 2, :3], [0.0, 0.0, 1.0], atol=1e-12)
+    at = np.concatenate([level.unknowns.shifts.ravel(), level.unknowns.turns.ravel()])
+    same = np.concatenate([free.unknowns.shifts.ravel(), free.unknowns.turns[:, -1]])
+    assert np.all(np.diag(level.covariance)[at] < 1.05 * np.diag(free.covariance)[same])
+
+
+def test_frames_come_from_nothing_but_the_motion() -> None:
+    """Whatever frames stood there, the rough ones are good to decimetres and the fine ones within their uncertainty."""
+    observations = wrong(drive())
+    observations = replace(observations, frames=np.tile(np.eye(4), (3, 1, 1)))
+    rough = frames_from_motion(observations)
+    assert np.abs(rough[:, :3, 3] - frames()[:, :3, 3]).max() < 0.3
+    distance, _, missed_m = surprise(observations, FROM_NOTHING, Setup(rough, np.zeros(3), LAYOUT))
+    assert distance < 36.1
+    assert np.linalg.norm(missed_m, axis=1).max() < 1e-3
+
+
+def test_prisms_are_found_against_each_other() -> None:
+    """A prism that sits 4 mm off is found; where the robot's origin is stays as it was."""
+    observations = drive()
+    shifted = LAYOUT.copy()
+    shifted[2] += [0.004, 0.0, 0.0]
+    found = calibrate_motion(
+        replace(observations, layout=shifted), Unknowns(prism_sigma_m=0.01), prior=PRIOR, noise_scale=1.0
+    )
+    apart = np.linalg.norm(found.setup.layout - np.roll(found.setup.layout, 1, axis=0), axis=1)
+    assert apart == pytest.approx(np.linalg.norm(LAYOUT - np.roll(LAYOUT, 1, axis=0), axis=1), abs=5e-4)
+    assert found.setup.layout.mean(axis=0) == pytest.approx(shifted.mean(axis=0), abs=1e-9)
+    assert found.prism_sigmas_m().max() < 5e-4
+
+
+@pytest.mark.parametrize("levelled", [False, True])
+def test_derivatives_are_exact(levelled: bool) -> None:  # noqa: FBT001
+    """Each unknown moves the residuals as its derivative says."""
+    known = Unknowns(
+        shift_sigma_m=1.0, turn_sigma_rad=1.0, latency_sigma_s=1.0, prism_sigma_m=1.0, levelled=levelled
+    )
+    observations = drive(10.0)
+    setup = Setup.of(observations)
+    unknowns = UnknownSetup.of(observations, setup, known)
+    knots = first_guess(observations, knot_times(observations.time_s))
+    at = np.arange(len(observations))
+    linearised = linearise(observations, knots, at)
+    exact = unknowns.jacobian(observations, linearised, setup)
+    for unknown in range(len(unknowns.sigmas)):
+        residuals = []
+        for step in (1e-6, -1e-6):
+            move = np.zeros(len(unknowns.sigmas))
+            move[unknown] = step
+            moved = unknowns.moved(setup, move)
+            changed = replace(
+                observations,
+                time_s=observations.time_s - moved.latencies_s[observations.station],
+                frames=moved.frames,
+                layout=moved.layout,
+            )
+            residuals.append(linearise(changed, knots, at).residuals_m)
+        assert exact[:, :, unknown] == pytest.approx((residuals[0] - residuals[1]) / 2e-6, abs=1e-6)
+
+
+def test_what_a_straight_drive_does_not_tell_is_named() -> None:
+    """Driving straight on level ground leaves turns about the way open; winding about leaves nothing open."""
+    straight = calibrate_motion(drive(30.0, straight=True), REFINE, prior=PRIOR, noise_scale=1.0)
+    sentences = [direction.sentence for direction in undetermined(straight)]
+    assert any(
+        "station 2 turns by" in sentence and "mrad about bearing" in sentence for sentence in sentences
+    )
+    assert undetermined(calibrate_motion(drive(), REFINE, prior=PRIOR, noise_scale=1.0)) == []
+
+
+def test_station_1_is_needed() -> None:
+    """Frames and latencies are those beside station 1."""
+    observations = drive(20.0)
+    with pytest.raises(GeometryError, match="station 1 has measured nothing"):
+        calibrate_motion(observations.select(observations.station > 0), REFINE, prior=PRIOR)
+
+
+def test_something_must_be_unknown() -> None:
+    """With everything held there is nothing to do."""
+    with pytest.raises(GeometryError, match="nothing to find"):
+        calibrate_motion(drive(20.0), Unknowns(), prior=PRIOR)
+
+
+def test_a_robot_that_stands_does_not_tell_frames() -> None:
+    """Without a way there is nothing to lay over."""
+    with pytest.raises(GeometryError, match="no further than"):
+        frames_from_motion(drive(20.0, still=True))
+
+
+def test_stations_that_measured_at_different_times_have_no_common_way() -> None:
+    """Two stations need ten seconds in common."""
+    observations = drive(40.0)
+    apart = (observations.station != 1) == (observations.time_s < 30.0)
+    with pytest.raises(GeometryError, match="stations 1 and 2 have only"):
+        frames_from_motion(observations.select(apart))

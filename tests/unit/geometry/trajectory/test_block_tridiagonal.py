@@ -1,0 +1,78 @@
+"""Block tridiagonal systems against dense ones."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from tsgt.errors import GeometryError
+from tsgt.geometry.trajectory.block_tridiagonal import factorise
+
+if TYPE_CHECKING:
+    from tsgt.geometry import FloatArray
+
+
+def made_up(count: int, size: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Give a positive definite matrix: blocks on its diagonal, right of it, and the whole."""
+    rng = np.random.default_rng(count)
+    root = np.zeros((count * size, count * size))
+    for k in range(count):
+        here = slice(k * size, (k + 1) * size)
+        root[here, here] = rng.normal(size=(size, size)) / size + 2 * np.eye(size)
+        if k:
+            root[here, (k - 1) * size : k * size] = rng.normal(size=(size, size)) / size
+    whole = root @ root.T
+    blocks = whole.reshape(count, size, count, size).transpose(0, 2, 1, 3)
+    rows = np.arange(count)
+    return blocks[rows, rows], blocks[rows[:-1], rows[1:]], whole
+
+
+SHAPES = [(1, 1), (1, 4), (2, 3), (7, 5), (30, 18)]
+
+
+@pytest.mark.parametrize(("count", "size"), SHAPES)
+def test_solutions_are_those_of_the_dense_system(count: int, size: int) -> None:
+    """One right hand side and several give what a dense solver gives."""
+    diagonal, beside, whole = made_up(count, size)
+    factor = factorise(diagonal, beside)
+    right = np.random.default_rng(0).normal(size=(count, size, 3))
+    expected = np.linalg.solve(whole, right.reshape(-1, 3)).reshape(right.shape)
+    np.testing.assert_allclose(factor.solve(right), expected, atol=1e-12)
+    np.testing.assert_allclose(factor.solve(right[:, :, 1]), expected[:, :, 1], atol=1e-12)
+
+
+@pytest.mark.parametrize(("count", "size"), SHAPES)
+def test_marginals_are_blocks_of_the_inverse(count: int, size: int) -> None:
+    """Covariances and those of neighbours are the inverse's blocks."""
+    diagonal, beside, whole = made_up(count, size)
+    own, next_to = factorise(diagonal, beside).marginals()
+    inverse = np.linalg.inv(whole).reshape(count, size, count, size).transpose(0, 2, 1, 3)
+    k = np.arange(count)
+    np.testing.assert_allclose(own, inverse[k, k], atol=1e-13)
+    np.testing.assert_allclose(next_to, inverse[k[:-1], k[1:]], atol=1e-13)
+
+
+@pytest.mark.parametrize(("count", "size"), SHAPES)
+def test_determinant(count: int, size: int) -> None:
+    """The determinant's logarithm is the dense one."""
+    diagonal, beside, whole = made_up(count, size)
+    assert factorise(diagonal, beside).log_determinant() == pytest.approx(
+        np.linalg.slogdet(whole)[1], rel=1e-12
+    )
+
+
+def test_upper_triangles_of_the_diagonal_are_not_looked_at() -> None:
+    """What stands above the diagonal of a block on it changes nothing."""
+    diagonal, beside, _ = made_up(4, 3)
+    changed = np.tril(diagonal)
+    np.testing.assert_array_equal(factorise(changed, beside).banded, factorise(diagonal, beside).banded)
+
+
+def test_what_is_not_determined_is_an_error() -> None:
+    """A matrix that is not positive definite is refused in words."""
+    diagonal, beside, _ = made_up(4, 3)
+    diagonal[2] = 0.0
+    with pytest.raises(GeometryError, match="do not determine"):
+        factorise(diagonal, beside)

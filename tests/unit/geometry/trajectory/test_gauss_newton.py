@@ -1,0 +1,394 @@
+"""The most probable trajectory against dense Gaussian-process regression and scipy's least squares; what goes wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from harness.prior_motion import SIGMAS_M, STEP_S, as_points, draw_motions, in_time, measure, rows_at
+from harness.scene import FRAMES, LAYOUT
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+from scipy.stats import multivariate_normal
+
+from tsgt.errors import GeometryError
+from tsgt.geometry import Observations, Trajectory, cartesian_to_polar, exp_so3
+from tsgt.geometry.trajectory.gauss_newton import (
+    HOPELESS,
+    LEAST_STEP_S,
+    OUTLYING,
+    SETTLED,
+    Anchor,
+    knot_times,
+    log_evidence,
+    nearest,
+    solve,
+    start_anchor,
+)
+from tsgt.geometry.trajectory.initialisation import first_guess
+from tsgt.geometry.trajectory.motion_prior import process_noise, transition
+from tsgt.geometry.trajectory.states import STATE, Knots, Steps, linearise_steps, spread
+from tsgt.model import MotionPrior
+
+if TYPE_CHECKING:
+    from tsgt.geometry import FloatArray
+
+PRIOR = MotionPrior()
+MOTION = draw_motions(PRIOR, count=1, duration_s=8.0, seed=3)[0]
+
+
+@pytest.fixture(scope="module")
+def observations() -> Observations:
+    """Six seconds of a robot, three stations, exact stamps."""
+    found = in_time(measure(MOTION, until_s=6.0, seed=4))
+    return replace(found, time_sigma_s=np.zeros(len(found)))
+
+
+def guess_of(observations: Observations) -> Knots:
+    """Give the first guess at the knots of these measurements."""
+    return first_guess(observations, knot_times(observations.time_s))
+
+
+def a_point(time_s: FloatArray, x_m: FloatArray, sigma_m: float) -> Observations:
+    """Give measurements of the robot's origin itself, alike along all three axes: then only translation is measured."""
+    count = len(time_s)
+    return Observations(
+        time_s=time_s,
+        time_sigma_s=np.zeros(count),
+        points_m=np.repeat(x_m[:, None], 3, axis=1),
+        sigmas_m=np.full((count, 3), sigma_m),
+        polar=np.zeros(count, dtype=bool),
+        station=np.zeros(count, dtype=np.intp),
+        prism=np.zeros(count, dtype=np.intp),
+        frames=np.eye(4)[None],
+        layout=np.zeros((1, 3)),
+    )
+
+
+def at_rest(time_s: FloatArray) -> Knots:
+    """Give a robot at the origin."""
+    zero = np.zeros((len(time_s), 3))
+    return Knots(time_s, zero, np.broadcast_to(np.eye(3), (len(time_s), 3, 3)), zero, zero, zero, zero)
+
+
+def dense_prior(time_s: FloatArray, first: FloatArray, time_constant_s: float, sigma: float) -> FloatArray:
+    """Joint covariance of one axis's three parts at all instants, (K, 3, K, 3), from that of the first, (3, 3)."""
+    count = len(time_s)
+    joint = np.zeros((count, 3, count, 3))
+    own = first
+    for k in range(count):
+        joint[k, :, k] = own
+        for later in range(k + 1, count):
+            phi = transition(time_s[later] - time_s[k], time_constant_s)
+            joint[k, :, later] = own @ phi.T
+            joint[later, :, k] = phi @ own
+        if k + 1 < count:
+            dt_s = time_s[k + 1] - time_s[k]
+            phi = transition(dt_s, time_constant_s)
+            own = phi @ own @ phi.T + sigma**2 * process_noise(dt_s, time_constant_s)
+    return joint
+
+
+def test_translation_is_dense_gaussian_process_regression() -> None:
+    """Where only positions are measured, means, covariances and evidence are those of the textbook's dense formulas."""
+    rng = np.random.default_rng(5)
+    time_s = np.cumsum(rng.uniform(0.05, 0.6, 25))
+    measured = np.sin(time_s) + rng.normal(scale=0.05, size=25)
+    data, sigma_m = a_point(time_s, measured, 0.05), 0.05
+    priors = (PRIOR, replace(PRIOR, acceleration_sigma_mps2=(1.3, 1.3, 1.3), acceleration_time_s=0.3))
+    evidence, expected_evidence = [], []
+    for prior in priors:
+        sigma, lasting_s = prior.acceleration_sigma_mps2[0], prior.acceleration_time_s
+        spread_of_first = np.array([2.0, 1.5, sigma])
+        information = np.eye(STATE)
+        for axis in range(3):
+            own = prior.acceleration_sigma_mps2[axis]
+            information[axis, axis], information[6 + axis, 6 + axis] = 2.0**-2, 1.5**-2
+            information[12 + axis, 12 + axis] = own**-2
+        # Where the measurements are, so that none is an outlier to begin with.
+        start = replace(at_rest(time_s), position=data.points_m)
+        at_origin = Anchor(at_rest(time_s).select(slice(0, 1)), information)
+        found = solve(data, start, prior, anchor=at_origin)
+        assert np.all(found.weights == 1.0)
+
+        joint = dense_prior(time_s, np.diag(spread_of_first**2), lasting_s, sigma)
+        of_measured = joint[:, 0, :, 0] + sigma_m**2 * np.eye(25)
+        gain = np.linalg.solve(of_measured, joint[:, 0].reshape(25, -1)).T
+        mean = (gain @ measured).reshape(25, 3)
+        covariance = joint.reshape(75, 75) - gain @ joint[:, 0].reshape(25, -1)
+        for part, values in enumerate((found.knots.position, found.knots.velocity, found.knots.acceleration)):
+            np.testing.assert_allclose(values[:, 0], mean[:, part], atol=1e-8)
+        diagonal, beside = found.factor.marginals()
+        blocks, parts = covariance.reshape(25, 3, 25, 3), [0, 6, 12]
+        for k in range(25):
+            np.testing.assert_allclose(diagonal[k][np.ix_(parts, parts)], blocks[k, :, k], atol=1e-9)
+        for k in range(24):
+            np.testing.assert_allclose(beside[k][np.ix_(parts, parts)], blocks[k, :, k + 1], atol=1e-9)
+        evidence.append(log_evidence(found, data, prior))
+        per_axis = []
+        for own in prior.acceleration_sigma_mps2:
+            first = np.diag(np.array([2.0, 1.5, own]) ** 2)
+            own_joint = dense_prior(time_s, first, lasting_s, own)[:, 0, :, 0]
+            per_axis.append(multivariate_normal(cov=own_joint + sigma_m**2 * np.eye(25)).logpdf(measured))
+        expected_evidence.append(sum(per_axis))
+    # What the angular acceleration's prior leaves in the evidence is the same for both: nothing turns.
+    assert evidence[1] - evidence[0] == pytest.approx(expected_evidence[1] - expected_evidence[0], abs=1e-5)
+
+
+def test_six_degrees_of_freedom_are_least_squares(observations: Observations) -> None:
+    """On polar measurements of a turning robot the states are those that scipy's least squares finds.
+
+    Its residuals are written out with the angles themselves.
+    """
+    data = observations.select(observations.time_s < 1.0)
+    start = guess_of(data)
+    found = solve(data, start, PRIOR)
+    assert np.all(found.weights == 1.0)
+    at, steps = nearest(start.time_s, data.time_s), Steps.of(start.time_s, PRIOR)
+    anchor = start_anchor(start.select(slice(0, 1)), PRIOR)
+    roots = np.swapaxes(np.linalg.cholesky(spread(steps.information)), 1, 2)
+    anchor_root = np.sqrt(np.diag(anchor.information))
+    measured = np.stack(cartesian_to_polar(data.points_m), axis=-1)
+
+    def residuals(flat: FloatArray) -> FloatArray:
+        knots = found.knots.moved(flat.reshape(-1, STATE))
+        delta_s = (data.time_s - knots.time_s[at])[:, None]
+        turn = knots.angular_velocity[at] * delta_s + knots.angular_acceleration[at] * delta_s**2 / 2
+        arm = Rotation.from_rotvec(turn).apply(LAYOUT[data.prism])
+        world = (
+            knots.position[at]
+            + knots.velocity[at] * delta_s
+            + knots.acceleration[at] * delta_s**2 / 2
+            + Rotation.from_matrix(knots.rotation[at]).apply(arm)
+        )
+        frames = FRAMES[data.station]
+        seen = np.einsum("mji,mj->mi", frames[:, :3, :3], world - frames[:, :3, 3])
+        around, zenith, distance_m = np.stack(cartesian_to_polar(seen), axis=-1).T
+        turned = (around - measured[:, 0] + np.pi) % (2 * np.pi) - np.pi
+        by_measurement = np.stack(
+            [
+                distance_m - measured[:, 2],
+                turned * measured[:, 2] * np.sin(measured[:, 1]),
+                (zenith - measured[:, 1]) * measured[:, 2],
+            ],
+            axis=-1,
+        )
+        by_step = (roots @ linearise_steps(knots, steps).residuals[..., None])[..., 0]
+        first = anchor_root * knots.select(slice(0, 1)).error_from(anchor.near)[0]
+        return np.concatenate([(by_measurement / data.sigmas_m).ravel(), by_step.ravel(), first])
+
+    diagonal, _ = found.factor.marginals()
+    sigmas = np.sqrt(np.diagonal(diagonal, axis1=1, axis2=2))
+    # In sigmas, from a tenth of one away in each of them.
+    begin = np.random.default_rng(1).normal(scale=0.1, size=sigmas.size)
+
+    def in_sigmas(error: FloatArray) -> FloatArray:
+        return residuals(error * sigmas.ravel())
+
+    oracle = least_squares(in_sigmas, begin, method="lm")
+    # The search ends where a step gains less than this.
+    assert 2 * oracle.cost == pytest.approx(found.cost, abs=SETTLED * len(data) ** 0.5)
+    assert np.abs(oracle.x).max() < 0.03
+
+
+def test_the_order_of_measurements_is_irrelevant(observations: Observations) -> None:
+    """Shuffled measurements give the same trajectory, and each its own distance and weight."""
+    start = guess_of(observations)
+    order = np.random.default_rng(6).permutation(len(observations))
+    found, shuffled = (solve(data, start, PRIOR) for data in (observations, observations.select(order)))
+    np.testing.assert_allclose(shuffled.knots.error_from(found.knots), 0.0, atol=1e-8)
+    np.testing.assert_allclose(shuffled.distances, found.distances[order], atol=1e-5)
+    assert shuffled.cost == pytest.approx(found.cost)
+
+
+def test_good_measurements_are_three_sigmas_squared_away_less_what_they_fit(
+    observations: Observations,
+) -> None:
+    """Distances have the expectation of a chi-square with three degrees of freedom, less the freedom of the fit."""
+    found = solve(observations, guess_of(observations), PRIOR)
+    # The trajectory takes what it takes up: six numbers a time, every 0.4 s, of nine that are measured.
+    assert 0.8 < found.distances.mean() < 3.0
+    assert np.count_nonzero(found.weights < 1.0) <= 1
+
+
+@pytest.mark.parametrize("miss_m", [0.1, 0.5, 30.0])
+def test_outliers_are_named(observations: Observations, miss_m: float) -> None:
+    """A reflection that is off by so much gets next to no weight, far off none; it alone does so, and bends nothing."""
+    clean = solve(observations, guess_of(observations), PRIOR)
+    wrong = len(observations) // 2
+    points = observations.points_m.copy()
+    points[wrong] *= 1 + miss_m / np.linalg.norm(points[wrong])
+    found = solve(replace(observations, points_m=points), guess_of(observations), PRIOR)
+    assert np.argmin(found.weights) == wrong
+    assert found.weights[wrong] < 16 / (miss_m / 0.01) ** 2
+    little = OUTLYING**2 / found.distances[wrong]
+    assert found.weights[wrong] == pytest.approx(0.0 if found.distances[wrong] > HOPELESS**2 else little)
+    assert np.count_nonzero((found.weights < 1.0) & (clean.weights == 1.0)) == 1
+    arm = LAYOUT.mean(axis=0)
+    centroid, clean_centroid = (s.knots.position + s.knots.rotation @ arm for s in (found, clean))
+    assert np.linalg.norm(centroid - clean_centroid, axis=1).max() < 0.01
+
+
+def test_a_lock_on_the_wrong_prism_is_named(observations: Observations) -> None:
+    """Measurements of a neighbour's prism under the own number are outliers, and no others."""
+    wrong = np.flatnonzero(observations.prism == 0)[4:7]
+    truth = MOTION.select(rows_at(observations.time_s[wrong]))
+    world = truth.position + truth.rotation @ LAYOUT[1]
+    points = observations.points_m.copy()
+    points[wrong] = np.einsum("ij,mi->mj", FRAMES[0, :3, :3], world - FRAMES[0, :3, 3])
+    data = replace(observations, points_m=points)
+    found = solve(data, guess_of(data), PRIOR)
+    clean = solve(observations, guess_of(observations), PRIOR)
+    named = np.flatnonzero((found.weights < 1.0) & (clean.weights == 1.0))
+    np.testing.assert_array_equal(named, wrong)
+
+
+def test_a_station_that_stays_on_the_wrong_prism_turns_nothing() -> None:
+    """What two prisms do not tell is not told by many outliers together either: it stays as uncertain as without them."""
+    (motion,) = draw_motions(PRIOR, count=1, duration_s=8.0, seed=4)
+    observations = in_time(measure(motion, until_s=6.0, seed=4))
+    wrong = (observations.prism == 0) & (observations.time_s > 3.0)
+    truth = motion.select(rows_at(observations.time_s[wrong]))
+    world = truth.position + truth.rotation @ LAYOUT[1]
+    points = observations.points_m.copy()
+    points[wrong] = np.einsum("ij,mi->mj", FRAMES[0, :3, :3], world - FRAMES[0, :3, 3])
+    others = observations.select(~wrong)
+    (state, covariance), (expected, expected_covariance) = (
+        Trajectory(solution.knots, PRIOR, *solution.factor.marginals()).at(np.array([4.0]))
+        for solution in (
+            solve(each, guess_of(others), PRIOR) for each in (replace(observations, points_m=points), others)
+        )
+    )
+    sigmas = np.sqrt(np.diagonal(expected_covariance, axis1=1, axis2=2))
+    assert np.abs(state.error_from(expected) / sigmas).max() < 2.0
+    worst, expected_worst = (
+        np.linalg.eigvalsh(each[0, 3:6, 3:6])[-1] for each in (covariance, expected_covariance)
+    )
+    assert worst == pytest.approx(expected_worst, rel=0.1)
+
+
+def test_a_solution_from_points_is_near_that_from_polar_ones(observations: Observations) -> None:
+    """Cartesian points, whose noise is known less well, put the robot within millimetres of the same place."""
+    found = solve(observations, guess_of(observations), PRIOR)
+    of_points = solve(as_points(observations), guess_of(observations), PRIOR)
+    miss = of_points.knots.position - found.knots.position
+    assert np.sqrt((miss**2).sum(axis=1).mean()) < 2 * SIGMAS_M[0]
+
+
+def test_a_bad_start_still_finds_it(observations: Observations) -> None:
+    """From metres and tens of degrees away it comes to the same trajectory, with the same covariances."""
+    start = guess_of(observations)
+    rng = np.random.default_rng(7)
+    error = np.zeros((len(start), STATE))
+    error[:, :3], error[:, 3:6] = rng.normal(scale=2.0, size=(2, len(start), 3)) * [[[1.0]], [[0.2]]]
+    anchor = start_anchor(start.select(slice(0, 1)), PRIOR)
+    good, bad = (solve(observations, begin, PRIOR, anchor=anchor) for begin in (start, start.moved(error)))
+    assert bad.cost == pytest.approx(good.cost, rel=1e-5)
+    np.testing.assert_allclose(bad.knots.position, good.knots.position, atol=1e-4)
+    np.testing.assert_allclose(
+        bad.factor.marginals()[0][:, :6, :6], good.factor.marginals()[0][:, :6, :6], atol=1e-5
+    )
+
+
+@pytest.mark.parametrize("most", [0, 1, 2, 3])
+def test_covariances_are_never_damped(observations: Observations, most: int) -> None:
+    """Wherever the search is cut short, the covariances are those of the system there, without the search's damping."""
+    start = guess_of(observations)
+    rng = np.random.default_rng(8)
+    error = np.zeros((len(start), STATE))
+    error[:, 3:6] = rng.normal(scale=0.6, size=(len(start), 3))
+    anchor = start_anchor(start.select(slice(0, 1)), PRIOR)
+    cut = solve(observations, start.moved(error), PRIOR, anchor=anchor, most_iterations=most)
+    assert cut.iterations == most
+    there = solve(observations, cut.knots, PRIOR, anchor=anchor, most_iterations=0)
+    np.testing.assert_allclose(there.factor.banded, cut.factor.banded, rtol=1e-9, atol=1e-9)
+
+
+def test_two_prisms_are_not_enough_to_begin_with(observations: Observations) -> None:
+    """Measurements of two prisms alone are refused, and the message says how many there are."""
+    with pytest.raises(GeometryError, match=r"3 prisms.*2 have been measured"):
+        guess_of(observations.select(observations.prism != 2))
+
+
+def test_prisms_in_one_place_are_refused(observations: Observations) -> None:
+    """Three stations that all track one prism give no attitude, and the message asks which station tracks which."""
+    points = observations.points_m.copy()
+    for station in range(3):
+        rows = observations.station == station
+        points[rows] = (np.array([50.0, 40.0, 1.0]) - FRAMES[station, :3, 3]) @ FRAMES[station, :3, :3]
+    with pytest.raises(GeometryError, match="which station tracks which prism"):
+        guess_of(replace(observations, points_m=points))
+
+
+def test_what_nothing_determines_is_an_error(observations: Observations) -> None:
+    """Without any knowledge of the first state and with one measurement there is no trajectory."""
+    start = guess_of(observations)
+    nothing = Anchor(start.select(slice(0, 1)), np.zeros((STATE, STATE)))
+    with pytest.raises(GeometryError, match="do not determine the trajectory"):
+        solve(observations.select(slice(0, 1)), start, PRIOR, anchor=nothing)
+
+
+def test_one_visible_prism_leaves_a_covariance_that_says_so(observations: Observations) -> None:
+    """When two of three prisms vanish the attitude becomes uncertain, faster than the place of the prism still seen."""
+    data = observations.select((observations.time_s < 2.0) | (observations.prism == 0))
+    start = first_guess(data, knot_times(data.time_s))
+    diagonal, _ = solve(data, start, PRIOR).factor.marginals()
+    before, after = diagonal[np.searchsorted(start.time_s, 1.5)], diagonal[-1]
+    turning = np.sqrt(np.linalg.eigvalsh(after[3:6, 3:6]).max() / np.linalg.eigvalsh(before[3:6, 3:6]).max())
+    assert turning > 10
+    by_error = np.concatenate([np.eye(3), np.zeros((3, 3))], axis=1)
+    found = solve(data, start, PRIOR).knots
+    x, y, z = LAYOUT[0]
+    by_error[:, 3:] = -found.rotation[-1] @ np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    of_prism = by_error @ after[:6, :6] @ by_error.T
+    assert np.sqrt(np.linalg.eigvalsh(of_prism).max()) < 0.01
+
+
+@pytest.mark.parametrize("rate_radps", [0.0, 1.5, 2.5])
+def test_a_robot_that_turns_fast_while_one_prism_is_seen_is_not_lost(rate_radps: float) -> None:
+    """The first guess turns on where two prisms are not seen, and puts the robot where the third one is."""
+    time_s = np.arange(round(8.0 / STEP_S) + 1, dtype=np.float64) * STEP_S
+    still = np.zeros((len(time_s), 3))
+    velocity, rates = (np.tile(v, (len(time_s), 1)) for v in ([0.8, -0.5, 0.0], [0.3, 0.0, rate_radps]))
+    motion = Knots(
+        time_s,
+        np.array([60.0, 45.0, -1.0]) + time_s[:, None] * velocity,
+        exp_so3(time_s[:, None] * rates),
+        velocity,
+        rates,
+        still,
+        still,
+    )
+    whole = in_time(measure(motion, until_s=7.5, seed=18))
+    data = whole.select((whole.time_s < 3.0) | (whole.time_s > 4.5) | (whole.prism == 0))
+    start = guess_of(data)
+    truth = motion.select(rows_at(start.time_s))
+    away = start.error_from(truth)
+    assert np.linalg.norm(away[:, 3:6], axis=1).max() < 0.7
+    found = solve(data, start, PRIOR)
+    assert np.all(found.weights == 1.0)
+    assert np.linalg.norm(found.knots.error_from(truth)[:, 3:6], axis=1).max() < 0.1
+
+
+def test_knots_stand_at_measurements() -> None:
+    """One measurement alone has its knot at its instant; those within the least step share one at their mean."""
+    times = knot_times(np.array([1.0, 1.2, 1.2 + 0.3 * LEAST_STEP_S, 3.3]))
+    np.testing.assert_allclose(times, [1.0, 1.2 + 0.15 * LEAST_STEP_S, 3.3])
+
+
+def test_knots_are_apart_and_near() -> None:
+    """However measurements fall, knots keep a distance and every measurement has one within the least step."""
+    time_s = np.sort(np.random.default_rng(9).uniform(0, 20, 2000))
+    times = knot_times(time_s)
+    assert np.diff(times).min() > 0.2 * LEAST_STEP_S
+    assert np.abs(times[nearest(times, time_s)] - time_s).max() < LEAST_STEP_S
+
+
+def test_nearest_is_the_nearest() -> None:
+    """Each instant gets the knot that is nearest, before the first and after the last one too."""
+    knots_s = np.array([0.0, 1.0, 3.0])
+    time_s = np.array([-5.0, 0.4, 0.6, 1.9, 2.1, 9.0])
+    np.testing.assert_array_equal(nearest(knots_s, time_s), [0, 0, 1, 1, 2, 2])
+    np.testing.assert_array_equal(nearest(knots_s[:1], time_s), 0)

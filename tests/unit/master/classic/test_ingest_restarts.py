@@ -1,0 +1,165 @@
+"""The intake: what may be of another clock, because the station's program may have been started again."""
+
+from __future__ import annotations
+
+import pytest
+from harness.clock_exchanges import SECOND, START_NS, synchronisation
+
+from tsgt.master.classic.ingest import Intake
+from tsgt.radio.classic.messages import MeasurementMessage, no_measurement_yet
+from tsgt.timesync.two_way import RegressionFilter, clock_filter
+
+MS = 1_000_000
+TURN_ROUND_NS = 1_500_000
+
+
+class Master:
+    """One station's intake, at instants that count from the start in s."""
+
+    def __init__(self, filter_name: str = "regression") -> None:
+        self.intake = Intake({1: 4}, lambda: clock_filter(filter_name))  # type: ignore[arg-type]
+        self.ahead_ns = 0
+
+    def synchronise(self, at_s: float, *, cycles: int = 5) -> list[tuple[int, int | None]]:
+        """Exchange packets from an instant on; return stamp and bound of what was held until then, in ns."""
+        samples = synchronisation(at_s, lambda _: self.ahead_ns, cycles=cycles, turn_round_ns=TURN_ROUND_NS)
+        found = self.intake.synchronised(1, samples, samples[-1].received_ns)
+        return [(m.stamp_ns, m.stamp_bound_ns) for m in found.measurements]
+
+    def restart(self, at_s: float, step_ns: int) -> None:
+        """Start the station's program again, with a clock that is ahead by so much more; it says so."""
+        self.ahead_ns += step_ns
+        now_ns = START_NS + round(at_s * SECOND)
+        self.intake.unanswered(1)
+        answer = no_measurement_yet(1)
+        assert self.intake.answered(answer, requested_ns=now_ns - 194 * MS, received_ns=now_ns).doubtful
+
+    def poll(
+        self, at_s: float, *, made_s: float | None = None, status: int = 0
+    ) -> tuple[int, int | None] | None:
+        """Ask for a measurement, made then or 50 ms before the request; return its stamp and bound, in ns."""
+        received_ns = START_NS + round(at_s * SECOND)
+        made_ns = received_ns - 244 * MS if made_s is None else START_NS + round(made_s * SECOND)
+        message = MeasurementMessage(
+            station=1,
+            status=status,
+            zenith_angle_rad=1.5,
+            horizontal_angle_rad=0.5,
+            slope_distance_m=30.0 if status == 0 else 0.0,
+            time_ns=made_ns + self.ahead_ns,
+        )
+        arrival = self.intake.answered(message, requested_ns=received_ns - 194 * MS, received_ns=received_ns)
+        measurement = arrival.measurement
+        return None if measurement is None else (measurement.stamp_ns, measurement.stamp_bound_ns)
+
+
+@pytest.mark.parametrize(
+    ("first_ms", "second_ms", "apart_s"), [(1.5, 3.0, 60), (-1.5, -3.0, 60), (1.5, 1.0, 20)]
+)
+def test_two_restarts_with_small_steps_do_not_pass_for_a_frequency(
+    first_ms: float, second_ms: float, apart_s: float
+) -> None:
+    """Each step is less than an exchange can tell; until the next synchronisation all stamps are within their bounds."""
+    master = Master()
+    master.synchronise(0, cycles=50)
+    master.restart(24, round(first_ms * MS))
+    master.synchronise(25)
+    master.restart(24 + apart_s, round(second_ms * MS))
+    master.synchronise(25 + apart_s)
+    for number in range(170):
+        at_s = 27 + apart_s + number / 2
+        found = master.poll(at_s)
+        assert found is not None
+        stamp_ns, bound_ns = found
+        assert bound_ns is not None
+        assert abs(stamp_ns - (START_NS + round(at_s * SECOND) - 244 * MS)) <= bound_ns
+
+
+def test_no_line_reaches_over_what_may_have_been_a_restart() -> None:
+    """The frequency that was known stays a first guess; what the step would make of it is left out."""
+    through, anew = RegressionFilter(), RegressionFilter()
+    for clock in (through, anew):
+        clock.update(synchronisation(0, lambda _: 0.0, cycles=50, turn_round_ns=TURN_ROUND_NS))
+    stepped = synchronisation(30, lambda _: 1.0 * MS, turn_round_ns=TURN_ROUND_NS)
+    through.update(stepped)
+    assert not anew.update(stepped, anew=True).restarted  # as far as exchanges tell
+    at_ns = stepped[-1].station_ns
+    assert abs(through.at(at_ns).frequency_ppm) > 20
+    assert abs(anew.at(at_ns).frequency_ppm) < 2
+
+
+@pytest.mark.parametrize("apart_s", [28, 60])
+def test_a_station_that_had_nothing_yet_was_restarted_while_nobody_asked_it(apart_s: int) -> None:
+    """The others were synchronised meanwhile; no line reaches over the step, though there was no measurement before."""
+    master = Master()
+    master.synchronise(0)
+    master.ahead_ns += 1_800_000
+    now_ns = START_NS + apart_s * SECOND
+    answer = no_measurement_yet(1)
+    assert master.intake.answered(answer, requested_ns=now_ns - 194 * MS, received_ns=now_ns).doubtful
+    master.synchronise(apart_s + 0.5)
+    for number in range(170):
+        at_s = apart_s + 3 + number / 2
+        found = master.poll(at_s)
+        assert found is not None
+        stamp_ns, bound_ns = found
+        assert bound_ns is not None
+        assert abs(stamp_ns - (START_NS + round(at_s * SECOND) - 244 * MS)) <= bound_ns
+
+
+def test_the_papers_filter_takes_a_tenth_all_the_same() -> None:
+    """It is as the paper has it."""
+    plain, anew = clock_filter("paper"), clock_filter("paper")
+    for clock in (plain, anew):
+        clock.update(synchronisation(0, lambda _: 0.0))
+    stepped = synchronisation(30, lambda _: 1.0 * MS)
+    plain.update(stepped)
+    anew.update(stepped, anew=True)
+    assert plain.at(stepped[-1].station_ns) == anew.at(stepped[-1].station_ns)
+
+
+def test_what_comes_while_the_clock_is_doubted_waits_for_a_synchronisation() -> None:
+    """It is stamped with the clock that is found then."""
+    master = Master()
+    master.synchronise(0)
+    assert master.poll(2.0) is not None
+    master.intake.doubt(1)
+    master.ahead_ns += 30 * MS
+    assert master.poll(3.0) is None
+    ((stamp_ns, _),) = master.synchronise(3.5)
+    assert stamp_ns == pytest.approx(START_NS + 2756 * MS, abs=2 * MS)
+    assert master.poll(6.0) is not None
+
+
+def test_an_error_that_came_late_is_told_once() -> None:
+    """With the time of its arrival, as it looked old; after a silence it comes again, and its clock is known by then."""
+    master = Master()
+    master.synchronise(0)
+    assert master.poll(2.0) is not None
+    master.intake.unanswered(1)
+    assert master.poll(5.0, made_s=2.5, status=3) is not None
+    master.intake.unanswered(1)
+    assert master.poll(11.0, made_s=2.5, status=3) is None
+    assert master.synchronise(12.0) == []
+
+
+def test_errors_of_an_authors_node_are_told_although_their_time_is_always_the_same() -> None:
+    """It means nothing; they are known by their status."""
+    master = Master()
+    master.synchronise(0)
+    told = []
+    for number, status in enumerate((1, 2, 2, 1)):
+        received_ns = START_NS + (2 + number) * SECOND
+        message = MeasurementMessage(
+            station=1,
+            status=status,
+            zenith_angle_rad=-1.0,
+            horizontal_angle_rad=-1.0,
+            slope_distance_m=-1.0,
+            time_ns=12_345 * SECOND,
+        )
+        arrival = master.intake.answered(
+            message, requested_ns=received_ns - 194 * MS, received_ns=received_ns
+        )
+        told.append(None if arrival.measurement is None else arrival.measurement.raw_status)
+    assert told == [1, 2, None, 1]

@@ -1,0 +1,324 @@
+"""The scheduler on a made-up channel where each turn takes its time, without radio and clock."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from harness.radios import PAPER
+
+from tsgt.master.classic.scheduler import Cadence, Scheduler, StationPlan, Task
+from tsgt.model import ClockSample
+from tsgt.radio.classic.messages import no_measurement_yet
+from tsgt.radio.classic.transactions import Ordered, Poll, Synchronisation, Timing
+
+MS = 1_000_000
+SECOND = 1000 * MS
+TIMING = Timing.of(PAPER, 250 * MS)
+SAMPLE = ClockSample(sent_ns=0, station_ns=1, received_ns=2, forward_ns=0, back_ns=0)
+
+# Durations at the paper's settings: a poll that is answered and one that is not, a cycle, what is around the cycles.
+POLL_NS, TIMEOUT_NS, CYCLE_NS, FRAME_NS = 195 * MS, 304 * MS, 245 * MS, 162 * MS
+
+PAPERS = Cadence(initial_cycles=50, resync_cycles=5, interval_ns=300 * SECOND)
+
+
+@dataclass
+class Channel:
+    """Carries turns out: stations answer, are dead, refuse orders, give no stamps, or leave their clock open."""
+
+    cadence: Cadence = PAPERS
+    stations: int = 3
+    now_ns: int = 0
+    dead: set[int] = field(default_factory=set)
+    refusing: set[int] = field(default_factory=set)
+    stampless: set[int] = field(default_factory=set)
+    doubted: set[int] = field(default_factory=set)
+    turns: list[tuple[int, Task]] = field(default_factory=list)
+    spent_ns: Counter[int] = field(default_factory=Counter)
+
+    def __post_init__(self) -> None:
+        self.scheduler = Scheduler(
+            [StationPlan(station=n, prism=n + 3) for n in range(1, self.stations + 1)],
+            self.cadence,
+            TIMING,
+            self.now_ns,
+        )
+
+    def run(self, until_s: float) -> None:
+        """Take turns until an instant."""
+        while self.now_ns < until_s * SECOND:
+            turn = self.scheduler.next(self.now_ns)
+            if isinstance(turn, int):
+                assert turn > self.now_ns
+                self.now_ns = turn
+                continue
+            self.turns.append((self.now_ns, turn))
+            took_ns = self._carry_out(turn)
+            self.spent_ns[turn.station] += took_ns
+            self.now_ns += took_ns
+            self.scheduler.finished(turn, self.now_ns)
+            if isinstance(turn, Synchronisation) and turn.station in self.doubted:
+                self.scheduler.doubted(turn.station, self.now_ns)
+
+    def _carry_out(self, turn: Task) -> int:
+        dead = turn.station in self.dead
+        if isinstance(turn, Ordered):
+            turn.ok = None if dead else turn.station not in self.refusing
+            return 10 * SECOND if dead else 500 * MS
+        if isinstance(turn, Poll):
+            turn.message = None if dead else no_measurement_yet(turn.station)
+            return TIMEOUT_NS if dead else POLL_NS
+        turn.answered = not dead
+        if dead:
+            return FRAME_NS + 3 * TIMEOUT_NS
+        if turn.station in self.stampless:
+            return FRAME_NS + 2 * turn._cycles * CYCLE_NS
+        turn.samples = [SAMPLE] * turn._cycles
+        return FRAME_NS + turn._cycles * CYCLE_NS
+
+    def of(self, kind: type[Any], *, since_s: float = 0) -> list[tuple[int, Any]]:
+        """Return turns of a kind with their instants."""
+        return [(at, turn) for at, turn in self.turns if isinstance(turn, kind) and at >= since_s * SECOND]
+
+    def rate_hz(self, station: int, since_s: float) -> float:
+        """How often a station was polled with success."""
+        polls = [
+            turn for _, turn in self.of(Poll, since_s=since_s) if turn.station == station and turn.answered
+        ]
+        return len(polls) / (self.now_ns / SECOND - since_s)
+
+
+def test_each_station_is_told_to_track_then_synchronised_then_polled() -> None:
+    """The order goes first with the station's prism; all are synchronised before the first poll."""
+    channel = Channel()
+    channel.run(60)
+    kinds = [(type(turn), turn.station) for _, turn in channel.turns[:9]]
+    assert kinds == [(kind, n) for kind in (Ordered, Synchronisation, Poll) for n in (1, 2, 3)]
+    assert channel.of(Ordered)[0][1]._order.to_bytes() == b"n14"
+    assert [turn._cycles for _, turn in channel.of(Synchronisation)[:3]] == [50, 50, 50]
+
+
+def test_three_stations_get_the_rate_that_the_air_allows() -> None:
+    """Round robin; synchronisations take less than a twentieth of the time."""
+    channel = Channel()
+    channel.run(700)
+    for station in (1, 2, 3):
+        assert channel.rate_hz(station, 100) == pytest.approx(SECOND / POLL_NS / 3, rel=0.05)
+    assert all(turn.station == place % 3 + 1 for place, (_, turn) in enumerate(channel.turns))
+
+
+def test_synchronisations_are_staggered_evenly() -> None:
+    """After the first minutes each station has its own every 300 s, 100 s after the one before it."""
+    channel = Channel()
+    channel.run(3000)
+    later = [(at, turn.station) for at, turn in channel.of(Synchronisation, since_s=700)]
+    assert [turn._cycles for _, turn in channel.of(Synchronisation, since_s=100)] == [5] * len(
+        channel.of(Synchronisation, since_s=100)
+    )
+    for (one_ns, one), (other_ns, other) in pairwise(later):
+        assert (other_ns - one_ns) / SECOND == pytest.approx(100, abs=2)
+        assert other == one % 3 + 1
+
+
+def test_early_synchronisations_leave_time_for_polls_between_them() -> None:
+    """Stations that were first synchronised one after the other do not take the channel together again."""
+    channel = Channel(Cadence(initial_cycles=5, resync_cycles=5, interval_ns=300 * SECOND))
+    channel.run(300)
+    starts_ns = [at for at, _ in channel.of(Synchronisation, since_s=10)]
+    assert min(b - a for a, b in pairwise(starts_ns)) > 5 * SECOND
+
+
+def test_a_dead_station_costs_the_others_little() -> None:
+    """It gets a twentieth of the time; the others are polled more often than with it alive."""
+    channel = Channel()
+    channel.run(120)
+    channel.dead.add(3)
+    spent_ns = channel.spent_ns[3]
+    channel.run(150)
+    channel.run(1350)
+    assert (channel.spent_ns[3] - spent_ns) / (1230 * SECOND) < 0.055
+    two_alone_hz = SECOND / POLL_NS / 2
+    assert channel.rate_hz(1, 150) > 0.93 * two_alone_hz
+    assert channel.rate_hz(2, 150) > 0.93 * two_alone_hz
+
+
+def test_a_station_that_was_never_there_costs_the_others_little() -> None:
+    """Its first synchronisation fails, and so do the next ones, further and further apart."""
+    channel = Channel(dead={2})
+    channel.run(60)
+    assert not [turn for _, turn in channel.of(Poll) if turn.station == 2]
+    spent_ns = channel.spent_ns[2]
+    channel.run(660)
+    assert (channel.spent_ns[2] - spent_ns) / (600 * SECOND) < 0.055
+    channel.dead.clear()
+    channel.run(720)
+    assert channel.rate_hz(2, 690) > 1.5
+    back = [
+        turn for _, turn in channel.of(Synchronisation, since_s=660) if turn.station == 2 and turn.samples
+    ]
+    assert back[0]._cycles == 5  # the others do not wait 12 s for it
+
+
+@pytest.mark.parametrize(("outage_s", "found_s"), [(0.5, 1.0), (10, 6.0), (300, 25.0)])
+def test_a_station_is_found_again_soon(outage_s: float, found_s: float) -> None:
+    """The longer it was silent the longer it may take; from then on it has its turn in every round."""
+    channel = Channel()
+    channel.run(60)
+    channel.dead.add(1)
+    channel.run(60 + outage_s)
+    channel.dead.clear()
+    channel.run(60 + outage_s + found_s)
+    channel.run(90 + outage_s + found_s)
+    since_s = 60 + outage_s + found_s
+    assert channel.rate_hz(1, since_s) == pytest.approx(channel.rate_hz(2, since_s), rel=0.05)
+
+
+def test_one_lost_packet_costs_no_more_than_itself() -> None:
+    """After a single time-out the stations have their turns one after the other as before."""
+    channel = Channel()
+    channel.run(60)
+    channel.dead.add(1)
+    channel.run(60.5)
+    channel.dead.clear()
+    channel.run(70)
+    assert [turn.station for _, turn in channel.of(Poll)[-9:]] in (
+        [1, 2, 3] * 3,
+        [2, 3, 1] * 3,
+        [3, 1, 2] * 3,
+    )
+
+
+def test_a_poll_without_an_answer_is_repeated_at_once_but_only_once() -> None:
+    """The packet may have been lost; a round later, the gap between two measurements would be twice as long."""
+    channel = Channel()
+    channel.run(60)
+    channel.dead.add(2)
+    channel.run(62)
+    stations = [turn.station for _, turn in channel.of(Poll)]
+    unanswered = next(place for place, (_, turn) in enumerate(channel.of(Poll)) if not turn.answered)
+    assert stations[unanswered : unanswered + 4] == [2, 2, 3, 1]
+
+
+def test_a_station_that_refuses_to_track_is_told_again_and_never_polled() -> None:
+    """In direct mode a poll would be an order to measure; orders come less and less often."""
+    channel = Channel(refusing={3})
+    channel.run(300)
+    assert not [turn for _, turn in channel.of(Poll) if turn.station == 3]
+    orders_ns = [at for at, turn in channel.of(Ordered) if turn.station == 3]
+    gaps_ns = [b - a for a, b in pairwise(orders_ns[2:])]
+    assert gaps_ns[-1] > 9 * SECOND
+    channel.refusing.clear()
+    channel.run(330)
+    assert [turn for _, turn in channel.of(Poll) if turn.station == 3]
+
+
+def test_an_order_lost_after_many_refusals_costs_no_more_than_itself() -> None:
+    """An instrument that is being connected refuses often, which costs little; a lost packet is not paid for as often."""
+    channel = Channel(stations=1, refusing={1})
+    channel.run(20)
+    assert [turn.ok for _, turn in channel.of(Ordered)[:5]] == [False] * 5
+    lost = channel.scheduler.next(channel.now_ns)
+    assert isinstance(lost, Ordered)
+    channel.scheduler.finished(lost, channel.now_ns + SECOND)
+    assert isinstance(channel.scheduler.next(channel.now_ns + SECOND), Synchronisation)
+
+
+def test_a_station_with_another_clock_is_synchronised_before_anything_else() -> None:
+    """Whoever is next in the round waits; it may have been restarted, so it is told its prism again."""
+    channel = Channel()
+    channel.run(90)
+    channel.scheduler.resynchronise(2, channel.now_ns)
+    channel.run(92)
+    first, second = [turn for at, turn in channel.turns if at >= 90 * SECOND][:2]
+    assert isinstance(first, Ordered)
+    assert isinstance(second, Synchronisation)
+    assert first.station == second.station == 2
+    channel.run(400)
+    following = [at / SECOND for at, t in channel.of(Synchronisation, since_s=91) if t.station == 2]
+    assert following[0] < 190  # its frequency is learnt anew
+
+
+def test_a_station_whose_synchronisation_leaves_doubt_is_synchronised_again_at_once() -> None:
+    """As one whose clock was found to be another one; its measurements wait meanwhile."""
+    channel = Channel(doubted={2})
+    channel.run(44)
+    channel.doubted.clear()
+    kinds = [type(turn) for _, turn in channel.turns if turn.station == 2]
+    assert kinds[:4] == [Ordered, Synchronisation] * 2
+    channel.run(100)
+    assert channel.rate_hz(2, 80) == pytest.approx(channel.rate_hz(1, 80), rel=0.1)
+
+
+def share_of_2(channel: Channel) -> float:
+    """Return which part of the time station 2 takes in the quarter of an hour from the third minute on."""
+    channel.run(180)
+    spent_ns = channel.spent_ns[2]
+    channel.run(1080)
+    return (channel.spent_ns[2] - spent_ns) / (900 * SECOND)
+
+
+@pytest.mark.parametrize("samples", [True, False])
+def test_a_station_whose_synchronisations_always_leave_doubt_gets_no_more_than_its_share(
+    *, samples: bool
+) -> None:
+    """Each leads to the next, but others have their turns in between."""
+    channel = Channel()
+    channel.run(60)
+    channel.doubted.add(2)
+    if not samples:
+        channel.stampless.add(2)
+    channel.scheduler.doubted(2, channel.now_ns)
+    assert share_of_2(channel) < 0.34
+    channel.doubted.clear()
+    channel.stampless.clear()
+    channel.run(1200)
+    assert channel.rate_hz(2, 1150) == pytest.approx(channel.rate_hz(1, 1150), rel=0.1)
+
+
+def test_doubts_that_are_far_apart_cost_no_pause() -> None:
+    """Only those count that come one after the other, without a poll in between."""
+    channel = Channel()
+    channel.run(60)
+    for until_s in range(70, 130, 10):
+        before_ns = channel.now_ns
+        channel.scheduler.doubted(2, before_ns)
+        channel.run(until_s)
+        at_once = [turn for at, turn in channel.turns if at >= before_ns][:2]
+        assert [(type(turn), turn.station) for turn in at_once] == [(Ordered, 2), (Synchronisation, 2)]
+
+
+def test_a_station_that_answers_but_has_no_stamps_gets_no_more_than_its_share() -> None:
+    """Its clock was found to be another one, and no synchronisation says which."""
+    channel = Channel()
+    channel.run(60)
+    channel.stampless.add(2)
+    channel.scheduler.resynchronise(2, channel.now_ns)
+    assert share_of_2(channel) < 0.34
+
+
+def test_a_late_yes_of_one_station_is_not_taken_for_another_ones() -> None:
+    """While a station may still answer its order, the others have to say twice that they track."""
+    channel = Channel(stations=2, dead={1})
+    channel.run(40)
+    assert len([turn for _, turn in channel.of(Ordered) if turn.station == 2]) == 2
+    assert [turn for _, turn in channel.of(Synchronisation) if turn.station == 2]
+
+
+def test_with_nobody_there_the_channel_rests() -> None:
+    """When every station is left alone there is an instant to wait for."""
+    channel = Channel(stations=1, dead={1})
+    channel.run(600)
+    assert channel.spent_ns[1] < 60 * SECOND
+
+
+def test_a_turn_that_was_broken_off_is_taken_again() -> None:
+    """The radio failed within the first order: the station is told once more in its next turn."""
+    channel = Channel()
+    first = channel.scheduler.next(0)
+    assert isinstance(first, Ordered)
+    channel.run(60)
+    assert [turn.station for _, turn in channel.of(Ordered)] == [2, 3, 1]

@@ -1,0 +1,155 @@
+"""The loop of the frames: beacons go out when they are due, replies are handed on, silence is told."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import pytest
+from harness.field import running
+from harness.frames import KEY, TIMING, counted
+from harness.radios import MS, Bench, bench
+
+from tsgt.master.superframe.frame_loop import FrameLoop
+from tsgt.radio.superframe.master import SuperframeMaster
+from tsgt.radio.superframe.phase_lock import Plan
+from tsgt.radio.superframe.wire.authentication import CODE_BYTES, Authenticator
+from tsgt.radio.superframe.wire.codec import decode_beacon, encode_reply
+from tsgt.radio.superframe.wire.messages import Introduction, Reply, SlotOrder
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from tsgt.radio.base import Packet, Transmitted
+    from tsgt.radio.superframe.reception import Heard
+
+
+@dataclass
+class Notes:
+    """A listener that writes down what it is told."""
+
+    told: list[str] = field(default_factory=list)
+    sent_ns: list[int] = field(default_factory=list)
+    ready_after_s: float = 0.0
+
+    async def ready(self) -> None:
+        """Take some time."""
+        await asyncio.sleep(self.ready_after_s)
+
+    def composing(self) -> None:
+        """Note it."""
+        self.told.append("composing")
+
+    def beacon(self, sent: Transmitted) -> None:
+        """Note it."""
+        self.told.append("beacon")
+        self.sent_ns.append(sent.done_at_ns)
+
+    def heard(self, heard: Heard, packet: Packet) -> None:
+        """Note who."""
+        assert packet.payload
+        self.told.append(f"heard {heard.station}")
+
+    def silent(self, stations: Sequence[int]) -> None:
+        """Note who."""
+        self.told.append(f"silent {list(stations)}")
+
+
+class LateLock:
+    """Lets each frame begin a second after it could."""
+
+    def measured(self, index: int, time_us: int) -> None:
+        """Learn nothing."""
+
+    def forecast(self, earliest_ns: int, beacon_bytes: int) -> int:  # noqa: ARG002 (as the real one)
+        """Return when the next frame begins."""
+        return earliest_ns + 1000 * MS
+
+    def plan(self, earliest_ns: int, grants: Sequence[int], beacon_bytes: int) -> Plan:  # noqa: ARG002 (as above)
+        """Plan the next frame."""
+        return Plan(earliest_ns + 1000 * MS, SlotOrder())
+
+
+def master_on(both: Bench, *, late: bool = False) -> SuperframeMaster:
+    """Make a master of two stations."""
+    lock = LateLock() if late else None
+    return SuperframeMaster(
+        {1: 1, 2: 2},
+        TIMING,
+        Authenticator(KEY),
+        counted(),
+        both.clock.monotonic_ns(),
+        lock=lock,  # type: ignore[arg-type]
+    )
+
+
+async def answer(both: Bench, master: SuperframeMaster, *, early_ns: int = 0) -> None:
+    """Introduce station 2 in its slot of each frame; the other side's radio."""
+    while True:
+        packet = await both.there.radio.receive()
+        beacon = decode_beacon(packet.payload[:-CODE_BYTES])
+        span = TIMING.slots([entry.grant for entry in beacon.stations], beacon.order)[1]
+        assert span is not None
+        content = encode_reply(Reply(introduction=Introduction(nonce=5, lineage=1, run_start=0, oldest=0)))
+        code = Authenticator(KEY).reply_code(
+            session=master.session,
+            station=2,
+            station_nonce=5,
+            counter=master.counter,
+            beacon_code=packet.payload[-CODE_BYTES:],
+            sequence=0,
+            content=content,
+        )
+        at_ns = packet.received_at_ns - TIMING.reception_ns + span.start_ns - early_ns
+        await both.there.radio.transmit(content + code, at_ns=at_ns)
+
+
+async def test_frames_go_round() -> None:
+    """Composed, out, heard, silent; the next one follows when the last slot is over."""
+    async with bench() as both:
+        master, notes = master_on(both), Notes()
+        async with (
+            running(answer(both, master)),
+            running(FrameLoop(both.here.radio, both.clock, master, notes).run()),
+        ):
+            await asyncio.sleep(3)
+    assert notes.told[:8] == ["composing", "beacon", "heard 2", "silent [1]"] * 2
+    for before_ns, after_ns in pairwise(notes.sent_ns):
+        assert (after_ns - before_ns) / MS < 500
+
+
+async def test_a_frame_ends_when_nobody_is_waited_for_any_more() -> None:
+    """Without an answer it lasts until the last slot is over."""
+    async with bench() as both:
+        master, notes = master_on(both), Notes()
+        async with running(FrameLoop(both.here.radio, both.clock, master, notes).run()):
+            await asyncio.sleep(2)
+    assert notes.told[:6] == ["composing", "beacon", "silent [1, 2]"] * 2
+    slots_ns = 2 * (TIMING.airtime_ns(44) + TIMING.guard_ns) + TIMING.turn_round_ns
+    session_bytes = 25  # of a beacon that tells two stations how to join
+    first_ns = notes.sent_ns[1] - notes.sent_ns[0] - TIMING.airtime_ns(session_bytes)
+    assert first_ns == pytest.approx(slots_ns, abs=8 * MS)
+
+
+async def test_a_frame_that_is_to_begin_later_is_composed_later() -> None:
+    """So that it acknowledges what is written until then."""
+    async with bench() as both:
+        master, notes = master_on(both, late=True), Notes()
+        async with running(FrameLoop(both.here.radio, both.clock, master, notes).run()):
+            await asyncio.sleep(0.9)
+            assert notes.told == []
+            await asyncio.sleep(0.1)
+            assert notes.told == ["composing"]
+
+
+async def test_nothing_is_sent_before_all_is_put_away() -> None:
+    """The listener says when."""
+    async with bench() as both:
+        master, notes = master_on(both), Notes(ready_after_s=1.0)
+        async with running(FrameLoop(both.here.radio, both.clock, master, notes).run()):
+            await asyncio.sleep(0.99)
+            assert notes.told == []
+            await asyncio.sleep(0.1)
+            assert notes.told == ["composing"]

@@ -1,0 +1,303 @@
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from harness.scene import SECOND, START, driving, standing_scene
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tsgt.config import ScenarioConfig
+from tsgt.geometry import exp_so3, polar_to_cartesian
+from tsgt.master.reacquisition_hints import AGAIN_NS, SELDOM_NS, TRIES, Searches
+from tsgt.model import Status
+from tsgt.simulation.world import scenario_world
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from harness.scene import Motion, Scene
+    from numpy.typing import NDArray
+
+    from tsgt.radio.commands import Direction
+
+STEP_S = 0.4
+LOST_S = 10.0
+
+
+def ns(time_s: float) -> int:
+    """Return an instant of the scene on the master's Unix clock."""
+    return START + round(time_s * SECOND)
+
+
+def watch(
+    searches: Searches,
+    scene: Scene,
+    *,
+    since_s: float = 0.0,
+    until_s: float = 12.5,
+    sees: Callable[[int, float], Status | None] = lambda station, time_s: _loses(
+        station, time_s, from_s=LOST_S
+    ),
+) -> None:
+    """Let all stations measure for a while; by default the second one loses its prism. None: it is not heard."""
+    for step in range(math.ceil(since_s / STEP_S), math.ceil(until_s / STEP_S)):
+        for station in (1, 2, 3):
+            time_s = STEP_S * step + 0.01 * station
+            status = sees(station, time_s)
+            if status is not None:
+                searches.measured(scene.measure(station, time_s, status=status))
+
+
+def beside_rad(scene: Scene, towards: Direction, time_s: float, *, station: int = 2, prism: int = 0) -> float:
+    """Return how far a direction is from where the station's prism is, or another one."""
+    true = scene.measure(station, time_s, prism=prism)
+    at = polar_to_cartesian(true.horizontal_angle_rad, true.zenith_angle_rad, 1.0)
+    told = polar_to_cartesian(towards.horizontal_angle_rad, towards.zenith_angle_rad, 1.0)
+    return math.acos(min(float(at @ told), 1.0))
+
+
+def test_a_station_without_its_prism_is_told_where_it_is() -> None:
+    """After two seconds, to within what the layout leaves open: 0.8 m in 38 m, and half a metre more."""
+    scene = standing_scene()
+    searches = Searches(scene.parameters)
+    watch(searches, scene)
+    assert searches.towards(2, ns(12.0)) is None
+    towards = searches.towards(2, ns(12.5))
+    assert towards is not None
+    assert beside_rad(scene, towards, 12.5) < towards.spread_rad < math.radians(2.5)
+    assert searches.towards(1, ns(12.5)) is None
+
+
+def test_angles_alone_are_no_prism() -> None:
+    """An instrument that has lost it may still tell its angles."""
+    scene = standing_scene()
+    searches = Searches(scene.parameters)
+    watch(searches, scene, sees=lambda s, t: Status.ANGLE_ONLY if s == 2 and t > LOST_S else Status.OK)
+    assert searches.towards(2, ns(12.5)) is not None
+
+
+@pytest.mark.parametrize("status", [Status.TILT, Status.ERROR, Status.WRONG_DISTANCE, Status.LOW_ACCURACY])
+def test_who_has_another_trouble_is_left_alone(status: Status) -> None:
+    """Looking for a prism does not level an instrument."""
+    scene = standing_scene()
+    searches = Searches(scene.parameters)
+    watch(searches, scene, sees=lambda s, t: status if s == 2 and t > LOST_S else Status.OK)
+    assert searches.towards(2, ns(12.5)) is None
+
+
+def motion(
+    speed_mps: float, yaw_rate_radps: float, heading_rad: float, tilt_rad: float
+) -> Callable[[float], Motion]:
+    """Make a robot that drives a bend, leaning; it is 50 m away after twelve seconds and a half."""
+
+    def along_m(time_s: float) -> NDArray[np.float64]:
+        """Give the way from where it is after 12.5 s, by the sum of small steps."""
+        turned = heading_rad + yaw_rate_radps * (12.5 + (time_s - 12.5) * (np.arange(200) + 0.5) / 200)
+        mean = np.array([np.cos(turned).mean(), np.sin(turned).mean(), 0.0])
+        return speed_mps * (time_s - 12.5) * mean
+
+    def at(time_s: float) -> Motion:
+        yaw = exp_so3(np.array([0.0, 0.0, heading_rad + yaw_rate_radps * time_s]))
+        lean = exp_so3(np.array([tilt_rad, -tilt_rad, 0.0]))
+        return yaw @ lean, np.array([45.0, 25.0, 1.0]) + along_m(time_s)
+
+    return at
+
+
+@settings(max_examples=60)
+@given(
+    speed_mps=st.floats(0.0, 1.5),
+    yaw_rate_radps=st.floats(-0.5, 0.5),
+    heading_rad=st.floats(-math.pi, math.pi),
+    tilt_rad=st.floats(-0.4, 0.4),
+    lost=st.sampled_from([(2,), (2, 3), (1, 2)]),
+)
+def test_the_prism_is_within_the_spread(
+    speed_mps: float, yaw_rate_radps: float, heading_rad: float, tilt_rad: float, lost: tuple[int, ...]
+) -> None:
+    """However the robot drives and leans, by one other prism as by two, for a second and a half from now on."""
+    scene = standing_scene().moving(motion(speed_mps, yaw_rate_radps, heading_rad, tilt_rad))
+    searches = Searches(scene.parameters)
+    watch(searches, scene, sees=lambda s, t: Status.NO_TARGET if s in lost and t > LOST_S else Status.OK)
+    towards = searches.towards(2, ns(12.6))
+    assert towards is not None
+    for ahead_s in (0.0, 0.5, 1.0, 1.5):
+        assert beside_rad(scene, towards, 12.6 + ahead_s) <= towards.spread_rad
+    assert towards.spread_rad < math.asin((1.0 + 0.5 + 1.1 * speed_mps + 0.5) / 40.0)
+
+
+def test_the_prism_is_found_in_the_reference_scenario() -> None:
+    """Which starts, stops and turns at any time: always there when the order is given, mostly when the telescope is."""
+    world = scenario_world(ScenarioConfig(), 600.0, np.random.default_rng(0))
+
+    def motion(time_s: float) -> Motion:
+        T_station1_robot = world.pose_at(np.array([time_s]))[0]
+        return T_station1_robot[:3, :3], T_station1_robot[:3, 3]
+
+    scene = standing_scene().moving(motion)
+    inside = []
+    for begin_s in range(0, 590, 5):
+        searches = Searches(scene.parameters)
+        lost = partial(_loses, from_s=begin_s + 0.5)
+        watch(searches, scene, since_s=begin_s, until_s=begin_s + 3.0, sees=lost)
+        now_s = begin_s + 3.1
+        towards = searches.towards(2, ns(now_s))
+        assert towards is not None
+        inside.append(
+            [beside_rad(scene, towards, now_s + ahead_s) <= towards.spread_rad for ahead_s in (0.0, 1.0, 2.0)]
+        )
+    shares = np.mean(inside, axis=0)
+    assert shares[0] == 1.0
+    assert shares[1] >= 0.98
+    assert shares[2] >= 0.93
+
+
+def _loses(station: int, time_s: float, *, from_s: float) -> Status:
+    """Let the second station lose its prism."""
+    return Status.NO_TARGET if station == 2 and time_s >= from_s else Status.OK
+
+
+def test_nobody_sees_the_robot() -> None:
+    """Then nobody knows where it is: all have lost it, or what came of it is too old."""
+    scene = standing_scene()
+    searches = Searches(scene.parameters)
+    watch(searches, scene, sees=lambda _, t: Status.NO_TARGET if t > LOST_S else Status.OK)
+    assert searches.towards(2, ns(12.5)) is None
+    searches = Searches(scene.parameters)
+    watch(searches, scene, until_s=12.0)
+    assert searches.towards(2, ns(12.5)) is not None
+    searches = Searches(scene.parameters)
+    watch(searches, scene, until_s=12.0)
+    assert searches.towards(2, ns(13.3)) is None
+
+
+def test_one_point_is_not_enough() -> None:
+    """It does not tell how fast the robot is."""
+    scene = standing_scene()
+    searches = Searches(scene.parameters)
+    watch(
+        searches, scene, sees=lambda s, t: Status.NO_TARGET if s == 2 else (Status.OK if t > 12.3 else None)
+    )
+    assert searches.towards(2, ns(12.5)) is None
+
+
+def test_a_robot_that_is_very_near_may_be_anywhere() -> None:
+    """No direction says anything where the robot is about as large as its distance."""
+    near = standing_scene().moving(lambda _: (np.eye(3), np.array([2.5, -2.0, -1.0])))
+    searches = Searches(near.parameters)
+    watch(searches, near)
+    assert searches.towards(2, ns(12.5)) is None
+
+
+def test_another_station_on_the_same_prism_knows_best() -> None:
+    """Where stations outnumber prisms; only its start is left open."""
+    scene = standing_scene()
+    searches = Searches(scene.parameters)
+    watch(searches, scene)
+    for step in range(25, 32):
+        searches.measured(scene.measure(1, STEP_S * step + 0.05, prism=2))
+    towards = searches.towards(2, ns(12.5))
+    assert towards is not None
+    assert beside_rad(scene, towards, 12.5) < 1e-4
+    assert towards.spread_rad == pytest.approx(0.5 / 38, rel=0.1)
+
+
+def test_the_direction_is_in_the_face_of_the_telescope() -> None:
+    """Who measures in the second face would have to turn over otherwise."""
+    scene = standing_scene()
+    searches, turned = Searches(scene.parameters), Searches(scene.parameters)
+    watch(searches, scene)
+    for step in range(32):
+        for station in (1, 2, 3):
+            time_s = STEP_S * step + 0.01 * station
+            lost = station == 2 and time_s > LOST_S
+            first = scene.measure(station, time_s, status=Status.NO_TARGET if lost else Status.OK)
+            turned.measured(
+                replace(
+                    first,
+                    horizontal_angle_rad=first.horizontal_angle_rad + math.pi,
+                    zenith_angle_rad=math.tau - first.zenith_angle_rad,
+                )
+            )
+    one, two = searches.towards(2, ns(12.5)), turned.towards(2, ns(12.5))
+    assert one is not None
+    assert two is not None
+    assert two.zenith_angle_rad == pytest.approx(math.tau - one.zenith_angle_rad)
+    apart_rad = math.remainder(two.horizontal_angle_rad - one.horizontal_angle_rad, math.tau)
+    assert abs(apart_rad) == pytest.approx(math.pi)
+
+
+def test_a_direction_holds_for_five_seconds_and_then_comes_anew() -> None:
+    """From the points of then; after six of them only every half minute, and none in between."""
+    scene = standing_scene().moving(driving)
+    searches = Searches(scene.parameters)
+    told: list[tuple[float, Direction | None]] = [(0.0, None)]
+    for tenth in range(1000):
+        time_s = 0.1 * tenth
+        watch(searches, scene, since_s=time_s, until_s=time_s + 0.1)
+        towards = searches.towards(2, ns(time_s + 0.2))
+        if towards is not told[-1][1]:
+            told.append((time_s + 0.2, towards))
+    changes_s = [round(time_s - told[1][0], 6) for time_s, _ in told[1:]]
+    again_s, seldom_s = AGAIN_NS / SECOND, SELDOM_NS / SECOND
+    assert changes_s == pytest.approx(
+        [
+            *(again_s * number for number in range(TRIES + 1)),
+            again_s * (TRIES - 1) + seldom_s,
+            again_s * TRIES + seldom_s,
+            again_s * (TRIES - 1) + 2 * seldom_s,
+        ],
+        abs=0.11,
+    )
+    assert [towards is None for _, towards in told[1:]] == [False] * TRIES + [True, False, True, False]
+    for time_s, towards in told:
+        assert towards is None or beside_rad(scene, towards, time_s) <= towards.spread_rad
+
+
+def test_who_has_its_prism_again_needs_no_direction() -> None:
+    """At once; and when it loses it again, it is told again after two seconds."""
+    scene = standing_scene()
+    searches = Searches(scene.parameters)
+    watch(searches, scene)
+    first = searches.towards(2, ns(12.5))
+    assert first is not None
+    watch(searches, scene, since_s=12.5, until_s=14.0, sees=lambda _s, _t: Status.OK)
+    assert searches.towards(2, ns(14.0)) is None
+    watch(searches, scene, since_s=14.0, until_s=16.0)
+    assert searches.towards(2, ns(16.0)) is None
+    watch(searches, scene, since_s=16.0, until_s=16.5)
+    again = searches.towards(2, ns(16.5))
+    assert again is not None
+    assert again is not first
+
+
+def test_measurements_that_come_late_count_where_they_belong() -> None:
+    """One from before the loss changes nothing; one from within it shows that the prism was there."""
+    scene = standing_scene()
+    before, within = Searches(scene.parameters), Searches(scene.parameters)
+    for searches in (before, within):
+        watch(searches, scene)
+    before.measured(scene.measure(2, 9.0))
+    within.measured(scene.measure(2, 11.5))
+    assert before.towards(2, ns(12.6)) is not None
+    assert within.towards(2, ns(12.6)) is None
+    for searches in (before, within):
+        watch(searches, scene, since_s=12.5, until_s=13.5)
+    assert within.towards(2, ns(13.6)) is not None
+
+
+def test_strangers_and_the_future_are_passed_over() -> None:
+    """A station that nobody knows, and a measurement that says to be from tomorrow."""
+    scene = standing_scene()
+    searches = Searches(scene.parameters)
+    searches.measured(replace(scene.measure(1, 1.0), station=9))
+    tomorrow = replace(scene.measure(2, 1.0), stamp_ns=ns(86_400.0))
+    searches.measured(tomorrow)
+    watch(searches, scene)
+    towards = searches.towards(2, ns(12.5))
+    assert towards is not None

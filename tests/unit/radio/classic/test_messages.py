@@ -1,0 +1,202 @@
+from __future__ import annotations
+
+import math
+import struct
+from typing import Any
+
+import pytest
+
+from tsgt.model import Status
+from tsgt.radio.classic.messages import (
+    Acknowledgement,
+    Command,
+    MeasurementMessage,
+    PingReply,
+    TimeReply,
+    decode_command,
+    decode_reply,
+    no_measurement_yet,
+    raw_status,
+    status_of,
+)
+
+MEASUREMENT = MeasurementMessage(
+    station=3,
+    status=0,
+    zenith_angle_rad=1.5,
+    horizontal_angle_rad=0.25,
+    slope_distance_m=64.125,
+    time_ns=1_700_000_000_999_999_999,
+)
+MEASUREMENT_HEX = "03 00 000000000000f83f 000000000000d03f 0000000000085040 00f15365 ffc99a3b"
+
+COMMANDS = [
+    (Command("t", 1), "7431"),
+    (Command("p", 2), "7032"),
+    (Command("e", 3), "6533"),
+    (Command("s", 4), "7334"),
+    (Command("c", 9), "6339"),
+    (Command("d", 1), "6431"),
+    (Command("n", 1), "6e31"),
+    (Command("n", 1, 3), "6e3133"),
+]
+REPLIES = [
+    (PingReply(1), "6531"),
+    (TimeReply(1_700_000_000_000_000_001), "73 00f15365 01000000"),
+    (TimeReply(0), "73 00000000 00000000"),
+    (TimeReply(2**32 * 10**9 - 1), "73 ffffffff ffc99a3b"),
+    (Acknowledgement("d", ok=True), "644f6b"),
+    (Acknowledgement("d", ok=False), "644e6f"),
+    (Acknowledgement("n", ok=True), "6e4f6b"),
+    (Acknowledgement("n", ok=False), "6e4e6f"),
+    (MEASUREMENT, MEASUREMENT_HEX),
+]
+
+
+@pytest.mark.parametrize(("command", "golden"), COMMANDS)
+def test_every_command_has_its_bytes(command: Command, golden: str) -> None:
+    """Commands are the bytes of the authors' nodes, and these bytes are the commands."""
+    assert command.to_bytes() == bytes.fromhex(golden)
+    assert decode_command(bytes.fromhex(golden)) == command
+
+
+@pytest.mark.parametrize(("reply", "golden"), REPLIES)
+def test_every_reply_has_its_bytes(
+    reply: PingReply | TimeReply | Acknowledgement | MeasurementMessage, golden: str
+) -> None:
+    """Replies are the bytes of the authors' nodes, and these bytes are the replies."""
+    assert reply.to_bytes() == bytes.fromhex(golden)
+    assert decode_reply(bytes.fromhex(golden)) == reply
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [b"", b"t", b"t0", b"ta", b"x1", b"T1", b"t1 ", b"t13", b"n10", b"n1a", b"n133", b"\xb2\xb9", b"t\xb2"],
+)
+def test_other_packets_are_no_commands(payload: bytes) -> None:
+    """Station 0, unknown letters, prisms where none belong and bytes beyond ASCII are not understood."""
+    assert decode_command(payload) is None
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        *(b"", b"e", b"e0", b"t1", b"dok", b"tOk", b"s", bytes(9), bytes(33), bytes(35)),
+        b"s" + struct.pack("<II", 1, 1_000_000_000),
+    ],
+)
+def test_other_packets_are_no_replies(payload: bytes) -> None:
+    """Wrong letters and lengths, and more nanoseconds than a second has, are not understood."""
+    assert decode_reply(payload) is None
+
+
+def _packed(**changes: Any) -> bytes:
+    fields = {"station": 1, "status": 0, "zenith": 1.5, "horizontal": 2.0, "distance": 50.0, "s": 7, "ns": 8}
+    return struct.pack("<BBdddII", *(fields | changes).values())
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        *({"station": station} for station in (0, 10, 255)),
+        *({"status": status} for status in (5, 255)),
+        *({name: value} for name in ("zenith", "horizontal", "distance") for value in (math.nan, -math.inf)),
+        *({"status": 3, name: math.nan} for name in ("zenith", "horizontal", "distance")),
+        {"zenith": 13.0},
+        {"horizontal": -13.0},
+        {"distance": -1.0},
+        {"distance": 20_001.0},
+        {"status": 4, "distance": -1.0},
+        {"ns": 1_000_000_000},
+    ],
+)
+def test_impossible_numbers_are_no_measurement(changes: dict[str, float]) -> None:
+    """A packet of 34 bytes with a number that no station sends is somebody else's."""
+    assert isinstance(decode_reply(_packed()), MeasurementMessage)
+    assert decode_reply(_packed(**changes)) is None
+
+
+@pytest.mark.parametrize("status", [1, 2, 3])
+@pytest.mark.parametrize(
+    ("seconds", "nanoseconds"), [(0, 0), (2**32 - 1, 2**32 - 1), (0, 2**32 - 1), (7, 10**9)]
+)
+def test_garbage_times_of_errors_are_no_times(status: int, seconds: int, nanoseconds: int) -> None:
+    """The authors' nodes have no time with an error; what they send for it is read as none."""
+    reply = decode_reply(
+        _packed(status=status, zenith=-1.0, horizontal=-1.0, distance=-1.0, s=seconds, ns=nanoseconds)
+    )
+    assert isinstance(reply, MeasurementMessage)
+    assert (reply.status, reply.time_ns, reply.slope_distance_m) == (status, 0, -1.0)
+
+
+def test_the_time_of_our_own_errors_arrives() -> None:
+    """A tsgt client stamps the attempts that failed, too."""
+    reply = decode_reply(_packed(status=3, zenith=0.0, horizontal=0.0, distance=0.0))
+    assert isinstance(reply, MeasurementMessage)
+    assert reply.time_ns == 7_000_000_008
+
+
+@pytest.mark.parametrize(
+    ("status", "expected"),
+    [
+        (0, Status.OK),
+        (1, Status.TILT),
+        (2, Status.WRONG_DISTANCE),
+        (3, Status.NO_TARGET),
+        (4, Status.ANGLE_ONLY),
+    ],
+)
+def test_status_numbers_have_a_verdict(status: int, expected: Status) -> None:
+    """Only 0 may enter a pose."""
+    reply = decode_reply(_packed(status=status))
+    assert isinstance(reply, MeasurementMessage)
+    assert status_of(reply) is expected
+    assert expected.usable == (status == 0)
+
+
+def test_every_verdict_has_a_number() -> None:
+    """Exactly the usable verdicts go out as good, and none becomes usable on its way."""
+    assert {status for status in Status if raw_status(status) == 0} == {s for s in Status if s.usable}
+    assert raw_status(Status.ERROR) == raw_status(Status.NO_TARGET) == 3
+
+
+def test_zeros_are_no_good_measurement() -> None:
+    """An authors' node before its first measurement sends zeros as good; nobody believes them."""
+    reply = decode_reply(b"\x02" + bytes(33))
+    assert isinstance(reply, MeasurementMessage)
+    assert status_of(reply) is Status.NO_TARGET
+    assert status_of(no_measurement_yet(2)) is Status.NO_TARGET
+
+
+def test_a_good_measurement_without_distance_is_not_good() -> None:
+    """A distance of 0 would put the prism into the station."""
+    reply = decode_reply(_packed(distance=0.0))
+    assert isinstance(reply, MeasurementMessage)
+    assert status_of(reply) is Status.ANGLE_ONLY
+
+
+@pytest.mark.parametrize(
+    "arguments", [("x", 1), ("t", 0), ("t", 10), ("t", 1, 3), ("n", 1, 0), ("n", 1, 10), ("n", -1)]
+)
+def test_there_is_no_such_command(arguments: Any) -> None:
+    """What does not fit into a command is refused where it is made."""
+    with pytest.raises(ValueError, match=r"expected 1 to 9|only 1 to 9|there is no command"):
+        Command(*arguments)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"station": 10},
+        {"status": 5},
+        {"zenith_angle_rad": math.nan},
+        {"slope_distance_m": math.inf},
+        {"time_ns": -1},
+        {"time_ns": 2**32 * 10**9},
+    ],
+)
+def test_no_impossible_number_is_sent(changes: dict[str, Any]) -> None:
+    """What does not fit into a measurement is refused where it is made."""
+    fields = {name: getattr(MEASUREMENT, name) for name in MeasurementMessage.__slots__}
+    with pytest.raises(ValueError, match=r"expected|finite|does not fit"):
+        MeasurementMessage(**(fields | changes))

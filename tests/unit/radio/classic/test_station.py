@@ -1,0 +1,142 @@
+from __future__ import annotations
+
+import pytest
+
+from tsgt.radio.classic.messages import MeasurementMessage, no_measurement_yet
+from tsgt.radio.classic.transactions import ClassicStation
+from tsgt.radio.commands import DirectOrder, MeasureOrder, TrackOrder
+
+NONE_YET = no_measurement_yet(1).to_bytes()
+SOME = MeasurementMessage(
+    station=1,
+    status=0,
+    zenith_angle_rad=1.5,
+    horizontal_angle_rad=2.0,
+    slope_distance_m=50.0,
+    time_ns=1_000_000_007,
+)
+
+
+@pytest.fixture
+def station() -> ClassicStation:
+    """Return station 1, as it starts."""
+    return ClassicStation(1)
+
+
+def test_a_request_before_the_first_measurement_is_answered(station: ClassicStation) -> None:
+    """Silence would cost the master its time-out; what it gets is no good measurement."""
+    assert station.received(b"t1", 5) == NONE_YET
+    assert NONE_YET[:2] == b"\x01\x03"
+
+
+def test_the_newest_measurement_is_sent_again_and_again(station: ClassicStation) -> None:
+    """A measurement answers every request until there is a newer one."""
+    station.received(b"e1", 4)
+    station.measured(SOME)
+    assert [station.received(b"t1", 5) for _ in range(2)] == [SOME.to_bytes()] * 2
+
+
+def test_a_station_that_begins_says_so_until_it_is_synchronised(station: ClassicStation) -> None:
+    """A master that knew it before its restart has to learn that its clock may be another one."""
+    station.measured(SOME)
+    assert [station.received(b"t1", 5) for _ in range(2)] == [NONE_YET] * 2
+    station.received(b"e1", 6)
+    assert station.received(b"t1", 7) == SOME.to_bytes()
+
+
+def test_a_station_that_nobody_synchronises_gives_its_measurements_in_the_end(
+    station: ClassicStation,
+) -> None:
+    """The authors' master synchronises when it is time, and does not wait for that."""
+    station.measured(SOME)
+    assert [station.received(b"t1", 5) for _ in range(9)] == [NONE_YET] * 8 + [SOME.to_bytes()]
+
+
+@pytest.mark.parametrize("payload", [b"", b"t2", b"e2", b"x1", b"e1 ", bytes(34), SOME.to_bytes(), b"dOk"])
+def test_packets_of_others_are_passed_over(station: ClassicStation, payload: bytes) -> None:
+    """Commands for other stations, their replies, and foreign packets are not answered."""
+    assert station.received(payload, 5) is None
+
+
+def test_a_ping_is_answered_and_its_stamp_kept(station: ClassicStation) -> None:
+    """The stamp is the reception of the last ping, however often it is asked for."""
+    assert [station.received(payload, at) for payload, at in ((b"p1", 1), (b"e1", 2), (b"e2", 3))] == [
+        None,
+        b"e1",
+        None,
+    ]
+    assert [station.received(payload, 4) for payload in (b"s1", b"s1", b"c1", b"s1")] == [
+        bytes.fromhex("73 00000000 02000000"),
+        bytes.fromhex("73 00000000 02000000"),
+        None,
+        bytes.fromhex("73 00000000 02000000"),
+    ]
+
+
+def test_without_a_ping_there_is_no_stamp(station: ClassicStation) -> None:
+    """A stamp of zero says so."""
+    assert station.received(b"s1", 5) == b"s" + bytes(8)
+
+
+def test_an_order_is_carried_out_and_then_answered(station: ClassicStation) -> None:
+    """The way to direct mode and back, each order once, each confirmed again when it is repeated."""
+    assert station.received(b"d1", 5) == DirectOrder()
+    assert station.executed(DirectOrder(), ok=True) == b"dOk"
+    assert station.received(b"d1", 6) == b"dOk"
+    assert station.received(b"n1", 7) == TrackOrder(None)
+    assert station.executed(TrackOrder(None), ok=True) == b"nOk"
+    assert station.received(b"n1", 8) == b"nOk"
+
+
+def test_a_failed_order_changes_nothing(station: ClassicStation) -> None:
+    """After ``dNo`` the station tracks on, after ``nNo`` it stays in direct mode."""
+    station.received(b"e1", 4)
+    station.measured(SOME)
+    station.received(b"d1", 5)
+    assert station.executed(DirectOrder(), ok=False) == b"dNo"
+    assert station.received(b"t1", 6) == SOME.to_bytes()
+    station.received(b"d1", 7)
+    station.executed(DirectOrder(), ok=True)
+    station.received(b"n1", 8)
+    assert station.executed(TrackOrder(None), ok=False) == b"nNo"
+    assert station.received(b"t1", 9) == MeasureOrder()
+
+
+def test_another_prism_is_an_order_also_while_tracking(station: ClassicStation) -> None:
+    """The first order for a prism is carried out, its repetition confirmed, the next prism ordered again."""
+    assert station.received(b"n13", 5) == TrackOrder(3)
+    assert station.executed(TrackOrder(3), ok=True) == b"nOk"
+    assert station.received(b"n13", 6) == b"nOk"
+    assert station.received(b"n14", 7) == TrackOrder(4)
+
+
+def test_a_measurement_from_before_a_change_of_prism_is_not_sent(station: ClassicStation) -> None:
+    """The message does not say which prism it is of, so the old one must not pass for the new one."""
+    station.measured(SOME)
+    station.received(b"n14", 5)
+    station.executed(TrackOrder(4), ok=True)
+    assert station.received(b"t1", 6) == NONE_YET
+
+
+def test_requests_in_direct_mode_are_single_measurements(station: ClassicStation) -> None:
+    """Each request is one measurement, and its answer the one that was made for it."""
+    station.measured(SOME)
+    station.received(b"d1", 5)
+    station.executed(DirectOrder(), ok=True)
+    for _ in range(2):
+        assert station.received(b"t1", 6) == MeasureOrder()
+        assert station.shot(SOME) == SOME.to_bytes()
+
+
+def test_one_order_at_a_time(station: ClassicStation) -> None:
+    """While one is under way others are passed over, requests for data and pings are answered."""
+    station.received(b"e1", 4)
+    station.measured(SOME)
+    station.received(b"d1", 5)
+    assert [station.received(payload, 6) for payload in (b"d1", b"n1", b"n13")] == [None] * 3
+    assert [station.received(payload, 7) for payload in (b"t1", b"e1")] == [SOME.to_bytes(), b"e1"]
+    station.executed(DirectOrder(), ok=True)
+    station.received(b"t1", 8)
+    assert [station.received(payload, 9) for payload in (b"t1", b"d1", b"n1")] == [None] * 3
+    station.shot(SOME)
+    assert station.received(b"d1", 10) == b"dOk"

@@ -1,0 +1,108 @@
+from __future__ import annotations
+
+import pytest
+from harness.radios import MS, PAPER
+
+from tsgt.radio.base import LoRaSettings
+from tsgt.radio.classic.messages import Command, MeasurementMessage
+from tsgt.radio.classic.transactions import Ordered, Poll, Request, Shot, Timing, Turn
+
+TIMING = Timing.of(PAPER, 250 * MS)
+SOME = MeasurementMessage(
+    station=1,
+    status=0,
+    zenith_angle_rad=1.5,
+    horizontal_angle_rad=2.0,
+    slope_distance_m=50.0,
+    time_ns=1_000_000_007,
+)
+
+
+def test_timing_of_the_paper() -> None:
+    """At SF 9 the airtimes are those of the paper, and 250 ms are enough for every reply."""
+    assert [TIMING.airtime_ns(size) for size in (2, 9, 34)] == [53_760_000, 78_336_000, 139_776_000]
+    assert [TIMING.timeout_ns(size) for size in (2, 9, 34)] == [250 * MS] * 3
+    assert TIMING.tx_done_ns == 67_000
+    assert TIMING.rx_done_ns == pytest.approx(0.76 * 2.048e6, abs=1)
+
+
+@pytest.mark.parametrize("spreading_factor", [10, 11, 12])
+def test_slow_replies_are_waited_for(spreading_factor: int) -> None:
+    """Where a measurement lasts 250 ms and more the time-out follows it."""
+    settings = LoRaSettings(
+        frequency_hz=905_000_000, spreading_factor=spreading_factor, bandwidth_hz=250_000, coding_rate=6
+    )
+    timing = Timing.of(settings, 250 * MS)
+    assert timing.timeout_ns(34) >= timing.airtime_ns(34) + timing.rx_done_ns + 100 * MS
+
+
+def test_a_poll_asks_once() -> None:
+    """A request, its answer, and the turn is over."""
+    poll = Poll(1, TIMING)
+    assert poll.request() == Request(b"t1", 250 * MS)
+    assert not poll.answered
+    assert _reply(poll, SOME.to_bytes())
+    assert (poll.answered, poll.message, poll.request()) == (True, SOME, None)
+
+
+def test_a_poll_without_answer_is_over() -> None:
+    """It is the scheduler's to ask again."""
+    poll = Poll(1, TIMING)
+    poll.request()
+    poll.timed_out()
+    assert (poll.answered, poll.request()) == (False, None)
+
+
+@pytest.mark.parametrize(
+    "payload", [b"e1", b"dOk", bytes(34), b"\x02" + SOME.to_bytes()[1:], SOME.to_bytes()[:-1]]
+)
+def test_a_poll_waits_for_its_own_station(payload: bytes) -> None:
+    """Other replies, foreign packets and the measurement of another station are not the answer."""
+    poll = Poll(1, TIMING)
+    poll.request()
+    assert not _reply(poll, payload)
+    assert not poll.answered
+
+
+def test_a_single_measurement_has_time() -> None:
+    """The instrument takes seconds; the wait is longer than that."""
+    shot = Shot(1, TIMING, 20_000 * MS)
+    request = shot.request()
+    assert request is not None
+    assert (request.payload, request.reply_timeout_ns) == (b"t1", 20_250 * MS)
+    assert _reply(shot, SOME.to_bytes())
+    assert shot.message == SOME
+
+
+@pytest.mark.parametrize(
+    ("order", "payload", "ok"),
+    [
+        (Command("d", 1), b"dOk", True),
+        (Command("d", 1), b"dNo", False),
+        (Command("n", 1, 3), b"nOk", True),
+        (Command("n", 1), b"nNo", False),
+    ],
+)
+def test_an_order_is_answered(order: Command, payload: bytes, *, ok: bool) -> None:
+    """A farewell to a synchronisation that was left, the order, and its answer."""
+    turn = Ordered(1, order, 2_000 * MS)
+    assert turn.request() == Request(b"c1", 0)
+    assert turn.request() == Request(order.to_bytes(), 2_000 * MS)
+    assert _reply(turn, payload)
+    assert turn.request() is None
+    assert turn.ok is ok
+
+
+@pytest.mark.parametrize("payload", [b"nOk", b"nNo", b"d1", SOME.to_bytes()])
+def test_an_order_waits_for_its_own_answer(payload: bytes) -> None:
+    """The answer to the other order, come late, is not the one that is waited for."""
+    turn = Ordered(1, Command("d", 1), 2_000 * MS)
+    turn.request()
+    turn.request()
+    assert not _reply(turn, payload)
+    turn.timed_out()
+    assert (turn.ok, turn.request()) == (None, None)
+
+
+def _reply(turn: Turn, payload: bytes) -> bool:
+    return turn.replied(payload, sent_ns=0, received_ns=200 * MS, exact=True)

@@ -1,0 +1,39 @@
+"""Presets of power per region."""
+
+from __future__ import annotations
+
+import pytest
+
+from tsgt.errors import RadioSettingsError
+from tsgt.radio.planning.regulations import HIGHEST_DBM, LOWEST_DBM, REGIONS, preset_power_dbm
+
+
+@pytest.mark.parametrize(
+    ("region", "frequency_hz", "bandwidth_hz", "power_dbm"),
+    [
+        ("EU868", 868_100_000, 125_000, 14),
+        ("EU868", 869_525_000, 250_000, 17),
+        ("EU433", 433_900_000, 250_000, 10),
+        ("US915", 905_000_000, 500_000, 17),
+        ("CA915", 905_000_000, 250_000, LOWEST_DBM),
+    ],
+)
+def test_a_channel_has_its_power(region: str, frequency_hz: int, bandwidth_hz: int, power_dbm: int) -> None:
+    """The band decides, and in North America whether a fixed channel is wide enough."""
+    assert preset_power_dbm(region, frequency_hz=frequency_hz, bandwidth_hz=bandwidth_hz) == power_dbm
+
+
+@pytest.mark.parametrize(
+    ("region", "frequency_hz", "bandwidth_hz"),
+    [("EU868", 905_000_000, 250_000), ("EU868", 868_650_000, 125_000), ("EU868", 869_525_000, 500_000)],
+)
+def test_a_channel_outside_is_refused(region: str, frequency_hz: int, bandwidth_hz: int) -> None:
+    """Wrong region, a gap between bands, or too wide for the band: the message names the bands."""
+    with pytest.raises(RadioSettingsError, match="not within a band of EU868"):
+        preset_power_dbm(region, frequency_hz=frequency_hz, bandwidth_hz=bandwidth_hz)
+
+
+def test_no_preset_is_beyond_the_chip() -> None:
+    """Presets stay within what the chip may do all the time."""
+    for bands in REGIONS.values():
+        assert all(LOWEST_DBM <= band.power_dbm <= HIGHEST_DBM for band in bands)

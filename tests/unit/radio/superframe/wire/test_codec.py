@@ -1,0 +1,358 @@
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from tsgt.errors import MessageError
+from tsgt.model import Status
+from tsgt.radio.superframe.wire.bits import BitReader, BitWriter
+from tsgt.radio.superframe.wire.codec import (
+    angle_code,
+    angle_rad,
+    decode_beacon,
+    decode_reply,
+    distance_code,
+    distance_m,
+    encode_beacon,
+    encode_reply,
+    is_far,
+    reply_bytes,
+)
+from tsgt.radio.superframe.wire.messages import (
+    GRANT_BYTES,
+    AnswerPart,
+    Beacon,
+    Confirmation,
+    Introduction,
+    OrderPart,
+    Reply,
+    Run,
+    SessionPart,
+    ShotPart,
+    Sighting,
+    SlotOrder,
+    StatePart,
+    StationEntry,
+    Towards,
+)
+
+SIGHTING = Sighting(200, 100_000, Status.OK, 5_000_000, 4_194_304, 750_000)
+SINGLE = Reply(runs=(Run(sightings=(SIGHTING,)),))
+INTRODUCTION = Introduction(nonce=0x89ABCDEF, lineage=0x1234, run_start=2**32 - 1, oldest=2**32 - 1)
+STATE = StatePart(prism=16, direct=True, connected=True, late=255, doubted=15, rssi_dbm=-127)
+SESSION = SessionPart(nonce=2**48 - 1, counter_high=1, sent_high=2, guard=3, turn_round=4)
+
+BEACON = Beacon(
+    frame=0xA5,
+    sent=0x1234,
+    cumulative=0x56,
+    order=SlotOrder(first=2, reverse=True),
+    stations=(StationEntry(0xF, 2), StationEntry(0, 15), StationEntry(5, 0)),
+)
+
+
+def robot(count: int) -> Run:
+    """Return measurements of a robot at 75 m that drives at 1.5 m/s at 45 degrees to the line of sight."""
+    sightings = []
+    for k in range(count):
+        ahead_m, aside_m = 75.0 - 0.424 * k, 0.424 * k
+        direction = (angle_code(1.0 + math.atan2(aside_m, ahead_m)), angle_code(1.55 + 2e-4 * k))
+        distance = distance_code(math.hypot(ahead_m, aside_m), far=False)
+        sightings.append(
+            Sighting(200 - k, 100_000 - 25_000 * k - k % 3 * 30, Status.OK, *direction, distance)
+        )
+    return Run(sightings=tuple(sightings))
+
+
+# --- Sizes -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("stations", "length"), [(1, 6), (3, 8), (16, 21)])
+def test_a_plain_beacon_takes_a_byte_per_station(stations: int, length: int) -> None:
+    """Five bytes and one for each station."""
+    beacon = replace(BEACON, stations=(StationEntry(1, 2),) * stations)
+    assert len(encode_beacon(beacon)) == length
+
+
+def test_an_empty_reply_fits_the_smallest_grant() -> None:
+    """A station with nothing to say sends five bytes, code and all."""
+    assert reply_bytes(Reply()) == GRANT_BYTES[1] == 5
+
+
+def test_one_measurement_takes_thirteen_bytes() -> None:
+    """Seventeen with the code: the second grant."""
+    assert len(encode_reply(SINGLE)) == 13
+    assert reply_bytes(SINGLE) == GRANT_BYTES[2]
+
+
+@pytest.mark.parametrize(("count", "length"), [(2, 26), (3, 33), (4, 39), (8, 62)])
+def test_measurements_of_a_moving_robot_share_their_bits(count: int, length: int) -> None:
+    """Each further one costs about eight bytes instead of thirteen."""
+    assert reply_bytes(Reply(runs=(robot(count),))) <= length
+
+
+def test_a_station_that_joins_can_send_a_measurement_at_once() -> None:
+    """Introduction, state and a measurement with everything that can be said of it fit the grant of 44 bytes."""
+    run = Run(sightings=(SIGHTING,), direct=True, quality=15, wide=True, prism=16, far=True)
+    assert reply_bytes(Reply(introduction=INTRODUCTION, state=STATE, runs=(run,))) <= 44
+
+
+# --- What comes back ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "beacon",
+    [
+        BEACON,
+        replace(BEACON, stations=(StationEntry(0, 1),) * 16),
+        replace(BEACON, session=SESSION),
+        replace(BEACON, confirmations=(Confirmation(3, 2**32 - 1), Confirmation(1, 0))),
+        replace(BEACON, orders=(OrderPart(1, 15, 0, 15), OrderPart(2, 0, 3))),
+        replace(BEACON, session=SESSION, confirmations=(Confirmation(2, 7),), orders=(OrderPart(3, 1, 1),)),
+    ],
+)
+def test_beacons_come_back(beacon: Beacon) -> None:
+    """With nothing extra, with each extra, with all of them."""
+    assert decode_beacon(encode_beacon(beacon)) == beacon
+
+
+@pytest.mark.parametrize(
+    "reply",
+    [
+        Reply(),
+        SINGLE,
+        Reply(
+            runs=(robot(16), replace(robot(2), direct=True, quality=0), Run(sightings=(SIGHTING,), far=True))
+        ),
+        Reply(
+            introduction=INTRODUCTION, state=STATE, turn_round_us=2**22 - 1, answer=AnswerPart(15, ok=True)
+        ),
+        Reply(state=STATE, shot=ShotPart(9, Status.ERROR, 1, 2**24 - 1, None), runs=SINGLE.runs),
+        Reply(turn_round_us=0),
+        Reply(answer=AnswerPart(0, ok=False)),
+    ],
+)
+def test_replies_come_back(reply: Reply) -> None:
+    """Empty, of each form, with each part."""
+    assert decode_reply(encode_reply(reply)) == reply
+
+
+def test_a_session_time_of_nothing_has_no_high_bits() -> None:
+    """Where the previous beacon's time is not known, neither half of it is."""
+    beacon = decode_beacon(encode_beacon(replace(BEACON, sent=0, session=SESSION)))
+    assert beacon.session == replace(SESSION, sent_high=0)
+
+
+@pytest.mark.parametrize(("quality", "back"), [(0, 3), (3, 3), (4, 4)])
+def test_a_plain_single_measurement_claims_what_all_of_them_do(quality: int, back: int) -> None:
+    """A better quality is not worth the bits; a worse one is."""
+    reply = decode_reply(encode_reply(Reply(runs=(Run(sightings=(SIGHTING,), quality=quality),))))
+    assert reply.runs[0].quality == back
+
+
+def test_the_newest_measurement_goes_modulo_its_fields() -> None:
+    """Sequence number and time keep their low bits: 8 and 17, or 32 and 36 in a wide run."""
+    sighting = replace(SIGHTING, sequence=2**40 + 300, time=2**40 + 2**20 + 5)
+    narrow, wide = (
+        decode_reply(encode_reply(Reply(runs=(Run(sightings=(sighting,), wide=wide),)))).runs[0].sightings[0]
+        for wide in (False, True)
+    )
+    assert (narrow.sequence, narrow.time) == (300 - 256, 5)
+    assert (wide.sequence, wide.time) == (300, 2**20 + 5)
+
+
+def test_older_measurements_keep_their_distance_to_the_newest() -> None:
+    """However far back they are, over any gap, also below zero."""
+    run = Run(
+        sightings=(
+            SIGHTING,
+            replace(SIGHTING, sequence=SIGHTING.sequence - 9_000, time=SIGHTING.time - 225_000_000),
+            replace(SIGHTING, sequence=SIGHTING.sequence - 9_001, time=SIGHTING.time - 225_025_000),
+        )
+    )
+    back = decode_reply(encode_reply(Reply(runs=(run,)))).runs[0]
+    assert back.sightings == run.sightings
+    assert reply_bytes(Reply(runs=(run,))) < 35
+
+
+def test_differences_go_round_the_circle() -> None:
+    """From just above 0 to just below a full turn is a small step."""
+    across = Run(
+        sightings=(replace(SIGHTING, horizontal=3), replace(SIGHTING, sequence=199, horizontal=2**24 - 3))
+    )
+    beside = Run(sightings=(replace(SIGHTING, horizontal=9), replace(SIGHTING, sequence=199, horizontal=3)))
+    assert decode_reply(encode_reply(Reply(runs=(across,)))).runs == (across,)
+    assert reply_bytes(Reply(runs=(across,))) == reply_bytes(Reply(runs=(beside,)))
+
+
+def test_measurements_without_distance_stay_without() -> None:
+    """Between measurements that have one, and before them."""
+    bare = replace(SIGHTING, status=Status.ANGLE_ONLY, distance=None)
+    run = Run(
+        sightings=(
+            SIGHTING,
+            replace(bare, sequence=199, time=75_000),
+            replace(bare, sequence=198, time=50_000),
+            replace(SIGHTING, sequence=197, time=25_000),
+        )
+    )
+    assert decode_reply(encode_reply(Reply(runs=(run,)))).runs == (run,)
+
+
+# --- What is refused ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "beacon",
+    [
+        replace(BEACON, frame=256),
+        replace(BEACON, sent=-1),
+        replace(BEACON, stations=()),
+        replace(BEACON, stations=(StationEntry(0, 0),) * 17),
+        replace(BEACON, confirmations=(Confirmation(4, 0),)),
+        replace(BEACON, orders=(OrderPart(0, 0, 0),)),
+        replace(BEACON, orders=(OrderPart(1, 0, 4),)),
+        replace(BEACON, orders=(OrderPart(1, 0, 5),)),
+        replace(BEACON, orders=(OrderPart(1, 0, 1, 1),)),
+        replace(BEACON, orders=(OrderPart(1, 0, 1, 0, Towards(1, 2)),)),
+        replace(BEACON, orders=(OrderPart(1, 0, 4, 16, Towards(1, 2)),)),
+        replace(BEACON, orders=(OrderPart(1, 0, 4, 0, Towards(2**16, 2)),)),
+    ],
+)
+def test_beacons_that_do_not_fit_are_refused(beacon: Beacon) -> None:
+    """Numbers beyond their fields, stations that are not there, orders that do not exist."""
+    with pytest.raises(MessageError):
+        encode_beacon(beacon)
+
+
+@pytest.mark.parametrize(
+    "run",
+    [
+        Run(sightings=()),
+        Run(sightings=tuple(replace(SIGHTING, sequence=k) for k in range(17, 0, -1))),
+        Run(sightings=(SIGHTING, SIGHTING)),
+        Run(sightings=(SIGHTING, replace(SIGHTING, sequence=201))),
+        Run(sightings=(SIGHTING, replace(SIGHTING, sequence=200 - 2**32))),
+        Run(sightings=(SIGHTING, replace(SIGHTING, sequence=199, time=-(2**36)))),
+        Run(sightings=(SIGHTING,), quality=16),
+        Run(sightings=(SIGHTING,), prism=17),
+        Run(sightings=(replace(SIGHTING, distance=2**24),)),
+        Run(sightings=(replace(SIGHTING, zenith=-1),)),
+        Run(sightings=(SIGHTING, replace(SIGHTING, sequence=199, distance=2**24))),
+        Run(sightings=(SIGHTING, replace(SIGHTING, sequence=199, horizontal=-1))),
+    ],
+)
+def test_runs_that_do_not_fit_are_refused(run: Run) -> None:
+    """None or too many measurements, not newest first, weeks apart, numbers beyond their fields."""
+    with pytest.raises(MessageError):
+        encode_reply(Reply(runs=(run,)))
+
+
+def _bits(*fields: tuple[int, int]) -> bytes:
+    writer = BitWriter()
+    for value, width in fields:
+        writer.put(value, width)
+    return writer.to_bytes()
+
+
+_PLAIN = ((1, 2), (7, 8), (0, 1), (9, 16), (3, 8), (0, 5))
+_EXTENDED = ((1, 2), (7, 8), (1, 1), (9, 16), (3, 8), (0, 5), (0, 4), (0x12, 8))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "cut off"),
+        (_bits(*_PLAIN), "1 to 16 stations, got 0"),
+        (_bits((2, 2), *_PLAIN[1:], (0x12, 8)), "version 2"),
+        (_bits(*_EXTENDED, (0, 2)), "not in the form"),
+        (_bits(*_EXTENDED, (3, 2), (0, 4), (0, 4), (0, 4), (0, 4), (0, 2), (1, 1)), "not in the form"),
+        (_bits(*_EXTENDED, (3, 2), (1, 4), (0, 4), (0, 4), (0, 4), (0, 2)), "station 2"),
+        (_bits(*_EXTENDED, (2, 2), (0, 4), (0, 16)), "cut off"),
+        (_bits(*_EXTENDED, (3, 2), (0, 4), (0, 4), (4, 4), (0, 4), (0, 16)), "cut off"),
+        (_bits(*_EXTENDED, (3, 2), (0, 4), (0, 4), (5, 4), (0, 4), (0, 2)), "no order 5"),
+        (_bits(*_EXTENDED, (2, 2), (0, 4), (0, 32), (1, 2), *[(0, 8)] * 13, (0, 2)), "not in the form"),
+    ],
+)
+def test_foreign_beacons_are_refused(content: bytes, message: str) -> None:
+    """Cut off, of another version, padded with ones, with items that are not there or in another order."""
+    with pytest.raises(MessageError, match=message):
+        decode_beacon(content)
+
+
+_HEADER = ((1, 2), (1, 2))
+_RUN = ((3, 4), (0, 1), (1, 4), (200, 8), (100_000, 17), (0, 3), (5, 24), (6, 24), (7, 24))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "cut off"),
+        (_bits((0, 2), (1, 2)), "version 0"),
+        (_bits((1, 2), (3, 2)), "form 3"),
+        (_bits(*_HEADER, (1, 4)), "not in the form"),
+        (_bits((1, 2), (2, 2), (0, 5)), "not in the form"),
+        (_bits((1, 2), (0, 2), (200, 8), (5, 17), (7, 3), (0, 72)), "status 7"),
+        (_bits((1, 2), (0, 2), (200, 8), (5, 17), (0, 3), (0, 72), (0, 8)), "not in the form"),
+        (_bits(*_HEADER, (3, 4), (0, 1), (0, 4), (200, 8), (5, 17), (0, 3), (0, 72)), "not in the form"),
+        (_bits(*_HEADER, *_RUN, (0, 1), (0, 10), (0, 9), (0, 9)), "cut off"),
+        (_bits(*_HEADER, *_RUN, (0, 1), (1, 2), (0, 12), (0, 9), (0, 9), (0, 10)), "not in the form"),
+        (_bits(*_HEADER, *_RUN, (1, 1), (0, 3), (1, 1), (0, 10), (0, 9), (0, 9), (0, 10)), "not in the form"),
+    ],
+)
+def test_foreign_replies_are_refused(content: bytes, message: str) -> None:
+    """Cut off, of another version or form, padded, in a form or in fields wider than need be."""
+    with pytest.raises(MessageError, match=message):
+        decode_reply(content)
+
+
+def test_a_field_holds_nothing_wider() -> None:
+    """Neither too large a number nor one below zero; bits are taken as they were put, and no more of them."""
+    writer = BitWriter()
+    for value in (4, -1):
+        with pytest.raises(MessageError):
+            writer.put(value, 2)
+    writer.put(3, 2)
+    reader = BitReader(writer.to_bytes())
+    assert (reader.take(0), reader.take(2), reader.remaining) == (0, 3, 6)
+    with pytest.raises(MessageError):
+        reader.take(7)
+
+
+# --- Angles and distances ----------------------------------------------------------------------------------------
+
+
+def test_angles_go_round() -> None:
+    """A full turn is 2^24; what is below zero or above a turn comes back within it."""
+    assert angle_code(math.pi) == 2**23
+    assert angle_code(-math.pi / 2) == angle_code(1.5 * math.pi + 4 * math.pi) == 3 * 2**22
+    assert angle_code(math.tau - 1e-9) == 0
+    assert angle_rad(2**22) == pytest.approx(math.pi / 2, abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("metres", "far", "code"),
+    [
+        (None, False, None),
+        (0.0, False, None),
+        (-1.0, True, None),
+        (0.0001, False, 1),
+        (123.45674, False, 1_234_567),
+        (1677.7215, False, 2**24 - 1),
+        (1677.7216, False, None),
+        (1677.7216, True, 1_677_722),
+        (20_000.0, True, None),
+    ],
+)
+def test_distances_are_whole_units(metres: float | None, *, far: bool, code: int | None) -> None:
+    """0.1 mm, or 1 mm in a far run; what does not fit is none."""
+    assert distance_code(metres, far=far) == code
+    if code is not None and metres is not None:
+        assert distance_m(code, far=far) == pytest.approx(metres, abs=5.01e-4 if far else 5.01e-5)
+
+
+def test_long_distances_need_a_far_run() -> None:
+    """From where the field of 0.1 mm ends."""
+    assert [is_far(metres) for metres in (None, 1677.7215, 1677.7216, 5000.0)] == [False, False, True, True]

@@ -1,0 +1,67 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tsgt.radio.commands import Direction, DirectOrder, MeasureOrder, SearchOrder, TrackOrder
+from tsgt.radio.superframe.wire.codec import order_of, order_part, spread_rad
+
+
+@pytest.mark.parametrize(
+    "order",
+    [
+        TrackOrder(16),
+        SearchOrder(),
+        SearchOrder(Direction(math.pi, 1.5 * math.pi, spread_rad(5))),
+        DirectOrder(),
+        MeasureOrder(),
+    ],
+)
+def test_orders_come_back(order: TrackOrder | SearchOrder | DirectOrder | MeasureOrder) -> None:
+    """As they were; a direction to within its rounding, which makes the spread one step wider."""
+    part = order_part(3, 9, order, tracked=2)
+    assert (part.station, part.ticket) == (3, 9)
+    back = order_of(part)
+    if isinstance(order, SearchOrder) and order.towards is not None:
+        order = SearchOrder(Direction(math.pi, 1.5 * math.pi, spread_rad(6)))
+    assert back == order
+
+
+def test_to_track_without_a_prism_means_the_tracked_one() -> None:
+    """A station that knows of another one would otherwise take that."""
+    assert order_of(order_part(1, 0, TrackOrder(None), tracked=7)) == TrackOrder(7)
+
+
+@given(
+    horizontal_rad=st.floats(-1.0, 10.0),
+    zenith_rad=st.floats(0.0, math.tau),
+    wide_rad=st.floats(0.0, math.radians(45.2)),
+)
+def test_a_direction_covers_what_it_did(horizontal_rad: float, zenith_rad: float, wide_rad: float) -> None:
+    """All that was within the spread of the direction is so after its way over the air, and not much more."""
+    order = order_of(
+        order_part(1, 0, SearchOrder(Direction(horizontal_rad, zenith_rad, wide_rad)), tracked=1)
+    )
+    assert isinstance(order, SearchOrder)
+    back = order.towards
+    assert back is not None
+    aside = [
+        abs(math.remainder(after_rad - before_rad, math.tau))
+        for after_rad, before_rad in (
+            (back.horizontal_angle_rad, horizontal_rad),
+            (back.zenith_angle_rad, zenith_rad),
+        )
+    ]
+    assert math.hypot(*aside) + wide_rad <= back.spread_rad + 1e-12
+    assert back.spread_rad <= max(math.sqrt(2) * (wide_rad + 1e-4), spread_rad(0))
+
+
+def test_no_spread_is_wider_than_can_be_said() -> None:
+    """45 degrees to every side; nobody looks for a prism in more than that."""
+    order = order_of(order_part(1, 0, SearchOrder(Direction(0.0, 1.5, 3.0)), tracked=1))
+    assert isinstance(order, SearchOrder)
+    assert order.towards is not None
+    assert math.degrees(order.towards.spread_rad) == pytest.approx(45.25, abs=0.01)

@@ -1,0 +1,379 @@
+from __future__ import annotations
+
+import asyncio
+import errno
+import sys
+import time
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import pytest
+from harness.pi import LINE, FakePi, FakeRpiGpio
+from harness.radios import PAPER, make_side, running_timeline
+
+from tsgt.errors import RadioError, RadioNotFoundError, RadioSettingsError
+from tsgt.radio.sx127x import hal
+from tsgt.radio.sx127x.driver import SX127x
+from tsgt.radio.sx127x.hal import DRAGINO_HAT, Edge, Wiring, open_hal
+from tsgt.simulation.kernel.clocks import VirtualClock
+from tsgt.simulation.lora.air import Air
+from tsgt.simulation.lora.link import LinkModel
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+Backend = Literal["gpiod", "rpi-gpio"]
+BACKENDS = pytest.mark.parametrize("backend", ["gpiod", "rpi-gpio"])
+
+
+@pytest.fixture
+def pi(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakePi:
+    """Make a Pi with all its packages."""
+    made = FakePi(tmp_path)
+    monkeypatch.setattr(hal, "_DEV", tmp_path)
+    monkeypatch.setitem(sys.modules, "spidev", made.spidev())
+    monkeypatch.setitem(sys.modules, "gpiod", made.gpiod())
+    rpi = made.rpi()
+    monkeypatch.setitem(sys.modules, "RPi", rpi)
+    return made
+
+
+def hat(backend: Backend = "gpiod", *, nss_pin: int | None = 25, spi_hz: int = 5_000_000) -> Wiring:
+    """Wire a radio like the HAT."""
+    return Wiring(backend=backend, reset_pin=17, dio0_pin=4, nss_pin=nss_pin, spi_hz=spi_hz)
+
+
+def rpi_gpio() -> FakeRpiGpio:
+    """Return the stand-in that is installed."""
+    gpio = sys.modules["RPi"].GPIO
+    assert isinstance(gpio, FakeRpiGpio)
+    return gpio
+
+
+def test_dragino_preset_is_the_hat() -> None:
+    """The preset has the pins of the HAT's manual, chip select driven by hand, and kernel time stamps."""
+    assert hat() == DRAGINO_HAT
+
+
+def test_spi_clock_above_the_data_sheet_is_refused() -> None:
+    """The chip takes up to 10 MHz."""
+    with pytest.raises(RadioSettingsError, match="10000000, got 10000001"):
+        hat(spi_hz=10_000_001)
+
+
+# --- What both back ends do ---------------------------------------------------------------------------------------
+
+
+@BACKENDS
+def test_bus_is_opened_as_the_chip_needs_it(pi: FakePi, backend: Backend) -> None:
+    """SPI mode 0 with the wiring's clock, the controller's own chip select off where a pin does it."""
+    opened = open_hal(hat(backend, spi_hz=500_000))
+    (bus,) = pi.buses
+    assert (bus.mode, bus.max_speed_hz, bus.no_cs) == (0, 500_000, True)
+    opened.close()
+
+
+@BACKENDS
+def test_controller_that_cannot_leave_its_chip_select_alone_will_do(pi: FakePi, backend: Backend) -> None:
+    """Where no_cs is not supported, CE0 toggles beside the pin, which does no harm."""
+    pi.no_cs_error = OSError(errno.EINVAL, "Invalid argument")
+    opened = open_hal(hat(backend))
+    assert opened.transfer(b"\x42\x00") == b"\x42\x00"
+    opened.close()
+
+
+@BACKENDS
+def test_chip_select_is_low_during_each_transfer_only(pi: FakePi, backend: Backend) -> None:
+    """NSS idles high from the beginning, is low while bytes pass, and high again after a failure."""
+    opened = open_hal(hat(backend))
+    assert pi.levels[25]
+    opened.transfer(b"\x42\x00")
+    assert pi.nss_during_transfer == [False]
+    assert pi.levels[25]
+    pi.transfer_error = OSError(errno.EIO, "Input/output error")
+    with pytest.raises(RadioError, match=r"/dev/spidev0.0: transfer failed: .*Input/output error"):
+        opened.transfer(b"\x42\x00")
+    assert pi.levels[25]
+    opened.close()
+
+
+@BACKENDS
+def test_kernel_chip_select_needs_no_pin(pi: FakePi, backend: Backend) -> None:
+    """Without an NSS pin none is asked for, and the SPI driver keeps its chip select."""
+    pi.nss_pin = None
+    opened = open_hal(hat(backend, nss_pin=None))
+    opened.transfer(b"\x42\x00")
+    assert set(pi.levels) == {17, 4}
+    assert not pi.buses[0].no_cs
+    opened.close()
+
+
+@BACKENDS
+def test_reset_is_released_at_first_and_follows(pi: FakePi, backend: Backend) -> None:
+    """NRESET starts released, and goes low and high as told."""
+    levels: list[bool] = []
+    opened = open_hal(hat(backend))
+    levels.append(pi.levels[17])
+    for low in (True, False):
+        opened.set_reset(low=low)
+        levels.append(pi.levels[17])
+    assert levels == [True, False, True]
+    opened.close()
+
+
+@BACKENDS
+def test_level_of_dio0_is_read(pi: FakePi, backend: Backend) -> None:
+    """dio0() is the level of the pin."""
+    opened = open_hal(hat(backend))
+    assert not opened.dio0()
+    pi.levels[4] = True
+    assert opened.dio0()
+    opened.close()
+
+
+@BACKENDS
+async def test_everything_is_let_go(pi: FakePi, backend: Backend) -> None:
+    """close() lets go of the bus and of every pin, also while edges are waited for, and may be called twice."""
+    opened = open_hal(hat(backend))
+    opened.on_dio0(lambda _edge: None)
+    opened.close()
+    opened.close()
+    assert pi.open_things == 0
+
+
+@BACKENDS
+@pytest.mark.parametrize(
+    ("pin", "hint"),
+    [
+        (25, r"BCM 25 \(NSS\) is in use: .*spi0-1cs,cs0_pin=25"),
+        (17, r"BCM 17 \(reset\) is in use: another program"),
+        (4, r"BCM 4 \(DIO0\) is in use: .*w1-gpio"),
+    ],
+)
+def test_busy_pin_is_named_with_the_usual_cause(pi: FakePi, backend: Backend, pin: int, hint: str) -> None:
+    """A pin that another has is named with its role and who usually has it; what was opened is let go."""
+    # rpi-lgpio has an exception of its own, with this text.
+    busy = OSError(errno.EBUSY, "Device or resource busy") if backend == "gpiod" else Exception("'GPIO busy'")
+    pi.request_errors[pin] = busy
+    with pytest.raises(RadioError, match=hint):
+        open_hal(hat(backend))
+    assert pi.open_things == 0
+
+
+@pytest.mark.parametrize(
+    ("backend", "error"),
+    [
+        ("gpiod", PermissionError(errno.EACCES, "Permission denied")),
+        ("rpi-gpio", RuntimeError("No access to /dev/mem.  Try running as root!")),
+        ("rpi-gpio", Exception("permission denied")),
+    ],
+)
+def test_missing_permission_for_pins_names_the_group(pi: FakePi, backend: Backend, error: Exception) -> None:
+    """A user who may not touch the pins is told which group to join."""
+    pi.request_errors[17] = error
+    with pytest.raises(RadioError, match="usermod -aG gpio"):
+        open_hal(hat(backend))
+
+
+@BACKENDS
+def test_other_failures_of_a_pin_are_told_as_they_are(pi: FakePi, backend: Backend) -> None:
+    """What we do not know is passed on with pin and role."""
+    pi.request_errors[17] = OSError(errno.EINVAL, "Invalid argument")
+    with pytest.raises(RadioError, match=r"BCM 17 \(reset\) cannot be had: .*Invalid argument"):
+        open_hal(hat(backend))
+
+
+@BACKENDS
+async def test_driver_works_through_the_pins_of_a_pi(pi: FakePi, backend: Backend) -> None:
+    """The whole way, driver, back end, package, chip: packets pass in both directions."""
+    timeline = running_timeline()
+    air = Air(timeline, np.random.default_rng(0), LinkModel())
+    there = make_side(air, "there")
+    chip = make_side(air, "here").chip
+    pi.answer = chip.transfer
+    pi.on_drive = lambda pin, level: chip.set_reset(not level) if pin == 17 else None
+
+    def edge(at_ns: int, level: bool) -> None:  # noqa: FBT001 (a level)
+        pi.levels[4] = level
+        if level and backend == "gpiod":
+            pi.requests[-1].rise(at_ns)
+        elif level:
+            rpi_gpio().callbacks[4](4)
+
+    chip.on_dio(0, edge)
+    here = SX127x(open_hal(hat(backend)), VirtualClock(0))
+    await here.start(PAPER)
+    await there.radio.start(PAPER)
+    await here.transmit(b"hello")
+    assert (await there.radio.receive()).payload == b"hello"
+    await there.radio.transmit(b"world")
+    assert (await here.receive()).payload == b"world"
+    assert here.statistics.resets == 0
+    await here.close()
+    await there.radio.close()
+    assert pi.open_things == 0
+
+
+# --- The bus ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("error", "expected", "hint"),
+    [
+        (FileNotFoundError(errno.ENOENT, "No such file"), RadioNotFoundError, "raspi-config nonint do_spi 0"),
+        (PermissionError(errno.EACCES, "Permission denied"), RadioError, "usermod -aG spi"),
+        (OSError(errno.ENXIO, "No such device or address"), RadioError, "No such device or address"),
+    ],
+)
+def test_bus_that_cannot_be_opened_says_what_to_do(
+    pi: FakePi, error: OSError, expected: type[RadioError], hint: str
+) -> None:
+    """SPI that is switched off, a missing group, and anything else name the device and the remedy."""
+    pi.open_error = error
+    with pytest.raises(expected, match=f"/dev/spidev0.0.*{hint}"):
+        open_hal(hat())
+
+
+@pytest.mark.usefixtures("pi")
+def test_second_program_on_the_bus_is_refused() -> None:
+    """Two owners of one radio would each see half of it; the second is told so."""
+    first = open_hal(hat())
+    with pytest.raises(RadioError, match=r"/dev/spidev0\.0 is in use: tsgt runs twice"):
+        open_hal(hat())
+    first.close()
+    open_hal(hat()).close()
+
+
+@pytest.mark.usefixtures("pi")
+@pytest.mark.parametrize(
+    ("package", "backend"), [("spidev", "gpiod"), ("gpiod", "gpiod"), ("RPi", "rpi-gpio")]
+)
+def test_missing_package_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, package: str, backend: Backend
+) -> None:
+    """A package that is not installed is named with the extras that bring it."""
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(RadioError, match=rf"package {package}.* is missing: pip install 'tsgt\[pi\]'"):
+        open_hal(hat(backend))
+
+
+# --- gpiod --------------------------------------------------------------------------------------------------------
+
+
+def test_gpio_chip_is_found_by_its_label(pi: FakePi) -> None:
+    """The chip behind the pin header is found whatever its number, which differs between kernels."""
+    opened = open_hal(hat())
+    assert {request.path.rpartition("/")[2] for request in pi.requests} == {"gpiochip4"}
+    opened.close()
+
+
+def test_named_gpio_chip_is_used(pi: FakePi) -> None:
+    """A chip that the wiring names is taken without looking."""
+    opened = open_hal(Wiring(reset_pin=17, dio0_pin=4, nss_pin=25, gpio_chip="/dev/gpiochip7"))
+    assert {request.path for request in pi.requests} == {"/dev/gpiochip7"}
+    opened.close()
+
+
+def test_board_without_pin_header_says_so(pi: FakePi) -> None:
+    """Where no chip has a known label, the message names them and the way out."""
+    pi.labels["gpiochip4"] = "INT34C6:00"
+    with pytest.raises(RadioNotFoundError, match=r"pinctrl-bcm2835, .* name it as gpio_chip"):
+        open_hal(hat())
+    assert pi.open_things == 0
+
+
+def test_missing_permission_for_gpio_chips_names_the_group(pi: FakePi) -> None:
+    """A user who may not even look at the chips is told which group to join."""
+    pi.chip_error = PermissionError(errno.EACCES, "Permission denied")
+    with pytest.raises(RadioError, match="usermod -aG gpio"):
+        open_hal(hat())
+
+
+def test_missing_gpio_chip_is_named(pi: FakePi) -> None:
+    """A chip that the wiring names and that does not exist is named."""
+    pi.request_errors[25] = FileNotFoundError(errno.ENOENT, "No such file")
+    with pytest.raises(RadioNotFoundError, match="no GPIO chip /dev/gpiochip7"):
+        open_hal(Wiring(reset_pin=17, dio0_pin=4, nss_pin=25, gpio_chip="/dev/gpiochip7"))
+
+
+def test_gpiod_of_the_first_generation_is_refused(pi: FakePi, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Version 1, which old systems bring along, is told from version 2."""
+    del pi
+    monkeypatch.delattr(sys.modules["gpiod"], "request_lines")
+    with pytest.raises(RadioError, match=r"gpiod is older than 2\.0"):
+        open_hal(hat())
+
+
+async def test_gpiod_edges_carry_the_stamp_of_the_kernel(pi: FakePi) -> None:
+    """Each edge arrives in the loop with the kernel's CLOCK_MONOTONIC stamp; gaps in its numbers are lost edges."""
+    opened = open_hal(hat())
+    dio0 = pi.requests[-1]
+    assert dio0.settings.event_clock is LINE.Clock.MONOTONIC
+    assert dio0.settings.edge_detection is LINE.Edge.RISING
+    edges: asyncio.Queue[Edge] = asyncio.Queue()
+    opened.on_dio0(edges.put_nowait)
+    dio0.rise(1_000)
+    dio0.rise(2_000, lost=2)
+    assert await edges.get() == Edge(1_000, lost=0)
+    assert await edges.get() == Edge(2_000, lost=2)
+    dio0.rise(3_000)
+    assert await edges.get() == Edge(3_000, lost=0)
+    assert opened.stamp_sigma_ns == 10_000
+    opened.close()
+
+
+# --- RPi.GPIO -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("pi")
+async def test_rpi_edges_are_stamped_in_the_thread() -> None:
+    """An edge is stamped where the callback is called and handed to the loop's thread, with a sigma of 1 ms."""
+    opened = open_hal(hat("rpi-gpio"))
+    edges: asyncio.Queue[Edge] = asyncio.Queue()
+    opened.on_dio0(edges.put_nowait)
+    assert rpi_gpio().pulls[4] == rpi_gpio().PUD_DOWN
+    before_ns = time.monotonic_ns()
+    await asyncio.to_thread(rpi_gpio().callbacks[4], 4)
+    after_ns = time.monotonic_ns()
+    edge = await edges.get()
+    assert before_ns <= edge.at_ns <= after_ns
+    assert edge.lost == 0
+    assert opened.stamp_sigma_ns == 1_000_000
+    opened.close()
+
+
+@pytest.mark.usefixtures("pi")
+async def test_rpi_gpio_without_interrupts_says_what_to_do() -> None:
+    """Kernels since 6.6 give RPi.GPIO no interrupts; the way out is named."""
+    rpi_gpio().detect_error = RuntimeError("Failed to add edge detection")
+    opened = open_hal(hat("rpi-gpio"))
+    with pytest.raises(RadioError, match=r"6\.6: use gpiod or rpi-lgpio"):
+        opened.on_dio0(lambda _edge: None)
+    opened.close()
+
+
+@pytest.mark.usefixtures("pi")
+async def test_edge_after_the_end_of_the_loop_is_dropped() -> None:
+    """A callback that comes when the loop is closed raises nothing in RPi.GPIO's thread."""
+    opened = open_hal(hat("rpi-gpio"))
+    other = asyncio.new_event_loop()
+    other.close()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(asyncio, "get_running_loop", lambda: other)
+        opened.on_dio0(lambda _edge: None)
+    rpi_gpio().callbacks[4](4)
+    opened.close()
+
+
+def test_rpi_gpio_on_another_board_says_what_to_do(pi: FakePi, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a Pi 5 the import of RPi.GPIO itself fails."""
+    del pi
+
+    class Refusing:
+        @property
+        def GPIO(self) -> object:  # noqa: N802 (its name)
+            raise RuntimeError("Cannot determine SOC peripheral base address")
+
+    monkeypatch.setitem(sys.modules, "RPi", Refusing())
+    with pytest.raises(RadioError, match=r"Cannot determine SOC .*use gpiod or rpi-lgpio"):
+        open_hal(hat("rpi-gpio"))

@@ -1,0 +1,213 @@
+"""The instrument's side of GeoCOM: framing, checksums, codes of the transport, one request after the other."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+from harness.total_stations import SETUP, Bench
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tsgt.simulation.instrument.geocom.server import PROCEDURES, Forced, crc_16
+from tsgt.simulation.kernel.event_loop import run_virtual
+from tsgt.station.geocom.codec import Rpc
+
+
+async def test_a_request_without_a_number_is_answered_with_zero() -> None:
+    """The answer always has a transaction."""
+    answer = await Bench().type(b"%R1Q,5003:\r\n")
+    assert (answer.transaction, answer.code, answer.values) == (0, 0, ["230001"])
+
+
+@pytest.mark.parametrize("end", [b"\r", b"\n", b"\r\n"])
+async def test_every_end_of_a_line_will_do(end: bytes) -> None:
+    """CR, LF or both."""
+    assert (await Bench().type(b"%R1Q,0,7:" + end)).transaction == 7
+
+
+async def test_empty_lines_are_not_answered() -> None:
+    """A client that wakes it up with LF CR LF gets one answer to its one request."""
+    bench = Bench()
+    assert (await bench.type(b"\n\r\n%R1Q,0,3:\r\n")).transaction == 3
+    assert await bench.quiet(1.0)
+
+
+async def test_garbage_ends_with_a_line_feed() -> None:
+    """What stands before the line feed is forgotten."""
+    bench = Bench()
+    assert (await bench.type(b"\x00\xffgarbage\n%R1Q,0,3:\r\n")).transaction == 3
+    assert await bench.quiet(1.0)
+
+
+async def test_a_request_in_pieces() -> None:
+    """It waits for the end of the line."""
+    bench = Bench()
+    await bench.send(b"%R1Q,")
+    await asyncio.sleep(1.0)
+    assert (await bench.type(b"0,4:\r\n")).transaction == 4
+
+
+@pytest.mark.parametrize(
+    ("line", "com_code"),
+    [
+        (b"%R1Q,nonsense\r\n", 3078),
+        (b"%R1Q,4711,1:\r\n", 3081),
+        (b"%R1Q,2167,1:50\r\n", 3080),
+        (b"%R1Q,2167,1:50,1,1\r\n", 3080),
+        (b"%R1Q,2167,1:50,x\r\n", 3080),
+        (b"%R1Q,0,1,5:\r\n", 3101),
+    ],
+)
+async def test_requests_that_cannot_be_understood(line: bytes, com_code: int) -> None:
+    """The code of the transport says why."""
+    assert (await Bench().type(line)).com_code == com_code
+
+
+async def test_checksums() -> None:
+    """A request with a checksum gets an answer with one, over the line without it."""
+    bench = Bench()
+    crc = crc_16(b"%R1Q,5003,9:")
+    await bench.send(b"%%R1Q,5003,9,%d:\r\n" % crc)
+    assert bench.port is not None
+    line = (await bench.port.read()).data.strip()
+    head, _, tail = line.partition(b":")
+    mark, com_code, transaction, checksum = head.split(b",")
+    assert int(checksum) == crc_16(b",".join((mark, com_code, transaction)) + b":" + tail)
+
+
+def test_the_checksum_is_crc_16_arc() -> None:
+    """By the published check value."""
+    assert crc_16(b"123456789") == 0xBB3D
+
+
+async def test_numbers_have_the_decimals_that_are_set() -> None:
+    """Coarse numbers are possible, and refused beyond 15 digits."""
+    bench = Bench()
+    await bench.do((107, 4))
+    assert len((await bench.ask(2107, 1)).values[0].partition(".")[2]) <= 4
+    assert await bench.code(107, 16) == 2
+
+
+async def test_one_after_the_other() -> None:
+    """Requests that come meanwhile wait their turn; of too many the oldest are lost."""
+    bench = Bench()
+    await bench.send(b"".join(b"%%R1Q,0,%d:\r\n" % number for number in range(1, 9)))
+    answered = [(await bench.listen()).transaction for _ in range(5)]
+    assert answered == [1, 5, 6, 7, 8]
+    assert await bench.quiet(1.0)
+
+
+async def test_a_long_function_is_aborted() -> None:
+    """A single c ends it with code 8, right away."""
+    bench = Bench()
+    await bench.do((9027, 1.0, 1.5, 0, 0, 0))
+    began_ns = bench.timeline.now_ns()
+    await bench.send(b"%R1Q,9029,50:1.0,1.0,0\r\n")
+    await asyncio.sleep(0.5)
+    await bench.send(b"c\r\n")
+    assert bench.port is not None
+    assert (await bench.port.read()).data == b"?\r\n"
+    answer = await bench.listen()
+    assert (answer.transaction, answer.code) == (50, 8)
+    assert bench.timeline.now_ns() - began_ns < 0.6e9
+    await bench.do((0,))
+
+
+async def test_a_wait_is_bounded() -> None:
+    """Without a distance it answers when the time given is over."""
+    bench = Bench()
+    for wait_ms in (50, 500, 3000):
+        began_ns = bench.timeline.now_ns()
+        assert await bench.code(2167, wait_ms, 1) == 1285
+        assert wait_ms < (bench.timeline.now_ns() - began_ns) / 1e6 < wait_ms + 90
+
+
+async def test_forced_codes() -> None:
+    """A test can make it answer what it likes, to whom it likes, as often as it likes."""
+    bench = Bench()
+    server = bench.instrument.server
+    server.forced.append(Forced(code=1293, rpc=2008, times=2))
+    server.forced.append(Forced(com_code=3108))
+    assert (await bench.ask(0)).com_code == 3108
+    assert [await bench.code(2008, 1, 1) for _ in range(3)] == [1293, 1293, 0]
+
+
+async def test_every_procedure_answers() -> None:
+    """Whatever the procedure and however silly the numbers, there is one answer and it is well formed."""
+    for rpc, (signature, _) in PROCEDURES.items():
+        bench = Bench()
+        bench.instrument.settings.power_mode = 0
+        parameters = ['"x"' if kind == "s" else "1" for kind in signature]
+        answer = await bench.ask(rpc, *parameters)
+        assert answer.com_code == 0, Rpc(rpc)
+        assert await bench.quiet(2.0)
+
+
+@given(st.binary(max_size=60))
+def test_no_bytes_break_it(data: bytes) -> None:
+    """After anything and a line feed it answers a proper request."""
+
+    async def run() -> None:
+        bench = Bench(duration_s=1.0)
+        await bench.send(data + b"\n")
+        await asyncio.sleep(20.0)
+        assert bench.port is not None
+        bench.port.drain()
+        assert (await bench.type(b"%R1Q,0,77:\r\n")).transaction == 77
+
+    run_virtual(run)
+
+
+async def test_settings_are_read_back() -> None:
+    """What is written is what is read."""
+    bench = Bench()
+    for write, read, *parameters in (
+        (9031, 9030, 1),
+        (9043, 9042, 1.5, 1.25, 0.5, 0.25, 1),
+        (9041, 9040, 0.5, 0.25),
+        (9007, 9008, 0.00001, 0.00002),
+        (14002, 14001, 0, 0, 900_000),
+        (17019, 17018, 4),
+        (17021, 17022, 0),
+        (17008, 17009, 7),
+        (17037, 17036, 1),
+        (17035, 17034, 2),
+        (2020, 2021, 9),
+        (2024, 2023, 0.0175),
+        (2028, 2029, 0.00000065, 950.5, 21.5, 15.0),
+        (2030, 2031, 1, 6370000.0, 0.13),
+        (2010, 2009, 1.0, 2.0, 3.0, 1.5),
+        (2016, 2014, 1, 1, 0, 0),
+        (1059, 1058, 2),
+        (107, 108, 9),
+    ):
+        await bench.do((write, *parameters))
+        values = (await bench.ask(read)).values
+        assert [float(value) for value in values] == [float(parameter) for parameter in parameters]
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [
+        (2020, 14),
+        (17008, 4),
+        (17019, 5),
+        (9047, 0, 5),
+        (9031, 3),
+        (14002, 0, 0, 1000),
+        (1059, 4),
+        (2008, 9, 1),
+    ],
+)
+async def test_settings_that_it_does_not_take(request_: tuple[int, ...]) -> None:
+    """Out of range is code 2."""
+    assert await Bench().code(*request_) == 2
+
+
+async def test_continuous_measuring_is_known() -> None:
+    """Whether it measures can be asked."""
+    bench = Bench()
+    assert (await bench.ask(1070)).values == ["0"]
+    await bench.do(*SETUP)
+    assert (await bench.ask(1070)).values == ["1"]

@@ -1,0 +1,47 @@
+"""The noise of simulated measurements: each part acts in its direction, as large as stated."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from tsgt.geometry import polar_to_cartesian
+from tsgt.model import ARCSECOND_RAD, InstrumentNoise
+from tsgt.simulation.instrument.edm import with_noise
+
+POINT = np.array([60.0, 45.0, 60.0])
+DISTANCE_M = float(np.linalg.norm(POINT))
+SILENT = {"range_sigma_m": 0.0, "range_sigma_ppm": 0.0, "angle_sigma_rad": 0.0, "pointing_sigma_m": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("part", "sigma", "direction", "expected_m"),
+    [
+        ("range_sigma_m", 0.002, "along", 0.002),
+        ("range_sigma_ppm", 100.0, "along", 100e-6 * DISTANCE_M),
+        ("angle_sigma_rad", 20 * ARCSECOND_RAD, "across", 20 * ARCSECOND_RAD * DISTANCE_M),
+        ("angle_sigma_rad", 20 * ARCSECOND_RAD, "up", 20 * ARCSECOND_RAD * DISTANCE_M),
+        ("pointing_sigma_m", 0.001, "along", 0.001),
+        ("pointing_sigma_m", 0.001, "across", 0.001),
+        ("pointing_sigma_m", 0.001, "up", 0.001),
+    ],
+)
+def test_noise_is_as_large_as_stated(part: str, sigma: float, direction: str, expected_m: float) -> None:
+    """Angles and ppm grow with the distance; a steep sight has no more noise across than a level one."""
+    points = np.tile(POINT, (20_000, 1))
+    noise = InstrumentNoise(**SILENT | {part: sigma})
+    error = polar_to_cartesian(*with_noise(points, noise, np.random.default_rng(1))) - points
+    sight = POINT / DISTANCE_M
+    across = np.cross(sight, [0.0, 0.0, 1.0])
+    across /= np.linalg.norm(across)
+    seen_m = error @ {"along": sight, "across": across, "up": np.cross(across, sight)}[direction]
+    assert seen_m.std() == pytest.approx(expected_m, rel=0.03)
+    assert abs(seen_m.mean()) < 4 * expected_m / math.sqrt(len(seen_m))
+
+
+def test_without_noise_it_is_the_truth() -> None:
+    """Angles and distance of the point itself."""
+    seen = with_noise(POINT[None], InstrumentNoise(**SILENT), np.random.default_rng(1))
+    np.testing.assert_allclose(polar_to_cartesian(*seen)[0], POINT, atol=1e-12)

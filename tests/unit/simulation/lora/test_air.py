@@ -1,0 +1,373 @@
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from harness.air import (
+    SYMBOL_NS,
+    RecordingAntenna,
+    Scene,
+    frame,
+    link_with_snr,
+    listening,
+    modulation,
+)
+
+from tsgt.radio.airtime import airtime_us
+from tsgt.simulation.lora.frames import Header, Reception
+from tsgt.simulation.lora.link import FixedLoss, LinkModel
+
+IMPLICIT = modulation(explicit_header=False)
+
+
+def receive(sent: dict[str, Any], heard: dict[str, Any]) -> Reception:
+    """Send one frame and return what arrives."""
+    scene = Scene()
+    scene.rx.listen(listening(**heard))
+    scene.send(frame(**sent))
+    scene.finish()
+    (reception,) = scene.antenna.receptions
+    return reception
+
+
+def test_receiver_is_told_in_time() -> None:
+    """The lock comes with the fifth symbol, the header 8 symbols after the preamble, the end after the airtime."""
+    scene = Scene()
+    scene.rx.listen(listening())
+    sent = scene.send(frame(10.0))
+    scene.finish()
+    airtime_ns = 1000 * airtime_us(34, spreading_factor=9, bandwidth_hz=250_000, coding_rate=6)
+    assert scene.antenna.events == [
+        (sent.start_ns + 5 * SYMBOL_NS, "preamble"),
+        (sent.start_ns + round(20.25 * SYMBOL_NS), "header"),
+        (sent.start_ns + airtime_ns, "received"),
+    ]
+
+
+def test_reception_says_what_the_link_budget_says() -> None:
+    """Payload, header, power, SNR and the error of the carrier are those of the frame at the receiver."""
+    scene = Scene(LinkModel(path_loss=FixedLoss(default_db=100.0)))
+    scene.rx.listen(listening(modulation=modulation(frequency_hz=905e6 - 10_000)))
+    scene.sender("tx", crystal_ppm=10.0)
+    sent = scene.send(frame(crc=False))
+    scene.finish()
+    (reception,) = scene.antenna.receptions
+    assert reception.payload == sent.payload
+    assert reception.crc_ok
+    assert reception.header == Header(34, 6, crc=False)
+    assert reception.rssi_dbm == pytest.approx(-86.0)
+    assert reception.snr_db == pytest.approx(-86.0 + 113.5, abs=0.05)
+    assert reception.frequency_error_hz == pytest.approx(10_000 + 9_050)
+
+
+def test_crystals_far_apart_do_not_meet() -> None:
+    """Crystals that put the carriers more than a quarter of the bandwidth apart keep radios from meeting."""
+    scene = Scene()
+    scene.rx.listen(listening())
+    scene.sender("tx", crystal_ppm=70.0)
+    scene.send(frame())
+    assert scene.finish() == []
+
+
+def test_back_to_back_frames_are_all_received() -> None:
+    """A receiver that stays in reception gets one frame after the other."""
+    scene = Scene()
+    scene.rx.listen(listening())
+    sent = scene.send(frame())
+    for _ in range(5):
+        sent = scene.send(frame(start_ns=sent.end_ns))
+    assert scene.finish() == ["received"] * 6
+
+
+def test_becoming_deaf_ends_a_reception_silently() -> None:
+    """A receiver that leaves reception is told nothing of the frame that it was locked to."""
+    scene = Scene()
+    scene.rx.listen(listening())
+    scene.send(frame())
+    scene.at(30.0)
+    scene.rx.listen(None)
+    scene.finish()
+    assert [what for _, what in scene.antenna.events] == ["preamble", "header"]
+
+
+def test_listening_anew_begins_anew() -> None:
+    """A new reception in the middle of a frame loses it and finds the next one."""
+    scene = Scene()
+    scene.rx.listen(listening())
+    sent = scene.send(frame(payload=b"first"))
+    scene.at(15.0)
+    scene.rx.listen(listening(15.0))
+    scene.send(frame(start_ns=sent.end_ns, payload=b"second"))
+    scene.finish()
+    assert [what for _, what in scene.antenna.events] == ["preamble", "preamble", "header", "received"]
+    assert scene.antenna.receptions[0].payload == b"second"
+
+
+def test_antenna_may_stop_listening_when_told() -> None:
+    """A chip in single reception leaves it from within what the air tells it."""
+
+    class Single(RecordingAntenna):
+        def frame_ended(self, at_ns: int, reception: Reception | None) -> None:
+            super().frame_ended(at_ns, reception)
+            port.listen(None)
+
+    scene = Scene()
+    antenna = Single()
+    port = scene.air.join(antenna, "single")
+    port.listen(listening())
+    sent = scene.send(frame())
+    scene.send(frame(start_ns=sent.end_ns))
+    scene.finish()
+    assert antenna.outcomes == ["received"]
+
+
+def test_locked_receiver_ignores_later_frames() -> None:
+    """While it follows a frame on one channel, a receiver misses what begins there, and is free afterwards."""
+    scene = Scene(LinkModel(path_loss=FixedLoss(pairs_db={("far", "rx"): 100.0})))
+    scene.rx.listen(listening())
+    scene.send(frame(payload=b"near" * 8))
+    scene.send(frame(30.0, payload=b"far" * 8), "far")
+    scene.send(frame(120.0, payload=b"later"), "far")
+    scene.finish()
+    assert [reception.payload for reception in scene.antenna.receptions] == [b"near" * 8, b"later"]
+
+
+def test_weaker_frame_beside_the_channel_does_not_take_over() -> None:
+    """Two senders at opposite ends of what a receiver tolerates bear each other; the one that was first is kept."""
+    scene = Scene()
+    scene.rx.listen(listening())
+    scene.send(frame(modulation=modulation(frequency_hz=905.05e6), payload=b"first"), "one")
+    scene.send(frame(6.0, modulation=modulation(frequency_hz=904.95e6), power_dbm=10.0), "other")
+    scene.finish()
+    assert [reception.payload for reception in scene.antenna.receptions] == [b"first"]
+
+
+def test_search_goes_on_after_a_header_that_is_lost() -> None:
+    """A receiver that lost a header finds the preamble of a frame that began before that, if enough is left."""
+    scene = Scene()
+    scene.rx.listen(listening(max_payload_bytes=20))
+    scene.send(frame(payload=bytes(34), power_dbm=0.0), "long")
+    sent = scene.send(frame(17.5, payload=bytes(10), power_dbm=14.0), "short")
+    assert scene.finish() == ["lost", "received"]
+    assert scene.antenna.events[0] == (5 * SYMBOL_NS, "preamble")
+    assert scene.antenna.events[-1][0] == sent.end_ns
+
+
+def test_longer_payload_than_allowed_is_dropped_at_the_header() -> None:
+    """A header that announces more than the receiver takes leads to nothing."""
+    scene = Scene()
+    scene.rx.listen(listening(max_payload_bytes=33))
+    sent = scene.send(frame())
+    scene.finish()
+    assert scene.antenna.events[1:] == [(sent.header_end_ns, "lost")]
+
+
+@pytest.mark.parametrize(
+    ("sent", "heard", "outcomes"),
+    [(8, 6, ["received"]), (12, 8, ["received"]), (13, 8, []), (8, 20, ["received"])],
+)
+def test_preamble_may_be_a_little_longer_than_set(sent: int, heard: int, outcomes: list[str]) -> None:
+    """A preamble of up to four symbols more than the receiver's setting is recognised, a shorter one always."""
+    scene = Scene()
+    scene.rx.listen(listening(preamble_symbols=heard))
+    scene.send(frame(preamble_symbols=sent))
+    assert scene.finish() == outcomes
+
+
+def test_late_receiver_hears_the_rest_of_a_long_preamble() -> None:
+    """What counts is how much of the preamble a receiver hears."""
+    scene = Scene()
+    scene.send(frame(preamble_symbols=30))
+    scene.at(20.0)
+    scene.rx.listen(listening(20.0))
+    assert scene.finish() == ["received"]
+
+
+def test_sender_decides_where_there_is_a_header() -> None:
+    """Coding rate, length and checksum of the receiver do not matter with an explicit header."""
+    reception = receive({"crc": False, "coding_rate": 8}, {"crc": True, "coding_rate": 5, "payload_bytes": 1})
+    assert reception.header == Header(34, 8, crc=False)
+    assert len(reception.payload) == 34
+
+
+def test_implicit_header_needs_no_header_event() -> None:
+    """Without a header nothing is reported between lock and end."""
+    scene = Scene()
+    scene.rx.listen(listening(modulation=IMPLICIT))
+    scene.send(frame(modulation=IMPLICIT))
+    scene.finish()
+    assert [what for _, what in scene.antenna.events] == ["preamble", "received"]
+
+
+@pytest.mark.parametrize(
+    ("sent", "heard", "crc_ok", "whole"),
+    [
+        ({"crc": False}, {"crc": True}, False, True),
+        ({"crc": True}, {"crc": False}, True, True),
+        ({"coding_rate": 8}, {}, False, False),
+        ({}, {"payload_bytes": 20}, False, True),
+        ({}, {"payload_bytes": 40}, False, False),
+        ({}, {"payload_bytes": 40, "crc": False}, True, False),
+    ],
+    ids=str,
+)
+def test_implicit_header_takes_the_receivers_word(
+    sent: dict[str, Any],
+    heard: dict[str, Any],
+    *,
+    crc_ok: bool,
+    whole: bool,
+) -> None:
+    """Without a header, the receiver's length, coding rate and checksum must be the sender's."""
+    settings = {"modulation": IMPLICIT}
+    reception = receive(settings | sent, settings | heard)
+    assert reception.crc_ok == crc_ok
+    assert len(reception.payload) == heard.get("payload_bytes", 34)
+    assert (frame().payload.startswith(reception.payload)) == whole
+
+
+def test_damaged_payload_differs() -> None:
+    """A payload whose checksum is wrong has its length and wrong bytes."""
+    scene = Scene(link_with_snr(-15.5))
+    scene.rx.listen(listening())
+    sent = scene.send(frame())
+    for _ in range(50):
+        sent = scene.send(frame(start_ns=sent.end_ns))
+    scene.finish()
+    damaged = [reception for reception in scene.antenna.receptions if not reception.crc_ok]
+    assert damaged
+    assert all(len(reception.payload) == 34 for reception in damaged)
+    assert all(reception.payload != sent.payload for reception in damaged)
+
+
+@pytest.mark.parametrize(
+    ("cut_symbols", "events"),
+    [(3.0, []), (10.0, ["preamble", "lost"]), (30.0, ["preamble", "header", "damaged"])],
+)
+def test_frame_that_is_cut_short(cut_symbols: float, events: list[str]) -> None:
+    """A sender that stops leaves a receiver that waits for header or payload in vain, and reports that in time."""
+    scene = Scene()
+    scene.rx.listen(listening())
+    sent = scene.send(frame())
+    scene.at(cut_symbols)
+    scene.sender("tx").stop_transmitting(round(cut_symbols * SYMBOL_NS))
+    scene.finish()
+    assert [what for _, what in scene.antenna.events] == events
+    if events[-1:] == ["damaged"]:
+        assert scene.antenna.events[-1][0] == sent.end_ns
+
+
+def test_cut_frame_disturbs_no_longer() -> None:
+    """What is cut off the air does not interfere."""
+    scene = Scene()
+    scene.rx.listen(listening())
+    scene.send(frame(-40.0), "other")
+    scene.at(-5.0)
+    scene.sender("other").stop_transmitting(-5 * SYMBOL_NS)
+    scene.rx.listen(listening(-5.0))
+    scene.send(frame())
+    assert scene.finish() == ["received"]
+
+
+def test_preamble_that_is_drowned_at_first_is_found_later() -> None:
+    """A receiver finds a long preamble once a frame that drowned its beginning has ended."""
+    scene = Scene()
+    scene.send(frame(-60.0), "other")
+    scene.at(-10.0)
+    scene.rx.listen(listening(-10.0, preamble_symbols=20))
+    scene.send(frame(preamble_symbols=20))
+    assert scene.finish() == ["received"]
+    assert 8.25 * SYMBOL_NS < scene.antenna.events[0][0] <= 20 * SYMBOL_NS
+
+
+def test_new_frame_ends_the_one_before() -> None:
+    """A radio has one transmitter."""
+    scene = Scene()
+    scene.rx.listen(listening())
+    scene.send(frame())
+    scene.send(frame(30.0))
+    scene.send(frame(100.0))
+    assert scene.finish() == ["damaged", "received"]
+
+
+def test_leaving_cuts_the_frame_and_frees_the_name() -> None:
+    """A radio that leaves takes its frame with it; the name can be used again."""
+    scene = Scene()
+    scene.rx.listen(listening())
+    scene.send(frame())
+    scene.at(30.0)
+    scene.air.leave("tx")
+    scene.air.leave("nobody")
+    assert scene.finish() == ["damaged"]
+    scene.air.join(RecordingAntenna(), "tx")
+
+
+def test_names_are_unique() -> None:
+    """Two radios of one name would be one in the link model, which is refused."""
+    with pytest.raises(ValueError, match="there is a radio 'rx' on the air already"):
+        Scene().air.join(RecordingAntenna(), "rx")
+
+
+def test_attenuation_during_a_run() -> None:
+    """A radio that something shadows from now on is not heard any more, until it is gone."""
+    scene = Scene()
+    scene.rx.listen(listening())
+    scene.send(frame())
+    scene.link.attenuate("tx", "rx", 80.0)
+    scene.send(frame(100.0))
+    scene.link.attenuate("tx", "rx", 0.0)
+    scene.send(frame(200.0))
+    scene.finish()
+    assert [at_ns for at_ns, what in scene.antenna.events if what == "received"] == [
+        frame().end_ns,
+        frame(200.0).end_ns,
+    ]
+
+
+def test_rssi_adds_noise_and_signals() -> None:
+    """RSSI is the noise floor on a quiet channel, and with it the sum of what is sent in its band."""
+    scene = Scene(LinkModel(path_loss=FixedLoss(default_db=80.0)))
+    assert scene.rx.rssi_dbm(0) == pytest.approx(-116.5, abs=0.05)
+    scene.rx.listen(listening())
+    assert scene.rx.rssi_dbm(0) == pytest.approx(-113.5, abs=0.05)
+    scene.send(frame(1.0), "one")
+    scene.send(frame(2.0), "other")
+    scene.send(frame(2.0, modulation=modulation(frequency_hz=910e6)), "elsewhere")
+    assert scene.rx.rssi_dbm(SYMBOL_NS * 3 // 2) == pytest.approx(-66.0, abs=0.01)
+    assert scene.rx.rssi_dbm(2 * SYMBOL_NS) == pytest.approx(-63.0, abs=0.02)
+    scene.at(100.0)
+    assert scene.rx.rssi_dbm(100 * SYMBOL_NS) == pytest.approx(-113.5, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("at_symbols", "present"), [(0.5, False), (1.0, True), (12.25, True), (13.0, False), (60.0, False)]
+)
+def test_activity_is_found_in_preambles_only(at_symbols: float, *, present: bool) -> None:
+    """Activity detection finds a preamble that filled the last symbol, and no payload."""
+    scene = Scene()
+    scene.send(frame())
+    at_ns = round(at_symbols * SYMBOL_NS)
+    scene.timeline.advance_to(at_ns)
+    assert scene.rx.preamble_present(modulation(sync_word=0x12), at_ns) == present
+    assert not scene.rx.preamble_present(modulation(spreading_factor=10), at_ns)
+    assert not scene.rx.preamble_present(modulation(inverted_iq=True), at_ns)
+
+
+def test_activity_too_weak_is_not_found() -> None:
+    """A preamble below the threshold of detection is no activity."""
+    scene = Scene(link_with_snr(-25.0))
+    scene.send(frame())
+    scene.at(5.0)
+    assert not scene.rx.preamble_present(modulation(), 5 * SYMBOL_NS)
+
+
+def test_old_frames_are_forgotten() -> None:
+    """The air remembers a frame as long as one that overlaps it is undecided, and no longer."""
+    scene = Scene()
+    scene.rx.listen(listening())
+    for number in range(1000):
+        scene.send(frame(number * 40.0), f"tx{number % 2}")
+        assert len(scene.air.frames) <= 4
+    scene.at(1000 * 40.0 + 100.0)
+    scene.send(frame(1000 * 40.0 + 100.0))
+    assert len(scene.air.frames) == 1

@@ -1,0 +1,62 @@
+"""Radios on the simulated air as a mission has them: hosts that take their time, stamps that scatter."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from harness.radios import MS, PAPER, running_timeline
+
+from tsgt.simulation.kernel.clocks import VirtualClock
+from tsgt.simulation.lora.air import Air
+from tsgt.simulation.lora.link import LinkModel
+from tsgt.simulation.lora.radios import HostDelay, StampJitter, opener
+
+PACKETS = 400
+
+
+async def _starts_ms(delay: HostDelay, *, lead_ns: int) -> list[float]:
+    """Ask for a packet each second, so long before it; return how late each began."""
+    clock, late_ms = VirtualClock(0), []
+    air = Air(running_timeline(), np.random.default_rng(0), LinkModel())
+    async with opener(air, "here", clock, np.random.default_rng(1), PAPER, delay)() as radio:
+        for second in range(1, PACKETS + 1):
+            at_ns = second * 1000 * MS
+            await clock.sleep_until(at_ns - lead_ns)
+            late_ms.append(((await radio.transmit(b"x", at_ns=at_ns)).started_at_ns - at_ns) / MS)
+    return late_ms
+
+
+async def test_a_host_is_woken_late() -> None:
+    """What has been prepared in time begins 0.3 ms late in the median, once in a hundred 3 ms, and never early."""
+    late_ms = await _starts_ms(HostDelay(), lead_ns=100 * MS)
+    assert min(late_ms) > 0
+    assert np.median(late_ms) == pytest.approx(0.3, rel=0.15)
+    assert np.quantile(late_ms, 0.99) == pytest.approx(3.0, rel=0.4)
+
+
+async def test_what_is_asked_for_too_late_begins_later() -> None:
+    """A host that takes 10 ms to prepare a packet cannot begin within 4 ms."""
+    late_ms = await _starts_ms(HostDelay(work_ms=10.0, wake_median_ms=0.0), lead_ns=4 * MS)
+    assert late_ms == pytest.approx([6.0] * PACKETS, abs=0.1)
+
+
+async def test_stamps_scatter() -> None:
+    """Stamps of both ends of the air are off by what is asked for, and the radio claims no less."""
+    clock = VirtualClock(0)
+    air = Air(running_timeline(), np.random.default_rng(0), LinkModel())
+    jitter = [StampJitter(20_000, np.random.default_rng(seed)) for seed in (1, 2)]
+    one, other = (
+        opener(air, name, clock, np.random.default_rng(3), PAPER, jitter=each)
+        for name, each in zip(("here", "there"), jitter, strict=True)
+    )
+    sent_ns, received_ns = [], []
+    async with one() as here, other() as there:
+        for second in range(1, PACKETS + 1):
+            sent = await here.transmit(b"x", at_ns=second * 1000 * MS)
+            packet = await there.receive()
+            assert sent.stamp_sigma_ns == packet.stamp_sigma_ns == round(np.hypot(3_000, 20_000))
+            sent_ns.append(sent.done_at_ns - sent.started_at_ns)
+            received_ns.append(packet.received_at_ns - sent.started_at_ns)
+    assert np.std(sent_ns) == pytest.approx(20_200, rel=0.15)
+    assert np.std(received_ns) == pytest.approx(20_200, rel=0.15)
+    assert abs(np.corrcoef(sent_ns, received_ns)[0, 1]) < 0.2

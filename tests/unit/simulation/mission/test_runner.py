@@ -1,0 +1,391 @@
+"""Whole missions on virtual time: the real daemons, crashes and restarts included."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from harness.missions import QUICK, SUPERFRAME, mission
+
+from tsgt.cli.simulate.figures import figures, frame_ms, outage_figures, station_figures
+from tsgt.cli.simulate.poses import estimator_figures
+from tsgt.config.radio import ClassicMasterConfig
+from tsgt.simulation.checks.invariants import violations
+from tsgt.simulation.mission.authors_node import AuthorsTiming
+from tsgt.simulation.options import Outage, Restart
+from tsgt.simulation.scenario_files import find_scenario, with_stations
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tsgt.config import ScenarioConfig
+    from tsgt.simulation.mission.mission import Mission
+    from tsgt.simulation.options import Node
+
+
+def test_a_mission_of_a_minute(tmp_path: Path) -> None:
+    """Three stations deliver above 1.3 Hz each, stamped to 0.3 ms (their drift is not known at once), and the poses are good to centimetres."""
+    run = mission(tmp_path, duration_s=60.0)
+    assert violations(run) == []
+    for figure in station_figures(run).values():
+        assert figure.measured == pytest.approx(144, abs=2)  # 2.5 Hz, but for the time that connecting takes
+        assert figure.rate_hz > 1.3
+        assert figure.duplicates == 0
+        assert figure.time_error_us[2] < 300
+    poses = estimator_figures(run)["linear"]
+    assert poses.valid_poses > 600
+    assert poses.against_truth.position_rms_mm < 40
+    assert poses.against_truth.orientation_rms_deg < 2
+
+
+def with_lines(scenario: ScenarioConfig) -> ScenarioConfig:
+    """Return a scenario whose master has the paper's estimator."""
+    pipeline = scenario.pipeline.model_copy(update={"estimator": "linear"})
+    return scenario.model_copy(update={"pipeline": pipeline})
+
+
+@pytest.mark.parametrize(("node", "least_hz", "most_hz"), [("ours", 1.5, 1.72), ("authors", 1.3, 1.6)])
+def test_rates_at_the_papers_settings(tmp_path: Path, node: Node, least_hz: float, most_hz: float) -> None:
+    """Airtime bounds three stations at 1.72 Hz each; the paper measured about 1.4 Hz with its nodes."""
+    scenario = with_lines(find_scenario("dynamic"))
+    run = mission(
+        tmp_path, scenario, duration_s=120.0, node=node, protocol=ClassicMasterConfig(kind="classic")
+    )
+    for figure in station_figures(run).values():
+        assert least_hz <= figure.rate_hz <= most_hz
+
+
+def test_one_seed_is_one_run(tmp_path: Path) -> None:
+    """The same seed gives the same lines on the stream, to the last bit, and another seed others."""
+    one, same, other = (
+        mission(tmp_path / name, duration_s=10.0, seed=seed)
+        for name, seed in (("one", 3), ("same", 3), ("other", 4))
+    )
+    assert json.dumps(figures(one)) == json.dumps(figures(same))
+    assert one.sessions[0].lines == same.sessions[0].lines
+    assert one.sessions[0].lines != other.sessions[0].lines
+
+
+def test_clocks_that_drift_either_way(tmp_path: Path) -> None:
+    """Stations drift by plus and minus what is asked for, are years behind, and the master knows both."""
+    run = mission(tmp_path, duration_s=40.0, drift_ppm=50.0)
+    assert violations(run) == []
+    last = {clock.station: clock for clock in run.sessions[0].clocks}
+    drifts = [last[station].frequency_ppm for station in (1, 2, 3)]
+    assert drifts == pytest.approx([50.0, -50.0, 50.0], abs=10.0)
+    assert all(clock.offset_ns < -(10**15) for clock in last.values())
+
+
+def test_the_authors_node_is_polled(tmp_path: Path) -> None:
+    """Stations with the authors' node deliver a little slower, stamped to a millisecond or two after they were read.
+
+    The master takes off how late they stamp a ping on average: half a look, and seven transfers from the chip.
+    """
+    run = mission(tmp_path, with_lines(find_scenario("dynamic")), duration_s=40.0, node="authors")
+    assert violations(run) == []
+    samples = [sample for clock in run.sessions[0].clocks for sample in clock.samples]
+    timing = AuthorsTiming()
+    (delay_ns,) = {sample.forward_ns - sample.back_ns for sample in samples}
+    assert delay_ns == pytest.approx(timing.look_ns / 2 + 7 * timing.transfer_ns, abs=50_000)
+    for figure in station_figures(run).values():
+        assert 1.2 < figure.rate_hz < 1.65
+        assert figure.time_error_us[2] < 3000
+    assert estimator_figures(run)["linear"].valid_poses > 300
+
+
+def test_lost_packets_cost_measurements_and_nothing_else(tmp_path: Path) -> None:
+    """A tenth of all packets lost: fewer measurements arrive, all of them right."""
+    scenario = find_scenario("dynamic")
+    lossy = scenario.model_copy(update={"radio": scenario.radio.model_copy(update={"loss_probability": 0.1})})
+    run = mission(tmp_path, lossy, duration_s=40.0)
+    assert violations(run) == []
+    for figure in station_figures(run).values():
+        assert 15 < figure.delivered < 50
+
+
+def test_hidden_prisms_never_enter_a_pose(tmp_path: Path) -> None:
+    """In the forest stations lose their prism; that is delivered as a status, and no pose is made of it.
+
+    Until an instrument has noticed that it has lost it, it says that it has angles only.
+    """
+    run = mission(tmp_path, find_scenario("snowmobile"), duration_s=60.0, seed=1)
+    assert violations(run) == []
+    statuses = {measurement.status for measurement in run.sessions[0].measurements}
+    assert {"ok", "no_target"} <= statuses <= {"ok", "no_target", "angle_only"}
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_fewer_or_more_stations_than_prisms(tmp_path: Path, count: int) -> None:
+    """Two stations measure but make no pose; five share three prisms."""
+    run = mission(tmp_path, with_stations(find_scenario("dynamic"), count), duration_s=20.0)
+    assert violations(run) == []
+    assert list(station_figures(run)) == list(range(1, count + 1))
+    assert all(figure.delivered > 5 for figure in station_figures(run).values())
+    assert (estimator_figures(run)["linear"].valid_poses > 0) == (count >= 3)
+
+
+def test_a_client_that_crashes_and_comes_back(tmp_path: Path) -> None:
+    """The others go on, the station is back by itself after its restart, and poses with it."""
+
+    async def crash(mission: Mission) -> None:
+        await mission.sleep_until(15.0)
+        await mission.kill("station2")
+        await mission.sleep_until(20.0)
+        mission.start_station(2)
+
+    run = mission(tmp_path, duration_s=45.0, script=crash)
+    assert violations(run) == []
+    stamps = {
+        station: np.array(
+            [(m.stamp_ns - run.start_ns) / 1e9 for m in run.sessions[0].measurements if m.station == station]
+        )
+        for station in (1, 2, 3)
+    }
+    assert not np.any((stamps[2] > 15.5) & (stamps[2] < 20.0))
+    assert np.sum(stamps[2] > 30.0) > 15
+    assert np.sum((stamps[1] > 15.0) & (stamps[1] < 20.0)) > 3
+    poses_s = (run.sessions[0].valid_poses().stamp_ns - run.start_ns) / 1e9
+    assert np.sum(poses_s > 30.0) > 150
+    assert len(run.witnesses[2].journals) == 2
+
+
+@pytest.mark.parametrize("down_s", [2.2, 8.0, 15.0])
+@pytest.mark.parametrize("at_s", [0.85, 2.3, 15.45])
+def test_a_computer_whose_clock_stands_still_while_it_is_off(
+    tmp_path: Path, at_s: float, down_s: float
+) -> None:
+    """A Pi without a battery clock goes on from where it was, also when that was in a synchronisation: no stamp lies."""
+
+    async def reboot(mission: Mission) -> None:
+        await mission.sleep_until(at_s)
+        await mission.kill("station1")
+        mission.computers["station1"].clock.step(-round(down_s * 1e9))
+        await mission.sleep_until(at_s + down_s)
+        mission.start_station(1)
+
+    run = mission(tmp_path, duration_s=35.0, script=reboot)
+    assert violations(run) == []
+    late = [m for m in run.sessions[0].measurements if m.station == 1 and m.stamp_ns > run.end_ns - 5 * 10**9]
+    assert len(late) > 4
+
+
+def test_a_master_that_crashes_and_comes_back(tmp_path: Path) -> None:
+    """The second master makes a recording of its own, synchronises all clocks again, and poses come back."""
+
+    async def crash(mission: Mission) -> None:
+        await mission.sleep_until(15.0)
+        await mission.kill("master")
+        await mission.sleep_until(17.0)
+        mission.start_master()
+
+    run = mission(tmp_path, duration_s=45.0, script=crash)
+    assert violations(run) == []
+    first, second = run.sessions
+    assert first.recording() != second.recording()
+    assert {clock.station for clock in second.clocks} == {1, 2, 3}
+    assert len(second.valid_poses().stamp_ns) > 150
+
+
+def test_an_outage(tmp_path: Path) -> None:
+    """While the robot is behind a hill for one station nothing arrives from it, and from the others more."""
+    run = mission(tmp_path, duration_s=40.0, outages=(Outage((2,), 15.0, 10.0),))
+    assert violations(run) == []
+    received_s = {
+        station: np.array(
+            [
+                (m.received_ns - run.start_ns) / 1e9
+                for m in run.sessions[0].measurements
+                if m.station == station
+            ]
+        )
+        for station in (1, 2, 3)
+    }
+    assert not np.any((received_s[2] > 15.5) & (received_s[2] < 25.0))
+    assert np.sum(received_s[2] > 27.0) > 15
+    assert np.sum((received_s[1] > 15.0) & (received_s[1] < 25.0)) > 5
+    (outage,) = outage_figures(run)
+    assert np.isnan(outage.drained_s)  # what was measured meanwhile is lost over this protocol
+    assert 0 < outage.live_age_ms < 1000
+
+
+def test_an_outage_ends_between_two_nanoseconds(tmp_path: Path) -> None:
+    """Instants are rounded to whole ones; the hill must not stay for that."""
+    outage = Outage((2,), 2.1, 0.2)
+    assert round(outage.end_s * 1e9) / 1e9 < outage.end_s
+    run = mission(tmp_path, duration_s=20.0, outages=(outage,))
+    received_s = [
+        (m.received_ns - run.start_ns) / 1e9 for m in run.sessions[0].measurements if m.station == 2
+    ]
+    assert max(received_s) > 15.0
+
+
+def test_restarts_that_are_asked_for(tmp_path: Path) -> None:
+    """A client and the master end when they are told to, and are back two seconds later."""
+    run = mission(tmp_path, duration_s=40.0, restarts=(Restart(1, 15.0), Restart(None, 20.0)))
+    assert violations(run) == []
+    assert [len(witness.journals) for witness in run.witnesses.values()] == [2, 1, 1]
+    assert [len(witness.statuses) for witness in run.witnesses.values()] == [2, 1, 1]
+    assert len(run.sessions) == 2
+    made_s = np.array(sorted(run.witnesses[1].stamps_ns.values())) / 1e9
+    assert not np.any((made_s > 15.0) & (made_s < 17.0))
+    assert np.sum(made_s > 17.0) > 50
+
+
+def test_somebody_else_on_the_channel(tmp_path: Path) -> None:
+    """Foreign packets cost some measurements and bend none, and change nothing of what is measured."""
+    alone, disturbed = (
+        mission(tmp_path / name, duration_s=40.0, foreign_per_s=per_s)
+        for name, per_s in (("alone", 0.0), ("disturbed", 0.5))
+    )
+    assert violations(disturbed) == []
+    for one, other in zip(station_figures(alone).values(), station_figures(disturbed).values(), strict=True):
+        assert one.measured == other.measured
+        assert 0.5 * one.delivered < other.delivered < one.delivered
+
+
+def test_stamps_that_scatter_and_drifts_that_change(tmp_path: Path) -> None:
+    """Time errors grow by the stamps' scatter and stay within the bounds stated.
+
+    The first synchronisation takes a second, so that 20 us of scatter make the frequency a guess until the second one.
+    """
+    run = mission(tmp_path, duration_s=60.0, stamp_jitter_us=20.0, drift_ramp_ppm_per_min=1.0)
+    assert violations(run) == []
+    for figure in station_figures(run).values():
+        assert 5 < figure.time_error_us[0] < 1500
+
+
+def test_a_clock_that_is_set_while_the_client_runs(tmp_path: Path) -> None:
+    """A step of a station's Unix clock bends nothing: its client has fixed its time at its start."""
+
+    async def step(mission: Mission) -> None:
+        await mission.sleep_until(15.0)
+        mission.computers["station1"].clock.step(3_600_000_000_000)
+
+    run = mission(tmp_path, duration_s=30.0, script=step)
+    assert violations(run) == []
+    assert not any(clock.restarted for clock in run.sessions[0].clocks[3:])
+
+
+def test_the_paper_filter_lags_behind(tmp_path: Path) -> None:
+    """With the paper's filter and 50 ppm the stamps are off, by no more than its bound says."""
+    paper = QUICK.model_copy(update={"clock_filter": "paper", "resync_interval_s": 20.0})
+    run = mission(
+        tmp_path, with_lines(find_scenario("dynamic")), duration_s=120.0, drift_ppm=50.0, protocol=paper
+    )
+    assert violations(run) == []
+    for figure in station_figures(run).values():
+        assert figure.time_error_us[2] > 2000
+
+
+# --- The protocol superframe ----------------------------------------------------------------------------------------
+
+
+def _lossy(loss: float) -> ScenarioConfig:
+    scenario = find_scenario("dynamic")
+    return scenario.model_copy(update={"radio": scenario.radio.model_copy(update={"loss_probability": loss})})
+
+
+def test_the_superframe_delivers_everything(tmp_path: Path) -> None:
+    """Three stations deliver all that they measure, at once and once, and the poses are better for it."""
+    run = mission(tmp_path, duration_s=60.0, protocol=SUPERFRAME)
+    assert violations(run) == []
+    for figure in station_figures(run).values():
+        assert figure.delivered == figure.measured == pytest.approx(144, abs=2)
+        assert figure.rate_hz == pytest.approx(2.5, abs=0.06)
+        assert figure.duplicates == 0
+        assert figure.age_ms[0] < 350  # of which the instrument takes 20 to 60 ms, and the line some
+        assert figure.within_2s > 0.99
+        assert figure.time_error_us[2] < 100
+    poses = estimator_figures(run)
+    assert poses["linear"].valid_poses > 1100
+    assert poses["linear"].against_truth.position_rms_mm < 20
+    assert poses["continuous"].against_truth.position_rms_mm < 3
+    assert 350 < frame_ms(run) < 450
+
+
+def test_one_seed_is_one_run_of_the_superframe(tmp_path: Path) -> None:
+    """Nonces, keys and all."""
+    one, same, other = (
+        mission(tmp_path / name, _lossy(0.1), duration_s=10.0, seed=seed, protocol=SUPERFRAME)
+        for name, seed in (("one", 3), ("same", 3), ("other", 4))
+    )
+    assert json.dumps(figures(one)) == json.dumps(figures(same))
+    assert one.sessions[0].lines == same.sessions[0].lines
+    assert one.sessions[0].lines != other.sessions[0].lines
+
+
+@pytest.mark.parametrize("authenticated", [True, False])
+def test_an_outage_over_the_superframe(tmp_path: Path, *, authenticated: bool) -> None:
+    """Behind a hill, with a tenth of all packets lost: everything arrives afterwards, what is live first."""
+    run = mission(
+        tmp_path,
+        _lossy(0.1),
+        duration_s=70.0,
+        protocol=SUPERFRAME,
+        outages=(Outage((1, 2, 3), 20.0, 20.0),),
+        authenticated=authenticated,
+    )
+    assert violations(run) == []
+    for figure in station_figures(run).values():
+        assert figure.delivered == figure.measured
+    (outage,) = outage_figures(run)
+    assert 1 < outage.drained_s < 20
+    assert outage.live_age_ms < 1000
+    assert outage.time_error_us[2] < 200
+
+
+def test_restarts_over_the_superframe(tmp_path: Path) -> None:
+    """Nothing that was measured is lost when clients or the master end and start again, and no bound is broken."""
+    run = mission(
+        tmp_path,
+        _lossy(0.1),
+        duration_s=70.0,
+        protocol=SUPERFRAME,
+        drift_ppm=50.0,
+        stamp_jitter_us=20.0,
+        restarts=(Restart(1, 15.0), Restart(2, 15.2), Restart(None, 30.0), Restart(1, 30.5)),
+        outages=(Outage((3,), 25.0, 10.0),),
+    )
+    assert violations(run) == []
+    assert [len(witness.journals) for witness in run.witnesses.values()] == [3, 2, 1]
+    for figure in station_figures(run).values():
+        assert figure.delivered == figure.measured
+
+
+def test_a_computer_that_was_off(tmp_path: Path) -> None:
+    """Its clock begins anew; what it has in its journal from before arrives with a bound that holds."""
+
+    async def reboot(mission: Mission) -> None:
+        await mission.reboot(1, at_s=30.0, off_s=10.0)
+
+    run = mission(
+        tmp_path,
+        duration_s=70.0,
+        protocol=SUPERFRAME,
+        drift_ppm=50.0,
+        script=reboot,
+        outages=(Outage((1,), 22.0, 10.0),),
+    )
+    assert violations(run) == []
+    station = station_figures(run)[1]
+    # Twice two seconds go into connecting.
+    assert station.delivered == station.measured == pytest.approx(2.5 * (60 - 4), abs=2)
+
+
+def test_forged_packets_over_the_superframe(tmp_path: Path) -> None:
+    """Somebody sends noise and what he has heard, changed and unchanged: it costs some packets and bends nothing."""
+    run = mission(tmp_path, duration_s=60.0, protocol=SUPERFRAME, foreign_per_s=1.0)
+    assert violations(run) == []
+    for figure in station_figures(run).values():
+        assert figure.delivered >= figure.measured - 1
+        assert figure.duplicates == 0
+
+
+def test_many_stations(tmp_path: Path) -> None:
+    """Twelve stations share the channel, and each delivers what it measures."""
+    run = mission(tmp_path, with_stations(find_scenario("dynamic"), 12), duration_s=30.0, protocol=SUPERFRAME)
+    assert violations(run) == []
+    for figure in station_figures(run).values():
+        assert figure.delivered >= figure.measured - 2  # frames last 2.5 s, and the drain 5 s

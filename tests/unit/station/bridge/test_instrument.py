@@ -1,0 +1,550 @@
+from __future__ import annotations
+
+import asyncio
+import random
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from harness.bridge import COMMANDS, HELLO, FakeProgram, FakeStart, measured
+from structlog.testing import capture_logs
+
+from tsgt.config.client import BridgeInstrumentConfig
+from tsgt.errors import InstrumentError, InstrumentRefusedError
+from tsgt.model import Status
+from tsgt.radio.commands import Direction
+from tsgt.simulation.kernel.clocks import VirtualClock
+from tsgt.station.bridge.instrument import BridgeInstrument
+from tsgt.station.instrument import Atmosphere
+from tsgt.station.instrument_supervisor import InstrumentKeeper
+from tsgt.station.session import Session
+
+if TYPE_CHECKING:
+    from tsgt.station.instrument import Reading
+
+CLOCK = VirtualClock(0)
+CONFIG = BridgeInstrumentConfig(kind="bridge", command=("bridge",))
+FULL = HELLO | {"commands": COMMANDS}
+
+
+async def tracking(
+    hello: dict[str, Any] = FULL, config: BridgeInstrumentConfig = CONFIG
+) -> tuple[BridgeInstrument, FakeProgram, FakeStart]:
+    """Connect to a program and have prism 1 tracked, a minute after the computer was switched on."""
+    await asyncio.sleep(max(0.0, 60.0 - CLOCK.monotonic_ns() / 1e9))
+    start = FakeStart(CLOCK, hello)
+    instrument = BridgeInstrument(config, CLOCK, start)
+    await instrument.connect()
+    await instrument.track(1)
+    return instrument, start.programs[0], start
+
+
+async def waiting(instrument: BridgeInstrument) -> list[Reading]:
+    """Return the readings that are there."""
+    readings = []
+    try:
+        while True:
+            async with asyncio.timeout(0):
+                readings.append(await instrument.read())
+    except TimeoutError:
+        return readings
+
+
+async def test_connecting_says_who_is_behind_the_program() -> None:
+    """The name comes from hello, and with it how measurements get their times."""
+    hello = {"model": "S7", "serial_number": "12", "firmware": "1.2", "make": "Acme"}
+    for stamps, how in (
+        ({"stamps": "host"}, "stamped by the bridge"),
+        ({"stamps": "instrument", "clock": "UTC"}, "stamped by its clock UTC"),
+        ({"stamps": "arrival"}, "stamped on arrival"),
+    ):
+        instrument = BridgeInstrument(CONFIG, CLOCK, FakeStart(CLOCK, HELLO | hello | stamps))
+        assert await instrument.connect() == f"Acme S7 12, {how}"
+
+
+async def test_a_measurement_is_read_as_it_was_said() -> None:
+    """Angles, distance, verdict and times are those of the line; the latency is taken off the stamp."""
+    config = CONFIG.model_copy(update={"latency_ms": 20.0})
+    instrument, program, _ = await tracking(config=config)
+    now_ns = CLOCK.monotonic_ns()
+    program.measure(
+        12.5,
+        status="low_accuracy",
+        raw_status=1284,
+        host_time_ns=now_ns - 1_000_000,
+        instrument_time_ns=7,
+        unknown="key",
+    )
+    reading = await instrument.read()
+    assert reading.at_ns == now_ns - 21_000_000
+    assert reading.received_ns == now_ns
+    assert (reading.prism, reading.slope_distance_m) == (1, 12.5)
+    assert (reading.horizontal_angle_rad, reading.zenith_angle_rad) == (1.0, 1.5)
+    assert (reading.status, reading.raw_status, reading.instrument_time_ns) == (Status.LOW_ACCURACY, 1284, 7)
+
+
+async def test_commands_and_their_answers() -> None:
+    """The program is told what to do in its own format."""
+    instrument, program, _ = await tracking()
+    await instrument.track(2, Direction(horizontal_angle_rad=1.0, zenith_angle_rad=1.5, spread_rad=0.1))
+    await instrument.set_atmosphere(Atmosphere(temperature_c=12.0, pressure_hpa=950.0))
+    await instrument.direct()
+    towards = {"horizontal_angle_rad": 1.0, "zenith_angle_rad": 1.5, "spread_rad": 0.1}
+    assert program.commands == [
+        {"type": "track", "id": 1, "prism": 1, "towards": None},
+        {"type": "track", "id": 2, "prism": 2, "towards": towards},
+        {"type": "atmosphere", "id": 3, "temperature_c": 12.0, "pressure_hpa": 950.0},
+        {"type": "direct", "id": 4},
+    ]
+
+
+async def test_what_the_program_refuses_changes_nothing() -> None:
+    """It goes on tracking the prism that it tracked."""
+    instrument, program, _ = await tracking()
+    program.on_command = lambda command: program.done(command, "there is no prism 9\x1b[31m")
+    with pytest.raises(InstrumentRefusedError, match=r"bridge: track: there is no prism 9 \[31m"):
+        await instrument.track(9)
+    program.measure()
+    assert (await instrument.read()).prism == 1
+
+
+async def test_a_program_that_takes_no_commands_can_be_tracked_with() -> None:
+    """It measures what a person has set up; everything else is refused, and nothing is sent."""
+    instrument, program, _ = await tracking(HELLO)
+    program.measure()
+    assert (await instrument.read()).prism == 1
+    for refused in (
+        instrument.direct(),
+        instrument.measure(),
+        instrument.set_atmosphere(Atmosphere(temperature_c=12.0, pressure_hpa=950.0)),
+    ):
+        with pytest.raises(InstrumentRefusedError):
+            await refused
+    assert program.commands == []
+
+
+async def test_a_single_measurement() -> None:
+    """The shot answers the command; one without a target is an answer too, and so is an error."""
+    instrument, program, _ = await tracking()
+    with pytest.raises(InstrumentRefusedError, match="call direct first"):
+        await instrument.measure()
+    await instrument.direct()
+    shot = measured(20.0) | {"type": "shot"}
+    program.on_command = lambda command: program.say(shot | {"id": command["id"]})
+    reading = await instrument.measure()
+    assert (reading.prism, reading.slope_distance_m, reading.at_ns) == (None, 20.0, CLOCK.monotonic_ns())
+    program.on_command = lambda command: program.say(
+        {"type": "shot", "id": command["id"], "status": "no_target"}
+    )
+    reading = await instrument.measure()
+    assert (reading.status, reading.slope_distance_m) == (Status.NO_TARGET, None)
+    for answer in (shot | {"slope_distance_m": -1.0}, {"type": "done"}, {"type": "done", "error": "no foil"}):
+        program.on_command = lambda command, answer=answer: program.say(answer | {"id": command["id"]})  # type: ignore[misc]
+        with pytest.raises(InstrumentRefusedError, match=r"expected metres|gives no measurement|no foil"):
+            await instrument.measure()
+
+
+async def test_after_a_change_nothing_of_the_old_prism_is_read() -> None:
+    """What was measured before the answer is of the old prism; a line that names another one is not believed."""
+    instrument, program, _ = await tracking()
+    program.measure(1.0)
+
+    def answer(command: dict[str, Any]) -> None:
+        program.say(program.measurement(2.0), {"type": "done", "id": command["id"]}, program.measurement(3.0))
+
+    program.on_command = answer
+    await asyncio.sleep(0.4)
+    await instrument.track(3)
+    await asyncio.sleep(0.4)
+    program.measure(4.0, prism=1)
+    program.measure(5.0, prism=3)
+    assert [(reading.prism, reading.slope_distance_m) for reading in await waiting(instrument)] == [(3, 5.0)]
+
+
+async def test_each_measurement_counts_once() -> None:
+    """A line with the time of the one before it is a repeat, also after the program was started anew."""
+    instrument, program, start = await tracking()
+    line = program.measurement(instrument_time_ns=1000)
+    program.say(line, line)
+    program.measure(host_time_ns=CLOCK.monotonic_ns(), instrument_time_ns=1000)
+    program.exit()
+    assert len(await instrument_readings(instrument)) == 1
+    await instrument.connect()
+    await instrument.track(1)
+    start.programs[1].say(line)
+    assert await waiting(instrument) == []
+
+
+async def test_a_coarse_time_of_the_instrument_loses_nothing() -> None:
+    """Where it has whole seconds only, other numbers tell that it is another measurement."""
+    instrument, program, _ = await tracking()
+    for number in range(10):
+        await asyncio.sleep(0.4)
+        program.measure(1.0 + number, instrument_time_ns=CLOCK.monotonic_ns() // 10**9 * 10**9)
+    assert len(await waiting(instrument)) == 10
+
+
+async def instrument_readings(instrument: BridgeInstrument) -> list[Reading]:
+    """Read until the program is lost."""
+    readings = []
+    try:
+        while True:
+            readings.append(await instrument.read())
+    except InstrumentError:
+        return readings
+
+
+async def test_what_came_before_the_end_is_read_before_the_error() -> None:
+    """Nothing that was measured is lost with the program, even if somebody connects before it is read."""
+    instrument, program, _ = await tracking()
+    program.measure(1.0)
+    await asyncio.sleep(0.4)
+    program.measure(2.0)
+    program.exit("exit status 3: no license")
+    assert (await instrument.read()).slope_distance_m == 1.0
+    await instrument.connect()
+    await instrument.track(1)
+    assert (await instrument.read()).slope_distance_m == 2.0
+
+
+async def test_an_end_is_said_with_its_reason() -> None:
+    """The error has the program, how it ended, and what it complained of."""
+    instrument, program, _ = await tracking()
+    program.exit("exit status 3: no license")
+    with pytest.raises(InstrumentError, match=r"bridge: the program has ended \(exit status 3: no license\)"):
+        await instrument.read()
+    assert "no license" in instrument.condition.problem
+
+
+async def test_silence_while_tracking_is_a_stall() -> None:
+    """After silence_s the program is killed; a sign of life gives it so long again, rubbish does not."""
+    instrument, program, _ = await tracking()
+    began_ns = CLOCK.monotonic_ns()
+
+    async def talk() -> None:
+        await asyncio.sleep(4.0)
+        program.say({"type": "status", "activity": "looking around"})
+        await asyncio.sleep(4.0)
+        program.say(b"rubbish")
+
+    talking = asyncio.create_task(talk())
+    with pytest.raises(
+        InstrumentError, match=r"has said nothing for 5 s \(a line of the program cannot be used"
+    ):
+        await instrument.read()
+    assert CLOCK.monotonic_ns() - began_ns == 9_000_000_000
+    assert program.ended
+    await talking
+
+
+async def test_in_direct_mode_silence_is_no_stall() -> None:
+    """A program has nothing to say while a person aims."""
+    instrument, program, _ = await tracking()
+    await instrument.direct()
+    await asyncio.sleep(3600.0)
+    await instrument.check()
+    await instrument.track(1)
+    program.measure()
+    await instrument.read()
+
+
+async def test_in_direct_mode_the_end_of_the_program_is_missed() -> None:
+    """Nobody reads then, but the client asks."""
+    instrument, program, _ = await tracking()
+    await instrument.direct()
+    program.exit("exit status 3")
+    with pytest.raises(InstrumentError, match="has ended"):
+        await instrument.check()
+
+
+async def test_a_command_without_an_answer_is_a_stall() -> None:
+    """It is waited for 30 s, whatever else the program says."""
+    instrument, program, _ = await tracking()
+    program.on_command = lambda _: program.say({"type": "done", "id": 77})
+    began_ns = CLOCK.monotonic_ns()
+    with pytest.raises(InstrumentError, match="does not answer to direct"):
+        await instrument.direct()
+    assert CLOCK.monotonic_ns() - began_ns == 30_000_000_000
+    assert program.ended
+
+
+async def test_a_program_may_take_its_time_to_find_the_instrument() -> None:
+    """With status lines it may wait for ever; without a word it has 30 s."""
+    start = FakeStart(CLOCK)
+    instrument = BridgeInstrument(CONFIG, CLOCK, start)
+    connecting = asyncio.create_task(instrument.connect())
+    for _ in range(10):
+        await asyncio.sleep(20.0)
+        start.programs[0].say({"type": "status", "problem": "switch the instrument on"})
+        assert instrument.condition.problem == "switch the instrument on"
+    start.programs[0].say(HELLO)
+    await connecting
+    began_ns = CLOCK.monotonic_ns()
+    with pytest.raises(InstrumentError, match="has not said hello"):
+        await instrument.connect()
+    assert CLOCK.monotonic_ns() - began_ns == 30_000_000_000
+
+
+async def test_another_version_is_refused() -> None:
+    """The error names both, and the program is ended."""
+    start = FakeStart(CLOCK, {"type": "hello", "bridge": 2})
+    instrument = BridgeInstrument(CONFIG, CLOCK, start)
+    with pytest.raises(
+        InstrumentError, match=r"speaks version 2 of the bridge's lines, and this client version 1"
+    ):
+        await instrument.connect()
+    assert start.programs[0].ended
+
+
+async def test_a_second_hello_ends_the_run() -> None:
+    """A wrapper has started its program anew, which knows nothing of what it was told."""
+    instrument, program, _ = await tracking()
+    program.say(FULL)
+    with pytest.raises(InstrumentError, match="begun anew"):
+        await instrument.read()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        b"Vendor SDK 3.2, Copyright",
+        b"\xff\xfe\x00",
+        b"[" * 5000,
+        b'{"type":"measurement"' + b" " * 100_000 + b"}",
+        b'{"type":"measurement","status":"ok","horizontal_angle_rad":NaN}',
+        {"slope_distance_m": 1e400},
+        {"slope_distance_m": -1},
+        {"slope_distance_m": 0},
+        {"slope_distance_m": 12_345_678},
+        {"slope_distance_m": None},
+        {"slope_distance_m": "12"},
+        {"horizontal_angle_rad": 200.0},
+        {"zenith_angle_rad": -0.1},
+        {"status": "fine"},
+        {"status": None},
+        {"raw_status": 1 << 40},
+        {"host_time_ns": None},
+        {"host_time_ns": -1},
+        {"host_time_ns": 1.5e9},
+        {"host_time_ns": 10**400},
+        {"host_time_ns": 1_700_000_000_000_000_000},
+        {"host_time_ns": 60_000_000_001},
+        {"host_time_ns": 49_000_000_000},
+        {"prism": 2},
+    ],
+)
+async def test_a_line_that_cannot_be_is_refused(wrong: bytes | dict[str, Any]) -> None:
+    """It is said in the log and in the condition, and the next good line is read as if nothing had been."""
+    with capture_logs() as logs:
+        instrument, program, _ = await tracking()
+        program.say(wrong if isinstance(wrong, bytes) else program.measurement() | wrong)
+        assert await waiting(instrument) == []
+        assert "cannot be used" in instrument.condition.problem
+        await asyncio.sleep(0.4)
+        program.measure()
+        assert len(await waiting(instrument)) == 1
+    assert [entry["event"] for entry in logs] == ["bridge_line_refused"]
+    assert len(logs[0]["line"]) <= 200
+    assert instrument.condition.problem == ""
+
+
+async def test_refusals_are_logged_once_a_minute() -> None:
+    """With their number."""
+    with capture_logs() as logs:
+        _, program, _ = await tracking()
+        for _ in range(130):
+            await asyncio.sleep(1.0)
+            program.say(b"rubbish")
+    assert [entry["refused"] for entry in logs] == [1, 61, 121]
+
+
+@pytest.mark.parametrize("flood", [b"{}\n" * 2000, b"x" * 2_000_000, b"\n" * 3000])
+async def test_a_program_that_runs_wild_is_ended(flood: bytes) -> None:
+    """Neither many lines nor one without an end keep the client busy."""
+    instrument, program, _ = await tracking()
+    program.print(flood)
+    assert program.ended
+    with pytest.raises(InstrumentError, match="more than 1000 lines in a second"):
+        await instrument.read()
+
+
+async def test_rubbish_in_pieces_does_no_harm() -> None:
+    """Random bytes between good lines, in random pieces: each good line is read once, and nothing else."""
+    generator = random.Random(1)  # noqa: S311 (no secrets)
+    instrument, program, _ = await tracking()
+    count = 200
+    for number in range(count):
+        await asyncio.sleep(0.4)
+        good = b"\n" + repr(program.measurement(1.0 + number)).replace("'", '"').encode() + b"\n"
+        data = generator.randbytes(generator.randrange(300)) + good + generator.randbytes(20) + b"\n"
+        while data:
+            cut = generator.randrange(1, 100)
+            program.print(data[:cut])
+            data = data[cut:]
+    readings = await waiting(instrument)
+    assert [reading.slope_distance_m for reading in readings] == [1.0 + number for number in range(count)]
+
+
+async def test_a_missing_target_is_news_twice_a_second_at_most() -> None:
+    """Every change of the status is, and the first one after a measurement."""
+    instrument, program, _ = await tracking()
+    for _ in range(100):
+        await asyncio.sleep(0.05)
+        program.say({"type": "measurement", "status": "no_target"})
+    assert len(await waiting(instrument)) == 10
+    for status in ("no_target", "angle_only", "no_target"):
+        program.measure()
+        await asyncio.sleep(0.01)
+        program.say({"type": "measurement", "status": status})
+    assert len(await waiting(instrument)) == 6
+
+
+async def test_without_times_the_arrival_is_the_stamp() -> None:
+    """It is exact only for lines that come alone: of several in one piece nobody knows when each was made."""
+    instrument, program, _ = await tracking(HELLO | {"stamps": "arrival"})
+    program.say(measured(1.0))
+    at_ns = CLOCK.monotonic_ns()
+    await asyncio.sleep(0.4)
+    program.say(measured(2.0), measured(3.0))
+    assert [(reading.slope_distance_m, reading.at_ns) for reading in await waiting(instrument)] == [
+        (1.0, at_ns)
+    ]
+    assert "flush" in instrument.condition.problem
+
+
+async def test_the_instruments_own_time_is_put_on_the_hosts_clock() -> None:
+    """The jitter of the way does not matter, and the first lines wait until the clock is known."""
+    generator = random.Random(2)  # noqa: S311 (no secrets)
+    instrument, program, _ = await tracking(HELLO | {"stamps": "instrument", "clock": "power-on"})
+    true_ns, readings = {}, []
+    for number in range(300):
+        await asyncio.sleep(0.4)
+        made_ns = CLOCK.monotonic_ns()
+        time_ns = 3_600_000_000_000 + round(made_ns * (1 + 20e-6))
+        true_ns[time_ns] = made_ns
+        await asyncio.sleep(generator.expovariate(1 / 0.005) if number != 100 else 1.0)
+        program.say(measured(instrument_time_ns=time_ns))
+        readings += await waiting(instrument)
+        if number == 3:
+            assert readings == []
+    assert [reading.instrument_time_ns for reading in readings] == list(true_ns)
+    errors_ms = [(reading.at_ns - true_ns[reading.instrument_time_ns or 0]) / 1e6 for reading in readings]
+    assert max(map(abs, errors_ms)) < 4.0
+    assert max(map(abs, errors_ms[20:])) < 1.5
+
+
+async def test_an_instrument_that_was_switched_off_and_on() -> None:
+    """Until its new time is known nothing is read, and then nothing with a wrong time."""
+    instrument, program, _ = await tracking(HELLO | {"stamps": "instrument"})
+    switched_on_ns, readings, true_ns = 0, [], {}
+    for number in range(60):
+        await asyncio.sleep(0.4)
+        if number == 30:
+            switched_on_ns = CLOCK.monotonic_ns() - 1
+        time_ns = CLOCK.monotonic_ns() - switched_on_ns
+        true_ns[time_ns] = CLOCK.monotonic_ns()
+        program.say(measured(instrument_time_ns=time_ns))
+        readings += await waiting(instrument)
+    assert len(readings) > 55
+    assert all(abs(reading.at_ns - true_ns[reading.instrument_time_ns or 0]) < 1e6 for reading in readings)
+
+
+async def test_condition_and_record_follow_what_the_program_says() -> None:
+    """Battery, problems and settings; the record changes with the settings only."""
+    assert BridgeInstrument(CONFIG, CLOCK).record is None
+    config = CONFIG.model_copy(update={"latency_ms": 3.0})
+    instrument, program, _ = await tracking(HELLO | {"model": "S7"}, config)
+    before = instrument.record
+    assert (instrument.condition.activity, instrument.condition.problem) == ("tracking", "")
+    program.say({"type": "status", "problem": "not level", "battery_percent": 30})
+    assert instrument.record == before
+    assert (instrument.condition.problem, instrument.condition.battery_percent) == ("not level", 30)
+    program.say({"type": "settings", "prism_type": "360", "prism_constant_m": 0.002})
+    record = instrument.record
+    assert record is not None
+    assert (record.make, record.model, record.prism_type, record.latency_ns) == (
+        "Fake",
+        "S7",
+        "360",
+        3_000_000,
+    )
+    assert record.prism_constant_m == 0.002
+
+
+async def test_a_cancelled_reading_takes_nothing_away() -> None:
+    """Whoever gives up waiting gets that reading with the next call."""
+    instrument, program, _ = await tracking()
+    readings: list[Reading] = []
+    for number in range(40):
+        program.measure(1.0 + number)
+        await asyncio.sleep(0.1)
+        readings += await waiting(instrument)
+    assert len(readings) == 40
+
+
+async def test_a_program_that_always_ends_is_started_with_pauses() -> None:
+    """The keeper starts it about once a second, for ever, and says why once."""
+    start = FakeStart(CLOCK)
+    instrument = BridgeInstrument(CONFIG, CLOCK, start)
+    keeper = InstrumentKeeper(
+        instrument,
+        Session(1, 1),
+        CLOCK,
+        on_reading=lambda _: None,
+        on_record=lambda _: None,
+        on_done=lambda _: None,
+    )
+
+    async def end_each() -> None:
+        while True:
+            await asyncio.sleep(0.01)
+            for program in start.programs:
+                if not program.ended:
+                    program.exit("exit status 1: no licence")
+
+    with capture_logs() as logs:
+        tasks = [asyncio.create_task(keeper.keep()), asyncio.create_task(end_each())]
+        await asyncio.sleep(60.0)
+        for task in tasks:
+            task.cancel()
+        await asyncio.wait(tasks)
+    assert 55 <= len(start.programs) <= 65
+    assert [entry["event"] for entry in logs] == ["instrument_lost"]
+    assert "no licence" in keeper.condition.problem
+
+
+async def test_a_program_that_ends_at_random_loses_and_doubles_nothing() -> None:
+    """Each measurement that it has printed reaches the client once, though each run begins with the last one again."""
+    generator = random.Random(3)  # noqa: S311 (no secrets)
+    start = FakeStart(CLOCK, FULL)
+    instrument = BridgeInstrument(CONFIG, CLOCK, start)
+    readings: list[Reading] = []
+    keeper = InstrumentKeeper(
+        instrument,
+        Session(1, 1),
+        CLOCK,
+        on_reading=readings.append,
+        on_record=lambda _: None,
+        on_done=lambda _: None,
+    )
+    keeping = asyncio.create_task(keeper.keep())
+    said: list[float] = []
+    last: dict[str, Any] | None = None
+    with capture_logs():
+        for number in range(5000):
+            await asyncio.sleep(0.05)
+            program = start.programs[-1]
+            tracks = any(command["type"] == "track" for command in program.commands)
+            if program.ended or not tracks:
+                continue
+            if last is not None:
+                program.say(last)
+            last = program.measurement(1.0 + number)
+            program.say(last)
+            said.append(1.0 + number)
+            if generator.random() < 0.05:
+                program.exit()
+        await asyncio.sleep(3.0)
+        keeping.cancel()
+        await asyncio.wait([keeping])
+    assert len(start.programs) > 50
+    assert [reading.slope_distance_m for reading in readings] == said

@@ -1,0 +1,165 @@
+"""GeoCOM in ASCII: lines as the manual prints them, and what the return codes mean."""
+
+from __future__ import annotations
+
+import pytest
+
+from tsgt.errors import MessageError
+from tsgt.station.geocom.codec import Byte, Rpc, decode_reply, encode_request
+from tsgt.station.geocom.codes import ReturnCode, Verdict, name_of, verdict
+
+
+def test_requests_as_they_go_over_the_line() -> None:
+    """Without and with a transaction, without and with parameters, and with a checksum."""
+    assert encode_request(Rpc.COM_NULL_PROC) == b"%R1Q,0:\r\n"
+    assert encode_request(Rpc.TMC_GET_FULL_MEAS, (100, 1), transaction=7) == b"%R1Q,2167,7:100,1\r\n"
+    assert (
+        encode_request(Rpc.AUT_MAKE_POSITIONING, (1.5, -0.25, 0, False, True), transaction=32_767)
+        == b"%R1Q,9027,32767:1.5,-0.25,0,0,1\r\n"
+    )
+    assert encode_request(Rpc.BAP_SET_PRISM_TYPE2, (9, "a,b")) == b'%R1Q,17030:9,"a,b"\r\n'
+    assert encode_request(5007, (2026, Byte(0x0B))) == b"%R1Q,5007:2026,'0B'\r\n"
+    with_checksum = encode_request(Rpc.COM_NULL_PROC, transaction=1, checksum=True)
+    assert with_checksum.startswith(b"%R1Q,0,1,")
+
+
+@pytest.mark.parametrize(
+    ("value", "decimals", "text"),
+    [
+        (6.58e-7, 10, "0.000000658"),
+        (1 / 3, 4, "0.3333"),
+        (2.0, 10, "2.0"),
+        (2.5, 0, "2.0"),
+        (0.0, 10, "0.0"),
+        (-1e-3, 10, "-0.001"),
+        (400, 10, "400"),
+        (True, 10, "1"),
+        ("", 10, '""'),
+        ('5" \\ %~\n', 10, r'"5\x22 \x5c \x25\x7e\x0a"'),
+        ("Ä", 10, r'"\xc4"'),
+    ],
+)
+def test_parameters_as_they_go_over_the_line(value: float | str, decimals: int, text: str) -> None:
+    """Never an exponent, no zeros at the end but one, nothing in a text that could end it or the line."""
+    assert encode_request(1, (value,), decimals=decimals) == f"%R1Q,1:{text}\r\n".encode()
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), Byte(256), Byte(-1), "€"])
+def test_what_cannot_be_sent_is_refused(value: float | str) -> None:
+    """A number that is none, a byte that is none, a character that GeoCOM has not."""
+    with pytest.raises(MessageError):
+        encode_request(1, (value,))
+
+
+@pytest.mark.parametrize("transaction", [0, -1, 32_768])
+def test_a_transaction_has_fifteen_bits(transaction: int) -> None:
+    """Beyond, an instrument would give it back with a sign; 0 means none."""
+    with pytest.raises(MessageError, match="between 1 and 32767"):
+        encode_request(1, transaction=transaction)
+
+
+def test_a_checksum_needs_a_transaction() -> None:
+    """It is the third number of the header."""
+    with pytest.raises(MessageError, match="needs a transaction"):
+        encode_request(1, checksum=True)
+
+
+def test_replies_as_they_come() -> None:
+    """Numbers with and without exponent, texts with commas and escapes, bytes, and replies with no value at all."""
+    reply = decode_reply(b'%R1P,0,12:1284,1.5,-0.1e-07,3,"TS16, 1\\"",\'2f\',0x1F,""\r\n')
+    assert (reply.com_code, reply.transaction, reply.code) == (0, 12, 1284)
+    assert reply.values == (1.5, -0.1e-7, 3, 'TS16, 1"', 0x2F, 31, "")
+    assert decode_reply(b"%R1P,0,0:0").values == ()
+    assert decode_reply(b"%R1P,3081,4:0").com_code == 3081
+    assert decode_reply(b"%R1P,3077:").com_code == 3077
+    assert decode_reply(b"%R1P,0:27").transaction == 0
+    assert decode_reply(b'%R1P,0,1:0,"a\\x0d\\\\\\%"').values == ("a\r\\%",)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"",
+        b"?",
+        b"%R1Q,0,1:",
+        b"%R1P,0,1",
+        b"%R1P,0,1:",
+        b"%R1P,x,1:0",
+        b"%R1P,0,1:0,",
+        b"%R1P,0,1:0,,1",
+        b"%R1P,0,1:0,1.2.3",
+        b"%R1P,0,1:0,nan",
+        b"%R1P,0,1:0,inf",
+        b"%R1P,0,1:0,1e999",
+        b"%R1P,0,1:0,1_000",
+        b'%R1P,0,1:0,"open',
+        b'%R1P,0,1:0,"a"b',
+        b"%R1P,0,1:0,'zz'",
+        b'%R1P,0,1:"text"',
+        b"%R1P,0,1:0.5",
+        b"%R1P,0,1:'00'",
+        b"%R1P,0,1:0,\xb2",
+        b"%R1P,0,1:0,1\x00",
+        b"%R1P,0,1234567:0",
+    ],
+)
+def test_damaged_replies_are_refused(line: bytes) -> None:
+    """Cut, mixed up, or with what no instrument sends."""
+    with pytest.raises(MessageError):
+        decode_reply(line)
+
+
+def test_a_checksum_is_checked_where_there_is_one() -> None:
+    """Wrong, it is refused in any case; missing, only where it was agreed on and the request got through."""
+    line = encode_request(0, (0, 5), transaction=3, checksum=True).replace(b"%R1Q", b"%R1P")
+    with pytest.raises(MessageError, match="checksum is"):
+        decode_reply(line)
+    with pytest.raises(MessageError, match="without its checksum"):
+        decode_reply(b"%R1P,0,3:0", checksum=True)
+    assert decode_reply(b"%R1P,3110,3:0", checksum=True).com_code == 3110
+
+
+@pytest.mark.parametrize(
+    ("code", "with_values", "without"),
+    [
+        (0, Verdict.USABLE, Verdict.USABLE),
+        (16, Verdict.USABLE, Verdict.USABLE),
+        (1283, Verdict.LOW_ACCURACY, Verdict.NOTHING),
+        (1284, Verdict.LOW_ACCURACY, Verdict.NOTHING),
+        (1285, Verdict.ANGLE_ONLY, Verdict.NOTHING),
+        (1288, Verdict.ANGLE_ONLY, Verdict.NOTHING),
+        (1289, Verdict.ANGLE_ONLY, Verdict.NOTHING),
+        (1290, Verdict.TILT, Verdict.TILT),
+        (1291, Verdict.WRONG_DISTANCE, Verdict.WRONG_DISTANCE),
+        (1292, Verdict.NO_TARGET, Verdict.NO_TARGET),
+        (1293, Verdict.BUSY, Verdict.BUSY),
+        (1294, Verdict.ERROR, Verdict.ERROR),
+        (1381, Verdict.LOW_ACCURACY, Verdict.ERROR),
+        (1399, Verdict.LOW_ACCURACY, Verdict.ERROR),
+        (517, Verdict.NO_TARGET, Verdict.NO_TARGET),
+        (524, Verdict.NO_TARGET, Verdict.NO_TARGET),
+        (8710, Verdict.NO_TARGET, Verdict.NO_TARGET),
+        (27, Verdict.LICENCE, Verdict.LICENCE),
+        (5, Verdict.UNAVAILABLE, Verdict.UNAVAILABLE),
+        (3081, Verdict.UNAVAILABLE, Verdict.UNAVAILABLE),
+        (12, Verdict.SHUT_DOWN, Verdict.SHUT_DOWN),
+        (13, Verdict.BUSY, Verdict.BUSY),
+        (3108, Verdict.ASLEEP, Verdict.ASLEEP),
+        (22, Verdict.TILT, Verdict.TILT),
+        (770, Verdict.ERROR, Verdict.ERROR),
+        (8714, Verdict.ERROR, Verdict.ERROR),
+        (4711, Verdict.ERROR, Verdict.ERROR),
+    ],
+)
+def test_what_a_code_means(code: int, with_values: Verdict, without: Verdict) -> None:
+    """Which measurements may be used, which have angles only, and what else is to be told apart."""
+    assert verdict(code, has_values=True) is with_values
+    assert verdict(code, has_values=False) is without
+
+
+def test_codes_have_names_and_families() -> None:
+    """A known code by its name, another one by the part of the instrument that it is from."""
+    assert name_of(ReturnCode.NA) == "27 NA"
+    assert name_of(1284) == "1284 TMC_ACCURACY_GUARANTEE"
+    assert name_of(8799) == "8799 (unknown, of AUT)"
+    assert name_of(65_000) == "65000 (unknown)"

@@ -1,0 +1,563 @@
+"""The driver for Leica instruments, on a simulated instrument at the end of a simulated line."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+import pytest
+from harness.leica import leica_bench, leica_config
+
+from tsgt.config.scenario import InstrumentModelConfig, StatusFaultConfig
+from tsgt.errors import InstrumentError, InstrumentRefusedError
+from tsgt.model import Status
+from tsgt.radio.commands import Direction
+from tsgt.simulation.instrument.geocom.server import Forced
+from tsgt.station.geocom.codec import Rpc
+from tsgt.station.geocom.codes import ReturnCode
+from tsgt.station.geocom.connection import Reply
+from tsgt.station.instrument import Atmosphere
+from tsgt.station.instrument_supervisor import InstrumentKeeper
+from tsgt.station.leica.reacquisition import Look
+from tsgt.station.leica.search import Finder
+from tsgt.station.session import Session
+
+if TYPE_CHECKING:
+    from tsgt.station.geocom.connection import GeoComConnection
+
+
+def hidden(start_s: float, end_s: float) -> StatusFaultConfig:
+    """Return a time in which nothing can be seen."""
+    return StatusFaultConfig(station=1, status="no_target", start_s=start_s, end_s=end_s)
+
+
+# --- Tracking -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rate_hz", [2.5, 7.0, 20.0])
+async def test_every_distance_that_was_offered_is_read_once(rate_hz: float) -> None:
+    """Whatever the rate: no repeats, nothing left out, values as they were offered."""
+    async with leica_bench(rate_hz=rate_hz) as day:
+        await day.begin()
+        readings = await day.read_for(60.0)
+    offered = day.station.offered
+    assert 0 <= len(offered) - len(readings) <= 1
+    for reading, source in zip(readings, offered, strict=False):
+        assert reading.instrument_time_ns == source.instrument_ms * 1_000_000
+        assert reading.slope_distance_m == pytest.approx(source.distance_m, abs=1e-9)
+
+
+async def test_hardly_a_tick_of_a_fast_instrument_is_missed() -> None:
+    """At 20 Hz with short answers nearly every tick is there."""
+    model = InstrumentModelConfig(processing_min_ms=5.0, processing_max_ms=10.0)
+    async with leica_bench(rate_hz=20.0, model=model) as day:
+        await day.begin()
+        readings = await day.read_for(60.0)
+    assert len(readings) > 0.97 * 60 * 20
+
+
+async def test_times_are_those_of_the_distances() -> None:
+    """After half a minute a stamp without the fastest way of an answer, 20 ms here, is hardly off."""
+    async with leica_bench(leica_config(latency_ms=20.0)) as day:
+        await day.begin()
+        await day.read_for(30.0)
+        readings = await day.read_for(60.0)
+    true_ns = {offered.instrument_ms: offered.true_ns for offered in day.station.offered}
+    errors_ms = [(r.at_ns - true_ns[(r.instrument_time_ns or 0) // 1_000_000]) / 1e6 for r in readings]
+    assert np.median(errors_ms) == pytest.approx(0.0, abs=0.9)
+    assert max(errors_ms) - min(errors_ms) < 5
+    assert all(r.received_ns is not None and r.received_ns > r.at_ns for r in readings)
+
+
+async def test_about_two_questions_are_asked_for_a_slow_distance() -> None:
+    """Where distances come every 400 ms, most questions in between would be for nothing."""
+    async with leica_bench() as day:
+        await day.begin()
+        await day.read_for(20.0)
+        asked = 0
+        receive = day.station.receive
+
+        def counting(data: bytes) -> None:
+            nonlocal asked
+            asked += b",2167," in data or b"Q,2167" in data
+            receive(data)
+
+        day.station.receive = counting  # type: ignore[method-assign]
+        readings = await day.read_for(60.0)
+    assert len(readings) > 145
+    assert asked < 2.6 * len(readings)
+
+
+async def test_a_cancelled_reading_costs_nothing() -> None:
+    """Whoever gives up waiting gets the same distances with the next calls."""
+    async with leica_bench() as day:
+        await day.begin()
+        times = []
+        for _ in range(100):
+            times += [reading.instrument_time_ns for reading in await day.read_for(0.13)]
+    assert len(times) == len(set(times))
+    assert [time // 1_000_000 for time in times if time] == [
+        offered.instrument_ms for offered in day.station.offered[: len(times)]
+    ]
+
+
+# --- The lock -----------------------------------------------------------------------------------------------------
+
+
+async def test_a_lock_is_kept_over_a_connection() -> None:
+    """Neither connecting nor setting up lets the prism go, for which a person would be needed."""
+    async with leica_bench() as day:
+        await day.begin()
+        await day.read_for(1.0)
+        await day.instrument.close()
+        await day.begin()
+        assert (await day.instrument.read()).status is Status.OK
+        assert day.instrument.condition.activity == "tracking prism 1"
+        assert not day.station.beeps
+
+
+async def test_a_short_occlusion_is_bridged_by_the_instrument() -> None:
+    """While it predicts nothing is searched; readings say that there is no prism, once, and go on after it."""
+    async with leica_bench(faults=[hidden(20.0, 21.0)]) as day:
+        await day.begin()
+        await day.read_for(19.0 - day.now_s)
+        during = await day.read_for(2.0)
+        after = await day.read_until(Status.OK, within_s=2.0)
+    assert Status.NO_TARGET in {reading.status for reading in during}
+    assert after.prism == 1
+
+
+async def test_a_lost_prism_is_found_again() -> None:
+    """After a long occlusion the telescope searches, and tracks on; readings say NO_TARGET at least every second."""
+    async with leica_bench(faults=[hidden(20.0, 40.0)]) as day:
+        await day.begin()
+        await day.read_for(22.0 - day.now_s)
+        lost = await day.read_for(17.0)
+        assert {reading.status for reading in lost} == {Status.NO_TARGET}
+        assert 8 <= len(lost) <= 36
+        assert max(np.diff([reading.at_ns for reading in lost])) < 1.5e9
+        found = await day.read_until(Status.OK, within_s=60.0)
+        assert found.prism == 1
+        assert len(await day.read_for(10.0)) >= 24
+
+
+async def test_the_master_says_where_to_look() -> None:
+    """A prism that has gone elsewhere is found at once where the order says it is."""
+    async with leica_bench(leica_config(search_window_deg=10.0)) as day:
+        await day.begin()
+        reading = await day.instrument.read()
+        day.station.blocked = True
+        await day.read_until(Status.NO_TARGET, within_s=5.0)
+        day.station.telescope.turn_to((reading.horizontal_angle_rad + 1.5, math.pi / 2))
+        await day.read_for(4.0)
+        day.station.blocked = False
+        towards = Direction(reading.horizontal_angle_rad, reading.zenith_angle_rad, 0.05)
+        await day.instrument.track(1, towards)
+        found = await day.read_until(Status.OK, within_s=12.0)
+    assert found.prism == 1
+
+
+async def test_an_order_leaves_a_search_alone_that_has_found_the_prism() -> None:
+    """One that comes while the instrument locks in does not send the telescope elsewhere."""
+    async with leica_bench(leica_config(search_window_deg=10.0)) as day:
+        await day.begin()
+        reading = await day.instrument.read()
+        day.station.blocked = True
+        await day.read_until(Status.NO_TARGET, within_s=5.0)
+        await day.read_for(4.0)
+        day.station.blocked = False
+        elsewhere = Direction(reading.horizontal_angle_rad + 1.0, reading.zenith_angle_rad, 0.05)
+        while not day.instrument.condition.activity.startswith("looking") or not day.station.settings.lock:
+            await day.read_for(0.05)
+        await day.instrument.track(1, elsewhere)
+        found = await day.read_until(Status.OK, within_s=2.0)
+    assert found.prism == 1
+
+
+async def test_a_lock_by_hand_during_a_search_that_fails_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next search would begin with letting go of it."""
+    looks = []
+    async with leica_bench() as day:
+
+        async def fail(_: Finder, look: Look) -> bool:
+            looks.append(look)
+            day.station.blocked = False
+            day.station.lock_by_hand(1)
+            return False
+
+        monkeypatch.setattr(Finder, "look", fail)
+        await day.begin()
+        await day.read_for(3.0)
+        day.station.blocked = True
+        await day.read_until(Status.NO_TARGET, within_s=5.0)
+        await day.read_until(Status.OK, within_s=20.0)
+    assert len(looks) == 1
+
+
+async def test_a_lock_by_hand_during_a_search_ends_that() -> None:
+    """The instrument's answer that it was ended is no reason to search on."""
+    async with leica_bench() as day:
+        await day.begin()
+        await day.read_for(3.0)
+        day.station.blocked = True
+        while not (
+            day.instrument.condition.activity.startswith("searching") and day.station.telescope.moving
+        ):
+            await day.instrument.read()
+        day.station.blocked = False
+        day.station.lock_by_hand(1)
+        await day.read_until(Status.OK, within_s=2.0)
+
+
+@pytest.mark.parametrize(("misses", "called"), [(1, False), (3, True)])
+async def test_a_robot_that_drives_on_after_a_sweep_is_swept_for_again(misses: int, called: bool) -> None:  # noqa: FBT001
+    """It cannot be far, so that is done before a person is called; but not for ever."""
+    async with leica_bench() as day:
+        await day.begin()
+        await day.read_for(3.0)
+        day.station.blocked = True
+        while not day.instrument.condition.activity.startswith("searching around"):
+            await day.instrument.read()
+        day.station.blocked = False
+        day.station.server.forced.append(
+            Forced(code=ReturnCode.AUT_NO_TARGET, rpc=Rpc.AUT_FINE_ADJUST, times=misses)
+        )
+        await day.read_until(Status.OK, within_s=60.0)
+        assert bool(day.station.beeps) == called
+
+
+class LockedByHand:
+    """A line to an instrument that finds the prism; before it can point at it, a person ends that and locks in."""
+
+    def __init__(self) -> None:
+        self.asked: list[Rpc] = []
+
+    async def call(self, rpc: Rpc, *_: object, **__: object) -> Reply:
+        """Answer as that instrument does."""
+        self.asked.append(rpc)
+        values = (int(Rpc.AUT_FINE_ADJUST in self.asked),) if rpc is Rpc.MOT_READ_LOCK_STATUS else ()
+        code = ReturnCode.ABORT if rpc is Rpc.AUT_FINE_ADJUST else ReturnCode.OK
+        return Reply(code, values, 0, 1)
+
+
+async def test_a_lock_by_hand_after_a_sweep_is_kept() -> None:
+    """A prism that could not be pointed at is swept for again only while nobody has locked in on it."""
+    line = LockedByHand()
+    finder = Finder(cast("GeoComConnection", line), power_search=True)
+    assert await finder.look(Look("searching", sweep=True, centre=None, width_rad=0.1, height_rad=0.1))
+    assert line.asked.count(Rpc.AUT_PS_SEARCH_WINDOW) == 1
+
+
+async def test_a_person_is_called_when_nothing_helps() -> None:
+    """After all searches it beeps and says what is to be done; locked in by hand, it goes on."""
+    async with leica_bench(faults=[hidden(5.0, 200.0)]) as day:
+        await day.begin()
+        await day.read_for(100.0)
+        assert day.station.beeps
+        assert "point the telescope at prism 1" in day.instrument.condition.problem
+        await day.read_for(200.0 - day.now_s)
+        day.station.lock_by_hand(1)
+        await day.read_until(Status.OK, within_s=60.0)
+        assert day.instrument.condition.problem == ""
+
+
+async def test_another_prism_needs_a_person() -> None:
+    """Nothing tells prisms apart: until somebody has turned the telescope, and lets it rest, there is no target."""
+    async with leica_bench() as day:
+        await day.begin()
+        await day.read_for(2.0)
+        await day.instrument.track(2)
+        waiting = await day.read_for(10.0)
+        assert {reading.status for reading in waiting} == {Status.NO_TARGET}
+        assert {reading.prism for reading in waiting} == {2}
+        assert "point the telescope at prism 2" in day.instrument.condition.problem
+        assert day.station.beeps
+        day.station.telescope.turn_to((3.0, 1.5))
+        await asyncio.sleep(0.5)
+        day.station.aim_at_prism(2)
+        found = await day.read_until(Status.OK, within_s=20.0)
+        assert found.prism == 2
+        assert day.station.telescope.prism == 2
+        assert day.instrument.condition.problem == ""
+
+
+async def test_without_the_licence_a_person_does_it_all() -> None:
+    """It is said once; distances of what a person points at and locks in on are measured."""
+    async with leica_bench() as day:
+        day.station.robotic_licence = False
+        await day.begin()
+        readings = await day.read_for(10.0)
+        assert {reading.status for reading in readings} == {Status.OK}
+        assert "GeoCOM Robotic" in day.instrument.condition.problem
+
+
+async def test_a_change_of_prism_survives_the_cable() -> None:
+    """Unplugged while it waits for a person: it still does afterwards, and takes no old prism for the new one."""
+    async with leica_bench() as day:
+        await day.begin()
+        await day.read_for(2.0)
+        await day.instrument.track(2)
+        await day.read_for(2.0)
+        day.line.plugged = False
+        await day.instrument.close()
+        day.line.plugged = True
+        await day.begin(2)
+        assert {reading.status for reading in await day.read_for(8.0)} == {Status.NO_TARGET}
+
+
+async def test_another_prism_is_found_where_the_master_says() -> None:
+    """No person is needed then."""
+    async with leica_bench() as day:
+        await day.begin()
+        await day.read_for(2.0)
+        day.station.aim_at_prism(3)
+        horizontal_rad, zenith_rad = day.station.telescope.direction()
+        day.station.aim(None)
+        await day.instrument.track(3, Direction(horizontal_rad, zenith_rad, 0.002))
+        found = await day.read_until(Status.OK, within_s=15.0)
+        assert found.prism == 3
+        assert not day.station.beeps
+
+
+# --- What the instrument says of itself ---------------------------------------------------------------------------
+
+
+async def test_faults_have_their_status() -> None:
+    """Not level, a wrong correction, too close: each is said, and tracking goes on afterwards."""
+    faults = [
+        StatusFaultConfig(station=1, status="tilt", start_s=10.0, end_s=15.0),
+        StatusFaultConfig(station=1, status="wrong_distance", start_s=20.0, end_s=25.0),
+        StatusFaultConfig(station=1, status="angle_only", start_s=30.0, end_s=35.0),
+    ]
+    async with leica_bench(faults=faults) as day:
+        await day.begin()
+        readings = await day.read_for(45.0)
+    seen = {reading.status for reading in readings}
+    assert {Status.OK, Status.TILT, Status.WRONG_DISTANCE, Status.ANGLE_ONLY} <= seen
+    assert readings[-1].status.usable
+    assert all((reading.slope_distance_m is not None) == reading.status.usable for reading in readings)
+
+
+async def test_it_is_set_up_as_configured() -> None:
+    """Reflector, constant, mode, air and the rest are what is read back, and the record says so."""
+    config = leica_config(
+        prism_type="360",
+        prism_constant_mm=None,
+        atmosphere={"temperature_c": 25.0, "pressure_hpa": 900.0},
+        narrow_view=True,
+        angle_delay_ms=3.0,
+    )
+    async with leica_bench(config) as day:
+        day.station.settings.incline = False
+        await day.begin()
+        record = day.instrument.record
+    settings = day.station.settings
+    assert (settings.prism_type, settings.prism_constant_m) == (3, 0.0231)
+    assert (settings.edm_mode, settings.power_mode, settings.incline) == (9, 0, True)
+    assert settings.air[:3] == (6.58e-7, 900.0, 25.0)
+    assert settings.narrow_view
+    assert record is not None
+    assert (record.make, record.prism_type, record.prism_constant_m) == ("Leica", "360", 0.0231)
+    assert record.atmospheric_ppm == pytest.approx(43.0, abs=0.1)
+    assert (record.temperature_c, record.distance_mode) == (25.0, "continuous_fast")
+    assert record.angle_delay_ns == 3_000_000
+
+
+async def test_the_air_can_change_while_it_tracks() -> None:
+    """No lock is lost, the record follows; nonsense is refused and tracking goes on."""
+    async with leica_bench() as day:
+        await day.begin()
+        await day.instrument.read()
+        await day.instrument.set_atmosphere(Atmosphere(temperature_c=30.0, pressure_hpa=950.0))
+        assert day.station.settings.air[1:3] == (950.0, 30.0)
+        record = day.instrument.record
+        assert record is not None
+        assert record.pressure_hpa == 950.0
+        with pytest.raises(InstrumentRefusedError, match="atmosphere"):
+            await day.instrument.set_atmosphere(Atmosphere(temperature_c=30.0, pressure_hpa=100.0))
+        assert (await day.instrument.read()).status is Status.OK
+
+
+async def test_a_low_battery_is_said() -> None:
+    """With its charge, so that somebody can bring another one."""
+    async with leica_bench() as day:
+        day.station.battery_percent = 9.0
+        await day.begin()
+        await day.instrument.read()
+        assert day.instrument.condition.battery_percent == 9
+        assert "battery" in day.instrument.condition.problem
+
+
+# --- Single measurements ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("faces", [1, 2])
+async def test_single_measurements_of_a_foil(faces: int) -> None:
+    """True distance to the foil, in one face or two; without a target it says so; then it tracks again by itself."""
+    async with leica_bench(leica_config(target_faces=faces)) as day:
+        await day.begin()
+        await day.read_for(3.0)
+        await day.instrument.direct()
+        day.station.aim(None)
+        assert (await day.instrument.measure()).status is Status.NO_TARGET
+        day.station.aim(1)
+        shot = await day.instrument.measure()
+        assert shot.status.usable
+        assert shot.slope_distance_m == pytest.approx(20.6216, abs=0.01)
+        assert shot.horizontal_angle_rad == pytest.approx(math.tau - math.atan2(5, 20), abs=5e-4)
+        assert shot.zenith_angle_rad < math.pi
+        await day.instrument.track(1)
+        assert (await day.read_until(Status.OK, within_s=30.0)).prism == 1
+        assert day.station.settings.prism_constant_m == 0.0
+
+
+@pytest.mark.parametrize("code", [ReturnCode.TMC_BUSY, ReturnCode.FATAL])
+async def test_the_distance_of_the_last_shot_is_not_given_again(code: ReturnCode) -> None:
+    """An instrument that will not forget it has it still, whatever it is pointed at by now."""
+    async with leica_bench() as day:
+        await day.begin()
+        await day.instrument.direct()
+        day.station.aim(1)
+        first = await day.instrument.measure()
+        day.station.server.forced.append(Forced(code=code, rpc=Rpc.TMC_DO_MEASURE, times=1))
+        second = await day.instrument.measure()
+        assert second.instrument_time_ns != first.instrument_time_ns
+        day.station.server.forced.append(Forced(code=code, rpc=Rpc.TMC_DO_MEASURE, times=20))
+        with pytest.raises(InstrumentRefusedError, match="begins no new measurement"):
+            await day.instrument.measure()
+
+
+async def test_a_shot_is_set_up_anew_after_a_power_cycle() -> None:
+    """The instrument has forgotten that the target is a foil; nobody had told that it was off."""
+    async with leica_bench() as day:
+        await day.begin()
+        await day.instrument.direct()
+        day.station.aim(1)
+        before = await day.instrument.measure()
+        day.station.switch_off()
+        day.station.switch_on()
+        await asyncio.sleep(6.0)
+        day.station.settings.prism_type, day.station.settings.prism_constant_m = 0, 0.0
+        day.station.aim(1)
+        after = await day.instrument.measure()
+    assert before.slope_distance_m is not None
+    assert after.slope_distance_m == pytest.approx(before.slope_distance_m, abs=0.01)
+
+
+async def test_the_wrap_of_its_time_costs_some_seconds() -> None:
+    """After 24.8 days its milliseconds are negative: stamps are as good as before, and not as good as distances alone."""
+    async with leica_bench() as day:
+        day.station._on_since_ns = day.clock.monotonic_ns() - (2**31 - 15_000) * 1_000_000
+        await day.begin()
+        readings = [reading for reading in await day.read_for(40.0) if reading.status.usable]
+        truths = {each.instrument_ms: each.true_ns for each in day.station.offered}
+        late_ms = [
+            (reading.at_ns - truths[reading.instrument_time_ns // 1_000_000]) / 1e6
+            for reading in readings
+            if reading.instrument_time_ns is not None
+        ]
+    assert any((reading.instrument_time_ns or 0) < 0 for reading in readings)
+    assert len(late_ms) > 85
+    assert all(15.0 < late < 30.0 for late in late_ms)
+
+
+async def test_calls_at_the_wrong_time_are_refused() -> None:
+    """A single measurement while tracking, a reading while not, anything without a connection."""
+    async with leica_bench() as day:
+        with pytest.raises(InstrumentError, match="not connected"):
+            await day.instrument.read()
+        await day.instrument.connect()
+        with pytest.raises(InstrumentRefusedError, match="call track first"):
+            await day.instrument.read()
+        await day.instrument.track(1)
+        with pytest.raises(InstrumentRefusedError, match="direct"):
+            await day.instrument.measure()
+        assert (await day.instrument.read()).status is Status.OK
+
+
+# --- Lines and power ----------------------------------------------------------------------------------------------
+
+
+async def test_the_first_reading_comes_soon_after_the_cable() -> None:
+    """Unplugged and plugged in again: with the lock kept, within 2 s of the first attempt, in the same time."""
+    async with leica_bench() as day:
+        await day.begin()
+        before = (await day.read_for(20.0))[-1]
+        day.line.plugged = False
+        with pytest.raises(InstrumentError):
+            await day.read_for(5.0)
+        await day.instrument.close()
+        await asyncio.sleep(10.0)
+        day.line.plugged = True
+        begun_s = day.now_s
+        await day.begin()
+        reading = await day.instrument.read()
+        took_s = day.now_s - begun_s
+    assert reading.status.usable
+    assert took_s < 2.0
+    assert before.instrument_time_ns is not None
+    assert reading.instrument_time_ns is not None
+    apart_ns = (reading.at_ns - before.at_ns) - (reading.instrument_time_ns - before.instrument_time_ns)
+    assert abs(apart_ns) < 5_000_000
+
+
+async def test_a_power_cycle_begins_the_time_anew() -> None:
+    """Its count is near zero then: no stamp is wrong, and after a person has locked in it goes on."""
+    async with leica_bench(leica_config(latency_ms=20.0)) as day:
+        await day.begin()
+        await day.read_for(20.0)
+        day.station.switch_off()
+        with pytest.raises(InstrumentError):
+            await day.read_for(20.0)
+        await day.instrument.close()
+        day.station.switch_on()
+        await asyncio.sleep(6.0)
+        day.station.lock_by_hand(1)
+        begun = len(day.station.offered)
+        await day.begin()
+        readings = [r for r in await day.read_for(20.0) if r.status.usable]
+    true_ns = {offered.instrument_ms: offered.true_ns for offered in day.station.offered[begun:]}
+    assert len(readings) > 40
+    for reading in readings:
+        assert reading.instrument_time_ns is not None
+        assert abs(reading.at_ns - true_ns[reading.instrument_time_ns // 1_000_000]) < 20_000_000
+
+
+async def test_searches_end_with_the_connection() -> None:
+    """Closing in the middle of a search ends it at the instrument too, and leaves nothing running."""
+    async with leica_bench(faults=[hidden(3.0, 60.0)]) as day:
+        await day.begin()
+        while "searching" not in day.instrument.condition.activity:
+            await day.instrument.read()
+        await day.instrument.close()
+        await day.begin()
+        assert (await day.instrument.read()).status is Status.NO_TARGET
+
+
+@pytest.mark.parametrize("away_s", [0.5, 7.3, 60.0])
+async def test_the_client_reads_again_within_three_seconds(away_s: float) -> None:
+    """From the device being back to the first reading, whenever in the client's pauses that happens."""
+    readings: list[tuple[float, Status]] = []
+    async with leica_bench() as day:
+        keeper = InstrumentKeeper(
+            day.instrument,
+            Session(1, 1),
+            day.clock,
+            on_reading=lambda reading: readings.append((day.now_s, reading.status)),
+            on_record=lambda _: None,
+            on_done=lambda _: None,
+        )
+        task = asyncio.create_task(keeper.keep())
+        await asyncio.sleep(20.0)
+        day.line.plugged = False
+        await asyncio.sleep(away_s)
+        day.line.plugged = True
+        back_s = day.now_s
+        await asyncio.sleep(10.0)
+        task.cancel()
+        await asyncio.wait({task})
+    after = [(at_s, status) for at_s, status in readings if at_s > back_s]
+    assert after[0][0] - back_s < 3.0
+    assert all(status.usable for _, status in after)

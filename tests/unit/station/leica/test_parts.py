@@ -1,0 +1,175 @@
+"""The smaller parts of the driver for Leica instruments: replies, faces, pace, models, wet thermometers."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from tsgt.config.client import LeicaInstrumentConfig
+from tsgt.errors import InstrumentRefusedError
+from tsgt.model import Status
+from tsgt.station.geocom.connection import Reply
+from tsgt.station.leica.identity import model_of
+from tsgt.station.leica.measurement import FullMeasurement, Readings, full_measurement
+from tsgt.station.leica.setup import PRISM_TYPES, TRACKING_MODES, wet_temperature_c
+from tsgt.station.leica.target import both_faces, check_same_target
+from tsgt.station.leica.timing import Pace
+
+MS = 1_000_000
+GOOD = (1.5, 1.6, 1e-6, 0.0, 0.0, 1e-6, 50.5, 12_345)
+
+
+def reply(code: int, *values: float | str) -> Reply:
+    """Return a reply that came at 1 s."""
+    return Reply(code, values, 0, 1_000_000_000)
+
+
+@pytest.mark.parametrize("code", [0, 1283, 1284])
+def test_usable_codes_give_the_distance(code: int) -> None:
+    """In motion accuracy is not guaranteed, and the distance is as good as it gets."""
+    got = full_measurement(reply(code, *GOOD))
+    assert got.status.usable
+    assert (got.distance_m, got.time_ms) == (50.5, 12_345)
+
+
+@pytest.mark.parametrize(
+    ("code", "status"),
+    [
+        (1285, Status.ANGLE_ONLY),
+        (1288, Status.ANGLE_ONLY),
+        (1289, Status.ANGLE_ONLY),
+        (1290, Status.TILT),
+        (1291, Status.WRONG_DISTANCE),
+        (1292, Status.NO_TARGET),
+        (12, Status.ERROR),
+        (4711, Status.ERROR),
+    ],
+)
+def test_other_codes_give_none(code: int, status: Status) -> None:
+    """Whatever stands in the place of the distance."""
+    got = full_measurement(reply(code, *GOOD))
+    assert got.status is status
+    assert (got.distance_m, got.time_ms) == (None, None)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        (),
+        (1.5,),
+        GOOD[:7],
+        (*GOOD[:6], 0.0, 12_345),
+        (*GOOD[:6], float("nan"), 1),
+        (*GOOD[:6], "x", 1),
+        (*GOOD[:6], 50_500.0, 12_345),
+        (*GOOD[:7], 1e308),
+        (15.2, *GOOD[1:]),
+        (1.5, 16.0, *GOOD[2:]),
+        ("a", *GOOD[1:]),
+    ],
+)
+def test_a_good_code_with_bad_values_gives_no_distance(values: tuple[float | str, ...]) -> None:
+    """A distance of zero is none, and a part of a reply is not filled up."""
+    got = full_measurement(reply(0, *values))
+    assert not got.status.usable
+    assert got.distance_m is None
+
+
+def test_the_mean_of_two_faces_is_free_of_the_axes_errors() -> None:
+    """Collimation and index have opposite signs in the two; also across the zero of the circle."""
+    for horizontal_rad in (0.00001, 1.0, math.tau - 0.00001):
+        collimation, index = 0.0001, 0.0002
+        first = FullMeasurement(
+            (horizontal_rad + collimation) % math.tau, 1.4 + index, 20.0, 1, Status.OK, 0, 0
+        )
+        second = FullMeasurement(
+            (horizontal_rad + math.pi - collimation) % math.tau,
+            math.tau - 1.4 + index,
+            20.002,
+            2,
+            Status.LOW_ACCURACY,
+            1284,
+            0,
+        )
+        mean = both_faces(first, second)
+        apart = math.remainder(mean.horizontal_angle_rad - horizontal_rad, math.tau)
+        assert apart == pytest.approx(0.0, abs=1e-12)
+        assert mean.zenith_angle_rad == pytest.approx(1.4)
+        assert mean.distance_m == pytest.approx(20.001)
+        assert mean.status is Status.LOW_ACCURACY
+
+
+def test_two_faces_of_different_things_are_no_mean() -> None:
+    """Somebody has turned the telescope, or walked through the line of sight."""
+    first = FullMeasurement(1.0, 1.4, 20.0, 1, Status.OK, 0, 0)
+    second = FullMeasurement(1.0 + math.pi, math.tau - 1.4, 20.001, 2, Status.OK, 0, 0)
+    check_same_target(first, second)
+    for other in (
+        second._replace(distance_m=18.7),
+        second._replace(horizontal_angle_rad=1.02 + math.pi),
+        second._replace(zenith_angle_rad=math.tau - 1.38),
+    ):
+        with pytest.raises(InstrumentRefusedError, match="measure again"):
+            check_same_target(first, other)
+
+
+def test_a_status_is_repeated_now_and_then() -> None:
+    """At once when it changes, else every half second: enough for people, little for journal and radio."""
+    readings = Readings(1, 0)
+    given = []
+    for number in range(100):
+        status = Status.NO_TARGET if number < 50 else Status.TILT
+        measured = FullMeasurement(0.0, 0.0, None, None, status, 0, number * 50 * MS)
+        reading = readings.without(measured)
+        if reading is not None:
+            given.append((number, reading.status))
+    assert given[0] == (0, Status.NO_TARGET)
+    assert (50, Status.TILT) in given
+    assert len(given) == 10
+
+
+def test_the_pace_follows_the_instrument() -> None:
+    """Nothing is waited for until it is known how often distances come, and shortly before the next is asked."""
+    pace = Pace()
+    for number in range(5):
+        assert pace.next_ns(0, 0) == 0
+        pace.distance(1000 + 400 * number)
+    assert pace.interval_ns == 400 * MS
+    assert pace.next_ns(1_000 * MS, 50 * MS) == 1_340 * MS
+    pace.distance(1000 + 1650)
+    assert pace.interval_ns == 50 * MS
+
+
+def test_a_faster_instrument_is_noticed() -> None:
+    """Whoever sleeps until the next distance sees none between: once in a while nothing is waited for."""
+    pace = Pace()
+    for number in range(30):
+        pace.distance(400 * number)
+    waits = []
+    for number in range(30, 80):
+        pace.distance(400 * number)
+        waits.append(pace.next_ns(1, 0) != 0)
+    assert 0 < waits.count(False) <= 3
+
+
+def test_models_are_known_by_the_beginning_of_their_names() -> None:
+    """As instruments give them; whoever is unknown has no delays."""
+    assert model_of('TS16 P 1" R500').angle_delay_ns == 7_220_000
+    assert model_of("Leica TS60 I").angle_delay_ns == 4_980_000
+    assert model_of("MS60").angle_delay_ns == 0
+    assert model_of("TCRP1201+").latency_ns == 0
+    assert model_of("").angle_delay_ns == 0
+
+
+@pytest.mark.parametrize(("dry_c", "wet_c"), [(12.0, 8.2), (20.0, 15.1), (30.0, 23.9), (0.0, -2.3)])
+def test_a_wet_thermometer_shows_less(dry_c: float, wet_c: float) -> None:
+    """At 60 % relative humidity, by the psychrometric tables."""
+    assert wet_temperature_c(dry_c) == pytest.approx(wet_c, abs=0.8)
+
+
+def test_every_configured_word_is_known() -> None:
+    """What the configuration allows, the driver can set."""
+    fields = LeicaInstrumentConfig.model_fields
+    assert set(fields["prism_type"].annotation.__args__) == set(PRISM_TYPES)  # type: ignore[union-attr]
+    assert set(fields["distance_mode"].annotation.__args__) == set(TRACKING_MODES)  # type: ignore[union-attr]

@@ -1,0 +1,207 @@
+"""The client's status socket: the status, a request, and people who do neither."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from contextlib import asynccontextmanager, suppress
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from harness.client import client_config
+from harness.radios import PAPER
+from harness.shots import ScriptedInstrument
+
+from tsgt.errors import InstrumentRefusedError, RadioError, RecordingError
+from tsgt.recording import RecordingWriter, encode_line, read_lines
+from tsgt.recording.recorder import Recorder
+from tsgt.simulation.kernel.clocks import VirtualClock
+from tsgt.station.control_socket import MOST_TALKS, AtmosphereRequest
+from tsgt.station.daemon import run_client
+from tsgt.station.instrument import Condition
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator
+    from contextlib import AbstractAsyncContextManager
+    from pathlib import Path
+
+    from tsgt.radio.base import Radio
+
+START_NS = 1_700_000_000_000_000_000
+WARM = encode_line(AtmosphereRequest(temperature_c=25.0, pressure_hpa=1000.0))
+
+
+def no_radio() -> AbstractAsyncContextManager[Radio]:
+    """Fail."""
+    raise RadioError("no chip")
+
+
+@asynccontextmanager
+async def client(folder: Path) -> AsyncGenerator[ScriptedInstrument]:
+    """Run a client without a radio; its instrument is connected."""
+    clock = VirtualClock(START_NS)
+    instrument = ScriptedInstrument(clock)
+    config = client_config(folder)
+    running = asyncio.create_task(
+        run_client(config, PAPER, instrument=instrument, open_radio=no_radio, clock=clock)
+    )
+    try:
+        await asyncio.sleep(2.0)
+        yield instrument
+    finally:
+        began_ns = clock.monotonic_ns()
+        running.cancel()
+        await asyncio.wait([running])
+        assert clock.monotonic_ns() - began_ns < 500_000_000
+
+
+async def talk(folder: Path, request: bytes = b"") -> list[dict[str, Any]]:
+    """Say something to the client and return its lines."""
+    reader, writer = await asyncio.open_unix_connection(folder / "client.sock")
+    writer.write(request)
+    lines = (await reader.read()).splitlines()
+    writer.close()
+    return [json.loads(line) for line in lines]
+
+
+def journalled(folder: Path, kind: str) -> list[dict[str, Any]]:
+    """Return the lines of a kind in the only journal."""
+    (path,) = (folder / "journals").iterdir()
+    return [json.loads(line.data) for line in read_lines(path) if line.type == kind]
+
+
+async def test_a_crowd_is_let_go(tmp_path: Path) -> None:
+    """So many are let in and the others not; a second later there is room again."""
+    async with client(tmp_path):
+        crowd = [await asyncio.open_unix_connection(tmp_path / "client.sock") for _ in range(MOST_TALKS + 5)]
+        async with asyncio.timeout(0.01):
+            lines = [await reader.readline() for reader, _ in crowd]
+        assert [bool(line) for line in lines] == [True] * MOST_TALKS + [False] * 5
+        await asyncio.sleep(1.1)
+        assert len(await talk(tmp_path, b"?\n")) == 2
+        for _, writer in crowd:
+            writer.close()
+
+
+async def test_who_says_nothing_gets_the_status_and_soon_the_end(tmp_path: Path) -> None:
+    """The line comes at once, the end after a second."""
+    async with client(tmp_path):
+        reader, writer = await asyncio.open_unix_connection(tmp_path / "client.sock")
+        async with asyncio.timeout(0.01):
+            assert json.loads(await reader.readline())["type"] == "client_status"
+        async with asyncio.timeout(1.1):
+            assert await reader.read() == b""
+        writer.close()
+
+
+async def test_the_air_is_set_and_journalled(tmp_path: Path) -> None:
+    """The answer has what was read back; status and journal have it, too."""
+    async with client(tmp_path) as instrument:
+        instrument.give()
+        first, answer = await talk(tmp_path, WARM + b"\n")
+        instrument.give()
+        await asyncio.sleep(0.1)
+        (after,) = await talk(tmp_path)
+    assert first["settings"]["temperature_c"] is None
+    assert (answer["type"], answer["problem"]) == ("answer", "")
+    assert answer["settings"]["temperature_c"] == 25.0
+    assert answer["settings"]["atmospheric_ppm"] == 10.0
+    assert after["settings"] == answer["settings"]
+    before, changed = journalled(tmp_path, "instrument")
+    assert before["temperature_c"] is None
+    assert changed == answer["settings"]
+    first_ns, second_ns = (line["stamp_ns"] for line in journalled(tmp_path, "measurement"))
+    assert before["stamp_ns"] <= first_ns < changed["stamp_ns"] <= second_ns
+
+
+async def test_what_is_refused_is_said(tmp_path: Path) -> None:
+    """In the instrument's own words."""
+    async with client(tmp_path) as instrument:
+        instrument.air_refusal = InstrumentRefusedError("it has no such setting")
+        _, answer = await talk(tmp_path, WARM + b"\n")
+    assert answer["problem"] == "it has no such setting"
+
+
+@pytest.mark.parametrize(
+    ("request_line", "words"),
+    [
+        (b"hello\n", "not understood"),
+        (b'{"type":"reboot"}\n', "field type"),
+        (b'{"type":"atmosphere","temperature_c":20.0}\n', "field pressure_hpa"),
+        (b'{"type":"atmosphere","temperature_c":1013.0,"pressure_hpa":20.0}\n', "field temperature_c"),
+        (b'{"type":"atmosphere","temperature_c":NaN,"pressure_hpa":1000.0}\n', "not understood"),
+    ],
+)
+async def test_nonsense_is_answered(tmp_path: Path, request_line: bytes, words: str) -> None:
+    """It says what is wrong with it, and sets nothing."""
+    async with client(tmp_path) as instrument:
+        before = instrument.record
+        _, answer = await talk(tmp_path, request_line)
+        assert words in answer["problem"]
+        assert instrument.record == before
+
+
+async def test_who_talks_without_end_is_cut_off(tmp_path: Path) -> None:
+    """And the client goes on."""
+    async with client(tmp_path):
+        with suppress(ConnectionResetError):
+            await talk(tmp_path, b"x" * 10_000)
+        assert len(await talk(tmp_path)) == 1
+
+
+async def test_people_who_stay_hold_up_nobody(tmp_path: Path) -> None:
+    """Neither others who ask nor the end of the client."""
+    async with client(tmp_path):
+        stays = [await asyncio.open_unix_connection(tmp_path / "client.sock") for _ in range(50)]
+        async with asyncio.timeout(0.01):
+            reader, writer = await asyncio.open_unix_connection(tmp_path / "client.sock")
+            await reader.readline()
+    for _, writer_ in (*stays, (reader, writer)):
+        writer_.close()
+
+
+async def test_the_status_has_what_the_instrument_says_of_itself(tmp_path: Path) -> None:
+    """What it is doing, what a person should see to, how its battery is; without it, why."""
+    async with client(tmp_path) as instrument:
+        instrument.condition = Condition(
+            activity="looking around", problem="point the telescope at prism 1", battery_percent=9
+        )
+        (status,) = await talk(tmp_path)
+        instrument.plugged = False
+        instrument.fail()
+        await asyncio.sleep(1.0)
+        (without,) = await talk(tmp_path)
+    assert (status["activity"], status["problem"]) == ("looking around", "point the telescope at prism 1")
+    assert status["battery_percent"] == 9
+    assert (without["instrument"], without["settings"]) == (None, None)
+    assert without["problem"] == "nobody answers; is the cable in?"
+
+
+async def test_a_full_disk_is_said_with_what_is_not_journalled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """How many lines wait, and when no more can wait, how many are lost; measuring goes on."""
+    full = False
+    write_line = RecordingWriter.write_line
+
+    def write_if_room(writer: RecordingWriter, line: bytes) -> None:
+        if full:
+            raise RecordingError("no room", path=tmp_path)
+        write_line(writer, line)
+
+    monkeypatch.setattr(RecordingWriter, "write_line", write_if_room)
+    monkeypatch.setattr(Recorder.__init__, "__kwdefaults__", {"waiting_lines": 10})
+    said: list[str] = []
+    monkeypatch.setattr("tsgt.service.sd_notify", lambda *assignments: said.extend(assignments))
+    async with client(tmp_path) as instrument:
+        full = True
+        for _ in range(15):
+            instrument.give()
+            await asyncio.sleep(0.1)
+        await asyncio.sleep(1.0)
+        (status,) = await talk(tmp_path)
+        full = False
+    assert (status["journal_ok"], status["journal_waiting"], status["journal_lost"]) == (False, 10, 5)
+    assert status["measurements"] == 15
+    assert any("disk fails: 10 lines not written, 5 lines lost" in line for line in said)
+    assert len(journalled(tmp_path, "measurement")) == 10

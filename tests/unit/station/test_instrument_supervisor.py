@@ -1,0 +1,262 @@
+"""The keeper of an instrument: connections, orders, air and settings, whatever the instrument is."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import pytest
+from harness.shots import RECORD, ScriptedInstrument
+from structlog.testing import capture_logs
+
+from tsgt.errors import InstrumentError, InstrumentRefusedError
+from tsgt.radio.commands import Direction, DirectOrder, MeasureOrder, SearchOrder, TrackOrder
+from tsgt.simulation.kernel.clocks import VirtualClock
+from tsgt.station.instrument import Atmosphere, Condition, Reading
+from tsgt.station.instrument_supervisor import CHECK_S, NOT_CONNECTED, Done, InstrumentKeeper
+from tsgt.station.session import Session
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator
+
+    from tsgt.recording.journal import InstrumentRecord
+
+WARM = Atmosphere(temperature_c=25.0, pressure_hpa=1000.0)
+COLD = Atmosphere(temperature_c=-5.0, pressure_hpa=1000.0)
+GONE = "the instrument is gone"
+
+
+@dataclass
+class Bench:
+    """A keeper, its instrument, and all that it has handed out, in that order."""
+
+    instrument: ScriptedInstrument
+    session: Session = field(default_factory=lambda: Session(1, 1))
+    out: list[Reading | InstrumentRecord | Done] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.keeper = InstrumentKeeper(
+            self.instrument,
+            self.session,
+            VirtualClock(0),
+            on_reading=self.out.append,
+            on_record=self.out.append,
+            on_done=self.done,
+        )
+
+    def done(self, done: Done) -> None:
+        """Do what the client does."""
+        self.out.append(done)
+        if done.ok and not isinstance(done.order, MeasureOrder):
+            self.session.executed(done.order)
+
+    async def ordered(self, order: TrackOrder | SearchOrder | DirectOrder | MeasureOrder) -> Done:
+        """Give an order and wait for what becomes of it."""
+        self.keeper.give(order)
+        while not (self.out and isinstance(self.out[-1], Done)):  # noqa: ASYNC110 (virtual time)
+            await asyncio.sleep(0.01)
+        done = self.out.pop()
+        assert isinstance(done, Done)
+        return done
+
+
+@asynccontextmanager
+async def bench(
+    instrument: ScriptedInstrument | None = None, *, connected: bool = True
+) -> AsyncGenerator[Bench]:
+    """Keep an instrument; it is connected and tracks, after the second that this takes."""
+    made = Bench(instrument or ScriptedInstrument(VirtualClock(0)))
+    keeping = asyncio.create_task(made.keeper.keep())
+    try:
+        await asyncio.sleep(1.5)
+        if connected:
+            assert made.keeper.description == "scripted"
+            assert made.out.pop(0) == RECORD
+        yield made
+    finally:
+        keeping.cancel()
+        await asyncio.wait([keeping])
+    assert keeping.cancelled()
+
+
+async def test_an_order_that_is_refused_leaves_the_instrument_as_it_is() -> None:
+    """It is answered with no, there is no new connection, and the next reading comes."""
+    async with bench() as day:
+        day.instrument.refusal = InstrumentRefusedError("there is no prism 9")
+        with capture_logs() as logs:
+            assert await day.ordered(TrackOrder(9)) == Done(TrackOrder(9), ok=False)
+            day.instrument.refusal = None
+            reading = day.instrument.give()
+            await asyncio.sleep(0.1)
+        assert day.out == [reading]
+    assert [entry["event"] for entry in logs] == ["order_refused"]
+
+
+async def test_a_single_measurement_that_is_refused_is_answered() -> None:
+    """There is none, and the instrument stays ready for the next one."""
+    async with bench() as day:
+        assert (await day.ordered(DirectOrder())).ok
+        day.instrument.target = InstrumentRefusedError("no target there")
+        assert await day.ordered(MeasureOrder()) == Done(MeasureOrder(), ok=False)
+        assert day.keeper.description == "scripted"
+
+
+async def test_a_search_is_told_where_to_look() -> None:
+    """The direction in the order reaches the instrument; without one it looks where it last had the prism."""
+    towards = Direction(1.0, 1.5, 0.05)
+    async with bench() as day:
+        assert (await day.ordered(SearchOrder(towards))).ok
+        assert (await day.ordered(SearchOrder())).ok
+    assert day.instrument.prisms == [1, 1, 1]
+    assert day.instrument.towards == [None, towards, None]
+
+
+async def test_an_instrument_that_is_back_is_used_within_a_second() -> None:
+    """However long it was away: the pauses do not grow beyond that."""
+    async with bench() as day:
+        day.instrument.plugged = False
+        day.instrument.fail()
+        await asyncio.sleep(600.0)
+        assert day.keeper.description is None
+        day.instrument.plugged = True
+        await asyncio.sleep(1.0 + 1.0 + 0.01)  # the longest pause, and what tracking takes
+        assert day.keeper.description == "scripted"
+
+
+async def test_without_a_connection_the_problem_is_why() -> None:
+    """Before it there is none, with it the instrument's own counts."""
+    instrument = ScriptedInstrument(VirtualClock(0))
+    instrument.plugged = False
+    async with bench(instrument, connected=False) as day:
+        assert day.keeper.condition.problem == "nobody answers; is the cable in?"
+        instrument.plugged = True
+        instrument.condition = Condition(problem="battery low", battery_percent=9)
+        await asyncio.sleep(3.0)
+        assert day.keeper.condition == instrument.condition
+
+
+async def test_settings_are_handed_out_before_what_was_measured_with_them() -> None:
+    """Once after each connection and after each change."""
+    async with bench() as day:
+        first = day.instrument.give()
+        await asyncio.sleep(0.1)
+        changed = day.instrument.record = replace(RECORD, distance_mode="fast")
+        second = day.instrument.give()
+        third = day.instrument.give()
+        await asyncio.sleep(0.1)
+        assert day.out == [first, changed, second, third]
+        day.out.clear()
+        day.instrument.fail()
+        await asyncio.sleep(3.0)
+        assert day.out == [RECORD]
+
+
+async def test_the_air_is_set_between_two_readings() -> None:
+    """No reading is lost, the settings are handed out, and whoever asked is told that it is done."""
+    async with bench() as day:
+        assert await day.keeper.set_atmosphere(WARM) == ""
+        day.instrument.give()
+        await asyncio.sleep(0.1)
+        settings, reading = day.out
+    assert settings == replace(RECORD, atmospheric_ppm=10.0, temperature_c=25.0, pressure_hpa=1000.0)
+    assert isinstance(reading, Reading)
+
+
+async def test_the_air_is_set_while_nothing_is_measured() -> None:
+    """In direct mode too, where nobody reads."""
+    async with bench() as day:
+        assert (await day.ordered(DirectOrder())).ok
+        assert await day.keeper.set_atmosphere(WARM) == ""
+        assert (await day.ordered(MeasureOrder())).ok
+
+
+async def test_an_instrument_that_goes_while_nothing_is_measured_is_missed() -> None:
+    """In direct mode nobody reads: it is asked now and then, and connected again when it is back."""
+    async with bench() as day:
+        assert (await day.ordered(DirectOrder())).ok
+        day.instrument.plugged = False
+        await asyncio.sleep(CHECK_S + 0.1)
+        assert "is the cable in?" in day.keeper.condition.problem
+        day.instrument.plugged = True
+        await asyncio.sleep(3.0)
+        assert not day.keeper.condition.problem
+        assert day.instrument.prisms[-1] is None
+        assert (await day.ordered(MeasureOrder())).ok
+
+
+async def test_the_air_is_set_again_after_each_connection() -> None:
+    """Also when it was asked for while there was no instrument."""
+    instrument = ScriptedInstrument(VirtualClock(0))
+    instrument.plugged = False
+    async with bench(instrument, connected=False) as day:
+        assert await day.keeper.set_atmosphere(COLD) == NOT_CONNECTED
+        instrument.plugged = True
+        for _ in range(2):
+            await asyncio.sleep(3.0)
+            assert instrument.record is not None
+            assert instrument.record.temperature_c == -5.0
+            instrument.fail()
+
+
+async def test_an_air_that_is_refused_is_forgotten() -> None:
+    """Whoever asked is told why, and it is not tried again with the next connection."""
+    async with bench() as day:
+        day.instrument.air_refusal = InstrumentRefusedError("it has no such setting")
+        assert await day.keeper.set_atmosphere(WARM) == "it has no such setting"
+        day.instrument.air_refusal = None
+        day.instrument.fail()
+        await asyncio.sleep(3.0)
+        assert day.instrument.record == RECORD
+
+
+async def test_an_instrument_that_goes_while_the_air_is_set_gets_it_later() -> None:
+    """Whoever asked is not left waiting."""
+    async with bench() as day:
+        day.instrument.air_refusal = InstrumentError(GONE)
+        assert await day.keeper.set_atmosphere(WARM) == NOT_CONNECTED
+        day.instrument.air_refusal = None
+        await asyncio.sleep(3.0)
+        assert day.instrument.record is not None
+        assert day.instrument.record.temperature_c == 25.0
+
+
+@pytest.mark.parametrize("after_s", [0.0, 0.05])
+async def test_of_two_requests_the_later_one_counts(after_s: float) -> None:
+    """Before or while the first one is carried out; both are answered."""
+    async with bench() as day, asyncio.TaskGroup() as group:
+        first = group.create_task(day.keeper.set_atmosphere(WARM))
+        await asyncio.sleep(after_s)
+        second = group.create_task(day.keeper.set_atmosphere(COLD))
+        await asyncio.sleep(1.0)
+        assert first.done()
+        assert second.result() == ""
+        assert day.instrument.record is not None
+        assert day.instrument.record.temperature_c == -5.0
+
+
+async def test_an_order_and_the_air_together() -> None:
+    """Neither is lost when both come in the same moment."""
+    async with bench() as day, asyncio.TaskGroup() as group:
+        setting = group.create_task(day.keeper.set_atmosphere(WARM))
+        assert (await day.ordered(TrackOrder(2))).ok
+        assert await setting == ""
+    assert day.instrument.prisms == [1, 2]
+
+
+class FailsWhenStopped(ScriptedInstrument):
+    """An instrument that is gone in the moment in which nobody wants it any more."""
+
+    async def read(self) -> Reading:
+        """Wait, and fail at the end."""
+        try:
+            return await super().read()
+        except asyncio.CancelledError:
+            raise InstrumentError(GONE) from None
+
+
+async def test_a_keeper_that_is_stopped_in_the_moment_of_a_failure_stops() -> None:
+    """The error does not take the place of the cancellation."""
+    async with bench(FailsWhenStopped(VirtualClock(0))):
+        pass

@@ -1,0 +1,52 @@
+"""The line below answers that are late by chance."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tsgt.timesync.envelope import line_below, lowest
+
+SPREAD = 40.0
+
+
+@pytest.mark.parametrize("count", [12, 100, 1000])
+def test_how_far_the_lowest_answer_is_from_the_line(count: int) -> None:
+    """Mean and scatter are those of many trials, whether what is cut off matters or not."""
+    random = np.random.default_rng(1)
+    heights = random.uniform(0, SPREAD, (4000, count)) + random.uniform(0, 1, (4000, count))
+    found = lowest(SPREAD / (count + 1))
+    assert found.mean == pytest.approx(heights.min(axis=1).mean(), rel=0.25)
+    assert found.sigma == pytest.approx(heights.min(axis=1).std(), rel=0.25)
+
+
+def test_errors_of_the_line_are_as_stated() -> None:
+    """At the end of the answers, over many trials: no bias to speak of, and a scatter like the stated one."""
+    random = np.random.default_rng(2)
+    errors = []
+    for _ in range(200):
+        x = np.sort(random.uniform(0, 1000, 60))
+        slope = random.normal(0, 0.01)
+        y = slope * x + random.uniform(0, SPREAD, 60)
+        scale = SPREAD / 61
+        line = line_below(
+            list(zip(x.tolist(), y.tolist(), strict=True)),
+            middle=float(x.mean()),
+            scale=scale,
+            known=(0.0, 0.01),
+            most=0.05,
+        )
+        error = line.height - scale + line.slope * 1000 - slope * 1000
+        errors.append(
+            error / np.hypot(np.hypot(scale, line.pivot_sigma), line.slope_sigma * (1000 - line.pivot))
+        )
+    assert abs(np.mean(errors)) < 0.4
+    assert 0.6 < np.sqrt(np.mean(np.square(errors))) < 1.4
+
+
+def test_one_answer_tells_nothing_of_the_slope() -> None:
+    """What was known of it before remains."""
+    line = line_below([(3.0, 5.0)], middle=3.0, scale=1.0, known=(1e-3, 1e-3), most=1e-2)
+    assert line.slope == pytest.approx(1e-3, rel=1e-2)
+    assert line.slope_sigma == pytest.approx(1e-3, rel=5e-2)
+    assert line.height + line.slope * 3 == pytest.approx(5.0)

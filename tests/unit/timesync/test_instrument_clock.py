@@ -1,0 +1,218 @@
+"""The fit of the instrument's time to the host's clock, sample by sample."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tsgt.timesync.instrument_clock import ENOUGH, InstrumentClock
+
+MS = 1_000_000
+OFFSET_NS = 77_000_000_000_000
+FASTEST_MS = 20
+
+
+def arrived_ns(instrument_ms: float, late_ms: float = 0.0, rate: float = 0.0) -> int:
+    """Return when an answer with that time arrives."""
+    return OFFSET_NS + round((instrument_ms * (1 + rate) + FASTEST_MS + late_ms) * MS)
+
+
+def standing(samples: int = 200, rate: float = 0.0, start_ms: int = 5_000_000) -> InstrumentClock:
+    """Return a clock with samples every 400 ms, every fourth one as fast as can be."""
+    clock = InstrumentClock()
+    for number in range(samples):
+        ms = start_ms + 400 * number
+        assert clock.add(ms, arrived_ns(ms, 10.0 * (number % 4), rate))
+    return clock
+
+
+def test_nothing_is_told_before_there_are_enough_samples() -> None:
+    """A few answers may all have been late."""
+    clock = InstrumentClock()
+    for number in range(ENOUGH):
+        assert clock.at(1000) is None
+        clock.add(1000 + 100 * number, arrived_ns(1000 + 100 * number))
+    assert clock.stands
+    time = clock.at(1000)
+    assert time is not None
+    assert 0 <= time.host_ns - arrived_ns(1000) < MS  # it was taken within the ms that it is told in
+
+
+def test_the_fastest_answers_decide() -> None:
+    """Late ones change nothing: they are late on one side only."""
+    time = standing().at(5_079_600)
+    assert time is not None
+    assert abs(time.host_ns - arrived_ns(5_079_600)) < MS / 2
+    assert time.bound_ns < 5 * MS
+
+
+@pytest.mark.parametrize("rate", [-200e-6, -20e-6, 20e-6, 200e-6])
+def test_the_rate_is_found(rate: float) -> None:
+    """After some minutes it is known to a few parts in a million, and times follow it."""
+    clock = standing(1000, rate)
+    assert clock.rate_ppm == pytest.approx(rate * 1e6, abs=5)
+    time = clock.at(5_399_600)
+    assert time is not None
+    assert abs(time.host_ns - arrived_ns(5_399_600, rate=rate)) < MS
+
+
+@pytest.mark.parametrize("start_ms", [300, 4_000_000, 2_000_000_000])
+def test_a_power_cycle_begins_anew(start_ms: int) -> None:
+    """The count begins near 0, or anywhere: three answers that agree say so, and old times are not told any more."""
+    clock = standing()
+    results = [
+        clock.add(start_ms + 100 * n, arrived_ns(5_200_000 + 100 * n, late_ms=7 * (n % 8)))
+        for n in range(8 * ENOUGH)
+    ]
+    assert results.count(False) == 1
+    assert clock.stands
+    time = clock.at(start_ms)
+    assert time is not None
+    assert abs(time.host_ns - arrived_ns(5_200_000)) < MS
+
+
+def test_the_wrap_of_the_count_begins_anew() -> None:
+    """After 24.8 days a count of 32 bits goes negative."""
+    start_ms = 2**31 - 400 * 100
+    clock = InstrumentClock()
+    told, outside = [], 0
+    for number in range(300):
+        ms = start_ms + 400 * number
+        wrapped = ms - 2**32 if ms >= 2**31 else ms
+        clock.add(wrapped, arrived_ns(ms, 10.0 * (number % 4)))
+        time = clock.stamp(wrapped, arrived_ns(ms, 50.0))
+        if time is not None:
+            told.append(abs(time.host_ns - arrived_ns(ms)))
+            outside += told[-1] > time.bound_ns
+    assert len(told) > 300 - 2 * ENOUGH - 2
+    assert outside == 0
+    assert max(told[-150:]) < MS
+
+
+def test_one_damaged_time_is_doubted() -> None:
+    """A digit that the line has changed gets no time, and bends no other one."""
+    clock = standing()
+    before = clock.at(5_080_000)
+    for wrong_ms in (-30_000, 90, 700, 5_000, 40_000_000):
+        assert clock.stamp(5_080_000 + wrong_ms, arrived_ns(5_080_000, 5.0)) is None
+        for number in range(40):
+            clock.add(5_080_000 + 400 * number, arrived_ns(5_080_000 + 400 * number, 10.0))
+    after = clock.at(5_080_000)
+    assert before is not None
+    assert after is not None
+    assert abs(after.host_ns - before.host_ns) < MS
+
+
+@pytest.mark.parametrize("wrong_ms", [-5000, 60, 400, 70_000])
+@pytest.mark.parametrize("which", [0, 3, 7])
+def test_a_damaged_time_among_the_first_is_left_out(wrong_ms: int, which: int) -> None:
+    """There is no envelope yet that contradicts it, but the others do."""
+    clock = InstrumentClock()
+    for number in range(ENOUGH + 2):
+        ms = 60_000 + 50 * number
+        clock.add(ms + (wrong_ms if number == which else 0), arrived_ns(ms, 3.0 * (number % 4)))
+    time = clock.at(60_000)
+    assert time is not None
+    assert abs(time.host_ns - arrived_ns(60_000)) < 10 * MS
+
+
+@pytest.mark.parametrize("before", range(1, ENOUGH))
+def test_a_power_cycle_among_the_first_is_survived(before: int) -> None:
+    """However many samples there were before it, those after it are believed in the end."""
+    clock = InstrumentClock()
+    for number in range(before):
+        clock.add(50_000_000 + 50 * number, arrived_ns(0, 50.0 * number))
+    for number in range(3 * ENOUGH):
+        ms = 5000 + 50 * number
+        clock.add(ms, arrived_ns(ms, 3.0 * (number % 4)))
+    time = clock.at(5000)
+    assert time is not None
+    assert abs(time.host_ns - arrived_ns(5000)) < 10 * MS
+
+
+def test_answers_that_become_faster_lower_the_envelope() -> None:
+    """Another baud or a better cable: what some of them agree on is believed, and nothing is forgotten."""
+    clock = standing()
+    for number in range(200):
+        ms = 5_080_000 + 400 * number
+        assert clock.add(ms, arrived_ns(ms, -12.0 + number % 3))
+    time = clock.at(5_160_000)
+    assert time is not None
+    assert abs(time.host_ns - arrived_ns(5_160_000, -12.0)) < MS
+
+
+def test_a_gap_is_bridged() -> None:
+    """After ten minutes without an answer the first one is put where the rate says, with a wider bound."""
+    clock = standing(1000, 20e-6)
+    ms = 5_400_000 + 600_000
+    time = clock.stamp(ms, arrived_ns(ms, 35.0, 20e-6))
+    before = clock.at(5_399_600)
+    assert time is not None
+    assert before is not None
+    assert abs(time.host_ns - arrived_ns(ms, rate=20e-6)) < time.bound_ns
+    assert before.bound_ns < time.bound_ns < 40 * MS
+
+
+def test_a_stale_answer_has_no_time() -> None:
+    """More than two seconds on the way: rather none than a doubtful one."""
+    clock = standing()
+    assert clock.stamp(5_080_000, arrived_ns(5_080_000, 1_900.0)) is not None
+    assert clock.stamp(5_080_400, arrived_ns(5_080_400, 2_100.0)) is None
+
+
+class Told(NamedTuple):
+    """What became of 300 answers: times, and how many of those are off by more than their bound."""
+
+    times_ns: list[int]
+    arrived_ns: list[int]
+    outside: int
+
+
+def of_answers(random: np.random.Generator, rate_ppm: float, spread_ms: float, period_ms: int) -> Told:
+    """Give a clock answers that take anything up to ``spread_ms``."""
+    clock = InstrumentClock()
+    told = Told([], [], 0)
+    for number in range(300):
+        true_ms = 1_000_000 + number * period_ms + random.normal(0, 4)
+        arrived = arrived_ns(true_ms, random.uniform(0, spread_ms), rate_ppm * 1e-6)
+        clock.add(int(true_ms), arrived)
+        time = None if clock.doubts else clock.stamp(int(true_ms), arrived)
+        if time is None:
+            continue
+        told.times_ns.append(time.host_ns)
+        told.arrived_ns.append(arrived)
+        beyond = abs(time.host_ns - arrived_ns(true_ms, rate=rate_ppm * 1e-6)) > time.bound_ns
+        told = told._replace(outside=told.outside + beyond)
+    return told
+
+
+@settings(max_examples=30)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    rate_ppm=st.floats(-100, 100),
+    spread_ms=st.floats(0.1, 100),
+    period_ms=st.sampled_from([50, 400, 1000]),
+)
+def test_times_are_in_order_and_never_after_the_answer(
+    seed: int, rate_ppm: float, spread_ms: float, period_ms: int
+) -> None:
+    """And nearly every answer has one."""
+    told = of_answers(np.random.default_rng(seed), rate_ppm, spread_ms, period_ms)
+    assert len(told.times_ns) >= 280
+    assert all(before < after for before, after in pairwise(told.times_ns))
+    assert all(time <= arrived for time, arrived in zip(told.times_ns, told.arrived_ns, strict=True))
+
+
+def test_of_a_hundred_times_hardly_one_is_outside_of_its_bound() -> None:
+    """Not in each run: where no early answer was a fast one, dozens in a row may be."""
+    random = np.random.default_rng(5)
+    outside = sum(
+        of_answers(random, random.uniform(-100, 100), random.uniform(0.1, 100), period_ms).outside
+        for period_ms in 20 * [50, 400, 1000]
+    )
+    assert outside <= 60 * 300 // 100

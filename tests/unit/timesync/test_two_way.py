@@ -1,0 +1,398 @@
+"""The clock filters: signs, fits, late stamps, steps, and what they say they do not know."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from harness.clock_exchanges import SECOND, START_NS, WAY_NS, drifting, exchange, synchronisation
+
+from tsgt.timesync.offset_regression import Frequency, fit, sift
+from tsgt.timesync.two_way import ArrivalCheck, ClockFilter, clock_filter
+
+MS = 1_000_000
+NAMES = ("regression", "paper")
+
+
+def error_ns(found: ClockFilter, true_s: float, offset_ns: float) -> float:
+    """Return by how much the filter's offset is too high, asked with the station's time as the master would."""
+    true_ns = round(true_s * SECOND)
+    return found.at(START_NS + true_ns + round(offset_ns)).offset_ns - offset_ns
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_offset_is_positive_when_the_station_is_ahead(name: str) -> None:
+    """A station whose clock shows two seconds more has an offset of plus two seconds."""
+    found = clock_filter(name)  # type: ignore[arg-type]
+    found.update(synchronisation(0, drifting(2 * SECOND, 0)))
+    assert found.at(START_NS).offset_ns == pytest.approx(2 * SECOND, abs=MS)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_nothing_is_known_before_the_first_synchronisation(name: str) -> None:
+    """Asking for an offset that nobody has measured is an error, also after everything was forgotten."""
+    found = clock_filter(name)  # type: ignore[arg-type]
+    with pytest.raises(LookupError):
+        found.at(START_NS)
+    found.update(synchronisation(0, drifting(0, 0)))
+    found.forget()
+    with pytest.raises(LookupError):
+        found.at(START_NS)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_first_synchronisation_is_a_start(name: str) -> None:
+    """The first update says that it started anew, the second does not, the first after forgetting does."""
+    found = clock_filter(name)  # type: ignore[arg-type]
+    clock = drifting(0, 5)
+    assert [found.update(synchronisation(start_s, clock)).restarted for start_s in (0, 300)] == [True, False]
+    found.forget()
+    assert found.update(synchronisation(600, clock)).restarted
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_single_exchange_will_do(name: str) -> None:
+    """One exchange gives an offset, with a bound that covers its round trip and grows with time."""
+    found = clock_filter(name)  # type: ignore[arg-type]
+    found.update([exchange(0, drifting(7 * SECOND, 20), turn_round_ns=4 * MS)])
+    for true_s in (0.0, 10.0, 300.0):
+        offset_ns = 7 * SECOND + 20e3 * true_s
+        estimate = found.at(START_NS + round(true_s * SECOND + offset_ns))
+        assert abs(estimate.offset_ns - offset_ns) <= estimate.bound_ns
+        assert estimate.sigma_ns <= estimate.bound_ns
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_clock_that_is_decades_off_loses_no_nanosecond(name: str) -> None:
+    """Offsets beyond what a float resolves come out as exactly as small ones."""
+    found = clock_filter(name)  # type: ignore[arg-type]
+    years_ns = -1_600_000_000 * SECOND - 1
+    found.update(synchronisation(0, lambda _: 0.0))
+    small = found.at(START_NS + SECOND).offset_ns
+    far = clock_filter(name)  # type: ignore[arg-type]
+    samples = synchronisation(0, lambda _: 0.0)
+    far.update(
+        [
+            type(s)(
+                sent_ns=s.sent_ns,
+                station_ns=s.station_ns + years_ns,
+                received_ns=s.received_ns,
+                forward_ns=s.forward_ns,
+                back_ns=s.back_ns,
+            )
+            for s in samples
+        ]
+    )
+    assert far.at(START_NS + years_ns + SECOND).offset_ns == small + years_ns
+
+
+# --- paper
+
+
+def test_paper_takes_the_midpoint_and_then_a_tenth() -> None:
+    """The first mean counts whole; of the second one a tenth is taken (equation 1 with w = 0.1)."""
+    found = clock_filter("paper")
+    found.update(synchronisation(0, drifting(0, 0), turn_round_ns=3 * MS))
+    # The station stamps before its turn-round, so the midpoint comes half a turn-round late.
+    assert found.at(START_NS).offset_ns == -1.5 * MS
+    found.update(synchronisation(300, drifting(10 * MS, 0), turn_round_ns=3 * MS))
+    assert found.at(START_NS).offset_ns == pytest.approx(-0.5 * MS, abs=1)
+
+
+def test_paper_knows_no_frequency() -> None:
+    """Its offset is the same at any time, and its bound grows by 100 ppm."""
+    found = clock_filter("paper")
+    found.update(synchronisation(0, drifting(0, 10)))
+    early, late = found.at(START_NS + 2 * SECOND), found.at(START_NS + 102 * SECOND)
+    assert early.offset_ns == late.offset_ns
+    assert late.frequency_ppm == 0.0
+    assert late.bound_ns - early.bound_ns == pytest.approx(10 * MS, rel=1e-3)
+
+
+# --- regression
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_line_is_that_of_an_independent_least_squares(seed: int) -> None:
+    """With equal round trips and next to no prior, offset and frequency are those of numpy.polyfit."""
+    rng = np.random.default_rng(seed)
+    ppm = rng.uniform(-80, 80)
+    samples = [
+        exchange(sent_ns, drifting(0, ppm), late_ns=round(rng.normal(0, 8000)), turn_round_ns=0)
+        for sent_ns in sorted(rng.integers(0, 30 * SECOND, 40).tolist())
+    ]
+    # A late stamp delays the answer, too: taken off, so that all round trips are as long.
+    samples = [
+        type(s)(
+            sent_ns=s.sent_ns,
+            station_ns=s.station_ns,
+            received_ns=s.sent_ns + 2 * WAY_NS + 5 * MS,
+            forward_ns=WAY_NS,
+            back_ns=WAY_NS,
+        )
+        for s in samples
+    ]
+    batch = sift(samples, 0.0, noise_ns=1e6)
+    assert len(batch.station_ns) == 40
+    line, _ = fit([batch], Frequency(0.0, 1e9), 0.0)
+    t = (batch.station_ns - batch.station_ns[-1]) / 1e9
+    (frequency, offset_ns), covariance = np.polyfit(t, batch.offset_ns - batch.offset_ns[-1], 1, cov=True)
+    assert line.frequency == pytest.approx(frequency, rel=1e-9)
+    assert line.offset_ns == pytest.approx(offset_ns, rel=1e-9, abs=1e-3)
+    # The noise is drawn a little towards the usual one, by two in forty.
+    assert line.variances[0] == pytest.approx(covariance[1, 1], rel=0.2)
+    assert line.variances[2] == pytest.approx(covariance[0, 0], rel=0.2)
+    assert line.variances[1] == pytest.approx(covariance[0, 1], rel=0.2)
+
+
+def test_weights_are_those_of_the_normal_equations() -> None:
+    """Slow round trips count less, by the stated rule; checked with numpy's lstsq on scaled rows."""
+    rng = np.random.default_rng(1)
+    samples = [
+        exchange(
+            n * SECOND,
+            drifting(0, 3),
+            late_ns=int(rng.integers(0, 20_000)),
+            turn_round_ns=int(rng.integers(MS, 8 * MS)),
+        )
+        for n in range(30)
+    ]
+    batch = sift(samples, 0.0, noise_ns=1e6)
+    line, _ = fit([batch], Frequency(0.0, 1e9), 0.0)
+    excess_ms = (batch.excess_ns - batch.excess_ns.min()) / MS
+    root = np.sqrt(1 / (1 + (excess_ms / 2) ** 2))
+    rows = np.stack([np.ones(30), (batch.station_ns - batch.station_ns[-1]) / 1e9], axis=1)
+    expected, *_ = np.linalg.lstsq(
+        rows * root[:, None], (batch.offset_ns - batch.offset_ns[-1]) * root, rcond=None
+    )
+    assert [line.offset_ns, line.frequency] == pytest.approx(expected.tolist(), rel=1e-6)
+
+
+def test_regression_follows_drift_to_the_next_synchronisation() -> None:
+    """After two synchronisations 300 s apart, 50 ppm are known well enough for the next 300 s."""
+    found = clock_filter("regression")
+    clock = drifting(0, 50)
+    for start_s in (0, 300):
+        found.update(synchronisation(start_s, clock))
+    assert found.at(START_NS).frequency_ppm == pytest.approx(50, abs=0.1)
+    assert abs(error_ns(found, 600, 50e3 * 600)) < 0.05 * MS
+
+
+def test_a_short_first_synchronisation_does_not_run_wild() -> None:
+    """Two stamps that scatter by 40 us within a quarter of a second are 160 ppm; crystals are not."""
+    found = clock_filter("regression")
+    found.update(synchronisation(0, drifting(0, 0), cycles=2, late_ns=[0, 40_000]))
+    assert abs(found.at(START_NS).frequency_ppm) < 30
+
+
+def test_late_stamps_are_left_out() -> None:
+    """Three of five stamps are late by milliseconds: they are rejected and do no harm."""
+    found = clock_filter("regression")
+    clock = drifting(0, 10)
+    found.update(synchronisation(0, clock, cycles=50))
+    updated = found.update(synchronisation(300, clock, late_ns=[2 * MS, 5 * MS, 9 * MS]))
+    assert (updated.rejected, updated.restarted) == (3, False)
+    assert abs(error_ns(found, 301, 10e3 * 301)) < 0.02 * MS
+
+
+LATE_NS = [n * MS for n in (5, 1, 3, 2, 4)]
+"""Five stamps, all late, none of which another one confirms."""
+
+
+def test_a_stamp_that_no_other_confirms_hardly_counts() -> None:
+    """It may be late by as much as its round trip took too long, so it does not bend a line of those that agree."""
+    found = clock_filter("regression")
+    clock = drifting(0, 10)
+    for start_s in (0, 300, 600):
+        found.update(synchronisation(start_s, clock, cycles=20))
+    assert found.update(synchronisation(900, clock, late_ns=LATE_NS)).rejected == 4
+    assert abs(error_ns(found, 901, 10e3 * 901)) < 0.05 * MS
+
+
+def test_stamps_that_never_agree_are_better_than_none() -> None:
+    """A station whose stamps are always late by something is followed, as well as they allow."""
+    found = clock_filter("regression")
+    clock = drifting(0, 40)
+    for start_s in range(0, 3901, 300):
+        found.update(synchronisation(start_s, clock, late_ns=LATE_NS))
+    assert 1 * MS < error_ns(found, 3910, 40e3 * 3910) < 3 * MS
+    assert 3 * MS < found.at(START_NS + 3910 * SECOND).bound_ns < 10 * MS
+
+
+def test_impossible_exchanges_are_left_out() -> None:
+    """A reply that came before it could have come has a wrong stamp on it."""
+    found = clock_filter("regression")
+    samples = synchronisation(0, drifting(0, 0))
+    samples[2] = exchange(samples[2].sent_ns - START_NS, drifting(3 * MS, 0), turn_round_ns=-6 * MS)
+    assert found.update(samples).rejected == 1
+    assert abs(error_ns(found, 1, 0)) < 0.02 * MS
+
+
+def test_a_line_that_bends_lets_go_of_the_past() -> None:
+    """A clock that changes its frequency by 3 ppm is followed from the second synchronisation after that."""
+    found = clock_filter("regression")
+
+    def clock(true_ns: int) -> float:
+        return 10e-6 * true_ns + 3e-6 * max(0, true_ns - 3000 * SECOND)
+
+    for start_s in range(0, 3901, 300):
+        found.update(synchronisation(start_s, clock))
+    assert found.at(START_NS).frequency_ppm == pytest.approx(13, abs=0.1)
+    assert abs(error_ns(found, 4200, clock(4200 * SECOND))) < 0.05 * MS
+
+
+@pytest.mark.parametrize("step_ms", [20, -20, 200, -200, 10_000_000])
+def test_a_step_between_synchronisations_starts_anew(step_ms: int) -> None:
+    """A clock that was set by more than the bound is noticed; the frequency is kept, the offset is not."""
+    found = clock_filter("regression")
+
+    def clock(true_ns: int) -> float:
+        return 10e-6 * true_ns + (step_ms * MS if true_ns > 700 * SECOND else 0)
+
+    for start_s in (0, 300, 600):
+        assert found.update(synchronisation(start_s, clock)).restarted == (start_s == 0)
+    assert found.update(synchronisation(900, clock)).restarted
+    assert abs(error_ns(found, 901, clock(901 * SECOND))) < 0.05 * MS
+    assert found.at(START_NS).frequency_ppm == pytest.approx(10, abs=1)
+
+
+@pytest.mark.parametrize("step_ms", [50, -50])
+@pytest.mark.parametrize("after", [1, 3, 4])
+def test_a_step_within_a_synchronisation(step_ms: int, after: int) -> None:
+    """Exchanges from before a step are left out: the newest clock is the one that counts."""
+    found = clock_filter("regression")
+    old = synchronisation(0, drifting(0, 0))
+    new = synchronisation(0, drifting(step_ms * MS, 0))
+    updated = found.update([*old[:after], *new[after:]])
+    assert updated.rejected == after
+    assert abs(error_ns(found, 2, step_ms * MS)) < 0.02 * MS
+
+
+def test_frequency_is_remembered_when_the_offset_is_forgotten() -> None:
+    """After a restart five exchanges do, because the crystal is the same."""
+    found = clock_filter("regression")
+    clock = drifting(0, 40)
+    for start_s in (0, 300, 600):
+        found.update(synchronisation(start_s, clock))
+    found.forget()
+    found.update(synchronisation(700, drifting(-3600 * SECOND, 40)))
+    assert abs(error_ns(found, 1000, -3600 * SECOND + 40e3 * 1000)) < 0.1 * MS
+
+
+@pytest.mark.parametrize("step_ms", [1.4, -1.4, 0.3])
+def test_a_frequency_that_may_be_a_small_step_is_not_remembered(step_ms: float) -> None:
+    """A clock that was set by less than its bound seems to run at another frequency, which its next restart may end."""
+    found = clock_filter("regression")
+    found.update(synchronisation(0, drifting(0, -20), cycles=8, turn_round_ns=3 * MS))
+    found.update(synchronisation(14, drifting(step_ms * MS, -20), turn_round_ns=3 * MS))
+    assert abs(found.at(START_NS + 15 * SECOND).frequency_ppm + 20) > 10
+    clock = drifting(-3600 * SECOND, -20)
+    assert found.update(synchronisation(30, clock)).restarted
+    for true_s in (31, 40, 60, 120):
+        stamped_ns = START_NS + true_s * SECOND + round(clock(true_s * SECOND))
+        ways_ns = exchange(0, clock).excess_ns  # what all stamps share is not what this is about
+        assert abs(error_ns(found, true_s, clock(true_s * SECOND))) < found.at(stamped_ns).bound_ns - ways_ns
+
+
+def test_another_crystal_is_believed_after_a_long_synchronisation() -> None:
+    """A station computer that was exchanged is not held to the frequency of the old one."""
+    found = clock_filter("regression")
+    for start_s in (0, 300, 600):
+        found.update(synchronisation(start_s, drifting(0, 40)))
+    found.forget()
+    found.update(synchronisation(700, drifting(0, -10), cycles=50))
+    assert found.at(START_NS).frequency_ppm == pytest.approx(-10, abs=1.5)
+
+
+def test_bound_covers_what_all_stamps_share() -> None:
+    """Stamps that are all late by 3 ms cannot be told from punctual ones, but the round trip bounds it."""
+    found = clock_filter("regression")
+    found.update(synchronisation(0, drifting(0, 0), late_ns=[3 * MS] * 5))
+    assert error_ns(found, 1, 0) == pytest.approx(3 * MS, abs=1000)
+    assert 3 * MS < found.at(START_NS + SECOND).bound_ns < 6 * MS
+
+
+def test_bound_grows_with_age_and_sigma_stays_below() -> None:
+    """The longer nothing is heard of a clock, the less is known of it."""
+    found = clock_filter("regression")
+    for start_s in (0, 300, 600):
+        found.update(synchronisation(start_s, drifting(0, 1)))
+    estimates = [found.at(START_NS + at_s * SECOND) for at_s in (601, 900, 1800, 7200, 10**9)]
+    bounds_ns = [estimate.bound_ns for estimate in estimates]
+    assert bounds_ns == sorted(bounds_ns)
+    assert all(0 < estimate.sigma_ns < estimate.bound_ns for estimate in estimates)
+    assert bounds_ns[1] < 3 * MS
+
+
+# --- arrivals
+
+
+def polls(
+    check: ArrivalCheck, *, count: int, first_s: float = 0.0, step_s: float = 0.0, seed: int = 0
+) -> list[bool]:
+    """Poll every 0.58 s a clock that is wrong by the step; measurements are 0 to 0.45 s old when sent."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for requested_s in first_s + 0.58 * np.arange(count):
+        sent_s = requested_s + 0.06
+        stamp_s = sent_s - rng.uniform(0, 0.45) + step_s
+        found.append(
+            check.check(
+                START_NS + round(stamp_s * SECOND),
+                requested_ns=START_NS + round(requested_s * SECOND),
+                received_ns=START_NS + round((sent_s + 0.14) * SECOND),
+                bound_ns=2 * MS,
+            )
+        )
+    return found
+
+
+def test_arrivals_no_false_alarm_in_hours() -> None:
+    """Four hours of polls without a step raise no alarm."""
+    assert all(polls(ArrivalCheck(), count=25_000))
+
+
+def test_arrivals_no_false_alarm_after_lost_replies_and_lost_lock() -> None:
+    """Minutes without a measurement, and then one again, are nothing to worry about."""
+    check = ArrivalCheck()
+    assert all(polls(check, count=10))
+    assert all(polls(check, count=10, first_s=7.5))
+    for requested_s in range(15, 300):
+        check.nothing_new(START_NS + requested_s * SECOND)
+    assert all(polls(check, count=10, first_s=300.0))
+
+
+def test_arrivals_the_first_measurement_may_be_as_old_as_it_likes() -> None:
+    """A station that lost its target an hour ago answers the first request with what it last saw."""
+    assert polls(ArrivalCheck(), count=1, step_s=-3600) == [True]
+
+
+@pytest.mark.parametrize("step_s", [1.0, 3600.0, -1.0, -3600.0])
+def test_arrivals_a_step_is_noticed_at_once(step_s: float) -> None:
+    """Measurements from the future, or from before the previous one, come from another clock."""
+    check = ArrivalCheck()
+    polls(check, count=5)
+    assert polls(check, count=1, first_s=5 * 0.58, step_s=step_s) == [False]
+
+
+@pytest.mark.parametrize("step_s", [0.3, -0.4])
+def test_arrivals_a_step_of_some_tenths_is_noticed_soon(step_s: float) -> None:
+    """Steps just beyond the reply time-out show within a minute of polls."""
+    check = ArrivalCheck()
+    polls(check, count=5)
+    assert not all(polls(check, count=100, first_s=5 * 0.58, step_s=step_s))
+
+
+def test_arrivals_a_station_that_restarted_while_it_had_nothing_new() -> None:
+    """A station that answered without news is known to have had nothing older than that."""
+    check = ArrivalCheck()
+    polls(check, count=5)
+    check.nothing_new(START_NS + 100 * SECOND)
+    assert polls(check, count=1, first_s=100.58, step_s=-30.0) == [False]
+
+
+def test_arrivals_a_wide_bound_makes_the_check_lenient() -> None:
+    """After a long outage the offset itself may be off by its bound, which is no step."""
+    check = ArrivalCheck()
+    assert check.check(START_NS, requested_ns=START_NS, received_ns=START_NS, bound_ns=0)
+    late = {"requested_ns": START_NS + SECOND, "received_ns": START_NS + SECOND}
+    assert check.check(START_NS + 3 * SECOND, bound_ns=2 * SECOND, **late)

@@ -1,0 +1,162 @@
+"""What a report's figures share: an axis of time that people read, and curves of as many points as paper shows. Pure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.analysis.figures.style import STROKES
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
+    from numpy.typing import NDArray
+
+    from tsgt.analysis.figures.style import Stroke
+    from tsgt.geometry import FloatArray
+
+BUCKETS = 1500
+"""A page's width at 200 dpi has about as many dots."""
+
+STRETCHES = 150
+"""In so many parts a band is drawn."""
+
+HATCHES = ("", "///", "...", "xxx", "\\\\\\", "+++")
+"""Areas differ by these too, so that they can be told apart in grey."""
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """The axis of time: from the first measurement, in a unit that keeps the numbers small.
+
+    Attributes
+    ----------
+    origin_ns
+        What counts as 0, on the master's Unix clock.
+    unit_s
+        Seconds in one unit.
+    label
+        Of the axis.
+    """
+
+    origin_ns: int
+    unit_s: float
+    label: str
+
+    @classmethod
+    def over(cls, start_ns: int, end_ns: int) -> Clock:
+        """Choose the unit for a recording."""
+        span_s = (end_ns - start_ns) / 1e9
+        unit_s, name = (1.0, "s") if span_s <= 300 else (60.0, "min") if span_s <= 4 * 3600 else (3600.0, "h")
+        return cls(start_ns, unit_s, f"time from the first measurement ({name})")
+
+    def of(self, stamp_ns: NDArray[np.int64] | int) -> FloatArray:
+        """Where instants stand on the axis."""
+        return np.asarray((np.asarray(stamp_ns, dtype=np.int64) - self.origin_ns) / (1e9 * self.unit_s))
+
+
+def stroke(row: int) -> Stroke:
+    """How the curve of that number is drawn."""
+    return STROKES[row % len(STROKES)]
+
+
+def hatch(row: int) -> str:
+    """How the area of that number is hatched."""
+    return HATCHES[row % len(HATCHES)]
+
+
+def thinned(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Keep of each stretch of a long curve its lowest and its highest point, and its gaps.
+
+    Parameters
+    ----------
+    x, y
+        (N,); NaN in ``y`` leaves a gap.
+    """
+    size = len(x) // BUCKETS
+    if size < 4:
+        return x, y
+    n = len(x) // size
+    stretches = y[: n * size].reshape(n, size)
+    blank = np.isnan(stretches).all(axis=1)
+    low = np.where(blank, 0, np.argmin(np.where(np.isnan(stretches), np.inf, stretches), axis=1))
+    high = np.where(blank, 0, np.argmax(np.where(np.isnan(stretches), -np.inf, stretches), axis=1))
+    ends = np.sort(np.stack([low, high], axis=1), axis=1) + size * np.arange(n)[:, None]
+    rows = np.concatenate([ends.ravel(), np.arange(n * size, len(x))])
+    return x[rows], y[rows]
+
+
+def curve(
+    panel: Axes, x: FloatArray, y: FloatArray, row: int, *, label: str | None, dashes: bool = True
+) -> None:
+    """Draw a long curve as the one of that number; ``dashes`` off where it is too ragged to show any."""
+    look = stroke(row)
+    panel.plot(
+        *thinned(x, y),
+        color=look.color,
+        linestyle=look.linestyle if dashes else "-",
+        linewidth=0.9,
+        label=label,
+    )
+
+
+def banded(panel: Axes, x: FloatArray, y: FloatArray, row: int, *, label: str | None) -> None:
+    """Draw what swings too fast for a curve, as the one of that number: its median, and where nine tenths of it lie."""
+    size = max(1, len(x) // STRETCHES)
+    n = -(-len(x) // size)
+    filled = np.full(n * size, np.nan)
+    filled[: len(y)] = y
+    stretches = filled.reshape(n, size)
+    told = np.isfinite(stretches).any(axis=1)
+    figures = np.full((3, n), np.nan)
+    figures[:, told] = np.nanpercentile(stretches[told], (5, 50, 95), axis=1)
+    middle = x[np.minimum(np.arange(n) * size + size // 2, len(x) - 1)]
+    look = stroke(row)
+    panel.fill_between(middle, figures[0], figures[2], color=look.color, alpha=0.25, linewidth=0)
+    panel.plot(middle, figures[1], color=look.color, linestyle=look.linestyle, label=label)
+
+
+def plain_log(axis: Axis) -> None:
+    """Make an axis logarithmic, with plain numbers."""
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter  # noqa: PLC0415 (an extra)
+
+    name = "x" if axis is axis.axes.xaxis else "y"
+    axis.axes.set(**{f"{name}scale": "log"})
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def shade(panel: Axes, spans: Sequence[tuple[float, float]], label: str) -> None:
+    """Shade stretches of the axis of time."""
+    if spans:
+        # As one object: an hour has hundreds of stretches.
+        panel.broken_barh(
+            [(start, end - start) for start, end in spans],
+            (0.0, 1.0),
+            transform=panel.get_xaxis_transform(),
+            color="#e6e6e6",
+            linewidth=0,
+            zorder=0,
+            label=label,
+        )
+
+
+def dots(panel: Axes, x: FloatArray, y: FloatArray, row: int, *, label: str | None = None) -> None:
+    """Draw many points as the ones of that number: as a picture, so that a PDF stays small."""
+    look = stroke(row)
+    panel.plot(
+        x,
+        y,
+        linestyle="none",
+        marker=look.marker,
+        markersize=2.0 if len(x) < 3000 else 1.0,
+        markeredgewidth=0,
+        color=look.color,
+        label=label,
+        rasterized=True,
+    )

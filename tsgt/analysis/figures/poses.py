@@ -1,0 +1,186 @@
+"""Figures of a report: where the robot went, both estimators, residuals. From data to matplotlib, nothing else."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.analysis.figures.axes import banded, curve, dots, plain_log, stroke
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from matplotlib.figure import Figure
+    from numpy.typing import NDArray
+
+    from tsgt.analysis.evaluation.held_out import HeldOut
+    from tsgt.analysis.figures.axes import Clock
+    from tsgt.analysis.processing import Estimator
+    from tsgt.analysis.report.findings import Difference
+    from tsgt.estimation.pose_batch import PoseBatch
+    from tsgt.geometry import FloatArray
+
+_AXES = ("x", "y", "z")
+_SIGHT = ("along the line of sight", "horizontally across", "vertically across")
+
+
+def draw_map(figure: Figure, poses: PoseBatch, stations: Mapping[int, FloatArray]) -> None:
+    """Draw the way from above, with the stations; where no pose is valid the line is broken.
+
+    Parameters
+    ----------
+    figure
+        An empty one.
+    poses
+        As computed.
+    stations
+        Positions in frame ``station1``, (3,) each, by number.
+    """
+    panel = figure.subplots()
+    xy = np.where(poses.valid[:, None], poses.position_m, np.nan)[:, :2]
+    step = max(1, len(xy) // 20_000)
+    panel.plot(*xy[::step].T, color=stroke(1).color, linewidth=0.9, label="robot")
+    ends = np.flatnonzero(poses.valid)[[0, -1]]
+    for row, (end, name) in enumerate(zip(ends, ("start", "end"), strict=True)):
+        panel.plot(
+            *xy[end],
+            linestyle="none",
+            marker="os"[row],
+            markersize=5,
+            markerfacecolor="white" if row == 0 else "black",
+            markeredgecolor="black",
+            label=name,
+        )
+    for row, (number, position) in enumerate(stations.items()):
+        panel.plot(
+            *position[:2],
+            linestyle="none",
+            marker="^",
+            markersize=6,
+            color=stroke(2).color,
+            label="station" if row == 0 else None,
+        )
+        x, y = position[:2].tolist()
+        panel.annotate(str(number), (x, y), textcoords="offset points", xytext=(5, 3), fontsize=7)
+    panel.set_aspect("equal", adjustable="datalim")
+    panel.set_xlabel("x in frame station1 (m)")
+    panel.set_ylabel("y in frame station1 (m)")
+    figure.legend(loc="outside upper center", ncols=4)
+
+
+def draw_coordinates(figure: Figure, poses: PoseBatch, clock: Clock) -> None:
+    """Draw the position over time, and below it the sigmas of position and rotation that the poses state."""
+    axes = figure.subplots(5, 1, sharex=True)
+    time, valid = clock.of(poses.stamp_ns), poses.valid
+    sigma = np.sqrt(np.einsum("nii->ni", poses.covariance))
+    sigma[~valid] = np.nan
+    position = np.where(valid[:, None], poses.position_m, np.nan)
+    for row, name in enumerate(_AXES):
+        curve(axes[row], time, position[:, row], 1, label=None, dashes=False)
+        axes[row].set_ylabel(f"{name} (m)")
+    for row, (columns, label) in enumerate(
+        (([0, 1], "horizontally; about x and y"), ([2], "in height; about z"))
+    ):
+        rms = [np.sqrt(np.mean(sigma[:, [c + first for c in columns]] ** 2, axis=1)) for first in (0, 3)]
+        banded(axes[3], time, 1e3 * rms[0], row, label=label)
+        banded(axes[4], time, np.degrees(rms[1]), row, label=None)
+    axes[3].set_ylabel("position\nsigma (mm)")
+    axes[4].set_ylabel("rotation\nsigma (deg)")
+    for panel in axes[3:]:
+        plain_log(panel.yaxis)
+    axes[4].set_xlabel(clock.label)
+    figure.align_ylabels(axes)
+    handles, labels = axes[3].get_legend_handles_labels()
+    figure.legend(handles, [f"sigma {x}" for x in labels], loc="outside upper center", ncols=2)
+
+
+def draw_held_out(figure: Figure, misses: Mapping[Estimator, HeldOut]) -> None:
+    """Draw how many of the left-out measurements each estimator missed by how much."""
+    axes = figure.subplots(1, 2, sharey=True)
+    for panel, gap, title in zip(
+        axes, (False, True), ("neighbours at most 1 s apart", "at gaps over 1 s"), strict=True
+    ):
+        reach_mm = 0.0
+        for row, (name, each) in enumerate(misses.items()):
+            chosen = np.sort(1e3 * each.missed_m[each.at_gap == gap])
+            share = 100 * np.arange(1, len(chosen) + 1) / max(1, len(chosen))
+            look = stroke(row)
+            panel.plot(chosen, share, color=look.color, linestyle=look.linestyle, label=name)
+            # The farthest misses would squeeze all others.
+            reach_mm = max(reach_mm, 1.2 * np.percentile(chosen, 97) if len(chosen) else 0.0)
+        if reach_mm:
+            panel.set_xlim(0.0, reach_mm)
+        else:
+            panel.text(0.5, 0.5, "none", transform=panel.transAxes, ha="center", va="center")
+            panel.set_xticks([])
+        panel.set_title(title, loc="left")
+        panel.set_xlabel("missed by (mm)")
+    axes[0].set_ylabel("share missed by less (%)")
+    axes[0].set_ylim(0, 101)  # a curve at 100 % is seen
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
+
+
+def draw_difference(figure: Figure, difference: Difference, clock: Clock) -> None:
+    """Draw how far the poses of the two estimators are apart."""
+    axes = figure.subplots(2, 1, sharex=True)
+    time, position, rotation = _with_gaps(difference)
+    curve(axes[0], clock.of(time), 1e3 * position, 1, label=None, dashes=False)
+    curve(axes[1], clock.of(time), np.degrees(rotation), 1, label=None, dashes=False)
+    axes[0].set_ylabel("position (mm)")
+    axes[1].set_ylabel("rotation (deg)")
+    for panel in axes:
+        panel.set_ylim(bottom=0.0)
+    axes[1].set_xlabel(clock.label)
+    figure.align_ylabels(axes)
+
+
+def draw_residuals(
+    figure: Figure,
+    normalised: FloatArray,
+    stamp_ns: NDArray[np.int64],
+    station: NDArray[np.int64],
+    clock: Clock,
+) -> None:
+    """Draw the normalised residuals of each station over time.
+
+    Parameters
+    ----------
+    figure
+        An empty one.
+    normalised
+        (M, 3) in sigmas, along the line of sight, horizontally and vertically across it.
+    stamp_ns, station
+        (M,) when, and who measured.
+    clock
+        The axis of time.
+    """
+    numbers = np.unique(station).tolist()
+    axes = figure.subplots(len(numbers), 3, sharex=True, sharey=True, squeeze=False)
+    for row, number in enumerate(numbers):
+        rows = station == number
+        for column, name in enumerate(_SIGHT):
+            panel = axes[row, column]
+            # What is further out is drawn at the edge: it is named in the table of outliers.
+            dots(panel, clock.of(stamp_ns[rows]), np.clip(normalised[rows, column], -5.8, 5.8), 1)
+            for limit in (-3.0, 3.0):
+                panel.axhline(limit, color="black", linestyle="--", linewidth=0.8)
+            panel.axhline(0.0, color="black", linewidth=0.6)
+            if row == 0:
+                panel.set_title(name)
+        axes[row, 0].set_ylabel(f"station {number}\n(sigmas)")
+    axes[0, 0].set_ylim(-6, 6)
+    figure.supxlabel(clock.label, fontsize=8)
+
+
+def _with_gaps(difference: Difference) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
+    """Put a NaN where epochs are missing, so that no line is drawn across."""
+    steps = np.diff(difference.stamp_ns)
+    if not len(steps):
+        return difference.stamp_ns, difference.position_m, difference.rotation_rad
+    breaks = np.flatnonzero(steps > 2 * np.median(steps)) + 1
+    return (
+        np.insert(difference.stamp_ns, breaks, difference.stamp_ns[breaks] - 1),
+        np.insert(difference.position_m, breaks, np.nan),
+        np.insert(difference.rotation_rad, breaks, np.nan),
+    )

@@ -1,0 +1,108 @@
+"""Poses and measurements in the formats of other programs: TUM for evo, CSV for spreadsheets.
+
+The columns of the CSV files are described in docs/reference/csv.md.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from tsgt.model import PointMeasurement
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+
+    from tsgt.estimation.pose_batch import PoseBatch
+    from tsgt.model import Measurement
+    from tsgt.recording.stream_records import PoseRecord
+
+POSE_COLUMNS = (
+    *("stamp_ns", "valid", "reason", "estimator", "kind"),
+    *("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"),
+    *("sigma_x_m", "sigma_y_m", "sigma_z_m", "sigma_rx_rad", "sigma_ry_rad", "sigma_rz_rad"),
+    *("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps"),
+    "residual_m",
+)
+
+MEASUREMENT_COLUMNS = (
+    *("type", "station", "prism", "sequence", "stamp_ns", "received_ns", "status"),
+    *("horizontal_angle_rad", "zenith_angle_rad", "slope_distance_m"),
+    *("x_m", "y_m", "z_m"),
+    *("stamp_sigma_ns", "stamp_bound_ns", "raw_status", "host_time_ns", "instrument_time_ns"),
+)
+
+
+def tum_lines(poses: Iterable[tuple[int, Sequence[float], Sequence[float]]]) -> Iterator[str]:
+    """Format poses as the TUM RGB-D benchmark does: ``stamp_s x y z qx qy qz qw``.
+
+    Parameters
+    ----------
+    poses
+        Valid poses: Unix time in ns, position in m, unit quaternion x, y, z, w.
+
+    Yields
+    ------
+    str
+        One line per pose: seconds with nine decimals, exactly the nanoseconds; metres to the nanometre.
+    """
+    row = "{:d}.{:09d} {:.9f} {:.9f} {:.9f} {:.12f} {:.12f} {:.12f} {:.12f}\n".format
+    for stamp_ns, position_m, orientation_xyzw in poses:
+        yield row(*divmod(stamp_ns, 1_000_000_000), *position_m, *orientation_xyzw)
+
+
+def valid_rows(batch: PoseBatch) -> Iterator[tuple[int, Sequence[float], Sequence[float]]]:
+    """Yield time, position and orientation of the valid poses of a batch, for :func:`tum_lines`."""
+    valid = batch.valid
+    columns = (batch.stamp_ns, batch.position_m, batch.orientation_xyzw)
+    return zip(*(column[valid].tolist() for column in columns), strict=True)
+
+
+def valid_records(
+    poses: Iterable[PoseRecord],
+) -> Iterator[tuple[int, Sequence[float], Sequence[float]]]:
+    """Yield time, position and orientation of the valid poses among records, for :func:`tum_lines`."""
+    for pose in poses:
+        if pose.valid and pose.position_m is not None and pose.orientation_xyzw is not None:
+            yield pose.stamp_ns, pose.position_m, pose.orientation_xyzw
+
+
+def pose_csv(poses: Iterable[PoseRecord]) -> Iterator[str]:
+    """Yield the line of column names and a line per pose, valid or not; what a pose does not have stays empty."""
+    yield _line(POSE_COLUMNS)
+    for pose in poses:
+        sigmas = (
+            [None] * 6 if pose.covariance is None else [math.sqrt(pose.covariance[7 * i]) for i in range(6)]
+        )
+        yield _line(
+            (
+                *(pose.stamp_ns, int(pose.valid), pose.reason, pose.estimator, pose.kind),
+                *(pose.position_m or [None] * 3),
+                *(pose.orientation_xyzw or [None] * 4),
+                *sigmas,
+                *(pose.velocity_mps or [None] * 3),
+                *(pose.angular_velocity_radps or [None] * 3),
+                pose.residual_m,
+            )
+        )
+
+
+def measurement_csv(measurements: Iterable[Measurement]) -> Iterator[str]:
+    """Yield the line of column names and a line per measurement; what it does not have stays empty."""
+    yield _line(MEASUREMENT_COLUMNS)
+    for m in measurements:
+        polar: Sequence[float | None] = [None] * 3
+        position: Sequence[float | None] = [None] * 3
+        times: Sequence[int | None] = [None] * 5
+        if isinstance(m, PointMeasurement):
+            position = m.position_m
+        else:
+            polar = (m.horizontal_angle_rad, m.zenith_angle_rad, m.slope_distance_m)
+            times = (m.stamp_sigma_ns, m.stamp_bound_ns, m.raw_status, m.host_time_ns, m.instrument_time_ns)
+        who = (m.type, m.station, m.prism, m.sequence, m.stamp_ns, m.received_ns, m.status.value)
+        yield _line((*who, *polar, *position, *times))
+
+
+def _line(row: Iterable[object]) -> str:
+    # Numbers and our own words hold neither commas nor quotes, so there is nothing to escape.
+    return ",".join("" if value is None else str(value) for value in row) + "\n"

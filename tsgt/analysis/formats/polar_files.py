@@ -1,0 +1,180 @@
+"""Reading tracks of raw polar measurements: the format that ``tsgt export --format csv --records measurements`` writes.
+
+The columns are described in docs/reference/csv.md.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from tsgt.analysis.formats.csv_table import HORIZONTAL, ZENITH, read_table
+from tsgt.errors import InputFileError
+from tsgt.model import PointMeasurement, PolarMeasurement, Status
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from tsgt.analysis.formats.csv_table import Row
+    from tsgt.model import Measurement
+
+_TIME = ("stamp_ns", "time_s")
+_POINT = ("x_m", "y_m", "z_m")
+_OPTIONAL = (
+    *("type", "station", "prism", "sequence", "received_ns", "status"),
+    *("stamp_sigma_ns", "stamp_bound_ns", "raw_status", "host_time_ns", "instrument_time_ns"),
+    *_POINT,
+)
+
+
+def read_polar_tracks(paths: Sequence[Path]) -> list[Measurement]:
+    """Read the measurements of one drive.
+
+    Parameters
+    ----------
+    paths
+        One file of all stations, or several. In a file without a column ``station`` all lines are of the station whose
+        number is the place of the file among them, from 1.
+
+    Returns
+    -------
+    list of PolarMeasurement or PointMeasurement
+        In the order of arrival; those of which it is not said arrived when they were made.
+
+    Raises
+    ------
+    InputFileError
+        A file cannot be read, is empty, has a wrong column or number, or a measurement stands there twice.
+    """
+    measurements: list[Measurement] = []
+    counts: dict[int, int] = {}
+    seen: dict[tuple[int, int, int], str] = {}
+    for place, path in enumerate(paths, start=1):
+        header, rows = read_table(path)
+        header.expect([_TIME, HORIZONTAL, ZENITH, ["slope_distance_m"]], _OPTIONAL)
+        for row in rows:
+            station = row.positive_integer("station") if "station" in row.cells else place
+            found = _measurement(row, station, counts.get(station, 0))
+            where = f"{path}, line {row.line}"
+            known = seen.setdefault((station, found.prism, found.stamp_ns), where)
+            if known != where and found.status.usable:
+                raise row.error(
+                    f"station {station} measured prism {found.prism} at this time already in {known}; keep one of the lines"
+                )
+            counts[station] = counts.get(station, 0) + 1
+            measurements.append(found)
+    return sorted(measurements, key=lambda m: m.received_ns)
+
+
+def _measurement(row: Row, station: int, count: int) -> Measurement:
+    """Read one line; ``count`` is how many there have been of this station."""
+    stamp_ns = row.whole("stamp_ns") if "stamp_ns" in row.cells else row.seconds_ns("time_s")
+    prism = row.positive_integer("prism") if "prism" in row.cells else station
+    sequence = _whole(row, "sequence")
+    received_ns = _whole(row, "received_ns")
+    sequence = count if sequence is None else sequence
+    received_ns = stamp_ns if received_ns is None else received_ns
+    status = _status(row)
+    match row.cells.get("type", "measurement"):
+        case "measurement":
+            horizontal_rad, zenith_rad = row.angles_rad()
+            return PolarMeasurement(
+                station=station,
+                prism=prism,
+                sequence=sequence,
+                stamp_ns=stamp_ns,
+                stamp_sigma_ns=_whole(row, "stamp_sigma_ns") or 0,
+                stamp_bound_ns=_whole(row, "stamp_bound_ns"),
+                received_ns=received_ns,
+                horizontal_angle_rad=horizontal_rad,
+                zenith_angle_rad=zenith_rad,
+                slope_distance_m=_distance_m(row),
+                status=status,
+                raw_status=_whole(row, "raw_status") or 0,
+                host_time_ns=_whole(row, "host_time_ns"),
+                instrument_time_ns=_whole(row, "instrument_time_ns"),
+            )
+        case "point" if all(name in row.cells for name in _POINT):
+            return PointMeasurement(
+                station=station,
+                prism=prism,
+                sequence=sequence,
+                stamp_ns=stamp_ns,
+                received_ns=received_ns,
+                position_m=(row.number("x_m"), row.number("y_m"), row.number("z_m")),
+                status=status,
+            )
+        case "point":
+            raise row.error("a point needs the columns x_m, y_m and z_m")
+        case other:
+            raise row.error(f"type is {other!r}; it is measurement or point")
+
+
+def _distance_m(row: Row) -> float | None:
+    """Read the slope distance; an empty cell says that there was none."""
+    if not row.cells["slope_distance_m"]:
+        return None
+    distance_m = row.number("slope_distance_m")
+    if distance_m < 0.0:
+        raise row.error(
+            f"slope_distance_m is {row.cells['slope_distance_m']}; expected a distance in m, or an empty cell"
+        )
+    return distance_m
+
+
+def _whole(row: Row, column: str) -> int | None:
+    return row.whole(column) if row.cells.get(column) else None
+
+
+def _status(row: Row) -> Status:
+    text = row.cells.get("status") or Status.OK.value
+    try:
+        return Status(text)
+    except ValueError:
+        raise row.error(
+            f"status is {text!r}; expected one of {', '.join(Status)}, or an empty cell"
+        ) from None
+
+
+def station_prisms(measurements: Sequence[Measurement]) -> dict[int, int]:
+    """Tell which prism each station tracks: the one that it measured most often.
+
+    Returns
+    -------
+    dict
+        Number of the prism by that of the station, sorted.
+    """
+    counts: dict[int, dict[int, int]] = {}
+    for m in measurements:
+        by_prism = counts.setdefault(m.station, {})
+        by_prism[m.prism] = by_prism.get(m.prism, 0) + 1
+    return {
+        station: max(by_prism, key=lambda prism: by_prism[prism])
+        for station, by_prism in sorted(counts.items())
+    }
+
+
+def check_tracks(measurements: Sequence[Measurement], paths: Sequence[Path]) -> None:
+    """Refuse tracks that have no time in common, and such of which none can be used.
+
+    Raises
+    ------
+    InputFileError
+        As said; it names the stations.
+    """
+    spans: dict[int, tuple[int, int]] = {}
+    for m in measurements:
+        if m.status.usable:
+            start, end = spans.get(m.station, (m.stamp_ns, m.stamp_ns))
+            spans[m.station] = min(start, m.stamp_ns), max(end, m.stamp_ns)
+    if not spans:
+        raise InputFileError("no measurement has a status that can be used", path=paths[0])
+    latest = max(spans, key=lambda station: spans[station][0])
+    first_over = min(spans, key=lambda station: spans[station][1])
+    late_ns = spans[latest][0] - spans[first_over][1]
+    if late_ns > 0:
+        raise InputFileError(
+            f"the measurements of station {latest} begin {late_ns / 1e9:.1f} s after the last one of station "
+            f"{first_over}; take the tracks of one drive, on one clock",
+            path=paths[0],
+        )

@@ -1,0 +1,94 @@
+"""Distances between prisms over time, to stand beside those between satellite receivers."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.analysis.evaluation.inter_prism import at_epochs
+from tsgt.analysis.gnss.baselines import Distances
+from tsgt.errors import RecordingError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from tsgt.estimation.tracks import Track
+    from tsgt.model import Parameters
+
+
+def prism_pairs(parameters: Parameters, tracks: Mapping[int, Track], path: Path) -> tuple[Distances, ...]:
+    """Measure the distances between all prisms over time, as ``tsgt evaluate`` does: at 20 Hz, all pairs or none.
+
+    Parameters
+    ----------
+    parameters
+        The prism layout (the reference distances) and the outage limit.
+    tracks
+        One track per prism of the layout, in frame ``station1``.
+    path
+        The recording, for messages.
+
+    Raises
+    ------
+    RecordingError
+        A prism was not measured, or the layout has one prism only.
+    """
+    missing = [prism.prism for prism in parameters.prisms if not len(tracks[prism.prism])]
+    if missing or len(parameters.prisms) < 2:
+        what = f"prism {missing[0]} was not measured" if missing else "it has one prism only"
+        raise RecordingError(f"no distances between prisms: {what}", path=path)
+    found = at_epochs(parameters, tracks)
+    return tuple(
+        Distances(
+            name=f"{a}-{b}",
+            times_ns=found.stamp_ns[found.valid],
+            distances_m=distances_m[found.valid],
+            reference_m=found.references_m[a, b],
+            quality=None,
+            invalid_ns=found.stamp_ns[~found.valid],
+        )
+        for (a, b), distances_m in found.distances_m.items()
+    )
+
+
+def common_part(
+    gnss: Sequence[Distances], prisms: Sequence[Distances], path: Path
+) -> tuple[tuple[Distances, ...], tuple[Distances, ...]]:
+    """Cut both to the time that they share, so that their figures are of the same stretch of the way.
+
+    Parameters
+    ----------
+    gnss, prisms
+        Distances between receivers, and between prisms.
+    path
+        The recording, for messages.
+
+    Raises
+    ------
+    RecordingError
+        They share no time.
+    """
+    theirs, ours = span(gnss), span(prisms)
+    if theirs is None or ours is None:
+        which = "receivers" if theirs is None else "prisms"
+        raise RecordingError(f"nothing to compare: there are no distances between {which}", path=path)
+    start_ns, end_ns = max(theirs[0], ours[0]), min(theirs[1], ours[1])
+    if start_ns > end_ns:
+        late = ours[0] > theirs[1]
+        raise RecordingError(
+            f"its distances {'begin' if late else 'end'} {(start_ns - end_ns) / 1e9:.1f} s "
+            f"{'after the end' if late else 'before the start'} of the receivers'; was the master's clock right?",
+            path=path,
+        )
+    both = tuple(tuple(pair.between(start_ns, end_ns) for pair in pairs) for pairs in (gnss, prisms))
+    if None in map(span, both):
+        raise RecordingError("while its prisms were seen the receivers had no positions in common", path=path)
+    return both[0], both[1]
+
+
+def span(pairs: Sequence[Distances]) -> tuple[int, int] | None:
+    """Return the first and the last time of any distance; None without one."""
+    times = np.concatenate([np.empty(0, np.int64), *(pair.times_ns for pair in pairs)])
+    return (int(times.min()), int(times.max())) if len(times) else None

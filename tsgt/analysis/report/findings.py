@@ -1,0 +1,349 @@
+"""Everything that a report tells of a recording, found once; what cannot be found says why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+from tsgt.analysis.design.perturbation import Perturbation, equivalent, first_order_sigmas, perturbation_study
+from tsgt.analysis.evaluation.held_out import held_out
+from tsgt.analysis.evaluation.inter_prism import at_epochs, inter_prism
+from tsgt.analysis.evaluation.reference import compare, compare_aligned
+from tsgt.analysis.evaluation.residuals import normalised_residuals, outliers, residual_figures
+from tsgt.analysis.evaluation.stationary import standing_errors
+from tsgt.analysis.processing import process, with_estimator
+from tsgt.analysis.report.log import Log, read_log
+from tsgt.analysis.report.motion import ride
+from tsgt.analysis.report.stations import station_figures, station_records
+from tsgt.analysis.smoothing import smoothed
+from tsgt.analysis.validation import believed
+from tsgt.errors import GeometryError, RecordingError
+from tsgt.estimation.observations import build_observations
+from tsgt.estimation.tracks import build_tracks
+from tsgt.geometry import check_layout, log_so3, rotation_from_quaternion
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from tsgt.analysis.evaluation.held_out import HeldOut
+    from tsgt.analysis.evaluation.inter_prism import InterPrism
+    from tsgt.analysis.evaluation.metrics import Align, AlignedFigures, PoseFigures
+    from tsgt.analysis.evaluation.reference import Reference
+    from tsgt.analysis.evaluation.residuals import AxisFigures, Outlier
+    from tsgt.analysis.evaluation.stationary import StandingFigures
+    from tsgt.analysis.processing import Estimator
+    from tsgt.analysis.report.motion import Ride
+    from tsgt.analysis.report.stations import StationFigures, StationRecord
+    from tsgt.analysis.smoothing import Smoothed
+    from tsgt.estimation.pose_batch import PoseBatch
+    from tsgt.geometry import FloatArray
+    from tsgt.recording import Recording
+
+T = TypeVar("T")
+
+_NOISES_M = tuple(0.02 * level for level in range(21))
+_DRAWS = 1000
+_EQUIVALENT_DRAWS = 20_000
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """The two estimators' poses beside each other, where both are valid: (N,) each.
+
+    Attributes
+    ----------
+    stamp_ns
+        Epochs.
+    position_m
+        Distance between the positions of the prisms' centroid.
+    rotation_rad
+        Angle between the rotations.
+    """
+
+    stamp_ns: np.ndarray[Any, np.dtype[np.int64]]
+    position_m: FloatArray
+    rotation_rad: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class PoseNoise:
+    """What noise on the prisms of this layout does to a pose.
+
+    Attributes
+    ----------
+    study
+        For noise of several sizes.
+    first_order_per_mm
+        Sigmas of position (m) and rotation (rad) for 1 mm of noise, (3,) each.
+    as_measured
+        For the noise that explains the mean error of the distances between prisms; None where there are none.
+    """
+
+    study: list[Perturbation]
+    first_order_per_mm: tuple[FloatArray, FloatArray]
+    as_measured: Perturbation | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Findings:
+    """What was found of a recording.
+
+    Attributes
+    ----------
+    recording, path
+        What it is of.
+    start_ns, end_ns
+        First and last measurement.
+    log
+        Radio, clocks, events.
+    stations, station_figures
+        What each station measured, and in figures by its number.
+    inter_prism, ride
+        Distances between prisms; None where a prism is missing.
+    odometry_ns
+        When the robot stood still by its odometry, within the recording or not; None without odometry.
+    continuous, linear
+        Poses of both estimators; None where one has none.
+    difference
+        Between the two; None where one is missing.
+    held_out
+        Misses of left-out measurements; None where none were left out.
+    residuals, outliers, normalised
+        Of the continuous trajectory; empty without it.
+    compared
+        Against the reference, by estimator; empty without one.
+    aligned
+        The same after an alignment, where one was asked for and could be found.
+    stops
+        The mean pose of each stop against the reference, by estimator.
+    reference
+        The reference.
+    pose_noise
+        What the layout makes of noise; None where no pose can come of it.
+    problems
+        Why something is missing, in sentences, by its name.
+    """
+
+    recording: Recording
+    path: Path
+    start_ns: int
+    end_ns: int
+    log: Log
+    stations: list[StationRecord]
+    station_figures: dict[int, StationFigures]
+    inter_prism: InterPrism | None
+    ride: Ride | None
+    odometry_ns: tuple[tuple[int, int], ...] | None
+    continuous: Smoothed | None
+    linear: PoseBatch | None
+    difference: Difference | None
+    held_out: dict[Estimator, HeldOut] | None
+    residuals: dict[int, dict[str, AxisFigures]]
+    outliers: list[Outlier]
+    normalised: FloatArray
+    compared: dict[Estimator, PoseFigures]
+    aligned: dict[Estimator, AlignedFigures]
+    stops: dict[Estimator, StandingFigures]
+    reference: Reference | None
+    pose_noise: PoseNoise | None
+    problems: dict[str, str]
+
+    @property
+    def poses(self) -> PoseBatch | None:
+        """The poses that the report shows: those of the estimator of the recording, else of the other one."""
+        both = self.both
+        return both.get(self.recording.parameters.pipeline.estimator) or next(iter(both.values()), None)
+
+    @property
+    def both(self) -> dict[Estimator, PoseBatch]:
+        """The poses of each estimator that has some."""
+        continuous = None if self.continuous is None else self.continuous.poses
+        found: dict[Estimator, PoseBatch | None] = {"linear": self.linear, "continuous": continuous}
+        return {name: poses for name, poses in found.items() if poses is not None}
+
+    @property
+    def duration_s(self) -> float:
+        """From the first measurement to the last, in s."""
+        return (self.end_ns - self.start_ns) / 1e9
+
+
+def find(
+    recording: Recording,
+    path: Path,
+    *,
+    reference: Reference | None,
+    with_held_out: bool,
+    align: Align | None = None,
+    still_ns: Sequence[tuple[int, int]] | None = None,
+    on_progress: Callable[[float], None] | None = None,
+) -> Findings:
+    """Find everything that a report tells.
+
+    Parameters
+    ----------
+    recording
+        Measurements and the parameters in force.
+    path
+        Its file.
+    reference
+        What to compare poses with, if anything.
+    with_held_out
+        Whether to leave measurements out and predict them.
+    align
+        How poses are aligned with the reference besides, if at all.
+    still_ns
+        When the robot stood still, if something else than the measurements tells it.
+    on_progress
+        Called now and then with the share of the work that is done, 0 to 1.
+
+    Raises
+    ------
+    RecordingError
+        There is no measurement at all, or the file cannot be read.
+    """
+    report = on_progress or (lambda _: None)
+    parameters = recording.parameters
+    measurements = believed(recording)
+    if not measurements:
+        raise RecordingError("holds no measurements, so there is nothing to report", path=path)
+    problems: dict[str, str] = {}
+    start_ns, end_ns = min(m.stamp_ns for m in measurements), max(m.stamp_ns for m in measurements)
+    stations = station_records(measurements, [s.station for s in parameters.stations])
+    limit_ns = parameters.pipeline.outage_limit_ns
+    fitted = 0.5 if with_held_out else 0.8
+
+    def attempt(name: str, compute: Callable[[], T]) -> T | None:
+        try:
+            return compute()
+        except (RecordingError, GeometryError) as error:
+            problems[name] = str(error).removeprefix(f"{path}: ")
+            return None
+
+    continuous = attempt(
+        "continuous",
+        lambda: smoothed(recording, path=path, on_progress=lambda share: report(fitted * share)),
+    )
+    report(fitted)
+    linear = attempt("linear", lambda: process(with_estimator(recording, "linear"), path=path))
+    tracks = build_tracks(parameters, measurements)
+    unseen = [prism for prism, track in tracks.items() if not len(track)]
+    if unseen:
+        names = " and ".join(f"prism {prism}" for prism in unseen)
+        problems["inter_prism"] = f"nothing usable was measured of {names}"
+    epochs = None if unseen else at_epochs(parameters, tracks)
+    distances = None if epochs is None else inter_prism(parameters, tracks, still_ns, epochs)
+    moved = continuous.poses if continuous is not None else linear
+    left_out = None
+    if with_held_out and continuous is not None:
+        report(fitted + 0.1)
+        observations, _ = build_observations(parameters, continuous.sources, origin_ns=continuous.origin_ns)
+        left_out = attempt(
+            "held_out",
+            lambda: held_out(
+                observations, parameters.pipeline, on_progress=lambda s: report(fitted + 0.1 + 0.3 * s)
+            ),
+        )
+    report(0.9)
+    centroid_m = np.mean([prism.position_m for prism in parameters.prisms], axis=0)
+    both: tuple[tuple[Estimator, PoseBatch | None], ...] = (
+        ("linear", linear),
+        ("continuous", None if continuous is None else continuous.poses),
+    )
+    compared: dict[Estimator, PoseFigures] = {}
+    aligned: dict[Estimator, AlignedFigures] = {}
+    stops: dict[Estimator, StandingFigures] = {}
+    if reference is not None:
+        compared = {name: compare(poses, reference, centroid_m) for name, poses in both if poses is not None}
+        stood_ns = () if distances is None else distances.still_ns
+        for name, poses in both:
+            if poses is None:
+                continue
+            stops[name] = standing_errors(poses, reference, stood_ns, centroid_m).summary()
+            if align is not None and compared[name].compared:
+                left = attempt("aligned", partial(compare_aligned, poses, reference, centroid_m, align))
+                aligned |= {} if left is None else {name: left}
+    return Findings(
+        recording=recording,
+        path=path,
+        start_ns=start_ns,
+        end_ns=end_ns,
+        log=read_log(path),
+        stations=stations,
+        station_figures={
+            each.station: station_figures(each, start_ns=start_ns, end_ns=end_ns, outage_limit_ns=limit_ns)
+            for each in stations
+        },
+        inter_prism=distances,
+        ride=None if epochs is None else ride(parameters, epochs, moved),
+        odometry_ns=None if still_ns is None else tuple(still_ns),
+        continuous=continuous,
+        linear=linear,
+        difference=None
+        if continuous is None or linear is None
+        else difference(linear, continuous.poses, centroid_m),
+        held_out=left_out,
+        residuals={} if continuous is None else residual_figures(continuous.fit, continuous.sources),
+        outliers=[] if continuous is None else outliers(continuous.fit, continuous.sources),
+        normalised=np.empty((0, 3)) if continuous is None else normalised_residuals(continuous.fit),
+        compared=compared,
+        aligned=aligned,
+        stops=stops,
+        reference=reference,
+        pose_noise=attempt("pose_noise", lambda: _pose_noise(recording, distances)),
+        problems=problems,
+    )
+
+
+def difference(a: PoseBatch, b: PoseBatch, point_m: FloatArray) -> Difference:
+    """Compare poses at the epochs at which both are valid.
+
+    Parameters
+    ----------
+    a, b
+        Poses at epochs that increase.
+    point_m
+        Point of the robot whose position is compared, (3,).
+    """
+    stamps, rows_a, rows_b = np.intersect1d(
+        a.stamp_ns[a.valid], b.stamp_ns[b.valid], assume_unique=True, return_indices=True
+    )
+    rows = np.flatnonzero(a.valid)[rows_a], np.flatnonzero(b.valid)[rows_b]
+    turns = [rotation_from_quaternion(p.orientation_xyzw[r]) for p, r in zip((a, b), rows, strict=True)]
+    points = [p.position_m[r] + R @ point_m for p, r, R in zip((a, b), rows, turns, strict=True)]
+    return Difference(
+        stamps,
+        np.linalg.norm(points[0] - points[1], axis=1),
+        np.linalg.norm(log_so3(np.swapaxes(turns[0], 1, 2) @ turns[1]), axis=1),
+    )
+
+
+def _pose_noise(recording: Recording, distances: InterPrism | None) -> PoseNoise:
+    prisms = recording.parameters.prisms
+    layout = np.array([prism.position_m for prism in prisms])
+    check_layout(layout, names=[prism.prism for prism in prisms])
+    centroid_m = layout.mean(axis=0)
+    # The same recording has to give the same report.
+    random = np.random.default_rng(0)
+    errors = [
+        np.abs(pair.distances_m - pair.reference_m)
+        for pair in (distances.dynamic if distances is not None else ())
+    ]
+    found = np.concatenate(errors) if errors else np.empty(0)
+    mean_m = float(found.mean()) if len(found) else 0.0
+    return PoseNoise(
+        perturbation_study(layout, _NOISES_M, draws=_DRAWS, point_m=centroid_m, random=random),
+        first_order_sigmas(layout, 1e-3, point_m=centroid_m),
+        equivalent(layout, mean_m, draws=_EQUIVALENT_DRAWS, point_m=centroid_m, random=random)
+        if mean_m > 0.0
+        else None,
+    )
+
+
+def position_sigma_mm(poses: PoseBatch) -> FloatArray:
+    """Give the sigma of the position per axis (root mean square of the three) that each valid pose states, in mm."""
+    covariance = poses.covariance[poses.valid, :3, :3]
+    return np.asarray(1e3 * np.sqrt(np.einsum("nii->n", covariance) / 3))

@@ -1,0 +1,203 @@
+"""Errors of the distances between prisms beside how the robot moved at that time. Pure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.geometry import rotate, rotation_from_quaternion
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from tsgt.analysis.evaluation.inter_prism import Epochs
+    from tsgt.estimation.pose_batch import PoseBatch
+    from tsgt.geometry import FloatArray
+    from tsgt.model import Parameters
+
+BINS = 8
+LEAST_IN_BIN = 20
+"""One second of epochs: fewer say nothing about a bin."""
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """How a robot moved at N epochs; NaN where no pose is valid.
+
+    Attributes
+    ----------
+    speed_mps
+        (N,) of the prisms' centroid.
+    acceleration_mps2
+        (N,) by which that speed grows; negative while the robot slows down.
+    turning_radps
+        (N,) length of the angular velocity.
+    """
+
+    speed_mps: FloatArray
+    acceleration_mps2: FloatArray
+    turning_radps: FloatArray
+
+    @classmethod
+    def unknown(cls, n: int) -> Motion:
+        """Make one of which nothing is known."""
+        return cls(*(np.full(n, np.nan) for _ in range(3)))
+
+
+@dataclass(frozen=True, slots=True)
+class Ride:
+    """Distance errors over time.
+
+    Attributes
+    ----------
+    stamp_ns
+        (N,) 20 Hz epochs in the time that all tracks cover.
+    error_m
+        By pair's name, (N,) measured distance less that of the layout; NaN where one of the tracks has a gap.
+    motion
+        How the robot moved then.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    error_m: dict[str, FloatArray]
+    motion: Motion
+
+
+@dataclass(frozen=True, slots=True)
+class Bins:
+    """Errors sorted by one quantity into bins of equal width.
+
+    Attributes
+    ----------
+    edges
+        (B + 1,) of the bins.
+    counts
+        (B,) errors in each.
+    median, mean, p95
+        (B,) of |error| in m; NaN where there are too few.
+    """
+
+    edges: FloatArray
+    counts: NDArray[np.int64]
+    median: FloatArray
+    mean: FloatArray
+    p95: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Mean |error| by two quantities.
+
+    Attributes
+    ----------
+    x_edges, y_edges
+        (X + 1,) and (Y + 1,).
+    mean
+        (Y, X) in m; NaN where there are too few.
+    counts
+        (Y, X).
+    """
+
+    x_edges: FloatArray
+    y_edges: FloatArray
+    mean: FloatArray
+    counts: NDArray[np.int64]
+
+
+def ride(parameters: Parameters, found: Epochs, poses: PoseBatch | None) -> Ride:
+    """Put the errors of the distances beside the robot's motion.
+
+    Parameters
+    ----------
+    parameters
+        The prism layout.
+    found
+        Distances over time.
+    poses
+        What tells how the robot moved; None where there are none.
+    """
+    centroid_m = np.mean([prism.position_m for prism in parameters.prisms], axis=0)
+    error_m = {f"{a}-{b}": m - found.references_m[a, b] for (a, b), m in found.distances_m.items()}
+    unknown = Motion.unknown(len(found.stamp_ns))
+    return Ride(
+        found.stamp_ns, error_m, unknown if poses is None else _motion(poses, centroid_m, found.stamp_ns)
+    )
+
+
+def _motion(poses: PoseBatch, centroid_m: FloatArray, epochs: NDArray[np.int64]) -> Motion:
+    if len(poses) < 2:
+        return Motion.unknown(len(epochs))
+    rows = poses.valid
+    velocity = np.full((len(poses), 3), np.nan)
+    arms = np.cross(poses.angular_velocity_radps[rows], centroid_m)
+    turned = rotate(rotation_from_quaternion(poses.orientation_xyzw[rows]), arms)
+    velocity[rows] = poses.velocity_mps[rows] + turned
+    time_s = (poses.stamp_ns - poses.stamp_ns[0]) / 1e9
+    speed = np.linalg.norm(velocity, axis=1)
+    turning = np.where(rows, np.linalg.norm(poses.angular_velocity_radps, axis=1), np.nan)
+    at_s = (epochs - poses.stamp_ns[0]) / 1e9
+    columns = (speed, np.gradient(speed, time_s), turning)
+    return Motion(*(np.interp(at_s, time_s, column, left=np.nan, right=np.nan) for column in columns))
+
+
+def binned(error_m: FloatArray, quantity: FloatArray) -> Bins | None:
+    """Sort errors by a quantity; None where there is too little to sort.
+
+    Parameters
+    ----------
+    error_m
+        (P, N) of P pairs at N epochs; NaN where unknown.
+    quantity
+        (N,); NaN where unknown.
+    """
+    edges = _edges(quantity)
+    if edges is None:
+        return None
+    place = _places(quantity, edges)
+    size = np.abs(error_m)
+    found = []
+    for i in range(len(edges) - 1):
+        some = size[:, place == i]
+        some = some[np.isfinite(some)]
+        told = len(some) >= LEAST_IN_BIN
+        figures = (np.median(some), np.mean(some), np.percentile(some, 95)) if told else (np.nan,) * 3
+        found.append((len(some), *map(float, figures)))
+    counts, median, mean, p95 = (np.array(column) for column in zip(*found, strict=True))
+    return Bins(edges, counts, median, mean, p95)
+
+
+def gridded(error_m: FloatArray, x: FloatArray, y: FloatArray) -> Grid | None:
+    """Sort errors by two quantities; arguments as for :func:`binned`."""
+    x_edges, y_edges = _edges(x), _edges(y)
+    if x_edges is None or y_edges is None:
+        return None
+    columns, rows = _places(x, x_edges), _places(y, y_edges)
+    shape = (len(y_edges) - 1, len(x_edges) - 1)
+    mean, counts = np.full(shape, np.nan), np.zeros(shape, np.int64)
+    size = np.abs(error_m)
+    for i in range(shape[0]):
+        for j in range(shape[1]):
+            some = size[:, (rows == i) & (columns == j)]
+            some = some[np.isfinite(some)]
+            counts[i, j] = len(some)
+            if len(some) >= LEAST_IN_BIN:
+                mean[i, j] = some.mean()
+    return Grid(x_edges, y_edges, mean, counts)
+
+
+def _edges(quantity: FloatArray) -> FloatArray | None:
+    known = quantity[np.isfinite(quantity)]
+    if len(known) < LEAST_IN_BIN:
+        return None
+    # The few largest would leave most bins empty; they are counted in the outermost ones.
+    top = float(np.percentile(np.abs(known), 99))
+    low = -top if (known < 0.0).any() else 0.0
+    return np.linspace(low, top, BINS + 1) if top > 0.0 else None
+
+
+def _places(quantity: FloatArray, edges: FloatArray) -> NDArray[np.int64]:
+    """Bin of each, -1 where it is not known."""
+    found = np.clip(np.searchsorted(edges, quantity, side="right") - 1, 0, len(edges) - 2)
+    return np.where(np.isfinite(quantity), found, -1)

@@ -1,0 +1,166 @@
+"""All numbers of a report, as ``--json`` prints them. Pure."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tsgt.analysis.report.calibration import calibration_keys
+from tsgt.analysis.report.elements import median
+from tsgt.analysis.report.findings import position_sigma_mm
+from tsgt.analysis.report.motion import binned, gridded
+from tsgt.analysis.report.verdicts import bound_and_speed, verdicts
+from tsgt.estimation.pose_batch import Kind
+
+if TYPE_CHECKING:
+    from tsgt.analysis.design.perturbation import Perturbation
+    from tsgt.analysis.evaluation.inter_prism import InterPrism
+    from tsgt.analysis.processing import Estimator
+    from tsgt.analysis.report.findings import Difference, Findings
+    from tsgt.analysis.report.motion import Bins, Grid, Ride
+    from tsgt.estimation.pose_batch import PoseBatch
+    from tsgt.geometry import FloatArray
+
+
+def figures_of(findings: Findings) -> dict[str, Any]:
+    """Collect all numbers; those of ``tsgt evaluate`` without a report have the same names."""
+    f = findings
+    poses = f.poses
+    bound_ms, fast_mps = bound_and_speed(f)
+    found: dict[str, Any] = {
+        "verdicts": [{"level": v.level.value, "text": v.text} for v in verdicts(f)],
+        "estimator": None if poses is None else Kind(poses.kind[0]).estimator,
+        "start_ns": f.start_ns,
+        "measured_s": f.duration_s,
+        "duration_s": math.nan if poses is None else int(poses.stamp_ns[-1] - poses.stamp_ns[0]) / 1e9,
+        "poses": 0 if poses is None else len(poses),
+        "valid_poses": 0 if poses is None else int(np.count_nonzero(poses.valid)),
+        "invalid": {} if poses is None else poses.invalid_counts(),
+        "by_estimator": {name: of_poses(each) for name, each in f.both.items()},
+        "protocol": f.log.protocol,
+        "authenticated": f.log.authenticated,
+        "events": [{"stamp_ns": stamp_ns, "message": message} for stamp_ns, message in f.log.events],
+        "stations": {number: _station(f, number) for number in f.station_figures},
+        "bound_median_ms": bound_ms,
+        "speed_p95_mps": fast_mps,
+        "problems": f.problems,
+        "calibration": calibration_keys(f.recording),
+    }
+    if f.inter_prism is not None:
+        found |= _distances(f.inter_prism)
+    if f.ride is not None:
+        found["errors_by_motion_mm"] = _by_motion(f.ride)
+    if f.held_out is not None:
+        found["held_out_mm"] = {
+            name: {**dataclasses.asdict(each.figures), "gaps": dataclasses.asdict(each.gaps)}
+            for name, each in f.held_out.items()
+        }
+    if f.difference is not None and len(f.difference.stamp_ns):
+        found["estimators_apart"] = apart(f.difference)
+    if f.continuous is not None:
+        motion = f.continuous.motion
+        found |= {
+            "motion": dataclasses.asdict(motion.prior),
+            "noise_scale": motion.noise_scale,
+            "motion_tuned": motion.tuned,
+            "residuals": {
+                station: {axis: dataclasses.asdict(each) for axis, each in axes.items()}
+                for station, axes in f.residuals.items()
+            },
+            "outliers": [dataclasses.asdict(stray) for stray in f.outliers],
+        }
+    if f.compared:
+        found["estimators"] = {name: _compared(f, name) for name in f.compared}
+        found |= found["estimators"].get(f.recording.parameters.pipeline.estimator, {})
+    if f.pose_noise is not None and f.pose_noise.as_measured is not None:
+        found["perturbation"] = _as_measured(f.pose_noise.as_measured)
+    return found
+
+
+def _compared(f: Findings, name: Estimator) -> dict[str, Any]:
+    """Tell how far one estimator's poses are from the reference."""
+    found = {**dataclasses.asdict(f.compared[name]), "standing": dataclasses.asdict(f.stops[name])}
+    aligned = f.aligned.get(name)
+    return found if aligned is None else {**found, "aligned": dataclasses.asdict(aligned)}
+
+
+def spread(values: FloatArray) -> dict[str, float]:
+    """Sum up what is not NaN, by its median and the 95th percentile; NaN where there is nothing."""
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return {"median": math.nan, "p95": math.nan}
+    return {"median": float(np.median(known)), "p95": float(np.percentile(known, 95))}
+
+
+def apart(difference: Difference) -> dict[str, Any]:
+    """Tell how far both estimators' poses are apart."""
+    return {
+        "epochs": len(difference.stamp_ns),
+        "position_mm": spread(1e3 * difference.position_m),
+        "rotation_deg": spread(np.degrees(difference.rotation_rad)),
+    }
+
+
+def of_poses(poses: PoseBatch) -> dict[str, Any]:
+    """Count an estimator's poses, and sum up the sigmas that the valid ones state."""
+    return {
+        "poses": len(poses),
+        "valid_poses": int(np.count_nonzero(poses.valid)),
+        "invalid": poses.invalid_counts(),
+        "position_sigma_mm": spread(position_sigma_mm(poses)),
+    }
+
+
+def _station(f: Findings, station: int) -> dict[str, Any]:
+    series = f.log.radio.get(station)
+    heard = (None, None, None) if series is None else (series.rssi_dbm, series.snr_db, series.loss)
+    names = ("rssi_median_dbm", "snr_median_db", "loss_median")
+    found = dataclasses.asdict(f.station_figures[station])
+    return {**found, **{name: median(values) for name, values in zip(names, heard, strict=True)}}
+
+
+def _distances(found: InterPrism) -> dict[str, Any]:
+    return {
+        "inter_prism_mm": {pair.name: dataclasses.asdict(pair.summary()) for pair in found.dynamic},
+        "inter_prism_static_mm": {pair.name: dataclasses.asdict(pair.summary()) for pair in found.static},
+        "epochs": found.epochs,
+        "invalid_epochs": found.invalid_epochs,
+        "still_s": found.still_s,
+        "still_intervals": len(found.still_ns),
+    }
+
+
+def _by_motion(ride: Ride) -> dict[str, Any]:
+    errors_m, motion = np.array(list(ride.error_m.values())), ride.motion
+    turning = motion.turning_radps
+    found = {
+        "speed_mps": binned(errors_m, motion.speed_mps),
+        "acceleration_mps2": binned(errors_m, motion.acceleration_mps2),
+        "angular_rate_radps": binned(errors_m, turning),
+    }
+    grids = {
+        "speed_and_angular_rate": gridded(errors_m, motion.speed_mps, turning),
+        "acceleration_and_angular_rate": gridded(errors_m, motion.acceleration_mps2, turning),
+    }
+    return {name: _in_mm(each) for name, each in (*found.items(), *grids.items()) if each is not None}
+
+
+def _in_mm(sorted_errors: Bins | Grid) -> dict[str, Any]:
+    in_mm = ("median", "mean", "p95")
+    return {
+        name: (1e3 * values if name in in_mm else values).tolist()
+        for name, values in dataclasses.asdict(sorted_errors).items()
+    }
+
+
+def _as_measured(noise: Perturbation) -> dict[str, float]:
+    return {
+        "inter_prism_mean_mm": 1e3 * noise.inter_prism_mean_m,
+        "noise_mm": 1e3 * noise.noise_m,
+        "position_norm_mean_mm": 1e3 * noise.position_norm_mean_m,
+        "rotation_norm_mean_rad": noise.rotation_norm_mean_rad,
+        "rotation_norm_mean_deg": math.degrees(noise.rotation_norm_mean_rad),
+    }

@@ -1,0 +1,151 @@
+"""How regularly stations measured: rates, gaps, statuses. Pure."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.estimation.tracks import usable
+from tsgt.model import PolarMeasurement
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from tsgt.geometry import FloatArray
+    from tsgt.model import Measurement
+
+
+@dataclass(frozen=True, slots=True)
+class StationRecord:
+    """What one station measured, in the order of time; repeats of a measurement count once.
+
+    Attributes
+    ----------
+    station
+        Its number.
+    prisms
+        Those that it measured.
+    stamp_ns
+        (N,) as recorded, on the master's Unix clock.
+    usable
+        (N,) whether status and distance allow it to enter a pose.
+    bound_ns
+        (N,) by how much the stamp may be wrong; NaN where nobody can say.
+    delay_s
+        (N,) from the measurement to its arrival at the master.
+    statuses
+        How often the instrument said what.
+    distance_m
+        Nearest and farthest; NaN where it gave none.
+    """
+
+    station: int
+    prisms: tuple[int, ...]
+    stamp_ns: NDArray[np.int64]
+    usable: NDArray[np.bool_]
+    bound_ns: FloatArray
+    delay_s: FloatArray
+    statuses: dict[str, int]
+    distance_m: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class StationFigures:
+    """A station in figures, as they stand in a report.
+
+    Attributes
+    ----------
+    measurements, usable
+        How many there are, and how many of them can enter a pose.
+    rate_hz
+        Usable ones per second, from the first to the last; NaN with fewer than two.
+    longest_gap_s
+        Longest time without a usable one, the recording's start and end included.
+    gaps, in_gaps
+        How many gaps are longer than the outage limit, and what share of the recording they take.
+    statuses
+        How often the instrument said what.
+    delay_median_s, delay_p95_s
+        From the measurement to its arrival at the master.
+    bound_max_ms
+        Largest bound of a stamp; NaN where none was recorded.
+    distance_min_m, distance_max_m
+        Slope distances; NaN where it gave none.
+    """
+
+    measurements: int
+    usable: int
+    rate_hz: float
+    longest_gap_s: float
+    gaps: int
+    in_gaps: float
+    statuses: dict[str, int]
+    delay_median_s: float
+    delay_p95_s: float
+    bound_max_ms: float
+    distance_min_m: float
+    distance_max_m: float
+
+
+def station_records(measurements: Sequence[Measurement], stations: Sequence[int]) -> list[StationRecord]:
+    """Sort measurements by station; a station that sent none has an empty record.
+
+    Parameters
+    ----------
+    measurements
+        In any order.
+    stations
+        Numbers of those that should have measured; others that did come after them.
+    """
+    found: dict[int, dict[int, Measurement]] = {station: {} for station in stations}
+    for m in measurements:
+        found.setdefault(m.station, {}).setdefault(m.stamp_ns, m)
+    return [_record(station, [each[t] for t in sorted(each)]) for station, each in found.items()]
+
+
+def _record(station: int, measurements: Sequence[Measurement]) -> StationRecord:
+    polar = [m for m in measurements if isinstance(m, PolarMeasurement)]
+    distances = [m.slope_distance_m for m in polar if usable(m) and m.slope_distance_m is not None]
+    bounds = [getattr(m, "stamp_bound_ns", None) for m in measurements]
+    return StationRecord(
+        station=station,
+        prisms=tuple(sorted({m.prism for m in measurements})),
+        stamp_ns=np.array([m.stamp_ns for m in measurements], dtype=np.int64),
+        usable=np.array([usable(m) for m in measurements], dtype=np.bool_),
+        bound_ns=np.array([np.nan if bound is None else bound for bound in bounds], dtype=np.float64),
+        delay_s=np.array([m.received_ns - m.stamp_ns for m in measurements], dtype=np.int64) / 1e9,
+        statuses=dict(Counter(m.status.value for m in measurements).most_common()),
+        distance_m=(min(distances), max(distances)) if distances else (np.nan, np.nan),
+    )
+
+
+def station_figures(
+    record: StationRecord, *, start_ns: int, end_ns: int, outage_limit_ns: int
+) -> StationFigures:
+    """Sum a station up over a recording from ``start_ns`` to ``end_ns``."""
+    times_ns = record.stamp_ns[record.usable]
+    steps_s = np.diff(np.concatenate([[start_ns], times_ns, [end_ns]])) / 1e9
+    long = steps_s > outage_limit_ns / 1e9
+    span_s = (int(times_ns[-1]) - int(times_ns[0])) / 1e9 if len(times_ns) > 1 else 0.0
+    whole_s = (end_ns - start_ns) / 1e9
+    delays = record.delay_s if len(record.delay_s) else np.array([np.nan])
+    known = record.bound_ns[np.isfinite(record.bound_ns)]
+    return StationFigures(
+        measurements=len(record.stamp_ns),
+        usable=len(times_ns),
+        rate_hz=(len(times_ns) - 1) / span_s if span_s > 0 else np.nan,
+        longest_gap_s=float(steps_s.max()),
+        gaps=int(long.sum()),
+        in_gaps=float(steps_s[long].sum() / whole_s) if whole_s > 0 else 0.0,
+        statuses=record.statuses,
+        delay_median_s=float(np.median(delays)),
+        delay_p95_s=float(np.percentile(delays, 95)),
+        bound_max_ms=float(known.max()) / 1e6 if len(known) else np.nan,
+        distance_min_m=record.distance_m[0],
+        distance_max_m=record.distance_m[1],
+    )

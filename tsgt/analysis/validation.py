@@ -1,0 +1,119 @@
+"""What of a recording is believed, and why no poses can come of one."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.errors import RecordingError
+from tsgt.estimation.pose_batch import Reason
+from tsgt.estimation.tracks import believable, usable
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from tsgt.estimation.pose_batch import PoseBatch
+    from tsgt.model import Measurement, Parameters
+    from tsgt.recording import Recording
+
+EPOCHS_MAX = 2_000_000
+"""More poses at once than this (28 h at 20 Hz, about 1.5 GB) come of a wrong clock, not of field work."""
+
+
+def believed(recording: Recording) -> list[Measurement]:
+    """Measurements that can have been made when their stamps say, those of unknown stations included."""
+    stations = {station.station: station for station in recording.parameters.stations}
+    return [
+        m for m in recording.measurements if m.station not in stations or believable(m, stations[m.station])
+    ]
+
+
+def check_measured(parameters: Parameters, measurements: Sequence[Measurement], path: Path) -> None:
+    """Refuse a recording in which a prism of the layout was never measured: no pose can come of it."""
+    if not measurements:
+        raise RecordingError("holds no measurements, so there is nothing to process", path=path)
+    known = {station.station for station in parameters.stations}
+    seen = {m.prism for m in measurements if usable(m) and m.station in known}
+    for prism in (p.prism for p in parameters.prisms):
+        if prism not in seen:
+            raise RecordingError(
+                f"prism {prism} has no usable measurement ({_what_came(prism, known, measurements, parameters)}), "
+                "and a pose needs all prisms of the layout; add its station's measurements or take a layout without it",
+                path=path,
+            )
+
+
+def check_span(parameters: Parameters, measurements: Sequence[Measurement], path: Path) -> None:
+    """Refuse more poses than a computer can hold."""
+    stamps = [m.stamp_ns for m in measurements]
+    span_ns = max(stamps) - min(stamps)
+    if span_ns > EPOCHS_MAX * parameters.pipeline.period_ns:
+        raise RecordingError(
+            f"its measurements span {span_ns / 86_400e9:.1f} days, too many for one trajectory: "
+            "leave out those that were stamped by a wrong clock, or process with a lower --rate",
+            path=path,
+        )
+
+
+def _what_came(
+    prism: int, known: set[int], measurements: Sequence[Measurement], parameters: Parameters
+) -> str:
+    came = [m for m in measurements if m.prism == prism]
+    strangers = sorted({m.station for m in came} - known)
+    if strangers:
+        return f"station {strangers[0]} measured it, but is not among the parameters"
+    if came:
+        statuses = Counter(m.status.value for m in came)
+        return f"{len(came)} with status " + ", ".join(
+            f"{status} ({n})" for status, n in statuses.most_common()
+        )
+    homes = [str(s.station) for s in parameters.stations if s.prism == prism]
+    return f"station {' and '.join(homes)} sent none of it" if homes else "no station tracks it"
+
+
+def why_none_is_valid(poses: PoseBatch, parameters: Parameters) -> str:
+    """Say in one line why there is no valid pose, and what to look at."""
+    counts = poses.invalid_counts()
+    if not counts:
+        return "the measurements of the stations have no pose epoch in common; record for longer"
+    # A pose that was computed and refused tells more than gaps, of which every recording has some.
+    told = (Reason.TILT, Reason.RESIDUAL, Reason.DEGENERATE_GEOMETRY, Reason.UNCERTAIN)
+    computed = [reason for reason in told if reason.word in counts]
+    candidates = computed or [r for r in Reason if r.word in counts]
+    limits = parameters.pipeline
+    match max(candidates, key=lambda reason: counts[reason.word]):
+        case Reason.TILT:
+            advice = (
+                "the robot would lie upside down: the prism layout is mirrored or two prisms are swapped; "
+                "check numbers and signs of the prism positions"
+            )
+        case Reason.RESIDUAL:
+            typical_mm = float(np.nanmedian(poses.residual_m)) * 1e3
+            advice = (
+                f"the prisms miss their layout by {typical_mm:.0f} mm (median), allowed are "
+                f"{limits.residual_limit_m * 1e3:.0f} mm: check for swapped prisms, another robot's layout, "
+                "wrong station frames"
+            )
+        case Reason.DEGENERATE_GEOMETRY:
+            advice = (
+                "the measured prisms lie in a line or at one place: check which station tracks which prism"
+            )
+        case Reason.UNCERTAIN:
+            advice = (
+                f"at no epoch the position is known to {limits.position_sigma_limit_m * 1e3:g} mm and the rotation to "
+                f"{math.degrees(limits.rotation_sigma_limit_rad):g} degrees: check that the stations' times overlap, "
+                "and which station tracks which prism"
+            )
+        case Reason.STATION_STATUS:
+            advice = "the stations report errors: check tilt, prism and lock"
+        case _:
+            advice = (
+                f"at no epoch do all prisms have measurements at most {limits.outage_limit_ns / 1e9:g} s apart "
+                "around it: check that the stations' times overlap"
+            )
+    listed = ", ".join(f"{reason} {count}" for reason, count in counts.items())
+    return f"none of {len(poses)} poses is valid ({listed}); {advice}"

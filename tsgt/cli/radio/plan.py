@@ -1,0 +1,294 @@
+"""The command ``radio plan``: what a channel carries, before anybody drives into the field."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from tsgt.cli.options import finite, json_option
+from tsgt.cli.output import print_json, print_table
+from tsgt.cli.radio.options import Modem, modem_options
+from tsgt.config.radio import LARGEST_NUMBERS, ClassicMasterConfig, SuperframeMasterConfig
+from tsgt.radio.base import LoRaSettings
+from tsgt.radio.planning.capacity import Cycle, Load
+from tsgt.radio.planning.from_config import planned_cycle
+from tsgt.radio.planning.link_budget import path_loss_db, sensitivity_dbm
+from tsgt.radio.planning.regulations import DIPOLE_DBI, LOWEST_DBM, REGIONS, Use, exceeded, preset_power_dbm
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    MasterProtocol = ClassicMasterConfig | SuperframeMasterConfig
+
+_CLASSIC = ClassicMasterConfig(kind="classic")
+_SUPERFRAME = SuperframeMasterConfig(kind="superframe")
+
+_FREQUENCIES_MHZ = {"EU868": 869.525, "EU433": 433.92, "US915": 905.0, "CA915": 905.0}
+"""A channel for each region: in Europe that with the highest limits, in North America the paper's."""
+
+_TABLE_STATIONS = (1, 2, 3, 4, 6, 8, 12, 16)
+_ENOUGH_MARGIN_DB = 10.0
+"""For fading, trees and people in the way."""
+_ALL = 0.999
+"""So much of what the instruments measure is all of it."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Row:
+    """What becomes of one choice of settings and stations."""
+
+    settings: LoRaSettings
+    stations: int
+    margin_db: float
+    cycle: Cycle
+
+    def use(self, antenna_gain_dbi: float) -> Use:
+        return Use(self.settings, antenna_gain_dbi, self.cycle.master_duty, self.cycle.station_duty)
+
+    def json(self) -> dict[str, Any]:
+        return {
+            "sf": self.settings.spreading_factor,
+            "coding_rate": self.settings.coding_rate,
+            "stations": self.stations,
+            "link_margin_db": self.margin_db,
+            **_figures(self.cycle),
+        }
+
+
+@click.command()
+@click.option(
+    "--protocol",
+    type=click.Choice(list(LARGEST_NUMBERS)),
+    required=True,
+    help="classic is the paper's, superframe sends everything.",
+)
+@click.option("--stations", type=click.IntRange(1, 16), required=True, help="How many.")
+@modem_options
+@click.option(
+    "--rate-hz",
+    type=click.FloatRange(0.01, 100),
+    callback=finite,
+    default=2.5,
+    show_default=True,
+    help="How often each instrument measures.",
+)
+@click.option(
+    "--loss",
+    type=click.FloatRange(0, 0.9),
+    callback=finite,
+    default=0.0,
+    show_default=True,
+    help="Probability that a radio does not hear a packet.",
+)
+@click.option("--region", type=click.Choice(list(REGIONS)), help="Whose limits to hold it against.")
+@click.option(
+    "--frequency-mhz",
+    type=click.FloatRange(137, 1020),
+    callback=finite,
+    help="Carrier.  [default: a channel of the region, or 905]",
+)
+@click.option("--power-dbm", type=int, help="At the radio, 2 to 17 or 20.  [default: the region's, or 2]")
+@click.option(
+    "--distance-m",
+    type=click.FloatRange(1, 1e6),
+    callback=finite,
+    default=1000.0,
+    show_default=True,
+    help="For the link margin.",
+)
+@click.option(
+    "--path-loss-exponent",
+    type=click.FloatRange(1.5, 6),
+    callback=finite,
+    default=3.0,
+    show_default=True,
+    help="2 in free space, 2.7 to 3.5 over ground and through trees.",
+)
+@click.option(
+    "--antenna-gain-db",
+    type=click.FloatRange(-30, 30),
+    callback=finite,
+    default=DIPOLE_DBI,
+    show_default=True,
+    help="Of each antenna, its cable deducted, in dBi; 2.15 is a dipole.",
+)
+@click.option(
+    "--start-jitter-ms",
+    type=click.FloatRange(0.5, 50),
+    callback=finite,
+    default=_SUPERFRAME.start_jitter_ms,
+    show_default=True,
+    help="How late a computer starts a transmission at worst; as in the master's configuration.",
+)
+@click.option(
+    "--turn-round-ms",
+    type=click.FloatRange(3, 60),
+    callback=finite,
+    default=_SUPERFRAME.turn_round_ms,
+    show_default=True,
+    help="What a computer needs from a beacon to the first slot; likewise.",
+)
+@click.option("--no-phase-lock", is_flag=True, help="Frames do not follow the instruments; likewise.")
+@json_option
+def plan_command(
+    *,
+    protocol: str,
+    stations: int,
+    modem: Modem,
+    rate_hz: float,
+    loss: float,
+    region: str | None,
+    frequency_mhz: float | None,
+    power_dbm: int | None,
+    distance_m: float,
+    path_loss_exponent: float,
+    antenna_gain_db: float,
+    start_jitter_ms: float,
+    turn_round_ms: float,
+    no_phase_lock: bool,
+    as_json: bool,
+) -> None:
+    """Compute what the radio channel carries: how often, how old, how far, and whether it is allowed.
+
+    Rate is of different measurements per station that reach the master, age the time from when the client has a
+    measurement to its arrival there: add what the instrument needs, 80 to 140 ms for a simulated one on a fast line.
+    The table shows both for other spreading factors, coding rates and numbers of stations. Frequencies, powers and
+    limits are for orientation: the law of the place decides.
+    """
+    if stations > LARGEST_NUMBERS[protocol]:
+        raise click.UsageError(
+            f"--stations {stations}: {protocol} can have {LARGEST_NUMBERS[protocol]} at most"
+        )
+    frequency_hz = round(1e6 * (frequency_mhz or _FREQUENCIES_MHZ.get(region or "", 905.0)))
+    if power_dbm is None:
+        power_dbm = LOWEST_DBM
+        if region is not None:
+            power_dbm = preset_power_dbm(region, frequency_hz=frequency_hz, bandwidth_hz=modem.bandwidth_hz)
+    settings = LoRaSettings(
+        frequency_hz=frequency_hz,
+        spreading_factor=modem.spreading_factor,
+        bandwidth_hz=modem.bandwidth_hz,
+        coding_rate=modem.coding_rate,
+        preamble_symbols=modem.preamble_symbols,
+        power_dbm=power_dbm,
+    )
+    spoken: MasterProtocol = _CLASSIC
+    if protocol == "superframe":
+        spoken = _SUPERFRAME.model_copy(
+            update={
+                "start_jitter_ms": start_jitter_ms,
+                "turn_round_ms": turn_round_ms,
+                "phase_lock": not no_phase_lock,
+            }
+        )
+    received_dbm = (
+        power_dbm + 2 * antenna_gain_db - path_loss_db(distance_m, frequency_hz, path_loss_exponent)
+    )
+
+    def row(settings: LoRaSettings, stations: int) -> _Row:
+        needed_dbm = sensitivity_dbm(settings.spreading_factor, settings.bandwidth_hz)
+        load = Load(stations=stations, rate_hz=rate_hz, loss=loss)
+        return _Row(settings, stations, received_dbm - needed_dbm, planned_cycle(spoken, load, settings))
+
+    planned = row(settings, stations)
+    numbers = sorted({stations, *(n for n in _TABLE_STATIONS if n <= LARGEST_NUMBERS[protocol])})
+    table = [
+        row(replace(settings, spreading_factor=sf, coding_rate=coding_rate), n)
+        for sf in range(7, 13)
+        for coding_rate in range(5, 9)
+        for n in numbers
+    ]
+    warnings = _warnings(planned, table, spoken, rate_hz=rate_hz)
+    # What reaches furthest first, then what transmits least.
+    others = sorted(
+        (other for other in table if other.stations == stations and other.cycle.rate_hz >= _ALL * rate_hz),
+        key=lambda other: (-other.margin_db, other.cycle.master_duty),
+    )
+    warnings += exceeded(planned.use(antenna_gain_db), region, [o.use(antenna_gain_db) for o in others])
+    if as_json:
+        print_json(
+            {
+                "protocol": protocol,
+                "stations": stations,
+                "frequency_mhz": frequency_hz / 1e6,
+                "power_dbm": power_dbm,
+                **_figures(planned.cycle),
+                "link_margin_db": planned.margin_db,
+                "received_dbm": received_dbm,
+                "warnings": warnings,
+                "table": [each.json() for each in table],
+            }
+        )
+        return
+    _print(planned, received_dbm=received_dbm, distance_m=distance_m, rate_hz=rate_hz)
+    for warning in warnings:
+        click.echo(f"warning      {warning}")
+    click.echo(f"\nRate in Hz and median age in s, by number of stations; link margin at {distance_m:g} m:\n")
+    _print_table(table, numbers)
+
+
+def _figures(cycle: Cycle) -> dict[str, Any]:
+    figures = asdict(cycle)
+    return {
+        "cycle_ms": figures["cycle_ms"],
+        "rate_hz": figures["rate_hz"],
+        "age_ms": {"p50": figures["age_p50_ms"], "p99": figures["age_p99_ms"]},
+        "duty_cycle": {"master": figures["master_duty"], "station": figures["station_duty"]},
+    }
+
+
+def _warnings(planned: _Row, table: Sequence[_Row], spoken: MasterProtocol, *, rate_hz: float) -> list[str]:
+    found = []
+    if planned.cycle.rate_hz < _ALL * rate_hz:
+        enough = [
+            row for row in table if row.stations == planned.stations and row.cycle.rate_hz >= _ALL * rate_hz
+        ]
+        remedies = [
+            f"SF {row.settings.spreading_factor} with 4/{row.settings.coding_rate}, link margin {row.margin_db:.0f} dB"
+            for row in sorted(enough, key=lambda row: -row.margin_db)[:1]
+        ]
+        if isinstance(spoken, ClassicMasterConfig):
+            remedies.append("--protocol superframe")
+        remedies.append("fewer stations")
+        found.append(
+            f"{planned.cycle.rate_hz:.2f} of {rate_hz:g} measurements per second and station get through. "
+            f"More do with: {'; '.join(remedies)}"
+        )
+    if planned.margin_db < _ENOUGH_MARGIN_DB:
+        found.append(
+            f"the link margin is {planned.margin_db:.0f} dB; {_ENOUGH_MARGIN_DB:.0f} are needed for fading, trees and "
+            "people in the way. A higher spreading factor gives 2.5 dB per step, better antennas give more"
+        )
+    return found
+
+
+def _print(planned: _Row, *, received_dbm: float, distance_m: float, rate_hz: float) -> None:
+    settings, cycle = planned.settings, planned.cycle
+    click.echo(
+        f"channel      {settings.frequency_hz / 1e6:g} MHz, SF {settings.spreading_factor}, "
+        f"{settings.bandwidth_hz / 1e3:g} kHz, 4/{settings.coding_rate}, {settings.power_dbm} dBm"
+    )
+    click.echo(f"cycle        {cycle.cycle_ms:.0f} ms for {planned.stations} stations")
+    click.echo(f"rate         {cycle.rate_hz:.2f} of {rate_hz:g} Hz per station")
+    click.echo(f"age          median {cycle.age_p50_ms:.0f} ms, p99 {cycle.age_p99_ms:.0f} ms")
+    click.echo(
+        f"duty cycle   master {100 * cycle.master_duty:.1f} %, each station {100 * cycle.station_duty:.1f} %"
+    )
+    click.echo(
+        f"link margin  {planned.margin_db:.1f} dB at {distance_m:g} m ({received_dbm:.1f} dBm received)"
+    )
+
+
+def _print_table(table: Sequence[_Row], numbers: Sequence[int]) -> None:
+    rows = []
+    for first in range(0, len(table), len(numbers)):
+        row = table[first]
+        cells = [
+            f"{each.cycle.rate_hz:.2f} {each.cycle.age_p50_ms / 1e3:5.2f}"
+            for each in table[first : first + len(numbers)]
+        ]
+        name = f"SF {row.settings.spreading_factor}, 4/{row.settings.coding_rate}"
+        rows.append([name, f"{row.margin_db:.0f} dB", *cells])
+    print_table(["", "margin", *(str(n) for n in numbers)], rows)

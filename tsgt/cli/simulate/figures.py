@@ -1,0 +1,274 @@
+"""Figures of a simulated run: what was measured and delivered, how well it was timed, and all figures under their keys."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tsgt.cli.simulate.poses import pose_keys
+from tsgt.simulation.mission.run_log import Measured
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Sequence
+
+    from tsgt.simulation.mission.run_log import StationWitness
+    from tsgt.simulation.mission.runner import Run
+    from tsgt.simulation.options import Outage
+
+
+IN_TIME_NS = 2_000_000_000
+"""What reaches the pipeline so long after it was measured is still of use to a robot that drives."""
+
+
+@dataclass(frozen=True, slots=True)
+class StationFigures:
+    """What became of one station's measurements.
+
+    Attributes
+    ----------
+    measured
+        How many the client read from its instrument before the end of the run.
+    delivered
+        How many different ones of them reached the pipeline, up to the end of the drain.
+    duplicates
+        How many the pipeline was handed again.
+    rate_hz
+        Different measurements that reached the pipeline per second, up to the end of the run: from the end of the
+        initial synchronisation of all stations, or over ``superframe`` from when the last station was first heard; NaN
+        where that never came.
+    time_error_us
+        Percentiles 50, 99 and 100 of the absolute error of their time stamps, in us; NaN without any.
+    age_ms
+        Percentiles 50 and 99 of the time from a measurement to the pipeline, in ms; NaN without any.
+    within_2s
+        Which part of those measured reached the pipeline within :data:`IN_TIME_NS`.
+    queued, late_slots
+        How many still waited in the station's queue at the end, and how many slots it left empty because it was late;
+        None where there is neither.
+    """
+
+    measured: int
+    delivered: int
+    duplicates: int
+    rate_hz: float
+    time_error_us: tuple[float, float, float]
+    age_ms: tuple[float, float]
+    within_2s: float
+    queued: int | None
+    late_slots: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class OutageFigures:
+    """What an outage did.
+
+    Attributes
+    ----------
+    drained_s
+        From its end until the last measurement made before that had arrived from all of its stations; NaN: never.
+    live_age_ms
+        Median age of what these stations measured meanwhile, from the outage's end until it was drained.
+    time_error_us
+        Percentiles 50, 99 and 100 of the absolute error of the time stamps of what they measured within the outage.
+    """
+
+    drained_s: float
+    live_age_ms: float
+    time_error_us: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class _Delivery:
+    """A measurement that reached the pipeline for the first time; instants in ns from the start."""
+
+    measured_ns: int
+    received_ns: int
+    arrived_ns: int
+    error_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Station:
+    """What was measured by one station, by true time in ns from the start, and what of it arrived."""
+
+    measured_ns: list[int]
+    deliveries: dict[int, _Delivery]
+    duplicates: int
+
+
+def station_figures(run: Run) -> dict[int, StationFigures]:
+    """Count and time what came from each station."""
+    stations = _stations(run)
+    return {number: _station_figures(run, number, stations) for number in run.witnesses}
+
+
+def outage_figures(run: Run) -> list[OutageFigures]:
+    """Tell of each outage how long it lasted on."""
+    stations = _stations(run)
+    return [_outage_figures(outage, stations) for outage in run.outages]
+
+
+def _stations(run: Run) -> dict[int, _Station]:
+    return {number: _station(run, witness) for number, witness in run.witnesses.items()}
+
+
+def _station(run: Run, witness: StationWitness) -> _Station:
+    """Find out what of a station's measurements before the end of the run arrived, and when."""
+    found = Measured(witness)
+    end_ns = run.end_ns - run.start_ns
+    deliveries: dict[int, _Delivery] = {}
+    duplicates = 0
+    for session in run.sessions:
+        seen: set[int] = set()
+        for measurement, arrived_ns in zip(session.measurements, session.arrived_ns, strict=True):
+            if measurement.station != witness.station:
+                continue
+            true_ns = found.true_ns(measurement)
+            if true_ns is None or true_ns > end_ns:
+                continue
+            duplicates += true_ns in seen
+            seen.add(true_ns)
+            delivery = _Delivery(
+                measured_ns=true_ns,
+                received_ns=measurement.received_ns - session.zero_ns,
+                arrived_ns=arrived_ns,
+                error_ns=measurement.stamp_ns - session.zero_ns - true_ns,
+            )
+            deliveries.setdefault(true_ns, delivery)
+    measured_ns = [true_ns for true_ns in witness.stamps_ns.values() if true_ns <= end_ns]
+    return _Station(measured_ns, deliveries, duplicates)
+
+
+def _counted_from_ns(run: Run, stations: dict[int, _Station]) -> int | None:
+    """Return when the last station was synchronised, or heard, for the first time; None if one never was."""
+    first_ns: dict[int, int] = {}
+    for session in run.sessions:
+        for clock in session.clocks:
+            first_ns.setdefault(clock.station, clock.stamp_ns - session.zero_ns)
+    for number, station in stations.items():
+        if run.superframe and station.deliveries:
+            first_ns[number] = min(delivery.received_ns for delivery in station.deliveries.values())
+    return max(first_ns.values()) if first_ns.keys() >= run.witnesses.keys() else None
+
+
+def _station_figures(run: Run, number: int, stations: dict[int, _Station]) -> StationFigures:
+    from_ns, end_ns = _counted_from_ns(run, stations), run.end_ns - run.start_ns
+    station, statuses = stations[number], run.witnesses[number].statuses
+    deliveries = station.deliveries.values()
+    rate_hz = math.nan
+    if from_ns is not None and from_ns < end_ns:
+        counted = sum(from_ns <= delivery.received_ns <= end_ns for delivery in deliveries)
+        rate_hz = counted / ((end_ns - from_ns) / 1e9)
+    return StationFigures(
+        measured=len(station.measured_ns),
+        delivered=len(deliveries),
+        duplicates=station.duplicates,
+        rate_hz=rate_hz,
+        time_error_us=_errors_us(deliveries),
+        age_ms=_percentiles(_ages_ns(deliveries), 50, 99, unit_ns=1e6),
+        within_2s=_within_2s(_ages_ns(deliveries), len(station.measured_ns)),
+        queued=statuses[-1].queued if statuses else None,
+        late_slots=sum(status.late or 0 for status in statuses) if run.superframe else None,
+    )
+
+
+def _outage_figures(outage: Outage, stations: dict[int, _Station]) -> OutageFigures:
+    start_ns, end_ns = round(outage.start_s * 1e9), round(outage.end_s * 1e9)
+    those = [stations[number] for number in outage.stations]
+    deliveries = [delivery for station in those for delivery in station.deliveries.values()]
+    drained_ns = math.nan
+    if all(ns in station.deliveries for station in those for ns in station.measured_ns if ns < end_ns):
+        before = (delivery.arrived_ns for delivery in deliveries if delivery.measured_ns < end_ns)
+        drained_ns = max(end_ns, *before) - end_ns
+    live_ns = [
+        delivery.arrived_ns - delivery.measured_ns
+        for delivery in deliveries
+        # Without a drain all that came after it: no comparison with NaN holds.
+        if end_ns <= delivery.measured_ns and not delivery.measured_ns > end_ns + drained_ns
+    ]
+    return OutageFigures(
+        drained_s=drained_ns / 1e9,
+        live_age_ms=_percentiles(live_ns, 50, unit_ns=1e6)[0],
+        time_error_us=_errors_us([d for d in deliveries if start_ns <= d.measured_ns < end_ns]),
+    )
+
+
+def _ages_ns(deliveries: Collection[_Delivery]) -> list[int]:
+    return [delivery.arrived_ns - delivery.measured_ns for delivery in deliveries]
+
+
+def _within_2s(ages_ns: Sequence[int], measured: int) -> float:
+    return sum(age_ns <= IN_TIME_NS for age_ns in ages_ns) / max(1, measured)
+
+
+def _errors_us(deliveries: Collection[_Delivery]) -> tuple[float, float, float]:
+    return _percentiles([abs(delivery.error_ns) for delivery in deliveries], 50, 99, 100, unit_ns=1e3)
+
+
+def _percentiles(values_ns: Sequence[int], *percentiles: int, unit_ns: float) -> tuple[Any, ...]:
+    if not values_ns:
+        return (math.nan,) * len(percentiles)
+    return tuple(float(value) for value in np.percentile(values_ns, percentiles) / unit_ns)
+
+
+def frame_ms(run: Run) -> float:
+    """Return the mean time from one beacon to the next, in ms; NaN without any."""
+    frames = sum(session.frames for session in run.sessions)
+    return sum(session.framed_ns for session in run.sessions) / frames / 1e6 if frames else math.nan
+
+
+def figures(run: Run) -> dict[str, Any]:
+    """Put the figures under the keys that others rely on."""
+    return {
+        "stations": {number: _station_keys(station) for number, station in station_figures(run).items()},
+        "all": _all_keys(run),
+        **({"frame_ms": frame_ms(run)} if run.superframe else {}),
+        "outages": [
+            {
+                "stations": outage.stations,
+                "start_s": outage.start_s,
+                "seconds": outage.seconds,
+                "drained_s": found.drained_s,
+                "live_age_ms": {"p50": found.live_age_ms},
+                "time_error_us": dict(zip(("p50", "p99", "max"), found.time_error_us, strict=True)),
+            }
+            for outage, found in zip(run.outages, outage_figures(run), strict=True)
+        ],
+        **pose_keys(run),
+        "airtime_fraction": run.airtime_s / run.duration_s,
+        "sim_seconds": run.duration_s,
+    }
+
+
+def _all_keys(run: Run) -> dict[str, Any]:
+    """Put the figures of all stations together under the keys of one."""
+    stations = _stations(run).values()
+    measured = sum(len(station.measured_ns) for station in stations)
+    deliveries = [delivery for station in stations for delivery in station.deliveries.values()]
+    return {
+        "measured": measured,
+        "delivered": len(deliveries),
+        "duplicates": sum(station.duplicates for station in stations),
+        "time_error_us": dict(zip(("p50", "p99", "max"), _errors_us(deliveries), strict=True)),
+        "age_ms": dict(
+            zip(("p50", "p99"), _percentiles(_ages_ns(deliveries), 50, 99, unit_ns=1e6), strict=True)
+        ),
+        "within_2s": _within_2s(_ages_ns(deliveries), measured),
+    }
+
+
+def _station_keys(station: StationFigures) -> dict[str, Any]:
+    return {
+        "measured": station.measured,
+        "delivered": station.delivered,
+        "duplicates": station.duplicates,
+        "rate_hz": station.rate_hz,
+        "time_error_us": dict(zip(("p50", "p99", "max"), station.time_error_us, strict=True)),
+        "age_ms": dict(zip(("p50", "p99"), station.age_ms, strict=True)),
+        "within_2s": station.within_2s,
+        "queued": station.queued,
+        "late_slots": station.late_slots,
+    }

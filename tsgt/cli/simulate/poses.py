@@ -1,0 +1,174 @@
+"""How good the poses of a simulated run were: what each estimator makes of the run, and what was streamed live."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import Counter
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
+
+import numpy as np
+
+from tsgt.analysis.evaluation.inter_prism import inter_prism
+from tsgt.analysis.evaluation.metrics import PoseFigures, inner_part
+from tsgt.analysis.processing import Estimator, process, with_estimator
+from tsgt.errors import RecordingError
+from tsgt.estimation.pose_batch import PoseBatch
+from tsgt.estimation.tracks import build_tracks
+from tsgt.geometry import rotation_from_quaternion, transform_from
+from tsgt.recording import Recording, RecordingHeader
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from tsgt.model import Measurement
+    from tsgt.recording.stream_records import Kind
+    from tsgt.simulation.mission.runner import Run
+
+
+@dataclass(frozen=True, slots=True)
+class EstimatorFigures:
+    """How good poses were, against the truth.
+
+    Attributes
+    ----------
+    poses, valid_poses
+        How many there are, and how many of them are valid.
+    against_truth
+        How far valid ones are off.
+    """
+
+    poses: int
+    valid_poses: int
+    against_truth: PoseFigures
+
+
+def pose_keys(run: Run) -> dict[str, Any]:
+    """Put the figures under the keys that others rely on."""
+    inter_prism_mean_mm = _inter_prism_mean_mm(run)
+    return {
+        "estimators": {
+            name: {**_keys(found), "inter_prism_mean_mm": inter_prism_mean_mm}
+            for name, found in estimator_figures(run).items()
+        },
+        "live": {
+            kind: {**_keys(found), "newest_ms": dict(zip(("p50", "p99"), newest_ms(run, kind), strict=True))}
+            for kind, found in live_figures(run).items()
+        },
+    }
+
+
+def estimator_figures(run: Run) -> dict[Estimator, EstimatorFigures]:
+    """Compare what each estimator makes of all that reached the pipeline with the truth."""
+    measurements = _measurements(run)
+    recording = Recording(
+        header=RecordingHeader(software="", created_ns=run.start_ns, source="simulate"),
+        parameters=run.parameters,
+        measurements=measurements,
+        end_ns=max((m.received_ns for m in measurements), default=None),
+    )
+    return {name: _processed_figures(run, with_estimator(recording, name)) for name in get_args(Estimator)}
+
+
+def _measurements(run: Run) -> list[Measurement]:
+    """Return all measurements as if nobody had set the master's clock between two of its sessions."""
+    found: list[Measurement] = []
+    for session in run.sessions:
+        later_ns = run.start_ns - session.zero_ns
+        found += [
+            replace(m, stamp_ns=m.stamp_ns + later_ns, received_ns=m.received_ns + later_ns)
+            if later_ns
+            else m
+            for m in session.measurements
+        ]
+    return found
+
+
+def _processed_figures(run: Run, recording: Recording) -> EstimatorFigures:
+    try:
+        poses = process(recording, path=Path("the run's recording"))
+    except RecordingError:
+        # No valid pose came of it, as when fewer stations than prisms are simulated.
+        poses = PoseBatch.blank(np.empty(0, np.int64), ())
+    valid = poses.valid
+    return _pose_figures(
+        run,
+        len(poses),
+        poses.stamp_ns[valid],
+        poses.position_m[valid],
+        poses.orientation_xyzw[valid],
+        poses.covariance[valid],
+    )
+
+
+def live_figures(run: Run) -> dict[Kind, EstimatorFigures]:
+    """Compare the poses of the stream with the truth, by their kind."""
+    counts: Counter[Kind] = Counter()
+    for session in run.sessions:
+        counts.update(session.poses)
+    streamed = [session.valid_poses() for session in run.sessions]
+    found = {}
+    for kind, count in sorted(counts.items()):
+        some = [poses.select(poses.kind == kind) for poses in streamed]
+        stamp_ns = [
+            poses.stamp_ns + run.start_ns - session.zero_ns
+            for session, poses in zip(run.sessions, some, strict=True)
+        ]
+        names = ("position_m", "orientation_xyzw", "covariance")
+        columns = (np.concatenate([getattr(poses, name) for poses in some]) for name in names)
+        found[kind] = _pose_figures(run, count, np.concatenate(stamp_ns), *columns)
+    return found
+
+
+def newest_ms(run: Run, kind: Kind) -> tuple[float, float]:
+    """Percentiles 50 and 99 of the age of the newest measurement at the epoch of a pose of the stream; NaN without any."""
+    streamed = [session.valid_poses() for session in run.sessions]
+    ages_s = np.concatenate([poses.newest_s[poses.kind == kind] for poses in streamed])
+    known = ages_s[np.isfinite(ages_s)]
+    if not len(known):
+        return math.nan, math.nan
+    p50, p99 = np.percentile(known, [50, 99]).tolist()
+    return 1e3 * p50, 1e3 * p99
+
+
+def _pose_figures(
+    run: Run,
+    count: int,
+    stamp_ns: NDArray[np.int64],
+    position_m: NDArray[np.float64],
+    orientation_xyzw: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+) -> EstimatorFigures:
+    inner = inner_part(stamp_ns, run.start_ns, run.end_ns)
+    return EstimatorFigures(
+        poses=count,
+        valid_poses=len(stamp_ns),
+        against_truth=PoseFigures.of(
+            transform_from(rotation_from_quaternion(orientation_xyzw[inner]), position_m[inner]),
+            covariance[inner],
+            run.world.pose_at((stamp_ns[inner] - run.start_ns) / 1e9),
+            run.world.prisms_m.mean(axis=0),
+        ),
+    )
+
+
+def _inter_prism_mean_mm(run: Run) -> float:
+    """Return the mean over all pairs of how far their interpolated distances are from those of the layout."""
+    tracks = build_tracks(run.parameters, _measurements(run))
+    if not all(len(track) for track in tracks.values()):
+        return math.nan
+    pairs = inter_prism(run.parameters, tracks).dynamic
+    return float(np.mean([pair.summary().mean_abs_error for pair in pairs]))
+
+
+def _keys(found: EstimatorFigures) -> dict[str, Any]:
+    truth = found.against_truth
+    return {
+        "poses": found.poses,
+        "valid_poses": found.valid_poses,
+        "position_rms_mm": truth.position_rms_mm,
+        "orientation_rms_deg": truth.orientation_rms_deg,
+        "nees": dataclasses.asdict(truth.nees),
+    }

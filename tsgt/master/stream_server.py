@@ -1,0 +1,257 @@
+"""The stream: JSON lines on a UNIX socket, to any number of readers.
+
+Problem: a reader that sleeps must cost the others and the master nothing, and must know that it has missed
+something. Idea: the kernel and the transport take what they can; behind them each reader has a queue of its own,
+and when that is full its oldest line goes. The reader finds an event ``lines_lost`` with their number where they
+are missing, and then the newest lines. The lines are described in docs/reference/stream.md.
+
+There is no task in here: lines go out from within :meth:`StreamServer.publish` and from the event loop's
+callbacks.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import select
+import time
+from collections import deque
+from typing import TYPE_CHECKING, Self
+
+import structlog
+
+from tsgt.recording import encode_line
+from tsgt.recording.stream_records import EventRecord
+from tsgt.service import UnixListener
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+QUEUE_LINES = 2000
+
+MOST_READERS = 64
+"""More at a time are let go at once: each costs memory, and a file descriptor that the radio may need."""
+
+CLOSE_TIMEOUT_S = 0.5
+"""How long readers have, at the end, to take what is waiting for them."""
+
+_TURNS_TO_SET_UP = 5
+"""Turns of the event loop from accepting a connection to its protocol, with some in hand."""
+
+log = structlog.get_logger()
+
+
+class StreamServer:
+    """Serves lines to every reader of a UNIX socket; an async context manager.
+
+    A reader gets the greeting and then whatever is published from then on. What readers send is read and
+    thrown away. On leaving, readers have :data:`CLOSE_TIMEOUT_S` to take what is waiting for them.
+
+    Parameters
+    ----------
+    path
+        The socket. A stale one of an earlier run is replaced; its folder is created if need be.
+    hello
+        The greeting, without line end.
+    mode
+        Permissions of the socket.
+    queue_lines
+        How many lines wait for a reader, beyond what kernel and transport hold, before it loses the oldest.
+    unix_now_ns
+        The master's Unix clock, for the event ``lines_lost``.
+
+    Raises
+    ------
+    StreamError
+        On entering: another program serves the socket, or it cannot be made.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        hello: bytes,
+        *,
+        mode: int = 0o660,
+        queue_lines: int = QUEUE_LINES,
+        unix_now_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self._path = path
+        self._hello = hello
+        self._mode = mode
+        self._queue_lines = queue_lines
+        self._unix_now_ns = unix_now_ns
+        self._readers: set[_Reader] = set()
+        self._changed = asyncio.Event()
+        self._closing = False
+
+    async def __aenter__(self) -> Self:
+        self._listener = UnixListener(self._path, self._mode)
+        loop = asyncio.get_running_loop()
+        try:
+            self._server = await loop.create_unix_server(self._new_reader, sock=self._listener.socket)
+        except BaseException:  # cancelled: nobody will call __aexit__
+            self._listener.remove()
+            self._listener.socket.close()
+            raise
+        log.info("stream_opened", path=str(self._path))
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self._closing = True
+        self._listener.remove()
+        # No new connections; those that asyncio is just setting up come to their end while there is a server.
+        asyncio.get_running_loop().remove_reader(self._listener.socket)
+        for _turn in range(_TURNS_TO_SET_UP):
+            await asyncio.sleep(0)
+        self._server.close()
+        try:
+            async with asyncio.timeout(CLOSE_TIMEOUT_S):
+                await self._until(lambda: not any(reader.waiting for reader in self._readers))
+                for reader in self._readers:
+                    reader.close()
+                await self._until(lambda: not self._readers)
+        except TimeoutError:
+            log.warning("stream_closed_on_slow_readers", readers=len(self._readers))
+        finally:
+            for reader in self._readers:
+                reader.abort()
+        await self._until(lambda: not self._readers)
+
+    @property
+    def readers(self) -> int:
+        """How many readers are connected."""
+        return len(self._readers)
+
+    def publish(self, line: bytes) -> None:
+        """Send a line, given without line end, to all readers; never waits, slow readers lose lines."""
+        data = line + b"\n"
+        for reader in self._readers:
+            reader.send(data)
+
+    async def publish_patiently(self, line: bytes) -> None:
+        """Send a line as soon as every reader has room for it, so that nobody loses any."""
+        # Always one turn of the event loop, so that a long run of lines does not keep readers from connecting.
+        await asyncio.sleep(0)
+        await self._until(lambda: not any(reader.full for reader in self._readers))
+        self.publish(line)
+
+    async def finish(self) -> None:
+        """Return when every reader has taken everything and is let go, however long it takes; for a replay."""
+        await self._until(lambda: not any(reader.waiting for reader in self._readers))
+        for reader in self._readers:
+            reader.close()  # which sends what the transport still holds
+        await self._until(lambda: not self._readers)
+
+    async def wait_for_reader(self) -> None:
+        """Return when at least one reader is connected."""
+        await self._until(lambda: bool(self._readers))
+
+    async def _until(self, condition: Callable[[], bool]) -> None:
+        while not condition():
+            self._changed.clear()
+            await self._changed.wait()
+
+    def _new_reader(self) -> asyncio.Protocol:
+        if self._closing:
+            return _TooLate()
+        return _Reader(self._readers, self._changed, self._hello, self._queue_lines, self._unix_now_ns)
+
+
+class _TooLate(asyncio.Protocol):
+    """A connection that was made while the server closed."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        transport.close()
+
+
+class _Reader(asyncio.Protocol):
+    """One connection, from its greeting on: the transport while it takes lines, the queue while it does not."""
+
+    def __init__(
+        self,
+        readers: set[_Reader],
+        changed: asyncio.Event,
+        hello: bytes,
+        queue_lines: int,
+        unix_now_ns: Callable[[], int],
+    ) -> None:
+        self._readers = readers
+        self._changed = changed
+        self._hello = hello
+        self._queue: deque[bytes] = deque()
+        self._queue_lines = queue_lines
+        self._unix_now_ns = unix_now_ns
+        self._paused = False
+        self._lost = 0
+
+    @property
+    def waiting(self) -> bool:
+        return bool(self._queue)
+
+    @property
+    def full(self) -> bool:
+        return len(self._queue) >= self._queue_lines
+
+    def send(self, data: bytes) -> None:
+        if not self._paused:
+            self._transport.write(data)
+            return
+        if self.full:
+            self._queue.popleft()
+            self._lost += 1
+        self._queue.append(data)
+
+    def close(self) -> None:
+        self._transport.close()
+
+    def abort(self) -> None:
+        self._transport.abort()
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.WriteTransport)  # noqa: S101 (asyncio's promise for a stream socket)
+        self._transport = transport
+        if len(self._readers) >= MOST_READERS:
+            log.warning("reader_refused", readers=len(self._readers))
+            self.abort()
+            return
+        self._transport.write(self._hello + b"\n")
+        self._readers.add(self)
+        self._changed.set()
+        log.info("reader_connected", readers=len(self._readers))
+
+    def data_received(self, data: bytes) -> None:
+        """Readers have nothing to say yet."""
+
+    def eof_received(self) -> bool:
+        """Keep the connection of a reader that only has nothing to say: a shell pipe through socat."""
+        poller = select.poll()
+        poller.register(self._transport.get_extra_info("socket").fileno(), select.POLLOUT)
+        return not any(events & select.POLLHUP for _, events in poller.poll(0))
+
+    def pause_writing(self) -> None:
+        self._paused = True
+
+    def resume_writing(self) -> None:
+        self._paused = False
+        if self._lost:
+            log.warning("reader_lost_lines", count=self._lost)
+            self._transport.write(encode_line(self._lines_lost()) + b"\n")
+            self._lost = 0
+        while self._queue and not self._paused:
+            self._transport.write(self._queue.popleft())
+        self._changed.set()
+
+    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 (a reader may go as it likes)
+        if self not in self._readers:
+            return  # one too many
+        self._readers.discard(self)
+        self._changed.set()
+        log.info("reader_disconnected", readers=len(self._readers))
+
+    def _lines_lost(self) -> EventRecord:
+        return EventRecord(
+            stamp_ns=self._unix_now_ns(),
+            event="lines_lost",
+            message=f"this reader was too slow and lost {self._lost} lines here",
+            count=self._lost,
+        )

@@ -1,0 +1,236 @@
+"""What to write into an SX127x, in which order, to set it up, to send and to receive; when to do so is the driver's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import structlog
+
+from tsgt.errors import RadioNotFoundError
+from tsgt.radio.sx127x import registers as reg
+from tsgt.radio.sx127x.register_io import (
+    RegisterAccess,
+    RegisterValue,
+    frf,
+    op_mode,
+    packet_strength,
+    receive_frf,
+    register_values,
+)
+from tsgt.radio.sx127x.registers import Irq, Mode, Register
+
+if TYPE_CHECKING:
+    from tsgt.clock import Clock
+    from tsgt.radio.base import LoRaSettings
+    from tsgt.radio.sx127x.hal import Hal
+
+log = structlog.get_logger()
+
+RESET_LOW_NS = 1_000_000
+"""How long NRESET is held low; the chip asks for 0.1 ms (section 7.2.2)."""
+RESET_WAIT_NS = 10_000_000
+"""How long the chip is left alone after it; it asks for 5 ms."""
+MODE_WAIT_NS = 1_000_000
+"""From a change of mode until it is checked; the oscillator takes 0.25 ms to start."""
+
+# Plain integers: members of IntFlag are slow to combine.
+_RX_DONE = int(Irq.RX_DONE)
+_TX_DONE = int(Irq.TX_DONE)
+_CRC_ERROR = int(Irq.PAYLOAD_CRC_ERROR)
+_ABSENT = 0xFF  # what an open MISO line reads as; no state of the chip has all flags set
+
+
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """A packet as the chip holds it.
+
+    Attributes
+    ----------
+    payload
+        Its bytes, right or wrong.
+    has_crc, crc_wrong
+        Whether the sender added a CRC, and whether it contradicts the bytes.
+    rssi_dbm, snr_db
+        Signal strength and signal-to-noise ratio.
+    """
+
+    payload: bytes
+    has_crc: bool
+    crc_wrong: bool
+    rssi_dbm: float
+    snr_db: float
+
+
+class Chip:
+    """An SX127x in LoRa mode. All methods raise :class:`~tsgt.errors.RadioError` when the bus fails.
+
+    Parameters
+    ----------
+    hal
+        Bus and pins.
+    clock
+        Times the reset.
+    settings
+        What it is set up with.
+    """
+
+    def __init__(self, hal: Hal, clock: Clock, settings: LoRaSettings) -> None:
+        self._hal = hal
+        self._clock = clock
+        self._settings = settings
+        self._registers = RegisterAccess(hal)
+        self._probe = 0x55
+
+    async def set_up(self) -> None:
+        """Reset the chip, identify it, write and verify all settings, and enter reception.
+
+        Raises
+        ------
+        RadioNotFoundError
+            It is not an SX1276/77/78/79, or there is none.
+        RadioError
+            A register does not keep its value.
+        """
+        self._hal.set_reset(low=True)
+        await self._pause(RESET_LOW_NS)
+        self._hal.set_reset(low=False)
+        await self._pause(RESET_WAIT_NS)
+        self._identify()
+        # LongRangeMode can only be changed in SLEEP (section 4.1.6), which is therefore entered first.
+        sleep = self._op_mode(Mode.SLEEP)
+        self._registers.write(Register.OP_MODE, sleep.value & ~reg.LONG_RANGE_MODE)
+        await self._change_mode(Mode.SLEEP)
+        await self._change_mode(Mode.STDBY)
+        for register in register_values(self._settings):
+            self._registers.write_verified(register)
+        self.enter_reception()
+        await self._pause(MODE_WAIT_NS)
+        self.check_reception()
+
+    def sleep(self) -> None:
+        """Fall silent and draw hardly any current."""
+        self._write_mode(Mode.SLEEP)
+
+    def enter_standby(self) -> None:
+        """Stop receiving or sending; a packet that has ended stays readable."""
+        self._write_mode(Mode.STDBY)
+
+    def enter_reception(self) -> None:
+        """Receive packet after packet; flags of what was before are gone."""
+        self.enter_standby()
+        self._tune(receive_frf(self._settings))
+        self._registers.write(Register.IRQ_FLAGS, reg.ALL_IRQ_FLAGS)
+        self._registers.write(Register.DIO_MAPPING_1, reg.DIO0_RX_DONE)
+        self._write_mode(Mode.RXCONTINUOUS)
+
+    def check_reception(self) -> None:
+        """Check that the chip is in reception with our settings and takes what is written.
+
+        A receiver that is deaf with all its registers alive cannot be told from silence on the air.
+
+        Raises
+        ------
+        RadioError
+            It has reset itself, hangs, or is gone.
+        """
+        self._registers.verify(self._op_mode(Mode.RXCONTINUOUS))
+        self._registers.verify(RegisterValue(Register.SYNC_WORD, self._settings.sync_word))
+        # Nothing depends on this pointer between packets; a hung chip keeps its registers and looks well.
+        self._probe ^= 0xFF
+        self._registers.write_verified(RegisterValue(Register.FIFO_ADDR_PTR, self._probe))
+
+    def load(self, payload: bytes) -> None:
+        """Make ready for :meth:`send`, from standby; flags of what was before are gone.
+
+        Raises
+        ------
+        RadioError
+            The chip did not take it.
+        """
+        self._tune(frf(self._settings.frequency_hz))
+        self._registers.write(Register.IRQ_FLAGS, reg.ALL_IRQ_FLAGS)
+        self._registers.write_verified(RegisterValue(Register.DIO_MAPPING_1, reg.DIO0_TX_DONE))
+        self._registers.write_verified(RegisterValue(Register.PAYLOAD_LENGTH, len(payload)))
+        self._registers.write(Register.FIFO_ADDR_PTR, 0x00)
+        self._registers.write_burst(Register.FIFO, payload)
+        self._registers.verify(RegisterValue(Register.FIFO_ADDR_PTR, len(payload)))
+
+    def send(self) -> None:
+        """Send the packet that was loaded, now; the chip returns to standby by itself."""
+        self._write_mode(Mode.TX)
+
+    def packet_sent(self) -> bool:
+        """Whether TxDone is set."""
+        return bool(self._flags() & _TX_DONE)
+
+    def packet_waits(self) -> bool:
+        """Whether RxDone is set."""
+        return bool(self._flags() & _RX_DONE)
+
+    def take_packet(self) -> Arrival | None:
+        """Read the packet that waits, if there is one, and clear its flags."""
+        first = Register.FIFO_RX_CURRENT_ADDR
+        status = self._registers.read_burst(first, Register.HOP_CHANNEL - first + 1)
+
+        def value(register: Register) -> int:
+            return status[register - first]
+
+        flags = value(Register.IRQ_FLAGS)
+        if flags == _ABSENT or not flags & _RX_DONE:
+            return None
+        self._registers.write(Register.IRQ_FLAGS, flags)
+        self._registers.write(Register.FIFO_ADDR_PTR, value(Register.FIFO_RX_CURRENT_ADDR))
+        rssi_dbm, snr_db = packet_strength(
+            value(Register.PKT_RSSI_VALUE),
+            value(Register.PKT_SNR_VALUE),
+            frequency_hz=self._settings.frequency_hz,
+        )
+        return Arrival(
+            payload=self._registers.read_burst(Register.FIFO, value(Register.RX_NB_BYTES)),
+            has_crc=bool(value(Register.HOP_CHANNEL) & reg.CRC_ON_PAYLOAD),
+            crc_wrong=bool(flags & _CRC_ERROR),
+            rssi_dbm=rssi_dbm,
+            snr_db=snr_db,
+        )
+
+    def _identify(self) -> None:
+        version = self._registers.read(Register.VERSION)
+        if version in {0x00, 0xFF}:
+            raise RadioNotFoundError(
+                f"no radio answers (RegVersion reads 0x{version:02X}): check power and wiring, the NSS pin "
+                "(Dragino HAT: BCM 25), the reset pin, and that no overlay drives NSS or takes the SPI bus"
+            )
+        if version == reg.VERSION_SX1272:
+            raise RadioNotFoundError(
+                "the radio is an SX1272 or SX1273 (RegVersion reads 0x22), whose registers differ: "
+                "use a module with an SX1276/77/78/79, such as an RFM95"
+            )
+        if version not in {reg.VERSION_SX1276, *reg.VERSIONS_LIKE_SX1276}:
+            raise RadioNotFoundError(
+                f"RegVersion reads 0x{version:02X}, not 0x12 as that of an SX1276/77/78/79: "
+                "check the module, the wiring, and a lower spi_hz"
+            )
+        if version != reg.VERSION_SX1276:
+            log.info("radio_version_unusual", version=version)
+
+    async def _change_mode(self, mode: Mode) -> None:
+        self._write_mode(mode)
+        await self._pause(MODE_WAIT_NS)
+        self._registers.verify(self._op_mode(mode))
+
+    def _op_mode(self, mode: Mode) -> RegisterValue:
+        return RegisterValue(Register.OP_MODE, op_mode(self._settings, mode))
+
+    def _write_mode(self, mode: Mode) -> None:
+        self._registers.write(Register.OP_MODE, op_mode(self._settings, mode))
+
+    def _tune(self, frequency: bytes) -> None:
+        self._registers.write_burst(Register.FRF_MSB, frequency)
+
+    def _flags(self) -> int:
+        flags = self._registers.read(Register.IRQ_FLAGS)
+        return 0 if flags == _ABSENT else flags
+
+    async def _pause(self, duration_ns: int) -> None:
+        await self._clock.sleep_until(self._clock.monotonic_ns() + duration_ns)

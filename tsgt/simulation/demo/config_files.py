@@ -1,0 +1,201 @@
+"""The folder of a demonstration: configuration files as a mission has them, for simulated radios and instruments."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from tsgt.config import scenario_parameters
+from tsgt.radio.key_file import write_key
+from tsgt.simulation.mission.mission import instrument_config
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tsgt.config import ScenarioConfig
+    from tsgt.config.scenario import SimulatedStation
+
+Protocol = Literal["superframe", "classic"]
+
+INITIAL_CYCLES = 8
+"""Fewer than the paper's 50, which take half a minute: nobody wants to wait so long for a demonstration."""
+
+_SUPERFRAME = """\
+[protocol]
+kind = "superframe"     # every measurement gets through; `tsgt demo --protocol classic` shows the paper's
+key_file = "radio.key"  # the same for all
+"""
+
+_CLASSIC = """\
+[protocol]
+kind = "classic"        # the paper's
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class DemoFiles:
+    """What stands where in the folder of a demonstration.
+
+    Attributes
+    ----------
+    folder
+        Everything lies in here: configuration, sockets, logs, journals and recordings.
+    socket
+        UNIX socket of the pose stream.
+    stations
+        Numbers of the stations.
+    """
+
+    folder: Path
+    socket: Path
+    stations: tuple[int, ...]
+
+    @property
+    def air_socket(self) -> Path:
+        """UNIX socket of the air."""
+        return self.folder / "air.sock"
+
+    @property
+    def master_config(self) -> Path:
+        """Configuration of the master."""
+        return self.folder / "master.toml"
+
+    @property
+    def key(self) -> Path:
+        """Key of all radios, where the protocol has one."""
+        return self.folder / "radio.key"
+
+    @property
+    def recordings(self) -> Path:
+        """Folder of the master's recordings."""
+        return self.folder / "recordings"
+
+    def client_config(self, station: int) -> Path:
+        """Return the configuration of a station's client."""
+        return self.folder / f"client{station}.toml"
+
+    def instrument_port(self, station: int) -> Path:
+        """Return the serial port of a station's simulated instrument."""
+        return self.folder / f"instrument{station}.tty"
+
+    def status_socket(self, station: int) -> Path:
+        """Return the UNIX socket on which a station's client says how it does."""
+        return self.folder / f"client{station}.sock"
+
+    def journals(self, station: int) -> Path:
+        """Return the folder of a station's journals."""
+        return self.folder / f"journals{station}"
+
+
+def write_demo_files(
+    folder: Path, scenario: ScenarioConfig, socket: Path, protocol: Protocol = "superframe"
+) -> DemoFiles:
+    """Write all configuration and set-up files of a scenario into a folder, and a key.
+
+    Parameters
+    ----------
+    folder
+        Exists.
+    scenario
+        Stations, prisms and limits.
+    socket
+        Where the poses are to go.
+    protocol
+        What master and stations speak.
+    """
+    files = DemoFiles(folder, socket, tuple(station.station for station in scenario.stations))
+    parameters = scenario_parameters(scenario)
+    frames = [
+        f"[stations.{station.station}]\nT_station1_station = {json.dumps(station.T_station1_station)}\n"
+        for station in parameters.stations
+    ]
+    (folder / "station_frames.toml").write_text("\n".join(['kind = "station_frames"\n', *frames]))
+    prisms = [
+        f"[prisms.{prism.prism}]\nposition_m = {json.dumps(prism.position_m)}\n"
+        for prism in parameters.prisms
+    ]
+    (folder / "prism_layout.toml").write_text("\n".join(['kind = "prism_layout"\n', *prisms]))
+    if protocol == "superframe":
+        write_key(files.key)
+    files.master_config.write_text(_master(files, scenario, protocol))
+    for station in scenario.stations:
+        files.client_config(station.station).write_text(_client(files, scenario, station, protocol))
+    return files
+
+
+def _master(files: DemoFiles, scenario: ScenarioConfig, protocol: Protocol) -> str:
+    stations = "\n".join(
+        f"[[stations]]\nstation = {station.station}\nprism = {station.prism}\n"
+        f"prism_constant_mm = {station.prism_constant_mm!r}\n"
+        f"noise = {{ {_inline(station.noise.model_dump())} }}\n"
+        for station in scenario.stations
+    )
+    limits = scenario.pipeline.model_dump(mode="json")
+    motion = limits.pop("motion")
+    pipeline = "\n".join(f"{key} = {json.dumps(value)}" for key, value in limits.items())
+    classic = f"{_CLASSIC}initial_cycles = {INITIAL_CYCLES}      # the paper's 50 take half a minute\n"
+    return f"""\
+kind = "master"
+
+[setup]
+station_frames = "station_frames.toml"
+prism_layout = "prism_layout.toml"
+
+{_radio(scenario, "master")}
+{_SUPERFRAME if protocol == "superframe" else classic}
+[pipeline]
+{pipeline}
+motion = {{ {_inline(motion)} }}
+
+[stream]
+socket = {json.dumps(str(files.socket))}
+
+[recording]
+directory = "{files.recordings.name}"
+
+{stations}"""
+
+
+def _client(files: DemoFiles, scenario: ScenarioConfig, station: SimulatedStation, protocol: Protocol) -> str:
+    number = station.station
+    instrument = instrument_config(station, files.instrument_port(number))
+    return f"""\
+kind = "client"
+station = {number}
+prism = {station.prism}
+status_socket = "{files.status_socket(number).name}"
+
+[instrument]
+kind = "leica"
+port = "{files.instrument_port(number).name}"
+baud = {instrument.baud}
+prism_type = "{instrument.prism_type}"
+prism_constant_mm = {instrument.prism_constant_mm!r}
+latency_ms = {instrument.latency_ms!r}
+angle_delay_ms = {instrument.angle_delay_ms!r}
+
+{_radio(scenario, f"station{number}")}
+{_SUPERFRAME if protocol == "superframe" else _CLASSIC}
+[journal]
+directory = "{files.journals(number).name}"
+"""
+
+
+def _radio(scenario: ScenarioConfig, name: str) -> str:
+    radio = scenario.radio
+    return f"""\
+[radio]
+kind = "simulated"
+air_socket = "air.sock"
+name = "{name}"
+frequency_mhz = {radio.frequency_mhz!r}
+spreading_factor = {radio.spreading_factor}  # 9 as in the paper; the authors' deployed nodes use 8
+bandwidth_khz = {radio.bandwidth_khz!r}
+coding_rate = {radio.coding_rate}
+power_dbm = {radio.power_dbm}
+"""
+
+
+def _inline(values: dict[str, float | list[float]]) -> str:
+    return ", ".join(f"{key} = {value!r}" for key, value in values.items())

@@ -1,0 +1,162 @@
+"""The demonstration: the real daemons as processes, with air, instruments and robot simulated in this one.
+
+Everything that the daemons touch outside themselves is real: sockets, serial ports (pseudo-terminals), files, signals,
+time. Radios and instruments are simulated; so a daemon can be killed and started again like one in the field.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import AsyncExitStack, suppress
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.errors import StreamError
+from tsgt.simulation.demo.processes import Process
+from tsgt.simulation.instrument.pty import PtyLine
+from tsgt.simulation.instrument.total_station import SimulatedTotalStation
+from tsgt.simulation.kernel.timeline import LoopTimeline
+from tsgt.simulation.lora.air_server import AirServer
+from tsgt.simulation.mission.mission import scenario_link
+from tsgt.simulation.world import scenario_world
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from tsgt.clock import Clock
+    from tsgt.config import ScenarioConfig
+    from tsgt.simulation.demo.config_files import DemoFiles
+    from tsgt.simulation.lora.link import LinkModel
+
+STARTUP_LIMIT_S = 60.0
+"""From the start of the daemons to the first pose; a slow machine takes five seconds."""
+
+_MAX_LINE_BYTES = 1 << 20
+_RECONNECT_S = 0.2
+_LAST_LINES_S = 2.0
+
+
+class Demo:
+    """A scenario in real time.
+
+    Parameters
+    ----------
+    scenario
+        World, stations and prisms.
+    files
+        Configuration of the daemons, written already.
+    duration_s
+        From the first pose to the end.
+    seed
+        Of everything that is drawn.
+    clock
+        CLOCK_MONOTONIC of this machine, which all processes share.
+
+    Attributes
+    ----------
+    world
+        The truth; its zero is ``start_ns``.
+    start_ns
+        CLOCK_MONOTONIC at the start of the world, in ns.
+    processes
+        The daemons: the clients in the order of the stations, then the master.
+    """
+
+    def __init__(
+        self, scenario: ScenarioConfig, files: DemoFiles, *, duration_s: float, seed: int, clock: Clock
+    ) -> None:
+        self._scenario = scenario
+        self._files = files
+        self._duration_s = duration_s
+        self._clock = clock
+        world_rng, self._air_rng, *self._instrument_rngs = np.random.default_rng(seed).spawn(
+            2 + len(scenario.stations)
+        )
+        self.world = scenario_world(scenario, duration_s + STARTUP_LIMIT_S + 10, world_rng)
+        self.start_ns = clock.monotonic_ns()
+        self.processes = [
+            Process(
+                f"client {station}",
+                "main_client",
+                ("--config", str(files.client_config(station))),
+                files.folder / f"client{station}.log",
+            )
+            for station in files.stations
+        ]
+        self.processes.append(
+            Process(
+                "master",
+                "main_master",
+                ("--config", str(files.master_config)),
+                files.folder / "master.log",
+            )
+        )
+        self._first_pose = asyncio.Event()
+        self._ending = False
+
+    async def run(self, on_line: Callable[[bytes], None]) -> None:
+        """Run to the end, or until cancelled, which ends the daemons in order too.
+
+        Parameters
+        ----------
+        on_line
+            Gets each line of the master's stream.
+
+        Raises
+        ------
+        StreamError
+            A socket cannot be made, or no pose comes.
+        """
+        timeline = LoopTimeline(asyncio.get_running_loop())
+        async with AsyncExitStack() as stack:
+            await stack.enter_async_context(AirServer(self._files.air_socket, self._link(), self._air_rng))
+            for station, rng in zip(self._scenario.stations, self._instrument_rngs, strict=True):
+                instrument = SimulatedTotalStation(
+                    station, self._scenario, self.world, timeline, rng, start_ns=self.start_ns
+                )
+                port = self._files.instrument_port(station.station)
+                await stack.enter_async_context(PtyLine(instrument, port))
+            tasks = [asyncio.create_task(process.keep_running()) for process in self.processes]
+            reading = asyncio.create_task(self._read(on_line))
+            try:
+                await self._until_the_end()
+            finally:
+                self._ending = True
+                for task in tasks:
+                    task.cancel()
+                await asyncio.wait(tasks)
+                await asyncio.wait([reading], timeout=_LAST_LINES_S)
+                reading.cancel()
+                await asyncio.wait([reading])
+
+    def _link(self) -> LinkModel:
+        """Return the scenario's conditions; the robot's radio stays in the middle of its area."""
+        places = {f"station{s.station}": s.position_m for s in self._scenario.stations}
+        places["master"] = self._scenario.motion.area_centre_m
+        return scenario_link(self._scenario.radio, places, self._air_rng)
+
+    async def _until_the_end(self) -> None:
+        try:
+            async with asyncio.timeout(STARTUP_LIMIT_S):
+                await self._first_pose.wait()
+        except TimeoutError:
+            raise StreamError(
+                f"{self._files.folder}: no pose within {STARTUP_LIMIT_S:g} s; see the logs in this folder"
+            ) from None
+        await asyncio.sleep(self._duration_s)
+
+    async def _read(self, on_line: Callable[[bytes], None]) -> None:
+        """Follow the stream, also of a master that was started again, until the end."""
+        while not self._ending:
+            with suppress(OSError):
+                reader, writer = await asyncio.open_unix_connection(self._files.socket, limit=_MAX_LINE_BYTES)
+                try:
+                    while line := await reader.readline():
+                        if line.startswith(b'{"type":"pose"'):
+                            self._first_pose.set()
+                        on_line(line)
+                finally:
+                    writer.close()
+            if not self._ending:
+                await asyncio.sleep(_RECONNECT_S)

@@ -1,0 +1,117 @@
+"""What can be set in a simulated total station."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+from tsgt.model import ARCSECOND_RAD
+from tsgt.simulation.instrument.edm import atmospheric_ppm
+
+ANGLE_SIGMA_RAD: Final = 1.0 * ARCSECOND_RAD
+"""What it claims of its angles."""
+
+COMPENSATOR_SIGMA_RAD: Final = 0.5 * ARCSECOND_RAD
+
+TAPE: Final = 2
+USER_PRISM: Final = 9
+
+OFF: Final = 2
+"""What it may do when nobody speaks to it: go off."""
+
+PRISM_CONSTANTS_M: Final = {
+    0: 0.0,
+    1: 0.0175,
+    TAPE: 0.0344,
+    3: 0.0231,
+    7: 0.0300,
+    8: 0.0,
+    10: 0.0344,
+    11: 0.0231,
+    12: 0.0281,
+}
+"""By the number of the prism type: what Leica instruments add, in m. The user's own type has the user's constant."""
+
+EDM_MODES: Final = frozenset({1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12})
+"""Those of a TPS1200+; 13 and 14 came with the TS30."""
+
+MODE_OF_PROGRAM: Final = {0: 2, 1: 3, 2: 4, 3: 5, 4: 7, 6: 8, 7: 10, 8: 11, 9: 12, 10: 9}
+"""The EDM mode that a measuring program of the BAP chapter sets; a TPS1200+ has no program 5 (fast tracking)."""
+
+
+@dataclass(slots=True)
+class Settings:
+    """Everything that GeoCOM can set, at what it is when an instrument has been switched on and set up by a person.
+
+    Attributes
+    ----------
+    decimals
+        Digits right of the point, in both directions.
+    atr, lock
+        The user's switches: target recognition, following.
+    edm_mode, program, target_type
+        How distances are measured: by the numbers of TMC, of BAP; 0 with a reflector, 1 without.
+    prism_type, prism_constant_m, user_constant_m
+        Which reflector, the constant that is added, and that of the user's own type.
+    search_area
+        Window of PowerSearch: centre and range in both angles in rad, and whether it is used.
+    spiral_rad
+        Window of the search with the target recognition, full width and height.
+    search_range_m, search_range_on
+        Between these distances PowerSearch takes a prism for one.
+    air
+        Wavelength in m, pressure in hPa, dry and wet temperature in degrees, as TMC_SetAtmCorr has them.
+    geometric_ppm, atmospheric_ppm
+        Scale corrections in 1e-6; the second one belongs to ``air``, unless it was set by itself.
+    incline, angle_switches
+        Compensator; correction of angles for tilt, standing axis, collimation, tilting axis.
+    orientation_rad
+        What the horizontal circle shows for the true direction zero.
+    power_mode, power_timeout_ms
+        What it does when nobody speaks to it for so long: 0 nothing, 2 off.
+    """
+
+    decimals: int = 15
+    atr: bool = True
+    lock: bool = True
+    fine_adjust_mode: int = 0
+    tolerance_rad: tuple[float, float] = (4.7e-6, 4.7e-6)
+    timeout_s: tuple[float, float] = (10.0, 10.0)
+    edm_mode: int = 2
+    program: int = 0
+    target_type: int = 0
+    prism_type: int = 0
+    prism_constant_m: float = 0.0
+    user_constant_m: float = 0.0
+    user_prism: str = ""
+    search_area: tuple[float, float, float, float, int] = (0.0, 0.0, 0.0, 0.0, 0)
+    spiral_rad: tuple[float, float] = (0.07, 0.07)
+    search_range_m: tuple[int, int] = (0, 400)
+    search_range_on: bool = False
+    atr_setting: int = 0
+    narrow_view: bool = False
+    air: tuple[float, float, float, float] = (6.58e-7, 1013.25, 12.0, 8.6)
+    atmospheric_ppm: float = field(default_factory=lambda: atmospheric_ppm(12.0, 1013.25))
+    geometric_ppm: float = 0.0
+    refraction: tuple[int, float, float] = (1, 6_378_000.0, 0.13)
+    refraction_method: int = 1
+    incline: bool = True
+    angle_switches: tuple[int, int, int, int] = (1, 1, 1, 1)
+    orientation_rad: float = 0.0
+    station_m: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    reflector_height_m: float = 0.0
+    guide_light: int = 0
+    laser: bool = False
+    power_mode: int = 2
+    power_timeout_ms: int = 900_000
+
+    def power_cycle(self) -> None:
+        """Forget what does not survive being switched off."""
+        self.decimals = 15
+        self.atr = self.lock = False
+        self.timeout_s = (10.0, 10.0)
+        self.laser = False
+
+    def ppm(self) -> float:
+        """Return the scale correction of distances, in 1e-6."""
+        return self.atmospheric_ppm + self.geometric_ppm

@@ -1,0 +1,234 @@
+"""A serial port: opened for this program alone, with as little delay as its adapter allows, and closed whatever happens."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import fcntl
+import os
+import termios
+from collections import deque
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import serial
+import serial_asyncio
+import structlog
+
+from tsgt.errors import InstrumentError
+from tsgt.station.serial.base import Chunk
+
+if TYPE_CHECKING:
+    from tsgt.clock import Clock
+    from tsgt.station.serial.base import Port
+
+log = structlog.get_logger()
+
+_ROOT: Final = Path("/")
+_GOOD_LATENCY_MS: Final = 2
+_KEPT_CHUNKS: Final = 1024  # of 1 KiB at most; what nobody reads must not fill the memory
+_PTY_MAJORS: Final = range(136, 144)
+
+_FAILURES: Final = (OSError, ValueError, termios.error)
+"""What pyserial lets through, its own SerialException being an OSError; ``termios.error`` is none."""
+
+
+async def open_serial_port(path: Path, baud: int, clock: Clock) -> Port:
+    """Open a serial port: 8 bits, no parity, one stop bit, for this program alone.
+
+    Parameters
+    ----------
+    path
+        The device, or a link to it.
+    baud
+        Bits per second.
+    clock
+        Stamps what comes.
+
+    Raises
+    ------
+    InstrumentError
+        There is none, it is taken, or it may not be opened, or cannot at this speed.
+    """
+    try:
+        device = serial.Serial(os.fspath(path), baud, timeout=0, exclusive=True)
+    except _FAILURES as error:
+        raise InstrumentError(_why_not(path, baud, error)) from error
+    try:
+        if os.major(os.fstat(device.fileno()).st_rdev) not in _PTY_MAJORS:
+            # The lock of above is heeded by those alone who ask for it. A pseudo-terminal would stay closed for ever.
+            fcntl.ioctl(device.fileno(), termios.TIOCEXCL)
+    except _FAILURES as error:
+        device.close()
+        raise InstrumentError(_why_not(path, baud, error)) from error
+    _lower_latency(path, device)
+    port = _SerialPort(str(path), baud, clock)
+    serial_asyncio.SerialTransport(asyncio.get_running_loop(), port, device)
+    await port.opened
+    return port
+
+
+def port_holder(path: Path, *, root: Path = _ROOT) -> str | None:
+    """Return which process has a port open, as ``minicom (process 123)``; None where nobody has, or it cannot be told.
+
+    Parameters
+    ----------
+    path
+        The device, or a link to it.
+    root
+        Where the machine's files are.
+    """
+    device = os.path.realpath(path)
+    for descriptor in root.glob("proc/[0-9]*/fd/*"):
+        with suppress(OSError):  # another user's, or gone in the meantime
+            if str(descriptor.readlink()) == device:
+                return _process(descriptor.parents[1])
+    # Other users' processes do not show what they have open, but whoever has a lock is told to all.
+    with suppress(OSError, ValueError):
+        status = Path(device).stat()
+        place = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
+        for line in (root / "proc" / "locks").read_text(encoding="ascii").splitlines():
+            fields = line.split()
+            if place in fields:
+                return _process(root / "proc" / fields[fields.index(place) - 1])
+    return None
+
+
+def latency_timer_ms(path: Path, *, root: Path = _ROOT) -> int | None:
+    """Return for how long a USB adapter holds bytes back to send more of them at once; None where it has no such timer.
+
+    Parameters
+    ----------
+    path
+        The device, or a link to it.
+    root
+        Where the machine's files are.
+
+    Notes
+    -----
+    Adapters of FTDI have one: 16 ms unless told otherwise. Others have a fixed one, or none.
+    """
+    try:
+        return int(_latency_timer(path, root).read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        return None
+
+
+class _SerialPort(asyncio.Protocol):
+    """A :class:`~tsgt.station.serial.base.Port`."""
+
+    def __init__(self, name: str, baud: int, clock: Clock) -> None:
+        loop = asyncio.get_running_loop()
+        self.name = name
+        self.baud = baud
+        self.opened: asyncio.Future[None] = loop.create_future()
+        self._closed: asyncio.Future[None] = loop.create_future()
+        self._clock = clock
+        self._transport: Any = None
+        self._chunks: deque[Chunk] = deque(maxlen=_KEPT_CHUNKS)
+        self._waiter: asyncio.Future[None] | None = None
+        self._lost = ""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = transport
+        if not self.opened.done():
+            self.opened.set_result(None)
+
+    def data_received(self, data: bytes) -> None:
+        self._chunks.append(Chunk(data, self._clock.monotonic_ns()))
+        self._wake()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._lost = self._lost or _gone(self.name, exc)
+        self._closed.set_result(None)
+        self._wake()
+
+    def write(self, data: bytes) -> None:
+        self._check()
+        try:
+            # Not by the transport: it would put a plug that has just been pulled into the log with all its callers.
+            os.write(self._transport.serial.fileno(), data)
+        except BlockingIOError:
+            pass  # the line takes nothing; the lost request is found by its missing reply
+        except _FAILURES as error:
+            self._lost = _gone(self.name, error)
+            raise InstrumentError(self._lost) from error
+
+    async def read(self) -> Chunk:
+        while not self._chunks:
+            self._check()
+            self._waiter = asyncio.get_running_loop().create_future()
+            try:
+                await self._waiter
+            finally:
+                self._waiter = None
+        return self._chunks.popleft()
+
+    def drain(self) -> bytes:
+        self._check()
+        data = b"".join(chunk.data for chunk in self._chunks)
+        self._chunks.clear()
+        return data
+
+    async def close(self) -> None:
+        self._lost = self._lost or f"{self.name}: closed"
+        if not self._transport.is_closing():
+            with suppress(*_FAILURES):
+                # What the kernel still has to send would be waited for, with the whole program.
+                self._transport.serial.reset_output_buffer()
+            self._transport.abort()
+        await asyncio.shield(self._closed)
+
+    def _check(self) -> None:
+        if self._lost:
+            raise InstrumentError(self._lost)
+
+    def _wake(self) -> None:
+        if self._waiter is not None and not self._waiter.done():
+            self._waiter.set_result(None)
+
+
+def _gone(name: str, error: Exception | None) -> str:
+    return f"{name}: the line is gone, probably unplugged ({error})"
+
+
+def _lower_latency(path: Path, device: serial.Serial) -> None:
+    with suppress(*_FAILURES):  # a port that has no such setting
+        device.set_low_latency_mode(True)
+    latency_ms = latency_timer_ms(path, root=_ROOT)
+    if latency_ms is not None and latency_ms > _GOOD_LATENCY_MS:
+        with suppress(OSError):
+            _latency_timer(path, _ROOT).write_text("1", encoding="ascii")
+            latency_ms = latency_timer_ms(path, root=_ROOT)
+    if latency_ms is not None and latency_ms > _GOOD_LATENCY_MS:
+        _warn_of_latency(str(path), latency_ms)
+
+
+@cache  # said once, not at every speed that is tried
+def _warn_of_latency(port: str, latency_ms: int) -> None:
+    log.warning("serial_latency", port=port, latency_ms=latency_ms)
+
+
+def _latency_timer(path: Path, root: Path) -> Path:
+    return root / "sys/bus/usb-serial/devices" / Path(os.path.realpath(path)).name / "latency_timer"
+
+
+def _process(folder: Path) -> str:
+    name = "a process"
+    with suppress(OSError):
+        name = (folder / "comm").read_text(encoding="utf-8", errors="replace").strip()
+    return f"{name} (process {folder.name})"
+
+
+def _why_not(path: Path, baud: int, error: Exception) -> str:
+    number = getattr(error, "errno", None)
+    if number == errno.ENOENT:
+        return f"there is no {path}: plug the cable in, or look for its name with: ls /dev/serial/by-id/"
+    if number in (errno.EACCES, errno.EPERM):
+        return f"no permission for {path}: put the user into the group of the device (dialout or uucp)"
+    if number in (errno.EBUSY, errno.EAGAIN):
+        holder = port_holder(path) or "a process of another user"
+        return f"{path} is taken by {holder}: end it, a port can have one user only"
+    return f"{path} cannot be opened at {baud} baud: {error}"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from tsgt.config.client import BridgeInstrumentConfig, LeicaInstrumentConfig
 from tsgt.config.radio import HardwareRadioConfig, SimulatedRadioConfig, SuperframeConfig
 from tsgt.radio.key_file import read_key
-from tsgt.radio.planning.from_config import wiring
+from tsgt.radio.from_config import wiring
 from tsgt.radio.sx127x.driver import SX127x
 from tsgt.radio.sx127x.hal import open_hal
 
@@ -68,7 +68,7 @@ def radio_opener(config: RadioConfig, settings: LoRaSettings, clock: Clock) -> O
     config
         What stands under ``[radio]``.
     settings
-        Those of :func:`~tsgt.radio.planning.from_config.lora_settings`.
+        Those of :func:`~tsgt.radio.from_config.lora_settings`.
     clock
         The machine's.
     """

@@ -28,7 +28,7 @@ from tsgt.config.radio import ClassicConfig, SuperframeConfig
 from tsgt.errors import ConfigError, GeometryError
 from tsgt.geometry import check_layout
 from tsgt.model import Parameters, PrismPosition
-from tsgt.radio.planning.from_config import lora_settings
+from tsgt.radio.from_config import lora_settings
 
 
 @click.group("config")

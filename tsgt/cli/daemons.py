@@ -27,7 +27,7 @@ def client(config_path: Path) -> None:
     from tsgt.clock import SystemClock, boot_id  # noqa: PLC0415
     from tsgt.config import ClientConfig, load  # noqa: PLC0415
     from tsgt.config.permissions import check_trust  # noqa: PLC0415
-    from tsgt.radio.planning.from_config import lora_settings  # noqa: PLC0415
+    from tsgt.radio.from_config import lora_settings  # noqa: PLC0415
     from tsgt.station.daemon import run_client  # noqa: PLC0415
 
     check_trust(config_path)
@@ -59,7 +59,7 @@ def master(config_path: Path) -> None:
     from tsgt.config import MasterConfig, load, parameters  # noqa: PLC0415
     from tsgt.config.permissions import check_trust  # noqa: PLC0415
     from tsgt.master.daemon import run_master  # noqa: PLC0415
-    from tsgt.radio.planning.from_config import lora_settings  # noqa: PLC0415
+    from tsgt.radio.from_config import lora_settings  # noqa: PLC0415
 
     check_trust(config_path)
     config = load(config_path, MasterConfig)

@@ -17,7 +17,7 @@ from tsgt.doctor.computer import EARLIEST, is_installed, may_write
 from tsgt.doctor.finding import failed, note, ok, skipped
 from tsgt.errors import ConfigError, GeometryError
 from tsgt.radio.key_file import check_access, read_key
-from tsgt.radio.planning.from_config import lora_settings
+from tsgt.radio.from_config import lora_settings
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -10,7 +10,7 @@ from tsgt.config.radio import ClassicConfig, ClassicMasterConfig, HardwareRadioC
 from tsgt.doctor.finding import failed, note, ok, skipped
 from tsgt.doctor.serial_line import no_right
 from tsgt.radio.planning.capacity import Load
-from tsgt.radio.planning.from_config import lora_settings, planned_cycle, wiring
+from tsgt.radio.from_config import lora_settings, planned_cycle, wiring
 from tsgt.radio.planning.regulations import DIPOLE_DBI, Use, exceeded
 from tsgt.radio.sx127x.chip import Chip
 from tsgt.radio.sx127x.register_io import RegisterAccess

@@ -13,7 +13,7 @@ from tsgt.config.radio import ClassicMasterConfig
 from tsgt.errors import InstrumentError, RadioError, StreamError, TsgtError
 from tsgt.model import Status
 from tsgt.radio.commands import DirectOrder, MeasureOrder, TrackOrder
-from tsgt.radio.planning.from_config import lora_settings
+from tsgt.radio.from_config import lora_settings
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable, Mapping

@@ -13,7 +13,7 @@ from tsgt.cli.radio.options import Modem, modem_options
 from tsgt.config.radio import LARGEST_NUMBERS, ClassicMasterConfig, SuperframeMasterConfig
 from tsgt.radio.base import LoRaSettings
 from tsgt.radio.planning.capacity import Cycle, Load
-from tsgt.radio.planning.from_config import planned_cycle
+from tsgt.radio.from_config import planned_cycle
 from tsgt.radio.planning.link_budget import path_loss_db, sensitivity_dbm
 from tsgt.radio.planning.regulations import DIPOLE_DBI, LOWEST_DBM, REGIONS, Use, exceeded, preset_power_dbm
 

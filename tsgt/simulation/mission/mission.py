@@ -27,7 +27,7 @@ from tsgt.config.radio import (
     SuperframeMasterConfig,
 )
 from tsgt.master.daemon import run_master
-from tsgt.radio.planning.from_config import lora_settings
+from tsgt.radio.from_config import lora_settings
 from tsgt.recording import decode
 from tsgt.simulation.faults.adversary import ForeignRadio
 from tsgt.simulation.instrument.serial_line import SimulatedLine

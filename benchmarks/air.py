@@ -13,14 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tsgt.radio.airtime import airtime_us
-from tsgt.radio.base import LoRaSettings
-from tsgt.simulation.kernel.clocks import VirtualClock
-from tsgt.simulation.kernel.event_loop import run_virtual
-from tsgt.simulation.kernel.timeline import VirtualTimeline
-from tsgt.simulation.lora.air import Air
-from tsgt.simulation.lora.link import LinkModel
-from tsgt.simulation.lora.radios import simulated_radio
+from tsgt.radio import LoRaSettings, airtime_us
+from tsgt.simulation.kernel import VirtualClock, VirtualTimeline, run_virtual
+from tsgt.simulation.lora import Air, LinkModel, simulated_radio
 
 RADIOS = 4
 DURATION_S = 600

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from harness.beacon_scenarios import BEACON_SCENARIOS, run_beacon_scenario
 
-from tsgt.timesync.beacon_clock import BeaconClock
+from tsgt.timesync import BeaconClock
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -22,8 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.geometry import Observations, exp_so3, invert, transform_from, transform_points
-from tsgt.geometry.trajectory.batch import fit
-from tsgt.geometry.trajectory.fixed_lag import FixedLag
+from tsgt.geometry.trajectory import FixedLag, fit
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:

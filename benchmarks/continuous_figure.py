@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import matplotlib as mpl
 import numpy as np
 
-from tsgt.analysis.evaluation.reference import read_tum
+from tsgt.analysis.evaluation import read_tum
 from tsgt.analysis.processing import process, with_estimator
 from tsgt.geometry import log_so3, rotation_from_quaternion
 from tsgt.recording import load_recording

@@ -35,12 +35,10 @@ from harness.aftermath import aftermath
 
 from tsgt.clock import SystemClock
 from tsgt.log import configure_logging
-from tsgt.simulation.checks.invariants import Violation
-from tsgt.simulation.demo.config_files import write_demo_files
-from tsgt.simulation.demo.demo import Demo
-from tsgt.simulation.instrument.pty import PtyLine
-from tsgt.simulation.instrument.total_station import SimulatedTotalStation
-from tsgt.simulation.kernel.timeline import LoopTimeline
+from tsgt.simulation.checks import Violation
+from tsgt.simulation.demo import Demo, write_demo_files
+from tsgt.simulation.instrument import PtyLine, SimulatedTotalStation
+from tsgt.simulation.kernel import LoopTimeline
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

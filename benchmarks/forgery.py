@@ -11,8 +11,8 @@ import time
 import numpy as np
 from harness.forgery import KINDS, forge
 
-from tsgt.radio.base import LoRaSettings
-from tsgt.radio.superframe.slots import FrameTiming
+from tsgt.radio import LoRaSettings
+from tsgt.radio.superframe import FrameTiming
 
 MS = 1_000_000
 

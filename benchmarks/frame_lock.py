@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from tsgt.radio.base import LoRaSettings
+from tsgt.radio import LoRaSettings
+from tsgt.radio.superframe import COMPOSED_NS, FrameLock, FrameTiming
 from tsgt.radio.superframe.grants import expected
-from tsgt.radio.superframe.phase_lock import COMPOSED_NS, FrameLock, Plan
-from tsgt.radio.superframe.slots import FrameTiming
-from tsgt.radio.superframe.wire.messages import GRANT_BYTES, SlotOrder
-from tsgt.timesync.periodicity import Beat
+from tsgt.radio.superframe.phase_lock import Plan
+from tsgt.radio.superframe.wire import GRANT_BYTES, SlotOrder
+from tsgt.timesync import Beat
 
 if TYPE_CHECKING:
     from tsgt.geometry import FloatArray

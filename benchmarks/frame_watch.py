@@ -18,23 +18,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 import structlog
 
-from tsgt.config import ScenarioConfig
-from tsgt.config.master import FrameWatchConfig
-from tsgt.config.radio import ClassicMasterConfig
-from tsgt.estimation.live import Feed
+from tsgt.config import ClassicMasterConfig, FrameWatchConfig, ScenarioConfig
+from tsgt.estimation import Feed
 from tsgt.geometry import exp_so3, transform_from
 from tsgt.master.layout_monitor import FrameWatch
-from tsgt.recording import load_recording
-from tsgt.recording.stream_records import PoseRecord
-from tsgt.simulation.mission.runner import simulate
+from tsgt.recording import PoseRecord, load_recording
 from tsgt.simulation.options import Options
+from tsgt.simulation.runner import simulate
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from tsgt.geometry import FloatArray
     from tsgt.model import Measurement, Parameters
-    from tsgt.recording.stream_records import EventRecord
+    from tsgt.recording import EventRecord
     from tsgt.simulation.options import Node
 
     Drive = tuple[Parameters, Sequence[Measurement]]

@@ -15,19 +15,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.evaluation.metrics import inner_part
+from tsgt.analysis.evaluation import inner_part
 from tsgt.analysis.smoothing import motion_of
 from tsgt.analysis.validation import believed
-from tsgt.config.radio import SuperframeMasterConfig
-from tsgt.estimation.observations import build_observations, middle_m
+from tsgt.config import SuperframeMasterConfig
+from tsgt.estimation import build_observations
+from tsgt.estimation.observations import middle_m
 from tsgt.geometry import log_so3
-from tsgt.geometry.trajectory.batch import fit
-from tsgt.geometry.trajectory.hyperparameters import tune
+from tsgt.geometry.trajectory import fit, tune
 from tsgt.log import configure_logging
 from tsgt.model import PipelineParameters
 from tsgt.recording import load_recording
-from tsgt.simulation.mission.runner import simulate
 from tsgt.simulation.options import Options
+from tsgt.simulation.runner import simulate
 from tsgt.simulation.scenario_files import find_scenario
 
 if TYPE_CHECKING:

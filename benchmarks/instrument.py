@@ -15,16 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tsgt.config import ScenarioConfig
-from tsgt.config.client import LeicaInstrumentConfig
-from tsgt.config.scenario import InstrumentModelConfig, SimulatedStation
-from tsgt.simulation.instrument.serial_line import SimulatedLine
-from tsgt.simulation.instrument.total_station import SimulatedTotalStation
-from tsgt.simulation.kernel.clocks import VirtualClock
-from tsgt.simulation.kernel.event_loop import run_virtual
-from tsgt.simulation.kernel.timeline import VirtualTimeline
+from tsgt.config import InstrumentModelConfig, LeicaInstrumentConfig, ScenarioConfig, SimulatedStation
+from tsgt.simulation.instrument import SimulatedLine, SimulatedTotalStation
+from tsgt.simulation.kernel import VirtualClock, VirtualTimeline, run_virtual
 from tsgt.simulation.world import scenario_world
-from tsgt.station.leica.instrument import LeicaInstrument
+from tsgt.station.leica import LeicaInstrument
 
 DURATION_S = 600.0
 

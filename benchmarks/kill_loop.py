@@ -29,14 +29,12 @@ from harness.aftermath import Found, aftermath
 from tsgt.clock import SystemClock
 from tsgt.config import ScenarioConfig
 from tsgt.log import configure_logging
-from tsgt.simulation.checks.invariants import Violation
-from tsgt.simulation.demo.config_files import write_demo_files
-from tsgt.simulation.demo.demo import Demo
-from tsgt.simulation.instrument.pty import PtyLine
-from tsgt.simulation.instrument.total_station import SimulatedTotalStation
-from tsgt.simulation.kernel.timeline import LoopTimeline
-from tsgt.simulation.lora.air_server import AirServer
-from tsgt.simulation.mission.mission import scenario_link
+from tsgt.simulation.checks import Violation
+from tsgt.simulation.demo import Demo, write_demo_files
+from tsgt.simulation.instrument import PtyLine, SimulatedTotalStation
+from tsgt.simulation.kernel import LoopTimeline
+from tsgt.simulation.lora import AirServer
+from tsgt.simulation.mission import scenario_link
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -16,14 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from tsgt.analysis.merge.merge import merge
-from tsgt.config import ScenarioConfig
-from tsgt.config.radio import ClassicMasterConfig, SuperframeMasterConfig
+from tsgt.analysis.merge import merge
+from tsgt.config import ClassicMasterConfig, ScenarioConfig, SuperframeMasterConfig
 from tsgt.log import configure_logging
-from tsgt.recording import decode_line, read_lines
-from tsgt.recording.merged import MergedRecord
-from tsgt.simulation.mission.runner import simulate
+from tsgt.recording import MergedRecord, decode_line, read_lines
 from tsgt.simulation.options import Options, Outage
+from tsgt.simulation.runner import simulate
 
 AROUND_S = 300.0
 

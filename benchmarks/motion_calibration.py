@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from tsgt.analysis.calibration.motion import calibrate_recording
-from tsgt.geometry.calibration.motion_parameters import Setup, Unknowns
-from tsgt.geometry.rigid import exp_so3
+from tsgt.analysis.calibration import calibrate_recording
+from tsgt.geometry import exp_so3
+from tsgt.geometry.calibration import Setup, Unknowns
 from tsgt.recording import load_recording
 
 if TYPE_CHECKING:

@@ -15,22 +15,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.evaluation.held_out import (
-    FOLDS,
-    folds,
-    hold_out,
-    missed_by_lines,
-    missed_by_trajectory,
-    never_out,
-)
-from tsgt.estimation.observations import build_observations
-from tsgt.geometry.trajectory.batch import fit
+from tsgt.analysis.evaluation import folds, hold_out, missed_by_lines, missed_by_trajectory, never_out
+from tsgt.analysis.evaluation.held_out import FOLDS
+from tsgt.estimation import build_observations
+from tsgt.geometry.trajectory import fit
 from tsgt.geometry.trajectory.hyperparameters import logarithms, search
 from tsgt.model import MotionPrior
 from tsgt.recording import load_recording
 
 if TYPE_CHECKING:
-    from tsgt.analysis.evaluation.held_out import Fold
+    from tsgt.analysis.evaluation import Fold
     from tsgt.geometry import FloatArray, Observations
     from tsgt.geometry.trajectory.hyperparameters import Tuned
 

@@ -15,9 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import chi2
 
-from tsgt.geometry.trajectory.gauss_newton import knot_times, solve
-from tsgt.geometry.trajectory.initialisation import first_guess
-from tsgt.geometry.trajectory.query import Trajectory
+from tsgt.geometry.trajectory import Trajectory, first_guess, knot_times, solve
 from tsgt.model import MotionPrior
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))

@@ -15,14 +15,9 @@ from collections import Counter
 
 import numpy as np
 
-from tsgt.config import ScenarioConfig
-from tsgt.config.scenario import InstrumentModelConfig
-from tsgt.simulation.instrument.serial_line import SimulatedLine
-from tsgt.simulation.instrument.telescope import Lock
-from tsgt.simulation.instrument.total_station import SimulatedTotalStation
-from tsgt.simulation.kernel.clocks import VirtualClock
-from tsgt.simulation.kernel.event_loop import run_virtual
-from tsgt.simulation.kernel.timeline import VirtualTimeline
+from tsgt.config import InstrumentModelConfig, ScenarioConfig
+from tsgt.simulation.instrument import Lock, SimulatedLine, SimulatedTotalStation
+from tsgt.simulation.kernel import VirtualClock, VirtualTimeline, run_virtual
 from tsgt.simulation.world import scenario_world
 
 TIMES = 120

@@ -20,25 +20,35 @@ import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
 
-from tsgt.analysis.evaluation.inter_prism import PairDistances, at_epochs, inter_prism
-from tsgt.analysis.evaluation.metrics import PoseErrors, inner_part, pose_errors
-from tsgt.analysis.evaluation.reference import Reference
-from tsgt.analysis.evaluation.stationary import StandingErrors, standing_errors
+from tsgt.analysis.evaluation import (
+    PairDistances,
+    PoseErrors,
+    Reference,
+    at_epochs,
+    inner_part,
+    inter_prism,
+    pose_errors,
+    standing_errors,
+)
+from tsgt.analysis.evaluation.stationary import StandingErrors
 from tsgt.analysis.processing import process, with_estimator
 from tsgt.cli.output import print_json
-from tsgt.config.radio import ClassicMasterConfig, SuperframeMasterConfig
-from tsgt.estimation.tracks import build_tracks
+from tsgt.config import ClassicMasterConfig, SuperframeMasterConfig
+from tsgt.estimation import build_tracks
 from tsgt.geometry import quaternion_from_rotation, rotation_from_quaternion, transform_from
 from tsgt.log import configure_logging
 from tsgt.recording import load_recording
-from tsgt.simulation.mission.runner import Run, simulate
 from tsgt.simulation.options import Options
+from tsgt.simulation.runner import simulate
 from tsgt.simulation.scenario_files import find_scenario
+
+if TYPE_CHECKING:
+    from tsgt.simulation.mission import Run
 
 EXPERIMENTS = {"quarry": (0,), "ski-trail": (0, 1, 2), "snowmobile": (0,)}
 """Seeds of the drives, by scenario: the paper drove the ski trail three times."""

@@ -26,14 +26,13 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import pytest
 
-from tsgt.config import ScenarioConfig
-from tsgt.config.radio import ClassicMasterConfig, SuperframeMasterConfig
+from tsgt.config import ClassicMasterConfig, ScenarioConfig, SuperframeMasterConfig
 from tsgt.log import configure_logging
-from tsgt.simulation.checks.invariants import violations
-from tsgt.simulation.faults.catalogue import QUICK_CYCLES, FaultKind
-from tsgt.simulation.mission.disk import FULL
-from tsgt.simulation.mission.runner import simulate
-from tsgt.simulation.options import MASTER, Options
+from tsgt.simulation.checks import violations
+from tsgt.simulation.faults import QUICK_CYCLES, FaultKind
+from tsgt.simulation.mission import FULL, MASTER
+from tsgt.simulation.options import Options
+from tsgt.simulation.runner import simulate
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from harness import defects
@@ -42,7 +41,7 @@ from harness.defects import Planting
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
 
-    from tsgt.simulation.mission.mission import Mission
+    from tsgt.simulation.mission import Mission
 
 TESTS = Path(__file__).parents[1] / "tests"
 

@@ -22,20 +22,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.config import ScenarioConfig, scenario_parameters
-from tsgt.estimation.linear import Pipeline
+from tsgt.estimation import Pipeline
 from tsgt.recording import RecordingHeader, RecordingWriter
-from tsgt.simulation.instrument.serial_line import SimulatedLine
-from tsgt.simulation.instrument.total_station import SimulatedTotalStation
-from tsgt.simulation.kernel.clocks import VirtualClock
-from tsgt.simulation.kernel.event_loop import run_virtual
-from tsgt.simulation.kernel.timeline import VirtualTimeline
-from tsgt.simulation.mission.mission import instrument_config
+from tsgt.simulation.instrument import SimulatedLine, SimulatedTotalStation
+from tsgt.simulation.kernel import VirtualClock, VirtualTimeline, run_virtual
+from tsgt.simulation.mission import instrument_config
 from tsgt.simulation.world import scenario_world
-from tsgt.station.leica.instrument import LeicaInstrument
+from tsgt.station.leica import LeicaInstrument
 from tsgt.station.session import Session
 
 if TYPE_CHECKING:
-    from tsgt.config.scenario import SimulatedStation
+    from tsgt.config import SimulatedStation
     from tsgt.model import PolarMeasurement
 
 DURATION_S = 3600

@@ -16,11 +16,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from tsgt.config.radio import ClassicMasterConfig, SuperframeMasterConfig
+from tsgt.config import ClassicMasterConfig, SuperframeMasterConfig
 from tsgt.log import configure_logging
-from tsgt.simulation.checks.invariants import violations
-from tsgt.simulation.mission.runner import simulate
+from tsgt.simulation.checks import violations
 from tsgt.simulation.options import Options
+from tsgt.simulation.runner import simulate
 from tsgt.simulation.scenario_files import find_scenario
 
 if TYPE_CHECKING:

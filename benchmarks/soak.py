@@ -23,18 +23,21 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from tsgt.config.radio import ClassicMasterConfig, SuperframeMasterConfig
+from tsgt.config import ClassicMasterConfig, SuperframeMasterConfig
 from tsgt.geometry import log_so3, rotation_from_quaternion
 from tsgt.log import configure_logging
-from tsgt.simulation.checks.invariants import violations
-from tsgt.simulation.faults.catalogue import QUICK_CYCLES, FaultKind
-from tsgt.simulation.mission.runner import Run, simulate
+from tsgt.simulation.checks import violations
+from tsgt.simulation.faults import QUICK_CYCLES, FaultKind
 from tsgt.simulation.options import Options
+from tsgt.simulation.runner import simulate
 from tsgt.simulation.scenario_files import find_scenario
+
+if TYPE_CHECKING:
+    from tsgt.simulation.mission import Run
 
 DURATION_S = 220.0
 LIMITS = (22.46, 38.26, 60.0)

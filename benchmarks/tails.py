@@ -18,9 +18,17 @@ from scipy.stats import chi2
 
 from tsgt.config import ScenarioConfig
 from tsgt.estimation.observations import FIRST_TIME_SIGMA_S, FIRST_TIMES, INSTRUMENT_TIME_SIGMA_S
-from tsgt.geometry import Observations, cartesian_to_polar, log_so3, polar_to_cartesian
-from tsgt.geometry.rigid import exp_so3, invert, transform_from, transform_points
-from tsgt.geometry.trajectory.batch import fit
+from tsgt.geometry import (
+    Observations,
+    cartesian_to_polar,
+    exp_so3,
+    invert,
+    log_so3,
+    polar_to_cartesian,
+    transform_from,
+    transform_points,
+)
+from tsgt.geometry.trajectory import fit
 from tsgt.simulation.world import World, scenario_world
 
 HOUR_S = 3600.0

@@ -13,7 +13,7 @@ import structlog
 from hypothesis import Phase, settings
 
 import tsgt.cli  # noqa: F401 (sets how many threads numpy has, before it is loaded)
-from tsgt.simulation.kernel.event_loop import run_virtual
+from tsgt.simulation.kernel import run_virtual
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -12,17 +12,17 @@ import pytest
 from harness.bridge import ServedInstrument
 from harness.leica import leica_bench
 
-from tsgt.config.client import BridgeInstrumentConfig
+from tsgt.config import BridgeInstrumentConfig
 from tsgt.errors import InstrumentError
 from tsgt.model import Status
-from tsgt.station.bridge.instrument import BridgeInstrument
+from tsgt.station.bridge import BridgeInstrument
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
 
     from harness.leica import LeicaBench
 
-    from tsgt.station.instrument import Instrument
+    from tsgt.station import Instrument
 
 PERIOD_NS = 400_000_000
 UNEVEN_NS = 40_000_000

@@ -15,18 +15,18 @@ from typing import TYPE_CHECKING
 
 from tsgt.errors import RecordingError
 from tsgt.model import PolarMeasurement
-from tsgt.radio.superframe.wire.messages import RESTART_SKIP
-from tsgt.recording import decode, load_recording
-from tsgt.recording.format import Typed
+from tsgt.radio.superframe.wire import RESTART_SKIP
+from tsgt.recording import Typed, decode, load_recording
 from tsgt.recording.journal import load_journal
-from tsgt.simulation.checks.invariants import Violation, altered, beyond_bound, delivered_twice, misread
-from tsgt.simulation.mission.run_log import Measured, Session, StationWitness
+from tsgt.simulation.checks import Violation
+from tsgt.simulation.checks.invariants import altered, beyond_bound, delivered_twice, misread
+from tsgt.simulation.mission import Measured, Session, StationWitness
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from tsgt.recording.journal import Journal
-    from tsgt.simulation.instrument.geocom.answers import Offered
+    from tsgt.simulation.instrument.geocom import Offered
 
 _HEAD_LINES = 2
 """A file that ends within these, the header and whose it is, holds nothing else."""

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tsgt.simulation.kernel.timeline import VirtualTimeline
-from tsgt.simulation.lora.air import Air
+from tsgt.simulation.kernel import VirtualTimeline
+from tsgt.simulation.lora import Air, LinkModel
 from tsgt.simulation.lora.frames import Frame, Header, Listening, Modulation, Reception
-from tsgt.simulation.lora.link import FixedLoss, LinkModel
+from tsgt.simulation.lora.link import FixedLoss
 
 if TYPE_CHECKING:
     from tsgt.simulation.lora.frames import Port

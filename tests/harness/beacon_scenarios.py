@@ -13,14 +13,17 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tsgt.radio.superframe.master import SESSION_EVERY, SESSION_EVERY_WANTED
+from tsgt.radio.superframe import SESSION_EVERY
+from tsgt.radio.superframe.master import SESSION_EVERY_WANTED
 from tsgt.radio.superframe.station_state import TIME_AT_START
-from tsgt.radio.superframe.wire.messages import TIME_UNIT_US
-from tsgt.timesync.beacon_clock import BeaconClock, Instant
+from tsgt.radio.superframe.wire import TIME_UNIT_US
+from tsgt.timesync import BeaconClock
 from tsgt.timesync.dual_rate import SIGMAS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from tsgt.timesync.beacon_clock import Instant
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -8,15 +8,15 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from tsgt.errors import InstrumentError
-from tsgt.radio.commands import Direction
-from tsgt.station.instrument import Atmosphere
+from tsgt.radio import Direction
+from tsgt.station import Atmosphere
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from tsgt.clock import Clock
+    from tsgt.station import Instrument, Reading
     from tsgt.station.bridge.process import Listener
-    from tsgt.station.instrument import Instrument, Reading
 
 HELLO = {"type": "hello", "bridge": 1, "make": "Fake", "stamps": "host"}
 COMMANDS = ["track", "direct", "measure", "atmosphere"]

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.simulation.kernel.timeline import VirtualTimeline
-from tsgt.simulation.lora.chip import SX1276Chip
+from tsgt.simulation.kernel import VirtualTimeline
+from tsgt.simulation.lora import SX1276Chip
 from tsgt.simulation.lora.frames import Frame, Header, Reception
 from tsgt.simulation.lora.modem import ChipTiming
 

@@ -10,22 +10,25 @@ from typing import TYPE_CHECKING
 import numpy as np
 from harness.radios import PAPER, make_side, running_timeline
 
-from tsgt.config import ClientConfig, ScenarioConfig
-from tsgt.config.client import JournalConfig, LeicaInstrumentConfig
-from tsgt.config.radio import ClassicConfig, SimulatedRadioConfig
-from tsgt.radio.classic.messages import MeasurementMessage, decode_reply
+from tsgt.config import (
+    ClassicConfig,
+    ClientConfig,
+    JournalConfig,
+    LeicaInstrumentConfig,
+    ScenarioConfig,
+    SimulatedRadioConfig,
+)
+from tsgt.radio.classic import MeasurementMessage
+from tsgt.radio.classic.messages import decode_reply
 from tsgt.recording.journal import load_journal
-from tsgt.simulation.instrument.serial_line import SimulatedLine
-from tsgt.simulation.instrument.total_station import SimulatedTotalStation
-from tsgt.simulation.kernel.clocks import DriftingClock, VirtualClock
-from tsgt.simulation.lora.air import Air
-from tsgt.simulation.lora.link import LinkModel
-from tsgt.simulation.lora.radios import opener
-from tsgt.simulation.mission.mission import instrument_config
+from tsgt.simulation.instrument import SimulatedLine, SimulatedTotalStation
+from tsgt.simulation.kernel import DriftingClock, VirtualClock
+from tsgt.simulation.lora import Air, LinkModel, opener
+from tsgt.simulation.mission import instrument_config
 from tsgt.simulation.mission.run_log import WatchedInstrument
 from tsgt.simulation.world import scenario_world
-from tsgt.station.daemon import run_client
-from tsgt.station.leica.instrument import LeicaInstrument
+from tsgt.station import run_client
+from tsgt.station.leica import LeicaInstrument
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
@@ -33,11 +36,11 @@ if TYPE_CHECKING:
 
     from harness.radios import Side
 
-    from tsgt.config.radio import ProtocolConfig
+    from tsgt.config import ProtocolConfig
     from tsgt.model import PolarMeasurement
-    from tsgt.radio.base import OpenRadio
+    from tsgt.radio import OpenRadio
     from tsgt.radio.classic.messages import Reply
-    from tsgt.station.instrument import Reading
+    from tsgt.station import Reading
 
 START_NS = 1_700_000_000_000_000_000
 OFFSET_NS = -3_600_000_000_000

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from tsgt.master.classic.scheduler import Cadence
 from tsgt.model import ClockSample
-from tsgt.radio.airtime import airtime_us, symbol_time_ns
-from tsgt.timesync.two_way import ArrivalCheck, ClockEstimate, clock_filter
+from tsgt.radio import airtime_us, symbol_time_ns
+from tsgt.timesync import ArrivalCheck, ClockEstimate, clock_filter
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

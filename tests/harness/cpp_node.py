@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from harness.blocking import BlockingProgram
 
-    from tsgt.simulation.lora.chip import SX1276Chip
+    from tsgt.simulation.lora import SX1276Chip
 
 TRANSFER_S = 50e-6
 """Two bytes at 500 kHz, and the system call."""

@@ -19,14 +19,13 @@ from tsgt.master.classic import ingest
 from tsgt.master.recording_thread import Disk
 from tsgt.master.superframe import link
 from tsgt.model import Status
-from tsgt.radio.superframe import master, session
+from tsgt.radio.superframe import SuperframeStation, master, session
 from tsgt.radio.superframe.receive_window import Inbox, Numbers
 from tsgt.radio.superframe.send_queue import Delivery
 from tsgt.radio.superframe.session import StationSession
-from tsgt.radio.superframe.station import SuperframeStation
 from tsgt.radio.superframe.station_state import Peer
-from tsgt.radio.superframe.wire.messages import TIME_UNIT_US
-from tsgt.recording.writer import RecordingWriter
+from tsgt.radio.superframe.wire import TIME_UNIT_US
+from tsgt.recording import RecordingWriter
 from tsgt.simulation.mission import mission
 from tsgt.station import backlog, daemon
 from tsgt.station.leica.timing import InstrumentTimes

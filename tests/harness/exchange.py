@@ -10,19 +10,16 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from tsgt.model import Status
+from tsgt.radio import Packet, Transmitted
 from tsgt.radio.airtime import TX_DONE_NS
-from tsgt.radio.base import Packet, Transmitted
-from tsgt.radio.superframe.command_exchange import Situation
-from tsgt.radio.superframe.master import SuperframeMaster
-from tsgt.radio.superframe.send_queue import Outbox, Queued
-from tsgt.radio.superframe.station import SuperframeStation
+from tsgt.radio.superframe import Outbox, Queued, Situation, SuperframeMaster, SuperframeStation
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from tsgt.radio.superframe.reception import Heard, TimedSighting
-    from tsgt.radio.superframe.slots import FrameTiming
-    from tsgt.radio.superframe.wire.authentication import Authenticator
+    from tsgt.radio.superframe import FrameTiming, TimedSighting
+    from tsgt.radio.superframe.reception import Heard
+    from tsgt.radio.superframe.wire import Authenticator
 
 MS = 1_000_000
 PERIOD_NS = 400 * MS

@@ -12,27 +12,28 @@ from harness.radios import PAPER, running_timeline
 from harness.scene import START, standing_scene
 
 from tsgt.clock import UnixTimeline
-from tsgt.config import MasterConfig
-from tsgt.config.master import RecordingConfig, SetupConfig, StationConfig, StreamConfig
-from tsgt.config.radio import ClassicMasterConfig, SimulatedRadioConfig, SuperframeMasterConfig
+from tsgt.config import (
+    ClassicMasterConfig,
+    MasterConfig,
+    RecordingConfig,
+    SetupConfig,
+    SimulatedRadioConfig,
+    StationConfig,
+    StreamConfig,
+    SuperframeMasterConfig,
+)
 from tsgt.errors import InstrumentError
-from tsgt.master.daemon import run_master
+from tsgt.master import run_master
 from tsgt.model import Status
-from tsgt.radio.classic.messages import MeasurementMessage, raw_status
+from tsgt.radio import DirectOrder, SearchOrder, TrackOrder
+from tsgt.radio.classic import MeasurementMessage, raw_status
 from tsgt.radio.classic.transactions import ClassicStation
-from tsgt.radio.commands import DirectOrder, SearchOrder, TrackOrder
-from tsgt.radio.superframe.command_exchange import Situation
-from tsgt.radio.superframe.send_queue import Outbox, Queued
-from tsgt.radio.superframe.station import SuperframeStation
-from tsgt.radio.superframe.wire.authentication import Authenticator
-from tsgt.radio.superframe.wire.codec import angle_code
-from tsgt.radio.superframe.wire.messages import RESTART_SKIP
-from tsgt.simulation.kernel.clocks import DriftingClock, VirtualClock
-from tsgt.simulation.lora.air import Air
-from tsgt.simulation.lora.link import LinkModel
-from tsgt.simulation.lora.radios import opener
+from tsgt.radio.superframe import Outbox, Queued, Situation, SuperframeStation
+from tsgt.radio.superframe.wire import RESTART_SKIP, Authenticator, angle_code
+from tsgt.simulation.kernel import DriftingClock, VirtualClock
+from tsgt.simulation.lora import Air, LinkModel, opener
 from tsgt.simulation.mission.authors_node import AUTHORS_STAMP_DELAY_MS, AuthorsNode
-from tsgt.station.instrument import Condition, Reading
+from tsgt.station import Condition, Reading
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Coroutine
@@ -42,11 +43,10 @@ if TYPE_CHECKING:
     from harness.scene import Scene
 
     from tsgt.clock import Clock
-    from tsgt.radio.base import OpenRadio, Packet, Radio
-    from tsgt.radio.commands import Direction
-    from tsgt.radio.superframe.session import Reception
+    from tsgt.radio import Direction, OpenRadio, Packet, Radio
+    from tsgt.radio.superframe import Reception
     from tsgt.recording.journal import InstrumentRecord
-    from tsgt.station.instrument import Atmosphere
+    from tsgt.station import Atmosphere
 
 T = TypeVar("T")
 

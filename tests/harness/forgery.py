@@ -15,15 +15,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from harness.exchange import START_NS, Exchange
 
-from tsgt.radio.superframe.wire.authentication import CODE_BYTES, Authenticator
-from tsgt.radio.superframe.wire.codec import decode_reply
+from tsgt.radio.superframe.wire import CODE_BYTES, Authenticator, decode_reply
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     import numpy as np
 
-    from tsgt.radio.superframe.slots import FrameTiming
+    from tsgt.radio.superframe import FrameTiming
 
 KINDS = (
     "noise",

@@ -9,27 +9,31 @@ from harness.radios import MS, PAPER
 
 from tsgt.model import Status
 from tsgt.radio.airtime import TX_DONE_NS
-from tsgt.radio.superframe.master import SuperframeMaster
-from tsgt.radio.superframe.slots import FrameTiming, SlotSpan
-from tsgt.radio.superframe.wire.authentication import CODE_BYTES, Authenticator
-from tsgt.radio.superframe.wire.codec import angle_code, decode_beacon, distance_code, encode_reply
-from tsgt.radio.superframe.wire.messages import (
+from tsgt.radio.superframe import FrameTiming, SuperframeMaster
+from tsgt.radio.superframe.wire import (
+    CODE_BYTES,
     SESSION_TIME_BITS,
     TIME_BITS,
     TIME_UNIT_US,
     WIDE_TIME_BITS,
+    Authenticator,
     Introduction,
     Reply,
     Run,
     Sighting,
+    angle_code,
+    decode_beacon,
+    distance_code,
+    encode_reply,
 )
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from tsgt.radio.superframe.phase_lock import FrameLock
+    from tsgt.radio.superframe import FrameLock
     from tsgt.radio.superframe.reception import Heard
-    from tsgt.radio.superframe.wire.messages import Beacon
+    from tsgt.radio.superframe.slots import SlotSpan
+    from tsgt.radio.superframe.wire import Beacon
 
 KEY = bytes(range(32))
 TIMING = FrameTiming.stated(PAPER, start_jitter_ns=5 * MS, turn_round_ns=8 * MS, clock_error_ppm=100.0)

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from tsgt.errors import InstrumentError
-from tsgt.simulation.kernel.clocks import VirtualClock
-from tsgt.station.serial.base import Chunk
+from tsgt.simulation.kernel import VirtualClock
+from tsgt.station.serial import Chunk
 
 if TYPE_CHECKING:
     from tsgt.clock import Clock

@@ -8,33 +8,33 @@ from typing import TYPE_CHECKING
 from harness.radios import MS, PAPER
 
 from tsgt.model import Status
+from tsgt.radio import Packet, Transmitted
 from tsgt.radio.airtime import TX_DONE_NS
-from tsgt.radio.base import Packet, Transmitted
-from tsgt.radio.superframe.command_exchange import Situation
-from tsgt.radio.superframe.send_queue import Outbox, Queued
-from tsgt.radio.superframe.slots import GUARD_UNIT_NS, FrameTiming
-from tsgt.radio.superframe.station import SuperframeStation
-from tsgt.radio.superframe.wire.authentication import CODE_BYTES, Authenticator
-from tsgt.radio.superframe.wire.codec import decode_reply, encode_beacon
-from tsgt.radio.superframe.wire.messages import (
+from tsgt.radio.superframe import FrameTiming, Outbox, Queued, Situation, SuperframeStation
+from tsgt.radio.superframe.slots import GUARD_UNIT_NS
+from tsgt.radio.superframe.wire import (
+    CODE_BYTES,
     GRANT_BYTES,
     RESTART_SKIP,
     TIME_BITS,
     TIME_UNIT_US,
     WIDE_TIME_BITS,
+    Authenticator,
     Beacon,
     Confirmation,
     SessionPart,
     SlotOrder,
     StationEntry,
+    decode_reply,
+    encode_beacon,
 )
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from tsgt.radio.superframe.session import Reception
+    from tsgt.radio.superframe import Reception
     from tsgt.radio.superframe.station import Heard
-    from tsgt.radio.superframe.wire.messages import OrderPart, Reply, Run
+    from tsgt.radio.superframe.wire import OrderPart, Reply, Run
 
 SECOND = 1_000_000_000
 KEY = bytes(range(32))

@@ -10,15 +10,13 @@ import numpy as np
 from harness.blocking import BlockingProgram
 from harness.radios import make_side, running_timeline
 
-from tsgt.simulation.lora.air import Air
-from tsgt.simulation.lora.chip import SX1276Chip
-from tsgt.simulation.lora.link import LinkModel
+from tsgt.simulation.lora import Air, LinkModel, SX1276Chip
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
 
-    from tsgt.radio.base import LoRaSettings
-    from tsgt.radio.sx127x.driver import SX127x
+    from tsgt.radio import LoRaSettings
+    from tsgt.radio.sx127x import SX127x
 
 SIZES = (5, 17, 34, 251)
 """Payloads for all drivers: Adafruit's takes 5 to 251 bytes."""

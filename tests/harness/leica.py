@@ -10,21 +10,19 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from tsgt.config import ScenarioConfig
-from tsgt.config.client import LeicaInstrumentConfig
-from tsgt.config.scenario import InstrumentModelConfig, SimulatedStation, StatusFaultConfig
-from tsgt.simulation.instrument.serial_line import SimulatedLine
-from tsgt.simulation.instrument.total_station import SimulatedTotalStation
-from tsgt.simulation.kernel.clocks import VirtualClock
+from tsgt.config import InstrumentModelConfig, LeicaInstrumentConfig, ScenarioConfig, SimulatedStation
+from tsgt.simulation.instrument import SimulatedLine, SimulatedTotalStation
+from tsgt.simulation.kernel import VirtualClock
 from tsgt.simulation.world import scenario_world
-from tsgt.station.leica.instrument import LeicaInstrument
+from tsgt.station.leica import LeicaInstrument
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Sequence
 
+    from tsgt.config.scenario import StatusFaultConfig
     from tsgt.model import Status
     from tsgt.simulation.kernel.event_loop import VirtualEventLoop
-    from tsgt.station.instrument import Reading
+    from tsgt.station import Reading
 
 TARGETS_M = ((20.0, 5.0, 0.5),)
 

@@ -9,25 +9,23 @@ from typing import TYPE_CHECKING, cast
 from harness.radios import MS, PAPER
 
 from tsgt.clock import UnixTimeline
-from tsgt.config.master import StationConfig
-from tsgt.config.radio import ClassicMasterConfig
-from tsgt.master.classic.link import ClassicLink
+from tsgt.config import ClassicMasterConfig, StationConfig
+from tsgt.master.classic import ClassicLink
 from tsgt.master.publisher import Reports
 from tsgt.master.station_events import Alerts
 from tsgt.master.statistics import Monitor
-from tsgt.radio.base import Packet, Transmitted
-from tsgt.radio.classic.messages import MeasurementMessage
+from tsgt.radio import Packet, TrackOrder, Transmitted
+from tsgt.radio.classic import MeasurementMessage
 from tsgt.radio.classic.transactions import ClassicStation, Timing
-from tsgt.radio.commands import TrackOrder
-from tsgt.recording.stream_records import ClockRecord
-from tsgt.simulation.kernel.clocks import VirtualClock
+from tsgt.recording import ClockRecord
+from tsgt.simulation.kernel import VirtualClock
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable
 
     from tsgt.master.publisher import Outlet
     from tsgt.model import PolarMeasurement
-    from tsgt.radio.base import LoRaSettings
+    from tsgt.radio import LoRaSettings
 
 SECOND = 1000 * MS
 START = 1_600_000_000 * SECOND

@@ -8,23 +8,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 from harness.radios import running_timeline
 
-from tsgt.doctor.checklist import examine
-from tsgt.doctor.machine import Machine, User
+from tsgt.doctor import Machine, examine
+from tsgt.doctor.machine import User
 from tsgt.errors import InstrumentError
-from tsgt.simulation.kernel.clocks import VirtualClock
-from tsgt.simulation.lora.air import Air
-from tsgt.simulation.lora.chip import SX1276Chip
-from tsgt.simulation.lora.hal import SimulatedHal
-from tsgt.simulation.lora.link import LinkModel
+from tsgt.simulation.kernel import VirtualClock
+from tsgt.simulation.lora import Air, LinkModel, SimulatedHal, SX1276Chip
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from tsgt.doctor.finding import Finding
-    from tsgt.radio.sx127x.hal import Hal, Wiring
-    from tsgt.station.serial.base import OpenPort, Port
-    from tsgt.station.status import ClientStatus
+    from tsgt.doctor import Finding
+    from tsgt.radio.sx127x import Hal, Wiring
+    from tsgt.station import ClientStatus
+    from tsgt.station.serial import OpenPort, Port
 
 NOW_NS = 1_795_260_000_000_000_000
 """2026-11-21."""

@@ -9,7 +9,7 @@ from harness.prior_motion import PLACE_M, STEP_S
 from scipy.stats import norm
 
 from tsgt.geometry import exp_so3
-from tsgt.geometry.trajectory.states import Knots
+from tsgt.geometry.trajectory import Knots
 
 if TYPE_CHECKING:
     from tsgt.geometry import FloatArray

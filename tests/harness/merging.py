@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from tsgt.recording import decode_line, read_lines
-from tsgt.recording.merged import MergedRecord
+from tsgt.recording import MergedRecord, decode_line, read_lines
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from tsgt.model import PolarMeasurement
-    from tsgt.simulation.mission.runner import Run
+    from tsgt.simulation.mission import Run
 
 
 def journals(run: Run) -> list[Path]:

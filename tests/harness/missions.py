@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from tsgt.config import ScenarioConfig
-from tsgt.config.radio import ClassicMasterConfig, SuperframeMasterConfig
-from tsgt.simulation.mission.runner import Run, simulate
+from tsgt.config import ClassicMasterConfig, ScenarioConfig, SuperframeMasterConfig
 from tsgt.simulation.options import Options
+from tsgt.simulation.runner import simulate
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
     from pathlib import Path
 
-    from tsgt.simulation.mission.mission import Mission
+    from tsgt.simulation.mission import Mission, Run
 
 QUICK = ClassicMasterConfig(kind="classic", initial_cycles=5)
 """The protocol with a short synchronisation at the start: 1.2 s for each station."""

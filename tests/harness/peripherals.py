@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from harness.blocking import BlockingProgram
 
-    from tsgt.simulation.lora.chip import SX1276Chip
+    from tsgt.simulation.lora import SX1276Chip
 
 
 def import_driver(name: str, stand_ins: dict[str, ModuleType]) -> ModuleType:

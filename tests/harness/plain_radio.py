@@ -5,13 +5,13 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-from tsgt.radio.base import Packet, Transmitted
+from tsgt.radio import Packet, Transmitted
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from tsgt.clock import Clock
-    from tsgt.radio.base import LoRaSettings
+    from tsgt.radio import LoRaSettings
 
 AIRTIME_NS = 50_000_000
 

@@ -17,7 +17,7 @@ from tsgt.geometry import (
     polar_to_cartesian,
     transform_points,
 )
-from tsgt.geometry.trajectory.states import Knots
+from tsgt.geometry.trajectory import Knots
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -9,19 +9,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.radio.base import LoRaSettings
-from tsgt.radio.sx127x.driver import SX127x
-from tsgt.simulation.kernel.clocks import VirtualClock
+from tsgt.radio import LoRaSettings
+from tsgt.radio.sx127x import SX127x
+from tsgt.simulation.kernel import VirtualClock
 from tsgt.simulation.kernel.event_loop import VirtualEventLoop
-from tsgt.simulation.lora.air import Air
-from tsgt.simulation.lora.chip import SX1276Chip
-from tsgt.simulation.lora.hal import SimulatedHal
-from tsgt.simulation.lora.link import LinkModel
+from tsgt.simulation.lora import Air, LinkModel, SimulatedHal, SX1276Chip
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
 
-    from tsgt.simulation.kernel.timeline import VirtualTimeline
+    from tsgt.simulation.kernel import VirtualTimeline
 
 PAPER = LoRaSettings(frequency_hz=905_000_000, spreading_factor=9, bandwidth_hz=250_000, coding_rate=6)
 """The modem settings of the paper."""

@@ -11,15 +11,16 @@ from tsgt.model import (
     StationParameters,
     Status,
 )
-from tsgt.recording import RecordingHeader, encode_line
-from tsgt.recording.stream_records import (
+from tsgt.recording import (
     ClockRecord,
     EventRecord,
     HelloRecord,
     PoseRecord,
+    RecordingHeader,
     StationShare,
     StationStatus,
     StatusRecord,
+    encode_line,
 )
 
 SECOND = 1_000_000_000

@@ -16,26 +16,21 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from tsgt.config import ScenarioConfig
-from tsgt.config.client import LeicaInstrumentConfig
+from tsgt.config import LeicaInstrumentConfig, ScenarioConfig
+from tsgt.simulation.instrument import LineFault, SimulatedLine, SimulatedTotalStation
 from tsgt.simulation.instrument.geocom.server import Forced
-from tsgt.simulation.instrument.serial_line import LineFault, SimulatedLine
-from tsgt.simulation.instrument.total_station import SimulatedTotalStation
-from tsgt.simulation.kernel.clocks import DriftingClock, VirtualClock
-from tsgt.simulation.kernel.event_loop import run_virtual
-from tsgt.simulation.kernel.timeline import VirtualTimeline
+from tsgt.simulation.kernel import DriftingClock, VirtualClock, VirtualTimeline, run_virtual
 from tsgt.simulation.world import scenario_world
-from tsgt.station.geocom.codec import Rpc
-from tsgt.station.geocom.codes import ReturnCode
+from tsgt.station.geocom import ReturnCode, Rpc
 from tsgt.station.instrument_supervisor import InstrumentKeeper
-from tsgt.station.leica.instrument import LeicaInstrument
+from tsgt.station.leica import LeicaInstrument
 from tsgt.station.session import Session
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
 
-    from tsgt.simulation.instrument.geocom.answers import Offered
-    from tsgt.station.instrument import Reading
+    from tsgt.simulation.instrument.geocom import Offered
+    from tsgt.station import Reading
 
 SETTLE_S: Final = 10.0
 """Before the fault: connecting takes two seconds."""

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 from tsgt.errors import InstrumentError
 from tsgt.model import Status
 from tsgt.recording.journal import InstrumentRecord
-from tsgt.station.instrument import Condition, Reading
+from tsgt.station import Condition, Reading
 
 if TYPE_CHECKING:
     from tsgt.clock import Clock
-    from tsgt.radio.commands import Direction
-    from tsgt.station.instrument import Atmosphere
+    from tsgt.radio import Direction
+    from tsgt.station import Atmosphere
 
 READING = Reading(
     at_ns=0,

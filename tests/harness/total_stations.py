@@ -8,16 +8,15 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from tsgt.config import MotionConfig, NoiseConfig, ScenarioConfig
-from tsgt.simulation.instrument.serial_line import SimulatedLine
-from tsgt.simulation.instrument.total_station import SimulatedTotalStation
-from tsgt.simulation.kernel.clocks import VirtualClock
+from tsgt.simulation.instrument import SimulatedLine, SimulatedTotalStation
+from tsgt.simulation.kernel import VirtualClock
 from tsgt.simulation.kernel.event_loop import VirtualEventLoop
 from tsgt.simulation.world import scenario_world
 
 if TYPE_CHECKING:
-    from tsgt.simulation.kernel.timeline import VirtualTimeline
+    from tsgt.simulation.kernel import VirtualTimeline
     from tsgt.simulation.world import World
-    from tsgt.station.serial.base import Chunk, Port
+    from tsgt.station.serial import Chunk, Port
 
 SILENT = NoiseConfig(range_sigma_mm=0.0, range_sigma_ppm=0.0, angle_sigma_arcsec=0.0, pointing_sigma_mm=0.0)
 

@@ -10,7 +10,7 @@ from harness.blocking import ACCESS_S
 from harness.lab import SIZES, lab, payload
 from harness.peripherals import CircuitPythonPin, CircuitPythonSpi, circuit_python_modules, import_driver
 
-from tsgt.radio.base import LoRaSettings
+from tsgt.radio import LoRaSettings
 
 if TYPE_CHECKING:
     from harness.lab import Lab

@@ -15,31 +15,30 @@ from harness.shots import READING, ScriptedInstrument
 
 from tsgt.clock import UnixTimeline
 from tsgt.errors import InstrumentError
-from tsgt.master.classic.transport import Collector
+from tsgt.master.classic import Collector
 from tsgt.model import Status
-from tsgt.radio.base import LoRaSettings
-from tsgt.radio.classic.messages import Command, MeasurementMessage, raw_status, status_of
-from tsgt.radio.classic.transactions import (
-    ClassicStation,
+from tsgt.radio import LoRaSettings, MeasureOrder
+from tsgt.radio.classic import (
+    Command,
+    MeasurementMessage,
     Ordered,
     Poll,
     Shot,
     Synchronisation,
-    Timing,
+    raw_status,
+    status_of,
 )
-from tsgt.radio.commands import MeasureOrder
-from tsgt.simulation.kernel.clocks import DriftingClock, VirtualClock
-from tsgt.simulation.lora.air import Air
-from tsgt.simulation.lora.link import LinkModel
-from tsgt.simulation.lora.radios import opener
+from tsgt.radio.classic.transactions import ClassicStation, Timing
+from tsgt.simulation.kernel import DriftingClock, VirtualClock
+from tsgt.simulation.lora import Air, LinkModel, opener
 from tsgt.simulation.mission.authors_node import AUTHORS_STAMP_DELAY_MS, AuthorsMaster, AuthorsNode
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Coroutine
 
-    from tsgt.radio.base import Radio
+    from tsgt.radio import Radio
     from tsgt.radio.classic.station import ClassicOrder
-    from tsgt.station.instrument import Reading
+    from tsgt.station import Reading
 
 SECOND = 1000 * MS
 START_NS = 1_790_000_000 * SECOND

@@ -9,7 +9,7 @@ import pytest
 from harness.cpp_node import CppNode
 from harness.lab import lab, payload
 
-from tsgt.radio.base import LoRaSettings
+from tsgt.radio import LoRaSettings
 
 if TYPE_CHECKING:
     from harness.lab import Lab

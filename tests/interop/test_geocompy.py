@@ -17,9 +17,8 @@ from geocompy.geo.gcdata import Adjust, ATRLock, EDMModeV2, Measurement, PowerSo
 from geocompy.geo.gctypes import GeoComCode
 
 from tsgt.config import ScenarioConfig
-from tsgt.simulation.instrument.pty import PtyLine
-from tsgt.simulation.instrument.total_station import SimulatedTotalStation
-from tsgt.simulation.kernel.timeline import LoopTimeline
+from tsgt.simulation.instrument import PtyLine, SimulatedTotalStation
+from tsgt.simulation.kernel import LoopTimeline
 from tsgt.simulation.world import scenario_world
 
 if TYPE_CHECKING:

@@ -14,8 +14,8 @@ from geocompy.data import Coordinate
 from geocompy.geo import GeoCom
 from geocompy.geo.gctypes import GeoComCode, rpcnames
 
-from tsgt.station.geocom.codec import Byte, Parameter, Rpc, decode_reply, encode_request
-from tsgt.station.geocom.codes import ReturnCode
+from tsgt.station.geocom import Parameter, ReturnCode, Rpc
+from tsgt.station.geocom.codec import Byte, decode_reply, encode_request
 
 
 class Wire(Connection):

@@ -9,7 +9,7 @@ import pytest
 from harness.lab import SIZES, lab, payload
 from harness.peripherals import RaspberryPi, import_driver
 
-from tsgt.radio.base import LoRaSettings
+from tsgt.radio import LoRaSettings
 
 if TYPE_CHECKING:
     from harness.lab import Lab

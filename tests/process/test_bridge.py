@@ -16,10 +16,10 @@ import pytest
 from structlog.testing import capture_logs
 
 from tsgt.clock import SystemClock
-from tsgt.config.client import BridgeInstrumentConfig
+from tsgt.config import BridgeInstrumentConfig
 from tsgt.errors import InstrumentError
 from tsgt.recording.journal import load_journal
-from tsgt.station.bridge.instrument import BridgeInstrument
+from tsgt.station.bridge import BridgeInstrument
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from tsgt.analysis.formats.target_file import read_some_targets
+from tsgt.analysis.formats import read_some_targets
 from tsgt.radio.key_file import write_key
 
 if TYPE_CHECKING:

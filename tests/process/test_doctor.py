@@ -11,9 +11,8 @@ import numpy as np
 from harness.made_up_machine import CLIENT
 
 from tsgt.config import ScenarioConfig
-from tsgt.simulation.instrument.pty import PtyLine
-from tsgt.simulation.instrument.total_station import SimulatedTotalStation
-from tsgt.simulation.kernel.timeline import LoopTimeline
+from tsgt.simulation.instrument import PtyLine, SimulatedTotalStation
+from tsgt.simulation.kernel import LoopTimeline
 from tsgt.simulation.world import scenario_world
 
 if TYPE_CHECKING:

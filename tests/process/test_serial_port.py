@@ -17,15 +17,14 @@ from structlog.testing import capture_logs
 
 from tsgt.clock import SystemClock
 from tsgt.errors import InstrumentError
-from tsgt.station.geocom.codec import Rpc
-from tsgt.station.geocom.connection import GeoComConnection
+from tsgt.station.geocom import GeoComConnection, Rpc
 from tsgt.station.serial import serial_port
 from tsgt.station.serial.serial_port import latency_timer_ms, open_serial_port, port_holder
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from tsgt.station.serial.base import Port
+    from tsgt.station.serial import Port
 
 
 @dataclass

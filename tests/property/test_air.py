@@ -10,10 +10,10 @@ from harness.air import RecordingAntenna, frame, modulation
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tsgt.simulation.kernel.timeline import VirtualTimeline
-from tsgt.simulation.lora.air import Air
+from tsgt.simulation.kernel import VirtualTimeline
+from tsgt.simulation.lora import Air, LinkModel
 from tsgt.simulation.lora.frames import Frame, Listening, Modulation
-from tsgt.simulation.lora.link import FixedLoss, LinkModel
+from tsgt.simulation.lora.link import FixedLoss
 
 NAMES = ("a", "b", "c")
 

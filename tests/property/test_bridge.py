@@ -14,14 +14,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from structlog.testing import capture_logs
 
-from tsgt.simulation.kernel.clocks import VirtualClock
-from tsgt.simulation.kernel.event_loop import run_virtual
+from tsgt.simulation.kernel import VirtualClock, run_virtual
 from tsgt.station.bridge.messages import LineCutter
 from tsgt.station.bridge.run import BridgeRun, Refusals
 from tsgt.station.bridge.timing import OLDEST_NS, Stamper
 
 if TYPE_CHECKING:
-    from tsgt.station.instrument import Reading
+    from tsgt.station import Reading
 
 STAMPS = ("host", "instrument", "arrival")
 

@@ -11,29 +11,27 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tsgt.model import Status
-from tsgt.radio.classic.messages import (
-    LAST_TIME_NS,
-    Acknowledgement,
+from tsgt.radio import MeasureOrder
+from tsgt.radio.classic import (
     Command,
-    Letter,
     MeasurementMessage,
-    PingReply,
-    TimeReply,
-    decode_command,
-    decode_reply,
-    no_measurement_yet,
-    status_of,
-)
-from tsgt.radio.classic.transactions import (
-    ClassicStation,
     Ordered,
     Poll,
     Shot,
     Synchronisation,
-    Timing,
-    Turn,
+    decode_command,
+    status_of,
 )
-from tsgt.radio.commands import MeasureOrder
+from tsgt.radio.classic.messages import (
+    LAST_TIME_NS,
+    Acknowledgement,
+    Letter,
+    PingReply,
+    TimeReply,
+    decode_reply,
+    no_measurement_yet,
+)
+from tsgt.radio.classic.transactions import ClassicStation, Timing, Turn
 
 TIMING = Timing.of(PAPER, 250 * MS)
 

@@ -10,7 +10,7 @@ from harness.clock_exchanges import SECOND, START_NS, exchange
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tsgt.timesync.two_way import clock_filter
+from tsgt.timesync import clock_filter
 
 MS = 1_000_000
 

@@ -16,7 +16,7 @@ from structlog.testing import capture_logs
 from tsgt.errors import InstrumentError
 from tsgt.model import Status
 from tsgt.simulation.instrument.serial_line import LineFaults
-from tsgt.simulation.kernel.event_loop import run_virtual
+from tsgt.simulation.kernel import run_virtual
 
 HOSTILE_S = 20.0
 BACK_S = 30.0

@@ -13,10 +13,10 @@ from harness.frames import KEY, TIMING
 
 from tsgt.errors import MessageError
 from tsgt.model import Status
-from tsgt.radio.superframe.wire.authentication import CODE_BYTES, Authenticator
-from tsgt.radio.superframe.wire.codec import decode_reply, encode_beacon, encode_reply
-from tsgt.radio.superframe.wire.messages import (
+from tsgt.radio.superframe.wire import (
+    CODE_BYTES,
     AnswerPart,
+    Authenticator,
     Beacon,
     Confirmation,
     Introduction,
@@ -29,6 +29,9 @@ from tsgt.radio.superframe.wire.messages import (
     SlotOrder,
     StatePart,
     StationEntry,
+    decode_reply,
+    encode_beacon,
+    encode_reply,
 )
 
 

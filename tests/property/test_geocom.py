@@ -27,21 +27,18 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tsgt.errors import InstrumentError, MessageError
-from tsgt.simulation.kernel.clocks import VirtualClock
-from tsgt.simulation.kernel.event_loop import run_virtual
+from tsgt.simulation.kernel import VirtualClock, run_virtual
+from tsgt.station.geocom import GeoComConnection, Rpc, Verdict, name_of, verdict
 from tsgt.station.geocom.codec import (
     MAX_TRANSACTION,
     Byte,
     ReplyLine,
-    Rpc,
     crc16_arc,
     decode_reply,
     encode_request,
 )
-from tsgt.station.geocom.codes import Verdict, name_of, verdict
-from tsgt.station.geocom.connection import GeoComConnection
 from tsgt.station.geocom.framing import ReplyLines, StampedLine
-from tsgt.station.serial.base import Chunk
+from tsgt.station.serial import Chunk
 
 latin = st.text(st.characters(max_codepoint=0xFF), max_size=20)
 reals = st.floats(-1e6, 1e6)

@@ -10,8 +10,8 @@ from harness.pos_files import SECOND, Variant, write_pos
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tsgt.analysis.formats.rtklib import read_pos
-from tsgt.analysis.gnss.baselines import receivers
+from tsgt.analysis.formats import read_pos
+from tsgt.analysis.gnss import receivers
 from tsgt.errors import InputFileError
 
 FIRST = 1_483_228_800  # 2017-01-01, from when on GPS is 18 s ahead of UTC

@@ -19,13 +19,11 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
 from structlog.testing import capture_logs
 
 from tsgt.errors import MessageError
-from tsgt.radio.superframe.wire.authentication import CODE_BYTES, Authenticator
-from tsgt.radio.superframe.wire.codec import decode_reply
+from tsgt.radio.superframe.wire import CODE_BYTES, Authenticator, decode_reply
 
 if TYPE_CHECKING:
-    from tsgt.radio.base import Radio
-    from tsgt.simulation.mission.mission import Mission
-    from tsgt.simulation.mission.runner import Run
+    from tsgt.radio import Radio
+    from tsgt.simulation.mission import Mission, Run
 
 REMEMBERED = 50
 SETTLING_FRAMES = 15

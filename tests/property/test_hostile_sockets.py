@@ -26,13 +26,11 @@ from hypothesis import strategies as st
 from structlog.testing import capture_logs
 
 from tsgt.errors import RadioError, StreamError
-from tsgt.master.stream_server import StreamServer
-from tsgt.recording import encode_line
-from tsgt.recording.format import MAX_LINE_BYTES
+from tsgt.master import StreamServer
+from tsgt.recording import MAX_LINE_BYTES, encode_line
 from tsgt.recording.journal import InstrumentRecord
-from tsgt.simulation.kernel.clocks import VirtualClock
-from tsgt.simulation.kernel.event_loop import run_virtual
-from tsgt.simulation.lora.air_client import AirClient
+from tsgt.simulation.kernel import VirtualClock, run_virtual
+from tsgt.simulation.lora import AirClient, AirServer, LinkModel
 from tsgt.simulation.lora.air_messages import (
     FrameLine,
     Incoming,
@@ -43,16 +41,14 @@ from tsgt.simulation.lora.air_messages import (
     Transmit,
     Welcome,
 )
-from tsgt.simulation.lora.air_server import AirServer
-from tsgt.simulation.lora.link import FixedLoss, LinkModel
-from tsgt.station.control_socket import Answer, AtmosphereRequest
-from tsgt.station.daemon import run_client
+from tsgt.simulation.lora.link import FixedLoss
+from tsgt.station import Answer, AtmosphereRequest, run_client
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from contextlib import AbstractAsyncContextManager
 
-    from tsgt.radio.base import Radio
+    from tsgt.radio import Radio
 
 FRAME = FrameLine.of(frame())
 SETTINGS = InstrumentRecord(make="Leica", prism_type="round", prism_constant_m=0.0, atmospheric_ppm=8.1)

@@ -9,14 +9,11 @@ import pytest
 from harness.pos_files import Variant
 from harness.records import POSE, STATUS, measurement, recording_bytes
 
-from tsgt.analysis.evaluation.reference import read_tum
-from tsgt.analysis.formats.odometry import read_still_intervals
-from tsgt.analysis.formats.rtklib import read_pos
-from tsgt.analysis.formats.target_file import read_target_file
+from tsgt.analysis.evaluation import read_tum
+from tsgt.analysis.formats import read_pos, read_still_intervals, read_target_file
 from tsgt.config import load_any
 from tsgt.errors import ConfigError, InputFileError, RecordingError
-from tsgt.recording import load_recording
-from tsgt.recording.format import MAX_LINE_BYTES
+from tsgt.recording import MAX_LINE_BYTES, load_recording
 from tsgt.station.bridge.messages import LineCutter
 
 if TYPE_CHECKING:

@@ -13,12 +13,11 @@ from harness.records import CLOCK, EVENT, HEADER, STATUS
 from harness.scene import START, driving, standing_scene
 from hypothesis import given, settings
 
-from tsgt.config.master import GeofenceConfig
-from tsgt.estimation.linear import Pipeline
-from tsgt.estimation.live import Feed
+from tsgt.config import GeofenceConfig
+from tsgt.estimation import Feed, Pipeline
+from tsgt.master import replayed
 from tsgt.master.geofence import Geofence
 from tsgt.master.publisher import Outlet
-from tsgt.master.replay import replayed
 from tsgt.master.statistics import Monitor
 from tsgt.model import Status
 from tsgt.recording import encode_line
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
     from harness.scene import Scene
 
     from tsgt.model import Measurement, PolarMeasurement
-    from tsgt.recording.stream_records import ClockRecord, EventRecord, PoseRecord, StatusRecord
+    from tsgt.recording import ClockRecord, EventRecord, PoseRecord, StatusRecord
 
 TRANSPORT_NS = 2_000_000_000
 SCENE = standing_scene().moving(driving)

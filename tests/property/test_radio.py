@@ -13,12 +13,9 @@ from harness.radios import PAPER, make_side, running_timeline
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tsgt.simulation.kernel.event_loop import run_virtual
-from tsgt.simulation.kernel.timeline import VirtualTimeline
-from tsgt.simulation.lora.air import Air
-from tsgt.simulation.lora.chip import SX1276Chip
+from tsgt.simulation.kernel import VirtualTimeline, run_virtual
+from tsgt.simulation.lora import Air, LinkModel, SX1276Chip
 from tsgt.simulation.lora.frames import Frame, Header, Modulation, Reception
-from tsgt.simulation.lora.link import LinkModel
 
 MS = 1_000_000
 

@@ -8,9 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from tsgt.geometry import exp_so3, of_point, with_curvature
-from tsgt.geometry.rigid import skew
-from tsgt.geometry.trajectory.states import Knots
+from tsgt.geometry import exp_so3, of_point, skew, with_curvature
+from tsgt.geometry.trajectory import Knots
 
 same_every_time = settings(derandomize=True, max_examples=50)
 STEP = 1e-4

@@ -10,14 +10,7 @@ from hypothesis import strategies as st
 
 from tsgt.errors import MessageError
 from tsgt.model import Status
-from tsgt.radio.superframe.wire.codec import (
-    decode_beacon,
-    decode_reply,
-    encode_beacon,
-    encode_reply,
-    reply_bytes,
-)
-from tsgt.radio.superframe.wire.messages import (
+from tsgt.radio.superframe.wire import (
     SINGLE_QUALITY,
     AnswerPart,
     Beacon,
@@ -32,8 +25,13 @@ from tsgt.radio.superframe.wire.messages import (
     SlotOrder,
     StatePart,
     StationEntry,
-    Towards,
+    decode_beacon,
+    decode_reply,
+    encode_beacon,
+    encode_reply,
+    reply_bytes,
 )
+from tsgt.radio.superframe.wire.messages import Towards
 
 LONGEST_PACKET_BYTES = 255
 

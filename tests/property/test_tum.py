@@ -7,8 +7,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tsgt.analysis.evaluation.reference import Reference, read_tum
-from tsgt.analysis.formats.export import tum_lines
+from tsgt.analysis.evaluation import Reference, read_tum
+from tsgt.analysis.formats import tum_lines
 from tsgt.errors import InputFileError
 
 stamps = st.lists(st.integers(0, 2**63 - 1), min_size=2, max_size=20, unique=True).map(sorted)

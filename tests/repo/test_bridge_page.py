@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tsgt.config.client import BridgeInstrumentConfig
+from tsgt.config import BridgeInstrumentConfig
 from tsgt.station.bridge.messages import (
     AtmosphereCommand,
     Command,

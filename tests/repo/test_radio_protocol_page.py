@@ -11,37 +11,14 @@ from typing import NamedTuple
 import pytest
 
 from tsgt.model import Status
-from tsgt.radio.base import LoRaSettings
-from tsgt.radio.classic.messages import (
-    Acknowledgement,
-    MeasurementMessage,
-    PingReply,
-    TimeReply,
-    decode_command,
-    decode_reply,
-    raw_status,
-    status_of,
-)
+from tsgt.radio import Direction, DirectOrder, LoRaSettings, MeasureOrder, SearchOrder, TrackOrder
+from tsgt.radio.classic import MeasurementMessage, decode_command, raw_status, status_of
+from tsgt.radio.classic.messages import Acknowledgement, PingReply, TimeReply, decode_reply
 from tsgt.radio.classic.transactions import Timing
-from tsgt.radio.commands import Direction, DirectOrder, MeasureOrder, SearchOrder, TrackOrder
-from tsgt.radio.superframe.wire.authentication import Authenticator
-from tsgt.radio.superframe.wire.block_codec import (
-    DISTANCE_WIDTHS,
-    HORIZONTAL_WIDTHS,
-    TIME_WIDTHS,
-    ZENITH_WIDTHS,
-)
-from tsgt.radio.superframe.wire.codec import (
-    decode_beacon,
-    encode_beacon,
-    encode_reply,
-    order_part,
-    spread_rad,
-)
-from tsgt.radio.superframe.wire.codec import decode_reply as decode_superframe_reply
-from tsgt.radio.superframe.wire.messages import (
+from tsgt.radio.superframe.wire import (
     GRANT_BYTES,
     AnswerPart,
+    Authenticator,
     Beacon,
     Confirmation,
     Introduction,
@@ -54,8 +31,20 @@ from tsgt.radio.superframe.wire.messages import (
     SlotOrder,
     StatePart,
     StationEntry,
-    Towards,
+    decode_beacon,
+    encode_beacon,
+    encode_reply,
+    order_part,
 )
+from tsgt.radio.superframe.wire import decode_reply as decode_superframe_reply
+from tsgt.radio.superframe.wire.block_codec import (
+    DISTANCE_WIDTHS,
+    HORIZONTAL_WIDTHS,
+    TIME_WIDTHS,
+    ZENITH_WIDTHS,
+)
+from tsgt.radio.superframe.wire.codec import spread_rad
+from tsgt.radio.superframe.wire.messages import Towards
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "radio-protocol.md").read_text()
 

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tsgt.config.client import ClientConfig, JournalConfig
-from tsgt.config.master import RecordingConfig, StreamConfig
+from tsgt.config import ClientConfig, JournalConfig, RecordingConfig, StreamConfig
 
 ROOT = Path(__file__).parents[2]
 UNITS = sorted((ROOT / "configs" / "systemd").glob("*.service"))

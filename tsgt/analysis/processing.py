@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 from tsgt.analysis.smoothing import smoothed
 from tsgt.analysis.validation import EPOCHS_MAX, believed, check_measured, check_span, why_none_is_valid
 from tsgt.errors import ConfigError, DegenerateGeometryError, RecordingError
-from tsgt.estimation.linear import Pipeline
+from tsgt.estimation import Pipeline
 from tsgt.geometry import check_layout
 from tsgt.model import PolarMeasurement, PrismPosition
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
-    from tsgt.estimation.pose_batch import PoseBatch
+    from tsgt.estimation import PoseBatch
     from tsgt.model import Matrix4, Measurement, Parameters, TargetResidual, Vector3
     from tsgt.recording import Recording
 

@@ -9,20 +9,16 @@ import numpy as np
 
 from tsgt.analysis.validation import believed, check_measured, check_span, why_none_is_valid
 from tsgt.errors import GeometryError, RecordingError
-from tsgt.estimation.observations import build_observations
-from tsgt.estimation.pose_batch import PoseBatch
-from tsgt.estimation.pose_output import ContinuousPoses, Seen
-from tsgt.estimation.tracks import measured_at_ns, usable
+from tsgt.estimation import ContinuousPoses, PoseBatch, Seen, build_observations, measured_at_ns, usable
 from tsgt.geometry import check_layout
-from tsgt.geometry.trajectory.batch import fit
-from tsgt.geometry.trajectory.hyperparameters import CALMEST, at_least, tune
+from tsgt.geometry.trajectory import CALMEST, at_least, fit, tune
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from tsgt.geometry import Observations
-    from tsgt.geometry.trajectory.batch import Fit
+    from tsgt.geometry.trajectory import Fit
     from tsgt.model import Measurement, MotionPrior, Parameters, PipelineParameters
     from tsgt.recording import Recording
 

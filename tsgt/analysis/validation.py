@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.errors import RecordingError
-from tsgt.estimation.pose_batch import Reason
-from tsgt.estimation.tracks import believable, usable
+from tsgt.estimation import Reason, believable, usable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from tsgt.estimation.pose_batch import PoseBatch
+    from tsgt.estimation import PoseBatch
     from tsgt.model import Measurement, Parameters
     from tsgt.recording import Recording
 

@@ -12,9 +12,8 @@ from tsgt.cli.options import DEFAULT_CLIENT_SOCKET, json_option, path_type
 from tsgt.cli.output import harmless
 from tsgt.cli.status import setting_lines
 from tsgt.errors import InstrumentError, StreamError
-from tsgt.recording import decode, encode_line
-from tsgt.recording.format import MAX_LINE_BYTES, Typed
-from tsgt.station.control_socket import Answer, AtmosphereRequest
+from tsgt.recording import MAX_LINE_BYTES, Typed, decode, encode_line
+from tsgt.station import Answer, AtmosphereRequest
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -7,21 +7,24 @@ from contextlib import asynccontextmanager
 from functools import partial
 from typing import TYPE_CHECKING
 
-from tsgt.config.client import BridgeInstrumentConfig, LeicaInstrumentConfig
-from tsgt.config.radio import HardwareRadioConfig, SimulatedRadioConfig, SuperframeConfig
-from tsgt.radio.key_file import read_key
+from tsgt.config import (
+    BridgeInstrumentConfig,
+    HardwareRadioConfig,
+    LeicaInstrumentConfig,
+    SimulatedRadioConfig,
+    SuperframeConfig,
+)
 from tsgt.radio.from_config import wiring
-from tsgt.radio.sx127x.driver import SX127x
-from tsgt.radio.sx127x.hal import open_hal
+from tsgt.radio.key_file import read_key
+from tsgt.radio.sx127x import SX127x, open_hal
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
 
     from tsgt.clock import Clock
-    from tsgt.config.client import InstrumentConfig
-    from tsgt.config.radio import ClassicConfig, RadioConfig
-    from tsgt.radio.base import LoRaSettings, OpenRadio, Radio
-    from tsgt.station.instrument import Instrument
+    from tsgt.config import ClassicConfig, InstrumentConfig, RadioConfig
+    from tsgt.radio import LoRaSettings, OpenRadio, Radio
+    from tsgt.station import Instrument
 
 
 def make_instrument(config: InstrumentConfig, clock: Clock) -> Instrument:
@@ -37,12 +40,12 @@ def make_instrument(config: InstrumentConfig, clock: Clock) -> Instrument:
     # Each only where it is needed: a client is small, and whoever has no serial port needs no package for one.
     match config:
         case LeicaInstrumentConfig():
-            from tsgt.station.leica.instrument import LeicaInstrument  # noqa: PLC0415
-            from tsgt.station.serial.serial_port import open_serial_port  # noqa: PLC0415
+            from tsgt.station.leica import LeicaInstrument
+            from tsgt.station.serial.serial_port import open_serial_port
 
             return LeicaInstrument(config, partial(open_serial_port, config.port, clock=clock), clock)
         case BridgeInstrumentConfig():
-            from tsgt.station.bridge.instrument import BridgeInstrument  # noqa: PLC0415
+            from tsgt.station.bridge import BridgeInstrument
 
             return BridgeInstrument(config, clock)
 
@@ -94,12 +97,14 @@ def _simulated(config: SimulatedRadioConfig, settings: LoRaSettings, clock: Cloc
     @asynccontextmanager
     async def open_radio() -> AsyncGenerator[Radio]:
         # Only here, so that a daemon in the field does not load the simulation.
-        import numpy as np  # noqa: PLC0415
+        import numpy as np
 
-        from tsgt.simulation.kernel.timeline import LoopTimeline  # noqa: PLC0415
-        from tsgt.simulation.lora.air_client import AirClient  # noqa: PLC0415
-        from tsgt.simulation.lora.chip import SX1276Chip  # noqa: PLC0415
-        from tsgt.simulation.lora.hal import SimulatedHal  # noqa: PLC0415
+        from tsgt.simulation.kernel import LoopTimeline
+        from tsgt.simulation.lora import (
+            AirClient,
+            SimulatedHal,
+            SX1276Chip,
+        )
 
         timeline = LoopTimeline(asyncio.get_running_loop())
         async with AirClient(config.air_socket, config.name, timeline) as air:

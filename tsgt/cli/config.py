@@ -13,18 +13,19 @@ from tsgt.cli.options import json_option
 from tsgt.cli.output import print_json
 from tsgt.config import (
     KINDS,
+    ClassicConfig,
     ClientConfig,
     MasterConfig,
     Model,
     PrismLayoutFile,
     ScenarioConfig,
     StationFramesFile,
+    SuperframeConfig,
     json_schema,
     load_any,
     parameters,
     scenario_parameters,
 )
-from tsgt.config.radio import ClassicConfig, SuperframeConfig
 from tsgt.errors import ConfigError, GeometryError
 from tsgt.geometry import check_layout
 from tsgt.model import Parameters, PrismPosition

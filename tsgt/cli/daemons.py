@@ -22,13 +22,16 @@ def client(config_path: Path) -> None:
     Runs until SIGTERM or Ctrl-C. Instrument, radio and disk may fail and come back meanwhile.
     """
     # Only here, as `--help` needs none of it.
-    from tsgt import service  # noqa: PLC0415
-    from tsgt.cli.composition import make_instrument, radio_key, radio_opener  # noqa: PLC0415
-    from tsgt.clock import SystemClock, boot_id  # noqa: PLC0415
-    from tsgt.config import ClientConfig, load  # noqa: PLC0415
-    from tsgt.config.permissions import check_trust  # noqa: PLC0415
-    from tsgt.radio.from_config import lora_settings  # noqa: PLC0415
-    from tsgt.station.daemon import run_client  # noqa: PLC0415
+    from tsgt import service
+    from tsgt.cli.composition import make_instrument, radio_key, radio_opener
+    from tsgt.clock import SystemClock, boot_id
+    from tsgt.config import (
+        ClientConfig,
+        check_trust,
+        load,
+    )
+    from tsgt.radio.from_config import lora_settings
+    from tsgt.station import run_client
 
     check_trust(config_path)
     config = load(config_path, ClientConfig)
@@ -53,13 +56,17 @@ def master(config_path: Path) -> None:
     Runs until SIGTERM or Ctrl-C. Stations, radio and disk may fail and come back meanwhile.
     """
     # Only here, as `--help` needs none of it.
-    from tsgt import service  # noqa: PLC0415
-    from tsgt.cli.composition import radio_key, radio_opener  # noqa: PLC0415
-    from tsgt.clock import SystemClock  # noqa: PLC0415
-    from tsgt.config import MasterConfig, load, parameters  # noqa: PLC0415
-    from tsgt.config.permissions import check_trust  # noqa: PLC0415
-    from tsgt.master.daemon import run_master  # noqa: PLC0415
-    from tsgt.radio.from_config import lora_settings  # noqa: PLC0415
+    from tsgt import service
+    from tsgt.cli.composition import radio_key, radio_opener
+    from tsgt.clock import SystemClock
+    from tsgt.config import (
+        MasterConfig,
+        check_trust,
+        load,
+        parameters,
+    )
+    from tsgt.master import run_master
+    from tsgt.radio.from_config import lora_settings
 
     check_trust(config_path)
     config = load(config_path, MasterConfig)

@@ -14,15 +14,23 @@ from tsgt import service
 from tsgt.cli.options import json_option, path_type
 from tsgt.cli.output import CHECK_FAILED, print_json
 from tsgt.clock import SystemClock
-from tsgt.doctor.checklist import examine
-from tsgt.doctor.finding import Finding, Outcome
-from tsgt.doctor.machine import Machine, current_user, find_user, free_bytes, group_name, run_command
+from tsgt.doctor import (
+    Finding,
+    Machine,
+    Outcome,
+    current_user,
+    examine,
+    find_user,
+    free_bytes,
+    group_name,
+    run_command,
+)
 from tsgt.log import configure_logging
-from tsgt.radio.sx127x.hal import open_hal
+from tsgt.radio.sx127x import open_hal
 
 if TYPE_CHECKING:
-    from tsgt.station.serial.base import OpenPort, Port
-    from tsgt.station.status import ClientStatus
+    from tsgt.station import ClientStatus
+    from tsgt.station.serial import OpenPort, Port
 
 USUAL = (Path("/etc/tsgt/client.toml"), Path("/etc/tsgt/master.toml"))
 
@@ -119,8 +127,8 @@ def _client_status(path: Path) -> ClientStatus | None:
     """Ask the client behind a socket; None where nobody serves it."""
     if not _serves(path):
         return None
-    from tsgt.cli.status import status_of  # noqa: PLC0415 (only where there is one)
-    from tsgt.station.status import ClientStatus  # noqa: PLC0415 (as above)
+    from tsgt.cli.status import status_of
+    from tsgt.station import ClientStatus
 
     record, _ = status_of(path)
     return record if isinstance(record, ClientStatus) else None

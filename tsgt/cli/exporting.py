@@ -9,21 +9,18 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tsgt.analysis.evaluation.reference import read_tum
-from tsgt.analysis.formats.export import measurement_csv, pose_csv, tum_lines, valid_records
-from tsgt.analysis.formats.mcap import messages, write_mcap
+from tsgt.analysis.evaluation import read_tum
+from tsgt.analysis.formats import measurement_csv, messages, pose_csv, tum_lines, valid_records, write_mcap
 from tsgt.analysis.processing import process
 from tsgt.cli.options import keep_going_option, path_type, recording_argument
 from tsgt.cli.recordings import TUNING, load, progress, refuse_to_replace, report_problem, write_lines
 from tsgt.errors import CorruptLineError, RecordingError
-from tsgt.recording import decode_line, read_lines, write_atomically
-from tsgt.recording.stream_records import PoseRecord
+from tsgt.recording import PoseRecord, decode_line, read_lines, write_atomically
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from tsgt.recording import Recording
-    from tsgt.recording.stream_records import Kind
+    from tsgt.recording import Kind, Recording
 
 STDOUT = Path("-")
 

@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tsgt.analysis.formats.polar_files import check_tracks, read_polar_tracks, station_prisms
-from tsgt.analysis.formats.rts_files import read_prisms, read_tracks
-from tsgt.analysis.formats.rts_import import point_measurements, polar_measurements, stations_from_targets
+from tsgt.analysis.formats import check_tracks, read_polar_tracks, read_prisms, read_tracks, station_prisms
 from tsgt.analysis.processing import with_frames, with_latencies, with_targets
+from tsgt.analysis.rts_import import point_measurements, polar_measurements, stations_from_targets
 from tsgt.cli.options import constant_type, finite, json_option, path_type
 from tsgt.cli.output import print_json
 from tsgt.cli.recordings import refuse_to_replace, write_recording
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from tsgt.analysis.formats.rts_import import SolvedStations
+    from tsgt.analysis.rts_import import SolvedStations
     from tsgt.model import Measurement
 
 

@@ -16,10 +16,8 @@ from tsgt.cli.recordings import report_problem
 from tsgt.cli.render import render
 from tsgt.clock import SystemClock
 from tsgt.errors import RecordingError, StreamError
-from tsgt.master.stream_server import StreamServer
-from tsgt.recording import decode, encode_line
-from tsgt.recording.format import MAX_LINE_BYTES, Typed
-from tsgt.recording.stream_records import HelloRecord
+from tsgt.master import StreamServer
+from tsgt.recording import MAX_LINE_BYTES, HelloRecord, Typed, decode, encode_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -70,8 +68,8 @@ def replay(recording: Path, *, socket_path: Path, speed: float, wait: bool, keep
     the last bit, at any speed. A slow reader is waited for.
     """
     # Only here, so that `tsgt listen` starts without numpy.
-    from tsgt.master.replay import replay as play  # noqa: PLC0415
-    from tsgt.master.replay import replayed  # noqa: PLC0415
+    from tsgt.master import replay as play
+    from tsgt.master import replayed
 
     arrivals = replayed(recording, keep_going=keep_going, on_problem=report_problem)
     first = next(arrivals, None)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tsgt.analysis.merge.merge import merge as merge_journals
+from tsgt.analysis.merge import merge as merge_journals
 from tsgt.cli.options import json_option, keep_going_option, path_type, recording_argument
 from tsgt.cli.output import print_json
 from tsgt.cli.recordings import refuse_to_replace, report_problem
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from tsgt.analysis.merge.merge import Merged, MergedJournal
+    from tsgt.analysis.merge import Merged, MergedJournal
 
 
 @click.command()

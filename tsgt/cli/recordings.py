@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from tsgt.analysis.processing import Estimator
     from tsgt.analysis.smoothing import Motion
     from tsgt.errors import RecordingError
-    from tsgt.estimation.pose_batch import PoseBatch
+    from tsgt.estimation import PoseBatch
     from tsgt.model import Parameters
     from tsgt.recording import Recording
 

@@ -7,8 +7,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from tsgt.model import PointMeasurement, PolarMeasurement
-from tsgt.recording import decode
-from tsgt.recording.stream_records import (
+from tsgt.recording import (
     PROTOCOL_VERSION,
     ClockRecord,
     EventRecord,
@@ -16,6 +15,7 @@ from tsgt.recording.stream_records import (
     PoseRecord,
     StationStatus,
     StatusRecord,
+    decode,
 )
 
 if TYPE_CHECKING:

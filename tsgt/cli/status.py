@@ -17,10 +17,8 @@ from tsgt.cli.output import CHECK_FAILED, harmless
 from tsgt.cli.render import clock_time
 from tsgt.errors import StreamError
 from tsgt.model import Status
-from tsgt.recording import decode
-from tsgt.recording.format import MAX_LINE_BYTES, Typed
-from tsgt.recording.stream_records import HelloRecord, StationStatus, StatusRecord
-from tsgt.station.status import ClientStatus
+from tsgt.recording import MAX_LINE_BYTES, HelloRecord, StationStatus, StatusRecord, Typed, decode
+from tsgt.station import ClientStatus
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

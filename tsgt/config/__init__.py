@@ -5,7 +5,16 @@ Each file says by its top-level key ``kind`` what it is: ``client``, ``master``,
 """
 
 from tsgt.config.base import Model, NoiseConfig
-from tsgt.config.client import ClientConfig
+from tsgt.config.client import (
+    Baud,
+    BridgeInstrumentConfig,
+    ClientConfig,
+    InstrumentConfig,
+    JournalConfig,
+    LeicaInstrumentConfig,
+    PressureHpa,
+    TemperatureC,
+)
 from tsgt.config.files import (
     json_schema,
     load,
@@ -16,31 +25,92 @@ from tsgt.config.files import (
     load_target_residuals,
 )
 from tsgt.config.instrument_models import KINDS
-from tsgt.config.master import MasterConfig, StationConfig
-from tsgt.config.parameters import parameters, scenario_parameters
+from tsgt.config.master import (
+    FrameWatchConfig,
+    GeofenceConfig,
+    MasterConfig,
+    RecordingConfig,
+    SetupConfig,
+    StationConfig,
+    StreamConfig,
+)
+from tsgt.config.parameters import level_frame, noise, parameters, scenario_parameters
+from tsgt.config.permissions import check_trust
 from tsgt.config.pipeline import PipelineConfig
-from tsgt.config.scenario import MotionConfig, ScenarioConfig
+from tsgt.config.radio import (
+    LARGEST_NUMBERS,
+    ClassicConfig,
+    ClassicMasterConfig,
+    HardwareRadioConfig,
+    MasterProtocolConfig,
+    ModemConfig,
+    ProtocolConfig,
+    RadioConfig,
+    SimulatedRadioConfig,
+    SuperframeConfig,
+    SuperframeMasterConfig,
+    WiringConfig,
+)
+from tsgt.config.scenario import (
+    InstrumentModelConfig,
+    MotionConfig,
+    OcclusionConfig,
+    ScenarioConfig,
+    ScenarioRadioConfig,
+    SimulatedStation,
+)
 from tsgt.config.setup import PrismLayoutFile, StationFramesFile
 
 __all__ = [
     "KINDS",
+    "LARGEST_NUMBERS",
+    "Baud",
+    "BridgeInstrumentConfig",
+    "ClassicConfig",
+    "ClassicMasterConfig",
     "ClientConfig",
+    "FrameWatchConfig",
+    "GeofenceConfig",
+    "HardwareRadioConfig",
+    "InstrumentConfig",
+    "InstrumentModelConfig",
+    "JournalConfig",
+    "LeicaInstrumentConfig",
     "MasterConfig",
+    "MasterProtocolConfig",
     "Model",
+    "ModemConfig",
     "MotionConfig",
     "NoiseConfig",
+    "OcclusionConfig",
     "PipelineConfig",
+    "PressureHpa",
     "PrismLayoutFile",
+    "ProtocolConfig",
+    "RadioConfig",
+    "RecordingConfig",
     "ScenarioConfig",
+    "ScenarioRadioConfig",
+    "SetupConfig",
+    "SimulatedRadioConfig",
+    "SimulatedStation",
     "StationConfig",
     "StationFramesFile",
+    "StreamConfig",
+    "SuperframeConfig",
+    "SuperframeMasterConfig",
+    "TemperatureC",
+    "WiringConfig",
+    "check_trust",
     "json_schema",
+    "level_frame",
     "load",
     "load_any",
     "load_prism_layout",
     "load_station_frames",
     "load_station_latencies",
     "load_target_residuals",
+    "noise",
     "parameters",
     "scenario_parameters",
 ]

@@ -6,8 +6,7 @@ from functools import partial
 from inspect import isawaitable
 from typing import TYPE_CHECKING
 
-from tsgt.config import ClientConfig, MasterConfig
-from tsgt.config.client import LeicaInstrumentConfig
+from tsgt.config import ClientConfig, LeicaInstrumentConfig, MasterConfig
 from tsgt.doctor import computer, files, radio, serial_line
 from tsgt.doctor.finding import Finding, failed, note, ok, skipped
 from tsgt.doctor.instrument import RunningDaemon, check_instrument

@@ -9,20 +9,27 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tsgt.config import ClientConfig, MasterConfig, load, load_any, parameters
-from tsgt.config.permissions import check_trust
-from tsgt.config.radio import SuperframeConfig
-from tsgt.config.setup import PrismLayoutFile, StationFramesFile
+from tsgt.config import (
+    ClientConfig,
+    MasterConfig,
+    PrismLayoutFile,
+    StationFramesFile,
+    SuperframeConfig,
+    check_trust,
+    load,
+    load_any,
+    parameters,
+)
 from tsgt.doctor.computer import EARLIEST, is_installed, may_write
 from tsgt.doctor.finding import failed, note, ok, skipped
 from tsgt.errors import ConfigError, GeometryError
-from tsgt.radio.key_file import check_access, read_key
 from tsgt.radio.from_config import lora_settings
+from tsgt.radio.key_file import check_access, read_key
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from tsgt.config.radio import ProtocolConfig
+    from tsgt.config import ProtocolConfig
     from tsgt.doctor.finding import Finding
     from tsgt.doctor.machine import Machine, User
 

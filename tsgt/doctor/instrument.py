@@ -6,18 +6,18 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from tsgt.config.client import BridgeInstrumentConfig, LeicaInstrumentConfig
+from tsgt.config import BridgeInstrumentConfig, LeicaInstrumentConfig
 from tsgt.doctor.finding import failed, note, ok, skipped
 from tsgt.doctor.serial_line import line_holder
 from tsgt.errors import InstrumentError
 
 if TYPE_CHECKING:
-    from tsgt.config.client import InstrumentConfig
+    from tsgt.config import InstrumentConfig
     from tsgt.doctor.finding import Finding
     from tsgt.doctor.machine import Machine
-    from tsgt.station.geocom.connection import GeoComConnection
-    from tsgt.station.leica.identity import Identity
-    from tsgt.station.status import ClientStatus
+    from tsgt.station import ClientStatus
+    from tsgt.station.geocom import GeoComConnection
+    from tsgt.station.leica import Identity
 
 LOW_PERCENT = 50
 """For the evening before: a day takes more."""
@@ -112,8 +112,8 @@ async def _ask(machine: Machine, config: LeicaInstrumentConfig) -> list[Finding]
     if (reason := _out_of_reach(machine, config)) is not None:
         return [skipped(name, reason) for name in _NAMES]
     # Only here: a master, and a client with another instrument, need none of it.
-    from tsgt.station.geocom.connection import connect  # noqa: PLC0415
-    from tsgt.station.leica.identity import identify  # noqa: PLC0415
+    from tsgt.station.geocom import connect  # noqa: PLC0415
+    from tsgt.station.leica import identify  # noqa: PLC0415
 
     try:
         connection = await connect(
@@ -202,9 +202,13 @@ def _judge_battery(percent: int | None, *, external: bool) -> Finding:
 
 async def _level(connection: GeoComConnection) -> Finding:
     """Read the compensator; only an instrument that stands where it will measure needs to be level."""
-    from tsgt.station.geocom.codec import Rpc  # noqa: PLC0415 (as above)
-    from tsgt.station.geocom.codes import Verdict, name_of, verdict  # noqa: PLC0415 (as above)
-    from tsgt.station.leica.identity import numbers  # noqa: PLC0415 (as above)
+    from tsgt.station.geocom import (  # noqa: PLC0415 (as above)
+        Rpc,
+        Verdict,
+        name_of,
+        verdict,
+    )
+    from tsgt.station.leica import numbers  # noqa: PLC0415 (as above)
 
     reply = await connection.call(Rpc.TMC_GET_ANGLE1, AUTOMATIC)
     values = numbers(reply, 6)

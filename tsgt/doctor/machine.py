@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from tsgt.clock import Clock
-    from tsgt.radio.sx127x.hal import Hal, Wiring
-    from tsgt.station.serial.base import OpenPort
-    from tsgt.station.status import ClientStatus
+    from tsgt.radio.sx127x import Hal, Wiring
+    from tsgt.station import ClientStatus
+    from tsgt.station.serial import OpenPort
 
 COMMAND_TIMEOUT_S = 5.0
 """timedatectl asks a service that may have to be started first; none of the commands takes longer than this."""

@@ -5,20 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tsgt.config import MasterConfig
-from tsgt.config.radio import ClassicConfig, ClassicMasterConfig, HardwareRadioConfig, SuperframeMasterConfig
+from tsgt.config import (
+    ClassicConfig,
+    ClassicMasterConfig,
+    HardwareRadioConfig,
+    MasterConfig,
+    SuperframeMasterConfig,
+)
 from tsgt.doctor.finding import failed, note, ok, skipped
 from tsgt.doctor.serial_line import no_right
-from tsgt.radio.planning.capacity import Load
 from tsgt.radio.from_config import lora_settings, planned_cycle, wiring
-from tsgt.radio.planning.regulations import DIPOLE_DBI, Use, exceeded
-from tsgt.radio.sx127x.chip import Chip
-from tsgt.radio.sx127x.register_io import RegisterAccess
-from tsgt.radio.sx127x.registers import Register
+from tsgt.radio.planning import DIPOLE_DBI, Load, Use, exceeded
+from tsgt.radio.sx127x import Chip, Register, RegisterAccess
 
 if TYPE_CHECKING:
-    from tsgt.config import ClientConfig
-    from tsgt.config.radio import MasterProtocolConfig, RadioConfig
+    from tsgt.config import ClientConfig, MasterProtocolConfig, RadioConfig
     from tsgt.doctor.finding import Finding
     from tsgt.doctor.machine import Machine, User
 

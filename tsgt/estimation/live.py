@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from tsgt.model import Measurement, Parameters
-    from tsgt.recording.stream_records import PoseRecord
+    from tsgt.recording import PoseRecord
 
 
 class Feed:

@@ -9,8 +9,6 @@ What lies on the way from measurement to pose gives the same bits for an item al
 so that a live stream, its replay and later processing agree exactly.
 """
 
-from __future__ import annotations
-
 from tsgt.geometry.alignment import Alignment, BatchAlignment, align, align_many, align_triplets
 from tsgt.geometry.interpolation import (
     NO_GAP_NS,

@@ -19,10 +19,10 @@ import structlog
 import tsgt
 from tsgt import service
 from tsgt.clock import UnixTimeline
-from tsgt.config.radio import ClassicMasterConfig
+from tsgt.config import ClassicMasterConfig
 from tsgt.errors import RadioError, StreamError
-from tsgt.estimation.live import Feed
-from tsgt.master.classic.link import ClassicLink
+from tsgt.estimation import Feed
+from tsgt.master.classic import ClassicLink
 from tsgt.master.geofence import Geofence, run_fence_command
 from tsgt.master.layout_monitor import FrameWatch
 from tsgt.master.publisher import Outlet, Reports
@@ -31,23 +31,28 @@ from tsgt.master.recording_thread import Disk
 from tsgt.master.station_events import Alerts
 from tsgt.master.statistics import Monitor
 from tsgt.master.stream_server import StreamServer
-from tsgt.master.superframe.link import SuperframeLink
+from tsgt.master.superframe import SuperframeLink
 from tsgt.radio.supervisor import keep_radio
-from tsgt.recording import RecordingHeader, RecordingWriter, encode_line
-from tsgt.recording.files import new_recording_path
+from tsgt.recording import (
+    EventRecord,
+    HelloRecord,
+    PoseRecord,
+    RecordingHeader,
+    RecordingWriter,
+    encode_line,
+    new_recording_path,
+)
 from tsgt.recording.recorder import Recorder
-from tsgt.recording.stream_records import EventRecord, HelloRecord, PoseRecord
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable, Sequence
 
     from tsgt.clock import Clock
-    from tsgt.config import MasterConfig
-    from tsgt.config.master import FrameWatchConfig, GeofenceConfig
+    from tsgt.config import FrameWatchConfig, GeofenceConfig, MasterConfig
     from tsgt.master.publisher import Watcher
     from tsgt.model import Measurement, Parameters
-    from tsgt.radio.base import LoRaSettings, OpenRadio, Radio
-    from tsgt.recording.stream_records import StatusRecord
+    from tsgt.radio import LoRaSettings, OpenRadio, Radio
+    from tsgt.recording import StatusRecord
 
 STATUS_PERIOD_NS = 1_000_000_000
 

@@ -19,14 +19,14 @@ from typing import TYPE_CHECKING, Protocol
 import structlog
 
 from tsgt.polygon import contains, distance_to_edge, edges
-from tsgt.recording.stream_records import EventRecord
+from tsgt.recording import EventRecord
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from tsgt.model import Measurement
     from tsgt.polygon import Point
-    from tsgt.recording.stream_records import PoseRecord
+    from tsgt.recording import PoseRecord
 
 
 class FenceSettings(Protocol):

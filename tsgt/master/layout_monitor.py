@@ -18,10 +18,10 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from tsgt.recording.stream_records import EventRecord
+from tsgt.recording import EventRecord
 
 if TYPE_CHECKING:
-    from tsgt.recording.stream_records import PoseRecord
+    from tsgt.recording import PoseRecord
 
 QUARTILE = 4
 """The alarm looks at what three of four poses miss their limit by. Interpolation brings the median of a good frame to

@@ -12,10 +12,9 @@ import asyncio
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from tsgt.estimation.live import Feed
+from tsgt.estimation import Feed
 from tsgt.model import PolarMeasurement
-from tsgt.recording import encode_line
-from tsgt.recording.stream_records import EventRecord, PoseRecord
+from tsgt.recording import EventRecord, PoseRecord, encode_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
     from tsgt.master.station_events import Alerts
     from tsgt.master.statistics import Monitor
     from tsgt.model import Measurement, Parameters
-    from tsgt.recording.stream_records import BeaconRecord, ClockRecord, StatusRecord
+    from tsgt.recording import BeaconRecord, ClockRecord, StatusRecord
 
 
 class Watcher(Protocol):

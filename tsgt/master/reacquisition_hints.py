@@ -14,17 +14,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.estimation.tracks import believable, build_tracks, measured_at_ns
+from tsgt.estimation import believable, build_tracks, measured_at_ns
 from tsgt.geometry import cartesian_to_polar, invert, transform_points
 from tsgt.model import PolarMeasurement, Status
-from tsgt.radio.commands import Direction
+from tsgt.radio import Direction
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from numpy.typing import NDArray
 
-    from tsgt.estimation.tracks import Track
+    from tsgt.estimation import Track
     from tsgt.model import Parameters
 
 LOST_FOR_NS = 2_000_000_000

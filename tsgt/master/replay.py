@@ -6,10 +6,17 @@ import math
 from typing import TYPE_CHECKING
 
 from tsgt.errors import CorruptLineError, RecordingError
-from tsgt.estimation.live import Feed
+from tsgt.estimation import Feed
 from tsgt.model import Measurement, Parameters, PointMeasurement, PolarMeasurement
-from tsgt.recording import decode_line, encode_line, read_lines
-from tsgt.recording.stream_records import BeaconRecord, ClockRecord, EventRecord, StatusRecord
+from tsgt.recording import (
+    BeaconRecord,
+    ClockRecord,
+    EventRecord,
+    StatusRecord,
+    decode_line,
+    encode_line,
+    read_lines,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -26,25 +26,26 @@ from tsgt.model import (
     StationParameters,
     TargetResidual,
 )
-from tsgt.recording import FORMAT_VERSION, RecordingHeader
+from tsgt.recording import (
+    FORMAT_VERSION,
+    PROTOCOL_VERSION,
+    BeaconRecord,
+    ClockRecord,
+    EventRecord,
+    HelloRecord,
+    MergedRecord,
+    PoseRecord,
+    RecordingHeader,
+    StationShare,
+    StationStatus,
+    StatusRecord,
+)
 from tsgt.recording.journal import (
     AcknowledgedRecord,
     InstrumentRecord,
     JournalRecord,
     ReceptionRecord,
     TargetRecord,
-)
-from tsgt.recording.merged import MergedRecord
-from tsgt.recording.stream_records import (
-    PROTOCOL_VERSION,
-    BeaconRecord,
-    ClockRecord,
-    EventRecord,
-    HelloRecord,
-    PoseRecord,
-    StationShare,
-    StationStatus,
-    StatusRecord,
 )
 
 Line = (

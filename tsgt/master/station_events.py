@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from tsgt.model import Status
-from tsgt.recording.stream_records import EventRecord
+from tsgt.recording import EventRecord
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

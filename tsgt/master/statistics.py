@@ -6,15 +6,15 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
-from tsgt.estimation.tracks import usable
+from tsgt.estimation import usable
 from tsgt.model import PolarMeasurement, Status
-from tsgt.recording.stream_records import StationStatus, StatusRecord
+from tsgt.recording import StationStatus, StatusRecord
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
     from tsgt.model import Measurement
-    from tsgt.timesync.two_way import ClockEstimate
+    from tsgt.timesync import ClockEstimate
 
 RATE_WINDOW_NS = 10_000_000_000
 LOSS_REQUESTS = 50

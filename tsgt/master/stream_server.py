@@ -19,8 +19,7 @@ from typing import TYPE_CHECKING, Self
 
 import structlog
 
-from tsgt.recording import encode_line
-from tsgt.recording.stream_records import EventRecord
+from tsgt.recording import EventRecord, encode_line
 from tsgt.service import UnixListener
 
 if TYPE_CHECKING:

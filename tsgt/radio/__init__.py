@@ -1,7 +1,44 @@
 """The radio: settings, packets, and what the program asks of any LoRa radio."""
 
-from __future__ import annotations
+from tsgt.radio.airtime import (
+    HEADER_SYMBOLS,
+    SYNC_QUARTER_SYMBOLS,
+    airtime_us,
+    bit_rate_Bps,
+    low_data_rate_required,
+    payload_symbols,
+    symbol_time_ns,
+)
+from tsgt.radio.base import (
+    BANDWIDTHS_HZ,
+    MAX_PAYLOAD_BYTES,
+    LoRaSettings,
+    OpenRadio,
+    Packet,
+    Radio,
+    Transmitted,
+)
+from tsgt.radio.commands import Direction, DirectOrder, MeasureOrder, Order, SearchOrder, TrackOrder
 
-from tsgt.radio.base import LoRaSettings, Packet, Radio, Transmitted
-
-__all__ = ["LoRaSettings", "Packet", "Radio", "Transmitted"]
+__all__ = [
+    "BANDWIDTHS_HZ",
+    "HEADER_SYMBOLS",
+    "MAX_PAYLOAD_BYTES",
+    "SYNC_QUARTER_SYMBOLS",
+    "DirectOrder",
+    "Direction",
+    "LoRaSettings",
+    "MeasureOrder",
+    "OpenRadio",
+    "Order",
+    "Packet",
+    "Radio",
+    "SearchOrder",
+    "TrackOrder",
+    "Transmitted",
+    "airtime_us",
+    "bit_rate_Bps",
+    "low_data_rate_required",
+    "payload_symbols",
+    "symbol_time_ns",
+]

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from tsgt.config.radio import ClassicMasterConfig
+from tsgt.config import ClassicMasterConfig
 from tsgt.errors import ConfigError, RadioSettingsError
 from tsgt.radio.base import LoRaSettings
-from tsgt.radio.classic.turn import Timing
-from tsgt.radio.planning.capacity import classic_cycle, superframe_cycle
-from tsgt.radio.planning.regulations import LOWEST_DBM, preset_power_dbm
-from tsgt.radio.superframe.slots import FrameTiming
-from tsgt.radio.sx127x.hal import Wiring
+from tsgt.radio.classic import Timing
+from tsgt.radio.planning import LOWEST_DBM, classic_cycle, preset_power_dbm, superframe_cycle
+from tsgt.radio.superframe import FrameTiming
+from tsgt.radio.sx127x import Wiring
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tsgt.config.radio import MasterProtocolConfig, ModemConfig, WiringConfig
-    from tsgt.radio.planning.capacity import Cycle, Load
+    from tsgt.config import MasterProtocolConfig, ModemConfig, WiringConfig
+    from tsgt.radio.planning import Cycle, Load
 
 
 def lora_settings(config: ModemConfig, path: Path) -> LoRaSettings:

@@ -13,10 +13,10 @@ import secrets
 import stat
 from typing import TYPE_CHECKING
 
-from tsgt.config.permissions import check_trust
+from tsgt.config import check_trust
 from tsgt.errors import ConfigError, OutputFileError
-from tsgt.radio.superframe.wire.authentication import KEY_BYTES
-from tsgt.recording.files import sync_folder
+from tsgt.radio.superframe.wire import KEY_BYTES
+from tsgt.recording import sync_folder
 
 if TYPE_CHECKING:
     from pathlib import Path

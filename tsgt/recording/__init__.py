@@ -10,22 +10,58 @@ Nothing that can be imported from here waits, asks for the time or logs, so the 
 :mod:`tsgt.recording.recorder` does log.
 """
 
-from tsgt.recording.files import new_recording_path, write_atomically
-from tsgt.recording.format import FORMAT_VERSION, Line, RecordingHeader, decode, decode_line, encode_line
+from tsgt.recording.files import new_recording_path, sync_folder, write_atomically
+from tsgt.recording.format import (
+    FORMAT_VERSION,
+    MAX_LINE_BYTES,
+    Line,
+    RecordingHeader,
+    Typed,
+    decode,
+    decode_line,
+    encode_line,
+)
+from tsgt.recording.merged import MergedRecord
 from tsgt.recording.reader import Recording, load_recording, read_lines
+from tsgt.recording.stream_records import (
+    PROTOCOL_VERSION,
+    BeaconRecord,
+    ClockRecord,
+    EventRecord,
+    HelloRecord,
+    Kind,
+    PoseRecord,
+    StationShare,
+    StationStatus,
+    StatusRecord,
+)
 from tsgt.recording.writer import RecordingWriter
 
 __all__ = [
     "FORMAT_VERSION",
+    "MAX_LINE_BYTES",
+    "PROTOCOL_VERSION",
+    "BeaconRecord",
+    "ClockRecord",
+    "EventRecord",
+    "HelloRecord",
+    "Kind",
     "Line",
+    "MergedRecord",
+    "PoseRecord",
     "Recording",
     "RecordingHeader",
     "RecordingWriter",
+    "StationShare",
+    "StationStatus",
+    "StatusRecord",
+    "Typed",
     "decode",
     "decode_line",
     "encode_line",
     "load_recording",
     "new_recording_path",
     "read_lines",
+    "sync_folder",
     "write_atomically",
 ]

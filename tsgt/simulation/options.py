@@ -6,16 +6,15 @@ import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
-from tsgt.config.radio import SuperframeMasterConfig
+from tsgt.config import SuperframeMasterConfig
 from tsgt.errors import ConfigError
 from tsgt.simulation.faults.catalogue import FaultKind  # noqa: TC001
+from tsgt.simulation.mission.computer import MASTER
 
 if TYPE_CHECKING:
-    from tsgt.config.radio import ClassicMasterConfig
+    from tsgt.config import ClassicMasterConfig
 
 Node = Literal["ours", "authors"]
-
-MASTER = "master"
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,12 +6,11 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tsgt.config import ScenarioConfig, load
-from tsgt.config.radio import LARGEST_NUMBERS
+from tsgt.config import LARGEST_NUMBERS, ScenarioConfig, load
 from tsgt.errors import ConfigError
 
 if TYPE_CHECKING:
-    from tsgt.config.scenario import SimulatedStation
+    from tsgt.config import SimulatedStation
 
 _FILES = Path(__file__).parent / "scenarios"
 

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from tsgt.config import MotionConfig, ScenarioConfig
-    from tsgt.config.scenario import OcclusionConfig
+    from tsgt.config import MotionConfig, OcclusionConfig, ScenarioConfig
 
 STEP_S = 0.02
 

@@ -9,13 +9,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import structlog
 
 from tsgt.model import PolarMeasurement
-from tsgt.radio.superframe.receive_window import KNOWN_LINEAGES
-from tsgt.radio.superframe.send_queue import Queued
-from tsgt.radio.superframe.session import Reception
-from tsgt.radio.superframe.wire.codec import angle_code
-from tsgt.radio.superframe.wire.messages import RESTART_SKIP
-from tsgt.recording import decode
-from tsgt.recording.format import MAX_LINE_BYTES, Typed
+from tsgt.radio.superframe import KNOWN_LINEAGES, Queued, Reception
+from tsgt.radio.superframe.wire import RESTART_SKIP, angle_code
+from tsgt.recording import MAX_LINE_BYTES, Typed, decode
 from tsgt.recording.journal import AcknowledgedRecord, JournalRecord, ReceptionRecord
 
 if TYPE_CHECKING:

@@ -13,9 +13,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, NoReturn, Self
 
-from tsgt.config.client import PressureHpa, TemperatureC
+from tsgt.config import PressureHpa, TemperatureC  # noqa: TC001 (pydantic resolves annotations at run time)
 from tsgt.recording import encode_line
-from tsgt.recording.journal import InstrumentRecord
+from tsgt.recording.journal import InstrumentRecord  # noqa: TC001 (likewise)
 from tsgt.service import UnixListener
 
 if TYPE_CHECKING:

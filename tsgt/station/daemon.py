@@ -15,11 +15,9 @@ import tsgt
 from tsgt import service
 from tsgt.clock import UnixTimeline
 from tsgt.errors import RecordingError
-from tsgt.radio.commands import MeasureOrder, Order
-from tsgt.radio.superframe.command_exchange import Situation
-from tsgt.radio.superframe.send_queue import Outbox
-from tsgt.radio.superframe.station import SuperframeStation
-from tsgt.radio.superframe.wire.authentication import Authenticator
+from tsgt.radio import MeasureOrder, Order
+from tsgt.radio.superframe import Outbox, Situation, SuperframeStation
+from tsgt.radio.superframe.wire import Authenticator
 from tsgt.radio.supervisor import keep_radio
 from tsgt.recording import RecordingHeader, RecordingWriter, decode, encode_line, new_recording_path
 from tsgt.recording.journal import InstrumentRecord, JournalRecord
@@ -29,8 +27,7 @@ from tsgt.station.control_socket import Answer, AtmosphereRequest, StatusSocket
 from tsgt.station.instrument import Atmosphere
 from tsgt.station.instrument_supervisor import Done, InstrumentKeeper
 from tsgt.station.journal import PATIENCE_S, JournalQueue
-from tsgt.station.links.classic import ClassicLink
-from tsgt.station.links.superframe import SuperframeLink
+from tsgt.station.links import ClassicLink, SuperframeLink
 from tsgt.station.session import Session
 
 if TYPE_CHECKING:
@@ -40,9 +37,9 @@ if TYPE_CHECKING:
 
     from tsgt.clock import Clock
     from tsgt.config import ClientConfig
-    from tsgt.radio.base import LoRaSettings, OpenRadio, Radio
+    from tsgt.radio import LoRaSettings, OpenRadio, Radio
     from tsgt.station.instrument import Instrument, Reading
-    from tsgt.station.links.base import Link
+    from tsgt.station.links import Link
     from tsgt.station.status import ClientStatus
 
 _SKIP_BITS = 22

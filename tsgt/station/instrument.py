@@ -9,7 +9,7 @@ from tsgt.model import check_finite, check_instants
 
 if TYPE_CHECKING:
     from tsgt.model import Status
-    from tsgt.radio.commands import Direction
+    from tsgt.radio import Direction
     from tsgt.recording.journal import InstrumentRecord
 
 

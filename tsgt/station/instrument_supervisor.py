@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NoReturn
 import structlog
 
 from tsgt.errors import InstrumentError, InstrumentRefusedError
-from tsgt.radio.commands import DirectOrder, MeasureOrder, Order, SearchOrder, TrackOrder
+from tsgt.radio import DirectOrder, MeasureOrder, Order, SearchOrder, TrackOrder
 
 if TYPE_CHECKING:
     from collections.abc import Callable

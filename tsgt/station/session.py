@@ -10,7 +10,7 @@ from collections import deque
 from typing import TYPE_CHECKING
 
 from tsgt.model import PolarMeasurement, Status
-from tsgt.radio.commands import DirectOrder, MeasureOrder, Order, SearchOrder, TrackOrder
+from tsgt.radio import DirectOrder, MeasureOrder, Order, SearchOrder, TrackOrder
 from tsgt.recording.journal import TargetRecord
 from tsgt.station.status import ClientStatus, LastMeasurement
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from harness.scene import LAYOUT, SECOND, START, Motion, counted_from, standing_scene
 
-from tsgt.analysis.evaluation.held_out import FOLDS, held_out
+from tsgt.analysis.evaluation import held_out
+from tsgt.analysis.evaluation.held_out import FOLDS
 from tsgt.analysis.processing import process, with_estimator
 from tsgt.analysis.smoothing import smoothed
 from tsgt.errors import RecordingError
-from tsgt.estimation.observations import build_observations
-from tsgt.estimation.pose_batch import Kind, Reason
+from tsgt.estimation import Kind, Reason, build_observations
 from tsgt.geometry import exp_so3, rotate, rotation_from_quaternion, skew
 from tsgt.model import Status
 from tsgt.recording import Recording, RecordingHeader

@@ -12,7 +12,7 @@ import pytest
 
 from tsgt.recording import encode_line
 from tsgt.recording.journal import InstrumentRecord
-from tsgt.station.control_socket import Answer
+from tsgt.station import Answer
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -11,7 +11,7 @@ import pytest
 from tsgt.cli.composition import make_instrument
 from tsgt.config import ClientConfig, load
 from tsgt.errors import InstrumentError
-from tsgt.simulation.kernel.clocks import VirtualClock
+from tsgt.simulation.kernel import VirtualClock
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 

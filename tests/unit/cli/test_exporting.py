@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from harness.cli import Outcome, Tsgt
 
-    from tsgt.recording.stream_records import Kind, PoseRecord
+    from tsgt.recording import Kind, PoseRecord
 
 PERIOD_NS = 50_000_000
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from harness.cli import Tsgt
 
-    from tsgt.simulation.mission.runner import Run
+    from tsgt.simulation.mission import Run
 
 
 @pytest.fixture(scope="module")

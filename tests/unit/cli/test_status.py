@@ -12,10 +12,10 @@ import pytest
 
 from tsgt.cli.status import client_text, duration, master_text, station_word
 from tsgt.model import Status
-from tsgt.recording import encode_line
+from tsgt.recording import HelloRecord, StationStatus, StatusRecord, encode_line
 from tsgt.recording.journal import InstrumentRecord
-from tsgt.recording.stream_records import HelloRecord, StationStatus, StatusRecord
-from tsgt.station.status import ClientStatus, LastMeasurement
+from tsgt.station import ClientStatus
+from tsgt.station.status import LastMeasurement
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -9,8 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tsgt.config import MasterConfig, NoiseConfig, PipelineConfig, ScenarioConfig, load, parameters
-from tsgt.config.parameters import noise, pipeline_parameters, scenario_parameters
+from tsgt.config import (
+    MasterConfig,
+    NoiseConfig,
+    PipelineConfig,
+    ScenarioConfig,
+    load,
+    noise,
+    parameters,
+    scenario_parameters,
+)
+from tsgt.config.parameters import pipeline_parameters
 from tsgt.errors import ConfigError
 from tsgt.geometry import check_transform
 from tsgt.model import TRACKING_NOISE, Parameters, PipelineParameters

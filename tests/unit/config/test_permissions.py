@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tsgt.config.permissions import check_trust
+from tsgt.config import check_trust
 from tsgt.errors import ConfigError
 
 

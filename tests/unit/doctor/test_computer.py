@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 from harness.made_up_machine import MadeUpMachine
 
-from tsgt.doctor.finding import Outcome
-from tsgt.doctor.machine import User, current_user, find_user, group_name, run_command
+from tsgt.doctor import Outcome, current_user, find_user, group_name, run_command
+from tsgt.doctor.machine import User
 
 if TYPE_CHECKING:
     from pathlib import Path

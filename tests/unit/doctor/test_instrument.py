@@ -9,22 +9,20 @@ import pytest
 from harness.made_up_machine import NOW_NS, MadeUpMachine
 from harness.radios import running_timeline
 
-from tsgt.config import ScenarioConfig
-from tsgt.config.client import LeicaInstrumentConfig
-from tsgt.doctor.finding import Outcome
+from tsgt.config import LeicaInstrumentConfig, ScenarioConfig
+from tsgt.doctor import Outcome
 from tsgt.doctor.instrument import judge_identity
 from tsgt.errors import InstrumentError, StreamError
-from tsgt.simulation.instrument.serial_line import SimulatedLine
-from tsgt.simulation.instrument.total_station import SimulatedTotalStation
-from tsgt.simulation.kernel.clocks import VirtualClock
+from tsgt.simulation.instrument import SimulatedLine, SimulatedTotalStation
+from tsgt.simulation.kernel import VirtualClock
 from tsgt.simulation.world import scenario_world
-from tsgt.station.leica.identity import Identity
-from tsgt.station.status import ClientStatus
+from tsgt.station import ClientStatus
+from tsgt.station.leica import Identity
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tsgt.station.serial.base import Port
+    from tsgt.station.serial import Port
 
 NAMES = ("instrument", "licence", "battery", "level")
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from harness.made_up_machine import MadeUpMachine
 
-from tsgt.doctor.finding import Outcome
+from tsgt.doctor import Outcome
 from tsgt.doctor.machine import User
 from tsgt.errors import RadioError
 

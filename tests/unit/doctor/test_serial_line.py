@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 from harness.made_up_machine import ADAPTER, MadeUpMachine
 
-from tsgt.doctor.finding import Outcome
+from tsgt.doctor import Outcome
 from tsgt.doctor.machine import User
 
 if TYPE_CHECKING:

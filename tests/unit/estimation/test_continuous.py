@@ -9,8 +9,8 @@ import pytest
 from harness.scene import SECOND, START, Scene, counted_from, driving, standing, standing_scene
 
 from tsgt.errors import DegenerateGeometryError
+from tsgt.estimation import Kind, PoseBatch, Reason
 from tsgt.estimation.continuous import ContinuousPipeline
-from tsgt.estimation.pose_batch import Kind, PoseBatch, Reason
 from tsgt.geometry import exp_so3, log_so3, rotation_from_quaternion
 from tsgt.model import PolarMeasurement, PrismPosition, Status
 

@@ -10,8 +10,7 @@ import pytest
 from harness.scene import LAYOUT, SECOND, START, driving, standing, standing_scene
 
 from tsgt.errors import DegenerateGeometryError
-from tsgt.estimation.linear import Pipeline
-from tsgt.estimation.pose_batch import PoseBatch, Reason
+from tsgt.estimation import Pipeline, PoseBatch, Reason
 from tsgt.geometry import exp_so3, log_so3, rotation_from_quaternion
 from tsgt.model import TRACKING_NOISE, PrismPosition, Status
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from harness.scene import START, standing_scene
 
-from tsgt.estimation.live import Feed
+from tsgt.estimation import Feed
 from tsgt.model import PolarMeasurement
-from tsgt.recording.stream_records import PoseRecord
+from tsgt.recording import PoseRecord
 
 
 def test_a_measurement_is_followed_by_the_poses_that_it_completes() -> None:

@@ -6,14 +6,10 @@ import numpy as np
 import pytest
 from harness.scene import START, Motion, standing_scene
 
-from tsgt.estimation.observations import (
-    INSTRUMENT_TIME_SIGMA_S,
-    LEAST_SIGMA_M,
-    build_observations,
-    middle_m,
-)
+from tsgt.estimation import build_observations
+from tsgt.estimation.observations import INSTRUMENT_TIME_SIGMA_S, LEAST_SIGMA_M, middle_m
 from tsgt.geometry import exp_so3, log_so3
-from tsgt.geometry.trajectory.batch import fit
+from tsgt.geometry.trajectory import fit
 from tsgt.model import InstrumentNoise, MotionPrior, PointMeasurement
 
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from harness.scene import SECOND, START, standing, standing_scene
 
-from tsgt.estimation.pose_batch import Reason
-from tsgt.estimation.pose_output import ContinuousPoses, Seen
-from tsgt.geometry.trajectory.states import Knots
+from tsgt.estimation import ContinuousPoses, Reason, Seen
+from tsgt.geometry.trajectory import Knots
 
 NONE = np.empty(0, np.int64)
 SEEN = Seen(NONE, NONE, NONE.astype(np.intp), np.empty(0), [NONE] * 3)

@@ -9,11 +9,11 @@ import pytest
 from harness.aftermath import aftermath
 from harness.records import HEADER, PARAMETERS, measurement
 
-from tsgt.radio.superframe.wire.messages import RESTART_SKIP
+from tsgt.radio.superframe.wire import RESTART_SKIP
 from tsgt.recording import encode_line
 from tsgt.recording.journal import JournalRecord
-from tsgt.simulation.instrument.geocom.answers import Offered
-from tsgt.station.geocom.codes import ReturnCode
+from tsgt.simulation.instrument.geocom import Offered
+from tsgt.station.geocom import ReturnCode
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

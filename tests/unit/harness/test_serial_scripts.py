@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import pytest
 from harness.serial_scripts import Bench, Script, all_scripts, run_script
 
-from tsgt.simulation.instrument.serial_line import LineFault
+from tsgt.simulation.instrument import LineFault
 
 if TYPE_CHECKING:
-    from tsgt.simulation.instrument.geocom.answers import Offered
+    from tsgt.simulation.instrument.geocom import Offered
 
 SCRIPTS = all_scripts()
 KINDS = sorted({script.kind for script in SCRIPTS})

@@ -15,16 +15,15 @@ from harness.field import STATIONS, TRUE, field_of, running
 from harness.radios import PAPER
 from harness.scene import START, driving, standing_scene
 
-from tsgt.config.master import GeofenceConfig
+from tsgt.config import GeofenceConfig
 from tsgt.errors import RadioError
 from tsgt.geometry import rotation_from_quaternion
+from tsgt.master import replayed
 from tsgt.master.geofence import run_fence_command
-from tsgt.master.replay import replayed
 from tsgt.model import PolarMeasurement, Status
-from tsgt.recording import encode_line, read_lines
-from tsgt.recording.stream_records import ClockRecord, EventRecord, PoseRecord, StatusRecord
+from tsgt.recording import ClockRecord, EventRecord, PoseRecord, StatusRecord, encode_line, read_lines
 from tsgt.service import run
-from tsgt.simulation.lora.radios import opener
+from tsgt.simulation.lora import opener
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
 
     from harness.field import Field
 
-    from tsgt.radio.base import Radio, Transmitted
+    from tsgt.radio import Radio, Transmitted
 
 DRIVING = standing_scene().moving(driving)
 MS = 1_000_000

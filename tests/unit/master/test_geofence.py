@@ -12,11 +12,11 @@ from harness.records import NO_POSE, POSE, SECOND, START
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tsgt.config.master import GeofenceConfig
+from tsgt.config import GeofenceConfig
 from tsgt.master.geofence import Geofence
 
 if TYPE_CHECKING:
-    from tsgt.recording.stream_records import PoseRecord
+    from tsgt.recording import PoseRecord
 
 SQUARE = ((0.0, 0.0), (10.0, 0.0), (10.0, 10.0), (0.0, 10.0))
 BAY = ((0.0, 0.0), (9.0, 0.0), (9.0, 9.0), (6.0, 9.0), (6.0, 3.0), (3.0, 3.0), (3.0, 9.0), (0.0, 9.0))

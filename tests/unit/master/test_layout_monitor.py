@@ -10,14 +10,13 @@ import pytest
 from harness.arrivals import simulated_measurements
 from harness.records import NO_POSE, POSE, SECOND, START
 
-from tsgt.analysis.formats.rts_files import read_prisms, read_tracks
-from tsgt.analysis.formats.rts_import import point_measurements
-from tsgt.config import ScenarioConfig, scenario_parameters
-from tsgt.config.master import FrameWatchConfig
-from tsgt.estimation.live import Feed
+from tsgt.analysis.formats import read_prisms, read_tracks
+from tsgt.analysis.rts_import import point_measurements
+from tsgt.config import FrameWatchConfig, ScenarioConfig, scenario_parameters
+from tsgt.estimation import Feed
 from tsgt.master.layout_monitor import FrameWatch
 from tsgt.model import Parameters, StationParameters
-from tsgt.recording.stream_records import PoseRecord, Reason, StationShare
+from tsgt.recording import PoseRecord, StationShare
 from tsgt.simulation.world import World
 
 if TYPE_CHECKING:
@@ -25,7 +24,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tsgt.model import Matrix4, Measurement
-    from tsgt.recording.stream_records import EventRecord
+    from tsgt.recording import EventRecord
+    from tsgt.recording.stream_records import Reason
 
 PERIOD_NS = SECOND // 20
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from harness.scene import Motion, Scene
     from numpy.typing import NDArray
 
-    from tsgt.radio.commands import Direction
+    from tsgt.radio import Direction
 
 STEP_S = 0.4
 LOST_S = 10.0

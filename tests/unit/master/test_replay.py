@@ -11,11 +11,10 @@ from harness.records import EVENT, HEADER
 from harness.scene import START, standing_scene
 
 from tsgt.errors import CorruptLineError, RecordingError
-from tsgt.estimation.live import Feed
-from tsgt.master.replay import replay, replayed
-from tsgt.master.stream_server import StreamServer
+from tsgt.estimation import Feed
+from tsgt.master import StreamServer, replay, replayed
 from tsgt.recording import RecordingWriter, encode_line
-from tsgt.simulation.kernel.clocks import VirtualClock
+from tsgt.simulation.kernel import VirtualClock
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -8,7 +8,7 @@ import pytest
 
 from tsgt.master.statistics import Monitor
 from tsgt.model import PolarMeasurement, Status
-from tsgt.timesync.two_way import ClockEstimate
+from tsgt.timesync import ClockEstimate
 
 SECOND = 1_000_000_000
 

@@ -8,13 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tsgt.radio.airtime import (
-    airtime_us,
-    bit_rate_Bps,
-    low_data_rate_required,
-    payload_symbols,
-    symbol_time_ns,
-)
+from tsgt.radio import airtime_us, bit_rate_Bps, low_data_rate_required, payload_symbols, symbol_time_ns
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

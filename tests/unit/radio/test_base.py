@@ -6,7 +6,7 @@ import pytest
 from harness.radios import PAPER
 
 from tsgt.errors import RadioSettingsError
-from tsgt.radio.base import LoRaSettings
+from tsgt.radio import LoRaSettings
 
 
 @pytest.mark.parametrize(

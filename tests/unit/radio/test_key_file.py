@@ -10,7 +10,7 @@ import pytest
 
 from tsgt.errors import ConfigError, OutputFileError
 from tsgt.radio.key_file import read_key, write_key
-from tsgt.radio.superframe.wire.authentication import KEY_BYTES
+from tsgt.radio.superframe.wire import KEY_BYTES
 
 
 @pytest.fixture

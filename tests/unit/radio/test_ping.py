@@ -8,12 +8,12 @@ import pytest
 from harness.plain_radio import AIRTIME_NS, PlainRadio
 
 from tsgt.radio.ping import Answer, Exchange, Strength, answer, ping, summarise, summarise_answers
-from tsgt.simulation.kernel.clocks import VirtualClock
+from tsgt.simulation.kernel import VirtualClock
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from tsgt.radio.base import Radio
+    from tsgt.radio import Radio
 
 TIMEOUT_NS = 200_000_000
 

@@ -11,12 +11,12 @@ from structlog.testing import capture_logs
 
 from tsgt.errors import RadioError, RadioSettingsError, StreamError, TsgtError
 from tsgt.radio.supervisor import keep_radio
-from tsgt.simulation.kernel.clocks import VirtualClock
+from tsgt.simulation.kernel import VirtualClock
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
 
-    from tsgt.radio.base import Radio
+    from tsgt.radio import Radio
 
 CLOCK = VirtualClock(0)
 

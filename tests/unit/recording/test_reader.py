@@ -19,9 +19,7 @@ from harness.records import (
 )
 
 from tsgt.errors import CorruptLineError, RecordingError, RecordingVersionError
-from tsgt.recording import encode_line, load_recording, read_lines
-from tsgt.recording.format import MAX_LINE_BYTES
-from tsgt.recording.merged import MergedRecord
+from tsgt.recording import MAX_LINE_BYTES, MergedRecord, encode_line, load_recording, read_lines
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from tsgt.config import MotionConfig, ScenarioConfig
-from tsgt.config.scenario import OcclusionConfig
+from tsgt.config import MotionConfig, OcclusionConfig, ScenarioConfig
 from tsgt.geometry import check_transform, transform_points
 from tsgt.simulation.world import STEP_S, World, draw_occlusions, scenario_world
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from harness.records import HEADER, measurement
 from structlog.testing import capture_logs
 
-from tsgt.radio.superframe.session import Reception
-from tsgt.radio.superframe.wire.messages import RESTART_SKIP
+from tsgt.radio.superframe import Reception
+from tsgt.radio.superframe.wire import RESTART_SKIP
 from tsgt.recording import encode_line
 from tsgt.recording.journal import AcknowledgedRecord, JournalRecord, ReceptionRecord
 from tsgt.station import backlog as backlog_module

@@ -15,17 +15,16 @@ from harness.shots import ScriptedInstrument
 from tsgt.errors import InstrumentRefusedError, RadioError, RecordingError
 from tsgt.recording import RecordingWriter, encode_line, read_lines
 from tsgt.recording.recorder import Recorder
-from tsgt.simulation.kernel.clocks import VirtualClock
-from tsgt.station.control_socket import MOST_TALKS, AtmosphereRequest
-from tsgt.station.daemon import run_client
-from tsgt.station.instrument import Condition
+from tsgt.simulation.kernel import VirtualClock
+from tsgt.station import AtmosphereRequest, Condition, run_client
+from tsgt.station.control_socket import MOST_TALKS
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
     from contextlib import AbstractAsyncContextManager
     from pathlib import Path
 
-    from tsgt.radio.base import Radio
+    from tsgt.radio import Radio
 
 START_NS = 1_700_000_000_000_000_000
 WARM = encode_line(AtmosphereRequest(temperature_c=25.0, pressure_hpa=1000.0))

@@ -17,16 +17,17 @@ from structlog.testing import capture_logs
 from tsgt.config.scenario import StatusFaultConfig
 from tsgt.errors import RadioError, RecordingError, StreamError
 from tsgt.model import Status
-from tsgt.radio.classic.messages import Acknowledgement, MeasurementMessage, PingReply, TimeReply
+from tsgt.radio.classic import MeasurementMessage
+from tsgt.radio.classic.messages import Acknowledgement, PingReply, TimeReply
 from tsgt.recording import RecordingWriter, read_lines
 from tsgt.recording.journal import load_journal
-from tsgt.station.daemon import run_client
+from tsgt.station import run_client
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable
     from pathlib import Path
 
-    from tsgt.radio.base import Radio
+    from tsgt.radio import Radio
 
 
 async def test_every_measurement_is_journalled_and_the_newest_is_answered(tmp_path: Path) -> None:

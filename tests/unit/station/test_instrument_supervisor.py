@@ -12,9 +12,9 @@ from harness.shots import RECORD, ScriptedInstrument
 from structlog.testing import capture_logs
 
 from tsgt.errors import InstrumentError, InstrumentRefusedError
-from tsgt.radio.commands import Direction, DirectOrder, MeasureOrder, SearchOrder, TrackOrder
-from tsgt.simulation.kernel.clocks import VirtualClock
-from tsgt.station.instrument import Atmosphere, Condition, Reading
+from tsgt.radio import Direction, DirectOrder, MeasureOrder, SearchOrder, TrackOrder
+from tsgt.simulation.kernel import VirtualClock
+from tsgt.station import Atmosphere, Condition, Reading
 from tsgt.station.instrument_supervisor import CHECK_S, NOT_CONNECTED, Done, InstrumentKeeper
 from tsgt.station.session import Session
 

@@ -14,7 +14,7 @@ from structlog.testing import capture_logs
 from unit.station.test_control_socket import WARM, journalled, no_radio, talk
 
 from tsgt.recording.journal import load_journal
-from tsgt.station.daemon import run_client
+from tsgt.station import run_client
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator

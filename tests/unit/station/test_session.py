@@ -7,11 +7,11 @@ from dataclasses import replace
 import pytest
 
 from tsgt.model import PolarMeasurement, Status
-from tsgt.radio.commands import DirectOrder, MeasureOrder, SearchOrder, TrackOrder
+from tsgt.radio import DirectOrder, MeasureOrder, SearchOrder, TrackOrder
 from tsgt.recording.journal import InstrumentRecord
-from tsgt.station.instrument import Condition, Reading
+from tsgt.station import ClientStatus, Condition, Reading
 from tsgt.station.session import Session
-from tsgt.station.status import ClientStatus, LinkStatus
+from tsgt.station.status import LinkStatus
 
 SECOND = 1_000_000_000
 START = 1_600_000_000 * SECOND

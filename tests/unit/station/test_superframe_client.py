@@ -14,12 +14,12 @@ from structlog.testing import capture_logs
 from unit.station.test_daemon import asked
 
 from tsgt.clock import UnixTimeline
-from tsgt.config.radio import SuperframeConfig
+from tsgt.config import SuperframeConfig
 from tsgt.errors import RecordingError
-from tsgt.radio.superframe.wire.messages import RESTART_SKIP, AnswerPart, OrderPart
+from tsgt.radio.superframe.wire import RESTART_SKIP, AnswerPart, OrderPart
 from tsgt.recording import RecordingWriter, read_lines
 from tsgt.recording.journal import load_journal
-from tsgt.simulation.kernel.clocks import VirtualClock
+from tsgt.simulation.kernel import VirtualClock
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Sequence

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tsgt.timesync import beacon_clock
-from tsgt.timesync.beacon_clock import BeaconClock
+from tsgt.timesync import BeaconClock, beacon_clock
 
 FRAME_NS = 400_000_000
 START_NS = 5_000_000_000_000

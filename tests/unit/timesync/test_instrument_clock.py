@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tsgt.timesync.instrument_clock import ENOUGH, InstrumentClock
+from tsgt.timesync import InstrumentClock
+from tsgt.timesync.instrument_clock import ENOUGH
 
 MS = 1_000_000
 OFFSET_NS = 77_000_000_000_000

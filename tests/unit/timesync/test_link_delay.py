@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tsgt.timesync.link_delay import RoundTrip
+from tsgt.timesync import RoundTrip
 
 NOMINAL_NS = 1_489_480
 SYMBOL_NS = 2_048_000

@@ -3,7 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tsgt.timesync.periodicity import LEAST, MOST, Rhythm
+from tsgt.timesync import Rhythm
+from tsgt.timesync.periodicity import LEAST, MOST
 
 PERIOD_US = 400_000
 PHASE_US = 123_456

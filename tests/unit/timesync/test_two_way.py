@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from harness.clock_exchanges import SECOND, START_NS, WAY_NS, drifting, exchange, synchronisation
 
+from tsgt.timesync import ArrivalCheck, ClockFilter, clock_filter
 from tsgt.timesync.offset_regression import Frequency, fit, sift
-from tsgt.timesync.two_way import ArrivalCheck, ClockFilter, clock_filter
 
 MS = 1_000_000
 NAMES = ("regression", "paper")

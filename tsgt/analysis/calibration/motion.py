@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, cast
 
-from tsgt.analysis.evaluation.held_out import (
+from tsgt.analysis.evaluation import (
     HeldOut,
     folds,
     hold_out,
@@ -14,19 +14,16 @@ from tsgt.analysis.evaluation.held_out import (
     never_out,
 )
 from tsgt.errors import GeometryError
-from tsgt.estimation.observations import build_observations
-from tsgt.geometry.calibration.motion import MotionCalibration, calibrate_motion
-from tsgt.geometry.calibration.motion_initialisation import frames_from_motion
-from tsgt.geometry.calibration.motion_parameters import Setup
-from tsgt.geometry.trajectory.batch import fit
-from tsgt.geometry.trajectory.hyperparameters import tune
+from tsgt.estimation import build_observations
+from tsgt.geometry.calibration import MotionCalibration, Setup, calibrate_motion, frames_from_motion
+from tsgt.geometry.trajectory import fit, tune
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from tsgt.analysis.evaluation.held_out import Fold
+    from tsgt.analysis.evaluation import Fold
     from tsgt.geometry import FloatArray, Observations
-    from tsgt.geometry.calibration.motion_parameters import Unknowns
+    from tsgt.geometry.calibration import Unknowns
     from tsgt.model import Matrix4, MotionPrior, Parameters, Vector3
     from tsgt.recording import Recording
 

@@ -14,11 +14,10 @@ from scipy.special import chdtri
 
 from tsgt.errors import DegenerateGeometryError
 from tsgt.geometry import log_so3
-from tsgt.geometry.calibration.frame_fit import Fit, Pairs, fit_frame
-from tsgt.geometry.calibration.targets import FALSE_ALARM, MIN_POINTS, STATION_LIMITS
+from tsgt.geometry.calibration import FALSE_ALARM, MIN_POINTS, STATION_LIMITS, Fit, Pairs, fit_frame
 
 if TYPE_CHECKING:
-    from tsgt.geometry.calibration.frame_fit import Name, PointSet
+    from tsgt.geometry.calibration import Name, PointSet
 
 FEWEST_FOR_HEADING = 2
 

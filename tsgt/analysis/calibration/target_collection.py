@@ -10,14 +10,14 @@ import dataclasses
 from typing import TYPE_CHECKING
 
 from tsgt.analysis.calibration.targets import solve_stations
-from tsgt.analysis.formats.target_file import Sight, TargetFile, read_some_targets
+from tsgt.analysis.formats import Sight, TargetFile, read_some_targets
 from tsgt.errors import DegenerateGeometryError, InputFileError
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
     from pathlib import Path
 
-    from tsgt.geometry.calibration.targets import FrameCalibration
+    from tsgt.geometry.calibration import FrameCalibration
 
 HEADER = "station,target,horizontal_angle_rad,zenith_angle_rad,slope_distance_m,constant_mm"
 

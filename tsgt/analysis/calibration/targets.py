@@ -9,17 +9,15 @@ import numpy as np
 
 from tsgt.errors import DegenerateGeometryError, InputFileError
 from tsgt.geometry import check_layout, corrected_distance, measurement_covariance, polar_to_cartesian
-from tsgt.geometry.calibration.frame_fit import PointSet
-from tsgt.geometry.calibration.targets import calibrate_frame, calibrate_prisms
+from tsgt.geometry.calibration import PointSet, calibrate_frame, calibrate_prisms
 from tsgt.model import TARGET_NOISE, TargetResidual
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from tsgt.analysis.formats.target_file import PrismFile, Sight, TargetFile
-    from tsgt.geometry.calibration.frame_fit import Name
-    from tsgt.geometry.calibration.targets import FrameCalibration, PrismCalibration
+    from tsgt.analysis.formats import PrismFile, Sight, TargetFile
+    from tsgt.geometry.calibration import FrameCalibration, Name, PrismCalibration
 
 REPEAT_LIMIT_M = 0.02
 """Two measurements of one target are a mistake when they lie further than this from their mean: another target,

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.analysis.smoothing import motion_of
-from tsgt.geometry.trajectory.batch import fit
+from tsgt.geometry.trajectory import fit
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from tsgt.analysis.processing import Estimator
     from tsgt.geometry import FloatArray, Observations
-    from tsgt.geometry.trajectory.query import Trajectory
+    from tsgt.geometry.trajectory import Trajectory
     from tsgt.model import PipelineParameters
 
 FOLDS = 5

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from tsgt.estimation.tracks import Track
+    from tsgt.estimation import Track
     from tsgt.model import Parameters
 
 EPOCH_NS = 50_000_000

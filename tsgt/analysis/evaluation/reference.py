@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.analysis.evaluation.metrics import Align, AlignedFigures
-    from tsgt.estimation.pose_batch import PoseBatch
+    from tsgt.estimation import PoseBatch
     from tsgt.geometry import FloatArray
 
 FARTHEST_APART_NS = 100_000_000

@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.geometry.trajectory.gauss_newton import nearest
-from tsgt.geometry.trajectory.measurement_factors import linearise
+from tsgt.geometry.trajectory import linearise, nearest
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from tsgt.geometry import FloatArray
-    from tsgt.geometry.trajectory.batch import Fit
+    from tsgt.geometry.trajectory import Fit
     from tsgt.model import Measurement
 
 POLAR_AXES = ("range", "horizontal_angle", "zenith_angle")

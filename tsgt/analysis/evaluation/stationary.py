@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from tsgt.analysis.evaluation.reference import Reference
-    from tsgt.estimation.pose_batch import PoseBatch
+    from tsgt.estimation import PoseBatch
     from tsgt.geometry import FloatArray
 
 LEAST_POSES = 20

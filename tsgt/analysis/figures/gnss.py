@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from tsgt.analysis.figures.style import PAGE_MM, STROKES, drawing, save
-from tsgt.analysis.formats.rtklib import QUALITIES
-from tsgt.analysis.gnss.baselines import BEST_FIRST
+from tsgt.analysis.formats import QUALITIES
+from tsgt.analysis.gnss import BEST_FIRST
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.analysis.figures.style import Stroke
-    from tsgt.analysis.gnss.baselines import Distances, Receiver
+    from tsgt.analysis.gnss import Distances, Receiver
 
 _SMALLEST_MM = 0.1
 """Errors below are drawn here: a logarithmic axis has no zero, and nothing measures better."""

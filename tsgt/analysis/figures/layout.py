@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.design.layout_study import HEADINGS
+from tsgt.analysis.design import HEADINGS
 from tsgt.analysis.figures.style import PAGE_MM, STROKES, drawing, save
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from tsgt.analysis.design.layout_study import LayoutFigures
+    from tsgt.analysis.design import LayoutFigures
     from tsgt.geometry import FloatArray
 
 _HEIGHT_MM = 115.0

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from matplotlib.axes import Axes
 
-    from tsgt.analysis.design.perturbation import Perturbation
+    from tsgt.analysis.design import Perturbation
     from tsgt.geometry import FloatArray
 
 _HEIGHT_MM = 95.0

@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-    from tsgt.analysis.evaluation.held_out import HeldOut
+    from tsgt.analysis.evaluation import HeldOut
     from tsgt.analysis.figures.axes import Clock
     from tsgt.analysis.processing import Estimator
     from tsgt.analysis.report.findings import Difference
-    from tsgt.estimation.pose_batch import PoseBatch
+    from tsgt.estimation import PoseBatch
     from tsgt.geometry import FloatArray
 
 _AXES = ("x", "y", "z")

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from tsgt.analysis.evaluation.inter_prism import InterPrism, PairDistances
+    from tsgt.analysis.evaluation import InterPrism, PairDistances
     from tsgt.analysis.figures.axes import Clock
     from tsgt.analysis.report.log import ClockSeries, RadioSeries
     from tsgt.analysis.report.motion import Bins, Grid, Ride

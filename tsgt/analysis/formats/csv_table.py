@@ -8,7 +8,7 @@ from decimal import Decimal, InvalidOperation
 from typing import TYPE_CHECKING
 
 from tsgt.errors import InputFileError, quoted
-from tsgt.estimation.tracks import FARTHEST_M
+from tsgt.estimation import FARTHEST_M
 from tsgt.model import LAST_INSTANT_NS
 
 if TYPE_CHECKING:

@@ -13,9 +13,9 @@ from tsgt.model import PointMeasurement
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from tsgt.estimation.pose_batch import PoseBatch
+    from tsgt.estimation import PoseBatch
     from tsgt.model import Measurement
-    from tsgt.recording.stream_records import PoseRecord
+    from tsgt.recording import PoseRecord
 
 POSE_COLUMNS = (
     *("stamp_ns", "valid", "reason", "estimator", "kind"),

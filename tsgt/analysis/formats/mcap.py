@@ -20,18 +20,17 @@ import numpy as np
 
 import tsgt
 from tsgt.errors import MessageError, MissingExtraError
-from tsgt.estimation.tracks import build_tracks
+from tsgt.estimation import build_tracks
 from tsgt.geometry import quaternion_from_rotation
 from tsgt.model import IDENTITY4, ROBOT_FRAME, WORLD_FRAME
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from tsgt.analysis.evaluation.reference import Reference
-    from tsgt.estimation.tracks import Track
+    from tsgt.analysis.evaluation import Reference
+    from tsgt.estimation import Track
     from tsgt.model import Parameters
-    from tsgt.recording import Recording
-    from tsgt.recording.stream_records import PoseRecord
+    from tsgt.recording import PoseRecord, Recording
 
 POSE_TOPIC = "/tsgt/pose"
 ODOMETRY_TOPIC = "/tsgt/odometry"

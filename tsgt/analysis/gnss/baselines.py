@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.formats.rtklib import QUALITIES, SECOND_NS
+from tsgt.analysis.formats import QUALITIES, SECOND_NS
 from tsgt.errors import InputFileError, MissingExtraError
 from tsgt.geometry import interpolate
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from tsgt.analysis.formats.rtklib import PosFile, TimeSystem
+    from tsgt.analysis.formats import PosFile, TimeSystem
 
 # The day from which GPS is so many seconds ahead of UTC: IERS Bulletin C. None has been announced since that of 2017.
 _AHEAD_FROM = (

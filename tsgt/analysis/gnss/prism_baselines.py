@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.evaluation.inter_prism import at_epochs
+from tsgt.analysis.evaluation import at_epochs
 from tsgt.analysis.gnss.baselines import Distances
 from tsgt.errors import RecordingError
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from tsgt.estimation.tracks import Track
+    from tsgt.estimation import Track
     from tsgt.model import Parameters
 
 

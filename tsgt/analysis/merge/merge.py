@@ -15,11 +15,10 @@ from typing import TYPE_CHECKING, NamedTuple
 from tsgt.analysis.merge.matching import Boot, Run, better
 from tsgt.analysis.merge.recording_index import Recorded, identity, read_recorded
 from tsgt.errors import RecordingError
-from tsgt.estimation.observations import instrument_time_sigma_s
+from tsgt.estimation import instrument_time_sigma_s
 from tsgt.model import LAST_INSTANT_NS, PolarMeasurement
-from tsgt.recording import RecordingWriter, encode_line, read_lines, write_atomically
+from tsgt.recording import MergedRecord, RecordingWriter, encode_line, read_lines, write_atomically
 from tsgt.recording.journal import is_only_begun, load_journal
-from tsgt.recording.merged import MergedRecord
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

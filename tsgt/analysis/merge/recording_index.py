@@ -8,9 +8,7 @@ from typing import TYPE_CHECKING
 
 from tsgt.errors import CorruptLineError, RecordingError
 from tsgt.model import Parameters, PolarMeasurement
-from tsgt.recording import RecordingHeader, decode_line, read_lines
-from tsgt.recording.merged import MergedRecord
-from tsgt.recording.stream_records import BeaconRecord, ClockRecord
+from tsgt.recording import BeaconRecord, ClockRecord, MergedRecord, RecordingHeader, decode_line, read_lines
 
 if TYPE_CHECKING:
     from collections.abc import Callable

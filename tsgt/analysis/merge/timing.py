@@ -12,15 +12,13 @@ from bisect import bisect_right
 from statistics import median
 from typing import TYPE_CHECKING, NamedTuple
 
-from tsgt.timesync.beacon_clock import BeaconClock
-from tsgt.timesync.offset_regression import sag_ns
-from tsgt.timesync.two_way import RegressionFilter
+from tsgt.timesync import BeaconClock, RegressionFilter, sag_ns
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from tsgt.model import ClockSample
-    from tsgt.timesync.two_way import ClockEstimate
+    from tsgt.timesync import ClockEstimate
 
 _CONFIRMED = 2
 """So many stamps of a synchronisation confirm each other; one alone may be late."""

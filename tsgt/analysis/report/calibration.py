@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tsgt.analysis.figures.axes import hatch, stroke
+from tsgt.analysis.figures import hatch, stroke
 from tsgt.analysis.report.elements import number, wide
 from tsgt.analysis.report.page import Section, Table
 from tsgt.model import PolarMeasurement

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.figures.style import PAGE_MM, drawing, save
+from tsgt.analysis.figures import PAGE_MM, drawing, save
 from tsgt.analysis.report.page import Plot
 
 if TYPE_CHECKING:

@@ -8,12 +8,18 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from tsgt.analysis.design.perturbation import Perturbation, equivalent, first_order_sigmas, perturbation_study
-from tsgt.analysis.evaluation.held_out import held_out
-from tsgt.analysis.evaluation.inter_prism import at_epochs, inter_prism
-from tsgt.analysis.evaluation.reference import compare, compare_aligned
-from tsgt.analysis.evaluation.residuals import normalised_residuals, outliers, residual_figures
-from tsgt.analysis.evaluation.stationary import standing_errors
+from tsgt.analysis.design import Perturbation, equivalent, first_order_sigmas, perturbation_study
+from tsgt.analysis.evaluation import (
+    at_epochs,
+    compare,
+    compare_aligned,
+    held_out,
+    inter_prism,
+    normalised_residuals,
+    outliers,
+    residual_figures,
+    standing_errors,
+)
 from tsgt.analysis.processing import process, with_estimator
 from tsgt.analysis.report.log import Log, read_log
 from tsgt.analysis.report.motion import ride
@@ -21,25 +27,29 @@ from tsgt.analysis.report.stations import station_figures, station_records
 from tsgt.analysis.smoothing import smoothed
 from tsgt.analysis.validation import believed
 from tsgt.errors import GeometryError, RecordingError
-from tsgt.estimation.observations import build_observations
-from tsgt.estimation.tracks import build_tracks
+from tsgt.estimation import build_observations, build_tracks
 from tsgt.geometry import check_layout, log_so3, rotation_from_quaternion
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from tsgt.analysis.evaluation.held_out import HeldOut
-    from tsgt.analysis.evaluation.inter_prism import InterPrism
-    from tsgt.analysis.evaluation.metrics import Align, AlignedFigures, PoseFigures
-    from tsgt.analysis.evaluation.reference import Reference
-    from tsgt.analysis.evaluation.residuals import AxisFigures, Outlier
-    from tsgt.analysis.evaluation.stationary import StandingFigures
+    from tsgt.analysis.evaluation import (
+        Align,
+        AlignedFigures,
+        AxisFigures,
+        HeldOut,
+        InterPrism,
+        Outlier,
+        PoseFigures,
+        Reference,
+        StandingFigures,
+    )
     from tsgt.analysis.processing import Estimator
     from tsgt.analysis.report.motion import Ride
     from tsgt.analysis.report.stations import StationFigures, StationRecord
     from tsgt.analysis.smoothing import Smoothed
-    from tsgt.estimation.pose_batch import PoseBatch
+    from tsgt.estimation import PoseBatch
     from tsgt.geometry import FloatArray
     from tsgt.recording import Recording
 

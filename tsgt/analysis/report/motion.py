@@ -12,8 +12,8 @@ from tsgt.geometry import rotate, rotation_from_quaternion
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from tsgt.analysis.evaluation.inter_prism import Epochs
-    from tsgt.estimation.pose_batch import PoseBatch
+    from tsgt.analysis.evaluation import Epochs
+    from tsgt.estimation import PoseBatch
     from tsgt.geometry import FloatArray
     from tsgt.model import Parameters
 

@@ -13,15 +13,15 @@ from tsgt.analysis.report.elements import median
 from tsgt.analysis.report.findings import position_sigma_mm
 from tsgt.analysis.report.motion import binned, gridded
 from tsgt.analysis.report.verdicts import bound_and_speed, verdicts
-from tsgt.estimation.pose_batch import Kind
+from tsgt.estimation import Kind
 
 if TYPE_CHECKING:
-    from tsgt.analysis.design.perturbation import Perturbation
-    from tsgt.analysis.evaluation.inter_prism import InterPrism
+    from tsgt.analysis.design import Perturbation
+    from tsgt.analysis.evaluation import InterPrism
     from tsgt.analysis.processing import Estimator
     from tsgt.analysis.report.findings import Difference, Findings
     from tsgt.analysis.report.motion import Bins, Grid, Ride
-    from tsgt.estimation.pose_batch import PoseBatch
+    from tsgt.estimation import PoseBatch
     from tsgt.geometry import FloatArray
 
 

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tsgt.analysis.figures import Clock
 from tsgt.analysis.figures import stations as draw
-from tsgt.analysis.figures.axes import Clock
 from tsgt.analysis.report.calibration import calibration
 from tsgt.analysis.report.elements import LISTED, median, number, utc, wide
 from tsgt.analysis.report.motion import binned, gridded
@@ -17,7 +17,7 @@ from tsgt.analysis.report.sections_poses import estimators, perturbation, residu
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from tsgt.analysis.evaluation.inter_prism import PairDistances
+    from tsgt.analysis.evaluation import PairDistances
     from tsgt.analysis.report.findings import Findings
     from tsgt.analysis.report.motion import Ride
     from tsgt.geometry import FloatArray

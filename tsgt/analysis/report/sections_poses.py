@@ -10,20 +10,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tsgt.analysis.figures import draw_perturbation, panels_height_mm
 from tsgt.analysis.figures import poses as draw
-from tsgt.analysis.figures.perturbation import draw_perturbation
-from tsgt.analysis.figures.stations import panels_height_mm
 from tsgt.analysis.report.elements import LISTED, number, utc, wide
 from tsgt.analysis.report.numbers import apart, of_poses
 from tsgt.analysis.report.page import Plot, Section, Table
-from tsgt.estimation.pose_batch import Kind
+from tsgt.estimation import Kind
 from tsgt.model import PolarMeasurement
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from tsgt.analysis.figures.axes import Clock
+    from tsgt.analysis.figures import Clock
     from tsgt.analysis.report.findings import Findings
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.estimation.tracks import usable
+from tsgt.estimation import usable
 from tsgt.model import PolarMeasurement
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.analysis.report.findings import position_sigma_mm
-from tsgt.estimation.pose_batch import Kind
+from tsgt.estimation import Kind
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

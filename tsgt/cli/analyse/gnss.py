@@ -10,22 +10,24 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
-from tsgt.analysis.figures.gnss import draw_gnss
-from tsgt.analysis.formats.rtklib import QUALITIES, read_pos
-from tsgt.analysis.gnss.baselines import (
+from tsgt.analysis.figures import draw_gnss
+from tsgt.analysis.formats import QUALITIES, read_pos
+from tsgt.analysis.gnss import (
     DistanceErrors,
+    common_part,
+    prism_pairs,
     quality_shares,
     receiver_pairs,
     receivers,
+    span,
 )
-from tsgt.analysis.gnss.prism_baselines import common_part, prism_pairs, span
 from tsgt.cli.analyse.options import figure_option
 from tsgt.cli.options import json_option, keep_going_option, path_type
 from tsgt.cli.output import print_json, print_table
 from tsgt.cli.recordings import load, progress
 from tsgt.cli.render import clock_time
 from tsgt.errors import InputFileError
-from tsgt.estimation.tracks import build_tracks
+from tsgt.estimation import build_tracks
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -33,7 +35,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from tsgt.analysis.gnss.baselines import Distances, Receiver
+    from tsgt.analysis.gnss import Distances, Receiver
 
 _HEADER = [
     "pair",

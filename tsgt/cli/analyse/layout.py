@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
-from tsgt.analysis.design.layout_search import Task, best_layout
-from tsgt.analysis.design.layout_study import (
+from tsgt.analysis.design import (
     LayoutFigures,
     Stances,
     Station,
+    Task,
+    best_layout,
     pose_covariances,
     together_or_around,
 )
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from tsgt.analysis.design.layout_search import Criterion
+    from tsgt.analysis.design import Criterion
     from tsgt.config import ScenarioConfig
     from tsgt.geometry import FloatArray
     from tsgt.model import Parameters, Vector3
@@ -165,7 +166,7 @@ def layout_command(
     centre = places.mean(axis=0)
     distances = {d: _by_arrangement(candidates[0], stations, centre, d, point) for d in _DISTANCES_M}
     if figure is not None:
-        from tsgt.analysis.figures.layout import draw_layouts  # noqa: PLC0415 (needs an extra)
+        from tsgt.analysis.figures import draw_layouts
 
         draw_layouts({c.name: c.covariance for c in candidates}, distances, figure)
     if as_json:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 import numpy as np
 
-from tsgt.analysis.figures.style import FORMATS
+from tsgt.analysis.figures import FORMATS
 from tsgt.cli.options import path_type
 from tsgt.config import load_prism_layout
 from tsgt.errors import ConfigError, GeometryError

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
-from tsgt.analysis.design.perturbation import Perturbation, equivalent, first_order_sigmas, perturbation_study
+from tsgt.analysis.design import Perturbation, equivalent, first_order_sigmas, perturbation_study
 from tsgt.cli.analyse.options import figure_option, read_layout
 from tsgt.cli.options import finite, json_option, path_type
 from tsgt.cli.output import print_json, print_table
@@ -118,7 +118,7 @@ def perturbation_command(
     )
     per_mm = first_order_sigmas(layout, 1e-3, point_m=point)
     if figure is not None:
-        from tsgt.analysis.figures.perturbation import draw_perturbation  # noqa: PLC0415 (needs an extra)
+        from tsgt.analysis.figures import draw_perturbation
 
         draw_perturbation(study, per_mm, [figure])
     if as_json:

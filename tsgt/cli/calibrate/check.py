@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tsgt.analysis.calibration.station_check import check_station
-from tsgt.analysis.calibration.targets import mean_points
-from tsgt.analysis.formats.target_file import read_some_targets
+from tsgt.analysis.calibration import check_station, mean_points
+from tsgt.analysis.formats import read_some_targets
 from tsgt.cli.calibrate.session import shot, target_session
 from tsgt.cli.operator import Terminal
 from tsgt.cli.options import constant_type, finite, json_option, master_config_option, path_type
@@ -22,9 +21,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from tsgt.analysis.calibration.station_check import StationCheck
-    from tsgt.analysis.calibration.target_collection import Cell
-    from tsgt.analysis.formats.target_file import Sight
+    from tsgt.analysis.calibration import Cell, StationCheck
+    from tsgt.analysis.formats import Sight
     from tsgt.cli.calibrate.session import TargetSession
     from tsgt.cli.operator import Operator
 

@@ -7,24 +7,24 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tsgt.analysis.calibration.target_collection import TargetCollection
+from tsgt.analysis.calibration import TargetCollection
 from tsgt.cli.calibrate.session import shot, target_session
 from tsgt.cli.operator import Terminal
 from tsgt.cli.options import constant_type, finite, master_config_option, path_type
 from tsgt.cli.output import print_table
 from tsgt.clock import SystemClock
 from tsgt.config import MasterConfig, load
-from tsgt.geometry.calibration.targets import FrameCalibration
+from tsgt.geometry.calibration import FrameCalibration
 from tsgt.recording import write_atomically
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from tsgt.analysis.calibration.target_collection import Cell
+    from tsgt.analysis.calibration import Cell
     from tsgt.cli.calibrate.session import TargetSession
     from tsgt.cli.operator import Operator
-    from tsgt.geometry.calibration.frame_fit import Name
+    from tsgt.geometry.calibration import Name
 
 KEYS = "Enter measures, s skips, r redoes the last one (r 3: target 3, r 2 3: of station 2), q quits"
 

@@ -9,24 +9,21 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
 from tsgt.clock import UnixTimeline
-from tsgt.master.classic.transport import Collector
-from tsgt.master.superframe.frame_loop import FrameLoop
-from tsgt.master.superframe.link import superframe_timing
+from tsgt.master.classic import Collector
+from tsgt.master.superframe import FrameLoop, superframe_timing
 from tsgt.model import Status
-from tsgt.radio.classic.messages import Command, status_of
-from tsgt.radio.classic.transactions import Ordered, Shot, Timing
-from tsgt.radio.commands import DirectOrder, MeasureOrder, TrackOrder
-from tsgt.radio.superframe.master import SuperframeMaster
-from tsgt.radio.superframe.wire.authentication import Authenticator
-from tsgt.radio.superframe.wire.codec import angle_rad, distance_m
+from tsgt.radio import DirectOrder, MeasureOrder, TrackOrder
+from tsgt.radio.classic import Command, Ordered, Shot, status_of
+from tsgt.radio.classic.transactions import Timing
+from tsgt.radio.superframe import SuperframeMaster
+from tsgt.radio.superframe.wire import Authenticator, angle_rad, distance_m
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Mapping, Sequence
 
     from tsgt.clock import Clock
-    from tsgt.config.radio import ClassicMasterConfig, SuperframeMasterConfig
-    from tsgt.radio.base import LoRaSettings, Packet, Radio, Transmitted
-    from tsgt.radio.commands import Order
+    from tsgt.config import ClassicMasterConfig, SuperframeMasterConfig
+    from tsgt.radio import LoRaSettings, Order, Packet, Radio, Transmitted
     from tsgt.radio.superframe.reception import Heard
 
 ORDER_TIMEOUT_S = 10.0

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
-from tsgt.analysis.calibration.targets import solve_prisms, solve_stations, target_residuals
-from tsgt.analysis.formats.setup_files import write_prism_layout, write_station_frames
-from tsgt.analysis.formats.target_file import read_prism_file, read_target_file
+from tsgt.analysis.calibration import solve_prisms, solve_stations, target_residuals
+from tsgt.analysis.formats import read_prism_file, read_target_file, write_prism_layout, write_station_frames
 from tsgt.cli.calibrate.check import check
 from tsgt.cli.calibrate.collect import collect
 from tsgt.cli.calibrate.motion import motion
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from tsgt.geometry import FloatArray
-    from tsgt.geometry.calibration.targets import FrameCalibration, WeakAxis
+    from tsgt.geometry.calibration import FrameCalibration, WeakAxis
 
 file_argument = click.argument("file", type=click.Path(path_type=Path))
 

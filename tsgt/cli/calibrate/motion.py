@@ -9,22 +9,21 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 import numpy as np
 
-from tsgt.analysis.calibration.motion import calibrate_recording
-from tsgt.analysis.formats.setup_files import write_prism_layout, write_station_frames
+from tsgt.analysis.calibration import calibrate_recording
+from tsgt.analysis.formats import write_prism_layout, write_station_frames
 from tsgt.cli.options import json_option, keep_going_option, path_type, recording_argument
 from tsgt.cli.output import CHECK_FAILED, print_json, print_table
 from tsgt.cli.recordings import refuse_to_replace, report_problem
-from tsgt.geometry.calibration.motion_parameters import Unknowns
-from tsgt.geometry.calibration.observability import undetermined
+from tsgt.geometry.calibration import Unknowns, undetermined
 from tsgt.recording import load_recording
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from tsgt.analysis.calibration.motion import CalibratedRecording, Judgement
-    from tsgt.analysis.evaluation.held_out import HeldOut
-    from tsgt.geometry.calibration.observability import Undetermined
+    from tsgt.analysis.calibration import CalibratedRecording, Judgement
+    from tsgt.analysis.evaluation import HeldOut
+    from tsgt.geometry.calibration import Undetermined
 
 Command = TypeVar("Command", bound="Callable[..., Any] | click.Command")
 

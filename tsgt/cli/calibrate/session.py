@@ -6,13 +6,13 @@ import asyncio
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from typing import TYPE_CHECKING
 
-from tsgt.analysis.formats.target_file import Sight
+from tsgt.analysis.formats import Sight
 from tsgt.cli.calibrate.commands import ClassicOrders, superframe_orders
 from tsgt.cli.composition import radio_key, radio_opener
-from tsgt.config.radio import ClassicMasterConfig
+from tsgt.config import ClassicMasterConfig
 from tsgt.errors import InstrumentError, RadioError, StreamError, TsgtError
 from tsgt.model import Status
-from tsgt.radio.commands import DirectOrder, MeasureOrder, TrackOrder
+from tsgt.radio import DirectOrder, MeasureOrder, TrackOrder
 from tsgt.radio.from_config import lora_settings
 
 if TYPE_CHECKING:
@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from tsgt.cli.operator import Operator
     from tsgt.clock import Clock
     from tsgt.config import MasterConfig
-    from tsgt.radio.base import OpenRadio
-    from tsgt.radio.commands import Order
+    from tsgt.radio import OpenRadio, Order
 
 MEANING = {
     Status.TILT: "the instrument is not level; level it, then all its targets have to be measured again",

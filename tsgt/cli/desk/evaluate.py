@@ -9,10 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from tsgt.analysis.evaluation.held_out import held_out
-from tsgt.analysis.evaluation.inter_prism import inter_prism
-from tsgt.analysis.evaluation.reference import read_tum
-from tsgt.analysis.evaluation.residuals import outliers, residual_figures
+from tsgt.analysis.evaluation import held_out, inter_prism, outliers, read_tum, residual_figures
 from tsgt.analysis.processing import process
 from tsgt.analysis.smoothing import smoothed
 from tsgt.cli.desk.reference import against, print_against
@@ -33,17 +30,13 @@ from tsgt.cli.recordings import (
     progress,
 )
 from tsgt.errors import GeometryError, RecordingError
-from tsgt.estimation.observations import build_observations
-from tsgt.estimation.tracks import build_tracks
+from tsgt.estimation import build_observations, build_tracks
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from tsgt.analysis.evaluation.held_out import HeldOut
-    from tsgt.analysis.evaluation.inter_prism import PairDistances
-    from tsgt.analysis.evaluation.metrics import Align
-    from tsgt.analysis.evaluation.residuals import Outlier
+    from tsgt.analysis.evaluation import Align, HeldOut, Outlier, PairDistances
     from tsgt.analysis.processing import Estimator
     from tsgt.analysis.smoothing import Smoothed
     from tsgt.cli.desk.reference import Against

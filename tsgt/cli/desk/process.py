@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tsgt.analysis.formats.export import tum_lines, valid_rows
+from tsgt.analysis.formats import tum_lines, valid_rows
 from tsgt.analysis.processing import process as process_recording
 from tsgt.analysis.smoothing import smoothed
 from tsgt.cli.options import finite, json_option, keep_going_option, path_type, recording_argument
@@ -39,10 +39,9 @@ if TYPE_CHECKING:
 
     from tsgt.analysis.processing import Estimator
     from tsgt.analysis.smoothing import Motion
-    from tsgt.estimation.pose_batch import PoseBatch
+    from tsgt.estimation import PoseBatch
     from tsgt.model import Parameters
-    from tsgt.recording import Recording
-    from tsgt.recording.stream_records import PoseRecord
+    from tsgt.recording import PoseRecord, Recording
 
 
 @click.command()

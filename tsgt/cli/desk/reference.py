@@ -11,20 +11,17 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
-from tsgt.analysis.evaluation.reference import compare, compare_aligned
-from tsgt.analysis.evaluation.stationary import standing_errors
+from tsgt.analysis.evaluation import compare, compare_aligned, standing_errors
 from tsgt.analysis.processing import process, with_estimator
 from tsgt.cli.output import print_table
 from tsgt.errors import DegenerateGeometryError, InputFileError, RecordingError
-from tsgt.estimation.pose_batch import PoseBatch
+from tsgt.estimation import PoseBatch
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from tsgt.analysis.evaluation.metrics import Align, AlignedFigures, PoseFigures
-    from tsgt.analysis.evaluation.reference import Reference
-    from tsgt.analysis.evaluation.stationary import StandingFigures
+    from tsgt.analysis.evaluation import Align, AlignedFigures, PoseFigures, Reference, StandingFigures
     from tsgt.analysis.processing import Estimator
     from tsgt.analysis.smoothing import Smoothed
     from tsgt.recording import Recording

@@ -6,11 +6,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tsgt.analysis.formats.odometry import read_still_intervals
-from tsgt.analysis.report.findings import find
-from tsgt.analysis.report.numbers import figures_of
-from tsgt.analysis.report.page import page
-from tsgt.analysis.report.verdicts import verdicts
+from tsgt.analysis.formats import read_still_intervals
+from tsgt.analysis.report import figures_of, find, page, verdicts
 from tsgt.cli.output import json_text, print_json
 from tsgt.cli.recordings import TUNING, progress
 from tsgt.errors import OutputFileError
@@ -19,9 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from tsgt.analysis.evaluation.metrics import Align
-    from tsgt.analysis.evaluation.reference import Reference
-    from tsgt.analysis.report.findings import Findings
+    from tsgt.analysis.evaluation import Align, Reference
+    from tsgt.analysis.report import Findings
     from tsgt.recording import Recording
 
 HELD_OUT_UP_TO_S = 900.0
@@ -99,7 +95,7 @@ def write_report(
     MissingExtraError
         matplotlib is not installed.
     """
-    from tsgt.analysis.report.sections import facts, sections  # noqa: PLC0415 (needs an extra)
+    from tsgt.analysis.report import facts, sections
 
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -14,14 +14,14 @@ from tsgt.cli.output import print_json
 from tsgt.cli.radio.options import Modem, modem_options
 from tsgt.cli.radio.ping import ping_command
 from tsgt.cli.radio.plan import plan_command
-from tsgt.radio.airtime import (
+from tsgt.radio import (
+    MAX_PAYLOAD_BYTES,
     SYNC_QUARTER_SYMBOLS,
     airtime_us,
     bit_rate_Bps,
     low_data_rate_required,
     payload_symbols,
 )
-from tsgt.radio.base import MAX_PAYLOAD_BYTES
 from tsgt.radio.key_file import write_key
 
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tsgt.radio.base import BANDWIDTHS_HZ
-from tsgt.radio.sx127x.hal import DRAGINO_HAT, Wiring
+from tsgt.radio import BANDWIDTHS_HZ
+from tsgt.radio.sx127x import DRAGINO_HAT, Wiring
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -15,8 +15,7 @@ from tsgt.cli.options import finite, json_option
 from tsgt.cli.output import CHECK_FAILED, print_json
 from tsgt.cli.radio.options import Modem, modem_options, wiring_options
 from tsgt.clock import SystemClock
-from tsgt.radio.airtime import airtime_us
-from tsgt.radio.base import MAX_PAYLOAD_BYTES, LoRaSettings
+from tsgt.radio import MAX_PAYLOAD_BYTES, LoRaSettings, airtime_us
 from tsgt.radio.ping import (
     RUNS,
     SHORTEST_PAYLOAD_BYTES,
@@ -27,9 +26,8 @@ from tsgt.radio.ping import (
     summarise,
     summarise_answers,
 )
-from tsgt.radio.planning.regulations import LOWEST_DBM, REGIONS, preset_power_dbm
-from tsgt.radio.sx127x.driver import RadioStatistics, SX127x
-from tsgt.radio.sx127x.hal import Wiring, open_hal
+from tsgt.radio.planning import LOWEST_DBM, REGIONS, preset_power_dbm
+from tsgt.radio.sx127x import RadioStatistics, SX127x, Wiring, open_hal
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable
@@ -281,14 +279,19 @@ def _on_simulation(
 ) -> RadioStatistics:
     """Run a session with a simulated radio, another one answering."""
     # Only here, so that a station's small computer does not load numpy to ping.
-    import numpy as np  # noqa: PLC0415
+    import numpy as np
 
-    from tsgt.simulation.kernel.clocks import VirtualClock  # noqa: PLC0415
-    from tsgt.simulation.kernel.event_loop import run_virtual  # noqa: PLC0415
-    from tsgt.simulation.kernel.timeline import VirtualTimeline  # noqa: PLC0415
-    from tsgt.simulation.lora.air import Air  # noqa: PLC0415
-    from tsgt.simulation.lora.link import LinkModel, LogDistanceLoss  # noqa: PLC0415
-    from tsgt.simulation.lora.radios import simulated_radio  # noqa: PLC0415
+    from tsgt.simulation.kernel import (
+        VirtualClock,
+        VirtualTimeline,
+        run_virtual,
+    )
+    from tsgt.simulation.lora import (
+        Air,
+        LinkModel,
+        LogDistanceLoss,
+        simulated_radio,
+    )
 
     timeline, clock, rng = VirtualTimeline(), VirtualClock(0), np.random.default_rng(seed)
     places = {"here": (0.0, 0.0, 0.0), "there": (distance_m, 0.0, 0.0)}

@@ -10,12 +10,21 @@ import click
 from tsgt.cli.options import finite, json_option
 from tsgt.cli.output import print_json, print_table
 from tsgt.cli.radio.options import Modem, modem_options
-from tsgt.config.radio import LARGEST_NUMBERS, ClassicMasterConfig, SuperframeMasterConfig
-from tsgt.radio.base import LoRaSettings
-from tsgt.radio.planning.capacity import Cycle, Load
+from tsgt.config import LARGEST_NUMBERS, ClassicMasterConfig, SuperframeMasterConfig
+from tsgt.radio import LoRaSettings
 from tsgt.radio.from_config import planned_cycle
-from tsgt.radio.planning.link_budget import path_loss_db, sensitivity_dbm
-from tsgt.radio.planning.regulations import DIPOLE_DBI, LOWEST_DBM, REGIONS, Use, exceeded, preset_power_dbm
+from tsgt.radio.planning import (
+    DIPOLE_DBI,
+    LOWEST_DBM,
+    REGIONS,
+    Cycle,
+    Load,
+    Use,
+    exceeded,
+    path_loss_db,
+    preset_power_dbm,
+    sensitivity_dbm,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

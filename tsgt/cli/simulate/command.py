@@ -16,26 +16,26 @@ import click
 import numpy as np
 from click.core import ParameterSource
 
-from tsgt.analysis.formats.export import tum_lines
+from tsgt.analysis.formats import tum_lines
 from tsgt.cli.options import finite, json_option
 from tsgt.cli.output import CHECK_FAILED, print_json, print_table, require_new_file
 from tsgt.cli.simulate.figures import figures
-from tsgt.config.radio import LARGEST_NUMBERS, ClassicMasterConfig, SuperframeMasterConfig
+from tsgt.config import LARGEST_NUMBERS, ClassicMasterConfig, SuperframeMasterConfig
 from tsgt.errors import OutputFileError, TsgtError
 from tsgt.geometry import quaternion_from_rotation
 from tsgt.log import configure_logging
 from tsgt.recording import write_atomically
-from tsgt.simulation.checks.invariants import Violation, violations
-from tsgt.simulation.faults.catalogue import CALM_S, QUICK_CYCLES, SETTLE_S, FaultKind, parse_faults
-from tsgt.simulation.mission.runner import simulate
+from tsgt.simulation.checks import Violation, violations
+from tsgt.simulation.faults import CALM_S, QUICK_CYCLES, SETTLE_S, FaultKind, parse_faults
 from tsgt.simulation.options import Options, Outage, Restart
+from tsgt.simulation.runner import simulate
 from tsgt.simulation.scenario_files import MOST_STATIONS, find_scenario, with_stations
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from tsgt.config import ScenarioConfig
-    from tsgt.simulation.mission.runner import Run
+    from tsgt.simulation.mission import Run
 
 LISTED_VIOLATIONS = 20
 

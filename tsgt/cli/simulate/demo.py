@@ -22,27 +22,24 @@ import click
 import numpy as np
 
 from tsgt import service
-from tsgt.analysis.evaluation.metrics import PoseErrors, inner_part, pose_errors
+from tsgt.analysis.evaluation import PoseErrors, inner_part, pose_errors
 from tsgt.cli.options import finite, json_option
 from tsgt.cli.output import print_json, require_new_file
 from tsgt.cli.status import station_word
 from tsgt.clock import SystemClock, UnixTimeline
-from tsgt.config import ScenarioConfig, load
-from tsgt.config.permissions import check_trust
+from tsgt.config import ScenarioConfig, check_trust, load
 from tsgt.errors import OutputFileError, StreamError
 from tsgt.geometry import rotation_from_quaternion, transform_from
 from tsgt.log import configure_logging
-from tsgt.recording import decode
-from tsgt.recording.stream_records import EventRecord, PoseRecord, StatusRecord
+from tsgt.recording import EventRecord, PoseRecord, StatusRecord, decode
 from tsgt.service import MAX_SOCKET_PATH_BYTES
-from tsgt.simulation.demo.config_files import write_demo_files
-from tsgt.simulation.demo.demo import Demo
+from tsgt.simulation.demo import Demo, write_demo_files
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from tsgt.recording.stream_records import Kind
-    from tsgt.simulation.demo.config_files import DemoFiles
+    from tsgt.recording import Kind
+    from tsgt.simulation.demo import DemoFiles
 
 LINE_INTERVAL_S = 5.0
 """How often there is a line where the output is no terminal."""

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tsgt.cli.simulate.poses import pose_keys
-from tsgt.simulation.mission.run_log import Measured
+from tsgt.simulation.mission import Measured
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
 
-    from tsgt.simulation.mission.run_log import StationWitness
-    from tsgt.simulation.mission.runner import Run
+    from tsgt.simulation.mission import Run, StationWitness
     from tsgt.simulation.options import Outage
 
 

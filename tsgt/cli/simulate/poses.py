@@ -11,12 +11,10 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
-from tsgt.analysis.evaluation.inter_prism import inter_prism
-from tsgt.analysis.evaluation.metrics import PoseFigures, inner_part
+from tsgt.analysis.evaluation import PoseFigures, inner_part, inter_prism
 from tsgt.analysis.processing import Estimator, process, with_estimator
 from tsgt.errors import RecordingError
-from tsgt.estimation.pose_batch import PoseBatch
-from tsgt.estimation.tracks import build_tracks
+from tsgt.estimation import PoseBatch, build_tracks
 from tsgt.geometry import rotation_from_quaternion, transform_from
 from tsgt.recording import Recording, RecordingHeader
 
@@ -24,8 +22,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.model import Measurement
-    from tsgt.recording.stream_records import Kind
-    from tsgt.simulation.mission.runner import Run
+    from tsgt.recording import Kind
+    from tsgt.simulation.mission import Run
 
 
 @dataclass(frozen=True, slots=True)

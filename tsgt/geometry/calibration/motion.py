@@ -18,19 +18,14 @@ from tsgt.errors import GeometryError
 from tsgt.geometry.calibration.motion_parameters import Setup, Unknowns, UnknownSetup, bends
 from tsgt.geometry.calibration.timestamp_drift import Part, allowed_for, likely_wander_s
 from tsgt.geometry.rigid import rotate
-from tsgt.geometry.trajectory.gauss_newton import LEAST_STEP_S, knot_times, solve
-from tsgt.geometry.trajectory.hyperparameters import scaled, tune
-from tsgt.geometry.trajectory.initialisation import first_guess
-from tsgt.geometry.trajectory.states import STATE
+from tsgt.geometry.trajectory import LEAST_STEP_S, STATE, first_guess, knot_times, scaled, solve, tune
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from tsgt.geometry.rigid import FloatArray
-    from tsgt.geometry.trajectory.gauss_newton import Solution
-    from tsgt.geometry.trajectory.measurement_factors import Observations
-    from tsgt.geometry.trajectory.states import Knots
+    from tsgt.geometry.trajectory import Knots, Observations, Solution
 
 PIECE_S = 40.0
 """A recording is taken as trajectories of this length: memory stays bounded, and pieces that contradict each other show.

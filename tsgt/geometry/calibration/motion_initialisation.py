@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.geometry.rigid import FloatArray
-    from tsgt.geometry.trajectory.measurement_factors import Observations
+    from tsgt.geometry.trajectory import Observations
 
 STEP_S = 0.5
 GAP_S = 1.0

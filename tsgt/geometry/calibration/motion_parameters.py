@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.geometry.rigid import FloatArray
-    from tsgt.geometry.trajectory.measurement_factors import Linearised, Observations
+    from tsgt.geometry.trajectory import Linearised, Observations
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,17 +13,16 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 from tsgt.model import PolarMeasurement, Status
-from tsgt.radio.classic.messages import OK, status_of
-from tsgt.recording.stream_records import ClockRecord
-from tsgt.timesync.offset_regression import highest_offset_ns
-from tsgt.timesync.two_way import ArrivalCheck
+from tsgt.radio.classic import OK, status_of
+from tsgt.recording import ClockRecord
+from tsgt.timesync import ArrivalCheck, highest_offset_ns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from tsgt.model import ClockSample
-    from tsgt.radio.classic.messages import MeasurementMessage
-    from tsgt.timesync.two_way import ClockEstimate, ClockFilter
+    from tsgt.radio.classic import MeasurementMessage
+    from tsgt.timesync import ClockEstimate, ClockFilter
 
 UNTIMED_SIGMA_NS = 1_000_000_000
 """One sigma of a stamp that is only the time of arrival: an error message of the authors' nodes has no other."""

@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING
 from tsgt.master.classic.ingest import RESTART_NS, Intake
 from tsgt.master.classic.scheduler import Cadence, Scheduler, StationPlan
 from tsgt.master.classic.transport import Collector
-from tsgt.radio.classic.transactions import Ordered, Poll, Synchronisation, Timing
-from tsgt.timesync.two_way import clock_filter
+from tsgt.radio.classic import Ordered, Poll, Synchronisation
+from tsgt.radio.classic.transactions import Timing
+from tsgt.timesync import clock_filter
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from tsgt.config.master import StationConfig
-    from tsgt.config.radio import ClassicMasterConfig
+    from tsgt.config import ClassicMasterConfig, StationConfig
     from tsgt.master.classic.scheduler import Task
     from tsgt.master.publisher import Reports
-    from tsgt.radio.base import LoRaSettings, Packet, Radio
-    from tsgt.recording.stream_records import StatusRecord
+    from tsgt.radio import LoRaSettings, Packet, Radio
+    from tsgt.recording import StatusRecord
 
 
 class ClassicLink:

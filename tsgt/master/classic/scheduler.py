@@ -16,8 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from tsgt.radio.classic.messages import Command
-from tsgt.radio.classic.transactions import Ordered, Poll, Synchronisation
+from tsgt.radio.classic import Command, Ordered, Poll, Synchronisation
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from tsgt.clock import Clock, UnixTimeline
-    from tsgt.radio.base import Packet, Radio
+    from tsgt.radio import Packet, Radio
     from tsgt.radio.classic.transactions import Timing, Turn
 
 EXACT_SIGMA_NS = 1_000_000

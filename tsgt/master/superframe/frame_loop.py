@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NoReturn, Protocol
 
-from tsgt.master.classic.transport import next_packet
+from tsgt.master.classic import next_packet
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from tsgt.clock import Clock
-    from tsgt.radio.base import Packet, Radio, Transmitted
-    from tsgt.radio.superframe.master import SuperframeMaster
+    from tsgt.radio import Packet, Radio, Transmitted
+    from tsgt.radio.superframe import SuperframeMaster
     from tsgt.radio.superframe.reception import Heard
 
 LEAD_NS = 6_000_000

@@ -10,25 +10,22 @@ import structlog
 
 from tsgt.master.superframe.frame_loop import FrameLoop
 from tsgt.model import LAST_INSTANT_NS, PolarMeasurement
-from tsgt.radio.commands import SearchOrder, TrackOrder
-from tsgt.radio.superframe.master import SuperframeMaster
-from tsgt.radio.superframe.phase_lock import FrameLock
-from tsgt.radio.superframe.slots import FrameTiming
-from tsgt.radio.superframe.wire.authentication import Authenticator
-from tsgt.recording.stream_records import BeaconRecord
+from tsgt.radio import SearchOrder, TrackOrder
+from tsgt.radio.superframe import FrameLock, FrameTiming, SuperframeMaster
+from tsgt.radio.superframe.wire import Authenticator
+from tsgt.recording import BeaconRecord
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from tsgt.config.master import StationConfig
-    from tsgt.config.radio import SuperframeMasterConfig
+    from tsgt.config import StationConfig, SuperframeMasterConfig
     from tsgt.master.publisher import Reports
     from tsgt.master.reacquisition_hints import Searches
     from tsgt.master.recording_thread import Disk
-    from tsgt.radio.base import LoRaSettings, Packet, Radio, Transmitted
-    from tsgt.radio.commands import Direction
-    from tsgt.radio.superframe.reception import Heard, TimedSighting
-    from tsgt.recording.stream_records import StatusRecord
+    from tsgt.radio import Direction, LoRaSettings, Packet, Radio, Transmitted
+    from tsgt.radio.superframe import TimedSighting
+    from tsgt.radio.superframe.reception import Heard
+    from tsgt.recording import StatusRecord
 
 DISK_PATIENCE_S = 0.015
 """A beacon waits so long for the disk to take the last reply. Acknowledging it a frame later costs a repetition."""

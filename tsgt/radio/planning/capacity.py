@@ -12,21 +12,31 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
-from tsgt.radio.classic.messages import COMMAND_BYTES, MEASUREMENT_BYTES, PING_REPLY_BYTES, TIME_REPLY_BYTES
-from tsgt.radio.superframe import grants
-from tsgt.radio.superframe.master import SESSION_EVERY
-from tsgt.radio.superframe.phase_lock import COMPOSED_NS, LEAST_MARGIN_NS, WORTH
-from tsgt.radio.superframe.slots import slot_sequence
-from tsgt.radio.superframe.station_state import EXCHANGE_EVERY
-from tsgt.radio.superframe.wire.authentication import CODE_BYTES
-from tsgt.radio.superframe.wire.codec import encode_beacon
-from tsgt.radio.superframe.wire.messages import GRANT_BYTES, Beacon, SessionPart, SlotOrder, StationEntry
+from tsgt.radio.classic import COMMAND_BYTES, MEASUREMENT_BYTES, PING_REPLY_BYTES, TIME_REPLY_BYTES
+from tsgt.radio.superframe import (
+    COMPOSED_NS,
+    EXCHANGE_EVERY,
+    LEAST_MARGIN_NS,
+    SESSION_EVERY,
+    WORTH,
+    grants,
+    slot_sequence,
+)
+from tsgt.radio.superframe.wire import (
+    CODE_BYTES,
+    GRANT_BYTES,
+    Beacon,
+    SessionPart,
+    SlotOrder,
+    StationEntry,
+    encode_beacon,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from tsgt.radio.classic.turn import Timing
-    from tsgt.radio.superframe.slots import FrameTiming
+    from tsgt.radio.classic import Timing
+    from tsgt.radio.superframe import FrameTiming
 
 HOST_NS = 3_400_000
 """What a computer takes from a packet to what it sends next, on average, where it is not told when to send: that of

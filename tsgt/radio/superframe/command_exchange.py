@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING, NamedTuple
 
-from tsgt.radio.superframe.wire.codec import order_of
+from tsgt.radio.superframe.wire import order_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from tsgt.radio.commands import Order
-    from tsgt.radio.superframe.wire.messages import AnswerPart, OrderPart, Reply, ShotPart, StatePart
+    from tsgt.radio.superframe.wire import AnswerPart, OrderPart, Reply, ShotPart, StatePart
 
 LONGEST_TURN_ROUND_PAUSE = 48
 """The master makes room for a turn-round in one of 32 replies. After so many without it the backlog waits; it

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 
 from tsgt.model import Status
 from tsgt.radio.superframe.slots import LONGEST_FRAME_NS
-from tsgt.radio.superframe.wire.codec import reply_bytes
-from tsgt.radio.superframe.wire.messages import (
+from tsgt.radio.superframe.wire import (
     GRANT_BYTES,
     SINGLE_QUALITY,
     AnswerPart,
@@ -23,13 +22,14 @@ from tsgt.radio.superframe.wire.messages import (
     ShotPart,
     Sighting,
     StatePart,
+    reply_bytes,
 )
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from tsgt.radio.superframe.slots import FrameTiming
-    from tsgt.timesync.periodicity import Beat
+    from tsgt.timesync import Beat
 
 UNKNOWN_GRANT = GRANT_BYTES.index(44)
 """For a station of which nothing is known: introduction, state and a measurement, or five measurements."""

@@ -22,17 +22,18 @@ from tsgt.radio.airtime import TX_DONE_NS, symbol_time_ns
 from tsgt.radio.superframe.grants import UNKNOWN_GRANT, asked_again, longest_grant
 from tsgt.radio.superframe.slots import GUARD_UNIT_NS, slot_sequence
 from tsgt.radio.superframe.station_state import EXACT_SIGMA_NS, Peer, Reception
-from tsgt.radio.superframe.wire.authentication import CODE_BYTES
-from tsgt.radio.superframe.wire.codec import decode_reply, encode_beacon
-from tsgt.radio.superframe.wire.messages import (
+from tsgt.radio.superframe.wire import (
+    CODE_BYTES,
     GRANT_BYTES,
     SESSION_TIME_BITS,
     Beacon,
     SessionPart,
     SlotOrder,
     StationEntry,
+    decode_reply,
+    encode_beacon,
 )
-from tsgt.timesync.link_delay import RoundTrip
+from tsgt.timesync import RoundTrip
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -41,8 +42,7 @@ if TYPE_CHECKING:
     from tsgt.radio.superframe.phase_lock import FrameLock
     from tsgt.radio.superframe.reception import Heard
     from tsgt.radio.superframe.slots import FrameTiming, SlotSpan
-    from tsgt.radio.superframe.wire.authentication import Authenticator
-    from tsgt.radio.superframe.wire.messages import Reply
+    from tsgt.radio.superframe.wire import Authenticator, Reply
 
 NONCE_BITS = 48
 

@@ -17,8 +17,8 @@ from collections import deque
 from statistics import fmean, median
 from typing import TYPE_CHECKING, NamedTuple
 
-from tsgt.radio.superframe.wire.messages import SlotOrder
-from tsgt.timesync.periodicity import Rhythm
+from tsgt.radio.superframe.wire import SlotOrder
+from tsgt.timesync import Rhythm
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

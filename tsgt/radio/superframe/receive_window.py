@@ -11,12 +11,12 @@ from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import TYPE_CHECKING
 
-from tsgt.radio.superframe.wire.messages import RESTART_SKIP
+from tsgt.radio.superframe.wire import RESTART_SKIP
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from tsgt.radio.superframe.wire.messages import Introduction
+    from tsgt.radio.superframe.wire import Introduction
 
 NARROW_BITS = 8
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from tsgt.model import Status
     from tsgt.radio.commands import Order
-    from tsgt.radio.superframe.wire.messages import AnswerPart, ShotPart, StatePart
+    from tsgt.radio.superframe.wire import AnswerPart, ShotPart, StatePart
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

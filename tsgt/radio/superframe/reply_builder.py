@@ -4,8 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from tsgt.radio.superframe.wire.codec import distance_code, is_far, reply_bytes
-from tsgt.radio.superframe.wire.messages import WIDE_TIME_BITS, Reply, Run, Sighting, quality_bound_us
+from tsgt.radio.superframe.wire import (
+    WIDE_TIME_BITS,
+    Reply,
+    Run,
+    Sighting,
+    distance_code,
+    is_far,
+    quality_bound_us,
+    reply_bytes,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

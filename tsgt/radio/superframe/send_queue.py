@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from itertools import pairwise, takewhile
 from typing import TYPE_CHECKING, NamedTuple
 
-from tsgt.radio.superframe.wire.messages import RESTART_SKIP
+from tsgt.radio.superframe.wire import RESTART_SKIP
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence

@@ -15,17 +15,21 @@ from tsgt.radio.superframe.command_exchange import Conversation
 from tsgt.radio.superframe.reply_builder import Timed, quality_of
 from tsgt.radio.superframe.send_queue import Delivery
 from tsgt.radio.superframe.slots import GUARD_UNIT_NS, FrameTiming
-from tsgt.radio.superframe.wire.authentication import CODE_BYTES
-from tsgt.radio.superframe.wire.messages import SESSION_TIME_BITS, TIME_UNIT_US, TURN_ROUND_BITS, Confirmation
-from tsgt.timesync.beacon_clock import BeaconClock
+from tsgt.radio.superframe.wire import (
+    CODE_BYTES,
+    SESSION_TIME_BITS,
+    TIME_UNIT_US,
+    TURN_ROUND_BITS,
+    Confirmation,
+)
+from tsgt.timesync import BeaconClock
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
     from tsgt.radio.base import LoRaSettings, Packet
     from tsgt.radio.superframe.send_queue import Outbox, Queued
-    from tsgt.radio.superframe.wire.authentication import Authenticator
-    from tsgt.radio.superframe.wire.messages import Beacon, Reply, SessionPart
+    from tsgt.radio.superframe.wire import Authenticator, Beacon, Reply, SessionPart
 
 HISTORY = 4
 """A beacon tells of so many frames before it whether the reply is in the recording."""

@@ -15,13 +15,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 from tsgt.radio.airtime import TX_DONE_NS, airtime_us, rx_done_ns, symbol_time_ns
-from tsgt.radio.superframe.wire.messages import GRANT_BYTES
+from tsgt.radio.superframe.wire import GRANT_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from tsgt.radio.base import LoRaSettings
-    from tsgt.radio.superframe.wire.messages import SlotOrder
+    from tsgt.radio.superframe.wire import SlotOrder
 
 GUARD_UNIT_NS = 250_000
 """Guard and turn-round are told to the stations in these units."""

@@ -14,9 +14,18 @@ from typing import TYPE_CHECKING, NamedTuple
 from tsgt.errors import MessageError
 from tsgt.radio.superframe.reply_builder import LEAST_SIGHTING_BYTES, pack
 from tsgt.radio.superframe.session import SessionKeeper
-from tsgt.radio.superframe.wire.authentication import CODE_BYTES
-from tsgt.radio.superframe.wire.codec import decode_beacon, distance_code, encode_reply, reply_bytes
-from tsgt.radio.superframe.wire.messages import AnswerPart, Introduction, Reply, ShotPart, StatePart
+from tsgt.radio.superframe.wire import (
+    CODE_BYTES,
+    AnswerPart,
+    Introduction,
+    Reply,
+    ShotPart,
+    StatePart,
+    decode_beacon,
+    distance_code,
+    encode_reply,
+    reply_bytes,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -29,7 +38,7 @@ if TYPE_CHECKING:
     from tsgt.radio.superframe.send_queue import Outbox
     from tsgt.radio.superframe.session import Reception, StationSession
     from tsgt.radio.superframe.slots import SlotSpan
-    from tsgt.radio.superframe.wire.authentication import Authenticator
+    from tsgt.radio.superframe.wire import Authenticator
 
 WORST_STAMP_NS = 1_000_000
 """A beacon whose stamp has a larger sigma tells no slot."""

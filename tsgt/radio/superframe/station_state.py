@@ -15,21 +15,23 @@ from tsgt.radio.superframe.grants import MOST_MEASUREMENTS, UNKNOWN_GRANT, Deman
 from tsgt.radio.superframe.receive_window import Inbox
 from tsgt.radio.superframe.reception import Heard, TimedSighting
 from tsgt.radio.superframe.reply_builder import NARROW_AGE_NS
-from tsgt.radio.superframe.wire.codec import angle_rad, distance_m, order_part
-from tsgt.radio.superframe.wire.messages import (
+from tsgt.radio.superframe.wire import (
     SINGLE_QUALITY,
     TIME_BITS,
     TIME_UNIT_US,
     WIDE_TIME_BITS,
     Confirmation,
+    angle_rad,
+    distance_m,
+    order_part,
     quality_bound_us,
 )
-from tsgt.timesync.periodicity import Beat, Rhythm
+from tsgt.timesync import Beat, Rhythm
 
 if TYPE_CHECKING:
     from tsgt.radio.commands import Order
-    from tsgt.radio.superframe.wire.messages import AnswerPart, OrderPart, Reply, Run, ShotPart, StatePart
-    from tsgt.timesync.link_delay import RoundTrip
+    from tsgt.radio.superframe.wire import AnswerPart, OrderPart, Reply, Run, ShotPart, StatePart
+    from tsgt.timesync import RoundTrip
 
 UNNOTICED_NS = 30_000_000
 """A beacon that was held back for longer may agree with others, as far as the low bits of their times tell."""

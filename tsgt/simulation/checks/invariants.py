@@ -10,23 +10,22 @@ from statistics import median
 from typing import TYPE_CHECKING, NamedTuple
 
 from tsgt.errors import RecordingError
-from tsgt.estimation.tracks import usable
-from tsgt.master.classic.ingest import UNTIMED_SIGMA_NS
-from tsgt.master.replay import replayed
+from tsgt.estimation import usable
+from tsgt.master import replayed
+from tsgt.master.classic import UNTIMED_SIGMA_NS
 from tsgt.model import Status
 from tsgt.recording import load_recording
 from tsgt.simulation.checks.liveness import stuck
 from tsgt.simulation.checks.pose_consistency import doubtful_poses
-from tsgt.simulation.mission.run_log import Measured
+from tsgt.simulation.mission import Measured
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
     from tsgt.model import PolarMeasurement
-    from tsgt.simulation.instrument.geocom.answers import Offered
-    from tsgt.simulation.mission.run_log import Session, StationWitness
-    from tsgt.simulation.mission.runner import Run
+    from tsgt.simulation.instrument.geocom import Offered
+    from tsgt.simulation.mission import Run, Session, StationWitness
 
 _ROUNDING_NS = 1_000
 # Half of a unit on the air, and what is lost in the sums on either side.

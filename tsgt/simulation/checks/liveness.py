@@ -6,13 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.estimation.tracks import usable
+from tsgt.estimation import usable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from tsgt.simulation.mission.run_log import Measured
-    from tsgt.simulation.mission.runner import Run
+    from tsgt.simulation.mission import Measured, Run
 
 RECOVERY_S = 10.0
 """So long after the last fault everything is as it was."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 import gc
 from collections import deque
 
-from tsgt.master.classic.ingest import KNOWN_MEASUREMENTS
-from tsgt.master.stream_server import QUEUE_LINES
-from tsgt.radio.superframe.send_queue import MOST_QUEUED
+from tsgt.master import QUEUE_LINES
+from tsgt.master.classic import KNOWN_MEASUREMENTS
+from tsgt.radio.superframe import MOST_QUEUED
 from tsgt.recording.recorder import HUNG_FACTOR, WAITING_LINES
-from tsgt.timesync.beacon_clock import MOST_PAIRS
+from tsgt.timesync import MOST_PAIRS
 
 MOST_ENTRIES = 500
 """A list, queue or table of a daemon has at most so many entries, if nothing else is stated."""

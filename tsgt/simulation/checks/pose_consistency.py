@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.estimation.tracks import build_tracks, usable
+from tsgt.estimation import build_tracks, usable
 from tsgt.geometry import log_so3, rotation_from_quaternion
 
 if TYPE_CHECKING:
@@ -14,10 +14,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from tsgt.estimation.tracks import Track
+    from tsgt.estimation import Track
     from tsgt.model import Parameters
-    from tsgt.simulation.mission.run_log import Session, ValidPoses
-    from tsgt.simulation.mission.runner import Run
+    from tsgt.simulation.mission import Run, Session, ValidPoses
 
 # More than any station's latency, which is taken off the stamps.
 _LATENCY_NS = 5_000_000_000

@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Literal
 
 from tsgt.config import scenario_parameters
 from tsgt.radio.key_file import write_key
-from tsgt.simulation.mission.mission import instrument_config
+from tsgt.simulation.mission import instrument_config
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tsgt.config import ScenarioConfig
-    from tsgt.config.scenario import SimulatedStation
+    from tsgt.config import ScenarioConfig, SimulatedStation
 
 Protocol = Literal["superframe", "classic"]
 

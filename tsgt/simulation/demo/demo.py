@@ -14,11 +14,10 @@ import numpy as np
 
 from tsgt.errors import StreamError
 from tsgt.simulation.demo.processes import Process
-from tsgt.simulation.instrument.pty import PtyLine
-from tsgt.simulation.instrument.total_station import SimulatedTotalStation
-from tsgt.simulation.kernel.timeline import LoopTimeline
-from tsgt.simulation.lora.air_server import AirServer
-from tsgt.simulation.mission.mission import scenario_link
+from tsgt.simulation.instrument import PtyLine, SimulatedTotalStation
+from tsgt.simulation.kernel import LoopTimeline
+from tsgt.simulation.lora import AirServer
+from tsgt.simulation.mission import scenario_link
 from tsgt.simulation.world import scenario_world
 
 if TYPE_CHECKING:
@@ -27,7 +26,7 @@ if TYPE_CHECKING:
     from tsgt.clock import Clock
     from tsgt.config import ScenarioConfig
     from tsgt.simulation.demo.config_files import DemoFiles
-    from tsgt.simulation.lora.link import LinkModel
+    from tsgt.simulation.lora import LinkModel
 
 STARTUP_LIMIT_S = 60.0
 """From the start of the daemons to the first pose; a slow machine takes five seconds."""

@@ -9,21 +9,18 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from tsgt.simulation.faults.adversary import LONGEST_NOISE_BYTES, ForeignRadio
 from tsgt.simulation.faults.catalogue import AFTER_BOOT_S, FaultKind
-from tsgt.simulation.instrument.serial_line import LineFault
-from tsgt.simulation.instrument.telescope import Lock
-from tsgt.simulation.kernel.clocks import DriftingClock
-from tsgt.simulation.mission.disk import FULL, READ_ONLY
-from tsgt.simulation.mission.mission import station_name
-from tsgt.simulation.options import MASTER
+from tsgt.simulation.instrument import LineFault, Lock
+from tsgt.simulation.kernel import DriftingClock
+from tsgt.simulation.lora.adversary import LONGEST_NOISE_BYTES, ForeignRadio
+from tsgt.simulation.mission import FULL, MASTER, READ_ONLY, station_name
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
-    from tsgt.radio.base import Radio
+    from tsgt.radio import Radio
     from tsgt.simulation.faults.catalogue import Fault
-    from tsgt.simulation.mission.mission import Mission
+    from tsgt.simulation.mission import Mission
 
 _OUT_OF_REACH_DB = 300.0
 _JAMMER_GAIN_DB = -40.0

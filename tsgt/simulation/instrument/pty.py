@@ -14,7 +14,7 @@ import tty
 from typing import TYPE_CHECKING, Self
 
 from tsgt.simulation.instrument.serial_line import Wire
-from tsgt.simulation.kernel.timeline import LoopTimeline
+from tsgt.simulation.kernel import LoopTimeline
 
 if TYPE_CHECKING:
     from pathlib import Path

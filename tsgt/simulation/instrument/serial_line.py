@@ -18,15 +18,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.errors import InstrumentError
-from tsgt.station.serial.base import Chunk
+from tsgt.station.serial import Chunk
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from tsgt.clock import Clock
     from tsgt.simulation.instrument.total_station import SimulatedTotalStation
-    from tsgt.simulation.kernel.timeline import Timeline
-    from tsgt.station.serial.base import Port
+    from tsgt.simulation.kernel import Timeline
+    from tsgt.station.serial import Port
 
 GARBAGE = b"\x00\xff\x1a%R1\x81,7"
 """Bytes that are no answer, though they begin like one."""

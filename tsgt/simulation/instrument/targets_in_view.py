@@ -7,17 +7,16 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from tsgt.config.parameters import level_frame
+from tsgt.config import level_frame
 from tsgt.geometry import cartesian_to_polar, invert, transform_points
 from tsgt.simulation.instrument.telescope import Lock
 from tsgt.simulation.instrument.visibility import Sight, apart_rad
-from tsgt.station.geocom.codes import ReturnCode
+from tsgt.station.geocom import ReturnCode
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from tsgt.config import ScenarioConfig
-    from tsgt.config.scenario import SimulatedStation
+    from tsgt.config import ScenarioConfig, SimulatedStation
     from tsgt.simulation.instrument.telescope import Telescope
     from tsgt.simulation.instrument.visibility import Direction2
     from tsgt.simulation.world import World

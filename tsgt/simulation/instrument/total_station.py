@@ -11,7 +11,7 @@ import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from tsgt.config.parameters import noise
+from tsgt.config import noise
 from tsgt.errors import InstrumentError
 from tsgt.model import ARCSECOND_RAD, TARGET_NOISE
 from tsgt.simulation.instrument.edm import (
@@ -22,22 +22,20 @@ from tsgt.simulation.instrument.edm import (
     atmospheric_ppm,
     with_noise,
 )
-from tsgt.simulation.instrument.geocom.answers import Offered
-from tsgt.simulation.instrument.geocom.server import GeoComServer
+from tsgt.simulation.instrument.geocom import GeoComServer, Offered
 from tsgt.simulation.instrument.settings import COMPENSATOR_SIGMA_RAD, OFF, PRISM_CONSTANTS_M, TAPE, Settings
 from tsgt.simulation.instrument.targets_in_view import Scenery, Seen, direction_of
 from tsgt.simulation.instrument.telescope import Telescope
-from tsgt.station.geocom.codes import ReturnCode
+from tsgt.station.geocom import ReturnCode
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     import numpy as np
 
-    from tsgt.config import ScenarioConfig
-    from tsgt.config.scenario import SimulatedStation
+    from tsgt.config import ScenarioConfig, SimulatedStation
     from tsgt.simulation.instrument.visibility import Direction2
-    from tsgt.simulation.kernel.timeline import Timeline
+    from tsgt.simulation.kernel import Timeline
     from tsgt.simulation.world import World
 
 TILT_LIMIT_RAD: Final = math.radians(4 / 60)

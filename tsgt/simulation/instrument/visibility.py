@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.config.parameters import level_frame
+from tsgt.config import level_frame
 from tsgt.geometry import cartesian_to_polar, invert, transform_points
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from tsgt.config.scenario import SimulatedStation
+    from tsgt.config import SimulatedStation
     from tsgt.simulation.world import World
 
 STEP_S = 0.02

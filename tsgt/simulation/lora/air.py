@@ -26,7 +26,7 @@ from functools import partial
 from hashlib import shake_128
 from typing import TYPE_CHECKING, NamedTuple
 
-from tsgt.radio.planning.link_budget import REQUIRED_SNR_DB
+from tsgt.radio.planning import REQUIRED_SNR_DB
 from tsgt.simulation.lora import link
 from tsgt.simulation.lora.frames import Header, Reception
 from tsgt.simulation.lora.link import uniforms
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from tsgt.simulation.kernel.timeline import Timeline
+    from tsgt.simulation.kernel import Timeline
     from tsgt.simulation.lora.frames import Antenna, Frame, Listening, Modulation
     from tsgt.simulation.lora.link import LinkModel
 

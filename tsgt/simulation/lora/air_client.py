@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from tsgt.simulation.kernel.timeline import Timeline
+    from tsgt.simulation.kernel import Timeline
     from tsgt.simulation.lora.air import Transceiver
     from tsgt.simulation.lora.frames import Antenna, Frame, Header, Listening, Modulation, Port, Reception
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self, TypeVar
 
 from pydantic import Field
 
-from tsgt.recording.format import Typed, decode
+from tsgt.recording import Typed, decode
 from tsgt.simulation.lora.frames import Frame, Modulation
 
 T = TypeVar("T")

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 import structlog
 
+from tsgt.radio.sx127x import Mode, Register
 from tsgt.radio.sx127x import registers as reg
-from tsgt.radio.sx127x.registers import Mode, Register
-from tsgt.simulation.lora import modem as modem
+from tsgt.simulation.lora import modem
 from tsgt.simulation.lora.chip_memory import (
     FIFO_BYTES,
     FIRST_AFTER_PAGED,
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from tsgt.simulation.kernel.timeline import Timeline
+    from tsgt.simulation.kernel import Timeline
     from tsgt.simulation.lora.frames import Antenna, Port
 
 log = structlog.get_logger()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tsgt.radio.sx127x.registers import Register
+from tsgt.radio.sx127x import Register
 
 FIFO_BYTES = 256
 FIFO_PATTERN = 0xA5

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
-from tsgt.radio.airtime import HEADER_SYMBOLS, payload_symbols, symbol_time_ns
+from tsgt.radio import HEADER_SYMBOLS, payload_symbols, symbol_time_ns
 
 
 @dataclass(frozen=True)

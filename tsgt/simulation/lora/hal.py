@@ -5,12 +5,12 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-from tsgt.radio.sx127x.hal import Edge
+from tsgt.radio.sx127x import Edge
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from tsgt.radio.sx127x.hal import EdgeCallback
+    from tsgt.radio.sx127x import EdgeCallback
     from tsgt.simulation.lora.chip import SX1276Chip
 
 

@@ -14,7 +14,7 @@ from hashlib import blake2b
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Protocol
 
-from tsgt.radio.planning.link_budget import NOISE_FIGURE_DB, noise_dbm, path_loss_db
+from tsgt.radio.planning import NOISE_FIGURE_DB, noise_dbm, path_loss_db
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

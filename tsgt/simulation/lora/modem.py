@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Protocol
 
+from tsgt.radio.sx127x import Mode, Register
 from tsgt.radio.sx127x import registers as reg
-from tsgt.radio.sx127x.registers import Mode, Register
 from tsgt.simulation.lora.frames import Frame, Header, Listening, Reception
 from tsgt.simulation.lora.register_map import (
     frequency_error_registers,
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from tsgt.simulation.kernel.timeline import Handle, Timeline
+    from tsgt.simulation.kernel import Handle, Timeline
     from tsgt.simulation.lora.chip_memory import ChipMemory
     from tsgt.simulation.lora.frames import Antenna, Port
     from tsgt.simulation.lora.register_map import ModemSettings

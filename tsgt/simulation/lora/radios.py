@@ -6,7 +6,7 @@ import math
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, NamedTuple
 
-from tsgt.radio.sx127x.driver import SX127x
+from tsgt.radio.sx127x import SX127x
 from tsgt.simulation.lora.chip import SX1276Chip
 from tsgt.simulation.lora.hal import SimulatedHal
 
@@ -15,9 +15,8 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from tsgt.radio.base import LoRaSettings, OpenRadio, Packet, Radio, Transmitted
-    from tsgt.simulation.kernel.clocks import SimulatedClock
-    from tsgt.simulation.kernel.timeline import Timeline
+    from tsgt.radio import LoRaSettings, OpenRadio, Packet, Radio, Transmitted
+    from tsgt.simulation.kernel import SimulatedClock, Timeline
     from tsgt.simulation.lora.air import Air
 
 

@@ -9,10 +9,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
-from tsgt.radio.airtime import low_data_rate_required, symbol_time_ns
-from tsgt.radio.base import BANDWIDTHS_HZ
+from tsgt.radio import BANDWIDTHS_HZ, low_data_rate_required, symbol_time_ns
+from tsgt.radio.sx127x import Register
 from tsgt.radio.sx127x import registers as reg
-from tsgt.radio.sx127x.registers import Register
 from tsgt.simulation.lora.frames import Modulation
 
 if TYPE_CHECKING:

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     import numpy as np
 
     from tsgt.clock import Clock
-    from tsgt.radio.base import Radio
-    from tsgt.station.instrument import Instrument, Reading
+    from tsgt.radio import Radio
+    from tsgt.station import Instrument, Reading
 
 _TIME = struct.Struct("<II")
 _MEASUREMENT = struct.Struct("<BBdddII")

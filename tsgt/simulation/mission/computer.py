@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-from tsgt.simulation.lora.radios import HostDelay, opener
+from tsgt.simulation.lora import HostDelay, opener
 from tsgt.simulation.mission.disk import Killed, ProgramWrites, SimulatedDisk
 
 if TYPE_CHECKING:
@@ -13,10 +13,12 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from tsgt.radio.base import LoRaSettings, OpenRadio
-    from tsgt.simulation.kernel.clocks import DriftingClock, VirtualClock
-    from tsgt.simulation.lora.air import Air
-    from tsgt.simulation.lora.radios import RadioHardware, StampJitter
+    from tsgt.radio import LoRaSettings, OpenRadio
+    from tsgt.simulation.kernel import DriftingClock, VirtualClock
+    from tsgt.simulation.lora import Air, RadioHardware, StampJitter
+
+MASTER = "master"
+"""Name of the master's computer."""
 
 
 class Computer:

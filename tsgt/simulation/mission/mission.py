@@ -16,46 +16,45 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from tsgt.config import ClientConfig, MasterConfig, scenario_parameters
-from tsgt.config.client import JournalConfig, LeicaInstrumentConfig
-from tsgt.config.master import RecordingConfig, SetupConfig, StationConfig, StreamConfig
-from tsgt.config.radio import (
+from tsgt.config import (
     ClassicConfig,
     ClassicMasterConfig,
+    ClientConfig,
+    JournalConfig,
+    LeicaInstrumentConfig,
+    MasterConfig,
+    RecordingConfig,
+    SetupConfig,
     SimulatedRadioConfig,
+    StationConfig,
+    StreamConfig,
     SuperframeConfig,
     SuperframeMasterConfig,
+    scenario_parameters,
 )
-from tsgt.master.daemon import run_master
+from tsgt.master import run_master
 from tsgt.radio.from_config import lora_settings
 from tsgt.recording import decode
-from tsgt.simulation.faults.adversary import ForeignRadio
-from tsgt.simulation.instrument.serial_line import SimulatedLine
-from tsgt.simulation.instrument.total_station import SimulatedTotalStation
-from tsgt.simulation.kernel.clocks import DriftingClock, VirtualClock, ramped
-from tsgt.simulation.lora.air import Air
-from tsgt.simulation.lora.link import LinkModel, LogDistanceLoss
-from tsgt.simulation.lora.radios import StampJitter, opener
+from tsgt.simulation.instrument import SimulatedLine, SimulatedTotalStation
+from tsgt.simulation.kernel import DriftingClock, VirtualClock, ramped
+from tsgt.simulation.lora import Air, LinkModel, LogDistanceLoss, StampJitter, opener
+from tsgt.simulation.lora.adversary import ForeignRadio
 from tsgt.simulation.mission.authors_node import AUTHORS_STAMP_DELAY_MS, AuthorsNode
-from tsgt.simulation.mission.computer import Computer
-from tsgt.simulation.mission.run_log import Session, StationWitness, WatchedInstrument
-from tsgt.simulation.options import MASTER
+from tsgt.simulation.mission.computer import MASTER, Computer
+from tsgt.simulation.mission.run_log import START_UNIX_NS, Session, StationWitness, WatchedInstrument
 from tsgt.simulation.world import scenario_world
-from tsgt.station.daemon import run_client
-from tsgt.station.leica.instrument import LeicaInstrument
-from tsgt.station.status import ClientStatus
+from tsgt.station import ClientStatus, run_client
+from tsgt.station.leica import LeicaInstrument
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine
 
-    from tsgt.config import ScenarioConfig
-    from tsgt.config.client import Baud
-    from tsgt.config.scenario import ScenarioRadioConfig, SimulatedStation
-    from tsgt.radio.base import OpenRadio
-    from tsgt.simulation.kernel.timeline import Timeline
+    from tsgt.config import Baud, ScenarioConfig, ScenarioRadioConfig, SimulatedStation
+    from tsgt.radio import OpenRadio
+    from tsgt.simulation.kernel import Timeline
     from tsgt.simulation.options import Options, Outage
     from tsgt.simulation.world import World
-    from tsgt.station.instrument import Reading
+    from tsgt.station import Reading
 
 STATUS_SOCKET = "client.sock"
 
@@ -156,9 +155,6 @@ def scenario_link(
         loss_probability=radio.loss_probability,
     )
 
-
-START_UNIX_NS = 1_800_000_000_000_000_000
-"""Unix time at which every simulated run starts, on the master's clock: 15 January 2027."""
 
 DRAIN_S = 5.0
 """How long a run goes on after its end, so that what is under way can arrive."""

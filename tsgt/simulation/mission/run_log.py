@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, get_args
 import numpy as np
 
 from tsgt.model import PolarMeasurement
-from tsgt.recording import decode_line, read_lines
+from tsgt.recording import BeaconRecord, ClockRecord, Kind, PoseRecord, StatusRecord, decode_line, read_lines
 from tsgt.recording.journal import AcknowledgedRecord, load_journal
-from tsgt.recording.stream_records import BeaconRecord, ClockRecord, Kind, PoseRecord, StatusRecord
 from tsgt.simulation.mission.disk import UNWRITTEN_NS
 
 if TYPE_CHECKING:
@@ -22,12 +21,17 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from tsgt.radio.commands import Direction
+    from tsgt.model import Parameters
+    from tsgt.radio import Direction
     from tsgt.recording.journal import InstrumentRecord
-    from tsgt.simulation.instrument.geocom.answers import Offered
-    from tsgt.station.instrument import Atmosphere, Condition, Instrument, Reading
-    from tsgt.station.status import ClientStatus
+    from tsgt.simulation.faults.catalogue import FaultKind
+    from tsgt.simulation.instrument.geocom import Offered
+    from tsgt.simulation.options import Outage
+    from tsgt.simulation.world import World
+    from tsgt.station import Atmosphere, ClientStatus, Condition, Instrument, Reading
 
+START_UNIX_NS = 1_800_000_000_000_000_000
+"""Unix time at which each simulated mission starts, on the master's clock: 15 January 2027."""
 
 _HEAD_LINES = 2
 # What is left of a program that is killed lives on for an instant.
@@ -376,3 +380,57 @@ class WatchedInstrument:
     async def close(self) -> None:
         """Let go of the instrument."""
         await self._instrument.close()
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """A mission that is over.
+
+    Attributes
+    ----------
+    parameters
+        What the master knew of the set-up: the exact truth.
+    world
+        The truth; its instants count from the start of the run.
+    duration_s
+        How long it measured, without the drain.
+    sessions
+        What the master sent out, one entry for each time that it was started.
+    witnesses
+        What was read from the instruments, by station number.
+    airtime_s
+        How long there was a packet on the air, of whomever.
+    superframe
+        Whether that protocol was spoken.
+    outages
+        When who did not hear whom.
+    faults
+        How many of each kind there were.
+    calm_s
+        When they were over, in s from the start; None: there were none.
+    rate_hz
+        How often each instrument measures, by station number.
+    overgrown
+        What was longer in memory than it should be.
+    start_ns
+        Unix time of the start on the master's clock, in ns.
+    """
+
+    parameters: Parameters
+    world: World
+    duration_s: float
+    sessions: list[Session]
+    witnesses: dict[int, StationWitness]
+    airtime_s: float
+    superframe: bool
+    outages: tuple[Outage, ...] = ()
+    faults: Counter[FaultKind] = field(default_factory=Counter)
+    calm_s: float | None = None
+    rate_hz: dict[int, float] = field(default_factory=dict)
+    overgrown: tuple[str, ...] = ()
+    start_ns: int = START_UNIX_NS
+
+    @property
+    def end_ns(self) -> int:
+        """Unix time of the end on the master's clock, in ns; the drain comes after it."""
+        return self.start_ns + round(self.duration_s * 1e9)

@@ -1,1 +1,7 @@
 """TODO face."""
+
+from tsgt.station.bridge.instrument import BridgeInstrument
+
+__all__ = [
+    "BridgeInstrument",
+]

@@ -31,8 +31,8 @@ from tsgt.station.instrument import Condition
 
 if TYPE_CHECKING:
     from tsgt.clock import Clock
-    from tsgt.config.client import BridgeInstrumentConfig
-    from tsgt.radio.commands import Direction
+    from tsgt.config import BridgeInstrumentConfig
+    from tsgt.radio import Direction
     from tsgt.station.bridge.process import Program, StartProgram
     from tsgt.station.instrument import Atmosphere, Reading
 

@@ -12,8 +12,8 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from tsgt.model import LARGEST_NUMBER, LAST_INSTANT_NS, Status
-from tsgt.radio.commands import Direction  # noqa: TC001 (pydantic looks it up when the program runs)
-from tsgt.recording.format import Typed, decode
+from tsgt.radio import Direction  # noqa: TC001 (pydantic looks it up when the program runs)
+from tsgt.recording import Typed, decode
 
 FORMAT_VERSION = 1
 """Of the lines. It changes when a client of the old one would misunderstand the new one."""

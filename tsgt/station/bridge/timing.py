@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from tsgt.timesync.instrument_clock import LATEST_NS, InstrumentClock
+from tsgt.timesync import LATEST_NS, InstrumentClock
 
 if TYPE_CHECKING:
     from tsgt.station.bridge.messages import Hello, MeasurementLine

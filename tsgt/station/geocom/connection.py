@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from tsgt.clock import Clock
     from tsgt.station.geocom.codec import Parameter
-    from tsgt.station.serial.base import OpenPort, Port
+    from tsgt.station.serial import OpenPort, Port
 
 log = structlog.get_logger()
 

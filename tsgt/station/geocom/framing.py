@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 if TYPE_CHECKING:
-    from tsgt.station.serial.base import Chunk
+    from tsgt.station.serial import Chunk
 
 _REPLY_MARK: Final = b"%R1P"
 _MAX_LINE: Final = 4096  # far more than the longest reply; more than that without an end is no line

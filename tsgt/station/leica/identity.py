@@ -14,11 +14,10 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from tsgt.station.geocom.codec import Rpc
-from tsgt.station.geocom.codes import ReturnCode, Verdict, verdict
+from tsgt.station.geocom import ReturnCode, Rpc, Verdict, verdict
 
 if TYPE_CHECKING:
-    from tsgt.station.geocom.connection import GeoComConnection, Reply
+    from tsgt.station.geocom import GeoComConnection, Reply
 
 Numbers = tuple[float, ...]
 

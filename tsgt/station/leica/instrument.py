@@ -11,7 +11,7 @@ import structlog
 
 from tsgt.errors import InstrumentError, InstrumentRefusedError
 from tsgt.recording.journal import InstrumentRecord
-from tsgt.station.geocom.connection import connect
+from tsgt.station.geocom import connect
 from tsgt.station.instrument import Condition, Reading
 from tsgt.station.leica.identity import Identity, check_power, identify, model_of
 from tsgt.station.leica.reacquisition import LossSequence
@@ -33,11 +33,11 @@ from tsgt.station.leica.tracking import Tracking
 
 if TYPE_CHECKING:
     from tsgt.clock import Clock
-    from tsgt.config.client import LeicaInstrumentConfig
-    from tsgt.radio.commands import Direction
-    from tsgt.station.geocom.connection import GeoComConnection
+    from tsgt.config import LeicaInstrumentConfig
+    from tsgt.radio import Direction
+    from tsgt.station.geocom import GeoComConnection
     from tsgt.station.instrument import Atmosphere
-    from tsgt.station.serial.base import OpenPort
+    from tsgt.station.serial import OpenPort
 
 log = structlog.get_logger()
 

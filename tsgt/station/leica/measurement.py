@@ -6,12 +6,12 @@ import math
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from tsgt.model import Status
-from tsgt.station.geocom.codes import Verdict, verdict
+from tsgt.station.geocom import Verdict, verdict
 from tsgt.station.instrument import Reading
 from tsgt.station.leica.identity import numbers
 
 if TYPE_CHECKING:
-    from tsgt.station.geocom.connection import Reply
+    from tsgt.station.geocom import Reply
 
 REPEAT_NS: Final = 500_000_000
 """A status without a distance that does not change is given this often."""

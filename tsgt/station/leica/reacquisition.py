@@ -14,7 +14,7 @@ from enum import IntEnum
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 if TYPE_CHECKING:
-    from tsgt.radio.commands import Direction
+    from tsgt.radio import Direction
 
 NARROWEST_RAD: Final = math.radians(1.5)
 """The field of view of the target recognition: a narrower window needs no search."""

@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-from tsgt.station.geocom.codec import Rpc
-from tsgt.station.geocom.codes import ReturnCode, Verdict, verdict
+from tsgt.station.geocom import ReturnCode, Rpc, Verdict, verdict
 from tsgt.station.leica.identity import done, numbers
 from tsgt.station.leica.reacquisition import NARROWEST_RAD, WIDEST_ADJUST_RAD, Lock, Look, Pointing
 
 if TYPE_CHECKING:
-    from tsgt.station.geocom.codec import Parameter
-    from tsgt.station.geocom.connection import GeoComConnection, Reply
+    from tsgt.station.geocom import GeoComConnection, Parameter, Reply
 
 _TRIES: Final = 3
 _TURN_S: Final = 30.0

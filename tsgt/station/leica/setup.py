@@ -6,17 +6,15 @@ import math
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from tsgt.errors import InstrumentError
-from tsgt.station.geocom.codec import Rpc
-from tsgt.station.geocom.codes import Verdict, name_of, verdict
+from tsgt.station.geocom import Rpc, Verdict, name_of, verdict
 from tsgt.station.instrument import Atmosphere
 from tsgt.station.leica.identity import done, numbers
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from tsgt.config.client import LeicaInstrumentConfig
-    from tsgt.station.geocom.codec import Parameter
-    from tsgt.station.geocom.connection import GeoComConnection, Reply
+    from tsgt.config import LeicaInstrumentConfig
+    from tsgt.station.geocom import GeoComConnection, Parameter, Reply
     from tsgt.station.leica.identity import Identity, Numbers
 
 DECIMALS: Final = 10

@@ -7,15 +7,14 @@ from typing import TYPE_CHECKING, Final
 
 from tsgt.errors import InstrumentRefusedError
 from tsgt.model import Status
-from tsgt.station.geocom.codec import Rpc
-from tsgt.station.geocom.codes import name_of
+from tsgt.station.geocom import Rpc, name_of
 from tsgt.station.leica.identity import done
 from tsgt.station.leica.measurement import full_measurement
 from tsgt.station.leica.setup import clear
 
 if TYPE_CHECKING:
     from tsgt.clock import Clock
-    from tsgt.station.geocom.connection import GeoComConnection
+    from tsgt.station.geocom import GeoComConnection
     from tsgt.station.leica.measurement import FullMeasurement
 
 _WAIT_MS: Final = 1000

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
-from tsgt.station.geocom.codec import Rpc
+from tsgt.station.geocom import Rpc
 from tsgt.station.leica.identity import numbers
 from tsgt.station.leica.measurement import MOST_MS, Stamp
-from tsgt.timesync.instrument_clock import InstrumentClock
+from tsgt.timesync import InstrumentClock
 
 if TYPE_CHECKING:
     from tsgt.clock import Clock
-    from tsgt.station.geocom.connection import GeoComConnection
+    from tsgt.station.geocom import GeoComConnection
     from tsgt.station.leica.measurement import FullMeasurement
 
 log = structlog.get_logger()

@@ -9,8 +9,7 @@ import structlog
 
 from tsgt.errors import InstrumentError
 from tsgt.model import Status
-from tsgt.station.geocom.codec import Rpc
-from tsgt.station.geocom.codes import Verdict, name_of, verdict
+from tsgt.station.geocom import Rpc, Verdict, name_of, verdict
 from tsgt.station.leica.measurement import REPEAT_NS, FullMeasurement, Readings, full_measurement
 from tsgt.station.leica.reacquisition import (
     LOOKING,
@@ -30,8 +29,8 @@ from tsgt.station.leica.timing import IDLE_NS, Pace
 
 if TYPE_CHECKING:
     from tsgt.clock import Clock
-    from tsgt.radio.commands import Direction
-    from tsgt.station.geocom.connection import GeoComConnection
+    from tsgt.radio import Direction
+    from tsgt.station.geocom import GeoComConnection
     from tsgt.station.instrument import Reading
     from tsgt.station.leica.timing import InstrumentTimes
 

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, NoReturn, Protocol
 
 if TYPE_CHECKING:
     from tsgt.model import PolarMeasurement
-    from tsgt.radio.base import Radio
-    from tsgt.radio.commands import DirectOrder, SearchOrder, TrackOrder
+    from tsgt.radio import DirectOrder, Radio, SearchOrder, TrackOrder
     from tsgt.recording.journal import TargetRecord
     from tsgt.station.status import LinkStatus
 

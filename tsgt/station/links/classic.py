@@ -8,9 +8,9 @@ import structlog
 
 from tsgt.errors import RadioError
 from tsgt.model import Status
-from tsgt.radio.classic.messages import MeasurementMessage, decode_command, raw_status
+from tsgt.radio import SearchOrder
+from tsgt.radio.classic import MeasurementMessage, decode_command, raw_status
 from tsgt.radio.classic.transactions import TURN_ROUND_NS, ClassicStation
-from tsgt.radio.commands import SearchOrder
 from tsgt.station.links.traffic_monitor import Strangers
 from tsgt.station.status import LinkStatus
 
@@ -19,8 +19,7 @@ if TYPE_CHECKING:
 
     from tsgt.clock import Clock, UnixTimeline
     from tsgt.model import PolarMeasurement
-    from tsgt.radio.base import Packet, Radio
-    from tsgt.radio.commands import DirectOrder, Order, TrackOrder
+    from tsgt.radio import DirectOrder, Order, Packet, Radio, TrackOrder
     from tsgt.recording.journal import TargetRecord
     from tsgt.station.session import Session
 

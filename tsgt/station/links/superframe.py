@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 import structlog
 
-from tsgt.radio.superframe.wire.codec import angle_code
+from tsgt.radio.superframe.wire import angle_code
 from tsgt.recording.journal import AcknowledgedRecord, ReceptionRecord
 from tsgt.station.backlog import queued
 from tsgt.station.links.traffic_monitor import Strangers
@@ -17,11 +17,9 @@ if TYPE_CHECKING:
 
     from tsgt.clock import Clock, UnixTimeline
     from tsgt.model import PolarMeasurement
-    from tsgt.radio.base import Radio
-    from tsgt.radio.commands import DirectOrder, Order, SearchOrder, TrackOrder
-    from tsgt.radio.superframe.command_exchange import Situation
-    from tsgt.radio.superframe.send_queue import Outbox
-    from tsgt.radio.superframe.station import Heard, SuperframeStation
+    from tsgt.radio import DirectOrder, Order, Radio, SearchOrder, TrackOrder
+    from tsgt.radio.superframe import Outbox, Situation, SuperframeStation
+    from tsgt.radio.superframe.station import Heard
     from tsgt.recording.journal import TargetRecord
 
 LEAD_NS = 6_000_000

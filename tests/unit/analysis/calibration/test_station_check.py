@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from tsgt.analysis.calibration.station_check import StationCheck, check_station
+from tsgt.analysis.calibration import StationCheck, check_station
 from tsgt.geometry import (
     cartesian_to_polar,
     exp_so3,
@@ -18,7 +18,7 @@ from tsgt.geometry import (
     transform_from,
     transform_points,
 )
-from tsgt.geometry.calibration.frame_fit import PointSet
+from tsgt.geometry.calibration import PointSet
 from tsgt.model import TARGET_NOISE
 
 if TYPE_CHECKING:

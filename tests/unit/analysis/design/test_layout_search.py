@@ -7,8 +7,7 @@ from itertools import combinations, product
 import numpy as np
 import pytest
 
-from tsgt.analysis.design.layout_search import Criterion, Task, best_layout
-from tsgt.analysis.design.layout_study import Stances, Station
+from tsgt.analysis.design import Criterion, Stances, Station, Task, best_layout
 from tsgt.errors import GeometryError
 from tsgt.model import ARCSECOND_RAD, InstrumentNoise
 

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from tsgt.analysis.design.layout_study import (
+from tsgt.analysis.design import (
     HEADINGS,
     LayoutFigures,
     Stances,

@@ -8,12 +8,8 @@ import time
 import numpy as np
 import pytest
 
-from tsgt.analysis.design.perturbation import (
-    equivalent,
-    euler_angles_rad,
-    first_order_sigmas,
-    perturbation_study,
-)
+from tsgt.analysis.design import equivalent, first_order_sigmas, perturbation_study
+from tsgt.analysis.design.perturbation import euler_angles_rad
 from tsgt.config import ScenarioConfig
 from tsgt.errors import DegenerateGeometryError
 from tsgt.geometry import exp_so3, rotation_from_quaternion

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tsgt.analysis.evaluation.metrics import inner_part, pose_errors
+from tsgt.analysis.evaluation import inner_part, pose_errors
 from tsgt.geometry import transform_from
 
 POINT = np.array([0.0, 0.1, 1.2])

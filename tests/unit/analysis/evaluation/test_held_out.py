@@ -5,17 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tsgt.analysis.evaluation.held_out import (
-    MissFigures,
-    folds,
-    hold_out,
-    missed_by_lines,
-    missed_by_trajectory,
-    never_out,
-)
+from tsgt.analysis.evaluation import folds, hold_out, missed_by_lines, missed_by_trajectory, never_out
+from tsgt.analysis.evaluation.held_out import MissFigures
 from tsgt.geometry import Observations
-from tsgt.geometry.trajectory.query import Trajectory
-from tsgt.geometry.trajectory.states import Knots
+from tsgt.geometry.trajectory import Knots, Trajectory
 from tsgt.model import MotionPrior
 
 LAYOUT = np.array([[-0.5, 0.0, 1.0], [0.5, 0.0, 1.0], [0.0, 0.5, 1.5]])

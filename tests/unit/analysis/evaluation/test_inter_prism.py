@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from harness.scene import LAYOUT, SECOND, START, Scene, driving, standing, standing_scene
 
-from tsgt.analysis.evaluation.inter_prism import InterPrism, inter_prism, still_intervals
-from tsgt.estimation.tracks import Track, build_tracks
+from tsgt.analysis.evaluation import InterPrism, inter_prism
+from tsgt.analysis.evaluation.inter_prism import still_intervals
+from tsgt.estimation import Track, build_tracks
 from tsgt.geometry import exp_so3
 
 LIMIT_NS = SECOND

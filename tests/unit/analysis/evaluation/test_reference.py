@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tsgt.analysis.evaluation import compare, read_tum
 from tsgt.analysis.evaluation.metrics import NeesFigures
-from tsgt.analysis.evaluation.reference import compare, read_tum
 from tsgt.errors import InputFileError
-from tsgt.estimation.pose_batch import Kind, PoseBatch, Reason
+from tsgt.estimation import Kind, PoseBatch, Reason
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from harness.prior_motion import as_points, draw_motions, in_time, measure
 
-from tsgt.analysis.evaluation.residuals import outliers, residual_figures
-from tsgt.geometry.trajectory.batch import fit
+from tsgt.analysis.evaluation import outliers, residual_figures
+from tsgt.geometry.trajectory import fit
 from tsgt.model import MotionPrior, PolarMeasurement
 
 if TYPE_CHECKING:
     from tsgt.geometry import Observations
-    from tsgt.geometry.trajectory.batch import Fit
+    from tsgt.geometry.trajectory import Fit
 
 PRIOR = MotionPrior()
 

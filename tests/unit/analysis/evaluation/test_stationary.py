@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tsgt.analysis.evaluation.reference import Reference
-from tsgt.analysis.evaluation.stationary import standing_errors
-from tsgt.estimation.pose_batch import Kind, PoseBatch, Reason
+from tsgt.analysis.evaluation import Reference, standing_errors
+from tsgt.estimation import Kind, PoseBatch, Reason
 
 START_NS = 1_700_000_000_000_000_000
 SECOND_NS = 1_000_000_000

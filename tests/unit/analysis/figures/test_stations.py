@@ -7,10 +7,9 @@ import pytest
 
 pytest.importorskip("matplotlib")
 
-from tsgt.analysis.figures.axes import Clock
+from tsgt.analysis.figures import Clock, drawing
 from tsgt.analysis.figures.stations import draw_clocks, draw_gaps
-from tsgt.analysis.figures.style import drawing
-from tsgt.analysis.report.stations import StationRecord
+from tsgt.analysis.report import StationRecord
 
 SECOND = 1_000_000_000
 

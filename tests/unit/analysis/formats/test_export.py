@@ -8,20 +8,13 @@ import numpy as np
 import pytest
 from harness.scene import START, driving, standing_scene
 
-from tsgt.analysis.formats.export import (
-    MEASUREMENT_COLUMNS,
-    POSE_COLUMNS,
-    measurement_csv,
-    pose_csv,
-    tum_lines,
-    valid_records,
-    valid_rows,
-)
-from tsgt.estimation.linear import Pipeline
+from tsgt.analysis.formats import measurement_csv, pose_csv, tum_lines, valid_records, valid_rows
+from tsgt.analysis.formats.export import MEASUREMENT_COLUMNS, POSE_COLUMNS
+from tsgt.estimation import Pipeline
 from tsgt.model import PointMeasurement
 
 if TYPE_CHECKING:
-    from tsgt.estimation.pose_batch import PoseBatch
+    from tsgt.estimation import PoseBatch
 
 DOCUMENT = Path(__file__).parents[4] / "docs" / "reference" / "csv.md"
 

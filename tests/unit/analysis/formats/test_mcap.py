@@ -13,17 +13,16 @@ from harness.records import HEADER
 from harness.scene import FRAMES, LAYOUT, START, driving, standing_scene
 from rosbags.highlevel import AnyReader
 
-from tsgt.analysis.evaluation.reference import Reference
-from tsgt.analysis.formats.mcap import messages, write_mcap
+from tsgt.analysis.evaluation import Reference
+from tsgt.analysis.formats import messages, write_mcap
 from tsgt.errors import MissingExtraError
-from tsgt.estimation.linear import Pipeline
-from tsgt.estimation.tracks import build_tracks
+from tsgt.estimation import Pipeline, build_tracks
 from tsgt.geometry import rotation_from_quaternion
 from tsgt.model import StationParameters
 from tsgt.recording import Recording
 
 if TYPE_CHECKING:
-    from tsgt.estimation.pose_batch import PoseBatch
+    from tsgt.estimation import PoseBatch
 
 DOCUMENT = Path(__file__).parents[4] / "docs" / "reference" / "mcap.md"
 

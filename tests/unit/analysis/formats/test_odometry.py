@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tsgt.analysis.formats.odometry import read_still_intervals
+from tsgt.analysis.formats import read_still_intervals
 from tsgt.errors import InputFileError
 
 if TYPE_CHECKING:

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tsgt.analysis.formats.export import measurement_csv
-from tsgt.analysis.formats.polar_files import check_tracks, read_polar_tracks, station_prisms
+from tsgt.analysis.formats import check_tracks, measurement_csv, read_polar_tracks, station_prisms
 from tsgt.errors import InputFileError
 from tsgt.model import PointMeasurement, PolarMeasurement, Status
 

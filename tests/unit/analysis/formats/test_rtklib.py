@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from harness.pos_files import BASE, SECOND, Variant, write_pos
 
-from tsgt.analysis.formats.rtklib import QUALITIES, read_pos
+from tsgt.analysis.formats import QUALITIES, read_pos
 from tsgt.errors import InputFileError
 
 if TYPE_CHECKING:

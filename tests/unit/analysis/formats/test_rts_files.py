@@ -8,7 +8,8 @@ import pytest
 from harness.published import write_prisms
 from harness.scene import LAYOUT
 
-from tsgt.analysis.formats.rts_files import read_prisms, read_track
+from tsgt.analysis.formats import read_prisms
+from tsgt.analysis.formats.rts_files import read_track
 from tsgt.errors import ConfigError, InputFileError
 
 if TYPE_CHECKING:

@@ -8,9 +8,9 @@ from harness.published import TARGET_CONSTANT_M, write_targets, write_tracks
 from harness.scene import FRAMES
 
 from tsgt.analysis.formats.rts_files import PublishedTrack, read_track
-from tsgt.analysis.formats.rts_import import point_measurements, polar_measurements, stations_from_targets
+from tsgt.analysis.rts_import import point_measurements, polar_measurements, stations_from_targets
 from tsgt.errors import GeometryError, InputFileError
-from tsgt.estimation.tracks import build_tracks
+from tsgt.estimation import build_tracks
 from tsgt.geometry import polar_to_cartesian
 from tsgt.model import Parameters, PolarMeasurement, PrismPosition, StationParameters
 

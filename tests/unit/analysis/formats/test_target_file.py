@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tsgt.analysis.calibration.targets import solve_prisms, solve_stations
-from tsgt.analysis.formats.target_file import read_prism_file, read_target_file
+from tsgt.analysis.calibration import solve_prisms, solve_stations
+from tsgt.analysis.formats import read_prism_file, read_target_file
 from tsgt.errors import DegenerateGeometryError, InputFileError
 
 DOCUMENT = Path(__file__).parents[4] / "docs" / "reference" / "target-file.md"

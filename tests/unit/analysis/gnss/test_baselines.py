@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from harness.pos_files import SECOND, Variant, write_pos
 
-from tsgt.analysis.figures.gnss import draw_gnss
-from tsgt.analysis.formats.rtklib import PosFile, read_pos
-from tsgt.analysis.gnss.baselines import receiver_pairs, receivers, utc_from_gps
-from tsgt.analysis.gnss.prism_baselines import common_part
+from tsgt.analysis.figures import draw_gnss
+from tsgt.analysis.formats import PosFile, read_pos
+from tsgt.analysis.gnss import common_part, receiver_pairs, receivers
+from tsgt.analysis.gnss.baselines import utc_from_gps
 from tsgt.errors import InputFileError, MissingExtraError, RecordingError
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from tsgt.analysis.gnss.baselines import Distances, Receiver
+    from tsgt.analysis.gnss import Distances, Receiver
 
 START = 1_653_499_242 * SECOND
 TENTH = SECOND // 10

@@ -12,15 +12,15 @@ import pytest
 from harness.merging import assert_true, journals, merged_in, recording
 from harness.missions import SUPERFRAME, mission
 
-from tsgt.analysis.merge.merge import MARGIN_NS, WORST_BOUND_NS, merge
+from tsgt.analysis.merge import merge
+from tsgt.analysis.merge.merge import MARGIN_NS, WORST_BOUND_NS
 from tsgt.analysis.merge.recording_index import identity
 from tsgt.analysis.processing import process
 from tsgt.config import ScenarioConfig
 from tsgt.config.scenario import StatusFaultConfig
 from tsgt.errors import CorruptLineError, RecordingError
-from tsgt.estimation.observations import build_observations, instrument_time_sigma_s
-from tsgt.estimation.pose_batch import Reason
-from tsgt.master.replay import replayed
+from tsgt.estimation import Reason, build_observations, instrument_time_sigma_s
+from tsgt.master import replayed
 from tsgt.model import PolarMeasurement, Status
 from tsgt.recording import RecordingWriter, load_recording
 from tsgt.recording.journal import load_journal
@@ -29,8 +29,7 @@ from tsgt.simulation.options import Outage, Restart
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tsgt.simulation.mission.mission import Mission
-    from tsgt.simulation.mission.runner import Run
+    from tsgt.simulation.mission import Mission, Run
 
 S = 1_000_000_000
 

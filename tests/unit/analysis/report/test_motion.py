@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from harness.scene import SECOND, START, Scene, driving, standing_scene
 
-from tsgt.analysis.evaluation.inter_prism import at_epochs, inter_prism
-from tsgt.analysis.figures.axes import BUCKETS, Clock, thinned
+from tsgt.analysis.evaluation import at_epochs, inter_prism
+from tsgt.analysis.figures import Clock
+from tsgt.analysis.figures.axes import BUCKETS, thinned
 from tsgt.analysis.report.motion import BINS, binned, gridded, ride
-from tsgt.estimation.tracks import Track, build_tracks
+from tsgt.estimation import Track, build_tracks
 
 
 def tracks_of(scene: Scene, *, duration_s: float = 8.0) -> dict[int, Track]:

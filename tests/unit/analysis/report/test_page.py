@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from tsgt.analysis.report.page import Section, Table, page
+from tsgt.analysis.report import page
+from tsgt.analysis.report.page import Section, Table
 from tsgt.analysis.report.verdicts import Level, Verdict
 
 

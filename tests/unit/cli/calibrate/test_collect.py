@@ -15,20 +15,17 @@ from harness.field import TRUE, SceneInstrument, Station, field_of
 from harness.radios import PAPER
 from harness.scene import FRAMES
 
-from tsgt.analysis.calibration.station_check import check_station
-from tsgt.analysis.calibration.target_collection import TargetCollection
-from tsgt.analysis.calibration.targets import mean_points
-from tsgt.analysis.formats.target_file import read_some_targets, read_target_file
+from tsgt.analysis.calibration import TargetCollection, check_station, mean_points
+from tsgt.analysis.formats import read_some_targets, read_target_file
 from tsgt.cli.calibrate.check import measure_again, print_check
 from tsgt.cli.calibrate.collect import collect_targets
 from tsgt.cli.calibrate.session import TargetSession, target_session
-from tsgt.config.client import JournalConfig
-from tsgt.config.radio import SuperframeConfig, SuperframeMasterConfig
+from tsgt.config import JournalConfig, SuperframeConfig, SuperframeMasterConfig
 from tsgt.errors import InputFileError, RadioError, TsgtError
 from tsgt.geometry import cartesian_to_polar, invert, transform_points
 from tsgt.model import Status
-from tsgt.simulation.lora.radios import opener
-from tsgt.station.daemon import run_client
+from tsgt.simulation.lora import opener
+from tsgt.station import run_client
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
@@ -37,8 +34,8 @@ if TYPE_CHECKING:
     from harness.cli import Tsgt
     from harness.field import Field
 
-    from tsgt.radio.base import OpenRadio
-    from tsgt.station.instrument import Reading
+    from tsgt.radio import OpenRadio
+    from tsgt.station import Reading
 
 KEY = bytes(range(32))
 TARGETS = np.array([[20.0, 3.0, 0.5], [5.0, 18.0, -0.5], [-14.0, 9.0, 1.0], [-8.0, -16.0, 0.2]])

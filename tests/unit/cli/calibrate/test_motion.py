@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from harness.published import write_prisms, write_targets, write_tracks
 
-from tsgt.analysis.calibration.motion import calibrate_recording
+from tsgt.analysis.calibration import calibrate_recording
 from tsgt.config import load_station_frames, load_station_latencies
 from tsgt.geometry import exp_so3
-from tsgt.geometry.calibration.motion_parameters import Unknowns
+from tsgt.geometry.calibration import Unknowns
 from tsgt.recording import load_recording
 
 if TYPE_CHECKING:

@@ -13,12 +13,9 @@ import pytest
 from harness.published import write_prisms, write_targets, write_tracks
 from harness.scene import driving, standing
 
-from tsgt.analysis.evaluation.reference import read_tum
-from tsgt.analysis.formats.odometry import read_still_intervals
-from tsgt.analysis.report.findings import Findings, find
-from tsgt.analysis.report.numbers import figures_of
-from tsgt.analysis.report.sections import sections
-from tsgt.analysis.report.verdicts import verdicts
+from tsgt.analysis.evaluation import read_tum
+from tsgt.analysis.formats import read_still_intervals
+from tsgt.analysis.report import Findings, figures_of, find, sections, verdicts
 from tsgt.cli.main import cli, run
 from tsgt.recording import load_recording
 

@@ -10,26 +10,20 @@ import numpy as np
 import pytest
 
 from tsgt.cli.radio import ping as ping_command
-from tsgt.radio.base import LoRaSettings
+from tsgt.radio import LoRaSettings
 from tsgt.radio.ping import answer, ping
-from tsgt.radio.sx127x.hal import DRAGINO_HAT
-from tsgt.simulation.kernel.clocks import VirtualClock
-from tsgt.simulation.kernel.event_loop import run_virtual
-from tsgt.simulation.kernel.timeline import VirtualTimeline
-from tsgt.simulation.lora.air import Air
-from tsgt.simulation.lora.chip import SX1276Chip
-from tsgt.simulation.lora.hal import SimulatedHal
-from tsgt.simulation.lora.link import LinkModel
-from tsgt.simulation.lora.radios import simulated_radio
+from tsgt.radio.sx127x import DRAGINO_HAT
+from tsgt.simulation.kernel import VirtualClock, VirtualTimeline, run_virtual
+from tsgt.simulation.lora import Air, LinkModel, SimulatedHal, SX1276Chip, simulated_radio
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Coroutine
 
     from harness.cli import Tsgt
 
-    from tsgt.radio.base import Radio
+    from tsgt.radio import Radio
     from tsgt.radio.ping import Exchange
-    from tsgt.radio.sx127x.hal import Wiring
+    from tsgt.radio.sx127x import Wiring
 
 T = TypeVar("T")
 

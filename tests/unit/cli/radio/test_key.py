@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tsgt.cli.composition import radio_key
-from tsgt.config.radio import ClassicConfig, SuperframeConfig, SuperframeMasterConfig
+from tsgt.config import ClassicConfig, SuperframeConfig, SuperframeMasterConfig
 from tsgt.errors import ConfigError
 from tsgt.radio.key_file import read_key
 

@@ -11,15 +11,13 @@ import numpy as np
 import pytest
 from harness.records import POSE
 
-from tsgt.analysis.evaluation.metrics import pose_errors
+from tsgt.analysis.evaluation import pose_errors
 from tsgt.cli.simulate.demo import Progress
 from tsgt.clock import SystemClock, UnixTimeline
 from tsgt.config import ScenarioConfig
 from tsgt.geometry import quaternion_from_rotation, rotation_from_quaternion, transform_from
-from tsgt.recording import encode_line
-from tsgt.recording.stream_records import StatusRecord
-from tsgt.simulation.demo.config_files import write_demo_files
-from tsgt.simulation.demo.demo import Demo
+from tsgt.recording import StatusRecord, encode_line
+from tsgt.simulation.demo import Demo, write_demo_files
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -10,13 +10,10 @@ import pytest
 
 from tsgt.errors import GeometryError
 from tsgt.geometry import Observations, exp_so3, rotate
-from tsgt.geometry.calibration.motion import calibrate_motion
-from tsgt.geometry.calibration.motion_initialisation import frames_from_motion
-from tsgt.geometry.calibration.motion_parameters import Setup, Unknowns, UnknownSetup
-from tsgt.geometry.calibration.observability import undetermined
-from tsgt.geometry.trajectory.gauss_newton import knot_times
-from tsgt.geometry.trajectory.initialisation import first_guess
-from tsgt.geometry.trajectory.measurement_factors import line_of_sight_axes, linearise
+from tsgt.geometry.calibration import Setup, Unknowns, calibrate_motion, frames_from_motion, undetermined
+from tsgt.geometry.calibration.motion_parameters import UnknownSetup
+from tsgt.geometry.trajectory import first_guess, knot_times, linearise
+from tsgt.geometry.trajectory.measurement_factors import line_of_sight_axes
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:

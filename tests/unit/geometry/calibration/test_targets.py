@@ -22,8 +22,8 @@ from tsgt.geometry import (
     transform_from,
     transform_points,
 )
-from tsgt.geometry.calibration.frame_fit import Pairs, PointSet, fit_frame
-from tsgt.geometry.calibration.targets import Limits, calibrate_frame, calibrate_prisms
+from tsgt.geometry.calibration import Pairs, PointSet, calibrate_frame, calibrate_prisms, fit_frame
+from tsgt.geometry.calibration.targets import Limits
 from tsgt.model import ARCSECOND_RAD, InstrumentNoise
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from harness.prior_motion import draw_motions, in_time, measure
 
 from tsgt.errors import GeometryError
 from tsgt.geometry.trajectory import batch as fitting
-from tsgt.geometry.trajectory.batch import fit
+from tsgt.geometry.trajectory import fit
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:

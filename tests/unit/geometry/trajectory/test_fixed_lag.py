@@ -9,8 +9,7 @@ import pytest
 from harness.prior_motion import draw_motions, in_time, measure, rows_at
 
 from tsgt.geometry import FixedLag, FloatArray, Observations, Trajectory
-from tsgt.geometry.trajectory.gauss_newton import knot_times, solve
-from tsgt.geometry.trajectory.initialisation import first_guess
+from tsgt.geometry.trajectory import first_guess, knot_times, solve
 from tsgt.geometry.trajectory.innovation_monitor import DOUBT_BACK_S
 from tsgt.model import MotionPrior
 

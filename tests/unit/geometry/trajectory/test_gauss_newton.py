@@ -15,21 +15,17 @@ from scipy.stats import multivariate_normal
 
 from tsgt.errors import GeometryError
 from tsgt.geometry import Observations, Trajectory, cartesian_to_polar, exp_so3
+from tsgt.geometry.trajectory import LEAST_STEP_S, STATE, Knots, first_guess, knot_times, nearest, solve
 from tsgt.geometry.trajectory.gauss_newton import (
     HOPELESS,
-    LEAST_STEP_S,
     OUTLYING,
     SETTLED,
     Anchor,
-    knot_times,
     log_evidence,
-    nearest,
-    solve,
     start_anchor,
 )
-from tsgt.geometry.trajectory.initialisation import first_guess
 from tsgt.geometry.trajectory.motion_prior import process_noise, transition
-from tsgt.geometry.trajectory.states import STATE, Knots, Steps, linearise_steps, spread
+from tsgt.geometry.trajectory.states import Steps, linearise_steps, spread
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:

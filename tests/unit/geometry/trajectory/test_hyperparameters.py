@@ -7,8 +7,8 @@ import pytest
 from harness.prior_motion import STEP_S, in_time, measure, rows_at
 
 from tsgt.geometry import Knots, exp_so3, log_so3
-from tsgt.geometry.trajectory.batch import fit
-from tsgt.geometry.trajectory.hyperparameters import at_least, hidden
+from tsgt.geometry.trajectory import at_least, fit
+from tsgt.geometry.trajectory.hyperparameters import hidden
 from tsgt.geometry.trajectory.motion_prior import axis_sigmas
 from tsgt.model import MotionPrior, PipelineParameters
 

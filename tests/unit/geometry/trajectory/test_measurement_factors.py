@@ -19,8 +19,8 @@ from tsgt.geometry import (
     transform_from,
     transform_points,
 )
-from tsgt.geometry.trajectory.measurement_factors import line_of_sight_axes, linearise
-from tsgt.geometry.trajectory.states import STATE, Knots
+from tsgt.geometry.trajectory import STATE, Knots, linearise
+from tsgt.geometry.trajectory.measurement_factors import line_of_sight_axes
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tsgt.geometry import FloatArray, Trajectory, exp_so3
+from tsgt.geometry.trajectory import STATE, Knots
 from tsgt.geometry.trajectory.propagation import Ahead
-from tsgt.geometry.trajectory.states import STATE, Knots
 from tsgt.model import MotionPrior
 
 PRIOR = MotionPrior(acceleration_time_s=0.3, angular_acceleration_time_s=0.9)

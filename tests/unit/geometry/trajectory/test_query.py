@@ -11,10 +11,17 @@ from harness.prior_motion import STEP_S, draw_motions, in_time, measure, rows_at
 from scipy.stats import chi2
 
 from tsgt.geometry import exp_so3, log_so3
-from tsgt.geometry.trajectory.gauss_newton import Anchor, knot_times, solve, start_anchor
-from tsgt.geometry.trajectory.initialisation import first_guess
-from tsgt.geometry.trajectory.query import Trajectory, ros_covariance
-from tsgt.geometry.trajectory.states import STATE, Knots, joined
+from tsgt.geometry.trajectory import (
+    STATE,
+    Knots,
+    Trajectory,
+    first_guess,
+    joined,
+    knot_times,
+    ros_covariance,
+    solve,
+)
+from tsgt.geometry.trajectory.gauss_newton import Anchor, start_anchor
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:

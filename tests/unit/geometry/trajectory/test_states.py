@@ -12,13 +12,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tsgt.geometry import exp_so3
+from tsgt.geometry.trajectory import STATE, Knots, joined
 from tsgt.geometry.trajectory.states import (
-    STATE,
-    Knots,
     LinearisedSteps,
     Steps,
     add_steps,
-    joined,
     linearise_steps,
     spread,
     turn_between,

@@ -10,8 +10,8 @@ import pytest
 from harness.prior_motion import draw_motions, in_time, measure
 
 from tsgt.errors import GeometryError
-from tsgt.geometry.trajectory import hyperparameters
-from tsgt.geometry.trajectory.hyperparameters import LEAST_MEASUREMENTS, scaled, tune
+from tsgt.geometry.trajectory import hyperparameters, scaled, tune
+from tsgt.geometry.trajectory.hyperparameters import LEAST_MEASUREMENTS
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:

@@ -11,10 +11,12 @@ from harness.scene import START
 from hypothesis import given
 from hypothesis import settings as limits
 
-from tsgt.master.classic.ingest import UNTIMED_SIGMA_NS, Intake
+from tsgt.master.classic import UNTIMED_SIGMA_NS
+from tsgt.master.classic.ingest import Intake
 from tsgt.model import ClockSample, Status
-from tsgt.radio.classic.messages import MeasurementMessage, decode_reply, no_measurement_yet
-from tsgt.timesync.two_way import clock_filter
+from tsgt.radio.classic import MeasurementMessage
+from tsgt.radio.classic.messages import decode_reply, no_measurement_yet
+from tsgt.timesync import clock_filter
 
 if TYPE_CHECKING:
     from tsgt.master.classic.ingest import Arrival, Synchronised

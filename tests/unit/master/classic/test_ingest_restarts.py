@@ -6,8 +6,9 @@ import pytest
 from harness.clock_exchanges import SECOND, START_NS, synchronisation
 
 from tsgt.master.classic.ingest import Intake
-from tsgt.radio.classic.messages import MeasurementMessage, no_measurement_yet
-from tsgt.timesync.two_way import RegressionFilter, clock_filter
+from tsgt.radio.classic import MeasurementMessage
+from tsgt.radio.classic.messages import no_measurement_yet
+from tsgt.timesync import RegressionFilter, clock_filter
 
 MS = 1_000_000
 TURN_ROUND_NS = 1_500_000

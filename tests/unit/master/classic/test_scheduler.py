@@ -12,8 +12,9 @@ from harness.radios import PAPER
 
 from tsgt.master.classic.scheduler import Cadence, Scheduler, StationPlan, Task
 from tsgt.model import ClockSample
+from tsgt.radio.classic import Ordered, Poll, Synchronisation
 from tsgt.radio.classic.messages import no_measurement_yet
-from tsgt.radio.classic.transactions import Ordered, Poll, Synchronisation, Timing
+from tsgt.radio.classic.transactions import Timing
 
 MS = 1_000_000
 SECOND = 1000 * MS

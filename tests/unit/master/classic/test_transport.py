@@ -12,7 +12,7 @@ from harness.radios import MS, PAPER, Bench, bench
 
 from tsgt.clock import UnixTimeline
 from tsgt.errors import RadioError
-from tsgt.master.classic.transport import Collector
+from tsgt.master.classic import Collector
 from tsgt.radio.classic.transactions import Request, Timing
 
 if TYPE_CHECKING:

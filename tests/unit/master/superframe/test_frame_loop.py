@@ -12,17 +12,23 @@ from harness.field import running
 from harness.frames import KEY, TIMING, counted
 from harness.radios import MS, Bench, bench
 
-from tsgt.master.superframe.frame_loop import FrameLoop
-from tsgt.radio.superframe.master import SuperframeMaster
+from tsgt.master.superframe import FrameLoop
+from tsgt.radio.superframe import SuperframeMaster
 from tsgt.radio.superframe.phase_lock import Plan
-from tsgt.radio.superframe.wire.authentication import CODE_BYTES, Authenticator
-from tsgt.radio.superframe.wire.codec import decode_beacon, encode_reply
-from tsgt.radio.superframe.wire.messages import Introduction, Reply, SlotOrder
+from tsgt.radio.superframe.wire import (
+    CODE_BYTES,
+    Authenticator,
+    Introduction,
+    Reply,
+    SlotOrder,
+    decode_beacon,
+    encode_reply,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from tsgt.radio.base import Packet, Transmitted
+    from tsgt.radio import Packet, Transmitted
     from tsgt.radio.superframe.reception import Heard
 
 

@@ -19,11 +19,19 @@ from harness.scene import START, driving, standing_scene
 from structlog.testing import capture_logs
 
 from tsgt.errors import RadioError, RecordingError
-from tsgt.master.replay import replayed
+from tsgt.master import replayed
 from tsgt.model import PolarMeasurement, Status
-from tsgt.recording import RecordingWriter, encode_line, read_lines
-from tsgt.recording.stream_records import BeaconRecord, EventRecord, PoseRecord, StationStatus, StatusRecord
-from tsgt.simulation.lora.link import LinkModel
+from tsgt.recording import (
+    BeaconRecord,
+    EventRecord,
+    PoseRecord,
+    RecordingWriter,
+    StationStatus,
+    StatusRecord,
+    encode_line,
+    read_lines,
+)
+from tsgt.simulation.lora import LinkModel
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
@@ -31,7 +39,7 @@ if TYPE_CHECKING:
 
     from harness.field import Field
 
-    from tsgt.radio.base import Radio, Transmitted
+    from tsgt.radio import Radio, Transmitted
 
 MS = 1_000_000
 SECOND = 1000 * MS

@@ -7,17 +7,13 @@ from typing import Any
 import pytest
 
 from tsgt.model import Status
+from tsgt.radio.classic import Command, MeasurementMessage, decode_command, raw_status, status_of
 from tsgt.radio.classic.messages import (
     Acknowledgement,
-    Command,
-    MeasurementMessage,
     PingReply,
     TimeReply,
-    decode_command,
     decode_reply,
     no_measurement_yet,
-    raw_status,
-    status_of,
 )
 
 MEASUREMENT = MeasurementMessage(

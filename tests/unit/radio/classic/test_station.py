@@ -2,9 +2,10 @@ from __future__ import annotations
 
 import pytest
 
-from tsgt.radio.classic.messages import MeasurementMessage, no_measurement_yet
+from tsgt.radio import DirectOrder, MeasureOrder, TrackOrder
+from tsgt.radio.classic import MeasurementMessage
+from tsgt.radio.classic.messages import no_measurement_yet
 from tsgt.radio.classic.transactions import ClassicStation
-from tsgt.radio.commands import DirectOrder, MeasureOrder, TrackOrder
 
 NONE_YET = no_measurement_yet(1).to_bytes()
 SOME = MeasurementMessage(

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 import pytest
 from harness.radios import MS, PAPER
 
+from tsgt.radio.classic import Synchronisation
 from tsgt.radio.classic.messages import TimeReply
-from tsgt.radio.classic.transactions import ClassicStation, Synchronisation, Timing
+from tsgt.radio.classic.transactions import ClassicStation, Timing
 
 TIMING = Timing.of(PAPER, 250 * MS)
 PING_NS = TIMING.airtime_ns(2)

@@ -3,9 +3,9 @@ from __future__ import annotations
 import pytest
 from harness.radios import MS, PAPER
 
-from tsgt.radio.base import LoRaSettings
-from tsgt.radio.classic.messages import Command, MeasurementMessage
-from tsgt.radio.classic.transactions import Ordered, Poll, Request, Shot, Timing, Turn
+from tsgt.radio import LoRaSettings
+from tsgt.radio.classic import Command, MeasurementMessage, Ordered, Poll, Shot
+from tsgt.radio.classic.transactions import Request, Timing, Turn
 
 TIMING = Timing.of(PAPER, 250 * MS)
 SOME = MeasurementMessage(

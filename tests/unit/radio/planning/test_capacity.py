@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from tsgt.radio.base import LoRaSettings
+from tsgt.radio import LoRaSettings
 from tsgt.radio.classic.transactions import Timing
-from tsgt.radio.planning.capacity import Cycle, Load, classic_cycle, superframe_cycle
-from tsgt.radio.superframe.slots import FrameTiming
+from tsgt.radio.planning import Cycle, Load, classic_cycle, superframe_cycle
+from tsgt.radio.superframe import FrameTiming
 
 
 def classic(stations: int = 3, loss: float = 0.0, *, rate_hz: float = 2.5, **settings: Any) -> Cycle:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from tsgt.errors import RadioSettingsError
-from tsgt.radio.planning.regulations import HIGHEST_DBM, LOWEST_DBM, REGIONS, preset_power_dbm
+from tsgt.radio.planning import LOWEST_DBM, REGIONS, preset_power_dbm
+from tsgt.radio.planning.regulations import HIGHEST_DBM
 
 
 @pytest.mark.parametrize(

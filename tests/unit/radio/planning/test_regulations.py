@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from tsgt.errors import RadioSettingsError
-from tsgt.radio.base import LoRaSettings
-from tsgt.radio.planning.regulations import DIPOLE_DBI, Use, exceeded
+from tsgt.radio import LoRaSettings
+from tsgt.radio.planning import DIPOLE_DBI, Use, exceeded
 
 
 def use(

@@ -6,6 +6,7 @@ import pytest
 from harness.frames import TIMING
 from harness.radios import PAPER
 
+from tsgt.radio.superframe import FrameTiming
 from tsgt.radio.superframe.grants import (
     UNKNOWN_GRANT,
     Demand,
@@ -15,9 +16,8 @@ from tsgt.radio.superframe.grants import (
     grant,
     longest_grant,
 )
-from tsgt.radio.superframe.slots import FrameTiming
-from tsgt.radio.superframe.wire.messages import GRANT_BYTES
-from tsgt.timesync.periodicity import Beat
+from tsgt.radio.superframe.wire import GRANT_BYTES
+from tsgt.timesync import Beat
 
 BEAT = Beat(period_us=400_000, phase_us=0, spread_us=0)
 

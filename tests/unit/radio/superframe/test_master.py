@@ -14,14 +14,13 @@ from harness.frames import KEY, TIMING, ZERO_NS, Frames, frames_of, sighting
 from harness.radios import MS
 
 from tsgt.model import Status
-from tsgt.radio.commands import Direction, DirectOrder, MeasureOrder, SearchOrder, TrackOrder
-from tsgt.radio.superframe import master
-from tsgt.radio.superframe.phase_lock import FrameLock
+from tsgt.radio import Direction, DirectOrder, MeasureOrder, SearchOrder, TrackOrder
+from tsgt.radio.superframe import FrameLock, master
 from tsgt.radio.superframe.station_state import TIME_AT_START
-from tsgt.radio.superframe.wire.authentication import Authenticator
-from tsgt.radio.superframe.wire.messages import (
+from tsgt.radio.superframe.wire import (
     GRANT_BYTES,
     AnswerPart,
+    Authenticator,
     Confirmation,
     OrderPart,
     Reply,
@@ -30,11 +29,11 @@ from tsgt.radio.superframe.wire.messages import (
     ShotPart,
     SlotOrder,
     StatePart,
-    Towards,
 )
+from tsgt.radio.superframe.wire.messages import Towards
 
 if TYPE_CHECKING:
-    from tsgt.radio.commands import Order
+    from tsgt.radio import Order
 
 STATE = StatePart(prism=1, direct=False, connected=True, late=0, doubted=0, rssi_dbm=-80)
 

@@ -9,9 +9,8 @@ from harness.frames import TIMING, ZERO_NS, Frames, frames_of, older, sighting
 from harness.radios import MS
 
 from tsgt.model import Status
-from tsgt.radio.commands import MeasureOrder
-from tsgt.radio.superframe.wire.codec import angle_code
-from tsgt.radio.superframe.wire.messages import GRANT_BYTES, Reply, Run, Sighting, StatePart
+from tsgt.radio import MeasureOrder
+from tsgt.radio.superframe.wire import GRANT_BYTES, Reply, Run, Sighting, StatePart, angle_code
 
 STATE = StatePart(prism=1, direct=False, connected=True, late=0, doubted=0, rssi_dbm=-80)
 US = 1_000

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from harness.radios import MS, PAPER
 
-from tsgt.radio.superframe.phase_lock import COMPOSED_NS, FrameLock, Plan
-from tsgt.radio.superframe.slots import FrameTiming
-from tsgt.radio.superframe.wire.messages import GRANT_BYTES, SlotOrder
+from tsgt.radio.superframe import COMPOSED_NS, FrameLock, FrameTiming
+from tsgt.radio.superframe.phase_lock import Plan
+from tsgt.radio.superframe.wire import GRANT_BYTES, SlotOrder
 
 TIMING = FrameTiming.stated(PAPER, start_jitter_ns=5 * MS, turn_round_ns=8 * MS, clock_error_ppm=100)
 BEACON_BYTES = 12

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tsgt.radio.superframe.receive_window import Inbox, Numbers
-from tsgt.radio.superframe.wire.messages import RESTART_SKIP, Introduction
+from tsgt.radio.superframe.wire import RESTART_SKIP, Introduction
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -10,8 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tsgt.radio.superframe.reply_builder import LONGEST_RUN, NARROW_AGE_NS, Timed, pack, quality_of
-from tsgt.radio.superframe.wire.codec import decode_reply, encode_reply, reply_bytes
-from tsgt.radio.superframe.wire.messages import AnswerPart, Reply, quality_bound_us
+from tsgt.radio.superframe.wire import (
+    AnswerPart,
+    Reply,
+    decode_reply,
+    encode_reply,
+    quality_bound_us,
+    reply_bytes,
+)
 
 PERIOD = 25_000
 

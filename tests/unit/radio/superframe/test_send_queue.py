@@ -9,15 +9,16 @@ from harness.hand_master import queued
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tsgt.radio.superframe import Outbox
 from tsgt.radio.superframe import send_queue as outbox_module
 from tsgt.radio.superframe.receive_window import Inbox
-from tsgt.radio.superframe.send_queue import Delivery, Extent, Outbox
-from tsgt.radio.superframe.wire.messages import RESTART_SKIP, Introduction
+from tsgt.radio.superframe.send_queue import Delivery, Extent
+from tsgt.radio.superframe.wire import RESTART_SKIP, Introduction
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from tsgt.radio.superframe.send_queue import Queued
+    from tsgt.radio.superframe import Queued
 
 
 START = 7 + RESTART_SKIP

@@ -21,15 +21,13 @@ from harness.hand_master import (
 from harness.radios import MS
 
 from tsgt.model import Status
-from tsgt.radio.base import Transmitted
-from tsgt.radio.commands import DirectOrder, MeasureOrder, SearchOrder, TrackOrder
-from tsgt.radio.superframe.command_exchange import Situation
-from tsgt.radio.superframe.send_queue import Outbox
-from tsgt.radio.superframe.wire.authentication import Authenticator
-from tsgt.radio.superframe.wire.messages import (
+from tsgt.radio import DirectOrder, MeasureOrder, SearchOrder, TrackOrder, Transmitted
+from tsgt.radio.superframe import Outbox, Situation
+from tsgt.radio.superframe.wire import (
     GRANT_BYTES,
     RESTART_SKIP,
     AnswerPart,
+    Authenticator,
     OrderPart,
     ShotPart,
     quality_bound_us,
@@ -38,8 +36,7 @@ from tsgt.radio.superframe.wire.messages import (
 if TYPE_CHECKING:
     from harness.hand_master import Answered
 
-    from tsgt.radio.superframe.session import Reception
-    from tsgt.radio.superframe.station import SuperframeStation
+    from tsgt.radio.superframe import Reception, SuperframeStation
 
 PERIOD_NS = 400 * MS
 

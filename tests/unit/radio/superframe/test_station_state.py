@@ -9,8 +9,8 @@ import pytest
 from harness.exchange import MS, Exchange
 from harness.frames import KEY, TIMING
 
-from tsgt.radio.commands import DirectOrder
-from tsgt.radio.superframe.wire.authentication import Authenticator
+from tsgt.radio import DirectOrder
+from tsgt.radio.superframe.wire import Authenticator
 
 if TYPE_CHECKING:
     from collections.abc import Collection

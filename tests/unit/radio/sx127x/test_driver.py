@@ -9,11 +9,10 @@ from harness.radios import MS, PAPER, bench, make_side
 from structlog.testing import capture_logs
 
 from tsgt.errors import RadioError, RadioSettingsError
-from tsgt.radio.airtime import airtime_us
-from tsgt.radio.base import BANDWIDTHS_HZ, LoRaSettings
+from tsgt.radio import BANDWIDTHS_HZ, LoRaSettings, airtime_us
+from tsgt.radio.sx127x import Register
 from tsgt.radio.sx127x.driver import QUEUE_PACKETS, State
 from tsgt.radio.sx127x.register_io import FRF, receive_frf, register_values
-from tsgt.radio.sx127x.registers import Register
 from tsgt.simulation.lora.frames import Frame, Modulation
 
 

@@ -10,15 +10,13 @@ from harness.radios import MS, PAPER, Bench, bench, make_side, running_timeline
 from structlog.testing import capture_logs
 
 from tsgt.errors import RadioError, RadioNotFoundError, RadioTimeoutError
-from tsgt.radio.sx127x.driver import RETRY_NS, State, SX127x
-from tsgt.radio.sx127x.hal import Edge
-from tsgt.radio.sx127x.registers import Register
-from tsgt.simulation.kernel.clocks import VirtualClock
-from tsgt.simulation.lora.air import Air
-from tsgt.simulation.lora.link import LinkModel
+from tsgt.radio.sx127x import Edge, Register, SX127x
+from tsgt.radio.sx127x.driver import RETRY_NS, State
+from tsgt.simulation.kernel import VirtualClock
+from tsgt.simulation.lora import Air, LinkModel
 
 if TYPE_CHECKING:
-    from tsgt.radio.sx127x.hal import EdgeCallback
+    from tsgt.radio.sx127x import EdgeCallback
 
 
 def new_air() -> Air:

@@ -12,12 +12,9 @@ from harness.pi import LINE, FakePi, FakeRpiGpio
 from harness.radios import PAPER, make_side, running_timeline
 
 from tsgt.errors import RadioError, RadioNotFoundError, RadioSettingsError
-from tsgt.radio.sx127x import hal
-from tsgt.radio.sx127x.driver import SX127x
-from tsgt.radio.sx127x.hal import DRAGINO_HAT, Edge, Wiring, open_hal
-from tsgt.simulation.kernel.clocks import VirtualClock
-from tsgt.simulation.lora.air import Air
-from tsgt.simulation.lora.link import LinkModel
+from tsgt.radio.sx127x import DRAGINO_HAT, Edge, SX127x, Wiring, hal, open_hal
+from tsgt.simulation.kernel import VirtualClock
+from tsgt.simulation.lora import Air, LinkModel
 
 if TYPE_CHECKING:
     from pathlib import Path

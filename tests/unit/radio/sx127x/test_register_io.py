@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 from harness.radios import PAPER
 
-from tsgt.radio.base import BANDWIDTHS_HZ, LoRaSettings
+from tsgt.radio import BANDWIDTHS_HZ, LoRaSettings
+from tsgt.radio.sx127x import Mode, Register
 from tsgt.radio.sx127x.register_io import frf, op_mode, packet_strength, receive_frf, register_values
-from tsgt.radio.sx127x.registers import Mode, Register
 
 
 def values(settings: LoRaSettings) -> dict[Register, int]:

@@ -16,21 +16,19 @@ from harness.missions import QUICK, SUPERFRAME, mission
 
 from tsgt.config import ScenarioConfig
 from tsgt.model import Status
-from tsgt.recording import encode_line
+from tsgt.recording import EventRecord, encode_line
 from tsgt.recording.journal import AcknowledgedRecord
-from tsgt.recording.stream_records import EventRecord
-from tsgt.simulation.checks import pose_consistency
-from tsgt.simulation.checks.invariants import misread, violations
+from tsgt.simulation.checks import pose_consistency, violations
+from tsgt.simulation.checks.invariants import misread
 from tsgt.simulation.checks.liveness import unacknowledged
+from tsgt.simulation.mission import Measured
 from tsgt.simulation.mission.disk import UNWRITTEN_NS
-from tsgt.simulation.mission.run_log import Measured
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from tsgt.simulation.mission.run_log import StationWitness
-    from tsgt.simulation.mission.runner import Run
+    from tsgt.simulation.mission import Run, StationWitness
 
 
 @pytest.fixture(scope="module", params=["classic", "superframe"])

@@ -7,9 +7,16 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tsgt.cli.composition import radio_key
-from tsgt.config import ClientConfig, MasterConfig, ScenarioConfig, load, parameters, scenario_parameters
-from tsgt.config.client import LeicaInstrumentConfig
-from tsgt.simulation.demo.config_files import write_demo_files
+from tsgt.config import (
+    ClientConfig,
+    LeicaInstrumentConfig,
+    MasterConfig,
+    ScenarioConfig,
+    load,
+    parameters,
+    scenario_parameters,
+)
+from tsgt.simulation.demo import write_demo_files
 
 if TYPE_CHECKING:
     from pathlib import Path

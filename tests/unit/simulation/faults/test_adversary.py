@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from harness.plain_radio import PlainRadio
 
-from tsgt.simulation.faults.adversary import LONGEST_NOISE_BYTES, ForeignRadio
-from tsgt.simulation.kernel.clocks import VirtualClock
+from tsgt.simulation.kernel import VirtualClock
+from tsgt.simulation.lora.adversary import LONGEST_NOISE_BYTES, ForeignRadio
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
 
-    from tsgt.radio.base import Radio
+    from tsgt.radio import Radio
 
 HEARD = [bytes([number]) * 10 for number in range(1, 5)]
 

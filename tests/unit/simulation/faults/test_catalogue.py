@@ -11,14 +11,14 @@ from harness.missions import QUICK, SUPERFRAME, mission
 
 from tsgt.config import ScenarioConfig
 from tsgt.errors import ConfigError
-from tsgt.simulation.checks.invariants import violations
-from tsgt.simulation.faults.catalogue import CALM_S, SETTLE_S, FaultKind, draw_faults, parse_faults
+from tsgt.simulation.checks import violations
+from tsgt.simulation.faults import CALM_S, SETTLE_S, FaultKind, draw_faults, parse_faults
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from tsgt.simulation.mission import Mission
     from tsgt.simulation.mission.computer import Computer
-    from tsgt.simulation.mission.mission import Mission
 
 DURATION_S = 60.0
 

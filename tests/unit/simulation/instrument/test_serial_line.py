@@ -8,7 +8,8 @@ import pytest
 from harness.total_stations import Bench
 
 from tsgt.errors import InstrumentError
-from tsgt.simulation.instrument.serial_line import LineFault, line_ns
+from tsgt.simulation.instrument import LineFault
+from tsgt.simulation.instrument.serial_line import line_ns
 
 
 async def test_bytes_take_their_time() -> None:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tsgt.simulation.kernel.clocks import DriftingClock, VirtualClock, ramped
+from tsgt.simulation.kernel import DriftingClock, VirtualClock, ramped
 
 START_NS = 1_700_000_000_123_456_789
 HOUR_NS = 3_600_000_000_000

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tsgt.simulation.kernel.clocks import VirtualClock
-from tsgt.simulation.kernel.event_loop import VirtualEventLoop, run_virtual
-from tsgt.simulation.kernel.timeline import VirtualTimeline
+from tsgt.simulation.kernel import VirtualClock, VirtualTimeline, run_virtual
+from tsgt.simulation.kernel.event_loop import VirtualEventLoop
 
 if TYPE_CHECKING:
     from pathlib import Path

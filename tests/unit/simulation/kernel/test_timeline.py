@@ -6,7 +6,7 @@ import asyncio
 import time
 from functools import partial
 
-from tsgt.simulation.kernel.timeline import LoopTimeline, VirtualTimeline
+from tsgt.simulation.kernel import LoopTimeline, VirtualTimeline
 
 
 def test_time_stands_still_by_itself() -> None:

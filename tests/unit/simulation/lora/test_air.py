@@ -13,9 +13,10 @@ from harness.air import (
     modulation,
 )
 
-from tsgt.radio.airtime import airtime_us
+from tsgt.radio import airtime_us
+from tsgt.simulation.lora import LinkModel
 from tsgt.simulation.lora.frames import Header, Reception
-from tsgt.simulation.lora.link import FixedLoss, LinkModel
+from tsgt.simulation.lora.link import FixedLoss
 
 IMPLICIT = modulation(explicit_header=False)
 

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from harness.air import SYMBOL_NS, Scene, frame, listening, modulation
 
-from tsgt.simulation.lora.link import FixedLoss, LinkModel
+from tsgt.simulation.lora import LinkModel
+from tsgt.simulation.lora.link import FixedLoss
 
 if TYPE_CHECKING:
     from tsgt.simulation.lora.frames import Modulation

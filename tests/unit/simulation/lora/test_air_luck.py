@@ -8,12 +8,8 @@ import numpy as np
 import pytest
 from harness.air import RecordingAntenna, Scene, frame, link_with_snr, listening
 
-from tsgt.simulation.lora.link import (
-    LinkModel,
-    detection_probability,
-    header_probability,
-    payload_probability,
-)
+from tsgt.simulation.lora import LinkModel
+from tsgt.simulation.lora.link import detection_probability, header_probability, payload_probability
 
 
 def outcomes_of(count: int, link: LinkModel, seed: int = 0, **changes: Any) -> dict[str, int]:

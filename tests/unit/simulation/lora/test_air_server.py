@@ -16,11 +16,10 @@ from structlog.testing import capture_logs
 
 from tsgt.errors import StreamError
 from tsgt.recording import encode_line
-from tsgt.simulation.lora import air_server
-from tsgt.simulation.lora.air_client import WELCOME_TIMEOUT_S, AirClient
+from tsgt.simulation.lora import AirClient, AirServer, LinkModel, LogDistanceLoss, air_server
+from tsgt.simulation.lora.air_client import WELCOME_TIMEOUT_S
 from tsgt.simulation.lora.air_messages import MAX_LINE_BYTES, FrameLine, Transmit
-from tsgt.simulation.lora.air_server import AirServer
-from tsgt.simulation.lora.link import FixedLoss, LinkModel, LogDistanceLoss
+from tsgt.simulation.lora.link import FixedLoss
 
 if TYPE_CHECKING:
     from pathlib import Path

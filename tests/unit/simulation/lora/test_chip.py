@@ -23,8 +23,8 @@ from harness.chips import (
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tsgt.simulation.kernel.timeline import LoopTimeline, VirtualTimeline
-from tsgt.simulation.lora.chip import SX1276Chip
+from tsgt.simulation.kernel import LoopTimeline, VirtualTimeline
+from tsgt.simulation.lora import SX1276Chip
 
 FLAGS, TX_DONE = 0x12, 0x08
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from harness.chips import CAD, FSRX, FSTX, RXCONTINUOUS, RXSINGLE, SLEEP, STDBY, TX, Bench
 
-from tsgt.simulation.kernel.timeline import VirtualTimeline
-from tsgt.simulation.lora.air import Air
-from tsgt.simulation.lora.link import LinkModel
+from tsgt.simulation.kernel import VirtualTimeline
+from tsgt.simulation.lora import Air, LinkModel
 
 RX_BASE, CURRENT, FLAGS, NB_BYTES = 0x0F, 0x10, 0x12, 0x13
 RX_TIMEOUT, RX_DONE, CRC_ERROR, VALID_HEADER = 0x80, 0x40, 0x20, 0x10

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 from harness.chips import NO_JITTER, Bench
 
-from tsgt.simulation.kernel.event_loop import run_virtual
-from tsgt.simulation.lora.hal import SimulatedHal
+from tsgt.simulation.kernel import run_virtual
+from tsgt.simulation.lora import SimulatedHal
 
 if TYPE_CHECKING:
-    from tsgt.radio.sx127x.hal import Edge, Hal
+    from tsgt.radio.sx127x import Edge, Hal
 
 
 def packets(bench: Bench, hal: SimulatedHal, count: int) -> list[Edge]:

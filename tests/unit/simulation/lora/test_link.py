@@ -5,11 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from tsgt.radio.planning.link_budget import REQUIRED_SNR_DB, noise_dbm
+from tsgt.radio.planning import REQUIRED_SNR_DB, noise_dbm
+from tsgt.simulation.lora import LinkModel, LogDistanceLoss
 from tsgt.simulation.lora.link import (
     FixedLoss,
-    LinkModel,
-    LogDistanceLoss,
     detection_probability,
     header_probability,
     payload_probability,

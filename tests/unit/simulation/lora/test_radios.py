@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 from harness.radios import MS, PAPER, running_timeline
 
-from tsgt.simulation.kernel.clocks import VirtualClock
-from tsgt.simulation.lora.air import Air
-from tsgt.simulation.lora.link import LinkModel
-from tsgt.simulation.lora.radios import HostDelay, StampJitter, opener
+from tsgt.simulation.kernel import VirtualClock
+from tsgt.simulation.lora import Air, HostDelay, LinkModel, StampJitter, opener
 
 PACKETS = 400
 

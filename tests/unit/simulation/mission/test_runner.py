@@ -11,8 +11,8 @@ from harness.missions import QUICK, SUPERFRAME, mission
 
 from tsgt.cli.simulate.figures import figures, frame_ms, outage_figures, station_figures
 from tsgt.cli.simulate.poses import estimator_figures
-from tsgt.config.radio import ClassicMasterConfig
-from tsgt.simulation.checks.invariants import violations
+from tsgt.config import ClassicMasterConfig
+from tsgt.simulation.checks import violations
 from tsgt.simulation.mission.authors_node import AuthorsTiming
 from tsgt.simulation.options import Outage, Restart
 from tsgt.simulation.scenario_files import find_scenario, with_stations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tsgt.config import ScenarioConfig
-    from tsgt.simulation.mission.mission import Mission
+    from tsgt.simulation.mission import Mission
     from tsgt.simulation.options import Node
 
 

@@ -8,18 +8,18 @@ import pytest
 from harness.bridge import COMMANDS, HELLO, FakeProgram, FakeStart, measured
 from structlog.testing import capture_logs
 
-from tsgt.config.client import BridgeInstrumentConfig
+from tsgt.config import BridgeInstrumentConfig
 from tsgt.errors import InstrumentError, InstrumentRefusedError
 from tsgt.model import Status
-from tsgt.radio.commands import Direction
-from tsgt.simulation.kernel.clocks import VirtualClock
-from tsgt.station.bridge.instrument import BridgeInstrument
-from tsgt.station.instrument import Atmosphere
+from tsgt.radio import Direction
+from tsgt.simulation.kernel import VirtualClock
+from tsgt.station import Atmosphere
+from tsgt.station.bridge import BridgeInstrument
 from tsgt.station.instrument_supervisor import InstrumentKeeper
 from tsgt.station.session import Session
 
 if TYPE_CHECKING:
-    from tsgt.station.instrument import Reading
+    from tsgt.station import Reading
 
 CLOCK = VirtualClock(0)
 CONFIG = BridgeInstrumentConfig(kind="bridge", command=("bridge",))

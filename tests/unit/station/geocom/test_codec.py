@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from tsgt.errors import MessageError
-from tsgt.station.geocom.codec import Byte, Rpc, decode_reply, encode_request
-from tsgt.station.geocom.codes import ReturnCode, Verdict, name_of, verdict
+from tsgt.station.geocom import ReturnCode, Rpc, Verdict, name_of, verdict
+from tsgt.station.geocom.codec import Byte, decode_reply, encode_request
 
 
 def test_requests_as_they_go_over_the_line() -> None:

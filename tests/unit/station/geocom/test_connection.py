@@ -23,9 +23,8 @@ from harness.geocom_line import (
 from structlog.testing import capture_logs
 
 from tsgt.errors import InstrumentError
-from tsgt.simulation.kernel.clocks import VirtualClock
-from tsgt.station.geocom.codec import Rpc
-from tsgt.station.geocom.connection import GeoComConnection, connect
+from tsgt.simulation.kernel import VirtualClock
+from tsgt.station.geocom import GeoComConnection, Rpc, connect
 
 if TYPE_CHECKING:
     from harness.geocom_line import Fault, MemoryPort

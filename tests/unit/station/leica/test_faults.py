@@ -10,16 +10,15 @@ import pytest
 from harness.leica import leica_bench, leica_config
 
 from tsgt.errors import InstrumentError
+from tsgt.simulation.instrument import LineFault
 from tsgt.simulation.instrument.geocom.server import Forced
-from tsgt.simulation.instrument.serial_line import LineFault
 from tsgt.simulation.instrument.total_station import BOOT_NS
-from tsgt.station.geocom.codec import Rpc
-from tsgt.station.geocom.codes import ReturnCode
+from tsgt.station.geocom import ReturnCode, Rpc
 
 if TYPE_CHECKING:
     from harness.leica import LeicaBench
 
-    from tsgt.station.instrument import Reading
+    from tsgt.station import Reading
 
 # A digit that is another one takes a checksum to be seen: see simulation/serial_scripts.py.
 FAULTS = [fault for fault in LineFault if fault not in (LineFault.NONE, LineFault.DIGIT)]

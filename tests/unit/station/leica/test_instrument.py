@@ -10,22 +10,21 @@ import numpy as np
 import pytest
 from harness.leica import leica_bench, leica_config
 
-from tsgt.config.scenario import InstrumentModelConfig, StatusFaultConfig
+from tsgt.config import InstrumentModelConfig
+from tsgt.config.scenario import StatusFaultConfig
 from tsgt.errors import InstrumentError, InstrumentRefusedError
 from tsgt.model import Status
-from tsgt.radio.commands import Direction
+from tsgt.radio import Direction
 from tsgt.simulation.instrument.geocom.server import Forced
-from tsgt.station.geocom.codec import Rpc
-from tsgt.station.geocom.codes import ReturnCode
-from tsgt.station.geocom.connection import Reply
-from tsgt.station.instrument import Atmosphere
+from tsgt.station import Atmosphere
+from tsgt.station.geocom import Reply, ReturnCode, Rpc
 from tsgt.station.instrument_supervisor import InstrumentKeeper
 from tsgt.station.leica.reacquisition import Look
 from tsgt.station.leica.search import Finder
 from tsgt.station.session import Session
 
 if TYPE_CHECKING:
-    from tsgt.station.geocom.connection import GeoComConnection
+    from tsgt.station.geocom import GeoComConnection
 
 
 def hidden(start_s: float, end_s: float) -> StatusFaultConfig:

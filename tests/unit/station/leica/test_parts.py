@@ -6,10 +6,10 @@ import math
 
 import pytest
 
-from tsgt.config.client import LeicaInstrumentConfig
+from tsgt.config import LeicaInstrumentConfig
 from tsgt.errors import InstrumentRefusedError
 from tsgt.model import Status
-from tsgt.station.geocom.connection import Reply
+from tsgt.station.geocom import Reply
 from tsgt.station.leica.identity import model_of
 from tsgt.station.leica.measurement import FullMeasurement, Readings, full_measurement
 from tsgt.station.leica.setup import PRISM_TYPES, TRACKING_MODES, wet_temperature_c

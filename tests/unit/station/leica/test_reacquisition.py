@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from tsgt.radio.commands import Direction
+from tsgt.radio import Direction
 from tsgt.station.leica.reacquisition import (
     FRESH_NS,
     PAUSES_NS,

@@ -12,20 +12,19 @@ from harness.radios import MS
 from tsgt.clock import UnixTimeline
 from tsgt.errors import RadioError
 from tsgt.model import PolarMeasurement, Status
-from tsgt.radio.base import Packet, Transmitted
-from tsgt.radio.classic.messages import Acknowledgement, MeasurementMessage, TimeReply, decode_reply
-from tsgt.radio.commands import DirectOrder, MeasureOrder, SearchOrder, TrackOrder
+from tsgt.radio import DirectOrder, MeasureOrder, Packet, SearchOrder, TrackOrder, Transmitted
+from tsgt.radio.classic import MeasurementMessage
+from tsgt.radio.classic.messages import Acknowledgement, TimeReply, decode_reply
 from tsgt.recording.journal import TargetRecord
-from tsgt.simulation.kernel.clocks import VirtualClock
-from tsgt.station.links.classic import ClassicLink
+from tsgt.simulation.kernel import VirtualClock
+from tsgt.station.links import ClassicLink
 from tsgt.station.session import Session
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
 
-    from tsgt.radio.base import LoRaSettings
+    from tsgt.radio import LoRaSettings, Order
     from tsgt.radio.classic.messages import Reply
-    from tsgt.radio.commands import Order
 
 START = 1_600_000_000_000_000_000
 

@@ -9,8 +9,7 @@ from tsgt.simulation.instrument.edm import CONTINUOUS
 from tsgt.simulation.instrument.geocom.answers import OK, Answer, Offered
 from tsgt.simulation.instrument.settings import ANGLE_SIGMA_RAD, COMPENSATOR_SIGMA_RAD
 from tsgt.simulation.instrument.telescope import Lock
-from tsgt.station.geocom.codec import Rpc
-from tsgt.station.geocom.codes import ReturnCode
+from tsgt.station.geocom import ReturnCode, Rpc
 
 if TYPE_CHECKING:
     from collections.abc import Callable

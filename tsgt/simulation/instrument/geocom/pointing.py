@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Final
 from tsgt.simulation.instrument.geocom.answers import OK, Answer, values
 from tsgt.simulation.instrument.telescope import Lock
 from tsgt.simulation.instrument.visibility import HEAD_SPEED_RADPS, apart_rad
-from tsgt.station.geocom.codec import Rpc
-from tsgt.station.geocom.codes import ReturnCode
+from tsgt.station.geocom import ReturnCode, Rpc
 
 if TYPE_CHECKING:
     from tsgt.simulation.instrument.geocom.answers import Job, Procedures

@@ -14,17 +14,17 @@ from tsgt.simulation.instrument.geocom.answers import Answer
 from tsgt.simulation.instrument.geocom.measuring import MEASURING
 from tsgt.simulation.instrument.geocom.pointing import LICENSED, SEARCHING
 from tsgt.simulation.instrument.geocom.setting import SETTING
-from tsgt.station.geocom.codes import ReturnCode
+from tsgt.station.geocom import ReturnCode
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     import numpy as np
 
-    from tsgt.config.scenario import InstrumentModelConfig
+    from tsgt.config import InstrumentModelConfig
     from tsgt.simulation.instrument.geocom.answers import Job, Procedures, Value
     from tsgt.simulation.instrument.total_station import SimulatedTotalStation
-    from tsgt.simulation.kernel.timeline import Handle, Timeline
+    from tsgt.simulation.kernel import Handle, Timeline
 
 PROCEDURES: Procedures = {**SETTING, **MEASURING, **SEARCHING}
 

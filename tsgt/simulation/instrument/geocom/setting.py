@@ -8,8 +8,7 @@ from tsgt.simulation.instrument.edm import CONTINUOUS, atmospheric_ppm
 from tsgt.simulation.instrument.geocom.answers import OK, Answer, values
 from tsgt.simulation.instrument.settings import EDM_MODES, MODE_OF_PROGRAM, PRISM_CONSTANTS_M, USER_PRISM
 from tsgt.simulation.instrument.visibility import FIELD_RAD, NARROW_FIELD_RAD
-from tsgt.station.geocom.codec import Rpc
-from tsgt.station.geocom.codes import ReturnCode
+from tsgt.station.geocom import ReturnCode, Rpc
 
 if TYPE_CHECKING:
     from tsgt.simulation.instrument.geocom.answers import Procedures

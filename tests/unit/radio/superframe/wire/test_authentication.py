@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tsgt.radio.superframe.wire.authentication import CODE_BYTES, KEY_BYTES, Authenticator
+from tsgt.radio.superframe.wire import CODE_BYTES, KEY_BYTES, Authenticator
 
 KEY = bytes(range(KEY_BYTES))
 

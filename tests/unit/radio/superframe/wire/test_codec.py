@@ -7,20 +7,7 @@ import pytest
 
 from tsgt.errors import MessageError
 from tsgt.model import Status
-from tsgt.radio.superframe.wire.bits import BitReader, BitWriter
-from tsgt.radio.superframe.wire.codec import (
-    angle_code,
-    angle_rad,
-    decode_beacon,
-    decode_reply,
-    distance_code,
-    distance_m,
-    encode_beacon,
-    encode_reply,
-    is_far,
-    reply_bytes,
-)
-from tsgt.radio.superframe.wire.messages import (
+from tsgt.radio.superframe.wire import (
     GRANT_BYTES,
     AnswerPart,
     Beacon,
@@ -35,8 +22,19 @@ from tsgt.radio.superframe.wire.messages import (
     SlotOrder,
     StatePart,
     StationEntry,
-    Towards,
+    angle_code,
+    angle_rad,
+    decode_beacon,
+    decode_reply,
+    distance_code,
+    distance_m,
+    encode_beacon,
+    encode_reply,
+    is_far,
+    reply_bytes,
 )
+from tsgt.radio.superframe.wire.bits import BitReader, BitWriter
+from tsgt.radio.superframe.wire.messages import Towards
 
 SIGHTING = Sighting(200, 100_000, Status.OK, 5_000_000, 4_194_304, 750_000)
 SINGLE = Reply(runs=(Run(sightings=(SIGHTING,)),))

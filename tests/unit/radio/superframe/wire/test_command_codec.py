@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tsgt.radio.commands import Direction, DirectOrder, MeasureOrder, SearchOrder, TrackOrder
-from tsgt.radio.superframe.wire.codec import order_of, order_part, spread_rad
+from tsgt.radio import Direction, DirectOrder, MeasureOrder, SearchOrder, TrackOrder
+from tsgt.radio.superframe.wire import order_of, order_part
+from tsgt.radio.superframe.wire.codec import spread_rad
 
 
 @pytest.mark.parametrize(

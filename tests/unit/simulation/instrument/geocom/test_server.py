@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tsgt.simulation.instrument.geocom.server import PROCEDURES, Forced, crc_16
-from tsgt.simulation.kernel.event_loop import run_virtual
-from tsgt.station.geocom.codec import Rpc
+from tsgt.simulation.kernel import run_virtual
+from tsgt.station.geocom import Rpc
 
 
 async def test_a_request_without_a_number_is_answered_with_zero() -> None:

@@ -5,87 +5,26 @@ from __future__ import annotations
 import asyncio
 import math
 from collections import Counter
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.config.radio import SuperframeMasterConfig
-from tsgt.simulation.checks.memory_bounds import overgrown
-from tsgt.simulation.faults.catalogue import CALM_S, draw_faults
-from tsgt.simulation.faults.injection import act, see_to_instruments
-from tsgt.simulation.kernel.event_loop import run_virtual
-from tsgt.simulation.kernel.timeline import VirtualTimeline
-from tsgt.simulation.mission.mission import DRAIN_S, START_UNIX_NS, Mission
+from tsgt.config import SuperframeMasterConfig
+from tsgt.simulation.checks import overgrown
+from tsgt.simulation.faults import CALM_S, act, draw_faults, see_to_instruments
+from tsgt.simulation.kernel import VirtualTimeline, run_virtual
+from tsgt.simulation.mission import DRAIN_S, Mission, Run
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
     from pathlib import Path
 
     from tsgt.config import ScenarioConfig
-    from tsgt.model import Parameters
-    from tsgt.simulation.faults.catalogue import FaultKind
-    from tsgt.simulation.mission.run_log import Session, StationWitness
-    from tsgt.simulation.options import Options, Outage
-    from tsgt.simulation.world import World
+    from tsgt.simulation.options import Options
 
 
 MEMORY_CHECK_S = 60
 """How often the memory of the daemons is looked at."""
-
-
-@dataclass(frozen=True, slots=True)
-class Run:
-    """A mission that is over.
-
-    Attributes
-    ----------
-    parameters
-        What the master knew of the set-up: the exact truth.
-    world
-        The truth; its instants count from the start of the run.
-    duration_s
-        How long it measured, without the drain.
-    sessions
-        What the master sent out, one entry for each time that it was started.
-    witnesses
-        What was read from the instruments, by station number.
-    airtime_s
-        How long there was a packet on the air, of whomever.
-    superframe
-        Whether that protocol was spoken.
-    outages
-        When who did not hear whom.
-    faults
-        How many of each kind there were.
-    calm_s
-        When they were over, in s from the start; None: there were none.
-    rate_hz
-        How often each instrument measures, by station number.
-    overgrown
-        What was longer in memory than it should be.
-    start_ns
-        Unix time of the start on the master's clock, in ns.
-    """
-
-    parameters: Parameters
-    world: World
-    duration_s: float
-    sessions: list[Session]
-    witnesses: dict[int, StationWitness]
-    airtime_s: float
-    superframe: bool
-    outages: tuple[Outage, ...] = ()
-    faults: Counter[FaultKind] = field(default_factory=Counter)
-    calm_s: float | None = None
-    rate_hz: dict[int, float] = field(default_factory=dict)
-    overgrown: tuple[str, ...] = ()
-    start_ns: int = START_UNIX_NS
-
-    @property
-    def end_ns(self) -> int:
-        """Unix time of the end on the master's clock, in ns; the drain comes after it."""
-        return self.start_ns + round(self.duration_s * 1e9)
 
 
 def simulate(

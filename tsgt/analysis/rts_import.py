@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from tsgt.analysis.calibration.targets import solve_stations, target_residuals
+from tsgt.analysis.calibration import solve_stations, target_residuals
 from tsgt.analysis.formats.target_file import read_target_file
 from tsgt.errors import GeometryError, InputFileError
 from tsgt.geometry import cartesian_to_polar, invert, raw_distance, transform_points

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from tsgt.clock import Clock
-    from tsgt.radio.base import OpenRadio, Radio
+    from tsgt.radio import OpenRadio, Radio
 
 LONGEST_NOISE_BYTES = 40
 _REMEMBERED = 64

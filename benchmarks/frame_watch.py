@@ -74,7 +74,7 @@ def alarms(parameters: Parameters, measurements: Sequence[Measurement]) -> list[
         for record in records
         if isinstance(record, PoseRecord)
         for event in watch.pose(record, record.stamp_ns)
-        if event.event == "frame_suspect"
+        if event.event == "layout_residual_high"
     ]
 
 

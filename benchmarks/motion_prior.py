@@ -99,7 +99,7 @@ def main() -> None:
                 )
             )
             more = (
-                f"{sigmas}; {prior.acceleration_time_s:.2g} and {prior.angular_acceleration_time_s:.2g} s; "
+                f"{sigmas}; {prior.acceleration_correlation_time_s:.2g} and {prior.angular_acceleration_time_s:.2g} s; "
                 f"noise x {found.noise_scale:.2f}"
             )
             evidence = f"{found.log_evidence - least:+.0f}"

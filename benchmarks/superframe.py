@@ -29,7 +29,7 @@ CASES = (
     "--protocol superframe --loss 0.1 --outage 1:300:60",
     "--protocol superframe --loss 0.1 --outage all:300:60",
     "--protocol superframe --loss 0.1 --restart 2:200 --restart 3:400",
-    "--protocol superframe --foreign-per-s 0.5",
+    "--protocol superframe --interference-rate-hz 0.5",
 )
 
 

@@ -403,7 +403,7 @@ class MotionPrior:
     ----------
     acceleration_sigma_mps2
         One sigma of the acceleration of the prisms' middle (centroid) along x, y, z of frame ``station1``.
-    acceleration_time_s
+    acceleration_correlation_time_s
         How long an acceleration lasts in s: after this its correlation has fallen to 1/e.
     angular_acceleration_sigma_radps2
         One sigma of the angular acceleration about x, y, z of the robot.
@@ -414,13 +414,15 @@ class MotionPrior:
     __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
     acceleration_sigma_mps2: Vector3 = (0.4, 0.4, 0.2)
-    acceleration_time_s: float = 0.8
+    acceleration_correlation_time_s: float = 0.8
     angular_acceleration_sigma_radps2: Vector3 = (0.15, 0.15, 0.2)
     angular_acceleration_time_s: float = 0.4
 
     def __post_init__(self) -> None:
         """Refuse motion that no robot has."""
-        _check_limits(self, acceleration_time_s=(1e-3, 1e4), angular_acceleration_time_s=(1e-3, 1e4))
+        _check_limits(
+            self, acceleration_correlation_time_s=(1e-3, 1e4), angular_acceleration_time_s=(1e-3, 1e4)
+        )
         for sigma in (*self.acceleration_sigma_mps2, *self.angular_acceleration_sigma_radps2):
             if not 1e-6 <= sigma <= 1e6:
                 raise ValueError(f"a sigma of an acceleration is {sigma}, expected 1e-06 to 1e+06")

@@ -91,7 +91,7 @@ class ClockScenario:
         Share of cycles that get no answer, and of polls.
     step
         The clock is set, or the station starts anew.
-    silence_s
+    stall_timeout_s
         From when to when the station is out of reach. It goes on measuring; those measurements reach the master
         with the station's journal and are judged like the others.
     duration_s
@@ -108,7 +108,7 @@ class ClockScenario:
     late_always_s: float = 0.0
     loss: float = 0.0
     step: Step | None = None
-    silence_s: tuple[float, float] | None = None
+    stall_timeout_s: tuple[float, float] | None = None
     duration_s: float = 4 * HOUR_S
 
 
@@ -141,7 +141,7 @@ SCENARIOS: tuple[ClockScenario, ...] = (
         name="outage",
         summary="out of reach for 90 minutes, and 3 ppm more meanwhile",
         warming_ppm=3.0,
-        silence_s=(HOUR_S + 50, 2.5 * HOUR_S + 50),
+        stall_timeout_s=(HOUR_S + 50, 2.5 * HOUR_S + 50),
     ),
 )
 
@@ -259,7 +259,7 @@ class _Run:
 
     def _reachable(self, at_s: float) -> bool:
         s = self._scenario
-        silent = s.silence_s is not None and s.silence_s[0] <= at_s < s.silence_s[1]
+        silent = s.stall_timeout_s is not None and s.stall_timeout_s[0] <= at_s < s.stall_timeout_s[1]
         return not silent and not self._away(at_s)
 
     def _away(self, at_s: float) -> bool:

@@ -351,7 +351,7 @@ class Field:
             kind="master",
             setup=SetupConfig(station_frames=self.folder / "frames", prism_layout=self.folder / "prisms"),
             stations=tuple(
-                StationConfig(station=n, prism=n, prism_constant_mm=10.0, stamp_delay_ms=delay_ms)
+                StationConfig(station=n, prism=n, prism_constant_mm=10.0, timestamp_delay_ms=delay_ms)
                 for n in STATIONS
             ),
             radio=SimulatedRadioConfig(

@@ -41,7 +41,7 @@ def draw_motions(prior: MotionPrior, *, count: int, duration_s: float, seed: int
     times = np.arange(round(duration_s / STEP_S) + 1, dtype=np.float64) * STEP_S
     parts = []
     for sigmas, time_s in (
-        (prior.acceleration_sigma_mps2, prior.acceleration_time_s),
+        (prior.acceleration_sigma_mps2, prior.acceleration_correlation_time_s),
         (prior.angular_acceleration_sigma_radps2, prior.angular_acceleration_time_s),
     ):
         kept = np.exp(-STEP_S / time_s)

@@ -35,12 +35,12 @@ ONE = (
 
 
 def with_program(
-    *command: str, use: Callable[[BridgeInstrument], Awaitable[None]], silence_s: float = 5.0
+    *command: str, use: Callable[[BridgeInstrument], Awaitable[None]], stall_timeout_s: float = 5.0
 ) -> None:
     """Use a program in real time, and end it."""
 
     async def main() -> None:
-        config = BridgeInstrumentConfig(kind="bridge", command=command, silence_s=silence_s)
+        config = BridgeInstrumentConfig(kind="bridge", command=command, stall_timeout_s=stall_timeout_s)
         instrument = BridgeInstrument(config, SystemClock())
         try:
             await use(instrument)
@@ -101,7 +101,7 @@ def test_a_shell_script_will_do() -> None:
 
     with capture_logs() as logs:
         with_program("sh", "-c", f"{HELLO} sleep 0.05; {ONE} echo no licence >&2; exit 3", use=use)
-    assert [(entry["event"], entry["text"]) for entry in logs] == [("bridge_said", "no licence")]
+    assert [(entry["event"], entry["text"]) for entry in logs] == [("bridge_stderr", "no licence")]
 
 
 def test_one_that_cannot_be_started() -> None:
@@ -169,7 +169,7 @@ def test_one_that_stalls_is_killed_and_works_when_started_again(tmp_path: Path) 
         "-c",
         f"{HELLO} test -e {mark} || {{ touch {mark}; kill -STOP $$; }}; sleep 0.05; {ONE} exec sleep 60",
         use=use,
-        silence_s=0.5,
+        stall_timeout_s=0.5,
     )
 
 

@@ -142,6 +142,7 @@ def test_studies(damage: Damage) -> None:
             check(files, ("analyse", "layout", "--scenario", "@f.toml"))
         else:
             check(
-                files, ("analyse", "perturbation", "--step-mm", "200", "--draws", "3", "--prisms", "@f.toml")
+                files,
+                ("analyse", "perturbation", "--step-mm", "200", "--samples", "3", "--prisms", "@f.toml"),
             )
             check(files, ("analyse", "layout", "@f.toml"))

@@ -59,7 +59,7 @@ class LeicaInstrumentConfig(Model):
         400,
     )
     """Between these distances it looks for the prism: something shiny outside is passed over."""
-    narrow_view: bool = False
+    reduced_field_of_view: bool = False
     """Whether to see only the middle of the field of view, so that a neighbouring prism is not taken for the tracked one."""
     target: Literal["foil", "prism"] = "foil"
     """What single measurements are made of."""
@@ -74,7 +74,7 @@ class BridgeInstrumentConfig(Model):
     """A program that knows the instrument."""
     command: Annotated[tuple[str, ...], Field(min_length=1)]
     """The program and its arguments; it is started again when it ends."""
-    silence_s: Positive = 5.0
+    stall_timeout_s: Positive = 5.0
     """A program that says nothing for so long while it should measure has stalled, and is started again."""
     latency_ms: Annotated[float, Field(ge=-1000, le=1000)] = 0.0
     """From a measurement to the time that the program gives, taken off each stamp."""

@@ -80,7 +80,9 @@ def load_target_residuals(path: Path) -> dict[int, tuple[TargetResidual, ...]]:
     return {
         int(number): tuple(
             TargetResidual(
-                target=fit.target, residual_m=_metres(fit.residual_mm), left_out_m=_metres(fit.left_out_mm)
+                target=fit.target,
+                residual_m=_metres(fit.residual_mm),
+                left_out_m=_metres(fit.leave_one_out_mm),
             )
             for fit in entry.targets
         )

@@ -31,7 +31,7 @@ class StationConfig(Model):
     """Added to every slope distance. No default: a forgotten constant shows in nothing but wrong poses."""
     atmospheric_ppm: Annotated[float, Field(ge=-10_000, le=10_000)] = 0.0
     """Scale correction of the slope distance, only what the instrument does not apply itself."""
-    stamp_delay_ms: Annotated[float, Field(ge=0, le=1e3)] = 0.0
+    timestamp_delay_ms: Annotated[float, Field(ge=0, le=1e3)] = 0.0
     """How late the station's computer stamps a ping, on average: 0.7 for the authors' nodes, which poll."""
     latency_ms: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
     """From the measurement to its time stamp; taken off the stamp. Positive: the stamp is late."""
@@ -73,7 +73,7 @@ class FrameWatchConfig(Model):
 
     residual_mm: Positive = 6.0
     """The prisms of a robot that stands still miss their layout by at most this (root mean square) ..."""
-    residual_per_speed_ms: Annotated[float, Field(ge=0, le=1e3)] = 6.0
+    residual_speed_gain_ms: Annotated[float, Field(ge=0, le=1e3)] = 6.0
     """... and by this times the robot's speed more while it moves."""
     window_s: Positive = 10.0
     """Three of four poses over this time have to miss it by more."""

@@ -117,7 +117,7 @@ def pipeline_parameters(pipeline: PipelineConfig) -> PipelineParameters:
         angular_acceleration_sigma_radps2=pipeline.angular_acceleration_sigma_radps2,
         motion=MotionPrior(
             acceleration_sigma_mps2=pipeline.motion.acceleration_sigma_mps2,
-            acceleration_time_s=pipeline.motion.acceleration_time_s,
+            acceleration_correlation_time_s=pipeline.motion.acceleration_correlation_time_s,
             angular_acceleration_sigma_radps2=pipeline.motion.angular_acceleration_sigma_radps2,
             angular_acceleration_time_s=pipeline.motion.angular_acceleration_time_s,
         ),

@@ -19,7 +19,7 @@ class MotionConfig(Model):
 
     acceleration_sigma_mps2: PerAxis = (0.4, 0.4, 0.2)
     """One sigma of the acceleration of the prisms' middle along x, y, z of station 1."""
-    acceleration_time_s: Lasting = 0.8
+    acceleration_correlation_time_s: Lasting = 0.8
     """How long an acceleration lasts."""
     angular_acceleration_sigma_radps2: PerAxis = (0.15, 0.15, 0.2)
     """One sigma of the angular acceleration about x, y, z of the robot."""

@@ -114,7 +114,7 @@ class SuperframeMasterConfig(SuperframeConfig):
 
     start_jitter_ms: Annotated[float, Field(ge=0.5, le=50)] = 5.0
     """How late a station's computer starts a transmission at worst: 5 as a rule, 1 to 2 with real-time priority."""
-    turn_round_ms: Annotated[float, Field(ge=3, le=60)] = 8.0
+    turnaround_ms: Annotated[float, Field(ge=3, le=60)] = 8.0
     """What a station's computer needs from the end of a beacon to its first slot."""
     clock_error_ppm: Annotated[float, Field(ge=0, le=1000)] = 100.0
     """By how much two computers' clocks may run apart."""

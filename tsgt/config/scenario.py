@@ -41,7 +41,7 @@ class MotionConfig(Model):
     """Roll and pitch on rough ground while moving, root mean square of each."""
     heave_rms_mm: NotNegative = 20.0
     """Up and down on rough ground while moving, root mean square."""
-    shaking_smoothing_s: Smoothing = 0.5
+    attitude_smoothing_s: Smoothing = 0.5
     """Sigma of the Gaussian that smooths white noise into roll, pitch and heave."""
     area_centre_m: Place = (60.0, 45.0, -1.0)
     """Where the robot starts and stays around, in the frame of station 1."""

@@ -17,7 +17,7 @@ class TargetFit(Model):
     """Number of the target."""
     residual_mm: NotNegative | None = None
     """Where the station sees it less where station 1 does, in the solved frame; a rejected target has none."""
-    left_out_mm: NotNegative | None = None
+    leave_one_out_mm: NotNegative | None = None
     """The same with the frame solved from the other targets alone; none where these were too few."""
 
 

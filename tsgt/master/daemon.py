@@ -249,7 +249,7 @@ class _Master:
         while interval_s is not None:
             turn_ns, now_ns = link.turn_ns, self.reports.now_ns()
             if turn_ns is not None and now_ns - turn_ns > STUCK_NS:
-                log.error("turns_stuck", for_s=(now_ns - turn_ns) / 1e9)
+                log.error("scheduler_stalled", for_s=(now_ns - turn_ns) / 1e9)
             else:
                 service.sd_notify("WATCHDOG=1")
             await self._clock.sleep_until(self._clock.monotonic_ns() + round(interval_s * 1e9))
@@ -265,7 +265,7 @@ class _Master:
                 async with open_radio() as radio:
                     if self._radio_failed:
                         self._radio_failed = False
-                        self.reports.event("radio_back", "the radio of the master works again")
+                        self.reports.event("radio_recovered", "the radio of the master works again")
                     yield radio
             except (RadioError, StreamError) as error:
                 if not self._radio_failed:

@@ -104,11 +104,11 @@ class Geofence:
         if self._beyond:
             return [
                 *events,
-                self._event(now_ns, "fence_left", f"fence {self.name} left: the robot is {what}"),
+                self._event(now_ns, "geofence_exited", f"fence {self.name} left: the robot is {what}"),
             ]
         return [
             *events,
-            self._event(now_ns, "fence_entered", f"fence {self.name} entered: the robot is {what}"),
+            self._event(now_ns, "geofence_entered", f"fence {self.name} entered: the robot is {what}"),
         ]
 
     def measurement(self, record: Measurement) -> list[EventRecord]:  # noqa: ARG002 (poses tell where the robot is)
@@ -124,7 +124,7 @@ class Geofence:
         if self._beyond:
             return []
         message = f"fence {self.name} left: no valid pose for {self._settings.lost_after_s:g} s"
-        return [self._event(now_ns, "fence_left", message)]
+        return [self._event(now_ns, "geofence_exited", message)]
 
     def next_deadline_ns(self) -> int | None:
         """Return when :meth:`tick` is to be called if no valid pose comes before; None while nothing runs out."""

@@ -42,7 +42,7 @@ class WatchSettings(Protocol):
         """By how much the prisms of a robot that stands still may miss their layout, root mean square."""
 
     @property
-    def residual_per_speed_ms(self) -> float:
+    def residual_speed_gain_ms(self) -> float:
         """Times the robot's speed: how much more they may miss it by while it moves; mm per m/s."""
 
     @property
@@ -85,14 +85,14 @@ class FrameWatch:
         self._suspect = False
 
     def pose(self, record: PoseRecord, now_ns: int) -> list[EventRecord]:
-        """Take a pose that came out at ``now_ns``; return ``frame_suspect`` or ``frame_restored`` where it is so.
+        """Take a pose that came out at ``now_ns``; return ``layout_residual_high`` or ``frame_restored`` where it is so.
 
         Poses that are not valid for another reason than their residual say nothing of the frames. It is made for the
         estimator ``linear``: the other one bends its trajectory until the prisms fit.
         """
         if record.residual_m is None or record.velocity_mps is None or record.reason not in ("", "residual"):
             return []
-        limit_mm = self._settings.residual_mm + self._settings.residual_per_speed_ms * math.hypot(
+        limit_mm = self._settings.residual_mm + self._settings.residual_speed_gain_ms * math.hypot(
             *record.velocity_mps
         )
         shares = {
@@ -126,7 +126,7 @@ class FrameWatch:
             f"{self._figures()}: a tripod or a prism has moved, likeliest that of station {likeliest}; "
             f"check with tsgt calibrate check{blind}"
         )
-        return EventRecord(stamp_ns=now_ns, event="frame_suspect", message=message, station=likeliest)
+        return EventRecord(stamp_ns=now_ns, event="layout_residual_high", message=message, station=likeliest)
 
     def _figures(self) -> str:
         residual_mm = statistics.median(sample.residual_mm for sample in self._samples)

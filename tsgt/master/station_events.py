@@ -79,7 +79,7 @@ class Alerts:
         if not found.lost:
             return []
         found.lost = False
-        return [_event(now_ns, "station_back", f"answers again after {silent_s:.0f} s", station)]
+        return [_event(now_ns, "station_recovered", f"answers again after {silent_s:.0f} s", station)]
 
     def ordered(self, station: int, prism: int, now_ns: int, *, tracks: bool) -> list[EventRecord]:
         """Take note of whether a station says that it tracks its prism."""
@@ -97,23 +97,25 @@ class Alerts:
         text = "has another clock than before: restarted, or set; its measurements are put on the new one"
         return [_event(now_ns, "station_clock_stepped", text, station)]
 
-    def beacon_doubted(self, station: int, now_ns: int, count: int) -> list[EventRecord]:
+    def beacon_time_rejected(self, station: int, now_ns: int, count: int) -> list[EventRecord]:
         """Tell that a station received beacons at a time at which they cannot have been sent."""
         text = (
             f"station {station} received {count} beacons at a time at which they cannot have been sent; somebody may be "
             "holding back packets and sending them later. They are not used"
         )
         return [
-            EventRecord(stamp_ns=now_ns, event="beacon_doubted", message=text, station=station, count=count)
+            EventRecord(
+                stamp_ns=now_ns, event="beacon_time_rejected", message=text, station=station, count=count
+            )
         ]
 
-    def link_doubted(self, station: int, now_ns: int) -> list[EventRecord]:
+    def link_delay_anomaly(self, station: int, now_ns: int) -> list[EventRecord]:
         """Tell that the time between a station and the master came out as it cannot be."""
         text = (
             "and the master disagree on how long a packet takes; somebody may be holding back packets and sending them "
             "later, or a radio stamps badly. This exchange is not used"
         )
-        return [_event(now_ns, "link_doubted", text, station)]
+        return [_event(now_ns, "link_delay_anomaly", text, station)]
 
     def polled(self, station: int, now_ns: int) -> list[EventRecord]:
         """Take note of an answer, before the measurement that it may hold; tell when none comes any more.

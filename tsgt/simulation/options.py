@@ -144,5 +144,5 @@ class Options:
     authenticated: bool = True
     outages: tuple[Outage, ...] = ()
     restarts: tuple[Restart, ...] = ()
-    foreign_per_s: float = 0.0
+    interference_rate_hz: float = 0.0
     faults: frozenset[FaultKind] = frozenset()

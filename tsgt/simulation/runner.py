@@ -71,7 +71,7 @@ def simulate(
             *(mission.interrupt(outage) for outage in options.outages),
             *(mission.restart(restart.station, restart.at_s) for restart in options.restarts),
             *(act(mission, fault) for fault in faults),
-            *([mission.be_foreign()] if options.foreign_per_s else []),
+            *([mission.be_foreign()] if options.interference_rate_hz else []),
             *([see_to_instruments(mission, options.duration_s - CALM_S)] if faults else []),
         ]
         acting = [asyncio.create_task(each) for each in acts]

@@ -154,7 +154,7 @@ def _motion(motion: MotionConfig, n: int, generator: np.random.Generator) -> NDA
         commands = _commands(motion, n, start_yaw, generator)
         speeds = commands[:, 0]
         state = _driven(motion, _smoothed(commands, motion.command_smoothing_s), start_yaw)
-    shaking = _unit_noise(n, 3, motion.shaking_smoothing_s, generator)
+    shaking = _unit_noise(n, 3, motion.attitude_smoothing_s, generator)
     shaking *= _smoothed((speeds[:, None] > 0).astype(np.float64), motion.command_smoothing_s)
     state[:, 2] += shaking[:, 0] * motion.heave_rms_mm / 1e3
     state[:, 4:] += shaking[:, 1:] * math.radians(motion.tilt_rms_deg)

@@ -98,7 +98,7 @@ def read_backlog(directory: Path, station: int) -> Backlog:
     left = max((_left(journals, lineage) for lineage in lineages), key=lambda each: len(each.undelivered))
     undelivered, receptions = left.undelivered, left.receptions
     if len(undelivered) > MOST_MEASUREMENTS:
-        log.warning("backlog_left_behind", measurements=len(undelivered) - MOST_MEASUREMENTS)
+        log.warning("measurements_discarded", measurements=len(undelivered) - MOST_MEASUREMENTS)
     # A run that has heard no master leaves measurements whose time rests on what the runs before it have heard.
     boots = {each.boot for each in undelivered}
     for head, path in reversed(journals):

@@ -164,11 +164,11 @@ def test_a_reference(good: dict[str, str], number: str) -> None:
         (TRAIL, "route_m", "1e300"),
         (TRAIL, "route_m", "1e7"),
         (TRAIL, "corner_smoothing_m", "1e-300"),
-        (DYNAMIC, "shaking_smoothing_s", "1e-300"),
+        (DYNAMIC, "attitude_smoothing_s", "1e-300"),
         (DYNAMIC, "rate_hz", "1e-300"),
         (DYNAMIC, r"acceleration_sigma_mps2 = \[", "1e-300"),
-        (DYNAMIC, "acceleration_time_s", "1e-300"),
-        (DYNAMIC, "acceleration_time_s", "1e6"),
+        (DYNAMIC, "acceleration_correlation_time_s", "1e-300"),
+        (DYNAMIC, "acceleration_correlation_time_s", "1e6"),
         (DYNAMIC, "interval_min_s", "1e-300"),
     ],
 )
@@ -180,7 +180,7 @@ def test_a_scenario(scenario: str, key: str, number: str) -> None:
     assert re.findall(r"\w+_\w+", key)[0] in outcome.err
 
 
-@pytest.mark.parametrize("key", ["acceleration_time_s", "angular_acceleration_time_s"])
+@pytest.mark.parametrize("key", ["acceleration_correlation_time_s", "angular_acceleration_time_s"])
 def test_how_a_robot_moves(good: dict[str, str], key: str) -> None:
     """What no estimator can compute with is an error of the configuration, and names its key."""
     content = with_number(MASTER, key, "1e-300")

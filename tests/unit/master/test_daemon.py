@@ -128,7 +128,7 @@ async def test_a_station_dies_and_comes_back_with_another_clock(tmp_path: Path) 
         field.stations[2].clock.step(3_600_000 * MS)
         field.stations[2].start()
         await asyncio.sleep(15)
-    assert events(field) == ["station_lost 2", "station_back 2", "station_clock_stepped 2"]
+    assert events(field) == ["station_lost 2", "station_recovered 2", "station_clock_stepped 2"]
     assert max(stamp_errors_ms(field.of(PolarMeasurement))) < 0.2
     others = [m for m in field.records[:lost_at] if isinstance(m, PolarMeasurement) and m.station == 1]
     gaps = [b.stamp_ns - a.stamp_ns for a, b in pairwise(others)]
@@ -203,7 +203,7 @@ async def test_the_recording_is_the_stream_and_replays_bit_for_bit(
     assert [line.type for line in lines[:2]] == ["recording", "parameters"]
     assert [line.data for line in lines[2:]] == streamed
     assert [line for _, some in replayed(field.recording()) for line in some] == streamed
-    assert {"fence_left", "fence_entered", "station_lost 3"} <= set(events(field))
+    assert {"geofence_exited", "geofence_entered", "station_lost 3"} <= set(events(field))
 
 
 @pytest.mark.parametrize("at_ms", [0, 1, 30, 200, 1000, 1777, 4000, 4100, 5321, 9000])
@@ -253,7 +253,7 @@ async def test_a_radio_that_fails_is_opened_again(tmp_path: Path) -> None:
             assert events(field) == ["radio_failed"]
             works = True
             await asyncio.sleep(15)
-            assert events(field) == ["radio_failed", "radio_back"]
+            assert events(field) == ["radio_failed", "radio_recovered"]
             assert field.of(PoseRecord)[-1].valid
     assert len(field.of(StatusRecord)) >= 44
 
@@ -308,12 +308,12 @@ def test_a_fence_runs_its_command(tmp_path: Path) -> None:
 
     async def commands() -> None:
         script = f'echo "$TSGT_EVENT $TSGT_FENCE" > {tmp_path}/said'
-        await run_fence_command(("sh", "-c", script), event="fence_left", fence="yard")
-        await run_fence_command(("/nonexistent",), event="fence_left", fence="yard")
-        await run_fence_command(("false",), event="fence_left", fence="yard")
+        await run_fence_command(("sh", "-c", script), event="geofence_exited", fence="yard")
+        await run_fence_command(("/nonexistent",), event="geofence_exited", fence="yard")
+        await run_fence_command(("false",), event="geofence_exited", fence="yard")
 
     run(commands)
-    assert (tmp_path / "said").read_text() == "fence_left yard\n"
+    assert (tmp_path / "said").read_text() == "geofence_exited yard\n"
 
 
 def test_no_name_of_a_fence_is_a_command(tmp_path: Path) -> None:
@@ -322,8 +322,8 @@ def test_no_name_of_a_fence_is_a_command(tmp_path: Path) -> None:
 
     async def commands() -> None:
         script = f'printf %s "$TSGT_FENCE" > {tmp_path}/said'
-        await run_fence_command(("sh", "-c", script), event="fence_left", fence=name)
-        await run_fence_command(("touch", f"{tmp_path}/$TSGT_FENCE"), event="fence_left", fence=name)
+        await run_fence_command(("sh", "-c", script), event="geofence_exited", fence=name)
+        await run_fence_command(("touch", f"{tmp_path}/$TSGT_FENCE"), event="geofence_exited", fence=name)
 
     run(commands)
     assert (tmp_path / "said").read_text() == name

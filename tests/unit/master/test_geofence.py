@@ -53,57 +53,57 @@ def test_the_first_pose_beyond_the_boundary_gives_the_event() -> None:
     watched = fence()
     assert watched.pose(at(9.9, 5.0), START) == []
     (event,) = watched.pose(at(10.25, 5.0), START + 7)
-    assert (event.event, event.stamp_ns) == ("fence_left", START + 7)
+    assert (event.event, event.stamp_ns) == ("geofence_exited", START + 7)
     assert event.message == "fence yard left: the robot is 0.25 m beyond its limit at x 10.25, y 5.00 m"
 
 
 def test_a_robot_that_starts_beyond_is_told_of_at_once() -> None:
     """The first valid pose arms the fence; a start on the right side is no event."""
-    assert run(fence(), [at(11, 5)]) == ["fence_left"]
+    assert run(fence(), [at(11, 5)]) == ["geofence_exited"]
     assert run(fence(), [at(5, 5)]) == [""]
 
 
 def test_it_is_back_only_beyond_the_hysteresis() -> None:
     """Driving along the boundary gives one event, not a hundred."""
     poses = [at(x, 5) for x in (9.0, 10.1, 9.9, 10.1, 9.6, 9.4, 9.9)]
-    assert run(fence(), poses) == ["", "fence_left", "", "", "", "fence_entered", ""]
+    assert run(fence(), poses) == ["", "geofence_exited", "", "", "", "geofence_entered", ""]
 
 
 def test_keep_outside_turns_it_round() -> None:
     """An area that is forbidden is left by driving into it."""
     poses = [at(x, 5) for x in (12.0, 10.1, 9.9, 10.4, 10.6)]
-    assert run(fence(keep="outside"), poses) == ["", "", "fence_left", "", "fence_entered"]
+    assert run(fence(keep="outside"), poses) == ["", "", "geofence_exited", "", "geofence_entered"]
 
 
 def test_the_margin_keeps_the_origin_away() -> None:
     """A robot whose front is a metre ahead of its origin has to turn a metre earlier."""
-    assert run(fence(margin_m=1.0), [at(8.9, 5), at(9.1, 5)]) == ["", "fence_left"]
-    assert run(fence(margin_m=1.0, keep="outside"), [at(11.1, 5), at(10.9, 5)]) == ["", "fence_left"]
+    assert run(fence(margin_m=1.0), [at(8.9, 5), at(9.1, 5)]) == ["", "geofence_exited"]
+    assert run(fence(margin_m=1.0, keep="outside"), [at(11.1, 5), at(10.9, 5)]) == ["", "geofence_exited"]
 
 
 def test_the_uncertainty_counts_across_the_edge_only() -> None:
     """0.2 m of sigma along an edge is harmless beside it, across it three of them are not."""
     along, across = at(9.5, 5, sigma_y_m=0.2), at(9.5, 5, sigma_x_m=0.2)
-    assert run(fence(sigmas=3.0), [along, across]) == ["", "fence_left"]
+    assert run(fence(sigmas=3.0), [along, across]) == ["", "geofence_exited"]
 
 
 def test_an_edge_further_off_counts_if_the_position_is_poor_that_way() -> None:
     """The east edge is nearer, but it is the north edge that the robot may have crossed."""
-    assert run(fence(sigmas=3.0), [at(9.5, 9.0, sigma_y_m=0.4)]) == ["fence_left"]
+    assert run(fence(sigmas=3.0), [at(9.5, 9.0, sigma_y_m=0.4)]) == ["geofence_exited"]
 
 
 def test_an_oblique_edge_sees_how_x_and_y_vary_together() -> None:
     """0.7 m before an edge at 45 degrees: what errs towards it may have crossed it, what errs along it has not."""
     diamond = ((10.0, 0.0), (0.0, 10.0), (-10.0, 0.0), (0.0, -10.0))
     poses = [at(4.5, 4.5, sigma_x_m=0.3, sigma_y_m=0.3, rho=rho) for rho in (-0.9, 0.9)]
-    assert run(fence(polygon_m=diamond, sigmas=2.0), poses) == ["", "fence_left"]
+    assert run(fence(polygon_m=diamond, sigmas=2.0), poses) == ["", "geofence_exited"]
 
 
 def test_on_the_boundary_the_uncertainty_counts_as_well() -> None:
     """Wherever rounding puts a point on the boundary; without uncertainty it is still in."""
     for point in ((10.0, 5.0), (0.0, 5.0), (5.0, 0.0), (5.0, 10.0), (0.0, 0.0), (10.0, 10.0)):
         assert run(fence(), [at(*point)]) == [""]
-        assert run(fence(sigmas=1.0), [at(*point, sigma_x_m=0.1, sigma_y_m=0.1)]) == ["fence_left"]
+        assert run(fence(sigmas=1.0), [at(*point, sigma_x_m=0.1, sigma_y_m=0.1)]) == ["geofence_exited"]
 
 
 @given(
@@ -134,7 +134,7 @@ def test_it_agrees_with_brute_force(
     if not left_at_all and math.isclose(spare, 0.0, abs_tol=0.05):
         # Near the limit the oracle's directions, off by 2.5 mm at 200 mm or more, decide nothing.
         return
-    expected = "fence_left" if left_at_all or spare < 0 else ""
+    expected = "geofence_exited" if left_at_all or spare < 0 else ""
     pose = at(x, y, sigma_x_m=sx, sigma_y_m=sy, rho=rho)
     assert run(fence(polygon_m=BAY, sigmas=2.0, keep=keep, margin_m=margin), [pose]) == [expected]
 
@@ -147,7 +147,7 @@ def test_events_alternate(steps: list[tuple[float, float, int]]) -> None:
         now_ns += wait_ns
         events += watched.pose(at(x, y, sigma_x_m=0.1), now_ns)
     words = [event.event for event in events]
-    assert words == (["fence_left", "fence_entered"] * len(words))[: len(words)]
+    assert words == (["geofence_exited", "geofence_entered"] * len(words))[: len(words)]
 
 
 def test_no_valid_pose_for_a_while_counts_as_leaving() -> None:
@@ -160,22 +160,22 @@ def test_no_valid_pose_for_a_while_counts_as_leaving() -> None:
     assert watched.pose(NO_POSE, START + SECOND) == []
     assert watched.tick(START + 2 * SECOND - 1) == []
     (event,) = watched.tick(START + 2 * SECOND)
-    assert event.event == "fence_left"
+    assert event.event == "geofence_exited"
     assert event.message == "fence yard left: no valid pose for 2 s"
     assert watched.next_deadline_ns() is None
     assert watched.tick(START + 9 * SECOND) == []
     # Within the hysteresis: it was loss that made it leave, not the boundary.
-    assert [e.event for e in watched.pose(at(9.9, 5), START + 10 * SECOND)] == ["fence_entered"]
+    assert [e.event for e in watched.pose(at(9.9, 5), START + 10 * SECOND)] == ["geofence_entered"]
 
 
 def test_a_loss_is_noticed_with_the_next_pose_where_no_tick_came() -> None:
     """An invalid pose or a valid one after the deadline does what the tick would have done."""
     watched = fence()
     watched.pose(at(5, 5), START)
-    assert [e.event for e in watched.pose(NO_POSE, START + 2 * SECOND)] == ["fence_left"]
+    assert [e.event for e in watched.pose(NO_POSE, START + 2 * SECOND)] == ["geofence_exited"]
     watched.pose(at(5, 5), START + 3 * SECOND)
     late = watched.pose(at(5, 5), START + 6 * SECOND)
-    assert [e.event for e in late] == ["fence_left", "fence_entered"]
+    assert [e.event for e in late] == ["geofence_exited", "geofence_entered"]
 
 
 def test_a_loss_beyond_the_boundary_is_no_second_event() -> None:
@@ -184,7 +184,7 @@ def test_a_loss_beyond_the_boundary_is_no_second_event() -> None:
     watched.pose(at(11, 5), START)
     assert watched.tick(START + 5 * SECOND) == []
     assert watched.pose(at(9.9, 5), START + 6 * SECOND) == []
-    assert [e.event for e in watched.pose(at(9.0, 5), START + 7 * SECOND)] == ["fence_entered"]
+    assert [e.event for e in watched.pose(at(9.0, 5), START + 7 * SECOND)] == ["geofence_entered"]
 
 
 def test_without_a_valid_pose_it_is_not_armed() -> None:

@@ -55,7 +55,7 @@ def events(poses: Iterable[PoseRecord], **settings: float) -> list[EventRecord]:
 def test_the_alarm_names_station_and_figures() -> None:
     """One event when three of four poses pass the limit, with the likeliest station and what cannot be seen."""
     (event,) = events([pose(n, 4.0) for n in range(200)] + [pose(200 + n, 9.0) for n in range(300)])
-    assert (event.event, event.station) == ("frame_suspect", 2)
+    assert (event.event, event.station) == ("layout_residual_high", 2)
     assert event.message == (
         "the prisms miss their layout by 9.0 mm, allowed are 6.0 mm (medians over 10 s): a tripod or a prism has moved, "
         "likeliest that of station 2; check with tsgt calibrate check; a movement across the plane of three prisms "
@@ -68,11 +68,11 @@ def test_the_alarm_names_station_and_figures() -> None:
 def test_it_ends_well_below_the_limit_only() -> None:
     """Between 0.8 and 1 times the limit nothing changes; below there is one event."""
     steps = [
-        (9.0, "frame_suspect"),
+        (9.0, "layout_residual_high"),
         (5.0, None),
         (3.0, "frame_restored"),
         (5.0, None),
-        (7.0, "frame_suspect"),
+        (7.0, "layout_residual_high"),
     ]
     poses = [pose(300 * k + n, mm) for k, (mm, _) in enumerate(steps) for n in range(300)]
     assert [e.event for e in events(poses)] == [word for _, word in steps if word]
@@ -166,4 +166,4 @@ def test_a_tripod_moved_by_20_mm_is_noticed(station: int, bearing_deg: int) -> N
     parameters, measurements = driven(1, rate_hz=1.5, duration_s=240.0)
     bearing = np.radians(bearing_deg)
     off = displaced(parameters, station, (0.02 * float(np.cos(bearing)), 0.02 * float(np.sin(bearing))))
-    assert [e.event for e in events(live(off, measurements))][:1] == ["frame_suspect"]
+    assert [e.event for e in events(live(off, measurements))][:1] == ["layout_residual_high"]

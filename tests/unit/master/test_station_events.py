@@ -22,7 +22,7 @@ def test_a_station_is_lost_once_and_back_once() -> None:
         names += [event.event for event in alerts.tick(now_ns, unix_ns=now_ns)]
     assert names == ["station_lost"]
     (back,) = alerts.asked(1, START + 61 * SECOND, answered=True)
-    assert (back.event, back.station) == ("station_back", 1)
+    assert (back.event, back.station) == ("station_recovered", 1)
     assert "after 60 s" in back.message
 
 
@@ -127,7 +127,7 @@ def test_a_status_that_comes_late_is_no_news() -> None:
 def test_packets_that_were_held_back_are_told() -> None:
     """By the station that was to be deceived, or by the time that a packet took."""
     alerts = Alerts([1], START)
-    (doubted,) = alerts.beacon_doubted(1, START, 3)
-    assert (doubted.event, doubted.station, doubted.count) == ("beacon_doubted", 1, 3)
-    (link,) = alerts.link_doubted(1, START)
-    assert (link.event, link.station) == ("link_doubted", 1)
+    (doubted,) = alerts.beacon_time_rejected(1, START, 3)
+    assert (doubted.event, doubted.station, doubted.count) == ("beacon_time_rejected", 1, 3)
+    (link,) = alerts.link_delay_anomaly(1, START)
+    assert (link.event, link.station) == ("link_delay_anomaly", 1)

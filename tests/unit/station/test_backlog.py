@@ -182,7 +182,7 @@ def test_what_is_too_much_stays_in_the_journal(tmp_path: Path, monkeypatch: pyte
     journal(tmp_path, "station1-a", head(0), *measured(*range(5)))
     with capture_logs() as logs:
         assert numbers(read_backlog(tmp_path, 1)) == [2, 3, 4]
-    assert logs == [{"event": "backlog_left_behind", "log_level": "warning", "measurements": 2}]
+    assert logs == [{"event": "measurements_discarded", "log_level": "warning", "measurements": 2}]
 
 
 def test_of_a_long_journal_the_end_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

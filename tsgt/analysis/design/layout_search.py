@@ -59,7 +59,7 @@ class Task:
 
     envelope_m: FloatArray
     count: int
-    least_distance_m: float
+    min_separation_m: float
     criterion: Criterion
     stations: tuple[Station, ...]
     stances: Stances
@@ -118,7 +118,7 @@ def best_layout(
             on_progress((start + 1) / _STARTS)
     if found is None:
         raise GeometryError(
-            f"the envelope has no room for {task.count} prisms at least {task.least_distance_m * 1e3:g} mm apart"
+            f"the envelope has no room for {task.count} prisms at least {task.min_separation_m * 1e3:g} mm apart"
         )
     return _refined(found[1], task)
 
@@ -182,5 +182,5 @@ def _apart(places: FloatArray, others: FloatArray, task: Task) -> np.ndarray:
     """Which of the places (M, 3) are far enough from all others (K, 3); shape (M,)."""
     distances = np.linalg.norm(places[:, None] - others, axis=-1)
     # A grid may offer exactly the distance, give or take a rounding.
-    clear: np.ndarray = (distances >= task.least_distance_m * (1 - 1e-9)).all(axis=1)
+    clear: np.ndarray = (distances >= task.min_separation_m * (1 - 1e-9)).all(axis=1)
     return clear

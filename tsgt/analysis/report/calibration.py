@@ -84,7 +84,7 @@ def calibration_keys(recording: Recording) -> dict[int, Any]:
                 {
                     "target": t.target,
                     "residual_mm": None if t.residual_m is None else 1e3 * t.residual_m,
-                    "left_out_mm": None if t.left_out_m is None else 1e3 * t.left_out_m,
+                    "leave_one_out_mm": None if t.left_out_m is None else 1e3 * t.left_out_m,
                 }
                 for t in targets
             ],

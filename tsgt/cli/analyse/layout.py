@@ -79,7 +79,7 @@ class _Candidate:
     help="Find the best layout in this box, in the frame of the robot, in m.",
 )
 @click.option(
-    "--least-distance-mm",
+    "--min-separation-mm",
     type=click.FloatRange(10, 10_000),
     callback=finite,
     default=300.0,
@@ -87,7 +87,7 @@ class _Candidate:
     help="Between two prisms in the envelope: instruments have to tell them apart.",
 )
 @click.option(
-    "--by",
+    "--objective",
     "criterion",
     type=click.Choice(["rotation", "position"]),
     default="rotation",
@@ -115,7 +115,7 @@ def layout_command(
     config_path: Path | None,
     area: tuple[float, float, float, float] | None,
     envelope: tuple[float, ...] | None,
-    least_distance_mm: float,
+    min_separation_mm: float,
     criterion: Criterion,
     point_m: Vector3,
     seed: int,
@@ -153,7 +153,7 @@ def layout_command(
         task = Task(
             envelope_m=_box(envelope),
             count=len(slots),
-            least_distance_m=least_distance_mm / 1e3,
+            min_separation_m=min_separation_mm / 1e3,
             criterion=criterion,
             stations=stations,
             stances=stances,

@@ -48,7 +48,9 @@ _PAPER = "The paper: 10 mm between prisms are 10 mm in position and 0.01 rad in 
     help="From 0 in steps of this.",
 )
 @click.option(
+    "--samples",
     "--draws",
+    "samples",
     type=click.IntRange(2, 1_000_000),
     default=1000,
     show_default=True,
@@ -81,7 +83,7 @@ def perturbation_command(
     *,
     noise_mm_max: float,
     step_mm: float,
-    draws: int,
+    samples: int,
     inter_prism_mm: float,
     prisms: Path | None,
     point_m: tuple[float, float, float] | None,
@@ -108,7 +110,7 @@ def perturbation_command(
         study = perturbation_study(
             layout,
             [1e-3 * step_mm * level for level in range(levels)],
-            draws=draws,
+            draws=samples,
             point_m=point,
             random=random,
             on_progress=on_progress,
@@ -126,7 +128,7 @@ def perturbation_command(
             {
                 "prisms": known,
                 "point_m": point.tolist(),
-                "draws": draws,
+                "samples": samples,
                 "seed": seed,
                 "at_mm": {f"{1e3 * each.noise_m:g}": _keys(each) for each in study},
                 "first_order_per_mm": {
@@ -137,7 +139,7 @@ def perturbation_command(
             }
         )
         return
-    _print(study, draws)
+    _print(study, samples)
     _print_equivalent(as_measured, per_mm, point)
 
 
@@ -162,8 +164,8 @@ def _keys(found: Perturbation) -> dict[str, Any]:
     }
 
 
-def _print(study: Sequence[Perturbation], draws: int) -> None:
-    click.echo(f"{len(study)} sizes of noise, {draws} poses each; mean and standard deviation (mm, mrad)\n")
+def _print(study: Sequence[Perturbation], samples: int) -> None:
+    click.echo(f"{len(study)} sizes of noise, {samples} poses each; mean and standard deviation (mm, mrad)\n")
     stride = max(1, (len(study) - 1) // _LISTED_LEVELS)
     rows = [
         [

@@ -46,7 +46,8 @@ def _sigma_option(name: str, default: float, text: str) -> Callable[[Command], C
 @click.command()
 @recording_argument
 @click.option(
-    "--frames",
+    "--initial-frames",
+    "frames",
     type=click.Choice(["known", "unknown"]),
     default="known",
     show_default=True,
@@ -129,7 +130,7 @@ def motion(
         _print(found, stations, positions if prisms else {}, sigmas)
     for direction in weak:
         click.echo(f"note: the motion did not determine (one sigma): {direction.sentence}", err=True)
-    comment = f"written by tsgt calibrate motion {recording} --frames {frames} --dof {dof}"
+    comment = f"written by tsgt calibrate motion {recording} --initial-frames {frames} --dof {dof}"
     if output is not None:
         write_station_frames(
             output,

@@ -197,7 +197,7 @@ def ping_command(
                 "here": _strength(summary.here),
                 "there": _strength(summary.there),
                 "round_trip_ms": _times(summary.round_trip_ns),
-                "turn_round_ms": _times(summary.turn_round_ns),
+                "turnaround_ms": _times(summary.turn_round_ns),
             }
         )
     else:
@@ -244,7 +244,7 @@ def _answer(settings: LoRaSettings, wiring: Wiring, *, count: int | None, as_jso
                 "crc_errors": statistics.crc_errors,
                 "lost_edges": statistics.lost_edges,
                 "here": _strength(summary.heard),
-                "turn_round_ms": _times(summary.turn_round_ns),
+                "turnaround_ms": _times(summary.turn_round_ns),
             }
         )
     else:

@@ -132,10 +132,10 @@ class _Row:
     help="How late a computer starts a transmission at worst; as in the master's configuration.",
 )
 @click.option(
-    "--turn-round-ms",
+    "--turnaround-ms",
     type=click.FloatRange(3, 60),
     callback=finite,
-    default=_SUPERFRAME.turn_round_ms,
+    default=_SUPERFRAME.turnaround_ms,
     show_default=True,
     help="What a computer needs from a beacon to the first slot; likewise.",
 )
@@ -155,7 +155,7 @@ def plan_command(
     path_loss_exponent: float,
     antenna_gain_db: float,
     start_jitter_ms: float,
-    turn_round_ms: float,
+    turnaround_ms: float,
     no_phase_lock: bool,
     as_json: bool,
 ) -> None:
@@ -188,7 +188,7 @@ def plan_command(
         spoken = _SUPERFRAME.model_copy(
             update={
                 "start_jitter_ms": start_jitter_ms,
-                "turn_round_ms": turn_round_ms,
+                "turnaround_ms": turnaround_ms,
                 "phase_lock": not no_phase_lock,
             }
         )

@@ -97,13 +97,13 @@ LISTED_VIOLATIONS = 20
     help="How the master follows the stations' clocks; of the protocol classic.  [default: regression]",
 )
 @click.option(
-    "--node",
+    "--station-software",
     type=click.Choice(["ours", "authors"]),
     default="ours",
     show_default=True,
     help="What the stations run: our client, or a node as the paper's authors deployed it, which speaks classic.",
 )
-@click.option("--no-key", is_flag=True, help="Radios without a key; of the protocol superframe.")
+@click.option("--unauthenticated", is_flag=True, help="Radios without a key; of the protocol superframe.")
 @click.option(
     "--outage",
     "outage_texts",
@@ -119,7 +119,7 @@ LISTED_VIOLATIONS = 20
     help="A client, or the master, ends at this time and is started again 2 s later.",
 )
 @click.option(
-    "--foreign-per-s",
+    "--interference-rate-hz",
     type=click.FloatRange(0, 100),
     callback=finite,
     default=0.0,
@@ -156,11 +156,11 @@ def simulate_command(
     drift_ramp_ppm_per_min: float,
     stamp_jitter_us: float,
     clock_filter: Any,
-    node: Any,
-    no_key: bool,
+    station_software: Any,
+    unauthenticated: bool,
     outage_texts: tuple[str, ...],
     restart_texts: tuple[str, ...],
-    foreign_per_s: float,
+    interference_rate_hz: float,
     faults_text: str,
     estimator: Any,
     seed: int,
@@ -176,14 +176,14 @@ def simulate_command(
     """
     for path in (output, truth):
         require_new_file(path)
-    if protocol != "classic" and node == "authors":
+    if protocol != "classic" and station_software == "authors":
         raise click.UsageError("the authors' node speaks classic alone; say --protocol classic")
     if protocol != "classic" and clock_filter is not None:
         raise click.UsageError(
             "--clock-filter is of classic, where the master follows clocks; say --protocol classic"
         )
-    if protocol == "classic" and no_key:
-        raise click.UsageError("--no-key is of superframe; classic never has a key")
+    if protocol == "classic" and unauthenticated:
+        raise click.UsageError("--unauthenticated is of superframe; classic never has a key")
     scenario = find_scenario(scenario_name)
     if stations is not None:
         scenario = with_stations(scenario, stations)
@@ -204,14 +204,14 @@ def simulate_command(
         drift_ramp_ppm_per_min=drift_ramp_ppm_per_min,
         stamp_jitter_us=stamp_jitter_us,
         seed=seed,
-        node=node,
+        node=station_software,
         protocol=SuperframeMasterConfig(kind="superframe")
         if protocol == "superframe"
         else _classic(clock_filter, often_anew=bool(faults)),
-        authenticated=not no_key,
+        authenticated=not unauthenticated,
         outages=tuple(Outage.parse(text, numbers) for text in outage_texts),
         restarts=tuple(Restart.parse(text, numbers) for text in restart_texts),
-        foreign_per_s=foreign_per_s,
+        interference_rate_hz=interference_rate_hz,
         faults=faults,
     )
     _check_times(options)
@@ -224,7 +224,7 @@ def simulate_command(
         result = {
             "scenario": scenario.name,
             "protocol": protocol,
-            "node": node,
+            "station_software": station_software,
             "clock_filter": (clock_filter or "regression") if protocol == "classic" else None,
             "seed": seed,
             "again": again,
@@ -330,7 +330,7 @@ def _write_truth(run: Run, truth: Path) -> None:
 
 def _print(result: dict[str, Any], found: list[Violation]) -> None:
     click.echo(
-        f"{result['scenario']}, {result['protocol']} ({result['node']}), seed {result['seed']}: "
+        f"{result['scenario']}, {result['protocol']} ({result['station_software']}), seed {result['seed']}: "
         f"{result['sim_seconds']:g} s simulated in {result['wall_seconds']:.1f} s\n"
     )
     rows = [

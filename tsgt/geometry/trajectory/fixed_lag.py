@@ -375,7 +375,10 @@ def _with_knots_at(knots: Knots, time_s: FloatArray, prior: MotionPrior) -> Knot
 
 def _predicted(start: Knots, time_s: float, prior: MotionPrior) -> Knots:
     dt_s = time_s - float(start.time_s[0])
-    slow, turning = kick(dt_s, prior.acceleration_time_s), kick(dt_s, prior.angular_acceleration_time_s)
+    slow, turning = (
+        kick(dt_s, prior.acceleration_correlation_time_s),
+        kick(dt_s, prior.angular_acceleration_time_s),
+    )
     turn = start.angular_velocity * dt_s + start.angular_acceleration * turning[0]
     return Knots(
         np.array([time_s]),

@@ -212,7 +212,9 @@ def logarithms(prior: MotionPrior, scale: float) -> FloatArray:
     """Parameters as they are searched for: acceleration sigmas x and z, its time, the same of the rotation, noise's scale."""
     sigmas = axis_sigmas(prior)
     x, _, z, roll, _, yaw = sigmas
-    return np.log([x, z, prior.acceleration_time_s, roll, yaw, prior.angular_acceleration_time_s, scale])
+    return np.log(
+        [x, z, prior.acceleration_correlation_time_s, roll, yaw, prior.angular_acceleration_time_s, scale]
+    )
 
 
 def _meaning(parameters: FloatArray) -> tuple[MotionPrior, float]:

@@ -37,7 +37,7 @@ _QUADRATURE_BELOW = 2.0
 
 def axis_times_s(prior: MotionPrior) -> FloatArray:
     """Correlation time of each axis in s, shape (6,)."""
-    return np.repeat([prior.acceleration_time_s, prior.angular_acceleration_time_s], 3)
+    return np.repeat([prior.acceleration_correlation_time_s, prior.angular_acceleration_time_s], 3)
 
 
 def axis_sigmas(prior: MotionPrior) -> FloatArray:
@@ -51,7 +51,7 @@ def prior_of(sigmas: Iterable[float], times_s: Iterable[float]) -> MotionPrior:
     time_s, angular_time_s = map(float, times_s)
     return MotionPrior(
         acceleration_sigma_mps2=(x, y, z),
-        acceleration_time_s=time_s,
+        acceleration_correlation_time_s=time_s,
         angular_acceleration_sigma_radps2=(roll, pitch, yaw),
         angular_acceleration_time_s=angular_time_s,
     )

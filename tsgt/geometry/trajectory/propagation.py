@@ -53,7 +53,7 @@ class Ahead:
         self.time_s = float(start.time_s[0])
         self._start = start
         self._covariance = covariance
-        self._times_s = np.array([prior.acceleration_time_s, prior.angular_acceleration_time_s])
+        self._times_s = np.array([prior.acceleration_correlation_time_s, prior.angular_acceleration_time_s])
         self._variances = livelier * axis_sigmas(prior) ** 2
 
     def at(self, time_s: float, *, parts: int = STATE) -> tuple[Knots, FloatArray]:

@@ -173,7 +173,7 @@ class Trajectory:
 
     def _times_s(self) -> FloatArray:
         """Correlation times of both kinds of axes in s, shape (2,)."""
-        return np.array([self.prior.acceleration_time_s, self.prior.angular_acceleration_time_s])
+        return np.array([self.prior.acceleration_correlation_time_s, self.prior.angular_acceleration_time_s])
 
 
 def _to_error(by_turn: FloatArray, wander: FloatArray, rate: FloatArray) -> FloatArray:

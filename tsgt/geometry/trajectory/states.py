@@ -124,7 +124,7 @@ class Steps:
     def of(cls, time_s: FloatArray, prior: MotionPrior, sigmas: FloatArray | None = None) -> Steps:
         """Make them for K instants; ``sigmas``, (K - 1, 6), are those of the accelerations in each step, if not the prior's."""
         dt_s = (time_s[1:] - time_s[:-1])[:, None]
-        times_s = np.array([prior.acceleration_time_s, prior.angular_acceleration_time_s])
+        times_s = np.array([prior.acceleration_correlation_time_s, prior.angular_acceleration_time_s])
         two_phi, two_information = transition(dt_s, times_s), process_information(dt_s, times_s)
         weights = (axis_sigmas(prior)[None] if sigmas is None else sigmas) ** -2.0
         return cls(

@@ -49,7 +49,7 @@ class ClassicLink:
     ) -> None:
         self._reports = reports
         self._prisms = {station.station: station.prism for station in stations}
-        delays_ns = {station.station: round(station.stamp_delay_ms * 1e6) for station in stations}
+        delays_ns = {station.station: round(station.timestamp_delay_ms * 1e6) for station in stations}
         self._timing = Timing.of(settings, round(protocol.reply_timeout_ms * 1e6))
         self._scheduler = Scheduler(
             [

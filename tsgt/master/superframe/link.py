@@ -174,9 +174,9 @@ class SuperframeLink:
             sequences = tuple(sighting.sequence for sighting in heard.sightings)
             self._unwritten.append(_Unwritten(station, sequences, range(first_line, self._disk.taken)))
         if heard.doubted_beacons:
-            reports.events(reports.alerts.beacon_doubted(station, now_ns, heard.doubted_beacons))
-        if heard.link_doubted:
-            reports.events(reports.alerts.link_doubted(station, now_ns))
+            reports.events(reports.alerts.beacon_time_rejected(station, now_ns, heard.doubted_beacons))
+        if heard.link_delay_anomaly:
+            reports.events(reports.alerts.link_delay_anomaly(station, now_ns))
         self._stand(heard, now_ns)
 
     def silent(self, stations: Sequence[int]) -> None:
@@ -267,6 +267,6 @@ def superframe_timing(protocol: SuperframeMasterConfig, settings: LoRaSettings) 
     return FrameTiming.stated(
         settings,
         start_jitter_ns=round(protocol.start_jitter_ms * 1e6),
-        turn_round_ns=round(protocol.turn_round_ms * 1e6),
+        turn_round_ns=round(protocol.turnaround_ms * 1e6),
         clock_error_ppm=protocol.clock_error_ppm,
     )

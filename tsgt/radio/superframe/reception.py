@@ -62,7 +62,7 @@ class Heard:
         What became of an order, and which it was: given once, however often the station says it.
     doubted_beacons
         How many beacons it has received since its last word at a time at which they cannot have been sent.
-    link_doubted
+    link_delay_anomaly
         A self-calibration came to something that cannot be: somebody may be delaying packets.
     lateness_ns
         By how much it came later than its slot foresees.
@@ -77,5 +77,5 @@ class Heard:
     answer: AnswerPart | None = None
     shot: ShotPart | None = None
     doubted_beacons: int = 0
-    link_doubted: bool = False
+    link_delay_anomaly: bool = False
     lateness_ns: int = 0

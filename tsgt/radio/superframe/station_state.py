@@ -369,7 +369,7 @@ class Peer:
             joined=joined,
             state=reply.state,
             doubted_beacons=self._stated(reply.state),
-            link_doubted=not self._exchanged(reply, at),
+            link_delay_anomaly=not self._exchanged(reply, at),
             lateness_ns=at.lateness_ns,
             order=order,
             answer=answer,

@@ -89,7 +89,7 @@ class Settings:
     search_range_m: tuple[int, int] = (0, 400)
     search_range_on: bool = False
     atr_setting: int = 0
-    narrow_view: bool = False
+    reduced_field_of_view: bool = False
     air: tuple[float, float, float, float] = (6.58e-7, 1013.25, 12.0, 8.6)
     atmospheric_ppm: float = field(default_factory=lambda: atmospheric_ppm(12.0, 1013.25))
     geometric_ppm: float = 0.0

@@ -71,7 +71,7 @@ class AuthorsTiming:
 
 AUTHORS_STAMP_DELAY_MS = 0.7
 """How late their node stamps a ping, on average: half a look, 0.5 ms, and the seven transfers of a packet of two
-bytes, 0.23 ms. What a master is to be told as ``stamp_delay_ms``."""
+bytes, 0.23 ms. What a master is to be told as ``timestamp_delay_ms``."""
 
 
 class _PolledRadio:

@@ -92,7 +92,7 @@ def master_config(scenario: ScenarioConfig, options: Options, folder: Path) -> M
                 station=s.station,
                 prism=s.prism,
                 prism_constant_mm=s.prism_constant_mm,
-                stamp_delay_ms=AUTHORS_STAMP_DELAY_MS if options.node == "authors" else 0.0,
+                timestamp_delay_ms=AUTHORS_STAMP_DELAY_MS if options.node == "authors" else 0.0,
                 noise=s.noise,
             )
             for s in scenario.stations
@@ -365,7 +365,7 @@ class Mission:
 
     async def be_foreign(self) -> None:
         """Use the channel as somebody else, until cancelled."""
-        radio = ForeignRadio(self._true, self._foreign_rng, self._options.foreign_per_s)
+        radio = ForeignRadio(self._true, self._foreign_rng, self._options.interference_rate_hz)
         await radio.run(self.stranger(FOREIGN))
 
     def stranger(self, name: str, gain_db: float = 0.0, sync_word: int | None = None) -> OpenRadio:

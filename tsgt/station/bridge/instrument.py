@@ -107,7 +107,7 @@ class BridgeInstrument:
         if run.tracking is None:
             raise InstrumentRefusedError(f"{self._config.command[0]}: no prism is tracked; call track first")
         if not self._readings:
-            limit_s = self._config.silence_s
+            limit_s = self._config.stall_timeout_s
             await run.until(
                 lambda: len(self._readings) > 0, limit_s, f"has said nothing for {limit_s:g} s", patient=True
             )

@@ -202,4 +202,4 @@ class _Stderr:
                 self._dropped += 1
                 continue
             self._logged += 1
-            log.info("bridge_said", text=self.last, dropped=self._dropped)
+            log.info("bridge_stderr", text=self.last, dropped=self._dropped)

@@ -141,7 +141,7 @@ def plan(config: LeicaInstrumentConfig, identity: Identity) -> list[Setting]:
                 1,
             )
         )
-        if config.narrow_view:
+        if config.reduced_field_of_view:
             settings.append(_switch("the narrow view", Rpc.BAP_GET_RED_ATR_FOV, Rpc.BAP_SET_RED_ATR_FOV, 1))
     return settings
 

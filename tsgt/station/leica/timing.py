@@ -175,7 +175,7 @@ class InstrumentTimes:
 
     def _note(self, began: int) -> None:
         if self._fit.began != began:
-            log.info("instrument_time_began_anew")
+            log.info("instrument_clock_reset")
             self._last_ms = None
 
     def _is_worth_a_line(self, now_ns: int) -> bool:

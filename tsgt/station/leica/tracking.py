@@ -387,7 +387,7 @@ class Tracking:
     async def _call(self, for_what: str) -> None:
         """Ask a person to do something, and beep."""
         self.call_for = for_what
-        log.warning("person_needed", what=for_what)
+        log.warning("operator_required", what=for_what)
         await self._line.call(Rpc.BMM_BEEP_ALARM)
 
     def _give_up_searching(self) -> None:

@@ -116,7 +116,7 @@ class ClassicLink:
                 packet = await radio.receive()
                 if self._clock.monotonic_ns() - packet.received_at_ns > TURN_ROUND_NS:
                     # This computer was busy; the master asks somebody else by now.
-                    log.warning("request_too_old")
+                    log.warning("request_expired")
                     continue
                 await self._received(packet, radio)
         finally:

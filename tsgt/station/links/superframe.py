@@ -91,8 +91,8 @@ class SuperframeLink:
         """See the protocol; whatever has been measured will be delivered."""
         left_through = self._outbox.left_through
         self._outbox.add(queued(measurement, self._timeline.unix_at_zero_ns, self._boot))
-        if self._outbox.left_through != left_through and self._is_seldom("backlog_left_behind"):
-            log.warning("backlog_left_behind", measurements=1)
+        if self._outbox.left_through != left_through and self._is_seldom("measurements_discarded"):
+            log.warning("measurements_discarded", measurements=1)
 
     def executed(self, order: TrackOrder | SearchOrder | DirectOrder, *, ok: bool) -> None:  # noqa: ARG002 (one at a time)
         """See the protocol."""
@@ -119,8 +119,8 @@ class SuperframeLink:
             refused = self._station.refused
             heard = self._station.received(packet)
             self._strangers.heard(master=heard is not None)
-            if self._station.refused != refused and self._is_seldom("beacon_refused"):
-                log.warning("beacon_refused", refused=self._station.refused)
+            if self._station.refused != refused and self._is_seldom("beacon_authentication_failed"):
+                log.warning("beacon_authentication_failed", refused=self._station.refused)
             if heard is not None:
                 self._note(heard)
                 self._give()
@@ -134,7 +134,7 @@ class SuperframeLink:
         if reply is not None:
             self._station.sent(await radio.transmit(reply, at_ns=slot_ns))
         if self._station.late != late:
-            log.info("slot_late", late=self._station.late)
+            log.info("slot_missed", late=self._station.late)
 
     def _note(self, heard: Heard) -> None:
         """Put into journal and log what a beacon has brought."""
@@ -153,9 +153,9 @@ class SuperframeLink:
         if heard.joined:
             log.info("session_joined", queued=len(self._outbox))
         if heard.left_behind:
-            log.warning("backlog_left_behind", measurements=heard.left_behind)
-        if heard.doubted and self._is_seldom("beacon_doubted"):
-            log.warning("beacon_doubted", doubted=self._station.doubted)
+            log.warning("measurements_discarded", measurements=heard.left_behind)
+        if heard.doubted and self._is_seldom("beacon_time_rejected"):
+            log.warning("beacon_time_rejected", doubted=self._station.doubted)
 
     def _note_acknowledged(self) -> None:
         now_ns = self._clock.monotonic_ns()

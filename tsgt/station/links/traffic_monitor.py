@@ -47,4 +47,4 @@ class Strangers:
         self.packets += 1
         if now_ns >= self._warn_ns:
             self._warn_ns = now_ns + AGAIN_NS
-            log.warning("master_not_understood", packets=self.packets, for_s=(now_ns - self._since_ns) / 1e9)
+            log.warning("no_valid_beacon", packets=self.packets, for_s=(now_ns - self._since_ns) / 1e9)

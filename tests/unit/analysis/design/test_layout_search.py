@@ -19,12 +19,12 @@ BOX = ((-0.5, -0.4, 0.8), (0.5, 0.4, 1.6))
 
 
 def _task(
-    envelope_m: object, *, count: int = 3, criterion: Criterion = "rotation", least_distance_m: float = 0.3
+    envelope_m: object, *, count: int = 3, criterion: Criterion = "rotation", min_separation_m: float = 0.3
 ) -> Task:
     return Task(
         envelope_m=np.array(envelope_m, dtype=np.float64),
         count=count,
-        least_distance_m=least_distance_m,
+        min_separation_m=min_separation_m,
         criterion=criterion,
         stations=tuple(Station(np.array(place), NOISE, i) for i, place in enumerate(PLACES[:count])),
         stances=Stances.at([[60.0, 45.0, -1.0]]),
@@ -67,7 +67,7 @@ def test_no_small_move_makes_it_better() -> None:
 
 def test_prisms_keep_their_distance() -> None:
     """A fourth prism would share a corner with another one if it were allowed to."""
-    found = best_layout(_task(BOX, count=4, least_distance_m=0.6), np.random.default_rng(0))
+    found = best_layout(_task(BOX, count=4, min_separation_m=0.6), np.random.default_rng(0))
     for a, b in combinations(found, 2):
         assert np.linalg.norm(a - b) >= 0.6 * (1 - 1e-6)
 

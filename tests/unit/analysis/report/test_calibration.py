@@ -48,7 +48,7 @@ def test_each_target_has_its_row() -> None:
     assert [plot.name for plot in section.plots] == ["calibration"]
     keys = calibration_keys(recording((), TARGETS, ()))[2]
     assert round(keys["rms_mm"], 2) == 3.54
-    assert keys["targets"][2] == {"target": 9, "residual_mm": None, "left_out_mm": 60.0}
+    assert keys["targets"][2] == {"target": 9, "residual_mm": None, "leave_one_out_mm": 60.0}
 
 
 def test_a_recording_without_targets_says_so() -> None:

@@ -62,7 +62,7 @@ def test_ten_millimetres_between_prisms_beside_the_paper(tsgt: Tsgt) -> None:
 def test_the_study_as_text(tsgt: Tsgt) -> None:
     """A table, the equivalent noise, and the paper's figures to compare with."""
     outcome = tsgt(
-        "analyse", "perturbation", "--noise-mm-max", 20, "--step-mm", 5, "--draws", 100, "--seed", 3
+        "analyse", "perturbation", "--noise-mm-max", 20, "--step-mm", 5, "--samples", 100, "--seed", 3
     )
     assert outcome.code == 0
     assert outcome.out.startswith("5 sizes of noise, 100 poses each")
@@ -87,7 +87,7 @@ def test_another_layout_and_another_point(tsgt: Tsgt, small: Path) -> None:
     "arguments",
     [
         ("--step-mm", 0),
-        ("--draws", 1),
+        ("--samples", 1),
         ("--noise-mm-max", "nan"),
         ("--point", "nan", 0, 0),
         ("--step-mm", 1e-3),
@@ -146,7 +146,15 @@ def test_poses_are_known_worse_from_afar(tsgt: Tsgt) -> None:
 def test_layouts_as_text(tsgt: Tsgt, small: Path) -> None:
     """Ranking, the found layout as it stands in a file, and the stations elsewhere."""
     outcome = tsgt(
-        "analyse", "layout", small, "--scenario", "quarry", "--by", "position", "--envelope", *[-1, 1] * 3
+        "analyse",
+        "layout",
+        small,
+        "--scenario",
+        "quarry",
+        "--objective",
+        "position",
+        "--envelope",
+        *[-1, 1] * 3,
     )
     assert outcome.code == 0
     ranked = [line.split()[0] for line in outcome.out.splitlines()[4:6]]
@@ -203,7 +211,7 @@ def test_a_layout_without_a_tracked_prism_is_refused(tsgt: Tsgt, tmp_path: Path)
 def test_figures_are_drawn(tsgt: Tsgt, tmp_path: Path, study: str, ending: str) -> None:
     """In the format that the ending names."""
     path = tmp_path / f"study{ending}"
-    arguments = ("analyse", study, "--figure", path, *(("--draws", 10) if study == "perturbation" else ()))
+    arguments = ("analyse", study, "--figure", path, *(("--samples", 10) if study == "perturbation" else ()))
     assert tsgt(*arguments).code == 0
     assert path.read_bytes().startswith(FIGURES[ending])
 

@@ -82,7 +82,15 @@ def test_what_a_layout_counts_from_does_not_matter(recording: Path) -> None:
 def test_text_names_the_stations(tsgt: Tsgt, recording: Path) -> None:
     """Without --json a table for people comes."""
     done = tsgt(
-        "calibrate", "motion", recording, "--no-held-out", "--frames", "unknown", "--dof", "4", "--prisms"
+        "calibrate",
+        "motion",
+        recording,
+        "--no-held-out",
+        "--initial-frames",
+        "unknown",
+        "--dof",
+        "4",
+        "--prisms",
     )
     assert done.code == 0
     assert "station 2 x" in done.out

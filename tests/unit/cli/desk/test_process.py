@@ -96,7 +96,10 @@ def test_what_was_found_of_the_motion_is_kept(tsgt: Tsgt, recording: Path) -> No
     assert parameters["pipeline"]["noise_scale"] == result["noise_scale"]
     text = tsgt("process", recording, "--estimator", "continuous", "--output", output).out
     assert f"  noise_scale = {result['noise_scale']:.3g}\n  [pipeline.motion]\n" in text
-    assert f"  acceleration_time_s = {result['motion']['acceleration_time_s']:.3g}\n" in text
+    assert (
+        f"  acceleration_correlation_time_s = {result['motion']['acceleration_correlation_time_s']:.3g}\n"
+        in text
+    )
 
 
 def test_the_estimator_is_the_recordings_unless_told_otherwise(tsgt: Tsgt, recording: Path) -> None:

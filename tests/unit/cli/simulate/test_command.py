@@ -49,7 +49,7 @@ def test_the_keys_of_the_superframe(tsgt: Tsgt) -> None:
     """The protocol that is spoken unless told otherwise has frames, queues, late slots and outages to tell of."""
     found = tsgt(
         *("simulate", "--stations", 2, "--duration", 20, "--outage", "2:8:4", "--restart", "1:10"),
-        *("--drift-ramp-ppm-per-min", 1, "--stamp-jitter-us", 20, "--foreign-per-s", 0.2, "--json"),
+        *("--drift-ramp-ppm-per-min", 1, "--stamp-jitter-us", 20, "--interference-rate-hz", 0.2, "--json"),
     ).json()
     assert found["protocol"] == "superframe"
     assert found["violations"] == 0
@@ -185,14 +185,14 @@ def test_a_run_too_short_for_poses_has_dashes(tsgt: Tsgt) -> None:
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        (("--node", "authors"), "the authors' node speaks classic alone"),
+        (("--station-software", "authors"), "the authors' node speaks classic alone"),
         ((*CLASSIC, "--stations", 10), "station 10: classic knows 1 to 9"),
         (("--outage", "4:10:10"), "there is no station 4"),
         (("--restart", "10"), "expected STATION:AT"),
         (("--duration", 20, "--outage", "all:20:5"), "--outage at 20 s: the run ends at 20 s"),
         (("--duration", 20, "--restart", "master:60"), "--restart at 60 s: the run ends at 20 s"),
         (("--clock-filter", "paper"), "say --protocol classic"),
-        ((*CLASSIC, "--no-key"), "classic never has a key"),
+        ((*CLASSIC, "--unauthenticated"), "classic never has a key"),
     ],
 )
 def test_what_does_not_go_together(tsgt: Tsgt, arguments: tuple[str | int, ...], reason: str) -> None:

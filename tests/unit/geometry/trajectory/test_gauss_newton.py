@@ -93,10 +93,13 @@ def test_translation_is_dense_gaussian_process_regression() -> None:
     time_s = np.cumsum(rng.uniform(0.05, 0.6, 25))
     measured = np.sin(time_s) + rng.normal(scale=0.05, size=25)
     data, sigma_m = a_point(time_s, measured, 0.05), 0.05
-    priors = (PRIOR, replace(PRIOR, acceleration_sigma_mps2=(1.3, 1.3, 1.3), acceleration_time_s=0.3))
+    priors = (
+        PRIOR,
+        replace(PRIOR, acceleration_sigma_mps2=(1.3, 1.3, 1.3), acceleration_correlation_time_s=0.3),
+    )
     evidence, expected_evidence = [], []
     for prior in priors:
-        sigma, lasting_s = prior.acceleration_sigma_mps2[0], prior.acceleration_time_s
+        sigma, lasting_s = prior.acceleration_sigma_mps2[0], prior.acceleration_correlation_time_s
         spread_of_first = np.array([2.0, 1.5, sigma])
         information = np.eye(STATE)
         for axis in range(3):

@@ -65,7 +65,7 @@ def test_the_livelier_prior_holds_axis_by_axis() -> None:
     """What is livelier stays; what is calmer comes up to the share, at its own correlation time."""
     calm = MotionPrior(
         acceleration_sigma_mps2=(1.0, 1.0, 0.001),
-        acceleration_time_s=0.2,
+        acceleration_correlation_time_s=0.2,
         angular_acceleration_sigma_radps2=(0.5, 0.5, 0.003),
         angular_acceleration_time_s=0.1,
     )
@@ -74,7 +74,7 @@ def test_the_livelier_prior_holds_axis_by_axis() -> None:
     turning = 0.5 * 0.2 * np.sqrt((0.4 / (1 + 0.4**2)) / (0.1 / (1 + 0.1**2)))
     assert found.acceleration_sigma_mps2 == pytest.approx((1.0, 1.0, raised))
     assert found.angular_acceleration_sigma_radps2 == pytest.approx((0.5, 0.5, turning))
-    assert (found.acceleration_time_s, found.angular_acceleration_time_s) == (0.2, 0.1)
+    assert (found.acceleration_correlation_time_s, found.angular_acceleration_time_s) == (0.2, 0.1)
 
 
 def test_a_prior_is_at_least_itself() -> None:

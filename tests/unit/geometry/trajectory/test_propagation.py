@@ -12,7 +12,7 @@ from tsgt.geometry.trajectory import STATE, Knots
 from tsgt.geometry.trajectory.propagation import Ahead
 from tsgt.model import MotionPrior
 
-PRIOR = MotionPrior(acceleration_time_s=0.3, angular_acceleration_time_s=0.9)
+PRIOR = MotionPrior(acceleration_correlation_time_s=0.3, angular_acceleration_time_s=0.9)
 
 
 def turning(rate_radps: float) -> tuple[Knots, FloatArray]:

@@ -145,7 +145,7 @@ def test_steps_enter_the_normal_equations_as_squares(seed: int) -> None:
 def test_a_step_as_the_prior_expects_has_no_residual() -> None:
     """Without noise each axis goes on with its velocity while its acceleration dies away."""
     dt_s = 0.7
-    tau = PRIOR.acceleration_time_s
+    tau = PRIOR.acceleration_correlation_time_s
     start, speed, push = np.array([[1.0, 2, 3]]), np.array([[0.5, -1, 0.2]]), np.array([[0.3, 0.1, -0.2]])
     dying = np.exp(-dt_s / tau)
     lost = tau * (1 - dying)

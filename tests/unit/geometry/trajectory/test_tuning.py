@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 PRIOR = MotionPrior(
     acceleration_sigma_mps2=(0.5, 0.5, 0.2),
-    acceleration_time_s=0.8,
+    acceleration_correlation_time_s=0.8,
     angular_acceleration_sigma_radps2=(0.2, 0.2, 0.4),
     angular_acceleration_time_s=0.5,
 )
@@ -53,7 +53,9 @@ def test_the_motion_that_made_the_measurements_is_found(observations: Observatio
     np.testing.assert_allclose(
         found.prior.angular_acceleration_sigma_radps2, PRIOR.angular_acceleration_sigma_radps2, rtol=0.3
     )
-    assert found.prior.acceleration_time_s == pytest.approx(PRIOR.acceleration_time_s, rel=0.5)
+    assert found.prior.acceleration_correlation_time_s == pytest.approx(
+        PRIOR.acceleration_correlation_time_s, rel=0.5
+    )
     assert found.prior.angular_acceleration_time_s == pytest.approx(
         PRIOR.angular_acceleration_time_s, rel=0.5
     )
@@ -62,8 +64,8 @@ def test_the_motion_that_made_the_measurements_is_found(observations: Observatio
 
 def test_where_the_search_begins_matters_little(observations: Observations) -> None:
     """From ten times calmer and from ten times wilder robots the same is found."""
-    calm = MotionPrior(acceleration_sigma_mps2=(0.05, 0.05, 0.02), acceleration_time_s=3.0)
-    wild = MotionPrior(acceleration_sigma_mps2=(5.0, 5.0, 2.0), acceleration_time_s=0.1)
+    calm = MotionPrior(acceleration_sigma_mps2=(0.05, 0.05, 0.02), acceleration_correlation_time_s=3.0)
+    wild = MotionPrior(acceleration_sigma_mps2=(5.0, 5.0, 2.0), acceleration_correlation_time_s=0.1)
     found = [tune(observations, start=start) for start in (calm, wild)]
     assert found[0].log_evidence == pytest.approx(found[1].log_evidence, abs=2.0)
     np.testing.assert_allclose(
@@ -76,7 +78,7 @@ def test_what_is_given_stays(observations: Observations) -> None:
     few = observations.select(slice(0, 200))
     kept = tune(few, start=PRIOR, fixed=True)
     np.testing.assert_allclose(kept.prior.acceleration_sigma_mps2, PRIOR.acceleration_sigma_mps2)
-    assert kept.prior.acceleration_time_s == pytest.approx(PRIOR.acceleration_time_s)
+    assert kept.prior.acceleration_correlation_time_s == pytest.approx(PRIOR.acceleration_correlation_time_s)
     assert tune(few, noise_scale=1.5).noise_scale == pytest.approx(1.5)
 
 

@@ -257,7 +257,7 @@ async def test_a_radio_that_fails_within_a_frame_goes_on_with_the_next(tmp_path:
                 fails = True
             await asyncio.sleep(8)
     assert undelivered(field, until_s=47) == NOTHING
-    assert events(field) == ["radio_failed", "radio_back"] * 5
+    assert events(field) == ["radio_failed", "radio_recovered"] * 5
     beacons = field.of(BeaconRecord)
     assert len({beacon.session for beacon in beacons}) == 1
     assert all(after.counter > before.counter for before, after in pairwise(beacons))
@@ -300,7 +300,7 @@ async def test_after_an_outage_everything_comes_live_data_first(tmp_path: Path) 
     late = [m for m in back if m.stamp_ns < START + 79 * SECOND]
     assert len(late) > 140
     assert max(m.received_ns for m in late) < START + 100 * SECOND
-    assert events(field) == ["station_lost 3", "station_back 3"]
+    assert events(field) == ["station_lost 3", "station_recovered 3"]
 
 
 async def test_statuses_that_come_late_are_no_news(tmp_path: Path) -> None:

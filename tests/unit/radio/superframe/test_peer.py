@@ -206,7 +206,7 @@ def exchange(
     turn_round_us = frames.turn_rounds_us[1] + off_us
     heard = frames.answer(1, Reply(turn_round_us=turn_round_us), late_ns=late_ns, sigma_ns=sigma_ns)
     frames.end()
-    return heard.link_doubted
+    return heard.link_delay_anomaly
 
 
 def link_error_ns(frames: Frames) -> float:

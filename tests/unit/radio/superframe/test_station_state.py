@@ -37,9 +37,9 @@ def hold_back(exchange: Exchange, late_ns: int, frames: int, which: Collection[i
         exchange.frame(late_ns={2: late_ns} if frame in which else {})
         heard = exchange.heard.get(2)
         if heard is not None and heard.doubted_beacons:
-            told[frame] = "beacon_doubted"
-        elif heard is not None and heard.link_doubted:
-            told[frame] = "link_doubted"
+            told[frame] = "beacon_time_rejected"
+        elif heard is not None and heard.link_delay_anomaly:
+            told[frame] = "link_delay_anomaly"
     return told
 
 
@@ -59,7 +59,7 @@ def test_a_single_beacon_shifts_no_time(late_ns: int) -> None:
     assert max(abs(errors_ns[k]) for k in errors_ns if k > 20) < 60_000
     assert beyond_bound(member) == {}
     if late_ns != 131 * MS:
-        assert list(told.values()).count("beacon_doubted") >= 3
+        assert list(told.values()).count("beacon_time_rejected") >= 3
         assert min(told) == 1
 
 
@@ -69,7 +69,7 @@ def test_from_some_time_on_all_are_held_back(late_ns: int) -> None:
     exchange = exchange_of(60)
     told = hold_back(exchange, late_ns, 100, range(100))
     assert min(told) == 1
-    assert list(told.values()).count("link_doubted") >= 3
+    assert list(told.values()).count("link_delay_anomaly") >= 3
     assert beyond_bound(exchange.members[2]) == {}
 
 
@@ -77,7 +77,7 @@ def test_from_some_time_on_all_are_held_back(late_ns: int) -> None:
 def test_all_are_held_back_from_the_start(late_ns: int) -> None:
     """The round trip is longer than any chip makes it, and the bound contains what it may be."""
     exchange = exchange_of()
-    assert "link_doubted" in hold_back(exchange, late_ns, 100, range(100)).values()
+    assert "link_delay_anomaly" in hold_back(exchange, late_ns, 100, range(100)).values()
     assert beyond_bound(exchange.members[2]) == {}
 
 
@@ -107,7 +107,7 @@ def test_a_delay_that_grows_is_noticed_and_bounded_to_half_a_millisecond(step_ns
     for frame in range(300):
         exchange.frame(late_ns={2: min(frame * step_ns, 3 * MS)})
         heard = exchange.heard.get(2)
-        if heard is not None and (heard.link_doubted or heard.doubted_beacons):
+        if heard is not None and (heard.link_delay_anomaly or heard.doubted_beacons):
             told.append(frame)
     assert min(told) * step_ns < 400_000
     assert max(beyond_bound(exchange.members[2]).values(), default=0) < 500_000

@@ -236,7 +236,7 @@ def test_restarts_that_are_asked_for(tmp_path: Path) -> None:
 def test_somebody_else_on_the_channel(tmp_path: Path) -> None:
     """Foreign packets cost some measurements and bend none, and change nothing of what is measured."""
     alone, disturbed = (
-        mission(tmp_path / name, duration_s=40.0, foreign_per_s=per_s)
+        mission(tmp_path / name, duration_s=40.0, interference_rate_hz=per_s)
         for name, per_s in (("alone", 0.0), ("disturbed", 0.5))
     )
     assert violations(disturbed) == []
@@ -376,7 +376,7 @@ def test_a_computer_that_was_off(tmp_path: Path) -> None:
 
 def test_forged_packets_over_the_superframe(tmp_path: Path) -> None:
     """Somebody sends noise and what he has heard, changed and unchanged: it costs some packets and bends nothing."""
-    run = mission(tmp_path, duration_s=60.0, protocol=SUPERFRAME, foreign_per_s=1.0)
+    run = mission(tmp_path, duration_s=60.0, protocol=SUPERFRAME, interference_rate_hz=1.0)
     assert violations(run) == []
     for figure in station_figures(run).values():
         assert figure.delivered >= figure.measured - 1

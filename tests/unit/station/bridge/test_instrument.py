@@ -216,7 +216,7 @@ async def test_an_end_is_said_with_its_reason() -> None:
 
 
 async def test_silence_while_tracking_is_a_stall() -> None:
-    """After silence_s the program is killed; a sign of life gives it so long again, rubbish does not."""
+    """After stall_timeout_s the program is killed; a sign of life gives it so long again, rubbish does not."""
     instrument, program, _ = await tracking()
     began_ns = CLOCK.monotonic_ns()
 

@@ -345,7 +345,7 @@ async def test_it_is_set_up_as_configured() -> None:
         prism_type="360",
         prism_constant_mm=None,
         atmosphere={"temperature_c": 25.0, "pressure_hpa": 900.0},
-        narrow_view=True,
+        reduced_field_of_view=True,
         angle_delay_ms=3.0,
     )
     async with leica_bench(config) as day:
@@ -356,7 +356,7 @@ async def test_it_is_set_up_as_configured() -> None:
     assert (settings.prism_type, settings.prism_constant_m) == (3, 0.0231)
     assert (settings.edm_mode, settings.power_mode, settings.incline) == (9, 0, True)
     assert settings.air[:3] == (6.58e-7, 900.0, 25.0)
-    assert settings.narrow_view
+    assert settings.reduced_field_of_view
     assert record is not None
     assert (record.make, record.prism_type, record.prism_constant_m) == ("Leica", "360", 0.0231)
     assert record.atmospheric_ppm == pytest.approx(43.0, abs=0.1)

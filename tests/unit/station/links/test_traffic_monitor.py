@@ -35,8 +35,8 @@ def test_packets_without_the_master_are_counted_and_told_seldom() -> None:
             strangers.heard(master=False)
     assert strangers.packets == 91
     assert [(line["event"], line["packets"], line["for_s"]) for line in logs] == [
-        ("master_not_understood", 31, 30.0),
-        ("master_not_understood", 91, 90.0),
+        ("no_valid_beacon", 31, 30.0),
+        ("no_valid_beacon", 91, 90.0),
     ]
 
 

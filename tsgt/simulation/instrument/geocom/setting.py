@@ -230,7 +230,7 @@ def _set_recognition_setting(station: SimulatedTotalStation, setting: int) -> An
 
 def _set_narrow_view(station: SimulatedTotalStation, on: int) -> Answer:
     station.advance()
-    station.settings.narrow_view = bool(on)
+    station.settings.reduced_field_of_view = bool(on)
     station.telescope.field_rad = NARROW_FIELD_RAD if on else FIELD_RAD
     return OK
 
@@ -280,7 +280,7 @@ SETTING: Procedures = {
     Rpc.BAP_GET_TARGET_TYPE: ("", lambda s: values(s.settings.target_type)),
     Rpc.BAP_GET_ATR_SETTING: ("", lambda s: values(s.settings.atr_setting)),
     Rpc.BAP_SET_ATR_SETTING: ("i", _set_recognition_setting),
-    Rpc.BAP_GET_RED_ATR_FOV: ("", lambda s: values(s.settings.narrow_view)),
+    Rpc.BAP_GET_RED_ATR_FOV: ("", lambda s: values(s.settings.reduced_field_of_view)),
     Rpc.BAP_SET_RED_ATR_FOV: ("i", _set_narrow_view),
     Rpc.TMC_GET_PRISM_CORR: ("", lambda s: values(s.settings.prism_constant_m)),
     Rpc.TMC_SET_PRISM_CORR: ("d", _set_prism_constant),

@@ -11,11 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tsgt.model import Status
-from tsgt.radio import MeasureOrder
+from tsgt.radio import MeasureCommand
 from tsgt.radio.classic import (
-    Command,
+    CommandMessage,
     MeasurementMessage,
-    Ordered,
+    CommandTransaction,
     Poll,
     Shot,
     Synchronisation,
@@ -39,8 +39,8 @@ stations = st.integers(1, 9)
 times_ns = st.integers(0, LAST_TIME_NS)
 angles_rad = st.floats(-4 * math.pi, 4 * math.pi)
 commands = st.one_of(
-    st.builds(Command, st.sampled_from(cast("tuple[Letter, ...]", get_args(Letter))), stations),
-    st.builds(Command, st.just("n"), stations, st.integers(1, 9)),
+    st.builds(CommandMessage, st.sampled_from(cast("tuple[Letter, ...]", get_args(Letter))), stations),
+    st.builds(CommandMessage, st.just("n"), stations, st.integers(1, 9)),
 )
 measurements = st.builds(
     MeasurementMessage,
@@ -63,13 +63,13 @@ packets = st.one_of(
     st.binary(min_size=34, max_size=34),
     st.binary(min_size=32, max_size=32).map(lambda rest: b"\x01\x00" + rest),
     st.binary(min_size=8, max_size=8).map(lambda rest: b"s" + rest),
-    commands.map(Command.to_bytes),
+    commands.map(CommandMessage.to_bytes),
     replies.map(lambda reply: reply.to_bytes()),
 )
 
 
 @given(commands)
-def test_commands_come_back(command: Command) -> None:
+def test_commands_come_back(command: CommandMessage) -> None:
     """What is sent is what is understood."""
     assert decode_command(command.to_bytes()) == command
 
@@ -109,7 +109,7 @@ def test_a_station_survives_every_packet(events: list[tuple[bytes, int]]) -> Non
             assert under_way is None
             under_way = answer
         if under_way is not None and not patience:
-            if isinstance(under_way, MeasureOrder):
+            if isinstance(under_way, MeasureCommand):
                 station.shot(no_measurement_yet(1))
             else:
                 assert decode_reply(station.executed(under_way, ok=len(payload) % 2 == 0)) is not None
@@ -126,7 +126,7 @@ def test_every_turn_ends(turn: str, answers: list[list[tuple[bytes, int]]]) -> N
     turns: dict[str, Turn] = {
         "poll": Poll(1, TIMING),
         "shot": Shot(1, TIMING),
-        "order": Ordered(1, Command("n", 1, 2), 2000 * MS),
+        "order": CommandTransaction(1, CommandMessage("n", 1, 2), 2000 * MS),
         "synchronisation": Synchronisation(1, 5, TIMING),
     }
     subject = turns[turn]

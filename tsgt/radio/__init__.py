@@ -18,23 +18,23 @@ from tsgt.radio.base import (
     Radio,
     Transmitted,
 )
-from tsgt.radio.commands import Direction, DirectOrder, MeasureOrder, Order, SearchOrder, TrackOrder
+from tsgt.radio.commands import Command, DirectCommand, Direction, MeasureCommand, SearchCommand, TrackCommand
 
 __all__ = [
     "BANDWIDTHS_HZ",
     "HEADER_SYMBOLS",
     "MAX_PAYLOAD_BYTES",
     "SYNC_QUARTER_SYMBOLS",
-    "DirectOrder",
+    "Command",
+    "DirectCommand",
     "Direction",
     "LoRaSettings",
-    "MeasureOrder",
+    "MeasureCommand",
     "OpenRadio",
-    "Order",
     "Packet",
     "Radio",
-    "SearchOrder",
-    "TrackOrder",
+    "SearchCommand",
+    "TrackCommand",
     "Transmitted",
     "airtime_us",
     "bit_rate_Bps",

@@ -25,7 +25,7 @@ class Direction:
 
 
 @dataclass(frozen=True, slots=True)
-class TrackOrder:
+class TrackCommand:
     """Go back to tracking.
 
     Attributes
@@ -38,7 +38,7 @@ class TrackOrder:
 
 
 @dataclass(frozen=True, slots=True)
-class SearchOrder:
+class SearchCommand:
     """Look for the tracked prism anew, even if the instrument seems to have it. Not in the protocol classic.
 
     Attributes
@@ -51,13 +51,13 @@ class SearchOrder:
 
 
 @dataclass(frozen=True, slots=True)
-class DirectOrder:
+class DirectCommand:
     """Stop tracking and get ready for single measurements."""
 
 
 @dataclass(frozen=True, slots=True)
-class MeasureOrder:
+class MeasureCommand:
     """Make one single measurement."""
 
 
-Order = TrackOrder | SearchOrder | DirectOrder | MeasureOrder
+Command = TrackCommand | SearchCommand | DirectCommand | MeasureCommand

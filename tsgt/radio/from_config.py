@@ -83,7 +83,7 @@ def planned_cycle(protocol: MasterProtocolConfig, load: Load, settings: LoRaSett
     timing = FrameTiming.stated(
         settings,
         start_jitter_ns=round(protocol.start_jitter_ms * 1e6),
-        turn_round_ns=round(protocol.turnaround_ms * 1e6),
+        turnaround_ns=round(protocol.turnaround_ms * 1e6),
         clock_error_ppm=protocol.clock_error_ppm,
     )
     return superframe_cycle(load, timing, phase_lock=protocol.phase_lock)

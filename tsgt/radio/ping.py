@@ -26,7 +26,7 @@ _HEADER = struct.Struct("<2sHH")  # tag, run, number
 _REPORT = struct.Struct("<Ihb")  # previous turn-round in us, RSSI in tenths of dBm, SNR in quarters of dB
 _NO_TURN_ROUND = 0xFFFFFFFF
 
-SHORTEST_PAYLOAD_BYTES = _HEADER.size + _REPORT.size
+MIN_PAYLOAD_BYTES = _HEADER.size + _REPORT.size
 """What a reply has to hold."""
 
 RUNS = 1 << 16
@@ -106,7 +106,7 @@ class Answer:
 
     number: int | None
     heard: Strength
-    turn_round_ns: int | None
+    turnaround_ns: int | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -135,7 +135,7 @@ class Summary:
     here: Strength | None
     there: Strength | None
     round_trip_ns: tuple[int, int] | None
-    turn_round_ns: tuple[int, int] | None
+    turnaround_ns: tuple[int, int] | None
 
     @property
     def loss(self) -> float | None:
@@ -161,7 +161,7 @@ class AnswerSummary:
     repeated: int
     foreign: int
     heard: Strength | None
-    turn_round_ns: tuple[int, int] | None
+    turnaround_ns: tuple[int, int] | None
 
 
 async def ping(
@@ -180,7 +180,7 @@ async def ping(
     count
         How many requests, at most 65536.
     payload_bytes
-        Length of request and reply, :data:`SHORTEST_PAYLOAD_BYTES` to 255.
+        Length of request and reply, :data:`MIN_PAYLOAD_BYTES` to 255.
     timeout_ns
         From TxDone of a request until its reply is given up.
 
@@ -223,23 +223,23 @@ async def answer(radio: Radio) -> AsyncGenerator[Answer, None]:
         The radio failed.
     """
     previous: _Header | None = None
-    turn_round_us = _NO_TURN_ROUND
+    turnaround_us = _NO_TURN_ROUND
     while True:
         packet = await radio.receive()
         heard = Strength(packet.rssi_dbm, packet.snr_db)
         header = _header(packet, _REQUEST)
         if header is None or header == previous:
-            yield Answer(number=header and header.number, heard=heard, turn_round_ns=None)
+            yield Answer(number=header and header.number, heard=heard, turnaround_ns=None)
             continue
         if previous is None or header.run != previous.run:
-            turn_round_us = _NO_TURN_ROUND
+            turnaround_us = _NO_TURN_ROUND
         previous = header
-        report = _REPORT.pack(turn_round_us, round(heard.rssi_dbm * 10), round(heard.snr_db * 4))
+        report = _REPORT.pack(turnaround_us, round(heard.rssi_dbm * 10), round(heard.snr_db * 4))
         reply = _HEADER.pack(_REPLY, header.run, header.number) + report
         sent = await radio.transmit(reply.ljust(len(packet.payload), b"\0"))
-        turn_round_ns = sent.started_at_ns - packet.received_at_ns
-        turn_round_us = min(turn_round_ns // 1000, _NO_TURN_ROUND - 1)
-        yield Answer(number=header.number, heard=heard, turn_round_ns=turn_round_ns)
+        turnaround_ns = sent.started_at_ns - packet.received_at_ns
+        turnaround_us = min(turnaround_ns // 1000, _NO_TURN_ROUND - 1)
+        yield Answer(number=header.number, heard=heard, turnaround_ns=turnaround_ns)
 
 
 def summarise(exchanges: Iterable[Exchange]) -> Summary:
@@ -259,7 +259,7 @@ def summarise(exchanges: Iterable[Exchange]) -> Summary:
         round_trip_ns=_median_and_max(
             reply.received_at_ns - exchange.sent_at_ns for exchange, reply in answered
         ),
-        turn_round_ns=_median_and_max(
+        turnaround_ns=_median_and_max(
             reply.previous_turn_round_ns for reply in replies if reply.previous_turn_round_ns is not None
         ),
     )
@@ -268,14 +268,14 @@ def summarise(exchanges: Iterable[Exchange]) -> Summary:
 def summarise_answers(answers: Iterable[Answer]) -> AnswerSummary:
     """Put the answering side into figures."""
     answers = list(answers)
-    turn_rounds_ns = [each.turn_round_ns for each in answers if each.turn_round_ns is not None]
+    turn_rounds_ns = [each.turnaround_ns for each in answers if each.turnaround_ns is not None]
     foreign = sum(each.number is None for each in answers)
     return AnswerSummary(
         answered=len(turn_rounds_ns),
         repeated=len(answers) - len(turn_rounds_ns) - foreign,
         foreign=foreign,
-        heard=_mean(each.heard for each in answers if each.turn_round_ns is not None),
-        turn_round_ns=_median_and_max(turn_rounds_ns),
+        heard=_mean(each.heard for each in answers if each.turnaround_ns is not None),
+        turnaround_ns=_median_and_max(turn_rounds_ns),
     )
 
 
@@ -286,19 +286,19 @@ class _Header(NamedTuple):
 
 def _header(packet: Packet, tag: bytes) -> _Header | None:
     """Run and number of a packet of ours; None for anything else."""
-    if len(packet.payload) < SHORTEST_PAYLOAD_BYTES or packet.payload[: len(tag)] != tag:
+    if len(packet.payload) < MIN_PAYLOAD_BYTES or packet.payload[: len(tag)] != tag:
         return None
     _, run, number = _HEADER.unpack_from(packet.payload)
     return _Header(run, number)
 
 
 def _reply(packet: Packet) -> Reply:
-    turn_round_us, rssi_tenths_dbm, snr_quarters_db = _REPORT.unpack_from(packet.payload, _HEADER.size)
+    turnaround_us, rssi_tenths_dbm, snr_quarters_db = _REPORT.unpack_from(packet.payload, _HEADER.size)
     return Reply(
         received_at_ns=packet.received_at_ns,
         here=Strength(packet.rssi_dbm, packet.snr_db),
         there=Strength(rssi_tenths_dbm / 10, snr_quarters_db / 4),
-        previous_turn_round_ns=None if turn_round_us == _NO_TURN_ROUND else turn_round_us * 1000,
+        previous_turn_round_ns=None if turnaround_us == _NO_TURN_ROUND else turnaround_us * 1000,
     )
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from tsgt.radio.base import OpenRadio, Radio
 
 FIRST_PAUSE_NS = 100_000_000
-LONGEST_PAUSE_NS = 5_000_000_000
+MAX_PAUSE_NS = 5_000_000_000
 
 log = structlog.get_logger()
 
@@ -57,10 +57,10 @@ async def keep_radio(
             if (task := asyncio.current_task()) is not None and task.cancelling():
                 # Told to stop in the very moment in which the radio failed: the error took the place of the order.
                 raise asyncio.CancelledError from None
-            if clock.monotonic_ns() - began_ns > LONGEST_PAUSE_NS:
+            if clock.monotonic_ns() - began_ns > MAX_PAUSE_NS:
                 pause_ns, logged = FIRST_PAUSE_NS, ""
             if str(error) != logged:
                 logged = str(error)
                 log.error("radio_lost", error=logged)  # noqa: TRY400 (the message says it all)
             await clock.sleep_until(clock.monotonic_ns() + pause_ns)
-            pause_ns = min(2 * pause_ns, LONGEST_PAUSE_NS)
+            pause_ns = min(2 * pause_ns, MAX_PAUSE_NS)

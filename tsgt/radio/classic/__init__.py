@@ -6,13 +6,13 @@ from tsgt.radio.classic.messages import (
     OK,
     PING_REPLY_BYTES,
     TIME_REPLY_BYTES,
-    Command,
+    CommandMessage,
     MeasurementMessage,
     decode_command,
     raw_status,
     status_of,
 )
-from tsgt.radio.classic.transactions import Ordered, Poll, Shot, Synchronisation
+from tsgt.radio.classic.transactions import CommandTransaction, Poll, Shot, Synchronisation
 from tsgt.radio.classic.turn import Timing
 
 __all__ = [
@@ -21,9 +21,9 @@ __all__ = [
     "OK",
     "PING_REPLY_BYTES",
     "TIME_REPLY_BYTES",
-    "Command",
+    "CommandMessage",
+    "CommandTransaction",
     "MeasurementMessage",
-    "Ordered",
     "Poll",
     "Shot",
     "Synchronisation",

@@ -60,7 +60,7 @@ _NO_SECONDS = (0, 0xFFFF_FFFF)
 
 
 @dataclass(frozen=True, slots=True)
-class Command:
+class CommandMessage:
     """What the master tells a station.
 
     Attributes
@@ -234,7 +234,7 @@ def raw_status(status: Status) -> int:
     return _RAW_STATUS[status]
 
 
-def decode_command(payload: bytes) -> Command | None:
+def decode_command(payload: bytes) -> CommandMessage | None:
     """Return the command that a packet holds; None for anything else."""
     try:
         text = payload.decode("ascii")
@@ -244,7 +244,7 @@ def decode_command(payload: bytes) -> Command | None:
         return None
     prism = int(text[2]) if len(text) > COMMAND_BYTES else None
     try:
-        return Command(cast("Letter", text[0]), int(text[1]), prism)
+        return CommandMessage(cast("Letter", text[0]), int(text[1]), prism)
     except ValueError:
         return None
 

@@ -10,7 +10,7 @@ from tsgt.radio.classic.messages import (
     decode_command,
     no_measurement_yet,
 )
-from tsgt.radio.commands import DirectOrder, MeasureOrder, TrackOrder
+from tsgt.radio.commands import DirectCommand, MeasureCommand, TrackCommand
 
 _INTRODUCTIONS = 8
 """So many requests are answered as if there were no measurement yet, unless the station is synchronised before.
@@ -20,7 +20,7 @@ that is told that there is none can. It may not hear the first answers; but afte
 clock by itself, and into these fit about six of its requests."""
 
 
-ClassicOrder = TrackOrder | DirectOrder | MeasureOrder
+ClassicCommand = TrackCommand | DirectCommand | MeasureCommand
 """What this protocol can order."""
 
 
@@ -43,13 +43,13 @@ class ClassicStation:
         self._stamp_ns = 0
         self._direct = False
         self._prism: int | None = None
-        self._under_way: ClassicOrder | None = None
+        self._under_way: ClassicCommand | None = None
 
     def measured(self, message: MeasurementMessage) -> None:
         """Keep the newest measurement of the tracked prism for the next request, and for those after it."""
         self._newest = message
 
-    def received(self, payload: bytes, at_ns: int) -> bytes | ClassicOrder | None:
+    def received(self, payload: bytes, at_ns: int) -> bytes | ClassicCommand | None:
         """Take a packet.
 
         Parameters
@@ -70,7 +70,7 @@ class ClassicStation:
             return None
         match command.letter:
             case "t" if self._direct:
-                return self._begin(MeasureOrder())
+                return self._begin(MeasureCommand())
             case "t" if self._introductions:
                 self._introductions -= 1
                 return no_measurement_yet(self._station).to_bytes()
@@ -85,18 +85,18 @@ class ClassicStation:
             case "d" if self._direct and self._under_way is None:
                 return Acknowledgement("d", ok=True).to_bytes()
             case "d":
-                return self._begin(DirectOrder())
+                return self._begin(DirectCommand())
             case "n" if self._tracks(command.prism) and self._under_way is None:
                 return Acknowledgement("n", ok=True).to_bytes()
             case "n":
-                return self._begin(TrackOrder(command.prism))
+                return self._begin(TrackCommand(command.prism))
             case "p" | "c":  # synchronisation is no mode here: a ping is answered at any time
                 return None
 
-    def executed(self, order: TrackOrder | DirectOrder, *, ok: bool) -> bytes:
+    def executed(self, order: TrackCommand | DirectCommand, *, ok: bool) -> bytes:
         """Report that an order has been carried out, or has failed; return the answer to be sent."""
         self._under_way = None
-        if isinstance(order, DirectOrder):
+        if isinstance(order, DirectCommand):
             self._direct = self._direct or ok
             return Acknowledgement("d", ok).to_bytes()
         if ok:
@@ -114,7 +114,7 @@ class ClassicStation:
     def _tracks(self, prism: int | None) -> bool:
         return not self._direct and prism in (None, self._prism)
 
-    def _begin(self, order: ClassicOrder) -> ClassicOrder | None:
+    def _begin(self, order: ClassicCommand) -> ClassicCommand | None:
         if self._under_way is not None:
             return None
         self._under_way = order

@@ -22,14 +22,14 @@ from tsgt.radio.classic.messages import (
     PING_REPLY_BYTES,
     TIME_REPLY_BYTES,
     Acknowledgement,
-    Command,
+    CommandMessage,
     MeasurementMessage,
     PingReply,
     TimeReply,
     decode_reply,
 )
 from tsgt.radio.classic.station import ClassicStation
-from tsgt.radio.classic.turn import TURN_ROUND_NS, Request, Timing, Turn
+from tsgt.radio.classic.turn import TURNAROUND_NS, Request, Timing, Turn
 
 if TYPE_CHECKING:
     from tsgt.radio.classic.messages import Letter
@@ -180,7 +180,7 @@ class Synchronisation:
         self._silent = 0
 
     def _ask(self, letter: Letter, reply_timeout_ns: int) -> Request:
-        return Request(Command(letter, self.station).to_bytes(), reply_timeout_ns)
+        return Request(CommandMessage(letter, self.station).to_bytes(), reply_timeout_ns)
 
     def _earliest_ns(self, sent_ns: int) -> int:
         tolerance_ns = self.SLACK_NS + self._timing.symbol_ns // 4
@@ -286,7 +286,7 @@ class Poll:
         if self._asked:
             return None
         self._asked = True
-        return Request(Command("t", self.station).to_bytes(), self._timeout_ns)
+        return Request(CommandMessage("t", self.station).to_bytes(), self._timeout_ns)
 
     def replied(self, payload: bytes, *, sent_ns: int, received_ns: int, exact: bool) -> bool:  # noqa: ARG002
         """See :meth:`Turn.replied`."""
@@ -319,7 +319,7 @@ class Shot(Poll):
         self._timeout_ns += timeout_ns
 
 
-class Ordered:
+class CommandTransaction:
     """Give a station an order, ``d`` or ``n``, once.
 
     ``c`` goes ahead: a node that a master has left in the middle of a synchronisation is still in that mode.
@@ -337,11 +337,11 @@ class Ordered:
         What it answered; None before, or without an answer.
     """
 
-    def __init__(self, station: int, order: Command, timeout_ns: int) -> None:
+    def __init__(self, station: int, order: CommandMessage, timeout_ns: int) -> None:
         self.station = station
         self.ok: bool | None = None
         self._order = order
-        self._requests = [Request(order.to_bytes(), timeout_ns), Request(Command("c", station).to_bytes(), 0)]
+        self._requests = [Request(order.to_bytes(), timeout_ns), Request(CommandMessage("c", station).to_bytes(), 0)]
 
     def request(self) -> Request | None:
         """See :meth:`Turn.request`."""

@@ -10,7 +10,7 @@ from tsgt.radio.airtime import TX_DONE_NS, airtime_us, rx_done_ns, symbol_time_n
 if TYPE_CHECKING:
     from tsgt.radio.base import LoRaSettings
 
-TURN_ROUND_NS = 100_000_000
+TURNAROUND_NS = 100_000_000
 """What a station may at least take from a request to its reply; the authors' nodes take 12 ms."""
 
 
@@ -58,7 +58,7 @@ class Timing:
 
     def timeout_ns(self, reply_bytes: int) -> int:
         """Return how long to wait for a reply: as configured, or longer where the air is slow (SF 10 and above)."""
-        return max(self.reply_timeout_ns, self.airtime_ns(reply_bytes) + self.rx_done_ns + TURN_ROUND_NS)
+        return max(self.reply_timeout_ns, self.airtime_ns(reply_bytes) + self.rx_done_ns + TURNAROUND_NS)
 
 
 @dataclass(frozen=True, slots=True)

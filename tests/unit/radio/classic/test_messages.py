@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from tsgt.model import Status
-from tsgt.radio.classic import Command, MeasurementMessage, decode_command, raw_status, status_of
+from tsgt.radio.classic import CommandMessage, MeasurementMessage, decode_command, raw_status, status_of
 from tsgt.radio.classic.messages import (
     Acknowledgement,
     PingReply,
@@ -27,14 +27,14 @@ MEASUREMENT = MeasurementMessage(
 MEASUREMENT_HEX = "03 00 000000000000f83f 000000000000d03f 0000000000085040 00f15365 ffc99a3b"
 
 COMMANDS = [
-    (Command("t", 1), "7431"),
-    (Command("p", 2), "7032"),
-    (Command("e", 3), "6533"),
-    (Command("s", 4), "7334"),
-    (Command("c", 9), "6339"),
-    (Command("d", 1), "6431"),
-    (Command("n", 1), "6e31"),
-    (Command("n", 1, 3), "6e3133"),
+    (CommandMessage("t", 1), "7431"),
+    (CommandMessage("p", 2), "7032"),
+    (CommandMessage("e", 3), "6533"),
+    (CommandMessage("s", 4), "7334"),
+    (CommandMessage("c", 9), "6339"),
+    (CommandMessage("d", 1), "6431"),
+    (CommandMessage("n", 1), "6e31"),
+    (CommandMessage("n", 1, 3), "6e3133"),
 ]
 REPLIES = [
     (PingReply(1), "6531"),
@@ -50,7 +50,7 @@ REPLIES = [
 
 
 @pytest.mark.parametrize(("command", "golden"), COMMANDS)
-def test_every_command_has_its_bytes(command: Command, golden: str) -> None:
+def test_every_command_has_its_bytes(command: CommandMessage, golden: str) -> None:
     """Commands are the bytes of the authors' nodes, and these bytes are the commands."""
     assert command.to_bytes() == bytes.fromhex(golden)
     assert decode_command(bytes.fromhex(golden)) == command
@@ -177,7 +177,7 @@ def test_a_good_measurement_without_distance_is_not_good() -> None:
 def test_there_is_no_such_command(arguments: Any) -> None:
     """What does not fit into a command is refused where it is made."""
     with pytest.raises(ValueError, match=r"expected 1 to 9|only 1 to 9|there is no command"):
-        Command(*arguments)
+        CommandMessage(*arguments)
 
 
 @pytest.mark.parametrize(

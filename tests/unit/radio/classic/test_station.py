@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from tsgt.radio import DirectOrder, MeasureOrder, TrackOrder
+from tsgt.radio import DirectCommand, MeasureCommand, TrackCommand
 from tsgt.radio.classic import MeasurementMessage
 from tsgt.radio.classic.messages import no_measurement_yet
 from tsgt.radio.classic.transactions import ClassicStation
@@ -81,11 +81,11 @@ def test_without_a_ping_there_is_no_stamp(station: ClassicStation) -> None:
 
 def test_an_order_is_carried_out_and_then_answered(station: ClassicStation) -> None:
     """The way to direct mode and back, each order once, each confirmed again when it is repeated."""
-    assert station.received(b"d1", 5) == DirectOrder()
-    assert station.executed(DirectOrder(), ok=True) == b"dOk"
+    assert station.received(b"d1", 5) == DirectCommand()
+    assert station.executed(DirectCommand(), ok=True) == b"dOk"
     assert station.received(b"d1", 6) == b"dOk"
-    assert station.received(b"n1", 7) == TrackOrder(None)
-    assert station.executed(TrackOrder(None), ok=True) == b"nOk"
+    assert station.received(b"n1", 7) == TrackCommand(None)
+    assert station.executed(TrackCommand(None), ok=True) == b"nOk"
     assert station.received(b"n1", 8) == b"nOk"
 
 
@@ -94,28 +94,28 @@ def test_a_failed_order_changes_nothing(station: ClassicStation) -> None:
     station.received(b"e1", 4)
     station.measured(SOME)
     station.received(b"d1", 5)
-    assert station.executed(DirectOrder(), ok=False) == b"dNo"
+    assert station.executed(DirectCommand(), ok=False) == b"dNo"
     assert station.received(b"t1", 6) == SOME.to_bytes()
     station.received(b"d1", 7)
-    station.executed(DirectOrder(), ok=True)
+    station.executed(DirectCommand(), ok=True)
     station.received(b"n1", 8)
-    assert station.executed(TrackOrder(None), ok=False) == b"nNo"
-    assert station.received(b"t1", 9) == MeasureOrder()
+    assert station.executed(TrackCommand(None), ok=False) == b"nNo"
+    assert station.received(b"t1", 9) == MeasureCommand()
 
 
 def test_another_prism_is_an_order_also_while_tracking(station: ClassicStation) -> None:
     """The first order for a prism is carried out, its repetition confirmed, the next prism ordered again."""
-    assert station.received(b"n13", 5) == TrackOrder(3)
-    assert station.executed(TrackOrder(3), ok=True) == b"nOk"
+    assert station.received(b"n13", 5) == TrackCommand(3)
+    assert station.executed(TrackCommand(3), ok=True) == b"nOk"
     assert station.received(b"n13", 6) == b"nOk"
-    assert station.received(b"n14", 7) == TrackOrder(4)
+    assert station.received(b"n14", 7) == TrackCommand(4)
 
 
 def test_a_measurement_from_before_a_change_of_prism_is_not_sent(station: ClassicStation) -> None:
     """The message does not say which prism it is of, so the old one must not pass for the new one."""
     station.measured(SOME)
     station.received(b"n14", 5)
-    station.executed(TrackOrder(4), ok=True)
+    station.executed(TrackCommand(4), ok=True)
     assert station.received(b"t1", 6) == NONE_YET
 
 
@@ -123,9 +123,9 @@ def test_requests_in_direct_mode_are_single_measurements(station: ClassicStation
     """Each request is one measurement, and its answer the one that was made for it."""
     station.measured(SOME)
     station.received(b"d1", 5)
-    station.executed(DirectOrder(), ok=True)
+    station.executed(DirectCommand(), ok=True)
     for _ in range(2):
-        assert station.received(b"t1", 6) == MeasureOrder()
+        assert station.received(b"t1", 6) == MeasureCommand()
         assert station.shot(SOME) == SOME.to_bytes()
 
 
@@ -136,7 +136,7 @@ def test_one_order_at_a_time(station: ClassicStation) -> None:
     station.received(b"d1", 5)
     assert [station.received(payload, 6) for payload in (b"d1", b"n1", b"n13")] == [None] * 3
     assert [station.received(payload, 7) for payload in (b"t1", b"e1")] == [SOME.to_bytes(), b"e1"]
-    station.executed(DirectOrder(), ok=True)
+    station.executed(DirectCommand(), ok=True)
     station.received(b"t1", 8)
     assert [station.received(payload, 9) for payload in (b"t1", b"d1", b"n1")] == [None] * 3
     station.shot(SOME)

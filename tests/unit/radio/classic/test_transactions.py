@@ -13,7 +13,7 @@ from tsgt.radio.classic.transactions import ClassicStation, Timing
 TIMING = Timing.of(PAPER, 250 * MS)
 PING_NS = TIMING.airtime_ns(2)
 FORWARD_NS = PING_NS + TIMING.rx_done_ns
-TURN_ROUND_NS = 3 * MS
+TURNAROUND_NS = 3 * MS
 OFFSET_NS = 1_600_000_000_000_000_000
 
 Meddle = Callable[["Exchange"], None]
@@ -65,7 +65,7 @@ class Link:
                 stamp_ns = exchange.sent_ns + FORWARD_NS + self.late_ns + self.offset_ns
                 reply = self.station.received(request.payload, stamp_ns)
                 if isinstance(reply, bytes):
-                    back_ns = self.late_ns + TURN_ROUND_NS + TIMING.airtime_ns(len(reply)) + TIMING.rx_done_ns
+                    back_ns = self.late_ns + TURNAROUND_NS + TIMING.airtime_ns(len(reply)) + TIMING.rx_done_ns
                     exchange.replies.append((reply, FORWARD_NS + back_ns))
             self._after(exchange)
             self._now_ns += PING_NS
@@ -101,7 +101,7 @@ def test_a_sample_has_what_is_known() -> None:
     link, turn = Link(), Synchronisation(1, 3, TIMING)
     link.run(turn)
     assert _offsets_ns(turn) == [OFFSET_NS] * 3
-    assert [sample.excess_ns for sample in turn.samples] == [TURN_ROUND_NS] * 3
+    assert [sample.excess_ns for sample in turn.samples] == [TURNAROUND_NS] * 3
 
 
 def test_a_known_delay_of_the_stamp_is_taken_off() -> None:
@@ -190,7 +190,7 @@ def test_a_reply_before_its_time_is_none() -> None:
     link, turn = Link(echo), Synchronisation(1, 5, TIMING)
     link.run(turn)
     assert _offsets_ns(turn) == [OFFSET_NS] * 4
-    assert all(sample.excess_ns == TURN_ROUND_NS for sample in turn.samples)
+    assert all(sample.excess_ns == TURNAROUND_NS for sample in turn.samples)
 
 
 def test_a_stamp_does_not_count_twice() -> None:

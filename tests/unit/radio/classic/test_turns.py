@@ -4,7 +4,7 @@ import pytest
 from harness.radios import MS, PAPER
 
 from tsgt.radio import LoRaSettings
-from tsgt.radio.classic import Command, MeasurementMessage, Ordered, Poll, Shot
+from tsgt.radio.classic import CommandMessage, MeasurementMessage, CommandTransaction, Poll, Shot
 from tsgt.radio.classic.transactions import Request, Timing, Turn
 
 TIMING = Timing.of(PAPER, 250 * MS)
@@ -77,15 +77,15 @@ def test_a_single_measurement_has_time() -> None:
 @pytest.mark.parametrize(
     ("order", "payload", "ok"),
     [
-        (Command("d", 1), b"dOk", True),
-        (Command("d", 1), b"dNo", False),
-        (Command("n", 1, 3), b"nOk", True),
-        (Command("n", 1), b"nNo", False),
+        (CommandMessage("d", 1), b"dOk", True),
+        (CommandMessage("d", 1), b"dNo", False),
+        (CommandMessage("n", 1, 3), b"nOk", True),
+        (CommandMessage("n", 1), b"nNo", False),
     ],
 )
-def test_an_order_is_answered(order: Command, payload: bytes, *, ok: bool) -> None:
+def test_an_order_is_answered(order: CommandMessage, payload: bytes, *, ok: bool) -> None:
     """A farewell to a synchronisation that was left, the order, and its answer."""
-    turn = Ordered(1, order, 2_000 * MS)
+    turn = CommandTransaction(1, order, 2_000 * MS)
     assert turn.request() == Request(b"c1", 0)
     assert turn.request() == Request(order.to_bytes(), 2_000 * MS)
     assert _reply(turn, payload)
@@ -96,7 +96,7 @@ def test_an_order_is_answered(order: Command, payload: bytes, *, ok: bool) -> No
 @pytest.mark.parametrize("payload", [b"nOk", b"nNo", b"d1", SOME.to_bytes()])
 def test_an_order_waits_for_its_own_answer(payload: bytes) -> None:
     """The answer to the other order, come late, is not the one that is waited for."""
-    turn = Ordered(1, Command("d", 1), 2_000 * MS)
+    turn = CommandTransaction(1, CommandMessage("d", 1), 2_000 * MS)
     turn.request()
     turn.request()
     assert not _reply(turn, payload)

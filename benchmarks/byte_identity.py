@@ -52,7 +52,41 @@ OLD_OPTIONS = {
     "--samples": "--draws",
 }
 
-OLD_NAMES: dict[str, str] = {}
+OLD_NAMES = {
+    "beacon_doubted": "beacon_time_rejected",
+    "link_doubted": "link_delay_anomaly",
+    "fence_left": "geofence_exited",
+    "fence_entered": "geofence_entered",
+    "frame_suspect": "layout_residual_high",
+    "backlog_left_behind": "measurements_discarded",
+    "master_not_understood": "no_valid_beacon",
+    "person_needed": "operator_required",
+    "instrument_time_began_anew": "instrument_clock_reset",
+    "turns_stuck": "scheduler_stalled",
+    "slot_late": "slot_missed",
+    "bridge_said": "bridge_stderr",
+    "beacon_refused": "beacon_authentication_failed",
+    "request_too_old": "request_expired",
+    "station_back": "station_recovered",
+    "radio_back": "radio_recovered",
+    "residual_per_speed_ms": "residual_speed_gain_ms",
+    "turn_round_ms": "turnaround_ms",
+    "stamp_delay_ms": "timestamp_delay_ms",
+    "narrow_view": "reduced_field_of_view",
+    "silence_s": "stall_timeout_s",
+    "acceleration_time_s": "acceleration_correlation_time_s",
+    "shaking_smoothing_s": "attitude_smoothing_s",
+    "left_out_mm": "leave_one_out_mm",
+    "node": "station_software",
+    "draws": "samples",
+    "late": "missed_slots",
+    "doubted": "rejected_beacons",
+    "too_late": "outside_lag_window",
+    "missing": "outstanding",
+    "standing": "stationary",
+    "undetermined": "unobservable",
+    "again": "replay_command",
+}
 """Keys and event names that were renamed, old to new."""
 
 VOLATILE = re.compile(

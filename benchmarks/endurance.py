@@ -237,7 +237,7 @@ class Endurance:
                 writer.close()
         except (OSError, ValueError):
             return None
-        return {key: said[key] for key in ("late", "queued", "rate_hz", "measurements")}
+        return {key: said[key] for key in ("missed_slots", "queued", "rate_hz", "measurements")}
 
     # --- Afterwards -------------------------------------------------------------------------------------------
 
@@ -325,7 +325,7 @@ class Endurance:
     def _station(self, number: int, beacons_ns: Sequence[int]) -> dict[str, Any]:
         lives = self._said[number].values()
         slots = sum(life["first_ns"] <= at_ns <= life["last_ns"] for at_ns in beacons_ns for life in lives)
-        late = sum(life["late"] for life in lives)
+        late = sum(life["missed_slots"] for life in lives)
         ages_s = self._streams[-1].ages_s[number]
         return {
             "station": number,

@@ -93,7 +93,7 @@ class Stream:
             case "measurement":
                 self.ages_s[line["station"]].append((time.time_ns() - line["stamp_ns"]) / 1e9)
             case "status":
-                self.late = {each["id"]: each["late"] or 0 for each in line["stations"]}
+                self.late = {each["id"]: each["missed_slots"] or 0 for each in line["stations"]}
             case "event" if line["event"] == "lines_lost":
                 self.lost += line["count"]
 

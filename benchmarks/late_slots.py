@@ -59,7 +59,7 @@ def main() -> None:
             if m.stamp_ns < last_ns - UNDER_WAY_NS
         ]
         missing = sum((station, m.sequence) not in delivered for m in measured)
-        late = statuses[station]["late"]
+        late = statuses[station]["missed_slots"]
         print(
             f"{station:<8}{frames:8}{late:6}{late / max(1, frames):8.2%}{len(measured):10}{missing:9}"
             f"{statuses[station]['queued']:8}"

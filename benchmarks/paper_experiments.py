@@ -29,13 +29,13 @@ from tsgt.analysis.evaluation import (
     PairDistances,
     PoseErrors,
     Reference,
-    at_epochs,
-    inner_part,
+    distances_at_epochs,
+    interior_mask,
     inter_prism,
     pose_errors,
-    standing_errors,
+    stationary_errors,
 )
-from tsgt.analysis.evaluation.stationary import StandingErrors
+from tsgt.analysis.evaluation.stationary import StationaryErrors
 from tsgt.analysis.processing import process, with_estimator
 from tsgt.cli.output import print_json
 from tsgt.config import ClassicMasterConfig, SuperframeMasterConfig
@@ -43,12 +43,12 @@ from tsgt.estimation import build_tracks
 from tsgt.geometry import quaternion_from_rotation, rotation_from_quaternion, transform_from
 from tsgt.log import configure_logging
 from tsgt.recording import load_recording
-from tsgt.simulation.options import Options
+from tsgt.simulation.options import SimulationOptions
 from tsgt.simulation.runner import simulate
 from tsgt.simulation.scenario_files import find_scenario
 
 if TYPE_CHECKING:
-    from tsgt.simulation.mission import Run
+    from tsgt.simulation.mission import MissionResult
 
 EXPERIMENTS = {"quarry": (0,), "ski-trail": (0, 1, 2), "snowmobile": (0,)}
 """Seeds of the drives, by scenario: the paper drove the ski trail three times."""
@@ -78,7 +78,7 @@ class Drive:
     poses: int
     valid_poses: int
     errors: PoseErrors
-    stops: StandingErrors
+    stops: StationaryErrors
 
 
 def drive(experiment: str, system: str, seed: int) -> Drive:
@@ -88,10 +88,10 @@ def drive(experiment: str, system: str, seed: int) -> Drive:
     # What is recorded does not depend on the estimator that runs live; this one is the faster.
     pipeline = scenario.pipeline.model_copy(update={"estimator": "linear"})
     scenario = scenario.model_copy(update={"pipeline": pipeline})
-    options = Options(
+    options = SimulationOptions(
         duration_s=scenario.duration_s,
         seed=seed,
-        node="authors" if system == "letter" else "ours",
+        station_software="authors" if system == "letter" else "ours",
         protocol=SuperframeMasterConfig(kind="superframe")
         if system == "ours"
         else ClassicMasterConfig(
@@ -100,7 +100,7 @@ def drive(experiment: str, system: str, seed: int) -> Drive:
     )
     with tempfile.TemporaryDirectory(prefix="tsgt-paper-") as folder:
         run = simulate(scenario, options, folder=Path(folder))
-        path = run.sessions[-1].recording()
+        path = run.master_logs[-1].recording()
         if path is None:
             raise RuntimeError(f"{experiment}, {system}: the master made no recording")
         recording = load_recording(path)
@@ -108,13 +108,13 @@ def drive(experiment: str, system: str, seed: int) -> Drive:
     poses = process(recording, path=path)
     parameters = recording.parameters
     tracks = build_tracks(parameters, recording.measurements)
-    epochs = at_epochs(parameters, tracks)
+    epochs = distances_at_epochs(parameters, tracks)
     found = inter_prism(parameters, tracks, found=epochs)
     moving = epochs.valid.copy()
-    for start_ns, end_ns in found.still_ns:
+    for start_ns, end_ns in found.stationary_ns:
         moving &= (epochs.stamp_ns < start_ns) | (epochs.stamp_ns > end_ns)
     truth, centroid_m = truth_of(run), run.world.prisms_m.mean(axis=0)
-    rows = np.flatnonzero(poses.valid & inner_part(poses.stamp_ns, run.start_ns, run.end_ns))
+    rows = np.flatnonzero(poses.valid & interior_mask(poses.stamp_ns, run.start_ns, run.end_ns))
     turns = rotation_from_quaternion(poses.orientation_xyzw[rows])
     true = run.world.pose_at((poses.stamp_ns[rows] - run.start_ns) / 1e9)
     return Drive(
@@ -127,11 +127,11 @@ def drive(experiment: str, system: str, seed: int) -> Drive:
         poses=len(poses),
         valid_poses=int(np.count_nonzero(poses.valid)),
         errors=pose_errors(transform_from(turns, poses.position_m[rows]), true, centroid_m),
-        stops=standing_errors(poses, truth, found.still_ns, centroid_m),
+        stops=stationary_errors(poses, truth, found.stationary_ns, centroid_m),
     )
 
 
-def truth_of(run: Run) -> Reference:
+def truth_of(run: MissionResult) -> Reference:
     """Return the true poses at 20 Hz."""
     stamps = np.arange(run.start_ns, run.end_ns + 1, 50_000_000, dtype=np.int64)
     poses = run.world.pose_at((stamps - run.start_ns) / 1e9)
@@ -163,7 +163,7 @@ def together(drives: list[Drive]) -> Drive:
         poses=sum(each.poses for each in drives),
         valid_poses=sum(each.valid_poses for each in drives),
         errors=arrays(PoseErrors, "errors"),
-        stops=arrays(StandingErrors, "stops"),
+        stops=arrays(StationaryErrors, "stops"),
     )
 
 
@@ -173,7 +173,7 @@ def keys(found: Drive) -> dict[str, Any]:
     def pairs(some: tuple[PairDistances, ...]) -> dict[str, Any]:
         errors_mm = 1e3 * np.concatenate([np.abs(p.distances_m - p.reference_m) for p in some])
         return {
-            **{pair.name: dataclasses.asdict(pair.summary()) for pair in some},
+            **{pair.name: dataclasses.asdict(pair.statistics()) for pair in some},
             "all": {
                 "mean_abs_error": float(errors_mm.mean()) if len(errors_mm) else None,
                 "std_abs_error": float(errors_mm.std()) if len(errors_mm) else None,
@@ -189,7 +189,7 @@ def keys(found: Drive) -> dict[str, Any]:
         "valid_poses": found.valid_poses,
         "position_rms_mm": found.errors.position_rms_mm,
         "orientation_rms_deg": found.errors.orientation_rms_deg,
-        "standing": dataclasses.asdict(found.stops.summary()),
+        "stationary": dataclasses.asdict(found.stops.statistics()),
     }
 
 
@@ -199,7 +199,7 @@ def row(experiment: str, system: str, found: dict[str, Any]) -> str:
     whole, moving, stops = (
         found["inter_prism_mm"]["all"],
         found["inter_prism_moving_mm"]["all"],
-        found["standing"],
+        found["stationary"],
     )
 
     def number(value: float | None, digits: int) -> str:

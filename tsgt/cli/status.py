@@ -127,7 +127,11 @@ def _station_lines(station: StationStatus) -> list[str]:
         lines.append(f"  clock within {station.clock_bound_ns / 1e6:.2f} ms")
     elif station.stamp_bound_ns is not None:
         lines.append(f"  time within {station.stamp_bound_ns / 1e6:.2f} ms")
-    counts = {"missing": station.missing, "slots late": station.late, "beacons doubted": station.doubted}
+    counts = {
+        "outstanding": station.outstanding,
+        "missed slots": station.missed_slots,
+        "rejected beacons": station.rejected_beacons,
+    }
     lines += [f"  {count} {of_what}" for of_what, count in counts.items() if count]
     return [line for line in lines if line.strip()]
 
@@ -213,11 +217,11 @@ def _why_not_heard(record: ClientStatus) -> list[str]:
 
 def _superframe_lines(record: ClientStatus) -> list[str]:
     """Say how delivery and time of the protocol superframe do."""
-    lines = [f"{record.queued} to deliver, {record.late} slots late"]
+    lines = [f"{record.queued} to deliver, {record.missed_slots} missed slots"]
     if record.clock_bound_ns is not None:
         lines.append(f"  clock within {record.clock_bound_ns / 1e6:.2f} ms")
-    if record.doubted:
-        lines.append(f"  {record.doubted} beacons doubted")
+    if record.rejected_beacons:
+        lines.append(f"  {record.rejected_beacons} rejected beacons")
     if not record.authenticated:
         lines.append(_headline("NO KEY: anybody can take part", good=False))
     return lines

@@ -20,12 +20,12 @@ from tsgt.estimation.observations import build_observations
 from tsgt.estimation.pose_batch import Kind, PoseBatch
 from tsgt.estimation.pose_output import ContinuousPoses, Seen
 from tsgt.estimation.tracks import believable, measured_at_ns, usable
-from tsgt.geometry import FixedLag, check_layout, joined
+from tsgt.geometry import FixedLagSmoother, check_layout, concatenate_states
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from tsgt.geometry import Knots
+    from tsgt.geometry import States
     from tsgt.model import Measurement, Parameters
 
 SMOOTHED_EVERY_NS = 500_000_000
@@ -46,7 +46,7 @@ class ContinuousPipeline:
 
     Attributes
     ----------
-    too_late
+    outside_lag_window
         By station, how many measurements came when the time of their making had been smoothed for good.
 
     Raises
@@ -62,7 +62,7 @@ class ContinuousPipeline:
         check_layout([prism.position_m for prism in parameters.prisms], names=tuple(self._columns))
         self._stations = {station.station: station for station in parameters.stations}
         self._poses = ContinuousPoses(parameters)
-        self._window = FixedLag(self._limits.motion)
+        self._window = FixedLagSmoother(self._limits.motion)
         self._pending: list[Measurement] = []
         none = np.empty(0, np.int64)
         self._unusable: list[list[int]] = [[] for _ in self._columns]
@@ -70,7 +70,7 @@ class ContinuousPipeline:
         self._origin_ns = 0
         self._next_epoch_ns: int | None = None
         self._next_smoothed_ns = 0
-        self.too_late: Counter[int] = Counter()
+        self.outside_lag_window: Counter[int] = Counter()
         self._none = PoseBatch.blank(none, tuple(self._columns), Kind.PREDICTED)
 
     def begin_at(self, now_ns: int) -> None:
@@ -118,7 +118,7 @@ class ContinuousPipeline:
         self._pending.clear()
         # A station that has measured for hours without a master may send all of it now.
         late = observations.time_s < max(self._window.horizon_s, -self._limits.lag_ns / 1e9)
-        self.too_late.update(source.station for source, is_late in zip(sources, late, strict=True) if is_late)
+        self.outside_lag_window.update(source.station for source, is_late in zip(sources, late, strict=True) if is_late)
         times_ns = np.array([measured_at_ns(m, self._stations[m.station]) for m in sources], dtype=np.int64)
         stations = np.array([m.station for m in sources], dtype=np.int64)
         known = set(zip(self._seen.times_ns.tolist(), self._seen.stations.tolist(), strict=True))
@@ -155,15 +155,15 @@ class ContinuousPipeline:
         )
 
     def _predicted(self, epochs_ns: range) -> PoseBatch:
-        if not self._window.following:
+        if not self._window.initialised:
             return self._poses.predicted(epochs_ns, self._seen, None, _NONE)
-        settled = np.full(len(epochs_ns), self._window.settled and not self._window.doubtful)
+        settled = np.full(len(epochs_ns), self._window.converged and not self._window.ambiguous)
         found = [
-            self._window.predict((epoch_ns - self._origin_ns) / 1e9, parts=_POSE) for epoch_ns in epochs_ns
+            self._window.predict((epoch_ns - self._origin_ns) / 1e9, dim=_POSE) for epoch_ns in epochs_ns
         ]
         if len(found) == 1:
             return self._poses.predicted(epochs_ns, self._seen, *found[0], settled=settled)
-        states = joined([state for state, _ in found])
+        states = concatenate_states([state for state, _ in found])
         covariance = np.concatenate([each for _, each in found])
         return self._poses.predicted(epochs_ns, self._seen, states, covariance, settled=settled)
 
@@ -172,15 +172,15 @@ class ContinuousPipeline:
         stamp_ns = np.arange(self._next_smoothed_ns, last_ns + 1, self._limits.period_ns, dtype=np.int64)
         if not len(stamp_ns):
             return self._none
-        states: Knots | None = None
+        states: States | None = None
         covariance = _NONE
-        if self._window.following:
-            states, covariance = self._window.trajectory().at((stamp_ns - self._origin_ns) / 1e9, parts=_POSE)
+        if self._window.initialised:
+            states, covariance = self._window.trajectory().at((stamp_ns - self._origin_ns) / 1e9, dim=_POSE)
         time_s = (stamp_ns - self._origin_ns) / 1e9
-        sure = (time_s >= self._window.begun_s) & (time_s < self._window.doubtful_from_s)
-        sure &= ~self._window.contested(time_s)
+        sure = (time_s >= self._window.reliable_from_s) & (time_s < self._window.ambiguous_from_s)
+        sure &= ~self._window.ambiguous_at(time_s)
         poses = self._poses.smoothed(
-            stamp_ns, self._seen, states, covariance, settled=sure & self._window.settled
+            stamp_ns, self._seen, states, covariance, settled=sure & self._window.converged
         )
         self._next_smoothed_ns = int(stamp_ns[-1]) + self._limits.period_ns
         self._forget()
@@ -191,7 +191,7 @@ class ContinuousPipeline:
         self._seen = replace(self._seen, unusable_ns=unusable_ns)
 
     def _forget(self) -> None:
-        self._window.forget((self._next_smoothed_ns - self._origin_ns) / 1e9)
+        self._window.marginalise_before((self._next_smoothed_ns - self._origin_ns) / 1e9)
         seen = self._seen
         kept = seen.times_ns >= self._next_smoothed_ns - self._limits.outage_limit_ns
         kept[len(kept) - len(self._window.residuals_m) :] = True

@@ -28,8 +28,8 @@ from tsgt.geometry import (
     poses_from_prisms,
     quaternion_from_rotation,
     twists,
-    unseen_motion_covariance,
-    unseen_s2,
+    interpolation_error_covariance,
+    interpolation_error_s2,
 )
 
 if TYPE_CHECKING:
@@ -227,7 +227,7 @@ class Pipeline:
         """Fit the layout to the prisms at the rows where all of them are known."""
         points, velocities = between.points[rows], between.velocities_mps[rows]
         covariances = _interpolated_covariances(samples, between, rows)
-        unseen = unseen_s2(between.fraction[rows], between.gap_ns[rows])
+        unseen = interpolation_error_s2(between.fraction[rows], between.gap_ns[rows])
         poses = poses_from_prisms(self._layout, points)
         batch.reason[rows[poses.degenerate]] = Reason.DEGENERATE_GEOMETRY
         fitted = ~poses.degenerate
@@ -237,7 +237,7 @@ class Pipeline:
         batch.orientation_xyzw[rows] = quaternion_from_rotation(rotation)
         batch.covariance[rows] = pose_covariance(
             self._layout, rotation, covariances[fitted]
-        ) + unseen_motion_covariance(
+        ) + interpolation_error_covariance(
             self._layout,
             rotation,
             unseen[fitted],

@@ -54,9 +54,9 @@ class Feed:
         self._now_ns = max(self._now_ns, now_ns)
         return list(self._pipeline.advance(self._now_ns).records())
 
-    def too_late(self) -> Mapping[int, int] | None:
+    def outside_lag_window(self) -> Mapping[int, int] | None:
         """Return how many measurements of which station came too late for ``continuous``; None with ``linear``."""
-        return self._pipeline.too_late if isinstance(self._pipeline, ContinuousPipeline) else None
+        return self._pipeline.outside_lag_window if isinstance(self._pipeline, ContinuousPipeline) else None
 
     def next_deadline_ns(self) -> int | None:
         """Return when :meth:`advance` should be called if nothing arrives before; None while nothing waits."""

@@ -12,14 +12,14 @@ import numpy as np
 
 from tsgt.estimation.observations import middle_m
 from tsgt.estimation.pose_batch import Kind, PoseBatch, Reason
-from tsgt.geometry import of_point, quaternion_from_rotation, ros_covariance, with_curvature
+from tsgt.geometry import state_at_point, quaternion_from_rotation, ros_covariance, with_second_order_terms
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from tsgt.geometry import Knots
+    from tsgt.geometry import States
     from tsgt.model import Parameters
 
 NO_IDEA_RAD = 0.5
@@ -108,7 +108,7 @@ class ContinuousPoses:
         self,
         stamps_ns: Sequence[int],
         seen: Seen,
-        states: Knots | None,
+        states: States | None,
         covariance: NDArray[np.float64],
         *,
         settled: NDArray[np.bool_] | None = None,
@@ -132,7 +132,7 @@ class ContinuousPoses:
         self,
         stamp_ns: NDArray[np.int64],
         seen: Seen,
-        states: Knots | None,
+        states: States | None,
         covariance: NDArray[np.float64],
         *,
         settled: NDArray[np.bool_] | None = None,
@@ -213,7 +213,7 @@ class ContinuousPoses:
     def _judged(
         self,
         batch: PoseBatch,
-        states: Knots | None,
+        states: States | None,
         covariance: NDArray[np.float64],
         *,
         settled: NDArray[np.bool_] | None = None,
@@ -226,8 +226,8 @@ class ContinuousPoses:
         limits, rotation = self._limits, states.rotation
         variance_m2 = np.linalg.eigvalsh(covariance[:, :3, :3])[:, -1]
         sigma_m = np.sqrt(np.where(variance_m2 >= 0, variance_m2, np.nan))
-        states, covariance = of_point(states, covariance, self._to_origin_m)
-        covariance, sigma_rad = with_curvature(rotation, covariance)
+        states, covariance = state_at_point(states, covariance, self._to_origin_m)
+        covariance, sigma_rad = with_second_order_terms(rotation, covariance)
         unknown = ~(sigma_rad < NO_IDEA_RAD)
         batch.position_m[:] = states.position
         batch.orientation_xyzw[:] = quaternion_from_rotation(rotation)

@@ -32,7 +32,7 @@ from tsgt.master.station_events import Alerts
 from tsgt.master.statistics import Monitor
 from tsgt.master.stream_server import StreamServer
 from tsgt.master.superframe import SuperframeLink
-from tsgt.radio.supervisor import keep_radio
+from tsgt.radio.supervisor import supervise_radio
 from tsgt.recording import (
     EventRecord,
     HelloRecord,
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from tsgt.config import FrameWatchConfig, GeofenceConfig, MasterConfig
     from tsgt.master.publisher import Watcher
     from tsgt.model import Measurement, Parameters
-    from tsgt.radio import LoRaSettings, OpenRadio, Radio
+    from tsgt.radio import LoRaSettings, RadioOpener, Radio
     from tsgt.recording import StatusRecord
 
 STATUS_PERIOD_NS = 1_000_000_000
@@ -67,7 +67,7 @@ async def run_master(
     parameters: Parameters,
     settings: LoRaSettings,
     *,
-    open_radio: OpenRadio,
+    open_radio: RadioOpener,
     clock: Clock,
     key: bytes | None = None,
     random_bits: Callable[[int], int] = secrets.randbits,
@@ -137,11 +137,11 @@ async def run_master(
                 log.info("master_started", recording=str(path), stations=len(config.stations))
                 service.sd_notify("READY=1")
                 group.create_task(disk.run())
-                group.create_task(service.keep_synced(writer.sync, clock, config.recording.fsync_interval_s))
+                group.create_task(service.sync_periodically(writer.sync, clock, config.recording.fsync_interval_s))
                 group.create_task(master.keep_time())
                 group.create_task(master.report(link))
                 group.create_task(master.watchdog(link))
-                group.create_task(keep_radio(master.watched(open_radio), link.run, clock))
+                group.create_task(supervise_radio(master.watched(open_radio), link.run, clock))
         finally:
             service.sd_notify("STOPPING=1")
             recorder.close()
@@ -256,7 +256,7 @@ class _Master:
 
     # --- Radio --------------------------------------------------------------------------------------------------
 
-    def watched(self, open_radio: OpenRadio) -> OpenRadio:
+    def watched(self, open_radio: RadioOpener) -> RadioOpener:
         """Tell the stream when the radio fails, and when it is back."""
 
         @asynccontextmanager

@@ -112,9 +112,9 @@ class Outlet:
                 self._monitor.measurement(record)
                 for watcher in self._watchers:
                     events += watcher.measurement(record)
-        too_late = self._feed.too_late()
-        if too_late is not None:
-            self._monitor.too_late(too_late)
+        outside_lag_window = self._feed.outside_lag_window()
+        if outside_lag_window is not None:
+            self._monitor.outside_lag_window(outside_lag_window)
         for event in events:
             self.put(event)
         self._changed.set()

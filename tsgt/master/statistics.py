@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
     from tsgt.model import Measurement
-    from tsgt.timesync import ClockEstimate
+    from tsgt.timesync.two_way import ClockEstimate
 
 RATE_WINDOW_NS = 10_000_000_000
 LOSS_REQUESTS = 50
@@ -49,10 +49,13 @@ class Monitor:
         """Take note of the prism that a station says it tracks; None: it does not."""
         self._stations[station].prism = prism
 
-    def stands(self, station: int, *, joined: bool, missing: int, late: int, doubted: int) -> None:
+    def stands(
+        self, station: int, *, joined: bool, outstanding: int, missed_slots: int, rejected_beacons: int
+    ) -> None:
         """Take note of how a station stands in the protocol superframe; see :class:`StationStatus`."""
         found = self._stations[station]
-        found.joined, found.missing, found.late, found.doubted = joined, missing, late, doubted
+        found.joined, found.outstanding = joined, outstanding
+        found.missed_slots, found.rejected_beacons = missed_slots, rejected_beacons
 
     def measurement(self, measurement: Measurement) -> None:
         """Count a measurement; one of a station that is not reported on is passed over."""
@@ -70,10 +73,10 @@ class Monitor:
                 station.stamp_bound_ns = measurement.stamp_bound_ns
         station.arrivals_ns.append(measurement.received_ns)
 
-    def too_late(self, counts: Mapping[int, int]) -> None:
+    def outside_lag_window(self, counts: Mapping[int, int]) -> None:
         """Take note of how many measurements of each station came too late for the estimator so far."""
         for number, station in self._stations.items():
-            station.too_late = counts.get(number, 0)
+            station.outside_lag_window = counts.get(number, 0)
 
     def pose(self, *, valid: bool) -> None:
         """Count a pose."""
@@ -133,10 +136,10 @@ class _Station:
     arrivals_ns: deque[int] = field(default_factory=deque)
     first_ns: int = 0
     joined: bool | None = None
-    missing: int | None = None
-    late: int | None = None
-    doubted: int | None = None
-    too_late: int | None = None
+    outstanding: int | None = None
+    missed_slots: int | None = None
+    rejected_beacons: int | None = None
+    outside_lag_window: int | None = None
 
     def status_at(self, number: int, now_ns: int, clock: ClockEstimate | None) -> StationStatus:
         while self.arrivals_ns and self.arrivals_ns[0] <= now_ns - RATE_WINDOW_NS:
@@ -159,10 +162,10 @@ class _Station:
             clock_bound_ns=None if clock is None else clock.bound_ns,
             stamp_bound_ns=self.stamp_bound_ns,
             joined=self.joined,
-            missing=self.missing,
-            late=self.late,
-            doubted=self.doubted,
-            too_late=self.too_late,
+            outstanding=self.outstanding,
+            missed_slots=self.missed_slots,
+            rejected_beacons=self.rejected_beacons,
+            outside_lag_window=self.outside_lag_window,
         )
 
     def _rate_hz(self, now_ns: int) -> float | None:

@@ -187,14 +187,14 @@ class StationStatus:
         The time of its newest measurement is within this of the truth, in ns; null before the first one.
     joined
         Whether it has joined the present session of the master; null with the protocol classic.
-    missing
+    outstanding
         How many measurements are known to have been made and have not come yet; null with the protocol classic.
-    late
+    missed_slots
         How many of its slots it had to leave empty because its computer was late; null with the protocol classic.
-    doubted
+    rejected_beacons
         How many beacons it received at a time at which they cannot have been sent, as when somebody holds them back;
         null with the protocol classic.
-    too_late
+    outside_lag_window
         How many of its measurements came so late that the poses of their time had been smoothed for good; they count at the
         desk only. Null with the estimator linear.
     """
@@ -218,10 +218,10 @@ class StationStatus:
     clock_bound_ns: int | None = None
     stamp_bound_ns: int | None = None
     joined: bool | None = None
-    missing: int | None = None
-    late: int | None = None
-    doubted: int | None = None
-    too_late: int | None = None
+    outstanding: int | None = None
+    missed_slots: int | None = None
+    rejected_beacons: int | None = None
+    outside_lag_window: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

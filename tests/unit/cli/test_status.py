@@ -84,8 +84,8 @@ CLIENT = ClientStatus(
     authenticated=True,
     joined=True,
     queued=2,
-    late=1,
-    doubted=0,
+    missed_slots=1,
+    rejected_beacons=0,
     refused=0,
     clock_bound_ns=80_000,
 )
@@ -197,9 +197,9 @@ def test_a_client_says_what_the_disk_has_lost() -> None:
 
 def test_a_client_says_how_delivery_and_clock_do() -> None:
     """Over the protocol superframe; and loudly that there is no key, which is no fault."""
-    assert "2 to deliver, 1 slots late" in client_text(CLIENT)[0]
+    assert "2 to deliver, 1 missed slots" in client_text(CLIENT)[0]
     assert "  clock within 0.08 ms" in client_text(CLIENT)[0]
-    lines, well = client_text(dataclasses.replace(CLIENT, authenticated=False, doubted=3))
+    lines, well = client_text(dataclasses.replace(CLIENT, authenticated=False, rejected_beacons=3))
     assert well
     assert any("NO KEY" in line for line in lines)
     assert "  3 beacons doubted" in lines
@@ -338,7 +338,13 @@ def test_one_that_talks_of_something_else_is_not_listened_to_for_ever(
 def test_the_superframe_shows_frames_times_and_what_is_missing() -> None:
     """A missing key is not to be overlooked; what is zero is left out."""
     station = dataclasses.replace(
-        STATION, clock_bound_ns=None, stamp_bound_ns=152_000, joined=True, missing=12, late=0, doubted=1
+        STATION,
+        clock_bound_ns=None,
+        stamp_bound_ns=152_000,
+        joined=True,
+        outstanding=12,
+        missed_slots=0,
+        rejected_beacons=1,
     )
     record = dataclasses.replace(
         MASTER, stations=(station,), protocol="superframe", authenticated=False, frame_ms=378.2
@@ -349,7 +355,7 @@ def test_the_superframe_shows_frames_times_and_what_is_missing() -> None:
     assert "frame 378 ms" in plain
     assert "NO KEY" in plain
     assert "time within 0.15 ms" in plain
-    assert "12 missing" in plain
-    assert "1 beacons doubted" in plain
-    assert "late" not in plain
+    assert "12 outstanding" in plain
+    assert "1 rejected beacons" in plain
+    assert "missed" not in plain
     assert "NO KEY" not in "\n".join(master_text(dataclasses.replace(record, authenticated=True))[0])

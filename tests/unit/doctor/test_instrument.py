@@ -71,8 +71,8 @@ def client_status(
         authenticated=True,
         joined=True,
         queued=0,
-        late=0,
-        doubted=0,
+        missed_slots=0,
+        rejected_beacons=0,
         refused=0,
         clock_bound_ns=300_000,
     )

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from harness.scene import SECOND, START, Scene, counted_from, driving, standing, standing_scene
+from harness.scene import SECOND, START, Scene, with_origin, driving, standing, stationary_scene
 
 from tsgt.errors import DegenerateGeometryError
 from tsgt.estimation import Kind, PoseBatch, Reason
@@ -21,7 +21,7 @@ LAG = 3 * SECOND
 @pytest.fixture
 def scene() -> Scene:
     """Three stations and a robot that drives a bend."""
-    return standing_scene().moving(driving).with_limits(estimator="continuous")
+    return stationary_scene().moving(driving).with_limits(estimator="continuous")
 
 
 def every(
@@ -90,7 +90,7 @@ def test_where_a_layout_counts_from_does_not_matter(scene: Scene) -> None:
     """With the origin metres off the prisms, live poses are the same ones of another point of the robot."""
     arm = np.array([-3.0, 1.0, -1.5])
     measurements = every(scene, 8.0)
-    far = replace(scene, parameters=counted_from(scene.parameters, arm))
+    far = replace(scene, parameters=with_origin(scene.parameters, arm))
     for here, there in zip(stream(scene, measurements, 8.0), stream(far, measurements, 8.0), strict=True):
         np.testing.assert_array_equal(there.reason, here.reason)
         spoke = rotation_from_quaternion(here.orientation_xyzw[here.valid]) @ arm
@@ -136,7 +136,7 @@ def test_what_comes_too_late_is_counted(scene: Scene) -> None:
         pipeline.add(measurement)
     pipeline.add(replace(scene.measure(3, 1.05), received_ns=START + 8 * SECOND))
     pipeline.advance(START + 9 * SECOND)
-    assert pipeline.too_late == {3: 1}
+    assert pipeline.outside_lag_window == {3: 1}
 
 
 def test_what_was_measured_long_before_the_beginning_is_too_late(scene: Scene) -> None:
@@ -150,7 +150,7 @@ def test_what_was_measured_long_before_the_beginning_is_too_late(scene: Scene) -
     for measurement in (*old, *measurements):
         pipeline.add(measurement)
         pipeline.advance(measurement.received_ns)
-    assert sum(pipeline.too_late.values()) == len(old)
+    assert sum(pipeline.outside_lag_window.values()) == len(old)
     assert pipeline.advance(START + 8 * SECOND).valid.all()
 
 
@@ -251,7 +251,7 @@ def test_prisms_that_miss_their_layout_are_the_reason(scene: Scene) -> None:
 def test_a_robot_upside_down_is_refused() -> None:
     """It leans further than the limit: a mirrored layout, or swapped prisms."""
     _, position = standing(0.0)
-    scene = standing_scene().with_limits(estimator="continuous")
+    scene = stationary_scene().with_limits(estimator="continuous")
     scene = scene.moving(lambda _: (exp_so3(np.array([3.0, 0.0, 0.0])), position))
     _, smoothed = stream(scene, every(scene, 8.0), 8.0)
     assert smoothed.reason[-1] == Reason.TILT

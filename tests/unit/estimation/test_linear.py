@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.scene import LAYOUT, SECOND, START, driving, standing, standing_scene
+from harness.scene import LAYOUT, SECOND, START, driving, standing, stationary_scene
 
 from tsgt.errors import DegenerateGeometryError
 from tsgt.estimation import Pipeline, PoseBatch, Reason
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 @pytest.fixture
 def scene() -> Scene:
     """Three stations and a standing robot."""
-    return standing_scene()
+    return stationary_scene()
 
 
 def poses_of(scene: Scene, measurements: Sequence[PolarMeasurement], until_s: float) -> PoseBatch:

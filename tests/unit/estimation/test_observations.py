@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from harness.scene import START, Motion, standing_scene
+from harness.scene import START, Motion, stationary_scene
 
 from tsgt.estimation import build_observations
 from tsgt.estimation.observations import INSTRUMENT_TIME_SIGMA_S, LEAST_SIGMA_M, middle_m
 from tsgt.geometry import exp_so3, log_so3
-from tsgt.geometry.trajectory import fit
+from tsgt.geometry.trajectory import fit_trajectory
 from tsgt.model import InstrumentNoise, MotionPrior, PointMeasurement
 
 
@@ -19,7 +19,7 @@ def fast(time_s: float) -> Motion:
     return exp_so3(np.array([0.0, 0.0, yaw])), np.array([30.0 - 0.75 * time_s, 15.0 + 1.3 * time_s, -1.0])
 
 
-SCENE = standing_scene().moving(fast)
+SCENE = stationary_scene().moving(fast)
 
 
 @pytest.mark.parametrize("stated_ns", [1, 30_000, 4_000_000])
@@ -72,7 +72,7 @@ def test_times_that_are_off_as_in_an_instruments_first_minute_make_no_pose_over_
     ]
     observations, _ = build_observations(SCENE.parameters, measurements, origin_ns=START)
     times_s = np.arange(1.0, 7.0, 0.05)
-    states, covariance = fit(observations, prior=MotionPrior(), noise_scale=1.0).trajectory.at(times_s)
+    states, covariance = fit_trajectory(observations, prior=MotionPrior(), noise_scale=1.0).trajectory.at(times_s)
     rotation, position = (np.array(part) for part in zip(*map(fast, times_s.tolist()), strict=True))
     turned = log_so3(np.swapaxes(states.rotation, 1, 2) @ rotation)
     middle = position + rotation @ middle_m(SCENE.parameters)

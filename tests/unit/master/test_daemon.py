@@ -13,17 +13,17 @@ import numpy as np
 import pytest
 from harness.field import STATIONS, TRUE, field_of, running
 from harness.radios import PAPER
-from harness.scene import START, driving, standing_scene
+from harness.scene import START, driving, stationary_scene
 
 from tsgt.config import GeofenceConfig
 from tsgt.errors import RadioError
 from tsgt.geometry import rotation_from_quaternion
-from tsgt.master import replayed
 from tsgt.master.geofence import run_fence_command
+from tsgt.master.replay import replayed
 from tsgt.model import PolarMeasurement, Status
 from tsgt.recording import ClockRecord, EventRecord, PoseRecord, StatusRecord, encode_line, read_lines
 from tsgt.service import run
-from tsgt.simulation.lora import opener
+from tsgt.simulation.lora import radio_opener
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 
     from harness.field import Field
 
-    from tsgt.radio import Radio, Transmitted
+    from tsgt.radio import Radio, Transmission
 
-DRIVING = standing_scene().moving(driving)
+DRIVING = stationary_scene().moving(driving)
 MS = 1_000_000
 
 
@@ -238,7 +238,7 @@ async def test_a_radio_that_fails_is_opened_again(tmp_path: Path) -> None:
             async with field.open_radio()() as radio:
                 transmit = radio.transmit
 
-                async def breakable(payload: bytes, *, at_ns: int | None = None) -> Transmitted:
+                async def breakable(payload: bytes, *, at_ns: int | None = None) -> Transmission:
                     if not works:
                         raise RadioError("unplugged")
                     return await transmit(payload, at_ns=at_ns)
@@ -291,7 +291,7 @@ async def test_garbage_and_foreign_packets_change_nothing(tmp_path: Path) -> Non
 
         async def jam() -> None:
             rng = np.random.default_rng(1)
-            async with opener(field.air, "foreign", TRUE, rng, PAPER)() as radio:
+            async with radio_opener(field.air, "foreign", TRUE, rng, PAPER)() as radio:
                 while True:
                     await radio.transmit(rng.bytes(int(rng.integers(1, 40))))
                     await asyncio.sleep(float(rng.uniform(0.5, 2.0)))
@@ -355,7 +355,7 @@ async def test_a_master_whose_turns_stand_still_is_not_kept_alive(
                 async with field.open_radio()() as radio:
                     transmit = radio.transmit
 
-                    async def hanging(payload: bytes, *, at_ns: int | None = None) -> Transmitted:
+                    async def hanging(payload: bytes, *, at_ns: int | None = None) -> Transmission:
                         if stuck.is_set():
                             await asyncio.Event().wait()
                         return await transmit(payload, at_ns=at_ns)

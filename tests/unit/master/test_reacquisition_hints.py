@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.scene import SECOND, START, driving, standing_scene
+from harness.scene import SECOND, START, driving, stationary_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -63,7 +63,7 @@ def beside_rad(scene: Scene, towards: Direction, time_s: float, *, station: int 
 
 def test_a_station_without_its_prism_is_told_where_it_is() -> None:
     """After two seconds, to within what the layout leaves open: 0.8 m in 38 m, and half a metre more."""
-    scene = standing_scene()
+    scene = stationary_scene()
     searches = Searches(scene.parameters)
     watch(searches, scene)
     assert searches.towards(2, ns(12.0)) is None
@@ -75,7 +75,7 @@ def test_a_station_without_its_prism_is_told_where_it_is() -> None:
 
 def test_angles_alone_are_no_prism() -> None:
     """An instrument that has lost it may still tell its angles."""
-    scene = standing_scene()
+    scene = stationary_scene()
     searches = Searches(scene.parameters)
     watch(searches, scene, sees=lambda s, t: Status.ANGLE_ONLY if s == 2 and t > LOST_S else Status.OK)
     assert searches.towards(2, ns(12.5)) is not None
@@ -84,7 +84,7 @@ def test_angles_alone_are_no_prism() -> None:
 @pytest.mark.parametrize("status", [Status.TILT, Status.ERROR, Status.WRONG_DISTANCE, Status.LOW_ACCURACY])
 def test_who_has_another_trouble_is_left_alone(status: Status) -> None:
     """Looking for a prism does not level an instrument."""
-    scene = standing_scene()
+    scene = stationary_scene()
     searches = Searches(scene.parameters)
     watch(searches, scene, sees=lambda s, t: status if s == 2 and t > LOST_S else Status.OK)
     assert searches.towards(2, ns(12.5)) is None
@@ -121,7 +121,7 @@ def test_the_prism_is_within_the_spread(
     speed_mps: float, yaw_rate_radps: float, heading_rad: float, tilt_rad: float, lost: tuple[int, ...]
 ) -> None:
     """However the robot drives and leans, by one other prism as by two, for a second and a half from now on."""
-    scene = standing_scene().moving(motion(speed_mps, yaw_rate_radps, heading_rad, tilt_rad))
+    scene = stationary_scene().moving(motion(speed_mps, yaw_rate_radps, heading_rad, tilt_rad))
     searches = Searches(scene.parameters)
     watch(searches, scene, sees=lambda s, t: Status.NO_TARGET if s in lost and t > LOST_S else Status.OK)
     towards = searches.towards(2, ns(12.6))
@@ -139,7 +139,7 @@ def test_the_prism_is_found_in_the_reference_scenario() -> None:
         T_station1_robot = world.pose_at(np.array([time_s]))[0]
         return T_station1_robot[:3, :3], T_station1_robot[:3, 3]
 
-    scene = standing_scene().moving(motion)
+    scene = stationary_scene().moving(motion)
     inside = []
     for begin_s in range(0, 590, 5):
         searches = Searches(scene.parameters)
@@ -164,7 +164,7 @@ def _loses(station: int, time_s: float, *, from_s: float) -> Status:
 
 def test_nobody_sees_the_robot() -> None:
     """Then nobody knows where it is: all have lost it, or what came of it is too old."""
-    scene = standing_scene()
+    scene = stationary_scene()
     searches = Searches(scene.parameters)
     watch(searches, scene, sees=lambda _, t: Status.NO_TARGET if t > LOST_S else Status.OK)
     assert searches.towards(2, ns(12.5)) is None
@@ -178,7 +178,7 @@ def test_nobody_sees_the_robot() -> None:
 
 def test_one_point_is_not_enough() -> None:
     """It does not tell how fast the robot is."""
-    scene = standing_scene()
+    scene = stationary_scene()
     searches = Searches(scene.parameters)
     watch(
         searches, scene, sees=lambda s, t: Status.NO_TARGET if s == 2 else (Status.OK if t > 12.3 else None)
@@ -188,7 +188,7 @@ def test_one_point_is_not_enough() -> None:
 
 def test_a_robot_that_is_very_near_may_be_anywhere() -> None:
     """No direction says anything where the robot is about as large as its distance."""
-    near = standing_scene().moving(lambda _: (np.eye(3), np.array([2.5, -2.0, -1.0])))
+    near = stationary_scene().moving(lambda _: (np.eye(3), np.array([2.5, -2.0, -1.0])))
     searches = Searches(near.parameters)
     watch(searches, near)
     assert searches.towards(2, ns(12.5)) is None
@@ -196,7 +196,7 @@ def test_a_robot_that_is_very_near_may_be_anywhere() -> None:
 
 def test_another_station_on_the_same_prism_knows_best() -> None:
     """Where stations outnumber prisms; only its start is left open."""
-    scene = standing_scene()
+    scene = stationary_scene()
     searches = Searches(scene.parameters)
     watch(searches, scene)
     for step in range(25, 32):
@@ -209,7 +209,7 @@ def test_another_station_on_the_same_prism_knows_best() -> None:
 
 def test_the_direction_is_in_the_face_of_the_telescope() -> None:
     """Who measures in the second face would have to turn over otherwise."""
-    scene = standing_scene()
+    scene = stationary_scene()
     searches, turned = Searches(scene.parameters), Searches(scene.parameters)
     watch(searches, scene)
     for step in range(32):
@@ -234,7 +234,7 @@ def test_the_direction_is_in_the_face_of_the_telescope() -> None:
 
 def test_a_direction_holds_for_five_seconds_and_then_comes_anew() -> None:
     """From the points of then; after six of them only every half minute, and none in between."""
-    scene = standing_scene().moving(driving)
+    scene = stationary_scene().moving(driving)
     searches = Searches(scene.parameters)
     told: list[tuple[float, Direction | None]] = [(0.0, None)]
     for tenth in range(1000):
@@ -261,7 +261,7 @@ def test_a_direction_holds_for_five_seconds_and_then_comes_anew() -> None:
 
 def test_who_has_its_prism_again_needs_no_direction() -> None:
     """At once; and when it loses it again, it is told again after two seconds."""
-    scene = standing_scene()
+    scene = stationary_scene()
     searches = Searches(scene.parameters)
     watch(searches, scene)
     first = searches.towards(2, ns(12.5))
@@ -278,7 +278,7 @@ def test_who_has_its_prism_again_needs_no_direction() -> None:
 
 def test_measurements_that_come_late_count_where_they_belong() -> None:
     """One from before the loss changes nothing; one from within it shows that the prism was there."""
-    scene = standing_scene()
+    scene = stationary_scene()
     before, within = Searches(scene.parameters), Searches(scene.parameters)
     for searches in (before, within):
         watch(searches, scene)
@@ -293,7 +293,7 @@ def test_measurements_that_come_late_count_where_they_belong() -> None:
 
 def test_strangers_and_the_future_are_passed_over() -> None:
     """A station that nobody knows, and a measurement that says to be from tomorrow."""
-    scene = standing_scene()
+    scene = stationary_scene()
     searches = Searches(scene.parameters)
     searches.measured(replace(scene.measure(1, 1.0), station=9))
     tomorrow = replace(scene.measure(2, 1.0), stamp_ns=ns(86_400.0))

@@ -8,18 +8,19 @@ from typing import TYPE_CHECKING
 
 import pytest
 from harness.records import EVENT, HEADER
-from harness.scene import START, standing_scene
+from harness.scene import START, stationary_scene
 
 from tsgt.errors import CorruptLineError, RecordingError
 from tsgt.estimation import Feed
-from tsgt.master import StreamServer, replay, replayed
+from tsgt.master.replay import replay, replayed
+from tsgt.master.stream_server import StreamServer
 from tsgt.recording import RecordingWriter, encode_line
 from tsgt.simulation.kernel import VirtualClock
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-SCENE = standing_scene()
+SCENE = stationary_scene()
 
 
 def live_lines(path: Path, seconds: int = 3) -> list[bytes]:

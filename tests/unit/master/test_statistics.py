@@ -8,7 +8,7 @@ import pytest
 
 from tsgt.master.statistics import Monitor
 from tsgt.model import PolarMeasurement, Status
-from tsgt.timesync import ClockEstimate
+from tsgt.timesync.two_way import ClockEstimate
 
 SECOND = 1_000_000_000
 
@@ -127,9 +127,19 @@ def test_how_a_station_stands_on_the_superframe() -> None:
     """Nulls until something is known, as with the other protocol."""
     monitor = Monitor([2])
     station = monitor.status(SECOND).stations[0]
-    assert (station.joined, station.missing, station.late, station.doubted) == (None, None, None, None)
-    monitor.stands(2, joined=True, missing=3, late=4, doubted=5)
+    assert (station.joined, station.outstanding, station.missed_slots, station.rejected_beacons) == (
+        None,
+        None,
+        None,
+        None,
+    )
+    monitor.stands(2, joined=True, outstanding=3, missed_slots=4, rejected_beacons=5)
     status = monitor.status(SECOND, protocol="superframe", authenticated=True, frame_ms=378.5)
     assert (status.protocol, status.authenticated, status.frame_ms) == ("superframe", True, 378.5)
     station = status.stations[0]
-    assert (station.joined, station.missing, station.late, station.doubted) == (True, 3, 4, 5)
+    assert (station.joined, station.outstanding, station.missed_slots, station.rejected_beacons) == (
+        True,
+        3,
+        4,
+        5,
+    )

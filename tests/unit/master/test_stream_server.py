@@ -14,8 +14,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from tsgt.errors import StreamError
-from tsgt.master import StreamServer
-from tsgt.master.stream_server import CLOSE_TIMEOUT_S, MOST_READERS
+from tsgt.master.stream_server import CLOSE_TIMEOUT_S, MOST_READERS, StreamServer
 
 HELLO = b'{"type":"hello"}'
 BIG = 50_000

@@ -17,15 +17,15 @@ from tsgt.estimation import Kind
 
 if TYPE_CHECKING:
     from tsgt.analysis.design import Perturbation
-    from tsgt.analysis.evaluation import InterPrism
+    from tsgt.analysis.evaluation import InterPrismDistances
     from tsgt.analysis.processing import Estimator
     from tsgt.analysis.report.findings import Difference, Findings
-    from tsgt.analysis.report.motion import Bins, Grid, Ride
+    from tsgt.analysis.report.motion import Bins, Grid, DistanceErrorSeries
     from tsgt.estimation import PoseBatch
     from tsgt.geometry import FloatArray
 
 
-def figures_of(findings: Findings) -> dict[str, Any]:
+def report_numbers(findings: Findings) -> dict[str, Any]:
     """Collect all numbers; those of ``tsgt evaluate`` without a report have the same names."""
     f = findings
     poses = f.poses
@@ -43,7 +43,7 @@ def figures_of(findings: Findings) -> dict[str, Any]:
         "protocol": f.log.protocol,
         "authenticated": f.log.authenticated,
         "events": [{"stamp_ns": stamp_ns, "message": message} for stamp_ns, message in f.log.events],
-        "stations": {number: _station(f, number) for number in f.station_figures},
+        "stations": {number: _station(f, number) for number in f.station_statistics},
         "bound_median_ms": bound_ms,
         "speed_p95_mps": fast_mps,
         "problems": f.problems,
@@ -51,11 +51,11 @@ def figures_of(findings: Findings) -> dict[str, Any]:
     }
     if f.inter_prism is not None:
         found |= _distances(f.inter_prism)
-    if f.ride is not None:
-        found["errors_by_motion_mm"] = _by_motion(f.ride)
+    if f.distance_errors is not None:
+        found["errors_by_motion_mm"] = _by_motion(f.distance_errors)
     if f.held_out is not None:
         found["held_out_mm"] = {
-            name: {**dataclasses.asdict(each.figures), "gaps": dataclasses.asdict(each.gaps)}
+            name: {**dataclasses.asdict(each.statistics), "gaps": dataclasses.asdict(each.gaps)}
             for name, each in f.held_out.items()
         }
     if f.difference is not None and len(f.difference.stamp_ns):
@@ -82,7 +82,7 @@ def figures_of(findings: Findings) -> dict[str, Any]:
 
 def _compared(f: Findings, name: Estimator) -> dict[str, Any]:
     """Tell how far one estimator's poses are from the reference."""
-    found = {**dataclasses.asdict(f.compared[name]), "standing": dataclasses.asdict(f.stops[name])}
+    found = {**dataclasses.asdict(f.compared[name]), "stationary": dataclasses.asdict(f.stops[name])}
     aligned = f.aligned.get(name)
     return found if aligned is None else {**found, "aligned": dataclasses.asdict(aligned)}
 
@@ -118,24 +118,24 @@ def _station(f: Findings, station: int) -> dict[str, Any]:
     series = f.log.radio.get(station)
     heard = (None, None, None) if series is None else (series.rssi_dbm, series.snr_db, series.loss)
     names = ("rssi_median_dbm", "snr_median_db", "loss_median")
-    found = dataclasses.asdict(f.station_figures[station])
+    found = dataclasses.asdict(f.station_statistics[station])
     return {**found, **{name: median(values) for name, values in zip(names, heard, strict=True)}}
 
 
-def _distances(found: InterPrism) -> dict[str, Any]:
+def _distances(found: InterPrismDistances) -> dict[str, Any]:
     return {
-        "inter_prism_mm": {pair.name: dataclasses.asdict(pair.summary()) for pair in found.dynamic},
-        "inter_prism_static_mm": {pair.name: dataclasses.asdict(pair.summary()) for pair in found.static},
+        "inter_prism_mm": {pair.name: dataclasses.asdict(pair.statistics()) for pair in found.dynamic},
+        "inter_prism_static_mm": {pair.name: dataclasses.asdict(pair.statistics()) for pair in found.static},
         "epochs": found.epochs,
         "invalid_epochs": found.invalid_epochs,
-        "still_s": found.still_s,
-        "still_intervals": len(found.still_ns),
+        "still_s": found.stationary_s,
+        "still_intervals": len(found.stationary_ns),
     }
 
 
-def _by_motion(ride: Ride) -> dict[str, Any]:
+def _by_motion(ride: DistanceErrorSeries) -> dict[str, Any]:
     errors_m, motion = np.array(list(ride.error_m.values())), ride.motion
-    turning = motion.turning_radps
+    turning = motion.angular_rate_radps
     found = {
         "speed_mps": binned(errors_m, motion.speed_mps),
         "acceleration_mps2": binned(errors_m, motion.acceleration_mps2),

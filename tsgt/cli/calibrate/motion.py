@@ -14,16 +14,16 @@ from tsgt.analysis.formats import write_prism_layout, write_station_frames
 from tsgt.cli.options import json_option, keep_going_option, path_type, recording_argument
 from tsgt.cli.output import CHECK_FAILED, print_json, print_table
 from tsgt.cli.recordings import refuse_to_replace, report_problem
-from tsgt.geometry.calibration import Unknowns, undetermined
+from tsgt.geometry.calibration import SetupPrior, unobservable_directions
 from tsgt.recording import load_recording
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from tsgt.analysis.calibration import CalibratedRecording, Judgement
-    from tsgt.analysis.evaluation import HeldOut
-    from tsgt.geometry.calibration import Undetermined
+    from tsgt.analysis.calibration import CalibratedRecording, HeldOutComparison
+    from tsgt.analysis.evaluation import HeldOutErrors
+    from tsgt.geometry.calibration import UnobservableDirection
 
 Command = TypeVar("Command", bound="Callable[..., Any] | click.Command")
 
@@ -109,9 +109,9 @@ def motion(
     known = frames == "known"
     found = calibrate_recording(
         load_recording(recording, keep_going=keep_going, on_problem=report_problem),
-        Unknowns(
-            shift_sigma_m=frame_sigma_mm / 1e3 if known else UNKNOWN_SHIFT_M,
-            turn_sigma_rad=frame_sigma_mrad / 1e3 if known else UNKNOWN_TURN_RAD,
+        SetupPrior(
+            translation_sigma_m=frame_sigma_mm / 1e3 if known else UNKNOWN_SHIFT_M,
+            rotation_sigma_rad=frame_sigma_mrad / 1e3 if known else UNKNOWN_TURN_RAD,
             levelled=dof == "4",
             latency_sigma_s=(latency_sigma_ms / 1e3 if known else UNKNOWN_LATENCY_S) if latency else 0.0,
             prism_sigma_m=prism_sigma_mm / 1e3 if prisms else 0.0,
@@ -120,7 +120,7 @@ def motion(
         held_out=held_out,
         on_progress=_progress if sys.stderr.isatty() else None,
     )
-    weak = undetermined(found.calibration)
+    weak = unobservable_directions(found.calibration)
     stations = _stations(found)
     positions = {each.prism: np.array(each.position_m) for each in found.parameters.prisms}
     sigmas = dict(zip(positions, found.calibration.prism_sigmas_m(), strict=True))
@@ -142,7 +142,7 @@ def motion(
     if prism_output is not None:
         write_prism_layout(prism_output, positions, sigmas, comment=comment)
     judged = found.judgement
-    if judged is None or judged.before is None or judged.after.figures.mean <= judged.before.figures.mean:
+    if judged is None or judged.before is None or judged.after.statistics.mean <= judged.before.statistics.mean:
         return 0
     click.echo("check failed: measurements that were left out are predicted worse than before", err=True)
     return CHECK_FAILED
@@ -162,13 +162,13 @@ def _stations(found: CalibratedRecording) -> dict[int, dict[str, Any]]:
         parameters = found.parameters.stations[row]
         late = sigmas[unknowns.latencies[place]] if len(unknowns.latencies) else 0.0
         turn_sigmas = np.zeros(3)
-        turn_sigmas[3 - unknowns.turns.shape[1] :] = sigmas[unknowns.turns[place]]
+        turn_sigmas[3 - unknowns.rotations.shape[1] :] = sigmas[unknowns.rotations[place]]
         result[parameters.station] = {
             "correction_mm": 1e3 * float(np.linalg.norm(shifts_m[row])),
             "correction_mrad": 1e3 * float(np.linalg.norm(turns_rad[row])),
             "correction_xyz_mm": (1e3 * shifts_m[row]).tolist(),
             "correction_xyz_mrad": (1e3 * turns_rad[row]).tolist(),
-            "sigma_mm": (1e3 * sigmas[unknowns.shifts[place]]).tolist(),
+            "sigma_mm": (1e3 * sigmas[unknowns.translations[place]]).tolist(),
             "sigma_mrad": (1e3 * turn_sigmas).tolist(),
             "latency_ms": parameters.latency_ns / 1e6,
             "latency_correction_ms": 1e3 * float(calibration.setup.latencies_s[row]),
@@ -181,7 +181,7 @@ def _stations(found: CalibratedRecording) -> dict[int, dict[str, Any]]:
 def _json(
     found: CalibratedRecording,
     stations: dict[int, dict[str, Any]],
-    weak: list[Undetermined],
+    weak: list[UnobservableDirection],
     positions: dict[int, Any],
     sigmas: dict[int, Any],
 ) -> dict[str, Any]:
@@ -191,11 +191,11 @@ def _json(
         "prisms": {prism: position.tolist() for prism, position in positions.items()},
         "prism_sigma_mm": {prism: (1e3 * sigma).tolist() for prism, sigma in sigmas.items()},
         "pivot_m": calibration.unknowns.pivot.tolist(),
-        "undetermined": [direction.sentence for direction in weak],
+        "unobservable": [direction.description for direction in weak],
         "measurements": calibration.measurements,
         "outliers": calibration.outliers,
         "noise_scale": calibration.noise_scale,
-        "disagreement": calibration.disagreement,
+        "disagreement": calibration.birge_ratio,
         "wander_ms": 1e3 * calibration.wander_s,
         "motion": asdict(calibration.prior),
         "linear": None if judged is None else _figures(judged.linear),
@@ -204,8 +204,8 @@ def _json(
     }
 
 
-def _figures(predicted: HeldOut) -> dict[str, Any]:
-    return {**asdict(predicted.figures), "gaps": asdict(predicted.gaps)}
+def _figures(predicted: HeldOutErrors) -> dict[str, Any]:
+    return {**asdict(predicted.statistics), "gaps": asdict(predicted.gaps)}
 
 
 def _print(
@@ -260,12 +260,12 @@ def _print(
         _print_judgement(found.judgement)
 
 
-def _print_judgement(judged: Judgement) -> None:
+def _print_judgement(judged: HeldOutComparison) -> None:
     rows = []
     for name, predicted in (("linear", judged.linear), ("before", judged.before), ("after", judged.after)):
         if predicted is not None:
-            figures, gaps = predicted.figures, predicted.gaps
+            figures, gaps = predicted.statistics, predicted.gaps
             numbers = (figures.mean, figures.median, figures.p95, gaps.mean)
             rows.append([name, *(f"{number:.2f}" for number in numbers)])
-    title = f"{judged.after.figures.n} measurements left out, missed by mm"
+    title = f"{judged.after.statistics.n} measurements left out, missed by mm"
     print_table([title, "mean", "median", "p95", f"mean of {judged.after.gaps.n} at gaps"], rows)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
-from tsgt.analysis.evaluation import compare, compare_aligned, standing_errors
+from tsgt.analysis.evaluation import compare, compare_aligned, stationary_errors
 from tsgt.analysis.processing import process, with_estimator
 from tsgt.cli.output import print_table
 from tsgt.errors import DegenerateGeometryError, InputFileError, RecordingError
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from tsgt.analysis.evaluation import Align, AlignedFigures, PoseFigures, Reference, StandingFigures
+    from tsgt.analysis.evaluation import Align, AlignedErrorStatistics, PoseErrorStatistics, Reference, StationaryStatistics
     from tsgt.analysis.processing import Estimator
-    from tsgt.analysis.smoothing import Smoothed
+    from tsgt.analysis.smoothing import SmoothedRecording
     from tsgt.recording import Recording
 
 
@@ -41,26 +41,26 @@ class Against:
         The mean pose of each stop.
     """
 
-    unaligned: PoseFigures
-    aligned: AlignedFigures | None
-    standing: StandingFigures
+    unaligned: PoseErrorStatistics
+    aligned: AlignedErrorStatistics | None
+    stationary: StationaryStatistics
 
     def keys(self) -> dict[str, Any]:
         """Put the figures under their names, for ``--json``."""
         return {
             **dataclasses.asdict(self.unaligned),
-            "standing": dataclasses.asdict(self.standing),
+            "stationary": dataclasses.asdict(self.stationary),
             **({} if self.aligned is None else {"aligned": dataclasses.asdict(self.aligned)}),
         }
 
 
 def against(
     loaded: Recording,
-    continuous: Smoothed,
+    continuous: SmoothedRecording,
     reference: Reference,
     paths: tuple[Path, Path],
     *,
-    still_ns: Sequence[tuple[int, int]],
+    stationary_ns: Sequence[tuple[int, int]],
     align: Align | None,
 ) -> dict[Estimator, Against]:
     """Compare the poses of both estimators with a reference.
@@ -106,7 +106,7 @@ def against(
                 aligned=None
                 if align is None or not unaligned[name].compared
                 else compare_aligned(poses, reference, centroid_m, align),
-                standing=standing_errors(poses, reference, still_ns, centroid_m).summary(),
+                stationary=stationary_errors(poses, reference, stationary_ns, centroid_m).statistics(),
             )
             for name, poses in both
         }
@@ -158,7 +158,7 @@ def print_against(found: dict[Estimator, Against], reference_path: Path, align: 
             *(f"{value:.3f}" for value in (s.rotation_mean_deg, s.rotation_max_deg)),
         ]
         for name, each in found.items()
-        for s in (each.standing,)
+        for s in (each.stationary,)
         if s.stops
     ]
     if rows:

@@ -26,16 +26,16 @@ from tsgt.geometry import quaternion_from_rotation
 from tsgt.log import configure_logging
 from tsgt.recording import write_atomically
 from tsgt.simulation.checks import Violation, violations
-from tsgt.simulation.faults import CALM_S, QUICK_CYCLES, SETTLE_S, FaultKind, parse_faults
-from tsgt.simulation.options import Options, Outage, Restart
+from tsgt.simulation.faults import FAULT_FREE_TAIL_S, FAST_SYNC_CYCLES, FAULT_FREE_START_S, FaultKind, parse_faults
+from tsgt.simulation.options import SimulationOptions, Outage, Restart
 from tsgt.simulation.runner import simulate
-from tsgt.simulation.scenario_files import MOST_STATIONS, find_scenario, with_stations
+from tsgt.simulation.scenario_files import MAX_STATIONS, find_scenario, with_stations
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from tsgt.config import ScenarioConfig
-    from tsgt.simulation.mission import Run
+    from tsgt.simulation.mission import MissionResult
 
 LISTED_VIOLATIONS = 20
 
@@ -58,7 +58,7 @@ LISTED_VIOLATIONS = 20
 )
 @click.option(
     "--stations",
-    type=click.IntRange(1, MOST_STATIONS),
+    type=click.IntRange(1, MAX_STATIONS),
     help="How many; more than there are prisms track them in turn.  [default: those of the scenario]",
 )
 @click.option(
@@ -198,13 +198,13 @@ def simulate_command(
         radio = scenario.radio.model_copy(update={"loss_probability": loss})
         scenario = scenario.model_copy(update={"radio": radio})
     faults = parse_faults(faults_text)
-    options = Options(
+    options = SimulationOptions(
         duration_s=scenario.duration_s if duration_s is None else duration_s,
         drift_ppm=drift_ppm,
         drift_ramp_ppm_per_min=drift_ramp_ppm_per_min,
         stamp_jitter_us=stamp_jitter_us,
         seed=seed,
-        node=station_software,
+        station_software=station_software,
         protocol=SuperframeMasterConfig(kind="superframe")
         if protocol == "superframe"
         else _classic(clock_filter, often_anew=bool(faults)),
@@ -227,7 +227,7 @@ def simulate_command(
             "station_software": station_software,
             "clock_filter": (clock_filter or "regression") if protocol == "classic" else None,
             "seed": seed,
-            "again": again,
+            "replay_command": again,
             "faults": {str(kind): count for kind, count in sorted(run.faults.items())},
             **figures(run),
             "violations": len(found),
@@ -248,7 +248,7 @@ def simulate_command(
 def _classic(clock_filter: Literal["regression", "paper"] | None, *, often_anew: bool) -> ClassicMasterConfig:
     """Return the protocol's settings."""
     config = ClassicMasterConfig(kind="classic", clock_filter=clock_filter or "regression")
-    return config.model_copy(update={"initial_cycles": QUICK_CYCLES}) if often_anew else config
+    return config.model_copy(update={"initial_cycles": FAST_SYNC_CYCLES}) if often_anew else config
 
 
 def _again(context: click.Context) -> str:
@@ -268,11 +268,11 @@ def _again(context: click.Context) -> str:
     return " ".join(words)
 
 
-def _check_times(options: Options) -> None:
+def _check_times(options: SimulationOptions) -> None:
     """Refuse what would happen after the end of the run: it would look as if nothing came of it."""
-    if options.faults and options.duration_s < CALM_S + 2 * SETTLE_S:
+    if options.faults and options.duration_s < FAULT_FREE_TAIL_S + 2 * FAULT_FREE_START_S:
         raise click.UsageError(
-            f"--faults needs a --duration of at least {CALM_S + 2 * SETTLE_S:g} s: the last {CALM_S:g} s are without any"
+            f"--faults needs a --duration of at least {FAULT_FREE_TAIL_S + 2 * FAULT_FREE_START_S:g} s: the last {FAULT_FREE_TAIL_S:g} s are without any"
         )
     starts_s = [("--outage", outage.start_s) for outage in options.outages]
     starts_s += [("--restart", restart.at_s) for restart in options.restarts]
@@ -284,7 +284,7 @@ def _check_times(options: Options) -> None:
             )
 
 
-def _simulate(scenario: ScenarioConfig, options: Options, folder: Path) -> Run:
+def _simulate(scenario: ScenarioConfig, options: SimulationOptions, folder: Path) -> MissionResult:
     with _progress(options.duration_s) as progress:
         try:
             return simulate(scenario, options, folder=folder, progress=progress)
@@ -308,18 +308,18 @@ def _progress(duration_s: float) -> Iterator[Callable[[float], None]]:
         yield lambda now_s: bar.update(round(now_s) - bar.pos)
 
 
-def _keep_recording(run: Run, output: Path) -> None:
-    path = run.sessions[-1].recording()
+def _keep_recording(run: MissionResult, output: Path) -> None:
+    path = run.master_logs[-1].recording()
     if path is None:
         raise OutputFileError("the master made no recording that could be kept", path=output)
     with path.open("rb") as source, write_atomically(output) as target:
         shutil.copyfileobj(source, target)
 
 
-def _write_truth(run: Run, truth: Path) -> None:
+def _write_truth(run: MissionResult, truth: Path) -> None:
     """Write the true poses at the epochs of the stream, from the start to the end of the run."""
     period_ns = run.parameters.pipeline.period_ns
-    zero_ns = run.sessions[-1].zero_ns  # on the clock of the recording that is kept
+    zero_ns = run.master_logs[-1].unix_at_zero_ns  # on the clock of the recording that is kept
     end_ns = zero_ns + run.end_ns - run.start_ns
     stamps_ns = np.arange(-(-zero_ns // period_ns) * period_ns, end_ns + 1, period_ns, dtype=np.int64)
     poses = run.world.pose_at((stamps_ns - zero_ns) / 1e9)
@@ -384,7 +384,7 @@ def _print(result: dict[str, Any], found: list[Violation]) -> None:
         click.echo("faults       " + ", ".join(f"{count} {kind}" for kind, count in result["faults"].items()))
     click.echo(f"violations   {len(found)}")
     if found:
-        click.echo(f"  again with: {result['again']}")
+        click.echo(f"  again with: {result['replay_command']}")
     for line in result["violations_listed"]:
         click.echo(f"  {line}")
     if len(found) > LISTED_VIOLATIONS:

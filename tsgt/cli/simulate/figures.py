@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tsgt.cli.simulate.poses import pose_keys
-from tsgt.simulation.mission import Measured
+from tsgt.simulation.mission import JournalIndex
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
 
-    from tsgt.simulation.mission import Run, StationWitness
+    from tsgt.simulation.mission import MissionResult, StationLog
     from tsgt.simulation.options import Outage
 
 
@@ -98,32 +98,32 @@ class _Station:
     duplicates: int
 
 
-def station_figures(run: Run) -> dict[int, StationFigures]:
+def station_figures(run: MissionResult) -> dict[int, StationFigures]:
     """Count and time what came from each station."""
     stations = _stations(run)
-    return {number: _station_figures(run, number, stations) for number in run.witnesses}
+    return {number: _station_figures(run, number, stations) for number in run.station_logs}
 
 
-def outage_figures(run: Run) -> list[OutageFigures]:
+def outage_figures(run: MissionResult) -> list[OutageFigures]:
     """Tell of each outage how long it lasted on."""
     stations = _stations(run)
     return [_outage_figures(outage, stations) for outage in run.outages]
 
 
-def _stations(run: Run) -> dict[int, _Station]:
-    return {number: _station(run, witness) for number, witness in run.witnesses.items()}
+def _stations(run: MissionResult) -> dict[int, _Station]:
+    return {number: _station(run, station_log) for number, station_log in run.station_logs.items()}
 
 
-def _station(run: Run, witness: StationWitness) -> _Station:
+def _station(run: MissionResult, station_log: StationLog) -> _Station:
     """Find out what of a station's measurements before the end of the run arrived, and when."""
-    found = Measured(witness)
+    found = JournalIndex(station_log)
     end_ns = run.end_ns - run.start_ns
     deliveries: dict[int, _Delivery] = {}
     duplicates = 0
-    for session in run.sessions:
+    for session in run.master_logs:
         seen: set[int] = set()
         for measurement, arrived_ns in zip(session.measurements, session.arrived_ns, strict=True):
-            if measurement.station != witness.station:
+            if measurement.station != station_log.station:
                 continue
             true_ns = found.true_ns(measurement)
             if true_ns is None or true_ns > end_ns:
@@ -132,30 +132,30 @@ def _station(run: Run, witness: StationWitness) -> _Station:
             seen.add(true_ns)
             delivery = _Delivery(
                 measured_ns=true_ns,
-                received_ns=measurement.received_ns - session.zero_ns,
+                received_ns=measurement.received_ns - session.unix_at_zero_ns,
                 arrived_ns=arrived_ns,
-                error_ns=measurement.stamp_ns - session.zero_ns - true_ns,
+                error_ns=measurement.stamp_ns - session.unix_at_zero_ns - true_ns,
             )
             deliveries.setdefault(true_ns, delivery)
-    measured_ns = [true_ns for true_ns in witness.stamps_ns.values() if true_ns <= end_ns]
+    measured_ns = [true_ns for true_ns in station_log.true_times_ns.values() if true_ns <= end_ns]
     return _Station(measured_ns, deliveries, duplicates)
 
 
-def _counted_from_ns(run: Run, stations: dict[int, _Station]) -> int | None:
+def _counted_from_ns(run: MissionResult, stations: dict[int, _Station]) -> int | None:
     """Return when the last station was synchronised, or heard, for the first time; None if one never was."""
     first_ns: dict[int, int] = {}
-    for session in run.sessions:
+    for session in run.master_logs:
         for clock in session.clocks:
-            first_ns.setdefault(clock.station, clock.stamp_ns - session.zero_ns)
+            first_ns.setdefault(clock.station, clock.stamp_ns - session.unix_at_zero_ns)
     for number, station in stations.items():
         if run.superframe and station.deliveries:
             first_ns[number] = min(delivery.received_ns for delivery in station.deliveries.values())
-    return max(first_ns.values()) if first_ns.keys() >= run.witnesses.keys() else None
+    return max(first_ns.values()) if first_ns.keys() >= run.station_logs.keys() else None
 
 
-def _station_figures(run: Run, number: int, stations: dict[int, _Station]) -> StationFigures:
+def _station_figures(run: MissionResult, number: int, stations: dict[int, _Station]) -> StationFigures:
     from_ns, end_ns = _counted_from_ns(run, stations), run.end_ns - run.start_ns
-    station, statuses = stations[number], run.witnesses[number].statuses
+    station, statuses = stations[number], run.station_logs[number].statuses
     deliveries = station.deliveries.values()
     rate_hz = math.nan
     if from_ns is not None and from_ns < end_ns:
@@ -170,7 +170,7 @@ def _station_figures(run: Run, number: int, stations: dict[int, _Station]) -> St
         age_ms=_percentiles(_ages_ns(deliveries), 50, 99, unit_ns=1e6),
         within_2s=_within_2s(_ages_ns(deliveries), len(station.measured_ns)),
         queued=statuses[-1].queued if statuses else None,
-        late_slots=sum(status.late or 0 for status in statuses) if run.superframe else None,
+        late_slots=sum(status.missed_slots or 0 for status in statuses) if run.superframe else None,
     )
 
 
@@ -213,13 +213,13 @@ def _percentiles(values_ns: Sequence[int], *percentiles: int, unit_ns: float) ->
     return tuple(float(value) for value in np.percentile(values_ns, percentiles) / unit_ns)
 
 
-def frame_ms(run: Run) -> float:
+def frame_ms(run: MissionResult) -> float:
     """Return the mean time from one beacon to the next, in ms; NaN without any."""
-    frames = sum(session.frames for session in run.sessions)
-    return sum(session.framed_ns for session in run.sessions) / frames / 1e6 if frames else math.nan
+    frames = sum(session.frames for session in run.master_logs)
+    return sum(session.frames_duration_ns for session in run.master_logs) / frames / 1e6 if frames else math.nan
 
 
-def figures(run: Run) -> dict[str, Any]:
+def figures(run: MissionResult) -> dict[str, Any]:
     """Put the figures under the keys that others rely on."""
     return {
         "stations": {number: _station_keys(station) for number, station in station_figures(run).items()},
@@ -242,7 +242,7 @@ def figures(run: Run) -> dict[str, Any]:
     }
 
 
-def _all_keys(run: Run) -> dict[str, Any]:
+def _all_keys(run: MissionResult) -> dict[str, Any]:
     """Put the figures of all stations together under the keys of one."""
     stations = _stations(run).values()
     measured = sum(len(station.measured_ns) for station in stations)

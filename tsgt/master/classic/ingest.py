@@ -15,14 +15,15 @@ from typing import TYPE_CHECKING, NamedTuple
 from tsgt.model import PolarMeasurement, Status
 from tsgt.radio.classic import OK, status_of
 from tsgt.recording import ClockRecord
-from tsgt.timesync import ArrivalCheck, highest_offset_ns
+from tsgt.timesync.offset_regression import highest_offset_ns
+from tsgt.timesync.two_way import TimestampCheck
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from tsgt.model import ClockSample
     from tsgt.radio.classic import MeasurementMessage
-    from tsgt.timesync import ClockEstimate, ClockFilter
+    from tsgt.timesync.two_way import ClockEstimate, ClockFilter
 
 UNTIMED_SIGMA_NS = 1_000_000_000
 """One sigma of a stamp that is only the time of arrival: an error message of the authors' nodes has no other."""
@@ -154,7 +155,7 @@ class _Station:
         self._prism = prism
         self._clock = clock
         self._stamp_delay_ns = stamp_delay_ns
-        self._check = ArrivalCheck()
+        self._check = TimestampCheck()
         self._offset_ns: int | None = None
         self._last: int | _Untimed | None = None
         self._known: deque[int] = deque(maxlen=KNOWN_MEASUREMENTS)
@@ -179,7 +180,7 @@ class _Station:
         missed = self._missed or unasked
         back = self._is_back(received_ns)
         if message.time_ns == 0:
-            self._check.nothing_new(requested_ns)
+            self._check.no_new_measurement(requested_ns)
             if message.status == OK or not (message.zenith_angle_rad or message.horizontal_angle_rad):
                 # It has not measured anything yet.
                 self._had_nothing = True
@@ -187,7 +188,7 @@ class _Station:
             return Arrival(self._untimed(message, received_ns), doubtful=back)
         if message.time_ns in self._known:
             if message.time_ns == self._last:  # and not an older one that somebody plays back
-                self._check.nothing_new(requested_ns)
+                self._check.no_new_measurement(requested_ns)
             return Arrival(doubtful=back)
         present = self.clock(received_ns)
         if present is None or self._doubtful:
@@ -208,7 +209,7 @@ class _Station:
         if not possible:
             self._offset_ns = None
             self._clock.forget()
-            self._check = ArrivalCheck()
+            self._check = TimestampCheck()
             self._hold(message, received_ns)
             return Arrival(stepped=True, doubtful=True)
         if stale or self._had_nothing:  # between the nothing and this its program may have been started again

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 from tsgt.master.classic.ingest import RESTART_NS, Intake
 from tsgt.master.classic.scheduler import Cadence, Scheduler, StationPlan
 from tsgt.master.classic.transport import Collector
-from tsgt.radio.classic import Ordered, Poll, Synchronisation
-from tsgt.radio.classic.transactions import Timing
-from tsgt.timesync import clock_filter
+from tsgt.radio.classic import CommandTransaction, Poll, Synchronisation
+from tsgt.radio.classic.transactions import LinkTiming
+from tsgt.timesync.two_way import clock_filter
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -50,7 +50,7 @@ class ClassicLink:
         self._reports = reports
         self._prisms = {station.station: station.prism for station in stations}
         delays_ns = {station.station: round(station.timestamp_delay_ms * 1e6) for station in stations}
-        self._timing = Timing.of(settings, round(protocol.reply_timeout_ms * 1e6))
+        self._timing = LinkTiming.of(settings, round(protocol.reply_timeout_ms * 1e6))
         self._scheduler = Scheduler(
             [
                 StationPlan(
@@ -99,14 +99,14 @@ class ClassicLink:
         reports = self._reports
         now_ns, station = reports.now_ns(), turn.station
         self._scheduler.finished(turn, now_ns)
-        answered = turn.ok is not None if isinstance(turn, Ordered) else turn.answered
+        answered = turn.ok is not None if isinstance(turn, CommandTransaction) else turn.answered
         reports.monitor.asked(station, answered=answered)
         reports.events(reports.alerts.asked(station, now_ns, answered=answered))
         if not answered or collector.last is None:
             self._intake.unanswered(station)
             return
         reports.monitor.heard(station, now_ns, rssi_dbm=collector.last.rssi_dbm, snr_db=collector.last.snr_db)
-        if isinstance(turn, Ordered):
+        if isinstance(turn, CommandTransaction):
             prism = self._prisms[station]
             reports.monitor.tracks(station, prism if turn.ok else None)
             reports.events(reports.alerts.ordered(station, prism, now_ns, tracks=bool(turn.ok)))

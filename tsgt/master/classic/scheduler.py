@@ -16,12 +16,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from tsgt.radio.classic import Command, Ordered, Poll, Synchronisation
+from tsgt.radio.classic import CommandMessage, CommandTransaction, Poll, Synchronisation
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from tsgt.radio.classic.transactions import Timing
+    from tsgt.radio.classic.transactions import LinkTiming
 
 ORDER_TIMEOUT_NS = 1_000_000_000
 """A station that tracks says so at once. One that has to turn to its prism first takes longer, and is asked again:
@@ -50,7 +50,7 @@ _OUTAGE_SHARE = 4
 _STUCK_EVERY = 4
 """Every fourth turn of a silent station is a synchronisation, but not among the first."""
 
-Task = Poll | Synchronisation | Ordered
+Task = Poll | Synchronisation | CommandTransaction
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,7 +113,7 @@ class Scheduler:
     """
 
     def __init__(
-        self, stations: Sequence[StationPlan], cadence: Cadence, timing: Timing, start_ns: int
+        self, stations: Sequence[StationPlan], cadence: Cadence, timing: LinkTiming, start_ns: int
     ) -> None:
         self._round = [_Station(plan) for plan in stations]
         self._cadence = cadence
@@ -142,7 +142,7 @@ class Scheduler:
         """Take note of what came of the turn that :meth:`next` returned last."""
         station = self._station(turn.station)
         took_ns = now_ns - self._began_ns
-        if isinstance(turn, Ordered):
+        if isinstance(turn, CommandTransaction):
             # It does not say whose it is: it may be another's, late. That one is no second time late.
             sure = station.agreed or not any(
                 other is not station and now_ns < other.may_answer_ns for other in self._round
@@ -216,7 +216,7 @@ class Scheduler:
     def _turn(self, station: _Station, now_ns: int) -> Task:
         plan = station.plan
         if not station.tracks and not station.silent:
-            return Ordered(plan.station, Command("n", plan.station, plan.prism), ORDER_TIMEOUT_NS)
+            return CommandTransaction(plan.station, CommandMessage("n", plan.station, plan.prism), ORDER_TIMEOUT_NS)
         if station.tracks and station.synchronisations and not station.urgent:
             # A silent one is asked by polls, which cost least; but one that has missed the end of a synchronisation
             # answers no polls, so now and then it is a synchronisation again.

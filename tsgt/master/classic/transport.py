@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from tsgt.clock import Clock, UnixTimeline
     from tsgt.radio import Packet, Radio
-    from tsgt.radio.classic.transactions import Timing, Turn
+    from tsgt.radio.classic.transactions import LinkTiming, Transaction
 
 EXACT_SIGMA_NS = 1_000_000
 """RPi.GPIO's edges have this; the stamp of a packet that was found without its edge is tens of times worse."""
@@ -42,7 +42,7 @@ class Collector:
         How many packets were not the answer that was waited for: those of others, late ones, garbage.
     """
 
-    def __init__(self, radio: Radio, clock: Clock, timeline: UnixTimeline, timing: Timing) -> None:
+    def __init__(self, radio: Radio, clock: Clock, timeline: UnixTimeline, timing: LinkTiming) -> None:
         self._radio = radio
         self._clock = clock
         self._timeline = timeline
@@ -51,7 +51,7 @@ class Collector:
         self.requested_ns = 0
         self.foreign = 0
 
-    async def take(self, turn: Turn) -> None:
+    async def take(self, turn: Transaction) -> None:
         """Run a turn to its end.
 
         Raises

@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from tsgt.clock import Clock
-    from tsgt.radio import Packet, Radio, Transmitted
+    from tsgt.radio import Packet, Radio, Transmission
     from tsgt.radio.superframe import SuperframeMaster
-    from tsgt.radio.superframe.reception import Heard
+    from tsgt.radio.superframe.reception import ReceivedReply
 
 LEAD_NS = 6_000_000
 """A beacon is composed this long before it is due: the radio wants 5 ms of it."""
@@ -32,11 +32,11 @@ class Listener(Protocol):
         """Tell the master what is written: the beacon that is composed now acknowledges it."""
         ...
 
-    def beacon(self, sent: Transmitted) -> None:
+    def beacon(self, sent: Transmission) -> None:
         """Take note that the beacon of the present frame has gone out."""
         ...
 
-    def heard(self, heard: Heard, packet: Packet) -> None:
+    def heard(self, heard: ReceivedReply, packet: Packet) -> None:
         """Take what a reply brought, and the packet that it came in."""
         ...
 
@@ -86,11 +86,11 @@ class FrameLoop:
         sent = await self._radio.transmit(self._master.compose(), at_ns=start_ns)
         self._master.sent(sent.done_at_ns, sent.stamp_sigma_ns)
         self._listener.beacon(sent)
-        while (until_ns := self._master.waits_until_ns) is not None:
+        while (until_ns := self._master.reply_deadline_ns) is not None:
             packet = await next_packet(self._radio, self._clock, until_ns)
             if packet is None:
                 break
             heard = self._master.received(packet.payload, packet.received_at_ns, packet.stamp_sigma_ns)
             if heard is not None:
                 self._listener.heard(heard, packet)
-        self._listener.silent(self._master.finished())
+        self._listener.silent(self._master.finish())

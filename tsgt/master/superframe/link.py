@@ -10,8 +10,8 @@ import structlog
 
 from tsgt.master.superframe.frame_loop import FrameLoop
 from tsgt.model import LAST_INSTANT_NS, PolarMeasurement
-from tsgt.radio import SearchOrder, TrackOrder
-from tsgt.radio.superframe import FrameLock, FrameTiming, SuperframeMaster
+from tsgt.radio import SearchCommand, TrackCommand
+from tsgt.radio.superframe import PhaseLock, FrameTiming, SuperframeMaster
 from tsgt.radio.superframe.wire import Authenticator
 from tsgt.recording import BeaconRecord
 
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from tsgt.master.publisher import Reports
     from tsgt.master.reacquisition_hints import Searches
     from tsgt.master.recording_thread import Disk
-    from tsgt.radio import Direction, LoRaSettings, Packet, Radio, Transmitted
-    from tsgt.radio.superframe import TimedSighting
-    from tsgt.radio.superframe.reception import Heard
+    from tsgt.radio import Direction, LoRaSettings, Packet, Radio, Transmission
+    from tsgt.radio.superframe import TimedMeasurement
+    from tsgt.radio.superframe.reception import ReceivedReply
     from tsgt.recording import StatusRecord
 
 DISK_PATIENCE_S = 0.015
@@ -95,7 +95,7 @@ class SuperframeLink:
             Authenticator(key),
             random_bits,
             reports.clock.monotonic_ns(),
-            lock=FrameLock(timing, max(prisms)) if protocol.phase_lock else None,
+            lock=PhaseLock(timing, max(prisms)) if protocol.phase_lock else None,
         )
         self._unwritten: deque[_Unwritten] = deque()
         self._tracking_ns: dict[int, int] = {}
@@ -142,7 +142,7 @@ class SuperframeLink:
         """Tell what has been written while the beacon was waited for."""
         self._settle()
 
-    def beacon(self, sent: Transmitted) -> None:
+    def beacon(self, sent: Transmission) -> None:
         """Put a beacon on the stream and into the recording, for who merges journals later."""
         stamp_ns = self._reports.timeline.unix_ns(sent.done_at_ns)
         self._beacons_ns.append(stamp_ns)
@@ -155,7 +155,7 @@ class SuperframeLink:
             )
         )
 
-    def heard(self, heard: Heard, packet: Packet) -> None:
+    def heard(self, heard: ReceivedReply, packet: Packet) -> None:
         """Hand on what a reply brought."""
         reports, now_ns, station = self._reports, self._reports.now_ns(), heard.station
         reports.monitor.asked(station, answered=True)
@@ -166,15 +166,15 @@ class SuperframeLink:
         first_line = self._disk.taken
         received_ns = reports.timeline.unix_ns(packet.received_at_ns)
         reports.events(reports.alerts.polled(station, now_ns))
-        for sighting in heard.sightings:
+        for sighting in heard.measurements:
             measurement = self._measurement(station, sighting, received_ns)
             reports.measured(measurement)
             self._searches.measured(measurement)
-        if heard.sightings:
-            sequences = tuple(sighting.sequence for sighting in heard.sightings)
+        if heard.measurements:
+            sequences = tuple(sighting.sequence for sighting in heard.measurements)
             self._unwritten.append(_Unwritten(station, sequences, range(first_line, self._disk.taken)))
-        if heard.doubted_beacons:
-            reports.events(reports.alerts.beacon_time_rejected(station, now_ns, heard.doubted_beacons))
+        if heard.rejected_beacons:
+            reports.events(reports.alerts.beacon_time_rejected(station, now_ns, heard.rejected_beacons))
         if heard.link_delay_anomaly:
             reports.events(reports.alerts.link_delay_anomaly(station, now_ns))
         self._stand(heard, now_ns)
@@ -197,43 +197,43 @@ class SuperframeLink:
         """Tell the master what the disk has taken, and what it has lost."""
         while self._unwritten and (written := self._disk.written(self._unwritten[0].lines)) is not None:
             reply = self._unwritten.popleft()
-            inbox = self._master.peer(reply.station).inbox
-            (inbox.written if written else inbox.lost)(reply.sequences)
+            window = self._master.station(reply.station).delivery.window
+            (window.mark_written if written else window.mark_lost)(reply.sequences)
 
-    def _stand(self, heard: Heard, now_ns: int) -> None:
+    def _stand(self, heard: ReceivedReply, now_ns: int) -> None:
         """Report how a station stands, and put one to work that does not track its prism."""
         reports, station = self._reports, heard.station
-        peer, prism = self._master.peer(station), self._prisms[station]
+        station_state, prism = self._master.station(station), self._prisms[station]
         reports.monitor.stands(
             station,
-            joined=not peer.introducing,
-            missing=peer.inbox.missing,
-            late=peer.late,
-            doubted=peer.doubted,
+            joined=not station_state.introducing,
+            outstanding=station_state.delivery.window.outstanding,
+            missed_slots=station_state.missed_slots,
+            rejected_beacons=station_state.rejected_beacons,
         )
-        if heard.answer is not None and isinstance(heard.order, TrackOrder):
-            reports.events(reports.alerts.ordered(station, prism, now_ns, tracks=heard.answer.ok))
-        if heard.state is None:
+        if heard.response is not None and isinstance(heard.command, TrackCommand):
+            reports.events(reports.alerts.ordered(station, prism, now_ns, tracks=heard.response.ok))
+        if heard.status_report is None:
             return
-        tracks = not heard.state.direct and heard.state.prism == prism
-        reports.monitor.tracks(station, None if heard.state.direct else heard.state.prism)
+        tracks = not heard.status_report.direct and heard.status_report.prism == prism
+        reports.monitor.tracks(station, None if heard.status_report.direct else heard.status_report.prism)
         if tracks:
             reports.events(reports.alerts.ordered(station, prism, now_ns, tracks=True))
         elif now_ns - self._tracking_ns.get(station, -TRACK_AGAIN_NS) >= TRACK_AGAIN_NS:
             self._tracking_ns[station] = now_ns
-            self._master.order(station, TrackOrder(prism))
+            self._master.command(station, TrackCommand(prism))
 
     def _search(self) -> None:
         """Tell stations that have lost their prism where to look for it, and no more what has grown old."""
         now_ns = self._reports.now_ns()
         for station, prism in self._prisms.items():
-            peer = self._master.peer(station)
-            towards = self._searches.towards(station, now_ns) if peer.is_tracking(prism) else None
+            station_state = self._master.station(station)
+            towards = self._searches.towards(station, now_ns) if station_state.is_tracking(prism) else None
             if towards is None:
-                peer.withdraw(SearchOrder)
+                station_state.withdraw(SearchCommand)
             elif towards is not self._sought.get(station):
                 self._sought[station] = towards
-                self._master.order(station, SearchOrder(towards))
+                self._master.command(station, SearchCommand(towards))
                 log.info(
                     "search_ordered",
                     station=station,
@@ -242,7 +242,7 @@ class SuperframeLink:
                     spread_deg=round(math.degrees(towards.spread_rad), 2),
                 )
 
-    def _measurement(self, station: int, sighting: TimedSighting, received_ns: int) -> PolarMeasurement:
+    def _measurement(self, station: int, sighting: TimedMeasurement, received_ns: int) -> PolarMeasurement:
         true_ns = self._reports.timeline.unix_ns(sighting.measured_ns)
         # A master that believes to have started in 1970 may get measurements from before.
         stamp_ns = min(max(true_ns, 0), LAST_INSTANT_NS)
@@ -267,6 +267,6 @@ def superframe_timing(protocol: SuperframeMasterConfig, settings: LoRaSettings) 
     return FrameTiming.stated(
         settings,
         start_jitter_ns=round(protocol.start_jitter_ms * 1e6),
-        turn_round_ns=round(protocol.turnaround_ms * 1e6),
+        turnaround_ns=round(protocol.turnaround_ms * 1e6),
         clock_error_ppm=protocol.clock_error_ppm,
     )

@@ -16,7 +16,7 @@ from tsgt.master.classic.ingest import Intake
 from tsgt.model import ClockSample, Status
 from tsgt.radio.classic import MeasurementMessage
 from tsgt.radio.classic.messages import decode_reply, no_measurement_yet
-from tsgt.timesync import clock_filter
+from tsgt.timesync.two_way import clock_filter
 
 if TYPE_CHECKING:
     from tsgt.master.classic.ingest import Arrival, Synchronised

@@ -8,10 +8,10 @@ from harness.clock_exchanges import SECOND, START_NS, synchronisation
 from tsgt.master.classic.ingest import Intake
 from tsgt.radio.classic import MeasurementMessage
 from tsgt.radio.classic.messages import no_measurement_yet
-from tsgt.timesync import RegressionFilter, clock_filter
+from tsgt.timesync.two_way import RegressionFilter, clock_filter
 
 MS = 1_000_000
-TURN_ROUND_NS = 1_500_000
+TURNAROUND_NS = 1_500_000
 
 
 class Master:
@@ -23,7 +23,7 @@ class Master:
 
     def synchronise(self, at_s: float, *, cycles: int = 5) -> list[tuple[int, int | None]]:
         """Exchange packets from an instant on; return stamp and bound of what was held until then, in ns."""
-        samples = synchronisation(at_s, lambda _: self.ahead_ns, cycles=cycles, turn_round_ns=TURN_ROUND_NS)
+        samples = synchronisation(at_s, lambda _: self.ahead_ns, cycles=cycles, turnaround_ns=TURNAROUND_NS)
         found = self.intake.synchronised(1, samples, samples[-1].received_ns)
         return [(m.stamp_ns, m.stamp_bound_ns) for m in found.measurements]
 
@@ -80,8 +80,8 @@ def test_no_line_reaches_over_what_may_have_been_a_restart() -> None:
     """The frequency that was known stays a first guess; what the step would make of it is left out."""
     through, anew = RegressionFilter(), RegressionFilter()
     for clock in (through, anew):
-        clock.update(synchronisation(0, lambda _: 0.0, cycles=50, turn_round_ns=TURN_ROUND_NS))
-    stepped = synchronisation(30, lambda _: 1.0 * MS, turn_round_ns=TURN_ROUND_NS)
+        clock.update(synchronisation(0, lambda _: 0.0, cycles=50, turnaround_ns=TURNAROUND_NS))
+    stepped = synchronisation(30, lambda _: 1.0 * MS, turnaround_ns=TURNAROUND_NS)
     through.update(stepped)
     assert not anew.update(stepped, anew=True).restarted  # as far as exchanges tell
     at_ns = stepped[-1].station_ns

@@ -12,13 +12,13 @@ from harness.radios import PAPER
 
 from tsgt.master.classic.scheduler import Cadence, Scheduler, StationPlan, Task
 from tsgt.model import ClockSample
-from tsgt.radio.classic import Ordered, Poll, Synchronisation
+from tsgt.radio.classic import CommandTransaction, Poll, Synchronisation
 from tsgt.radio.classic.messages import no_measurement_yet
-from tsgt.radio.classic.transactions import Timing
+from tsgt.radio.classic.transactions import LinkTiming
 
 MS = 1_000_000
 SECOND = 1000 * MS
-TIMING = Timing.of(PAPER, 250 * MS)
+TIMING = LinkTiming.of(PAPER, 250 * MS)
 SAMPLE = ClockSample(sent_ns=0, station_ns=1, received_ns=2, forward_ns=0, back_ns=0)
 
 # Durations at the paper's settings: a poll that is answered and one that is not, a cycle, what is around the cycles.
@@ -67,7 +67,7 @@ class Channel:
 
     def _carry_out(self, turn: Task) -> int:
         dead = turn.station in self.dead
-        if isinstance(turn, Ordered):
+        if isinstance(turn, CommandTransaction):
             turn.ok = None if dead else turn.station not in self.refusing
             return 10 * SECOND if dead else 500 * MS
         if isinstance(turn, Poll):
@@ -98,8 +98,8 @@ def test_each_station_is_told_to_track_then_synchronised_then_polled() -> None:
     channel = Channel()
     channel.run(60)
     kinds = [(type(turn), turn.station) for _, turn in channel.turns[:9]]
-    assert kinds == [(kind, n) for kind in (Ordered, Synchronisation, Poll) for n in (1, 2, 3)]
-    assert channel.of(Ordered)[0][1]._order.to_bytes() == b"n14"
+    assert kinds == [(kind, n) for kind in (CommandTransaction, Synchronisation, Poll) for n in (1, 2, 3)]
+    assert channel.of(CommandTransaction)[0][1]._order.to_bytes() == b"n14"
     assert [turn._cycles for _, turn in channel.of(Synchronisation)[:3]] == [50, 50, 50]
 
 
@@ -209,7 +209,7 @@ def test_a_station_that_refuses_to_track_is_told_again_and_never_polled() -> Non
     channel = Channel(refusing={3})
     channel.run(300)
     assert not [turn for _, turn in channel.of(Poll) if turn.station == 3]
-    orders_ns = [at for at, turn in channel.of(Ordered) if turn.station == 3]
+    orders_ns = [at for at, turn in channel.of(CommandTransaction) if turn.station == 3]
     gaps_ns = [b - a for a, b in pairwise(orders_ns[2:])]
     assert gaps_ns[-1] > 9 * SECOND
     channel.refusing.clear()
@@ -221,9 +221,9 @@ def test_an_order_lost_after_many_refusals_costs_no_more_than_itself() -> None:
     """An instrument that is being connected refuses often, which costs little; a lost packet is not paid for as often."""
     channel = Channel(stations=1, refusing={1})
     channel.run(20)
-    assert [turn.ok for _, turn in channel.of(Ordered)[:5]] == [False] * 5
+    assert [turn.ok for _, turn in channel.of(CommandTransaction)[:5]] == [False] * 5
     lost = channel.scheduler.next(channel.now_ns)
-    assert isinstance(lost, Ordered)
+    assert isinstance(lost, CommandTransaction)
     channel.scheduler.finished(lost, channel.now_ns + SECOND)
     assert isinstance(channel.scheduler.next(channel.now_ns + SECOND), Synchronisation)
 
@@ -235,7 +235,7 @@ def test_a_station_with_another_clock_is_synchronised_before_anything_else() -> 
     channel.scheduler.resynchronise(2, channel.now_ns)
     channel.run(92)
     first, second = [turn for at, turn in channel.turns if at >= 90 * SECOND][:2]
-    assert isinstance(first, Ordered)
+    assert isinstance(first, CommandTransaction)
     assert isinstance(second, Synchronisation)
     assert first.station == second.station == 2
     channel.run(400)
@@ -249,7 +249,7 @@ def test_a_station_whose_synchronisation_leaves_doubt_is_synchronised_again_at_o
     channel.run(44)
     channel.doubted.clear()
     kinds = [type(turn) for _, turn in channel.turns if turn.station == 2]
-    assert kinds[:4] == [Ordered, Synchronisation] * 2
+    assert kinds[:4] == [CommandTransaction, Synchronisation] * 2
     channel.run(100)
     assert channel.rate_hz(2, 80) == pytest.approx(channel.rate_hz(1, 80), rel=0.1)
 
@@ -289,7 +289,10 @@ def test_doubts_that_are_far_apart_cost_no_pause() -> None:
         channel.scheduler.doubted(2, before_ns)
         channel.run(until_s)
         at_once = [turn for at, turn in channel.turns if at >= before_ns][:2]
-        assert [(type(turn), turn.station) for turn in at_once] == [(Ordered, 2), (Synchronisation, 2)]
+        assert [(type(turn), turn.station) for turn in at_once] == [
+            (CommandTransaction, 2),
+            (Synchronisation, 2),
+        ]
 
 
 def test_a_station_that_answers_but_has_no_stamps_gets_no_more_than_its_share() -> None:
@@ -305,7 +308,7 @@ def test_a_late_yes_of_one_station_is_not_taken_for_another_ones() -> None:
     """While a station may still answer its order, the others have to say twice that they track."""
     channel = Channel(stations=2, dead={1})
     channel.run(40)
-    assert len([turn for _, turn in channel.of(Ordered) if turn.station == 2]) == 2
+    assert len([turn for _, turn in channel.of(CommandTransaction) if turn.station == 2]) == 2
     assert [turn for _, turn in channel.of(Synchronisation) if turn.station == 2]
 
 
@@ -320,6 +323,6 @@ def test_a_turn_that_was_broken_off_is_taken_again() -> None:
     """The radio failed within the first order: the station is told once more in its next turn."""
     channel = Channel()
     first = channel.scheduler.next(0)
-    assert isinstance(first, Ordered)
+    assert isinstance(first, CommandTransaction)
     channel.run(60)
-    assert [turn.station for _, turn in channel.of(Ordered)] == [2, 3, 1]
+    assert [turn.station for _, turn in channel.of(CommandTransaction)] == [2, 3, 1]

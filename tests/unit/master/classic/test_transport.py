@@ -13,12 +13,12 @@ from harness.radios import MS, PAPER, Bench, bench
 from tsgt.clock import UnixTimeline
 from tsgt.errors import RadioError
 from tsgt.master.classic import Collector
-from tsgt.radio.classic.transactions import Request, Timing
+from tsgt.radio.classic.transactions import Request, LinkTiming
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-TIMING = Timing.of(PAPER, 250 * MS)
+TIMING = LinkTiming.of(PAPER, 250 * MS)
 TIMELINE = UnixTimeline(1000)
 
 
@@ -132,7 +132,7 @@ async def test_a_lost_edge_makes_an_inexact_stamp() -> None:
 
         async def answer_without_edge() -> None:
             packet = await both.there.radio.receive()
-            both.here.hal.lose_edges(1)
+            both.here.hal.drop_edges(1)
             await both.there.radio.transmit(b"e1", at_ns=packet.received_at_ns + MS)
 
         task = asyncio.create_task(answer_without_edge())

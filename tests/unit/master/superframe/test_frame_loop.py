@@ -14,11 +14,11 @@ from harness.radios import MS, Bench, bench
 
 from tsgt.master.superframe import FrameLoop
 from tsgt.radio.superframe import SuperframeMaster
-from tsgt.radio.superframe.phase_lock import Plan
+from tsgt.radio.superframe.phase_lock import FramePlan
 from tsgt.radio.superframe.wire import (
     CODE_BYTES,
     Authenticator,
-    Introduction,
+    JoinRequest,
     Reply,
     SlotOrder,
     decode_beacon,
@@ -28,8 +28,8 @@ from tsgt.radio.superframe.wire import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from tsgt.radio import Packet, Transmitted
-    from tsgt.radio.superframe.reception import Heard
+    from tsgt.radio import Packet, Transmission
+    from tsgt.radio.superframe.reception import ReceivedReply
 
 
 @dataclass
@@ -48,12 +48,12 @@ class Notes:
         """Note it."""
         self.told.append("composing")
 
-    def beacon(self, sent: Transmitted) -> None:
+    def beacon(self, sent: Transmission) -> None:
         """Note it."""
         self.told.append("beacon")
         self.sent_ns.append(sent.done_at_ns)
 
-    def heard(self, heard: Heard, packet: Packet) -> None:
+    def heard(self, heard: ReceivedReply, packet: Packet) -> None:
         """Note who."""
         assert packet.payload
         self.told.append(f"heard {heard.station}")
@@ -73,9 +73,9 @@ class LateLock:
         """Return when the next frame begins."""
         return earliest_ns + 1000 * MS
 
-    def plan(self, earliest_ns: int, grants: Sequence[int], beacon_bytes: int) -> Plan:  # noqa: ARG002 (as above)
+    def plan(self, earliest_ns: int, grants: Sequence[int], beacon_bytes: int) -> FramePlan:  # noqa: ARG002 (as above)
         """Plan the next frame."""
-        return Plan(earliest_ns + 1000 * MS, SlotOrder())
+        return FramePlan(earliest_ns + 1000 * MS, SlotOrder())
 
 
 def master_on(both: Bench, *, late: bool = False) -> SuperframeMaster:
@@ -96,9 +96,11 @@ async def answer(both: Bench, master: SuperframeMaster, *, early_ns: int = 0) ->
     while True:
         packet = await both.there.radio.receive()
         beacon = decode_beacon(packet.payload[:-CODE_BYTES])
-        span = TIMING.slots([entry.grant for entry in beacon.stations], beacon.order)[1]
+        span = TIMING.slots([entry.grant for entry in beacon.stations], beacon.slot_order)[1]
         assert span is not None
-        content = encode_reply(Reply(introduction=Introduction(nonce=5, lineage=1, run_start=0, oldest=0)))
+        content = encode_reply(
+            Reply(join_request=JoinRequest(nonce=5, stream_id=1, first_sequence=0, oldest=0))
+        )
         code = Authenticator(KEY).reply_code(
             session=master.session,
             station=2,
@@ -133,7 +135,7 @@ async def test_a_frame_ends_when_nobody_is_waited_for_any_more() -> None:
         async with running(FrameLoop(both.here.radio, both.clock, master, notes).run()):
             await asyncio.sleep(2)
     assert notes.told[:6] == ["composing", "beacon", "silent [1, 2]"] * 2
-    slots_ns = 2 * (TIMING.airtime_ns(44) + TIMING.guard_ns) + TIMING.turn_round_ns
+    slots_ns = 2 * (TIMING.airtime_ns(44) + TIMING.guard_ns) + TIMING.turnaround_ns
     session_bytes = 25  # of a beacon that tells two stations how to join
     first_ns = notes.sent_ns[1] - notes.sent_ns[0] - TIMING.airtime_ns(session_bytes)
     assert first_ns == pytest.approx(slots_ns, abs=8 * MS)

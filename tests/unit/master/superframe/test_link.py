@@ -15,11 +15,11 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 from harness.field import STATIONS, TRUE, field_of, running
-from harness.scene import START, driving, standing_scene
+from harness.scene import START, driving, stationary_scene
 from structlog.testing import capture_logs
 
 from tsgt.errors import RadioError, RecordingError
-from tsgt.master import replayed
+from tsgt.master.replay import replayed
 from tsgt.model import PolarMeasurement, Status
 from tsgt.recording import (
     BeaconRecord,
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
     from harness.field import Field
 
-    from tsgt.radio import Radio, Transmitted
+    from tsgt.radio import Radio, Transmission
 
 MS = 1_000_000
 SECOND = 1000 * MS
@@ -78,7 +78,7 @@ NOTHING: dict[int, set[int]] = {number: set() for number in STATIONS}
 
 async def test_every_measurement_comes_and_makes_poses(tmp_path: Path) -> None:
     """2.5 Hz from each station, stamped to microseconds; poses are valid, and the status says how it stands."""
-    scene = standing_scene().moving(driving)
+    scene = stationary_scene().moving(driving)
     async with field_of(tmp_path, scene, superframe=True) as field, running(field.master()):
         await asyncio.sleep(40)
     assert undelivered(field, until_s=39) == NOTHING
@@ -94,7 +94,12 @@ async def test_every_measurement_comes_and_makes_poses(tmp_path: Path) -> None:
     assert status.frame_ms == pytest.approx(378, abs=10)
     for station in status.stations:
         assert station.rate_hz == pytest.approx(2.5, abs=0.11)
-        assert (station.joined, station.missing, station.late, station.doubted) == (True, 0, 0, 0)
+        assert (station.joined, station.outstanding, station.missed_slots, station.rejected_beacons) == (
+            True,
+            0,
+            0,
+            0,
+        )
         assert (station.prism, station.locked, station.loss) == (station.id, True, 0)
         assert station.stamp_bound_ns is not None
         assert station.stamp_bound_ns < 300_000
@@ -171,15 +176,15 @@ async def test_what_is_not_written_is_not_acknowledged(tmp_path: Path) -> None:
         with patch.object(RecordingWriter, "write_line", failing):
             async with running(field.master()):
                 await asyncio.sleep(20)
-                before = [len(station.notes.outbox) for station in field.stations.values()]
+                before = [len(station.notes.send_queue) for station in field.stations.values()]
                 full.set()
                 await asyncio.sleep(20)
-                assert min(len(station.notes.outbox) for station in field.stations.values()) > 40
+                assert min(len(station.notes.send_queue) for station in field.stations.values()) > 40
                 assert max(before) < 5
                 assert field.of(PoseRecord)[-1].valid
                 full.clear()
                 await asyncio.sleep(20)
-                assert max(len(station.notes.outbox) for station in field.stations.values()) < 5
+                assert max(len(station.notes.send_queue) for station in field.stations.values()) < 5
     assert undelivered(field, until_s=58) == NOTHING
     written = [line.data for line in read_lines(field.recording()) if line.type == "measurement"]
     assert written == [encode_line(m) for m in field.of(PolarMeasurement)]
@@ -209,7 +214,7 @@ async def test_a_disk_that_hangs_holds_up_no_frame(tmp_path: Path) -> None:
                 try:
                     await asyncio.sleep(10)
                     assert len(field.of(BeaconRecord)) - frames > 12
-                    assert min(len(station.notes.outbox) for station in field.stations.values()) > 15
+                    assert min(len(station.notes.send_queue) for station in field.stations.values()) > 15
                 finally:
                     hangs.clear()
                     freed.set()
@@ -240,7 +245,7 @@ async def test_a_radio_that_fails_within_a_frame_goes_on_with_the_next(tmp_path:
             async with field.open_radio()() as radio:
                 transmit = radio.transmit
 
-                async def breakable(payload: bytes, *, at_ns: int | None = None) -> Transmitted:
+                async def breakable(payload: bytes, *, at_ns: int | None = None) -> Transmission:
                     nonlocal fails
                     sent = await transmit(payload, at_ns=at_ns)
                     if fails:
@@ -273,7 +278,7 @@ async def test_a_station_that_is_killed_comes_back_with_what_it_had(tmp_path: Pa
         await asyncio.sleep(20)
         numbers = [m.sequence for m in field.of(PolarMeasurement) if m.station == 2]
         assert max(numbers) > 1000
-        assert station_status(field, 2).missing == 0
+        assert station_status(field, 2).outstanding == 0
     assert undelivered(field, until_s=40) == NOTHING
 
 
@@ -282,19 +287,19 @@ async def test_after_an_outage_everything_comes_live_data_first(tmp_path: Path) 
     link = LinkModel()
     async with field_of(tmp_path, superframe=True, link=link) as field, running(field.master()):
         await asyncio.sleep(20)
-        link.attenuate("master", "station-3", 200)
+        link.set_attenuation("master", "station-3", 200)
         await asyncio.sleep(60)
         assert "station_lost 3" in events(field)
-        link.attenuate("master", "station-3", 0)
+        link.set_attenuation("master", "station-3", 0)
         await asyncio.sleep(5)
         age_s = station_status(field, 3).age_s
         assert age_s is not None
         assert age_s < 1.5
-        missing = station_status(field, 3).missing
+        missing = station_status(field, 3).outstanding
         assert missing is not None
         assert missing > 20
         await asyncio.sleep(25)
-        assert station_status(field, 3).missing == 0
+        assert station_status(field, 3).outstanding == 0
     assert undelivered(field, until_s=109) == NOTHING
     back = [m for m in field.of(PolarMeasurement) if m.station == 3 and m.received_ns > START + 80 * SECOND]
     late = [m for m in back if m.stamp_ns < START + 79 * SECOND]
@@ -308,13 +313,13 @@ async def test_statuses_that_come_late_are_no_news(tmp_path: Path) -> None:
     link = LinkModel()
     async with field_of(tmp_path, superframe=True, link=link) as field, running(field.master()):
         await asyncio.sleep(20)
-        link.attenuate("master", "station-1", 200)
+        link.set_attenuation("master", "station-1", 200)
         await asyncio.sleep(5)
         field.stations[1].instrument.status = Status.TILT
         await asyncio.sleep(20)
         field.stations[1].instrument.status = Status.OK
         await asyncio.sleep(5)
-        link.attenuate("master", "station-1", 0)
+        link.set_attenuation("master", "station-1", 0)
         await asyncio.sleep(20)
     tilted = [m for m in field.of(PolarMeasurement) if m.status is Status.TILT]
     assert len(tilted) == pytest.approx(50, abs=2)
@@ -341,7 +346,7 @@ async def test_a_station_in_direct_mode_is_put_back_to_tracking(tmp_path: Path) 
 
 async def test_a_station_without_its_prism_is_told_where_the_robot_is(tmp_path: Path) -> None:
     """Every 5 s, in its own circles, until it has it again; nobody else notices, and nothing is lost."""
-    scene = standing_scene().moving(driving)
+    scene = stationary_scene().moving(driving)
     with capture_logs() as logs:
         async with field_of(tmp_path, scene, superframe=True) as field, running(field.master()):
             tool = field.stations[2].instrument
@@ -424,18 +429,18 @@ async def test_a_search_that_is_refused_is_no_refusal_to_track(tmp_path: Path) -
 async def test_a_direction_that_has_grown_old_is_not_given_any_more(tmp_path: Path) -> None:
     """A station that was away in the meantime gets one of now, or none."""
     link = LinkModel()
-    driven = standing_scene().moving(lambda time_s: (np.eye(3), np.array([30.0, time_s - 20.0, -1.0])))
+    driven = stationary_scene().moving(lambda time_s: (np.eye(3), np.array([30.0, time_s - 20.0, -1.0])))
     async with field_of(tmp_path, driven, superframe=True, link=link) as field, running(field.master()):
         tool = field.stations[3].instrument
         await asyncio.sleep(10)
         tool.status = Status.NO_TARGET
         await asyncio.sleep(1.6)
-        link.attenuate("master", "station-3", 200)
+        link.set_attenuation("master", "station-3", 200)
         with capture_logs() as logs:
             await asyncio.sleep(20)
         assert [log["event"] for log in logs].count("search_ordered") == 1
         assert tool.sought == []
-        link.attenuate("master", "station-3", 0)
+        link.set_attenuation("master", "station-3", 0)
         await asyncio.sleep(5)
     ((at_ns, towards),) = tool.sought
     true = driven.measure(3, at_ns / SECOND)
@@ -476,9 +481,9 @@ async def test_a_replay_gives_every_line_again(tmp_path: Path) -> None:
     link = LinkModel(loss_probability=0.2)
     async with field_of(tmp_path, superframe=True, link=link) as field, running(field.master()):
         await asyncio.sleep(30)
-        link.attenuate("master", "station-3", 200)
+        link.set_attenuation("master", "station-3", 200)
         await asyncio.sleep(10)
-        link.attenuate("master", "station-3", 0)
+        link.set_attenuation("master", "station-3", 0)
         await asyncio.sleep(20)
     streamed = [encode_line(record) for record in field.records]
     assert [line for _, some in replayed(field.recording()) for line in some] == streamed

@@ -1,21 +1,25 @@
-# Two commands on a fresh machine with Python 3.11+ and make: `make demo` and `make test`.
+# On a fresh machine with Python 3.11+ and make: `make demo`, `make test`. Each installs what it needs into .venv.
 
 PYTHON ?= python3
 VENV ?= .venv
 DURATION ?= 30
 BIN := $(VENV)/bin
 
-# Property tests of what takes bytes from outside.
+# Property tests of everything that takes bytes from outside.
 FUZZED := $(addprefix tests/property/test_,$(addsuffix .py,air bridge classic damaged_files damaged_recordings \
 	damaged_replies forgery geocom gnss_files hostile_radio hostile_sockets radio recording \
 	superframe_messages tum))
 
-.PHONY: demo test lint types layers pytest fuzz soak bench generated format clean
+.PHONY: demo test test-all lint types layers fast-tests all-tests docs fuzz soak bench generated format clean
 
 demo: $(VENV)/.runtime
 	$(BIN)/tsgt demo --duration $(DURATION)
 
-test: lint types layers pytest
+# Lint, types, layers and the fast tests: a few minutes, what to run before a commit.
+test: lint types layers fast-tests
+
+# Everything: also whole missions, real processes, interoperability, planted defects, the documentation site.
+test-all: lint types layers all-tests docs
 
 lint: $(VENV)/.test
 	$(BIN)/ruff check .
@@ -27,17 +31,24 @@ types: $(VENV)/.test
 layers: $(VENV)/.test
 	$(BIN)/lint-imports
 
-# Those that run real processes in real time have the machine to themselves.
-pytest: $(VENV)/.test
+# A file is run by one worker, so that a mission that several of its tests look at is simulated once.
+fast-tests: $(VENV)/.test
+	$(BIN)/pytest -m "not slow" --numprocesses auto --dist loadfile
+
+# Tests that run real processes in real time have the machine to themselves.
+all-tests: $(VENV)/.test
 	$(BIN)/pytest --numprocesses auto --dist worksteal --ignore tests/process --ignore tests/interop
 	$(BIN)/pytest tests/process tests/interop
 
-# Forty times the examples of `make test`, on two cores; what is not done after 15 minutes is given up, and said.
-# A failing example is kept in .hypothesis: `pytest` with the name of its test makes it small and shows it.
+docs: $(VENV)/.test
+	$(BIN)/mkdocs build --strict --quiet
+
+# Forty times the examples of `make test`, on two cores; what is not done after 15 minutes is given up.
+# A failing example is kept in .hypothesis: `pytest` with the name of its test shrinks and shows it.
 fuzz: $(VENV)/.test
 	timeout --foreground --signal=INT 15m $(BIN)/pytest --hypothesis-profile=fuzz --numprocesses 2 --dist worksteal $(FUZZED)
 
-# Simulated missions with faults of all kinds for a quarter of an hour; what must never happen and does is printed.
+# Simulated missions with faults of all kinds for a quarter of an hour; prints each violated invariant.
 soak: $(VENV)/.test
 	$(BIN)/python benchmarks/soak.py --minutes 15
 
@@ -53,7 +64,7 @@ bench: $(VENV)/.test
 	$(BIN)/python benchmarks/nees.py
 	$(BIN)/python benchmarks/continuous.py
 
-# Schemas, field tables and the command reference come from the code; a test fails when they are stale.
+# Schemas, field tables and the command reference are generated from the code; a test fails when they are stale.
 generated: $(VENV)/.test
 	$(BIN)/python -m tsgt.master.schema
 	$(BIN)/tsgt config schema > configs/schema/config.schema.json
@@ -65,7 +76,7 @@ format: $(VENV)/.test
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) build dist site *.egg-info .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
 
 $(VENV)/bin/python:
 	$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(0 if v >= (3, 11) else f"tsgt needs Python 3.11 or newer, this is {v[0]}.{v[1]}: call make PYTHON=/path/to/python3.11")'

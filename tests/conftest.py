@@ -18,20 +18,27 @@ from tsgt.simulation.kernel import run_virtual
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-# What is started in the background of a script ignores Ctrl-C, and so would all programs that are tested.
+# A background job of a script ignores Ctrl-C, and so would every program that the tests start.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 FIELD_DATA = Path(__file__).parents[2] / "shared" / "data" / "rts"
 
-# How long an example takes says how busy the machine is, no more.
+# No deadline: how long an example takes depends on the load of the machine.
 settings.register_profile("ci", deadline=None)
-# For `make fuzz`. What fails stays in .hypothesis as it is: the next run without this profile makes it small, which
-# may take longer than all the rest.
+# For `make fuzz`: a failing example is kept in .hypothesis without shrinking, which may take longer than all the rest;
+# the next run without this profile shrinks it.
 settings.register_profile(
     "fuzz", deadline=None, max_examples=4000, phases=(Phase.explicit, Phase.reuse, Phase.generate)
 )
 settings.load_profile("ci")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests that run real processes or other people's programs as slow."""
+    for item in items:
+        if item.path.parent.name in {"process", "interop"}:
+            item.add_marker(pytest.mark.slow)
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -52,7 +59,7 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
 
 @pytest.fixture(autouse=True)
 def _logging_as_before() -> Iterator[None]:
-    """Undo what a command has set; a level of its own would hide events from the tests after it."""
+    """Restore the logging configuration: a level that a command sets would hide events from later tests."""
     yield
     structlog.reset_defaults()
 

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.geometry import Observations, exp_so3, invert, transform_from, transform_points
-from tsgt.geometry.trajectory import FixedLag, fit
+from tsgt.geometry.trajectory import FixedLagSmoother, fit_trajectory
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:
@@ -77,23 +77,23 @@ def batch(hours: float, stations: int) -> tuple[float, float]:
     observations = made_up(hours, stations)
     epochs_s = np.arange(observations.time_s[0], observations.time_s[-1], 1 / POSES_HZ)
     start_s = time.process_time()
-    found = fit(observations)
+    found = fit_trajectory(observations)
     fitted_s = time.process_time()
     for first in range(0, len(epochs_s), 1024):
-        found.trajectory.at(epochs_s[first : first + 1024], parts=6)
+        found.trajectory.at(epochs_s[first : first + 1024], dim=6)
     return fitted_s - start_s, time.process_time() - fitted_s
 
 
 def updates(stations: int) -> FloatArray:
     """Give CPU ms of each update with a fixed lag: take one measurement, let the oldest go, predict to where it is sent."""
     observations = made_up(LIVE_S / 3600, stations)
-    filtered = FixedLag(MotionPrior())
+    filtered = FixedLagSmoother(MotionPrior())
     took_ms: list[float] = []
     for row, time_s in enumerate(observations.time_s):
         start_s = time.process_time()
         filtered.update(observations.select(slice(row, row + 1)))
-        filtered.forget(time_s - LAG_S)
-        if filtered.following:
+        filtered.marginalise_before(time_s - LAG_S)
+        if filtered.initialised:
             filtered.predict(time_s + AHEAD_S)
         took_ms.append(1e3 * (time.process_time() - start_s))
     return np.array(took_ms)

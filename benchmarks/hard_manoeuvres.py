@@ -17,12 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
-from tsgt.geometry import FixedLag
+from tsgt.geometry import FixedLagSmoother
 from tsgt.model import MotionPrior
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from harness.manoeuvre import speeding_up_and_turning_back
-from harness.prior_motion import in_time, measure, rows_at
+from harness.prior_motion import sorted_by_time, measure, rows_at
 
 MANOEUVRES = {
     "turns back and speeds up": ((0.5, 1.5), (-0.5, 0.5)),
@@ -44,23 +44,23 @@ def predicted(name: str, seed: int) -> np.ndarray:
     motion = speeding_up_and_turning_back(
         duration_s=UNTIL_S + 0.1, at_s=TOLD_S, speeds_mps=speeds_mps, rates_radps=rates_radps
     )
-    measured = in_time(measure(motion, until_s=UNTIL_S, seed=seed))
+    measured = sorted_by_time(measure(motion, until_s=UNTIL_S, seed=seed))
     random = np.random.default_rng([seed, 1])
     phase_s, delay_s = random.uniform(0, BATCH_S), random.uniform(0.15, 0.3)
     come_s = phase_s + BATCH_S * np.ceil((measured.time_s + delay_s - phase_s) / BATCH_S)
-    window, taken, rows = FixedLag(MotionPrior()), 0, []
+    window, taken, rows = FixedLagSmoother(MotionPrior()), 0, []
     for now_s in np.arange(1.0, TOLD_S + NEAR_S, PERIOD_S):
         here = int(np.searchsorted(come_s, now_s, side="right"))
         if here > taken:
             window.update(measured.select(slice(taken, here)))
-            window.forget(now_s - LAG_S)
+            window.marginalise_before(now_s - LAG_S)
             taken = here
-        if now_s < TOLD_S - NEAR_S or not window.settled or window.doubtful:
+        if now_s < TOLD_S - NEAR_S or not window.converged or window.ambiguous:
             continue
         at_s = np.array([now_s])
         truth = motion.select(rows_at(at_s))
-        ways = (window.trajectory().at(at_s, parts=6), window.predict(now_s, parts=6))
-        rows.append([_nees(state.error_from(truth)[0, :6], covariance[0]) for state, covariance in ways])
+        ways = (window.trajectory().at(at_s, dim=6), window.predict(now_s, dim=6))
+        rows.append([_nees(state.local_coordinates_about(truth)[0, :6], covariance[0]) for state, covariance in ways])
     return np.array(rows).reshape(-1, 2)
 
 

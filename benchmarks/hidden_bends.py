@@ -15,18 +15,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.evaluation import inner_part
-from tsgt.analysis.smoothing import motion_of
-from tsgt.analysis.validation import believed
+from tsgt.analysis.evaluation import interior_mask
+from tsgt.analysis.smoothing import estimate_motion_model
+from tsgt.analysis.validation import plausible_measurements
 from tsgt.config import SuperframeMasterConfig
 from tsgt.estimation import build_observations
-from tsgt.estimation.observations import middle_m
+from tsgt.estimation.observations import centroid_m
 from tsgt.geometry import log_so3
-from tsgt.geometry.trajectory import fit, tune
+from tsgt.geometry.trajectory import fit_trajectory, tune
 from tsgt.log import configure_logging
 from tsgt.model import PipelineParameters
 from tsgt.recording import load_recording
-from tsgt.simulation.options import Options
+from tsgt.simulation.options import SimulationOptions
 from tsgt.simulation.runner import simulate
 from tsgt.simulation.scenario_files import find_scenario
 
@@ -53,15 +53,15 @@ def drive(name: str, seed: int) -> None:
     scenario = scenario.model_copy(
         update={"pipeline": scenario.pipeline.model_copy(update={"estimator": "linear"})}
     )
-    options = Options(
+    options = SimulationOptions(
         duration_s=scenario.duration_s,
         seed=seed,
-        node="ours",
+        station_software="ours",
         protocol=SuperframeMasterConfig(kind="superframe"),
     )
     with tempfile.TemporaryDirectory(prefix="tsgt-hidden-") as folder:
         run = simulate(scenario, options, folder=Path(folder))
-        path = run.sessions[-1].recording()
+        path = run.master_logs[-1].recording()
         if path is None:
             raise RuntimeError(f"{name}: the master made no recording")
         judge(f"{name} {seed}", load_recording(path), run.world, run.start_ns, run.end_ns)
@@ -69,25 +69,25 @@ def drive(name: str, seed: int) -> None:
 
 def judge(name: str, recording: Recording, world: World, start_ns: int, end_ns: int) -> None:
     """Print the lines of one recording."""
-    observations, _ = build_observations(recording.parameters, believed(recording), origin_ns=start_ns)
+    observations, _ = build_observations(recording.parameters, plausible_measurements(recording), origin_ns=start_ns)
     first_ns, last_ns = (round(1e9 * observations.time_s[row]) + start_ns for row in (0, -1))
     stamp_ns = np.arange(start_ns, end_ns, 50_000_000, dtype=np.int64)
-    stamp_ns = stamp_ns[inner_part(stamp_ns, start_ns, end_ns)]
+    stamp_ns = stamp_ns[interior_mask(stamp_ns, start_ns, end_ns)]
     stamp_ns = stamp_ns[(stamp_ns >= first_ns) & (stamp_ns <= last_ns)]
     at_s = (stamp_ns - start_ns) / 1e9
     truth = world.pose_at(at_s)
-    place_m = truth[:, :3, 3] + truth[:, :3, :3] @ middle_m(recording.parameters)
+    place_m = truth[:, :3, 3] + truth[:, :3, :3] @ centroid_m(recording.parameters)
     configured, motion = (
         recording.parameters.pipeline.motion,
-        motion_of(observations, recording.parameters.pipeline),
+        estimate_motion_model(observations, recording.parameters.pipeline),
     )
-    for label, prior, while_hidden in (
+    for label, prior, occluded_prior in (
         ("as found", tune(observations).prior, None),
         ("as processed", motion.prior, configured),
         ("as configured", configured, None),
     ):
-        found = fit(observations, prior=prior, while_hidden=while_hidden, noise_scale=motion.noise_scale)
-        states, covariance = found.trajectory.at(at_s, parts=6)
+        found = fit_trajectory(observations, prior=prior, occluded_prior=occluded_prior, noise_scale=motion.noise_scale)
+        states, covariance = found.trajectory.at(at_s, dim=6)
         off_m = place_m - states.position
         turned = log_so3(np.swapaxes(states.rotation, 1, 2) @ truth[:, :3, :3])
         error = np.concatenate([off_m, turned], axis=1)

@@ -19,7 +19,7 @@ import numpy as np
 
 from tsgt.analysis.calibration import calibrate_recording
 from tsgt.geometry import exp_so3
-from tsgt.geometry.calibration import Setup, Unknowns
+from tsgt.geometry.calibration import Setup, SetupPrior
 from tsgt.recording import load_recording
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from tsgt.model import Matrix4
     from tsgt.recording import Recording
 
-KNOWN = Unknowns(shift_sigma_m=0.02, turn_sigma_rad=0.002, latency_sigma_s=0.1)
+KNOWN = SetupPrior(translation_sigma_m=0.02, rotation_sigma_rad=0.002, latency_sigma_s=0.1)
 SHIFT_M, TURN_RAD, LATE_S = 0.005, 0.0005, 0.03
 
 
@@ -54,15 +54,15 @@ def judge(name: str, recording: Recording, rng: np.random.Generator) -> tuple[fl
     late_s = np.zeros(len(frames))
     late_s[1] = LATE_S
     unknowns = found.unknowns
-    error = unknowns.away(found.setup) - unknowns.away(Setup(frames, late_s, found.setup.layout))
+    error = unknowns.local_coordinates(found.setup) - unknowns.local_coordinates(Setup(frames, late_s, found.setup.layout))
     sigmas = error / np.sqrt(np.diag(found.covariance))
     squared = float(error @ np.linalg.solve(found.covariance, error))
-    largest = [1e3 * np.abs(error[at]).max() for at in (unknowns.shifts, unknowns.turns, unknowns.latencies)]
+    largest = [1e3 * np.abs(error[at]).max() for at in (unknowns.translations, unknowns.rotations, unknowns.latencies)]
     print(
         name,
         "{:.2f} mm {:.3f} mrad {:.2f} ms".format(*largest),
         f"largest {np.abs(sigmas).max():.1f} sigma, chi-square {squared:.1f} of {len(error)},",
-        f"noise {found.noise_scale:.2f}, wander {1e3 * found.wander_s:.2f} ms, disagreement {found.disagreement:.2f}",
+        f"noise {found.noise_scale:.2f}, wander {1e3 * found.wander_s:.2f} ms, disagreement {found.birge_ratio:.2f}",
         "in sigmas",
         " ".join(f"{each:.1f}" for each in sigmas),
         flush=True,

@@ -15,18 +15,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.evaluation import folds, hold_out, missed_by_lines, missed_by_trajectory, never_out
+from tsgt.analysis.evaluation import folds, cross_validate, interpolation_errors, trajectory_errors, training_rows
 from tsgt.analysis.evaluation.held_out import FOLDS
 from tsgt.estimation import build_observations
-from tsgt.geometry.trajectory import fit
-from tsgt.geometry.trajectory.hyperparameters import logarithms, search
+from tsgt.geometry.trajectory import fit_trajectory
+from tsgt.geometry.trajectory.hyperparameters import log_parameters, maximise_evidence
 from tsgt.model import MotionPrior
 from tsgt.recording import load_recording
 
 if TYPE_CHECKING:
     from tsgt.analysis.evaluation import Fold
     from tsgt.geometry import FloatArray, Observations
-    from tsgt.geometry.trajectory.hyperparameters import Tuned
+    from tsgt.geometry.trajectory.hyperparameters import Hyperparameters
 
 # An acceleration that lasts a millisecond is white at any rate of measuring; one of a minute, over the steps between
 # measurements and over their neighbours', is the sum of white jerk.
@@ -41,9 +41,9 @@ SCALES = (0.5, 20.0)
 _TIMES = (2, 5)
 
 
-def tuned(observations: Observations, time_s: float | None) -> Tuned:
+def tuned(observations: Observations, time_s: float | None) -> Hyperparameters:
     """Tune sigmas and noise with a given correlation time, or with the best."""
-    start = logarithms(MotionPrior(), 1.0)
+    start = log_parameters(MotionPrior(), 1.0)
     limits = [SIGMAS] * 6 + [SCALES]
     for row in _TIMES:
         limits[row] = FREE_TIME_S if time_s is None else (time_s, time_s)
@@ -54,20 +54,20 @@ def tuned(observations: Observations, time_s: float | None) -> Tuned:
             start[row - 2 : row] += np.log(gain)
             start[row] = np.log(time_s)
     least, most = np.log(limits).T
-    return search(observations, start, least, most)
+    return maximise_evidence(observations, start, least, most)
 
 
 def missed_m(observations: Observations, time_s: float | None) -> FloatArray:
     """By how much measurements that were left out are missed, in m, without those at gaps."""
-    seen = [tuned(observations.select(never_out(observations, number)), time_s) for number in range(FOLDS)]
+    seen = [tuned(observations.select(training_rows(observations, number)), time_s) for number in range(FOLDS)]
 
     def by_fold(fold: Fold) -> FloatArray:
         own = seen[fold.number]
-        kept = fit(observations.select(fold.kept), prior=own.prior, noise_scale=own.noise_scale)
-        return missed_by_trajectory(kept.trajectory, observations.select(fold.out))
+        kept = fit_trajectory(observations.select(fold.training), prior=own.prior, noise_scale=own.noise_scale)
+        return trajectory_errors(kept.trajectory, observations.select(fold.test))
 
-    held_out = hold_out(folds(observations), by_fold)
-    return held_out.missed_m[~held_out.at_gap]
+    held_out = cross_validate(folds(observations), by_fold)
+    return held_out.error_m[~held_out.at_gap]
 
 
 def row(name: str, evidence: str, missed: FloatArray, more: str = "") -> str:
@@ -99,13 +99,13 @@ def main() -> None:
                 )
             )
             more = (
-                f"{sigmas}; {prior.acceleration_correlation_time_s:.2g} and {prior.angular_acceleration_time_s:.2g} s; "
+                f"{sigmas}; {prior.acceleration_correlation_time_s:.2g} and {prior.angular_acceleration_correlation_time_s:.2g} s; "
                 f"noise x {found.noise_scale:.2f}"
             )
             evidence = f"{found.log_evidence - least:+.0f}"
             print(row(name, evidence, missed_m(observations, time_s), more), flush=True)
-        lines = hold_out(folds(observations), lambda fold: missed_by_lines(observations, fold))  # noqa: B023
-        print(row("linear", "", lines.missed_m[~lines.at_gap]), flush=True)
+        lines = cross_validate(folds(observations), lambda fold: interpolation_errors(observations, fold))  # noqa: B023
+        print(row("linear", "", lines.error_m[~lines.at_gap]), flush=True)
 
 
 if __name__ == "__main__":

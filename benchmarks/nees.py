@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import chi2
 
-from tsgt.geometry.trajectory import Trajectory, first_guess, knot_times, solve
+from tsgt.geometry.trajectory import Trajectory, initial_guess, knot_times, solve
 from tsgt.model import MotionPrior
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from harness.prior_motion import STEP_S, draw_motions, in_time, measure, rows_at
+from harness.prior_motion import STEP_S, draw_motions, sorted_by_time, measure, rows_at
 
 ROBOTS = 400
 UNTIL_S = 20.0
@@ -48,16 +48,16 @@ def main() -> None:
     found: dict[tuple[str, str], list[np.ndarray]] = {}
     start_s = time.process_time()
     for number, motion in enumerate(draw_motions(prior, count=robots, duration_s=UNTIL_S + 2.5, seed=1)):
-        whole = in_time(measure(motion, until_s=UNTIL_S, seed=number))
+        whole = sorted_by_time(measure(motion, until_s=UNTIL_S, seed=number))
         away = (whole.time_s > ONE_PRISM_S[0]) & (whole.time_s < ONE_PRISM_S[1]) & (whole.prism != 0)
         for name, (_, instants_s) in tables.items():
             observations = whole.select(~away) if name.startswith("one") else whole
             last_s = np.floor(observations.time_s[-1] / STEP_S) * STEP_S
             asked_s = instants_s + last_s if name == "predicted" else instants_s
-            solution = solve(observations, first_guess(observations, knot_times(observations.time_s)), prior)
+            solution = solve(observations, initial_guess(observations, knot_times(observations.time_s)), prior)
             trajectory = Trajectory(solution.knots, prior, *solution.factor.marginals())
             states, covariance = trajectory.at(asked_s)
-            error = motion.select(rows_at(asked_s)).error_from(states)
+            error = motion.select(rows_at(asked_s)).local_coordinates_about(states)
             for part, rows in PARTS.items():
                 solved = np.linalg.solve(covariance[:, rows, rows], error[:, rows, None])[..., 0]
                 found.setdefault((name, part), []).append(np.einsum("ni,ni->n", error[:, rows], solved))

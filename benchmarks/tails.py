@@ -28,7 +28,7 @@ from tsgt.geometry import (
     transform_from,
     transform_points,
 )
-from tsgt.geometry.trajectory import fit
+from tsgt.geometry.trajectory import fit_trajectory
 from tsgt.simulation.world import World, scenario_world
 
 HOUR_S = 3600.0
@@ -88,7 +88,7 @@ def measured(world: World, seed: int) -> tuple[Observations, np.ndarray]:
 
 def figures(observations: Observations, world: World) -> tuple[np.ndarray, np.ndarray]:
     """Return NEES and squared position errors in m^2 of all poses."""
-    found = fit(observations).trajectory
+    found = fit_trajectory(observations).trajectory
     times_s = np.arange(found.knots.time_s[0], found.knots.time_s[-1], STEP_S)
     states, covariance = found.at(times_s)
     truth = world.pose_at(times_s)

@@ -9,7 +9,7 @@ from harness.prior_motion import PLACE_M, STEP_S
 from scipy.stats import norm
 
 from tsgt.geometry import exp_so3
-from tsgt.geometry.trajectory import Knots
+from tsgt.geometry.trajectory import States
 
 if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
@@ -20,7 +20,7 @@ SMOOTHING_S = 0.35
 
 def speeding_up_and_turning_back(
     *, duration_s: float, at_s: float, speeds_mps: tuple[float, float], rates_radps: tuple[float, float]
-) -> Knots:
+) -> States:
     """Return the motion, on a grid of ``STEP_S``, of a level robot that is told another speed and yaw rate at an instant."""
     time_s = np.arange(round(duration_s / STEP_S) + 1, dtype=np.float64) * STEP_S
     told: FloatArray = norm.cdf(time_s, at_s, SMOOTHING_S)
@@ -30,7 +30,7 @@ def speeding_up_and_turning_back(
     ahead = np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)])
     about_z = np.array([0.0, 0.0, 1.0])
     velocity, angular_velocity = speed[:, None] * ahead, rate[:, None] * about_z
-    return Knots(
+    return States(
         time_s,
         PLACE_M + np.cumsum(velocity, axis=0) * STEP_S,
         exp_so3(yaw[:, None] * about_z),

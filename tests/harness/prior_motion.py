@@ -17,7 +17,7 @@ from tsgt.geometry import (
     polar_to_cartesian,
     transform_points,
 )
-from tsgt.geometry.trajectory import Knots
+from tsgt.geometry.trajectory import States
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -31,7 +31,7 @@ TIME_SIGMA_S = 0.0005
 PLACE_M = np.array([60.0, 45.0, -1.0])
 
 
-def draw_motions(prior: MotionPrior, *, count: int, duration_s: float, seed: int) -> list[Knots]:
+def draw_motions(prior: MotionPrior, *, count: int, duration_s: float, seed: int) -> list[States]:
     """Draw motions from the prior on a grid of ``STEP_S``, beginning anywhere and in any direction.
 
     The accelerations at the grid are exact draws of the process; between them they are taken as straight lines, and
@@ -42,7 +42,7 @@ def draw_motions(prior: MotionPrior, *, count: int, duration_s: float, seed: int
     parts = []
     for sigmas, time_s in (
         (prior.acceleration_sigma_mps2, prior.acceleration_correlation_time_s),
-        (prior.angular_acceleration_sigma_radps2, prior.angular_acceleration_time_s),
+        (prior.angular_acceleration_sigma_radps2, prior.angular_acceleration_correlation_time_s),
     ):
         kept = np.exp(-STEP_S / time_s)
         kicks = rng.normal(size=(count, len(times), 3))
@@ -58,7 +58,7 @@ def draw_motions(prior: MotionPrior, *, count: int, duration_s: float, seed: int
     for step in range(len(times) - 1):
         rotation[:, step + 1] = rotation[:, step] @ turns[:, step]
     return [
-        Knots(
+        States(
             times,
             *(part[i] for part in (position, rotation, velocity, angular_velocity)),
             *(part[i] for part in parts),
@@ -72,7 +72,7 @@ def rows_at(time_s: FloatArray) -> NDArray[np.intp]:
     return np.round(np.asarray(time_s) / STEP_S).astype(np.intp)
 
 
-def measure(motion: Knots, *, until_s: float, rate_hz: float = 2.5, seed: int) -> Observations:
+def measure(motion: States, *, until_s: float, rate_hz: float = 2.5, seed: int) -> Observations:
     """Measure each prism by its own station, with noise in range, both angles and time."""
     rng = np.random.default_rng(seed)
     times: list[FloatArray] = []
@@ -103,7 +103,7 @@ def measure(motion: Knots, *, until_s: float, rate_hz: float = 2.5, seed: int) -
     )
 
 
-def in_time(observations: Observations) -> Observations:
+def sorted_by_time(observations: Observations) -> Observations:
     """Put measurements in the order of time, which uncertain stamps may have upset."""
     return observations.select(np.argsort(observations.time_s, kind="stable"))
 
@@ -119,7 +119,7 @@ def add_polar_noise(points_m: FloatArray, sigmas_m: FloatArray, rng: np.random.G
     )
 
 
-def as_points(observations: Observations) -> Observations:
+def as_cartesian(observations: Observations) -> Observations:
     """Take the same measurements for Cartesian ones in frame ``station1``, alike in all directions."""
     return replace(
         observations,

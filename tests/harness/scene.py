@@ -88,7 +88,7 @@ class Scene:
         return replace(self, parameters=replace(self.parameters, pipeline=pipeline))
 
 
-def counted_from(parameters: Parameters, origin_m: NDArray[np.float64]) -> Parameters:
+def with_origin(parameters: Parameters, origin_m: NDArray[np.float64]) -> Parameters:
     """Return parameters whose robot frame has its origin elsewhere, (3,) in the robot frame that it had."""
     prisms = tuple(
         replace(prism, position_m=tuple((np.array(prism.position_m) - origin_m).tolist()))
@@ -97,7 +97,7 @@ def counted_from(parameters: Parameters, origin_m: NDArray[np.float64]) -> Param
     return replace(parameters, prisms=prisms)
 
 
-def standing_scene() -> Scene:
+def stationary_scene() -> Scene:
     """Three stations around the origin, each with its own yaw, and a standing robot."""
     return Scene(
         Parameters(

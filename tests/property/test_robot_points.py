@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from tsgt.geometry import exp_so3, of_point, skew, with_curvature
-from tsgt.geometry.trajectory import Knots
+from tsgt.geometry import exp_so3, state_at_point, skew, with_second_order_terms
+from tsgt.geometry.trajectory import States
 
 same_every_time = settings(derandomize=True, max_examples=50)
 STEP = 1e-4
@@ -21,7 +21,7 @@ def vectors(limit: float) -> st.SearchStrategy[np.ndarray]:
 
 
 states = st.builds(
-    lambda *parts: Knots(
+    lambda *parts: States(
         np.zeros(1), parts[0][None], exp_so3(parts[1])[None], *(part[None] for part in parts[2:])
     ),
     *map(vectors, (100.0, 3.0, 3.0, 2.0, 2.0, 2.0)),
@@ -33,11 +33,11 @@ covariances = arrays(np.float64, (1, 18, 18), elements=st.floats(-1.0, 1.0)).map
 NONE = np.zeros((1, 18, 18))
 
 
-def later(state: Knots, dt_s: float) -> Knots:
+def later(state: States, dt_s: float) -> States:
     """Carry a robot on with steady accelerations; rotations to the third order of the time."""
     rate, faster = state.angular_velocity, state.angular_acceleration
     turn = rate * dt_s + faster * dt_s**2 / 2 + np.cross(rate, faster) * dt_s**3 / 12
-    return Knots(
+    return States(
         state.time_s + dt_s,
         state.position + state.velocity * dt_s + state.acceleration * dt_s**2 / 2,
         state.rotation @ exp_so3(turn),
@@ -51,10 +51,10 @@ def later(state: Knots, dt_s: float) -> Knots:
 @same_every_time
 @given(states, arms)
 def test_another_points_velocity_and_acceleration_are_those_of_its_place(
-    state: Knots, arm: np.ndarray
+    state: States, arm: np.ndarray
 ) -> None:
     """As differences of where it is and how fast a little before and after."""
-    point, before, after = (of_point(later(state, dt_s), NONE, arm)[0] for dt_s in (0.0, -STEP, STEP))
+    point, before, after = (state_at_point(later(state, dt_s), NONE, arm)[0] for dt_s in (0.0, -STEP, STEP))
     seen = state.position[0] + state.rotation[0] @ arm
     np.testing.assert_allclose(point.position[0], seen, atol=1e-12)
     np.testing.assert_allclose(point.velocity, (after.position - before.position) / (2 * STEP), atol=1e-5)
@@ -64,27 +64,27 @@ def test_another_points_velocity_and_acceleration_are_those_of_its_place(
 @same_every_time
 @given(states, arms, covariances)
 def test_another_points_covariance_is_that_of_its_errors(
-    state: Knots, arm: np.ndarray, covariance: np.ndarray
+    state: States, arm: np.ndarray, covariance: np.ndarray
 ) -> None:
     """With the derivatives of its error by each part of the state's, as differences."""
-    point, found = of_point(state, covariance, arm)
+    point, found = state_at_point(state, covariance, arm)
     by_error = np.empty((6, 18))
     for part in range(18):
         error = np.zeros((1, 18))
         error[0, part] = STEP
-        more, less = (of_point(state.moved(sign * error), NONE, arm)[0] for sign in (1, -1))
-        by_error[:, part] = (more.error_from(point) - less.error_from(point))[0, :6] / (2 * STEP)
+        more, less = (state_at_point(state.retract(sign * error), NONE, arm)[0] for sign in (1, -1))
+        by_error[:, part] = (more.local_coordinates_about(point) - less.local_coordinates_about(point))[0, :6] / (2 * STEP)
     np.testing.assert_allclose(found[0], by_error @ covariance[0] @ by_error.T, atol=1e-5)
-    np.testing.assert_array_equal(of_point(state, covariance[:, :6, :6], arm)[1], found)
+    np.testing.assert_array_equal(state_at_point(state, covariance[:, :6, :6], arm)[1], found)
 
 
 @same_every_time
 @given(states, arms, covariances)
-def test_there_and_back_is_where_it_was(state: Knots, arm: np.ndarray, covariance: np.ndarray) -> None:
+def test_there_and_back_is_where_it_was(state: States, arm: np.ndarray, covariance: np.ndarray) -> None:
     """The same motion, and the same covariance."""
-    there, between = of_point(state, covariance, arm)
-    back, found = of_point(there, between, -arm)
-    np.testing.assert_allclose(back.error_from(state), 0.0, atol=1e-12)
+    there, between = state_at_point(state, covariance, arm)
+    back, found = state_at_point(there, between, -arm)
+    np.testing.assert_allclose(back.local_coordinates_about(state), 0.0, atol=1e-12)
     np.testing.assert_allclose(found, covariance[:, :6, :6], atol=1e-10)
 
 
@@ -102,7 +102,7 @@ def test_a_point_that_turns_about_a_line_comes_nearer_to_it() -> None:
         to_line @ rotation @ (exp_so3(angle * axis) @ arm - arm)
         for angle in random.normal(0, sigma_rad, 20_000)
     ]
-    curved, found_sigma_rad = with_curvature(rotation[None], covariance)
+    curved, found_sigma_rad = with_second_order_terms(rotation[None], covariance)
     found = curved[0, :3, :3]
     assert found_sigma_rad == pytest.approx(sigma_rad)
     assert to_line @ found @ to_line == pytest.approx(np.mean(np.square(sample)), rel=0.05)
@@ -119,5 +119,5 @@ def test_a_point_that_turns_about_another_comes_nearer_to_it() -> None:
     to_point = rotation @ arm / np.linalg.norm(arm)
     turns = random.normal(size=(20_000, 3)) * sigmas_rad
     sample = (rotation @ (exp_so3(turns) @ arm - arm).T).T @ to_point
-    found = with_curvature(rotation[None], covariance)[0][0, :3, :3]
+    found = with_second_order_terms(rotation[None], covariance)[0][0, :3, :3]
     assert to_point @ found @ to_point == pytest.approx(np.mean(np.square(sample)), rel=0.05)

@@ -1,12 +1,14 @@
-"""Geometry of prisms on a rigid robot, seen by total stations. numpy and scipy only.
+"""Mathematics of rigid bodies and polar measurements; sans-I/O, numpy and scipy only.
+
+In: polar measurements, station frames, prism layouts. Out: rotations and transforms (:mod:`~tsgt.geometry.rigid`),
+point-set registration, poses with covariances, interpolated tracks. Sub-rooms: ``trajectory``, the continuous-time
+estimator, and ``calibration``, station frames and prism layouts.
 
 Conventions (docs/explanation/conventions.md): SI units and radians, times in integer nanoseconds; ``T_a_b`` maps
 coordinates in frame b to frame a; quaternions are x, y, z, w with w >= 0; a pose covariance is 6x6 of
-(x, y, z, rotation about the fixed axes x, y, z) in the frame of the pose. Arrays are float64 and functions broadcast
-over leading dimensions.
-
-What lies on the way from measurement to pose gives the same bits for an item alone as for the same item in a batch,
-so that a live stream, its replay and later processing agree exactly.
+(x, y, z, rotation about the fixed axes x, y, z) in the frame of the pose. Arrays are float64; functions broadcast over
+leading dimensions. Whatever lies between measurement and pose gives the same bits for an item alone as for the same
+item in a batch: live stream, replay and post-processing agree exactly.
 """
 
 from tsgt.geometry.alignment import Alignment, BatchAlignment, align, align_many, align_triplets
@@ -16,7 +18,7 @@ from tsgt.geometry.interpolation import (
     interpolate,
     interpolate_prisms,
     interpolated_covariance,
-    unseen_s2,
+    interpolation_error_s2,
 )
 from tsgt.geometry.polar import (
     cartesian_jacobian,
@@ -30,10 +32,10 @@ from tsgt.geometry.polar import (
 from tsgt.geometry.pose import (
     Poses,
     check_layout,
+    interpolation_error_covariance,
     pose_covariance,
     poses_from_prisms,
     twists,
-    unseen_motion_covariance,
 )
 from tsgt.geometry.rigid import (
     FloatArray,
@@ -48,21 +50,21 @@ from tsgt.geometry.rigid import (
     transform_from,
     transform_points,
 )
-from tsgt.geometry.trajectory.fixed_lag import FixedLag
+from tsgt.geometry.trajectory.fixed_lag import FixedLagSmoother
 from tsgt.geometry.trajectory.measurement_factors import Observations
-from tsgt.geometry.trajectory.query import Trajectory, of_point, ros_covariance, with_curvature
-from tsgt.geometry.trajectory.states import Knots, joined
+from tsgt.geometry.trajectory.query import Trajectory, ros_covariance, state_at_point, with_second_order_terms
+from tsgt.geometry.trajectory.states import States, concatenate_states
 
 __all__ = [
     "NO_GAP_NS",
     "Alignment",
     "BatchAlignment",
-    "FixedLag",
+    "FixedLagSmoother",
     "FloatArray",
     "Interpolated",
-    "Knots",
     "Observations",
     "Poses",
+    "States",
     "Trajectory",
     "align",
     "align_many",
@@ -71,16 +73,17 @@ __all__ = [
     "cartesian_to_polar",
     "check_layout",
     "check_transform",
+    "concatenate_states",
     "corrected_distance",
     "exp_so3",
     "interpolate",
     "interpolate_prisms",
     "interpolated_covariance",
+    "interpolation_error_covariance",
+    "interpolation_error_s2",
     "invert",
-    "joined",
     "log_so3",
     "measurement_covariance",
-    "of_point",
     "polar_jacobian",
     "polar_to_cartesian",
     "pose_covariance",
@@ -91,10 +94,9 @@ __all__ = [
     "rotate",
     "rotation_from_quaternion",
     "skew",
+    "state_at_point",
     "transform_from",
     "transform_points",
     "twists",
-    "unseen_motion_covariance",
-    "unseen_s2",
-    "with_curvature",
+    "with_second_order_terms",
 ]

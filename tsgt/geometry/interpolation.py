@@ -179,7 +179,7 @@ def interpolated_covariance(
     return covariance
 
 
-def unseen_s2(fraction: FloatArray, gap_ns: NDArray[np.int64]) -> FloatArray:
+def interpolation_error_s2(fraction: FloatArray, gap_ns: NDArray[np.int64]) -> FloatArray:
     """By how much the straight line misses the path, per unit of acceleration: t_before t_after / 2.
 
     Parameters

@@ -116,7 +116,7 @@ def pose_covariance(layout: FloatArray, rotation: FloatArray, prism_covariances:
     return 0.5 * (covariance + covariance.swapaxes(1, 2))
 
 
-def unseen_motion_covariance(
+def interpolation_error_covariance(
     layout: FloatArray,
     rotation: FloatArray,
     unseen: FloatArray,
@@ -138,7 +138,7 @@ def unseen_motion_covariance(
         ``R_world_robot`` of the poses, shape (N, 3, 3).
     unseen
         By how much each prism's interpolation misses per unit of acceleration, in s^2, shape (N, P): see
-        :func:`tsgt.geometry.unseen_s2`.
+        :func:`tsgt.geometry.interpolation_error_s2`.
     acceleration_sigma_mps2
         One sigma, per axis, of the acceleration of the prisms' centroid.
     angular_acceleration_sigma_radps2

@@ -281,7 +281,7 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     return product
 
 
-def apply(matrix: FloatArray, vector: FloatArray) -> FloatArray:
+def matvec(matrix: FloatArray, vector: FloatArray) -> FloatArray:
     """Products of matrices and vectors, (..., 3); as :func:`~tsgt.geometry.rigid.rotate`, a few in a third of its time.
 
     It rounds as the matrices lie in memory, so that the same ones taken from elsewhere may give other bits.
@@ -290,7 +290,7 @@ def apply(matrix: FloatArray, vector: FloatArray) -> FloatArray:
     return product
 
 
-def log_of_steps(R: FloatArray) -> FloatArray:
+def fast_log_so3(R: FloatArray) -> FloatArray:
     """Rotation vectors of rotations that are mostly small, (..., 3); as :func:`~tsgt.geometry.rigid.log_so3`, but faster."""
     cosine = 0.5 * (R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1.0)
     if (cosine < _WELL_BELOW_A_RIGHT_ANGLE).any():

@@ -20,8 +20,8 @@ from tsgt.geometry import (
     transform_from,
     transform_points,
     twists,
-    unseen_motion_covariance,
-    unseen_s2,
+    interpolation_error_covariance,
+    interpolation_error_s2,
 )
 from tsgt.model import TRACKING_NOISE
 
@@ -63,7 +63,7 @@ def fitted(count: int) -> Callable[[Items], Results]:
             quaternion_from_rotation(poses.rotation),
             pose_covariance(layout, poses.rotation, COVARIANCES[items, :count]),
             *twists(layout, poses.rotation, VELOCITIES[items, :count]),
-            unseen_motion_covariance(
+            interpolation_error_covariance(
                 layout,
                 poses.rotation,
                 np.abs(VELOCITIES[items, :count, 0]),
@@ -90,7 +90,7 @@ def interpolated(items: Items) -> Results:
     covariance = interpolated_covariance(
         COVARIANCES[found.after % N, 0], COVARIANCES[found.after - 1, 1], found.fraction
     )
-    unseen = unseen_s2(found.fraction, found.gap_ns)
+    unseen = interpolation_error_s2(found.fraction, found.gap_ns)
     return found.points, found.velocities_mps, found.fraction, covariance, unseen
 
 

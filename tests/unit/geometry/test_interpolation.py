@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tsgt.errors import GeometryError
-from tsgt.geometry import NO_GAP_NS, interpolate, interpolate_prisms, interpolated_covariance, unseen_s2
+from tsgt.geometry import NO_GAP_NS, interpolate, interpolate_prisms, interpolated_covariance, interpolation_error_s2
 
 SECOND_NS = 1_000_000_000
 START_NS = 1_647_269_269_671_000_000
@@ -129,7 +129,7 @@ def test_covariance_matches_monte_carlo_of_a_curved_path() -> None:
     truth = acceleration * (fraction * gap_s) ** 2 / 2
     errors = before + fraction * (after - before) - truth
     noise = interpolated_covariance(covariances[:1], covariances[1:], np.array([fraction]))[0]
-    unseen_m = acceleration_sigma * unseen_s2(np.array([fraction]), np.array([800_000_000]))[0]
+    unseen_m = acceleration_sigma * interpolation_error_s2(np.array([fraction]), np.array([800_000_000]))[0]
     predicted = noise + unseen_m**2 * np.eye(3)
     # Whitened, the sample covariance is the identity; with 20000 draws its entries scatter by 0.01.
     whitening = np.linalg.inv(np.linalg.cholesky(predicted))
@@ -141,4 +141,4 @@ def test_covariance_on_a_sample_is_that_sample() -> None:
     before, after = np.diag([1.0, 2, 3])[None], np.diag([4.0, 5, 6])[None]
     found = interpolated_covariance(before, after, np.array([1.0]))
     np.testing.assert_array_equal(found, after)
-    assert unseen_s2(np.array([1.0]), np.array([SECOND_NS]))[0] == 0.0
+    assert interpolation_error_s2(np.array([1.0]), np.array([SECOND_NS]))[0] == 0.0

@@ -1,12 +1,17 @@
-"""TODO face."""
+"""Calibration of station frames, latencies and prism positions. Sans-I/O.
 
-from tsgt.geometry.calibration.frame_fit import Fit, Name, Pairs, PointSet, fit_frame
+In: points with covariances known in two frames (``targets``, ``frame_fit``), or the polar measurements of a moving robot
+(``motion*``, ``observability``, ``timestamp_drift``). Out: rigid transforms, latencies and prism positions, each with a
+covariance, rejected points, and the directions that the data leave unobservable.
+"""
+
+from tsgt.geometry.calibration.frame_fit import FrameFit, PointName, PointPairs, PointSet, fit_frame
 from tsgt.geometry.calibration.motion import MotionCalibration, calibrate_motion
 from tsgt.geometry.calibration.motion_initialisation import frames_from_motion
-from tsgt.geometry.calibration.motion_parameters import Setup, Unknowns
-from tsgt.geometry.calibration.observability import Undetermined, undetermined
+from tsgt.geometry.calibration.motion_parameters import Setup, SetupPrior
+from tsgt.geometry.calibration.observability import UnobservableDirection, unobservable_directions
 from tsgt.geometry.calibration.targets import (
-    FALSE_ALARM,
+    FALSE_ALARM_RATE,
     MIN_POINTS,
     STATION_LIMITS,
     FrameCalibration,
@@ -17,24 +22,24 @@ from tsgt.geometry.calibration.targets import (
 )
 
 __all__ = [
-    "FALSE_ALARM",
+    "FALSE_ALARM_RATE",
     "MIN_POINTS",
     "STATION_LIMITS",
-    "Fit",
     "FrameCalibration",
+    "FrameFit",
     "MotionCalibration",
-    "Name",
-    "Pairs",
+    "PointName",
+    "PointPairs",
     "PointSet",
     "PrismCalibration",
     "Setup",
-    "Undetermined",
-    "Unknowns",
+    "SetupPrior",
+    "UnobservableDirection",
     "WeakAxis",
     "calibrate_frame",
     "calibrate_motion",
     "calibrate_prisms",
     "fit_frame",
     "frames_from_motion",
-    "undetermined",
+    "unobservable_directions",
 ]

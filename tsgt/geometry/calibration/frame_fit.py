@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from tsgt.geometry.rigid import FloatArray
 
-Name = int | str
+PointName = int | str
 
 STEPS_MAX = 20
 STEP_DONE = 1e-10  # m and rad: far below any instrument, well above rounding at 100 m
@@ -40,7 +40,7 @@ class PointSet:
         (n, 3, 3) covariances in the same frame in m^2; may be zero.
     """
 
-    names: tuple[Name, ...]
+    names: tuple[PointName, ...]
     points_m: FloatArray
     covariances_m2: FloatArray
 
@@ -58,14 +58,14 @@ class PointSet:
         if not (np.isfinite(self.points_m).all() and np.isfinite(self.covariances_m2).all()):
             raise GeometryError("expected finite coordinates and covariances, got NaN or infinity")
 
-    def select(self, names: Sequence[Name]) -> PointSet:
+    def select(self, names: Sequence[PointName]) -> PointSet:
         """Take the points with these names, in this order."""
         rows = [self.names.index(name) for name in names]
         return PointSet(tuple(names), self.points_m[rows], self.covariances_m2[rows])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Pairs:
+class PointPairs:
     """The same points in both frames, in the same order, and what is to be solved from them.
 
     Attributes
@@ -81,15 +81,15 @@ class Pairs:
     levelled: bool
 
     @property
-    def names(self) -> tuple[Name, ...]:
+    def names(self) -> tuple[PointName, ...]:
         """Names of the points."""
         return self.source.names
 
-    def only(self, *names: Name) -> Pairs:
+    def only(self, *names: PointName) -> PointPairs:
         """Keep the points with these names, in this order."""
-        return Pairs(self.source.select(names), self.target.select(names), self.levelled)
+        return PointPairs(self.source.select(names), self.target.select(names), self.levelled)
 
-    def without(self, *names: Name) -> Pairs:
+    def without(self, *names: PointName) -> PointPairs:
         """Leave out the points with these names."""
         return self.only(*(name for name in self.names if name not in names))
 
@@ -105,7 +105,7 @@ class Pairs:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fit:
+class FrameFit:
     """A rigid transform from source to target.
 
     Attributes
@@ -121,26 +121,26 @@ class Fit:
     translation_m: FloatArray
     covariance: FloatArray
 
-    def misses_m(self, pairs: Pairs) -> FloatArray:
+    def residuals_m(self, pairs: PointPairs) -> FloatArray:
         """(n, 3) target minus transformed source in m."""
         moved = pairs.source.points_m @ self.rotation.T + self.translation_m
         misses: FloatArray = pairs.target.points_m - moved
         return misses
 
-    def noise_m2(self, pairs: Pairs) -> FloatArray:
+    def residual_covariances_m2(self, pairs: PointPairs) -> FloatArray:
         """(n, 3, 3) covariance of the misses from the noise of both points, in m^2."""
         noise: FloatArray = (
             self.rotation @ pairs.source.covariances_m2 @ self.rotation.T + pairs.target.covariances_m2
         )
         return noise
 
-    def misfit(self, pairs: Pairs) -> float:
+    def chi_squared(self, pairs: PointPairs) -> float:
         """Sum of the squared misses over their noise; chi squared if the noise is as stated."""
-        misses = self.misses_m(pairs)[:, :, None]
-        return float(np.sum(misses * np.linalg.solve(self.noise_m2(pairs), misses)))
+        misses = self.residuals_m(pairs)[:, :, None]
+        return float(np.sum(misses * np.linalg.solve(self.residual_covariances_m2(pairs), misses)))
 
 
-def fit_frame(pairs: Pairs, *, weighted: bool) -> Fit:
+def fit_frame(pairs: PointPairs, *, weighted: bool) -> FrameFit:
     """Fit by Gauss-Newton on the rigid transforms, from Arun's solution.
 
     Parameters
@@ -167,41 +167,45 @@ def fit_frame(pairs: Pairs, *, weighted: bool) -> Fit:
     covariance says how little it is worth.
     """
     start = _start(pairs)
-    noise = start.noise_m2(pairs)
+    noise = start.residual_covariances_m2(pairs)
     if weighted:
         weights = np.asarray(np.linalg.inv(noise), dtype=np.float64)
         fit = start
         for _ in range(STEPS_MAX):
             step, covariance = _step(fit, pairs, weights, noise)
-            fit = Fit(exp_so3(step[3:]) @ fit.rotation, fit.translation_m + step[:3], covariance)
+            fit = FrameFit(exp_so3(step[3:]) @ fit.rotation, fit.translation_m + step[:3], covariance)
             if np.abs(step).max() < STEP_DONE:
                 return fit
     _, covariance = _step(start, pairs, np.eye(3), noise)
-    return Fit(start.rotation, start.translation_m, covariance)
+    return FrameFit(start.rotation, start.translation_m, covariance)
 
 
-def _step(fit: Fit, pairs: Pairs, weights: FloatArray, noise_m2: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _step(
+    fit: FrameFit, pairs: PointPairs, weights: FloatArray, residual_covariances_m2: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Gauss-Newton step (6,) of (translation, rotation), and the covariance (6, 6) of an optimum found here."""
     free = pairs.unknowns
     jacobian = pose_jacobian(pairs.source.points_m @ fit.rotation.T)[:, :, free]
     projected = jacobian.transpose(0, 2, 1) @ weights
     inverse = np.linalg.inv(np.sum(projected @ jacobian, axis=0))
     step = np.zeros(6)
-    step[free] = inverse @ np.sum(projected @ fit.misses_m(pairs)[:, :, None], axis=0)[:, 0]
+    step[free] = inverse @ np.sum(projected @ fit.residuals_m(pairs)[:, :, None], axis=0)[:, 0]
     # Right for any weights; those of the noise itself leave the inverse alone.
-    spread = inverse @ np.sum(projected @ noise_m2 @ projected.transpose(0, 2, 1), axis=0) @ inverse
+    spread = (
+        inverse @ np.sum(projected @ residual_covariances_m2 @ projected.transpose(0, 2, 1), axis=0) @ inverse
+    )
     covariance = np.zeros((6, 6))
     covariance[np.ix_(free, free)] = (spread + spread.T) / 2
     return step, covariance
 
 
-def _start(pairs: Pairs) -> Fit:
+def _start(pairs: PointPairs) -> FrameFit:
     """Align without weights: Arun's solution, or for levelled instruments its two-dimensional form about the vertical."""
     nothing = np.zeros((6, 6))
     source, target = pairs.source.points_m, pairs.target.points_m
     if not pairs.levelled:
         aligned = align(source, target)
-        return Fit(aligned.rotation, aligned.translation_m, nothing)
+        return FrameFit(aligned.rotation, aligned.translation_m, nothing)
     a, b = source - source.mean(axis=0), target - target.mean(axis=0)
     cosine = float(np.sum(a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1]))
     sine = float(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]))
@@ -212,7 +216,7 @@ def _start(pairs: Pairs) -> Fit:
             "add points beside them"
         )
     rotation = exp_so3(np.array([0.0, 0.0, np.arctan2(sine, cosine)]))
-    return Fit(rotation, target.mean(axis=0) - rotation @ source.mean(axis=0), nothing)
+    return FrameFit(rotation, target.mean(axis=0) - rotation @ source.mean(axis=0), nothing)
 
 
 def pose_jacobian(rotated_m: FloatArray) -> FloatArray:

@@ -15,34 +15,42 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from tsgt.errors import GeometryError
-from tsgt.geometry.calibration.motion_parameters import Setup, Unknowns, UnknownSetup, bends
+from tsgt.geometry.calibration.motion_parameters import Setup, SetupParameters, SetupPrior, deformation_modes
 from tsgt.geometry.calibration.timestamp_drift import Part, allowed_for, likely_wander_s
 from tsgt.geometry.rigid import rotate
-from tsgt.geometry.trajectory import LEAST_STEP_S, STATE, first_guess, knot_times, scaled, solve, tune
+from tsgt.geometry.trajectory import (
+    MIN_KNOT_SPACING_S,
+    STATE_DIM,
+    initial_guess,
+    knot_times,
+    scale_noise,
+    solve,
+    tune,
+)
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from tsgt.geometry.rigid import FloatArray
-    from tsgt.geometry.trajectory import Knots, Observations, Solution
+    from tsgt.geometry.trajectory import Observations, Solution, States
 
-PIECE_S = 40.0
+SEGMENT_S = 40.0
 """A recording is taken as trajectories of this length: memory stays bounded, and pieces that contradict each other show.
 Their ends tell a little less."""
 
-MOST_GAP_S = 5.0
+MAX_GAP_S = 5.0
 """Where all stations are silent for longer, a piece ends: nothing of a robot's motion lasts that long, and a trajectory that
 nothing holds may not be found at all."""
 
-LEAST_MEASUREMENTS = 30
+MIN_MEASUREMENTS = 30
 """A piece with fewer is left out."""
 
-MOST_STEPS = 30
-SETTLED = 1e-3
+MAX_ITERATIONS = 30
+STEP_TOLERANCE = 1e-3
 """Squared length of a step in sigmas of the set-up: shorter ones end the search."""
 
-COARSE_SCALES = (20.0, 4.0)
+COARSE_NOISE_SCALES = (20.0, 4.0)
 """Noise is taken to be so many times larger at first, so that a wrong set-up does not make everything an outlier."""
 
 
@@ -60,7 +68,7 @@ class MotionCalibration:
         What was looked for, about the set-up that it began with: with levelled stations that which was given without tilts.
     covariance
         (G, G) of the unknowns in their order, given all measurements and what was known beforehand, times the square of
-        ``disagreement``.
+        ``birge_ratio``.
     disagreement
         1, or how many times more than noise and wandering time stamps explain the pieces of the recording contradict each
         other: a tripod that sinks.
@@ -75,11 +83,11 @@ class MotionCalibration:
         How many were used, and how many of these lie further out than noise explains.
     """
 
-    was: Setup
+    initial: Setup
     setup: Setup
-    unknowns: UnknownSetup
+    unknowns: SetupParameters
     covariance: FloatArray
-    disagreement: float
+    birge_ratio: float
     wander_s: float
     prior: MotionPrior
     noise_scale: float
@@ -88,14 +96,14 @@ class MotionCalibration:
 
     def corrections(self) -> tuple[FloatArray, FloatArray]:
         """How far each station's frame has moved, (S, 3) at the pivot in m, and turned, (S, 3) in rad."""
-        return self.setup.corrections(self.was, self.unknowns.pivot)
+        return self.setup.corrections(self.initial, self.unknowns.pivot)
 
     def prism_sigmas_m(self) -> FloatArray:
         """(P, 3) one sigma of each prism against the others, 0 where they are held."""
         places = self.unknowns.prisms
         if not len(places):
             return np.zeros_like(self.setup.layout)
-        by_unknown = bends(self.setup.layout)
+        by_unknown = deformation_modes(self.setup.layout)
         covariance = by_unknown @ self.covariance[np.ix_(places, places)] @ by_unknown.T
         return np.sqrt(np.diag(covariance)).reshape(-1, 3)
 
@@ -116,13 +124,13 @@ class _Piece:
     """One stretch of measurements, and where its trajectory was last."""
 
     observations: Observations
-    knots: Knots | None = None
+    knots: States | None = None
     latencies_s: FloatArray | float = 0.0
 
 
 def calibrate_motion(
     observations: Observations,
-    known: Unknowns,
+    known: SetupPrior,
     *,
     start: Setup | None = None,
     prior: MotionPrior | None = None,
@@ -149,37 +157,37 @@ def calibrate_motion(
     GeometryError
         Nothing to find, or the measurements do not determine a trajectory.
     """
-    was = setup = Setup.of(observations) if start is None else start
-    unknowns = UnknownSetup.of(setup.applied(observations), setup, known)
-    if known.levelled and known.shift_sigma_m > 0:
+    initial = setup = Setup.of(observations) if start is None else start
+    unknowns = SetupParameters.of(setup.applied(observations), setup, known)
+    if known.levelled and known.translation_sigma_m > 0:
         setup = setup.levelled(unknowns.pivot, unknowns.stations)
-        unknowns = replace(unknowns, began=setup)
+        unknowns = replace(unknowns, reference=setup)
     tell = on_progress or (lambda _: None)
     coarse = MotionPrior() if prior is None else prior
-    for scale in COARSE_SCALES:
+    for scale in COARSE_NOISE_SCALES:
         tell(f"coarse, noise times {scale:g}")
-        setup, _ = _search(_pieces(scaled(observations, scale)), unknowns, setup, coarse)
+        setup, _ = _search(_pieces(scale_noise(observations, scale)), unknowns, setup, coarse)
     if prior is None:
         tell("how the robot moves")
         tuned = tune(setup.applied(observations), noise_scale=noise_scale)
         prior, noise_scale = tuned.prior, tuned.noise_scale
     noise_scale = 1.0 if noise_scale is None else noise_scale
     tell("fine")
-    pieces = _pieces(scaled(observations, noise_scale))
+    pieces = _pieces(scale_noise(observations, noise_scale))
     setup, system = _search(pieces, unknowns, setup, prior)
-    beforehand = _known(unknowns, unknowns.away(setup))
+    beforehand = _known(unknowns, unknowns.local_coordinates(setup))
     wander_s = likely_wander_s(system.parts, beforehand, unknowns.latencies)
     if wander_s > 0:
         tell(f"time stamps that wander by {1e3 * wander_s:.1f} ms")
         setup, system = _search(pieces, unknowns, setup, prior, wander_s=wander_s)
-    disagreement = _disagreement(system.parts, unknowns)
+    birge_ratio = _disagreement(system.parts, unknowns)
     covariance = np.asarray(np.linalg.inv(system.information), np.float64)
     return MotionCalibration(
-        was,
+        initial,
         setup,
         unknowns,
-        covariance * disagreement**2,
-        disagreement,
+        covariance * birge_ratio**2,
+        birge_ratio,
         wander_s,
         prior,
         noise_scale,
@@ -188,7 +196,7 @@ def calibrate_motion(
     )
 
 
-def _disagreement(parts: list[Part], unknowns: UnknownSetup) -> float:
+def _disagreement(parts: list[Part], unknowns: SetupParameters) -> float:
     """Ratio of what pieces contradict each other by to what noise explains (R. T. Birge, Physical Review 40, 1932)."""
     count = len(unknowns.sigmas)
     squared, expected = 0.0, -float(count)
@@ -201,17 +209,22 @@ def _disagreement(parts: list[Part], unknowns: UnknownSetup) -> float:
 
 
 def _search(
-    pieces: list[_Piece], unknowns: UnknownSetup, setup: Setup, prior: MotionPrior, *, wander_s: float = 0.0
+    pieces: list[_Piece],
+    unknowns: SetupParameters,
+    setup: Setup,
+    prior: MotionPrior,
+    *,
+    wander_s: float = 0.0,
 ) -> tuple[Setup, _System]:
     """Gauss and Newton's method with Levenberg's damping."""
     system = _assemble(pieces, unknowns, setup, prior, wander_s)
     damping = 0.0
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_ITERATIONS):
         information = system.information + damping * np.diag(np.diag(system.information))
         move = np.asarray(np.linalg.solve(information, -system.gradient), np.float64)
-        if float(move @ system.information @ move) < SETTLED:
+        if float(move @ system.information @ move) < STEP_TOLERANCE:
             break
-        following = unknowns.moved(setup, move)
+        following = unknowns.retract(setup, move)
         tried = _assemble(pieces, unknowns, following, prior, wander_s)
         # Which knots there are changes with the latencies, and with it the cost, by next to nothing.
         if tried.cost <= system.cost + 1e-4 * abs(system.cost) + 0.1:
@@ -226,29 +239,29 @@ def _search(
 
 def _pieces(observations: Observations) -> list[_Piece]:
     time_s = observations.time_s
-    count = max(1, round(float(time_s[-1] - time_s[0]) / PIECE_S)) if len(time_s) else 0
+    count = max(1, round(float(time_s[-1] - time_s[0]) / SEGMENT_S)) if len(time_s) else 0
     edges = np.linspace(time_s[0], time_s[-1], count + 1)[1:-1] if count else ()
-    ends = np.concatenate([np.searchsorted(time_s, edges), np.flatnonzero(np.diff(time_s) > MOST_GAP_S) + 1])
+    ends = np.concatenate([np.searchsorted(time_s, edges), np.flatnonzero(np.diff(time_s) > MAX_GAP_S) + 1])
     rows = np.split(np.arange(len(time_s)), np.unique(ends).astype(np.intp))
-    found = [_Piece(observations.select(some)) for some in rows if len(some) >= LEAST_MEASUREMENTS]
+    found = [_Piece(observations.select(some)) for some in rows if len(some) >= MIN_MEASUREMENTS]
     usable = [piece for piece in found if len(np.unique(piece.observations.prism)) >= 3]
     if not usable:
         raise GeometryError(
-            f"too few measurements to calibrate with: no {PIECE_S:.0f} s of them have {LEAST_MEASUREMENTS}, "
+            f"too few measurements to calibrate with: no {SEGMENT_S:.0f} s of them have {MIN_MEASUREMENTS}, "
             "of at least 3 prisms"
         )
     return usable
 
 
-def _known(unknowns: UnknownSetup, away: FloatArray) -> Part:
+def _known(unknowns: SetupParameters, away: FloatArray) -> Part:
     """Give what is known beforehand of a set-up that is so far away from that."""
     return Part(np.diag(unknowns.sigmas**-2.0), away / unknowns.sigmas**2)
 
 
 def _assemble(
-    pieces: list[_Piece], unknowns: UnknownSetup, setup: Setup, prior: MotionPrior, wander_s: float
+    pieces: list[_Piece], unknowns: SetupParameters, setup: Setup, prior: MotionPrior, wander_s: float
 ) -> _System:
-    away = unknowns.away(setup)
+    away = unknowns.local_coordinates(setup)
     information, gradient = _known(unknowns, away)
     cost, measurements, outliers = float(away @ gradient), 0, 0
     parts = []
@@ -274,10 +287,10 @@ def _assemble(
 def _solved(piece: _Piece, observations: Observations, setup: Setup, prior: MotionPrior) -> Solution:
     knots = piece.knots
     # While the times have hardly moved the knots of the last step are near enough, and begin closer to the solution.
-    if knots is None or np.abs(setup.latencies_s - piece.latencies_s).max() > LEAST_STEP_S / 2:
-        knots = first_guess(observations, knot_times(observations.time_s))
+    if knots is None or np.abs(setup.latencies_s - piece.latencies_s).max() > MIN_KNOT_SPACING_S / 2:
+        knots = initial_guess(observations, knot_times(observations.time_s))
         piece.latencies_s = setup.latencies_s
-    solution = solve(observations, knots, prior, hopeless_heard=True)
+    solution = solve(observations, knots, prior, reject_outliers=False)
     piece.knots = solution.knots
     return solution
 
@@ -291,7 +304,7 @@ def _normal_equations(
     whiten *= np.sqrt(solution.weights)[:, None, None]
     residuals = rotate(whiten, linearised.residuals_m)
     by_state, by_setup = whiten @ linearised.jacobian, whiten @ by_setup
-    mixed = np.zeros((len(solution.knots), STATE, by_setup.shape[2]))
+    mixed = np.zeros((len(solution.knots), STATE_DIM, by_setup.shape[2]))
     np.add.at(mixed, solution.at, np.swapaxes(by_state, 1, 2) @ by_setup)
     flat = by_setup.reshape(-1, by_setup.shape[2])
     return flat.T @ flat, mixed, flat.T @ residuals.ravel()

@@ -67,15 +67,15 @@ def frames_from_motion(observations: Observations) -> FloatArray:
     ]
     pairs = [_Pair.of(a, b, tracks, observations.layout) for a, b in combinations(range(len(tracks)), 2)]
 
-    def misses_m(unknowns: FloatArray) -> FloatArray:
+    def residuals_m(unknowns: FloatArray) -> FloatArray:
         placed = [tracks[0].points_m] + [
             _placed(track.points_m, four)
             for track, four in zip(tracks[1:], unknowns.reshape(-1, 4), strict=True)
         ]
-        return np.concatenate([pair.misses_m(placed) for pair in pairs])
+        return np.concatenate([pair.residuals_m(placed) for pair in pairs])
 
     found = least_squares(
-        misses_m,
+        residuals_m,
         np.concatenate(start),
         loss="soft_l1",
         f_scale=LOSS_M,
@@ -103,7 +103,7 @@ class _Pair(NamedTuple):
         arms = layout[tracks[a].prism[epochs]] - layout[tracks[b].prism[epochs]]
         return cls(a, b, epochs, np.linalg.norm(arms, axis=1))
 
-    def misses_m(self, placed: list[FloatArray]) -> FloatArray:
+    def residuals_m(self, placed: list[FloatArray]) -> FloatArray:
         apart: FloatArray = np.linalg.norm(placed[self.a][self.epochs] - placed[self.b][self.epochs], axis=1)
         return apart - self.apart_m
 

@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.geometry.rigid import FloatArray
-    from tsgt.geometry.trajectory import Linearised, Observations
+    from tsgt.geometry.trajectory import LinearisedMeasurements, Observations
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Unknowns:
+class SetupPrior:
     """What to find, and what is known of it before the motion is looked at: one sigma each, 0 for what is held.
 
     Attributes
@@ -40,8 +40,8 @@ class Unknowns:
         Of each coordinate of a prism on the robot.
     """
 
-    shift_sigma_m: float = 0.0
-    turn_sigma_rad: float = 0.0
+    translation_sigma_m: float = 0.0
+    rotation_sigma_rad: float = 0.0
     levelled: bool = False
     latency_sigma_s: float = 0.0
     prism_sigma_m: float = 0.0
@@ -99,7 +99,7 @@ class Setup:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class UnknownSetup:
+class SetupParameters:
     """The unknowns as a vector of G numbers.
 
     Attributes
@@ -121,17 +121,17 @@ class UnknownSetup:
         (G,) what is known beforehand.
     """
 
-    began: Setup
+    reference: Setup
     pivot: FloatArray
     stations: NDArray[np.intp]
-    shifts: NDArray[np.intp]
-    turns: NDArray[np.intp]
+    translations: NDArray[np.intp]
+    rotations: NDArray[np.intp]
     latencies: NDArray[np.intp]
     prisms: NDArray[np.intp]
     sigmas: FloatArray
 
     @classmethod
-    def of(cls, observations: Observations, setup: Setup, known: Unknowns) -> UnknownSetup:
+    def of(cls, observations: Observations, setup: Setup, known: SetupPrior) -> SetupParameters:
         """Count the unknowns of a set-up that observations have.
 
         Raises
@@ -155,30 +155,30 @@ class UnknownSetup:
             sigmas.extend(wanted)
             return np.arange(len(sigmas) - len(wanted), len(sigmas))
 
-        frames = stations if known.shift_sigma_m > 0 else stations[:0]
+        frames = stations if known.translation_sigma_m > 0 else stations[:0]
         turning = 1 if known.levelled else 3
-        shifts = [take([known.shift_sigma_m] * 3) for _ in frames]
-        turns = [take([known.turn_sigma_rad] * turning) for _ in frames]
+        translations = [take([known.translation_sigma_m] * 3) for _ in frames]
+        rotations = [take([known.rotation_sigma_rad] * turning) for _ in frames]
         latencies = take([known.latency_sigma_s] * len(stations) if known.latency_sigma_s > 0 else [])
         free = max(3 * len(setup.layout) - 6, 0) if known.prism_sigma_m > 0 else 0
         prisms = take([known.prism_sigma_m] * free)
         if not sigmas:
             raise GeometryError("nothing to find: frames, latencies and prisms are all held")
         return cls(
-            began=setup,
+            reference=setup,
             pivot=observations.in_world().mean(axis=0),
             stations=stations,
-            shifts=np.array(shifts, np.intp).reshape(-1, 3),
-            turns=np.array(turns, np.intp).reshape(-1, turning),
+            translations=np.array(translations, np.intp).reshape(-1, 3),
+            rotations=np.array(rotations, np.intp).reshape(-1, turning),
             latencies=latencies,
             prisms=prisms,
             sigmas=np.array(sigmas),
         )
 
-    def moved(self, setup: Setup, move: FloatArray) -> Setup:
+    def retract(self, setup: Setup, move: FloatArray) -> Setup:
         """Return a set-up with (G,) changes."""
         frames, latencies_s = setup.frames.copy(), setup.latencies_s.copy()
-        for station, shift, turn in zip(self.stations, self.shifts, self.turns, strict=False):
+        for station, shift, turn in zip(self.stations, self.translations, self.rotations, strict=False):
             correction = np.eye(4)
             correction[:3, :3] = exp_so3(about_axes(move[turn]))
             correction[:3, 3] = self.pivot - correction[:3, :3] @ self.pivot + move[shift]
@@ -187,37 +187,43 @@ class UnknownSetup:
             latencies_s[self.stations] += move[self.latencies]
         layout = setup.layout
         if len(self.prisms):
-            layout = layout + (bends(layout) @ move[self.prisms]).reshape(-1, 3)
+            layout = layout + (deformation_modes(layout) @ move[self.prisms]).reshape(-1, 3)
         return Setup(frames, latencies_s, layout)
 
-    def away(self, setup: Setup) -> FloatArray:
+    def local_coordinates(self, setup: Setup) -> FloatArray:
         """(G,) how far a set-up is from the one that it began with."""
         found = np.zeros(len(self.sigmas))
-        shift, turn = setup.corrections(self.began, self.pivot)
-        for station, at_shift, at_turn in zip(self.stations, self.shifts, self.turns, strict=False):
+        shift, turn = setup.corrections(self.reference, self.pivot)
+        for station, at_shift, at_turn in zip(self.stations, self.translations, self.rotations, strict=False):
             found[at_shift] = shift[station]
             found[at_turn] = turn[station][-len(at_turn) :]
         if len(self.latencies):
-            found[self.latencies] = (setup.latencies_s - self.began.latencies_s)[self.stations]
+            found[self.latencies] = (setup.latencies_s - self.reference.latencies_s)[self.stations]
         if len(self.prisms):
-            found[self.prisms] = bends(setup.layout).T @ (setup.layout - self.began.layout).ravel()
+            found[self.prisms] = (
+                deformation_modes(setup.layout).T @ (setup.layout - self.reference.layout).ravel()
+            )
         return found
 
-    def jacobian(self, observations: Observations, linearised: Linearised, setup: Setup) -> FloatArray:
+    def jacobian(
+        self, observations: Observations, linearised: LinearisedMeasurements, setup: Setup
+    ) -> FloatArray:
         """(M, 3, G) how the residuals change with the unknowns."""
         found = np.zeros((len(observations), 3, len(self.sigmas)))
         arms = skew(linearised.point_m - self.pivot)
         for place, station in enumerate(self.stations):
             rows = np.flatnonzero(observations.station == station)
             by_point = linearised.by_point[rows]
-            if len(self.shifts):
-                turns = self.turns[place]
-                found[np.ix_(rows, np.arange(3), self.shifts[place])] = -by_point
-                found[np.ix_(rows, np.arange(3), turns)] = (by_point @ arms[rows])[:, :, -len(turns) :]
+            if len(self.translations):
+                rotations = self.rotations[place]
+                found[np.ix_(rows, np.arange(3), self.translations[place])] = -by_point
+                found[np.ix_(rows, np.arange(3), rotations)] = (by_point @ arms[rows])[
+                    :, :, -len(rotations) :
+                ]
             if len(self.latencies):
                 found[rows, :, self.latencies[place]] = -rotate(by_point, linearised.velocity_mps[rows])
         if len(self.prisms):
-            by_unknown = bends(setup.layout).reshape(-1, 3, len(self.prisms))
+            by_unknown = deformation_modes(setup.layout).reshape(-1, 3, len(self.prisms))
             found[:, :, self.prisms] = (
                 linearised.by_point @ linearised.rotation @ by_unknown[observations.prism]
             )
@@ -229,7 +235,7 @@ def about_axes(turn: FloatArray) -> FloatArray:
     return np.concatenate([np.zeros(3 - len(turn)), turn])
 
 
-def bends(layout: FloatArray) -> FloatArray:
+def deformation_modes(layout: FloatArray) -> FloatArray:
     """(3 P, 3 P - 6) orthonormal displacements of the prisms that no motion of the whole robot makes."""
     centred = layout - layout.mean(axis=0)
     rigid = np.concatenate([np.tile(np.eye(3), (len(layout), 1)), -skew(centred).reshape(-1, 3)], axis=1)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.geometry.calibration.motion_parameters import about_axes, bends
+from tsgt.geometry.calibration.motion_parameters import about_axes, deformation_modes
 from tsgt.geometry.polar import cartesian_to_polar
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ SHARE = 0.2
 
 
 @dataclass(frozen=True, slots=True)
-class Undetermined:
+class UnobservableDirection:
     """A direction in the set-up that the motion left uncertain.
 
     Attributes
@@ -36,16 +36,16 @@ class Undetermined:
         How many times its uncertainty is above the limit.
     """
 
-    sentence: str
+    description: str
     excess: float
 
 
-def undetermined(calibration: MotionCalibration) -> list[Undetermined]:
+def unobservable_directions(calibration: MotionCalibration) -> list[UnobservableDirection]:
     """Name what was not determined, the worst first; empty if everything was."""
     unknowns = calibration.unknowns
     limits = np.empty(len(unknowns.sigmas))
-    limits[unknowns.shifts] = SHIFT_LIMIT_M
-    limits[unknowns.turns] = TURN_LIMIT_RAD
+    limits[unknowns.translations] = SHIFT_LIMIT_M
+    limits[unknowns.rotations] = TURN_LIMIT_RAD
     limits[unknowns.latencies] = LATENCY_LIMIT_S
     limits[unknowns.prisms] = PRISM_LIMIT_M
     limits = np.minimum(limits, 0.5 * unknowns.sigmas)
@@ -55,7 +55,7 @@ def undetermined(calibration: MotionCalibration) -> list[Undetermined]:
         if value <= 1.0:
             break
         excess = float(np.sqrt(value))
-        found.append(Undetermined(_sentence(calibration, vector, excess * limits * vector), excess))
+        found.append(UnobservableDirection(_sentence(calibration, vector, excess * limits * vector), excess))
     return found
 
 
@@ -66,17 +66,17 @@ def _sentence(calibration: MotionCalibration, vector: FloatArray, sigma: FloatAr
     sigma = sigma * (1.0 if vector[np.argmax(np.abs(vector))] >= 0 else -1.0)
     parts: list[tuple[float, str]] = []
     for place, station in enumerate(unknowns.stations):
-        if len(unknowns.shifts):
-            shift, turn = sigma[unknowns.shifts[place]], sigma[unknowns.turns[place]]
+        if len(unknowns.translations):
+            shift, turn = sigma[unknowns.translations[place]], sigma[unknowns.rotations[place]]
             parts.append(
                 (
-                    float(np.linalg.norm(vector[unknowns.shifts[place]])),
+                    float(np.linalg.norm(vector[unknowns.translations[place]])),
                     f"station {station + 1} shifts by {1e3 * np.linalg.norm(shift):.2g} mm {_towards(shift)}",
                 )
             )
             parts.append(
                 (
-                    float(np.linalg.norm(vector[unknowns.turns[place]])),
+                    float(np.linalg.norm(vector[unknowns.rotations[place]])),
                     f"station {station + 1} turns by {1e3 * np.linalg.norm(turn):.2g} mrad about {_towards(about_axes(turn))}",
                 )
             )
@@ -84,7 +84,7 @@ def _sentence(calibration: MotionCalibration, vector: FloatArray, sigma: FloatAr
             late = unknowns.latencies[place]
             parts.append((abs(vector[late]), f"station {station + 1} is late by {1e3 * sigma[late]:.2g} ms"))
     if len(unknowns.prisms):
-        moved = (bends(calibration.setup.layout) @ sigma[unknowns.prisms]).reshape(-1, 3)
+        moved = (deformation_modes(calibration.setup.layout) @ sigma[unknowns.prisms]).reshape(-1, 3)
         weight = float(np.linalg.norm(vector[unknowns.prisms]))
         lengths = np.linalg.norm(moved, axis=1)
         for prism, length in enumerate(lengths):

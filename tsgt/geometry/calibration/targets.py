@@ -18,23 +18,23 @@ import numpy as np
 from scipy.special import chdtri
 
 from tsgt.errors import DegenerateGeometryError, GeometryError
-from tsgt.geometry.calibration.frame_fit import Pairs, PointSet, fit_frame, pose_jacobian
+from tsgt.geometry.calibration.frame_fit import PointPairs, PointSet, fit_frame, pose_jacobian
 from tsgt.geometry.rigid import transform_from, transform_points
 
 if TYPE_CHECKING:
-    from tsgt.geometry.calibration.frame_fit import Name
+    from tsgt.geometry.calibration.frame_fit import PointName
     from tsgt.geometry.rigid import FloatArray
 
-FALSE_ALARM = 1e-4
+FALSE_ALARM_RATE = 1e-4
 """Probability of suspecting any point of a set that is as good as its noise model says."""
 
-SCALE_MAX = 2.0
+MAX_NOISE_SCALE = 2.0
 """How much larger than its model the noise may be (one sigma) before points count as contradictory.
 
 The authors' four sets of field targets show 0.5 to 1.2 times ``tsgt.model.TARGET_NOISE``."""
 
-PREDICTION_LIMIT_M = 0.02
-PREDICTION_LIMIT_RAD = 0.1
+MAX_PREDICTION_SIGMA_M = 0.02
+MAX_PREDICTION_SIGMA_RAD = 0.1
 """Where the others hold a point or the frame to no better than this (one sigma), they are not said to predict it:
 the covariance is of first order and promises too much there."""
 
@@ -80,8 +80,8 @@ class RejectedPoint:
         How far it lies from where the points that were kept predict it, in m.
     """
 
-    name: Name
-    miss_m: float
+    name: PointName
+    prediction_error_m: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +133,7 @@ class FrameCalibration:
 
     T: FloatArray
     covariance: FloatArray
-    used: tuple[Name, ...]
+    used: tuple[PointName, ...]
     residuals_m: FloatArray
     leave_one_out_m: FloatArray
     rejected: tuple[RejectedPoint, ...]
@@ -212,7 +212,7 @@ def calibrate_frame(
             f"expected at least {MIN_POINTS} points known in both frames, got {len(common)} ({listed}); "
             "measure more of them"
         )
-    pairs = Pairs(source.select(common), target.select(common), levelled)
+    pairs = PointPairs(source.select(common), target.select(common), levelled)
     if np.linalg.eigvalsh(pairs.source.covariances_m2).min() <= 0:
         raise GeometryError(
             "expected noise in every direction of every source point, got a singular covariance"
@@ -226,10 +226,11 @@ def calibrate_frame(
         T=transform_from(fit.rotation, fit.translation_m),
         covariance=fit.covariance,
         used=kept.names,
-        residuals_m=np.linalg.norm(fit.misses_m(kept), axis=1),
+        residuals_m=np.linalg.norm(fit.residuals_m(kept), axis=1),
         leave_one_out_m=np.array([np.nan if p is None else p.length_m for p in predictions]),
         rejected=tuple(
-            RejectedPoint(name, float(np.linalg.norm(fit.misses_m(pairs.only(name))))) for name in bad or ()
+            RejectedPoint(name, float(np.linalg.norm(fit.residuals_m(pairs.only(name)))))
+            for name in bad or ()
         ),
         consistent=bad is not None,
         weak=_weak_axes(fit.covariance, kept.target.points_m, limits.weak_rad),
@@ -276,12 +277,14 @@ def calibrate_prisms(body: PointSet, body_cad: PointSet, prisms: PointSet) -> Pr
 class _Prediction:
     """Where one point misses its prediction by the others."""
 
-    miss_m: FloatArray  # (3,)
-    noise_m2: FloatArray  # (3, 3) covariance of the miss: of the prediction and of the point itself
+    prediction_error_m: FloatArray  # (3,)
+    residual_covariances_m2: (
+        FloatArray  # (3, 3) covariance of the miss: of the prediction and of the point itself
+    )
     scale: float  # of the others' scatter to their noise, as variances
 
     @classmethod
-    def of(cls, pairs: Pairs, name: Name, *, weighted: bool) -> _Prediction | None:
+    def of(cls, pairs: PointPairs, name: PointName, *, weighted: bool) -> _Prediction | None:
         """Predict a point from the others; None where they do not hold it."""
         others, point = pairs.without(name), pairs.only(name)
         try:
@@ -291,36 +294,38 @@ class _Prediction:
         jacobian = pose_jacobian(point.source.points_m @ fit.rotation.T)[0]
         spread = jacobian @ fit.covariance @ jacobian.T
         if (
-            np.linalg.eigvalsh(fit.covariance[3:, 3:]).max() > PREDICTION_LIMIT_RAD**2
-            or np.linalg.eigvalsh(spread).max() > PREDICTION_LIMIT_M**2
+            np.linalg.eigvalsh(fit.covariance[3:, 3:]).max() > MAX_PREDICTION_SIGMA_RAD**2
+            or np.linalg.eigvalsh(spread).max() > MAX_PREDICTION_SIGMA_M**2
         ):
             return None
         return cls(
-            miss_m=fit.misses_m(point)[0],
-            noise_m2=fit.noise_m2(point)[0] + spread,
-            scale=fit.misfit(others) / others.redundancy,
+            prediction_error_m=fit.residuals_m(point)[0],
+            residual_covariances_m2=fit.residual_covariances_m2(point)[0] + spread,
+            scale=fit.chi_squared(others) / others.redundancy,
         )
 
     @property
     def length_m(self) -> float:
-        return float(np.linalg.norm(self.miss_m))
+        return float(np.linalg.norm(self.prediction_error_m))
 
     @property
     def implausibility(self) -> float:
         """Squared miss over its noise."""
-        squared = float(self.miss_m @ np.linalg.solve(self.noise_m2, self.miss_m))
+        squared = float(
+            self.prediction_error_m @ np.linalg.solve(self.residual_covariances_m2, self.prediction_error_m)
+        )
         return squared / _noise_scale(self.scale)
 
 
 def _noise_scale(scatter: float) -> float:
     """Factor on the noise model's variances, given what the points scatter among themselves in units of it.
 
-    Where they disagree more than the model says, it is taken to be optimistic by as much, up to ``SCALE_MAX``.
+    Where they disagree more than the model says, it is taken to be optimistic by as much, up to ``MAX_NOISE_SCALE``.
     """
-    return min(max(scatter, 1.0), SCALE_MAX**2)
+    return min(max(scatter, 1.0), MAX_NOISE_SCALE**2)
 
 
-def _suspect(pairs: Pairs, blunder_m: float) -> Name | None:
+def _suspect(pairs: PointPairs, blunder_m: float) -> PointName | None:
     """Name the point that the others contradict most, if they do so beyond chance (chi squared, Bonferroni)."""
     scores = {}
     for name in pairs.names:
@@ -328,19 +333,19 @@ def _suspect(pairs: Pairs, blunder_m: float) -> Name | None:
         if prediction is not None and prediction.length_m >= blunder_m:
             scores[name] = prediction.implausibility
     worst = max(scores, key=lambda name: scores[name], default=None)
-    if worst is None or scores[worst] <= chdtri(3, FALSE_ALARM / len(pairs.names)):
+    if worst is None or scores[worst] <= chdtri(3, FALSE_ALARM_RATE / len(pairs.names)):
         return None
     return worst
 
 
-def _bad_points(pairs: Pairs, blunder_m: float) -> tuple[Name, ...] | None:
+def _bad_points(pairs: PointPairs, blunder_m: float) -> tuple[PointName, ...] | None:
     """Points to leave out, found one at a time; None where it cannot be told which ones are bad.
 
     It cannot be told when leaving out some other point instead would make the rest plausible as well, when
     fewer than four points would remain, when the bad ones come near to half of all, or when the rest disagree
     with their noise although none stands out.
     """
-    bad: list[Name] = []
+    bad: list[PointName] = []
     kept = pairs
     bad_max = (len(pairs.names) - MIN_POINTS) // 2
     while (suspect := _suspect(kept, blunder_m)) is not None:
@@ -349,8 +354,10 @@ def _bad_points(pairs: Pairs, blunder_m: float) -> tuple[Name, ...] | None:
             return None
         bad.append(suspect)
         kept = kept.without(suspect)
-    misfit = fit_frame(kept, weighted=True).misfit(kept)
-    return tuple(bad) if misfit <= SCALE_MAX**2 * chdtri(kept.redundancy, FALSE_ALARM) else None
+    chi_squared = fit_frame(kept, weighted=True).chi_squared(kept)
+    return (
+        tuple(bad) if chi_squared <= MAX_NOISE_SCALE**2 * chdtri(kept.redundancy, FALSE_ALARM_RATE) else None
+    )
 
 
 def _weak_axes(covariance: FloatArray, points_m: FloatArray, limit_rad: float) -> tuple[WeakAxis, ...]:
@@ -364,15 +371,15 @@ def _weak_axes(covariance: FloatArray, points_m: FloatArray, limit_rad: float) -
     return tuple(weak)
 
 
-def _tilt_rad(pairs: Pairs) -> float | None:
+def _tilt_rad(pairs: PointPairs) -> float | None:
     """Angle between the z axes if the points demand one: the misfit then drops by more than two unknowns explain."""
-    free = Pairs(pairs.source, pairs.target, levelled=False)
+    free = PointPairs(pairs.source, pairs.target, levelled=False)
     try:
         tilted = fit_frame(free, weighted=True)
     except DegenerateGeometryError:
         return None  # a line of points cannot tell
-    left = tilted.misfit(free)
-    drop = fit_frame(pairs, weighted=True).misfit(pairs) - left
-    if drop <= chdtri(2, FALSE_ALARM) * _noise_scale(left / free.redundancy):
+    left = tilted.chi_squared(free)
+    drop = fit_frame(pairs, weighted=True).chi_squared(pairs) - left
+    if drop <= chdtri(2, FALSE_ALARM_RATE) * _noise_scale(left / free.redundancy):
         return None
     return float(np.arccos(np.clip(tilted.rotation[2, 2], -1.0, 1.0)))

@@ -1,36 +1,48 @@
-"""TODO face."""
+"""The continuous-time estimator: Gaussian-process regression of a trajectory on polar measurements. Sans-I/O.
 
-from tsgt.geometry.trajectory.batch import Fit, fit
-from tsgt.geometry.trajectory.fixed_lag import FixedLag
-from tsgt.geometry.trajectory.gauss_newton import LEAST_STEP_S, Solution, knot_times, nearest, solve
-from tsgt.geometry.trajectory.hyperparameters import CALMEST, at_least, scaled, tune
-from tsgt.geometry.trajectory.initialisation import first_guess
-from tsgt.geometry.trajectory.measurement_factors import Linearised, Observations, linearise
-from tsgt.geometry.trajectory.query import Trajectory, of_point, ros_covariance, with_curvature
-from tsgt.geometry.trajectory.states import STATE, Knots, joined
+In: :class:`Observations` (measurements with noise, station frames, prism layout) and a motion prior. Out: a
+:class:`Trajectory`, which interpolates states and covariances at any time. :func:`fit_trajectory` solves a whole recording,
+:class:`FixedLagSmoother` works online, :func:`tune` finds the hyperparameters.
+docs/explanation/continuous-trajectory.md derives the equations.
+"""
+
+from tsgt.geometry.trajectory.batch import TrajectoryFit, fit_trajectory
+from tsgt.geometry.trajectory.fixed_lag import FixedLagSmoother
+from tsgt.geometry.trajectory.gauss_newton import (
+    MIN_KNOT_SPACING_S,
+    Solution,
+    knot_times,
+    nearest_knots,
+    solve,
+)
+from tsgt.geometry.trajectory.hyperparameters import NOISE_FLOOR_SHARE, scale_noise, tune, with_noise_floor
+from tsgt.geometry.trajectory.initialisation import initial_guess
+from tsgt.geometry.trajectory.measurement_factors import LinearisedMeasurements, Observations, linearise
+from tsgt.geometry.trajectory.query import Trajectory, ros_covariance, state_at_point, with_second_order_terms
+from tsgt.geometry.trajectory.states import STATE_DIM, States, concatenate_states
 
 __all__ = [
-    "CALMEST",
-    "LEAST_STEP_S",
-    "STATE",
-    "Fit",
-    "FixedLag",
-    "Knots",
-    "Linearised",
+    "MIN_KNOT_SPACING_S",
+    "NOISE_FLOOR_SHARE",
+    "STATE_DIM",
+    "FixedLagSmoother",
+    "LinearisedMeasurements",
     "Observations",
     "Solution",
+    "States",
     "Trajectory",
-    "at_least",
-    "first_guess",
-    "fit",
-    "joined",
+    "TrajectoryFit",
+    "concatenate_states",
+    "fit_trajectory",
+    "initial_guess",
     "knot_times",
     "linearise",
-    "nearest",
-    "of_point",
+    "nearest_knots",
     "ros_covariance",
-    "scaled",
+    "scale_noise",
     "solve",
+    "state_at_point",
     "tune",
-    "with_curvature",
+    "with_noise_floor",
+    "with_second_order_terms",
 ]

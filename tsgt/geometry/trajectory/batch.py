@@ -13,12 +13,18 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from tsgt.geometry.trajectory.gauss_newton import knot_times, nearest, solve
-from tsgt.geometry.trajectory.hyperparameters import CALMEST, at_least, hidden, scaled, tune
-from tsgt.geometry.trajectory.initialisation import Tracks
+from tsgt.geometry.trajectory.gauss_newton import knot_times, nearest_knots, solve
+from tsgt.geometry.trajectory.hyperparameters import (
+    NOISE_FLOOR_SHARE,
+    partially_occluded,
+    scale_noise,
+    tune,
+    with_noise_floor,
+)
+from tsgt.geometry.trajectory.initialisation import PrismTracks
 from tsgt.geometry.trajectory.motion_prior import axis_sigmas
 from tsgt.geometry.trajectory.query import Trajectory
-from tsgt.geometry.trajectory.states import joined
+from tsgt.geometry.trajectory.states import concatenate_states
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:
@@ -35,7 +41,7 @@ OVERLAP = 128
 
 
 @dataclass(frozen=True, slots=True)
-class Fit:
+class TrajectoryFit:
     """A trajectory fitted to measurements.
 
     Attributes
@@ -58,7 +64,7 @@ class Fit:
     observations: Observations
     noise_scale: float
     residuals_m: FloatArray
-    distances: FloatArray
+    squared_distances: FloatArray
     weights: FloatArray
 
     @property
@@ -74,14 +80,14 @@ class _Piece(NamedTuple):
     kept: slice
 
 
-def fit(
+def fit_trajectory(
     observations: Observations,
     *,
     prior: MotionPrior | None = None,
-    while_hidden: MotionPrior | None = None,
+    occluded_prior: MotionPrior | None = None,
     noise_scale: float | None = None,
     on_progress: Callable[[float], None] | None = None,
-) -> Fit:
+) -> TrajectoryFit:
     """Fit a trajectory.
 
     Parameters
@@ -107,15 +113,15 @@ def fit(
         tuned = tune(observations, start=prior, noise_scale=noise_scale, fixed=prior is not None)
         noise_scale = tuned.noise_scale
         if prior is None:
-            prior = at_least(tuned.prior, MotionPrior(), CALMEST)
-            while_hidden = while_hidden or MotionPrior()
-    observations = scaled(observations, noise_scale)
+            prior = with_noise_floor(tuned.prior, MotionPrior(), NOISE_FLOOR_SHARE)
+            occluded_prior = occluded_prior or MotionPrior()
+    observations = scale_noise(observations, noise_scale)
     times_s = knot_times(observations.time_s)
-    at = nearest(times_s, observations.time_s)
-    sigmas = _sigmas(observations, times_s, prior, while_hidden or prior)
+    at = nearest_knots(times_s, observations.time_s)
+    sigmas = _sigmas(observations, times_s, prior, occluded_prior or prior)
     pieces = _pieces(len(times_s))
-    tracks = Tracks.of(observations)
-    knots, covariances, besides, residuals_m, distances, weights = [], [], [], [], [], []
+    tracks = PrismTracks.of(observations)
+    knots, covariances, besides, residuals_m, squared_distances, weights = [], [], [], [], [], []
     for done, piece in enumerate(pieces):
         report(done / len(pieces))
         rows = slice(
@@ -124,36 +130,40 @@ def fit(
         guess = tracks.guess(times_s[piece.solved])
         between = slice(piece.solved.start, piece.solved.stop - 1)
         solution = solve(observations.select(rows), guess, prior, sigmas=sigmas[between])
-        covariance, beside = solution.factor.marginals()
+        covariance, cross_covariance = solution.factor.marginals()
         inner = slice(piece.kept.start - piece.solved.start, piece.kept.stop - piece.solved.start)
         knots.append(solution.knots.select(inner))
         covariances.append(covariance[inner])
-        besides.append(beside[inner])
+        besides.append(cross_covariance[inner])
         kept = slice(*np.searchsorted(at[rows], (piece.kept.start, piece.kept.stop)))
         # Not the whole solution: its factor is as large as all that is kept.
         residuals_m.append(solution.linearised.residuals_m[kept])
-        distances.append(solution.distances[kept])
+        squared_distances.append(solution.squared_distances[kept])
         weights.append(solution.weights[kept])
     report(1.0)
     trajectory = Trajectory(
-        joined(knots), prior, np.concatenate(covariances), np.concatenate(besides)[: len(times_s) - 1], sigmas
+        concatenate_states(knots),
+        prior,
+        np.concatenate(covariances),
+        np.concatenate(besides)[: len(times_s) - 1],
+        sigmas,
     )
-    return Fit(
+    return TrajectoryFit(
         trajectory,
         observations,
         noise_scale,
         np.concatenate(residuals_m),
-        np.concatenate(distances),
+        np.concatenate(squared_distances),
         np.concatenate(weights),
     )
 
 
 def _sigmas(
-    observations: Observations, times_s: FloatArray, prior: MotionPrior, while_hidden: MotionPrior
+    observations: Observations, times_s: FloatArray, prior: MotionPrior, occluded_prior: MotionPrior
 ) -> FloatArray:
     """(K - 1, 6) one sigma of the acceleration of each axis, from knot to knot."""
-    unseen = hidden(observations.time_s, observations.prism, 0.5 * (times_s[:-1] + times_s[1:]))
-    return np.where(unseen[:, None], axis_sigmas(at_least(prior, while_hidden)), axis_sigmas(prior))
+    unseen = partially_occluded(observations.time_s, observations.prism, 0.5 * (times_s[:-1] + times_s[1:]))
+    return np.where(unseen[:, None], axis_sigmas(with_noise_floor(prior, occluded_prior)), axis_sigmas(prior))
 
 
 def _pieces(count: int) -> list[_Piece]:

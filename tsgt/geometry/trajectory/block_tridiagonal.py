@@ -23,7 +23,7 @@ _BLOCKS_AT_ONCE = 64
 
 
 @dataclass(frozen=True, slots=True)
-class BlockFactor:
+class BlockCholesky:
     """The Cholesky factor of a block tridiagonal matrix.
 
     Attributes
@@ -67,18 +67,18 @@ class BlockFactor:
         """
         size, count = self.size, self.banded.shape[1] // self.size
         by_block = self.banded.T.reshape(count, size, 2 * size)
-        diagonal, beside = np.empty((count, size, size)), np.empty((count - 1, size, size))
+        diagonal, off_diagonal = np.empty((count, size, size)), np.empty((count - 1, size, size))
         later: FloatArray | None = None
         for start in range((count - 1) // _BLOCKS_AT_ONCE * _BLOCKS_AT_ONCE, -1, -_BLOCKS_AT_ONCE):
             inverse, below = _inverse_and_below(by_block[start : start + _BLOCKS_AT_ONCE])
             own, gain = np.swapaxes(inverse, 1, 2) @ inverse, np.swapaxes(-below @ inverse, 1, 2)
             for k in range(len(own) - 1, -1, -1):
                 if later is not None:
-                    shared = np.dot(gain[k], later, out=beside[start + k])
+                    shared = np.dot(gain[k], later, out=off_diagonal[start + k])
                     own[k] += np.dot(shared, gain[k].T)
                 later = own[k]
             diagonal[start : start + len(own)] = 0.5 * (own + np.swapaxes(own, 1, 2))
-        return diagonal, beside
+        return diagonal, off_diagonal
 
 
 def _inverse_and_below(by_block: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -94,7 +94,7 @@ def _inverse_and_below(by_block: FloatArray) -> tuple[FloatArray, FloatArray]:
     return inverse, below
 
 
-def factorise(diagonal: FloatArray, beside: FloatArray) -> BlockFactor:
+def factorise(diagonal: FloatArray, off_diagonal: FloatArray) -> BlockCholesky:
     """Factorise.
 
     Parameters
@@ -114,9 +114,9 @@ def factorise(diagonal: FloatArray, beside: FloatArray) -> BlockFactor:
     by_column = np.zeros((count, size, 2 * size))
     for column in range(size):
         by_column[:, column, : size - column] = diagonal[:, column:, column]
-        by_column[:-1, column, size - column : 2 * size - column] = beside[:, column]
+        by_column[:-1, column, size - column : 2 * size - column] = off_diagonal[:, column]
     # LAPACK itself, without what scipy asks about it first: live, there are a dozen systems a second.
     factor, failed = dpbtrf(by_column.reshape(count * size, 2 * size).T, lower=True, overwrite_ab=True)
     if failed:
         raise GeometryError("the measurements do not determine the trajectory")
-    return BlockFactor(factor, size)
+    return BlockCholesky(factor, size)

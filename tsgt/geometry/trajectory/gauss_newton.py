@@ -18,54 +18,60 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from tsgt.geometry.rigid import dot, inverse_right_jacobian
-from tsgt.geometry.trajectory.block_tridiagonal import BlockFactor, factorise
+from tsgt.geometry.trajectory.block_tridiagonal import BlockCholesky, factorise
 from tsgt.geometry.trajectory.measurement_factors import linearise
 from tsgt.geometry.trajectory.motion_prior import axis_sigmas
-from tsgt.geometry.trajectory.states import STATE, Knots, Steps, add_steps, linearise_steps
+from tsgt.geometry.trajectory.states import (
+    STATE_DIM,
+    ProcessFactors,
+    States,
+    add_process_factors,
+    linearise_process,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.geometry.rigid import FloatArray
-    from tsgt.geometry.trajectory.measurement_factors import Linearised, Observations
+    from tsgt.geometry.trajectory.measurement_factors import LinearisedMeasurements, Observations
     from tsgt.model import MotionPrior
 
-LEAST_STEP_S = 0.02
+MIN_KNOT_SPACING_S = 0.02
 """Knots are no closer: within half of this a robot's motion is told by velocity and acceleration."""
 
-OUTLYING = 4.0
+OUTLIER_THRESHOLD = 4.0
 """In sigmas of three dimensions: farther from the trajectory than this, a measurement counts the less the farther it is.
 One in a thousand good ones is (chi-square, 3 degrees of freedom: 16 is passed by 0.11 %)."""
 
-HOPELESS = 30.0
+REJECTION_THRESHOLD = 30.0
 """In sigmas: farther than this from a trajectory that has been found, a measurement has no say at all. Little says add up: ten
 of a station on a wrong prism, 500 sigmas off, had turned a robot by 0.13 rad about the line through its other two prisms."""
 
-START_SPEED = 10.0
-START_TURN = 10.0
+INITIAL_VELOCITY_SIGMA_MPS = 10.0
+INITIAL_ANGULAR_VELOCITY_SIGMA_RADPS = 10.0
 """One sigma of a robot's first velocity in m/s and of its turning in rad/s."""
 
-START_POSITION_M = 1e4
-START_ROTATION_RAD = 1e2
+INITIAL_POSITION_SIGMA_M = 1e4
+INITIAL_ROTATION_SIGMA_RAD = 1e2
 """One sigma of the first pose: none that tells anything."""
 
-MOST_ITERATIONS = 30
-SETTLED = 1e-3
+MAX_ITERATIONS = 30
+COST_TOLERANCE = 1e-3
 """Less gain in cost (minus twice a log density) than this ends the search."""
 
-NEARLY = 1e-2
+PREDICTED_GAIN_TOLERANCE = 1e-2
 """A step that promises less gain than this is the last one, and nothing is linearised again after it: all that it changes is a
 tenth of a sigma, and what that changes in the derivatives is far below rounding of the result."""
 
 _ROWS_AT_ONCE, _STEPS_AT_ONCE = 128, 256
 """What is made of so many measurements or steps stays in the nearest cache until it is added up: twice as fast as all at once."""
 
-LEAST_SHARE = 1e-3
+MIN_STEP_FRACTION = 1e-3
 """A step is halved until it helps, but not below this."""
 
 
 @dataclass(frozen=True, slots=True)
-class Anchor:
+class AnchorPrior:
     """What is known of the first knot besides the measurements.
 
     Attributes
@@ -79,9 +85,9 @@ class Anchor:
         which the information is next to nothing: as an error it stays in that direction, as another knot it would not.
     """
 
-    near: Knots
+    near: States
     information: FloatArray
-    expected: FloatArray = field(default_factory=lambda: np.zeros(STATE))
+    expected: FloatArray = field(default_factory=lambda: np.zeros(STATE_DIM))
 
 
 class Solution(NamedTuple):
@@ -109,18 +115,18 @@ class Solution(NamedTuple):
         What the prior says of the steps between the knots.
     """
 
-    knots: Knots
-    factor: BlockFactor
-    distances: FloatArray
+    knots: States
+    factor: BlockCholesky
+    squared_distances: FloatArray
     weights: FloatArray
-    linearised: Linearised
+    linearised: LinearisedMeasurements
     at: NDArray[np.intp]
     cost: float
     iterations: int
-    steps: Steps
+    steps: ProcessFactors
 
 
-class System(NamedTuple):
+class NormalEquations(NamedTuple):
     """The normal equations at some trajectory.
 
     Attributes
@@ -134,16 +140,16 @@ class System(NamedTuple):
     """
 
     diagonal: FloatArray
-    beside: FloatArray
+    off_diagonal: FloatArray
     gradient: FloatArray
     cost: float
-    distances: FloatArray
+    squared_distances: FloatArray
     weights: FloatArray
-    linearised: Linearised
+    linearised: LinearisedMeasurements
     rows: FloatArray
 
 
-def knot_times(time_s: FloatArray, *, least_step_s: float = LEAST_STEP_S) -> FloatArray:
+def knot_times(time_s: FloatArray, *, min_spacing_s: float = MIN_KNOT_SPACING_S) -> FloatArray:
     """Choose the instants of knots for measurements at some instants, in the order of time.
 
     Parameters
@@ -153,15 +159,15 @@ def knot_times(time_s: FloatArray, *, least_step_s: float = LEAST_STEP_S) -> Flo
     least_step_s
         Knots are no closer.
     """
-    slots = np.unique(np.round(time_s / least_step_s).astype(np.int64))
+    slots = np.unique(np.round(time_s / min_spacing_s).astype(np.int64))
     # The mean of its measurements' times, so that one alone has its knot exactly there.
-    index = np.searchsorted(slots, np.round(time_s / least_step_s).astype(np.int64))
+    index = np.searchsorted(slots, np.round(time_s / min_spacing_s).astype(np.int64))
     times: FloatArray = np.bincount(index, time_s) / np.bincount(index)
-    kept = np.concatenate([[True], np.diff(times) > 0.25 * least_step_s])
+    kept = np.concatenate([[True], np.diff(times) > 0.25 * min_spacing_s])
     return np.asarray(times[kept])
 
 
-def nearest(knots_s: FloatArray, time_s: FloatArray) -> NDArray[np.intp]:
+def nearest_knots(knots_s: FloatArray, time_s: FloatArray) -> NDArray[np.intp]:
     """(M,) which knot is nearest in time."""
     if len(knots_s) == 1:
         return np.zeros(len(time_s), np.intp)
@@ -170,32 +176,32 @@ def nearest(knots_s: FloatArray, time_s: FloatArray) -> NDArray[np.intp]:
     return found
 
 
-def start_anchor(first: Knots, prior: MotionPrior) -> Anchor:
+def diffuse_prior(first: States, prior: MotionPrior) -> AnchorPrior:
     """Return what is known of a robot of which nothing is known yet, about a first guess."""
     sigmas = np.concatenate(
         [
-            np.full(3, START_POSITION_M),
-            np.full(3, START_ROTATION_RAD),
-            np.full(3, START_SPEED),
-            np.full(3, START_TURN),
+            np.full(3, INITIAL_POSITION_SIGMA_M),
+            np.full(3, INITIAL_ROTATION_SIGMA_RAD),
+            np.full(3, INITIAL_VELOCITY_SIGMA_MPS),
+            np.full(3, INITIAL_ANGULAR_VELOCITY_SIGMA_RADPS),
             axis_sigmas(prior),
         ]
     )
     zero = np.zeros((1, 3))
-    return Anchor(
-        Knots(first.time_s, first.position, first.rotation, zero, zero, zero, zero), np.diag(sigmas**-2.0)
+    return AnchorPrior(
+        States(first.time_s, first.position, first.rotation, zero, zero, zero, zero), np.diag(sigmas**-2.0)
     )
 
 
 def solve(
     observations: Observations,
-    guess: Knots,
+    guess: States,
     prior: MotionPrior,
     *,
-    anchor: Anchor | None = None,
+    anchor: AnchorPrior | None = None,
     sigmas: FloatArray | None = None,
-    most_iterations: int = MOST_ITERATIONS,
-    hopeless_heard: bool = False,
+    max_iterations: int = MAX_ITERATIONS,
+    reject_outliers: bool = True,
 ) -> Solution:
     """Find the most probable trajectory.
 
@@ -214,66 +220,74 @@ def solve(
     most_iterations
         After so many steps it ends where it is.
     hopeless_heard
-        Whether what is :data:`HOPELESS` keeps its say: what is found then changes smoothly with all that it is found from.
+        Whether what is :data:`REJECTION_THRESHOLD` keeps its say: what is found then changes smoothly with all that it is found from.
 
     Raises
     ------
     GeometryError
         The measurements do not determine the trajectory.
     """
-    anchor = start_anchor(guess.select(slice(0, 1)), prior) if anchor is None else anchor
-    at = nearest(guess.time_s, observations.time_s)
-    steps = Steps.of(guess.time_s, prior, sigmas)
-    found = _descended(observations, at, guess, steps, anchor, most_iterations)
-    if hopeless_heard or not (found.distances > HOPELESS**2).any():
+    anchor = diffuse_prior(guess.select(slice(0, 1)), prior) if anchor is None else anchor
+    at = nearest_knots(guess.time_s, observations.time_s)
+    steps = ProcessFactors.of(guess.time_s, prior, sigmas)
+    found = _descended(observations, at, guess, steps, anchor, max_iterations)
+    if not reject_outliers or not (found.squared_distances > REJECTION_THRESHOLD**2).any():
         return found
     # Only now: from a guess that is far off, good measurements seem hopeless.
-    heard = np.zeros(len(at), np.bool_)
-    again = _descended(observations, at, found.knots, steps, anchor, most_iterations, heard)
+    rejectable = np.ones(len(at), np.bool_)
+    again = _descended(observations, at, found.knots, steps, anchor, max_iterations, rejectable)
     return again._replace(iterations=max(found.iterations, again.iterations))
 
 
 def _descended(
     observations: Observations,
     at: NDArray[np.intp],
-    knots: Knots,
-    steps: Steps,
-    anchor: Anchor,
-    most_iterations: int,
-    heard: NDArray[np.bool_] | None = None,
+    knots: States,
+    steps: ProcessFactors,
+    anchor: AnchorPrior,
+    max_iterations: int,
+    rejectable: NDArray[np.bool_] | None = None,
 ) -> Solution:
     iterations = 0
-    system = assemble(observations, at, knots, steps, anchor, heard=heard)
-    factor = factorise(system.diagonal, system.beside)
-    while iterations < most_iterations:
+    system = assemble(observations, at, knots, steps, anchor, rejectable=rejectable)
+    factor = factorise(system.diagonal, system.off_diagonal)
+    while iterations < max_iterations:
         iterations += 1
         move = factor.solve(-system.gradient)
-        if -float(np.vdot(move, system.gradient)) < NEARLY:
-            knots, system = knots.moved(move), nudged(system, at, move)
+        if -float(np.vdot(move, system.gradient)) < PREDICTED_GAIN_TOLERANCE:
+            knots, system = knots.retract(move), nudged(system, at, move)
             break
-        tried, following = _searched(observations, at, knots, move, system, steps, anchor, heard)
+        tried, following = _searched(observations, at, knots, move, system, steps, anchor, rejectable)
         if tried is None:
             break
         gained = system.cost - tried.cost
         knots, system = following, tried
-        factor = factorise(system.diagonal, system.beside)
-        if gained < SETTLED:
+        factor = factorise(system.diagonal, system.off_diagonal)
+        if gained < COST_TOLERANCE:
             break
     return Solution(
-        knots, factor, system.distances, system.weights, system.linearised, at, system.cost, iterations, steps
+        knots,
+        factor,
+        system.squared_distances,
+        system.weights,
+        system.linearised,
+        at,
+        system.cost,
+        iterations,
+        steps,
     )
 
 
 def _searched(
     observations: Observations,
     at: NDArray[np.intp],
-    knots: Knots,
+    knots: States,
     move: FloatArray,
-    system: System,
-    steps: Steps,
-    anchor: Anchor,
-    heard: NDArray[np.bool_] | None,
-) -> tuple[System | None, Knots]:
+    system: NormalEquations,
+    steps: ProcessFactors,
+    anchor: AnchorPrior,
+    rejectable: NDArray[np.bool_] | None,
+) -> tuple[NormalEquations | None, States]:
     """Go so far along a move that the cost falls; None where it does not on any way that rounding leaves visible.
 
     Half of a step is better than a damped one here: damping by the diagonal would hold the whole stiff chain of knots
@@ -281,9 +295,9 @@ def _searched(
     """
     promised = -float(np.vdot(move, system.gradient))
     share = 1.0
-    while share > LEAST_SHARE:
-        following = knots.moved(share * move)
-        tried = assemble(observations, at, following, steps, anchor, heard=heard)
+    while share > MIN_STEP_FRACTION:
+        following = knots.retract(share * move)
+        tried = assemble(observations, at, following, steps, anchor, rejectable=rejectable)
         if tried.cost < system.cost - 0.1 * share * promised:
             return tried, following
         share /= 2.0
@@ -293,13 +307,13 @@ def _searched(
 def assemble(
     observations: Observations,
     at: NDArray[np.intp],
-    knots: Knots,
-    steps: Steps,
-    anchor: Anchor,
+    knots: States,
+    steps: ProcessFactors,
+    anchor: AnchorPrior,
     *,
-    unheard: NDArray[np.bool_] | None = None,
-    heard: NDArray[np.bool_] | None = None,
-) -> System:
+    active: NDArray[np.bool_] | None = None,
+    rejectable: NDArray[np.bool_] | None = None,
+) -> NormalEquations:
     """Make the normal equations at some trajectory.
 
     Parameters
@@ -312,47 +326,54 @@ def assemble(
         (M,) measurements that have no say yet.
     heard
         (M,) measurements that have a say however far off they are; all where not given. Of the others, what is
-        :data:`HOPELESS` has none, which can be said only where the trajectory is no guess any more.
+        :data:`REJECTION_THRESHOLD` has none, which can be said only where the trajectory is no guess any more.
     """
     linearised = linearise(observations, knots, at)
     rows = linearised.whitened(observations)
-    distances = dot(rows[:, :, 18], rows[:, :, 18])
-    ratio = np.maximum(distances / OUTLYING**2, 1.0)
+    squared_distances = dot(rows[:, :, 18], rows[:, :, 18])
+    ratio = np.maximum(squared_distances / OUTLIER_THRESHOLD**2, 1.0)
     weights = 1.0 / ratio
-    capped = np.minimum(distances, OUTLYING**2) + OUTLYING**2 * np.log(ratio)
+    capped = np.minimum(squared_distances, OUTLIER_THRESHOLD**2) + OUTLIER_THRESHOLD**2 * np.log(ratio)
     # Nothing is hopeless beside others that do not fit either: then the trajectory is wrong, or the set-up.
-    if heard is not None and 2 * np.count_nonzero(ratio == 1.0) > len(ratio):
-        hopeless = ~heard & (distances > HOPELESS**2)
-        weights[hopeless] = 0.0
-        capped[hopeless] = OUTLYING**2 * (1.0 + 2.0 * math.log(HOPELESS / OUTLYING))
-    if unheard is not None:
-        weights[unheard] = capped[unheard] = 0.0
+    if rejectable is not None and 2 * np.count_nonzero(ratio == 1.0) > len(ratio):
+        rejected = rejectable & (squared_distances > REJECTION_THRESHOLD**2)
+        weights[rejected] = 0.0
+        capped[rejected] = OUTLIER_THRESHOLD**2 * (
+            1.0 + 2.0 * math.log(REJECTION_THRESHOLD / OUTLIER_THRESHOLD)
+        )
+    if active is not None:
+        weights[~active] = capped[~active] = 0.0
 
-    diagonal, beside = np.zeros((len(knots), STATE, STATE)), np.zeros((len(knots) - 1, STATE, STATE))
-    gradient = np.zeros((len(knots), STATE))
+    diagonal, off_diagonal = (
+        np.zeros((len(knots), STATE_DIM, STATE_DIM)),
+        np.zeros((len(knots) - 1, STATE_DIM, STATE_DIM)),
+    )
+    gradient = np.zeros((len(knots), STATE_DIM))
     add_rows(rows, weights, at, diagonal, gradient)
     cost = float(capped.sum())
-    for start in range(0, len(beside), _STEPS_AT_ONCE):
+    for start in range(0, len(off_diagonal), _STEPS_AT_ONCE):
         some, ends = slice(start, start + _STEPS_AT_ONCE), slice(start, start + _STEPS_AT_ONCE + 1)
         few = steps.select(some)
-        between = linearise_steps(knots.select(ends), few)
-        cost += add_steps(between, few, diagonal[ends], beside[some], gradient[ends])
+        between = linearise_process(knots.select(ends), few)
+        cost += add_process_factors(between, few, diagonal[ends], off_diagonal[some], gradient[ends])
 
-    error = knots.select(slice(0, 1)).error_from(anchor.near)[0]
-    by_error = np.eye(STATE)
+    error = knots.select(slice(0, 1)).local_coordinates_about(anchor.near)[0]
+    by_error = np.eye(STATE_DIM)
     by_error[3:6, 3:6] = inverse_right_jacobian(error[3:6])
     error -= anchor.expected
     pull = by_error.T @ anchor.information
     diagonal[0] += pull @ by_error
     gradient[0] += pull @ error
     cost += float(error @ anchor.information @ error)
-    return System(diagonal, beside, gradient, cost, distances, weights, linearised, rows)
+    return NormalEquations(
+        diagonal, off_diagonal, gradient, cost, squared_distances, weights, linearised, rows
+    )
 
 
 def add_rows(
     rows: FloatArray, weights: FloatArray, at: NDArray[np.intp], diagonal: FloatArray, gradient: FloatArray
 ) -> None:
-    """Add measurements, (M, 3, 19) as in :class:`System`, to normal equations, in which each counts its weight, (M,)."""
+    """Add measurements, (M, 3, 19) as in :class:`NormalEquations`, to normal equations, in which each counts its weight, (M,)."""
     by_knot = np.argsort(at, kind="stable")
     for start in range(0, len(at), _ROWS_AT_ONCE):
         some = by_knot[start : start + _ROWS_AT_ONCE]
@@ -362,11 +383,11 @@ def add_rows(
         place = np.arange(len(near)) - np.searchsorted(near, near)
         for each in range(int(place.max()) + 1):
             now = place == each
-            diagonal[near[now]] += normal[now, :STATE, :STATE]
-            gradient[near[now]] += normal[now, :STATE, STATE]
+            diagonal[near[now]] += normal[now, :STATE_DIM, :STATE_DIM]
+            gradient[near[now]] += normal[now, :STATE_DIM, STATE_DIM]
 
 
-def nudged(system: System, at: NDArray[np.intp], move: FloatArray) -> System:
+def nudged(system: NormalEquations, at: NDArray[np.intp], move: FloatArray) -> NormalEquations:
     """Give measurements' residuals and the cost after the whole of a move so small that no derivative changes by it.
 
     Derivatives, and where the prisms are and how fast, stay those of before it.
@@ -375,12 +396,12 @@ def nudged(system: System, at: NDArray[np.intp], move: FloatArray) -> System:
     linearised = system.linearised
     residuals_m = linearised.residuals_m + (linearised.jacobian @ moves)[:, :, 0]
     off = system.rows[:, :, 18] + (system.rows[:, :, :18] @ moves)[:, :, 0]
-    distances = dot(off, off)
+    squared_distances = dot(off, off)
     return system._replace(
         linearised=replace(linearised, residuals_m=residuals_m),
-        distances=distances,
+        squared_distances=squared_distances,
         # So that what is named an outlier is as far off as it is said to be.
-        weights=(system.weights > 0) / np.maximum(distances / OUTLYING**2, 1.0),
+        weights=(system.weights > 0) / np.maximum(squared_distances / OUTLIER_THRESHOLD**2, 1.0),
         cost=system.cost + float(np.vdot(move, system.gradient)),
     )
 

@@ -23,15 +23,15 @@ from scipy.optimize import minimize
 
 from tsgt.errors import GeometryError
 from tsgt.geometry.trajectory.gauss_newton import knot_times, log_evidence, solve
-from tsgt.geometry.trajectory.initialisation import first_guess
+from tsgt.geometry.trajectory.initialisation import initial_guess
 from tsgt.geometry.trajectory.motion_prior import (
+    axis_correlation_times_s,
     axis_sigmas,
-    axis_times_s,
-    prior_of,
+    prior_from_axes,
     process_information,
     transition,
 )
-from tsgt.geometry.trajectory.states import linearise_steps
+from tsgt.geometry.trajectory.states import linearise_process
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:
@@ -42,13 +42,13 @@ if TYPE_CHECKING:
     from tsgt.geometry.rigid import FloatArray
     from tsgt.geometry.trajectory.gauss_newton import Solution
     from tsgt.geometry.trajectory.measurement_factors import Observations
-    from tsgt.geometry.trajectory.states import Knots
+    from tsgt.geometry.trajectory.states import States
 
 WINDOW_S = 40.0
 WINDOWS = 4
 """A long recording is judged by so many stretches of it, evenly spread."""
 
-LEAST_MEASUREMENTS = 30
+MIN_MEASUREMENTS = 30
 """Fewer in a stretch tell nothing of how a robot moves."""
 
 _ROWS = np.array([0, 0, 1, 3, 3, 4])
@@ -64,7 +64,7 @@ _STEP = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
-class Tuned:
+class Hyperparameters:
     """Parameters that explain the measurements best.
 
     Attributes
@@ -87,10 +87,10 @@ class _Stretch:
 
     def __init__(self, observations: Observations) -> None:
         self.observations = observations
-        self.knots: Knots = first_guess(observations, knot_times(observations.time_s))
+        self.knots: States = initial_guess(observations, knot_times(observations.time_s))
         self.log_evidence = -np.inf
 
-    def found(self, knots: Knots, log_evidence: float) -> None:
+    def found(self, knots: States, log_evidence: float) -> None:
         """Take note of a trajectory."""
         if log_evidence > self.log_evidence:
             self.knots, self.log_evidence = knots, log_evidence
@@ -103,7 +103,7 @@ def tune(
     noise_scale: float | None = None,
     fixed: bool = False,
     on_progress: Callable[[int], None] | None = None,
-) -> Tuned:
+) -> Hyperparameters:
     """Find the parameters.
 
     Parameters
@@ -124,23 +124,25 @@ def tune(
     GeometryError
         No stretch has enough measurements of three prisms.
     """
-    at = logarithms(MotionPrior() if start is None else start, 1.0 if noise_scale is None else noise_scale)
+    at = log_parameters(
+        MotionPrior() if start is None else start, 1.0 if noise_scale is None else noise_scale
+    )
     least, most = np.minimum(_LEAST, at), np.maximum(_MOST, at)
     if noise_scale is not None:
         least[_SCALE] = most[_SCALE] = at[_SCALE]
     if fixed:
         least[:_SCALE] = most[:_SCALE] = at[:_SCALE]
-    return search(observations, at, least, most, on_progress=on_progress)
+    return maximise_evidence(observations, at, least, most, on_progress=on_progress)
 
 
-def search(
+def maximise_evidence(
     observations: Observations,
     start: FloatArray,
     least: FloatArray,
     most: FloatArray,
     *,
     on_progress: Callable[[int], None] | None = None,
-) -> Tuned:
+) -> Hyperparameters:
     """Find the parameters within limits.
 
     Parameters
@@ -148,7 +150,7 @@ def search(
     observations, on_progress
         As for :func:`tune`.
     start, least, most
-        Where to begin and what to keep to, (7,) each, as :func:`logarithms` gives them.
+        Where to begin and what to keep to, (7,) each, as :func:`log_parameters` gives them.
 
     Raises
     ------
@@ -177,10 +179,10 @@ def search(
         options={"maxiter": _MOST_STEPS, "ftol": _TOLERANCE},
     )
     prior, scale = _meaning(found.x)
-    return Tuned(prior, scale, -float(found.fun) / share)
+    return Hyperparameters(prior, scale, -float(found.fun) / share)
 
 
-def scaled(observations: Observations, scale: float) -> Observations:
+def scale_noise(observations: Observations, scale: float) -> Observations:
     """Return measurements whose noise is so many times the stated one."""
     return replace(observations, sigmas_m=observations.sigmas_m * scale)
 
@@ -195,7 +197,7 @@ def _stretches(observations: Observations) -> list[_Stretch]:
     found = []
     for start_s in starts:
         rows = (time_s >= start_s - 1e-9) & (time_s <= start_s + length_s + 1e-9)
-        if np.count_nonzero(rows) >= LEAST_MEASUREMENTS:
+        if np.count_nonzero(rows) >= MIN_MEASUREMENTS:
             try:
                 found.append(_Stretch(observations.select(rows)))
             except GeometryError:
@@ -203,36 +205,36 @@ def _stretches(observations: Observations) -> list[_Stretch]:
     if not found:
         raise GeometryError(
             f"too few measurements to tell how the robot moves: no {length_s:.0f} s of them have "
-            f"{LEAST_MEASUREMENTS}, of at least 3 prisms"
+            f"{MIN_MEASUREMENTS}, of at least 3 prisms"
         )
     return found
 
 
-def logarithms(prior: MotionPrior, scale: float) -> FloatArray:
+def log_parameters(prior: MotionPrior, scale: float) -> FloatArray:
     """Parameters as they are searched for: acceleration sigmas x and z, its time, the same of the rotation, noise's scale."""
     sigmas = axis_sigmas(prior)
     x, _, z, roll, _, yaw = sigmas
     return np.log(
-        [x, z, prior.acceleration_correlation_time_s, roll, yaw, prior.angular_acceleration_time_s, scale]
+        [x, z, prior.acceleration_correlation_time_s, roll, yaw, prior.angular_acceleration_correlation_time_s, scale]
     )
 
 
 def _meaning(parameters: FloatArray) -> tuple[MotionPrior, float]:
     values = np.exp(parameters)
-    return prior_of(list(values[_ROWS]), list(values[list(_TIMES)])), float(values[_SCALE])
+    return prior_from_axes(list(values[_ROWS]), list(values[list(_TIMES)])), float(values[_SCALE])
 
 
 def _evidence(stretch: _Stretch, parameters: FloatArray) -> tuple[float, FloatArray]:
     """Log evidence of one stretch and its gradient by the parameters."""
     prior, scale = _meaning(parameters)
-    observations = scaled(stretch.observations, scale)
-    solution = solve(observations, stretch.knots, prior, hopeless_heard=True)
+    observations = scale_noise(stretch.observations, scale)
+    solution = solve(observations, stretch.knots, prior, reject_outliers=False)
     value = log_evidence(solution, observations, prior)
     stretch.found(solution.knots, value)
-    covariance, beside = solution.factor.marginals()
+    covariance, cross_covariance = solution.factor.marginals()
     gradient = np.zeros(len(parameters))
     gradient[_SCALE] = _by_scale(solution, observations, covariance)
-    steps = _expected_steps(solution, covariance, beside)
+    steps = _expected_steps(solution, covariance, cross_covariance)
     sigmas, dt_s = axis_sigmas(prior), np.diff(solution.knots.time_s)
     energies = _energy(steps, solution.steps.phi, solution.steps.information)
     for axis, row in enumerate(_ROWS):
@@ -258,7 +260,7 @@ def _by_scale(solution: Solution, observations: Observations, covariance: FloatA
     information = np.linalg.inv(linearised.covariance(observations))
     by_state = linearised.jacobian
     spread_m2 = by_state @ covariance[solution.at] @ np.swapaxes(by_state, 1, 2)
-    expected = solution.distances + np.einsum("mij,mji->m", information, spread_m2)
+    expected = solution.squared_distances + np.einsum("mij,mji->m", information, spread_m2)
     # What an uncertain time adds does not grow with the instrument's noise.
     share = np.einsum("mii,mi->m", information, observations.sigmas_m**2) / 3.0
     return float((share * (solution.weights * expected - 3.0)).sum())
@@ -267,10 +269,10 @@ def _by_scale(solution: Solution, observations: Observations, covariance: FloatA
 _Moments = tuple["FloatArray", "FloatArray", "FloatArray"]
 
 
-def _expected_steps(solution: Solution, covariance: FloatArray, beside: FloatArray) -> _Moments:
+def _expected_steps(solution: Solution, covariance: FloatArray, cross_covariance: FloatArray) -> _Moments:
     """Second moments of what each step connects, by axis, (K - 1, 6, 3, 3): later with later, with earlier, earlier with it."""
-    between = linearise_steps(solution.knots, solution.steps)
-    count = len(beside)
+    between = linearise_process(solution.knots, solution.steps)
+    count = len(cross_covariance)
     earlier, later = between.earlier, between.later
     moments = later[..., :, None] * later[..., None, :]
     crossed = later[..., :, None] * earlier[..., None, :]
@@ -284,7 +286,7 @@ def _expected_steps(solution: Solution, covariance: FloatArray, beside: FloatArr
     for kind, axes in ((0, slice(0, 3)), (1, slice(3, 6))):
         first, last, shared = (
             matrix.reshape(count, 3, 2, 3, 3, 2, 3)[:, :, kind, :, :, kind].reshape(count, 9, 9)
-            for matrix in (covariance[:-1], covariance[1:], beside)
+            for matrix in (covariance[:-1], covariance[1:], cross_covariance)
         )
         with_earlier = by_earlier[kind] @ first + by_later[kind] @ np.swapaxes(shared, 1, 2)
         with_later = by_earlier[kind] @ shared + by_later[kind] @ last
@@ -322,7 +324,7 @@ def _expected_log_density(steps: _Moments, dt_s: FloatArray, time_s: float, sigm
     return -0.5 * float(energies.sum()) + 0.5 * len(sigmas) * float(logdet.sum())
 
 
-CALMEST = 1.0 / 3.0
+NOISE_FLOOR_SHARE = 1.0 / 3.0
 """No axis of a tuned prior is calmer than this share of the configured one's."""
 
 OUTAGE_S = 2.0
@@ -334,7 +336,7 @@ _PACE_RADPS = 1.0
 """To speed up and to brake, or to turn there and back, takes about six seconds."""
 
 
-def at_least(prior: MotionPrior, other: MotionPrior, share: float = 1.0) -> MotionPrior:
+def with_noise_floor(prior: MotionPrior, other: MotionPrior, share: float = 1.0) -> MotionPrior:
     """Make a prior livelier where it is calmer than another.
 
     What a robot may do unseen is the power of its acceleration at the pace of manoeuvres, ``sigma^2 time / (1 + (pace
@@ -347,9 +349,9 @@ def at_least(prior: MotionPrior, other: MotionPrior, share: float = 1.0) -> Moti
     share
         The least is the sigma that, with the correlation time of ``prior``, has the power of this share of ``other``'s.
     """
-    times_s = axis_times_s(prior)
-    least = share * axis_sigmas(other) * np.sqrt(_power(axis_times_s(other)) / _power(times_s))
-    return prior_of(np.maximum(axis_sigmas(prior), least), times_s[[0, 3]])
+    times_s = axis_correlation_times_s(prior)
+    least = share * axis_sigmas(other) * np.sqrt(_power(axis_correlation_times_s(other)) / _power(times_s))
+    return prior_from_axes(np.maximum(axis_sigmas(prior), least), times_s[[0, 3]])
 
 
 def _power(time_s: FloatArray) -> FloatArray:
@@ -357,7 +359,7 @@ def _power(time_s: FloatArray) -> FloatArray:
     return time_s / (1.0 + (_PACE_RADPS * time_s) ** 2)
 
 
-def hidden(time_s: FloatArray, prism: NDArray[np.intp], at_s: FloatArray) -> NDArray[np.bool_]:
+def partially_occluded(time_s: FloatArray, prism: NDArray[np.intp], at_s: FloatArray) -> NDArray[np.bool_]:
     """Tell when fewer than three prisms were seen.
 
     Parameters

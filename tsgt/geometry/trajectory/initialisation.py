@@ -10,7 +10,7 @@ import numpy as np
 from tsgt.errors import GeometryError
 from tsgt.geometry.pose import poses_from_prisms
 from tsgt.geometry.rigid import exp_so3
-from tsgt.geometry.trajectory.states import Knots, turn_between
+from tsgt.geometry.trajectory.states import States, rotation_between
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -22,7 +22,7 @@ _LONG = 3.0
 """So many times what is usual between two measurements of a prism is long."""
 
 
-def first_guess(observations: Observations, time_s: FloatArray) -> Knots:
+def initial_guess(observations: Observations, time_s: FloatArray) -> States:
     """Guess states at some instants.
 
     Parameters
@@ -42,11 +42,11 @@ def first_guess(observations: Observations, time_s: FloatArray) -> Knots:
     GeometryError
         Fewer than three prisms were measured, or their tracks coincide everywhere.
     """
-    return Tracks.of(observations).guess(time_s)
+    return PrismTracks.of(observations).guess(time_s)
 
 
 @dataclass(frozen=True, slots=True)
-class Tracks:
+class PrismTracks:
     """Where the prisms were measured, made ready once for guesses at many pieces of a long drive.
 
     Attributes
@@ -61,8 +61,8 @@ class Tracks:
     tracks: tuple[_Track, ...]
 
     @classmethod
-    def of(cls, observations: Observations) -> Tracks:
-        """Divide measurements by prism; errors as of :func:`first_guess`."""
+    def of(cls, observations: Observations) -> PrismTracks:
+        """Divide measurements by prism; errors as of :func:`initial_guess`."""
         points = observations.in_world()
         seen = [prism for prism in range(len(observations.layout)) if np.any(observations.prism == prism)]
         if len(seen) < 3:
@@ -75,8 +75,8 @@ class Tracks:
             tuple(_Track.of(observations.time_s[rows], points[rows]) for rows in each),
         )
 
-    def guess(self, time_s: FloatArray) -> Knots:
-        """Guess as :func:`first_guess` does, in a time that hardly grows with what lies before and after."""
+    def guess(self, time_s: FloatArray) -> States:
+        """Guess as :func:`initial_guess` does, in a time that hardly grows with what lies before and after."""
         tracks = np.stack([track.at(time_s) for track in self.tracks], axis=1)
         followed = np.stack([track.followed(time_s) for track in self.tracks], axis=1)
         poses = poses_from_prisms(self.layout, tracks)
@@ -95,7 +95,7 @@ class Tracks:
         position = (share * placed).sum(axis=1) / share.sum(axis=1)
         still = np.zeros_like(position)
         velocity = np.gradient(position, time_s, axis=0) if len(time_s) > 1 else still
-        return Knots(time_s, position, rotation, velocity, still, still, still)
+        return States(time_s, position, rotation, velocity, still, still, still)
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,16 +131,18 @@ def _turning(time_s: FloatArray, good_s: FloatArray, rotation: FloatArray) -> Fl
     if len(good_s) < 2:
         return np.broadcast_to(rotation[0], (len(time_s), 3, 3)).copy()
     zero = np.zeros((len(good_s), 3))
-    good = Knots(good_s, zero, rotation, zero, zero, zero, zero)
+    good = States(good_s, zero, rotation, zero, zero, zero, zero)
     earlier, later, step_s = (
         good.select(slice(None, -1)),
         good.select(slice(1, None)),
         np.diff(good_s)[:, None],
     )
-    rates = turn_between(earlier, later) / step_s
+    rates = rotation_between(earlier, later) / step_s
     # Each turn in the light of those before and after it.
     before, after = np.concatenate([rates[:1], rates[:-1]]), np.concatenate([rates[1:], rates[-1:]])
-    turns = turn_between(replace(earlier, angular_velocity=before), replace(later, angular_velocity=after))
+    turns = rotation_between(
+        replace(earlier, angular_velocity=before), replace(later, angular_velocity=after)
+    )
     which = np.clip(np.searchsorted(good_s, time_s, side="right") - 1, 0, len(turns) - 1)
     since_s = (np.clip(time_s, good_s[0], good_s[-1]) - good_s[which])[:, None]
     carried: FloatArray = rotation[which] @ exp_so3(since_s / step_s[which] * turns[which])

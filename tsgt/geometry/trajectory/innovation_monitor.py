@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from tsgt.geometry.rigid import FloatArray
     from tsgt.geometry.trajectory.measurement_factors import Observations
 
-DOUBT_BACK_S = 1.5
+AMBIGUITY_MARGIN_S = 1.5
 """So long before a measurement that contradicts, what it may bend is not known either: a few measurements of each prism."""
 
 
-class Doubt:
+class InnovationMonitor:
     """Keeps in mind which of the measurements of a window contradicted.
 
     Attributes
@@ -38,9 +38,9 @@ class Doubt:
     @property
     def from_s(self) -> float:
         """From when on it is not known where the robot was, infinite while nothing is doubtful."""
-        return self._contradicted_s - DOUBT_BACK_S if self.prisms else np.inf
+        return self._contradicted_s - AMBIGUITY_MARGIN_S if self.prisms else np.inf
 
-    def contested(self, time_s: FloatArray) -> NDArray[np.bool_]:
+    def ambiguous_at(self, time_s: FloatArray) -> NDArray[np.bool_]:
         """Whether it will never be known where the robot was at some instants, by the doubts that are settled.
 
         What contradicted is wrong, or what it contradicted. Where all of it is of one prism, and the trajectory has stayed what
@@ -64,7 +64,7 @@ class Doubt:
         """Let go of the other measurements of the window."""
         self._accused = self._accused[rows]
 
-    def forget(self, before_s: float) -> None:
+    def discard_before(self, before_s: float) -> None:
         """Let go of what was before an instant."""
         self._contested_s = [each for each in self._contested_s if each[1] >= before_s]
 
@@ -110,5 +110,5 @@ class Doubt:
         one_prism = len(np.unique(observations.prism[accused])) == 1
         if not (one_prism and outlying[accused].all()):
             times_s = observations.time_s[accused]
-            self._contested_s.append((float(times_s[0]) - DOUBT_BACK_S, float(times_s[-1])))
+            self._contested_s.append((float(times_s[0]) - AMBIGUITY_MARGIN_S, float(times_s[-1])))
         self._accused = np.zeros_like(accused)

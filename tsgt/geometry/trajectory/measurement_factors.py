@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.geometry.rigid import IDENTITY, FloatArray, apply, cross, dot, exp_and_right_jacobian, skew
+from tsgt.geometry.rigid import IDENTITY, FloatArray, cross, dot, exp_and_right_jacobian, matvec, skew
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from tsgt.geometry.trajectory.states import Knots
+    from tsgt.geometry.trajectory.states import States
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,11 +75,11 @@ class Observations:
     def in_world(self) -> FloatArray:
         """(M, 3) measured points in frame ``station1``, in m."""
         frames = self.frames[self.station]
-        return apply(frames[:, :3, :3], self.points_m) + frames[:, :3, 3]
+        return matvec(frames[:, :3, :3], self.points_m) + frames[:, :3, 3]
 
 
 @dataclass(frozen=True, slots=True)
-class Linearised:
+class LinearisedMeasurements:
     """Residuals of M measurements and how they change with the trajectory.
 
     Attributes
@@ -87,7 +87,7 @@ class Linearised:
     residuals_m
         (M, 3) predicted less measured: along the line of sight, horizontally and vertically across it.
     jacobian
-        (M, 3, 18) by the error of the knot's state, in the order of :class:`~tsgt.geometry.trajectory.states.Knots`.
+        (M, 3, 18) by the error of the knot's state, in the order of :class:`~tsgt.geometry.trajectory.states.States`.
     by_point
         (M, 3, 3) by the prism's position in frame ``station1``.
     point_m, velocity_mps
@@ -105,7 +105,7 @@ class Linearised:
 
     def covariance(self, observations: Observations) -> FloatArray:
         """(M, 3, 3) covariance of the residuals in m^2: the instrument's noise, and uncertain times on a moving prism."""
-        moved = apply(self.by_point, self.velocity_mps) * observations.time_sigma_s[:, None]
+        moved = matvec(self.by_point, self.velocity_mps) * observations.time_sigma_s[:, None]
         covariance: FloatArray = moved[:, :, None] * moved[:, None, :]
         for axis in range(3):
             covariance[:, axis, axis] += observations.sigmas_m[:, axis] ** 2
@@ -117,7 +117,7 @@ class Linearised:
         The covariance is a diagonal one plus the outer product of one vector, whose inverse root has a closed form.
         """
         deviation_m = observations.sigmas_m
-        along = apply(self.by_point, self.velocity_mps) * (observations.time_sigma_s[:, None] / deviation_m)
+        along = matvec(self.by_point, self.velocity_mps) * (observations.time_sigma_s[:, None] / deviation_m)
         root = np.sqrt(1.0 + dot(along, along))
         found = np.empty((len(along), 3, 19))
         np.divide(self.jacobian, deviation_m[:, :, None], out=found[:, :, :18])
@@ -126,7 +126,7 @@ class Linearised:
         return found
 
 
-def linearise(observations: Observations, knots: Knots, at: NDArray[np.intp]) -> Linearised:
+def linearise(observations: Observations, knots: States, at: NDArray[np.intp]) -> LinearisedMeasurements:
     """Compare measurements with a trajectory.
 
     Parameters
@@ -151,9 +151,9 @@ def linearise(observations: Observations, knots: Knots, at: NDArray[np.intp]) ->
         near.angular_velocity * delta_s + near.angular_acceleration * half
     )
     rotation = near.rotation @ turned
-    point = near.position + near.velocity * delta_s + near.acceleration * half + apply(rotation, arm)
+    point = near.position + near.velocity * delta_s + near.acceleration * half + matvec(rotation, arm)
     rate = near.angular_velocity + near.angular_acceleration * delta_s
-    velocity = near.velocity + near.acceleration * delta_s + apply(rotation, cross(rate, arm))
+    velocity = near.velocity + near.acceleration * delta_s + matvec(rotation, cross(rate, arm))
     residuals, by_point = _compared(observations, point)
     jacobian = np.empty((len(observations), 3, 18))
     by_rotation_then = -by_point @ rotation @ skew(arm)
@@ -164,14 +164,14 @@ def linearise(observations: Observations, knots: Knots, at: NDArray[np.intp]) ->
     jacobian[:, :, 9:12] = by_turn * delta_s[:, None]
     jacobian[:, :, 12:15] = by_point * half[:, None]
     jacobian[:, :, 15:18] = by_turn * half[:, None]
-    return Linearised(residuals, jacobian, by_point, point, velocity, rotation)
+    return LinearisedMeasurements(residuals, jacobian, by_point, point, velocity, rotation)
 
 
 def _compared(observations: Observations, point: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Residuals of predicted points in frame ``station1``, (M, 3), and their derivatives by these, (M, 3, 3)."""
     frames = observations.frames[observations.station]
     to_station = np.swapaxes(frames[:, :3, :3], 1, 2)
-    predicted = apply(to_station, point - frames[:, :3, 3])
+    predicted = matvec(to_station, point - frames[:, :3, 3])
     measured = observations.points_m
     residuals = predicted - measured
     by_predicted = np.repeat(IDENTITY[None], len(point), axis=0)
@@ -183,7 +183,7 @@ def _compared(observations: Observations, point: FloatArray) -> tuple[FloatArray
         away_m = np.where(distance_m > 0, distance_m, 1.0)
         direction = seen / away_m[:, None]
         residuals[polar, 0] = distance_m - measured_m
-        residuals[polar, 1:] = measured_m[:, None] * apply(axes, direction)[:, 1:]
+        residuals[polar, 1:] = measured_m[:, None] * matvec(axes, direction)[:, 1:]
         shrink = (measured_m / away_m)[:, None, None]
         away = axes[:, 1:] - (axes[:, 1:] @ direction[:, :, None]) * direction[:, None, :]
         by_predicted[polar, 0] = direction

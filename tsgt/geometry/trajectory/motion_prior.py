@@ -35,9 +35,9 @@ _QUADRATURE_BELOW = 2.0
 """In correlation times: from here the closed forms lose no digits that matter."""
 
 
-def axis_times_s(prior: MotionPrior) -> FloatArray:
+def axis_correlation_times_s(prior: MotionPrior) -> FloatArray:
     """Correlation time of each axis in s, shape (6,)."""
-    return np.repeat([prior.acceleration_correlation_time_s, prior.angular_acceleration_time_s], 3)
+    return np.repeat([prior.acceleration_correlation_time_s, prior.angular_acceleration_correlation_time_s], 3)
 
 
 def axis_sigmas(prior: MotionPrior) -> FloatArray:
@@ -45,7 +45,7 @@ def axis_sigmas(prior: MotionPrior) -> FloatArray:
     return np.array([*prior.acceleration_sigma_mps2, *prior.angular_acceleration_sigma_radps2])
 
 
-def prior_of(sigmas: Iterable[float], times_s: Iterable[float]) -> MotionPrior:
+def prior_from_axes(sigmas: Iterable[float], times_s: Iterable[float]) -> MotionPrior:
     """Make a prior of one sigma per axis, shape (6,), and the two correlation times in s."""
     x, y, z, roll, pitch, yaw = map(float, sigmas)
     time_s, angular_time_s = map(float, times_s)
@@ -53,7 +53,7 @@ def prior_of(sigmas: Iterable[float], times_s: Iterable[float]) -> MotionPrior:
         acceleration_sigma_mps2=(x, y, z),
         acceleration_correlation_time_s=time_s,
         angular_acceleration_sigma_radps2=(roll, pitch, yaw),
-        angular_acceleration_time_s=angular_time_s,
+        angular_acceleration_correlation_time_s=angular_time_s,
     )
 
 
@@ -108,7 +108,7 @@ def process_information(dt_s: ArrayLike, time_s: ArrayLike) -> FloatArray:
     return _scaled(np.asarray(information, np.float64), 1.0 / dt_s)
 
 
-def between(
+def interpolation_weights(
     before_s: FloatArray, after_s: FloatArray, time_s: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Interpolate one axis between two known instants.

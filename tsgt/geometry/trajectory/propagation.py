@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.geometry.trajectory.motion_prior import axis_sigmas, process_noise
-from tsgt.geometry.trajectory.states import STATE, Knots
+from tsgt.geometry.trajectory.states import STATE_DIM, States
 
 if TYPE_CHECKING:
     from tsgt.geometry.rigid import FloatArray
@@ -27,12 +27,12 @@ _SERIES_BELOW = 2.0
 _TERMS = 32
 _POWERS = np.arange(_TERMS, dtype=np.float64)
 
-_IDENTITY, _EYE = np.eye(3), np.eye(STATE)
+_IDENTITY, _EYE = np.eye(3), np.eye(STATE_DIM)
 
 _Vector = tuple[float, float, float]
 
 
-class Ahead:
+class Propagator:
     """Predicts a robot from one state.
 
     Parameters
@@ -48,28 +48,28 @@ class Ahead:
     """
 
     def __init__(
-        self, start: Knots, covariance: FloatArray, prior: MotionPrior, *, livelier: float = 1.0
+        self, start: States, covariance: FloatArray, prior: MotionPrior, *, process_noise_scale: float = 1.0
     ) -> None:
         self.time_s = float(start.time_s[0])
         self._start = start
         self._covariance = covariance
-        self._times_s = np.array([prior.acceleration_correlation_time_s, prior.angular_acceleration_time_s])
-        self._variances = livelier * axis_sigmas(prior) ** 2
+        self._times_s = np.array([prior.acceleration_correlation_time_s, prior.angular_acceleration_correlation_time_s])
+        self._variances = process_noise_scale * axis_sigmas(prior) ** 2
 
-    def at(self, time_s: float, *, parts: int = STATE) -> tuple[Knots, FloatArray]:
+    def at(self, time_s: float, *, dim: int = STATE_DIM) -> tuple[States, FloatArray]:
         """Return the state at an instant not before its own, and the covariance of the first parts of its error.
 
         Shapes are those that :meth:`~tsgt.geometry.trajectory.query.Trajectory.at` gives for one instant.
         """
         start, dt_s = self._start, time_s - self.time_s
-        slow, turning = (kick(dt_s, float(each)) for each in self._times_s)
+        slow, turning = (acceleration_response(dt_s, float(each)) for each in self._times_s)
         wander_s2 = dt_s * dt_s / 12
         before: _Vector = tuple(start.angular_velocity[0].tolist())
         gained: _Vector = tuple(start.angular_acceleration[0].tolist())
         here = _sum(before, gained, turning[1])
         turn = _sum(_sum(_scaled(before, dt_s), gained, turning[0]), _cross(before, here), wander_s2)
         turned, by_turn = _turned_and_derivative(turn)
-        states = Knots(
+        states = States(
             np.array([time_s]),
             start.position + start.velocity * dt_s + start.acceleration * slow[0],
             start.rotation @ turned,
@@ -92,8 +92,8 @@ class Ahead:
         by_start[3:6, 15:18] = by_turn * turning[0] + wandering * turning[1]
         by_noise[3:6, 3:6] = by_turn
         by_noise[3:6, 9:12] = wandering
-        by_start, by_noise = by_start[:parts], by_noise[:parts]
-        noise = np.zeros((STATE, STATE))
+        by_start, by_noise = by_start[:dim], by_noise[:dim]
+        noise = np.zeros((STATE_DIM, STATE_DIM))
         # Both kinds of axes, each for its three.
         by_axis = np.repeat(_noise(dt_s, self._times_s), 3, axis=0) * self._variances[:, None, None]
         np.einsum("iaja->aij", noise.reshape(3, 6, 3, 6))[...] = by_axis
@@ -101,7 +101,7 @@ class Ahead:
         return states, (0.5 * (covariance + covariance.T))[None]
 
 
-def kick(dt_s: float, time_s: float) -> _Vector:
+def acceleration_response(dt_s: float, time_s: float) -> _Vector:
     """Return what an acceleration of 1 becomes: the last column of :func:`~tsgt.geometry.trajectory.motion_prior.transition`."""
     s = dt_s / time_s
     if s < _SMALL_STEP:
@@ -178,7 +178,7 @@ def _sum(a: _Vector, b: _Vector, factor: float) -> _Vector:
 def _set_diagonal(matrix: FloatArray, row: int, column: int, places: float, turns: float) -> None:
     """Set the diagonals of two neighbouring blocks: three of places, three of turns."""
     flat = matrix.reshape(-1)
-    first = row * STATE + column
-    flat[first : first + 3 * (STATE + 1) : STATE + 1] = places
-    first += 3 * (STATE + 1)
-    flat[first : first + 3 * (STATE + 1) : STATE + 1] = turns
+    first = row * STATE_DIM + column
+    flat[first : first + 3 * (STATE_DIM + 1) : STATE_DIM + 1] = places
+    first += 3 * (STATE_DIM + 1)
+    flat[first : first + 3 * (STATE_DIM + 1) : STATE_DIM + 1] = turns

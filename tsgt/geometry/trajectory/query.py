@@ -15,14 +15,25 @@ import numpy as np
 from tsgt.geometry.rigid import (
     IDENTITY,
     FloatArray,
-    apply,
     cross,
     exp_and_right_jacobian,
     inverse_right_jacobian,
+    matvec,
     skew,
 )
-from tsgt.geometry.trajectory.motion_prior import axis_sigmas, between, process_noise, transition
-from tsgt.geometry.trajectory.states import STATE, Knots, joined, spread, turn_between
+from tsgt.geometry.trajectory.motion_prior import (
+    axis_sigmas,
+    interpolation_weights,
+    process_noise,
+    transition,
+)
+from tsgt.geometry.trajectory.states import (
+    STATE_DIM,
+    States,
+    axes_to_state,
+    concatenate_states,
+    rotation_between,
+)
 
 if TYPE_CHECKING:
     from tsgt.model import MotionPrior
@@ -30,7 +41,7 @@ if TYPE_CHECKING:
 _AT_ONCE = 512
 """What is made of so many instants stays in the cache: a third faster than eight times as many."""
 
-_EYE = np.eye(STATE)[None]
+_EYE = np.eye(STATE_DIM)[None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,13 +62,13 @@ class Trajectory:
         (K - 1, 6) one sigma of the acceleration of each axis in each step, where it is not that of ``prior``.
     """
 
-    knots: Knots
+    knots: States
     prior: MotionPrior
     covariance: FloatArray
-    beside: FloatArray
+    cross_covariance: FloatArray
     sigmas: FloatArray | None = None
 
-    def at(self, time_s: FloatArray, *, parts: int = STATE) -> tuple[Knots, FloatArray]:
+    def at(self, time_s: FloatArray, *, dim: int = STATE_DIM) -> tuple[States, FloatArray]:
         """Return the states at N instants, in any order, and the covariance of their errors.
 
         Parameters
@@ -71,31 +82,31 @@ class Trajectory:
         -------
         states : Knots
         covariance : FloatArray
-            (N, parts, parts).
+            (N, dim, dim).
         """
-        found = [self._at(time_s[i : i + _AT_ONCE], parts) for i in range(0, len(time_s), _AT_ONCE)]
+        found = [self._at(time_s[i : i + _AT_ONCE], dim) for i in range(0, len(time_s), _AT_ONCE)]
         if len(found) == 1:
             return found[0]
         if not found:
-            return self.knots.select(slice(0, 0)), np.empty((0, parts, parts))
-        return joined([states for states, _ in found]), np.concatenate(
+            return self.knots.select(slice(0, 0)), np.empty((0, dim, dim))
+        return concatenate_states([states for states, _ in found]), np.concatenate(
             [covariance for _, covariance in found]
         )
 
-    def _at(self, time_s: FloatArray, parts: int) -> tuple[Knots, FloatArray]:
+    def _at(self, time_s: FloatArray, dim: int) -> tuple[States, FloatArray]:
         later = np.searchsorted(self.knots.time_s, time_s, side="left")
         inside = (later > 0) & (later < len(self.knots))
         if inside.all():
-            return self._between(time_s, later, parts)
-        states, covariance = self._beyond(time_s, np.clip(later - 1, 0, None), parts)
+            return self._between(time_s, later, dim)
+        states, covariance = self._beyond(time_s, np.clip(later - 1, 0, None), dim)
         if inside.any():
-            some, some_covariance = self._between(time_s[inside], later[inside], parts)
-            for name in Knots.__slots__:
+            some, some_covariance = self._between(time_s[inside], later[inside], dim)
+            for name in States.__slots__:
                 getattr(states, name)[inside] = getattr(some, name)
             covariance[inside] = some_covariance
         return states, covariance
 
-    def _beyond(self, time_s: FloatArray, knot: np.ndarray, parts: int) -> tuple[Knots, FloatArray]:
+    def _beyond(self, time_s: FloatArray, knot: np.ndarray, dim: int) -> tuple[States, FloatArray]:
         """Predict from one knot, forwards or backwards: the prior's process looks the same either way."""
         start = self.knots.select(knot)
         dt_s = time_s - start.time_s
@@ -116,23 +127,23 @@ class Trajectory:
         turned, by_turn = exp_and_right_jacobian(turn)
         states = _states(time_s, start.position + moved[:, :3, 0], start.rotation @ turned, moved)
         to_error = _to_error(by_turn, wander, before)
-        by_start = to_error @ spread(phi)
+        by_start = to_error @ axes_to_state(phi)
         by_start[:, 3:6, 9:12] -= by_turn @ (wander[..., None] * skew(here))
         by_start[:, 3:6, 3:6] = np.swapaxes(turned, 1, 2)
-        by_start, to_error = by_start[:, :parts], to_error[:, :parts]
+        by_start, to_error = by_start[:, :dim], to_error[:, :dim]
         covariance = by_start @ self.covariance[knot] @ np.swapaxes(by_start, 1, 2)
-        return states, _symmetric(covariance + to_error @ spread(noise) @ np.swapaxes(to_error, 1, 2))
+        return states, _symmetric(covariance + to_error @ axes_to_state(noise) @ np.swapaxes(to_error, 1, 2))
 
-    def _between(self, time_s: FloatArray, later: np.ndarray, parts: int) -> tuple[Knots, FloatArray]:
+    def _between(self, time_s: FloatArray, later: np.ndarray, dim: int) -> tuple[States, FloatArray]:
         before, after = self.knots.select(later - 1), self.knots.select(later)
         dt_s, step_s = time_s - before.time_s, after.time_s - before.time_s
         # Both kinds of axes, each for its three.
         from_earlier, from_later, left = (
             np.repeat(matrix, 3, axis=1)
-            for matrix in between(dt_s[:, None], (step_s - dt_s)[:, None], self._times_s())
+            for matrix in interpolation_weights(dt_s[:, None], (step_s - dt_s)[:, None], self._times_s())
         )
         wander, rate, later_rate = (step_s**2 / 12)[:, None], before.angular_velocity, after.angular_velocity
-        full_turn = turn_between(before, after)
+        full_turn = rotation_between(before, after)
         turn = full_turn - wander * cross(rate, later_rate)
         zero = np.zeros((len(time_s), 3))
         earlier = np.stack(
@@ -148,7 +159,7 @@ class Trajectory:
         found_turn = found[:, 3:, 0] + wander_here * cross(rate, here)
         turned, by_found_turn = exp_and_right_jacobian(found_turn)
         states = _states(time_s, found[:, :3, 0], before.rotation @ turned, found)
-        by_earlier, by_later = spread(from_earlier), spread(from_later)
+        by_earlier, by_later = axes_to_state(from_earlier), axes_to_state(from_later)
         # The later rotation enters by the turn from the earlier one, less its wander; the result's by the turn to it.
         by_turn, turn_by_later = by_later[:, :, 3:6].copy(), inverse_right_jacobian(full_turn)
         by_later[:, :, 3:6] = by_turn @ turn_by_later
@@ -156,13 +167,13 @@ class Trajectory:
         # Of the opposite turn it is the transpose.
         by_earlier[:, :, 3:6] = -by_turn @ np.swapaxes(turn_by_later, 1, 2)
         by_earlier[:, :, 9:12] += by_turn @ (wander[..., None] * skew(later_rate))
-        to_error = _to_error(by_found_turn, wander_here, rate)[:, :parts]
+        to_error = _to_error(by_found_turn, wander_here, rate)[:, :dim]
         by_earlier, by_later = to_error @ by_earlier, to_error @ by_later
         by_earlier[:, 3:6, 9:12] -= by_found_turn @ (wander_here[..., None] * skew(here))
         by_earlier[:, 3:6, 3:6] += np.swapaxes(turned, 1, 2)
         sigmas = axis_sigmas(self.prior)[None] if self.sigmas is None else self.sigmas[later - 1]
-        added = to_error @ spread(left * (sigmas**2)[:, :, None, None])
-        mixed = by_earlier @ self.beside[later - 1] @ np.swapaxes(by_later, 1, 2)
+        added = to_error @ axes_to_state(left * (sigmas**2)[:, :, None, None])
+        mixed = by_earlier @ self.cross_covariance[later - 1] @ np.swapaxes(by_later, 1, 2)
         covariance = (
             by_earlier @ self.covariance[later - 1] @ np.swapaxes(by_earlier, 1, 2)
             + by_later @ self.covariance[later] @ np.swapaxes(by_later, 1, 2)
@@ -173,7 +184,7 @@ class Trajectory:
 
     def _times_s(self) -> FloatArray:
         """Correlation times of both kinds of axes in s, shape (2,)."""
-        return np.array([self.prior.acceleration_correlation_time_s, self.prior.angular_acceleration_time_s])
+        return np.array([self.prior.acceleration_correlation_time_s, self.prior.angular_acceleration_correlation_time_s])
 
 
 def _to_error(by_turn: FloatArray, wander: FloatArray, rate: FloatArray) -> FloatArray:
@@ -184,15 +195,15 @@ def _to_error(by_turn: FloatArray, wander: FloatArray, rate: FloatArray) -> Floa
     return matrix
 
 
-def _states(time_s: FloatArray, position: FloatArray, rotation: FloatArray, axes: FloatArray) -> Knots:
-    return Knots(time_s, position, rotation, axes[:, :3, 1], axes[:, 3:, 1], axes[:, :3, 2], axes[:, 3:, 2])
+def _states(time_s: FloatArray, position: FloatArray, rotation: FloatArray, axes: FloatArray) -> States:
+    return States(time_s, position, rotation, axes[:, :3, 1], axes[:, 3:, 1], axes[:, :3, 2], axes[:, 3:, 2])
 
 
-def _velocities(knots: Knots) -> FloatArray:
+def _velocities(knots: States) -> FloatArray:
     return np.concatenate([knots.velocity, knots.angular_velocity], axis=1)
 
 
-def _accelerations(knots: Knots) -> FloatArray:
+def _accelerations(knots: States) -> FloatArray:
     return np.concatenate([knots.acceleration, knots.angular_acceleration], axis=1)
 
 
@@ -221,7 +232,7 @@ def ros_covariance(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
     return _symmetric(turned @ covariance[:, :6, :6] @ np.swapaxes(turned, 1, 2))
 
 
-def of_point(states: Knots, covariance: FloatArray, arm: FloatArray) -> tuple[Knots, FloatArray]:
+def state_at_point(states: States, covariance: FloatArray, arm: FloatArray) -> tuple[States, FloatArray]:
     """Tell the motion of another point of the robot.
 
     Parameters
@@ -244,17 +255,17 @@ def of_point(states: Knots, covariance: FloatArray, arm: FloatArray) -> tuple[Kn
     swing = cross(rate, arm)
     moved = replace(
         states,
-        position=states.position + apply(rotation, arm),
-        velocity=states.velocity + apply(rotation, swing),
+        position=states.position + matvec(rotation, arm),
+        velocity=states.velocity + matvec(rotation, swing),
         acceleration=states.acceleration
-        + apply(rotation, cross(states.angular_acceleration, arm) + cross(rate, swing)),
+        + matvec(rotation, cross(states.angular_acceleration, arm) + cross(rate, swing)),
     )
     by_error = np.repeat(_EYE[:, :6, :6], len(states), axis=0)
     by_error[:, :3, 3:] = -rotation @ skew(arm)
     return moved, _symmetric(by_error @ covariance[:, :6, :6] @ np.swapaxes(by_error, 1, 2))
 
 
-def with_curvature(rotation: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+def with_second_order_terms(rotation: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Add what linear errors leave out of a position that turns with the robot about a line or a point.
 
     What two prisms do not tell is a turn by some angle θ about the line through them: it moves a point at the distance r
@@ -267,7 +278,7 @@ def with_curvature(rotation: FloatArray, covariance: FloatArray) -> tuple[FloatA
     rotation
         (N, 3, 3).
     covariance
-        (N, 6, 6) of the errors of position and rotation, as :func:`of_point` has it.
+        (N, 6, 6) of the errors of position and rotation, as :func:`state_at_point` has it.
 
     Returns
     -------

@@ -14,12 +14,12 @@ import numpy as np
 
 from tsgt.geometry.rigid import (
     FloatArray,
-    apply,
     cross,
     dot,
     exp_so3,
+    fast_log_so3,
     inverse_right_jacobian,
-    log_of_steps,
+    matvec,
     skew,
 )
 from tsgt.geometry.trajectory.motion_prior import axis_sigmas, process_information, transition
@@ -29,13 +29,13 @@ if TYPE_CHECKING:
 
     from tsgt.model import MotionPrior
 
-STATE = 18
+STATE_DIM = 18
 
 _LEAST_LONG_WAY_RAD = 0.3
 
 
 @dataclass(frozen=True, slots=True)
-class Knots:
+class States:
     """States at K instants.
 
     Attributes
@@ -61,9 +61,9 @@ class Knots:
     def __len__(self) -> int:
         return len(self.time_s)
 
-    def select(self, rows: slice | NDArray[np.intp]) -> Knots:
+    def select(self, rows: slice | NDArray[np.intp]) -> States:
         """Return some of them."""
-        return Knots(
+        return States(
             self.time_s[rows],
             self.position[rows],
             self.rotation[rows],
@@ -73,9 +73,9 @@ class Knots:
             self.angular_acceleration[rows],
         )
 
-    def moved(self, error: FloatArray) -> Knots:
+    def retract(self, error: FloatArray) -> States:
         """Return the states with errors, shape (K, 18), added."""
-        return Knots(
+        return States(
             self.time_s,
             self.position + error[:, 0:3],
             self.rotation @ exp_so3(error[:, 3:6]),
@@ -85,12 +85,12 @@ class Knots:
             self.angular_acceleration + error[:, 15:18],
         )
 
-    def error_from(self, other: Knots) -> FloatArray:
-        """Return the errors, shape (K, 18), that :meth:`moved` would have to add to ``other`` to get these states."""
+    def local_coordinates_about(self, other: States) -> FloatArray:
+        """Return the errors, shape (K, 18), that :meth:`retract` would have to add to ``other`` to get these states."""
         return np.concatenate(
             [
                 self.position - other.position,
-                log_of_steps(np.swapaxes(other.rotation, 1, 2) @ self.rotation),
+                fast_log_so3(np.swapaxes(other.rotation, 1, 2) @ self.rotation),
                 self.velocity - other.velocity,
                 self.angular_velocity - other.angular_velocity,
                 self.acceleration - other.acceleration,
@@ -100,13 +100,13 @@ class Knots:
         )
 
 
-def joined(parts: list[Knots]) -> Knots:
+def concatenate_states(parts: list[States]) -> States:
     """Return the states of all parts in their order."""
-    return Knots(*(np.concatenate([getattr(part, name) for part in parts]) for name in Knots.__slots__))
+    return States(*(np.concatenate([getattr(part, name) for part in parts]) for name in States.__slots__))
 
 
 @dataclass(frozen=True, slots=True)
-class Steps:
+class ProcessFactors:
     """What the prior says of the K - 1 steps from knot to knot; depends on their times alone.
 
     Attributes
@@ -121,10 +121,10 @@ class Steps:
     information: FloatArray
 
     @classmethod
-    def of(cls, time_s: FloatArray, prior: MotionPrior, sigmas: FloatArray | None = None) -> Steps:
+    def of(cls, time_s: FloatArray, prior: MotionPrior, sigmas: FloatArray | None = None) -> ProcessFactors:
         """Make them for K instants; ``sigmas``, (K - 1, 6), are those of the accelerations in each step, if not the prior's."""
         dt_s = (time_s[1:] - time_s[:-1])[:, None]
-        times_s = np.array([prior.acceleration_correlation_time_s, prior.angular_acceleration_time_s])
+        times_s = np.array([prior.acceleration_correlation_time_s, prior.angular_acceleration_correlation_time_s])
         two_phi, two_information = transition(dt_s, times_s), process_information(dt_s, times_s)
         weights = (axis_sigmas(prior)[None] if sigmas is None else sigmas) ** -2.0
         return cls(
@@ -132,13 +132,13 @@ class Steps:
             np.repeat(two_information, 3, axis=1) * weights[:, :, None, None],
         )
 
-    def select(self, rows: slice) -> Steps:
+    def select(self, rows: slice) -> ProcessFactors:
         """Return some of them."""
-        return Steps(self.phi[rows], self.information[rows])
+        return ProcessFactors(self.phi[rows], self.information[rows])
 
 
 @dataclass(frozen=True, slots=True)
-class LinearisedSteps:
+class LinearisedProcess:
     """How far K - 1 steps are from what the prior expects.
 
     A step's residuals are ``later - Phi earlier`` on each axis. All of it is linear in the states, but for the turn: that
@@ -163,7 +163,7 @@ class LinearisedSteps:
     turn_by_later: FloatArray
 
 
-def linearise_steps(knots: Knots, steps: Steps) -> LinearisedSteps:
+def linearise_process(knots: States, steps: ProcessFactors) -> LinearisedProcess:
     """Compare neighbours with the motion prior; exact derivatives.
 
     The rotation from one knot to the next, as a vector, is the sum of the turns on the way only where the axis stands
@@ -171,7 +171,7 @@ def linearise_steps(knots: Knots, steps: Steps) -> LinearisedSteps:
     fourth order in dt); the rest is linear in the angular acceleration, as the prior has it.
     """
     count = len(knots) - 1
-    turn = turn_between(knots.select(slice(None, -1)), knots.select(slice(1, None)))
+    turn = rotation_between(knots.select(slice(None, -1)), knots.select(slice(1, None)))
     before, after = knots.angular_velocity[:-1], knots.angular_velocity[1:]
     wander = ((knots.time_s[1:] - knots.time_s[:-1]) ** 2 / 12)[:, None]
     states = np.empty((count + 1, 6, 3))
@@ -187,12 +187,16 @@ def linearise_steps(knots: Knots, steps: Steps) -> LinearisedSteps:
     by_earlier[:, :, :3], by_later[:, :, :3] = -np.swapaxes(by_turn, 1, 2), by_turn
     by_earlier[:, :, 3:] = skew(wander * after)
     by_later[:, :, 3:] = skew(-wander * before)
-    residuals = np.swapaxes(later - apply(steps.phi, earlier), 1, 2).reshape(count, STATE)
-    return LinearisedSteps(earlier, later, residuals, by_earlier, by_later)
+    residuals = np.swapaxes(later - matvec(steps.phi, earlier), 1, 2).reshape(count, STATE_DIM)
+    return LinearisedProcess(earlier, later, residuals, by_earlier, by_later)
 
 
-def add_steps(
-    between: LinearisedSteps, steps: Steps, diagonal: FloatArray, beside: FloatArray, gradient: FloatArray
+def add_process_factors(
+    between: LinearisedProcess,
+    steps: ProcessFactors,
+    diagonal: FloatArray,
+    off_diagonal: FloatArray,
+    gradient: FloatArray,
 ) -> float:
     """Add what the prior says to the normal equations; only derivatives of turns make more of it than constants.
 
@@ -216,14 +220,14 @@ def add_steps(
     own[:-1] = weighed @ phi
     own[1:] += information
     _place_by_axis(diagonal)[...] += own
-    _place_by_axis(beside)[...] -= weighed
+    _place_by_axis(off_diagonal)[...] -= weighed
     residuals = between.residuals.reshape(count, 3, 2, 3)
     off = np.swapaxes(residuals[:, :, 0], 1, 2)
-    pull = apply(information, off)
+    pull = matvec(information, off)
     cost = float((pull * off).sum())
     by_order = gradient.reshape(-1, 3, 2, 3)
     by_order[1:, :, 0] += np.swapaxes(pull, 1, 2)
-    by_order[:-1, :, 0] -= np.swapaxes(apply(np.swapaxes(phi, 2, 3), pull), 1, 2)
+    by_order[:-1, :, 0] -= np.swapaxes(matvec(np.swapaxes(phi, 2, 3), pull), 1, 2)
 
     # Turn, angular velocity and acceleration by the errors of both knots, 9 each, and the residuals beside them.
     jacobian = np.zeros((count, 9, 19))
@@ -240,7 +244,7 @@ def add_steps(
     for matrix, part in (
         (diagonal[:-1], normal[:, :9, :9]),
         (diagonal[1:], normal[:, 9:18, 9:18]),
-        (beside, normal[:, :9, 9:18]),
+        (off_diagonal, normal[:, :9, 9:18]),
     ):
         matrix.reshape(count, 3, 2, 3, 3, 2, 3)[:, :, 1, :, :, 1] += part.reshape(count, 3, 3, 3, 3)
     by_order[:-1, :, 1] += normal[:, :9, 18].reshape(count, 3, 3)
@@ -255,13 +259,13 @@ def _place_by_axis(matrix: FloatArray) -> FloatArray:
     return view
 
 
-def turn_between(before: Knots, after: Knots) -> FloatArray:
+def rotation_between(before: States, after: States) -> FloatArray:
     """Turn from some states to others in rad, (N, 3): by more than pi where the angular velocities say so.
 
     A robot that goes on turning while nothing is seen of it comes back farther round than the shortest way. Less than
     0.3 rad from where it was it may have made a whole turn or none: then the shortest way stands.
     """
-    turn = log_of_steps(np.swapaxes(before.rotation, 1, 2) @ after.rotation)
+    turn = fast_log_so3(np.swapaxes(before.rotation, 1, 2) @ after.rotation)
     dt_s = (after.time_s - before.time_s)[:, None]
     expected = 0.5 * dt_s * (before.angular_velocity + after.angular_velocity)
     angle = np.sqrt(dot(turn, turn))[:, None]
@@ -273,9 +277,9 @@ def turn_between(before: Knots, after: Knots) -> FloatArray:
     return np.where(longer[:, None], the_other_way, turn)
 
 
-def spread(by_axis: FloatArray) -> FloatArray:
+def axes_to_state(by_axis: FloatArray) -> FloatArray:
     """Return matrices of the six axes, (N, 6, 3, 3), as one of the state, (N, 18, 18)."""
     matrix = np.zeros((len(by_axis), 3, 6, 3, 6))
     axes = np.arange(6)
     matrix[:, :, axes, :, axes] = by_axis.transpose(1, 0, 2, 3)
-    return matrix.reshape(-1, STATE, STATE)
+    return matrix.reshape(-1, STATE_DIM, STATE_DIM)

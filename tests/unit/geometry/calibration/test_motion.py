@@ -10,9 +10,9 @@ import pytest
 
 from tsgt.errors import GeometryError
 from tsgt.geometry import Observations, exp_so3, rotate
-from tsgt.geometry.calibration import Setup, Unknowns, calibrate_motion, frames_from_motion, undetermined
-from tsgt.geometry.calibration.motion_parameters import UnknownSetup
-from tsgt.geometry.trajectory import first_guess, knot_times, linearise
+from tsgt.geometry.calibration import Setup, SetupPrior, calibrate_motion, frames_from_motion, unobservable_directions
+from tsgt.geometry.calibration.motion_parameters import SetupParameters
+from tsgt.geometry.trajectory import initial_guess, knot_times, linearise
 from tsgt.geometry.trajectory.measurement_factors import line_of_sight_axes
 from tsgt.model import MotionPrior
 
@@ -23,8 +23,8 @@ LAYOUT = np.array([[-0.4559, -0.1759, 1.1167], [0.4844, -0.1759, 1.4167], [-0.02
 PRIOR = MotionPrior(
     acceleration_sigma_mps2=(0.4, 0.4, 0.1), angular_acceleration_sigma_radps2=(0.05, 0.05, 0.15)
 )
-REFINE = Unknowns(shift_sigma_m=0.05, turn_sigma_rad=0.005, latency_sigma_s=0.1)
-FROM_NOTHING = Unknowns(shift_sigma_m=10.0, turn_sigma_rad=0.2, latency_sigma_s=1.0)
+REFINE = SetupPrior(translation_sigma_m=0.05, rotation_sigma_rad=0.005, latency_sigma_s=0.1)
+FROM_NOTHING = SetupPrior(translation_sigma_m=10.0, rotation_sigma_rad=0.2, latency_sigma_s=1.0)
 
 
 def frames() -> FloatArray:
@@ -91,12 +91,12 @@ def wandering(observations: Observations, *, sigma_s: float, piece_s: float, see
 
 
 def surprise(
-    found_from: Observations, known: Unknowns, start: Setup | None = None
+    found_from: Observations, known: SetupPrior, start: Setup | None = None
 ) -> tuple[float, int, FloatArray]:
     """Squared distance of a result from the truth in its own sigmas, how many unknowns, error at the robot in m."""
     found = calibrate_motion(found_from, known, start=start, prior=PRIOR, noise_scale=1.0)
     true = Setup(frames(), np.array([0.0, 0.03, 0.0]), LAYOUT)
-    error = found.unknowns.away(found.setup) - found.unknowns.away(true)
+    error = found.unknowns.local_coordinates(found.setup) - found.unknowns.local_coordinates(true)
     missed, _ = found.setup.corrections(true, found.unknowns.pivot)
     return float(error @ np.linalg.solve(found.covariance, error)), len(error), missed
 
@@ -122,7 +122,7 @@ def test_stamps_that_wander_are_found_and_allowed_for() -> None:
         observations = wandering(wrong(drive(160.0, seed=seed)), sigma_s=3e-3, piece_s=40.0, seed=seed)
         found = calibrate_motion(observations, REFINE, prior=PRIOR, noise_scale=1.0)
         true = Setup(frames(), np.array([0.0, 0.03, 0.0]), LAYOUT)
-        error = found.unknowns.away(found.setup) - found.unknowns.away(true)
+        error = found.unknowns.local_coordinates(found.setup) - found.unknowns.local_coordinates(true)
         distances.append(float(error @ np.linalg.solve(found.covariance, error)))
         wander_s.append(found.wander_s)
     assert 1.5e-3 < np.mean(wander_s) < 5e-3
@@ -141,7 +141,7 @@ def test_a_silence_of_all_stations_does_no_harm() -> None:
     found = calibrate_motion(heard, REFINE, prior=PRIOR, noise_scale=1.0)
     assert found.measurements == len(heard)
     assert found.outliers < 5
-    assert found.disagreement < 1.5
+    assert found.birge_ratio < 1.5
 
 
 def test_levelled_stations_have_four_degrees_of_freedom() -> None:
@@ -151,8 +151,8 @@ def test_levelled_stations_have_four_degrees_of_freedom() -> None:
     level = calibrate_motion(observations, replace(REFINE, levelled=True), prior=PRIOR, noise_scale=1.0)
     assert len(level.unknowns.sigmas) == 10
     assert np.allclose(level.setup.frames[:, 2, :3], [0.0, 0.0, 1.0], atol=1e-12)
-    at = np.concatenate([level.unknowns.shifts.ravel(), level.unknowns.turns.ravel()])
-    same = np.concatenate([free.unknowns.shifts.ravel(), free.unknowns.turns[:, -1]])
+    at = np.concatenate([level.unknowns.translations.ravel(), level.unknowns.rotations.ravel()])
+    same = np.concatenate([free.unknowns.translations.ravel(), free.unknowns.rotations[:, -1]])
     assert np.all(np.diag(level.covariance)[at] < 1.05 * np.diag(free.covariance)[same])
 
 
@@ -173,7 +173,7 @@ def test_prisms_are_found_against_each_other() -> None:
     shifted = LAYOUT.copy()
     shifted[2] += [0.004, 0.0, 0.0]
     found = calibrate_motion(
-        replace(observations, layout=shifted), Unknowns(prism_sigma_m=0.01), prior=PRIOR, noise_scale=1.0
+        replace(observations, layout=shifted), SetupPrior(prism_sigma_m=0.01), prior=PRIOR, noise_scale=1.0
     )
     apart = np.linalg.norm(found.setup.layout - np.roll(found.setup.layout, 1, axis=0), axis=1)
     assert apart == pytest.approx(np.linalg.norm(LAYOUT - np.roll(LAYOUT, 1, axis=0), axis=1), abs=5e-4)
@@ -184,13 +184,13 @@ def test_prisms_are_found_against_each_other() -> None:
 @pytest.mark.parametrize("levelled", [False, True])
 def test_derivatives_are_exact(levelled: bool) -> None:  # noqa: FBT001
     """Each unknown moves the residuals as its derivative says."""
-    known = Unknowns(
-        shift_sigma_m=1.0, turn_sigma_rad=1.0, latency_sigma_s=1.0, prism_sigma_m=1.0, levelled=levelled
+    known = SetupPrior(
+        translation_sigma_m=1.0, rotation_sigma_rad=1.0, latency_sigma_s=1.0, prism_sigma_m=1.0, levelled=levelled
     )
     observations = drive(10.0)
     setup = Setup.of(observations)
-    unknowns = UnknownSetup.of(observations, setup, known)
-    knots = first_guess(observations, knot_times(observations.time_s))
+    unknowns = SetupParameters.of(observations, setup, known)
+    knots = initial_guess(observations, knot_times(observations.time_s))
     at = np.arange(len(observations))
     linearised = linearise(observations, knots, at)
     exact = unknowns.jacobian(observations, linearised, setup)
@@ -199,7 +199,7 @@ def test_derivatives_are_exact(levelled: bool) -> None:  # noqa: FBT001
         for step in (1e-6, -1e-6):
             move = np.zeros(len(unknowns.sigmas))
             move[unknown] = step
-            moved = unknowns.moved(setup, move)
+            moved = unknowns.retract(setup, move)
             changed = replace(
                 observations,
                 time_s=observations.time_s - moved.latencies_s[observations.station],
@@ -213,11 +213,11 @@ def test_derivatives_are_exact(levelled: bool) -> None:  # noqa: FBT001
 def test_what_a_straight_drive_does_not_tell_is_named() -> None:
     """Driving straight on level ground leaves turns about the way open; winding about leaves nothing open."""
     straight = calibrate_motion(drive(30.0, straight=True), REFINE, prior=PRIOR, noise_scale=1.0)
-    sentences = [direction.sentence for direction in undetermined(straight)]
+    sentences = [direction.description for direction in unobservable_directions(straight)]
     assert any(
-        "station 2 turns by" in sentence and "mrad about bearing" in sentence for sentence in sentences
+        "station 2 turns by" in description and "mrad about bearing" in description for description in sentences
     )
-    assert undetermined(calibrate_motion(drive(), REFINE, prior=PRIOR, noise_scale=1.0)) == []
+    assert unobservable_directions(calibrate_motion(drive(), REFINE, prior=PRIOR, noise_scale=1.0)) == []
 
 
 def test_station_1_is_needed() -> None:
@@ -230,7 +230,7 @@ def test_station_1_is_needed() -> None:
 def test_something_must_be_unknown() -> None:
     """With everything held there is nothing to do."""
     with pytest.raises(GeometryError, match="nothing to find"):
-        calibrate_motion(drive(20.0), Unknowns(), prior=PRIOR)
+        calibrate_motion(drive(20.0), SetupPrior(), prior=PRIOR)
 
 
 def test_a_robot_that_stands_does_not_tell_frames() -> None:

@@ -22,7 +22,7 @@ from tsgt.geometry import (
     transform_from,
     transform_points,
 )
-from tsgt.geometry.calibration import Pairs, PointSet, calibrate_frame, calibrate_prisms, fit_frame
+from tsgt.geometry.calibration import PointPairs, PointSet, calibrate_frame, calibrate_prisms, fit_frame
 from tsgt.geometry.calibration.targets import Limits
 from tsgt.model import ARCSECOND_RAD, InstrumentNoise
 
@@ -109,7 +109,7 @@ def test_the_covariance_is_that_of_the_errors(*, weighted: bool, levelled: bool)
     """Over many simulated campaigns the normalised squared error averages its degrees of freedom (NEES)."""
     simulated, free, nees = field(), FREE_OF[levelled], []
     for _ in range(400):
-        fit = fit_frame(Pairs(*simulated.measure(), levelled), weighted=weighted)
+        fit = fit_frame(PointPairs(*simulated.measure(), levelled), weighted=weighted)
         error = error_of(transform_from(fit.rotation, fit.translation_m), T_1_2)[free]
         nees.append(error @ np.linalg.solve(fit.covariance[np.ix_(free, free)], error) / len(free))
     # Three sigma of a mean of 400 chi squared variables over their degrees of freedom.
@@ -121,7 +121,7 @@ def test_weights_make_the_frame_better() -> None:
     simulated = field()
     errors: dict[bool, list[float]] = {True: [], False: []}
     for _ in range(200):
-        pairs = Pairs(*simulated.measure(), levelled=False)
+        pairs = PointPairs(*simulated.measure(), levelled=False)
         for weighted in (True, False):
             fit = fit_frame(pairs, weighted=weighted)
             errors[weighted].append(float(np.sum((fit.translation_m - T_1_2[:3, 3]) ** 2)))
@@ -151,7 +151,7 @@ def test_a_bad_point_is_named(number: int, extra_m: float) -> None:
     """A distance that is 50 mm wrong is rejected, and the frame is that of the other points."""
     solved = calibrate_frame(*field().measure({number: extra_m}))
     assert [point.name for point in solved.rejected] == [number]
-    assert solved.rejected[0].miss_m == pytest.approx(0.05, abs=0.006)
+    assert solved.rejected[0].prediction_error_m == pytest.approx(0.05, abs=0.006)
     assert number not in solved.used
     assert solved.rms_m < 0.003
     assert solved.consistent
@@ -192,7 +192,7 @@ def test_an_error_that_a_wrong_constant_can_make_is_not_a_bad_point() -> None:
     assert calibrate_frame(source, target).rejected == ()
     (rejected,) = calibrate_frame(source, target, limits=Limits(weak_rad=0.5e-3, blunder_m=0.005)).rejected
     assert rejected.name == 3
-    assert rejected.miss_m == pytest.approx(0.008)
+    assert rejected.prediction_error_m == pytest.approx(0.008)
 
 
 def test_points_all_around_are_not_weak() -> None:

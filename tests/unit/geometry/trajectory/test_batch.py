@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.prior_motion import draw_motions, in_time, measure
+from harness.prior_motion import draw_motions, sorted_by_time, measure
 
 from tsgt.errors import GeometryError
 from tsgt.geometry.trajectory import batch as fitting
-from tsgt.geometry.trajectory import fit
+from tsgt.geometry.trajectory import fit_trajectory
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:
@@ -25,22 +25,22 @@ PRIOR = MotionPrior()
 def observations() -> Observations:
     """Measure eighty seconds of a robot, some 600 measurements."""
     motion = draw_motions(PRIOR, count=1, duration_s=81.0, seed=21)[0]
-    return in_time(measure(motion, until_s=80.0, seed=22))
+    return sorted_by_time(measure(motion, until_s=80.0, seed=22))
 
 
 def test_pieces_give_what_one_gives(observations: Observations, monkeypatch: pytest.MonkeyPatch) -> None:
     """States to a hundredth of a millimetre, covariances to a thousandth of theirs, measurements in their order."""
-    whole = fit(observations, prior=PRIOR, noise_scale=1.0)
+    whole = fit_trajectory(observations, prior=PRIOR, noise_scale=1.0)
     monkeypatch.setattr("tsgt.geometry.trajectory.batch.KNOTS_AT_ONCE", 150)
     monkeypatch.setattr("tsgt.geometry.trajectory.batch.OVERLAP", 80)
-    pieces = fit(observations, prior=PRIOR, noise_scale=1.0)
-    error = pieces.trajectory.knots.error_from(whole.trajectory.knots)
+    pieces = fit_trajectory(observations, prior=PRIOR, noise_scale=1.0)
+    error = pieces.trajectory.knots.local_coordinates_about(whole.trajectory.knots)
     assert np.abs(error[:, :6]).max() < 1e-5
     sigma = np.sqrt(np.diagonal(whole.trajectory.covariance, axis1=1, axis2=2))
     scale = sigma[:, :, None] * sigma[:, None, :]
     assert (np.abs(pieces.trajectory.covariance - whole.trajectory.covariance) / scale).max() < 1e-3
-    beside = (np.abs(pieces.trajectory.beside - whole.trajectory.beside) / scale[:-1]).max()
-    assert beside < 1e-2
+    cross_covariance = (np.abs(pieces.trajectory.cross_covariance - whole.trajectory.cross_covariance) / scale[:-1]).max()
+    assert cross_covariance < 1e-2
     np.testing.assert_allclose(pieces.residuals_m, whole.residuals_m, atol=1e-5)
 
 
@@ -49,7 +49,7 @@ def test_outliers_are_known_by_their_weights(observations: Observations) -> None
     points = observations.points_m.copy()
     spoilt = np.array([50, 200, 201, 420])
     points[spoilt] += 0.5
-    found = fit(replace(observations, points_m=points), prior=PRIOR, noise_scale=1.0)
+    found = fit_trajectory(replace(observations, points_m=points), prior=PRIOR, noise_scale=1.0)
     assert set(spoilt) <= set(np.flatnonzero(found.weights < 1.0))
     assert np.all(found.weights[spoilt] < 0.01)
     assert np.count_nonzero(found.weights < 0.5) == len(spoilt)
@@ -58,7 +58,7 @@ def test_outliers_are_known_by_their_weights(observations: Observations) -> None
 def test_a_station_that_comes_late_is_no_reason_to_fail(observations: Observations) -> None:
     """Where one prism is not measured for a minute, the rest carries on, and the covariance says how well."""
     late = observations.select((observations.prism != 1) | (observations.time_s > 60.0))
-    found = fit(late, prior=PRIOR, noise_scale=1.0)
+    found = fit_trajectory(late, prior=PRIOR, noise_scale=1.0)
     _, covariance = found.trajectory.at(np.array([30.0, 70.0]))
     assert np.trace(covariance[0, 3:6, 3:6]) > 2 * np.trace(covariance[1, 3:6, 3:6])
 
@@ -69,7 +69,7 @@ def test_progress_goes_from_nothing_to_all(
     """Shares rise to 1."""
     monkeypatch.setattr("tsgt.geometry.trajectory.batch.KNOTS_AT_ONCE", 200)
     shares: list[float] = []
-    fit(observations, prior=PRIOR, noise_scale=1.0, on_progress=shares.append)
+    fit_trajectory(observations, prior=PRIOR, noise_scale=1.0, on_progress=shares.append)
     assert shares == sorted(shares)
     assert (shares[0], shares[-1]) == (0.0, 1.0)
     assert len(shares) > 3
@@ -77,15 +77,15 @@ def test_progress_goes_from_nothing_to_all(
 
 def test_what_is_not_given_is_found(observations: Observations) -> None:
     """The noise's scale comes back as it was put in."""
-    found = fit(replace(observations, sigmas_m=observations.sigmas_m / 3))
+    found = fit_trajectory(replace(observations, sigmas_m=observations.sigmas_m / 3))
     assert found.noise_scale == pytest.approx(3.0, rel=0.15)
-    assert found.distances.mean() < 3.0
+    assert found.squared_distances.mean() < 3.0
 
 
 def test_no_trajectory_without_three_prisms(observations: Observations) -> None:
     """The message says how many were measured."""
     with pytest.raises(GeometryError, match="3 prisms to begin with, 2 have been measured"):
-        fit(observations.select(observations.prism < 2), prior=PRIOR, noise_scale=1.0)
+        fit_trajectory(observations.select(observations.prism < 2), prior=PRIOR, noise_scale=1.0)
 
 
 def test_pieces_cover_all_knots_once() -> None:

@@ -35,8 +35,8 @@ SHAPES = [(1, 1), (1, 4), (2, 3), (7, 5), (30, 18)]
 @pytest.mark.parametrize(("count", "size"), SHAPES)
 def test_solutions_are_those_of_the_dense_system(count: int, size: int) -> None:
     """One right hand side and several give what a dense solver gives."""
-    diagonal, beside, whole = made_up(count, size)
-    factor = factorise(diagonal, beside)
+    diagonal, off_diagonal, whole = made_up(count, size)
+    factor = factorise(diagonal, off_diagonal)
     right = np.random.default_rng(0).normal(size=(count, size, 3))
     expected = np.linalg.solve(whole, right.reshape(-1, 3)).reshape(right.shape)
     np.testing.assert_allclose(factor.solve(right), expected, atol=1e-12)
@@ -46,8 +46,8 @@ def test_solutions_are_those_of_the_dense_system(count: int, size: int) -> None:
 @pytest.mark.parametrize(("count", "size"), SHAPES)
 def test_marginals_are_blocks_of_the_inverse(count: int, size: int) -> None:
     """Covariances and those of neighbours are the inverse's blocks."""
-    diagonal, beside, whole = made_up(count, size)
-    own, next_to = factorise(diagonal, beside).marginals()
+    diagonal, off_diagonal, whole = made_up(count, size)
+    own, next_to = factorise(diagonal, off_diagonal).marginals()
     inverse = np.linalg.inv(whole).reshape(count, size, count, size).transpose(0, 2, 1, 3)
     k = np.arange(count)
     np.testing.assert_allclose(own, inverse[k, k], atol=1e-13)
@@ -57,22 +57,22 @@ def test_marginals_are_blocks_of_the_inverse(count: int, size: int) -> None:
 @pytest.mark.parametrize(("count", "size"), SHAPES)
 def test_determinant(count: int, size: int) -> None:
     """The determinant's logarithm is the dense one."""
-    diagonal, beside, whole = made_up(count, size)
-    assert factorise(diagonal, beside).log_determinant() == pytest.approx(
+    diagonal, off_diagonal, whole = made_up(count, size)
+    assert factorise(diagonal, off_diagonal).log_determinant() == pytest.approx(
         np.linalg.slogdet(whole)[1], rel=1e-12
     )
 
 
 def test_upper_triangles_of_the_diagonal_are_not_looked_at() -> None:
     """What stands above the diagonal of a block on it changes nothing."""
-    diagonal, beside, _ = made_up(4, 3)
+    diagonal, off_diagonal, _ = made_up(4, 3)
     changed = np.tril(diagonal)
-    np.testing.assert_array_equal(factorise(changed, beside).banded, factorise(diagonal, beside).banded)
+    np.testing.assert_array_equal(factorise(changed, off_diagonal).banded, factorise(diagonal, off_diagonal).banded)
 
 
 def test_what_is_not_determined_is_an_error() -> None:
     """A matrix that is not positive definite is refused in words."""
-    diagonal, beside, _ = made_up(4, 3)
+    diagonal, off_diagonal, _ = made_up(4, 3)
     diagonal[2] = 0.0
     with pytest.raises(GeometryError, match="do not determine"):
-        factorise(diagonal, beside)
+        factorise(diagonal, off_diagonal)

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from harness.manoeuvre import speeding_up_and_turning_back
-from harness.prior_motion import draw_motions, in_time, measure, rows_at
+from harness.prior_motion import draw_motions, sorted_by_time, measure, rows_at
 
-from tsgt.geometry import FixedLag, FloatArray, Observations
+from tsgt.geometry import FixedLagSmoother, FloatArray, Observations
 from tsgt.geometry.trajectory.fixed_lag import LIVELIER_AHEAD
-from tsgt.geometry.trajectory.propagation import Ahead
+from tsgt.geometry.trajectory.propagation import Propagator
 from tsgt.model import MotionPrior
 
 PRIOR = MotionPrior()
@@ -25,24 +25,24 @@ LATEST_S = 0.8
 def observations() -> Observations:
     """Twelve seconds of a robot that moves as the prior says."""
     (motion,) = draw_motions(PRIOR, count=1, duration_s=12.0, seed=1)
-    return in_time(measure(motion, until_s=12.0, seed=1))
+    return sorted_by_time(measure(motion, until_s=12.0, seed=1))
 
 
-def followed(observations: Observations) -> FixedLag:
+def followed(observations: Observations) -> FixedLagSmoother:
     """One by one; what is older than the lag is let go of."""
-    window = FixedLag(PRIOR)
+    window = FixedLagSmoother(PRIOR)
     for row in range(len(observations)):
         window.update(observations.select(slice(row, row + 1)))
-        window.forget(observations.time_s[row] - LAG_S)
+        window.marginalise_before(observations.time_s[row] - LAG_S)
     return window
 
 
-def without_surprise(window: FixedLag, at_s: float) -> FloatArray:
+def without_surprise(window: FixedLagSmoother, at_s: float) -> FloatArray:
     """Return the covariance of the state at an instant, of a robot that is livelier from the last measurement on."""
     trajectory = window.trajectory()
     end_s = trajectory.knots.time_s[-1:]
     state, covariance = trajectory.at(end_s)
-    return Ahead(state, covariance[0], PRIOR, livelier=LIVELIER_AHEAD).at(at_s)[1]
+    return Propagator(state, covariance[0], PRIOR, process_noise_scale=LIVELIER_AHEAD).at(at_s)[1]
 
 
 def test_a_robot_that_does_the_unexpected_is_predicted_with_less_certainty(
@@ -80,14 +80,14 @@ def test_the_hardest_manoeuvres_are_not_far_beyond_what_predictions_state() -> N
     )
     largest = []
     for seed in range(6):
-        measured = in_time(measure(motion, until_s=9.0, seed=seed))
+        measured = sorted_by_time(measure(motion, until_s=9.0, seed=seed))
         found = []
         for last_s in np.arange(7.6, 8.4, 0.1):
             window = followed(measured.select(measured.time_s < last_s))
             for ahead_s in np.arange(0.2, LATEST_S, 0.1):
                 at = np.array([last_s + ahead_s])
-                state, covariance = window.predict(float(at[0]), parts=6)
-                error = state.error_from(motion.select(rows_at(at)))[0, :6]
+                state, covariance = window.predict(float(at[0]), dim=6)
+                error = state.local_coordinates_about(motion.select(rows_at(at)))[0, :6]
                 found.append(float(error @ np.linalg.solve(covariance[0], error)))
         largest.append(max(found))
     # Squared errors in sigmas. By the prior alone, which knows no such robot, the mean of these is 40.

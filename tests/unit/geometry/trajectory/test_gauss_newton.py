@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.prior_motion import SIGMAS_M, STEP_S, as_points, draw_motions, in_time, measure, rows_at
+from harness.prior_motion import SIGMAS_M, STEP_S, as_cartesian, draw_motions, sorted_by_time, measure, rows_at
 from harness.scene import FRAMES, LAYOUT
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
@@ -15,17 +15,17 @@ from scipy.stats import multivariate_normal
 
 from tsgt.errors import GeometryError
 from tsgt.geometry import Observations, Trajectory, cartesian_to_polar, exp_so3
-from tsgt.geometry.trajectory import LEAST_STEP_S, STATE, Knots, first_guess, knot_times, nearest, solve
+from tsgt.geometry.trajectory import MIN_KNOT_SPACING_S, STATE_DIM, States, initial_guess, knot_times, nearest_knots, solve
 from tsgt.geometry.trajectory.gauss_newton import (
-    HOPELESS,
-    OUTLYING,
-    SETTLED,
-    Anchor,
+    REJECTION_THRESHOLD,
+    OUTLIER_THRESHOLD,
+    COST_TOLERANCE,
+    AnchorPrior,
     log_evidence,
-    start_anchor,
+    diffuse_prior,
 )
 from tsgt.geometry.trajectory.motion_prior import process_noise, transition
-from tsgt.geometry.trajectory.states import Steps, linearise_steps, spread
+from tsgt.geometry.trajectory.states import ProcessFactors, linearise_process, axes_to_state
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:
@@ -38,13 +38,13 @@ MOTION = draw_motions(PRIOR, count=1, duration_s=8.0, seed=3)[0]
 @pytest.fixture(scope="module")
 def observations() -> Observations:
     """Six seconds of a robot, three stations, exact stamps."""
-    found = in_time(measure(MOTION, until_s=6.0, seed=4))
+    found = sorted_by_time(measure(MOTION, until_s=6.0, seed=4))
     return replace(found, time_sigma_s=np.zeros(len(found)))
 
 
-def guess_of(observations: Observations) -> Knots:
+def guess_of(observations: Observations) -> States:
     """Give the first guess at the knots of these measurements."""
-    return first_guess(observations, knot_times(observations.time_s))
+    return initial_guess(observations, knot_times(observations.time_s))
 
 
 def a_point(time_s: FloatArray, x_m: FloatArray, sigma_m: float) -> Observations:
@@ -63,10 +63,10 @@ def a_point(time_s: FloatArray, x_m: FloatArray, sigma_m: float) -> Observations
     )
 
 
-def at_rest(time_s: FloatArray) -> Knots:
+def at_rest(time_s: FloatArray) -> States:
     """Give a robot at the origin."""
     zero = np.zeros((len(time_s), 3))
-    return Knots(time_s, zero, np.broadcast_to(np.eye(3), (len(time_s), 3, 3)), zero, zero, zero, zero)
+    return States(time_s, zero, np.broadcast_to(np.eye(3), (len(time_s), 3, 3)), zero, zero, zero, zero)
 
 
 def dense_prior(time_s: FloatArray, first: FloatArray, time_constant_s: float, sigma: float) -> FloatArray:
@@ -101,14 +101,14 @@ def test_translation_is_dense_gaussian_process_regression() -> None:
     for prior in priors:
         sigma, lasting_s = prior.acceleration_sigma_mps2[0], prior.acceleration_correlation_time_s
         spread_of_first = np.array([2.0, 1.5, sigma])
-        information = np.eye(STATE)
+        information = np.eye(STATE_DIM)
         for axis in range(3):
             own = prior.acceleration_sigma_mps2[axis]
             information[axis, axis], information[6 + axis, 6 + axis] = 2.0**-2, 1.5**-2
             information[12 + axis, 12 + axis] = own**-2
         # Where the measurements are, so that none is an outlier to begin with.
         start = replace(at_rest(time_s), position=data.points_m)
-        at_origin = Anchor(at_rest(time_s).select(slice(0, 1)), information)
+        at_origin = AnchorPrior(at_rest(time_s).select(slice(0, 1)), information)
         found = solve(data, start, prior, anchor=at_origin)
         assert np.all(found.weights == 1.0)
 
@@ -119,12 +119,12 @@ def test_translation_is_dense_gaussian_process_regression() -> None:
         covariance = joint.reshape(75, 75) - gain @ joint[:, 0].reshape(25, -1)
         for part, values in enumerate((found.knots.position, found.knots.velocity, found.knots.acceleration)):
             np.testing.assert_allclose(values[:, 0], mean[:, part], atol=1e-8)
-        diagonal, beside = found.factor.marginals()
+        diagonal, off_diagonal = found.factor.marginals()
         blocks, parts = covariance.reshape(25, 3, 25, 3), [0, 6, 12]
         for k in range(25):
             np.testing.assert_allclose(diagonal[k][np.ix_(parts, parts)], blocks[k, :, k], atol=1e-9)
         for k in range(24):
-            np.testing.assert_allclose(beside[k][np.ix_(parts, parts)], blocks[k, :, k + 1], atol=1e-9)
+            np.testing.assert_allclose(off_diagonal[k][np.ix_(parts, parts)], blocks[k, :, k + 1], atol=1e-9)
         evidence.append(log_evidence(found, data, prior))
         per_axis = []
         for own in prior.acceleration_sigma_mps2:
@@ -145,14 +145,14 @@ def test_six_degrees_of_freedom_are_least_squares(observations: Observations) ->
     start = guess_of(data)
     found = solve(data, start, PRIOR)
     assert np.all(found.weights == 1.0)
-    at, steps = nearest(start.time_s, data.time_s), Steps.of(start.time_s, PRIOR)
-    anchor = start_anchor(start.select(slice(0, 1)), PRIOR)
-    roots = np.swapaxes(np.linalg.cholesky(spread(steps.information)), 1, 2)
+    at, steps = nearest_knots(start.time_s, data.time_s), ProcessFactors.of(start.time_s, PRIOR)
+    anchor = diffuse_prior(start.select(slice(0, 1)), PRIOR)
+    roots = np.swapaxes(np.linalg.cholesky(axes_to_state(steps.information)), 1, 2)
     anchor_root = np.sqrt(np.diag(anchor.information))
     measured = np.stack(cartesian_to_polar(data.points_m), axis=-1)
 
     def residuals(flat: FloatArray) -> FloatArray:
-        knots = found.knots.moved(flat.reshape(-1, STATE))
+        knots = found.knots.retract(flat.reshape(-1, STATE_DIM))
         delta_s = (data.time_s - knots.time_s[at])[:, None]
         turn = knots.angular_velocity[at] * delta_s + knots.angular_acceleration[at] * delta_s**2 / 2
         arm = Rotation.from_rotvec(turn).apply(LAYOUT[data.prism])
@@ -174,8 +174,8 @@ def test_six_degrees_of_freedom_are_least_squares(observations: Observations) ->
             ],
             axis=-1,
         )
-        by_step = (roots @ linearise_steps(knots, steps).residuals[..., None])[..., 0]
-        first = anchor_root * knots.select(slice(0, 1)).error_from(anchor.near)[0]
+        by_step = (roots @ linearise_process(knots, steps).residuals[..., None])[..., 0]
+        first = anchor_root * knots.select(slice(0, 1)).local_coordinates_about(anchor.near)[0]
         return np.concatenate([(by_measurement / data.sigmas_m).ravel(), by_step.ravel(), first])
 
     diagonal, _ = found.factor.marginals()
@@ -188,7 +188,7 @@ def test_six_degrees_of_freedom_are_least_squares(observations: Observations) ->
 
     oracle = least_squares(in_sigmas, begin, method="lm")
     # The search ends where a step gains less than this.
-    assert 2 * oracle.cost == pytest.approx(found.cost, abs=SETTLED * len(data) ** 0.5)
+    assert 2 * oracle.cost == pytest.approx(found.cost, abs=COST_TOLERANCE * len(data) ** 0.5)
     assert np.abs(oracle.x).max() < 0.03
 
 
@@ -197,8 +197,8 @@ def test_the_order_of_measurements_is_irrelevant(observations: Observations) -> 
     start = guess_of(observations)
     order = np.random.default_rng(6).permutation(len(observations))
     found, shuffled = (solve(data, start, PRIOR) for data in (observations, observations.select(order)))
-    np.testing.assert_allclose(shuffled.knots.error_from(found.knots), 0.0, atol=1e-8)
-    np.testing.assert_allclose(shuffled.distances, found.distances[order], atol=1e-5)
+    np.testing.assert_allclose(shuffled.knots.local_coordinates_about(found.knots), 0.0, atol=1e-8)
+    np.testing.assert_allclose(shuffled.squared_distances, found.squared_distances[order], atol=1e-5)
     assert shuffled.cost == pytest.approx(found.cost)
 
 
@@ -208,7 +208,7 @@ def test_good_measurements_are_three_sigmas_squared_away_less_what_they_fit(
     """Distances have the expectation of a chi-square with three degrees of freedom, less the freedom of the fit."""
     found = solve(observations, guess_of(observations), PRIOR)
     # The trajectory takes what it takes up: six numbers a time, every 0.4 s, of nine that are measured.
-    assert 0.8 < found.distances.mean() < 3.0
+    assert 0.8 < found.squared_distances.mean() < 3.0
     assert np.count_nonzero(found.weights < 1.0) <= 1
 
 
@@ -222,8 +222,8 @@ def test_outliers_are_named(observations: Observations, miss_m: float) -> None:
     found = solve(replace(observations, points_m=points), guess_of(observations), PRIOR)
     assert np.argmin(found.weights) == wrong
     assert found.weights[wrong] < 16 / (miss_m / 0.01) ** 2
-    little = OUTLYING**2 / found.distances[wrong]
-    assert found.weights[wrong] == pytest.approx(0.0 if found.distances[wrong] > HOPELESS**2 else little)
+    little = OUTLIER_THRESHOLD**2 / found.squared_distances[wrong]
+    assert found.weights[wrong] == pytest.approx(0.0 if found.squared_distances[wrong] > REJECTION_THRESHOLD**2 else little)
     assert np.count_nonzero((found.weights < 1.0) & (clean.weights == 1.0)) == 1
     arm = LAYOUT.mean(axis=0)
     centroid, clean_centroid = (s.knots.position + s.knots.rotation @ arm for s in (found, clean))
@@ -247,7 +247,7 @@ def test_a_lock_on_the_wrong_prism_is_named(observations: Observations) -> None:
 def test_a_station_that_stays_on_the_wrong_prism_turns_nothing() -> None:
     """What two prisms do not tell is not told by many outliers together either: it stays as uncertain as without them."""
     (motion,) = draw_motions(PRIOR, count=1, duration_s=8.0, seed=4)
-    observations = in_time(measure(motion, until_s=6.0, seed=4))
+    observations = sorted_by_time(measure(motion, until_s=6.0, seed=4))
     wrong = (observations.prism == 0) & (observations.time_s > 3.0)
     truth = motion.select(rows_at(observations.time_s[wrong]))
     world = truth.position + truth.rotation @ LAYOUT[1]
@@ -261,7 +261,7 @@ def test_a_station_that_stays_on_the_wrong_prism_turns_nothing() -> None:
         )
     )
     sigmas = np.sqrt(np.diagonal(expected_covariance, axis1=1, axis2=2))
-    assert np.abs(state.error_from(expected) / sigmas).max() < 2.0
+    assert np.abs(state.local_coordinates_about(expected) / sigmas).max() < 2.0
     worst, expected_worst = (
         np.linalg.eigvalsh(each[0, 3:6, 3:6])[-1] for each in (covariance, expected_covariance)
     )
@@ -271,7 +271,7 @@ def test_a_station_that_stays_on_the_wrong_prism_turns_nothing() -> None:
 def test_a_solution_from_points_is_near_that_from_polar_ones(observations: Observations) -> None:
     """Cartesian points, whose noise is known less well, put the robot within millimetres of the same place."""
     found = solve(observations, guess_of(observations), PRIOR)
-    of_points = solve(as_points(observations), guess_of(observations), PRIOR)
+    of_points = solve(as_cartesian(observations), guess_of(observations), PRIOR)
     miss = of_points.knots.position - found.knots.position
     assert np.sqrt((miss**2).sum(axis=1).mean()) < 2 * SIGMAS_M[0]
 
@@ -280,10 +280,10 @@ def test_a_bad_start_still_finds_it(observations: Observations) -> None:
     """From metres and tens of degrees away it comes to the same trajectory, with the same covariances."""
     start = guess_of(observations)
     rng = np.random.default_rng(7)
-    error = np.zeros((len(start), STATE))
+    error = np.zeros((len(start), STATE_DIM))
     error[:, :3], error[:, 3:6] = rng.normal(scale=2.0, size=(2, len(start), 3)) * [[[1.0]], [[0.2]]]
-    anchor = start_anchor(start.select(slice(0, 1)), PRIOR)
-    good, bad = (solve(observations, begin, PRIOR, anchor=anchor) for begin in (start, start.moved(error)))
+    anchor = diffuse_prior(start.select(slice(0, 1)), PRIOR)
+    good, bad = (solve(observations, begin, PRIOR, anchor=anchor) for begin in (start, start.retract(error)))
     assert bad.cost == pytest.approx(good.cost, rel=1e-5)
     np.testing.assert_allclose(bad.knots.position, good.knots.position, atol=1e-4)
     np.testing.assert_allclose(
@@ -296,12 +296,12 @@ def test_covariances_are_never_damped(observations: Observations, most: int) -> 
     """Wherever the search is cut short, the covariances are those of the system there, without the search's damping."""
     start = guess_of(observations)
     rng = np.random.default_rng(8)
-    error = np.zeros((len(start), STATE))
+    error = np.zeros((len(start), STATE_DIM))
     error[:, 3:6] = rng.normal(scale=0.6, size=(len(start), 3))
-    anchor = start_anchor(start.select(slice(0, 1)), PRIOR)
-    cut = solve(observations, start.moved(error), PRIOR, anchor=anchor, most_iterations=most)
+    anchor = diffuse_prior(start.select(slice(0, 1)), PRIOR)
+    cut = solve(observations, start.retract(error), PRIOR, anchor=anchor, max_iterations=most)
     assert cut.iterations == most
-    there = solve(observations, cut.knots, PRIOR, anchor=anchor, most_iterations=0)
+    there = solve(observations, cut.knots, PRIOR, anchor=anchor, max_iterations=0)
     np.testing.assert_allclose(there.factor.banded, cut.factor.banded, rtol=1e-9, atol=1e-9)
 
 
@@ -324,7 +324,7 @@ def test_prisms_in_one_place_are_refused(observations: Observations) -> None:
 def test_what_nothing_determines_is_an_error(observations: Observations) -> None:
     """Without any knowledge of the first state and with one measurement there is no trajectory."""
     start = guess_of(observations)
-    nothing = Anchor(start.select(slice(0, 1)), np.zeros((STATE, STATE)))
+    nothing = AnchorPrior(start.select(slice(0, 1)), np.zeros((STATE_DIM, STATE_DIM)))
     with pytest.raises(GeometryError, match="do not determine the trajectory"):
         solve(observations.select(slice(0, 1)), start, PRIOR, anchor=nothing)
 
@@ -332,7 +332,7 @@ def test_what_nothing_determines_is_an_error(observations: Observations) -> None
 def test_one_visible_prism_leaves_a_covariance_that_says_so(observations: Observations) -> None:
     """When two of three prisms vanish the attitude becomes uncertain, faster than the place of the prism still seen."""
     data = observations.select((observations.time_s < 2.0) | (observations.prism == 0))
-    start = first_guess(data, knot_times(data.time_s))
+    start = initial_guess(data, knot_times(data.time_s))
     diagonal, _ = solve(data, start, PRIOR).factor.marginals()
     before, after = diagonal[np.searchsorted(start.time_s, 1.5)], diagonal[-1]
     turning = np.sqrt(np.linalg.eigvalsh(after[3:6, 3:6]).max() / np.linalg.eigvalsh(before[3:6, 3:6]).max())
@@ -351,7 +351,7 @@ def test_a_robot_that_turns_fast_while_one_prism_is_seen_is_not_lost(rate_radps:
     time_s = np.arange(round(8.0 / STEP_S) + 1, dtype=np.float64) * STEP_S
     still = np.zeros((len(time_s), 3))
     velocity, rates = (np.tile(v, (len(time_s), 1)) for v in ([0.8, -0.5, 0.0], [0.3, 0.0, rate_radps]))
-    motion = Knots(
+    motion = States(
         time_s,
         np.array([60.0, 45.0, -1.0]) + time_s[:, None] * velocity,
         exp_so3(time_s[:, None] * rates),
@@ -360,34 +360,34 @@ def test_a_robot_that_turns_fast_while_one_prism_is_seen_is_not_lost(rate_radps:
         still,
         still,
     )
-    whole = in_time(measure(motion, until_s=7.5, seed=18))
+    whole = sorted_by_time(measure(motion, until_s=7.5, seed=18))
     data = whole.select((whole.time_s < 3.0) | (whole.time_s > 4.5) | (whole.prism == 0))
     start = guess_of(data)
     truth = motion.select(rows_at(start.time_s))
-    away = start.error_from(truth)
+    away = start.local_coordinates_about(truth)
     assert np.linalg.norm(away[:, 3:6], axis=1).max() < 0.7
     found = solve(data, start, PRIOR)
     assert np.all(found.weights == 1.0)
-    assert np.linalg.norm(found.knots.error_from(truth)[:, 3:6], axis=1).max() < 0.1
+    assert np.linalg.norm(found.knots.local_coordinates_about(truth)[:, 3:6], axis=1).max() < 0.1
 
 
 def test_knots_stand_at_measurements() -> None:
     """One measurement alone has its knot at its instant; those within the least step share one at their mean."""
-    times = knot_times(np.array([1.0, 1.2, 1.2 + 0.3 * LEAST_STEP_S, 3.3]))
-    np.testing.assert_allclose(times, [1.0, 1.2 + 0.15 * LEAST_STEP_S, 3.3])
+    times = knot_times(np.array([1.0, 1.2, 1.2 + 0.3 * MIN_KNOT_SPACING_S, 3.3]))
+    np.testing.assert_allclose(times, [1.0, 1.2 + 0.15 * MIN_KNOT_SPACING_S, 3.3])
 
 
 def test_knots_are_apart_and_near() -> None:
     """However measurements fall, knots keep a distance and every measurement has one within the least step."""
     time_s = np.sort(np.random.default_rng(9).uniform(0, 20, 2000))
     times = knot_times(time_s)
-    assert np.diff(times).min() > 0.2 * LEAST_STEP_S
-    assert np.abs(times[nearest(times, time_s)] - time_s).max() < LEAST_STEP_S
+    assert np.diff(times).min() > 0.2 * MIN_KNOT_SPACING_S
+    assert np.abs(times[nearest_knots(times, time_s)] - time_s).max() < MIN_KNOT_SPACING_S
 
 
 def test_nearest_is_the_nearest() -> None:
     """Each instant gets the knot that is nearest, before the first and after the last one too."""
     knots_s = np.array([0.0, 1.0, 3.0])
     time_s = np.array([-5.0, 0.4, 0.6, 1.9, 2.1, 9.0])
-    np.testing.assert_array_equal(nearest(knots_s, time_s), [0, 0, 1, 1, 2, 2])
-    np.testing.assert_array_equal(nearest(knots_s[:1], time_s), 0)
+    np.testing.assert_array_equal(nearest_knots(knots_s, time_s), [0, 0, 1, 1, 2, 2])
+    np.testing.assert_array_equal(nearest_knots(knots_s[:1], time_s), 0)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from harness.prior_motion import STEP_S, in_time, measure, rows_at
+from harness.prior_motion import STEP_S, sorted_by_time, measure, rows_at
 
-from tsgt.geometry import Knots, exp_so3, log_so3
-from tsgt.geometry.trajectory import at_least, fit
-from tsgt.geometry.trajectory.hyperparameters import hidden
+from tsgt.geometry import States, exp_so3, log_so3
+from tsgt.geometry.trajectory import with_noise_floor, fit_trajectory
+from tsgt.geometry.trajectory.hyperparameters import partially_occluded
 from tsgt.geometry.trajectory.motion_prior import axis_sigmas
 from tsgt.model import MotionPrior, PipelineParameters
 
@@ -19,7 +19,7 @@ BEND_RAD = np.radians(70.0)
 HIDDEN_S = (36.0, 44.0)
 
 
-def straight_but_for_a_bend() -> Knots:
+def straight_but_for_a_bend() -> States:
     """Drive at a metre per second, straight but for one bend."""
     time_s = np.arange(0.0, UNTIL_S + 1.0, STEP_S)
     share = np.clip((time_s - BEND_S[0]) / (BEND_S[1] - BEND_S[0]), 0.0, 1.0)
@@ -27,7 +27,7 @@ def straight_but_for_a_bend() -> Knots:
     about_z = np.stack([0 * yaw, 0 * yaw, yaw], axis=1)
     velocity = np.stack([np.cos(yaw), np.sin(yaw), 0 * yaw], axis=1)
     rates = np.gradient(about_z, STEP_S, axis=0)
-    return Knots(
+    return States(
         time_s,
         np.cumsum(velocity, axis=0) * STEP_S,
         exp_so3(about_z),
@@ -42,11 +42,11 @@ def straight_but_for_a_bend() -> Knots:
 def test_a_bend_in_an_outage_gives_no_valid_pose_beyond_six_sigmas(seen: tuple[int, ...]) -> None:
     """A robot that went straight while it was seen, and bends while at most some prisms are, is not taken to go straight."""
     motion = straight_but_for_a_bend()
-    whole = in_time(measure(motion, until_s=UNTIL_S, seed=3))
+    whole = sorted_by_time(measure(motion, until_s=UNTIL_S, seed=3))
     inside = (whole.time_s > HIDDEN_S[0]) & (whole.time_s < HIDDEN_S[1])
-    found = fit(whole.select(~inside | np.isin(whole.prism, seen))).trajectory
+    found = fit_trajectory(whole.select(~inside | np.isin(whole.prism, seen))).trajectory
     at_s = np.arange(30.0, 50.0, 0.1)
-    states, covariance = found.at(at_s, parts=6)
+    states, covariance = found.at(at_s, dim=6)
     truth = motion.select(rows_at(at_s))
     limits = PipelineParameters()
     rotation, position = covariance[:, 3:, 3:], covariance[:, :3, :3]
@@ -67,19 +67,19 @@ def test_the_livelier_prior_holds_axis_by_axis() -> None:
         acceleration_sigma_mps2=(1.0, 1.0, 0.001),
         acceleration_correlation_time_s=0.2,
         angular_acceleration_sigma_radps2=(0.5, 0.5, 0.003),
-        angular_acceleration_time_s=0.1,
+        angular_acceleration_correlation_time_s=0.1,
     )
-    found = at_least(calm, PRIOR, 0.5)
+    found = with_noise_floor(calm, PRIOR, 0.5)
     raised = 0.5 * 0.2 * np.sqrt((0.8 / (1 + 0.8**2)) / (0.2 / (1 + 0.2**2)))
     turning = 0.5 * 0.2 * np.sqrt((0.4 / (1 + 0.4**2)) / (0.1 / (1 + 0.1**2)))
     assert found.acceleration_sigma_mps2 == pytest.approx((1.0, 1.0, raised))
     assert found.angular_acceleration_sigma_radps2 == pytest.approx((0.5, 0.5, turning))
-    assert (found.acceleration_correlation_time_s, found.angular_acceleration_time_s) == (0.2, 0.1)
+    assert (found.acceleration_correlation_time_s, found.angular_acceleration_correlation_time_s) == (0.2, 0.1)
 
 
 def test_a_prior_is_at_least_itself() -> None:
     """Nothing changes by it."""
-    np.testing.assert_allclose(axis_sigmas(at_least(PRIOR, PRIOR)), axis_sigmas(PRIOR))
+    np.testing.assert_allclose(axis_sigmas(with_noise_floor(PRIOR, PRIOR)), axis_sigmas(PRIOR))
 
 
 def test_a_robot_is_hidden_while_fewer_than_three_prisms_are_seen() -> None:
@@ -90,4 +90,4 @@ def test_a_robot_is_hidden_while_fewer_than_three_prisms_are_seen() -> None:
     also = (time_s > 5.0) & (time_s < 9.0) & (prism == 1)
     kept = ~(gone | also)
     at_s = np.array([-1.0, 2.0, 4.0, 6.0, 8.0, 20.0])
-    assert hidden(time_s[kept], prism[kept], at_s).tolist() == [True, False, False, True, False, True]
+    assert partially_occluded(time_s[kept], prism[kept], at_s).tolist() == [True, False, False, True, False, True]

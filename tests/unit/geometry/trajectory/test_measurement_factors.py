@@ -19,7 +19,7 @@ from tsgt.geometry import (
     transform_from,
     transform_points,
 )
-from tsgt.geometry.trajectory import STATE, Knots, linearise
+from tsgt.geometry.trajectory import STATE_DIM, States, linearise
 from tsgt.geometry.trajectory.measurement_factors import line_of_sight_axes
 
 if TYPE_CHECKING:
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 LAYOUT = np.array([[-0.4559, -0.1759, 1.1167], [0.4844, -0.1759, 1.4167], [-0.0285, 0.3519, 1.0667]])
 
 
-def tumbling(rng: np.random.Generator) -> Knots:
+def tumbling(rng: np.random.Generator) -> States:
     """Give a robot at two instants in any attitude, fast in every respect."""
-    return Knots(
+    return States(
         np.array([0.0, 0.5]),
         rng.uniform(-30, 30, (2, 3)),
         Rotation.random(2, random_state=int(rng.integers(2**31))).as_matrix(),
@@ -41,7 +41,7 @@ def tumbling(rng: np.random.Generator) -> Knots:
 
 
 def observed(
-    knots: Knots, rng: np.random.Generator, *, count: int = 8, offset_s: float = 0.2
+    knots: States, rng: np.random.Generator, *, count: int = 8, offset_s: float = 0.2
 ) -> Observations:
     """Give measurements near both instants that miss the robot by centimetres, from stations in any attitude."""
     at = rng.integers(0, len(knots), count)
@@ -64,16 +64,16 @@ def observed(
     )
 
 
-def near(observations: Observations, knots: Knots) -> NDArray[np.intp]:
+def near(observations: Observations, knots: States) -> NDArray[np.intp]:
     """Which knot each measurement is near."""
     return np.asarray(np.argmin(np.abs(observations.time_s[:, None] - knots.time_s), axis=1), np.intp)
 
 
-def seen_at(points: FloatArray) -> tuple[Observations, Knots]:
+def seen_at(points: FloatArray) -> tuple[Observations, States]:
     """Give a station that has measured a robot of one prism at each of these points, and that robot, at the first."""
     count = len(points)
     zero = np.zeros((1, 3))
-    knots = Knots(np.zeros(1), points[:1], np.eye(3)[None], zero, zero, zero, zero)
+    knots = States(np.zeros(1), points[:1], np.eye(3)[None], zero, zero, zero, zero)
     observations = Observations(
         time_s=np.zeros(count),
         time_sigma_s=np.zeros(count),
@@ -98,10 +98,10 @@ def test_derivatives_by_the_state_are_exact(seed: int) -> None:
     at = near(observations, knots)
     found = linearise(observations, knots, at).jacobian
     step = 1e-5
-    for part in range(STATE):
-        error = np.zeros((2, STATE))
+    for part in range(STATE_DIM):
+        error = np.zeros((2, STATE_DIM))
         error[:, part] = step
-        forth, back = (linearise(observations, knots.moved(sign * error), at).residuals_m for sign in (1, -1))
+        forth, back = (linearise(observations, knots.retract(sign * error), at).residuals_m for sign in (1, -1))
         np.testing.assert_allclose(found[:, :, part], (forth - back) / (2 * step), atol=3e-8)
 
 
@@ -142,7 +142,7 @@ def test_residuals_are_those_of_range_and_angles(
     measured, there = (polar_to_cartesian(h, z, d) for d, h, z in (polar, moved))
     observations, _ = seen_at(measured[None])
     zero = np.zeros((1, 3))
-    knots = Knots(np.zeros(1), there[None], np.eye(3)[None], zero, zero, zero, zero)
+    knots = States(np.zeros(1), there[None], np.eye(3)[None], zero, zero, zero, zero)
     residuals = linearise(observations, knots, np.zeros(1, np.intp)).residuals_m[0]
     expected = np.zeros(3)
     expected[part] = 1e-6
@@ -155,9 +155,9 @@ def test_straight_up_is_no_special_case(zenith_rad: float) -> None:
     measured = polar_to_cartesian(0.3, zenith_rad, 20.0)
     observations, knots = seen_at(measured[None])
     miss = np.array([[0.001, -0.002, 0.003]])
-    error = np.zeros((1, STATE))
+    error = np.zeros((1, STATE_DIM))
     error[:, :3] = miss
-    found = linearise(observations, knots.moved(error), np.zeros(1, np.intp))
+    found = linearise(observations, knots.retract(error), np.zeros(1, np.intp))
     assert np.linalg.norm(found.residuals_m) == pytest.approx(np.linalg.norm(miss), rel=1e-3)
     assert abs(found.residuals_m[0, 0]) == pytest.approx(0.003, rel=2e-2)
     np.testing.assert_allclose(found.by_point[0] @ found.by_point[0].T, np.eye(3), atol=1e-3)
@@ -168,9 +168,9 @@ def test_second_face_is_the_same_measurement() -> None:
     first = np.array(polar_to_cartesian(1.2, 1.4, 50.0))
     second = np.array(polar_to_cartesian(1.2 + np.pi, 2 * np.pi - 1.4, 50.0))
     observations, knots = seen_at(np.array([first, second]))
-    error = np.zeros((1, STATE))
+    error = np.zeros((1, STATE_DIM))
     error[:, :3] = 0.01
-    found = linearise(observations, knots.moved(error), np.zeros(2, np.intp))
+    found = linearise(observations, knots.retract(error), np.zeros(2, np.intp))
     np.testing.assert_allclose(found.residuals_m[1], found.residuals_m[0], atol=1e-12)
     np.testing.assert_allclose(found.jacobian[1], found.jacobian[0], atol=1e-12)
 

@@ -12,9 +12,9 @@ from scipy.linalg import expm
 
 from tsgt.geometry.trajectory.motion_prior import (
     axis_sigmas,
-    axis_times_s,
-    between,
-    prior_of,
+    axis_correlation_times_s,
+    interpolation_weights,
+    prior_from_axes,
     process_information,
     process_noise,
     transition,
@@ -110,7 +110,7 @@ def test_between_is_dense_conditioning(share: float, time_s: float) -> None:
     on = transition(after_s, time_s)
     q_later, cross = on @ q_here @ on.T + q_on, q_here @ on.T
     gain = np.linalg.solve(q_later, cross.T).T
-    from_earlier, from_later, left = between(np.array(before_s), np.array(after_s), np.array(time_s))
+    from_earlier, from_later, left = interpolation_weights(np.array(before_s), np.array(after_s), np.array(time_s))
     np.testing.assert_allclose(from_later, gain, rtol=1e-6, atol=1e-7)
     expected = transition(before_s, time_s) - gain @ on @ transition(before_s, time_s)
     np.testing.assert_allclose(from_earlier, expected, rtol=1e-6, atol=1e-7)
@@ -124,7 +124,7 @@ def test_between_at_the_ends_is_the_ends() -> None:
     """At either end the interpolation is that end's state, and nothing is added to its covariance."""
     zero, step = np.array(0.0), np.array(0.4)
     for before, after, earlier_share in ((zero, step, 1.0), (step, zero, 0.0)):
-        from_earlier, from_later, left = between(before, after, np.array(0.5))
+        from_earlier, from_later, left = interpolation_weights(before, after, np.array(0.5))
         np.testing.assert_allclose(from_earlier, earlier_share * np.eye(3), atol=1e-10)
         np.testing.assert_allclose(from_later, (1 - earlier_share) * np.eye(3), atol=1e-10)
         np.testing.assert_allclose(left, 0.0, atol=1e-12)
@@ -133,5 +133,5 @@ def test_between_at_the_ends_is_the_ends() -> None:
 def test_a_prior_is_its_sigmas_and_times() -> None:
     """A prior made of sigmas and times gives them back."""
     prior = MotionPrior()
-    times_s = axis_times_s(prior)
-    assert prior_of(axis_sigmas(prior), times_s[[0, 5]]) == prior
+    times_s = axis_correlation_times_s(prior)
+    assert prior_from_axes(axis_sigmas(prior), times_s[[0, 5]]) == prior

@@ -8,22 +8,22 @@ import numpy as np
 import pytest
 
 from tsgt.geometry import FloatArray, Trajectory, exp_so3
-from tsgt.geometry.trajectory import STATE, Knots
-from tsgt.geometry.trajectory.propagation import Ahead
+from tsgt.geometry.trajectory import STATE_DIM, States
+from tsgt.geometry.trajectory.propagation import Propagator
 from tsgt.model import MotionPrior
 
-PRIOR = MotionPrior(acceleration_correlation_time_s=0.3, angular_acceleration_time_s=0.9)
+PRIOR = MotionPrior(acceleration_correlation_time_s=0.3, angular_acceleration_correlation_time_s=0.9)
 
 
-def turning(rate_radps: float) -> tuple[Knots, FloatArray]:
+def turning(rate_radps: float) -> tuple[States, FloatArray]:
     """Draw a robot anywhere that turns about so fast, and the covariance of its state."""
     rng = np.random.default_rng(4)
     parts = rng.normal(size=(5, 1, 3))
     parts[[2, 4]] *= rate_radps
     place, speed, rate, slow, turn = parts
-    spread = rng.normal(size=(STATE, STATE))
+    spread = rng.normal(size=(STATE_DIM, STATE_DIM))
     rotation = exp_so3(rng.normal(size=(1, 3)))
-    return Knots(np.array([7.0]), 30 * place, rotation, speed, rate, slow, turn), 1e-3 * spread @ spread.T
+    return States(np.array([7.0]), 30 * place, rotation, speed, rate, slow, turn), 1e-3 * spread @ spread.T
 
 
 @pytest.mark.parametrize("rate_radps", [0.0, 1e-3, 0.3, 5.0])
@@ -31,12 +31,12 @@ def turning(rate_radps: float) -> tuple[Knots, FloatArray]:
 def test_it_is_what_a_trajectory_predicts(rate_radps: float, ahead_s: float) -> None:
     """State and covariance, all parts and those of the pose alone; short and long steps have other formulas."""
     state, covariance = turning(rate_radps)
-    whole = Trajectory(state, PRIOR, covariance[None], np.empty((0, STATE, STATE)))
+    whole = Trajectory(state, PRIOR, covariance[None], np.empty((0, STATE_DIM, STATE_DIM)))
     time_s = 7.0 + ahead_s
-    for parts in (6, STATE):
-        found, spread = Ahead(state, covariance, PRIOR).at(time_s, parts=parts)
-        expected, expected_spread = whole.at(np.array([time_s]), parts=parts)
-        for name in Knots.__slots__:
+    for dim in (6, STATE_DIM):
+        found, spread = Propagator(state, covariance, PRIOR).at(time_s, dim=dim)
+        expected, expected_spread = whole.at(np.array([time_s]), dim=dim)
+        for name in States.__slots__:
             np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-12, atol=1e-12)
         sigmas = np.sqrt(np.diagonal(expected_spread[0]))
         scale = sigmas[:, None] * sigmas
@@ -51,6 +51,6 @@ def test_a_livelier_robot_is_one_of_a_prior_with_larger_sigmas() -> None:
     lively = replace(
         PRIOR, acceleration_sigma_mps2=(x, y, z), angular_acceleration_sigma_radps2=(roll, pitch, yaw)
     )
-    _, found = Ahead(state, covariance, PRIOR, livelier=2.0).at(7.6)
-    _, expected = Ahead(state, covariance, lively).at(7.6)
+    _, found = Propagator(state, covariance, PRIOR, process_noise_scale=2.0).at(7.6)
+    _, expected = Propagator(state, covariance, lively).at(7.6)
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-15)

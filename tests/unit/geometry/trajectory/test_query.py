@@ -7,21 +7,21 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pytest
-from harness.prior_motion import STEP_S, draw_motions, in_time, measure, rows_at
+from harness.prior_motion import STEP_S, draw_motions, sorted_by_time, measure, rows_at
 from scipy.stats import chi2
 
 from tsgt.geometry import exp_so3, log_so3
 from tsgt.geometry.trajectory import (
-    STATE,
-    Knots,
+    STATE_DIM,
+    States,
     Trajectory,
-    first_guess,
-    joined,
+    initial_guess,
+    concatenate_states,
     knot_times,
     ros_covariance,
     solve,
 )
-from tsgt.geometry.trajectory.gauss_newton import Anchor, start_anchor
+from tsgt.geometry.trajectory.gauss_newton import AnchorPrior, diffuse_prior
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ PRIOR = MotionPrior()
 SEEDS = 100
 
 
-def fitted(observations: Observations, start: Knots, anchor: Anchor | None = None) -> Trajectory:
+def fitted(observations: Observations, start: States, anchor: AnchorPrior | None = None) -> Trajectory:
     """Give the trajectory through measurements with knots where the start has them."""
     found = solve(observations, start, PRIOR, anchor=anchor)
     return Trajectory(found.knots, PRIOR, *found.factor.marginals())
@@ -41,7 +41,7 @@ class Case(NamedTuple):
     """A short recording, its first guess and its trajectory."""
 
     observations: Observations
-    start: Knots
+    start: States
     trajectory: Trajectory
 
 
@@ -49,21 +49,21 @@ class Case(NamedTuple):
 def case() -> Case:
     """Four seconds of a turning robot."""
     motion = draw_motions(PRIOR, count=1, duration_s=5.0, seed=11)[0]
-    observations = in_time(measure(motion, until_s=4.0, seed=12))
-    start = first_guess(observations, knot_times(observations.time_s))
+    observations = sorted_by_time(measure(motion, until_s=4.0, seed=12))
+    start = initial_guess(observations, knot_times(observations.time_s))
     return Case(observations, start, fitted(observations, start))
 
 
-def with_knots(start: Knots, trajectory: Trajectory, added_s: FloatArray) -> Knots:
+def with_knots(start: States, trajectory: Trajectory, added_s: FloatArray) -> States:
     """Give a start that has knots at further instants."""
     states, _ = trajectory.at(added_s)
-    whole = joined([start, states])
+    whole = concatenate_states([start, states])
     return whole.select(np.argsort(whole.time_s))
 
 
-def normalised_difference(states: Knots, covariance: FloatArray, others: Knots) -> FloatArray:
+def normalised_difference(states: States, covariance: FloatArray, others: States) -> FloatArray:
     """Differences in sigmas of each part, (N, 18)."""
-    return states.error_from(others) / np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    return states.local_coordinates_about(others) / np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
 
 
 def scaled(covariance: FloatArray, by: FloatArray) -> FloatArray:
@@ -77,7 +77,7 @@ def test_at_its_knots_it_is_its_knots(case: Case) -> None:
     """Asked for at a knot's own instant it gives that state and covariance."""
     knots = case.trajectory.knots
     states, covariance = case.trajectory.at(knots.time_s)
-    np.testing.assert_allclose(states.error_from(knots), 0.0, atol=1e-9)
+    np.testing.assert_allclose(states.local_coordinates_about(knots), 0.0, atol=1e-9)
     np.testing.assert_allclose(
         scaled(covariance, case.trajectory.covariance),
         scaled(case.trajectory.covariance, covariance),
@@ -89,7 +89,7 @@ def test_a_knot_without_measurement_changes_nothing(case: Case) -> None:
     """Between knots it is what a solution with a knot there says: states, velocities and covariances."""
     added_s = case.start.time_s[3:20] + 0.4 * np.diff(case.start.time_s)[3:20]
     states, covariance = case.trajectory.at(added_s)
-    anchor = start_anchor(case.start.select(slice(0, 1)), PRIOR)
+    anchor = diffuse_prior(case.start.select(slice(0, 1)), PRIOR)
     whole = fitted(case.observations, with_knots(case.start, case.trajectory, added_s), anchor)
     rows = np.searchsorted(whole.knots.time_s, added_s)
     # Two short steps follow a wandering axis a little better than a long one: a hundredth of a sigma.
@@ -123,23 +123,23 @@ def test_covariances_are_carried_by_exact_derivatives(where: str) -> None:
     rng = np.random.default_rng(13)
     first = exp_so3(rng.normal(size=3))
     rotation = np.stack([first, first @ exp_so3(np.array([0.9, -0.5, 0.7]))])
-    knots = Knots(np.array([0.0, 0.5]), rng.normal(size=(2, 3)), rotation, *rng.normal(size=(4, 2, 3)))
-    root = rng.normal(size=(2 * STATE, 2 * STATE))
+    knots = States(np.array([0.0, 0.5]), rng.normal(size=(2, 3)), rotation, *rng.normal(size=(4, 2, 3)))
+    root = rng.normal(size=(2 * STATE_DIM, 2 * STATE_DIM))
     joint = root @ root.T
-    blocks = joint.reshape(2, STATE, 2, STATE)
-    covariance, beside = np.stack([blocks[0, :, 0], blocks[1, :, 1]]), blocks[None, 0, :, 1]
+    blocks = joint.reshape(2, STATE_DIM, 2, STATE_DIM)
+    covariance, cross_covariance = np.stack([blocks[0, :, 0], blocks[1, :, 1]]), blocks[None, 0, :, 1]
     asked_s = np.array([{"between": 0.2, "before": -0.4, "after": 0.9}[where]])
-    states, found = Trajectory(knots, PRIOR, covariance, beside).at(asked_s)
-    _, added = Trajectory(knots, PRIOR, 0 * covariance, 0 * beside).at(asked_s)
+    states, found = Trajectory(knots, PRIOR, covariance, cross_covariance).at(asked_s)
+    _, added = Trajectory(knots, PRIOR, 0 * covariance, 0 * cross_covariance).at(asked_s)
     columns = []
-    for part in range(2 * STATE):
-        error = np.zeros(2 * STATE)
+    for part in range(2 * STATE_DIM):
+        error = np.zeros(2 * STATE_DIM)
         error[part] = 1e-6
         forth, back = (
-            Trajectory(knots.moved(sign * error.reshape(2, STATE)), PRIOR, covariance, beside).at(asked_s)[0]
+            Trajectory(knots.retract(sign * error.reshape(2, STATE_DIM)), PRIOR, covariance, cross_covariance).at(asked_s)[0]
             for sign in (1, -1)
         )
-        columns.append((forth.error_from(states)[0] - back.error_from(states)[0]) / 2e-6)
+        columns.append((forth.local_coordinates_about(states)[0] - back.local_coordinates_about(states)[0]) / 2e-6)
     derivative = np.stack(columns, axis=-1)
     np.testing.assert_allclose(found - added, [derivative @ joint @ derivative.T], rtol=1e-6, atol=1e-6)
 
@@ -159,7 +159,7 @@ def test_an_outage_shows_in_the_covariance(case: Case) -> None:
     """In the middle of a second without any measurement the pose is several times less certain than before it."""
     gap = (case.observations.time_s > 1.5) & (case.observations.time_s < 2.5)
     kept = case.observations.select(~gap)
-    trajectory = fitted(kept, first_guess(kept, knot_times(kept.time_s)))
+    trajectory = fitted(kept, initial_guess(kept, knot_times(kept.time_s)))
     _, covariance = trajectory.at(np.array([1.2, 2.0]))
     sigmas = np.sqrt(np.linalg.eigvalsh(covariance[:, :3, :3]).max(axis=1))
     assert sigmas[1] > 4 * sigmas[0]
@@ -170,13 +170,13 @@ def test_turning_on_through_an_outage() -> None:
     time_s = np.arange(round(16.0 / STEP_S) + 1, dtype=np.float64) * STEP_S
     still = np.zeros((len(time_s), 3))
     place, rates = (np.tile(value, (len(time_s), 1)) for value in ([60.0, 45.0, -1.0], [0.0, 0.0, 0.5]))
-    motion = Knots(time_s, place, exp_so3(rates * time_s[:, None]), still, rates, still, still)
-    observations = in_time(measure(motion, until_s=15.0, seed=17))
+    motion = States(time_s, place, exp_so3(rates * time_s[:, None]), still, rates, still, still)
+    observations = sorted_by_time(measure(motion, until_s=15.0, seed=17))
     kept = observations.select((observations.time_s < 4.0) | (observations.time_s > 11.0))
-    trajectory = fitted(kept, first_guess(kept, knot_times(kept.time_s)))
+    trajectory = fitted(kept, initial_guess(kept, knot_times(kept.time_s)))
     asked_s = np.array([3.5, 4.0, 7.5, 11.0, 11.5])
     states, covariance = trajectory.at(asked_s)
-    error = motion.select(rows_at(asked_s)).error_from(states)
+    error = motion.select(rows_at(asked_s)).local_coordinates_about(states)
     assert squared(error[:, :6], covariance[:, :6, :6]).max() < chi2.ppf(0.999, 6)
 
 
@@ -186,11 +186,11 @@ def test_the_order_of_instants_is_irrelevant(case: Case) -> None:
     order = np.random.default_rng(14).permutation(50)
     states, covariance = case.trajectory.at(asked_s)
     shuffled, shuffled_covariance = case.trajectory.at(asked_s[order])
-    np.testing.assert_allclose(shuffled.error_from(states.select(order)), 0.0, atol=1e-12)
+    np.testing.assert_allclose(shuffled.local_coordinates_about(states.select(order)), 0.0, atol=1e-12)
     np.testing.assert_allclose(shuffled_covariance, covariance[order], rtol=1e-9, atol=1e-12)
     nothing, no_covariance = case.trajectory.at(np.array([]))
     assert len(nothing) == 0
-    assert no_covariance.shape == (0, STATE, STATE)
+    assert no_covariance.shape == (0, STATE_DIM, STATE_DIM)
 
 
 def test_covariance_about_fixed_axes() -> None:
@@ -198,7 +198,7 @@ def test_covariance_about_fixed_axes() -> None:
     rng = np.random.default_rng(15)
     rotation = exp_so3(rng.normal(size=3))
     root = rng.normal(size=(6, 6)) * 1e-4
-    covariance = np.zeros((STATE, STATE))
+    covariance = np.zeros((STATE_DIM, STATE_DIM))
     covariance[:6, :6] = root @ root.T
     errors = rng.normal(size=(200_000, 6)) @ root.T
     drawn = rotation @ exp_so3(errors[:, 3:])
@@ -226,19 +226,19 @@ def errors_in_sigmas() -> dict[str, FloatArray]:
     }
     motions = draw_motions(PRIOR, count=SEEDS, duration_s=UNTIL_S + 1.5, seed=16)
     for seed, motion in enumerate(motions):
-        observations = in_time(measure(motion, until_s=UNTIL_S, seed=seed))
-        trajectory = fitted(observations, first_guess(observations, knot_times(observations.time_s)))
+        observations = sorted_by_time(measure(motion, until_s=UNTIL_S, seed=seed))
+        trajectory = fitted(observations, initial_guess(observations, knot_times(observations.time_s)))
         ends_s = np.floor(observations.time_s[-1] / STEP_S) * STEP_S
         for asked_s, pose, state in ((INSIDE_S, "pose", "state"), (ends_s + AHEAD_S, "ahead", "ahead_state")):
             states, covariance = trajectory.at(asked_s)
-            error = motion.select(rows_at(asked_s)).error_from(replace(states, time_s=asked_s))
+            error = motion.select(rows_at(asked_s)).local_coordinates_about(replace(states, time_s=asked_s))
             found[pose].append(squared(error[:, :6], covariance[:, :6, :6]))
             found[state].append(squared(error, covariance))
         rows = np.searchsorted(trajectory.knots.time_s, INSIDE_S)
         near = trajectory.knots.select(rows)
         on_grid = np.round(near.time_s / STEP_S) * STEP_S
         states, covariance = trajectory.at(on_grid)
-        error = motion.select(rows_at(on_grid)).error_from(states)
+        error = motion.select(rows_at(on_grid)).local_coordinates_about(states)
         found["knots"].append(squared(error[:, :6], covariance[:, :6, :6]))
     return {name: np.array(values) for name, values in found.items()}
 

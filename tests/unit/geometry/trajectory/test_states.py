@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tsgt.geometry import exp_so3
-from tsgt.geometry.trajectory import STATE, Knots, joined
+from tsgt.geometry.trajectory import STATE_DIM, States, concatenate_states
 from tsgt.geometry.trajectory.states import (
-    LinearisedSteps,
-    Steps,
-    add_steps,
-    linearise_steps,
-    spread,
-    turn_between,
+    LinearisedProcess,
+    ProcessFactors,
+    add_process_factors,
+    linearise_process,
+    axes_to_state,
+    rotation_between,
 )
 from tsgt.model import MotionPrior
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 PRIOR = MotionPrior()
 
 
-def wild_knots(seed: int, *, count: int = 4, step_s: float = 0.2) -> Knots:
+def wild_knots(seed: int, *, count: int = 4, step_s: float = 0.2) -> States:
     """States of a robot that tumbles: neighbours turn by up to two radians, unlike what their velocities say."""
     rng = np.random.default_rng(seed)
     turns = Rotation.from_rotvec(rng.uniform(-1.2, 1.2, (count, 3))).as_matrix()
@@ -38,10 +38,10 @@ def wild_knots(seed: int, *, count: int = 4, step_s: float = 0.2) -> Knots:
     for turn in turns[1:]:
         rotation.append(rotation[-1] @ turn)
     time_s = 100.0 + np.cumsum(rng.uniform(0.2, 1.8, count) * step_s)
-    return Knots(time_s, rng.normal(size=(count, 3)), np.array(rotation), *rng.normal(size=(4, count, 3)))
+    return States(time_s, rng.normal(size=(count, 3)), np.array(rotation), *rng.normal(size=(4, count, 3)))
 
 
-def spinning(step_s: float, *, count: int = 2) -> Knots:
+def spinning(step_s: float, *, count: int = 2) -> States:
     """Exact states under a constant angular acceleration across the angular velocity: the axis of the turn wanders."""
     fine = 2000
     rate, acceleration = np.array([0.8, -0.3, 0.5]), np.array([-0.5, 0.9, 0.4])
@@ -54,17 +54,17 @@ def spinning(step_s: float, *, count: int = 2) -> Knots:
     time_s = np.arange(count, dtype=np.float64) * step_s
     zero = np.zeros((count, 3))
     rates = rate + time_s[:, None] * acceleration
-    return Knots(time_s, zero, np.array(kept), zero, rates, zero, np.tile(acceleration, (count, 1)))
+    return States(time_s, zero, np.array(kept), zero, rates, zero, np.tile(acceleration, (count, 1)))
 
 
-def numerical(knots: Knots, steps: Steps, row: int) -> FloatArray:
+def numerical(knots: States, steps: ProcessFactors, row: int) -> FloatArray:
     """Give derivatives of all residuals by the error of one knot, (K - 1, 18, 18)."""
     step = 1e-6
     columns = []
-    for part in range(STATE):
-        error = np.zeros((len(knots), STATE))
+    for part in range(STATE_DIM):
+        error = np.zeros((len(knots), STATE_DIM))
         error[row, part] = step
-        forth, back = (linearise_steps(knots.moved(sign * error), steps).residuals for sign in (1, -1))
+        forth, back = (linearise_process(knots.retract(sign * error), steps).residuals for sign in (1, -1))
         columns.append((forth - back) / (2 * step))
     return np.stack(columns, axis=-1)
 
@@ -74,15 +74,15 @@ def numerical(knots: Knots, steps: Steps, row: int) -> FloatArray:
 def test_error_from_is_the_inverse_of_moved(seed: int) -> None:
     """The error between two sets of states is what was added to the one to get the other."""
     knots = wild_knots(seed)
-    error = np.random.default_rng(seed).uniform(-1.5, 1.5, (len(knots), STATE))
-    np.testing.assert_allclose(knots.moved(error).error_from(knots), error, atol=1e-12)
+    error = np.random.default_rng(seed).uniform(-1.5, 1.5, (len(knots), STATE_DIM))
+    np.testing.assert_allclose(knots.retract(error).local_coordinates_about(knots), error, atol=1e-12)
 
 
 def test_joined_parts_are_the_whole() -> None:
     """States taken apart and joined again are the same."""
     knots = wild_knots(1)
-    again = joined([knots.select(slice(0, 1)), knots.select(slice(1, None))])
-    for name in Knots.__slots__:
+    again = concatenate_states([knots.select(slice(0, 1)), knots.select(slice(1, None))])
+    for name in States.__slots__:
         np.testing.assert_array_equal(getattr(again, name), getattr(knots, name))
 
 
@@ -91,8 +91,8 @@ def test_joined_parts_are_the_whole() -> None:
 def test_derivatives_of_steps_are_exact(seed: int) -> None:
     """By the earlier and by the later state, for any attitudes, turns and velocities, they are the numerical ones."""
     knots = wild_knots(seed)
-    steps = Steps.of(knots.time_s, PRIOR)
-    by_earlier, by_later = whole_derivatives(linearise_steps(knots, steps), steps)
+    steps = ProcessFactors.of(knots.time_s, PRIOR)
+    by_earlier, by_later = whole_derivatives(linearise_process(knots, steps), steps)
     for row in range(len(knots)):
         by_row = numerical(knots, steps, row)
         if row < len(knots) - 1:
@@ -101,9 +101,9 @@ def test_derivatives_of_steps_are_exact(seed: int) -> None:
             np.testing.assert_allclose(by_later[row - 1], by_row[row - 1], atol=2e-8)
 
 
-def whole_derivatives(found: LinearisedSteps, steps: Steps) -> tuple[FloatArray, FloatArray]:
+def whole_derivatives(found: LinearisedProcess, steps: ProcessFactors) -> tuple[FloatArray, FloatArray]:
     """Give derivatives of all residuals by the errors of both knots, (N, 18, 18) each."""
-    by_earlier, by_later = -spread(steps.phi), np.tile(np.eye(STATE), (len(steps.phi), 1, 1))
+    by_earlier, by_later = -axes_to_state(steps.phi), np.tile(np.eye(STATE_DIM), (len(steps.phi), 1, 1))
     by_earlier[:, 3:6, 3:6] = found.turn_by_earlier[:, :, :3]
     by_earlier[:, 3:6, 9:12] += found.turn_by_earlier[:, :, 3:]
     by_later[:, 3:6, 3:6] = found.turn_by_later[:, :, :3]
@@ -116,24 +116,24 @@ def whole_derivatives(found: LinearisedSteps, steps: Steps) -> tuple[FloatArray,
 def test_steps_enter_the_normal_equations_as_squares(seed: int) -> None:
     """What is added to the system is that of the derivatives, the information and the residuals as whole matrices."""
     knots = wild_knots(seed)
-    steps = Steps.of(knots.time_s, PRIOR)
-    found = linearise_steps(knots, steps)
-    count, weights = len(knots), spread(steps.information)
-    jacobian = np.zeros((count - 1, STATE, count * STATE))
+    steps = ProcessFactors.of(knots.time_s, PRIOR)
+    found = linearise_process(knots, steps)
+    count, weights = len(knots), axes_to_state(steps.information)
+    jacobian = np.zeros((count - 1, STATE_DIM, count * STATE_DIM))
     for row, (earlier, later) in enumerate(zip(*whole_derivatives(found, steps), strict=True)):
-        jacobian[row, :, row * STATE : (row + 2) * STATE] = np.concatenate([earlier, later], axis=1)
+        jacobian[row, :, row * STATE_DIM : (row + 2) * STATE_DIM] = np.concatenate([earlier, later], axis=1)
     expected = np.einsum("nia,nij,njb->ab", jacobian, weights, jacobian)
-    diagonal, beside = np.zeros((count, STATE, STATE)), np.zeros((count - 1, STATE, STATE))
-    gradient = np.zeros((count, STATE))
-    cost = add_steps(found, steps, diagonal, beside, gradient)
+    diagonal, off_diagonal = np.zeros((count, STATE_DIM, STATE_DIM)), np.zeros((count - 1, STATE_DIM, STATE_DIM))
+    gradient = np.zeros((count, STATE_DIM))
+    cost = add_process_factors(found, steps, diagonal, off_diagonal, gradient)
     for row in range(count):
-        here, following = (slice(k * STATE, (k + 1) * STATE) for k in (row, row + 1))
+        here, following = (slice(k * STATE_DIM, (k + 1) * STATE_DIM) for k in (row, row + 1))
         np.testing.assert_allclose(
             diagonal[row], expected[here, here], rtol=1e-9, atol=1e-12 * expected.max()
         )
         if row < count - 1:
             np.testing.assert_allclose(
-                beside[row], expected[here, following], rtol=1e-9, atol=1e-12 * expected.max()
+                off_diagonal[row], expected[here, following], rtol=1e-9, atol=1e-12 * expected.max()
             )
     pulled = np.einsum("nij,nj->ni", weights, found.residuals)
     np.testing.assert_allclose(
@@ -150,7 +150,7 @@ def test_a_step_as_the_prior_expects_has_no_residual() -> None:
     dying = np.exp(-dt_s / tau)
     lost = tau * (1 - dying)
     still = np.zeros((2, 3))
-    knots = Knots(
+    knots = States(
         np.array([0.0, dt_s]),
         np.concatenate([start, start + dt_s * speed + tau * (dt_s - lost) * push]),
         np.broadcast_to(np.eye(3), (2, 3, 3)),
@@ -160,7 +160,7 @@ def test_a_step_as_the_prior_expects_has_no_residual() -> None:
         still,
     )
     np.testing.assert_allclose(
-        linearise_steps(knots, Steps.of(knots.time_s, PRIOR)).residuals, 0.0, atol=1e-14
+        linearise_process(knots, ProcessFactors.of(knots.time_s, PRIOR)).residuals, 0.0, atol=1e-14
     )
 
 
@@ -169,11 +169,11 @@ def test_wandering_axis_is_followed_to_fourth_order() -> None:
 
     Without the correction for the wandering axis it falls with the third.
     """
-    steady = replace(PRIOR, angular_acceleration_time_s=1e4)
+    steady = replace(PRIOR, angular_acceleration_correlation_time_s=1e4)
     left, uncorrected = [], []
     for step_s in (0.4, 0.2):
         knots = spinning(step_s)
-        residuals = linearise_steps(knots, Steps.of(knots.time_s, steady)).residuals[0, 3:6]
+        residuals = linearise_process(knots, ProcessFactors.of(knots.time_s, steady)).residuals[0, 3:6]
         left.append(np.linalg.norm(residuals))
         wander = step_s**2 / 12 * np.cross(knots.angular_velocity[0], knots.angular_velocity[1])
         uncorrected.append(np.linalg.norm(residuals + wander))
@@ -189,18 +189,18 @@ def test_a_robot_that_goes_on_turning_unseen_is_followed(turned_rad: float) -> N
     axis, dt_s = np.array([0.6, 0.0, 0.8]), 7.0
     zero, rates = np.zeros((2, 3)), np.tile(0.9 * turned_rad / dt_s * axis, (2, 1))
     rotation = np.stack([np.eye(3), exp_so3(turned_rad * axis)])
-    knots = Knots(np.array([0.0, dt_s]), zero, rotation, zero, rates, zero, zero)
-    found = turn_between(knots.select(slice(0, 1)), knots.select(slice(1, 2)))
+    knots = States(np.array([0.0, dt_s]), zero, rotation, zero, rates, zero, zero)
+    found = rotation_between(knots.select(slice(0, 1)), knots.select(slice(1, 2)))
     np.testing.assert_allclose(found[0], turned_rad * axis, atol=1e-9)
 
 
 def test_weights_are_those_of_each_axis() -> None:
     """An axis with twice the sigma has a quarter of the information, and axes are not coupled."""
     time_s = np.array([0.0, 0.3])
-    one = Steps.of(time_s, replace(PRIOR, acceleration_sigma_mps2=(0.1, 0.2, 0.4))).information
+    one = ProcessFactors.of(time_s, replace(PRIOR, acceleration_sigma_mps2=(0.1, 0.2, 0.4))).information
     np.testing.assert_allclose(one[:, 1], one[:, 0] / 4)
     np.testing.assert_allclose(one[:, 2], one[:, 0] / 16)
-    whole = spread(one)
+    whole = axes_to_state(one)
     mixed = whole.reshape(1, 3, 6, 3, 6).transpose(0, 2, 4, 1, 3).copy()
     for axis in range(6):
         np.testing.assert_array_equal(mixed[0, axis, axis], one[0, axis])

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.prior_motion import draw_motions, in_time, measure
+from harness.prior_motion import draw_motions, sorted_by_time, measure
 
 from tsgt.errors import GeometryError
-from tsgt.geometry.trajectory import hyperparameters, scaled, tune
-from tsgt.geometry.trajectory.hyperparameters import LEAST_MEASUREMENTS
+from tsgt.geometry.trajectory import hyperparameters, scale_noise, tune
+from tsgt.geometry.trajectory.hyperparameters import MIN_MEASUREMENTS
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ PRIOR = MotionPrior(
     acceleration_sigma_mps2=(0.5, 0.5, 0.2),
     acceleration_correlation_time_s=0.8,
     angular_acceleration_sigma_radps2=(0.2, 0.2, 0.4),
-    angular_acceleration_time_s=0.5,
+    angular_acceleration_correlation_time_s=0.5,
 )
 
 
@@ -29,7 +29,7 @@ PRIOR = MotionPrior(
 def observations() -> Observations:
     """Measure a minute and a half of a robot that moves as :data:`PRIOR` says."""
     motion = draw_motions(PRIOR, count=1, duration_s=91.0, seed=11)[0]
-    return in_time(measure(motion, until_s=90.0, seed=12))
+    return sorted_by_time(measure(motion, until_s=90.0, seed=12))
 
 
 def test_the_gradient_is_that_of_the_evidence(observations: Observations) -> None:
@@ -48,7 +48,7 @@ def test_the_gradient_is_that_of_the_evidence(observations: Observations) -> Non
 
 def test_the_motion_that_made_the_measurements_is_found(observations: Observations) -> None:
     """Sizes of accelerations come back to 30 %, the noise to 15 %: a minute and a half does not tell them better."""
-    found = tune(scaled(observations, 0.5))
+    found = tune(scale_noise(observations, 0.5))
     np.testing.assert_allclose(found.prior.acceleration_sigma_mps2, PRIOR.acceleration_sigma_mps2, rtol=0.3)
     np.testing.assert_allclose(
         found.prior.angular_acceleration_sigma_radps2, PRIOR.angular_acceleration_sigma_radps2, rtol=0.3
@@ -56,8 +56,8 @@ def test_the_motion_that_made_the_measurements_is_found(observations: Observatio
     assert found.prior.acceleration_correlation_time_s == pytest.approx(
         PRIOR.acceleration_correlation_time_s, rel=0.5
     )
-    assert found.prior.angular_acceleration_time_s == pytest.approx(
-        PRIOR.angular_acceleration_time_s, rel=0.5
+    assert found.prior.angular_acceleration_correlation_time_s == pytest.approx(
+        PRIOR.angular_acceleration_correlation_time_s, rel=0.5
     )
     assert found.noise_scale == pytest.approx(2.0, rel=0.15)
 
@@ -104,7 +104,7 @@ def test_a_robot_that_stands_still_is_no_trouble() -> None:
         velocity=np.zeros_like(motion.velocity),
         angular_velocity=np.zeros_like(motion.angular_velocity),
     )
-    found = tune(in_time(measure(rest, until_s=40.0, seed=6)))
+    found = tune(sorted_by_time(measure(rest, until_s=40.0, seed=6)))
     assert max(found.prior.acceleration_sigma_mps2) < 0.02
     assert found.noise_scale == pytest.approx(1.0, rel=0.15)
 
@@ -112,6 +112,6 @@ def test_a_robot_that_stands_still_is_no_trouble() -> None:
 def test_too_little_to_tell(observations: Observations) -> None:
     """Some seconds, or two prisms, tell nothing; the message says what is missing."""
     with pytest.raises(GeometryError, match="too few measurements to tell how the robot moves"):
-        tune(observations.select(slice(0, LEAST_MEASUREMENTS - 1)))
+        tune(observations.select(slice(0, MIN_MEASUREMENTS - 1)))
     with pytest.raises(GeometryError, match="of at least 3 prisms"):
         tune(observations.select(observations.prism < 2))

@@ -5,10 +5,16 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, Literal
 
-from tsgt.analysis.smoothing import smoothed
-from tsgt.analysis.validation import EPOCHS_MAX, believed, check_measured, check_span, why_none_is_valid
+from tsgt.analysis.smoothing import smooth_recording
+from tsgt.analysis.validation import (
+    MAX_EPOCHS,
+    check_prisms_measured,
+    check_time_span,
+    no_valid_pose_message,
+    plausible_measurements,
+)
 from tsgt.errors import ConfigError, DegenerateGeometryError, RecordingError
-from tsgt.estimation import Pipeline
+from tsgt.estimation import LinearEstimator
 from tsgt.geometry import check_layout
 from tsgt.model import PolarMeasurement, PrismPosition
 
@@ -53,20 +59,20 @@ def process(
         The prism layout cannot be used: prisms coincide or lie in a line.
     """
     if recording.parameters.pipeline.estimator == "continuous":
-        return smoothed(recording, path=path, on_progress=on_progress).poses
+        return smooth_recording(recording, path=path, on_progress=on_progress).poses
     parameters = recording.parameters
-    pipeline = Pipeline(parameters)
-    measurements = believed(recording)
-    check_measured(parameters, measurements, path)
-    check_span(parameters, measurements, path)
+    pipeline = LinearEstimator(parameters)
+    measurements = plausible_measurements(recording)
+    check_prisms_measured(parameters, measurements, path)
+    check_time_span(parameters, measurements, path)
     for measurement in sorted(measurements, key=lambda m: m.stamp_ns):
         pipeline.add(measurement)
     assert recording.end_ns is not None  # noqa: S101 (it has measurements, and each of them arrived)
     # A master that was left running has nothing to say for the days after the last measurement.
     first_ns = min(m.stamp_ns for m in measurements)
-    poses = pipeline.advance(min(recording.end_ns, first_ns + EPOCHS_MAX * parameters.pipeline.period_ns))
+    poses = pipeline.advance(min(recording.end_ns, first_ns + MAX_EPOCHS * parameters.pipeline.period_ns))
     if not poses.valid.any():
-        raise RecordingError(why_none_is_valid(poses, parameters), path=path)
+        raise RecordingError(no_valid_pose_message(poses, parameters), path=path)
     return poses
 
 

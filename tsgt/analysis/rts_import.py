@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from tsgt.model import Matrix4, Measurement
 
 
-AS_PUBLISHED: Final[Mapping[int, int]] = {1: 1, 2: 2, 3: 3}
+DEFAULT_TRACKED_PRISMS: Final[Mapping[int, int]] = {1: 1, 2: 2, 3: 3}
 """Which prism each of their stations tracks."""
 
 
@@ -54,7 +54,7 @@ def stations_from_targets(
     *,
     target_constant_m: float,
     prism_constant_m: float,
-    tracked: Mapping[int, int] = AS_PUBLISHED,
+    tracked: Mapping[int, int] = DEFAULT_TRACKED_PRISMS,
 ) -> SolvedStations:
     """Solve where the stations stood from the targets of the day, weighted by the instrument's noise.
 

@@ -7,18 +7,23 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.validation import believed, check_measured, check_span, why_none_is_valid
+from tsgt.analysis.validation import (
+    check_prisms_measured,
+    check_time_span,
+    no_valid_pose_message,
+    plausible_measurements,
+)
 from tsgt.errors import GeometryError, RecordingError
-from tsgt.estimation import ContinuousPoses, PoseBatch, Seen, build_observations, measured_at_ns, usable
+from tsgt.estimation import ContinuousPoseOutput, PoseBatch, MeasurementHistory, build_observations, measured_at_ns, usable
 from tsgt.geometry import check_layout
-from tsgt.geometry.trajectory import CALMEST, at_least, fit, tune
+from tsgt.geometry.trajectory import NOISE_FLOOR_SHARE, fit_trajectory, tune, with_noise_floor
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from tsgt.geometry import Observations
-    from tsgt.geometry.trajectory import Fit
+    from tsgt.geometry.trajectory import TrajectoryFit
     from tsgt.model import Measurement, MotionPrior, Parameters, PipelineParameters
     from tsgt.recording import Recording
 
@@ -30,7 +35,7 @@ _POSE = 6
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class MotionModel:
     """How a robot moves and how noisy it was measured.
 
     Attributes
@@ -49,7 +54,7 @@ class Motion:
 
 
 @dataclass(frozen=True, slots=True)
-class Smoothed:
+class SmoothedRecording:
     """A trajectory fitted to a recording.
 
     Attributes
@@ -67,15 +72,15 @@ class Smoothed:
     """
 
     poses: PoseBatch
-    fit: Fit
-    motion: Motion
+    fit: TrajectoryFit
+    motion: MotionModel
     sources: list[Measurement]
     origin_ns: int
 
 
-def smoothed(
+def smooth_recording(
     recording: Recording, *, path: Path, on_progress: Callable[[float], None] | None = None
-) -> Smoothed:
+) -> SmoothedRecording:
     """Fit a smooth trajectory to all measurements of a recording.
 
     How the robot moves is found from the measurements themselves. The recording's own motion parameters, with which the
@@ -102,17 +107,17 @@ def smoothed(
     parameters = recording.parameters
     names = [prism.prism for prism in parameters.prisms]
     check_layout(np.array([prism.position_m for prism in parameters.prisms]), names=names)
-    measurements = believed(recording)
-    check_measured(parameters, measurements, path)
-    check_span(parameters, measurements, path)
+    measurements = plausible_measurements(recording)
+    check_prisms_measured(parameters, measurements, path)
+    check_time_span(parameters, measurements, path)
     origin_ns = min(m.stamp_ns for m in measurements)
     observations, sources = build_observations(parameters, measurements, origin_ns=origin_ns)
-    motion = motion_of(observations, parameters.pipeline)
+    motion = estimate_motion_model(observations, parameters.pipeline)
     try:
-        found = fit(
+        found = fit_trajectory(
             observations,
             prior=motion.prior,
-            while_hidden=parameters.pipeline.motion,
+            occluded_prior=parameters.pipeline.motion,
             noise_scale=motion.noise_scale,
             on_progress=on_progress,
         )
@@ -120,28 +125,30 @@ def smoothed(
         raise RecordingError(str(error), path=path) from error
     poses = _poses(found, parameters, measurements, sources, origin_ns)
     if not poses.valid.any():
-        raise RecordingError(why_none_is_valid(poses, parameters), path=path)
-    return Smoothed(poses, found, motion, sources, origin_ns)
+        raise RecordingError(no_valid_pose_message(poses, parameters), path=path)
+    return SmoothedRecording(poses, found, motion, sources, origin_ns)
 
 
-def motion_of(observations: Observations, pipeline: PipelineParameters) -> Motion:
+def estimate_motion_model(observations: Observations, pipeline: PipelineParameters) -> MotionModel:
     """Find how the robot moves; where the measurements are too few to tell, and at least about as lively, as the parameters say."""
     try:
         tuned = tune(observations)
     except GeometryError:
-        return Motion(pipeline.motion, pipeline.noise_scale, tuned=False)
-    return Motion(at_least(tuned.prior, pipeline.motion, CALMEST), tuned.noise_scale, tuned=True)
+        return MotionModel(pipeline.motion, pipeline.noise_scale, tuned=False)
+    return MotionModel(
+        with_noise_floor(tuned.prior, pipeline.motion, NOISE_FLOOR_SHARE), tuned.noise_scale, tuned=True
+    )
 
 
 def _poses(
-    found: Fit,
+    found: TrajectoryFit,
     parameters: Parameters,
     measurements: Sequence[Measurement],
     sources: Sequence[Measurement],
     origin_ns: int,
 ) -> PoseBatch:
     stations = {station.station: station for station in parameters.stations}
-    seen = Seen(
+    seen = MeasurementHistory(
         times_ns=np.array([measured_at_ns(m, stations[m.station]) for m in sources], dtype=np.int64),
         stations=np.array([m.station for m in sources], dtype=np.int64),
         prisms=found.observations.prism,
@@ -161,9 +168,9 @@ def _poses(
     period_ns = parameters.pipeline.period_ns
     first, last = -(-int(seen.times_ns[0]) // period_ns), int(seen.times_ns[-1]) // period_ns
     epochs_ns = np.arange(first, last + 1, dtype=np.int64) * period_ns
-    chunks, poses = [], ContinuousPoses(parameters)
+    chunks, poses = [], ContinuousPoseOutput(parameters)
     for start in range(0, max(len(epochs_ns), 1), _EPOCHS_AT_ONCE):
         some_ns = epochs_ns[start : start + _EPOCHS_AT_ONCE]
-        states, covariance = found.trajectory.at((some_ns - origin_ns) / 1e9, parts=_POSE)
+        states, covariance = found.trajectory.at((some_ns - origin_ns) / 1e9, dim=_POSE)
         chunks.append(poses.smoothed(some_ns, seen, states, covariance))
     return PoseBatch.concatenated(chunks)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.errors import RecordingError
-from tsgt.estimation import Reason, believable, usable
+from tsgt.estimation import Reason, has_plausible_time, usable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,19 +19,19 @@ if TYPE_CHECKING:
     from tsgt.model import Measurement, Parameters
     from tsgt.recording import Recording
 
-EPOCHS_MAX = 2_000_000
+MAX_EPOCHS = 2_000_000
 """More poses at once than this (28 h at 20 Hz, about 1.5 GB) come of a wrong clock, not of field work."""
 
 
-def believed(recording: Recording) -> list[Measurement]:
+def plausible_measurements(recording: Recording) -> list[Measurement]:
     """Measurements that can have been made when their stamps say, those of unknown stations included."""
     stations = {station.station: station for station in recording.parameters.stations}
     return [
-        m for m in recording.measurements if m.station not in stations or believable(m, stations[m.station])
+        m for m in recording.measurements if m.station not in stations or has_plausible_time(m, stations[m.station])
     ]
 
 
-def check_measured(parameters: Parameters, measurements: Sequence[Measurement], path: Path) -> None:
+def check_prisms_measured(parameters: Parameters, measurements: Sequence[Measurement], path: Path) -> None:
     """Refuse a recording in which a prism of the layout was never measured: no pose can come of it."""
     if not measurements:
         raise RecordingError("holds no measurements, so there is nothing to process", path=path)
@@ -46,11 +46,11 @@ def check_measured(parameters: Parameters, measurements: Sequence[Measurement], 
             )
 
 
-def check_span(parameters: Parameters, measurements: Sequence[Measurement], path: Path) -> None:
+def check_time_span(parameters: Parameters, measurements: Sequence[Measurement], path: Path) -> None:
     """Refuse more poses than a computer can hold."""
     stamps = [m.stamp_ns for m in measurements]
     span_ns = max(stamps) - min(stamps)
-    if span_ns > EPOCHS_MAX * parameters.pipeline.period_ns:
+    if span_ns > MAX_EPOCHS * parameters.pipeline.period_ns:
         raise RecordingError(
             f"its measurements span {span_ns / 86_400e9:.1f} days, too many for one trajectory: "
             "leave out those that were stamped by a wrong clock, or process with a lower --rate",
@@ -74,7 +74,7 @@ def _what_came(
     return f"station {' and '.join(homes)} sent none of it" if homes else "no station tracks it"
 
 
-def why_none_is_valid(poses: PoseBatch, parameters: Parameters) -> str:
+def no_valid_pose_message(poses: PoseBatch, parameters: Parameters) -> str:
     """Say in one line why there is no valid pose, and what to look at."""
     counts = poses.invalid_counts()
     if not counts:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.scene import START, driving, standing_scene
+from harness.scene import START, driving, stationary_scene
 
 from tsgt.analysis.processing import has_raw_angles, process, with_frames, with_layout
 from tsgt.errors import ConfigError, RecordingError
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from tsgt.model import Measurement, Parameters
 
 PATH = Path("field.jsonl")
-SCENE = standing_scene().moving(driving)
+SCENE = stationary_scene().moving(driving)
 SCENE = replace(
     SCENE,
     parameters=replace(SCENE.parameters, pipeline=replace(SCENE.parameters.pipeline, estimator="linear")),

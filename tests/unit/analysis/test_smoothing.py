@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.scene import LAYOUT, SECOND, START, Motion, counted_from, standing_scene
+from harness.scene import LAYOUT, SECOND, START, Motion, stationary_scene, with_origin
 
-from tsgt.analysis.evaluation import held_out
+from tsgt.analysis.evaluation import held_out_errors
 from tsgt.analysis.evaluation.held_out import FOLDS
 from tsgt.analysis.processing import process, with_estimator
-from tsgt.analysis.smoothing import smoothed
+from tsgt.analysis.smoothing import smooth_recording
 from tsgt.errors import RecordingError
 from tsgt.estimation import Kind, Reason, build_observations
 from tsgt.geometry import exp_so3, rotate, rotation_from_quaternion, skew
@@ -36,7 +36,7 @@ def wandering(time_s: float) -> Motion:
     return exp_so3(np.array([0.0, 0.0, 0.6 * np.sin(0.7 * time_s)])), np.array(position)
 
 
-SCENE = standing_scene().moving(wandering)
+SCENE = stationary_scene().moving(wandering)
 
 
 def recording_of(measurements: Sequence[Measurement], parameters: Parameters = SCENE.parameters) -> Recording:
@@ -65,7 +65,7 @@ def drive(seconds: float = 14.0, *, noise_m: float = 0.002) -> list[PolarMeasure
 def test_the_poses_are_those_of_the_robot() -> None:
     """Smoothed ones, all the way from the first to the last measurement, better than straight lines make them."""
     measurements = drive()
-    found = smoothed(recording_of(measurements), path=PATH)
+    found = smooth_recording(recording_of(measurements), path=PATH)
     poses = found.poses
     assert set(poses.kind.tolist()) == {Kind.SMOOTHED}
     assert found.motion.tuned
@@ -100,7 +100,7 @@ def test_process_takes_the_estimator_of_the_recording() -> None:
     """And gives the same poses."""
     recording = recording_of(drive())
     np.testing.assert_array_equal(
-        process(recording, path=PATH).position_m, smoothed(recording, path=PATH).poses.position_m
+        process(recording, path=PATH).position_m, smooth_recording(recording, path=PATH).poses.position_m
     )
 
 
@@ -108,13 +108,13 @@ def test_late_measurements_count_where_they_belong() -> None:
     """The order of arrival changes no pose, however late a measurement came."""
     measurements = drive()
     late = [*measurements[:5], *measurements[6:], measurements[5]]
-    a, b = (smoothed(recording_of(some), path=PATH).poses for some in (measurements, late))
+    a, b = (smooth_recording(recording_of(some), path=PATH).poses for some in (measurements, late))
     np.testing.assert_array_equal(a.position_m, b.position_m)
 
 
 def test_too_few_measurements_take_the_recorded_motion() -> None:
     """Nobody can tell from two seconds how a robot moves."""
-    found = smoothed(recording_of(drive(2.0)), path=PATH)
+    found = smooth_recording(recording_of(drive(2.0)), path=PATH)
     assert not found.motion.tuned
     assert found.motion.prior == SCENE.parameters.pipeline.motion
 
@@ -122,7 +122,7 @@ def test_too_few_measurements_take_the_recorded_motion() -> None:
 def test_a_prism_out_of_sight_is_named_and_bridged_while_that_is_honest() -> None:
     """Two prisms and the robot's inertia carry on for a while; the pose stays valid, the prism's share says outage."""
     measurements = [m for m in drive() if m.station != 2 or not 6.0 < (m.stamp_ns - START) / SECOND < 8.0]
-    poses = smoothed(recording_of(measurements), path=PATH).poses
+    poses = smooth_recording(recording_of(measurements), path=PATH).poses
     out = poses.prism_reason[:, 1] == Reason.OUTAGE
     inside = (poses.stamp_ns > START + 6.5 * SECOND) & (poses.stamp_ns < START + 7.5 * SECOND)
     assert out[inside].all()
@@ -134,7 +134,7 @@ def test_a_prism_out_of_sight_is_named_and_bridged_while_that_is_honest() -> Non
 def test_nothing_is_valid_where_nothing_was_measured() -> None:
     """A gap of six seconds in all stations is not bridged."""
     measurements = [m for m in drive() if not 5.0 < (m.stamp_ns - START) / SECOND < 11.0]
-    poses = smoothed(recording_of(measurements), path=PATH).poses
+    poses = smooth_recording(recording_of(measurements), path=PATH).poses
     middle = np.abs(poses.stamp_ns - (START + 8 * SECOND)) < SECOND
     assert not poses.valid[middle].any()
     assert poses.valid[~middle].any()
@@ -145,7 +145,7 @@ def test_one_wrong_measurement_spoils_no_pose() -> None:
     measurements = drive()
     wrong = measurements[60]
     measurements[60] = replace(wrong, slope_distance_m=wrong.slope_distance_m + 1.0)  # type: ignore[operator]
-    poses = smoothed(recording_of(measurements), path=PATH).poses
+    poses = smooth_recording(recording_of(measurements), path=PATH).poses
     near = np.abs(poses.stamp_ns - wrong.stamp_ns) < SECOND
     assert poses.valid[near].all()
 
@@ -157,7 +157,7 @@ def test_a_mirrored_layout_is_said_to_be_one() -> None:
         for p in SCENE.parameters.prisms
     )
     with pytest.raises(RecordingError, match="the prism layout is mirrored"):
-        smoothed(recording_of(drive(), replace(SCENE.parameters, prisms=mirrored)), path=PATH)
+        smooth_recording(recording_of(drive(), replace(SCENE.parameters, prisms=mirrored)), path=PATH)
 
 
 def test_another_robots_layout_makes_no_poses() -> None:
@@ -166,7 +166,7 @@ def test_another_robots_layout_makes_no_poses() -> None:
         replace(p, position_m=(1.5 * p.position_m[0], 1.5 * p.position_m[1], p.position_m[2]))
         for p in SCENE.parameters.prisms
     )
-    poses = smoothed(recording_of(drive(), replace(SCENE.parameters, prisms=other)), path=PATH).poses
+    poses = smooth_recording(recording_of(drive(), replace(SCENE.parameters, prisms=other)), path=PATH).poses
     # At the very ends one prism alone may be near.
     assert poses.invalid_counts()["residual"] > 0.95 * len(poses)
 
@@ -174,17 +174,17 @@ def test_another_robots_layout_makes_no_poses() -> None:
 def test_no_measurements_are_refused() -> None:
     """So is a prism that was never seen."""
     with pytest.raises(RecordingError, match="holds no measurements"):
-        smoothed(recording_of([]), path=PATH)
+        smooth_recording(recording_of([]), path=PATH)
     blind = [replace(m, status=Status.NO_TARGET) if m.station == 1 else m for m in drive()]
     with pytest.raises(RecordingError, match="prism 1 has no usable measurement"):
-        smoothed(recording_of(blind), path=PATH)
+        smooth_recording(recording_of(blind), path=PATH)
 
 
 def test_where_a_layout_counts_from_does_not_matter() -> None:
     """With the origin metres off the prisms the poses are the same ones of another point, and so is how sure they are."""
     arm = np.array([-3.0, 1.0, -1.5])
-    near = smoothed(recording_of(drive()), path=PATH)
-    far = smoothed(recording_of(drive(), counted_from(SCENE.parameters, arm)), path=PATH)
+    near = smooth_recording(recording_of(drive()), path=PATH)
+    far = smooth_recording(recording_of(drive(), with_origin(SCENE.parameters, arm)), path=PATH)
     assert far.motion.noise_scale == pytest.approx(near.motion.noise_scale, rel=1e-4)
     rotation = rotation_from_quaternion(near.poses.orientation_xyzw)
     spoke = rotation @ arm
@@ -204,13 +204,13 @@ def test_what_is_held_out_was_not_seen() -> None:
     """Moving a left-out measurement moves no prediction, neither its own nor another one of its fold."""
     origin_ns = START
     observations, _ = build_observations(SCENE.parameters, drive(), origin_ns=origin_ns)
-    found = held_out(observations, SCENE.parameters.pipeline)
-    assert found["linear"].figures.n == found["continuous"].figures.n == 3 * 25
-    assert found["continuous"].figures.mean < 0.5 * found["linear"].figures.mean
+    found = held_out_errors(observations, SCENE.parameters.pipeline)
+    assert found["linear"].statistics.n == found["continuous"].statistics.n == 3 * 25
+    assert found["continuous"].statistics.mean < 0.5 * found["linear"].statistics.mean
     points = observations.points_m.copy()
     points[np.flatnonzero(observations.prism == 0)[FOLDS]] += 0.02
-    moved = held_out(replace(observations, points_m=points), SCENE.parameters.pipeline)
+    moved = held_out_errors(replace(observations, points_m=points), SCENE.parameters.pipeline)
     # It is the first of fold 0 of its prism, which leaves five out.
-    assert moved["continuous"].missed_m[0] > 0.015
-    np.testing.assert_array_equal(moved["continuous"].missed_m[1:5], found["continuous"].missed_m[1:5])
-    assert (moved["continuous"].missed_m[5:] != found["continuous"].missed_m[5:]).any()
+    assert moved["continuous"].error_m[0] > 0.015
+    np.testing.assert_array_equal(moved["continuous"].error_m[1:5], found["continuous"].error_m[1:5])
+    assert (moved["continuous"].error_m[5:] != found["continuous"].error_m[5:]).any()

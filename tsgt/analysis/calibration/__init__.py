@@ -1,15 +1,15 @@
 """TODO face."""
 
-from tsgt.analysis.calibration.motion import CalibratedRecording, Judgement, calibrate_recording
+from tsgt.analysis.calibration.motion import CalibratedRecording, HeldOutComparison, calibrate_recording
 from tsgt.analysis.calibration.station_check import StationCheck, check_station
-from tsgt.analysis.calibration.target_collection import Cell, TargetCollection
+from tsgt.analysis.calibration.target_collection import StationTarget, TargetCollection
 from tsgt.analysis.calibration.targets import mean_points, solve_prisms, solve_stations, target_residuals
 
 __all__ = [
     "CalibratedRecording",
-    "Cell",
-    "Judgement",
+    "HeldOutComparison",
     "StationCheck",
+    "StationTarget",
     "TargetCollection",
     "calibrate_recording",
     "check_station",

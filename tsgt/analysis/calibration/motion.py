@@ -6,30 +6,30 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, cast
 
 from tsgt.analysis.evaluation import (
-    HeldOut,
+    HeldOutErrors,
+    cross_validate,
     folds,
-    hold_out,
-    missed_by_lines,
-    missed_by_trajectory,
-    never_out,
+    interpolation_errors,
+    training_rows,
+    trajectory_errors,
 )
 from tsgt.errors import GeometryError
 from tsgt.estimation import build_observations
 from tsgt.geometry.calibration import MotionCalibration, Setup, calibrate_motion, frames_from_motion
-from tsgt.geometry.trajectory import fit, tune
+from tsgt.geometry.trajectory import fit_trajectory, tune
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from tsgt.analysis.evaluation import Fold
     from tsgt.geometry import FloatArray, Observations
-    from tsgt.geometry.calibration import Unknowns
+    from tsgt.geometry.calibration import SetupPrior
     from tsgt.model import Matrix4, MotionPrior, Parameters, Vector3
     from tsgt.recording import Recording
 
 
 @dataclass(frozen=True, slots=True)
-class Judgement:
+class HeldOutComparison:
     """How well measurements that were left out are predicted from the rest.
 
     Attributes
@@ -42,9 +42,9 @@ class Judgement:
         By the trajectory, with a set-up that was found without the left-out measurements.
     """
 
-    linear: HeldOut
-    before: HeldOut | None
-    after: HeldOut
+    linear: HeldOutErrors
+    before: HeldOutErrors | None
+    after: HeldOutErrors
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,12 +63,12 @@ class CalibratedRecording:
 
     calibration: MotionCalibration
     parameters: Parameters
-    judgement: Judgement | None
+    judgement: HeldOutComparison | None
 
 
 def calibrate_recording(
     recording: Recording,
-    known: Unknowns,
+    known: SetupPrior,
     *,
     frames_known: bool = True,
     held_out: bool = True,
@@ -111,7 +111,7 @@ def calibrate_recording(
     if held_out:
         parts = folds(observations)
         # By number of fold: these have seen nothing of what the folds of that number leave out.
-        seen = {part.number: observations.select(never_out(observations, part.number)) for part in parts}
+        seen = {part.number: observations.select(training_rows(observations, part.number)) for part in parts}
         found = {number: calibrated(some, f"without fifth {number + 1}") for number, some in seen.items()}
         before = None
         if frames_known:
@@ -122,8 +122,8 @@ def calibrate_recording(
                 observations, parts, {n: (own, t.prior, t.noise_scale) for n, t in tuned.items()}
             )
         tell("held-out prediction after")
-        judgement = Judgement(
-            hold_out(parts, lambda fold: missed_by_lines(observations, fold)),
+        judgement = HeldOutComparison(
+            cross_validate(parts, lambda fold: interpolation_errors(observations, fold)),
             before,
             _predicted(observations, parts, {n: (c.setup, c.prior, c.noise_scale) for n, c in found.items()}),
         )
@@ -132,19 +132,19 @@ def calibrate_recording(
 
 def _predicted(
     observations: Observations, parts: list[Fold], by: dict[int, tuple[Setup, MotionPrior, float]]
-) -> HeldOut:
-    def missed_m(fold: Fold) -> FloatArray:
+) -> HeldOutErrors:
+    def error_m(fold: Fold) -> FloatArray:
         setup, prior, noise_scale = by[fold.number]
-        kept = setup.applied(observations.select(fold.kept))
-        trajectory = fit(kept, prior=prior, noise_scale=noise_scale).trajectory
-        return missed_by_trajectory(trajectory, setup.applied(observations.select(fold.out)))
+        kept = setup.applied(observations.select(fold.training))
+        trajectory = fit_trajectory(kept, prior=prior, noise_scale=noise_scale).trajectory
+        return trajectory_errors(trajectory, setup.applied(observations.select(fold.test)))
 
-    return hold_out(parts, missed_m)
+    return cross_validate(parts, error_m)
 
 
 def _with_setup(parameters: Parameters, calibration: MotionCalibration) -> Parameters:
     setup = calibration.setup
-    bent_m = setup.layout - calibration.was.layout
+    bent_m = setup.layout - calibration.initial.layout
     stations = tuple(
         replace(
             station,

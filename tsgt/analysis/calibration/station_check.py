@@ -14,10 +14,17 @@ from scipy.special import chdtri
 
 from tsgt.errors import DegenerateGeometryError
 from tsgt.geometry import log_so3
-from tsgt.geometry.calibration import FALSE_ALARM, MIN_POINTS, STATION_LIMITS, Fit, Pairs, fit_frame
+from tsgt.geometry.calibration import (
+    FALSE_ALARM_RATE,
+    MIN_POINTS,
+    STATION_LIMITS,
+    FrameFit,
+    PointPairs,
+    fit_frame,
+)
 
 if TYPE_CHECKING:
-    from tsgt.geometry.calibration import Name, PointSet
+    from tsgt.geometry.calibration import PointName, PointSet
 
 FEWEST_FOR_HEADING = 2
 
@@ -45,7 +52,7 @@ class StationCheck:
         One movement of the station explains all shifts. If not, a target has moved or was mistaken for another.
     """
 
-    shifts_m: dict[Name, float]
+    shifts_m: dict[PointName, float]
     moved_m: float
     moved_sigma_m: float
     turned_rad: float | None
@@ -69,21 +76,21 @@ def check_station(then: PointSet, now: PointSet, *, limit_m: float = 0.0) -> Sta
     StationCheck
         The test of the shifts against noise has a false alarm in ten thousand.
     """
-    pairs = Pairs(now, then.select(now.names), levelled=False)
-    still = Fit(np.eye(3), np.zeros(3), np.zeros((6, 6)))
-    shifts_m = np.linalg.norm(still.misses_m(pairs), axis=1)
+    pairs = PointPairs(now, then.select(now.names), levelled=False)
+    still = FrameFit(np.eye(3), np.zeros(3), np.zeros((6, 6)))
+    shifts_m = np.linalg.norm(still.residuals_m(pairs), axis=1)
     count = len(pairs.names)
-    noise_only = still.misfit(pairs) <= chdtri(3 * count, FALSE_ALARM)
+    noise_only = still.chi_squared(pairs) <= chdtri(3 * count, FALSE_ALARM_RATE)
     fit, levelled = _fit(pairs)
     if fit is None:
         # The mean shift; for one target it is that target's own.
-        moved = still.misses_m(pairs).mean(axis=0)
-        covariance = still.noise_m2(pairs).mean(axis=0) / count
+        moved = still.residuals_m(pairs).mean(axis=0)
+        covariance = still.residual_covariances_m2(pairs).mean(axis=0) / count
         consistent = True
     else:
         moved, covariance = fit.translation_m, fit.covariance[:3, :3]
-        solved = Pairs(pairs.source, pairs.target, levelled)
-        consistent = bool(fit.misfit(solved) <= chdtri(solved.redundancy, FALSE_ALARM))
+        solved = PointPairs(pairs.source, pairs.target, levelled)
+        consistent = bool(fit.chi_squared(solved) <= chdtri(solved.redundancy, FALSE_ALARM_RATE))
     moved_m = float(np.linalg.norm(moved))
     direction = moved / moved_m if moved_m > 0 else np.array([1.0, 0.0, 0.0])
     return StationCheck(
@@ -97,13 +104,13 @@ def check_station(then: PointSet, now: PointSet, *, limit_m: float = 0.0) -> Sta
     )
 
 
-def _fit(pairs: Pairs) -> tuple[Fit | None, bool]:
+def _fit(pairs: PointPairs) -> tuple[FrameFit | None, bool]:
     """Fit as much as the targets hold: all, or position and heading (True), or nothing."""
     for levelled, fewest in ((False, MIN_POINTS), (True, FEWEST_FOR_HEADING)):
         if len(pairs.names) < fewest:
             continue
         try:
-            fit = fit_frame(Pairs(pairs.source, pairs.target, levelled), weighted=True)
+            fit = fit_frame(PointPairs(pairs.source, pairs.target, levelled), weighted=True)
         except DegenerateGeometryError:
             continue
         if np.linalg.eigvalsh(fit.covariance[3:, 3:]).max() <= STATION_LIMITS.weak_rad**2:

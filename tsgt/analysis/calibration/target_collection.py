@@ -10,7 +10,7 @@ import dataclasses
 from typing import TYPE_CHECKING
 
 from tsgt.analysis.calibration.targets import solve_stations
-from tsgt.analysis.formats import Sight, TargetFile, read_some_targets
+from tsgt.analysis.formats import TargetFile, TargetMeasurement, read_partial_target_file
 from tsgt.errors import DegenerateGeometryError, InputFileError
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 HEADER = "station,target,horizontal_angle_rad,zenith_angle_rad,slope_distance_m,constant_mm"
 
-Cell = tuple[int, int]
+StationTarget = tuple[int, int]
 """A station and a target."""
 
 
@@ -45,7 +45,7 @@ class TargetCollection:
         self.stations = tuple(stations)
         self.targets = tuple(targets)
         self._repeats = repeats
-        self._sights: dict[Cell, list[Sight]] = {}
+        self._sights: dict[StationTarget, list[TargetMeasurement]] = {}
         self._comments: list[str] = []
 
     def resume(self) -> None:
@@ -73,14 +73,14 @@ class TargetCollection:
             )
         self._comments = comments
         if len(rest) > 1:
-            file = read_some_targets(self.path)
+            file = read_partial_target_file(self.path)
             self._sights = {
                 (station, target): list(sights)
                 for station, targets in file.sights.items()
                 for target, sights in targets.items()
             }
 
-    def add(self, station: int, target: int, sight: Sight) -> None:
+    def add(self, station: int, target: int, sight: TargetMeasurement) -> None:
         """Take a measurement, one of perhaps several of this target; the line of the sight does not matter."""
         self._sights.setdefault((station, target), []).append(sight)
 
@@ -92,11 +92,11 @@ class TargetCollection:
         """Return how often a station has measured a target."""
         return len(self._sights.get((station, target), ()))
 
-    def next(self, skipped: Collection[Cell] = ()) -> Cell | None:
+    def next(self, skipped: Collection[StationTarget] = ()) -> StationTarget | None:
         """Return which target of which station is to be measured next; None when all is done or skipped."""
         return next((cell for cell in self.missing() if cell not in skipped), None)
 
-    def missing(self) -> Iterator[Cell]:
+    def missing(self) -> Iterator[StationTarget]:
         """Yield what has not been measured often enough, station by station."""
         for station in self.stations:
             for target in self.targets:
@@ -120,14 +120,14 @@ class TargetCollection:
         except (DegenerateGeometryError, InputFileError) as error:
             return str(error)
 
-    def _rows(self) -> Iterator[tuple[Cell, Sight]]:
+    def _rows(self) -> Iterator[tuple[StationTarget, TargetMeasurement]]:
         for cell, sights in sorted(self._sights.items()):
             for sight in sights:
                 yield cell, sight
 
     def _file(self) -> TargetFile:
         """Return what reading the file would give."""
-        sights: dict[int, dict[int, list[Sight]]] = {}
+        sights: dict[int, dict[int, list[TargetMeasurement]]] = {}
         first_line = len(self._comments) + 2
         for line, ((station, target), sight) in enumerate(self._rows(), start=first_line):
             numbered = dataclasses.replace(sight, line=line)
@@ -135,7 +135,7 @@ class TargetCollection:
         return TargetFile(self.path, sights, ())
 
 
-def _line(station: int, target: int, sight: Sight) -> str:
+def _line(station: int, target: int, sight: TargetMeasurement) -> str:
     # In the shortest form that reads back to the same bits.
     numbers = (sight.horizontal_angle_rad, sight.zenith_angle_rad, sight.slope_distance_m)
     constant = "" if sight.constant_m is None else f"{1e3 * sight.constant_m:.6g}"

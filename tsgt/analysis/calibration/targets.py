@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from tsgt.analysis.formats import PrismFile, Sight, TargetFile
-    from tsgt.geometry.calibration import FrameCalibration, Name, PrismCalibration
+    from tsgt.analysis.formats import PrismFile, TargetFile, TargetMeasurement
+    from tsgt.geometry.calibration import FrameCalibration, PointName, PrismCalibration
 
 REPEAT_LIMIT_M = 0.02
 """Two measurements of one target are a mistake when they lie further than this from their mean: another target,
@@ -78,12 +78,12 @@ def target_residuals(frame: FrameCalibration) -> tuple[TargetResidual, ...]:
             TargetResidual(
                 target=int(name),
                 residual_m=residual_m,
-                left_out_m=left_out_m if math.isfinite(left_out_m) else None,
+                leave_one_out_m=leave_one_out_m if math.isfinite(leave_one_out_m) else None,
             )
-            for name, residual_m, left_out_m in used
+            for name, residual_m, leave_one_out_m in used
         ),
         *(
-            TargetResidual(target=int(bad.name), residual_m=None, left_out_m=float(bad.miss_m))
+            TargetResidual(target=int(bad.name), residual_m=None, leave_one_out_m=float(bad.prediction_error_m))
             for bad in frame.rejected
         ),
     )
@@ -129,7 +129,7 @@ def solve_prisms(file: PrismFile, *, target_constant_m: float, prism_constant_m:
 
 def mean_points(
     path: Path,
-    measured: Mapping[int, Sequence[Sight]] | Mapping[str, Sequence[Sight]],
+    measured: Mapping[int, Sequence[TargetMeasurement]] | Mapping[str, Sequence[TargetMeasurement]],
     constant_m: float,
     what: str,
 ) -> PointSet:
@@ -151,7 +151,7 @@ def mean_points(
     InputFileError
         Repeated measurements of one target contradict each other, or a constant exceeds a distance.
     """
-    names: list[Name] = []
+    names: list[PointName] = []
     points, covariances = [], []
     for name, sights in measured.items():
         # Of either face: the formula for the first gives the same point for the angles of the second.

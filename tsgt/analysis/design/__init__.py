@@ -1,28 +1,33 @@
 """TODO face."""
 
-from tsgt.analysis.design.layout_search import Criterion, Task, best_layout
+from tsgt.analysis.design.layout_search import Criterion, LayoutProblem, optimal_layout
 from tsgt.analysis.design.layout_study import (
-    HEADINGS,
-    LayoutFigures,
-    Stances,
+    HEADING_COUNT,
+    PoseAccuracy,
+    RobotPoses,
     Station,
     pose_covariances,
-    together_or_around,
+    station_arrangements,
 )
-from tsgt.analysis.design.perturbation import Perturbation, equivalent, first_order_sigmas, perturbation_study
+from tsgt.analysis.design.perturbation import (
+    Perturbation,
+    equivalent_noise,
+    first_order_sigmas,
+    perturbation_study,
+)
 
 __all__ = [
-    "HEADINGS",
+    "HEADING_COUNT",
     "Criterion",
-    "LayoutFigures",
+    "LayoutProblem",
     "Perturbation",
-    "Stances",
+    "PoseAccuracy",
+    "RobotPoses",
     "Station",
-    "Task",
-    "best_layout",
-    "equivalent",
+    "equivalent_noise",
     "first_order_sigmas",
+    "optimal_layout",
     "perturbation_study",
     "pose_covariances",
-    "together_or_around",
+    "station_arrangements",
 ]

@@ -19,7 +19,7 @@ from tsgt.errors import GeometryError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from tsgt.analysis.design.layout_study import Stances, Station
+    from tsgt.analysis.design.layout_study import RobotPoses, Station
     from tsgt.geometry import FloatArray
 
 Criterion = Literal["rotation", "position"]
@@ -40,7 +40,7 @@ _FAINT_INFORMATION = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
-class Task:
+class LayoutProblem:
     """What is to be found.
 
     Attributes
@@ -62,12 +62,12 @@ class Task:
     min_separation_m: float
     criterion: Criterion
     stations: tuple[Station, ...]
-    stances: Stances
+    robot_poses: RobotPoses
     point_m: FloatArray
 
     def information(self, places_m: FloatArray, slot: int) -> FloatArray:
         """Tell what a prism at each of the places (M, 3) says of the pose; shape (M, N, 6, 6)."""
-        return prism_information(places_m, slot, self.stations, self.stances, self.point_m)
+        return prism_information(places_m, slot, self.stations, self.robot_poses, self.point_m)
 
     def variance(self, information: FloatArray) -> FloatArray:
         """Judge information matrices (..., N, 6, 6) by the mean over the stances of the summed variance, shape (...)."""
@@ -79,8 +79,8 @@ class Task:
         return judged
 
 
-def best_layout(
-    task: Task, random: np.random.Generator, *, on_progress: Callable[[float], None] | None = None
+def optimal_layout(
+    task: LayoutProblem, random: np.random.Generator, *, on_progress: Callable[[float], None] | None = None
 ) -> FloatArray:
     """Find the places in the envelope from which the pose is known best.
 
@@ -123,7 +123,7 @@ def best_layout(
     return _refined(found[1], task)
 
 
-def _start(grid: FloatArray, task: Task, random: np.random.Generator) -> list[int] | None:
+def _start(grid: FloatArray, task: LayoutProblem, random: np.random.Generator) -> list[int] | None:
     """Choose places far enough apart; None where chance led into a corner without room for the rest."""
     chosen: list[int] = []
     for place in random.permutation(len(grid)):
@@ -134,7 +134,7 @@ def _start(grid: FloatArray, task: Task, random: np.random.Generator) -> list[in
     return None
 
 
-def _refined(layout: FloatArray, task: Task) -> FloatArray:
+def _refined(layout: FloatArray, task: LayoutProblem) -> FloatArray:
     """Improve a layout in steps that halve, beginning with half the grid's."""
     least, greatest = task.envelope_m
     around = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -152,7 +152,7 @@ def _refined(layout: FloatArray, task: Task) -> FloatArray:
 
 def _exchange(
     layout: FloatArray,
-    task: Task,
+    task: LayoutProblem,
     offers: Callable[[int, FloatArray], tuple[FloatArray, FloatArray]],
 ) -> tuple[float, FloatArray]:
     """Let each prism in turn take the best of the places offered to it, until none moves.
@@ -178,7 +178,7 @@ def _exchange(
     return variance, layout
 
 
-def _apart(places: FloatArray, others: FloatArray, task: Task) -> np.ndarray:
+def _apart(places: FloatArray, others: FloatArray, task: LayoutProblem) -> np.ndarray:
     """Which of the places (M, 3) are far enough from all others (K, 3); shape (M,)."""
     distances = np.linalg.norm(places[:, None] - others, axis=-1)
     # A grid may offer exactly the distance, give or take a rounding.

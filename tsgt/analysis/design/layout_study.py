@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
     from tsgt.model import InstrumentNoise
 
-FARTHEST_POINT_M = 10_000.0
+MAX_POINT_DISTANCE_M = 10_000.0
 """No point of a robot is further from its prisms."""
 
-HEADINGS = 8
+HEADING_COUNT = 8
 """So many headings of the robot at each place, evenly around the circle."""
 
 
@@ -57,7 +57,7 @@ class Station:
 
 
 @dataclass(frozen=True, slots=True)
-class Stances:
+class RobotPoses:
     """N poses in which a level robot stands.
 
     Attributes
@@ -72,11 +72,11 @@ class Stances:
     position_m: FloatArray
 
     @classmethod
-    def at(cls, places_m: ArrayLike, headings_rad: ArrayLike | None = None) -> Stances:
+    def at(cls, places_m: ArrayLike, headings_rad: ArrayLike | None = None) -> RobotPoses:
         """Stand at each of the places (M, 3) with each of the headings: N = M x headings, place by place."""
         places = np.asarray(places_m, dtype=np.float64)
         if headings_rad is None:
-            headings_rad = np.arange(HEADINGS) * (2 * math.pi / HEADINGS)
+            headings_rad = np.arange(HEADING_COUNT) * (2 * math.pi / HEADING_COUNT)
         turns = np.zeros((np.size(headings_rad), 3))
         turns[:, 2] = headings_rad
         return cls(
@@ -86,7 +86,7 @@ class Stances:
 
 
 @dataclass(frozen=True, slots=True)
-class LayoutFigures:
+class PoseAccuracy:
     """How well poses are known; root mean squares over the stances of one sigma.
 
     Attributes
@@ -111,7 +111,7 @@ class LayoutFigures:
     worst_rotation_rad: float
 
     @classmethod
-    def of(cls, covariance: FloatArray) -> LayoutFigures:
+    def of(cls, covariance: FloatArray) -> PoseAccuracy:
         """Sum up the covariances (N, 6, 6) of :func:`pose_covariances`."""
         variances = np.diagonal(covariance, axis1=1, axis2=2)
         position, rotation = variances[:, :3], variances[:, 3:]
@@ -126,7 +126,7 @@ class LayoutFigures:
 
 
 def pose_covariances(
-    layout: FloatArray, stations: tuple[Station, ...], stances: Stances, point_m: FloatArray
+    layout: FloatArray, stations: tuple[Station, ...], robot_poses: RobotPoses, point_m: FloatArray
 ) -> FloatArray:
     """Covariance of the pose from one measurement by each station, all of them weighed by their noise.
 
@@ -158,10 +158,10 @@ def pose_covariances(
             f"the layout has {len(layout)} prisms for {len(stations)} stations: each prism needs a station of its own"
         )
     away_m = float(np.linalg.norm(point_m - layout.mean(axis=0)))
-    if away_m > FARTHEST_POINT_M:
+    if away_m > MAX_POINT_DISTANCE_M:
         raise GeometryError(f"the point is {away_m:g} m from the prisms; give one of the robot, in its frame")
     information = sum(
-        prism_information(layout[slot : slot + 1], slot, stations, stances, point_m)[0]
+        prism_information(layout[slot : slot + 1], slot, stations, robot_poses, point_m)[0]
         for slot in range(len(layout))
     )
     covariance: FloatArray = np.linalg.inv(information)
@@ -169,7 +169,11 @@ def pose_covariances(
 
 
 def prism_information(
-    places_m: FloatArray, slot: int, stations: tuple[Station, ...], stances: Stances, point_m: FloatArray
+    places_m: FloatArray,
+    slot: int,
+    stations: tuple[Station, ...],
+    robot_poses: RobotPoses,
+    point_m: FloatArray,
 ) -> FloatArray:
     """Tell what the measurements of one prism say of the pose, for several places where it could sit.
 
@@ -187,15 +191,15 @@ def prism_information(
     FloatArray
         Information matrices, shape (M, N, 6, 6), in the order and axes of :func:`pose_covariances`.
     """
-    in_world = rotate(stances.rotation, places_m[:, None]) + stances.position_m
+    in_world = rotate(robot_poses.rotation, places_m[:, None]) + robot_poses.position_m
     weight = np.zeros((*in_world.shape, 3))
     for station in stations:
         if station.slot != slot:
             continue
         noise = measurement_covariance(*cartesian_to_polar(in_world - station.position_m), station.noise)
         weight += np.linalg.inv(noise)
-    to_robot = np.swapaxes(stances.rotation, 1, 2)
-    weight = to_robot @ weight @ stances.rotation
+    to_robot = np.swapaxes(robot_poses.rotation, 1, 2)
+    weight = to_robot @ weight @ robot_poses.rotation
     # The prism moves with the point and about it: d = [I, -skew(arm)] (translation, rotation).
     jacobian = np.concatenate(
         [np.broadcast_to(np.eye(3), (len(places_m), 3, 3)), -skew(places_m - point_m)], axis=-1
@@ -204,7 +208,7 @@ def prism_information(
     return information
 
 
-def together_or_around(
+def station_arrangements(
     stations: tuple[Station, ...], centre_m: FloatArray, distance_m: float
 ) -> dict[str, tuple[Station, ...]]:
     """Move stations to a distance from the robot: all to one side of it, or evenly around it.

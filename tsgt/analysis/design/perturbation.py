@@ -150,7 +150,7 @@ def perturbed(
     )
 
 
-def equivalent(
+def equivalent_noise(
     layout: FloatArray,
     inter_prism_m: float,
     *,

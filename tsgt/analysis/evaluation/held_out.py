@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.smoothing import motion_of
-from tsgt.geometry.trajectory import fit
+from tsgt.analysis.smoothing import estimate_motion_model
+from tsgt.geometry.trajectory import fit_trajectory
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -45,20 +45,20 @@ class Fold:
     ----------
     number
         Which fifth, from 0.
-    out, kept
+    test, training
         Rows of the observations that are left out, and all others; increasing.
     at_gap
         For each of ``out``: the prism's remaining measurements before and after it are more than a second apart.
     """
 
     number: int
-    out: NDArray[np.intp]
-    kept: NDArray[np.intp]
+    test: NDArray[np.intp]
+    training: NDArray[np.intp]
     at_gap: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
-class MissFigures:
+class PredictionErrorStatistics:
     """Misses of left-out measurements in mm; NaN without any."""
 
     mean: float
@@ -67,11 +67,11 @@ class MissFigures:
     n: int
 
     @classmethod
-    def of(cls, missed_m: FloatArray) -> MissFigures:
+    def of(cls, error_m: FloatArray) -> PredictionErrorStatistics:
         """Sum misses in m up."""
-        if not len(missed_m):
+        if not len(error_m):
             return cls(math.nan, math.nan, math.nan, 0)
-        missed_mm = 1e3 * missed_m
+        missed_mm = 1e3 * error_m
         return cls(
             mean=float(np.mean(missed_mm)),
             median=float(np.median(missed_mm)),
@@ -81,29 +81,29 @@ class MissFigures:
 
 
 @dataclass(frozen=True, slots=True)
-class HeldOut:
+class HeldOutErrors:
     """Misses of all left-out measurements, in the order of the folds.
 
     Attributes
     ----------
-    missed_m
+    error_m
         (N,) distance between where the prism was measured and where it was predicted.
     at_gap
         (N,) as in :class:`Fold`.
     """
 
-    missed_m: FloatArray
+    error_m: FloatArray
     at_gap: NDArray[np.bool_]
 
     @property
-    def figures(self) -> MissFigures:
+    def statistics(self) -> PredictionErrorStatistics:
         """Of those that are not at gaps."""
-        return MissFigures.of(self.missed_m[~self.at_gap])
+        return PredictionErrorStatistics.of(self.error_m[~self.at_gap])
 
     @property
-    def gaps(self) -> MissFigures:
+    def gaps(self) -> PredictionErrorStatistics:
         """Of those at gaps."""
-        return MissFigures.of(self.missed_m[self.at_gap])
+        return PredictionErrorStatistics.of(self.error_m[self.at_gap])
 
 
 def folds(observations: Observations) -> list[Fold]:
@@ -136,7 +136,7 @@ def folds(observations: Observations) -> list[Fold]:
     return found
 
 
-def never_out(observations: Observations, number: int) -> NDArray[np.intp]:
+def training_rows(observations: Observations, number: int) -> NDArray[np.intp]:
     """Rows that no fold of a number leaves out, of whichever prism.
 
     What is estimated from these (a prior, stations' frames) may serve all folds of this number: it has seen none of the
@@ -145,39 +145,39 @@ def never_out(observations: Observations, number: int) -> NDArray[np.intp]:
     kept = np.ones(len(observations), np.bool_)
     for fold in folds(observations):
         if fold.number == number:
-            kept[fold.out] = False
+            kept[fold.test] = False
     return np.flatnonzero(kept)
 
 
-def hold_out(parts: Sequence[Fold], missed_m: Callable[[Fold], FloatArray]) -> HeldOut:
+def cross_validate(parts: Sequence[Fold], error_m: Callable[[Fold], FloatArray]) -> HeldOutErrors:
     """Collect what an estimator misses.
 
     Parameters
     ----------
     parts
         From :func:`folds`.
-    missed_m
+    error_m
         Given a fold, predicts what it leaves out from what it keeps; by how much it misses each, in m.
     """
     if not parts:
-        return HeldOut(np.empty(0), np.empty(0, np.bool_))
-    return HeldOut(
-        np.concatenate([missed_m(fold) for fold in parts]), np.concatenate([fold.at_gap for fold in parts])
+        return HeldOutErrors(np.empty(0), np.empty(0, np.bool_))
+    return HeldOutErrors(
+        np.concatenate([error_m(fold) for fold in parts]), np.concatenate([fold.at_gap for fold in parts])
     )
 
 
-def missed_by_lines(observations: Observations, fold: Fold) -> FloatArray:
+def interpolation_errors(observations: Observations, fold: Fold) -> FloatArray:
     """Predict by straight lines between each prism's own measurements, as the estimator ``linear`` does; misses in m."""
     points = observations.in_world()
-    prism = observations.prism[fold.out[0]]
-    kept = fold.kept[observations.prism[fold.kept] == prism]
-    time_s = observations.time_s[fold.out]
+    prism = observations.prism[fold.test[0]]
+    kept = fold.training[observations.prism[fold.training] == prism]
+    time_s = observations.time_s[fold.test]
     lines = [np.interp(time_s, observations.time_s[kept], points[kept, axis]) for axis in range(3)]
-    missed: FloatArray = np.linalg.norm(np.stack(lines, axis=1) - points[fold.out], axis=1)
+    missed: FloatArray = np.linalg.norm(np.stack(lines, axis=1) - points[fold.test], axis=1)
     return missed
 
 
-def missed_by_trajectory(trajectory: Trajectory, left_out: Observations) -> FloatArray:
+def trajectory_errors(trajectory: Trajectory, left_out: Observations) -> FloatArray:
     """By how much a trajectory misses measurements of prisms, in m."""
     states, _ = trajectory.at(left_out.time_s)
     arms = left_out.layout[left_out.prism]
@@ -186,12 +186,12 @@ def missed_by_trajectory(trajectory: Trajectory, left_out: Observations) -> Floa
     return missed
 
 
-def held_out(
+def held_out_errors(
     observations: Observations,
     pipeline: PipelineParameters,
     *,
     on_progress: Callable[[float], None] | None = None,
-) -> dict[Estimator, HeldOut]:
+) -> dict[Estimator, HeldOutErrors]:
     """Leave measurements out and predict them.
 
     How the robot moves is found five times, each time without the measurements of one number's folds of all prisms, so
@@ -216,7 +216,9 @@ def held_out(
     motions = []
     for number in range(FOLDS if parts else 0):
         report(number / (2 * FOLDS))
-        motions.append(motion_of(observations.select(never_out(observations, number)), pipeline))
+        motions.append(
+            estimate_motion_model(observations.select(training_rows(observations, number)), pipeline)
+        )
     done = 0
 
     def missed(fold: Fold) -> FloatArray:
@@ -224,17 +226,17 @@ def held_out(
         report(0.5 + 0.5 * done / len(parts))
         done += 1
         motion = motions[fold.number]
-        found = fit(
-            observations.select(fold.kept),
+        found = fit_trajectory(
+            observations.select(fold.training),
             prior=motion.prior,
-            while_hidden=pipeline.motion,
+            occluded_prior=pipeline.motion,
             noise_scale=motion.noise_scale,
         )
-        return missed_by_trajectory(found.trajectory, observations.select(fold.out))
+        return trajectory_errors(found.trajectory, observations.select(fold.test))
 
-    result: dict[Estimator, HeldOut] = {
-        "linear": hold_out(parts, lambda fold: missed_by_lines(observations, fold)),
-        "continuous": hold_out(parts, missed),
+    result: dict[Estimator, HeldOutErrors] = {
+        "linear": cross_validate(parts, lambda fold: interpolation_errors(observations, fold)),
+        "continuous": cross_validate(parts, missed),
     }
     report(1.0)
     return result

@@ -28,13 +28,13 @@ EPOCH_NS = 50_000_000
 
 # A tracked prism that stands still scatters by a few millimetres; over 0.3 s and more that stays well below this
 # speed, and whoever drives slower moves less between two stations' measurements than the noise of one.
-STILL_SPEED_MPS = 0.05
-STILL_BASE_NS = 300_000_000
-STILL_DURATION_NS = 3_000_000_000
+MAX_STATIONARY_SPEED_MPS = 0.05
+SPEED_BASELINE_NS = 300_000_000
+MIN_STATIONARY_NS = 3_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class DistanceFigures:
+class DistanceStatistics:
     """Distances between two prisms in figures, in mm, as ``tsgt evaluate`` reports them; NaN without distances.
 
     Attributes
@@ -84,13 +84,13 @@ class PairDistances:
         """The pair as it is called in reports: ``1-2``."""
         return "-".join(map(str, self.prisms))
 
-    def summary(self) -> DistanceFigures:
+    def statistics(self) -> DistanceStatistics:
         """Sum the distances up."""
         found = self.distances_m * 1e3
         reference = self.reference_m * 1e3
         error = np.abs(found - reference)
         nothing = len(found) == 0
-        return DistanceFigures(
+        return DistanceStatistics(
             reference=reference,
             mean=math.nan if nothing else float(np.mean(found)),
             std=math.nan if nothing else float(np.std(found)),
@@ -102,7 +102,7 @@ class PairDistances:
 
 
 @dataclass(frozen=True, slots=True)
-class InterPrism:
+class InterPrismDistances:
     """Distances between all prisms of a recording.
 
     Attributes
@@ -123,16 +123,16 @@ class InterPrism:
     static: tuple[PairDistances, ...]
     epochs: int
     invalid_epochs: int
-    still_ns: tuple[tuple[int, int], ...]
+    stationary_ns: tuple[tuple[int, int], ...]
 
     @property
-    def still_s(self) -> float:
+    def stationary_s(self) -> float:
         """For how long the robot stood still, in s."""
-        return sum(end - start for start, end in self.still_ns) / 1e9
+        return sum(end - start for start, end in self.stationary_ns) / 1e9
 
 
 @dataclass(frozen=True, slots=True)
-class Epochs:
+class EpochDistances:
     """Distances between all prisms at 20 Hz, from interpolated tracks.
 
     Attributes
@@ -153,7 +153,7 @@ class Epochs:
     references_m: dict[tuple[int, int], float]
 
 
-def at_epochs(parameters: Parameters, tracks: Mapping[int, Track]) -> Epochs:
+def distances_at_epochs(parameters: Parameters, tracks: Mapping[int, Track]) -> EpochDistances:
     """Measure the distances between all prisms at 20 Hz; arguments as for :func:`inter_prism`."""
     layout = {prism.prism: np.array(prism.position_m) for prism in parameters.prisms}
     start, end = _common_span([tracks[prism] for prism in layout])
@@ -163,7 +163,7 @@ def at_epochs(parameters: Parameters, tracks: Mapping[int, Track]) -> Epochs:
     valid = np.logical_and.reduce([found[prism].valid for prism in layout])
     pairs = list(combinations(layout, 2))
     apart = {(a, b): np.linalg.norm(found[a].points - found[b].points, axis=-1) for a, b in pairs}
-    return Epochs(
+    return EpochDistances(
         stamp_ns=epochs,
         valid=valid,
         distances_m={pair: np.where(valid, distances, np.nan) for pair, distances in apart.items()},
@@ -174,9 +174,9 @@ def at_epochs(parameters: Parameters, tracks: Mapping[int, Track]) -> Epochs:
 def inter_prism(
     parameters: Parameters,
     tracks: Mapping[int, Track],
-    still_ns: Sequence[tuple[int, int]] | None = None,
-    found: Epochs | None = None,
-) -> InterPrism:
+    stationary_ns: Sequence[tuple[int, int]] | None = None,
+    found: EpochDistances | None = None,
+) -> InterPrismDistances:
     """Measure the distances between all prisms, moving and standing.
 
     Parameters
@@ -189,7 +189,7 @@ def inter_prism(
         When the robot stood still, if something else than the tracks tells it; what of it lies before the first and after
         the last measurement does not count.
     found
-        From :func:`at_epochs`, if it is known already.
+        From :func:`distances_at_epochs`, if it is known already.
 
     Returns
     -------
@@ -197,28 +197,28 @@ def inter_prism(
         Without epochs where the tracks have no time in common.
     """
     chosen = [tracks[prism.prism] for prism in parameters.prisms]
-    found = at_epochs(parameters, tracks) if found is None else found
-    if still_ns is None:
-        still = still_intervals(chosen, parameters.pipeline.outage_limit_ns)
+    found = distances_at_epochs(parameters, tracks) if found is None else found
+    if stationary_ns is None:
+        still = stationary_intervals(chosen, parameters.pipeline.outage_limit_ns)
     else:
         start, end = min(int(t.times_ns[0]) for t in chosen), max(int(t.times_ns[-1]) for t in chosen)
-        still = [(max(a, start), min(b, end)) for a, b in still_ns if max(a, start) < min(b, end)]
+        still = [(max(a, start), min(b, end)) for a, b in stationary_ns if max(a, start) < min(b, end)]
     invalid = int(np.sum(~found.valid))
     dynamic, static = [], []
     for pair, reference_m in found.references_m.items():
         dynamic.append(PairDistances(pair, found.distances_m[pair][found.valid], reference_m, invalid))
         standing = _raw_distances(tracks[pair[0]], tracks[pair[1]], still)
         static.append(PairDistances(pair, standing, reference_m, 0))
-    return InterPrism(
+    return InterPrismDistances(
         dynamic=tuple(dynamic),
         static=tuple(static),
         epochs=len(found.stamp_ns),
         invalid_epochs=invalid,
-        still_ns=tuple(still),
+        stationary_ns=tuple(still),
     )
 
 
-def still_intervals(tracks: Sequence[Track], outage_limit_ns: int) -> list[tuple[int, int]]:
+def stationary_intervals(tracks: Sequence[Track], outage_limit_ns: int) -> list[tuple[int, int]]:
     """Find when all prisms stand still.
 
     A track moves from one position to the first one at least 0.3 s later if that is faster than 0.05 m/s; it is
@@ -239,18 +239,18 @@ def still_intervals(tracks: Sequence[Track], outage_limit_ns: int) -> list[tuple
     moving: list[tuple[int, int]] = []
     for track in tracks:
         times = track.times_ns
-        later = np.searchsorted(times, times + STILL_BASE_NS)
+        later = np.searchsorted(times, times + SPEED_BASELINE_NS)
         first = np.flatnonzero(later < len(times))
         second = later[first]
         step_ns = times[second] - times[first]
         step_m = np.linalg.norm(track.points_m[second] - track.points_m[first], axis=-1)
-        moves = (step_m > STILL_SPEED_MPS * step_ns * 1e-9) | (step_ns > outage_limit_ns)
+        moves = (step_m > MAX_STATIONARY_SPEED_MPS * step_ns * 1e-9) | (step_ns > outage_limit_ns)
         moving += zip(times[first][moves].tolist(), times[second][moves].tolist(), strict=True)
     start, end = _common_span(tracks)
     still = []
     reached = start
     for leaves, arrives in [*sorted(moving), (end, end)]:
-        if min(leaves, end) - reached >= STILL_DURATION_NS:
+        if min(leaves, end) - reached >= MIN_STATIONARY_NS:
             still.append((reached, min(leaves, end)))
         reached = max(reached, arrives)
     return still

@@ -53,7 +53,7 @@ NEES_95 = 12.591587
 
 
 @dataclass(frozen=True, slots=True)
-class NeesFigures:
+class NeesStatistics:
     """Normalised estimation error squared, of position and rotation together; NaN without poses.
 
     Attributes
@@ -71,7 +71,7 @@ class NeesFigures:
     max: float
 
     @classmethod
-    def of(cls, errors: NDArray[np.float64], covariance: NDArray[np.float64]) -> NeesFigures:
+    def of(cls, errors: NDArray[np.float64], covariance: NDArray[np.float64]) -> NeesStatistics:
         """Weigh errors, (N, 6), with their covariances, (N, 6, 6)."""
         if not len(errors):
             return cls(math.nan, math.nan, math.nan)
@@ -80,7 +80,7 @@ class NeesFigures:
 
 
 @dataclass(frozen=True, slots=True)
-class PoseFigures:
+class PoseErrorStatistics:
     """How far poses are from the truth; NaN where none could be compared.
 
     Attributes
@@ -96,7 +96,7 @@ class PoseFigures:
     compared: int
     position_rms_mm: float
     orientation_rms_deg: float
-    nees: NeesFigures
+    nees: NeesStatistics
 
     @classmethod
     def of(
@@ -105,7 +105,7 @@ class PoseFigures:
         covariance: NDArray[np.float64],
         true: NDArray[np.float64],
         point_m: NDArray[np.float64],
-    ) -> PoseFigures:
+    ) -> PoseErrorStatistics:
         """Compare poses with the truth at the same instants.
 
         Parameters
@@ -121,7 +121,7 @@ class PoseFigures:
             compared=len(estimated),
             position_rms_mm=errors.position_rms_mm,
             orientation_rms_deg=errors.orientation_rms_deg,
-            nees=NeesFigures.of(
+            nees=NeesStatistics.of(
                 np.concatenate([estimated[:, :3, 3] - true[:, :3, 3], turned], axis=1), covariance
             ),
         )
@@ -147,7 +147,7 @@ def pose_errors(
     )
 
 
-def inner_part(stamp_ns: NDArray[np.int64], start_ns: int, end_ns: int) -> NDArray[np.bool_]:
+def interior_mask(stamp_ns: NDArray[np.int64], start_ns: int, end_ns: int) -> NDArray[np.bool_]:
     """Tell, (N,), which instants count in a run's figures: those :data:`EDGE_NS` away from its start and end."""
     inner: NDArray[np.bool_] = (stamp_ns >= start_ns + EDGE_NS) & (stamp_ns <= end_ns - EDGE_NS)
     return inner
@@ -161,7 +161,7 @@ Align = Literal["translation", "rigid"]
 
 
 @dataclass(frozen=True, slots=True)
-class AlignedFigures:
+class AlignedErrorStatistics:
     """How far poses are from a reference when they have been brought as close to it as one transform can.
 
     Attributes
@@ -185,9 +185,9 @@ class AlignedFigures:
     hidden_orientation_deg: float
 
 
-def aligned_figures(
+def aligned_statistics(
     estimated: FloatArray, true: FloatArray, point_m: FloatArray, mode: Align
-) -> AlignedFigures:
+) -> AlignedErrorStatistics:
     """Align poses with the truth at the same instants, and compare.
 
     Parameters
@@ -208,12 +208,12 @@ def aligned_figures(
     before = pose_errors(estimated, true, point_m)
     found, wanted = transform_points(estimated, point_m), transform_points(true, point_m)
     if not len(estimated):
-        return AlignedFigures(*(math.nan,) * 6)
+        return AlignedErrorStatistics(*(math.nan,) * 6)
     rotation = align(found, wanted).rotation if mode == "rigid" else np.eye(3)
     shift = wanted.mean(axis=0) - found.mean(axis=0)
     moved = transform_from(rotation, wanted.mean(axis=0) - rotation @ found.mean(axis=0)) @ estimated
     after = pose_errors(moved, true, point_m)
-    return AlignedFigures(
+    return AlignedErrorStatistics(
         translation_mm=1e3 * float(np.linalg.norm(shift)),
         rotation_deg=math.degrees(float(np.linalg.norm(log_so3(rotation)))),
         position_rms_mm=after.position_rms_mm,

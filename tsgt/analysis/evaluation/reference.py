@@ -10,21 +10,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from tsgt.analysis.evaluation.metrics import PoseFigures, aligned_figures, inner_part
+from tsgt.analysis.evaluation.metrics import PoseErrorStatistics, aligned_statistics, interior_mask
 from tsgt.errors import InputFileError
 from tsgt.geometry import rotation_from_quaternion, transform_from
-from tsgt.model import LARGEST_COORDINATE_M, check_instants
+from tsgt.model import MAX_COORDINATE_M, check_instants
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from tsgt.analysis.evaluation.metrics import Align, AlignedFigures
+    from tsgt.analysis.evaluation.metrics import Align, AlignedErrorStatistics
     from tsgt.estimation import PoseBatch
     from tsgt.geometry import FloatArray
 
-FARTHEST_APART_NS = 100_000_000
+MAX_INTERPOLATION_GAP_NS = 100_000_000
 """Reference poses further apart than this say nothing about the time between them: at 0.5 m/s^2 a straight line
 misses by 0.6 mm there."""
 
@@ -54,7 +54,7 @@ class Reference:
         step_ns = self.stamp_ns[after] - self.stamp_ns[before]
         known = (stamp_ns >= self.stamp_ns[before]) & (stamp_ns <= self.stamp_ns[after])
         exact = (stamp_ns == self.stamp_ns[before]) | (stamp_ns == self.stamp_ns[after])
-        known &= exact | (step_ns <= FARTHEST_APART_NS)
+        known &= exact | (step_ns <= MAX_INTERPOLATION_GAP_NS)
         poses = np.broadcast_to(np.eye(4), (len(stamp_ns), 4, 4)).copy()
         if known.any():
             start_ns = self.stamp_ns[0]
@@ -113,13 +113,13 @@ def _pose(words: list[str], path: Path, number: int) -> tuple[int, list[float]]:
             "is not a pose; expected: stamp_s x y z qx qy qz qw", path=path, line=number
         ) from error
     # A quaternion far from unit length is none: columns of something else.
-    near = all(abs(coordinate) <= LARGEST_COORDINATE_M for coordinate in row[:3])  # which no NaN is
+    near = all(abs(coordinate) <= MAX_COORDINATE_M for coordinate in row[:3])  # which no NaN is
     if len(row) != 7 or not near or not 1e-3 < math.hypot(*row[3:]) < 1e3:
         raise InputFileError("is not a pose; expected: stamp_s x y z qx qy qz qw", path=path, line=number)
     return stamp_ns, row
 
 
-def paired(poses: PoseBatch, reference: Reference) -> tuple[NDArray[np.intp], FloatArray]:
+def match_poses(poses: PoseBatch, reference: Reference) -> tuple[NDArray[np.intp], FloatArray]:
     """Find the valid poses that have a reference, from 2 s after its start to 2 s before its end.
 
     Returns
@@ -130,12 +130,12 @@ def paired(poses: PoseBatch, reference: Reference) -> tuple[NDArray[np.intp], Fl
         (N, 4, 4) ``T_station1_robot`` of the reference at their instants.
     """
     ends_ns = int(reference.stamp_ns[0]), int(reference.stamp_ns[-1])
-    rows = np.flatnonzero(poses.valid & inner_part(poses.stamp_ns, *ends_ns))
+    rows = np.flatnonzero(poses.valid & interior_mask(poses.stamp_ns, *ends_ns))
     true, known = reference.at(poses.stamp_ns[rows])
     return rows[known], true[known]
 
 
-def compare(poses: PoseBatch, reference: Reference, point_m: FloatArray) -> PoseFigures:
+def compare(poses: PoseBatch, reference: Reference, point_m: FloatArray) -> PoseErrorStatistics:
     """Compare the valid poses with a reference, unaligned, from 2 s after its start to 2 s before its end.
 
     Parameters
@@ -147,16 +147,16 @@ def compare(poses: PoseBatch, reference: Reference, point_m: FloatArray) -> Pose
     point_m
         The point of the robot whose position is compared, (3,): the centroid of the prisms.
     """
-    rows, true = paired(poses, reference)
-    return PoseFigures.of(_transforms(poses, rows), poses.covariance[rows], true, point_m)
+    rows, true = match_poses(poses, reference)
+    return PoseErrorStatistics.of(_transforms(poses, rows), poses.covariance[rows], true, point_m)
 
 
 def compare_aligned(
     poses: PoseBatch, reference: Reference, point_m: FloatArray, mode: Align
-) -> AlignedFigures:
-    """Compare the same poses as :func:`compare` once they are aligned; see :func:`tsgt.analysis.evaluation.metrics.aligned_figures`."""
-    rows, true = paired(poses, reference)
-    return aligned_figures(_transforms(poses, rows), true, point_m, mode)
+) -> AlignedErrorStatistics:
+    """Compare the same poses as :func:`compare` once they are aligned; see :func:`tsgt.analysis.evaluation.metrics.aligned_statistics`."""
+    rows, true = match_poses(poses, reference)
+    return aligned_statistics(_transforms(poses, rows), true, point_m, mode)
 
 
 def _transforms(poses: PoseBatch, rows: NDArray[np.intp]) -> FloatArray:

@@ -11,25 +11,25 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.geometry.trajectory import linearise, nearest
+from tsgt.geometry.trajectory import linearise, nearest_knots
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from tsgt.geometry import FloatArray
-    from tsgt.geometry.trajectory import Fit
+    from tsgt.geometry.trajectory import TrajectoryFit
     from tsgt.model import Measurement
 
 POLAR_AXES = ("range", "horizontal_angle", "zenith_angle")
 POINT_AXES = ("x", "y", "z")
 
-LEAST_SHARE = 1e-3
+MIN_STEP_FRACTION = 1e-3
 """Where less than this share of a measurement's variance is left to its residual, the trajectory follows it wherever it
 goes, and the residual says nothing."""
 
 
 @dataclass(frozen=True, slots=True)
-class AxisFigures:
+class ResidualStatistics:
     """Normalised residuals of one axis of a station's measurements, in sigmas; NaN without any.
 
     Attributes
@@ -48,7 +48,7 @@ class AxisFigures:
     n: int
 
     @classmethod
-    def of(cls, normalised: FloatArray) -> AxisFigures:
+    def of(cls, normalised: FloatArray) -> ResidualStatistics:
         """Sum normalised residuals up."""
         if not len(normalised):
             return cls(math.nan, math.nan, math.nan, 0)
@@ -83,7 +83,7 @@ class Outlier:
     sigmas: float
 
 
-def normalised_residuals(fit: Fit) -> FloatArray:
+def normalised_residuals(fit: TrajectoryFit) -> FloatArray:
     """Residuals over the sigma that they should have; NaN where a residual says nothing.
 
     A residual is smaller than the noise that makes it, because the trajectory gives way to it: of the noise's variance,
@@ -94,17 +94,19 @@ def normalised_residuals(fit: Fit) -> FloatArray:
     FloatArray
         (M, 3): along the line of sight, horizontally and vertically across it.
     """
-    at = nearest(fit.trajectory.knots.time_s, fit.observations.time_s)
+    at = nearest_knots(fit.trajectory.knots.time_s, fit.observations.time_s)
     linearised = linearise(fit.observations, fit.trajectory.knots, at)
     noise = np.diagonal(linearised.covariance(fit.observations), axis1=1, axis2=2)
     jacobian = linearised.jacobian
     own = np.einsum("mij,mjk,mik->mi", jacobian, fit.trajectory.covariance[at], jacobian, optimize=True)
     left = noise - fit.weights[:, None] * own
-    told = left > LEAST_SHARE * noise
+    told = left > MIN_STEP_FRACTION * noise
     return np.where(told, fit.residuals_m / np.sqrt(np.where(told, left, 1.0)), np.nan)
 
 
-def residual_figures(fit: Fit, sources: Sequence[Measurement]) -> dict[int, dict[str, AxisFigures]]:
+def residual_statistics(
+    fit: TrajectoryFit, sources: Sequence[Measurement]
+) -> dict[int, dict[str, ResidualStatistics]]:
     """Sum the normalised residuals up by station and by what it measured.
 
     Parameters
@@ -116,18 +118,18 @@ def residual_figures(fit: Fit, sources: Sequence[Measurement]) -> dict[int, dict
     """
     normalised = normalised_residuals(fit)
     station = np.array([source.station for source in sources])
-    found: dict[int, dict[str, AxisFigures]] = {}
+    found: dict[int, dict[str, ResidualStatistics]] = {}
     for number in np.unique(station).tolist():
         found[number] = {}
         for polar, names in ((True, POLAR_AXES), (False, POINT_AXES)):
             rows = (station == number) & (fit.observations.polar == polar)
             for axis, name in enumerate(names if rows.any() else ()):
                 values = normalised[rows, axis]
-                found[number][name] = AxisFigures.of(values[np.isfinite(values)])
+                found[number][name] = ResidualStatistics.of(values[np.isfinite(values)])
     return found
 
 
-def outliers(fit: Fit, sources: Sequence[Measurement]) -> list[Outlier]:
+def outliers(fit: TrajectoryFit, sources: Sequence[Measurement]) -> list[Outlier]:
     """Name the measurements that the fit has taken for outliers, the worst first."""
     rows = np.flatnonzero(fit.weights < 1.0)
     return [
@@ -136,7 +138,7 @@ def outliers(fit: Fit, sources: Sequence[Measurement]) -> list[Outlier]:
             prism=sources[row].prism,
             stamp_ns=sources[row].stamp_ns,
             missed_mm=1e3 * float(np.linalg.norm(fit.residuals_m[row])),
-            sigmas=math.sqrt(fit.distances[row]),
+            sigmas=math.sqrt(fit.squared_distances[row]),
         )
-        for row in rows[np.argsort(-fit.distances[rows], kind="stable")].tolist()
+        for row in rows[np.argsort(-fit.squared_distances[rows], kind="stable")].tolist()
     ]

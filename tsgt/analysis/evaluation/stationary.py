@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from tsgt.estimation import PoseBatch
     from tsgt.geometry import FloatArray
 
-LEAST_POSES = 20
+MIN_POSES = 20
 """One second of poses at 20 Hz: the mean of fewer is not called that of a stop."""
 
 
 @dataclass(frozen=True, slots=True)
-class StandingFigures:
+class StationaryStatistics:
     """Errors of mean poses in figures; NaN without any stop.
 
     Attributes
@@ -44,7 +44,7 @@ class StandingFigures:
 
 
 @dataclass(frozen=True, slots=True)
-class StandingErrors:
+class StationaryErrors:
     """Errors of the mean pose of each stop.
 
     Attributes
@@ -58,11 +58,11 @@ class StandingErrors:
     position_m: FloatArray
     rotation_rad: FloatArray
 
-    def summary(self) -> StandingFigures:
+    def statistics(self) -> StationaryStatistics:
         """Sum the stops up."""
         nothing = len(self.position_m) == 0
         position_mm, rotation_deg = 1e3 * self.position_m, np.degrees(self.rotation_rad)
-        return StandingFigures(
+        return StationaryStatistics(
             stops=len(position_mm),
             position_mean_mm=math.nan if nothing else float(position_mm.mean()),
             position_max_mm=math.nan if nothing else float(position_mm.max()),
@@ -71,9 +71,9 @@ class StandingErrors:
         )
 
 
-def standing_errors(
-    poses: PoseBatch, reference: Reference, still_ns: Sequence[tuple[int, int]], point_m: FloatArray
-) -> StandingErrors:
+def stationary_errors(
+    poses: PoseBatch, reference: Reference, stationary_ns: Sequence[tuple[int, int]], point_m: FloatArray
+) -> StationaryErrors:
     """Compare the mean pose of each stop with the mean of the reference at the same instants, unaligned.
 
     Parameters
@@ -93,11 +93,11 @@ def standing_errors(
         One entry for each stop with a second or more of poses that have a reference.
     """
     position_m, rotation_rad = [], []
-    for start_ns, end_ns in still_ns:
+    for start_ns, end_ns in stationary_ns:
         rows = np.flatnonzero(poses.valid & (poses.stamp_ns >= start_ns) & (poses.stamp_ns <= end_ns))
         true, known = reference.at(poses.stamp_ns[rows])
         rows, true = rows[known], true[known]
-        if len(rows) < LEAST_POSES:
+        if len(rows) < MIN_POSES:
             continue
         turns = rotation_from_quaternion(poses.orientation_xyzw[rows])
         found = transform_from(turns, poses.position_m[rows])
@@ -105,4 +105,4 @@ def standing_errors(
         means = [Rotation.from_matrix(T[:, :3, :3]).mean() for T in (found, true)]
         position_m.append(float(np.linalg.norm(offset)))
         rotation_rad.append(float((means[1].inv() * means[0]).magnitude()))
-    return StandingErrors(np.array(position_m), np.array(rotation_rad))
+    return StationaryErrors(np.array(position_m), np.array(rotation_rad))

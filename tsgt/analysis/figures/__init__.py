@@ -1,22 +1,38 @@
 """TODO face."""
 
-from tsgt.analysis.figures.axes import Clock, hatch, stroke
+from tsgt.analysis.figures.axes import (
+    TimeAxis,
+    banded,
+    curve,
+    dots,
+    hatch,
+    legend_above,
+    panels_height_mm,
+    plain_log,
+    shade,
+    stroke,
+)
 from tsgt.analysis.figures.gnss import draw_gnss
 from tsgt.analysis.figures.layout import draw_layouts
 from tsgt.analysis.figures.perturbation import draw_perturbation
-from tsgt.analysis.figures.stations import panels_height_mm
-from tsgt.analysis.figures.style import FORMATS, PAGE_MM, drawing, save
+from tsgt.analysis.figures.style import FORMATS, PAGE_WIDTH_MM, drawing, save
 
 __all__ = [
     "FORMATS",
-    "PAGE_MM",
-    "Clock",
+    "PAGE_WIDTH_MM",
+    "TimeAxis",
+    "banded",
+    "curve",
+    "dots",
     "draw_gnss",
     "draw_layouts",
     "draw_perturbation",
     "drawing",
     "hatch",
+    "legend_above",
     "panels_height_mm",
+    "plain_log",
     "save",
+    "shade",
     "stroke",
 ]

@@ -12,12 +12,16 @@ from tsgt.analysis.figures.style import STROKES
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
+    from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
     from tsgt.analysis.figures.style import Stroke
     from tsgt.geometry import FloatArray
+
+PANEL_HEIGHT_MM = 26.0
 
 BUCKETS = 1500
 """A page's width at 200 dpi has about as many dots."""
@@ -30,7 +34,7 @@ HATCHES = ("", "///", "...", "xxx", "\\\\\\", "+++")
 
 
 @dataclass(frozen=True, slots=True)
-class Clock:
+class TimeAxis:
     """The axis of time: from the first measurement, in a unit that keeps the numbers small.
 
     Attributes
@@ -48,7 +52,7 @@ class Clock:
     label: str
 
     @classmethod
-    def over(cls, start_ns: int, end_ns: int) -> Clock:
+    def over(cls, start_ns: int, end_ns: int) -> TimeAxis:
         """Choose the unit for a recording."""
         span_s = (end_ns - start_ns) / 1e9
         unit_s, name = (1.0, "s") if span_s <= 300 else (60.0, "min") if span_s <= 4 * 3600 else (3600.0, "h")
@@ -160,3 +164,19 @@ def dots(panel: Axes, x: FloatArray, y: FloatArray, row: int, *, label: str | No
         label=label,
         rasterized=True,
     )
+
+
+def panels_height_mm(rows: int) -> float:
+    """Return the height of a figure with ``rows`` panels below each other."""
+    return 18.0 + PANEL_HEIGHT_MM * rows
+
+
+def legend_above(figure: Figure, axes: Sequence[Axes]) -> None:
+    """Draw one legend for all panels; each label appears once."""
+    handles: dict[str, Artist] = {}
+    for panel in axes:
+        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
+            handles.setdefault(str(label), handle)
+    if handles:
+        columns = min(len(handles), 6)
+        figure.legend(list(handles.values()), list(handles), loc="outside upper center", ncols=columns)

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from tsgt.analysis.figures.style import PAGE_MM, STROKES, drawing, save
+from tsgt.analysis.figures.style import PAGE_WIDTH_MM, STROKES, drawing, save
 from tsgt.analysis.formats import QUALITIES
-from tsgt.analysis.gnss import BEST_FIRST
+from tsgt.analysis.gnss import QUALITY_ORDER
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.analysis.figures.style import Stroke
-    from tsgt.analysis.gnss import Distances, Receiver
+    from tsgt.analysis.gnss import DistanceSeries, Receiver
 
 _SMALLEST_MM = 0.1
 """Errors below are drawn here: a logarithmic axis has no zero, and nothing measures better."""
@@ -37,7 +37,10 @@ class _Series(NamedTuple):
 
 
 def draw_gnss(
-    receivers: Sequence[Receiver], gnss: Sequence[Distances], prisms: Sequence[Distances], path: Path
+    receivers: Sequence[Receiver],
+    gnss: Sequence[DistanceSeries],
+    prisms: Sequence[DistanceSeries],
+    path: Path,
 ) -> None:
     """Draw errors of distances between receivers, and between prisms if there are any.
 
@@ -67,7 +70,7 @@ def draw_gnss(
     largest_mm = max(float(each.errors_mm.max()) for each in series)
     decades = np.log10(max(1.3 * largest_mm, _LARGEST_AT_LEAST_MM) / _SMALLEST_MM)
     bins = _SMALLEST_MM * np.logspace(0, decades, round(_BINS_PER_DECADE * decades) + 1)
-    with drawing(width_mm=PAGE_MM, height_mm=115) as figure:
+    with drawing(width_mm=PAGE_WIDTH_MM, height_mm=115) as figure:
         grid = figure.add_gridspec(3, 2, width_ratios=(3, 1), height_ratios=(4, 1.3, 1.3))
         errors = figure.add_subplot(grid[0, 0])
         shares = figure.add_subplot(grid[0, 1], sharey=errors)
@@ -120,7 +123,7 @@ def draw_gnss(
         save(figure, path)
 
 
-def _series(label: str, pairs: Sequence[Distances]) -> _Series:
+def _series(label: str, pairs: Sequence[DistanceSeries]) -> _Series:
     errors_mm = 1e3 * np.concatenate([pair.errors_m for pair in pairs])
     times_ns = np.concatenate([pair.times_ns for pair in pairs])
     return _Series(label, times_ns, np.maximum(errors_mm, _SMALLEST_MM))
@@ -154,7 +157,9 @@ def _curve(
 
 def _seen(receivers: Sequence[Receiver]) -> list[int]:
     """Return the qualities that there are, worst first."""
-    return [q for q in reversed(BEST_FIRST) if any(np.any(receiver.quality == q) for receiver in receivers)]
+    return [
+        q for q in reversed(QUALITY_ORDER) if any(np.any(receiver.quality == q) for receiver in receivers)
+    ]
 
 
 def _rows(receivers: Sequence[Receiver]) -> NDArray[np.float64]:

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.design import HEADINGS
-from tsgt.analysis.figures.style import PAGE_MM, STROKES, drawing, save
+from tsgt.analysis.design import HEADING_COUNT
+from tsgt.analysis.figures.style import PAGE_WIDTH_MM, STROKES, drawing, save
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from tsgt.analysis.design import LayoutFigures
+    from tsgt.analysis.design import PoseAccuracy
     from tsgt.geometry import FloatArray
 
 _HEIGHT_MM = 115.0
@@ -23,7 +23,7 @@ _UNITS = ("position, one sigma (mm)", "rotation, one sigma (mrad)")
 
 def draw_layouts(
     covariances: Mapping[str, FloatArray],
-    distances: Mapping[float, Mapping[str, LayoutFigures]],
+    distances: Mapping[float, Mapping[str, PoseAccuracy]],
     path: Path,
 ) -> None:
     """Draw the layouts over the robot's heading, and the first one over distance and arrangement of the stations.
@@ -32,7 +32,7 @@ def draw_layouts(
     ----------
     covariances
         By the name of a layout, in the order of the ranking: covariances (N, 6, 6) of stances with
-        :data:`tsgt.analysis.design.layout_study.HEADINGS` headings at each place.
+        :data:`tsgt.analysis.design.layout_study.HEADING_COUNT` headings at each place.
     distances
         By the stations' distance in m and the name of their arrangement.
     path
@@ -43,12 +43,12 @@ def draw_layouts(
     MissingExtraError, OutputFileError
         matplotlib is not installed; the file cannot be written.
     """
-    heading_deg = np.arange(HEADINGS + 1) * (360 / HEADINGS)
+    heading_deg = np.arange(HEADING_COUNT + 1) * (360 / HEADING_COUNT)
     distance_m = list(distances)
-    with drawing(width_mm=PAGE_MM, height_mm=_HEIGHT_MM) as figure:
+    with drawing(width_mm=PAGE_WIDTH_MM, height_mm=_HEIGHT_MM) as figure:
         axes = figure.subplots(2, 2, sharex="col", sharey="row")
         for (name, covariance), stroke in zip(covariances.items(), cycle(STROKES)):
-            variances = np.diagonal(covariance, axis1=1, axis2=2).reshape(-1, HEADINGS, 2, 3)
+            variances = np.diagonal(covariance, axis1=1, axis2=2).reshape(-1, HEADING_COUNT, 2, 3)
             sigmas = 1e3 * np.sqrt(variances.sum(axis=-1).mean(axis=0))
             for row in range(2):
                 closed = np.append(sigmas[:, row], sigmas[0, row])

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.figures.style import PAGE_MM, STROKES, drawing, save
+from tsgt.analysis.figures.style import PAGE_WIDTH_MM, STROKES, drawing, save
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -55,7 +55,7 @@ def draw_perturbation(
         ]
     )
     expected = (np.outer(noise_mm, 1e3 * first_order_per_mm[0]), np.outer(noise_mm, first_order_per_mm[1]))
-    with drawing(width_mm=PAGE_MM, height_mm=_HEIGHT_MM) as figure:
+    with drawing(width_mm=PAGE_WIDTH_MM, height_mm=_HEIGHT_MM) as figure:
         axes = figure.subplots(2, 4, sharex=True, sharey="row")
         for row, (mean, std) in enumerate((position_mm, rotation_rad)):
             for column, name in enumerate(_NAMES[row]):

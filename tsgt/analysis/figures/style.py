@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from matplotlib.figure import Figure
 
-PAGE_MM = 180.0
+PAGE_WIDTH_MM = 180.0
 """Width of both columns of most journals."""
 
 FORMATS = (".png", ".pdf", ".svg")

@@ -2,17 +2,17 @@
 
 from tsgt.analysis.formats.export import measurement_csv, pose_csv, tum_lines, valid_records, valid_rows
 from tsgt.analysis.formats.mcap import messages, write_mcap
-from tsgt.analysis.formats.odometry import read_still_intervals
-from tsgt.analysis.formats.polar_files import check_tracks, read_polar_tracks, station_prisms
+from tsgt.analysis.formats.odometry import read_stationary_intervals
+from tsgt.analysis.formats.polar_files import check_tracks, read_polar_tracks, tracked_prisms
 from tsgt.analysis.formats.rtklib import QUALITIES, SECOND_NS, PosFile, TimeSystem, read_pos
 from tsgt.analysis.formats.rts_files import read_prisms, read_tracks
 from tsgt.analysis.formats.setup_files import write_prism_layout, write_station_frames
 from tsgt.analysis.formats.target_file import (
     PrismFile,
-    Sight,
     TargetFile,
+    TargetMeasurement,
+    read_partial_target_file,
     read_prism_file,
-    read_some_targets,
     read_target_file,
 )
 
@@ -21,22 +21,22 @@ __all__ = [
     "SECOND_NS",
     "PosFile",
     "PrismFile",
-    "Sight",
     "TargetFile",
+    "TargetMeasurement",
     "TimeSystem",
     "check_tracks",
     "measurement_csv",
     "messages",
     "pose_csv",
+    "read_partial_target_file",
     "read_polar_tracks",
     "read_pos",
     "read_prism_file",
     "read_prisms",
-    "read_some_targets",
-    "read_still_intervals",
+    "read_stationary_intervals",
     "read_target_file",
     "read_tracks",
-    "station_prisms",
+    "tracked_prisms",
     "tum_lines",
     "valid_records",
     "valid_rows",

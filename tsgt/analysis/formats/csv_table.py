@@ -8,8 +8,8 @@ from decimal import Decimal, InvalidOperation
 from typing import TYPE_CHECKING
 
 from tsgt.errors import InputFileError, quoted
-from tsgt.estimation import FARTHEST_M
-from tsgt.model import LAST_INSTANT_NS
+from tsgt.estimation import MAX_DISTANCE_M
+from tsgt.model import MAX_INSTANT_NS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -89,9 +89,9 @@ class Row:
     def whole(self, column: str) -> int:
         """Read a whole number from 0 on that fits into 64 bits: counts, and times in ns."""
         text = self.cells[column]
-        if not (text.isascii() and text.isdigit() and len(text) <= 19 and int(text) <= LAST_INSTANT_NS):
+        if not (text.isascii() and text.isdigit() and len(text) <= 19 and int(text) <= MAX_INSTANT_NS):
             raise self.error(
-                f"{column} is {quoted(text)}; expected a whole number from 0 to {LAST_INSTANT_NS}"
+                f"{column} is {quoted(text)}; expected a whole number from 0 to {MAX_INSTANT_NS}"
             )
         return int(text)
 
@@ -100,7 +100,7 @@ class Row:
         try:
             # Limits first: the power of ten of a huge number would take for ever.
             time_s = Decimal(self.cells[column])
-            inside = time_s.is_finite() and 0 <= time_s <= Decimal(LAST_INSTANT_NS).scaleb(-9)
+            inside = time_s.is_finite() and 0 <= time_s <= Decimal(MAX_INSTANT_NS).scaleb(-9)
         except InvalidOperation:
             inside = False
         if not inside:
@@ -129,8 +129,8 @@ class Row:
         distance_m = self.number(column)
         if distance_m <= 0:
             raise self.error(f"{column} is {self.cells[column]}; expected more than zero, remove the line")
-        if distance_m > FARTHEST_M:
-            raise self.error(f"{column} is {quoted(self.cells[column])}; expected at most {FARTHEST_M:g} m")
+        if distance_m > MAX_DISTANCE_M:
+            raise self.error(f"{column} is {quoted(self.cells[column])}; expected at most {MAX_DISTANCE_M:g} m")
         return distance_m
 
 

@@ -11,16 +11,16 @@ from tsgt.model import check_instants
 if TYPE_CHECKING:
     from pathlib import Path
 
-STILL_MPS = 0.01
-STILL_RADPS = 0.01
+MAX_STATIONARY_SPEED_MPS = 0.01
+MAX_STATIONARY_RATE_RADPS = 0.01
 """Below both a robot stands: encoders at rest count next to nothing."""
 
-STILL_DURATION_NS = 3_000_000_000
-SILENCE_NS = 1_000_000_000
+MIN_STATIONARY_NS = 3_000_000_000
+MAX_SAMPLE_GAP_NS = 1_000_000_000
 """Nobody knows what the robot did between two lines further apart than this."""
 
 
-def read_still_intervals(path: Path) -> list[tuple[int, int]]:
+def read_stationary_intervals(path: Path) -> list[tuple[int, int]]:
     """Read when a robot stood still for 3 s or more.
 
     Parameters
@@ -62,7 +62,7 @@ def read_still_intervals(path: Path) -> list[tuple[int, int]]:
             raise InputFileError(
                 "its time is not after that of the line before; sort the lines", path=path, line=number
             )
-        if begun is not None and last is not None and (not still or stamp_ns - last > SILENCE_NS):
+        if begun is not None and last is not None and (not still or stamp_ns - last > MAX_SAMPLE_GAP_NS):
             found.append((begun, last))
             begun = None
         if still and begun is None:
@@ -72,7 +72,7 @@ def read_still_intervals(path: Path) -> list[tuple[int, int]]:
         found.append((begun, last))
     if last is None:
         raise InputFileError("holds no lines of odometry", path=path)
-    return [(start, end) for start, end in found if end - start >= STILL_DURATION_NS]
+    return [(start, end) for start, end in found if end - start >= MIN_STATIONARY_NS]
 
 
 def _sample(words: list[str], path: Path, number: int) -> tuple[int, bool]:
@@ -88,7 +88,9 @@ def _sample(words: list[str], path: Path, number: int) -> tuple[int, bool]:
         raise InputFileError(
             "is no odometry; expected: time_s,linear_mps,angular_radps", path=path, line=number
         ) from error
-    return stamp_ns, abs(linear_mps) <= STILL_MPS and abs(angular_radps) <= STILL_RADPS
+    return stamp_ns, abs(linear_mps) <= MAX_STATIONARY_SPEED_MPS and abs(
+        angular_radps
+    ) <= MAX_STATIONARY_RATE_RADPS
 
 
 def _is_number(word: str) -> bool:

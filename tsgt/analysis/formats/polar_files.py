@@ -136,7 +136,7 @@ def _status(row: Row) -> Status:
         ) from None
 
 
-def station_prisms(measurements: Sequence[Measurement]) -> dict[int, int]:
+def tracked_prisms(measurements: Sequence[Measurement]) -> dict[int, int]:
     """Tell which prism each station tracks: the one that it measured most often.
 
     Returns

@@ -11,7 +11,7 @@ import numpy as np
 from tsgt.config import load_prism_layout
 from tsgt.errors import DegenerateGeometryError, InputFileError, quoted
 from tsgt.geometry import check_layout
-from tsgt.model import LARGEST_COORDINATE_M, PrismPosition
+from tsgt.model import MAX_COORDINATE_M, PrismPosition
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -185,9 +185,9 @@ def _number(text: str, path: Path, line: int) -> float:
 
 def _coordinate(text: str, path: Path, line: int) -> float:
     value = _number(text, path, line)
-    if abs(value) > LARGEST_COORDINATE_M:
+    if abs(value) > MAX_COORDINATE_M:
         raise InputFileError(
-            f"expected at most {LARGEST_COORDINATE_M:g} m, got {quoted(text)}", path=path, line=line
+            f"expected at most {MAX_COORDINATE_M:g} m, got {quoted(text)}", path=path, line=line
         )
     return value
 

@@ -85,7 +85,7 @@ def write_prism_layout(
 
 def _target(station: int, fit: TargetResidual) -> str:
     """Table of one target's fit, to the micrometre."""
-    lengths_m = (("residual_mm", fit.residual_m), ("leave_one_out_mm", fit.left_out_m))
+    lengths_m = (("residual_mm", fit.residual_m), ("leave_one_out_mm", fit.leave_one_out_m))
     keys = "".join(f"{key} = {1e3 * value:.3f}\n" for key, value in lengths_m if value is not None)
     return f"[[stations.{station}.targets]]\ntarget = {fit.target}\n{keys}"
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from tsgt.analysis.formats.csv_table import HORIZONTAL, ZENITH, read_table
 from tsgt.errors import InputFileError, quoted
-from tsgt.model import LARGEST_COORDINATE_M
+from tsgt.model import MAX_COORDINATE_M
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -28,7 +28,7 @@ _CAD = ("x_m", "y_m", "z_m")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Sight:
+class TargetMeasurement:
     """One measurement of a target, raw, in either face.
 
     Attributes
@@ -67,7 +67,7 @@ class TargetFile:
     """
 
     path: Path
-    sights: dict[int, dict[int, list[Sight]]]
+    sights: dict[int, dict[int, list[TargetMeasurement]]]
     skipped: tuple[str, ...]
 
 
@@ -88,8 +88,8 @@ class PrismFile:
     """
 
     path: Path
-    prisms: dict[int, list[Sight]]
-    body: dict[str, list[Sight]]
+    prisms: dict[int, list[TargetMeasurement]]
+    body: dict[str, list[TargetMeasurement]]
     cad_m: dict[str, Vector3]
 
 
@@ -112,7 +112,7 @@ def read_target_file(path: Path) -> TargetFile:
     InputFileError
         The file cannot be read, is empty, has a wrong column or number, or a station is missing.
     """
-    file = read_some_targets(path)
+    file = read_partial_target_file(path)
     if 1 not in file.sights:
         raise InputFileError(
             "holds no usable target of station 1, whose frame is the world; add them", path=path
@@ -122,7 +122,7 @@ def read_target_file(path: Path) -> TargetFile:
     return file
 
 
-def read_some_targets(path: Path) -> TargetFile:
+def read_partial_target_file(path: Path) -> TargetFile:
     """Read a file of targets as :func:`read_target_file` does, whichever stations it holds.
 
     Raises
@@ -131,7 +131,7 @@ def read_some_targets(path: Path) -> TargetFile:
         The file cannot be read, is empty, or has a wrong column or number.
     """
     header, rows = read_table(path)
-    sights: dict[int, dict[int, list[Sight]]] = {}
+    sights: dict[int, dict[int, list[TargetMeasurement]]] = {}
     skipped: list[str] = []
     is_marker_file = tuple(header.names) == MARKER_COLUMNS
     if not is_marker_file:
@@ -170,8 +170,8 @@ def read_prism_file(path: Path) -> PrismFile:
     """
     header, rows = read_table(path)
     header.expect([["point"], ["kind"], *_SIGHT, *([name] for name in _CAD)], ["constant_mm"])
-    prisms: dict[int, list[Sight]] = {}
-    body: dict[str, list[Sight]] = {}
+    prisms: dict[int, list[TargetMeasurement]] = {}
+    body: dict[str, list[TargetMeasurement]] = {}
     cad_m: dict[str, Vector3] = {}
     for row in rows:
         kind = row.cells["kind"]
@@ -199,15 +199,15 @@ def read_prism_file(path: Path) -> PrismFile:
 
 
 def _place(row: Row, column: str) -> float:
-    return row.within(column, -LARGEST_COORDINATE_M, LARGEST_COORDINATE_M)
+    return row.within(column, -MAX_COORDINATE_M, MAX_COORDINATE_M)
 
 
 def _sight(
     row: Row, horizontal: str | None = None, zenith: str | None = None, distance: str = "slope_distance_m"
-) -> Sight:
+) -> TargetMeasurement:
     """Read the measurement of a line; without column names those of our own format."""
     horizontal_rad, zenith_rad = row.angles_rad(horizontal, zenith)
-    return Sight(
+    return TargetMeasurement(
         horizontal_angle_rad=horizontal_rad,
         zenith_angle_rad=zenith_rad,
         slope_distance_m=row.distance_m(distance),

@@ -1,25 +1,25 @@
 """TODO face."""
 
 from tsgt.analysis.gnss.baselines import (
-    BEST_FIRST,
-    DistanceErrors,
-    Distances,
+    QUALITY_ORDER,
+    DistanceErrorStatistics,
+    DistanceSeries,
     Receiver,
     quality_shares,
-    receiver_pairs,
+    receiver_distances,
     receivers,
 )
-from tsgt.analysis.gnss.prism_baselines import common_part, prism_pairs, span
+from tsgt.analysis.gnss.prism_baselines import common_interval, prism_distances, span
 
 __all__ = [
-    "BEST_FIRST",
-    "DistanceErrors",
-    "Distances",
+    "QUALITY_ORDER",
+    "DistanceErrorStatistics",
+    "DistanceSeries",
     "Receiver",
-    "common_part",
-    "prism_pairs",
+    "common_interval",
+    "prism_distances",
     "quality_shares",
-    "receiver_pairs",
+    "receiver_distances",
     "receivers",
     "span",
 ]

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tsgt.analysis.formats import QUALITIES, SECOND_NS
+from tsgt.analysis.gnss.leap_seconds import utc_from_gps
 from tsgt.errors import InputFileError, MissingExtraError
 from tsgt.geometry import interpolate
 
@@ -28,55 +28,6 @@ if TYPE_CHECKING:
 
     from tsgt.analysis.formats import PosFile, TimeSystem
 
-# The day from which GPS is so many seconds ahead of UTC: IERS Bulletin C. None has been announced since that of 2017.
-_AHEAD_FROM = (
-    ((1981, 7), 1),
-    ((1982, 7), 2),
-    ((1983, 7), 3),
-    ((1985, 7), 4),
-    ((1988, 1), 5),
-    ((1990, 1), 6),
-    ((1991, 1), 7),
-    ((1992, 7), 8),
-    ((1993, 7), 9),
-    ((1994, 7), 10),
-    ((1996, 1), 11),
-    ((1997, 7), 12),
-    ((1999, 1), 13),
-    ((2006, 1), 14),
-    ((2009, 1), 15),
-    ((2012, 7), 16),
-    ((2015, 7), 17),
-    ((2017, 1), 18),
-)
-
-_AHEAD_S = np.array([0, *(seconds for _, seconds in _AHEAD_FROM)], dtype=np.int64)
-_FROM_GPS_NS = np.array(
-    [
-        (round(datetime(year, month, 1, tzinfo=UTC).timestamp()) + seconds) * SECOND_NS
-        for (year, month), seconds in _AHEAD_FROM
-    ],
-    dtype=np.int64,
-)
-
-
-def utc_from_gps(gps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Convert GPS time to Unix time.
-
-    Parameters
-    ----------
-    gps_ns
-        (N,) ns from 1970-01-01 00:00:00 on the calendar of GPS time.
-
-    Returns
-    -------
-    NDArray[np.int64]
-        (N,) Unix time in ns. It has no name of its own for a leap second: within one it runs through the first second
-        of the new day, which then comes again.
-    """
-    return gps_ns - _AHEAD_S[np.searchsorted(_FROM_GPS_NS, gps_ns, side="right")] * SECOND_NS
-
-
 JST_AHEAD_NS = 9 * 3600 * SECOND_NS
 
 OUTAGE_LIMIT_NS = SECOND_NS
@@ -85,9 +36,9 @@ OUTAGE_LIMIT_NS = SECOND_NS
 INSIDE_EARTH_M = 6.3e6
 """RTKLIB writes the centre of the Earth where it has no position yet; everything on the ground is above this."""
 
-BEST_FIRST = (1, 2, 6, 4, 3, 5, 7, 0)
+QUALITY_ORDER = (1, 2, 6, 4, 3, 5, 7, 0)
 """RTKLIB's Q in the order of what the positions are worth."""
-_RANK = np.argsort(BEST_FIRST)
+_RANK = np.argsort(QUALITY_ORDER)
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +80,7 @@ class Receiver:
 
 
 @dataclass(frozen=True, slots=True)
-class DistanceErrors:
+class DistanceErrorStatistics:
     """How far distances stray from what they should be, in mm; NaN without distances.
 
     Attributes
@@ -147,7 +98,7 @@ class DistanceErrors:
     max: float
 
     @classmethod
-    def of(cls, errors_m: NDArray[np.float64]) -> DistanceErrors:
+    def of(cls, errors_m: NDArray[np.float64]) -> DistanceErrorStatistics:
         """Sum up (N,) absolute errors."""
         if not len(errors_m):
             return cls(0, math.nan, math.nan, math.nan, math.nan)
@@ -162,7 +113,7 @@ class DistanceErrors:
 
 
 @dataclass(frozen=True, slots=True)
-class Distances:
+class DistanceSeries:
     """Distances over time between two receivers or two prisms.
 
     Attributes
@@ -198,9 +149,9 @@ class Distances:
         if self.quality is None:
             return {}
         errors_m = self.errors_m
-        return {q: errors_m[self.quality == q] for q in BEST_FIRST if np.any(self.quality == q)}
+        return {q: errors_m[self.quality == q] for q in QUALITY_ORDER if np.any(self.quality == q)}
 
-    def between(self, start_ns: int, end_ns: int) -> Distances:
+    def between(self, start_ns: int, end_ns: int) -> DistanceSeries:
         """Return the part within a span of time."""
         inside = (self.times_ns >= start_ns) & (self.times_ns <= end_ns)
         return replace(
@@ -299,9 +250,9 @@ def _ecef_m(file: PosFile) -> NDArray[np.float64]:
             return np.column_stack(enu2ecef(*file.positions.T, *file.base, deg=False))
 
 
-def receiver_pairs(
+def receiver_distances(
     found: Sequence[Receiver], references_m: Sequence[float] | None = None
-) -> tuple[Distances, ...]:
+) -> tuple[DistanceSeries, ...]:
     """Measure the distances between all receivers over time.
 
     The second receiver of a pair is interpolated by a straight line to the epochs of the first: clocks of cheap
@@ -333,10 +284,10 @@ def receiver_pairs(
         before = np.where(same[valid], after, after - 1)
         distances_m = np.linalg.norm(a.points_m[valid] - points_m[valid], axis=1)
         ranks = [_RANK[a.quality[valid]], _RANK[b.quality[before]], _RANK[b.quality[after]]]
-        quality = np.array(BEST_FIRST)[np.max(ranks, axis=0)]
+        quality = np.array(QUALITY_ORDER)[np.max(ranks, axis=0)]
         reference_m = _median(distances_m, quality) if references_m is None else references_m[number]
         pairs.append(
-            Distances(
+            DistanceSeries(
                 name=f"{a.name}-{b.name}",
                 times_ns=a.times_ns[valid],
                 distances_m=distances_m,
@@ -356,5 +307,5 @@ def _median(distances_m: NDArray[np.float64], quality: NDArray[np.int64]) -> flo
 
 def quality_shares(receiver: Receiver) -> dict[str, float]:
     """Tell which share of a receiver's positions has which quality, best first."""
-    counts = {QUALITIES[q]: int(np.sum(receiver.quality == q)) for q in BEST_FIRST}
+    counts = {QUALITIES[q]: int(np.sum(receiver.quality == q)) for q in QUALITY_ORDER}
     return {name: count / len(receiver.quality) for name, count in counts.items() if count}

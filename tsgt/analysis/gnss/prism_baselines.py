@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.evaluation import at_epochs
-from tsgt.analysis.gnss.baselines import Distances
+from tsgt.analysis.evaluation import distances_at_epochs
+from tsgt.analysis.gnss.baselines import DistanceSeries
 from tsgt.errors import RecordingError
 
 if TYPE_CHECKING:
@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from tsgt.model import Parameters
 
 
-def prism_pairs(parameters: Parameters, tracks: Mapping[int, Track], path: Path) -> tuple[Distances, ...]:
+def prism_distances(
+    parameters: Parameters, tracks: Mapping[int, Track], path: Path
+) -> tuple[DistanceSeries, ...]:
     """Measure the distances between all prisms over time, as ``tsgt evaluate`` does: at 20 Hz, all pairs or none.
 
     Parameters
@@ -39,9 +41,9 @@ def prism_pairs(parameters: Parameters, tracks: Mapping[int, Track], path: Path)
     if missing or len(parameters.prisms) < 2:
         what = f"prism {missing[0]} was not measured" if missing else "it has one prism only"
         raise RecordingError(f"no distances between prisms: {what}", path=path)
-    found = at_epochs(parameters, tracks)
+    found = distances_at_epochs(parameters, tracks)
     return tuple(
-        Distances(
+        DistanceSeries(
             name=f"{a}-{b}",
             times_ns=found.stamp_ns[found.valid],
             distances_m=distances_m[found.valid],
@@ -53,9 +55,9 @@ def prism_pairs(parameters: Parameters, tracks: Mapping[int, Track], path: Path)
     )
 
 
-def common_part(
-    gnss: Sequence[Distances], prisms: Sequence[Distances], path: Path
-) -> tuple[tuple[Distances, ...], tuple[Distances, ...]]:
+def common_interval(
+    gnss: Sequence[DistanceSeries], prisms: Sequence[DistanceSeries], path: Path
+) -> tuple[tuple[DistanceSeries, ...], tuple[DistanceSeries, ...]]:
     """Cut both to the time that they share, so that their figures are of the same stretch of the way.
 
     Parameters
@@ -88,7 +90,7 @@ def common_part(
     return both[0], both[1]
 
 
-def span(pairs: Sequence[Distances]) -> tuple[int, int] | None:
+def span(pairs: Sequence[DistanceSeries]) -> tuple[int, int] | None:
     """Return the first and the last time of any distance; None without one."""
     times = np.concatenate([np.empty(0, np.int64), *(pair.times_ns for pair in pairs)])
     return (int(times.min()), int(times.max())) if len(times) else None

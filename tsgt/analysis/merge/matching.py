@@ -12,11 +12,11 @@ from tsgt.analysis.merge.recording_index import identity
 from tsgt.analysis.merge.timing import (
     Pair,
     Told,
-    by_beacons,
-    by_synchronisations,
-    can_be_the_same,
+    add_link_delay,
     link_constant,
-    with_way,
+    times_consistent,
+    times_from_beacons,
+    times_from_synchronisations,
 )
 
 if TYPE_CHECKING:
@@ -162,7 +162,7 @@ class Boot:
         ]
         if synchronisations:
             synchronisations.sort(key=lambda samples: samples[-1].station_ns)
-            found.take(by_synchronisations(synchronisations, self._stamps_ns))
+            found.take(times_from_synchronisations(synchronisations, self._stamps_ns))
 
     def _of_this_boot(
         self, samples: Sequence[ClockSample], anchors: Sequence[tuple[int, int]]
@@ -204,7 +204,7 @@ class Boot:
         if not pairs:
             return
         found.heard = True
-        times = by_beacons(pairs, self._stamps_ns)
+        times = times_from_beacons(pairs, self._stamps_ns)
         told = []
         for delivered in session.delivered.get(self.station, ()):
             for place in self._by_sequence.get(delivered.sequence, ()):
@@ -212,13 +212,13 @@ class Boot:
                 if (
                     time is not None
                     and same_content(self.entries[place].measurement, delivered)
-                    and can_be_the_same(delivered.stamp_ns, delivered.stamp_bound_ns or 0, time)
+                    and times_consistent(delivered.stamp_ns, delivered.stamp_bound_ns or 0, time)
                 ):
                     found.delivered.add(place)
                     told.append(Told(delivered.stamp_ns, delivered.stamp_bound_ns or 0, time))
         way = link_constant(told)
         if way is not None:
-            found.take([None if time is None else with_way(time, *way) for time in times])
+            found.take([None if time is None else add_link_delay(time, *way) for time in times])
 
     def _find_alike(self, session: Session, found: Found) -> None:
         """Find what is in both by number and content alone, for want of times."""

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 from tsgt.analysis.merge.matching import Boot, Run, better
-from tsgt.analysis.merge.recording_index import Recorded, identity, read_recorded
+from tsgt.analysis.merge.recording_index import RecordingIndex, identity, index_recording
 from tsgt.errors import RecordingError
 from tsgt.estimation import instrument_time_sigma_s
-from tsgt.model import LAST_INSTANT_NS, PolarMeasurement
+from tsgt.model import MAX_INSTANT_NS, PolarMeasurement
 from tsgt.recording import MergedRecord, RecordingWriter, encode_line, read_lines, write_atomically
-from tsgt.recording.journal import is_only_begun, load_journal
+from tsgt.recording.journal import is_unfinished_journal, load_journal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
     from tsgt.analysis.merge.timing import MasterTime
     from tsgt.recording.journal import Journal
 
-MARGIN_NS = 120_000_000_000
+SESSION_MARGIN_NS = 120_000_000_000
 """What was measured longer before the master started, or after it ended, is no part of its run. Within two minutes it
 may be: a master that fell over is back by then."""
 
-WORST_BOUND_NS = 50_000_000
+MAX_TIME_BOUND_NS = 50_000_000
 """A measurement whose time is less certain is left out: at 1.5 m/s that is 75 mm, and a gap does less harm."""
 
 
@@ -140,13 +140,13 @@ def merge(
     """
     paths = []
     for path in {path.resolve(): path for path in journals}.values():
-        if not is_only_begun(path):
+        if not is_unfinished_journal(path):
             paths.append(path)
         elif on_problem is not None:
             on_problem(RecordingError("was only begun and holds nothing; it is passed over", path=path))
     loaded = [load_journal(path, keep_going=keep_going, on_problem=on_problem) for path in paths]
     if output is not None:
-        recorded = read_recorded(recording, keep_going=keep_going, on_problem=on_problem)
+        recorded = index_recording(recording, keep_going=keep_going, on_problem=on_problem)
         merged, additions = _additions(recorded, recording, paths, loaded)
         with write_atomically(output) as file:
             for line in read_lines(recording, keep_going=keep_going):
@@ -156,7 +156,7 @@ def merge(
         return merged
     next(read_lines(recording))  # what opens it for writing would make a new one of a name that is mistyped
     with RecordingWriter(recording) as writer:
-        recorded = read_recorded(recording, keep_going=keep_going, on_problem=on_problem)
+        recorded = index_recording(recording, keep_going=keep_going, on_problem=on_problem)
         merged, additions = _additions(recorded, recording, paths, loaded)
         for addition in additions:
             writer.write(addition.record)
@@ -164,7 +164,7 @@ def merge(
 
 
 def _additions(
-    recorded: Recorded, recording: Path, paths: Sequence[Path], journals: Sequence[Journal]
+    recorded: RecordingIndex, recording: Path, paths: Sequence[Path], journals: Sequence[Journal]
 ) -> tuple[Merged, list[_Addition]]:
     """Find out what is to be added."""
     found = [
@@ -201,7 +201,7 @@ def _boots(journals: Sequence[Journal]) -> Iterator[Boot]:
     return map(Boot, boots.values())
 
 
-def _why_not(boot: Boot, recorded: Recorded, compared: Sequence[tuple[Session, Found]]) -> str:
+def _why_not(boot: Boot, recorded: RecordingIndex, compared: Sequence[tuple[Session, Found]]) -> str:
     """Say why nothing can come of some journals; empty where something can, or they are empty."""
     station = boot.station
     if station not in recorded.stations:
@@ -248,12 +248,12 @@ def _sort(
         return None
     best = None
     for session, time in timed:
-        if session.start_ns - MARGIN_NS <= time.unix_ns <= session.end_ns + MARGIN_NS:
+        if session.start_ns - SESSION_MARGIN_NS <= time.unix_ns <= session.end_ns + SESSION_MARGIN_NS:
             best = better(best, time)
     if best is None and timed:
         counts.outside += 1
         return None
-    if best is None or best.bound_ns > WORST_BOUND_NS or not 0 <= best.unix_ns <= LAST_INSTANT_NS:
+    if best is None or best.bound_ns > MAX_TIME_BOUND_NS or not 0 <= best.unix_ns <= MAX_INSTANT_NS:
         counts.untimed += 1
         return None
     counts.added += 1

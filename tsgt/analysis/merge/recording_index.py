@@ -43,7 +43,7 @@ class Session:
 
 
 @dataclass(slots=True)
-class Recorded:
+class RecordingIndex:
     """A recording as far as merging needs it.
 
     Attributes
@@ -82,9 +82,9 @@ def identity(measurement: PolarMeasurement) -> Identity | None:
     )
 
 
-def read_recorded(
+def index_recording(
     path: Path, *, keep_going: bool = False, on_problem: Callable[[RecordingError], None] | None = None
-) -> Recorded:
+) -> RecordingIndex:
     """Read a recording.
 
     Parameters
@@ -97,7 +97,7 @@ def read_recorded(
     RecordingError
         As :func:`~tsgt.recording.load_recording`; also for a file that no master has written.
     """
-    recorded = Recorded()
+    recorded = RecordingIndex()
     for line in read_lines(path, keep_going=keep_going, on_problem=on_problem):
         if line.type == "journal":
             raise RecordingError("is a station's journal; give the master's recording first", path=path)
@@ -119,7 +119,7 @@ def read_recorded(
     return recorded
 
 
-def _take(line: Line, recorded: Recorded, path: Path) -> None:
+def _take(line: Line, recorded: RecordingIndex, path: Path) -> None:
     if line.type == "recording":
         start_ns = decode_line(RecordingHeader, line, path).created_ns
         recorded.sessions.append(Session(start_ns, start_ns))

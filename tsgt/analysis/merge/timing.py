@@ -12,13 +12,15 @@ from bisect import bisect_right
 from statistics import median
 from typing import TYPE_CHECKING, NamedTuple
 
-from tsgt.timesync import BeaconClock, RegressionFilter, sag_ns
+from tsgt.timesync import BeaconClock
+from tsgt.timesync.offset_regression import interpolation_wander_ns
+from tsgt.timesync.two_way import RegressionFilter
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from tsgt.model import ClockSample
-    from tsgt.timesync import ClockEstimate
+    from tsgt.timesync.two_way import ClockEstimate
 
 _CONFIRMED = 2
 """So many stamps of a synchronisation confirm each other; one alone may be late."""
@@ -65,7 +67,7 @@ class Told(NamedTuple):
     found: MasterTime
 
 
-def by_synchronisations(
+def times_from_synchronisations(
     synchronisations: Sequence[Sequence[ClockSample]], stamps_ns: Sequence[int]
 ) -> list[MasterTime | None]:
     """Put times of a station on the master's clock, by two-way exchanges before and after them.
@@ -125,7 +127,7 @@ def _between(before: _Known, after: _Known, stamp_ns: int) -> MasterTime:
     share = since_ns / (since_ns + until_ns)
     one, other = before.estimate, after.estimate
     offset_ns = one.offset_ns + round(share * (other.offset_ns - one.offset_ns))
-    sag = sag_ns(since_ns / 1e9, until_ns / 1e9)
+    sag = interpolation_wander_ns(since_ns / 1e9, until_ns / 1e9)
     return MasterTime(
         stamp_ns - offset_ns,
         # The sag is a limit; frequencies change by a third of it at most, as a rule.
@@ -134,7 +136,7 @@ def _between(before: _Known, after: _Known, stamp_ns: int) -> MasterTime:
     )
 
 
-def by_beacons(pairs: Sequence[Pair], stamps_ns: Sequence[int]) -> list[MasterTime | None]:
+def times_from_beacons(pairs: Sequence[Pair], stamps_ns: Sequence[int]) -> list[MasterTime | None]:
     """Put times of a station on the master's clock, by beacons before and after them, but for the link constant.
 
     Parameters
@@ -158,7 +160,7 @@ def by_beacons(pairs: Sequence[Pair], stamps_ns: Sequence[int]) -> list[MasterTi
         while taken < len(pairs) and (taken < enough or received_ns[taken] < stamp_ns + _LEAST_NS):
             pair = pairs[taken]
             clock.add(
-                pair.received_ns, (pair.sent_ns - pairs[0].sent_ns) // 1000, pair.sigma_ns, in_full=True
+                pair.received_ns, (pair.sent_ns - pairs[0].sent_ns) // 1000, pair.sigma_ns, unambiguous=True
             )
             taken += 1
         instant = clock.at(stamp_ns)
@@ -191,12 +193,12 @@ def link_constant(told: Sequence[Told]) -> tuple[int, int] | None:
     return middle_ns, bound_ns
 
 
-def can_be_the_same(recorded_ns: int, recorded_bound_ns: int, found: MasterTime) -> bool:
+def times_consistent(recorded_ns: int, recorded_bound_ns: int, found: MasterTime) -> bool:
     """Tell whether a time in the recording can be the one that was found by beacons, without the link constant."""
     return abs(recorded_ns - found.unix_ns) <= recorded_bound_ns + found.bound_ns + _WAY_MOST_NS
 
 
-def with_way(found: MasterTime, way_ns: int, bound_ns: int) -> MasterTime:
+def add_link_delay(found: MasterTime, way_ns: int, bound_ns: int) -> MasterTime:
     """Add the link constant to a time that was found by beacons."""
     return MasterTime(
         found.unix_ns + way_ns,

@@ -1,10 +1,10 @@
 """TODO face."""
 
-from tsgt.analysis.report.findings import Difference, Findings, find
+from tsgt.analysis.report.findings import Difference, Findings, collect_findings
 from tsgt.analysis.report.log import ClockSeries, RadioSeries
-from tsgt.analysis.report.motion import Bins, Grid, Ride
-from tsgt.analysis.report.numbers import figures_of
-from tsgt.analysis.report.page import page
+from tsgt.analysis.report.motion import Bins, DistanceErrorSeries, Grid
+from tsgt.analysis.report.numbers import report_numbers
+from tsgt.analysis.report.page import render_page
 from tsgt.analysis.report.sections import facts, sections
 from tsgt.analysis.report.stations import StationRecord
 from tsgt.analysis.report.verdicts import verdicts
@@ -13,15 +13,15 @@ __all__ = [
     "Bins",
     "ClockSeries",
     "Difference",
+    "DistanceErrorSeries",
     "Findings",
     "Grid",
     "RadioSeries",
-    "Ride",
     "StationRecord",
+    "collect_findings",
     "facts",
-    "figures_of",
-    "find",
-    "page",
+    "render_page",
+    "report_numbers",
     "sections",
     "verdicts",
 ]

@@ -41,7 +41,7 @@ def calibration(recording: Recording) -> Section:
             str(station),
             str(target.target),
             "rejected" if target.residual_m is None else _mm(target.residual_m),
-            _mm(target.left_out_m),
+            _mm(target.leave_one_out_m),
         )
         for station, targets in found.items()
         for target in targets
@@ -84,7 +84,7 @@ def calibration_keys(recording: Recording) -> dict[int, Any]:
                 {
                     "target": t.target,
                     "residual_mm": None if t.residual_m is None else 1e3 * t.residual_m,
-                    "leave_one_out_mm": None if t.left_out_m is None else 1e3 * t.left_out_m,
+                    "leave_one_out_mm": None if t.leave_one_out_m is None else 1e3 * t.leave_one_out_m,
                 }
                 for t in targets
             ],
@@ -100,7 +100,7 @@ def draw_targets(figure: Figure, found: Mapping[int, Sequence[TargetResidual]]) 
         places = np.arange(len(targets), dtype=np.float64)
         heights = [
             [math.nan if value is None else 1e3 * value for value in column]
-            for column in ([t.residual_m for t in targets], [t.left_out_m for t in targets])
+            for column in ([t.residual_m for t in targets], [t.leave_one_out_m for t in targets])
         ]
         panel.bar(places - 0.2, heights[0], 0.38, color=stroke(1).color, label="residual")
         panel.bar(
@@ -129,7 +129,7 @@ def draw_targets(figure: Figure, found: Mapping[int, Sequence[TargetResidual]]) 
         panel.set_ylabel("mm")
     # A rejected target may be off by a hundred times as much, which would leave nothing to see of the others.
     used = [t for targets in found.values() for t in targets if t.residual_m is not None]
-    most_m = max((value or 0.0 for t in used for value in (t.residual_m, t.left_out_m)), default=0.0)
+    most_m = max((value or 0.0 for t in used for value in (t.residual_m, t.leave_one_out_m)), default=0.0)
     panels[0].set_ylim(0.0, 1.4e3 * max(most_m, 1e-4))
     panels[0].legend(loc="upper right", ncols=3)
     panels[-1].set_xlabel("target")

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.figures import PAGE_MM, drawing, save
-from tsgt.analysis.report.page import Plot
+from tsgt.analysis.figures import PAGE_WIDTH_MM, drawing, save
+from tsgt.analysis.report.page import ReportFigure
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -23,16 +23,16 @@ LISTED = 20
 """So many rows of a list that may be long."""
 
 
-def wide(name: str, caption: str, height_mm: float, fill: Callable[[Figure], None]) -> Plot:
+def wide(name: str, caption: str, height_mm: float, fill: Callable[[Figure], None]) -> ReportFigure:
     """Make a figure as wide as a page, which draws itself when it is written."""
 
     def write(paths: Sequence[Path]) -> None:
-        with drawing(width_mm=PAGE_MM, height_mm=height_mm) as figure:
+        with drawing(width_mm=PAGE_WIDTH_MM, height_mm=height_mm) as figure:
             fill(figure)
             for path in paths:
                 save(figure, path)
 
-    return Plot(name, caption, write)
+    return ReportFigure(name, caption, write)
 
 
 def number(value: float, digits: int = 1) -> str:

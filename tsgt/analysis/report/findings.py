@@ -8,24 +8,24 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from tsgt.analysis.design import Perturbation, equivalent, first_order_sigmas, perturbation_study
+from tsgt.analysis.design import Perturbation, equivalent_noise, first_order_sigmas, perturbation_study
 from tsgt.analysis.evaluation import (
-    at_epochs,
     compare,
     compare_aligned,
-    held_out,
+    distances_at_epochs,
+    held_out_errors,
     inter_prism,
     normalised_residuals,
     outliers,
-    residual_figures,
-    standing_errors,
+    residual_statistics,
+    stationary_errors,
 )
 from tsgt.analysis.processing import process, with_estimator
 from tsgt.analysis.report.log import Log, read_log
-from tsgt.analysis.report.motion import ride
-from tsgt.analysis.report.stations import station_figures, station_records
-from tsgt.analysis.smoothing import smoothed
-from tsgt.analysis.validation import believed
+from tsgt.analysis.report.motion import distance_error_series
+from tsgt.analysis.report.stations import station_records, station_statistics
+from tsgt.analysis.smoothing import smooth_recording
+from tsgt.analysis.validation import plausible_measurements
 from tsgt.errors import GeometryError, RecordingError
 from tsgt.estimation import build_observations, build_tracks
 from tsgt.geometry import check_layout, log_so3, rotation_from_quaternion
@@ -36,19 +36,19 @@ if TYPE_CHECKING:
 
     from tsgt.analysis.evaluation import (
         Align,
-        AlignedFigures,
-        AxisFigures,
-        HeldOut,
-        InterPrism,
+        AlignedErrorStatistics,
+        HeldOutErrors,
+        InterPrismDistances,
         Outlier,
-        PoseFigures,
+        PoseErrorStatistics,
         Reference,
-        StandingFigures,
+        ResidualStatistics,
+        StationaryStatistics,
     )
     from tsgt.analysis.processing import Estimator
-    from tsgt.analysis.report.motion import Ride
-    from tsgt.analysis.report.stations import StationFigures, StationRecord
-    from tsgt.analysis.smoothing import Smoothed
+    from tsgt.analysis.report.motion import DistanceErrorSeries
+    from tsgt.analysis.report.stations import StationRecord, StationStatistics
+    from tsgt.analysis.smoothing import SmoothedRecording
     from tsgt.estimation import PoseBatch
     from tsgt.geometry import FloatArray
     from tsgt.recording import Recording
@@ -144,20 +144,20 @@ class Findings:
     end_ns: int
     log: Log
     stations: list[StationRecord]
-    station_figures: dict[int, StationFigures]
-    inter_prism: InterPrism | None
-    ride: Ride | None
+    station_statistics: dict[int, StationStatistics]
+    inter_prism: InterPrismDistances | None
+    distance_errors: DistanceErrorSeries | None
     odometry_ns: tuple[tuple[int, int], ...] | None
-    continuous: Smoothed | None
+    continuous: SmoothedRecording | None
     linear: PoseBatch | None
     difference: Difference | None
-    held_out: dict[Estimator, HeldOut] | None
-    residuals: dict[int, dict[str, AxisFigures]]
+    held_out: dict[Estimator, HeldOutErrors] | None
+    residuals: dict[int, dict[str, ResidualStatistics]]
     outliers: list[Outlier]
     normalised: FloatArray
-    compared: dict[Estimator, PoseFigures]
-    aligned: dict[Estimator, AlignedFigures]
-    stops: dict[Estimator, StandingFigures]
+    compared: dict[Estimator, PoseErrorStatistics]
+    aligned: dict[Estimator, AlignedErrorStatistics]
+    stops: dict[Estimator, StationaryStatistics]
     reference: Reference | None
     pose_noise: PoseNoise | None
     problems: dict[str, str]
@@ -181,14 +181,14 @@ class Findings:
         return (self.end_ns - self.start_ns) / 1e9
 
 
-def find(
+def collect_findings(
     recording: Recording,
     path: Path,
     *,
     reference: Reference | None,
     with_held_out: bool,
     align: Align | None = None,
-    still_ns: Sequence[tuple[int, int]] | None = None,
+    stationary_ns: Sequence[tuple[int, int]] | None = None,
     on_progress: Callable[[float], None] | None = None,
 ) -> Findings:
     """Find everything that a report tells.
@@ -217,7 +217,7 @@ def find(
     """
     report = on_progress or (lambda _: None)
     parameters = recording.parameters
-    measurements = believed(recording)
+    measurements = plausible_measurements(recording)
     if not measurements:
         raise RecordingError("holds no measurements, so there is nothing to report", path=path)
     problems: dict[str, str] = {}
@@ -235,7 +235,7 @@ def find(
 
     continuous = attempt(
         "continuous",
-        lambda: smoothed(recording, path=path, on_progress=lambda share: report(fitted * share)),
+        lambda: smooth_recording(recording, path=path, on_progress=lambda share: report(fitted * share)),
     )
     report(fitted)
     linear = attempt("linear", lambda: process(with_estimator(recording, "linear"), path=path))
@@ -244,8 +244,8 @@ def find(
     if unseen:
         names = " and ".join(f"prism {prism}" for prism in unseen)
         problems["inter_prism"] = f"nothing usable was measured of {names}"
-    epochs = None if unseen else at_epochs(parameters, tracks)
-    distances = None if epochs is None else inter_prism(parameters, tracks, still_ns, epochs)
+    epochs = None if unseen else distances_at_epochs(parameters, tracks)
+    distances = None if epochs is None else inter_prism(parameters, tracks, stationary_ns, epochs)
     moved = continuous.poses if continuous is not None else linear
     left_out = None
     if with_held_out and continuous is not None:
@@ -253,7 +253,7 @@ def find(
         observations, _ = build_observations(parameters, continuous.sources, origin_ns=continuous.origin_ns)
         left_out = attempt(
             "held_out",
-            lambda: held_out(
+            lambda: held_out_errors(
                 observations, parameters.pipeline, on_progress=lambda s: report(fitted + 0.1 + 0.3 * s)
             ),
         )
@@ -263,16 +263,16 @@ def find(
         ("linear", linear),
         ("continuous", None if continuous is None else continuous.poses),
     )
-    compared: dict[Estimator, PoseFigures] = {}
-    aligned: dict[Estimator, AlignedFigures] = {}
-    stops: dict[Estimator, StandingFigures] = {}
+    compared: dict[Estimator, PoseErrorStatistics] = {}
+    aligned: dict[Estimator, AlignedErrorStatistics] = {}
+    stops: dict[Estimator, StationaryStatistics] = {}
     if reference is not None:
         compared = {name: compare(poses, reference, centroid_m) for name, poses in both if poses is not None}
-        stood_ns = () if distances is None else distances.still_ns
+        stood_ns = () if distances is None else distances.stationary_ns
         for name, poses in both:
             if poses is None:
                 continue
-            stops[name] = standing_errors(poses, reference, stood_ns, centroid_m).summary()
+            stops[name] = stationary_errors(poses, reference, stood_ns, centroid_m).statistics()
             if align is not None and compared[name].compared:
                 left = attempt("aligned", partial(compare_aligned, poses, reference, centroid_m, align))
                 aligned |= {} if left is None else {name: left}
@@ -283,20 +283,20 @@ def find(
         end_ns=end_ns,
         log=read_log(path),
         stations=stations,
-        station_figures={
-            each.station: station_figures(each, start_ns=start_ns, end_ns=end_ns, outage_limit_ns=limit_ns)
+        station_statistics={
+            each.station: station_statistics(each, start_ns=start_ns, end_ns=end_ns, outage_limit_ns=limit_ns)
             for each in stations
         },
         inter_prism=distances,
-        ride=None if epochs is None else ride(parameters, epochs, moved),
-        odometry_ns=None if still_ns is None else tuple(still_ns),
+        distance_errors=None if epochs is None else distance_error_series(parameters, epochs, moved),
+        odometry_ns=None if stationary_ns is None else tuple(stationary_ns),
         continuous=continuous,
         linear=linear,
         difference=None
         if continuous is None or linear is None
         else difference(linear, continuous.poses, centroid_m),
         held_out=left_out,
-        residuals={} if continuous is None else residual_figures(continuous.fit, continuous.sources),
+        residuals={} if continuous is None else residual_statistics(continuous.fit, continuous.sources),
         outliers=[] if continuous is None else outliers(continuous.fit, continuous.sources),
         normalised=np.empty((0, 3)) if continuous is None else normalised_residuals(continuous.fit),
         compared=compared,
@@ -331,7 +331,7 @@ def difference(a: PoseBatch, b: PoseBatch, point_m: FloatArray) -> Difference:
     )
 
 
-def _pose_noise(recording: Recording, distances: InterPrism | None) -> PoseNoise:
+def _pose_noise(recording: Recording, distances: InterPrismDistances | None) -> PoseNoise:
     prisms = recording.parameters.prisms
     layout = np.array([prism.position_m for prism in prisms])
     check_layout(layout, names=[prism.prism for prism in prisms])
@@ -347,7 +347,7 @@ def _pose_noise(recording: Recording, distances: InterPrism | None) -> PoseNoise
     return PoseNoise(
         perturbation_study(layout, _NOISES_M, draws=_DRAWS, point_m=centroid_m, random=random),
         first_order_sigmas(layout, 1e-3, point_m=centroid_m),
-        equivalent(layout, mean_m, draws=_EQUIVALENT_DRAWS, point_m=centroid_m, random=random)
+        equivalent_noise(layout, mean_m, draws=_EQUIVALENT_DRAWS, point_m=centroid_m, random=random)
         if mean_m > 0.0
         else None,
     )

@@ -12,18 +12,18 @@ from tsgt.geometry import rotate, rotation_from_quaternion
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from tsgt.analysis.evaluation import Epochs
+    from tsgt.analysis.evaluation import EpochDistances
     from tsgt.estimation import PoseBatch
     from tsgt.geometry import FloatArray
     from tsgt.model import Parameters
 
 BINS = 8
-LEAST_IN_BIN = 20
+MIN_BIN_COUNT = 20
 """One second of epochs: fewer say nothing about a bin."""
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class RobotMotion:
     """How a robot moved at N epochs; NaN where no pose is valid.
 
     Attributes
@@ -38,16 +38,16 @@ class Motion:
 
     speed_mps: FloatArray
     acceleration_mps2: FloatArray
-    turning_radps: FloatArray
+    angular_rate_radps: FloatArray
 
     @classmethod
-    def unknown(cls, n: int) -> Motion:
+    def unknown(cls, n: int) -> RobotMotion:
         """Make one of which nothing is known."""
         return cls(*(np.full(n, np.nan) for _ in range(3)))
 
 
 @dataclass(frozen=True, slots=True)
-class Ride:
+class DistanceErrorSeries:
     """Distance errors over time.
 
     Attributes
@@ -62,7 +62,7 @@ class Ride:
 
     stamp_ns: NDArray[np.int64]
     error_m: dict[str, FloatArray]
-    motion: Motion
+    motion: RobotMotion
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +106,9 @@ class Grid:
     counts: NDArray[np.int64]
 
 
-def ride(parameters: Parameters, found: Epochs, poses: PoseBatch | None) -> Ride:
+def distance_error_series(
+    parameters: Parameters, found: EpochDistances, poses: PoseBatch | None
+) -> DistanceErrorSeries:
     """Put the errors of the distances beside the robot's motion.
 
     Parameters
@@ -120,15 +122,15 @@ def ride(parameters: Parameters, found: Epochs, poses: PoseBatch | None) -> Ride
     """
     centroid_m = np.mean([prism.position_m for prism in parameters.prisms], axis=0)
     error_m = {f"{a}-{b}": m - found.references_m[a, b] for (a, b), m in found.distances_m.items()}
-    unknown = Motion.unknown(len(found.stamp_ns))
-    return Ride(
+    unknown = RobotMotion.unknown(len(found.stamp_ns))
+    return DistanceErrorSeries(
         found.stamp_ns, error_m, unknown if poses is None else _motion(poses, centroid_m, found.stamp_ns)
     )
 
 
-def _motion(poses: PoseBatch, centroid_m: FloatArray, epochs: NDArray[np.int64]) -> Motion:
+def _motion(poses: PoseBatch, centroid_m: FloatArray, epochs: NDArray[np.int64]) -> RobotMotion:
     if len(poses) < 2:
-        return Motion.unknown(len(epochs))
+        return RobotMotion.unknown(len(epochs))
     rows = poses.valid
     velocity = np.full((len(poses), 3), np.nan)
     arms = np.cross(poses.angular_velocity_radps[rows], centroid_m)
@@ -139,7 +141,7 @@ def _motion(poses: PoseBatch, centroid_m: FloatArray, epochs: NDArray[np.int64])
     turning = np.where(rows, np.linalg.norm(poses.angular_velocity_radps, axis=1), np.nan)
     at_s = (epochs - poses.stamp_ns[0]) / 1e9
     columns = (speed, np.gradient(speed, time_s), turning)
-    return Motion(*(np.interp(at_s, time_s, column, left=np.nan, right=np.nan) for column in columns))
+    return RobotMotion(*(np.interp(at_s, time_s, column, left=np.nan, right=np.nan) for column in columns))
 
 
 def binned(error_m: FloatArray, quantity: FloatArray) -> Bins | None:
@@ -161,7 +163,7 @@ def binned(error_m: FloatArray, quantity: FloatArray) -> Bins | None:
     for i in range(len(edges) - 1):
         some = size[:, place == i]
         some = some[np.isfinite(some)]
-        told = len(some) >= LEAST_IN_BIN
+        told = len(some) >= MIN_BIN_COUNT
         figures = (np.median(some), np.mean(some), np.percentile(some, 95)) if told else (np.nan,) * 3
         found.append((len(some), *map(float, figures)))
     counts, median, mean, p95 = (np.array(column) for column in zip(*found, strict=True))
@@ -182,14 +184,14 @@ def gridded(error_m: FloatArray, x: FloatArray, y: FloatArray) -> Grid | None:
             some = size[:, (rows == i) & (columns == j)]
             some = some[np.isfinite(some)]
             counts[i, j] = len(some)
-            if len(some) >= LEAST_IN_BIN:
+            if len(some) >= MIN_BIN_COUNT:
                 mean[i, j] = some.mean()
     return Grid(x_edges, y_edges, mean, counts)
 
 
 def _edges(quantity: FloatArray) -> FloatArray | None:
     known = quantity[np.isfinite(quantity)]
-    if len(known) < LEAST_IN_BIN:
+    if len(known) < MIN_BIN_COUNT:
         return None
     # The few largest would leave most bins empty; they are counted in the outermost ones.
     top = float(np.percentile(np.abs(known), 99))

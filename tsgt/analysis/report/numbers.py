@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from tsgt.analysis.evaluation import InterPrismDistances
     from tsgt.analysis.processing import Estimator
     from tsgt.analysis.report.findings import Difference, Findings
-    from tsgt.analysis.report.motion import Bins, Grid, DistanceErrorSeries
+    from tsgt.analysis.report.motion import Bins, DistanceErrorSeries, Grid
     from tsgt.estimation import PoseBatch
     from tsgt.geometry import FloatArray
 

@@ -47,7 +47,7 @@ class Table:
 
 
 @dataclass(frozen=True, slots=True)
-class Plot:
+class ReportFigure:
     """A figure.
 
     Attributes
@@ -82,10 +82,10 @@ class Section:
     title: str
     text: tuple[str, ...] = ()
     tables: tuple[Table, ...] = ()
-    plots: tuple[Plot, ...] = ()
+    plots: tuple[ReportFigure, ...] = ()
 
 
-def page(
+def render_page(
     title: str,
     facts: Table,
     judged: Sequence[Verdict],
@@ -147,7 +147,7 @@ def _prose(text: str) -> str:
     return "".join(f"<code>{part}</code>" if i % 2 else part for i, part in enumerate(parts))
 
 
-def _plot(plot: Plot, image: bytes) -> str:
+def _plot(plot: ReportFigure, image: bytes) -> str:
     data = base64.b64encode(image).decode("ascii")
     return (
         f'<figure><img alt="{escape(plot.name)}" src="data:image/png;base64,{data}">\n'

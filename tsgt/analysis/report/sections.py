@@ -6,26 +6,26 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.figures import Clock
-from tsgt.analysis.figures import stations as draw
+from tsgt.analysis.figures import TimeAxis, panels_height_mm
+from tsgt.analysis.report import station_figures as draw
 from tsgt.analysis.report.calibration import calibration
 from tsgt.analysis.report.elements import LISTED, median, number, utc, wide
 from tsgt.analysis.report.motion import binned, gridded
-from tsgt.analysis.report.page import Plot, Section, Table
-from tsgt.analysis.report.sections_poses import estimators, perturbation, residuals, trajectory
+from tsgt.analysis.report.page import ReportFigure, Section, Table
+from tsgt.analysis.report.pose_sections import estimators, perturbation, residuals, trajectory
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from tsgt.analysis.evaluation import PairDistances
     from tsgt.analysis.report.findings import Findings
-    from tsgt.analysis.report.motion import Ride
+    from tsgt.analysis.report.motion import DistanceErrorSeries
     from tsgt.geometry import FloatArray
 
 
 def sections(f: Findings) -> list[Section]:
     """All sections in their order."""
-    clock = Clock.over(f.start_ns, f.end_ns)
+    clock = TimeAxis.over(f.start_ns, f.end_ns)
     return [
         _stations(f, clock),
         _clocks(f, clock),
@@ -48,7 +48,7 @@ def facts(f: Findings) -> Table:
         ("first measurement", f"{utc(f.start_ns)} UTC"),
         ("duration", f"{f.duration_s:.1f} s"),
         ("stations, prisms", f"{len(parameters.stations)}, {len(parameters.prisms)}"),
-        ("measurements", f"{sum(e.measurements for e in f.station_figures.values())}"),
+        ("measurements", f"{sum(e.measurements for e in f.station_statistics.values())}"),
         ("radio", f.log.protocol or "not recorded"),
         (
             "valid poses",
@@ -59,11 +59,11 @@ def facts(f: Findings) -> Table:
     return Table("", (), tuple(rows))
 
 
-def _stations(f: Findings, clock: Clock) -> Section:
+def _stations(f: Findings, clock: TimeAxis) -> Section:
     outage_limit_s = f.recording.parameters.pipeline.outage_limit_ns / 1e9
     rows = []
     for record in f.stations:
-        each = f.station_figures[record.station]
+        each = f.station_statistics[record.station]
         series = f.log.radio.get(record.station)
         rows.append(
             (
@@ -97,7 +97,7 @@ def _stations(f: Findings, clock: Clock) -> Section:
             "Time from each usable measurement to the one before, and measurements that are not usable (crosses at the "
             "foot). Even rows of points low down are good; what is above the dotted line makes poses invalid. Diamonds: a "
             "station began so much later, or ended so much earlier, than the first and the last of all.",
-            draw.panels_height_mm(n),
+            panels_height_mm(n),
             lambda figure: draw.draw_gaps(figure, f.stations, clock, outage_limit_s, f.end_ns),
         ),
         wide(
@@ -119,7 +119,7 @@ def _stations(f: Findings, clock: Clock) -> Section:
                 "radio",
                 "How the master heard the stations. Losses that come with a falling SNR are a matter of distance or "
                 "antennas; losses at a good SNR are collisions or a computer that is late.",
-                draw.panels_height_mm(3),
+                panels_height_mm(3),
                 lambda figure: draw.draw_radio(figure, heard, clock),
             )
         )
@@ -132,7 +132,7 @@ def _stations(f: Findings, clock: Clock) -> Section:
     return Section("Stations", tuple(text), (Table(caption, header, tuple(rows)), *events), tuple(plots))
 
 
-def _clocks(f: Findings, clock: Clock) -> Section:
+def _clocks(f: Findings, clock: TimeAxis) -> Section:
     bounded = any(np.isfinite(s.bound_ns).any() for s in f.stations)
     if not bounded and not f.log.clocks:
         return Section(
@@ -154,30 +154,30 @@ def _clocks(f: Findings, clock: Clock) -> Section:
     plot = wide(
         "clocks",
         caption,
-        draw.panels_height_mm(rows) + 8 * rows,
+        panels_height_mm(rows) + 8 * rows,
         lambda figure: draw.draw_clocks(figure, f.log.clocks, f.stations, clock),
     )
     return Section("Clocks", tuple(text), plots=(plot,))
 
 
-def _distances(f: Findings, clock: Clock) -> Section:
+def _distances(f: Findings, clock: TimeAxis) -> Section:
     title = "Distances between prisms"
-    if f.inter_prism is None or f.ride is None:
+    if f.inter_prism is None or f.distance_errors is None:
         return Section(title, (f"Not known: {f.problems['inter_prism']}.",))
-    found, ride = f.inter_prism, f.ride
+    found, ride = f.inter_prism, f.distance_errors
     if not found.epochs:
         return Section(title, ("The tracks of the prisms have no time in common.",))
     text = [
         (
             f"{found.epochs - found.invalid_epochs} of {found.epochs} epochs at 20 Hz have no gap in any track. The robot stood "
-            f"still for {found.still_s:.1f} s in {len(found.still_ns)} intervals (shaded below)."
+            f"still for {found.stationary_s:.1f} s in {len(found.stationary_ns)} intervals (shaded below)."
         )
     ]
-    if not found.still_ns:
+    if not found.stationary_ns:
         text.append(
             "There is no interval of 3 s or more in which it stood still, so nothing is told of standing."
         )
-    if f.odometry_ns and not found.still_ns:
+    if f.odometry_ns and not found.stationary_ns:
         text.append(
             f"The odometry has the robot standing from {utc(f.odometry_ns[0][0])} to {utc(f.odometry_ns[-1][1])} UTC, before "
             "or after this recording: is it of this drive, and were both clocks right?"
@@ -189,7 +189,7 @@ def _distances(f: Findings, clock: Clock) -> Section:
         Table("Standing still: raw pairs", header, _pairs(found.static)),
         Table("At 20 Hz, interpolated", header, _pairs(found.dynamic)),
     )
-    height_mm = draw.panels_height_mm(len(ride.error_m) + 2)
+    height_mm = panels_height_mm(len(ride.error_m) + 2)
     plots = (
         wide(
             "distances",
@@ -203,7 +203,7 @@ def _distances(f: Findings, clock: Clock) -> Section:
             "The same over time, interpolated, with the robot's speed and angular rate. Errors that grow with speed are "
             "time's; peaks at starts and stops come from straight lines between measurements.",
             height_mm,
-            lambda figure: draw.draw_ride(figure, ride, found.still_ns, clock),
+            lambda figure: draw.draw_distance_errors(figure, ride, found.stationary_ns, clock),
         ),
     )
     return Section(title, tuple(text), tables, plots)
@@ -211,13 +211,13 @@ def _distances(f: Findings, clock: Clock) -> Section:
 
 def _by_motion(f: Findings) -> Section:
     title = "Errors by motion"
-    ride = f.ride
+    ride = f.distance_errors
     if ride is None or not np.isfinite(ride.motion.speed_mps).any():
         return Section(title, ("Not known: it needs the distances between all prisms, and poses.",))
     errors = np.array(list(ride.error_m.values()))
     motion = ride.motion
     names = ("speed (m/s)", "acceleration (m/s²)", "angular rate (rad/s)")
-    values = (motion.speed_mps, motion.acceleration_mps2, motion.turning_radps)
+    values = (motion.speed_mps, motion.acceleration_mps2, motion.angular_rate_radps)
     bins = [(name, binned(errors, value)) for name, value in zip(names, values, strict=True)]
     if all(found is None for _, found in bins):
         return Section(title, ("There are too few distances, or the robot did not move.",))
@@ -234,12 +234,12 @@ def _by_motion(f: Findings) -> Section:
     return Section(title, plots=tuple(plots))
 
 
-def _grids(errors: FloatArray, ride: Ride, names: tuple[str, str, str]) -> list[Plot]:
+def _grids(errors: FloatArray, ride: DistanceErrorSeries, names: tuple[str, str, str]) -> list[ReportFigure]:
     motion = ride.motion
     found = [
         (name, names[2], grid)
         for name, x in ((names[0], motion.speed_mps), (names[1], motion.acceleration_mps2))
-        if (grid := gridded(errors, x, motion.turning_radps)) is not None
+        if (grid := gridded(errors, x, motion.angular_rate_radps)) is not None
     ]
     if not found:
         return []
@@ -254,5 +254,5 @@ def _pairs(pairs: Sequence[PairDistances]) -> tuple[tuple[str, ...], ...]:
     return tuple(
         (pair.name, str(s.valid), *map(number, (s.reference, s.mean, s.std, s.mean_abs_error, s.p95)))
         for pair in pairs
-        for s in (pair.summary(),)
+        for s in (pair.statistics(),)
     )

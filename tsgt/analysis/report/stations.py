@@ -55,7 +55,7 @@ class StationRecord:
 
 
 @dataclass(frozen=True, slots=True)
-class StationFigures:
+class StationStatistics:
     """A station in figures, as they stand in a report.
 
     Attributes
@@ -124,9 +124,9 @@ def _record(station: int, measurements: Sequence[Measurement]) -> StationRecord:
     )
 
 
-def station_figures(
+def station_statistics(
     record: StationRecord, *, start_ns: int, end_ns: int, outage_limit_ns: int
-) -> StationFigures:
+) -> StationStatistics:
     """Sum a station up over a recording from ``start_ns`` to ``end_ns``."""
     times_ns = record.stamp_ns[record.usable]
     steps_s = np.diff(np.concatenate([[start_ns], times_ns, [end_ns]])) / 1e9
@@ -135,7 +135,7 @@ def station_figures(
     whole_s = (end_ns - start_ns) / 1e9
     delays = record.delay_s if len(record.delay_s) else np.array([np.nan])
     known = record.bound_ns[np.isfinite(record.bound_ns)]
-    return StationFigures(
+    return StationStatistics(
         measurements=len(record.stamp_ns),
         usable=len(times_ns),
         rate_hz=(len(times_ns) - 1) / span_s if span_s > 0 else np.nan,

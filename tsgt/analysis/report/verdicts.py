@@ -94,7 +94,7 @@ def _poses(f: Findings) -> Iterator[Verdict]:
 
 def _stations(f: Findings) -> Iterator[Verdict]:
     limit_s = f.recording.parameters.pipeline.outage_limit_ns / 1e9
-    for number, each in f.station_figures.items():
+    for number, each in f.station_statistics.items():
         if not each.usable:
             yield Verdict(Level.BAD, f"Station {number} has no usable measurement.")
         elif each.in_gaps > _IN_GAPS:
@@ -113,7 +113,7 @@ def bound_and_speed(f: Findings) -> tuple[float, float]:
     """Median bound of the stamps in ms, and the speed in m/s below which the robot is 95 % of the time; NaN: not known."""
     bounds = [s.bound_ns[np.isfinite(s.bound_ns)] for s in f.stations]
     known = np.concatenate(bounds) if bounds else np.empty(0)
-    speed_mps = np.empty(0) if f.ride is None else f.ride.motion.speed_mps
+    speed_mps = np.empty(0) if f.distance_errors is None else f.distance_errors.motion.speed_mps
     speed_mps = speed_mps[np.isfinite(speed_mps)]
     return (
         float(np.median(known)) / 1e6 if len(known) else math.nan,
@@ -140,8 +140,8 @@ def _distances(f: Findings) -> Iterator[Verdict]:
     if f.inter_prism is None:
         yield Verdict(Level.BAD, f"Distances between prisms: {f.problems['inter_prism']}.")
         return
-    standing = [pair.summary() for pair in f.inter_prism.static if len(pair.distances_m)]
-    moving = [pair.summary() for pair in f.inter_prism.dynamic if len(pair.distances_m)]
+    standing = [pair.statistics() for pair in f.inter_prism.static if len(pair.distances_m)]
+    moving = [pair.statistics() for pair in f.inter_prism.dynamic if len(pair.distances_m)]
     if not moving:
         yield Verdict(Level.BAD, "At no time were all prisms measured without a gap.")
         return
@@ -156,7 +156,7 @@ def _distances(f: Findings) -> Iterator[Verdict]:
             f"{why}: errors of layout, frames and prism constants cannot be told from those of time.",
         )
     for pair in f.inter_prism.static:
-        figures = pair.summary()
+        figures = pair.statistics()
         bias_mm = figures.mean - figures.reference
         if abs(bias_mm) > _STATIC_BIAS_MM:
             yield Verdict(

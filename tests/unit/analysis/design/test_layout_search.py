@@ -7,7 +7,7 @@ from itertools import combinations, product
 import numpy as np
 import pytest
 
-from tsgt.analysis.design import Criterion, Stances, Station, Task, best_layout
+from tsgt.analysis.design import Criterion, LayoutProblem, RobotPoses, Station, optimal_layout
 from tsgt.errors import GeometryError
 from tsgt.model import ARCSECOND_RAD, InstrumentNoise
 
@@ -20,19 +20,19 @@ BOX = ((-0.5, -0.4, 0.8), (0.5, 0.4, 1.6))
 
 def _task(
     envelope_m: object, *, count: int = 3, criterion: Criterion = "rotation", min_separation_m: float = 0.3
-) -> Task:
-    return Task(
+) -> LayoutProblem:
+    return LayoutProblem(
         envelope_m=np.array(envelope_m, dtype=np.float64),
         count=count,
         min_separation_m=min_separation_m,
         criterion=criterion,
         stations=tuple(Station(np.array(place), NOISE, i) for i, place in enumerate(PLACES[:count])),
-        stances=Stances.at([[60.0, 45.0, -1.0]]),
+        robot_poses=RobotPoses.at([[60.0, 45.0, -1.0]]),
         point_m=np.zeros(3),
     )
 
 
-def _variance(task: Task, layout: np.ndarray) -> float:
+def _variance(task: LayoutProblem, layout: np.ndarray) -> float:
     told = [task.information(layout[slot][None], slot)[0] for slot in range(task.count)]
     return float(task.variance(np.sum(told, axis=0)))
 
@@ -47,7 +47,7 @@ def test_no_layout_of_a_coarse_grid_is_better(criterion: Criterion) -> None:
     best = min(
         float(task.variance(told[0][a] + told[1][b] + told[2][c])) for a, b, c in combinations(range(27), 3)
     )
-    found = best_layout(task, np.random.default_rng(0))
+    found = optimal_layout(task, np.random.default_rng(0))
     # The stations stand a little apart, so that it matters by a hair who tracks which prism.
     assert _variance(task, found) <= best * 1.001
     assert (found >= least).all()
@@ -57,7 +57,7 @@ def test_no_layout_of_a_coarse_grid_is_better(criterion: Criterion) -> None:
 def test_no_small_move_makes_it_better() -> None:
     """What is found is a local optimum within the envelope: 300 random shifts of 20 mm find nothing to gain."""
     task = _task(BOX, criterion="position")
-    found = best_layout(task, np.random.default_rng(0))
+    found = optimal_layout(task, np.random.default_rng(0))
     random = np.random.default_rng(1)
     reached = _variance(task, found)
     for _ in range(300):
@@ -67,32 +67,32 @@ def test_no_small_move_makes_it_better() -> None:
 
 def test_prisms_keep_their_distance() -> None:
     """A fourth prism would share a corner with another one if it were allowed to."""
-    found = best_layout(_task(BOX, count=4, min_separation_m=0.6), np.random.default_rng(0))
+    found = optimal_layout(_task(BOX, count=4, min_separation_m=0.6), np.random.default_rng(0))
     for a, b in combinations(found, 2):
         assert np.linalg.norm(a - b) >= 0.6 * (1 - 1e-6)
 
 
 def test_a_flat_envelope_is_one_too() -> None:
     """Prisms on a plate, all at one height."""
-    found = best_layout(_task(((-0.5, -0.5, 1.0), (0.5, 0.5, 1.0))), np.random.default_rng(0))
+    found = optimal_layout(_task(((-0.5, -0.5, 1.0), (0.5, 0.5, 1.0))), np.random.default_rng(0))
     np.testing.assert_array_equal(found[:, 2], 1.0)
 
 
 def test_the_same_seed_finds_the_same() -> None:
     """Randomness comes from the generator alone."""
-    one, two = (best_layout(_task(BOX), np.random.default_rng(5)) for _ in "ab")
+    one, two = (optimal_layout(_task(BOX), np.random.default_rng(5)) for _ in "ab")
     np.testing.assert_array_equal(one, two)
 
 
 def test_an_envelope_without_room_is_refused() -> None:
     """Three prisms 300 mm apart do not fit into a cube of 100 mm."""
     with pytest.raises(GeometryError, match="no room for 3 prisms at least 300 mm apart"):
-        best_layout(_task(((0, 0, 1.0), (0.1, 0.1, 1.1))), np.random.default_rng(0))
+        optimal_layout(_task(((0, 0, 1.0), (0.1, 0.1, 1.1))), np.random.default_rng(0))
 
 
 def test_progress_is_told() -> None:
     """Start by start, to the end."""
     told: list[float] = []
-    best_layout(_task(BOX), np.random.default_rng(0), on_progress=told.append)
+    optimal_layout(_task(BOX), np.random.default_rng(0), on_progress=told.append)
     assert told == sorted(told)
     assert told[-1] == 1.0

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from tsgt.analysis.design import (
-    HEADINGS,
-    LayoutFigures,
-    Stances,
+    HEADING_COUNT,
+    PoseAccuracy,
+    RobotPoses,
     Station,
     pose_covariances,
-    together_or_around,
+    station_arrangements,
 )
 from tsgt.config import ScenarioConfig
 from tsgt.errors import DegenerateGeometryError, GeometryError
@@ -34,7 +34,7 @@ NOISE = InstrumentNoise(
 EVEN = InstrumentNoise(range_sigma_m=0.0, range_sigma_ppm=0.0, angle_sigma_rad=0.0, pointing_sigma_m=0.003)
 """Alike in all directions and at all distances."""
 PLACES = [(0.0, 0.0, 0.0), (2.0, -1.5, 0.1), (-1.5, 2.5, -0.2)]
-STANCES = Stances.at([[60.0, 45.0, -1.0], [20.0, 10.0, -1.0]])
+STANCES = RobotPoses.at([[60.0, 45.0, -1.0], [20.0, 10.0, -1.0]])
 ORIGIN = np.zeros(3)
 
 
@@ -74,7 +74,7 @@ def test_weighing_is_never_worse_than_not_weighing() -> None:
 def test_polar_measurements_differentiated_numerically() -> None:
     """The information in two angles and a distance of each prism, from differences of what would be measured."""
     noise = dataclasses.replace(NOISE, pointing_sigma_m=0.0, angle_sigma_rad=20 * ARCSECOND_RAD)
-    stance = Stances.at([[50.0, -30.0, 2.0]], [0.7])
+    stance = RobotPoses.at([[50.0, -30.0, 2.0]], [0.7])
     R, origin = stance.rotation[0], stance.position_m[0]
     point = np.array([0.2, -0.1, 0.4])
 
@@ -112,7 +112,7 @@ def test_the_rotation_is_known_better_with_larger_layouts() -> None:
     """Twice as large is twice as good; the position of the centroid does not change."""
     centroid = LAYOUT.mean(axis=0)
     one, two = (
-        LayoutFigures.of(
+        PoseAccuracy.of(
             pose_covariances(centroid + scale * (LAYOUT - centroid), _stations(EVEN), STANCES, centroid)
         )
         for scale in (1, 2)
@@ -125,7 +125,7 @@ def test_the_rotation_is_known_better_with_larger_layouts() -> None:
 def test_figures_are_root_mean_squares_and_worst() -> None:
     """Over the stances, of the summed variances."""
     covariance = np.array([np.diag([1.0, 4, 4, 1, 0, 0]), np.diag([1.0, 0, 0, 0, 0, 3])])
-    found = LayoutFigures.of(covariance)
+    found = PoseAccuracy.of(covariance)
     assert found.position_m == pytest.approx(math.sqrt(5))
     assert found.worst_position_m == pytest.approx(3)
     assert found.rotation_rad == pytest.approx(math.sqrt(2))
@@ -135,15 +135,15 @@ def test_figures_are_root_mean_squares_and_worst() -> None:
 
 def test_stances_go_round_at_each_place() -> None:
     """Place by place, with all headings evenly around the circle."""
-    assert len(STANCES.position_m) == 2 * HEADINGS
-    np.testing.assert_array_equal(STANCES.position_m[HEADINGS], [20, 10, -1])
-    np.testing.assert_allclose(STANCES.rotation[1], exp_so3(np.array([0, 0, 2 * math.pi / HEADINGS])))
+    assert len(STANCES.position_m) == 2 * HEADING_COUNT
+    np.testing.assert_array_equal(STANCES.position_m[HEADING_COUNT], [20, 10, -1])
+    np.testing.assert_allclose(STANCES.rotation[1], exp_so3(np.array([0, 0, 2 * math.pi / HEADING_COUNT])))
 
 
 def test_stations_together_and_around() -> None:
     """All at the distance; on one side in the direction of the first, or evenly around."""
     centre = np.array([60.0, 45.0, -1.0])
-    found = together_or_around(_stations(NOISE), centre, 75.0)
+    found = station_arrangements(_stations(NOISE), centre, 75.0)
     for stations in found.values():
         for station, before in zip(stations, PLACES, strict=True):
             assert math.dist(station.position_m[:2], centre[:2]) == pytest.approx(75)

@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from tsgt.analysis.design import equivalent, first_order_sigmas, perturbation_study
+from tsgt.analysis.design import equivalent_noise, first_order_sigmas, perturbation_study
 from tsgt.analysis.design.perturbation import euler_angles_rad
 from tsgt.config import ScenarioConfig
 from tsgt.errors import DegenerateGeometryError
@@ -66,7 +66,7 @@ def test_the_position_of_the_centroid_is_never_biased() -> None:
 
 def test_ten_millimetres_between_prisms() -> None:
     """The noise that gives them is found, and what it does to the pose is what first order expects of it."""
-    found = equivalent(LAYOUT, 0.010, draws=50_000, point_m=CENTROID, random=_random())
+    found = equivalent_noise(LAYOUT, 0.010, draws=50_000, point_m=CENTROID, random=_random())
     assert found.inter_prism_mean_m == pytest.approx(0.010, rel=1e-6)
     # |difference of two prisms| along their line: sqrt(2) sigma sqrt(2 / pi) in the mean.
     assert found.noise_m == pytest.approx(0.010 * math.sqrt(math.pi) / 2, rel=0.01)
@@ -113,7 +113,7 @@ def test_prisms_in_a_line_are_refused() -> None:
 
 def test_errors_beyond_the_layout_have_their_noise_too() -> None:
     """Five metres between prisms that are one apart: absurd, and answered."""
-    found = equivalent(LAYOUT, 5.0, draws=2000, point_m=CENTROID, random=_random())
+    found = equivalent_noise(LAYOUT, 5.0, draws=2000, point_m=CENTROID, random=_random())
     assert found.inter_prism_mean_m == pytest.approx(5.0, rel=1e-6)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tsgt.analysis.evaluation import inner_part, pose_errors
+from tsgt.analysis.evaluation import interior_mask, pose_errors
 from tsgt.geometry import transform_from
 
 POINT = np.array([0.0, 0.1, 1.2])
@@ -53,5 +53,5 @@ def test_two_seconds_at_each_end_do_not_count() -> None:
     """Figures start 2 s after the start and end 2 s before the end, both included."""
     second = 1_000_000_000
     stamps = np.array([1.9, 2.0, 5.0, 8.0, 8.1]) * second
-    inner = inner_part(100 * second + stamps.astype(np.int64), 100 * second, 110 * second)
+    inner = interior_mask(100 * second + stamps.astype(np.int64), 100 * second, 110 * second)
     assert inner.tolist() == [False, True, True, True, False]

@@ -5,10 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tsgt.analysis.evaluation import folds, hold_out, missed_by_lines, missed_by_trajectory, never_out
-from tsgt.analysis.evaluation.held_out import MissFigures
+from tsgt.analysis.evaluation import (
+    cross_validate,
+    folds,
+    interpolation_errors,
+    training_rows,
+    trajectory_errors,
+)
+from tsgt.analysis.evaluation.held_out import PredictionErrorStatistics
 from tsgt.geometry import Observations
-from tsgt.geometry.trajectory import Knots, Trajectory
+from tsgt.geometry.trajectory import States, Trajectory
 from tsgt.model import MotionPrior
 
 LAYOUT = np.array([[-0.5, 0.0, 1.0], [0.5, 0.0, 1.0], [0.0, 0.5, 1.5]])
@@ -37,30 +43,30 @@ def test_each_measurement_but_the_outer_five_is_left_out_once() -> None:
     some = observations()
     parts = folds(some)
     assert [part.number for part in parts] == sorted([0, 1, 2, 3, 4] * 3)
-    left_out = np.sort(np.concatenate([part.out for part in parts]))
+    left_out = np.sort(np.concatenate([part.test for part in parts]))
     np.testing.assert_array_equal(left_out, np.arange(15, 45))
     for part in parts:
-        assert len(set(some.prism[part.out])) == 1
-        np.testing.assert_array_equal(np.sort(np.concatenate([part.out, part.kept])), np.arange(60))
+        assert len(set(some.prism[part.test])) == 1
+        np.testing.assert_array_equal(np.sort(np.concatenate([part.test, part.training])), np.arange(60))
 
 
 def test_a_fold_leaves_every_fifth_out() -> None:
     """So the neighbours of what is left out stay."""
     part = next(part for part in folds(observations(150)) if part.number == 2)
-    assert np.diff(part.out).tolist() == [15] * (len(part.out) - 1)
+    assert np.diff(part.test).tolist() == [15] * (len(part.test) - 1)
 
 
 def test_prisms_with_few_measurements_are_never_left_out() -> None:
     """Ten of a prism are all outer ones."""
     assert folds(observations(30)) == []
-    assert hold_out([], lambda part: np.empty(len(part.out))).figures.n == 0
+    assert cross_validate([], lambda part: np.empty(len(part.test))).statistics.n == 0
 
 
 def test_what_serves_all_folds_of_a_number_has_seen_none_of_them() -> None:
     """A prior may be tuned once for the three folds of a number."""
     some = observations()
     for part in folds(some):
-        assert not set(never_out(some, part.number)) & set(part.out)
+        assert not set(training_rows(some, part.number)) & set(part.test)
 
 
 def test_gaps_count_apart() -> None:
@@ -69,13 +75,13 @@ def test_gaps_count_apart() -> None:
     late = some.time_s + np.where(np.arange(60) >= 30, 0.5, 0.0)
     gapped = replace(some, time_s=late)
     parts = folds(gapped)
-    found = hold_out(parts, lambda part: missed_by_lines(gapped, part))
+    found = cross_validate(parts, lambda part: interpolation_errors(gapped, part))
     assert found.gaps.n == 6  # the last before and the first after, of each prism
-    assert found.figures.n == 24
-    assert found.figures.mean == pytest.approx(0.0, abs=1e-9)
+    assert found.statistics.n == 24
+    assert found.statistics.mean == pytest.approx(0.0, abs=1e-9)
     # The robot did not move while nothing was measured, as a straight line has it do.
     assert found.gaps.mean > 100.0
-    standing = hold_out(folds(some), lambda part: missed_by_lines(some, part))
+    standing = cross_validate(folds(some), lambda part: interpolation_errors(some, part))
     assert standing.gaps.n == 0
 
 
@@ -88,9 +94,9 @@ def test_lines_join_the_remaining_measurements() -> None:
     part = folds(curved)[0]
     expected = [
         np.linalg.norm((curved.points_m[row - 3] + curved.points_m[row + 3]) / 2 - curved.points_m[row])
-        for row in part.out
+        for row in part.test
     ]
-    np.testing.assert_allclose(missed_by_lines(curved, part), expected)
+    np.testing.assert_allclose(interpolation_errors(curved, part), expected)
 
 
 def test_a_trajectory_is_asked_where_the_prism_is() -> None:
@@ -98,7 +104,7 @@ def test_a_trajectory_is_asked_where_the_prism_is() -> None:
     some = observations()
     time_s = np.array([0.0, 6.0])
     zero = np.zeros((2, 3))
-    knots = Knots(
+    knots = States(
         time_s,
         np.array([[0.003, 0.004, 0.0], [6.003, 0.004, 0.0]]),
         np.broadcast_to(np.eye(3), (2, 3, 3)),
@@ -106,12 +112,12 @@ def test_a_trajectory_is_asked_where_the_prism_is() -> None:
         *(zero, zero, zero),
     )
     trajectory = Trajectory(knots, MotionPrior(), np.zeros((2, 18, 18)), np.zeros((1, 18, 18)))
-    np.testing.assert_allclose(missed_by_trajectory(trajectory, some), 0.005, rtol=1e-6)
+    np.testing.assert_allclose(trajectory_errors(trajectory, some), 0.005, rtol=1e-6)
 
 
 def test_figures_are_in_mm() -> None:
     """Mean, median and 95th percentile; NaN and a count of 0 without any."""
-    found = MissFigures.of(np.array([0.001, 0.002, 0.006]))
+    found = PredictionErrorStatistics.of(np.array([0.001, 0.002, 0.006]))
     assert found.n == 3
     assert [found.mean, found.median, found.p95] == pytest.approx([3.0, 2.0, 5.6])
-    assert MissFigures.of(np.empty(0)).n == 0
+    assert PredictionErrorStatistics.of(np.empty(0)).n == 0

@@ -4,10 +4,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from harness.scene import LAYOUT, SECOND, START, Scene, driving, standing, standing_scene
+from harness.scene import LAYOUT, SECOND, START, Scene, driving, standing, stationary_scene
 
-from tsgt.analysis.evaluation import InterPrism, inter_prism
-from tsgt.analysis.evaluation.inter_prism import still_intervals
+from tsgt.analysis.evaluation import InterPrismDistances, inter_prism
+from tsgt.analysis.evaluation.inter_prism import stationary_intervals
 from tsgt.estimation import Track, build_tracks
 from tsgt.geometry import exp_so3
 
@@ -29,7 +29,7 @@ def stop_and_go(time_s: float) -> tuple[np.ndarray, np.ndarray]:
     return exp_so3(np.zeros(3)), np.array([30.0 + np.clip(time_s - 10.0, 0.0, 10.0), 20.0, 0.0])
 
 
-def found_in(scene: Scene, *, duration_s: float, without: tuple[int, ...] = ()) -> InterPrism:
+def found_in(scene: Scene, *, duration_s: float, without: tuple[int, ...] = ()) -> InterPrismDistances:
     """Measure at 2.5 Hz with phases, leaving out some steps of station 2, and compare the prisms."""
     measurements = [
         scene.measure(station, 0.4 * step + 0.11 * station)
@@ -42,21 +42,21 @@ def found_in(scene: Scene, *, duration_s: float, without: tuple[int, ...] = ()) 
 
 def test_a_standing_robot_has_the_distances_of_its_layout() -> None:
     """Exact measurements give exact distances, interpolated and raw."""
-    found = found_in(standing_scene(), duration_s=8.0)
+    found = found_in(stationary_scene(), duration_s=8.0)
     for pairs in (found.dynamic, found.static):
         assert [pair.name for pair in pairs] == ["1-2", "1-3", "2-3"]
         for pair, reference in zip(pairs, REFERENCES_MM, strict=True):
-            figures = pair.summary()
+            figures = pair.statistics()
             assert figures.reference == pytest.approx(reference, abs=0.1)
             assert figures.mean == pytest.approx(figures.reference, abs=1e-6)
             assert figures.p95 == pytest.approx(0.0, abs=1e-6)
-    assert found.still_s == pytest.approx(7.6 - 0.22)
+    assert found.stationary_s == pytest.approx(7.6 - 0.22)
 
 
 def test_a_gap_is_counted_apart() -> None:
     """Epochs without all three tracks are invalid; they enter no mean."""
     # Station 2 measures at 0.22 + 0.4 step: without steps 5 to 7 there is a gap from 1.82 to 3.42 s.
-    found = found_in(standing_scene(), duration_s=8.0, without=(5, 6, 7))
+    found = found_in(stationary_scene(), duration_s=8.0, without=(5, 6, 7))
     assert found.invalid_epochs == len(range(1850, 3420, 50))
     assert all(pair.invalid == found.invalid_epochs for pair in found.dynamic)
     assert all(len(pair.distances_m) == found.epochs - found.invalid_epochs for pair in found.dynamic)
@@ -64,14 +64,14 @@ def test_a_gap_is_counted_apart() -> None:
 
 def test_the_epochs_span_what_all_tracks_cover() -> None:
     """From the first whole 50 ms that all tracks have reached to the last before one of them ends."""
-    found = found_in(standing_scene(), duration_s=8.0)
+    found = found_in(stationary_scene(), duration_s=8.0)
     assert found.epochs == len(range(350, 7600 + 110 + 1, 50))  # the last station starts at 0.33 s
 
 
 def test_figures_are_those_of_the_distances() -> None:
     """Mean and deviation of the distance, mean and 95th percentile of its error, against plain numpy."""
-    pair = found_in(standing_scene().moving(driving), duration_s=8.0).dynamic[1]
-    figures = pair.summary()
+    pair = found_in(stationary_scene().moving(driving), duration_s=8.0).dynamic[1]
+    figures = pair.statistics()
     mm = pair.distances_m * 1e3
     error = np.sort(np.abs(mm - figures.reference))
     assert figures.mean == pytest.approx(np.sum(mm) / len(mm))
@@ -82,19 +82,19 @@ def test_figures_are_those_of_the_distances() -> None:
 
 def test_no_distance_has_no_figures() -> None:
     """A robot that never stands has no static distances, and no mean of nothing."""
-    found = found_in(standing_scene().moving(stop_and_go), duration_s=40.0)
+    found = found_in(stationary_scene().moving(stop_and_go), duration_s=40.0)
     assert len(found.static[0].distances_m) > 0
-    moving = found_in(standing_scene().moving(lambda t: stop_and_go(t % 5 + 11)), duration_s=4.0)
-    assert moving.still_s == 0.0
-    figures = moving.static[0].summary()
+    moving = found_in(stationary_scene().moving(lambda t: stop_and_go(t % 5 + 11)), duration_s=4.0)
+    assert moving.stationary_s == 0.0
+    figures = moving.static[0].statistics()
     assert np.isnan([figures.mean, figures.std, figures.mean_abs_error, figures.p95]).all()
     assert figures.valid == 0
 
 
 def test_static_pairs_come_from_the_stationary_intervals_only() -> None:
     """Moving prisms measured at different instants would bend the distance; raw pairs do not contain them."""
-    found = found_in(standing_scene().moving(stop_and_go), duration_s=30.0)
-    assert 18.0 < found.still_s < 20.0
+    found = found_in(stationary_scene().moving(stop_and_go), duration_s=30.0)
+    assert 18.0 < found.stationary_s < 20.0
     for pair in found.static:
         np.testing.assert_allclose(pair.distances_m, pair.reference_m, atol=0.021)  # at most one slow step
         assert np.median(np.abs(pair.distances_m - pair.reference_m)) < 1e-9
@@ -104,7 +104,7 @@ def test_a_slow_drive_is_motion() -> None:
     """0.06 m/s is motion, 0.04 m/s is not."""
     times = [0.4 * step for step in range(20)]
     for speed, still in ((0.06, []), (0.04, [(START, START + round(7.6 * SECOND))])):
-        assert still_intervals([track(times, [speed * t for t in times])], LIMIT_NS) == still
+        assert stationary_intervals([track(times, [speed * t for t in times])], LIMIT_NS) == still
 
 
 def test_a_short_stop_is_no_stationary_interval() -> None:
@@ -112,13 +112,13 @@ def test_a_short_stop_is_no_stationary_interval() -> None:
     times = [0.4 * step for step in range(20)]
     for stop_s, count in ((2.8, 0), (3.6, 1)):
         x = [max(0.0, 2.0 - t) - max(0.0, t - 2.0 - stop_s) for t in times]
-        assert len(still_intervals([track(times, x)], LIMIT_NS)) == count
+        assert len(stationary_intervals([track(times, x)], LIMIT_NS)) == count
 
 
 def test_an_outage_is_not_standing() -> None:
     """Nobody knows what the robot did while a prism was lost."""
     times = [0.4 * step for step in range(11)] + [9.0 + 0.4 * step for step in range(11)]
-    intervals = still_intervals([track(times, [5.0] * 22)], LIMIT_NS)
+    intervals = stationary_intervals([track(times, [5.0] * 22)], LIMIT_NS)
     assert intervals == [(START, START + 4 * SECOND), (START + 9 * SECOND, START + 13 * SECOND)]
 
 
@@ -128,19 +128,19 @@ def test_noise_of_a_fast_instrument_is_not_motion() -> None:
     times = [0.05 * step for step in range(200)]
     x = rng.normal(0.0, 0.002, 200).tolist()
     assert max(abs(b - a) for a, b in pairwise(x)) / 0.05 > 0.05
-    assert still_intervals([track(times, x)], LIMIT_NS) == [(START, START + round(9.95 * SECOND))]
+    assert stationary_intervals([track(times, x)], LIMIT_NS) == [(START, START + round(9.95 * SECOND))]
 
 
 def test_all_tracks_must_stand() -> None:
     """One prism that moves is motion of the robot."""
     times = [0.4 * step for step in range(20)]
     standing_track = track(times, [0.0] * 20)
-    assert still_intervals([standing_track, track(times, [0.5 * t for t in times])], LIMIT_NS) == []
+    assert stationary_intervals([standing_track, track(times, [0.5 * t for t in times])], LIMIT_NS) == []
 
 
 def test_the_reference_is_the_layout() -> None:
     """The reference distances are those of the prism layout in the parameters."""
-    found = found_in(standing_scene().moving(standing), duration_s=4.0)
+    found = found_in(stationary_scene().moving(standing), duration_s=4.0)
     for pair in found.dynamic:
         a, b = pair.prisms
         assert pair.reference_m == pytest.approx(float(np.linalg.norm(LAYOUT[a - 1] - LAYOUT[b - 1])))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tsgt.analysis.evaluation.metrics import aligned_figures
+from tsgt.analysis.evaluation.metrics import aligned_statistics
 from tsgt.errors import DegenerateGeometryError
 from tsgt.geometry import transform_from, transform_points
 
@@ -27,7 +27,7 @@ def test_a_rigid_error_is_hidden_altogether() -> None:
     turn = Rotation.from_rotvec(np.radians(2.0) * np.array([0.0, 0.6, 0.8])).as_matrix()
     shift = np.array([0.03, 0.0, 0.04])
     off = transform_from(turn, middle + shift - turn @ middle)
-    found = aligned_figures(off @ true, true, POINT_M, "rigid")
+    found = aligned_statistics(off @ true, true, POINT_M, "rigid")
     assert found.translation_mm == pytest.approx(50.0, abs=1e-6)
     assert found.rotation_deg == pytest.approx(2.0, abs=1e-6)
     assert found.position_rms_mm == pytest.approx(0.0, abs=1e-6)
@@ -43,7 +43,7 @@ def test_a_shift_leaves_rotations_alone() -> None:
     found[:, :3, 3] += (0.003, 0.0, 0.0)
     found[::2, 2, 3] += 0.004
     found[1::2, 2, 3] -= 0.004
-    figures = aligned_figures(found, true, POINT_M, "translation")
+    figures = aligned_statistics(found, true, POINT_M, "translation")
     assert figures.translation_mm == pytest.approx(3.0, abs=1e-9)
     assert figures.rotation_deg == 0.0
     assert figures.position_rms_mm == pytest.approx(4.0, abs=1e-9)
@@ -57,11 +57,11 @@ def test_a_straight_way_does_not_say_how_to_turn() -> None:
         np.broadcast_to(np.eye(3), (9, 3, 3)), np.arange(9.0)[:, None] * (1.0, 0.0, 0.0)
     )
     with pytest.raises(DegenerateGeometryError):
-        aligned_figures(straight, straight, POINT_M, "rigid")
-    assert aligned_figures(straight, straight, POINT_M, "translation").translation_mm == 0.0
+        aligned_statistics(straight, straight, POINT_M, "rigid")
+    assert aligned_statistics(straight, straight, POINT_M, "translation").translation_mm == 0.0
 
 
 def test_without_poses_there_are_no_figures() -> None:
     """Nothing was compared, so nothing is told."""
-    nothing = aligned_figures(np.empty((0, 4, 4)), np.empty((0, 4, 4)), POINT_M, "rigid")
+    nothing = aligned_statistics(np.empty((0, 4, 4)), np.empty((0, 4, 4)), POINT_M, "rigid")
     assert math.isnan(nothing.translation_mm)

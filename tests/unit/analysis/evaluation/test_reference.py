@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tsgt.analysis.evaluation import compare, read_tum
-from tsgt.analysis.evaluation.metrics import NeesFigures
+from tsgt.analysis.evaluation.metrics import NeesStatistics
 from tsgt.errors import InputFileError
 from tsgt.estimation import Kind, PoseBatch, Reason
 
@@ -84,7 +84,7 @@ def test_nees_of_right_covariances_is_six() -> None:
     rng = np.random.default_rng(3)
     root = rng.normal(size=(6, 6))
     errors = rng.normal(size=(20_000, 6)) @ root.T
-    found = NeesFigures.of(errors, np.broadcast_to(root @ root.T, (20_000, 6, 6)))
+    found = NeesStatistics.of(errors, np.broadcast_to(root @ root.T, (20_000, 6, 6)))
     assert found.mean == pytest.approx(6.0, abs=0.1)
     assert found.above_95 == pytest.approx(0.05, abs=0.006)
 

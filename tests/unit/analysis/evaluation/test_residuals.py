@@ -5,15 +5,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.prior_motion import as_points, draw_motions, in_time, measure
+from harness.prior_motion import as_cartesian, draw_motions, measure, sorted_by_time
 
-from tsgt.analysis.evaluation import outliers, residual_figures
-from tsgt.geometry.trajectory import fit
+from tsgt.analysis.evaluation import outliers, residual_statistics
+from tsgt.geometry.trajectory import fit_trajectory
 from tsgt.model import MotionPrior, PolarMeasurement
 
 if TYPE_CHECKING:
     from tsgt.geometry import Observations
-    from tsgt.geometry.trajectory import Fit
+    from tsgt.geometry.trajectory import TrajectoryFit
 
 PRIOR = MotionPrior()
 
@@ -22,12 +22,12 @@ PRIOR = MotionPrior()
 def observations() -> Observations:
     """Measure a robot that moves as the prior says for a minute, with the noise that is stated."""
     (motion,) = draw_motions(PRIOR, count=1, duration_s=61.0, seed=4)
-    return in_time(measure(motion, until_s=60.0, seed=5))
+    return sorted_by_time(measure(motion, until_s=60.0, seed=5))
 
 
-def fitted(observations: Observations) -> Fit:
+def fitted(observations: Observations) -> TrajectoryFit:
     """Fit it with what is true of it."""
-    return fit(observations, prior=PRIOR, noise_scale=1.0)
+    return fit_trajectory(observations, prior=PRIOR, noise_scale=1.0)
 
 
 def sources(observations: Observations) -> list[PolarMeasurement]:
@@ -50,7 +50,7 @@ def sources(observations: Observations) -> list[PolarMeasurement]:
 
 def test_residuals_are_as_large_as_they_should_be(observations: Observations) -> None:
     """Where motion and noise are as supposed, normalised residuals have a mean of 0 and a standard deviation of 1."""
-    found = residual_figures(fitted(observations), sources(observations))
+    found = residual_statistics(fitted(observations), sources(observations))
     assert list(found) == [10, 11, 12]
     for axes in found.values():
         assert list(axes) == ["range", "horizontal_angle", "zenith_angle"]
@@ -67,7 +67,7 @@ def test_a_noisy_axis_shows(observations: Observations) -> None:
     worse = np.where(observations.prism == 1, along, 0.0)[:, None]
     distance_m = np.linalg.norm(observations.points_m, axis=1)[:, None]
     spoilt = replace(observations, points_m=observations.points_m * (1 + worse / distance_m))
-    found = residual_figures(fitted(spoilt), sources(spoilt))
+    found = residual_statistics(fitted(spoilt), sources(spoilt))
     assert found[11]["range"].std > 2.5
     assert found[11]["horizontal_angle"].std < 1.5
     assert found[10]["range"].std < 1.7
@@ -75,7 +75,7 @@ def test_a_noisy_axis_shows(observations: Observations) -> None:
 
 def test_cartesian_points_have_their_own_axes(observations: Observations) -> None:
     """Nobody knows along which line they were measured."""
-    found = residual_figures(fitted(as_points(observations)), sources(observations))
+    found = residual_statistics(fitted(as_cartesian(observations)), sources(observations))
     assert list(found[10]) == ["x", "y", "z"]
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tsgt.analysis.evaluation import Reference, standing_errors
+from tsgt.analysis.evaluation import Reference, stationary_errors
 from tsgt.estimation import Kind, PoseBatch, Reason
 
 START_NS = 1_700_000_000_000_000_000
@@ -31,10 +31,10 @@ def test_noise_averages_out_and_an_offset_stays() -> None:
     poses.position_m[200:, 1] += 0.003
     poses.orientation_xyzw[200:] = Rotation.from_euler("z", 0.4 + math.radians(1.0)).as_quat()
     stops = [(START_NS, START_NS + 4_950_000_000), (START_NS + 10 * SECOND_NS, START_NS + 20 * SECOND_NS)]
-    found = standing_errors(poses, truth, stops, POINT_M)
+    found = stationary_errors(poses, truth, stops, POINT_M)
     np.testing.assert_allclose(found.position_m, [0.0, 0.003], atol=1e-9)
     np.testing.assert_allclose(np.degrees(found.rotation_rad), [0.0, 1.0], atol=1e-6)
-    figures = found.summary()
+    figures = found.statistics()
     assert figures.stops == 2
     assert figures.position_max_mm == pytest.approx(3.0)
     assert figures.position_mean_mm == pytest.approx(1.5)
@@ -48,7 +48,7 @@ def test_a_robot_that_creeps_is_compared_with_where_it_was() -> None:
     poses.position_m[:, 0] += drift
     truth.position_m[:, 0] += drift
     poses.reason[200:] = Reason.OUTAGE
-    found = standing_errors(poses, truth, [(START_NS, START_NS + 20 * SECOND_NS)], POINT_M)
+    found = stationary_errors(poses, truth, [(START_NS, START_NS + 20 * SECOND_NS)], POINT_M)
     np.testing.assert_allclose(found.position_m, [0.0], atol=1e-9)
 
 
@@ -57,6 +57,6 @@ def test_a_stop_of_less_than_a_second_is_none() -> None:
     poses, truth = stood()
     poses.reason[200:] = Reason.OUTAGE
     stops = [(START_NS, START_NS + 900_000_000), (START_NS + 12 * SECOND_NS, START_NS + 20 * SECOND_NS)]
-    found = standing_errors(poses, truth, stops, POINT_M).summary()
+    found = stationary_errors(poses, truth, stops, POINT_M).statistics()
     assert found.stops == 0
     assert math.isnan(found.position_mean_mm)

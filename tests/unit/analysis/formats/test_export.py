@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.scene import START, driving, standing_scene
+from harness.scene import START, driving, stationary_scene
 
 from tsgt.analysis.formats import measurement_csv, pose_csv, tum_lines, valid_records, valid_rows
 from tsgt.analysis.formats.export import MEASUREMENT_COLUMNS, POSE_COLUMNS
-from tsgt.estimation import Pipeline
+from tsgt.estimation import LinearEstimator
 from tsgt.model import PointMeasurement
 
 if TYPE_CHECKING:
@@ -22,8 +22,8 @@ DOCUMENT = Path(__file__).parents[4] / "docs" / "reference" / "csv.md"
 @pytest.fixture
 def poses() -> PoseBatch:
     """Process some seconds of a driving robot; the first epochs are invalid."""
-    scene = standing_scene().moving(driving)
-    pipeline = Pipeline(scene.parameters)
+    scene = stationary_scene().moving(driving)
+    pipeline = LinearEstimator(scene.parameters)
     for step in range(10):
         for station in (1, 2, 3):
             pipeline.add(scene.measure(station, 0.4 * step + 0.11 * station))
@@ -74,7 +74,7 @@ def test_pose_csv_holds_all_poses(poses: PoseBatch) -> None:
 
 def test_measurement_csv_keeps_raw_values_and_points_apart() -> None:
     """A polar measurement has no position in it, a point no angles, and neither is computed."""
-    polar = standing_scene().measure(2, 0.25)
+    polar = stationary_scene().measure(2, 0.25)
     point = PointMeasurement(
         station=3, prism=3, sequence=7, stamp_ns=1, received_ns=2, position_m=(1.5, -2.0, 0.1)
     )

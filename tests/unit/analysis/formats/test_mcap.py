@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from harness.records import HEADER
-from harness.scene import FRAMES, LAYOUT, START, driving, standing_scene
+from harness.scene import FRAMES, LAYOUT, START, driving, stationary_scene
 from rosbags.highlevel import AnyReader
 
 from tsgt.analysis.evaluation import Reference
 from tsgt.analysis.formats import messages, write_mcap
 from tsgt.errors import MissingExtraError
-from tsgt.estimation import Pipeline, build_tracks
+from tsgt.estimation import LinearEstimator, build_tracks
 from tsgt.geometry import rotation_from_quaternion
 from tsgt.model import StationParameters
 from tsgt.recording import Recording
@@ -28,7 +28,7 @@ DOCUMENT = Path(__file__).parents[4] / "docs" / "reference" / "mcap.md"
 
 Read = dict[str, list[tuple[int, Any]]]
 
-SCENE = standing_scene().moving(driving)
+SCENE = stationary_scene().moving(driving)
 RECORDING = Recording(
     header=HEADER,
     parameters=SCENE.parameters,
@@ -41,7 +41,7 @@ RECORDING = Recording(
 
 def processed(recording: Recording) -> PoseBatch:
     """Process some seconds of a driving robot; the first epochs are invalid."""
-    pipeline = Pipeline(recording.parameters)
+    pipeline = LinearEstimator(recording.parameters)
     for measurement in recording.measurements:
         pipeline.add(measurement)
     return pipeline.advance(START + 3_900_000_000)

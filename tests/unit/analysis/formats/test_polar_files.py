@@ -7,7 +7,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tsgt.analysis.formats import check_tracks, measurement_csv, read_polar_tracks, station_prisms
+from tsgt.analysis.formats import check_tracks, measurement_csv, read_polar_tracks, tracked_prisms
 from tsgt.errors import InputFileError
 from tsgt.model import PointMeasurement, PolarMeasurement, Status
 
@@ -103,7 +103,7 @@ def test_a_file_for_each_station(tmp_path: Path) -> None:
         (2, 8, 0, "low_accuracy"),
         (1, 7, 1, "no_target"),
     ]
-    assert station_prisms(found) == {1: 7, 2: 8}
+    assert tracked_prisms(found) == {1: 7, 2: 8}
 
 
 HEADER = "stamp_ns,station,horizontal_angle_rad,zenith_angle_rad,slope_distance_m,status"

@@ -10,8 +10,8 @@ from harness.pos_files import SECOND, Variant, write_pos
 
 from tsgt.analysis.figures import draw_gnss
 from tsgt.analysis.formats import PosFile, read_pos
-from tsgt.analysis.gnss import common_part, receiver_pairs, receivers
-from tsgt.analysis.gnss.baselines import utc_from_gps
+from tsgt.analysis.gnss import common_interval, receiver_distances, receivers
+from tsgt.analysis.gnss.leap_seconds import utc_from_gps
 from tsgt.errors import InputFileError, MissingExtraError, RecordingError
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from tsgt.analysis.gnss import Distances, Receiver
+    from tsgt.analysis.gnss import DistanceSeries, Receiver
 
 START = 1_653_499_242 * SECOND
 TENTH = SECOND // 10
@@ -151,7 +151,7 @@ def test_a_file_without_any_position_is_refused(tmp_path: Path) -> None:
 
 def test_distances_are_those_on_the_robot(tmp_path: Path) -> None:
     """At common epochs nothing is interpolated, first and last epoch included."""
-    (pair,) = receiver_pairs(two(tmp_path), [0.8])
+    (pair,) = receiver_distances(two(tmp_path), [0.8])
     assert len(pair.times_ns) == 20
     np.testing.assert_allclose(pair.distances_m, np.hypot(0.8, 0.1), atol=3e-4)
     np.testing.assert_allclose(pair.errors_m, np.hypot(0.8, 0.1) - 0.8, atol=3e-4)
@@ -159,7 +159,7 @@ def test_distances_are_those_on_the_robot(tmp_path: Path) -> None:
 
 def test_clocks_that_are_apart_do_not_matter(tmp_path: Path) -> None:
     """At 1 m/s, epochs 8 ms apart would be 8 mm."""
-    (pair,) = receiver_pairs(two(tmp_path, delay_ns=-8_000_000), [0.8])
+    (pair,) = receiver_distances(two(tmp_path, delay_ns=-8_000_000), [0.8])
     assert len(pair.times_ns) == 19
     assert pair.invalid_ns.tolist() == [epochs(20)[-1]]
     np.testing.assert_allclose(pair.distances_m, np.hypot(0.8, 0.1), atol=3e-4)
@@ -167,7 +167,7 @@ def test_clocks_that_are_apart_do_not_matter(tmp_path: Path) -> None:
 
 def test_across_an_outage_there_is_no_distance(tmp_path: Path) -> None:
     """What is between two positions more than 1 s apart is not known; what is on them is."""
-    (pair,) = receiver_pairs(two(tmp_path, count=25, step_ns=12 * TENTH))
+    (pair,) = receiver_distances(two(tmp_path, count=25, step_ns=12 * TENTH))
     assert (np.diff(pair.times_ns) == 12 * TENTH).all()
     assert len(pair.times_ns) + len(pair.invalid_ns) == 25
 
@@ -181,10 +181,10 @@ def test_the_reference_is_the_median_of_fixed_distances(tmp_path: Path) -> None:
         receiver(tmp_path, "a", times_ns, way(times_ns)),
         receiver(tmp_path, "b", times_ns, way(times_ns) + apart, quality=quality),
     ]
-    (pair,) = receiver_pairs(receivers(files))
+    (pair,) = receiver_distances(receivers(files))
     assert pair.reference_m == pytest.approx(0.8, abs=3e-4)
     files[1] = receiver(tmp_path, "b", times_ns, way(times_ns) + apart, quality=[2] * 9)
-    (pair,) = receiver_pairs(receivers(files))
+    (pair,) = receiver_distances(receivers(files))
     assert pair.reference_m == pytest.approx(2.8, abs=3e-4)
 
 
@@ -195,7 +195,7 @@ def test_a_distance_is_as_good_as_the_worse_of_its_positions(tmp_path: Path) -> 
         receiver(tmp_path, "a", times_ns, way(times_ns), quality=[1, 1, 6, 2]),
         receiver(tmp_path, "b", times_ns, way(times_ns), quality=[1, 2, 5, 6]),
     ]
-    (pair,) = receiver_pairs(receivers(files))
+    (pair,) = receiver_distances(receivers(files))
     assert pair.quality is not None
     assert pair.quality.tolist() == [1, 2, 5, 6]
     assert list(pair.by_quality()) == [1, 2, 6, 5]
@@ -208,7 +208,7 @@ def test_a_distance_between_two_positions_is_as_good_as_the_worse(tmp_path: Path
         receiver(tmp_path, "a", epochs(4), way(epochs(4))),
         receiver(tmp_path, "b", later, way(later), quality=[1, 1, 2, 1]),
     ]
-    (pair,) = receiver_pairs(receivers(files))
+    (pair,) = receiver_distances(receivers(files))
     assert pair.quality is not None
     assert pair.quality.tolist() == [1, 2, 2]
 
@@ -224,9 +224,9 @@ def test_names_tell_receivers_apart(tmp_path: Path) -> None:
 
 def test_both_are_cut_to_the_time_that_they_share(tmp_path: Path) -> None:
     """So that figures are of the same stretch of the way."""
-    (pair,) = receiver_pairs(two(tmp_path))
+    (pair,) = receiver_distances(two(tmp_path))
     later = shifted(pair, SECOND)
-    (gnss,), (prisms,) = common_part([pair], [later], tmp_path / "r.jsonl")
+    (gnss,), (prisms,) = common_interval([pair], [later], tmp_path / "r.jsonl")
     assert (gnss.times_ns[0], gnss.times_ns[-1]) == (later.times_ns[0], pair.times_ns[-1])
     assert (prisms.times_ns[0], prisms.times_ns[-1]) == (later.times_ns[0], pair.times_ns[-1])
 
@@ -236,22 +236,22 @@ def test_both_are_cut_to_the_time_that_they_share(tmp_path: Path) -> None:
 )
 def test_what_shares_no_time_is_refused(tmp_path: Path, shift_s: int, message: str) -> None:
     """It tells by how much, for it may be a clock."""
-    (pair,) = receiver_pairs(two(tmp_path))
+    (pair,) = receiver_distances(two(tmp_path))
     with pytest.raises(RecordingError, match=message):
-        common_part([pair], [shifted(pair, shift_s * SECOND)], tmp_path / "r.jsonl")
+        common_interval([pair], [shifted(pair, shift_s * SECOND)], tmp_path / "r.jsonl")
 
 
 def test_no_position_while_prisms_were_seen_is_refused(tmp_path: Path) -> None:
     """The receivers have positions before and after alone."""
     times_ns = np.concatenate([epochs(5), epochs(5, delay_ns=100 * SECOND)])
     files = [receiver(tmp_path, name, times_ns, way(times_ns)) for name in "ab"]
-    (pair,) = receiver_pairs(receivers(files))
-    (prisms,) = receiver_pairs(two(tmp_path))
+    (pair,) = receiver_distances(receivers(files))
+    (prisms,) = receiver_distances(two(tmp_path))
     with pytest.raises(RecordingError, match="the receivers had no positions in common"):
-        common_part([pair], [shifted(prisms, 50 * SECOND)], tmp_path / "r.jsonl")
+        common_interval([pair], [shifted(prisms, 50 * SECOND)], tmp_path / "r.jsonl")
 
 
-def shifted(pair: Distances, by_ns: int) -> Distances:
+def shifted(pair: DistanceSeries, by_ns: int) -> DistanceSeries:
     """Return distances at another time."""
     fields = {name: getattr(pair, name) for name in type(pair).__dataclass_fields__}
     return type(pair)(**(fields | {"times_ns": pair.times_ns + by_ns}))
@@ -269,7 +269,7 @@ def test_the_library_is_named_where_it_is_missing(tmp_path: Path, monkeypatch: p
 def test_a_figure_is_drawn_of_few_and_of_many(tmp_path: Path, count: int) -> None:
     """With prisms and without; also of a receiver that was off all the time."""
     found = two(tmp_path, count=count)
-    pairs = receiver_pairs(found)
+    pairs = receiver_distances(found)
     absent = found[0].between(0, 1)
     assert len(absent.times_ns) == 0
     draw_gnss([*found, absent], [*pairs, pairs[0].between(0, 1)], [], tmp_path / "alone.png")

@@ -13,14 +13,14 @@ from harness.merging import assert_true, journals, merged_in, recording
 from harness.missions import SUPERFRAME, mission
 
 from tsgt.analysis.merge import merge
-from tsgt.analysis.merge.merge import MARGIN_NS, WORST_BOUND_NS
+from tsgt.analysis.merge.merge import MAX_TIME_BOUND_NS, SESSION_MARGIN_NS
 from tsgt.analysis.merge.recording_index import identity
 from tsgt.analysis.processing import process
 from tsgt.config import ScenarioConfig
 from tsgt.config.scenario import StatusFaultConfig
 from tsgt.errors import CorruptLineError, RecordingError
 from tsgt.estimation import Reason, build_observations, instrument_time_sigma_s
-from tsgt.master import replayed
+from tsgt.master.replay import replayed
 from tsgt.model import PolarMeasurement, Status
 from tsgt.recording import RecordingWriter, load_recording
 from tsgt.recording.journal import load_journal
@@ -29,13 +29,13 @@ from tsgt.simulation.options import Outage, Restart
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tsgt.simulation.mission import Mission, Run
+    from tsgt.simulation.mission import Mission, MissionResult
 
 S = 1_000_000_000
 
 
 @pytest.fixture(scope="module")
-def outage(tmp_path_factory: pytest.TempPathFactory) -> Run:
+def outage(tmp_path_factory: pytest.TempPathFactory) -> MissionResult:
     """Over classic, two minutes in which no station hears the master."""
     return mission(
         tmp_path_factory.mktemp("outage"),
@@ -47,13 +47,13 @@ def outage(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 @pytest.fixture(scope="module")
-def short(tmp_path_factory: pytest.TempPathFactory) -> Run:
+def short(tmp_path_factory: pytest.TempPathFactory) -> MissionResult:
     """Over classic, some seconds."""
     return mission(tmp_path_factory.mktemp("short"), duration_s=12.0)
 
 
 @pytest.fixture(scope="module")
-def frames(tmp_path_factory: pytest.TempPathFactory) -> Run:
+def frames(tmp_path_factory: pytest.TempPathFactory) -> MissionResult:
     """Over superframe; from half a minute before the end on nobody hears anybody."""
     return mission(
         tmp_path_factory.mktemp("frames"),
@@ -73,14 +73,14 @@ def measured(path: Path) -> Counter[object]:
     )
 
 
-def journalled(run: Run) -> Counter[object]:
+def journalled(run: MissionResult) -> Counter[object]:
     """Count what the journals hold, likewise."""
     return Counter(
         identity(measurement) for path in journals(run) for measurement in load_journal(path).measurements
     )
 
 
-def added_to(run: Run, path: Path, *, without: int = 0) -> list[PolarMeasurement]:
+def added_to(run: MissionResult, path: Path, *, without: int = 0) -> list[PolarMeasurement]:
     """Merge all journals of a mission into its recording, and return what was added, which must be true."""
     recording(run, path, without=without)
     merged = merge(path, journals(run))
@@ -93,7 +93,7 @@ def added_to(run: Run, path: Path, *, without: int = 0) -> list[PolarMeasurement
 # --- Classic ----------------------------------------------------------------------------------------------------------
 
 
-def test_an_outage_is_closed(outage: Run, tmp_path: Path) -> None:
+def test_an_outage_is_closed(outage: MissionResult, tmp_path: Path) -> None:
     """Poses that the recording alone cannot have are there after a merge, and are where the robot was."""
     path = recording(outage, tmp_path / "r.jsonl")
     before = process(load_recording(path), path=path)
@@ -111,7 +111,7 @@ def test_an_outage_is_closed(outage: Run, tmp_path: Path) -> None:
     assert np.sqrt(np.mean(error_m**2)) < 0.05
 
 
-def test_everything_is_there_once(outage: Run, tmp_path: Path) -> None:
+def test_everything_is_there_once(outage: MissionResult, tmp_path: Path) -> None:
     """Over classic the radio carries the newest measurements only; afterwards all of them are in the recording."""
     path = recording(outage, tmp_path / "r.jsonl")
     merged = merge(path, journals(outage))
@@ -121,7 +121,7 @@ def test_everything_is_there_once(outage: Run, tmp_path: Path) -> None:
     assert merged.bounds_ns[-1] < 5_000_000
 
 
-def test_a_second_merge_adds_nothing(outage: Run, tmp_path: Path) -> None:
+def test_a_second_merge_adds_nothing(outage: MissionResult, tmp_path: Path) -> None:
     """Neither the same journals nor copies of them bring anything that is there."""
     path = recording(outage, tmp_path / "r.jsonl")
     first = merge(path, journals(outage))
@@ -136,7 +136,7 @@ def test_a_second_merge_adds_nothing(outage: Run, tmp_path: Path) -> None:
     )
 
 
-def test_a_copy_of_a_journal_adds_nothing(short: Run, tmp_path: Path) -> None:
+def test_a_copy_of_a_journal_adds_nothing(short: MissionResult, tmp_path: Path) -> None:
     """Also when it is given along with the journal the first time."""
     path = recording(short, tmp_path / "r.jsonl")
     copy = tmp_path / "copy.jsonl"
@@ -145,7 +145,7 @@ def test_a_copy_of_a_journal_adds_nothing(short: Run, tmp_path: Path) -> None:
     assert measured(path) == journalled(short)
 
 
-def test_a_replay_is_the_stream_as_it_was(outage: Run, tmp_path: Path) -> None:
+def test_a_replay_is_the_stream_as_it_was(outage: MissionResult, tmp_path: Path) -> None:
     """What was merged was not on the stream."""
     path = recording(outage, tmp_path / "r.jsonl")
     before = list(replayed(path))
@@ -153,7 +153,7 @@ def test_a_replay_is_the_stream_as_it_was(outage: Run, tmp_path: Path) -> None:
     assert list(replayed(path)) == before
 
 
-def test_an_output_of_its_own(short: Run, tmp_path: Path) -> None:
+def test_an_output_of_its_own(short: MissionResult, tmp_path: Path) -> None:
     """It is the recording with what would have been appended, and the recording stays as it was."""
     path, output = recording(short, tmp_path / "r.jsonl"), tmp_path / "o.jsonl"
     content = path.read_bytes()
@@ -163,7 +163,7 @@ def test_an_output_of_its_own(short: Run, tmp_path: Path) -> None:
     assert output.read_bytes() == path.read_bytes()
 
 
-def test_killed_at_any_byte(short: Run, tmp_path: Path) -> None:
+def test_killed_at_any_byte(short: MissionResult, tmp_path: Path) -> None:
     """Once more, and everything is there once, whatever the kill has left of the last line."""
     path = recording(short, tmp_path / "r.jsonl")
     size = path.stat().st_size
@@ -193,12 +193,12 @@ def test_sessions_and_runs(tmp_path: Path) -> None:
         restarts=(Restart(2, 40.0), Restart(2, 55.0), Restart(None, 80.0)),
         script=set_clock,
     )
-    assert len(run.sessions) == 2
-    assert len(run.witnesses[2].journals) == 3
+    assert len(run.master_logs) == 2
+    assert len(run.station_logs[2].journals) == 3
     path = tmp_path / "r.jsonl"
     # The run from 42 to 55 s was never heard; it shares the computer's clock with the others.
     added = added_to(run, path)
-    silent = load_journal(run.witnesses[2].journals[1]).measurements
+    silent = load_journal(run.station_logs[2].journals[1]).measurements
     assert {identity(m) for m in silent} <= {identity(m) for m in added}
     assert measured(path) == journalled(run)
 
@@ -212,7 +212,7 @@ def test_a_computer_that_wakes_up_in_the_same_hour(tmp_path: Path) -> None:
         await mission.reboot(2, 40.0, 15.0)
 
     run = mission(tmp_path / "m", duration_s=90.0, script=reboot)
-    first, last = (load_journal(path).measurements for path in run.witnesses[2].journals)
+    first, last = (load_journal(path).measurements for path in run.station_logs[2].journals)
     assert first[-1].stamp_ns > last[0].stamp_ns
     path = tmp_path / "r.jsonl"
     added_to(run, path)
@@ -245,7 +245,7 @@ def test_what_was_long_before_is_left_out(tmp_path: Path) -> None:
         mission.start_master()
 
     run = mission(tmp_path / "m", duration_s=200.0, script=late_master)
-    del run.sessions[0]
+    del run.master_logs[0]
     path = tmp_path / "r.jsonl"
     recording(run, path)
     merged = merge(path, journals(run))
@@ -253,14 +253,14 @@ def test_what_was_long_before_is_left_out(tmp_path: Path) -> None:
     added = merged_in(path)
     assert_true(run, added)
     earliest_ns = min(m.stamp_ns for m in added)
-    assert 0 <= earliest_ns - (run.start_ns + 180 * S - MARGIN_NS) < S
-    assert merged.bounds_ns[-1] <= WORST_BOUND_NS
+    assert 0 <= earliest_ns - (run.start_ns + 180 * S - SESSION_MARGIN_NS) < S
+    assert merged.bounds_ns[-1] <= MAX_TIME_BOUND_NS
 
 
 # --- Superframe -------------------------------------------------------------------------------------------------------
 
 
-def test_what_was_never_delivered(frames: Run, tmp_path: Path) -> None:
+def test_what_was_never_delivered(frames: MissionResult, tmp_path: Path) -> None:
     """The mission ends out of reach: what waited in the stations' queues is merged, for a while beyond the last beacon."""
     path = tmp_path / "r.jsonl"
     added = added_to(frames, path)
@@ -269,7 +269,7 @@ def test_what_was_never_delivered(frames: Run, tmp_path: Path) -> None:
     assert merge(path, journals(frames)).added == 0
 
 
-def test_what_the_disk_of_the_master_lost(frames: Run, tmp_path: Path) -> None:
+def test_what_the_disk_of_the_master_lost(frames: MissionResult, tmp_path: Path) -> None:
     """Delivered, but not in the file: found missing by number and content, and timed by the beacons around it."""
     path = tmp_path / "r.jsonl"
     kept = len(load_recording(recording(frames, path)).measurements)
@@ -280,7 +280,7 @@ def test_what_the_disk_of_the_master_lost(frames: Run, tmp_path: Path) -> None:
     assert len(load_recording(path).measurements) == sum(journalled(frames).values())
 
 
-def test_the_instruments_time_counts_once(frames: Run, tmp_path: Path) -> None:
+def test_the_instruments_time_counts_once(frames: MissionResult, tmp_path: Path) -> None:
     """A time that was merged is as sure as one that was delivered, or as its journal says if that is less."""
     path = tmp_path / "r.jsonl"
     added = added_to(frames, path)
@@ -326,12 +326,12 @@ def test_numbers_that_begin_again(tmp_path: Path) -> None:
     async def emptied(mission: Mission) -> None:
         await mission.sleep_until(20.0)
         await mission.kill("station1")
-        mission.witnesses[1].journals[0].rename(kept)
+        mission.station_logs[1].journals[0].rename(kept)
         mission.start_station(1)
 
     run = mission(tmp_path / "m", protocol=SUPERFRAME, duration_s=40.0, script=emptied)
     path = recording(run, tmp_path / "r.jsonl", without=2)
-    of_both = [load_journal(journal).measurements for journal in (kept, *run.witnesses[1].journals)]
+    of_both = [load_journal(journal).measurements for journal in (kept, *run.station_logs[1].journals)]
     assert of_both[0][5].sequence == of_both[1][5].sequence
     before = len(load_recording(path).measurements)
     merged = merge(path, [kept, *journals(run)])
@@ -339,7 +339,7 @@ def test_numbers_that_begin_again(tmp_path: Path) -> None:
     assert before + merged.added == sum(journal.measurements for journal in merged.journals)
 
 
-def test_beacons_of_another_master(frames: Run, tmp_path: Path) -> None:
+def test_beacons_of_another_master(frames: MissionResult, tmp_path: Path) -> None:
     """A journal that heard none of this recording's is not taken for one that belongs to it."""
     path = recording(frames, tmp_path / "r.jsonl")
     other = tmp_path / "other.jsonl"
@@ -357,7 +357,7 @@ def test_beacons_of_another_master(frames: Run, tmp_path: Path) -> None:
 # --- What does not belong together ------------------------------------------------------------------------------------
 
 
-def test_journals_of_another_mission(short: Run, tmp_path: Path) -> None:
+def test_journals_of_another_mission(short: MissionResult, tmp_path: Path) -> None:
     """They are skipped and the reason is told; if there is nothing else, nothing is done."""
     other = mission(tmp_path / "other", duration_s=5.0, seed=9)
     path = recording(short, tmp_path / "r.jsonl")
@@ -373,7 +373,7 @@ def test_journals_of_another_mission(short: Run, tmp_path: Path) -> None:
     assert measured(path) == journalled(short)
 
 
-def test_another_protocol(short: Run, frames: Run, tmp_path: Path) -> None:
+def test_another_protocol(short: MissionResult, frames: MissionResult, tmp_path: Path) -> None:
     """Classic journals have nothing to do with beacons, nor superframe journals with synchronisations."""
     classic, superframe = recording(short, tmp_path / "c.jsonl"), recording(frames, tmp_path / "s.jsonl")
     with pytest.raises(
@@ -384,7 +384,7 @@ def test_another_protocol(short: Run, frames: Run, tmp_path: Path) -> None:
         merge(superframe, journals(short))
 
 
-def test_another_station(short: Run, tmp_path: Path) -> None:
+def test_another_station(short: MissionResult, tmp_path: Path) -> None:
     """A station that the recording does not know is told by its number."""
     path = recording(short, tmp_path / "r.jsonl")
     seventh = tmp_path / "station7.jsonl"
@@ -393,7 +393,7 @@ def test_another_station(short: Run, tmp_path: Path) -> None:
         merge(path, [seventh])
 
 
-def test_files_in_the_wrong_place(short: Run, tmp_path: Path) -> None:
+def test_files_in_the_wrong_place(short: MissionResult, tmp_path: Path) -> None:
     """A journal as recording, a recording as journal, neither: named, and nothing is touched or made."""
     path, journal = recording(short, tmp_path / "r.jsonl"), journals(short)[0]
     with pytest.raises(RecordingError, match="is a station's journal; give the master's recording first"):
@@ -411,7 +411,7 @@ def test_files_in_the_wrong_place(short: Run, tmp_path: Path) -> None:
         merge(path, [journal])
 
 
-def test_a_recording_that_is_being_written(short: Run, tmp_path: Path) -> None:
+def test_a_recording_that_is_being_written(short: MissionResult, tmp_path: Path) -> None:
     """The master has to end first; a copy can be made meanwhile."""
     path = recording(short, tmp_path / "r.jsonl")
     with RecordingWriter(path):
@@ -420,7 +420,7 @@ def test_a_recording_that_is_being_written(short: Run, tmp_path: Path) -> None:
         assert merge(path, journals(short), output=tmp_path / "o.jsonl").added > 0
 
 
-def test_damaged_lines(short: Run, tmp_path: Path) -> None:
+def test_damaged_lines(short: MissionResult, tmp_path: Path) -> None:
     """They are errors, or skipped and told of when that is asked for; the other lines are merged."""
     path, journal = recording(short, tmp_path / "r.jsonl"), tmp_path / "j.jsonl"
     lines = journals(short)[0].read_bytes().splitlines(keepends=True)

@@ -11,9 +11,9 @@ from tsgt.recording import Recording, RecordingHeader
 START_NS = 1_700_000_000_000_000_000
 AWAY: Matrix4 = ((1.0, 0.0, 0.0, 5.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 TARGETS = (
-    TargetResidual(target=4, residual_m=0.003, left_out_m=0.005),
-    TargetResidual(target=7, residual_m=0.004, left_out_m=None),
-    TargetResidual(target=9, residual_m=None, left_out_m=0.06),
+    TargetResidual(target=4, residual_m=0.003, leave_one_out_m=0.005),
+    TargetResidual(target=7, residual_m=0.004, leave_one_out_m=None),
+    TargetResidual(target=9, residual_m=None, leave_one_out_m=0.06),
 )
 
 

@@ -2,12 +2,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from harness.scene import SECOND, START, Scene, driving, standing_scene
+from harness.scene import SECOND, START, Scene, driving, stationary_scene
 
-from tsgt.analysis.evaluation import at_epochs, inter_prism
-from tsgt.analysis.figures import Clock
+from tsgt.analysis.evaluation import distances_at_epochs, inter_prism
+from tsgt.analysis.figures import TimeAxis
 from tsgt.analysis.figures.axes import BUCKETS, thinned
-from tsgt.analysis.report.motion import BINS, binned, gridded, ride
+from tsgt.analysis.report.motion import BINS, binned, distance_error_series, gridded
 from tsgt.estimation import Track, build_tracks
 
 
@@ -25,30 +25,30 @@ def tracks_of(scene: Scene, *, duration_s: float = 8.0) -> dict[int, Track]:
 
 def test_a_standing_robot_has_no_errors_and_one_interval() -> None:
     """Exact measurements give the distances of the layout at each epoch."""
-    scene = standing_scene()
+    scene = stationary_scene()
     tracks = tracks_of(scene)
-    found = ride(scene.parameters, at_epochs(scene.parameters, tracks), None)
+    found = distance_error_series(scene.parameters, distances_at_epochs(scene.parameters, tracks), None)
     assert list(found.error_m) == ["1-2", "1-3", "2-3"]
     for error_m in found.error_m.values():
         np.testing.assert_allclose(error_m, 0.0, atol=1e-9)
-    assert len(inter_prism(scene.parameters, tracks).still_ns) == 1
+    assert len(inter_prism(scene.parameters, tracks).stationary_ns) == 1
     assert np.isnan(found.motion.speed_mps).all()
 
 
 def test_straight_lines_cut_a_bend() -> None:
     """A driving robot's distances are off where tracks are interpolated, and no interval is still."""
-    scene = standing_scene().moving(driving)
+    scene = stationary_scene().moving(driving)
     tracks = tracks_of(scene)
-    found = ride(scene.parameters, at_epochs(scene.parameters, tracks), None)
+    found = distance_error_series(scene.parameters, distances_at_epochs(scene.parameters, tracks), None)
     assert max(np.abs(error_m).max() for error_m in found.error_m.values()) > 1e-4
-    assert inter_prism(scene.parameters, tracks).still_ns == ()
+    assert inter_prism(scene.parameters, tracks).stationary_ns == ()
 
 
 def test_distances_are_taken_in_the_given_intervals() -> None:
     """Somebody else may know better when the robot stood; outside nothing counts."""
-    scene = standing_scene()
+    scene = stationary_scene()
     found = inter_prism(scene.parameters, tracks_of(scene), [(START + SECOND, START + 3 * SECOND)])
-    assert found.still_s == 2.0
+    assert found.stationary_s == 2.0
     assert [pair.name for pair in found.static] == ["1-2", "1-3", "2-3"]
     for pair in found.static:
         assert len(pair.distances_m) == 5
@@ -57,14 +57,14 @@ def test_distances_are_taken_in_the_given_intervals() -> None:
 
 def test_standing_before_and_after_the_recording_does_not_count() -> None:
     """Odometry runs longer than stations measure; of another day nothing is left."""
-    scene = standing_scene()
+    scene = stationary_scene()
     tracks = tracks_of(scene)
     hour = 3600 * SECOND
     last_s = 0.4 * 19 + 0.33
     found = inter_prism(scene.parameters, tracks, [(START - hour, START + hour)])
-    assert found.still_s == pytest.approx(last_s - 0.11)
+    assert found.stationary_s == pytest.approx(last_s - 0.11)
     other_day = inter_prism(scene.parameters, tracks, [(START - 2 * hour, START - hour)])
-    assert other_day.still_ns == ()
+    assert other_day.stationary_ns == ()
     assert all(not len(pair.distances_m) for pair in other_day.static)
 
 
@@ -123,6 +123,6 @@ def test_a_long_curve_keeps_its_peaks_and_its_gaps() -> None:
 @pytest.mark.parametrize(("span_s", "unit"), [(100, "(s)"), (3600, "(min)"), (40_000, "(h)")])
 def test_the_axis_of_time_has_small_numbers(span_s: int, unit: str) -> None:
     """Its unit follows from how long the recording is."""
-    clock = Clock.over(START, START + span_s * SECOND)
+    clock = TimeAxis.over(START, START + span_s * SECOND)
     assert clock.label.endswith(unit)
     assert float(clock.of(START + span_s * SECOND)) <= 300

@@ -1,8 +1,8 @@
-"""The report's page, whatever stands in a recording."""
+"""The report's render_page, whatever stands in a recording."""
 
 from __future__ import annotations
 
-from tsgt.analysis.report import page
+from tsgt.analysis.report import render_page
 from tsgt.analysis.report.page import Section, Table
 from tsgt.analysis.report.verdicts import Level, Verdict
 
@@ -11,7 +11,7 @@ def test_text_from_outside_is_no_markup() -> None:
     """Names of files, sources and events are shown as they are; none becomes a tag or ends an attribute."""
     evil = "<script>alert(1)</script>\"'><img src=x onerror=alert(1)>`<b>`"
     table = Table(caption=evil, header=(evil, evil), rows=((evil, evil),))
-    text = page(
+    text = render_page(
         evil,
         table,
         [Verdict(Level.BAD, evil)],

@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.scene import SECOND, START, standing_scene
+from harness.scene import SECOND, START, stationary_scene
 
 from tsgt.analysis.report.log import read_log
-from tsgt.analysis.report.stations import station_figures, station_records
+from tsgt.analysis.report.stations import station_records, station_statistics
 from tsgt.model import Status
 
 if TYPE_CHECKING:
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 
 def test_a_station_is_summed_up() -> None:
     """Rate, gaps, statuses and delays are those of its measurements; one sent twice counts once."""
-    scene = standing_scene()
+    scene = stationary_scene()
     times_s = [0.0, 0.5, 1.0, 1.5, 4.0, 4.5, 5.0]
     measurements = [scene.measure(1, t) for t in times_s]
     measurements += [measurements[0], scene.measure(1, 2.0, status=Status.NO_TARGET)]
     records = station_records(measurements, [1, 2])
     assert [record.station for record in records] == [1, 2]
-    found = station_figures(records[0], start_ns=START, end_ns=START + 5 * SECOND, outage_limit_ns=SECOND)
+    found = station_statistics(records[0], start_ns=START, end_ns=START + 5 * SECOND, outage_limit_ns=SECOND)
     assert (found.measurements, found.usable) == (8, 7)
     assert found.rate_hz == pytest.approx(6 / 5)
     assert found.longest_gap_s == pytest.approx(2.5)
@@ -37,7 +37,7 @@ def test_a_station_is_summed_up() -> None:
 def test_a_station_that_sent_nothing_is_one_gap() -> None:
     """It has an entry all the same."""
     (record,) = station_records([], [3])
-    found = station_figures(record, start_ns=START, end_ns=START + 5 * SECOND, outage_limit_ns=SECOND)
+    found = station_statistics(record, start_ns=START, end_ns=START + 5 * SECOND, outage_limit_ns=SECOND)
     assert found.usable == 0
     assert (found.gaps, found.in_gaps, found.longest_gap_s) == (1, 1.0, 5.0)
     assert np.isnan(found.rate_hz)

@@ -10,7 +10,7 @@ from harness.clock_exchanges import SECOND, START_NS, exchange
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tsgt.analysis.merge.timing import by_synchronisations
+from tsgt.analysis.merge.timing import times_from_synchronisations
 
 MS = 1_000_000
 LARGEST_SWING_PPM = 10.0
@@ -57,7 +57,7 @@ def test_bound_contains_the_truth(
                 offset_ns,
                 late_ns=round(rng.normal(0, 5_000))
                 + (round(rng.exponential(late_ms * MS)) if rng.random() < late_share else 0),
-                turn_round_ns=round(rng.uniform(1, 8) * MS),
+                turnaround_ns=round(rng.uniform(1, 8) * MS),
             )
             for cycle in range(cycles if number == 0 else 5)
             if rng.random() >= loss
@@ -72,7 +72,7 @@ def test_bound_contains_the_truth(
         for time_s in np.linspace(before_s, after_s, 9).tolist()
     ]
     stamps_ns = [START_NS + true_ns + round(offset_ns(true_ns)) for true_ns in truths_ns]
-    found = by_synchronisations(synchronisations, stamps_ns)
+    found = times_from_synchronisations(synchronisations, stamps_ns)
     for true_ns, time in zip(truths_ns, found, strict=True):
         assert time is not None
         assert abs(time.unix_ns - START_NS - true_ns) <= time.bound_ns

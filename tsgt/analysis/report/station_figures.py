@@ -6,31 +6,23 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.figures.axes import curve, dots, hatch, plain_log, shade, stroke
+from tsgt.analysis.figures import curve, dots, hatch, legend_above, plain_log, shade, stroke
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from tsgt.analysis.evaluation import InterPrism, PairDistances
-    from tsgt.analysis.figures.axes import Clock
+    from tsgt.analysis.evaluation import InterPrismDistances, PairDistances
+    from tsgt.analysis.figures import TimeAxis
     from tsgt.analysis.report.log import ClockSeries, RadioSeries
-    from tsgt.analysis.report.motion import Bins, Grid, Ride
+    from tsgt.analysis.report.motion import Bins, DistanceErrorSeries, Grid
     from tsgt.analysis.report.stations import StationRecord
-
-_PANEL_MM = 26.0
-
-
-def panels_height_mm(rows: int) -> float:
-    """Height of a figure with that many panels, one above the other."""
-    return 18.0 + _PANEL_MM * rows
 
 
 def draw_gaps(
-    figure: Figure, stations: Sequence[StationRecord], clock: Clock, outage_limit_s: float, end_ns: int
+    figure: Figure, stations: Sequence[StationRecord], clock: TimeAxis, outage_limit_s: float, end_ns: int
 ) -> None:
     """Draw for each station how long before each measurement the last usable one was, and which are not usable.
 
@@ -78,10 +70,10 @@ def draw_gaps(
     axes[0].set_ylim(min(low, 0.15), max(1.4 * high, 3.0))
     figure.supylabel("time since the usable measurement before (s)", fontsize=8)
     axes[-1].set_xlabel(clock.label)
-    _legend_above(figure, list(axes))
+    legend_above(figure, list(axes))
 
 
-def draw_radio(figure: Figure, radio: Mapping[int, RadioSeries], clock: Clock) -> None:
+def draw_radio(figure: Figure, radio: Mapping[int, RadioSeries], clock: TimeAxis) -> None:
     """Draw strength, ratio to the noise and loss of each station's radio over time."""
     axes = figure.subplots(3, 1, sharex=True)
     for row, (station, series) in enumerate(radio.items()):
@@ -94,11 +86,11 @@ def draw_radio(figure: Figure, radio: Mapping[int, RadioSeries], clock: Clock) -
     top = max(5.0, axes[2].get_ylim()[1])
     axes[2].set_ylim(-0.05 * top, top)
     axes[2].set_xlabel(clock.label)
-    _legend_above(figure, [axes[0]])
+    legend_above(figure, [axes[0]])
 
 
 def draw_clocks(
-    figure: Figure, clocks: Mapping[int, ClockSeries], stations: Sequence[StationRecord], clock: Clock
+    figure: Figure, clocks: Mapping[int, ClockSeries], stations: Sequence[StationRecord], clock: TimeAxis
 ) -> None:
     """Draw how the stations' clocks wander, where synchronisations were recorded, and the bounds of all stamps."""
     bounded = [s for s in stations if np.isfinite(s.bound_ns).any()]
@@ -141,10 +133,10 @@ def draw_clocks(
             panel.set_ylim(least / 1.2 if wide else 0.0, max(1.2 * most, 1e-3))
     panels[-1].set_xlabel(clock.label)
     figure.align_ylabels(panels)
-    _legend_above(figure, list(panels))
+    legend_above(figure, list(panels))
 
 
-def draw_histograms(figure: Figure, found: InterPrism) -> None:
+def draw_histograms(figure: Figure, found: InterPrismDistances) -> None:
     """Draw the distances of each pair, standing above moving, about that of the layout."""
     axes = figure.subplots(2, len(found.dynamic), squeeze=False, sharex=True)
     spread = [
@@ -160,7 +152,7 @@ def draw_histograms(figure: Figure, found: InterPrism) -> None:
                 axes[row, column].set_ylabel(f"{name}\nshare (%)")
         axes[0, column].set_title(f"prisms {static.name}, layout {1e3 * static.reference_m:.1f} mm")
     figure.supxlabel("measured distance less that of the layout (mm)", fontsize=8)
-    _legend_above(figure, list(axes.ravel()))
+    legend_above(figure, list(axes.ravel()))
 
 
 def _histogram(panel: Axes, pair: PairDistances, reach_mm: float, row: int) -> None:
@@ -191,12 +183,14 @@ def _histogram(panel: Axes, pair: PairDistances, reach_mm: float, row: int) -> N
     )
 
 
-def draw_ride(figure: Figure, ride: Ride, still_ns: Sequence[tuple[int, int]], clock: Clock) -> None:
+def draw_distance_errors(
+    figure: Figure, ride: DistanceErrorSeries, stationary_ns: Sequence[tuple[int, int]], clock: TimeAxis
+) -> None:
     """Draw the error of each distance over time, and below it how the robot moved; shade where it stood."""
     pairs = list(ride.error_m.items())
     axes = figure.subplots(len(pairs) + 2, 1, sharex=True)
     time = clock.of(ride.stamp_ns)
-    still = [(float(clock.of(a)), float(clock.of(b))) for a, b in still_ns]
+    still = [(float(clock.of(a)), float(clock.of(b))) for a, b in stationary_ns]
     known = [1e3 * e[np.isfinite(e)] for _, e in pairs]
     reach = max((float(np.percentile(np.abs(e), 99.8)) for e in known if len(e)), default=1.0)
     for panel, (name, error_m) in zip(axes, pairs, strict=False):
@@ -206,7 +200,7 @@ def draw_ride(figure: Figure, ride: Ride, still_ns: Sequence[tuple[int, int]], c
         panel.set_ylabel(f"{name}\nerror (mm)")
     for panel, values, label in (
         (axes[-2], ride.motion.speed_mps, "speed\n(m/s)"),
-        (axes[-1], ride.motion.turning_radps, "angular rate\n(rad/s)"),
+        (axes[-1], ride.motion.angular_rate_radps, "angular rate\n(rad/s)"),
     ):
         curve(panel, time, values, 0, label=None, dashes=False)
         panel.set_ylabel(label)
@@ -215,7 +209,7 @@ def draw_ride(figure: Figure, ride: Ride, still_ns: Sequence[tuple[int, int]], c
         shade(panel, still, "standing still")
     axes[-1].set_xlabel(clock.label)
     figure.align_ylabels(axes)
-    _legend_above(figure, axes[:1])
+    legend_above(figure, axes[:1])
 
 
 def draw_bins(figure: Figure, bins: Sequence[tuple[str, Bins | None]]) -> None:
@@ -257,7 +251,7 @@ def draw_bins(figure: Figure, bins: Sequence[tuple[str, Bins | None]]) -> None:
     axes[1, 0].set_ylim(bottom=1.0)
     axes[0, 0].set_ylabel("|distance error| (mm)")
     axes[1, 0].set_ylabel("distances")
-    _legend_above(figure, axes[0])
+    legend_above(figure, axes[0])
 
 
 def draw_grids(figure: Figure, grids: Sequence[tuple[str, str, Grid]]) -> None:
@@ -310,15 +304,4 @@ def draw_statuses(figure: Figure, stations: Sequence[StationRecord]) -> None:
     panel.set_xlabel("share of its measurements (%)")
     panel.set_xlim(0, 100)
     if names:
-        _legend_above(figure, [panel])
-
-
-def _legend_above(figure: Figure, axes: Sequence[Axes]) -> None:
-    """One legend for all panels, each name once."""
-    found: dict[str, Artist] = {}
-    for panel in axes:
-        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
-            found.setdefault(str(label), handle)
-    if found:
-        columns = min(len(found), 6)
-        figure.legend(list(found.values()), list(found), loc="outside upper center", ncols=columns)
+        legend_above(figure, [panel])

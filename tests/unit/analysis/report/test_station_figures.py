@@ -7,9 +7,9 @@ import pytest
 
 pytest.importorskip("matplotlib")
 
-from tsgt.analysis.figures import Clock, drawing
-from tsgt.analysis.figures.stations import draw_clocks, draw_gaps
+from tsgt.analysis.figures import TimeAxis, drawing
 from tsgt.analysis.report import StationRecord
+from tsgt.analysis.report.station_figures import draw_clocks, draw_gaps
 
 SECOND = 1_000_000_000
 
@@ -33,7 +33,7 @@ def test_the_bounds_of_all_stations_are_on_one_scale_that_holds_them() -> None:
     """Each station has its panel; a scale that fits the first alone would cut the others off."""
     stations = [record(1, 0.0, 9.0, 1.0), record(2, 0.0, 9.0, 0.02), record(3, 0.0, 9.0, 40.0)]
     with drawing(width_mm=100, height_mm=100) as figure:
-        draw_clocks(figure, {}, stations, Clock.over(0, 9 * SECOND))
+        draw_clocks(figure, {}, stations, TimeAxis.over(0, 9 * SECOND))
         limits = {panel.get_ylim() for panel in figure.axes}
         assert len(figure.axes) == 3
         assert len(limits) == 1
@@ -46,7 +46,7 @@ def test_a_station_that_ends_early_has_its_gap_in_the_figure() -> None:
     """It is the longest one in the table, so it must be seen: from the last measurement to the end of all."""
     stations = [record(1, 0.0, 20.0, 1.0), record(2, 0.0, 8.0, 1.0)]
     with drawing(width_mm=100, height_mm=100) as figure:
-        draw_gaps(figure, stations, Clock.over(0, 20 * SECOND), 1.0, 20 * SECOND)
+        draw_gaps(figure, stations, TimeAxis.over(0, 20 * SECOND), 1.0, 20 * SECOND)
         marks = [
             [line.get_xydata() for line in panel.lines if line.get_label() == "gap at start or end"]
             for panel in figure.axes

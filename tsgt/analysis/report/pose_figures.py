@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.figures.axes import banded, curve, dots, plain_log, stroke
+from tsgt.analysis.figures import banded, curve, dots, plain_log, stroke
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-    from tsgt.analysis.evaluation import HeldOut
-    from tsgt.analysis.figures.axes import Clock
+    from tsgt.analysis.evaluation import HeldOutErrors
+    from tsgt.analysis.figures import TimeAxis
     from tsgt.analysis.processing import Estimator
     from tsgt.analysis.report.findings import Difference
     from tsgt.estimation import PoseBatch
@@ -69,7 +69,7 @@ def draw_map(figure: Figure, poses: PoseBatch, stations: Mapping[int, FloatArray
     figure.legend(loc="outside upper center", ncols=4)
 
 
-def draw_coordinates(figure: Figure, poses: PoseBatch, clock: Clock) -> None:
+def draw_coordinates(figure: Figure, poses: PoseBatch, clock: TimeAxis) -> None:
     """Draw the position over time, and below it the sigmas of position and rotation that the poses state."""
     axes = figure.subplots(5, 1, sharex=True)
     time, valid = clock.of(poses.stamp_ns), poses.valid
@@ -95,7 +95,7 @@ def draw_coordinates(figure: Figure, poses: PoseBatch, clock: Clock) -> None:
     figure.legend(handles, [f"sigma {x}" for x in labels], loc="outside upper center", ncols=2)
 
 
-def draw_held_out(figure: Figure, misses: Mapping[Estimator, HeldOut]) -> None:
+def draw_held_out(figure: Figure, misses: Mapping[Estimator, HeldOutErrors]) -> None:
     """Draw how many of the left-out measurements each estimator missed by how much."""
     axes = figure.subplots(1, 2, sharey=True)
     for panel, gap, title in zip(
@@ -103,7 +103,7 @@ def draw_held_out(figure: Figure, misses: Mapping[Estimator, HeldOut]) -> None:
     ):
         reach_mm = 0.0
         for row, (name, each) in enumerate(misses.items()):
-            chosen = np.sort(1e3 * each.missed_m[each.at_gap == gap])
+            chosen = np.sort(1e3 * each.error_m[each.at_gap == gap])
             share = 100 * np.arange(1, len(chosen) + 1) / max(1, len(chosen))
             look = stroke(row)
             panel.plot(chosen, share, color=look.color, linestyle=look.linestyle, label=name)
@@ -121,7 +121,7 @@ def draw_held_out(figure: Figure, misses: Mapping[Estimator, HeldOut]) -> None:
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
 
 
-def draw_difference(figure: Figure, difference: Difference, clock: Clock) -> None:
+def draw_difference(figure: Figure, difference: Difference, clock: TimeAxis) -> None:
     """Draw how far the poses of the two estimators are apart."""
     axes = figure.subplots(2, 1, sharex=True)
     time, position, rotation = _with_gaps(difference)
@@ -140,7 +140,7 @@ def draw_residuals(
     normalised: FloatArray,
     stamp_ns: NDArray[np.int64],
     station: NDArray[np.int64],
-    clock: Clock,
+    clock: TimeAxis,
 ) -> None:
     """Draw the normalised residuals of each station over time.
 

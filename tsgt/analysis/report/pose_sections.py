@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.analysis.figures import draw_perturbation, panels_height_mm
-from tsgt.analysis.figures import poses as draw
+from tsgt.analysis.report import pose_figures as draw
 from tsgt.analysis.report.elements import LISTED, number, utc, wide
 from tsgt.analysis.report.numbers import apart, of_poses
-from tsgt.analysis.report.page import Plot, Section, Table
+from tsgt.analysis.report.page import ReportFigure, Section, Table
 from tsgt.estimation import Kind
 from tsgt.model import PolarMeasurement
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from tsgt.analysis.figures import Clock
+    from tsgt.analysis.figures import TimeAxis
     from tsgt.analysis.report.findings import Findings
 
 
@@ -76,7 +76,7 @@ def reference_tables(f: Findings) -> list[Table]:
     return tables
 
 
-def estimators(f: Findings, clock: Clock) -> Section:
+def estimators(f: Findings, clock: TimeAxis) -> Section:
     """Tell how well both estimators do."""
     text = [
         f"The estimator {name} gives no poses: {f.problems[name]}."
@@ -90,7 +90,7 @@ def estimators(f: Findings, clock: Clock) -> Section:
         rows = [
             (label, str(m.n), number(m.mean), number(m.median), number(m.p95))
             for name, each in f.held_out.items()
-            for label, m in ((name, each.figures), (f"{name}, at gaps over 1 s", each.gaps))
+            for label, m in ((name, each.statistics), (f"{name}, at gaps over 1 s", each.gaps))
         ]
         tables.append(
             Table(
@@ -178,7 +178,7 @@ def _poses_of(f: Findings) -> Table:
     )
 
 
-def trajectory(f: Findings, clock: Clock) -> Section:
+def trajectory(f: Findings, clock: TimeAxis) -> Section:
     """Tell where the robot went."""
     poses = f.poses
     if poses is None:
@@ -207,7 +207,7 @@ def trajectory(f: Findings, clock: Clock) -> Section:
     return Section("Trajectory", (f"Poses are {estimator}.",), plots=plots)
 
 
-def residuals(f: Findings, clock: Clock) -> Section:
+def residuals(f: Findings, clock: TimeAxis) -> Section:
     """Tell how far measurements are from the trajectory."""
     if f.continuous is None:
         return Section("Residuals", ("There are none without the continuous trajectory.",))
@@ -284,4 +284,4 @@ def perturbation(f: Findings) -> Section:
         "Errors of the pose over noise on the prisms, for this layout: mean and spread per axis, and of the length. Dotted: "
         "what first-order propagation says."
     )
-    return Section(title, text, plots=(Plot("perturbation", caption, write),))
+    return Section(title, text, plots=(ReportFigure("perturbation", caption, write),))

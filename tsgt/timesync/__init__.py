@@ -1,25 +1,21 @@
-"""TODO face."""
+"""All clock models of the system: whose clock follows whose, with offset, skew, and bound. Sans-I/O; at most numpy.
 
-from tsgt.timesync.beacon_clock import MOST_PAIRS, BeaconClock
-from tsgt.timesync.instrument_clock import LATEST_NS, InstrumentClock
-from tsgt.timesync.link_delay import RoundTrip
-from tsgt.timesync.offset_regression import highest_offset_ns, sag_ns
-from tsgt.timesync.periodicity import Beat, Rhythm
-from tsgt.timesync.two_way import ArrivalCheck, ClockEstimate, ClockFilter, RegressionFilter, clock_filter
+In: timestamps of one-way messages, two-way exchanges, or an instrument's responses. Out: times on the other clock with
+sigma and bound. The station uses `beacon_clock` (the master's session time) and `instrument_clock`; the master uses
+`two_way` (a station's clock), `link_delay`, and `periodicity`. All build on `clock_line`.
+"""
+
+from tsgt.timesync.beacon_clock import MAX_SAMPLES, BeaconClock
+from tsgt.timesync.instrument_clock import MAX_DELAY_NS, InstrumentClock
+from tsgt.timesync.link_delay import LinkDelayEstimator
+from tsgt.timesync.periodicity import Period, Periodicity
 
 __all__ = [
-    "LATEST_NS",
-    "MOST_PAIRS",
-    "ArrivalCheck",
+    "MAX_DELAY_NS",
+    "MAX_SAMPLES",
     "BeaconClock",
-    "Beat",
-    "ClockEstimate",
-    "ClockFilter",
     "InstrumentClock",
-    "RegressionFilter",
-    "Rhythm",
-    "RoundTrip",
-    "clock_filter",
-    "highest_offset_ns",
-    "sag_ns",
+    "LinkDelayEstimator",
+    "Period",
+    "Periodicity",
 ]

@@ -1,9 +1,8 @@
-"""The master's session time on a station's clock, from the beacons that it receives.
+"""The master's session time on a station's clock, from the beacons that the station receives.
 
-Each beacon says when the one before it left. So every beacon that is received, with one after it, makes a *pair*: when
-the station received it, on its CLOCK_MONOTONIC, and the session time at which the master had sent it. The time between
-the two, the link constant, is the same for all; the master adds it. docs/explanation/superframe-clock.md says how the
-fit works, what its bound allows for, and what it has been seen to do.
+Each beacon states when the previous one was sent. So every received beacon that is followed by another makes a sample:
+its reception on the station's CLOCK_MONOTONIC, and the session time at which the master sent it. The time between the
+two, the link delay, is constant; the master adds it. docs/explanation/superframe-clock.md explains the fit and its bound.
 """
 
 from __future__ import annotations
@@ -13,49 +12,48 @@ from bisect import bisect_right
 from collections import deque
 from typing import NamedTuple
 
-from tsgt.timesync.dual_rate import Pair, Stretch, bound_us, rate_bound_ppm
+from tsgt.timesync.dual_rate import BeaconSample, ClockSegment
 
 SENDER_SIGMA_NS = 20_000
 COARSE_SENDER_SIGMA_NS = 1_000_000
-"""The pair contains the master's stamp too, of which the station is told nothing. So at first it is taken to be as
-coarse as stamps can be, until there are enough pairs to see how they scatter."""
+"""Sigma of the master's timestamp, which no beacon states: the coarse one until enough samples show their jitter."""
 
-UNKNOWN_RATE_PPM = 120.0
-"""Two computers' clocks run apart by no more than this, unless pairs show it."""
+MAX_SKEW_PPM = 120.0
+"""Bound of the skew between two computers' clocks before it is measured."""
 
-DOUBTED_US = 200.0
-"""A pair that is further off than this, and than is honest, cannot be what it says."""
+MAX_DEVIATION_US = 200.0
+"""A sample that deviates by more than this, and by more than the gate, is rejected."""
 
-_RATE_SIGMA_PPM = 30.0
+_SKEW_SIGMA_PPM = 30.0
 _SLEWED_SIGMA_PPM = 200.0
-"""What is known of the rate of a new clock, and of one that somebody has just touched."""
+"""Prior of the skew of a new clock, and of one that has just been slewed."""
 
-_FEWEST_RIVALS = 5
-"""So many pairs in a row that agree with each other outvote the fit that they do not agree with."""
+_MIN_CANDIDATE_SAMPLES = 5
+"""This many consecutive samples that agree with each other start a new segment against the current one."""
 
-MOST_PAIRS = 10_000
-_FORGOTTEN = 1_000
-"""An hour and more at the usual rate; let go of in large parts."""
+MAX_SAMPLES = 10_000
+_DROPPED_SAMPLES = 1_000
+"""An hour and more at the usual rate, and how many are dropped at a time."""
 
-_UNIQUE_US = 30_000.0
-"""Within half of 2^16 us the low bits of a time tell which it is; a little is left for stamps."""
-_LOW_BITS_US = 65_536.0
-_SURE_US = 5_000.0
+_MAX_UNWRAP_BOUND_US = 30_000.0
+"""The 16 low bits of a time are unambiguous within half of 2^16 us, less a margin for timestamps."""
+_WRAP_US = 65_536.0
+_MAX_UNWRAPPED_JUMP_US = 5_000.0
 """An offset that seems to have jumped by more than this may have jumped by 2^16 us more."""
 
-_FEWEST_IN_FULL = 2
-"""A single beacon may have been held back by any time. Two in a row by the same would be worse luck than there is."""
+_MIN_INITIAL_SAMPLES = 2
+"""One beacon can be delayed by any time; two in a row by the same delay are too unlikely."""
 
 
-class Instant(NamedTuple):
+class TimeEstimate(NamedTuple):
     """A time on the master's clock, or a duration.
 
     Attributes
     ----------
     time_us
-        In us; session time as stations give it, without the link constant.
+        Session time without the link delay.
     sigma_us
-        One standard error, as far as jitter and a usual crystal tell.
+        One sigma from jitter and the wander of a usual crystal.
     bound_us
         The truth is within this of ``time_us``.
     """
@@ -66,344 +64,335 @@ class Instant(NamedTuple):
 
 
 class _Jitter:
-    """How much stamps scatter, as a multiple of what they claim, from how each pair fits between its neighbours.
+    """Scale of the timestamps' scatter over their claimed sigma, from each sample's deviation from its neighbours.
 
-    What is believed beforehand counts for a few pairs, what is longer ago than some more is forgotten, and as long as
-    there have been few the scatter is taken to be larger than it looks.
+    A running mean square with a prior and exponential forgetting; inflated while there are few samples.
     """
 
-    _ENOUGH = 8
-    _FEW = 16
+    _MIN_SAMPLES = 8
+    _SMALL_SAMPLE_INFLATION = 16
     _PRIOR = 1.5
-    _PRIOR_PAIRS = 4.0
-    _MEMORY_PAIRS = 60.0
-    _LEAST = 0.1
+    _PRIOR_WEIGHT = 4.0
+    _MEMORY_SAMPLES = 60.0
+    _MIN_SCALE = 0.1
 
-    _MOST_AT_ONCE = 1_000.0
-    """An outlier is no scatter: with sixty pairs one counts for 17 times the mean square at most. Where all of them are
-    large the limit rises with each."""
+    _MAX_SQUARE = 1_000.0
+    """Cap of one sample's weighted square: an outlier is no jitter. Where all are large the cap rises with each."""
 
-    _LONGEST_NS = 15_000_000_000
-    """Between neighbours that are further apart a clock may wander by as much as stamps scatter."""
+    _MAX_SPAN_NS = 15_000_000_000
+    """Between neighbours further apart a clock may wander by as much as timestamps scatter."""
 
     def __init__(self) -> None:
-        self._pairs = self._PRIOR_PAIRS
+        self._weight = self._PRIOR_WEIGHT
         self._square = self._PRIOR**2
         self._seen = 0
         self._last: deque[tuple[int, int, float]] = deque(maxlen=3)
 
     @property
     def known(self) -> bool:
-        """Whether there were enough pairs."""
-        return self._seen >= self._ENOUGH
+        """Whether there were enough samples."""
+        return self._seen >= self._MIN_SAMPLES
 
     def variance_us2(self, sigma_ns: int) -> float:
-        """Return the variance of a pair whose reception claims this sigma, in us^2; never less than claimed."""
+        """Return the variance of a sample whose reception claims this sigma; never less than claimed."""
         if not self.known:
             return (sigma_ns**2 + COARSE_SENDER_SIGMA_NS**2) / 1e6
-        square = self._square * (1 + self._FEW / self._seen)
+        square = self._square * (1 + self._SMALL_SAMPLE_INFLATION / self._seen)
         return max(square * _claimed_us2(sigma_ns), sigma_ns**2 / 1e6, 1.0)
 
-    def add(self, pair: Pair) -> None:
-        """Learn from a pair and the two before it."""
-        self._last.append((pair.received_ns, pair.sent_ns - pair.received_ns, _claimed_us2(pair.sigma_ns)))
+    def add(self, sample: BeaconSample) -> None:
+        """Take the newest sample, which completes the neighbourhood of the one before it."""
+        offset_ns = sample.sent_ns - sample.received_ns
+        self._last.append((sample.received_ns, offset_ns, _claimed_us2(sample.sigma_ns)))
         if len(self._last) < 3:
             return
         (t0, y0, v0), (t1, y1, v1), (t2, y2, v2) = self._last
-        if t2 - t0 > self._LONGEST_NS:
+        if t2 - t0 > self._MAX_SPAN_NS:
             return
         share = (t1 - t0) / (t2 - t0)
-        missed_us = (y1 - y0 - share * (y2 - y0)) / 1000
+        deviation_us = (y1 - y0 - share * (y2 - y0)) / 1000
         expected = v1 + (1 - share) ** 2 * v0 + share**2 * v2
-        square = min(missed_us**2 / expected, self._MOST_AT_ONCE / self._pairs * self._square)
+        square = min(deviation_us**2 / expected, self._MAX_SQUARE / self._weight * self._square)
         self._seen += 1
-        self._pairs = min(self._pairs + 1, self._MEMORY_PAIRS)
-        self._square += (square - self._square) / self._pairs
-        self._square = max(self._square, self._LEAST**2)
+        self._weight = min(self._weight + 1, self._MEMORY_SAMPLES)
+        self._square += (square - self._square) / self._weight
+        self._square = max(self._square, self._MIN_SCALE**2)
 
 
 class BeaconClock:
-    """Fits the master's session time to a station's clock; one for each session of the master.
+    """Estimates the master's session time on a station's clock; one for each session of the master.
 
     Attributes
     ----------
-    first_received_ns, last_received_ns
-        When the first and the newest pair were received that have been believed.
-    pairs
+    initialised
+        Two unambiguous samples have agreed, one of them live; before that there is no time.
+    converged
+        Enough samples agree that delayed beacons would have been outvoted.
+    samples
         How many the fit rests on.
-    known
-        Two pairs in full have agreed, one of them live; before that there is no time.
-    settled
-        So many pairs agree that held-back beacons would have been outvoted.
+    first_received_ns, last_received_ns
+        Reception of the oldest and the newest of them.
     """
 
     def __init__(self) -> None:
         self._jitter = _Jitter()
-        self._stretches: list[Stretch] = []
-        self._begun_live = False
-        self._known = False
-        self._rival: Stretch | None = None
-        self._rival_in_full = False  # a live one has told its times to 2^40 us, and not just to 2^16
-        self._rival_live = False
-        self._rival_agrees = False  # with the fit, though only because nothing was heard for long
+        self._segments: list[ClockSegment] = []
+        self._initial_live = False
+        self.initialised = False
+        self._candidate: ClockSegment | None = None
+        self._candidate_unambiguous = False  # a live sample stated its time to 2^40 us, not only to 2^16
+        self._candidate_live = False
+        self._candidate_consistent = False  # with the fit, but only because of a long outage
 
     @property
     def first_received_ns(self) -> int | None:
         """See the class."""
-        return self._stretches[0].first_ns if self._stretches else None
+        return self._segments[0].first_ns if self._segments else None
 
     @property
     def last_received_ns(self) -> int | None:
         """See the class."""
-        return self._stretches[-1].last_ns if self._stretches else None
+        return self._segments[-1].last_ns if self._segments else None
 
     @property
-    def pairs(self) -> int:
+    def samples(self) -> int:
         """See the class."""
-        return sum(map(len, self._stretches))
+        return sum(map(len, self._segments))
 
     @property
-    def known(self) -> bool:
+    def converged(self) -> bool:
         """See the class."""
-        return self._known
-
-    @property
-    def settled(self) -> bool:
-        """See the class."""
-        return self._known and len(self._stretches[-1]) >= _FEWEST_RIVALS
+        return self.initialised and len(self._segments[-1]) >= _MIN_CANDIDATE_SAMPLES
 
     def add(
-        self, received_ns: int, sent_us: int, sigma_ns: int, *, in_full: bool = False, live: bool = True
+        self, received_ns: int, sent_us: int, sigma_ns: int, *, unambiguous: bool = False, live: bool = True
     ) -> bool:
-        """Take a pair, in the order of reception.
+        """Take a sample, in the order of reception.
+
+        A rejected sample does not change the fit, but the bound contains it until a consistent one follows. Five in a
+        row that agree with each other start a new segment, if one of them was live; beyond a jump of 5 ms a live one
+        must be unambiguous. Before initialisation only unambiguous samples are taken, and of two that disagree the
+        newer one is kept. A sample that is consistent only because of a long outage waits outside the fit, too, until
+        five agree with each other.
 
         Parameters
         ----------
         received_ns
-            When the beacon was received, on this computer's clock.
+            On this computer's clock.
         sent_us
-            Session time at which it had been sent.
+            Session time at which the beacon was sent.
         sigma_ns
-            One sigma of ``received_ns``, as the radio states it.
-        in_full
-            That time is from a session part, and not from :meth:`unwrap`.
+            One sigma of ``received_ns``, as the radio claims it.
+        unambiguous
+            The session time is from a session part, and not from :meth:`unwrap`.
         live
-            The master has heard the answer to this beacon, so that it was no recording of long ago.
+            The master has received the response to this beacon, so it was not replayed.
 
         Returns
         -------
         bool
-            False: this cannot be. It is more than 200 us off the fit, and more than jitter and the clocks can
-            explain: a beacon that was held up, or a clock that somebody has touched. The fit keeps away from it, but
-            its bound contains it until there is one that agrees. Five in a row that agree with each other instead
-            begin the fit anew, if one of them was live; if they are off by more than 5 ms, a live one has to be known in
-            full. Before there is a time, only pairs in full are taken, and the newer of two that do not agree
-            is kept. One that jitter does not explain, but a clock that nothing was heard of for long, is kept away from
-            the fit, too, until five agree with each other.
+            False: rejected. It deviates by more than 200 us, and by more than jitter and wander explain: the beacon
+            was delayed, or the clock was set.
         """
         sent_ns = 1000 * sent_us
-        newest_ns = self._rival.last_ns if self._rival else self.last_received_ns
+        newest_ns = self._candidate.last_ns if self._candidate else self.last_received_ns
         if newest_ns is not None and received_ns <= newest_ns:
             return False
-        pair = Pair(received_ns, sent_ns, sigma_ns, self._jitter.variance_us2(sigma_ns))
-        if not self.known:
-            return in_full and self._begin(pair, live=live)
-        stretch = self._stretches[-1]
-        agrees, unknown = stretch.agrees(pair), not self._jitter.known
-        if agrees or self._rival is not None:
-            self._jitter.add(pair)  # one that stands alone tells nothing of the others
-        if not agrees:
-            self._doubt(pair, stretch, in_full=in_full, live=live)
-            return abs(stretch.missed_us(pair)) <= DOUBTED_US
-        if self._is_alone(pair, stretch, live=live):
+        sample = BeaconSample(received_ns, sent_ns, sigma_ns, self._jitter.variance_us2(sigma_ns))
+        if not self.initialised:
+            return unambiguous and self._initialise(sample, live=live)
+        segment = self._segments[-1]
+        consistent, jitter_unknown = segment.is_consistent(sample), not self._jitter.known
+        if consistent or self._candidate is not None:
+            self._jitter.add(sample)  # a single outlier says nothing about the jitter of the others
+        if not consistent:
+            self._add_to_candidate(sample, segment, unambiguous=unambiguous, live=live)
+            return abs(segment.innovation_us(sample)) <= MAX_DEVIATION_US
+        if self._must_wait(sample, segment, live=live):
             return True
-        stretch.add(pair)
-        if unknown and self._jitter.known:
-            self._stretches[-1] = stretch.weighed_anew(self._jitter.variance_us2)
-        self._rival = None
-        self._forget()
+        segment.add(sample)
+        if jitter_unknown and self._jitter.known:
+            self._segments[-1] = segment.reweighted(self._jitter.variance_us2)
+        self._candidate = None
+        self._limit_samples()
         return True
 
     def unwrap(self, received_ns: int, low16: int) -> int | None:
-        """Return the full session time of a beacon.
-
-        Parameters
-        ----------
-        received_ns
-            When it was received.
-        low16
-            The 16 low bits of the session time at which it had been sent, in us.
-
-        Returns
-        -------
-        int | None
-            In us; None where there is more than one that it can be.
-        """
-        if not self.known:
+        """Return the full session time in us of a beacon, from its 16 low bits; None where it is ambiguous."""
+        if not self.initialised:
             return None
-        rival = self._rival
-        # A single beacon that was held back must not keep the next ones from being understood.
-        near = _instant(rival if rival and self._rival_in_full else self._stretches[-1], received_ns)
-        if near.bound_us > _UNIQUE_US:
+        candidate = self._candidate
+        # A single delayed beacon must not keep the next ones from being decoded.
+        segment = candidate if candidate and self._candidate_unambiguous else self._segments[-1]
+        predicted = _time_in(segment, received_ns)
+        if predicted.bound_us > _MAX_UNWRAP_BOUND_US:
             return None
-        near_us = round(near.time_us)
-        return near_us + (low16 - near_us + 0x8000) % 0x10000 - 0x8000
+        predicted_us = round(predicted.time_us)
+        return predicted_us + (low16 - predicted_us + 0x8000) % 0x10000 - 0x8000
 
-    def at(self, local_ns: int) -> Instant | None:
-        """Return the session time at an instant of this computer's clock, between and beyond pairs; None if not known."""
-        return self._at(local_ns) if self.known else None
+    def at(self, local_ns: int) -> TimeEstimate | None:
+        """Return the session time at an instant of this computer's clock, also beyond the samples; None before initialisation."""
+        return self._at(local_ns) if self.initialised else None
 
-    def elapsed(self, from_ns: int, to_ns: int) -> Instant:
-        """Return how long it was by the master's clock between two instants of this computer's.
+    def elapsed(self, from_ns: int, to_ns: int) -> TimeEstimate:
+        """Return the duration on the master's clock between two instants of this computer's.
 
-        As long as there is no time both clocks are taken to run alike, and the bound says what they can differ by.
+        Before initialisation both clocks are taken to run alike, within the bound of their skew.
         """
         local_us = (to_ns - from_ns) / 1000
-        if not self.known:
-            return _duration(local_us, 0.0, _RATE_SIGMA_PPM, UNKNOWN_RATE_PPM)
+        if not self.initialised:
+            return _duration(local_us, 0.0, _SKEW_SIGMA_PPM, MAX_SKEW_PPM)
         start, end = self._at(from_ns), self._at(to_ns)
-        by_ends = Instant(
+        by_ends = TimeEstimate(
             end.time_us - start.time_us,
             math.hypot(start.sigma_us, end.sigma_us),
             start.bound_us + end.bound_us,
         )
         earlier_ns, later_ns = min(from_ns, to_ns), max(from_ns, to_ns)
         index = self._index(earlier_ns)
-        stretch = self._stretches[index]
-        newest = index == len(self._stretches) - 1
-        if later_ns > stretch.last_ns and not newest:
-            return by_ends  # the rate has changed in between
-        fits, _ = stretch.at((from_ns + to_ns) // 2)
-        bound_ppm = rate_bound_ppm(fits)
-        if self._rival is not None and newest and later_ns > stretch.last_ns:
-            bound_ppm += self._doubt_us(self._rival) / ((self._rival.first_ns - stretch.last_ns) / 1e9)
-        by_rate = _duration(local_us, fits.slow.rate_ppm, math.sqrt(fits.slow.rate_variance), bound_ppm)
-        return by_ends if by_ends.bound_us < by_rate.bound_us else by_rate
+        segment = self._segments[index]
+        newest = index == len(self._segments) - 1
+        if later_ns > segment.last_ns and not newest:
+            return by_ends  # the skew has changed in between
+        estimate, _ = segment.at((from_ns + to_ns) // 2)
+        bound_ppm = estimate.skew_bound_ppm()
+        if self._candidate is not None and newest and later_ns > segment.last_ns:
+            bound_ppm += self._deviation_bound_us(self._candidate) / (
+                (self._candidate.first_ns - segment.last_ns) / 1e9
+            )
+        by_skew = _duration(local_us, estimate.slow.skew, math.sqrt(estimate.slow.skew_variance), bound_ppm)
+        return by_ends if by_ends.bound_us < by_skew.bound_us else by_skew
 
-    def _at(self, local_ns: int) -> Instant:
+    def _at(self, local_ns: int) -> TimeEstimate:
         index = self._index(local_ns)
-        stretch = self._stretches[index]
-        instant = _instant(stretch, local_ns)
-        outvoted = len(stretch) < _FEWEST_RIVALS  # it may have been wrong from its first pair on
-        if local_ns <= stretch.last_ns and not outvoted:
-            return instant
-        if index + 1 < len(self._stretches):
-            # Somewhere here one stretch turned into the next; nobody knows where.
-            return _either(instant, _instant(self._stretches[index + 1], local_ns))
-        if self._rival is None:
-            return instant
-        # The rate may have changed right after the last pair.
-        share = (local_ns - stretch.last_ns) / (self._rival.first_ns - stretch.last_ns)
-        share = max(share, 1.0) if outvoted else share
-        return instant._replace(bound_us=instant.bound_us + self._doubt_us(self._rival) * share)
+        segment = self._segments[index]
+        time = _time_in(segment, local_ns)
+        unconfirmed = len(segment) < _MIN_CANDIDATE_SAMPLES  # may be wrong from its first sample on
+        if local_ns <= segment.last_ns and not unconfirmed:
+            return time
+        if index + 1 < len(self._segments):
+            # Somewhere between the two segments the clock was set.
+            return _either(time, _time_in(self._segments[index + 1], local_ns))
+        if self._candidate is None:
+            return time
+        # The skew may have changed right after the last sample.
+        share = (local_ns - segment.last_ns) / (self._candidate.first_ns - segment.last_ns)
+        share = max(share, 1.0) if unconfirmed else share
+        return time._replace(bound_us=time.bound_us + self._deviation_bound_us(self._candidate) * share)
 
     def _index(self, local_ns: int) -> int:
-        """Return which stretch an instant is in; those between two belong to the earlier one."""
-        return max(bisect_right(self._stretches, local_ns, key=lambda stretch: stretch.first_ns) - 1, 0)
+        """Return the segment of an instant; one between two segments belongs to the earlier one."""
+        return max(bisect_right(self._segments, local_ns, key=lambda segment: segment.first_ns) - 1, 0)
 
-    def _begin(self, pair: Pair, *, live: bool) -> bool:
-        """Take a pair in full before there is a time; return whether it agrees with those before it."""
-        alone = not self._stretches
-        agrees = not alone and self._stretches[0].agrees(pair)
-        if agrees:
-            self._stretches[0].add(pair)
+    def _initialise(self, sample: BeaconSample, *, live: bool) -> bool:
+        """Take an unambiguous sample before initialisation; return whether it agrees with those before it."""
+        first = not self._segments
+        consistent = not first and self._segments[0].is_consistent(sample)
+        if consistent:
+            self._segments[0].add(sample)
         else:
             self._jitter = _Jitter()
-            self._stretches, self._begun_live = [Stretch(pair, 0.0, _RATE_SIGMA_PPM)], False
-        self._jitter.add(pair)
-        self._begun_live = self._begun_live or live
-        self._known = self._begun_live and len(self._stretches[0]) >= _FEWEST_IN_FULL
-        return agrees or alone
+            self._segments, self._initial_live = [ClockSegment(sample, 0.0, _SKEW_SIGMA_PPM)], False
+        self._jitter.add(sample)
+        self._initial_live = self._initial_live or live
+        self.initialised = self._initial_live and len(self._segments[0]) >= _MIN_INITIAL_SAMPLES
+        return consistent or first
 
-    def _doubt(self, pair: Pair, stretch: Stretch, *, in_full: bool, live: bool) -> None:
-        """Hold a pair that does not agree with the fit against others of its kind."""
-        if self._rival is None or not self._rival.agrees(pair):
-            self._rival, self._rival_agrees = Stretch(pair, stretch.rate_ppm, _SLEWED_SIGMA_PPM), False
-            self._rival_in_full, self._rival_live = in_full and live, live
+    def _add_to_candidate(
+        self, sample: BeaconSample, segment: ClockSegment, *, unambiguous: bool, live: bool
+    ) -> None:
+        """Collect inconsistent samples that agree with each other, and start a new segment when they suffice."""
+        candidate = self._candidate
+        if candidate is None or not candidate.is_consistent(sample):
+            self._candidate = ClockSegment(sample, segment.skew_ppm, _SLEWED_SIGMA_PPM)
+            self._candidate_consistent = False
+            self._candidate_unambiguous, self._candidate_live = unambiguous and live, live
             return
-        self._rival.add(pair)
-        self._rival_in_full = self._rival_in_full or (in_full and live)
-        self._rival_live = self._rival_live or live
-        if self._is_sure(self._rival) and self._rival_live and len(self._rival) >= _FEWEST_RIVALS:
-            self._stretches.append(self._rival)
-            self._rival = None
+        candidate.add(sample)
+        self._candidate_unambiguous = self._candidate_unambiguous or (unambiguous and live)
+        self._candidate_live = self._candidate_live or live
+        sufficient = self._candidate_live and len(candidate) >= _MIN_CANDIDATE_SAMPLES
+        if sufficient and self._is_unwrapped(candidate):
+            self._segments.append(candidate)
+            self._candidate = None
 
-    def _is_alone(self, pair: Pair, stretch: Stretch, *, live: bool) -> bool:
-        """Whether a pair that agrees with the fit has to wait for others, as it may have been held back.
+    def _must_wait(self, sample: BeaconSample, segment: ClockSegment, *, live: bool) -> bool:
+        """Whether a consistent sample has to wait for others, because after an outage it may be a delayed one.
 
-        After an outage a clock may be off by more than that, and a single pair would be all that tells. One that agrees with
-        those that wait only because nothing was heard for long again does not count together with them: they may have been
-        held back. But it tells of the rate.
+        After an outage a clock may be off by more than :data:`MAX_DEVIATION_US`, and a single sample would decide. One
+        that is consistent with the waiting ones only because of another long gap does not count together with them, as
+        they may have been delayed; but they improve its skew.
         """
-        waiting = self._rival if self._rival_agrees else None
-        if waiting is not None and _is_near(waiting, pair):
-            if len(waiting) + 1 >= _FEWEST_RIVALS:
-                stretch.add_all(waiting)
+        waiting = self._candidate if self._candidate_consistent else None
+        if waiting is not None and _is_near(waiting, sample):
+            if len(waiting) + 1 >= _MIN_CANDIDATE_SAMPLES:
+                segment.extend(waiting)
                 return False
-            waiting.add(pair)
+            waiting.add(sample)
             return True
-        if _is_near(stretch, pair):
+        if _is_near(segment, sample):
             return False
-        rate_ppm = stretch.rate_ppm
-        if waiting is not None and waiting.agrees(pair):
-            waiting.add(pair)
-            rate_ppm = waiting.rate_ppm
-        self._rival, self._rival_agrees = Stretch(pair, rate_ppm, _SLEWED_SIGMA_PPM), True
-        self._rival_in_full, self._rival_live = True, live  # it agrees, so its low bits tell which it is
+        skew_ppm = segment.skew_ppm
+        if waiting is not None and waiting.is_consistent(sample):
+            waiting.add(sample)
+            skew_ppm = waiting.skew_ppm
+        self._candidate = ClockSegment(sample, skew_ppm, _SLEWED_SIGMA_PPM)
+        self._candidate_consistent = True
+        # A consistent sample is unambiguous by its low bits.
+        self._candidate_unambiguous, self._candidate_live = True, live
         return True
 
-    def _off_us(self, rival: Stretch) -> float:
-        """Return how far the first pair of a rival is off the fit."""
-        stretch = self._stretches[-1]
-        fits, _ = stretch.at(rival.first_ns)
-        return (rival.base_ns - stretch.base_ns) / 1000 - fits.slow.offset_us
+    def _deviation_us(self, candidate: ClockSegment) -> float:
+        """Return the deviation of a candidate's first sample from the fit."""
+        segment = self._segments[-1]
+        estimate, _ = segment.at(candidate.first_ns)
+        return (candidate.base_ns - segment.base_ns) / 1000 - estimate.slow.offset
 
-    def _is_sure(self, rival: Stretch) -> bool:
-        """Whether it is known which multiple of 2^16 us its times contain."""
-        return self._rival_in_full or abs(self._off_us(rival)) <= _SURE_US
+    def _is_unwrapped(self, candidate: ClockSegment) -> bool:
+        """Whether the multiple of 2^16 us in the candidate's times is certain."""
+        return self._candidate_unambiguous or abs(self._deviation_us(candidate)) <= _MAX_UNWRAPPED_JUMP_US
 
-    def _doubt_us(self, rival: Stretch) -> float:
-        """Return how far the fit is off if a rival is right."""
-        return abs(self._off_us(rival)) + (0.0 if self._is_sure(rival) else _LOW_BITS_US)
+    def _deviation_bound_us(self, candidate: ClockSegment) -> float:
+        """Return the error of the fit if the candidate is right."""
+        return abs(self._deviation_us(candidate)) + (0.0 if self._is_unwrapped(candidate) else _WRAP_US)
 
-    def _forget(self) -> None:
-        """Let go of the oldest pairs when there are too many."""
-        if self.pairs <= MOST_PAIRS:
+    def _limit_samples(self) -> None:
+        if self.samples <= MAX_SAMPLES:
             return
-        oldest = self._stretches[0]
-        if len(oldest) > _FORGOTTEN:
-            oldest.forget(_FORGOTTEN)
+        oldest = self._segments[0]
+        if len(oldest) > _DROPPED_SAMPLES:
+            oldest.drop_oldest(_DROPPED_SAMPLES)
         else:
-            del self._stretches[0]
+            del self._segments[0]
 
 
-def _is_near(stretch: Stretch, pair: Pair) -> bool:
-    """Whether jitter explains a pair, or it is off by no more than is honest."""
-    return stretch.agrees_closely(pair) or abs(stretch.missed_us(pair)) <= DOUBTED_US
+def _is_near(segment: ClockSegment, sample: BeaconSample) -> bool:
+    """Whether jitter explains a sample, or it deviates by no more than the tolerance."""
+    return segment.is_within_jitter(sample) or abs(segment.innovation_us(sample)) <= MAX_DEVIATION_US
 
 
-def _instant(stretch: Stretch, local_ns: int) -> Instant:
-    fits, near_s = stretch.at(local_ns)
-    return Instant(
-        (local_ns + stretch.base_ns) / 1000 + fits.slow.offset_us,
-        math.sqrt(fits.slow.offset_variance),
-        bound_us(fits, near_s),
+def _time_in(segment: ClockSegment, local_ns: int) -> TimeEstimate:
+    estimate, near_s = segment.at(local_ns)
+    return TimeEstimate(
+        (local_ns + segment.base_ns) / 1000 + estimate.slow.offset,
+        math.sqrt(estimate.slow.offset_variance),
+        estimate.offset_bound_us(near_s),
     )
 
 
-def _either(one: Instant, other: Instant) -> Instant:
-    """Return the middle of two, and a bound that contains both."""
-    apart_us = abs(one.time_us - other.time_us)
-    return Instant(
+def _either(one: TimeEstimate, other: TimeEstimate) -> TimeEstimate:
+    """Return the midpoint of two estimates with a bound that contains both."""
+    difference_us = abs(one.time_us - other.time_us)
+    return TimeEstimate(
         (one.time_us + other.time_us) / 2,
-        max(one.sigma_us, other.sigma_us) + apart_us / 2,
-        max(one.bound_us, other.bound_us) + apart_us,
+        max(one.sigma_us, other.sigma_us) + difference_us / 2,
+        max(one.bound_us, other.bound_us) + difference_us,
     )
 
 
-def _duration(local_us: float, rate_ppm: float, sigma_ppm: float, bound_ppm: float) -> Instant:
+def _duration(local_us: float, skew_ppm: float, sigma_ppm: float, bound_ppm: float) -> TimeEstimate:
     scale = abs(local_us) / 1e6
-    return Instant(local_us + local_us * rate_ppm / 1e6, scale * sigma_ppm, scale * bound_ppm)
+    return TimeEstimate(local_us + local_us * skew_ppm / 1e6, scale * sigma_ppm, scale * bound_ppm)
 
 
 def _claimed_us2(sigma_ns: int) -> float:

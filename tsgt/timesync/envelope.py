@@ -1,10 +1,10 @@
-"""The line below answers that are late by chance, never early: how high it lies, how steep, and how well that is known.
+"""The lower envelope of responses that are delayed at random, never early: its height, its slope, and their errors.
 
-Over instrument time the answers lie above a straight line, late by anything from 0 to a spread. Given the slope, the line
-cannot be above the lowest answer, and is probably less than spread / number of answers below it. Where it is steeper, the
-lowest answer is another one, and on average the answers lie higher above it: the more answers there are, the less likely
-is a slope that leaves room below them. Over all slopes, each weighed by that and by what was known of it before, the mean
-and the scatter of the line are those that squares of errors are smallest with (Pitman's estimator).
+Over instrument time the responses lie above a straight line, by anything from 0 to a spread. Given the slope, the line
+cannot be above the lowest response, and is probably less than spread / number of responses below it. With a steeper
+slope another response is the lowest, and on average the responses lie higher above the line: the more responses there
+are, the less likely is a slope that leaves room below them. The mean and the covariance of the line over all slopes,
+weighted by that likelihood and the prior, minimise the mean square error (Pitman 1939).
 """
 
 from __future__ import annotations
@@ -15,57 +15,49 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-_SLOPES: Final = 24
-"""So many slopes are tried at a time."""
-
-_ZOOMS: Final = 5
-_FINE: Final = 1.5
-"""Slopes are close enough when they are no further apart than one sigma over this."""
+_GRID_SLOPES: Final = 24
+_MAX_REFINEMENTS: Final = 5
+_STEPS_PER_SIGMA: Final = 1.5
+"""The grid of slopes is refined until one sigma of the slope spans this many steps."""
 
 
-class Lowest(NamedTuple):
-    """How far the lowest of some answers lies above the line.
-
-    Attributes
-    ----------
-    mean, sigma
-        Mean and standard deviation, in units of the resolution.
-    """
+class MinimumDelay(NamedTuple):
+    """Mean and standard deviation of the lowest response's height above the line, in units of the resolution."""
 
     mean: float
     sigma: float
 
 
-def lowest(share: float) -> Lowest:
-    """Return how far the lowest answer is from the line, where both are cut off to whole units before they are compared.
+def minimum_delay(share: float) -> MinimumDelay:
+    """Return the height of the lowest response above the line, where times are truncated to whole units.
 
-    An answer is above the line by how late it is, evenly from 0 to a spread, and by what was cut off, evenly from 0 to 1.
-    Below a height s less than 1 lie s^2 / 2 of a spread, below a higher one s - 1/2.
+    A response is above the line by its delay, uniform from 0 to a spread, and by the truncation, uniform from 0 to 1.
+    A height s below 1 has the probability s^2 / 2 over the spread, a larger one s - 1/2.
 
     Parameters
     ----------
     share
-        The spread over the number of answers and one, in the same units, more than 0; for eight answers or more.
+        The spread over the number of responses plus one, in the same units, above 0; for eight responses or more.
     """
     below_one = math.exp(-0.5 / share)
     mean = math.sqrt(math.pi * share / 2) * math.erf(math.sqrt(0.5 / share)) + share * below_one
     square = 2 * share + 2 * share**2 * below_one
-    return Lowest(mean, math.sqrt(max(square - mean**2, 0.0)))
+    return MinimumDelay(mean, math.sqrt(max(square - mean**2, 0.0)))
 
 
-class Line(NamedTuple):
-    """What is known of a line.
+class LowerEnvelope(NamedTuple):
+    """A line below points, with its errors.
 
     Attributes
     ----------
     height, slope
-        It goes through (0, height); as high as answers allow: on average over the slopes it touches the lowest.
+        The line goes through (0, height) and touches the lowest response, on average over the slopes.
     slope_sigma
         Standard deviation of the slope.
     pivot
-        Where the line's height does not depend on the slope.
+        Position at which the line's height is uncorrelated with the slope.
     pivot_sigma
-        Standard deviation of its height there, for want of a better slope; that of the lowest answer comes on top.
+        Standard deviation of the height there; add that of :class:`MinimumDelay`.
     """
 
     height: float
@@ -75,62 +67,62 @@ class Line(NamedTuple):
     pivot_sigma: float
 
 
-def line_below(
+def fit_lower_envelope(
     points: Sequence[tuple[float, float]],
     *,
-    middle: float,
+    centre: float,
     scale: float,
-    known: tuple[float, float],
-    most: float,
-) -> Line:
-    """Lay a line below points.
+    prior: tuple[float, float],
+    max_slope: float,
+) -> LowerEnvelope:
+    """Fit a line below points.
 
     Parameters
     ----------
     points
         The lowest ones, in any order, at least one.
-    middle
-        Mean position of all.
+    centre
+        Mean position of all responses.
     scale
-        How far below the lowest answer the line is, on average.
-    known
-        Slope, and standard deviation of it, that were known before.
-    most
-        The slope is not more than this, up or down.
+        Mean distance of the line below the lowest response.
+    prior
+        Slope and its standard deviation.
+    max_slope
+        Bound of the slope's magnitude.
     """
-    corners = _hull(points)
-    known_slope, known_sigma = known
-    low, high = -most, most
-    for _ in range(_ZOOMS):
-        step = (high - low) / (_SLOPES - 1)
-        slopes = [low + i * step for i in range(_SLOPES)]
+    corners = _lower_hull(points)
+    prior_slope, prior_sigma = prior
+    low, high = -max_slope, max_slope
+    for _ in range(_MAX_REFINEMENTS):
+        step = (high - low) / (_GRID_SLOPES - 1)
+        slopes = [low + i * step for i in range(_GRID_SLOPES)]
         heights = [min(y - slope * x for x, y in corners) for slope in slopes]
-        exponents = [
-            (height + slope * middle) / scale - 0.5 * ((slope - known_slope) / known_sigma) ** 2
+        log_weights = [
+            (height + slope * centre) / scale - 0.5 * ((slope - prior_slope) / prior_sigma) ** 2
             for slope, height in zip(slopes, heights, strict=True)
         ]
-        best = max(exponents)
-        weights = [math.exp(exponent - best) for exponent in exponents]
+        largest = max(log_weights)
+        weights = [math.exp(log_weight - largest) for log_weight in log_weights]
         total = sum(weights)
         slope = sum(w * b for w, b in zip(weights, slopes, strict=True)) / total
-        square = sum(w * (b - slope) ** 2 for w, b in zip(weights, slopes, strict=True)) / total
-        sigma = math.sqrt(square)
-        if sigma > _FINE * step:
+        slope_variance = sum(w * (b - slope) ** 2 for w, b in zip(weights, slopes, strict=True)) / total
+        sigma = math.sqrt(slope_variance)
+        if sigma > _STEPS_PER_SIGMA * step:
             break
-        wide = max(4 * sigma, 1.5 * step)
-        low, high = slope - wide, slope + wide
+        half_width = max(4 * sigma, 1.5 * step)
+        low, high = slope - half_width, slope + half_width
     height = sum(w * a for w, a in zip(weights, heights, strict=True)) / total
-    together = (
+    covariance = (
         sum(w * (a - height) * (b - slope) for w, a, b in zip(weights, heights, slopes, strict=True)) / total
     )
-    scatter = sum(w * (a - height) ** 2 for w, a in zip(weights, heights, strict=True)) / total
-    pivot = -together / square if square > 0 else middle
-    pivot_sigma = math.sqrt(max(scatter - pivot**2 * square, 0.0))
-    return Line(height, slope, sigma, pivot, pivot_sigma)
+    height_variance = sum(w * (a - height) ** 2 for w, a in zip(weights, heights, strict=True)) / total
+    pivot = -covariance / slope_variance if slope_variance > 0 else centre
+    pivot_sigma = math.sqrt(max(height_variance - pivot**2 * slope_variance, 0.0))
+    return LowerEnvelope(height, slope, sigma, pivot, pivot_sigma)
 
 
-def _hull(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Return the points that a line from below can touch, from left to right."""
+def _lower_hull(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Return the lower convex hull from left to right (monotone chain: Andrew 1979)."""
     corners: list[tuple[float, float]] = []
     for x, y in sorted(points):
         while len(corners) > 1:

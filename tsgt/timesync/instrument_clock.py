@@ -1,10 +1,9 @@
-"""The instrument's own time on the host's clock, from when its answers arrived.
+"""The instrument's own time on the host's clock, from the arrival of its responses.
 
-An answer carries the instrument's time of a measurement, in ms since it was switched on. It arrives later by what the
-instrument and the line need: sometimes more, never less than the fastest way. So, over instrument time, "arrival less
-instrument time" lies above a line, the lower envelope, whose height is the offset of the clocks plus that fastest way
-and whose slope is how much slower the instrument's clock runs. docs/explanation/instrument-time.md says how well the
-fit does, and what it cannot see.
+A response carries the instrument's time of a measurement, in ms since it was switched on. It arrives after a delay of
+instrument and serial line, which varies but is never less than a minimum. So, over instrument time, "arrival less
+instrument time" lies above a line, the lower envelope, whose height is the clock offset plus the minimum delay and whose
+slope is the skew. docs/explanation/instrument-time.md states the errors of the fit, and what is unobservable.
 """
 
 from __future__ import annotations
@@ -15,60 +14,59 @@ from dataclasses import dataclass
 from statistics import median
 from typing import NamedTuple
 
-from tsgt.timesync.envelope import Lowest, line_below, lowest
+from tsgt.timesync.envelope import MinimumDelay, fit_lower_envelope, minimum_delay
 
-ENOUGH = 8
-"""So many samples make an envelope."""
+MIN_SAMPLES = 8
 
-LATEST_NS = 2_000_000_000
-"""An answer that is further behind the fastest way than this is not taken for a late one: something has jumped."""
+MAX_DELAY_NS = 2_000_000_000
+"""A response further above the envelope than this is not late: a clock has jumped."""
 
 _WINDOW_NS = 300e9
 _BIN_NS = 2e9
-"""Of each bin the lowest sample is kept. A crystal in the sun changes its rate by 1e-6 in some minutes: in a longer
-window the line would no longer be one."""
+"""Of each bin the lowest sample is kept. A crystal in the sun changes its rate by 1e-6 in some minutes: over a longer
+window the envelope is no line."""
 
-_KEPT = 30
-"""So many samples are kept however old they are."""
+_MIN_KEPT_SAMPLES = 30
+"""Number of samples that are kept regardless of their age."""
 
 _STEADY_NS = 120e9
-"""A rate that was found over a longer span than this is kept over a power cycle."""
+"""A skew from a longer span than this is kept over a power cycle."""
 
-_MOST_RATE = 300e-6
-_UNKNOWN_RATE = 60e-6
-_KNOWN_RATE = 5e-6
-"""Two clocks run apart by no more than the first, usually by less than the second, and about as they did before."""
-_WANDER = 1e-6
+_MAX_SKEW = 300e-6
+_UNKNOWN_SKEW_SIGMA = 60e-6
+_KNOWN_SKEW_SIGMA = 5e-6
+_SKEW_WANDER = 1e-6
+"""Bound of the skew, its sigma before and after it was measured, and its wander within the window."""
 
 _RESOLUTION_NS = 1e6
 _ROUNDING_NS = 0.3e6
-"""Instruments tell their time in whole ms; whether rounded or cut off is not known, and makes no difference here: what is
-added to one of their times is missing in what the envelope's height was found from."""
+"""Instruments state their time in whole ms. Whether they round or truncate is unknown, and cancels: what is added to a
+stated time is missing in the height of the envelope."""
 
-_MORE = 1.05
-"""By so much there are to be more samples before it is worth fitting again without other news."""
+_REFIT_GROWTH = 1.05
+"""Refit without other news when the number of samples has grown by this factor."""
 
-_LEAST_SHARE = 0.01
-_LATE = 4.0
-"""An answer that is later than so many times the mean counts for so much: it stalled, and tells nothing of the others."""
+_MIN_DELAY_SHARE = 0.01
+_DELAY_CAP = 4.0
+"""A delay counts as at most this many mean delays: a stall says nothing about the others."""
 
-_FEW = 3
-_AGREE_NS = 100e6
-_MEMORY = 32
-"""So many samples that contradict the envelope and agree with each other this well, among so many, outvote it."""
+_CANDIDATES = 3
+_CANDIDATE_SPREAD_NS = 100e6
+_CANDIDATE_WINDOW = 32
+"""This many inconsistent samples within this spread, among so many samples, replace the envelope."""
 
 
 class HostTime(NamedTuple):
-    """An instant of the instrument on the host's CLOCK_MONOTONIC, plus the time of the fastest way.
+    """An instant of the instrument on the host's CLOCK_MONOTONIC, plus the minimum delay.
 
     Attributes
     ----------
     host_ns
         The instant.
     sigma_ns
-        One standard error, of what samples can tell.
+        One sigma of the samples' information.
     bound_ns
-        The truth is within this of ``host_ns``, as long as the fastest way stays what it is.
+        The truth is within this of ``host_ns``, as long as the minimum delay stays the same.
     """
 
     host_ns: int
@@ -78,7 +76,7 @@ class HostTime(NamedTuple):
 
 @dataclass(slots=True)
 class _Bin:
-    """What is kept of two seconds: the lowest sample, and sums over all."""
+    """Two seconds of samples: the lowest one, and sums over all."""
 
     number: int
     x: float
@@ -89,241 +87,242 @@ class _Bin:
 
 
 class InstrumentClock:
-    """Fits the lower envelope; one for each instrument.
+    """Fits the lower envelope of one instrument.
 
-    A sample far from the envelope is doubted: it enters only when others agree with it. Where these are too far off for
-    any delay, the instrument has been switched off and on, or its count has jumped or begun anew: so does the fit.
+    A sample far from the envelope is inconsistent: it is used only when others agree with it. If these are too far off
+    for any delay, the instrument was switched off and on or its count has jumped, and the fit is reset.
 
     Attributes
     ----------
-    began
-        How often the count has begun anew.
-    doubts
-        Whether the last sample, or distance, is doubted.
+    resets
+        How often the instrument's count has restarted.
+    inconsistent
+        Whether the last sample, or distance, is inconsistent with the envelope.
     """
 
     def __init__(self) -> None:
         self._whole_ms = True
-        self._known_rate = 0.0  # of the host against the instrument, less 1; outlives a power cycle
-        self._known_sigma = _UNKNOWN_RATE
+        self._known_skew = 0.0  # host against instrument; survives a power cycle
+        self._known_sigma = _UNKNOWN_SKEW_SIGMA
         self._seen = 0
-        self.began = 0
-        self.doubts = False
-        self._begin([])
+        self.resets = 0
+        self.inconsistent = False
+        self._reset([])
 
-    def _begin(self, samples: list[tuple[int, int]]) -> None:
-        self._first = samples
+    def _reset(self, samples: list[tuple[int, int]]) -> None:
+        self._initial = samples
         self._bins: deque[_Bin] = deque()
         self._x0 = self._y0 = 0
-        self._a = self._b = self._lift = 0.0
-        self._above = self._excess = self._sigma = 0.0
-        self._rate_sigma = self._known_sigma
-        self._newest = self._middle = 0.0
+        self._height = self._skew = self._lift = 0.0
+        self._mean_delay = self._excess = self._sigma = 0.0
+        self._skew_sigma = self._known_sigma
+        self._newest = self._pivot = 0.0
         self._samples = self._fitted = 0
-        self._doubted: deque[tuple[int, int, int]] = deque(maxlen=_FEW)
+        self._candidates: deque[tuple[int, int, int]] = deque(maxlen=_CANDIDATES)
 
     @property
-    def stands(self) -> bool:
-        """Whether there were enough samples for times to be told."""
+    def initialised(self) -> bool:
+        """Whether there were enough samples for times."""
         return self._samples > 0
 
     @property
     def samples(self) -> int:
-        """How many samples the envelope lies under."""
+        """How many samples the envelope rests on."""
         return self._samples
 
     @property
-    def rate_ppm(self) -> float:
-        """By how much the host's clock gains on the instrument's, in 1e-6."""
-        return self._b * 1e6
+    def skew_ppm(self) -> float:
+        """Skew of the host's clock against the instrument's; positive: the host's runs faster."""
+        return self._skew * 1e6
 
     @property
     def sigma_ns(self) -> float:
-        """One standard error of the newest times; infinite while none are told."""
-        drift = self._rate_sigma * abs(self._newest - self._middle)
-        return math.hypot(self._sigma, drift) if self.stands else math.inf
+        """One sigma of the newest times; infinite before initialisation."""
+        drift = self._skew_sigma * abs(self._newest - self._pivot)
+        return math.hypot(self._sigma, drift) if self.initialised else math.inf
 
-    def expect_parts(self) -> None:
-        """Take it that times are told finer than in whole ms: an arrival is less by the part, and so is what is told."""
+    def use_fractional_milliseconds(self) -> None:
+        """Take times as finer than whole ms; the caller subtracts the fraction from each arrival and adds it to each result."""
         if self._whole_ms:
             self._whole_ms = False
-            if self.stands:
+            if self.initialised:
                 self._fit()
 
     def add(self, instrument_ms: int, arrived_ns: int) -> bool:
-        """Take a sample: an instrument time, and when the first byte of the answer with it arrived.
+        """Take a sample: an instrument time, and the arrival of the first byte of its response.
 
         Returns
         -------
         bool
-            False if the instrument's count has jumped: what was known of it is forgotten.
+            False: the instrument's count has jumped, and the fit is reset.
         """
         self._seen += 1
-        self.doubts = False
-        if not self.stands:
-            self._first.append((instrument_ms, arrived_ns))
-            if len(self._first) >= ENOUGH:
-                self._start()
+        self.inconsistent = False
+        if not self.initialised:
+            self._initial.append((instrument_ms, arrived_ns))
+            if len(self._initial) >= MIN_SAMPLES:
+                self._initialise()
             return True
-        x, y = self._place(instrument_ms, arrived_ns)
-        late = y - self._a - self._b * x
-        if not -self._allowed(x) <= late <= LATEST_NS:
-            return self._doubt(instrument_ms, arrived_ns)
-        self._take(x, y)
+        x, y = self._coordinates(instrument_ms, arrived_ns)
+        delay = y - self._height - self._skew * x
+        if not -self._gate(x) <= delay <= MAX_DELAY_NS:
+            return self._add_inconsistent(instrument_ms, arrived_ns)
+        new_bin = self._put(x, y)
+        below = y < self._height + self._skew * x
+        if new_bin or below or self._samples > _REFIT_GROWTH * self._fitted:
+            self._fit()
         return True
 
     def at(self, instrument_ms: int) -> HostTime | None:
-        """Return when that was on the host's clock; None where it is not known (yet)."""
-        if not self.stands:
+        """Return an instrument time on the host's clock; None before initialisation."""
+        if not self.initialised:
             return None
         x = float(instrument_ms * 1_000_000 - self._x0)
-        drift = self._rate_sigma * abs(x - self._middle)
-        host_ns = self._x0 + self._y0 + round(x + self._a + self._lift + self._b * x)
+        drift = self._skew_sigma * abs(x - self._pivot)
+        host_ns = self._x0 + self._y0 + round(x + self._height + self._lift + self._skew * x)
         sigma_ns = math.hypot(self._sigma, drift)
         return HostTime(host_ns, round(sigma_ns), round(_RESOLUTION_NS + 8 * self._excess + 3 * drift))
 
-    def stamp(self, instrument_ms: int, arrived_ns: int) -> HostTime | None:
-        """Return when a distance was taken, from that and from when the first byte of the answer with it arrived.
+    def timestamp(self, instrument_ms: int, arrived_ns: int) -> HostTime | None:
+        """Return the time of a distance, from its instrument time and the arrival of the first byte of its response.
 
-        It is no sample, unless it contradicts those there are: how late a distance comes depends on when it is asked for,
-        so that the fastest ones are no measure.
+        A distance is no sample unless it is inconsistent with the envelope: its delay depends on when it was requested.
 
         Returns
         -------
         HostTime or None
-            None where it is not known, or the distance contradicts what is known.
+            None before initialisation, or for an inconsistent distance.
         """
-        if self.stands:
-            x, y = self._place(instrument_ms, arrived_ns)
-            self.doubts = False
-            if not 0 <= y - self._a - self._b * x <= LATEST_NS:
+        if self.initialised:
+            x, y = self._coordinates(instrument_ms, arrived_ns)
+            self.inconsistent = False
+            if not 0 <= y - self._height - self._skew * x <= MAX_DELAY_NS:
                 self.add(instrument_ms, arrived_ns)
         else:
             self.add(instrument_ms, arrived_ns)
         time = self.at(instrument_ms)
-        if self.doubts or time is None or not arrived_ns <= time.host_ns + LATEST_NS:
+        if self.inconsistent or time is None or not arrived_ns <= time.host_ns + MAX_DELAY_NS:
             return None
         return time._replace(host_ns=min(time.host_ns, arrived_ns))
 
     # --- Samples ----------------------------------------------------------------------------------------------
 
-    def _place(self, instrument_ms: int, arrived_ns: int) -> tuple[float, float]:
-        """Return instrument time, and arrival less that, from the origin of this fit."""
+    def _coordinates(self, instrument_ms: int, arrived_ns: int) -> tuple[float, float]:
+        """Return instrument time, and arrival less instrument time, from the origin of this fit."""
         x = instrument_ms * 1_000_000 - self._x0
         return float(x), float(arrived_ns - self._y0 - self._x0 - x)
 
-    def _start(self) -> None:
-        """Begin with the first samples, without what does not belong to the others: a damaged one, a jump between."""
-        offsets = [arrived_ns - ms * 1_000_000 for ms, arrived_ns in self._first]
+    def _initialise(self) -> None:
+        """Fit the first samples, without outliers among them: a corrupted one, or a jump in between."""
+        offsets = [arrived_ns - ms * 1_000_000 for ms, arrived_ns in self._initial]
         middle = median(offsets)
         kept = [
             sample
-            for sample, y in sorted(zip(self._first, offsets, strict=True), key=lambda pair: pair[1])
-            if abs(y - middle) <= LATEST_NS
+            for sample, y in sorted(zip(self._initial, offsets, strict=True), key=lambda pair: pair[1])
+            if abs(y - middle) <= MAX_DELAY_NS
         ]
         if len(kept) > 2:
             lowest, second = (arrived - ms * 1_000_000 for ms, arrived in kept[:2])
             if second - lowest > max(5e6, 4 * (middle - second)):
                 del kept[0]
-        if len(kept) < ENOUGH - 1:
-            # The oldest goes, whatever it is: samples from before a power cycle may be the most of them.
-            del self._first[0]
+        if len(kept) < MIN_SAMPLES - 1:
+            # Drop the oldest, whichever it is: most samples may be from before a power cycle.
+            del self._initial[0]
             return
         kept.sort()
         self._x0 = kept[0][0] * 1_000_000
         self._y0 = kept[0][1] - self._x0
-        self._b = self._known_rate
-        placed = [self._place(*sample)[1] for sample in kept]
-        self._a = min(placed)
-        self._above = median(placed) - self._a
+        self._skew = self._known_skew
+        heights = [self._coordinates(*sample)[1] for sample in kept]
+        self._height = min(heights)
+        self._mean_delay = median(heights) - self._height
         for ms, arrived_ns in kept:
-            self._put(*self._place(ms, arrived_ns))
-        self._first = []
+            self._put(*self._coordinates(ms, arrived_ns))
+        self._initial = []
         self._fit()
 
-    def _allowed(self, x: float) -> float:
-        """Return how far below the envelope a sample may lie and be a faster answer than any before it, in ns."""
-        return _RESOLUTION_NS + 10 * self._excess + 3 * self._rate_sigma * abs(x - self._middle)
-
-    def _take(self, x: float, y: float) -> None:
-        new = self._put(x, y)
-        if new or y < self._a + self._b * x or self._samples > _MORE * self._fitted:
-            self._fit()
+    def _gate(self, x: float) -> float:
+        """Return how far below the envelope a sample may lie and still be a faster response, in ns."""
+        return _RESOLUTION_NS + 10 * self._excess + 3 * self._skew_sigma * abs(x - self._pivot)
 
     def _put(self, x: float, y: float) -> bool:
-        """Put a sample into its bin; return whether it is the first of a new one."""
+        """Put a sample into its bin; return whether it starts a new one."""
         bins = self._bins
         number = math.floor(x / _BIN_NS)
         new = not bins or number > bins[-1].number
         if new:
             bins.append(_Bin(number, x, y))
-            while bins[0].number < number - _WINDOW_NS / _BIN_NS and self._samples - bins[0].count >= _KEPT:
+            oldest = number - _WINDOW_NS / _BIN_NS
+            while bins[0].number < oldest and self._samples - bins[0].count >= _MIN_KEPT_SAMPLES:
                 self._samples -= bins.popleft().count
-        place = next((bin_ for bin_ in reversed(bins) if bin_.number <= number), bins[0])
-        if y - self._b * x < place.y - self._b * place.x:
-            place.x, place.y = x, y
-        place.count += 1
-        place.sum_x += x
-        place.sum_y += min(y, self._a + self._b * x + _LATE * max(self._above, _RESOLUTION_NS))
+        bin_ = next((bin_ for bin_ in reversed(bins) if bin_.number <= number), bins[0])
+        if y - self._skew * x < bin_.y - self._skew * bin_.x:
+            bin_.x, bin_.y = x, y
+        bin_.count += 1
+        bin_.sum_x += x
+        bin_.sum_y += min(
+            y, self._height + self._skew * x + _DELAY_CAP * max(self._mean_delay, _RESOLUTION_NS)
+        )
         self._samples += 1
         self._newest = max(self._newest, x)
         return new
 
-    def _doubt(self, instrument_ms: int, arrived_ns: int) -> bool:
-        """Keep a sample apart; believe it with the others that agree with it, when there are enough of them."""
-        self.doubts = True
-        self._doubted.append((self._seen, instrument_ms, arrived_ns))
-        offsets = [arrived - ms * 1_000_000 for _, ms, arrived in self._doubted]
-        recent = self._doubted[-1][0] - self._doubted[0][0] <= _MEMORY
-        if len(offsets) < _FEW or not recent or max(offsets) - min(offsets) > _AGREE_NS:
+    def _add_inconsistent(self, instrument_ms: int, arrived_ns: int) -> bool:
+        """Hold a sample until enough others agree with it; return False if they reset the fit."""
+        self.inconsistent = True
+        self._candidates.append((self._seen, instrument_ms, arrived_ns))
+        offsets = [arrived - ms * 1_000_000 for _, ms, arrived in self._candidates]
+        recent = self._candidates[-1][0] - self._candidates[0][0] <= _CANDIDATE_WINDOW
+        if len(offsets) < _CANDIDATES or not recent or max(offsets) - min(offsets) > _CANDIDATE_SPREAD_NS:
             return True
-        agreed = [(ms, arrived) for _, ms, arrived in self._doubted]
-        placed = [self._place(*sample) for sample in agreed]
-        if all(abs(y - self._a - self._b * x) <= LATEST_NS / 2 for x, y in placed):
-            # Answers have become faster, or the rate is another: what was lowest before is not any more.
-            self._doubted.clear()
+        agreeing = [(ms, arrived) for _, ms, arrived in self._candidates]
+        points = [self._coordinates(*sample) for sample in agreeing]
+        self.inconsistent = False
+        if all(abs(y - self._height - self._skew * x) <= MAX_DELAY_NS / 2 for x, y in points):
+            # The minimum delay or the skew has changed: the old envelope is void, the origin stays.
+            self._candidates.clear()
             self._bins.clear()
             self._samples = 0
-            for x, y in placed:
+            for x, y in points:
                 self._put(x, y)
             self._fit()
-            self.doubts = False
             return True
-        self._begin(agreed)
-        self.began += 1
-        self.doubts = False
+        self._reset(agreeing)
+        self.resets += 1
         return False
 
     # --- The fit ----------------------------------------------------------------------------------------------
 
     def _fit(self) -> None:
-        """Lay the line below all samples, with as much of the rate from them as they tell."""
+        """Fit the envelope to all samples."""
         bins = self._bins
         mean_x = sum(bin_.sum_x for bin_ in bins) / self._samples
         mean_y = sum(bin_.sum_y for bin_ in bins) / self._samples
-        envelope = min(bin_.y - self._b * (bin_.x - mean_x) for bin_ in bins)
-        above = mean_y - envelope
-        self._above = above if self._samples >= _KEPT else max(above, self._above)
-        share = max(2 * above / max(self._samples - 1, 1) / _RESOLUTION_NS, _LEAST_SHARE)
-        # The lowest of answers of which nothing is cut off is above the line as a wait is long: mean and sigma are the same.
-        height = lowest(share) if self._whole_ms else Lowest(share, share)
-        line = line_below(
-            [(bin_.x, bin_.y) for bin_ in bins],
-            middle=mean_x,
-            scale=height.sigma * _RESOLUTION_NS,
-            known=(self._known_rate, self._known_sigma),
-            most=_MOST_RATE,
+        envelope = min(bin_.y - self._skew * (bin_.x - mean_x) for bin_ in bins)
+        mean_delay = mean_y - envelope
+        self._mean_delay = (
+            mean_delay if self._samples >= _MIN_KEPT_SAMPLES else max(mean_delay, self._mean_delay)
         )
-        self._b = line.slope
-        self._rate_sigma = line.slope_sigma + _WANDER
+        share = max(2 * mean_delay / max(self._samples - 1, 1) / _RESOLUTION_NS, _MIN_DELAY_SHARE)
+        # Without truncation the minimum delay is exponentially distributed: mean and sigma are the same.
+        lowest = minimum_delay(share) if self._whole_ms else MinimumDelay(share, share)
+        line = fit_lower_envelope(
+            [(bin_.x, bin_.y) for bin_ in bins],
+            centre=mean_x,
+            scale=lowest.sigma * _RESOLUTION_NS,
+            prior=(self._known_skew, self._known_sigma),
+            max_slope=_MAX_SKEW,
+        )
+        self._skew = line.slope
+        self._skew_sigma = line.slope_sigma + _SKEW_WANDER
         if bins[-1].x - bins[0].x > _STEADY_NS:
-            self._known_rate, self._known_sigma = self._b, _KNOWN_RATE
-        self._a = min(bin_.y - self._b * bin_.x for bin_ in bins)
-        # Of a time in whole ms: a distance was taken within the one that follows, on average half of it later.
-        cut_off = 0.5 if self._whole_ms else 0.0
-        self._lift = line.height - self._a + (cut_off - height.mean) * _RESOLUTION_NS
-        self._excess = 2 * self._above / self._samples
+            self._known_skew, self._known_sigma = self._skew, _KNOWN_SKEW_SIGMA
+        self._height = min(bin_.y - self._skew * bin_.x for bin_ in bins)
+        # A time in whole ms is truncated: the distance was taken half of one later on average.
+        truncation = 0.5 if self._whole_ms else 0.0
+        self._lift = line.height - self._height + (truncation - lowest.mean) * _RESOLUTION_NS
+        self._excess = 2 * self._mean_delay / self._samples
         rounding_ns = _ROUNDING_NS if self._whole_ms else 0.0
-        self._sigma = math.hypot(rounding_ns, height.sigma * _RESOLUTION_NS, line.pivot_sigma)
-        self._middle = line.pivot
+        self._sigma = math.hypot(rounding_ns, lowest.sigma * _RESOLUTION_NS, line.pivot_sigma)
+        self._pivot = line.pivot
         self._fitted = self._samples

@@ -1,8 +1,8 @@
-"""When an instrument measures: at even intervals, found from the stamps of its measurements.
+"""Period and phase of an instrument's continuous measurement, from the timestamps of its measurements.
 
-Measurements get lost, come late and out of turn, and some instruments take a few milliseconds more or less each time.
-So the interval is first guessed from the shorter steps between neighbours, which numbers the measurements, and then
-fitted by least squares, once with all of them and once without those that lie far off.
+Measurements get lost, arrive late and out of order, and some instruments jitter by a few milliseconds. So a rough period
+from the shorter intervals numbers the measurements, and least squares fits period and phase, once with all of them and
+once without outliers.
 """
 
 from __future__ import annotations
@@ -12,113 +12,98 @@ from itertools import pairwise
 from statistics import fmean, median
 from typing import NamedTuple
 
-MOST = 24
-"""Measurements that are looked at: some ten seconds, short enough to follow any clock."""
+MAX_MEASUREMENTS = 24
+"""Measurements that are used: about ten seconds, short enough to follow any clock."""
 
-LEAST = 6
-"""Fewer do not tell an interval."""
+MIN_MEASUREMENTS = 6
 
-LONGEST_GAP_US = 5_000_000
-"""After so long without a measurement an instrument may have started anew, so that nothing of before holds."""
+MAX_GAP_US = 5_000_000
+"""After a longer gap the instrument may have restarted: earlier measurements are dropped."""
 
-LARGEST_SPREAD = 0.1
-"""An instrument that is off its beat by more than this part of its period keeps none."""
+MAX_RELATIVE_JITTER = 0.1
+"""An instrument whose jitter exceeds this part of its period has none."""
 
-_OUTLYING = 4.0
-_LEAST_OUTLYING_US = 500.0
+_OUTLIER_MEDIANS = 4.0
+_MIN_OUTLIER_US = 500.0
 
 
-class Beat(NamedTuple):
-    """At which instants an instrument measures.
+class Period(NamedTuple):
+    """When an instrument measures.
 
     Attributes
     ----------
     period_us
         From one measurement to the next.
     phase_us
-        One of the instants, at or near the newest measurement.
-    spread_us
-        By how much single measurements are off, one sigma.
+        Time of one of them, at or near the newest.
+    jitter_us
+        One sigma of a single measurement.
     """
 
     period_us: float
     phase_us: float
-    spread_us: float
+    jitter_us: float
 
 
-class Rhythm:
-    """The beat of one instrument.
-
-    Attributes
-    ----------
-    beat
-        As the measurements up to now show it; None while they show none.
-    newest_us
-        The newest measurement; None before the first.
-    """
+class Periodicity:
+    """Estimates the period of one instrument; ``period`` is None while there is none."""
 
     def __init__(self) -> None:
         self._times_us: list[int] = []
-        self.beat: Beat | None = None
+        self.period: Period | None = None
 
     @property
     def newest_us(self) -> int | None:
-        """When the newest measurement was made."""
+        """Time of the newest measurement; None before the first."""
         return self._times_us[-1] if self._times_us else None
 
     def add(self, time_us: int) -> None:
-        """Take a measurement; those that are known, or far older than the others, change nothing.
-
-        Parameters
-        ----------
-        time_us
-            When it was made, on any even clock.
-        """
+        """Take the time of a measurement, in any order, on any uniform clock; repeated and far older ones are ignored."""
         times = self._times_us
-        if times and time_us > times[-1] + LONGEST_GAP_US:
+        if times and time_us > times[-1] + MAX_GAP_US:
             times.clear()
         place = bisect_left(times, time_us)
-        if times[place : place + 1] == [time_us] or (times and time_us < times[-1] - LONGEST_GAP_US):
+        if times[place : place + 1] == [time_us] or (times and time_us < times[-1] - MAX_GAP_US):
             return
         times.insert(place, time_us)
-        del times[:-MOST]
-        self.beat = _beat(times)
-        if self.beat is None and len(times) == MOST:
-            del times[: MOST // 2]  # what came before a change of beat only hides the new one
+        del times[:-MAX_MEASUREMENTS]
+        self.period = _fit(times)
+        if self.period is None and len(times) == MAX_MEASUREMENTS:
+            del times[: MAX_MEASUREMENTS // 2]  # measurements before a change of period hide the new one
 
 
-def _beat(times_us: list[int]) -> Beat | None:
-    if len(times_us) < LEAST:
+def _fit(times_us: list[int]) -> Period | None:
+    if len(times_us) < MIN_MEASUREMENTS:
         return None
-    steps = [after - before for before, after in pairwise(times_us)]
-    usual = sorted(steps)[len(steps) // 4]  # where some are missing, longer steps are several intervals
+    intervals = [after - before for before, after in pairwise(times_us)]
+    rough = sorted(intervals)[len(intervals) // 4]  # intervals with lost measurements are multiples of it
     numbers = [0]
-    for step in steps:
-        numbers.append(numbers[-1] + max(round(step / usual), 1))
+    for interval in intervals:
+        numbers.append(numbers[-1] + max(round(interval / rough), 1))
     points = [
         (number - numbers[-1], float(time - times_us[-1]))
         for number, time in zip(numbers, times_us, strict=True)
     ]
-    fit = _line(points)
-    misses = _misses(points, fit)
-    limit_us = max(_OUTLYING * median(misses), _LEAST_OUTLYING_US)
-    kept = [point for point, miss in zip(points, misses, strict=True) if miss <= limit_us]
-    phase_us, period_us = fit = _line(kept)
-    spread_us = fmean([miss * miss for miss in _misses(kept, fit)]) ** 0.5
-    if spread_us > LARGEST_SPREAD * period_us:
+    line = _least_squares(points)
+    residuals = _residuals(points, line)
+    limit_us = max(_OUTLIER_MEDIANS * median(residuals), _MIN_OUTLIER_US)
+    kept = [point for point, residual in zip(points, residuals, strict=True) if residual <= limit_us]
+    phase_us, period_us = line = _least_squares(kept)
+    jitter_us = fmean([residual * residual for residual in _residuals(kept, line)]) ** 0.5
+    if jitter_us > MAX_RELATIVE_JITTER * period_us:
         return None
-    return Beat(period_us, times_us[-1] + phase_us, spread_us)
+    return Period(period_us, times_us[-1] + phase_us, jitter_us)
 
 
-def _misses(points: list[tuple[int, float]], fit: tuple[float, float]) -> list[float]:
-    start, slope = fit
-    return [abs(time - start - slope * number) for number, time in points]
+def _residuals(points: list[tuple[int, float]], line: tuple[float, float]) -> list[float]:
+    intercept, slope = line
+    return [abs(time - intercept - slope * number) for number, time in points]
 
 
-def _line(points: list[tuple[int, float]]) -> tuple[float, float]:
-    """Return value at number 0, and slope."""
-    middle, mean = fmean([number for number, _ in points]), fmean([time for _, time in points])
-    slope = sum([(number - middle) * (time - mean) for number, time in points]) / sum(
-        [(number - middle) ** 2 for number, _ in points]
+def _least_squares(points: list[tuple[int, float]]) -> tuple[float, float]:
+    """Return intercept and slope of the regression line."""
+    mean_number, mean_time = fmean([number for number, _ in points]), fmean([time for _, time in points])
+    slope = sum([(number - mean_number) * (time - mean_time) for number, time in points]) / sum(
+        [(number - mean_number) ** 2 for number, _ in points]
     )
-    return mean - slope * middle, slope
+    return mean_time - slope * mean_number, slope

@@ -22,7 +22,7 @@ def taught(pairs: int, *, ppm: float = 0.0, jitter_us: float = 0.0, seed: int = 
     clock, rng = BeaconClock(), np.random.default_rng(seed)
     for k in range(pairs):
         late_ns = round(1000 * rng.normal(0.0, jitter_us)) if jitter_us else 0
-        assert clock.add(received_ns(sent_us(k), ppm) + late_ns, sent_us(k), SIGMA_NS, in_full=k < 2)
+        assert clock.add(received_ns(sent_us(k), ppm) + late_ns, sent_us(k), SIGMA_NS, unambiguous=k < 2)
     return clock
 
 
@@ -37,7 +37,7 @@ def test_without_pairs_it_knows_nothing_but_durations() -> None:
     assert clock.at(START_NS) is None
     assert clock.unwrap(START_NS, 5) is None
     assert clock.last_received_ns is None
-    assert clock.pairs == 0
+    assert clock.samples == 0
     assert clock.elapsed(START_NS, START_NS + FRAME_NS)[::2] == pytest.approx((400_000.0, 48.0))
 
 
@@ -67,7 +67,7 @@ def test_of_two_first_pairs_that_do_not_agree_neither_is_a_time() -> None:
         taken = []
         for k in range(4):
             late_us = 248_000 if k == held else 0
-            taken.append(clock.add(received_ns(sent_us(k) + late_us), sent_us(k), SIGMA_NS, in_full=True))
+            taken.append(clock.add(received_ns(sent_us(k) + late_us), sent_us(k), SIGMA_NS, unambiguous=True))
             if k == 1:
                 assert clock.at(received_ns(sent_us(1))) is None
         at = clock.at(received_ns(sent_us(0)))
@@ -172,7 +172,7 @@ def test_a_single_beacon_in_a_long_outage_may_have_been_held_back(
             at = clock.at(received_ns(sent_us(before)))
             assert at is not None
             assert abs(at.time_us - sent_us(before)) <= at.bound_us
-    assert clock.pairs == 160
+    assert clock.samples == 160
 
 
 def test_a_beacon_that_was_held_up_for_long_does_not_keep_others_from_being_understood() -> None:
@@ -186,7 +186,7 @@ def test_recordings_of_long_ago_never_outvote_the_fit() -> None:
     """However many agree with each other: the master has heard no answer to any of them."""
     clock = taught(150)
     for k in range(150, 180):
-        assert not clock.add(received_ns(sent_us(k + 50)), sent_us(k), SIGMA_NS, in_full=True, live=False)
+        assert not clock.add(received_ns(sent_us(k + 50)), sent_us(k), SIGMA_NS, unambiguous=True, live=False)
     at = clock.at(received_ns(sent_us(230)))
     assert at is not None
     assert abs(at.time_us - sent_us(230)) < 1000
@@ -196,9 +196,9 @@ def test_first_pairs_that_are_outvoted_say_nothing_surely() -> None:
     """Neither of their own time nor of what was before them."""
     clock = BeaconClock()
     for k in range(2):
-        clock.add(received_ns(sent_us(k) + 30_000), sent_us(k), SIGMA_NS, in_full=True)
+        clock.add(received_ns(sent_us(k) + 30_000), sent_us(k), SIGMA_NS, unambiguous=True)
     for k in range(2, 10):
-        clock.add(received_ns(sent_us(k)), sent_us(k), SIGMA_NS, in_full=True)
+        clock.add(received_ns(sent_us(k)), sent_us(k), SIGMA_NS, unambiguous=True)
         for early_us in (sent_us(0) - 20_000_000, sent_us(0)):
             at = clock.at(received_ns(early_us))
             assert at is not None
@@ -240,7 +240,7 @@ def test_a_large_jump_needs_a_time_in_full() -> None:
     clock, jump_us = taught(150), 20_000
     for k in range(150, 160):
         assert not clock.add(received_ns(sent_us(k) + jump_us), sent_us(k), SIGMA_NS)
-    assert not clock.add(received_ns(sent_us(160) + jump_us), sent_us(160), SIGMA_NS, in_full=True)
+    assert not clock.add(received_ns(sent_us(160) + jump_us), sent_us(160), SIGMA_NS, unambiguous=True)
     assert clock.add(received_ns(sent_us(161) + jump_us), sent_us(161), SIGMA_NS)
 
 
@@ -251,7 +251,7 @@ def test_after_a_jump_beyond_16_bits_low_bits_follow_the_full_time() -> None:
         local_ns = received_ns(sent_us(k) + slept_us + 60_000_000 * 2)
         full = sent_us(k) if k == 152 else clock.unwrap(local_ns, sent_us(k) & 0xFFFF)
         if full is not None:
-            clock.add(local_ns, full, SIGMA_NS, in_full=k == 152)
+            clock.add(local_ns, full, SIGMA_NS, unambiguous=k == 152)
     at = clock.at(local_ns)
     assert at is not None
     assert abs(at.time_us - sent_us(159)) < at.bound_us < 1_000
@@ -271,7 +271,7 @@ def taught_coarsely(seed: int) -> BeaconClock:
     """Return a clock whose stamps scatter by 1 ms; some of its pairs are refused."""
     clock, rng = BeaconClock(), np.random.default_rng(seed)
     for k in range(30):
-        clock.add(received_ns(sent_us(k) + rng.normal(0, 1_000)), sent_us(k), SIGMA_NS, in_full=k < 4)
+        clock.add(received_ns(sent_us(k) + rng.normal(0, 1_000)), sent_us(k), SIGMA_NS, unambiguous=k < 4)
     return clock
 
 
@@ -290,16 +290,16 @@ def test_a_pair_must_be_newer() -> None:
     """A pair that was received before the newest one is refused."""
     clock = taught(10)
     assert not clock.add(received_ns(sent_us(9)), sent_us(9), SIGMA_NS)
-    assert clock.pairs == 10
+    assert clock.samples == 10
     assert clock.last_received_ns == received_ns(sent_us(9))
 
 
 def test_the_oldest_pairs_are_let_go_of(monkeypatch: pytest.MonkeyPatch) -> None:
     """What the clock remembers is limited, and what it knows of now does not suffer."""
-    monkeypatch.setattr(beacon_clock, "MOST_PAIRS", 100)
-    monkeypatch.setattr(beacon_clock, "_FORGOTTEN", 20)
+    monkeypatch.setattr(beacon_clock, "MAX_SAMPLES", 100)
+    monkeypatch.setattr(beacon_clock, "_DROPPED_SAMPLES", 20)
     clock = taught(500, ppm=50, jitter_us=28)
-    assert 80 <= clock.pairs <= 100
+    assert 80 <= clock.samples <= 100
     for k in (450, 499):
         at = clock.at(received_ns(sent_us(k), 50))
         assert at is not None
@@ -309,9 +309,9 @@ def test_the_oldest_pairs_are_let_go_of(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_old_stretches_are_let_go_of(monkeypatch: pytest.MonkeyPatch) -> None:
     """A stretch with few pairs goes as a whole."""
-    monkeypatch.setattr(beacon_clock, "MOST_PAIRS", 100)
-    monkeypatch.setattr(beacon_clock, "_FORGOTTEN", 20)
+    monkeypatch.setattr(beacon_clock, "MAX_SAMPLES", 100)
+    monkeypatch.setattr(beacon_clock, "_DROPPED_SAMPLES", 20)
     clock = taught(10)
     for k in range(20, 200):
         clock.add(received_ns(sent_us(k) + 2_000), sent_us(k), SIGMA_NS)
-    assert clock.pairs <= 100 + 1
+    assert clock.samples <= 100 + 1

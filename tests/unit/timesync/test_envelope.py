@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tsgt.timesync.envelope import line_below, lowest
+from tsgt.timesync.envelope import fit_lower_envelope, minimum_delay
 
 SPREAD = 40.0
 
@@ -15,7 +15,7 @@ def test_how_far_the_lowest_answer_is_from_the_line(count: int) -> None:
     """Mean and scatter are those of many trials, whether what is cut off matters or not."""
     random = np.random.default_rng(1)
     heights = random.uniform(0, SPREAD, (4000, count)) + random.uniform(0, 1, (4000, count))
-    found = lowest(SPREAD / (count + 1))
+    found = minimum_delay(SPREAD / (count + 1))
     assert found.mean == pytest.approx(heights.min(axis=1).mean(), rel=0.25)
     assert found.sigma == pytest.approx(heights.min(axis=1).std(), rel=0.25)
 
@@ -29,12 +29,12 @@ def test_errors_of_the_line_are_as_stated() -> None:
         slope = random.normal(0, 0.01)
         y = slope * x + random.uniform(0, SPREAD, 60)
         scale = SPREAD / 61
-        line = line_below(
+        line = fit_lower_envelope(
             list(zip(x.tolist(), y.tolist(), strict=True)),
-            middle=float(x.mean()),
+            centre=float(x.mean()),
             scale=scale,
-            known=(0.0, 0.01),
-            most=0.05,
+            prior=(0.0, 0.01),
+            max_slope=0.05,
         )
         error = line.height - scale + line.slope * 1000 - slope * 1000
         errors.append(
@@ -46,7 +46,7 @@ def test_errors_of_the_line_are_as_stated() -> None:
 
 def test_one_answer_tells_nothing_of_the_slope() -> None:
     """What was known of it before remains."""
-    line = line_below([(3.0, 5.0)], middle=3.0, scale=1.0, known=(1e-3, 1e-3), most=1e-2)
+    line = fit_lower_envelope([(3.0, 5.0)], centre=3.0, scale=1.0, prior=(1e-3, 1e-3), max_slope=1e-2)
     assert line.slope == pytest.approx(1e-3, rel=1e-2)
     assert line.slope_sigma == pytest.approx(1e-3, rel=5e-2)
     assert line.height + line.slope * 3 == pytest.approx(5.0)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tsgt.timesync import InstrumentClock
-from tsgt.timesync.instrument_clock import ENOUGH
+from tsgt.timesync.instrument_clock import MIN_SAMPLES
 
 MS = 1_000_000
 OFFSET_NS = 77_000_000_000_000
@@ -35,10 +35,10 @@ def standing(samples: int = 200, rate: float = 0.0, start_ms: int = 5_000_000) -
 def test_nothing_is_told_before_there_are_enough_samples() -> None:
     """A few answers may all have been late."""
     clock = InstrumentClock()
-    for number in range(ENOUGH):
+    for number in range(MIN_SAMPLES):
         assert clock.at(1000) is None
         clock.add(1000 + 100 * number, arrived_ns(1000 + 100 * number))
-    assert clock.stands
+    assert clock.initialised
     time = clock.at(1000)
     assert time is not None
     assert 0 <= time.host_ns - arrived_ns(1000) < MS  # it was taken within the ms that it is told in
@@ -56,7 +56,7 @@ def test_the_fastest_answers_decide() -> None:
 def test_the_rate_is_found(rate: float) -> None:
     """After some minutes it is known to a few parts in a million, and times follow it."""
     clock = standing(1000, rate)
-    assert clock.rate_ppm == pytest.approx(rate * 1e6, abs=5)
+    assert clock.skew_ppm == pytest.approx(rate * 1e6, abs=5)
     time = clock.at(5_399_600)
     assert time is not None
     assert abs(time.host_ns - arrived_ns(5_399_600, rate=rate)) < MS
@@ -68,10 +68,10 @@ def test_a_power_cycle_begins_anew(start_ms: int) -> None:
     clock = standing()
     results = [
         clock.add(start_ms + 100 * n, arrived_ns(5_200_000 + 100 * n, late_ms=7 * (n % 8)))
-        for n in range(8 * ENOUGH)
+        for n in range(8 * MIN_SAMPLES)
     ]
     assert results.count(False) == 1
-    assert clock.stands
+    assert clock.initialised
     time = clock.at(start_ms)
     assert time is not None
     assert abs(time.host_ns - arrived_ns(5_200_000)) < MS
@@ -86,11 +86,11 @@ def test_the_wrap_of_the_count_begins_anew() -> None:
         ms = start_ms + 400 * number
         wrapped = ms - 2**32 if ms >= 2**31 else ms
         clock.add(wrapped, arrived_ns(ms, 10.0 * (number % 4)))
-        time = clock.stamp(wrapped, arrived_ns(ms, 50.0))
+        time = clock.timestamp(wrapped, arrived_ns(ms, 50.0))
         if time is not None:
             told.append(abs(time.host_ns - arrived_ns(ms)))
             outside += told[-1] > time.bound_ns
-    assert len(told) > 300 - 2 * ENOUGH - 2
+    assert len(told) > 300 - 2 * MIN_SAMPLES - 2
     assert outside == 0
     assert max(told[-150:]) < MS
 
@@ -100,7 +100,7 @@ def test_one_damaged_time_is_doubted() -> None:
     clock = standing()
     before = clock.at(5_080_000)
     for wrong_ms in (-30_000, 90, 700, 5_000, 40_000_000):
-        assert clock.stamp(5_080_000 + wrong_ms, arrived_ns(5_080_000, 5.0)) is None
+        assert clock.timestamp(5_080_000 + wrong_ms, arrived_ns(5_080_000, 5.0)) is None
         for number in range(40):
             clock.add(5_080_000 + 400 * number, arrived_ns(5_080_000 + 400 * number, 10.0))
     after = clock.at(5_080_000)
@@ -114,7 +114,7 @@ def test_one_damaged_time_is_doubted() -> None:
 def test_a_damaged_time_among_the_first_is_left_out(wrong_ms: int, which: int) -> None:
     """There is no envelope yet that contradicts it, but the others do."""
     clock = InstrumentClock()
-    for number in range(ENOUGH + 2):
+    for number in range(MIN_SAMPLES + 2):
         ms = 60_000 + 50 * number
         clock.add(ms + (wrong_ms if number == which else 0), arrived_ns(ms, 3.0 * (number % 4)))
     time = clock.at(60_000)
@@ -122,13 +122,13 @@ def test_a_damaged_time_among_the_first_is_left_out(wrong_ms: int, which: int) -
     assert abs(time.host_ns - arrived_ns(60_000)) < 10 * MS
 
 
-@pytest.mark.parametrize("before", range(1, ENOUGH))
+@pytest.mark.parametrize("before", range(1, MIN_SAMPLES))
 def test_a_power_cycle_among_the_first_is_survived(before: int) -> None:
     """However many samples there were before it, those after it are believed in the end."""
     clock = InstrumentClock()
     for number in range(before):
         clock.add(50_000_000 + 50 * number, arrived_ns(0, 50.0 * number))
-    for number in range(3 * ENOUGH):
+    for number in range(3 * MIN_SAMPLES):
         ms = 5000 + 50 * number
         clock.add(ms, arrived_ns(ms, 3.0 * (number % 4)))
     time = clock.at(5000)
@@ -151,7 +151,7 @@ def test_a_gap_is_bridged() -> None:
     """After ten minutes without an answer the first one is put where the rate says, with a wider bound."""
     clock = standing(1000, 20e-6)
     ms = 5_400_000 + 600_000
-    time = clock.stamp(ms, arrived_ns(ms, 35.0, 20e-6))
+    time = clock.timestamp(ms, arrived_ns(ms, 35.0, 20e-6))
     before = clock.at(5_399_600)
     assert time is not None
     assert before is not None
@@ -162,8 +162,8 @@ def test_a_gap_is_bridged() -> None:
 def test_a_stale_answer_has_no_time() -> None:
     """More than two seconds on the way: rather none than a doubtful one."""
     clock = standing()
-    assert clock.stamp(5_080_000, arrived_ns(5_080_000, 1_900.0)) is not None
-    assert clock.stamp(5_080_400, arrived_ns(5_080_400, 2_100.0)) is None
+    assert clock.timestamp(5_080_000, arrived_ns(5_080_000, 1_900.0)) is not None
+    assert clock.timestamp(5_080_400, arrived_ns(5_080_400, 2_100.0)) is None
 
 
 class Told(NamedTuple):
@@ -182,7 +182,7 @@ def of_answers(random: np.random.Generator, rate_ppm: float, spread_ms: float, p
         true_ms = 1_000_000 + number * period_ms + random.normal(0, 4)
         arrived = arrived_ns(true_ms, random.uniform(0, spread_ms), rate_ppm * 1e-6)
         clock.add(int(true_ms), arrived)
-        time = None if clock.doubts else clock.stamp(int(true_ms), arrived)
+        time = None if clock.inconsistent else clock.timestamp(int(true_ms), arrived)
         if time is None:
             continue
         told.times_ns.append(time.host_ns)

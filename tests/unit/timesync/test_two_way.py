@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from harness.clock_exchanges import SECOND, START_NS, WAY_NS, drifting, exchange, synchronisation
 
-from tsgt.timesync import ArrivalCheck, ClockFilter, clock_filter
-from tsgt.timesync.offset_regression import Frequency, fit, sift
+from tsgt.timesync.offset_regression import SkewPrior, fit_line, select_samples
+from tsgt.timesync.two_way import ClockFilter, TimestampCheck, clock_filter
 
 MS = 1_000_000
 NAMES = ("regression", "paper")
@@ -34,7 +34,7 @@ def test_nothing_is_known_before_the_first_synchronisation(name: str) -> None:
     with pytest.raises(LookupError):
         found.at(START_NS)
     found.update(synchronisation(0, drifting(0, 0)))
-    found.forget()
+    found.reset()
     with pytest.raises(LookupError):
         found.at(START_NS)
 
@@ -45,7 +45,7 @@ def test_the_first_synchronisation_is_a_start(name: str) -> None:
     found = clock_filter(name)  # type: ignore[arg-type]
     clock = drifting(0, 5)
     assert [found.update(synchronisation(start_s, clock)).restarted for start_s in (0, 300)] == [True, False]
-    found.forget()
+    found.reset()
     assert found.update(synchronisation(600, clock)).restarted
 
 
@@ -53,7 +53,7 @@ def test_the_first_synchronisation_is_a_start(name: str) -> None:
 def test_a_single_exchange_will_do(name: str) -> None:
     """One exchange gives an offset, with a bound that covers its round trip and grows with time."""
     found = clock_filter(name)  # type: ignore[arg-type]
-    found.update([exchange(0, drifting(7 * SECOND, 20), turn_round_ns=4 * MS)])
+    found.update([exchange(0, drifting(7 * SECOND, 20), turnaround_ns=4 * MS)])
     for true_s in (0.0, 10.0, 300.0):
         offset_ns = 7 * SECOND + 20e3 * true_s
         estimate = found.at(START_NS + round(true_s * SECOND + offset_ns))
@@ -91,10 +91,10 @@ def test_a_clock_that_is_decades_off_loses_no_nanosecond(name: str) -> None:
 def test_paper_takes_the_midpoint_and_then_a_tenth() -> None:
     """The first mean counts whole; of the second one a tenth is taken (equation 1 with w = 0.1)."""
     found = clock_filter("paper")
-    found.update(synchronisation(0, drifting(0, 0), turn_round_ns=3 * MS))
+    found.update(synchronisation(0, drifting(0, 0), turnaround_ns=3 * MS))
     # The station stamps before its turn-round, so the midpoint comes half a turn-round late.
     assert found.at(START_NS).offset_ns == -1.5 * MS
-    found.update(synchronisation(300, drifting(10 * MS, 0), turn_round_ns=3 * MS))
+    found.update(synchronisation(300, drifting(10 * MS, 0), turnaround_ns=3 * MS))
     assert found.at(START_NS).offset_ns == pytest.approx(-0.5 * MS, abs=1)
 
 
@@ -104,7 +104,7 @@ def test_paper_knows_no_frequency() -> None:
     found.update(synchronisation(0, drifting(0, 10)))
     early, late = found.at(START_NS + 2 * SECOND), found.at(START_NS + 102 * SECOND)
     assert early.offset_ns == late.offset_ns
-    assert late.frequency_ppm == 0.0
+    assert late.skew_ppm == 0.0
     assert late.bound_ns - early.bound_ns == pytest.approx(10 * MS, rel=1e-3)
 
 
@@ -117,7 +117,7 @@ def test_line_is_that_of_an_independent_least_squares(seed: int) -> None:
     rng = np.random.default_rng(seed)
     ppm = rng.uniform(-80, 80)
     samples = [
-        exchange(sent_ns, drifting(0, ppm), late_ns=round(rng.normal(0, 8000)), turn_round_ns=0)
+        exchange(sent_ns, drifting(0, ppm), late_ns=round(rng.normal(0, 8000)), turnaround_ns=0)
         for sent_ns in sorted(rng.integers(0, 30 * SECOND, 40).tolist())
     ]
     # A late stamp delays the answer, too: taken off, so that all round trips are as long.
@@ -131,17 +131,17 @@ def test_line_is_that_of_an_independent_least_squares(seed: int) -> None:
         )
         for s in samples
     ]
-    batch = sift(samples, 0.0, noise_ns=1e6)
+    batch = select_samples(samples, 0.0, noise_ns=1e6)
     assert len(batch.station_ns) == 40
-    line, _ = fit([batch], Frequency(0.0, 1e9), 0.0)
+    line, _ = fit_line([batch], SkewPrior(0.0, 1e9), 0.0)
     t = (batch.station_ns - batch.station_ns[-1]) / 1e9
     (frequency, offset_ns), covariance = np.polyfit(t, batch.offset_ns - batch.offset_ns[-1], 1, cov=True)
-    assert line.frequency == pytest.approx(frequency, rel=1e-9)
-    assert line.offset_ns == pytest.approx(offset_ns, rel=1e-9, abs=1e-3)
+    assert line.line.skew == pytest.approx(frequency, rel=1e-9)
+    assert line.line.offset == pytest.approx(offset_ns, rel=1e-9, abs=1e-3)
     # The noise is drawn a little towards the usual one, by two in forty.
-    assert line.variances[0] == pytest.approx(covariance[1, 1], rel=0.2)
-    assert line.variances[2] == pytest.approx(covariance[0, 0], rel=0.2)
-    assert line.variances[1] == pytest.approx(covariance[0, 1], rel=0.2)
+    assert line.line.offset_variance == pytest.approx(covariance[1, 1], rel=0.2)
+    assert line.line.skew_variance == pytest.approx(covariance[0, 0], rel=0.2)
+    assert line.line.covariance == pytest.approx(covariance[0, 1], rel=0.2)
 
 
 def test_weights_are_those_of_the_normal_equations() -> None:
@@ -152,19 +152,19 @@ def test_weights_are_those_of_the_normal_equations() -> None:
             n * SECOND,
             drifting(0, 3),
             late_ns=int(rng.integers(0, 20_000)),
-            turn_round_ns=int(rng.integers(MS, 8 * MS)),
+            turnaround_ns=int(rng.integers(MS, 8 * MS)),
         )
         for n in range(30)
     ]
-    batch = sift(samples, 0.0, noise_ns=1e6)
-    line, _ = fit([batch], Frequency(0.0, 1e9), 0.0)
+    batch = select_samples(samples, 0.0, noise_ns=1e6)
+    line, _ = fit_line([batch], SkewPrior(0.0, 1e9), 0.0)
     excess_ms = (batch.excess_ns - batch.excess_ns.min()) / MS
     root = np.sqrt(1 / (1 + (excess_ms / 2) ** 2))
     rows = np.stack([np.ones(30), (batch.station_ns - batch.station_ns[-1]) / 1e9], axis=1)
     expected, *_ = np.linalg.lstsq(
         rows * root[:, None], (batch.offset_ns - batch.offset_ns[-1]) * root, rcond=None
     )
-    assert [line.offset_ns, line.frequency] == pytest.approx(expected.tolist(), rel=1e-6)
+    assert [line.line.offset, line.line.skew] == pytest.approx(expected.tolist(), rel=1e-6)
 
 
 def test_regression_follows_drift_to_the_next_synchronisation() -> None:
@@ -173,7 +173,7 @@ def test_regression_follows_drift_to_the_next_synchronisation() -> None:
     clock = drifting(0, 50)
     for start_s in (0, 300):
         found.update(synchronisation(start_s, clock))
-    assert found.at(START_NS).frequency_ppm == pytest.approx(50, abs=0.1)
+    assert found.at(START_NS).skew_ppm == pytest.approx(50, abs=0.1)
     assert abs(error_ns(found, 600, 50e3 * 600)) < 0.05 * MS
 
 
@@ -181,7 +181,7 @@ def test_a_short_first_synchronisation_does_not_run_wild() -> None:
     """Two stamps that scatter by 40 us within a quarter of a second are 160 ppm; crystals are not."""
     found = clock_filter("regression")
     found.update(synchronisation(0, drifting(0, 0), cycles=2, late_ns=[0, 40_000]))
-    assert abs(found.at(START_NS).frequency_ppm) < 30
+    assert abs(found.at(START_NS).skew_ppm) < 30
 
 
 def test_late_stamps_are_left_out() -> None:
@@ -222,7 +222,7 @@ def test_impossible_exchanges_are_left_out() -> None:
     """A reply that came before it could have come has a wrong stamp on it."""
     found = clock_filter("regression")
     samples = synchronisation(0, drifting(0, 0))
-    samples[2] = exchange(samples[2].sent_ns - START_NS, drifting(3 * MS, 0), turn_round_ns=-6 * MS)
+    samples[2] = exchange(samples[2].sent_ns - START_NS, drifting(3 * MS, 0), turnaround_ns=-6 * MS)
     assert found.update(samples).rejected == 1
     assert abs(error_ns(found, 1, 0)) < 0.02 * MS
 
@@ -236,7 +236,7 @@ def test_a_line_that_bends_lets_go_of_the_past() -> None:
 
     for start_s in range(0, 3901, 300):
         found.update(synchronisation(start_s, clock))
-    assert found.at(START_NS).frequency_ppm == pytest.approx(13, abs=0.1)
+    assert found.at(START_NS).skew_ppm == pytest.approx(13, abs=0.1)
     assert abs(error_ns(found, 4200, clock(4200 * SECOND))) < 0.05 * MS
 
 
@@ -252,7 +252,7 @@ def test_a_step_between_synchronisations_starts_anew(step_ms: int) -> None:
         assert found.update(synchronisation(start_s, clock)).restarted == (start_s == 0)
     assert found.update(synchronisation(900, clock)).restarted
     assert abs(error_ns(found, 901, clock(901 * SECOND))) < 0.05 * MS
-    assert found.at(START_NS).frequency_ppm == pytest.approx(10, abs=1)
+    assert found.at(START_NS).skew_ppm == pytest.approx(10, abs=1)
 
 
 @pytest.mark.parametrize("step_ms", [50, -50])
@@ -273,7 +273,7 @@ def test_frequency_is_remembered_when_the_offset_is_forgotten() -> None:
     clock = drifting(0, 40)
     for start_s in (0, 300, 600):
         found.update(synchronisation(start_s, clock))
-    found.forget()
+    found.reset()
     found.update(synchronisation(700, drifting(-3600 * SECOND, 40)))
     assert abs(error_ns(found, 1000, -3600 * SECOND + 40e3 * 1000)) < 0.1 * MS
 
@@ -282,9 +282,9 @@ def test_frequency_is_remembered_when_the_offset_is_forgotten() -> None:
 def test_a_frequency_that_may_be_a_small_step_is_not_remembered(step_ms: float) -> None:
     """A clock that was set by less than its bound seems to run at another frequency, which its next restart may end."""
     found = clock_filter("regression")
-    found.update(synchronisation(0, drifting(0, -20), cycles=8, turn_round_ns=3 * MS))
-    found.update(synchronisation(14, drifting(step_ms * MS, -20), turn_round_ns=3 * MS))
-    assert abs(found.at(START_NS + 15 * SECOND).frequency_ppm + 20) > 10
+    found.update(synchronisation(0, drifting(0, -20), cycles=8, turnaround_ns=3 * MS))
+    found.update(synchronisation(14, drifting(step_ms * MS, -20), turnaround_ns=3 * MS))
+    assert abs(found.at(START_NS + 15 * SECOND).skew_ppm + 20) > 10
     clock = drifting(-3600 * SECOND, -20)
     assert found.update(synchronisation(30, clock)).restarted
     for true_s in (31, 40, 60, 120):
@@ -298,9 +298,9 @@ def test_another_crystal_is_believed_after_a_long_synchronisation() -> None:
     found = clock_filter("regression")
     for start_s in (0, 300, 600):
         found.update(synchronisation(start_s, drifting(0, 40)))
-    found.forget()
+    found.reset()
     found.update(synchronisation(700, drifting(0, -10), cycles=50))
-    assert found.at(START_NS).frequency_ppm == pytest.approx(-10, abs=1.5)
+    assert found.at(START_NS).skew_ppm == pytest.approx(-10, abs=1.5)
 
 
 def test_bound_covers_what_all_stamps_share() -> None:
@@ -327,7 +327,7 @@ def test_bound_grows_with_age_and_sigma_stays_below() -> None:
 
 
 def polls(
-    check: ArrivalCheck, *, count: int, first_s: float = 0.0, step_s: float = 0.0, seed: int = 0
+    check: TimestampCheck, *, count: int, first_s: float = 0.0, step_s: float = 0.0, seed: int = 0
 ) -> list[bool]:
     """Poll every 0.58 s a clock that is wrong by the step; measurements are 0 to 0.45 s old when sent."""
     rng = np.random.default_rng(seed)
@@ -348,28 +348,28 @@ def polls(
 
 def test_arrivals_no_false_alarm_in_hours() -> None:
     """Four hours of polls without a step raise no alarm."""
-    assert all(polls(ArrivalCheck(), count=25_000))
+    assert all(polls(TimestampCheck(), count=25_000))
 
 
 def test_arrivals_no_false_alarm_after_lost_replies_and_lost_lock() -> None:
     """Minutes without a measurement, and then one again, are nothing to worry about."""
-    check = ArrivalCheck()
+    check = TimestampCheck()
     assert all(polls(check, count=10))
     assert all(polls(check, count=10, first_s=7.5))
     for requested_s in range(15, 300):
-        check.nothing_new(START_NS + requested_s * SECOND)
+        check.no_new_measurement(START_NS + requested_s * SECOND)
     assert all(polls(check, count=10, first_s=300.0))
 
 
 def test_arrivals_the_first_measurement_may_be_as_old_as_it_likes() -> None:
     """A station that lost its target an hour ago answers the first request with what it last saw."""
-    assert polls(ArrivalCheck(), count=1, step_s=-3600) == [True]
+    assert polls(TimestampCheck(), count=1, step_s=-3600) == [True]
 
 
 @pytest.mark.parametrize("step_s", [1.0, 3600.0, -1.0, -3600.0])
 def test_arrivals_a_step_is_noticed_at_once(step_s: float) -> None:
     """Measurements from the future, or from before the previous one, come from another clock."""
-    check = ArrivalCheck()
+    check = TimestampCheck()
     polls(check, count=5)
     assert polls(check, count=1, first_s=5 * 0.58, step_s=step_s) == [False]
 
@@ -377,22 +377,22 @@ def test_arrivals_a_step_is_noticed_at_once(step_s: float) -> None:
 @pytest.mark.parametrize("step_s", [0.3, -0.4])
 def test_arrivals_a_step_of_some_tenths_is_noticed_soon(step_s: float) -> None:
     """Steps just beyond the reply time-out show within a minute of polls."""
-    check = ArrivalCheck()
+    check = TimestampCheck()
     polls(check, count=5)
     assert not all(polls(check, count=100, first_s=5 * 0.58, step_s=step_s))
 
 
 def test_arrivals_a_station_that_restarted_while_it_had_nothing_new() -> None:
     """A station that answered without news is known to have had nothing older than that."""
-    check = ArrivalCheck()
+    check = TimestampCheck()
     polls(check, count=5)
-    check.nothing_new(START_NS + 100 * SECOND)
+    check.no_new_measurement(START_NS + 100 * SECOND)
     assert polls(check, count=1, first_s=100.58, step_s=-30.0) == [False]
 
 
 def test_arrivals_a_wide_bound_makes_the_check_lenient() -> None:
     """After a long outage the offset itself may be off by its bound, which is no step."""
-    check = ArrivalCheck()
+    check = TimestampCheck()
     assert check.check(START_NS, requested_ns=START_NS, received_ns=START_NS, bound_ns=0)
     late = {"requested_ns": START_NS + SECOND, "received_ns": START_NS + SECOND}
     assert check.check(START_NS + 3 * SECOND, bound_ns=2 * SECOND, **late)

@@ -5,43 +5,41 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tsgt.timesync.kalman import Estimate, carried, corrected, merged
+from tsgt.timesync.clock_line import ClockLine
 
 WALK_PPM2_PER_S = 0.3
 TIMES_S = np.array([0.0, 0.4, 0.9, 1.3, 8.0, 8.4, 9.1])
 VARIANCES = np.array([4.0, 1.0, 9.0, 4.0, 1.0, 2.0, 4.0])
 OFFSETS_US = np.array([0.0, 3.0, 4.0, 9.0, 70.0, 77.0, 75.0])
-PRIOR = Estimate(1.0, 5.0, 100.0, 3.0, 50.0)
-UNKNOWN = Estimate(0.0, 0.0, 1e9, 0.0, 1e9)
+PRIOR = ClockLine(1.0, 5.0, 100.0, 3.0, 50.0)
+UNKNOWN = ClockLine(0.0, 0.0, 1e9, 0.0, 1e9)
 
 
-def forwards(until_s: float) -> Estimate:
+def forwards(until_s: float) -> ClockLine:
     """Filter the comparisons up to an instant, and carry the result there."""
     estimate, at_s = PRIOR, 0.0
     for time_s, offset_us, variance in zip(TIMES_S, OFFSETS_US, VARIANCES, strict=True):
         if time_s > until_s:
             break
-        estimate = corrected(
-            carried(estimate, time_s - at_s, WALK_PPM2_PER_S * (time_s - at_s)), offset_us, variance
-        )
+        predicted = estimate.propagate(time_s - at_s, WALK_PPM2_PER_S * (time_s - at_s))
+        estimate = predicted.update(offset_us, variance)
         at_s = time_s
-    return carried(estimate, until_s - at_s, WALK_PPM2_PER_S * (until_s - at_s))
+    return estimate.propagate(until_s - at_s, WALK_PPM2_PER_S * (until_s - at_s))
 
 
-def backwards(until_s: float) -> Estimate:
+def backwards(until_s: float) -> ClockLine:
     """Filter the comparisons after an instant, newest first, and carry the result there."""
     estimate, at_s = UNKNOWN, float(TIMES_S[-1])
     for time_s, offset_us, variance in zip(TIMES_S[::-1], OFFSETS_US[::-1], VARIANCES[::-1], strict=True):
         if time_s <= until_s:
             break
-        estimate = corrected(
-            carried(estimate, time_s - at_s, WALK_PPM2_PER_S * (at_s - time_s)), offset_us, variance
-        )
+        predicted = estimate.propagate(time_s - at_s, WALK_PPM2_PER_S * (at_s - time_s))
+        estimate = predicted.update(offset_us, variance)
         at_s = time_s
-    return carried(estimate, until_s - at_s, WALK_PPM2_PER_S * (at_s - until_s))
+    return estimate.propagate(until_s - at_s, WALK_PPM2_PER_S * (at_s - until_s))
 
 
-def at_once(time_s: float) -> Estimate:
+def at_once(time_s: float) -> ClockLine:
     """Solve for offset and rate at all times together, from first principles, and return one of them."""
     times_s = np.unique([*TIMES_S, time_s])
     size = 2 * len(times_s)
@@ -52,7 +50,7 @@ def at_once(time_s: float) -> Estimate:
         information[:] += rows.T @ weight @ rows
         vector[:] += rows.T @ weight @ values
 
-    prior = np.array([[PRIOR.offset_variance, PRIOR.covariance], [PRIOR.covariance, PRIOR.rate_variance]])
+    prior = np.array([[PRIOR.offset_variance, PRIOR.covariance], [PRIOR.covariance, PRIOR.skew_variance]])
     observe(np.eye(2, size), np.array(PRIOR[:2]), prior)
     for k, gap_s in enumerate(np.diff(times_s)):
         rows = np.zeros((2, size))
@@ -66,7 +64,7 @@ def at_once(time_s: float) -> Estimate:
         observe(row, np.array([offset_us]), np.array([[variance]]))
     covariance = np.linalg.inv(information)
     values, k = covariance @ vector, 2 * int(np.searchsorted(times_s, time_s))
-    return Estimate(
+    return ClockLine(
         values[k], values[k + 1], covariance[k, k], covariance[k, k + 1], covariance[k + 1, k + 1]
     )
 
@@ -79,12 +77,10 @@ def test_forwards_is_the_least_squares_solution_at_the_end() -> None:
 @pytest.mark.parametrize("time_s", [0.2, 1.1, 4.0, 8.2, 9.0])
 def test_both_ways_merged_are_the_least_squares_solution(time_s: float) -> None:
     """Between comparisons, those before and those after together are all that there is to know."""
-    assert tuple(merged(forwards(time_s), backwards(time_s))) == pytest.approx(
-        tuple(at_once(time_s)), rel=1e-5
-    )
+    assert tuple(forwards(time_s).fuse(backwards(time_s))) == pytest.approx(tuple(at_once(time_s)), rel=1e-5)
 
 
 def test_carrying_back_undoes_carrying() -> None:
     """Without a walk nothing is lost on the way."""
-    there = carried(PRIOR, 7.0, 0.0)
-    assert tuple(carried(there, -7.0, 0.0)) == pytest.approx(tuple(PRIOR), rel=1e-9)
+    there = PRIOR.propagate(7.0, 0.0)
+    assert tuple(there.propagate(-7.0, 0.0)) == pytest.approx(tuple(PRIOR), rel=1e-9)

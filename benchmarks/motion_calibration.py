@@ -53,7 +53,7 @@ def judge(name: str, recording: Recording, rng: np.random.Generator) -> tuple[fl
     frames = np.array([*(each.T_station1_station for each in recording.parameters.stations), np.eye(4)])
     late_s = np.zeros(len(frames))
     late_s[1] = LATE_S
-    unknowns = found.unknowns
+    unknowns = found.parameters
     error = unknowns.local_coordinates(found.setup) - unknowns.local_coordinates(Setup(frames, late_s, found.setup.layout))
     sigmas = error / np.sqrt(np.diag(found.covariance))
     squared = float(error @ np.linalg.solve(found.covariance, error))

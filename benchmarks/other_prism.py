@@ -46,7 +46,7 @@ async def hide(timeline: VirtualTimeline, hidden_s: float, *, narrow: bool) -> C
     await succeeds(f"17037:{int(narrow)}")
     found: Counter[str] = Counter()
     while found.total() < TIMES:
-        station.lock_by_hand(1)
+        station.lock_manually(1)
         await asyncio.sleep(1.0)
         station.blocked = True
         await asyncio.sleep(hidden_s)

@@ -1,8 +1,7 @@
-"""Rigid alignment: the rotation and translation that bring one set of points closest to another.
+"""Rigid registration of point sets: least-squares rotation and translation.
 
-:func:`align` serves calibration: one set of any size, weighted, with covariance. :func:`align_triplets` and
-:func:`align_many` serve poses: one layout against very many measured sets, unweighted. For three points the
-optimum has a closed form, which :func:`align_triplets` evaluates; :func:`align_many` takes any number of points.
+:func:`align` serves calibration: one weighted set with covariance. :func:`align_triplets` and :func:`align_many` serve
+poses: one layout against many measured sets, unweighted; three points have a closed form.
 """
 
 from __future__ import annotations
@@ -22,10 +21,10 @@ if TYPE_CHECKING:
     from tsgt.geometry.rigid import FloatArray
 
 COLLINEAR_RATIO = 1e-6
-"""Points whose spread across their best line is less than this part of the spread along it lie in a line."""
+"""Points are collinear if their spread across their best line is less than this ratio of the spread along it."""
 
 ROUNDING = 1e-12
-"""Spread below this part of the coordinates themselves is rounding, not geometry."""
+"""A spread below this ratio of the coordinates is rounding error."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,13 +34,13 @@ class Alignment:
     Attributes
     ----------
     rotation
-        R, shape (3, 3): ``target = R source + t``. Always proper.
+        R, (3, 3), proper: ``target = R source + t``.
     translation_m
-        t in m, shape (3,).
+        t, (3,).
     residuals_m
-        Target less transformed source in m, shape (n, 3).
+        (n, 3) target minus transformed source.
     rms_m
-        Root mean square of the lengths of the residuals in m, unweighted.
+        Root mean square of the residuals' lengths, unweighted.
     covariance
         6x6 of (translation x, y, z in m; rotation about the target frame's fixed axes x, y, z in rad): the true
         transform is ``[exp(dtheta) R | t + dt]``.
@@ -66,14 +65,14 @@ class BatchAlignment:
     Attributes
     ----------
     rotation
-        Shape (N, 3, 3): ``point = R layout + t``. The identity where degenerate.
+        (N, 3, 3): ``point = R layout + t``. The identity where degenerate.
     translation_m
-        In m, shape (N, 3).
+        (N, 3).
     residuals_m
-        Measured less transformed layout in m, shape (N, P, 3).
+        (N, P, 3) measured minus transformed layout.
     degenerate
-        The measured points coincide or lie in a line (beside the layout: to :data:`COLLINEAR_RATIO`), so that no
-        rotation follows from them. Shape (N,).
+        (N,) the measured points coincide or are collinear (relative to the layout, to :data:`COLLINEAR_RATIO`): the
+        rotation is undefined.
     """
 
     rotation: FloatArray
@@ -93,27 +92,25 @@ def align(
 
     Parameters
     ----------
-    source
-        Points in the source frame in m, shape (n, 3), n >= 3.
-    target
-        The same points in the target frame in m, shape (n, 3).
+    source, target
+        (n, 3) the same n >= 3 points in either frame in m.
     weights
-        Positive weights of the points, shape (n,); equal when not given. Only their ratios count.
+        (n,) positive; equal when not given. Only their ratios count.
     covariances
-        Covariance of each residual (of both points together) in the axes of the target frame in m^2, shape
-        (n, 3, 3). When not given, the noise is taken as isotropic with variances inverse to the weights, and its
-        size is estimated from the residuals, of which 3n - 6 are free.
+        (n, 3, 3) covariance of each residual (of both points together) in the target frame in m^2. When not given, the
+        noise is taken as isotropic with variances inverse to the weights, its size estimated from the residuals with
+        3n - 6 degrees of freedom.
 
     Returns
     -------
     Alignment
-        The transform, its residuals and its covariance, which is of first order in the noise.
+        With a covariance of first order in the noise.
 
     Raises
     ------
     DegenerateGeometryError
-        Fewer than three points, points that coincide or lie in a line, or a mirror image that fits equally well
-        in more than one way.
+        Fewer than three points, coincident or collinear points, or a mirror image that fits equally well in more than one
+        way.
     GeometryError
         Shapes that do not match, numbers that are not finite, weights that are not positive.
     """
@@ -160,25 +157,25 @@ def align(
 
 
 def fit_gain(points: FloatArray, weights: FloatArray) -> FloatArray:
-    """How a small displacement of each point moves the rigid transform fitted to all of them.
+    """Return the derivative of the fitted rigid transform by the displacement of each point.
 
     Parameters
     ----------
     points
-        The points from the origin of the moved frame, in axes of one's choice, in m, shape (n, 3).
+        (n, 3) from the origin of the moved frame in m.
     weights
-        Their weights in the fit, shape (n,).
+        (n,) in the fit.
 
     Returns
     -------
     FloatArray
-        Shape (n, 6, 3). Summed over the points, gain times displacement is (translation of the moved frame's
-        origin, small rotation), in the same axes: the pseudo-inverse of ``[I, -skew(point)]``, in blocks.
+        (n, 6, 3). Summed over the points, gain times displacement is (translation of the moved frame's origin, small
+        rotation) in the axes of ``points``: the weighted pseudo-inverse of ``[I, -skew(point)]``, in blocks.
     """
     w = weights / weights.sum()
     mean = w @ points
     arms = skew(points - mean)
-    # About the weighted mean, translation and rotation part; from the origin their normal matrix is badly
+    # About the weighted mean, translation and rotation decouple; about the origin their normal matrix is badly
     # conditioned as soon as the points are far away.
     inertia = np.linalg.inv((w[:, None, None] * (np.swapaxes(arms, 1, 2) @ arms)).sum(axis=0))
     rotation = inertia @ (w[:, None, None] * arms)
@@ -192,9 +189,9 @@ def align_triplets(layout: ArrayLike, points: ArrayLike) -> BatchAlignment:
     Parameters
     ----------
     layout
-        The three points in the body frame in m, shape (3, 3).
+        (3, 3) the three points in the body frame in m.
     points
-        Measured triplets in the world frame in m, shape (N, 3, 3): item, point, coordinate.
+        (N, 3, 3) measured triplets in the world frame in m: item, point, coordinate.
 
     Returns
     -------
@@ -204,17 +201,16 @@ def align_triplets(layout: ArrayLike, points: ArrayLike) -> BatchAlignment:
     Raises
     ------
     DegenerateGeometryError
-        The layout's points coincide or lie in a line. A degenerate measured triplet is marked instead.
+        The layout's points coincide or are collinear. A degenerate measured triplet is marked instead.
     GeometryError
         Wrong shapes or numbers that are not finite.
 
     Notes
     -----
-    The optimum lays centroid on centroid and plane on plane, each triangle being seen in the same sense; what
-    remains is one angle in the plane. Let b1, b2, b3 be axes of the layout with b3 its normal, (u_i, v_i) its
-    points on b1, b2 from their centroid, and n the measured normal. With U = sum u_i p_i and V = sum v_i p_i, the
-    image r1 of b1 maximises U·r1 + V·(n x r1) = r1·(U - n x V), so r1 is the direction of U - n x V: neither
-    trigonometry nor a decomposition is needed.
+    The optimum maps centroid to centroid and plane to plane; what remains is one angle in the plane. Let b1, b2, b3 be axes
+    of the layout with b3 its normal, (u_i, v_i) its points on b1, b2 from their centroid, and n the measured normal. With
+    U = sum u_i p_i and V = sum v_i p_i, the image r1 of b1 maximises U·r1 + V·(n x r1) = r1·(U - n x V), so r1 is the
+    direction of U - n x V: no trigonometry, no decomposition.
     """
     layout = np.asarray(layout, dtype=np.float64)
     if layout.shape != (3, 3):
@@ -223,7 +219,7 @@ def align_triplets(layout: ArrayLike, points: ArrayLike) -> BatchAlignment:
     batch = _batch(points, 3)
     layout_mean, double_area, (b1, b2, b3), u, v = _triangle(layout.tobytes())
 
-    # Coordinates first and items last: each step below is a few passes over contiguous rows.
+    # Coordinates first, items last: each step below passes over contiguous rows.
     p = np.ascontiguousarray(batch.transpose(1, 2, 0))
     mean = (p[0] + p[1] + p[2]) / 3
     edge_1, edge_2 = p[1] - p[0], p[2] - p[0]
@@ -231,7 +227,7 @@ def align_triplets(layout: ArrayLike, points: ArrayLike) -> BatchAlignment:
     normal_length = _norm(normal)
     degenerate = normal_length <= COLLINEAR_RATIO * double_area
     normal /= np.where(degenerate, 1.0, normal_length)
-    # The u_i and the v_i sum to zero, so that U and V follow from the edges.
+    # The u_i and the v_i sum to zero: U and V follow from the edges.
     U = u[1] * edge_1 + u[2] * edge_2
     V = v[1] * edge_1 + v[2] * edge_2
     r1 = U - _cross(normal, V)
@@ -241,11 +237,10 @@ def align_triplets(layout: ArrayLike, points: ArrayLike) -> BatchAlignment:
         for axis, body_axis in ((r1, b1), (r2, b2), (normal, b3)):
             axis[:, degenerate] = body_axis[:, None]
 
-    # Each row of r1 with each of b1, and so on; each point with its two coordinates.
     R = b1[:, None] * r1[:, None] + b2[:, None] * r2[:, None] + b3[:, None] * normal[:, None]
     residuals = p - mean - (u[:, None, None] * r1 + v[:, None, None] * r2)
     translation = mean - (layout_mean[0] * R[:, 0] + layout_mean[1] * R[:, 1] + layout_mean[2] * R[:, 2])
-    # Contiguous, as a matrix product may round otherwise for another layout in memory, which depends on N here.
+    # Contiguous: the memory layout depends on N, and a matrix product may round differently for another layout.
     return BatchAlignment(
         rotation=np.ascontiguousarray(R.transpose(2, 0, 1)),
         translation_m=np.ascontiguousarray(translation.T),
@@ -256,14 +251,14 @@ def align_triplets(layout: ArrayLike, points: ArrayLike) -> BatchAlignment:
 
 @lru_cache(maxsize=16)
 def _triangle(points: bytes) -> tuple[FloatArray, float, FloatArray, FloatArray, FloatArray]:
-    """Return a layout's centroid, twice its area, its axes in rows, and its points along the first two of them."""
+    """Centroid of a layout, twice its area, its axes in rows, and its points' coordinates along the first two axes."""
     layout = _points(np.frombuffer(points).reshape(3, 3), "layout")
     check_spread(layout, "layout points")
     mean = (layout[0] + layout[1] + layout[2]) / 3
     normal = np.cross(layout[1] - layout[0], layout[2] - layout[0])
     double_area = float(np.linalg.norm(normal))
     b3 = normal / double_area
-    # b1 along the edge 0-1, so that both ends have the same v.
+    # b1 along the edge 0-1: both ends have the same v.
     b1 = layout[1] - layout[0]
     b1 = b1 / np.linalg.norm(b1)
     b2 = np.cross(b3, b1)
@@ -271,19 +266,14 @@ def _triangle(points: bytes) -> tuple[FloatArray, float, FloatArray, FloatArray,
 
 
 def align_many(layout: ArrayLike, points: ArrayLike) -> BatchAlignment:
-    """Alignment of a layout of any size with N measured sets, by one singular value decomposition each.
+    """Alignment of a layout of any size with N measured sets, by one SVD each (Arun et al. 1987), equal weights.
 
     Parameters
     ----------
     layout
-        Points in the body frame in m, shape (P, 3), P >= 3.
+        (P, 3) points in the body frame in m, P >= 3.
     points
-        Measured sets in the world frame in m, shape (N, P, 3).
-
-    Returns
-    -------
-    BatchAlignment
-        Least-squares transforms (Arun et al. 1987), equal weights.
+        (N, P, 3) measured sets in the world frame in m.
 
     Raises
     ------
@@ -295,7 +285,7 @@ def align_many(layout: ArrayLike, points: ArrayLike) -> BatchAlignment:
     check_spread(layout, "layout points")
 
     body = layout - layout.mean(axis=0)
-    # One by one, as a sum over an axis may group its terms differently for one item than for many.
+    # One by one: a sum over an axis may group its terms differently for one item than for many.
     mean = sum((batch[:, i] for i in range(1, len(layout))), start=batch[:, 0]) / len(layout)
     u, s, vt = np.linalg.svd(body.T @ (batch - mean[:, None]))
     u_t, v = np.swapaxes(u, 1, 2), np.swapaxes(vt, 1, 2).copy()
@@ -309,25 +299,18 @@ def align_many(layout: ArrayLike, points: ArrayLike) -> BatchAlignment:
 
 
 def spread_m(points: FloatArray) -> FloatArray:
-    """Root mean square of points about their mean along their principal axes in m, largest first; shape (3,)."""
+    """(3,) root mean square of points about their mean along their principal axes in m, largest first."""
     spread: FloatArray = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / np.sqrt(len(points))
     return spread
 
 
 def check_spread(points: FloatArray, what: str) -> None:
-    """Refuse points that coincide or lie in a line.
-
-    Parameters
-    ----------
-    points
-        Finite points in m, shape (n, 3), n >= 3.
-    what
-        What they are, in the plural, for the message.
+    """Check that (n, 3) points in m, n >= 3, span a triangle; ``what`` names them in the plural in the message.
 
     Raises
     ------
     DegenerateGeometryError
-        With the spread along and across their best line.
+        They coincide or are collinear; the message has the spread along and across their best line.
     """
     along_m, across_m, _ = spread_m(points)
     rounding_m = ROUNDING * float(np.abs(points).max())
@@ -343,7 +326,7 @@ def check_spread(points: FloatArray, what: str) -> None:
 
 
 def _points(points: ArrayLike, what: str) -> FloatArray:
-    """Point set of shape (n, 3), n >= 3, checked."""
+    """Check a point set of shape (n, 3), n >= 3."""
     array = np.asarray(points, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != 3:
         raise GeometryError(f"{what} points have shape (n, 3), got {array.shape}")
@@ -355,7 +338,7 @@ def _points(points: ArrayLike, what: str) -> FloatArray:
 
 
 def _batch(points: ArrayLike, count: int) -> FloatArray:
-    """Measured sets of shape (N, count, 3), checked."""
+    """Check measured sets of shape (N, count, 3)."""
     array = np.ascontiguousarray(points, dtype=np.float64)
     if array.ndim != 3 or array.shape[1:] != (count, 3):
         raise GeometryError(
@@ -368,7 +351,7 @@ def _batch(points: ArrayLike, count: int) -> FloatArray:
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
     """Cross products of vectors along the first axis."""
-    # Twice over, so that what comes one and two coordinates later is a slice.
+    # Concatenated twice: cyclic shifts become slices.
     a, b = np.concatenate([a, a]), np.concatenate([b, b])
     cross: FloatArray = a[1:4] * b[2:5] - a[2:5] * b[1:4]
     return cross

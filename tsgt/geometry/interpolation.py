@@ -1,7 +1,4 @@
-"""A prism's position between two of its measurements: a straight line in time, unless they are too far apart.
-
-Paper section III-D: linear interpolation of each prism to common epochs, invalid across an outage.
-"""
+"""Linear interpolation of a prism's track to common epochs, invalid across an outage (paper section III-D)."""
 
 from __future__ import annotations
 
@@ -21,7 +18,7 @@ if TYPE_CHECKING:
     from tsgt.geometry.rigid import FloatArray
 
 NO_GAP_NS = -1
-"""``gap_ns`` of an epoch that has no sample before it or none after it."""
+"""``gap_ns`` of an epoch without a sample before or after it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,18 +28,18 @@ class Interpolated:
     Attributes
     ----------
     points
-        Positions in m, shape (N, 3); 0 where invalid.
+        (N, 3) positions in m; 0 where invalid.
     velocities_mps
-        Velocities along the straight lines in m/s, shape (N, 3); 0 where invalid.
+        (N, 3) slopes of the interpolation; 0 where invalid.
     after
-        Index of the first sample at or after the epoch, shape (N,); the number of samples where there is none. The
-        sample before is the one before it.
+        (N,) index of the first sample at or after the epoch; the number of samples where there is none. The other sample of
+        the interval is the one before it.
     fraction
-        Where the epoch lies between the two, 0 exclusive to 1 inclusive, shape (N,); 0 where one of them is missing.
+        (N,) position of the epoch in the interval, 0 exclusive to 1 inclusive; 0 where a sample is missing.
     gap_ns
-        Time between the two in ns, shape (N,); :data:`NO_GAP_NS` where one of them is missing.
+        (N,) length of the interval; :data:`NO_GAP_NS` where a sample is missing.
     valid
-        Both samples are there, and not further apart than the outage limit; shape (N,).
+        (N,) both samples exist, not further apart than the outage limit.
     """
 
     points: FloatArray
@@ -61,19 +58,19 @@ def interpolate(
     Parameters
     ----------
     times_ns
-        Times of the samples in ns, strictly increasing, shape (M,). M may be 0.
+        (M,) sample times, strictly increasing; M may be 0.
     points
-        Positions of the samples in m, shape (M, 3).
+        (M, 3) sample positions in m.
     epochs_ns
-        Times to interpolate to in ns, shape (N,), in any order.
+        (N,) in any order.
     outage_limit_ns
-        Two samples further apart than this leave the time between them invalid; exactly as far is valid.
+        Longest valid interval between two samples, inclusive.
 
     Returns
     -------
     Interpolated
-        One row per epoch. An epoch on a sample belongs to the interval that ends there, so that it is decided as
-        soon as that sample is known.
+        One row per epoch. An epoch on a sample belongs to the interval that ends there, so that it is decided as soon as
+        that sample is known.
 
     Raises
     ------
@@ -103,25 +100,23 @@ def interpolate_prisms(
     epochs_ns: NDArray[np.int64],
     outage_limit_ns: int,
 ) -> Interpolated:
-    """Do for P prisms at once what :func:`interpolate` does for one, and trust that the samples are in order.
+    """Interpolate the samples of P prisms as :func:`interpolate` does for one, without its checks.
 
     Parameters
     ----------
     times_ns
-        Times of all samples in ns, prism after prism, those of each strictly increasing, shape (M,).
+        (M,) sample times of all prisms, prism after prism, strictly increasing within each.
     points
-        Positions of the samples in m, shape (M, 3).
+        (M, 3) sample positions in m.
     counts
-        How many each of the P prisms has.
+        Samples of each of the P prisms.
     epochs_ns
-        Times to interpolate to in ns, shape (N,), in any order.
-    outage_limit_ns
-        As for one.
+        (N,) in any order.
 
     Returns
     -------
     Interpolated
-        Shapes have a P after the N. ``after`` counts the samples of all prisms, one prism after the other.
+        Shapes (N, P, ...). ``after`` indexes the samples of all prisms.
     """
     after = np.empty((len(epochs_ns), len(counts)), dtype=np.int64)
     bounds = list(accumulate(counts, initial=0))
@@ -140,13 +135,13 @@ def _on_lines(
     outage_limit_ns: int,
 ) -> Interpolated:
     """Interpolate between each epoch's two samples, where it has them."""
-    # Where one is missing, any two stand in: nothing of them is kept.
+    # Where a sample is missing, any index will do: the result is masked.
     if not len(times_ns):
         times_ns, points = np.zeros(1, dtype=np.int64), np.zeros((1, 3))
     start, end = np.where(bracketed, (after - 1, after), 0)
     start_ns = times_ns[start]
     gap_ns = np.where(bracketed, times_ns[end] - start_ns, NO_GAP_NS)
-    # Differences of integers first: a Unix time in ns is beyond what a float64 resolves.
+    # Integer differences first: float64 does not resolve a Unix time in ns.
     fraction = np.where(bracketed, (epochs_ns - start_ns) / gap_ns, 0.0)
     valid = bracketed & (gap_ns <= outage_limit_ns)
 
@@ -160,40 +155,22 @@ def _on_lines(
 def interpolated_covariance(
     cov_before: FloatArray, cov_after: FloatArray, fraction: FloatArray
 ) -> FloatArray:
-    """Propagate the noise of two samples to an epoch on the line between them.
-
-    Parameters
-    ----------
-    cov_before, cov_after
-        Covariances of the two samples in m^2, shape (..., 3, 3).
-    fraction
-        Where the epoch lies between them, 0 to 1, shape (...).
-
-    Returns
-    -------
-    FloatArray
-        Shape (..., 3, 3), in m^2.
-    """
+    """Propagate the noise of two samples, (..., 3, 3) in m^2, to an epoch at a fraction, (...), of the interval between them."""
     f = fraction[..., None, None]
     covariance: FloatArray = (1 - f) ** 2 * cov_before + f**2 * cov_after
     return covariance
 
 
 def interpolation_error_s2(fraction: FloatArray, gap_ns: NDArray[np.int64]) -> FloatArray:
-    """By how much the straight line misses the path, per unit of acceleration: t_before t_after / 2.
+    """Error of linear interpolation per unit of constant acceleration, in m per m/s^2: t_before t_after / 2.
 
     Parameters
     ----------
     fraction
-        Where the epoch lies between two samples, 0 to 1, of any shape.
+        Position of the epoch in the interval, 0 to 1.
     gap_ns
-        Time between the two in ns, of the same shape.
-
-    Returns
-    -------
-    FloatArray
-        Of the same shape, in m per m/s^2, for an acceleration that is constant between the samples.
+        Length of the interval, of the same shape.
     """
     gap_s = np.asarray(gap_ns) * 1e-9
-    missed: FloatArray = (fraction * gap_s) * ((1 - fraction) * gap_s) / 2
-    return missed
+    error_s2: FloatArray = (fraction * gap_s) * ((1 - fraction) * gap_s) / 2
+    return error_s2

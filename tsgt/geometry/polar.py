@@ -1,7 +1,7 @@
-"""What a total station measures, as coordinates: polar to Cartesian and back, corrections, noise.
+"""Polar measurements of a total station: conversion, corrections, Jacobians, noise.
 
-The station frame is right-handed with z up. Horizontal angles run clockwise, seen from above, from the x axis;
-zenith angles run from straight up. All functions work element by element and broadcast; NaN passes through.
+The station frame is right-handed with z up. Horizontal angles run clockwise, seen from above, from the x axis; zenith
+angles run from straight up. All functions work element by element and broadcast; NaN passes through.
 """
 
 from __future__ import annotations
@@ -23,88 +23,67 @@ if TYPE_CHECKING:
 def polar_to_cartesian(
     horizontal_angle_rad: ArrayLike, zenith_angle_rad: ArrayLike, distance_m: ArrayLike
 ) -> FloatArray:
-    """Point in the station frame of a polar measurement.
+    """Points in the station frame, (..., 3) in m, of polar measurements.
 
     Parameters
     ----------
     horizontal_angle_rad
-        Horizontal angle in rad, clockwise.
+        Clockwise.
     zenith_angle_rad
-        Zenith angle in rad; above pi in the second face, where the horizontal angle is turned by pi: both faces
-        give the same point.
+        Above pi in the second face, where the horizontal angle is turned by pi: both faces give the same point.
     distance_m
-        Slope distance in m, corrected.
-
-    Returns
-    -------
-    FloatArray
-        x, y, z in m, shape (..., 3).
+        Corrected slope distance.
     """
     return np.asarray(distance_m)[..., None] * _direction(horizontal_angle_rad, zenith_angle_rad)
 
 
 def cartesian_to_polar(points: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """First-face polar coordinates of points in the station frame; inverse of :func:`polar_to_cartesian`.
-
-    Parameters
-    ----------
-    points
-        x, y, z in m, shape (..., 3).
+    """First-face polar coordinates of points in the station frame, (..., 3) in m; inverse of :func:`polar_to_cartesian`.
 
     Returns
     -------
     tuple of FloatArray
-        Horizontal angle in rad in [0, 2 pi), zenith angle in rad in [0, pi], distance in m, each of shape (...).
-        An angle that does not exist is 0: the horizontal angle straight up and down, both at the station itself.
+        Horizontal angle in rad in [0, 2 pi), zenith angle in rad in [0, pi], distance in m, each of shape (...). An
+        undefined angle is 0: the horizontal angle on the vertical axis, both angles at the station itself.
     """
     x, y, z = np.moveaxis(np.asarray(points, dtype=np.float64), -1, 0)
     horizontal_m = np.hypot(x, y)
     around = np.where(horizontal_m == 0, 0.0, np.mod(np.arctan2(-y, x), 2 * np.pi))
-    # The remainder of a tiny negative angle rounds up to the full circle itself.
+    # The remainder of a tiny negative angle rounds up to 2 pi.
     around = np.where(around >= 2 * np.pi, 0.0, around)
     zenith_angle_rad = np.where((horizontal_m == 0) & (z == 0), 0.0, np.arctan2(horizontal_m, z))
     return around, zenith_angle_rad, np.hypot(horizontal_m, z)
 
 
 def corrected_distance(slope_distance_m: ArrayLike, *, constant_m: float, ppm: float) -> FloatArray:
-    """Slope distance with atmospheric scale and prism constant applied.
+    """Corrected slope distance in m: atmospheric scale and prism constant applied.
 
     Parameters
     ----------
     slope_distance_m
-        Raw slope distance in m.
+        As measured.
     constant_m
-        Prism or target constant in m, added. It is not scaled: it is a length of glass, not of air.
+        Prism constant, added. It is not scaled: it is a length of glass, not of air.
     ppm
         Atmospheric correction in 1e-6 of the raw distance.
-
-    Returns
-    -------
-    FloatArray
-        Corrected slope distance in m.
     """
     return np.asarray(slope_distance_m, dtype=np.float64) * (1 + ppm * 1e-6) + constant_m
 
 
 def raw_distance(distance_m: ArrayLike, *, constant_m: float, ppm: float) -> FloatArray:
-    """Raw slope distance in m that :func:`corrected_distance` turns into ``distance_m``."""
+    """Raw slope distance in m; inverse of :func:`corrected_distance`."""
     return (np.asarray(distance_m, dtype=np.float64) - constant_m) / (1 + ppm * 1e-6)
 
 
 def polar_jacobian(
     horizontal_angle_rad: ArrayLike, zenith_angle_rad: ArrayLike, distance_m: ArrayLike
 ) -> FloatArray:
-    """Differentiate :func:`polar_to_cartesian`.
-
-    Parameters
-    ----------
-    horizontal_angle_rad, zenith_angle_rad, distance_m
-        As there.
+    """Jacobian of :func:`polar_to_cartesian`.
 
     Returns
     -------
     FloatArray
-        Shape (..., 3, 3): rows x, y, z; columns horizontal angle, zenith angle, distance (m/rad, m/rad, 1).
+        (..., 3, 3): rows x, y, z; columns horizontal angle, zenith angle, distance (m/rad, m/rad, 1).
     """
     h, z, d = np.broadcast_arrays(
         *(np.asarray(a, dtype=np.float64) for a in (horizontal_angle_rad, zenith_angle_rad, distance_m))
@@ -121,22 +100,17 @@ def polar_jacobian(
 
 
 def cartesian_jacobian(points: ArrayLike) -> FloatArray:
-    """Differentiate :func:`cartesian_to_polar`: the inverse of :func:`polar_jacobian`.
-
-    Parameters
-    ----------
-    points
-        x, y, z in m, shape (..., 3).
+    """Jacobian of :func:`cartesian_to_polar` at points, (..., 3) in m: the inverse of :func:`polar_jacobian`.
 
     Returns
     -------
     FloatArray
-        Shape (..., 3, 3): rows horizontal angle, zenith angle, distance; columns x, y, z (rad/m, rad/m, 1).
+        (..., 3, 3): rows horizontal angle, zenith angle, distance; columns x, y, z (rad/m, rad/m, 1).
 
     Raises
     ------
     GeometryError
-        A point lies straight above or below the station or in it: its horizontal angle has no derivative.
+        A point lies on the station's vertical axis: its horizontal angle has no derivative.
     """
     x, y, z = np.moveaxis(np.asarray(points, dtype=np.float64), -1, 0)
     horizontal_m = np.hypot(x, y)
@@ -165,25 +139,20 @@ def measurement_covariance(
     distance_m: ArrayLike,
     noise: InstrumentNoise,
 ) -> FloatArray:
-    """Covariance of a measured point in the station frame.
+    """Covariance of measured points in the station frame, (..., 3, 3) in m^2.
 
     Parameters
     ----------
     horizontal_angle_rad, zenith_angle_rad, distance_m
-        The measurement, as in :func:`polar_to_cartesian`.
+        As for :func:`polar_to_cartesian`.
     noise
-        One sigma of the instrument. The range's constant and ppm parts are independent and add as variances.
-
-    Returns
-    -------
-    FloatArray
-        Shape (..., 3, 3), in m^2.
+        Instrument sigmas. The range's constant and ppm parts are independent and add as variances.
 
     Notes
     -----
-    The horizontal angle's own noise is the angle sigma over sin(zenith angle), and the point moves by
-    distance x sin(zenith angle) per rad of it. The sines cancel: across the line of sight the noise is
-    distance x angle sigma in all directions, straight up as well, and only the line of sight has to be known.
+    The horizontal angle's sigma is the angle sigma over sin(zenith angle), and the point moves by distance x sin(zenith
+    angle) per rad of it. The sines cancel: across the line of sight the noise is distance x angle sigma in all directions,
+    straight up as well.
     """
     distance_m = np.asarray(distance_m, dtype=np.float64)
     direction = _direction(horizontal_angle_rad, zenith_angle_rad)
@@ -195,7 +164,7 @@ def measurement_covariance(
 
 
 def _direction(horizontal_angle_rad: ArrayLike, zenith_angle_rad: ArrayLike) -> FloatArray:
-    """Give the unit vector of the line of sight in the station frame, shape (..., 3)."""
+    """Return the unit vector of the line of sight in the station frame, (..., 3)."""
     h = np.asarray(horizontal_angle_rad, dtype=np.float64)
     z = np.asarray(zenith_angle_rad, dtype=np.float64)
     sin_z = np.sin(z)

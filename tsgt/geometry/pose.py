@@ -1,7 +1,7 @@
-"""Poses of the robot from the positions of its prisms, with residuals, covariance and twist.
+"""Robot poses from prism positions: registration, residuals, covariance and twist.
 
-The layout gives the prisms in the robot frame; everything else is in the world frame. A pose covariance is that of
-ROS: (x, y, z of the robot's origin, rotation about the world's fixed axes x, y, z).
+The layout gives the prisms in the robot frame; everything else is in the world frame. A pose covariance follows ROS:
+(x, y, z of the robot's origin, rotation about the world's fixed axes x, y, z).
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from tsgt.geometry.rigid import FloatArray
 
 MIN_PRISM_DISTANCE_M = 0.01
-"""Prisms are several centimetres wide: centres closer than this are a slip in the layout, not a robot."""
+"""Prisms are several centimetres wide: centres closer than this are a mistake in the layout."""
 
 MIN_LAYOUT_RATIO = 0.01
-"""Layouts flatter than this (spread across their best line over spread along it) leave the roll about it to noise."""
+"""Smallest ratio of the layout's spread across its best line to that along it; below, noise dominates the roll about it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,15 +38,15 @@ class Poses:
     Attributes
     ----------
     rotation
-        ``R_world_robot``, shape (N, 3, 3). The identity where degenerate.
+        (N, 3, 3) ``R_world_robot``. The identity where degenerate.
     translation_m
-        The robot's origin in the world in m, shape (N, 3).
+        (N, 3) the robot's origin in the world.
     residuals_m
-        How far each measured prism lies from where the pose puts it, in m, shape (N, P).
+        (N, P) distance of each measured prism from its fitted position.
     rms_m
-        Root mean square of these over the prisms in m, shape (N,).
+        (N,) root mean square of the residuals over the prisms.
     degenerate
-        The prisms coincide or lie in a line: no rotation follows from them. Shape (N,).
+        (N,) the prisms coincide or are collinear: the rotation is undefined.
     """
 
     rotation: FloatArray
@@ -62,25 +62,20 @@ def poses_from_prisms(layout: ArrayLike, points: ArrayLike) -> Poses:
     Parameters
     ----------
     layout
-        The P >= 3 prisms in the robot frame in m, shape (P, 3).
+        (P, 3) the P >= 3 prisms in the robot frame in m.
     points
-        The prisms in the world in m, shape (N, P, 3), in the same order.
-
-    Returns
-    -------
-    Poses
-        One per row of ``points``.
+        (N, P, 3) the prisms in the world in m, in the same order.
 
     Raises
     ------
     DegenerateGeometryError
-        The layout's prisms are fewer than three, coincide or lie in a line.
+        Fewer than three prisms in the layout, or they coincide or are collinear.
     GeometryError
         Wrong shapes or numbers that are not finite.
     """
     fit = (align_triplets if np.shape(layout)[:1] == (3,) else align_many)(layout, points)
     squares = dot(fit.residuals_m, fit.residuals_m)
-    # Prism by prism, as a sum over an axis may group its terms differently for one pose than for many.
+    # Prism by prism: a sum over an axis may group its terms differently for one pose than for many.
     mean_square = sum((squares[:, i] for i in range(squares.shape[1])), start=np.zeros(len(squares)))
     return Poses(
         rotation=fit.rotation,
@@ -92,25 +87,25 @@ def poses_from_prisms(layout: ArrayLike, points: ArrayLike) -> Poses:
 
 
 def pose_covariance(layout: FloatArray, rotation: FloatArray, prism_covariances: FloatArray) -> FloatArray:
-    """Propagate the noise of the prisms through the unweighted fit, to first order.
+    """Propagate prism noise through the unweighted fit, to first order.
 
     Parameters
     ----------
     layout
-        The prisms in the robot frame in m, shape (P, 3).
+        (P, 3) the prisms in the robot frame in m.
     rotation
-        ``R_world_robot`` of the poses, shape (N, 3, 3).
+        (N, 3, 3) ``R_world_robot``.
     prism_covariances
-        Covariances of the measured prisms in the world in m^2, shape (N, P, 3, 3).
+        (N, P, 3, 3) of the measured prisms in the world in m^2.
 
     Returns
     -------
     FloatArray
-        Shape (N, 6, 6), symmetric: (x, y, z of the robot's origin in m, rotation about the world's axes in rad).
+        (N, 6, 6), symmetric: x, y, z of the robot's origin in m, rotation about the world's axes in rad.
     """
     from_robot = rotation[:, None, None]
-    gain = _layout_gain(layout).reshape(-1, 2, 3, 3)  # that of the translation, that of the rotation
-    # The gain is constant in the robot frame; displacements go there, translation and rotation come back.
+    gain = _gains(layout)[0].reshape(-1, 2, 3, 3)
+    # The gain is constant in the robot frame: displacements are rotated into it, translation and rotation back.
     in_world = (from_robot @ gain @ from_robot.swapaxes(-2, -1)).reshape(*prism_covariances.shape[:2], 6, 3)
     covariance = _over_prisms(in_world @ prism_covariances @ in_world.swapaxes(2, 3))
     return 0.5 * (covariance + covariance.swapaxes(1, 2))
@@ -119,26 +114,24 @@ def pose_covariance(layout: FloatArray, rotation: FloatArray, prism_covariances:
 def interpolation_error_covariance(
     layout: FloatArray,
     rotation: FloatArray,
-    unseen: FloatArray,
+    error_s2: FloatArray,
     *,
     acceleration_sigma_mps2: float,
     angular_acceleration_sigma_radps2: float,
 ) -> FloatArray:
-    """Propagate a robot's unknown acceleration, which straight-line interpolation does not see, through the fit.
+    """Propagate the error of linear interpolation under an unknown acceleration through the fit.
 
-    The robot accelerates as a whole: the errors of its prisms have one cause and are far from independent. What is
-    common to them moves the pose; only what differs, in time to the next measurement or in place on a turning robot,
-    turns it.
+    The robot accelerates as a whole: its prisms' errors have one cause and are correlated. What they have in common shifts
+    the pose; what differs between them, in time or in place on a rotating robot, rotates it.
 
     Parameters
     ----------
     layout
-        The prisms in the robot frame in m, shape (P, 3).
+        (P, 3) the prisms in the robot frame in m.
     rotation
-        ``R_world_robot`` of the poses, shape (N, 3, 3).
-    unseen
-        By how much each prism's interpolation misses per unit of acceleration, in s^2, shape (N, P): see
-        :func:`tsgt.geometry.interpolation_error_s2`.
+        (N, 3, 3) ``R_world_robot``.
+    error_s2
+        (N, P) interpolation error per unit of acceleration in s^2: see :func:`tsgt.geometry.interpolation_error_s2`.
     acceleration_sigma_mps2
         One sigma, per axis, of the acceleration of the prisms' centroid.
     angular_acceleration_sigma_radps2
@@ -147,10 +140,10 @@ def interpolation_error_covariance(
     Returns
     -------
     FloatArray
-        Shape (N, 6, 6), in the order and axes of :func:`pose_covariance`, to which it adds.
+        (N, 6, 6), in the order and axes of :func:`pose_covariance`, to be added to it.
     """
-    effects = _over_prisms(unseen[:, :, None, None, None] * _acceleration_gains(layout))
-    # From the robot frame, in which the gains are constant, to the world: translation and rotation, each by itself.
+    effects = _over_prisms(error_s2[:, :, None, None, None] * _gains(layout)[1])
+    # From the robot frame, where the gains are constant, to the world; translation and rotation separately.
     blocks = effects.reshape(-1, 2, 2, 3, 3)
     in_world = (rotation[:, None, None] @ blocks).reshape(effects.shape)
     covariances = in_world @ np.ascontiguousarray(in_world.swapaxes(2, 3))
@@ -163,43 +156,43 @@ def interpolation_error_covariance(
 def twists(
     layout: FloatArray, rotation: FloatArray, prism_velocities_mps: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Velocity and angular velocity of the rigid robot that fit the prisms' velocities best, unweighted.
+    """Unweighted least-squares twist of the rigid robot from its prisms' velocities.
 
     Parameters
     ----------
     layout
-        The prisms in the robot frame in m, shape (P, 3).
+        (P, 3) the prisms in the robot frame in m.
     rotation
-        ``R_world_robot`` of the poses, shape (N, 3, 3).
+        (N, 3, 3) ``R_world_robot``.
     prism_velocities_mps
-        Velocities of the prisms in the world in m/s, shape (N, P, 3).
+        (N, P, 3) in the world.
 
     Returns
     -------
     velocity_mps : FloatArray
-        Velocity of the robot's origin in the world in m/s, shape (N, 3).
+        (N, 3) of the robot's origin in the world.
     angular_velocity_radps : FloatArray
-        Angular velocity in the robot frame in rad/s, shape (N, 3).
+        (N, 3) in the robot frame.
     """
     in_robot = rotate(np.swapaxes(rotation, 1, 2)[:, None], prism_velocities_mps)
-    twist = _over_prisms(rotate(_layout_gain(layout), in_robot))
+    twist = _over_prisms(rotate(_gains(layout)[0], in_robot))
     return rotate(rotation, twist[:, :3]), twist[:, 3:]
 
 
 def check_layout(layout: ArrayLike, names: Sequence[object] | None = None) -> None:
-    """Refuse a prism layout from which no pose can be computed well.
+    """Check that a prism layout determines poses well.
 
     Parameters
     ----------
     layout
-        The prisms in the robot frame in m, shape (P, 3).
+        (P, 3) the prisms in the robot frame in m.
     names
-        What the prisms are called in messages; their numbers from 1 when not given.
+        Names of the prisms in messages; 1, 2, ... when not given.
 
     Raises
     ------
     DegenerateGeometryError
-        Fewer than three prisms, two of them closer than :data:`MIN_PRISM_DISTANCE_M`, or all of them nearly in a line
+        Fewer than three prisms, two of them closer than :data:`MIN_PRISM_DISTANCE_M`, or all of them nearly collinear
         (:data:`MIN_LAYOUT_RATIO`).
     GeometryError
         Wrong shape or numbers that are not finite.
@@ -234,22 +227,17 @@ def _over_prisms(terms: FloatArray) -> FloatArray:
     return sum((terms[:, i] for i in range(terms.shape[1])), start=np.zeros_like(terms[:, 0]))
 
 
-def _layout_gain(layout: FloatArray) -> FloatArray:
-    """Gain of each prism in the unweighted fit, in the robot frame; shape (P, 6, 3)."""
-    return _gains(np.asarray(layout, dtype=np.float64).tobytes())[0]
-
-
-def _acceleration_gains(layout: FloatArray) -> FloatArray:
-    """Gains of the robot's acceleration and of its angular acceleration by way of each prism, in the robot frame; shape (P, 2, 6, 3)."""
-    return _gains(np.asarray(layout, dtype=np.float64).tobytes())[1]
+def _gains(layout: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Gains of a layout: of the fit, (P, 6, 3), and of linear and angular acceleration, (P, 2, 6, 3), in the robot frame."""
+    return _cached_gains(np.asarray(layout, dtype=np.float64).tobytes())
 
 
 @lru_cache(maxsize=16)
-def _gains(layout: bytes) -> tuple[FloatArray, FloatArray]:
-    """All gains of a layout; a robot keeps its own for years, and they cost more than all else of a single pose."""
+def _cached_gains(layout: bytes) -> tuple[FloatArray, FloatArray]:
+    """Compute the gains once per layout: they cost more than the rest of a single pose."""
     prisms = np.frombuffer(layout).reshape(-1, 3)
     gain = fit_gain(prisms, np.ones(len(prisms)))
-    turning = gain @ skew(prisms - prisms.mean(axis=0))
-    both = np.stack([gain, turning], axis=1)
+    angular = gain @ skew(prisms - prisms.mean(axis=0))
+    both = np.stack([gain, angular], axis=1)
     gain.flags.writeable = both.flags.writeable = False
     return gain, both

@@ -1,14 +1,11 @@
-"""Rotations and rigid transforms.
+"""Rotations and rigid transforms; Lie group operations of SO(3).
 
-``T_a_b`` maps coordinates in frame b to frame a. All functions broadcast over leading dimensions, and they give
-the same bits for an item alone as for the same item in a batch: element by element, no reduction over a batch.
+``T_a_b`` maps coordinates in frame b to frame a. All functions broadcast over leading dimensions and, unless stated
+otherwise, give the same bits for an item alone as in a batch: element by element, no reduction over a batch.
 
-Derivatives of rotations.
-
-Where a turn is small, digits are lost in what its square is multiplied by; so few that the square has none there.
-
-G. S. Chirikjian, "Stochastic models, information theory, and Lie groups", volume 2, section 10.8; T. D. Barfoot, "State
-estimation for robotics", section 7.1.
+Source: T. D. Barfoot, "State Estimation for Robotics", section 7.1; G. S. Chirikjian, "Stochastic Models, Information
+Theory, and Lie Groups", volume 2, section 10.8. Coefficients that lose digits at small angles multiply terms too small
+for the loss to matter.
 """
 
 from __future__ import annotations
@@ -26,81 +23,50 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 RIGID_TOLERANCE = 1e-6
-"""How far a rotation matrix may be from orthonormal: six decimals, as people type them into a file."""
+"""Allowed deviation of R^T R from the identity: that of a matrix typed with six decimals."""
 
 TINY = 1e-300
-"""Added to a square, it changes none but zero, which may then be divided by."""
+"""Added to a square before a division: changes nothing but zero."""
 
 IDENTITY = np.eye(3)
 
-_ACROSS = np.array(
+_SO3_GENERATORS = np.array(
     [
         [0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0],
         [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0],
         [0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0],
     ]
 )
-"""Matrices of the cross products with the three axes, a row each."""
+"""Flattened skew-symmetric matrices of the three unit vectors, one per row."""
 
 
 def skew(v: FloatArray) -> FloatArray:
-    """Matrix of the cross product: ``skew(v) @ p`` is ``v`` x ``p``.
-
-    Parameters
-    ----------
-    v
-        Vectors, shape (..., 3).
-
-    Returns
-    -------
-    FloatArray
-        Skew-symmetric matrices, shape (..., 3, 3).
-    """
+    """Skew-symmetric matrix of a vector, (..., 3) to (..., 3, 3): ``skew(v) @ p`` is ``v`` x ``p``."""
     v = np.asarray(v, dtype=np.float64)
-    # Each element is one of the vector's or zero, so that nothing is rounded.
-    matrix: FloatArray = (v @ _ACROSS).reshape(*v.shape, 3)
+    # Every product is with 0 or ±1: exact.
+    matrix: FloatArray = (v @ _SO3_GENERATORS).reshape(*v.shape, 3)
     return matrix
 
 
 def exp_so3(w: FloatArray) -> FloatArray:
-    """Rotation matrix of a rotation vector (Rodrigues' formula).
-
-    Parameters
-    ----------
-    w
-        Rotation vectors in rad, shape (..., 3): the axis, as long as the angle.
-
-    Returns
-    -------
-    FloatArray
-        Rotation matrices, shape (..., 3, 3).
-    """
+    """Exponential map (Rodrigues' formula): rotation vectors in rad, (..., 3), to rotation matrices, (..., 3, 3)."""
     w = np.asarray(w, dtype=np.float64)
-    # sin(a)/a and (1 - cos(a))/a^2, both by the half angle: smooth through zero without a branch.
+    # sin(a)/a and (1 - cos(a))/a^2 in terms of the half angle: smooth through zero without a branch.
     half_rad = 0.5 * np.sqrt(dot(w, w) + TINY)[..., None, None]
     ratio = np.sin(half_rad) / half_rad
-    across = skew(w)
+    skew_w = skew(w)
     matrix: FloatArray = (
-        IDENTITY + ratio * np.cos(half_rad) * across + 0.5 * ratio * ratio * (across @ across)
+        IDENTITY + ratio * np.cos(half_rad) * skew_w + 0.5 * ratio * ratio * (skew_w @ skew_w)
     )
     return matrix
 
 
 def log_so3(R: FloatArray) -> FloatArray:
-    """Rotation vector of a rotation matrix; inverse of :func:`exp_so3`.
+    """Logarithmic map, inverse of :func:`exp_so3`: rotation matrices, (..., 3, 3), to rotation vectors in rad, (..., 3).
 
-    Parameters
-    ----------
-    R
-        Rotation matrices, shape (..., 3, 3).
-
-    Returns
-    -------
-    FloatArray
-        Rotation vectors in rad, shape (..., 3), of length 0 to pi. At exactly pi the axis has two signs; either
-        may come.
+    The angle is in [0, pi]; at exactly pi the sign of the axis is arbitrary.
     """
-    # By way of the quaternion, which is well conditioned at every angle; the trace is not, near 0 and near pi.
+    # Via the quaternion, which is well conditioned at every angle; the trace is not, near 0 and near pi.
     q = quaternion_from_rotation(R)
     sine, cosine = np.sqrt(dot(q[..., :3], q[..., :3])), q[..., 3]
     small = sine < np.finfo(np.float64).tiny
@@ -109,23 +75,15 @@ def log_so3(R: FloatArray) -> FloatArray:
 
 
 def quaternion_from_rotation(R: FloatArray) -> FloatArray:
-    """Give the unit quaternion of a rotation matrix (Shepperd 1978: divide by the largest of the four).
+    """Return unit quaternions of rotation matrices (S. W. Shepperd, 1978: divide by the largest component).
 
-    Parameters
-    ----------
-    R
-        Rotation matrices, shape (..., 3, 3).
-
-    Returns
-    -------
-    FloatArray
-        Hamilton quaternions x, y, z, w with w >= 0, shape (..., 4).
+    Rotation matrices, (..., 3, 3), to Hamilton quaternions x, y, z, w with w >= 0, (..., 4).
     """
     R = np.asarray(R, dtype=np.float64)
     xx, yy, zz = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
     xy, xz, yz = R[..., 0, 1] + R[..., 1, 0], R[..., 0, 2] + R[..., 2, 0], R[..., 1, 2] + R[..., 2, 1]
     xw, yw, zw = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
-    # Four times the outer product of the quaternion with itself: each row is the quaternion, scaled.
+    # Four times the outer product of the quaternion with itself: each row is a scaled quaternion.
     rows = np.empty((*xx.shape, 4, 4))
     rows[..., 0, 0], rows[..., 1, 1] = 1 + xx - yy - zz, 1 - xx + yy - zz
     rows[..., 2, 2], rows[..., 3, 3] = 1 - xx - yy + zz, 1 + xx + yy + zz
@@ -143,17 +101,7 @@ def quaternion_from_rotation(R: FloatArray) -> FloatArray:
 
 
 def rotation_from_quaternion(q: FloatArray) -> FloatArray:
-    """Rotation matrix of a quaternion, which need not have unit length.
-
-    Parameters
-    ----------
-    q
-        Hamilton quaternions x, y, z, w, shape (..., 4).
-
-    Returns
-    -------
-    FloatArray
-        Rotation matrices, shape (..., 3, 3).
+    """Rotation matrices, (..., 3, 3), of Hamilton quaternions x, y, z, w of any length, (..., 4).
 
     Raises
     ------
@@ -177,20 +125,7 @@ def rotation_from_quaternion(q: FloatArray) -> FloatArray:
 
 
 def transform_from(R: FloatArray, t: FloatArray) -> FloatArray:
-    """4x4 transform of a rotation and a translation.
-
-    Parameters
-    ----------
-    R
-        Rotation matrices, shape (..., 3, 3).
-    t
-        Translations in m, shape (..., 3).
-
-    Returns
-    -------
-    FloatArray
-        Transforms, shape (..., 4, 4): ``p_a = R p_b + t``.
-    """
+    """4x4 transforms of rotations, (..., 3, 3), and translations in m, (..., 3): ``p_a = R p_b + t``."""
     R, t = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64)
     T = np.zeros((*np.broadcast(R[..., 0, 0], t[..., 0]).shape, 4, 4))
     T[..., :3, :3] = R
@@ -207,43 +142,25 @@ def invert(T: FloatArray) -> FloatArray:
 
 
 def rotate(R: FloatArray, v: FloatArray) -> FloatArray:
-    """Rotate vectors: ``R v`` for matrices (..., 3, 3) and vectors (..., 3), broadcast over the leading dimensions."""
+    """``R v`` for matrices, (..., 3, 3), and vectors, (..., 3), broadcast over the leading dimensions."""
     x, y, z = v[..., 0, None], v[..., 1, None], v[..., 2, None]
     return R[..., :, 0] * x + R[..., :, 1] * y + R[..., :, 2] * z
 
 
 def transform_points(T: FloatArray, points: FloatArray) -> FloatArray:
-    """Coordinates in frame a of points given in frame b.
-
-    Parameters
-    ----------
-    T
-        Rigid transforms ``T_a_b``, shape (..., 4, 4).
-    points
-        Points in frame b in m, shape (..., 3). The leading dimensions of the two are broadcast: one transform with
-        many points, or each point with its own.
-
-    Returns
-    -------
-    FloatArray
-        Points in frame a in m, shape (..., 3).
-    """
+    """Transform points in m, (..., 3), from frame b to frame a by ``T_a_b``, (..., 4, 4); leading dimensions broadcast."""
     T, points = np.asarray(T, dtype=np.float64), np.asarray(points, dtype=np.float64)
     return rotate(T[..., :3, :3], points) + T[..., :3, 3]
 
 
 def check_transform(T: ArrayLike) -> None:
-    """Refuse what is not one rigid transform.
-
-    Parameters
-    ----------
-    T
-        Expected: shape (4, 4), a proper rotation, last row 0 0 0 1.
+    """Check that a matrix is one rigid transform.
 
     Raises
     ------
     GeometryError
-        Wrong shape, not finite, last row wrong, not orthonormal to :data:`RIGID_TOLERANCE`, or mirrored.
+        Shape other than (4, 4), not finite, last row other than 0 0 0 1, not orthonormal to :data:`RIGID_TOLERANCE`,
+        or a reflection.
     """
     matrix = np.asarray(T, dtype=np.float64)
     if matrix.shape != (4, 4):
@@ -256,7 +173,7 @@ def check_transform(T: ArrayLike) -> None:
     error = float(np.abs(R.T @ R - np.eye(3)).max())
     if error > RIGID_TOLERANCE:
         raise GeometryError(
-            f"the rotation of a rigid transform is orthonormal, this one is off by {error:.1e}"
+            f"the rotation of a rigid transform is orthonormal, this one deviates by {error:.1e}"
         )
     if np.linalg.det(R) < 0:
         raise GeometryError(
@@ -265,71 +182,67 @@ def check_transform(T: ArrayLike) -> None:
 
 
 def dot(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Dot products of 3-vectors along the last axis; written out, so that a batch gives the bits of one item."""
+    """Dot products of 3-vectors along the last axis; written out, so that an item in a batch has the bits of one alone."""
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
 
 
-_WELL_BELOW_A_RIGHT_ANGLE = 0.5
+_MIN_COSINE = 0.5
 
-_NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
-"""The axis after each axis, and the one after that."""
+_NEXT, _AFTER_NEXT = np.array([1, 2, 0]), np.array([2, 0, 1])
+"""Cyclic index of the next axis and of the one after it."""
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Cross products of vectors along the last axis, (..., 3); numpy's own takes five times as long for a few."""
-    product: FloatArray = a.take(_NEXT, -1) * b.take(_LAST, -1) - a.take(_LAST, -1) * b.take(_NEXT, -1)
+    """Cross products of 3-vectors along the last axis; for a few vectors five times as fast as numpy's."""
+    product: FloatArray = a.take(_NEXT, -1) * b.take(_AFTER_NEXT, -1) - a.take(_AFTER_NEXT, -1) * b.take(
+        _NEXT, -1
+    )
     return product
 
 
 def matvec(matrix: FloatArray, vector: FloatArray) -> FloatArray:
-    """Products of matrices and vectors, (..., 3); as :func:`~tsgt.geometry.rigid.rotate`, a few in a third of its time.
+    """Matrix-vector products, (..., 3); for a few vectors three times as fast as :func:`rotate`.
 
-    It rounds as the matrices lie in memory, so that the same ones taken from elsewhere may give other bits.
+    Rounding depends on the memory layout of the matrices: not bit-identical between different layouts.
     """
     product: FloatArray = (matrix @ vector[..., None])[..., 0]
     return product
 
 
 def fast_log_so3(R: FloatArray) -> FloatArray:
-    """Rotation vectors of rotations that are mostly small, (..., 3); as :func:`~tsgt.geometry.rigid.log_so3`, but faster."""
+    """Logarithmic map for mostly small rotations, (..., 3, 3) to (..., 3); faster than :func:`log_so3`."""
     cosine = 0.5 * (R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1.0)
-    if (cosine < _WELL_BELOW_A_RIGHT_ANGLE).any():
+    if (cosine < _MIN_COSINE).any():
         return log_so3(R)
-    turned = 0.5 * (R[..., _LAST, _NEXT] - R[..., _NEXT, _LAST])
-    sine = np.sqrt(dot(turned, turned) + TINY)
-    logarithm: FloatArray = (np.arctan2(sine, cosine) / sine)[..., None] * turned
+    axis_sine = 0.5 * (R[..., _AFTER_NEXT, _NEXT] - R[..., _NEXT, _AFTER_NEXT])
+    sine = np.sqrt(dot(axis_sine, axis_sine) + TINY)
+    logarithm: FloatArray = (np.arctan2(sine, cosine) / sine)[..., None] * axis_sine
     return logarithm
 
 
-def exp_and_right_jacobian(turn: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rotate, and differentiate that: ``Exp(turn + d) = Exp(turn) Exp(J_r(turn) d)`` to first order.
+def exp_and_right_jacobian(w: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Exponential map and right Jacobian: ``Exp(w + d) = Exp(w) Exp(J_r(w) d)`` to first order in d (Barfoot 7.1).
 
-    Parameters
-    ----------
-    turn
-        Rotation vectors in rad, shape (..., 3).
-
-    Returns
-    -------
-    rotation : FloatArray
-        As :func:`~tsgt.geometry.rigid.exp_so3`, shape (..., 3, 3).
-    right_jacobian : FloatArray
-        Shape (..., 3, 3). The left Jacobian is that of ``-turn``, and its transpose.
+    Rotation vectors in rad, (..., 3), to rotation matrices and right Jacobians, (..., 3, 3) each. The left Jacobian is
+    ``J_l(w) = J_r(-w) = J_r(w)^T``.
     """
-    square = dot(turn, turn)[..., None, None] + TINY
+    square = dot(w, w)[..., None, None] + TINY
     half = 0.5 * np.sqrt(square)
     ratio = np.sin(half) / half
     first, second = ratio * np.cos(half), 0.5 * ratio * ratio
     third = (1.0 - first) / square
-    across = skew(turn)
-    twice = across @ across
-    return IDENTITY + first * across + second * twice, IDENTITY - second * across + third * twice
+    skew_w = skew(w)
+    skew_w_squared = skew_w @ skew_w
+    return (
+        IDENTITY + first * skew_w + second * skew_w_squared,
+        IDENTITY - second * skew_w + third * skew_w_squared,
+    )
 
 
-def inverse_right_jacobian(turn: FloatArray) -> FloatArray:
-    """Inverse of the right Jacobian: ``Log(R Exp(d)) = Log(R) + J_r^-1(Log R) d``; below a turn of pi; (..., 3, 3)."""
-    square = dot(turn, turn)[..., None, None] + TINY
+def inverse_right_jacobian(w: FloatArray) -> FloatArray:
+    """Inverse right Jacobian, (..., 3, 3): ``Log(R Exp(d)) = Log(R) + J_r^-1(Log R) d`` to first order, below pi (Barfoot 7.1)."""
+    square = dot(w, w)[..., None, None] + TINY
     half = 0.5 * np.sqrt(square)
-    across = skew(turn)
-    inverse: FloatArray = IDENTITY + 0.5 * across + (1.0 - half / np.tan(half)) / square * (across @ across)
+    skew_w = skew(w)
+    inverse: FloatArray = IDENTITY + 0.5 * skew_w + (1.0 - half / np.tan(half)) / square * (skew_w @ skew_w)
     return inverse

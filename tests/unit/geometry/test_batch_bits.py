@@ -12,6 +12,8 @@ from scipy.spatial.transform import Rotation
 from tsgt.geometry import (
     interpolate,
     interpolated_covariance,
+    interpolation_error_covariance,
+    interpolation_error_s2,
     measurement_covariance,
     polar_to_cartesian,
     pose_covariance,
@@ -20,8 +22,6 @@ from tsgt.geometry import (
     transform_from,
     transform_points,
     twists,
-    interpolation_error_covariance,
-    interpolation_error_s2,
 )
 from tsgt.model import TRACKING_NOISE
 

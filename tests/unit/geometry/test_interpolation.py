@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from tsgt.errors import GeometryError
-from tsgt.geometry import NO_GAP_NS, interpolate, interpolate_prisms, interpolated_covariance, interpolation_error_s2
+from tsgt.geometry import (
+    NO_GAP_NS,
+    interpolate,
+    interpolate_prisms,
+    interpolated_covariance,
+    interpolation_error_s2,
+)
 
 SECOND_NS = 1_000_000_000
 START_NS = 1_647_269_269_671_000_000

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from tsgt.geometry import exp_so3, log_so3, rotate, skew
-from tsgt.geometry.rigid import matvec, cross, exp_and_right_jacobian, inverse_right_jacobian, fast_log_so3
+from tsgt.geometry.rigid import cross, exp_and_right_jacobian, fast_log_so3, inverse_right_jacobian, matvec
 
 AXES = [(1.0, 0.0, 0.0), (0.6, 0.0, -0.8), (-2 / 3, 1 / 3, 2 / 3)]
 ANGLES_RAD = [0.0, 1e-300, 1e-12, 1e-6, 9.9e-3, 1.01e-2, 0.3, 2.0, 3.1]

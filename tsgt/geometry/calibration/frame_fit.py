@@ -1,7 +1,7 @@
-"""One frame found in another from the points known in both: a least-squares fit with the noise of both sides.
+"""Least-squares fit of one frame to another from points known in both, weighted by the noise of both.
 
-The start is Arun's alignment (Arun et al. 1987); Gauss-Newton on the rigid transforms then lets each miss count
-by its noise. For levelled instruments both work in the plane: heading and position.
+Arun's alignment (Arun et al. 1987) is the initial guess of Gauss-Newton on rigid transforms. For levelled instruments both
+solve heading and position only.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 PointName = int | str
 
-STEPS_MAX = 20
-STEP_DONE = 1e-10  # m and rad: far below any instrument, well above rounding at 100 m
+MAX_ITERATIONS = 20
+STEP_TOLERANCE = 1e-10  # in m and rad: far below any instrument's noise, well above rounding at 100 m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,11 +33,11 @@ class PointSet:
     Attributes
     ----------
     names
-        n different names: target numbers or names of body points.
+        n different target numbers or names of body points.
     points_m
-        (n, 3) coordinates in m.
+        (n, 3).
     covariances_m2
-        (n, 3, 3) covariances in the same frame in m^2; may be zero.
+        (n, 3, 3) in the same frame; may be zero.
     """
 
     names: tuple[PointName, ...]
@@ -59,14 +59,14 @@ class PointSet:
             raise GeometryError("expected finite coordinates and covariances, got NaN or infinity")
 
     def select(self, names: Sequence[PointName]) -> PointSet:
-        """Take the points with these names, in this order."""
+        """Return the points with these names, in this order."""
         rows = [self.names.index(name) for name in names]
         return PointSet(tuple(names), self.points_m[rows], self.covariances_m2[rows])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointPairs:
-    """The same points in both frames, in the same order, and what is to be solved from them.
+    """The same points in two frames, in the same order.
 
     Attributes
     ----------
@@ -86,21 +86,21 @@ class PointPairs:
         return self.source.names
 
     def only(self, *names: PointName) -> PointPairs:
-        """Keep the points with these names, in this order."""
+        """Return the points with these names, in this order."""
         return PointPairs(self.source.select(names), self.target.select(names), self.levelled)
 
     def without(self, *names: PointName) -> PointPairs:
-        """Leave out the points with these names."""
+        """Return all but the points with these names."""
         return self.only(*(name for name in self.names if name not in names))
 
     @property
     def unknowns(self) -> list[int]:
-        """Which of (x, y, z, rotation about x, y, z) are solved."""
+        """Solved components of (x, y, z, rotation about x, y, z)."""
         return [0, 1, 2, 5] if self.levelled else [0, 1, 2, 3, 4, 5]
 
     @property
     def redundancy(self) -> int:
-        """How many more coordinates there are than unknowns."""
+        """Degrees of freedom: coordinates minus unknowns."""
         return 3 * len(self.names) - len(self.unknowns)
 
 
@@ -113,8 +113,8 @@ class FrameFit:
     rotation, translation_m
         (3, 3) and (3,): ``target = rotation source + translation_m``.
     covariance
-        (6, 6) of (x, y, z, rotation about the target frame's fixed axes x, y, z) in m and rad, from the noise
-        of the points; zero for what is not solved.
+        (6, 6) of (x, y, z, rotation about the target frame's fixed axes x, y, z) in m and rad, from the noise of the points;
+        zero for components that are not solved.
     """
 
     rotation: FloatArray
@@ -122,90 +122,89 @@ class FrameFit:
     covariance: FloatArray
 
     def residuals_m(self, pairs: PointPairs) -> FloatArray:
-        """(n, 3) target minus transformed source in m."""
+        """(n, 3) target minus transformed source."""
         moved = pairs.source.points_m @ self.rotation.T + self.translation_m
         misses: FloatArray = pairs.target.points_m - moved
         return misses
 
     def residual_covariances_m2(self, pairs: PointPairs) -> FloatArray:
-        """(n, 3, 3) covariance of the misses from the noise of both points, in m^2."""
+        """(n, 3, 3) covariance of the residuals from the noise of both points."""
         noise: FloatArray = (
             self.rotation @ pairs.source.covariances_m2 @ self.rotation.T + pairs.target.covariances_m2
         )
         return noise
 
     def chi_squared(self, pairs: PointPairs) -> float:
-        """Sum of the squared misses over their noise; chi squared if the noise is as stated."""
-        misses = self.residuals_m(pairs)[:, :, None]
-        return float(np.sum(misses * np.linalg.solve(self.residual_covariances_m2(pairs), misses)))
+        """Sum of the squared normalised residuals."""
+        residuals = self.residuals_m(pairs)[:, :, None]
+        return float(np.sum(residuals * np.linalg.solve(self.residual_covariances_m2(pairs), residuals)))
 
 
 def fit_frame(pairs: PointPairs, *, weighted: bool) -> FrameFit:
-    """Fit by Gauss-Newton on the rigid transforms, from Arun's solution.
+    """Fit a rigid transform by Gauss-Newton, initialised with Arun's solution.
 
     Parameters
     ----------
     pairs
-        At least three points; no noise may be singular.
+        At least three points, no residual covariance singular.
     weighted
-        Weigh each miss with the inverse of its noise; False is Arun's plain least squares.
+        Weight each residual with its inverse covariance; False is Arun's unweighted least squares.
 
     Returns
     -------
-    Fit
-        The optimum; its covariance is of first order in the noise.
+    FrameFit
+        With a covariance of first order in the noise.
 
     Raises
     ------
     DegenerateGeometryError
-        The points do not determine the frame: too few, coinciding or in a line (levelled: above one another).
+        Too few points, or they coincide or are collinear (levelled: above one another).
 
     Notes
     -----
-    The weights are those at Arun's rotation, which is off by so little that they would not change. Only where the
-    points lie in a line up to their noise do the steps not settle; Arun's solution then stands as it is, and its
-    covariance says how little it is worth.
+    The weights are computed once, at Arun's rotation. The steps fail to converge only where the points are collinear up to their
+    noise; Arun's solution is returned then, with a covariance that shows it.
     """
-    start = _start(pairs)
-    noise = start.residual_covariances_m2(pairs)
+    initial = _initial_fit(pairs)
+    noise = initial.residual_covariances_m2(pairs)
     if weighted:
         weights = np.asarray(np.linalg.inv(noise), dtype=np.float64)
-        fit = start
-        for _ in range(STEPS_MAX):
-            step, covariance = _step(fit, pairs, weights, noise)
+        fit = initial
+        for _ in range(MAX_ITERATIONS):
+            step, covariance = _gauss_newton_step(fit, pairs, weights, noise)
             fit = FrameFit(exp_so3(step[3:]) @ fit.rotation, fit.translation_m + step[:3], covariance)
-            if np.abs(step).max() < STEP_DONE:
+            if np.abs(step).max() < STEP_TOLERANCE:
                 return fit
-    _, covariance = _step(start, pairs, np.eye(3), noise)
-    return FrameFit(start.rotation, start.translation_m, covariance)
+    _, covariance = _gauss_newton_step(initial, pairs, np.eye(3), noise)
+    return FrameFit(initial.rotation, initial.translation_m, covariance)
 
 
-def _step(
+def _gauss_newton_step(
     fit: FrameFit, pairs: PointPairs, weights: FloatArray, residual_covariances_m2: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Gauss-Newton step (6,) of (translation, rotation), and the covariance (6, 6) of an optimum found here."""
+    """Gauss-Newton step (6,) of (translation, rotation), and the covariance (6, 6) of an optimum at this fit."""
     free = pairs.unknowns
     jacobian = pose_jacobian(pairs.source.points_m @ fit.rotation.T)[:, :, free]
     projected = jacobian.transpose(0, 2, 1) @ weights
     inverse = np.linalg.inv(np.sum(projected @ jacobian, axis=0))
     step = np.zeros(6)
     step[free] = inverse @ np.sum(projected @ fit.residuals_m(pairs)[:, :, None], axis=0)[:, 0]
-    # Right for any weights; those of the noise itself leave the inverse alone.
-    spread = (
+    # Sandwich covariance: valid for any weights; equal to the inverse for those of the noise itself.
+    free_covariance = (
         inverse @ np.sum(projected @ residual_covariances_m2 @ projected.transpose(0, 2, 1), axis=0) @ inverse
     )
     covariance = np.zeros((6, 6))
-    covariance[np.ix_(free, free)] = (spread + spread.T) / 2
+    covariance[np.ix_(free, free)] = (free_covariance + free_covariance.T) / 2
     return step, covariance
 
 
-def _start(pairs: PointPairs) -> FrameFit:
-    """Align without weights: Arun's solution, or for levelled instruments its two-dimensional form about the vertical."""
-    nothing = np.zeros((6, 6))
+def _initial_fit(pairs: PointPairs) -> FrameFit:
+    """Unweighted alignment: Arun's solution, or its two-dimensional form about the vertical for levelled instruments."""
+    no_covariance = np.zeros((6, 6))
     source, target = pairs.source.points_m, pairs.target.points_m
     if not pairs.levelled:
         aligned = align(source, target)
-        return FrameFit(aligned.rotation, aligned.translation_m, nothing)
+        return FrameFit(aligned.rotation, aligned.translation_m, no_covariance)
     a, b = source - source.mean(axis=0), target - target.mean(axis=0)
     cosine = float(np.sum(a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1]))
     sine = float(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]))
@@ -216,10 +215,10 @@ def _start(pairs: PointPairs) -> FrameFit:
             "add points beside them"
         )
     rotation = exp_so3(np.array([0.0, 0.0, np.arctan2(sine, cosine)]))
-    return FrameFit(rotation, target.mean(axis=0) - rotation @ source.mean(axis=0), nothing)
+    return FrameFit(rotation, target.mean(axis=0) - rotation @ source.mean(axis=0), no_covariance)
 
 
 def pose_jacobian(rotated_m: FloatArray) -> FloatArray:
-    """Differentiate R p + t with respect to (t, rotation about the fixed axes), given R p; (n, 3, 6)."""
+    """Jacobian of R p + t by (t, rotation about the fixed axes), given R p; (n, 3, 6)."""
     identity = np.broadcast_to(np.eye(3), (len(rotated_m), 3, 3))
     return np.concatenate([identity, -skew(rotated_m)], axis=2)

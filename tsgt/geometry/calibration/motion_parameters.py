@@ -1,8 +1,8 @@
-"""What a calibration from motion may change: stations' frames, latencies, prism positions, as one vector. Pure.
+"""Parameters of a calibration from motion: station frames, latencies and prism positions as one vector. Sans-I/O.
 
-Station 1 (row 0) holds frame and time. A frame changes by a shift of the robot as the station sees it, and by a turn about a
-pivot in the middle of all measurements, both along the axes of frame ``station1``: so a shift is what happens at the robot.
-Prisms move against each other only, since where the robot has its origin no motion can tell.
+Station 1 (row 0) defines frame and time. A frame is corrected by a translation and by a rotation about a pivot at the
+centroid of all measurements, both in the axes of frame ``station1``: the translation is the displacement at the robot. Prisms
+move only relative to each other, since the motion does not determine the robot's origin.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetupPrior:
-    """What to find, and what is known of it before the motion is looked at: one sigma each, 0 for what is held.
+    """What to estimate, and its prior: one sigma each, 0 for what is fixed.
 
     Attributes
     ----------
-    shift_sigma_m
-        Of each coordinate of the robot as one of the stations 2, 3, ... sees it.
-    turn_sigma_rad
-        Of a station's turn about each axis.
+    translation_sigma_m
+        Of each coordinate of the robot as seen by the stations 2, 3, ...
+    rotation_sigma_rad
+        Of a station's rotation about each axis.
     levelled
-        Stations turn about the vertical only: 4 instead of 6 degrees of freedom.
+        Stations rotate about the vertical only: 4 instead of 6 degrees of freedom.
     latency_sigma_s
-        Of a station's latency beside that of station 1.
+        Of a station's latency relative to that of station 1.
     prism_sigma_m
         Of each coordinate of a prism on the robot.
     """
@@ -56,7 +56,7 @@ class Setup:
     frames
         (S, 4, 4) ``T_station1_station``.
     latencies_s
-        (S,) how much later than their instants the measurements are stamped, beyond what has been taken off.
+        (S,) delay of the timestamps, beyond the correction already applied.
     layout
         (P, 3) prisms in the robot frame in m.
     """
@@ -67,58 +67,58 @@ class Setup:
 
     @classmethod
     def of(cls, observations: Observations) -> Setup:
-        """Return the set-up that observations have."""
+        """Return the set-up of observations."""
         return cls(observations.frames, np.zeros(len(observations.frames)), observations.layout)
 
     def applied(self, observations: Observations) -> Observations:
-        """Return the observations with this set-up, in the order of time; they must have no latency of their own."""
+        """Return observations, whose latencies must be zero, with this set-up, in the order of time."""
         time_s = observations.time_s - self.latencies_s[observations.station]
-        moved = replace(observations, time_s=time_s, frames=self.frames, layout=self.layout)
-        return moved.select(np.argsort(time_s, kind="stable"))
+        updated = replace(observations, time_s=time_s, frames=self.frames, layout=self.layout)
+        return updated.select(np.argsort(time_s, kind="stable"))
 
-    def corrections(self, was: Setup, pivot: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """How far each station's frame has moved since it ``was``, (S, 3) at a pivot in m, and turned, (S, 3) in rad."""
-        back = np.swapaxes(was.frames[:, :3, :3], 1, 2)
-        seen = rotate(back, pivot - was.frames[:, :3, 3])
-        shift = rotate(self.frames[:, :3, :3], seen) + self.frames[:, :3, 3] - pivot
-        return shift, log_so3(self.frames[:, :3, :3] @ back)
+    def corrections(self, reference: Setup, pivot: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Corrections of each station's frame from a reference: (S, 3) translation at the pivot in m, (S, 3) rotation in rad."""
+        station_from_reference = np.swapaxes(reference.frames[:, :3, :3], 1, 2)
+        pivot_in_station = rotate(station_from_reference, pivot - reference.frames[:, :3, 3])
+        translation = rotate(self.frames[:, :3, :3], pivot_in_station) + self.frames[:, :3, 3] - pivot
+        return translation, log_so3(self.frames[:, :3, :3] @ station_from_reference)
 
     def levelled(self, pivot: FloatArray, stations: NDArray[np.intp]) -> Setup:
-        """Return the same with the tilts against station 1 taken out of some frames, turned about a pivot."""
+        """Return the set-up with the tilts of some stations against station 1 removed, rotated about a pivot."""
         frames = self.frames.copy()
         up = frames[0, :3, 2]
         for station in stations:
-            own = frames[station, :3, 2]
-            axis = np.cross(own, up)
+            own_up = frames[station, :3, 2]
+            axis = np.cross(own_up, up)
             sine = float(np.linalg.norm(axis))
             if sine > 0.0:
-                turn = exp_so3(axis / sine * np.arctan2(sine, float(own @ up)))
-                frames[station, :3, :3] = turn @ frames[station, :3, :3]
-                frames[station, :3, 3] = pivot + turn @ (frames[station, :3, 3] - pivot)
+                levelling = exp_so3(axis / sine * np.arctan2(sine, float(own_up @ up)))
+                frames[station, :3, :3] = levelling @ frames[station, :3, :3]
+                frames[station, :3, 3] = pivot + levelling @ (frames[station, :3, 3] - pivot)
         return replace(self, frames=frames)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SetupParameters:
-    """The unknowns as a vector of G numbers.
+    """Layout of the G parameters in one vector.
 
     Attributes
     ----------
-    began
-        The set-up about which they are known.
+    reference
+        The set-up about which the prior holds.
     pivot
-        (3,) the middle of all measurements in frame ``station1``, about which stations turn.
+        (3,) centroid of all measurements in frame ``station1``, about which stations rotate.
     stations
-        Rows of the stations whose frame or latency is unknown.
-    shifts, turns
-        (n, 3) and (n, 3 or 1) where in the vector each such station's are; turns about z only if there is one. n is 0
-        where frames are held.
+        (n,) rows of the stations whose frame or latency is estimated.
+    translations, rotations
+        (n, 3) and (n, 3 or 1) indices of each station's frame correction; rotation about z only if there is one. n is 0 where
+        frames are fixed.
     latencies
-        (n,) where each station's latency is; empty where they are held.
+        (n,) indices; empty where latencies are fixed.
     prisms
-        (3 P - 6,) where the prisms' are; empty where they are held.
+        (3 P - 6,) indices of the deformation modes; empty where prisms are fixed.
     sigmas
-        (G,) what is known beforehand.
+        (G,) of the prior.
     """
 
     reference: Setup
@@ -131,113 +131,117 @@ class SetupParameters:
     sigmas: FloatArray
 
     @classmethod
-    def of(cls, observations: Observations, setup: Setup, known: SetupPrior) -> SetupParameters:
-        """Count the unknowns of a set-up that observations have.
+    def of(cls, observations: Observations, setup: Setup, prior: SetupPrior) -> SetupParameters:
+        """Lay out the parameters of a set-up that observations have.
 
         Raises
         ------
         GeometryError
-            Nothing to find, station 1 has measured nothing, or a measurement is not polar.
+            Nothing to estimate, station 1 has measured nothing, or a measurement is not polar.
         """
         if not observations.polar.all():
             raise GeometryError(
-                "points in frame 1 do not tell what their stations measured; import the recording with its targets"
+                "points in frame station1 are no polar measurements of their stations; import the recording with its targets"
             )
-        seen = np.unique(observations.station)
-        if 0 not in seen:
+        measured = np.unique(observations.station)
+        if 0 not in measured:
             raise GeometryError(
-                "station 1 has measured nothing; frames and latencies are those beside station 1"
+                "station 1 has measured nothing; frames and latencies are relative to station 1"
             )
-        stations = seen[seen > 0]
+        stations = measured[measured > 0]
         sigmas: list[float] = []
 
-        def take(wanted: list[float]) -> NDArray[np.intp]:
+        def allocate(wanted: list[float]) -> NDArray[np.intp]:
             sigmas.extend(wanted)
             return np.arange(len(sigmas) - len(wanted), len(sigmas))
 
-        frames = stations if known.translation_sigma_m > 0 else stations[:0]
-        turning = 1 if known.levelled else 3
-        translations = [take([known.translation_sigma_m] * 3) for _ in frames]
-        rotations = [take([known.rotation_sigma_rad] * turning) for _ in frames]
-        latencies = take([known.latency_sigma_s] * len(stations) if known.latency_sigma_s > 0 else [])
-        free = max(3 * len(setup.layout) - 6, 0) if known.prism_sigma_m > 0 else 0
-        prisms = take([known.prism_sigma_m] * free)
+        frames = stations if prior.translation_sigma_m > 0 else stations[:0]
+        rotation_axes = 1 if prior.levelled else 3
+        translations = [allocate([prior.translation_sigma_m] * 3) for _ in frames]
+        rotations = [allocate([prior.rotation_sigma_rad] * rotation_axes) for _ in frames]
+        latencies = allocate([prior.latency_sigma_s] * len(stations) if prior.latency_sigma_s > 0 else [])
+        modes = max(3 * len(setup.layout) - 6, 0) if prior.prism_sigma_m > 0 else 0
+        prisms = allocate([prior.prism_sigma_m] * modes)
         if not sigmas:
-            raise GeometryError("nothing to find: frames, latencies and prisms are all held")
+            raise GeometryError("nothing to estimate: frames, latencies and prisms are all fixed")
         return cls(
             reference=setup,
             pivot=observations.in_world().mean(axis=0),
             stations=stations,
             translations=np.array(translations, np.intp).reshape(-1, 3),
-            rotations=np.array(rotations, np.intp).reshape(-1, turning),
+            rotations=np.array(rotations, np.intp).reshape(-1, rotation_axes),
             latencies=latencies,
             prisms=prisms,
             sigmas=np.array(sigmas),
         )
 
-    def retract(self, setup: Setup, move: FloatArray) -> Setup:
-        """Return a set-up with (G,) changes."""
+    def retract(self, setup: Setup, step: FloatArray) -> Setup:
+        """Apply a step, (G,), to a set-up."""
         frames, latencies_s = setup.frames.copy(), setup.latencies_s.copy()
-        for station, shift, turn in zip(self.stations, self.translations, self.rotations, strict=False):
+        for station, translation, rotation in zip(
+            self.stations, self.translations, self.rotations, strict=False
+        ):
             correction = np.eye(4)
-            correction[:3, :3] = exp_so3(about_axes(move[turn]))
-            correction[:3, 3] = self.pivot - correction[:3, :3] @ self.pivot + move[shift]
+            correction[:3, :3] = exp_so3(about_axes(step[rotation]))
+            correction[:3, 3] = self.pivot - correction[:3, :3] @ self.pivot + step[translation]
             frames[station] = correction @ frames[station]
         if len(self.latencies):
-            latencies_s[self.stations] += move[self.latencies]
+            latencies_s[self.stations] += step[self.latencies]
         layout = setup.layout
         if len(self.prisms):
-            layout = layout + (deformation_modes(layout) @ move[self.prisms]).reshape(-1, 3)
+            layout = layout + (deformation_modes(layout) @ step[self.prisms]).reshape(-1, 3)
         return Setup(frames, latencies_s, layout)
 
     def local_coordinates(self, setup: Setup) -> FloatArray:
-        """(G,) how far a set-up is from the one that it began with."""
-        found = np.zeros(len(self.sigmas))
-        shift, turn = setup.corrections(self.reference, self.pivot)
-        for station, at_shift, at_turn in zip(self.stations, self.translations, self.rotations, strict=False):
-            found[at_shift] = shift[station]
-            found[at_turn] = turn[station][-len(at_turn) :]
+        """(G,) difference of a set-up from the reference."""
+        coordinates = np.zeros(len(self.sigmas))
+        translation, rotation = setup.corrections(self.reference, self.pivot)
+        for station, at_translation, at_rotation in zip(
+            self.stations, self.translations, self.rotations, strict=False
+        ):
+            coordinates[at_translation] = translation[station]
+            coordinates[at_rotation] = rotation[station][-len(at_rotation) :]
         if len(self.latencies):
-            found[self.latencies] = (setup.latencies_s - self.reference.latencies_s)[self.stations]
+            coordinates[self.latencies] = (setup.latencies_s - self.reference.latencies_s)[self.stations]
         if len(self.prisms):
-            found[self.prisms] = (
+            coordinates[self.prisms] = (
                 deformation_modes(setup.layout).T @ (setup.layout - self.reference.layout).ravel()
             )
-        return found
+        return coordinates
 
     def jacobian(
         self, observations: Observations, linearised: LinearisedMeasurements, setup: Setup
     ) -> FloatArray:
-        """(M, 3, G) how the residuals change with the unknowns."""
-        found = np.zeros((len(observations), 3, len(self.sigmas)))
-        arms = skew(linearised.point_m - self.pivot)
-        for place, station in enumerate(self.stations):
+        """(M, 3, G) Jacobian of the residuals by the parameters."""
+        jacobian = np.zeros((len(observations), 3, len(self.sigmas)))
+        lever_arms = skew(linearised.point_m - self.pivot)
+        for i, station in enumerate(self.stations):
             rows = np.flatnonzero(observations.station == station)
             by_point = linearised.by_point[rows]
             if len(self.translations):
-                rotations = self.rotations[place]
-                found[np.ix_(rows, np.arange(3), self.translations[place])] = -by_point
-                found[np.ix_(rows, np.arange(3), rotations)] = (by_point @ arms[rows])[
-                    :, :, -len(rotations) :
+                rotation = self.rotations[i]
+                jacobian[np.ix_(rows, np.arange(3), self.translations[i])] = -by_point
+                jacobian[np.ix_(rows, np.arange(3), rotation)] = (by_point @ lever_arms[rows])[
+                    :, :, -len(rotation) :
                 ]
             if len(self.latencies):
-                found[rows, :, self.latencies[place]] = -rotate(by_point, linearised.velocity_mps[rows])
+                jacobian[rows, :, self.latencies[i]] = -rotate(by_point, linearised.velocity_mps[rows])
         if len(self.prisms):
-            by_unknown = deformation_modes(setup.layout).reshape(-1, 3, len(self.prisms))
-            found[:, :, self.prisms] = (
-                linearised.by_point @ linearised.rotation @ by_unknown[observations.prism]
+            modes = deformation_modes(setup.layout).reshape(-1, 3, len(self.prisms))
+            jacobian[:, :, self.prisms] = (
+                linearised.by_point @ linearised.rotation @ modes[observations.prism]
             )
-        return found
+        return jacobian
 
 
-def about_axes(turn: FloatArray) -> FloatArray:
-    """(3,) a turn about x, y and z; of a turn about z alone the others are 0."""
-    return np.concatenate([np.zeros(3 - len(turn)), turn])
+def about_axes(rotation: FloatArray) -> FloatArray:
+    """(3,) rotation vector from three components or from that about z alone."""
+    return np.concatenate([np.zeros(3 - len(rotation)), rotation])
 
 
 def deformation_modes(layout: FloatArray) -> FloatArray:
-    """(3 P, 3 P - 6) orthonormal displacements of the prisms that no motion of the whole robot makes."""
+    """(3 P, 3 P - 6) orthonormal displacements of the prisms orthogonal to all rigid motions."""
     centred = layout - layout.mean(axis=0)
     rigid = np.concatenate([np.tile(np.eye(3), (len(layout), 1)), -skew(centred).reshape(-1, 3)], axis=1)
-    whole, _, _ = np.linalg.svd(rigid, full_matrices=True)
-    return whole[:, 6:]
+    basis, _, _ = np.linalg.svd(rigid, full_matrices=True)
+    return basis[:, 6:]

@@ -1,4 +1,4 @@
-"""What a calibration from motion could not tell: directions in the set-up that the motion left uncertain, in words. Pure."""
+"""Observability of a calibration from motion: directions of the set-up that the motion left uncertain. Sans-I/O."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ SHIFT_LIMIT_M = 0.005
 TURN_LIMIT_RAD = 0.0005
 LATENCY_LIMIT_S = 0.005
 PRISM_LIMIT_M = 0.005
-"""One sigma from which something counts as not determined; so does what the motion did not halve."""
+"""One-sigma limits beyond which a parameter counts as unobservable; the limit is half the prior's sigma if that is smaller."""
 
-SHARE = 0.2
-"""Parts of a direction below this share of its largest are not worth a word."""
+MIN_COMPONENT_SHARE = 0.2
+"""Components of a direction below this share of its largest are omitted from the description."""
 
 
 @dataclass(frozen=True, slots=True)
 class UnobservableDirection:
-    """A direction in the set-up that the motion left uncertain.
+    """A direction of the set-up that the motion left uncertain.
 
     Attributes
     ----------
-    sentence
-        Everything in it that changes together, by one sigma each, in words.
+    description
+        All components of the direction, which change together, by one sigma each, in words.
     excess
-        How many times its uncertainty is above the limit.
+        Ratio of its uncertainty to the limit.
     """
 
     description: str
@@ -41,66 +41,75 @@ class UnobservableDirection:
 
 
 def unobservable_directions(calibration: MotionCalibration) -> list[UnobservableDirection]:
-    """Name what was not determined, the worst first; empty if everything was."""
-    unknowns = calibration.unknowns
-    limits = np.empty(len(unknowns.sigmas))
-    limits[unknowns.translations] = SHIFT_LIMIT_M
-    limits[unknowns.rotations] = TURN_LIMIT_RAD
-    limits[unknowns.latencies] = LATENCY_LIMIT_S
-    limits[unknowns.prisms] = PRISM_LIMIT_M
-    limits = np.minimum(limits, 0.5 * unknowns.sigmas)
+    """Directions whose uncertainty exceeds the limits, largest first: eigenvectors of the scaled covariance."""
+    parameters = calibration.parameters
+    limits = np.empty(len(parameters.sigmas))
+    limits[parameters.translations] = SHIFT_LIMIT_M
+    limits[parameters.rotations] = TURN_LIMIT_RAD
+    limits[parameters.latencies] = LATENCY_LIMIT_S
+    limits[parameters.prisms] = PRISM_LIMIT_M
+    limits = np.minimum(limits, 0.5 * parameters.sigmas)
     values, vectors = np.linalg.eigh(calibration.covariance / np.outer(limits, limits))
-    found = []
+    directions = []
     for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
         if value <= 1.0:
             break
         excess = float(np.sqrt(value))
-        found.append(UnobservableDirection(_sentence(calibration, vector, excess * limits * vector), excess))
-    return found
+        directions.append(
+            UnobservableDirection(_describe(calibration, vector, excess * limits * vector), excess)
+        )
+    return directions
 
 
-def _sentence(calibration: MotionCalibration, vector: FloatArray, sigma: FloatArray) -> str:
-    """Put a direction into words; ``vector`` in units of the limits, ``sigma`` the same in m, rad and s."""
-    unknowns = calibration.unknowns
-    # A direction has no sign of its own: the largest part is told as positive.
+def _describe(calibration: MotionCalibration, vector: FloatArray, sigma: FloatArray) -> str:
+    """Describe a direction; ``vector`` in units of the limits, ``sigma`` the same in m, rad and s."""
+    parameters = calibration.parameters
+    # The sign of a direction is arbitrary: make the largest component positive.
     sigma = sigma * (1.0 if vector[np.argmax(np.abs(vector))] >= 0 else -1.0)
-    parts: list[tuple[float, str]] = []
-    for place, station in enumerate(unknowns.stations):
-        if len(unknowns.translations):
-            shift, turn = sigma[unknowns.translations[place]], sigma[unknowns.rotations[place]]
-            parts.append(
+    components: list[tuple[float, str]] = []
+    for i, station in enumerate(parameters.stations):
+        if len(parameters.translations):
+            translation, rotation = sigma[parameters.translations[i]], sigma[parameters.rotations[i]]
+            components.append(
                 (
-                    float(np.linalg.norm(vector[unknowns.translations[place]])),
-                    f"station {station + 1} shifts by {1e3 * np.linalg.norm(shift):.2g} mm {_towards(shift)}",
+                    float(np.linalg.norm(vector[parameters.translations[i]])),
+                    f"station {station + 1} shifts by {1e3 * np.linalg.norm(translation):.2g} mm {_direction(translation)}",
                 )
             )
-            parts.append(
+            components.append(
                 (
-                    float(np.linalg.norm(vector[unknowns.rotations[place]])),
-                    f"station {station + 1} turns by {1e3 * np.linalg.norm(turn):.2g} mrad about {_towards(about_axes(turn))}",
+                    float(np.linalg.norm(vector[parameters.rotations[i]])),
+                    f"station {station + 1} turns by {1e3 * np.linalg.norm(rotation):.2g} mrad about {_direction(about_axes(rotation))}",
                 )
             )
-        if len(unknowns.latencies):
-            late = unknowns.latencies[place]
-            parts.append((abs(vector[late]), f"station {station + 1} is late by {1e3 * sigma[late]:.2g} ms"))
-    if len(unknowns.prisms):
-        moved = (deformation_modes(calibration.setup.layout) @ sigma[unknowns.prisms]).reshape(-1, 3)
-        weight = float(np.linalg.norm(vector[unknowns.prisms]))
-        lengths = np.linalg.norm(moved, axis=1)
+        if len(parameters.latencies):
+            latency = parameters.latencies[i]
+            components.append(
+                (abs(vector[latency]), f"station {station + 1} is late by {1e3 * sigma[latency]:.2g} ms")
+            )
+    if len(parameters.prisms):
+        displacements = (deformation_modes(calibration.setup.layout) @ sigma[parameters.prisms]).reshape(
+            -1, 3
+        )
+        weight = float(np.linalg.norm(vector[parameters.prisms]))
+        lengths = np.linalg.norm(displacements, axis=1)
         for prism, length in enumerate(lengths):
-            x, y, z = 1e3 * moved[prism]
-            parts.append(
+            x, y, z = 1e3 * displacements[prism]
+            components.append(
                 (
                     weight * float(length / lengths.max()),
                     f"prism {prism + 1} moves on the robot by ({x:.2g}, {y:.2g}, {z:.2g}) mm",
                 )
             )
-    largest = max(weight for weight, _ in parts)
-    told = sorted((part for part in parts if part[0] >= SHARE * largest), key=lambda part: -part[0])
-    return ", ".join(text for _, text in told)
+    largest = max(weight for weight, _ in components)
+    described = sorted(
+        (component for component in components if component[0] >= MIN_COMPONENT_SHARE * largest),
+        key=lambda component: -component[0],
+    )
+    return ", ".join(text for _, text in described)
 
 
-def _towards(direction: FloatArray) -> str:
+def _direction(direction: FloatArray) -> str:
     horizontal_rad, zenith_rad, _ = cartesian_to_polar(direction)
     elevation_deg = 90.0 - float(np.degrees(zenith_rad))
     if abs(elevation_deg) > 80.0:

@@ -1,12 +1,8 @@
-"""Frames from points that were measured in two of them: stations from targets, prisms from body points.
+"""Frames from points measured in two of them: stations from targets, prisms from body points. Sans-I/O.
 
-Every point has coordinates and a 3x3 covariance in both frames. The frames follow from the alignment of the
-points (paper section III-C, "Calibration procedure": Arun et al. 1987), by default refined so that each miss
-counts by the noise of both measurements. Each point is also predicted from all others: that exposes a bad point
-(data snooping after Baarda 1968, here with three coordinates at a time), which is named and left out. The
-covariance tells whether the points fix the frame at all, and if not, about which axis it can still turn.
-
-Nothing here knows files or instruments; the noise comes in with the points.
+The frame follows from the alignment of the points (paper section III-C, "Calibration procedure": Arun et al. 1987), by default
+weighted by the noise of both measurements. Each point is predicted from all others: data snooping (Baarda 1968, here with
+three coordinates at a time) rejects outliers. The covariance shows about which axes the points hold the frame weakly.
 """
 
 from __future__ import annotations
@@ -26,32 +22,33 @@ if TYPE_CHECKING:
     from tsgt.geometry.rigid import FloatArray
 
 FALSE_ALARM_RATE = 1e-4
-"""Probability of suspecting any point of a set that is as good as its noise model says."""
+"""Probability of suspecting any point of a set that matches its noise model."""
 
 MAX_NOISE_SCALE = 2.0
-"""How much larger than its model the noise may be (one sigma) before points count as contradictory.
+"""Factor on the noise model's sigmas beyond which points are inconsistent.
 
-The authors' four sets of field targets show 0.5 to 1.2 times ``tsgt.model.TARGET_NOISE``."""
+The authors' four sets of field targets show 0.5 to 1.2 times ``tsgt.model.TARGET_NOISE``.
+"""
 
 MAX_PREDICTION_SIGMA_M = 0.02
 MAX_PREDICTION_SIGMA_RAD = 0.1
-"""Where the others hold a point or the frame to no better than this (one sigma), they are not said to predict it:
-the covariance is of first order and promises too much there."""
+"""One-sigma limits on a point and a rotation predicted from the other points: beyond, the covariance of first order is too
+optimistic to test the prediction.
+"""
 
 MIN_POINTS = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What counts as bad; it depends on what the frame is for.
+    """Limits that depend on what the frame is for.
 
     Attributes
     ----------
     weak_rad
-        One-sigma rotation in rad above which an axis is weak.
+        One-sigma rotation above which an axis is weak.
     blunder_m
-        A point that misses its prediction by less than this in m is never rejected: so much may come from a
-        wrong constant, which is common to all points and no fault of one of them.
+        Smallest prediction error that is rejected as a blunder: a wrong prism constant, common to all points, may cause less.
     """
 
     weak_rad: float
@@ -59,25 +56,25 @@ class Limits:
 
 
 STATION_LIMITS = Limits(weak_rad=0.5e-3, blunder_m=0.01)
-"""For stations. 0.5 mrad is 10 mm at a prism 20 m off the axis, as much as all the rest of the system together.
-Targets all around give 0.06 to 0.11 mrad (the authors' field sets), four of them nearly in a line 3 to 5 mrad.
-A constant wrong by 10 mm moves single targets of these sets by up to 11 mm."""
+"""For stations. 0.5 mrad is 10 mm at a prism 20 m off the axis, as much as the rest of the system together. Targets all around
+give 0.06 to 0.11 mrad (the authors' field sets), four of them nearly collinear 3 to 5 mrad. A constant wrong by 10 mm moves
+single targets of these sets by up to 11 mm.
+"""
 
 BODY_LIMITS = Limits(weak_rad=5e-3, blunder_m=0.003)
-"""For the robot's body: 5 mm at a prism one metre off the axis; all points are seen from about one side, so that
-a wrong constant hardly bends them."""
+"""For the robot's body: 5 mm at a prism one metre off the axis. All points are seen from about one side, so that a wrong constant
+hardly distorts them.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class RejectedPoint:
-    """A point that the others contradict.
+    """A point that is inconsistent with the others.
 
     Attributes
     ----------
-    name
-        Its target number or name.
-    miss_m
-        How far it lies from where the points that were kept predict it, in m.
+    prediction_error_m
+        Distance from its prediction by the points that were kept.
     """
 
     name: PointName
@@ -86,14 +83,14 @@ class RejectedPoint:
 
 @dataclass(frozen=True, slots=True)
 class WeakAxis:
-    """An axis about which the points hardly hold the frame.
+    """An axis about which the points hold the frame weakly.
 
     Attributes
     ----------
     axis
-        Unit vector in the target frame; of the two senses the one that points towards the points.
+        Unit vector in the target frame, pointing towards the points.
     sigma_rad
-        One sigma of the rotation about it in rad, from the noise of the points.
+        One sigma of the rotation about it.
     """
 
     axis: tuple[float, float, float]
@@ -102,7 +99,7 @@ class WeakAxis:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameCalibration:
-    """A frame found from points: ``T`` takes coordinates in the source frame to the target frame.
+    """A frame found from points.
 
     Attributes
     ----------
@@ -110,25 +107,20 @@ class FrameCalibration:
         (4, 4) rigid transform from the source to the target frame, in m.
     covariance
         (6, 6) covariance of (x, y, z, rotation about the target frame's fixed axes x, y, z) in m and rad,
-        T_true = [exp(dtheta) R | t + dt], from the noise of the points; rows and columns of roll and pitch
-        are zero for levelled instruments.
+        T_true = [exp(dtheta) R | t + dt]; rows and columns of roll and pitch are zero for levelled instruments.
     used
         Names of the n points that the frame was computed from.
     residuals_m
-        (n,) distance in m of each used point from its transformed counterpart.
+        (n,) distance of each used point from its transformed counterpart.
     leave_one_out_m
-        (n,) the same in m when the frame is computed without that point; NaN where the others do not
-        determine it.
-    rejected
-        Points left out because the others contradict them.
+        (n,) the same when the frame is computed without that point; NaN where the others do not determine it.
     consistent
-        False where the points contradict each other and it cannot be told which one is bad; nothing is
-        rejected then, and the frame must not be used.
+        False where the points are inconsistent and the outliers cannot be identified; nothing is rejected then, and the frame
+        must not be used.
     weak
-        Axes about which the frame is poorly held, worst first; empty for a good set of points.
+        Weakly held axes, worst first.
     tilt_rad
-        Angle between the z axes in rad where the frames were taken as levelled and the points say beyond their
-        noise that they are not; None otherwise.
+        Angle between the z axes where the frames were taken as levelled and the points contradict that significantly.
     """
 
     T: FloatArray
@@ -143,12 +135,12 @@ class FrameCalibration:
 
     @property
     def rms_m(self) -> float:
-        """Root mean square of the residuals (vector lengths) in m."""
+        """Root mean square of the residuals."""
         return float(np.sqrt(np.mean(self.residuals_m**2)))
 
     @property
     def max_m(self) -> float:
-        """Largest residual in m."""
+        """Largest residual."""
         return float(self.residuals_m.max())
 
 
@@ -159,10 +151,9 @@ class PrismCalibration:
     Attributes
     ----------
     body
-        The robot frame as found from the body points; ``body.T`` takes station to robot coordinates.
+        The fit to the body points; ``body.T`` takes station to robot coordinates.
     prisms
-        Prism positions and covariances in the robot frame. The errors of the body fit are common to all
-        prisms; each covariance contains them.
+        Positions and covariances in the robot frame; each covariance contains the error of the body fit, which is common to all.
     """
 
     body: FrameCalibration
@@ -182,26 +173,17 @@ def calibrate_frame(
     Parameters
     ----------
     source, target
-        The points in either frame; they are paired by name, and a name that only one of them has is ignored.
-        No covariance of the source may be singular.
+        Paired by name; unpaired points are ignored. No covariance of the source may be singular.
     weighted
-        Weigh each miss with the inverse covariance of both points (maximum likelihood); False is Arun's plain
-        least squares. The search for bad points follows the noise model either way.
+        Weight each residual with its inverse covariance (maximum likelihood); False is Arun's unweighted least squares. Outlier
+        tests follow the noise model either way.
     levelled
         Both z axes are vertical: only heading and position are solved.
-    limits
-        What counts as weak and as a blunder.
-
-    Returns
-    -------
-    FrameCalibration
-        ``T`` takes source to target coordinates.
 
     Raises
     ------
     DegenerateGeometryError
-        There are fewer than three common points, or they coincide or lie in a line (levelled: above one
-        another).
+        Fewer than three common points, or they coincide or are collinear (levelled: above one another).
     GeometryError
         A covariance of the source is singular.
     """
@@ -217,9 +199,9 @@ def calibrate_frame(
         raise GeometryError(
             "expected noise in every direction of every source point, got a singular covariance"
         )
-    fit_frame(pairs, weighted=True)  # so that a degenerate set is refused before the search for bad points
-    bad = _bad_points(pairs, limits.blunder_m)
-    kept = pairs.without(*(bad or ()))
+    fit_frame(pairs, weighted=True)  # raises for a degenerate set
+    outliers = _outliers(pairs, limits.blunder_m)
+    kept = pairs.without(*(outliers or ()))
     fit = fit_frame(kept, weighted=weighted)
     predictions = [_Prediction.of(kept, name, weighted=weighted) for name in kept.names]
     return FrameCalibration(
@@ -230,9 +212,9 @@ def calibrate_frame(
         leave_one_out_m=np.array([np.nan if p is None else p.length_m for p in predictions]),
         rejected=tuple(
             RejectedPoint(name, float(np.linalg.norm(fit.residuals_m(pairs.only(name)))))
-            for name in bad or ()
+            for name in outliers or ()
         ),
-        consistent=bad is not None,
+        consistent=outliers is not None,
         weak=_weak_axes(fit.covariance, kept.target.points_m, limits.weak_rad),
         tilt_rad=_tilt_rad(kept) if levelled else None,
     )
@@ -243,22 +225,15 @@ def calibrate_prisms(body: PointSet, body_cad: PointSet, prisms: PointSet) -> Pr
 
     Parameters
     ----------
-    body
-        Body points as the station measured them, in the station's frame.
+    body, prisms
+        Body points and prisms as measured from the same place, in the station's frame.
     body_cad
-        The same points in the robot frame, from CAD, with the tolerance of the build as covariance.
-    prisms
-        Prisms as the station measured them from the same place, in the station's frame.
-
-    Returns
-    -------
-    PrismCalibration
-        The prisms in the robot frame.
+        The body points in the robot frame, from CAD, with the build tolerance as covariance.
 
     Raises
     ------
     DegenerateGeometryError
-        There are fewer than three body points, or they coincide or lie in a line.
+        Fewer than three body points, or they coincide or are collinear.
     """
     frame = calibrate_frame(body, body_cad, limits=BODY_LIMITS)
     rotation = frame.T[:3, :3]
@@ -275,88 +250,84 @@ def calibrate_prisms(body: PointSet, body_cad: PointSet, prisms: PointSet) -> Pr
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Prediction:
-    """Where one point misses its prediction by the others."""
+    """Prediction of one point by the others."""
 
-    prediction_error_m: FloatArray  # (3,)
-    residual_covariances_m2: (
-        FloatArray  # (3, 3) covariance of the miss: of the prediction and of the point itself
-    )
-    scale: float  # of the others' scatter to their noise, as variances
+    error_m: FloatArray  # (3,)
+    covariance_m2: FloatArray  # (3, 3) of the error: prediction plus measurement
+    variance_ratio: float  # variance ratio of the others' residuals to their noise
 
     @classmethod
     def of(cls, pairs: PointPairs, name: PointName, *, weighted: bool) -> _Prediction | None:
-        """Predict a point from the others; None where they do not hold it."""
+        """Predict a point from the others; None where they do not determine it well enough."""
         others, point = pairs.without(name), pairs.only(name)
         try:
             fit = fit_frame(others, weighted=weighted)
         except DegenerateGeometryError:
             return None
         jacobian = pose_jacobian(point.source.points_m @ fit.rotation.T)[0]
-        spread = jacobian @ fit.covariance @ jacobian.T
+        prediction_covariance = jacobian @ fit.covariance @ jacobian.T
         if (
             np.linalg.eigvalsh(fit.covariance[3:, 3:]).max() > MAX_PREDICTION_SIGMA_RAD**2
-            or np.linalg.eigvalsh(spread).max() > MAX_PREDICTION_SIGMA_M**2
+            or np.linalg.eigvalsh(prediction_covariance).max() > MAX_PREDICTION_SIGMA_M**2
         ):
             return None
         return cls(
-            prediction_error_m=fit.residuals_m(point)[0],
-            residual_covariances_m2=fit.residual_covariances_m2(point)[0] + spread,
-            scale=fit.chi_squared(others) / others.redundancy,
+            error_m=fit.residuals_m(point)[0],
+            covariance_m2=fit.residual_covariances_m2(point)[0] + prediction_covariance,
+            variance_ratio=fit.chi_squared(others) / others.redundancy,
         )
 
     @property
     def length_m(self) -> float:
-        return float(np.linalg.norm(self.prediction_error_m))
+        return float(np.linalg.norm(self.error_m))
 
     @property
-    def implausibility(self) -> float:
-        """Squared miss over its noise."""
-        squared = float(
-            self.prediction_error_m @ np.linalg.solve(self.residual_covariances_m2, self.prediction_error_m)
-        )
-        return squared / _noise_scale(self.scale)
+    def normalised_squared_error(self) -> float:
+        """Squared error over its covariance."""
+        squared = float(self.error_m @ np.linalg.solve(self.covariance_m2, self.error_m))
+        return squared / _noise_scale(self.variance_ratio)
 
 
-def _noise_scale(scatter: float) -> float:
-    """Factor on the noise model's variances, given what the points scatter among themselves in units of it.
-
-    Where they disagree more than the model says, it is taken to be optimistic by as much, up to ``MAX_NOISE_SCALE``.
-    """
-    return min(max(scatter, 1.0), MAX_NOISE_SCALE**2)
+def _noise_scale(variance_ratio: float) -> float:
+    """Factor on the noise model's variances, between 1 and ``MAX_NOISE_SCALE`` squared, from the variance ratio of the residuals."""
+    return min(max(variance_ratio, 1.0), MAX_NOISE_SCALE**2)
 
 
-def _suspect(pairs: PointPairs, blunder_m: float) -> PointName | None:
-    """Name the point that the others contradict most, if they do so beyond chance (chi squared, Bonferroni)."""
+def _worst_outlier(pairs: PointPairs, blunder_m: float) -> PointName | None:
+    """Name the point with the largest significant prediction error (chi squared, Bonferroni)."""
     scores = {}
     for name in pairs.names:
         prediction = _Prediction.of(pairs, name, weighted=True)
         if prediction is not None and prediction.length_m >= blunder_m:
-            scores[name] = prediction.implausibility
+            scores[name] = prediction.normalised_squared_error
     worst = max(scores, key=lambda name: scores[name], default=None)
     if worst is None or scores[worst] <= chdtri(3, FALSE_ALARM_RATE / len(pairs.names)):
         return None
     return worst
 
 
-def _bad_points(pairs: PointPairs, blunder_m: float) -> tuple[PointName, ...] | None:
-    """Points to leave out, found one at a time; None where it cannot be told which ones are bad.
+def _outliers(pairs: PointPairs, blunder_m: float) -> tuple[PointName, ...] | None:
+    """Outliers, found one at a time; None where they cannot be identified.
 
-    It cannot be told when leaving out some other point instead would make the rest plausible as well, when
-    fewer than four points would remain, when the bad ones come near to half of all, or when the rest disagree
-    with their noise although none stands out.
+    That is the case if rejecting another point instead would make the rest plausible as well, if fewer than four points would
+    remain, if the outliers come near to half of all, or if the rest are inconsistent with their noise although none stands out.
     """
-    bad: list[PointName] = []
+    outliers: list[PointName] = []
     kept = pairs
-    bad_max = (len(pairs.names) - MIN_POINTS) // 2
-    while (suspect := _suspect(kept, blunder_m)) is not None:
+    max_outliers = (len(pairs.names) - MIN_POINTS) // 2
+    while (suspect := _worst_outlier(kept, blunder_m)) is not None:
         others = [name for name in kept.names if name != suspect]
-        if len(bad) == bad_max or any(_suspect(kept.without(name), blunder_m) is None for name in others):
+        if len(outliers) == max_outliers or any(
+            _worst_outlier(kept.without(name), blunder_m) is None for name in others
+        ):
             return None
-        bad.append(suspect)
+        outliers.append(suspect)
         kept = kept.without(suspect)
     chi_squared = fit_frame(kept, weighted=True).chi_squared(kept)
     return (
-        tuple(bad) if chi_squared <= MAX_NOISE_SCALE**2 * chdtri(kept.redundancy, FALSE_ALARM_RATE) else None
+        tuple(outliers)
+        if chi_squared <= MAX_NOISE_SCALE**2 * chdtri(kept.redundancy, FALSE_ALARM_RATE)
+        else None
     )
 
 
@@ -372,14 +343,14 @@ def _weak_axes(covariance: FloatArray, points_m: FloatArray, limit_rad: float) -
 
 
 def _tilt_rad(pairs: PointPairs) -> float | None:
-    """Angle between the z axes if the points demand one: the misfit then drops by more than two unknowns explain."""
+    """Angle between the z axes if it is significant: the chi-squared test of the two additional unknowns."""
     free = PointPairs(pairs.source, pairs.target, levelled=False)
     try:
         tilted = fit_frame(free, weighted=True)
     except DegenerateGeometryError:
         return None  # a line of points cannot tell
-    left = tilted.chi_squared(free)
-    drop = fit_frame(pairs, weighted=True).chi_squared(pairs) - left
-    if drop <= chdtri(2, FALSE_ALARM_RATE) * _noise_scale(left / free.redundancy):
+    tilted_chi_squared = tilted.chi_squared(free)
+    drop = fit_frame(pairs, weighted=True).chi_squared(pairs) - tilted_chi_squared
+    if drop <= chdtri(2, FALSE_ALARM_RATE) * _noise_scale(tilted_chi_squared / free.redundancy):
         return None
     return float(np.arccos(np.clip(tilted.rotation[2, 2], -1.0, 1.0)))

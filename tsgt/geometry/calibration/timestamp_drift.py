@@ -1,10 +1,9 @@
-"""Time stamps that wander, as a calibration from motion allows for them. Pure.
+"""Timestamp drift (wander) as a random effect in a calibration from motion. Sans-I/O.
 
-A station's clock is followed to a millisecond or so, and what is left changes over minutes: it is no noise that averages out
-from one measurement to the next, and a trajectory that is late by a different time in each piece of a recording looks like
-turned frames. So in each piece of a recording every station may be late by some time of its own beside its latency, all of
-one size (a random effect), and that size is the one that makes the pieces most probable (restricted maximum likelihood: D. A.
-Harville, Journal of the American Statistical Association 72, 1977).
+A station's clock is known to a millisecond or so, and the error changes over minutes: it does not average out, and a
+trajectory with another time offset in each segment of a recording looks like rotated frames. Each station therefore gets an
+additional latency in each segment, all with one variance (a random effect), which restricted maximum likelihood estimates
+(D. A. Harville, Journal of the American Statistical Association 72, 1977).
 """
 
 from __future__ import annotations
@@ -21,18 +20,18 @@ if TYPE_CHECKING:
 
     from tsgt.geometry.rigid import FloatArray
 
-LEAST_WANDER_S = 1e-5
-MOST_WANDER_S = 0.1
-"""Less makes no difference with any instrument, more is no wandering."""
+MIN_WANDER_S = 1e-5
+MAX_WANDER_S = 0.1
+"""Bounds of the search: less is invisible with any instrument, more is no wander."""
 
 
-class Part(NamedTuple):
-    """What one piece of a recording tells of G unknowns.
+class SegmentInformation(NamedTuple):
+    """Information of one segment of a recording on G parameters, its trajectory eliminated.
 
     Attributes
     ----------
     information
-        (G, G), the piece's trajectory eliminated.
+        (G, G).
     gradient
         (G,) of half the cost.
     """
@@ -41,72 +40,78 @@ class Part(NamedTuple):
     gradient: FloatArray
 
 
-class Allowed(NamedTuple):
-    """A piece with its wandering eliminated as well.
+class WanderElimination(NamedTuple):
+    """A segment with its random latencies eliminated.
 
     Attributes
     ----------
-    part
-        What is left of it.
-    gained
-        By how much half the piece's cost falls.
-    log_share
-        Logarithm of how much of what is known of the wandering was known beforehand.
+    cost_reduction
+        By which half the segment's cost falls.
+    log_determinant
+        Log ratio of the prior to the posterior information on the random latencies.
     """
 
-    part: Part
-    gained: float
-    log_share: float
+    segment: SegmentInformation
+    cost_reduction: float
+    log_determinant: float
 
 
-def allowed_for(part: Part, latencies: NDArray[np.intp], wander_s: float) -> Allowed:
-    """Let each station be late by some time of its own in a piece.
+def eliminate_wander(
+    segment: SegmentInformation, latencies: NDArray[np.intp], wander_s: float
+) -> WanderElimination:
+    """Marginalise an additional latency of each station in a segment.
 
     Parameters
     ----------
-    part
-        The piece.
     latencies
-        (n,) which of the unknowns are latencies, of all stations but the first.
+        (n,) rows of the latencies in the parameters, of all stations but the first.
     wander_s
-        One sigma of that time, of each station.
+        One sigma of the additional latency of each station.
     """
-    information, gradient = part
-    # Those beside station 1: it wanders, too, and all others the other way with it.
-    known = wander_s**2 * (np.eye(len(latencies)) + 1.0)
-    share = np.eye(len(latencies)) + known @ information[np.ix_(latencies, latencies)]
-    covariance = np.linalg.solve(share, known)
+    information, gradient = segment
+    # Relative to station 1, whose own wander shifts all others alike.
+    prior_covariance = wander_s**2 * (np.eye(len(latencies)) + 1.0)
+    ratio = np.eye(len(latencies)) + prior_covariance @ information[np.ix_(latencies, latencies)]
+    covariance = np.linalg.solve(ratio, prior_covariance)
     covariance = 0.5 * (covariance + covariance.T)
-    mixed = information[:, latencies]
-    late = gradient[latencies]
-    left = Part(information - mixed @ covariance @ mixed.T, gradient - mixed @ covariance @ late)
-    return Allowed(left, 0.5 * float(late @ covariance @ late), -float(np.linalg.slogdet(share)[1]))
+    cross = information[:, latencies]
+    latency_gradient = gradient[latencies]
+    eliminated = SegmentInformation(
+        information - cross @ covariance @ cross.T, gradient - cross @ covariance @ latency_gradient
+    )
+    return WanderElimination(
+        eliminated,
+        0.5 * float(latency_gradient @ covariance @ latency_gradient),
+        -float(np.linalg.slogdet(ratio)[1]),
+    )
 
 
-def likely_wander_s(parts: Sequence[Part], known: Part, latencies: NDArray[np.intp]) -> float:
-    """How much stations' time stamps wander from piece to piece, one sigma; 0 if nothing speaks for it.
+def estimate_wander_s(
+    segments: Sequence[SegmentInformation], prior: SegmentInformation, latencies: NDArray[np.intp]
+) -> float:
+    """One sigma of the wander of latencies between segments; 0 without evidence for it.
 
     Parameters
     ----------
-    parts
-        The pieces of a recording, all about one set-up.
-    known
-        What is known of the unknowns beforehand, about the same set-up.
+    segments
+        The segments of a recording, linearised at one set-up.
+    prior
+        Prior information on the parameters at the same set-up.
     latencies
-        (n,) which of the unknowns are latencies.
+        (n,) rows of the latencies in the parameters.
     """
-    if not len(latencies) or len(parts) < 2:
+    if not len(latencies) or len(segments) < 2:
         return 0.0
 
     def negative(log_wander: float) -> float:
-        allowed = [allowed_for(part, latencies, float(np.exp(log_wander))) for part in parts]
-        information = known.information + sum(each.part.information for each in allowed)
-        gradient = known.gradient + sum(each.part.gradient for each in allowed)
-        probable = sum(each.gained + 0.5 * each.log_share for each in allowed)
-        probable += 0.5 * float(gradient @ np.linalg.solve(information, gradient))
-        return -float(probable - 0.5 * np.linalg.slogdet(information)[1])
+        eliminated = [eliminate_wander(segment, latencies, float(np.exp(log_wander))) for segment in segments]
+        information = prior.information + sum(each.segment.information for each in eliminated)
+        gradient = prior.gradient + sum(each.segment.gradient for each in eliminated)
+        log_likelihood = sum(each.cost_reduction + 0.5 * each.log_determinant for each in eliminated)
+        log_likelihood += 0.5 * float(gradient @ np.linalg.solve(information, gradient))
+        return -float(log_likelihood - 0.5 * np.linalg.slogdet(information)[1])
 
-    bounds = (float(np.log(LEAST_WANDER_S)), float(np.log(MOST_WANDER_S)))
+    bounds = (float(np.log(MIN_WANDER_S)), float(np.log(MAX_WANDER_S)))
     found = minimize_scalar(negative, bounds=bounds, method="bounded", options={"xatol": 0.01})
-    # At the bound below nothing speaks for it, and the search stops just short of the bound.
+    # Without evidence the search stops just short of the lower bound.
     return float(np.exp(found.x)) if found.fun < negative(bounds[0]) - 1e-6 else 0.0

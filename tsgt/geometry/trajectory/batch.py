@@ -1,8 +1,8 @@
-"""The smooth trajectory of a whole recording, of any length. Pure.
+"""Batch estimation: the trajectory of a whole recording of any length. Sans-I/O.
 
-What happened half a minute ago says nothing of where a robot is now that the measurements since do not say better. So a
-long recording is solved in pieces that overlap, and memory for the equations stays bounded; the result is that of one
-piece to far below the noise. Memory for what is kept is about 140 MB per hour of 3 stations at 2.5 Hz.
+A long recording is solved in overlapping segments, which bounds the memory for the equations; measurements half a minute
+away carry no information about a state, so that the result equals that of one segment to far below the noise. The result
+takes about 140 MB per hour of 3 stations at 2.5 Hz.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ if TYPE_CHECKING:
     from tsgt.geometry.rigid import FloatArray
     from tsgt.geometry.trajectory.measurement_factors import Observations
 
-KNOTS_AT_ONCE = 1024
-"""About two minutes of 3 stations at 2.5 Hz: their blocks fit into a cache."""
+KNOTS_PER_SEGMENT = 1024
+"""About two minutes of 3 stations at 2.5 Hz: their blocks fit into the cache."""
 
-OVERLAP = 128
-"""Knots on either side of a piece that are solved with it and left to its neighbours."""
+OVERLAP_KNOTS = 128
+"""Knots on either side of a segment that are solved with it and discarded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,18 +46,16 @@ class TrajectoryFit:
 
     Attributes
     ----------
-    trajectory
-        The robot's motion with its uncertainty.
     observations
-        The M measurements that it was fitted to; their noise is the stated one times ``noise_scale``.
+        The M measurements, their noise scaled by ``noise_scale``.
     noise_scale
-        The measurements scatter by so many times the stated noise of their instruments.
+        Factor on the stated noise of the instruments.
     residuals_m
-        (M, 3) trajectory less measurement: along the line of sight, horizontally and vertically across it.
-    distances
-        (M,) squared distances of the measurements from the trajectory, in sigmas of their noise.
+        (M, 3) trajectory minus measurement: along the line of sight, horizontally and vertically across it.
+    squared_distances
+        (M,) squared Mahalanobis distances of the residuals.
     weights
-        (M,) what each of them counts: 1, or less for an outlier.
+        (M,) of the robust loss: 1, or less for an outlier.
     """
 
     trajectory: Trajectory
@@ -69,12 +67,12 @@ class TrajectoryFit:
 
     @property
     def prior(self) -> MotionPrior:
-        """How the robot moves."""
+        """Motion prior."""
         return self.trajectory.prior
 
 
-class _Piece(NamedTuple):
-    """Knots by their numbers: those that are solved, and those of them that are kept."""
+class _Segment(NamedTuple):
+    """Slices of knots: those that are solved together, and those of them that are kept."""
 
     solved: slice
     kept: slice
@@ -95,57 +93,59 @@ def fit_trajectory(
     observations
         In the order of time, with the stated noise of the instruments.
     prior
-        How the robot moves; found from the measurements when not given.
-    while_hidden
-        How lively it is at least while fewer than three prisms are seen; no other than ``prior`` when only that is given.
+        Tuned on the measurements when not given.
+    occluded_prior
+        Process-noise floor while fewer than three prisms are observed; ``prior`` when only that is given.
     noise_scale
-        By what their stated noise is multiplied; found from the measurements when not given.
+        Factor on the stated noise; tuned on the measurements when not given.
     on_progress
-        Called now and then with the share of the work that is done, 0 to 1.
+        Called with the completed share of the work, 0 to 1.
 
     Raises
     ------
     GeometryError
-        Fewer than three prisms were measured, or too little to tell what is asked for.
+        Fewer than three prisms were measured, or too few measurements to tune what is not given.
     """
-    report = on_progress or (lambda _: None)
+    report_progress = on_progress or (lambda _: None)
     if prior is None or noise_scale is None:
-        tuned = tune(observations, start=prior, noise_scale=noise_scale, fixed=prior is not None)
+        tuned = tune(observations, start=prior, noise_scale=noise_scale, noise_only=prior is not None)
         noise_scale = tuned.noise_scale
         if prior is None:
             prior = with_noise_floor(tuned.prior, MotionPrior(), NOISE_FLOOR_SHARE)
             occluded_prior = occluded_prior or MotionPrior()
     observations = scale_noise(observations, noise_scale)
     times_s = knot_times(observations.time_s)
-    at = nearest_knots(times_s, observations.time_s)
+    knot_index = nearest_knots(times_s, observations.time_s)
     sigmas = _sigmas(observations, times_s, prior, occluded_prior or prior)
-    pieces = _pieces(len(times_s))
+    segments = _segments(len(times_s))
     tracks = PrismTracks.of(observations)
-    knots, covariances, besides, residuals_m, squared_distances, weights = [], [], [], [], [], []
-    for done, piece in enumerate(pieces):
-        report(done / len(pieces))
+    knots, covariances, cross_covariances, residuals_m, squared_distances, weights = [], [], [], [], [], []
+    for completed, segment in enumerate(segments):
+        report_progress(completed / len(segments))
         rows = slice(
-            *np.searchsorted(at, (piece.solved.start, piece.solved.stop)),
+            *np.searchsorted(knot_index, (segment.solved.start, segment.solved.stop)),
         )
-        guess = tracks.guess(times_s[piece.solved])
-        between = slice(piece.solved.start, piece.solved.stop - 1)
-        solution = solve(observations.select(rows), guess, prior, sigmas=sigmas[between])
+        guess = tracks.guess(times_s[segment.solved])
+        steps = slice(segment.solved.start, segment.solved.stop - 1)
+        solution = solve(observations.select(rows), guess, prior, sigmas=sigmas[steps])
         covariance, cross_covariance = solution.factor.marginals()
-        inner = slice(piece.kept.start - piece.solved.start, piece.kept.stop - piece.solved.start)
-        knots.append(solution.knots.select(inner))
-        covariances.append(covariance[inner])
-        besides.append(cross_covariance[inner])
-        kept = slice(*np.searchsorted(at[rows], (piece.kept.start, piece.kept.stop)))
-        # Not the whole solution: its factor is as large as all that is kept.
+        kept_knots = slice(
+            segment.kept.start - segment.solved.start, segment.kept.stop - segment.solved.start
+        )
+        knots.append(solution.knots.select(kept_knots))
+        covariances.append(covariance[kept_knots])
+        cross_covariances.append(cross_covariance[kept_knots])
+        kept = slice(*np.searchsorted(knot_index[rows], (segment.kept.start, segment.kept.stop)))
+        # Keep only these parts: the solution's factor is as large as the rest.
         residuals_m.append(solution.linearised.residuals_m[kept])
         squared_distances.append(solution.squared_distances[kept])
         weights.append(solution.weights[kept])
-    report(1.0)
+    report_progress(1.0)
     trajectory = Trajectory(
         concatenate_states(knots),
         prior,
         np.concatenate(covariances),
-        np.concatenate(besides)[: len(times_s) - 1],
+        np.concatenate(cross_covariances)[: len(times_s) - 1],
         sigmas,
     )
     return TrajectoryFit(
@@ -161,16 +161,18 @@ def fit_trajectory(
 def _sigmas(
     observations: Observations, times_s: FloatArray, prior: MotionPrior, occluded_prior: MotionPrior
 ) -> FloatArray:
-    """(K - 1, 6) one sigma of the acceleration of each axis, from knot to knot."""
-    unseen = partially_occluded(observations.time_s, observations.prism, 0.5 * (times_s[:-1] + times_s[1:]))
-    return np.where(unseen[:, None], axis_sigmas(with_noise_floor(prior, occluded_prior)), axis_sigmas(prior))
+    """(K - 1, 6) acceleration sigmas of each step between knots."""
+    occluded = partially_occluded(observations.time_s, observations.prism, 0.5 * (times_s[:-1] + times_s[1:]))
+    return np.where(
+        occluded[:, None], axis_sigmas(with_noise_floor(prior, occluded_prior)), axis_sigmas(prior)
+    )
 
 
-def _pieces(count: int) -> list[_Piece]:
-    """Divide knots into pieces of about equal length."""
-    number = max(-(-count // KNOTS_AT_ONCE), 1)
+def _segments(count: int) -> list[_Segment]:
+    """Divide knots into segments of about equal length."""
+    number = max(-(-count // KNOTS_PER_SEGMENT), 1)
     ends = [round(i * count / number) for i in range(number + 1)]
     return [
-        _Piece(slice(max(start - OVERLAP, 0), min(stop + OVERLAP, count)), slice(start, stop))
+        _Segment(slice(max(start - OVERLAP_KNOTS, 0), min(stop + OVERLAP_KNOTS, count)), slice(start, stop))
         for start, stop in pairwise(ends)
     ]

@@ -1,8 +1,8 @@
-"""Symmetric positive definite systems of equal blocks, of which only neighbours are coupled. Pure.
+"""Cholesky factorisation of symmetric positive definite block-tridiagonal systems. Sans-I/O.
 
-The normal equations of a trajectory have this form. LAPACK's banded Cholesky factorises them in a time that grows with
-their length; marginal covariances come out of the factor without forming the inverse (K. Takahashi, "Formation of
-sparse bus impedance matrix", 1973, for this form).
+The normal equations of a trajectory have this form (Barfoot, "State Estimation for Robotics", section 3.2). LAPACK's banded
+Cholesky factorises them in linear time; marginal covariances follow from the factor without forming the inverse
+(K. Takahashi, "Formation of sparse bus impedance matrix", 1973, for this form).
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from tsgt.errors import GeometryError
 if TYPE_CHECKING:
     from tsgt.geometry.rigid import FloatArray
 
-_BLOCKS_AT_ONCE = 64
-"""What is made of so many blocks before they are done with stays in the nearest cache: twice as fast as all at once."""
+_BLOCKS_PER_CHUNK = 64
+"""Chunk that stays in the L1 cache: twice as fast as all blocks in one pass."""
 
 
 @dataclass(frozen=True, slots=True)
 class BlockCholesky:
-    """The Cholesky factor of a block tridiagonal matrix.
+    """Cholesky factor of a block-tridiagonal matrix.
 
     Attributes
     ----------
     banded
-        (2 B, K B): the lower factor by its diagonals, as LAPACK keeps it.
+        (2 B, K B) the lower factor by its diagonals, LAPACK's band storage.
     size
         B, the order of one block.
     """
@@ -38,7 +38,7 @@ class BlockCholesky:
     size: int
 
     def solve(self, right: FloatArray) -> FloatArray:
-        """Solve for one right hand side, shape (K, B), or several, shape (K, B, N); the result has the same shape."""
+        """Solve for one right-hand side, (K, B), or several, (K, B, N); the result has the same shape."""
         solution, _ = dpbtrs(self.banded, right.reshape(self.banded.shape[1], -1), lower=True)
         return np.asarray(solution).reshape(right.shape)
 
@@ -46,77 +46,69 @@ class BlockCholesky:
         """Natural logarithm of the determinant of the matrix."""
         return 2.0 * float(np.log(self.banded[0]).sum())
 
-    def last(self) -> FloatArray:
-        """(B, B) lower triangle L: ``L L^T`` is the information of the last block when the others are eliminated."""
+    def last_block(self) -> FloatArray:
+        """(B, B) lower triangle L: ``L L^T`` is the Schur complement of the last block, all others eliminated."""
         size = self.size
-        by_block = self.banded[:, -size:]
+        last_columns = self.banded[:, -size:]
         lower = np.zeros((size, size))
         for column in range(size):
-            lower[column:, column] = by_block[: size - column, column]
+            lower[column:, column] = last_columns[: size - column, column]
         return lower
 
     def marginals(self) -> tuple[FloatArray, FloatArray]:
-        """Blocks of the inverse without the rest of it.
-
-        Returns
-        -------
-        diagonal : FloatArray
-            (K, B, B) blocks on the diagonal.
-        beside : FloatArray
-            (K - 1, B, B) blocks right of it: row of one, column of the next.
-        """
+        """Blocks of the inverse matrix: (K, B, B) on the diagonal and (K - 1, B, B) right of it."""
         size, count = self.size, self.banded.shape[1] // self.size
-        by_block = self.banded.T.reshape(count, size, 2 * size)
+        columns = self.banded.T.reshape(count, size, 2 * size)
         diagonal, off_diagonal = np.empty((count, size, size)), np.empty((count - 1, size, size))
-        later: FloatArray | None = None
-        for start in range((count - 1) // _BLOCKS_AT_ONCE * _BLOCKS_AT_ONCE, -1, -_BLOCKS_AT_ONCE):
-            inverse, below = _inverse_and_below(by_block[start : start + _BLOCKS_AT_ONCE])
-            own, gain = np.swapaxes(inverse, 1, 2) @ inverse, np.swapaxes(-below @ inverse, 1, 2)
+        next_block: FloatArray | None = None
+        for start in range((count - 1) // _BLOCKS_PER_CHUNK * _BLOCKS_PER_CHUNK, -1, -_BLOCKS_PER_CHUNK):
+            inverse, sub_diagonal = _inverse_and_sub_diagonal(columns[start : start + _BLOCKS_PER_CHUNK])
+            own, gain = np.swapaxes(inverse, 1, 2) @ inverse, np.swapaxes(-sub_diagonal @ inverse, 1, 2)
             for k in range(len(own) - 1, -1, -1):
-                if later is not None:
-                    shared = np.dot(gain[k], later, out=off_diagonal[start + k])
-                    own[k] += np.dot(shared, gain[k].T)
-                later = own[k]
+                if next_block is not None:
+                    cross = np.dot(gain[k], next_block, out=off_diagonal[start + k])
+                    own[k] += np.dot(cross, gain[k].T)
+                next_block = own[k]
             diagonal[start : start + len(own)] = 0.5 * (own + np.swapaxes(own, 1, 2))
         return diagonal, off_diagonal
 
 
-def _inverse_and_below(by_block: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Inverses of the factor's triangles on the diagonal, and its blocks below them, of some columns; (N, B, B) each."""
-    count, size, _ = by_block.shape
-    inverse, below = np.zeros((count, size, size)), np.empty((count, size, size))
+def _inverse_and_sub_diagonal(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Inverses of the factor's diagonal triangles, and its sub-diagonal blocks, of N block columns; (N, B, B) each."""
+    count, size, _ = columns.shape
+    inverse, sub_diagonal = np.zeros((count, size, size)), np.empty((count, size, size))
     for column in range(size):
-        inverse[:, column:, column] = by_block[:, column, : size - column]
-        below[:, :, column] = by_block[:, column, size - column : 2 * size - column]
+        inverse[:, column:, column] = columns[:, column, : size - column]
+        sub_diagonal[:, :, column] = columns[:, column, size - column : 2 * size - column]
     for block in inverse:
-        # Transposed it is as LAPACK keeps it, so that it works in place.
+        # The transpose has Fortran order: inverted in place.
         dtrtri(block.T, lower=False, overwrite_c=True)
-    return inverse, below
+    return inverse, sub_diagonal
 
 
 def factorise(diagonal: FloatArray, off_diagonal: FloatArray) -> BlockCholesky:
-    """Factorise.
+    """Factorise a block-tridiagonal matrix.
 
     Parameters
     ----------
     diagonal
-        (K, B, B) symmetric blocks on the diagonal; only their lower triangles are looked at.
-    beside
-        (K - 1, B, B) blocks right of the diagonal: row of one, column of the next.
+        (K, B, B) symmetric blocks on the diagonal; only the lower triangles are read.
+    off_diagonal
+        (K - 1, B, B) blocks right of the diagonal: row block k, column block k + 1.
 
     Raises
     ------
     GeometryError
-        The matrix is not positive definite: something is not determined.
+        The matrix is not positive definite.
     """
     count, size, _ = diagonal.shape
-    # Column by column, as LAPACK goes through it.
-    by_column = np.zeros((count, size, 2 * size))
+    # LAPACK's band storage is column by column.
+    columns = np.zeros((count, size, 2 * size))
     for column in range(size):
-        by_column[:, column, : size - column] = diagonal[:, column:, column]
-        by_column[:-1, column, size - column : 2 * size - column] = off_diagonal[:, column]
-    # LAPACK itself, without what scipy asks about it first: live, there are a dozen systems a second.
-    factor, failed = dpbtrf(by_column.reshape(count * size, 2 * size).T, lower=True, overwrite_ab=True)
+        columns[:, column, : size - column] = diagonal[:, column:, column]
+        columns[:-1, column, size - column : 2 * size - column] = off_diagonal[:, column]
+    # LAPACK directly: scipy's checks cost more than a system of the fixed lag, of which there are a dozen a second.
+    factor, failed = dpbtrf(columns.reshape(count * size, 2 * size).T, lower=True, overwrite_ab=True)
     if failed:
         raise GeometryError("the measurements do not determine the trajectory")
     return BlockCholesky(factor, size)

@@ -1,12 +1,11 @@
-"""The estimator ``continuous`` while measurements come in: a window of knots that moves along with time. Pure.
+"""Fixed-lag smoother: the estimator ``continuous`` online, in a window of knots that moves with time. Sans-I/O.
 
-Problem: the trajectory of hours must be known now, at the same cost for each measurement. Idea: keep the knots of the
-last few seconds; what came before is one Gaussian on the oldest of them, left over when the older ones are eliminated
-(the Schur complement). Within the window a measurement counts whenever it comes, and all are linearised again where the
-trajectory now is. docs/explanation/continuous-trajectory.md says more.
+The window holds the knots of the last few seconds. Older knots are marginalised (Schur complement) into an anchor prior on
+the oldest knot of the window, so that the cost per measurement stays constant. Within the window a measurement counts
+whenever it arrives, and all measurements are relinearised. docs/explanation/continuous-trajectory.md says more.
 
-A new measurement may lie far from what was predicted because the robot did the unexpected, or because it is wrong; so what
-it first counts is judged by its distance in sigmas of the prediction, not in those of the instrument.
+The initial weight of a new measurement follows from its normalised innovation squared (NIS; Bar-Shalom), which includes the
+uncertainty of the prediction: a large residual may also be a manoeuvre.
 """
 
 from __future__ import annotations
@@ -27,12 +26,12 @@ from tsgt.geometry.trajectory.gauss_newton import (
     AnchorPrior,
     NormalEquations,
     Solution,
-    add_rows,
+    add_measurements,
+    apply_linear_step,
     assemble,
     diffuse_prior,
     knot_times,
     nearest_knots,
-    nudged,
     solve,
 )
 from tsgt.geometry.trajectory.initialisation import initial_guess
@@ -48,86 +47,88 @@ if TYPE_CHECKING:
     from tsgt.geometry.rigid import FloatArray
     from tsgt.model import MotionPrior
 
-SURE_RAD = 0.1
-"""One sigma of the rotation: known so well, the robot is followed from one measurement to the next."""
+CONVERGED_SIGMA_RAD = 0.1
+"""Rotation sigma below which an initialised trajectory is tracked from measurement to measurement."""
 
-LOST_RAD = 0.2
-"""One sigma of the rotation: not known so well any more, it has to be guessed anew. What two prisms do not tell of it is
-another axis for each attitude: following further than linearisation holds would make knowledge of none."""
+LOST_SIGMA_RAD = 0.2
+"""Rotation sigma above which the trajectory is reinitialised. The rotation that two prisms leave unobserved is about another
+axis for each attitude: tracking beyond the range of the linearisation would create information from nothing.
+"""
 
-SOME_FIT = 0.5
-NEARLY_ALL_FIT = 0.9
-"""Share of the measurements that are no outliers. A trajectory that is followed bears a station on the wrong prism; one that
-is found from nothing bears next to none, as with some left out another robot, metres away, may fit the rest."""
+MIN_INLIER_SHARE = 0.5
+MIN_INITIAL_INLIER_SHARE = 0.9
+"""Share of inliers. A tracked trajectory tolerates a station on a wrong prism; an initialisation tolerates next to none: with
+some measurements rejected, another pose metres away may fit the rest.
+"""
 
 COST_TOLERANCE = 0.01
-"""In squared sigmas of the whole window: a step that is to gain less is the last one. Beside an outlier, whose say changes
-with each step, one of less than 1 left predictions up to 0.6 sigmas from those of a full search."""
+"""Predicted gain, in squared sigmas of the whole window, below which a step is the last one. Beside an outlier, whose weight
+changes with each step, a tolerance of 1 left predictions up to 0.6 sigmas from those of a full search.
+"""
 
-LITTLE_M = 0.05
-LITTLE_RAD = 0.005
-"""All states moved by less, derivatives stay what they are: at 20 m the line of sight bends by 0.06 mm over the one, and a
-prism 1.5 m away is 0.02 mm off the tangent of the other. The next measurement is linearised where the trajectory then is.
-With twice as much, predictions of a robot that turns by a rad per second were up to 0.4 sigmas from those of a full search."""
+STEP_TOLERANCE_M = 0.05
+STEP_TOLERANCE_RAD = 0.005
+"""Steps below both need no relinearisation: at 20 m the line of sight changes by 0.06 mm over the one, and a prism at 1.5 m is
+0.02 mm off the tangent of the other. The next measurement relinearises. With twice as much, predictions of a robot rotating
+at 1 rad/s were up to 0.4 sigmas from those of a full search.
+"""
 
-BEGINNING_ITERATIONS = 10
-"""Those that settle take six at most. What does not (a station on another robot) is tried again with each measurement."""
+MAX_INITIAL_ITERATIONS = 10
+"""Initialisations that converge take six at most; others (a station on another robot) are retried with each measurement."""
 
-TELLING, GAP_S = 3, 1.25
-"""So many measurements of each prism, none longer after the one before, tell which way a robot lies without any from before."""
+MIN_MEASUREMENTS_PER_PRISM, MAX_GAP_S = 3, 1.25
+"""Measurements of each prism, and the longest gap between them, that determine the trajectory without any earlier ones."""
 
-LIVELIER_AHEAD = 2.0
-"""How much livelier, in the variance of its accelerations, a robot is taken to be where nothing was measured yet. Driving is
-not Gaussian: for minutes nothing happens, and then the robot speeds up and turns the other way at once."""
+PREDICTION_NOISE_SCALE = 2.0
+"""Process-noise scale of predictions beyond the last measurement. Driving is not Gaussian: minutes of steady motion, then a
+sudden manoeuvre.
+"""
 
-SURPRISED = 4.0
-"""So far was the newest measurement from its prediction, squared and in its sigmas, from which on predictions are taken to be
-as much worse: who has begun to turn goes on with that. Of robots as the prior has them it is so once in four times."""
+PREDICTION_NIS_THRESHOLD = 4.0
+"""NIS of the newest measurement above which the covariance of predictions is scaled up in proportion: a manoeuvre that has
+begun goes on. A robot that moves as the prior says exceeds it once in four times.
+"""
 
 MAX_STEPS = 5
-"""Where these do not settle it, every step is tried before it is taken, as in :func:`tsgt.geometry.trajectory.gauss_newton.solve`."""
+"""Steps without line search; then :func:`tsgt.geometry.trajectory.gauss_newton.solve` takes over."""
 
-_AS_GOOD_AS_NOTHING = np.repeat([1.0, 1.0, 10.0, 10.0, 10.0, 10.0], 3)
-"""One sigma of the first state once measurements tell it to millimetres: m, rad, and these per second once and twice.
-With less still, rounding would lose it beside the stiff steps between knots when it is eliminated."""
+_DIFFUSE_SIGMAS = np.repeat([1.0, 1.0, 10.0, 10.0, 10.0, 10.0], 3)
+"""Sigmas of the first state's error (m, rad, and their first and second time derivatives) once measurements determine it to
+millimetres. Larger ones would be lost to rounding beside the stiff process factors when it is eliminated.
+"""
 
 
 class FixedLagSmoother:
-    """Follows a robot.
-
-    Parameters
-    ----------
-    prior
-        How it moves.
+    """Estimates the trajectory of a robot online.
 
     Attributes
     ----------
     observations
         The measurements of the window, in the order of time; None before the first one.
     residuals_m
-        (M, 3) what each of them is off the trajectory by, as :class:`~tsgt.geometry.trajectory.measurement_factors.LinearisedMeasurements` has it;
-        NaN while there is none.
+        (M, 3) their residuals as in :class:`~tsgt.geometry.trajectory.measurement_factors.LinearisedMeasurements`; NaN
+        without a trajectory.
     """
 
     def __init__(self, prior: MotionPrior) -> None:
         self._prior = prior
         self._horizon_s = -np.inf
         self._knots: States | None = None
-        self._steps: ProcessFactors | None = None
+        self._process: ProcessFactors | None = None
         self._anchor: AnchorPrior | None = None
         self._converged = False
         self._monitor = InnovationMonitor()
         self._reliable_from_s = np.inf
         self._solved: tuple[States, BlockCholesky] | None = None
         self._trajectory: Trajectory | None = None
-        self._end: Propagator | None = None
-        self._innovation = 0.0
+        self._propagator: Propagator | None = None
+        self._newest_nis = 0.0
         self.observations: Observations | None = None
         self.residuals_m: FloatArray = np.empty((0, 3))
 
     @property
     def horizon_s(self) -> float:
-        """Measurements made before this are too late: what they would have changed is no longer in the window."""
+        """Start of the window: earlier measurements are rejected."""
         return self._horizon_s
 
     @property
@@ -137,280 +138,296 @@ class FixedLagSmoother:
 
     @property
     def converged(self) -> bool:
-        """Whether it can be believed: it is known well enough, and explains what was measured."""
+        """Whether the trajectory is certain enough and explains the measurements."""
         return self._converged
 
     @property
     def reliable_from_s(self) -> float:
-        """From when on a trajectory that was found anew can be believed, infinite before the first one.
+        """Time from which the trajectory since the last initialisation is reliable, infinite before the first one.
 
-        Where each prism was seen once or twice, the robot may lie the other way about the line through two of them and move
-        otherwise. What comes later tells that for what comes later, not for what was before a gap. And the first measurement
-        of a prism, which nothing before it contradicts, may be of a wrong one: the robot would just seem to have come from
-        there. So it is the instant at which each of three prisms has been seen a second time.
+        It is the time at which each of three prisms has been measured a second time. After one or two measurements of each, the
+        robot may lie the other way about the line through two prisms; later measurements resolve that for later times, not for times
+        before a gap. And the first measurement of a prism, with nothing before it to contradict it, may be of a wrong prism.
         """
         return self._reliable_from_s
 
     @property
     def ambiguous(self) -> bool:
-        """Whether the last measurements contradict each other or what was before: it is not known where the robot goes."""
-        return bool(self._monitor.prisms)
+        """Whether the newest measurements are inconsistent with each other or with the trajectory."""
+        return bool(self._monitor.inconsistent_prisms)
 
     @property
     def ambiguous_from_s(self) -> float:
-        """From when on it is not known where the robot was, infinite while nothing is doubtful."""
-        return self._monitor.from_s
+        """Start of the current ambiguity, infinite while the measurements are consistent."""
+        return self._monitor.ambiguous_from_s
 
     def ambiguous_at(self, time_s: FloatArray) -> NDArray[np.bool_]:
-        """Whether it will never be known where the robot was at some instants, (N,) in s; see :class:`InnovationMonitor`."""
+        """Whether the state stays ambiguous at times (N,); see :class:`InnovationMonitor`."""
         return self._monitor.ambiguous_at(time_s)
 
     def update(self, new: Observations) -> None:
-        """Take measurements, in the order of time, none before :attr:`horizon_s`."""
-        held, self.observations = self.observations, _merged(self.observations, new)
+        """Process measurements, in the order of time, none before :attr:`horizon_s`."""
+        held, self.observations = self.observations, _merge(self.observations, new)
         try:
-            if not self._converged or held is None or not self._followed(held, new):
-                self._begin(self.observations)
+            if not self._converged or held is None or not self._update_tracked(held, new):
+                self._initialise(self.observations)
         except GeometryError:  # not determined, or not yet
-            self._converged, self._knots, self._steps, self._solved = False, None, None, None
+            self._converged, self._knots, self._process, self._solved = False, None, None, None
             self.residuals_m = np.full((len(self.observations), 3), np.nan)
-            self._monitor.begin(self.observations)
+            self._monitor.reset(self.observations)
 
     def marginalise_before(self, before_s: float) -> None:
-        """Let go of what was before an instant; states from then on can still be asked for, and no others."""
+        """Marginalise the states before a time; states from then on can still be queried."""
         self._monitor.discard_before(before_s)
         if self.observations is None:
             return
         if self._converged:
             try:
-                self._marginalise(before_s)
-            except GeometryError:  # by rounding alone; what the window holds is enough to begin with
+                self._eliminate_before(before_s)
+            except GeometryError:  # by rounding alone; the window suffices to reinitialise
                 self._converged = False
         if not self._converged:
             self._horizon_s = max(self._horizon_s, before_s)
-            self._keep(self.observations.time_s >= before_s)
+            self._select(self.observations.time_s >= before_s)
 
-    def _marginalise(self, before_s: float) -> None:
-        """Leave of the past one Gaussian on the last knot that is not after an instant."""
-        assert self.observations is not None  # noqa: S101 (it is settled)
-        assert self._knots is not None  # noqa: S101 (it is settled)
-        assert self._steps is not None  # noqa: S101 (it is settled)
-        assert self._anchor is not None  # noqa: S101 (it is settled)
-        first = int(np.searchsorted(self._knots.time_s, before_s, side="right")) - 1
+    @property
+    def _window(self) -> tuple[Observations, States, ProcessFactors, AnchorPrior]:
+        """Measurements, knots, process factors and anchor prior; only while converged."""
+        assert self.observations is not None  # noqa: S101 (converged)
+        assert self._knots is not None  # noqa: S101 (converged)
+        assert self._process is not None  # noqa: S101 (converged)
+        assert self._anchor is not None  # noqa: S101 (converged)
+        return self.observations, self._knots, self._process, self._anchor
+
+    def _eliminate_before(self, before_s: float) -> None:
+        """Marginalise the knots before the last one that is not after a time into an anchor prior on it."""
+        observations, knots, process, anchor = self._window
+        first = int(np.searchsorted(knots.time_s, before_s, side="right")) - 1
         if first <= 0:
             return
-        at = nearest_knots(self._knots.time_s, self.observations.time_s)
-        past, knots = at < first, self._knots.select(slice(first + 1))
-        steps = self._steps.select(slice(first))
-        rejectable = np.ones(int(past.sum()), np.bool_)
+        knot_index = nearest_knots(knots.time_s, observations.time_s)
+        is_past = knot_index < first
         system = assemble(
-            self.observations.select(past), at[past], knots, steps, self._anchor, rejectable=rejectable
+            observations.select(is_past),
+            knot_index[is_past],
+            knots.select(slice(first + 1)),
+            process.select(slice(first)),
+            anchor,
+            rejectable=np.ones(int(is_past.sum()), np.bool_),
         )
         factor = factorise(system.diagonal, system.off_diagonal)
-        left = factor.last()
-        expected = factor.solve(-system.gradient)[first]
-        self._anchor = AnchorPrior(knots.select(slice(first, None)), left @ left.T, expected)
-        self._knots, self._steps = (
-            self._knots.select(slice(first, None)),
-            self._steps.select(slice(first, None)),
-        )
+        root = factor.last_block()
+        mean = factor.solve(-system.gradient)[first]
+        self._anchor = AnchorPrior(knots.select(slice(first, first + 1)), root @ root.T, mean)
+        self._knots, self._process = knots.select(slice(first, None)), process.select(slice(first, None))
         self._horizon_s = float(self._knots.time_s[0])
-        self._keep(~past)
+        self._select(~is_past)
 
     def predict(self, time_s: float, *, dim: int = STATE_DIM) -> tuple[States, FloatArray]:
-        """Return the state at an instant, with its covariance as :meth:`Trajectory.at` does, by all measurements so far.
+        """Return the state at a time, given all measurements so far, with its covariance as :meth:`Trajectory.at` does.
 
-        Beyond the last of them the covariance is that of a livelier robot, and as much larger as the last one was farther off.
+        Beyond the last measurement the process noise is scaled by :data:`PREDICTION_NOISE_SCALE`, and the covariance by the newest
+        NIS.
         """
-        assert self._end is not None  # noqa: S101 (only called while following)
-        if time_s >= self._end.time_s:
-            state, covariance = self._end.at(time_s, dim=dim)
-            return state, covariance * max(1.0, self._innovation / SURPRISED)
+        assert self._propagator is not None  # noqa: S101 (only called while initialised)
+        if time_s >= self._propagator.time_s:
+            state, covariance = self._propagator.at(time_s, dim=dim)
+            return state, covariance * max(1.0, self._newest_nis / PREDICTION_NIS_THRESHOLD)
         return self.trajectory().at(np.array([time_s]), dim=dim)
 
     def trajectory(self) -> Trajectory:
-        """Return the trajectory over the window, and over what the last :meth:`forget` let go of."""
-        assert self._solved is not None  # noqa: S101 (only called while following)
+        """Return the trajectory over the window and over what the last :meth:`marginalise_before` eliminated."""
+        assert self._solved is not None  # noqa: S101 (only called while initialised)
         if self._trajectory is None:
             knots, factor = self._solved
             self._trajectory = Trajectory(knots, self._prior, *factor.marginals())
         return self._trajectory
 
-    def _keep(self, rows: NDArray[np.bool_]) -> None:
+    def _select(self, rows: NDArray[np.bool_]) -> None:
         assert self.observations is not None  # noqa: S101 (only called with some)
         self.observations = self.observations.select(rows)
         self.residuals_m = self.residuals_m[rows]
-        self._monitor.keep(rows)
+        self._monitor.select(rows)
 
-    def _begin(self, observations: Observations) -> None:
-        """Find the trajectory of all measurements of the window, knowing nothing else."""
-        self._converged, self._innovation = False, 0.0
-        self._monitor.begin(observations)
+    def _initialise(self, observations: Observations) -> None:
+        """Find the trajectory of all measurements of the window without any prior knowledge."""
+        self._converged, self._newest_nis = False, 0.0
+        self._monitor.reset(observations)
         if np.count_nonzero(np.bincount(observations.prism) >= 2) < 3:
-            raise GeometryError("to begin with, three prisms have to be measured twice")
+            raise GeometryError("an initialisation needs two measurements of each of three prisms")
         guess = initial_guess(observations, knot_times(observations.time_s))
         self._anchor = diffuse_prior(guess.select(slice(0, 1)), self._prior)
-        outlying = self._search(guess, BEGINNING_ITERATIONS)
+        outliers = self._solve(guess, MAX_INITIAL_ITERATIONS)
         if self._converged:
-            assert self._knots is not None  # noqa: S101 (it is settled)
-            self._anchor = AnchorPrior(self._knots.select(slice(0, 1)), np.diag(_AS_GOOD_AS_NOTHING**-2.0))
-            self._monitor.begun(float(observations.time_s[-1]))
-            self._reliable_from_s = _reliable_since_s(observations.select(~outlying))
+            assert self._knots is not None  # noqa: S101 (converged)
+            self._anchor = AnchorPrior(self._knots.select(slice(0, 1)), np.diag(_DIFFUSE_SIGMAS**-2.0))
+            self._monitor.set_start(float(observations.time_s[-1]))
+            self._reliable_from_s = _determined_from_s(observations.select(~outliers))
 
-    def _followed(self, held: Observations, new: Observations) -> bool:
-        """Add measurements to the trajectory found before; return whether that is still good to follow."""
-        assert self.observations is not None  # noqa: S101 (that has been set)
-        assert self._knots is not None  # noqa: S101 (it is settled)
-        assert self._steps is not None  # noqa: S101 (it is settled)
-        assert self._anchor is not None  # noqa: S101 (it is settled)
-        # Compared as where knots are added: rounding must not find it near here and far there.
-        if self._knots.time_s[0] - new.time_s[0] > 0.5 * MIN_KNOT_SPACING_S:
-            return False  # in the first window, before anything that had come
-        knots = _with_knots_at(self._knots, new.time_s, self._prior)
-        steps = self._steps if knots is self._knots else ProcessFactors.of(knots.time_s, self._prior)
-        at = nearest_knots(knots.time_s, self.observations.time_s)
-        is_new = _order(held, new) >= len(held)
+    def _update_tracked(self, held: Observations, new: Observations) -> bool:
+        """Add measurements to the trajectory and return whether it can still be tracked."""
+        observations, knots, process, anchor = self._window
+        # The same comparison as in _insert_knots: rounding must not decide differently.
+        if knots.time_s[0] - new.time_s[0] > 0.5 * MIN_KNOT_SPACING_S:
+            return False  # in the first window, earlier than all others
+        knots = _insert_knots(knots, new.time_s, self._prior)
+        if knots is not self._knots:
+            process = ProcessFactors.of(knots.time_s, self._prior)
+        knot_index = nearest_knots(knots.time_s, observations.time_s)
+        is_new = _time_order(held, new) >= len(held)
         system = assemble(
-            self.observations, at, knots, steps, self._anchor, active=~is_new, rejectable=~is_new
+            observations, knot_index, knots, process, anchor, active=~is_new, rejectable=~is_new
         )
-        squared_distances, in_turn = _distances_of_new(system, at, np.flatnonzero(is_new))
-        weights = 1.0 / np.maximum(squared_distances / OUTLIER_THRESHOLD**2, 1.0)
-        # What is hopelessly off says nothing of how the robot moves, and no other more than an outlier does.
-        surprises = [
-            min(each, OUTLIER_THRESHOLD**2) for each in in_turn.tolist() if each < REJECTION_THRESHOLD**2
+        nis, sequential_nis = _innovations(system, knot_index, np.flatnonzero(is_new))
+        weights = 1.0 / np.maximum(nis / OUTLIER_THRESHOLD**2, 1.0)
+        # A rejected measurement says nothing about the motion, any other no more than an outlier.
+        newest = [
+            min(each, OUTLIER_THRESHOLD**2)
+            for each in sequential_nis.tolist()
+            if each < REJECTION_THRESHOLD**2
         ]
-        self._innovation = (surprises or [self._innovation])[-1]
-        add_rows(system.rows[is_new], weights, at[is_new], system.diagonal, system.gradient)
+        self._newest_nis = (newest or [self._newest_nis])[-1]
+        add_measurements(
+            system.whitened[is_new], weights, knot_index[is_new], system.diagonal, system.gradient
+        )
         for _ in range(MAX_STEPS):
             factor = factorise(system.diagonal, system.off_diagonal)
-            move = factor.solve(-system.gradient)
-            gain = -float(np.vdot(move, system.gradient))
-            knots = knots.retract(move)
-            if gain < COST_TOLERANCE or (np.all(weights == 1.0) and _is_little(move)):
-                outlying = self._take(knots, steps, factor, nudged(system, at, move))
+            step = factor.solve(-system.gradient)
+            gain = -float(np.vdot(step, system.gradient))
+            knots = knots.retract(step)
+            if gain < COST_TOLERANCE or (np.all(weights == 1.0) and _is_below_step_tolerance(step)):
+                outliers = self._accept(knots, process, factor, apply_linear_step(system, knot_index, step))
                 break
-            system = assemble(self.observations, at, knots, steps, self._anchor, rejectable=~is_new)
+            system = assemble(observations, knot_index, knots, process, anchor, rejectable=~is_new)
         else:
-            outlying = self._search(knots, MAX_ITERATIONS)
-        self._monitor.hear(self.observations, is_new, in_turn > OUTLIER_THRESHOLD**2, outlying)
+            outliers = self._solve(knots, MAX_ITERATIONS)
+        self._monitor.update(observations, is_new, sequential_nis > OUTLIER_THRESHOLD**2, outliers)
         return self._converged
 
-    def _search(self, guess: States, max_iterations: int) -> NDArray[np.bool_]:
-        """Find the trajectory however far it is from a guess; return which measurements are outliers."""
+    def _solve(self, guess: States, max_iterations: int) -> NDArray[np.bool_]:
+        """Search for the trajectory from a guess however far off; return which measurements are outliers."""
         assert self.observations is not None  # noqa: S101 (only called with some)
         found = solve(
             self.observations, guess, self._prior, anchor=self._anchor, max_iterations=max_iterations
         )
-        outlying = self._take(found.knots, found.steps, found.factor, found)
+        outliers = self._accept(found.knots, found.process, found.factor, found)
         self._converged &= found.iterations < max_iterations
-        return outlying
+        return outliers
 
-    def _take(
-        self, knots: States, steps: ProcessFactors, factor: BlockCholesky, found: NormalEquations | Solution
+    def _accept(
+        self, knots: States, process: ProcessFactors, factor: BlockCholesky, found: NormalEquations | Solution
     ) -> NDArray[np.bool_]:
-        """Make it the trajectory; return which measurements are outliers."""
-        self._knots, self._steps, self._solved, self._trajectory = knots, steps, (knots, factor), None
+        """Make a solution the trajectory; return which measurements are outliers."""
+        self._knots, self._process, self._solved, self._trajectory = knots, process, (knots, factor), None
         self.residuals_m = found.linearised.residuals_m
-        inverse = np.linalg.inv(factor.last())
+        inverse = np.linalg.inv(factor.last_block())
         covariance = inverse.T @ inverse
-        self._end = Propagator(
-            knots.select(slice(-1, None)), covariance, self._prior, process_noise_scale=LIVELIER_AHEAD
+        self._propagator = Propagator(
+            knots.select(slice(-1, None)), covariance, self._prior, process_noise_scale=PREDICTION_NOISE_SCALE
         )
         sigma_rad = float(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1]))
-        outlying: NDArray[np.bool_] = found.squared_distances >= OUTLIER_THRESHOLD**2
-        fits = float(np.mean(~outlying)) > (SOME_FIT if self._converged else NEARLY_ALL_FIT)
-        self._converged = fits and sigma_rad < (LOST_RAD if self._converged else SURE_RAD)
-        return outlying
+        outliers: NDArray[np.bool_] = found.squared_distances >= OUTLIER_THRESHOLD**2
+        enough_inliers = float(np.mean(~outliers)) > (
+            MIN_INLIER_SHARE if self._converged else MIN_INITIAL_INLIER_SHARE
+        )
+        self._converged = enough_inliers and sigma_rad < (
+            LOST_SIGMA_RAD if self._converged else CONVERGED_SIGMA_RAD
+        )
+        return outliers
 
 
-def _reliable_since_s(observations: Observations) -> float:
-    """From when on measurements tell the trajectory by themselves; when the last one was made if they do not."""
+def _determined_from_s(observations: Observations) -> float:
+    """Time from which the measurements determine the trajectory by themselves; that of the last one if they do not."""
     since_gap = [
-        each_s[np.flatnonzero(np.diff(each_s, prepend=-np.inf) > GAP_S)[-1] :]
+        each_s[np.flatnonzero(np.diff(each_s, prepend=-np.inf) > MAX_GAP_S)[-1] :]
         for prism in np.unique(observations.prism)
         for each_s in [observations.time_s[observations.prism == prism]]
     ]
     counts = np.bincount(observations.prism[observations.time_s >= max(each_s[0] for each_s in since_gap)])
-    if np.count_nonzero(counts >= TELLING) < 3:
+    if np.count_nonzero(counts >= MIN_MEASUREMENTS_PER_PRISM) < 3:
         return float(observations.time_s[-1])
     return float(max(each_s[:2][-1] for each_s in since_gap))
 
 
-def _distances_of_new(
-    system: NormalEquations, at: NDArray[np.intp], new: NDArray[np.intp]
+def _innovations(
+    system: NormalEquations, knot_index: NDArray[np.intp], is_new: NDArray[np.intp]
 ) -> tuple[FloatArray, FloatArray]:
-    """Tell how far new measurements, rows that have no say in a system, are from the others' trajectory: squared sigmas.
+    """Normalised innovations squared (NIS) of new measurements, inactive in ``system``.
 
-    Once each by itself, and once as if they came one by one: by what those before it say as well that are no outliers.
+    Returns each one's own NIS, and its NIS conditioned on those before it that are inliers.
     """
-    rows = system.rows[new]
-    right = np.zeros((*system.gradient.shape, 3 * len(new) + 1))
-    right[:, :, -1] = -system.gradient
-    for place, row in enumerate(new):
-        right[at[row], :, 3 * place : 3 * place + 3] = rows[place, :, :STATE_DIM].T
-    found = factorise(system.diagonal, system.off_diagonal).solve(right)
-    seen = rows[:, :, :STATE_DIM] @ found[at[new]]
-    off = rows[:, :, STATE_DIM] + seen[:, :, -1]
-    expected = np.eye(3 * len(new)) + seen[:, :, :-1].reshape(3 * len(new), 3 * len(new))
-    alone = np.empty(len(new))
-    for place in range(len(new)):
-        own = slice(3 * place, 3 * place + 3)
-        alone[place] = off[place] @ np.linalg.solve(expected[own, own], off[place])
-    in_turn, fitting = alone.copy(), np.flatnonzero(alone < OUTLIER_THRESHOLD**2)
-    its = (3 * fitting[:, None] + np.arange(3)).ravel()
+    whitened = system.whitened[is_new]
+    rhs = np.zeros((*system.gradient.shape, 3 * len(is_new) + 1))
+    rhs[:, :, -1] = -system.gradient
+    for i, index in enumerate(is_new):
+        rhs[knot_index[index], :, 3 * i : 3 * i + 3] = whitened[i, :, :STATE_DIM].T
+    solved = factorise(system.diagonal, system.off_diagonal).solve(rhs)
+    projected = whitened[:, :, :STATE_DIM] @ solved[knot_index[is_new]]
+    innovations = whitened[:, :, STATE_DIM] + projected[:, :, -1]
+    covariance = np.eye(3 * len(is_new)) + projected[:, :, :-1].reshape(3 * len(is_new), 3 * len(is_new))
+    nis = np.empty(len(is_new))
+    for i in range(len(is_new)):
+        block = slice(3 * i, 3 * i + 3)
+        nis[i] = innovations[i] @ np.linalg.solve(covariance[block, block], innovations[i])
+    sequential_nis, inliers = nis.copy(), np.flatnonzero(nis < OUTLIER_THRESHOLD**2)
+    components = (3 * inliers[:, None] + np.arange(3)).ravel()
     try:
-        root = np.linalg.cholesky(expected[np.ix_(its, its)])
+        root = np.linalg.cholesky(covariance[np.ix_(components, components)])
     except np.linalg.LinAlgError:  # by rounding alone
         raise GeometryError("the measurements do not determine the trajectory") from None
-    in_turn[fitting] = (np.linalg.solve(root, off[fitting].ravel()).reshape(-1, 3) ** 2).sum(axis=1)
-    return alone, in_turn
+    sequential_nis[inliers] = (np.linalg.solve(root, innovations[inliers].ravel()).reshape(-1, 3) ** 2).sum(
+        axis=1
+    )
+    return nis, sequential_nis
 
 
-def _is_little(move: FloatArray) -> bool:
-    """Whether derivatives are the same after a move."""
-    return bool(np.abs(move[:, :3]).max() < LITTLE_M and np.abs(move[:, 3:6]).max() < LITTLE_RAD)
+def _is_below_step_tolerance(step: FloatArray) -> bool:
+    """Whether Jacobians stay the same over a step."""
+    return bool(
+        np.abs(step[:, :3]).max() < STEP_TOLERANCE_M and np.abs(step[:, 3:6]).max() < STEP_TOLERANCE_RAD
+    )
 
 
-def _with_knots_at(knots: States, time_s: FloatArray, prior: MotionPrior) -> States:
-    """Add knots where measurements have none near; their states are what those before them predict."""
+def _insert_knots(knots: States, time_s: FloatArray, prior: MotionPrior) -> States:
+    """Insert knots at measurement times that have none nearby; their states are propagated from the knot before."""
     for instant_s in time_s:
         if np.min(np.abs(knots.time_s - instant_s)) > 0.5 * MIN_KNOT_SPACING_S:
             after = int(np.searchsorted(knots.time_s, instant_s))
-            added = _predicted(knots.select(slice(after - 1, after)), instant_s, prior)
+            added = _propagate(knots.select(slice(after - 1, after)), instant_s, prior)
             knots = concatenate_states([knots.select(slice(after)), added, knots.select(slice(after, None))])
     return knots
 
 
-def _predicted(start: States, time_s: float, prior: MotionPrior) -> States:
+def _propagate(start: States, time_s: float, prior: MotionPrior) -> States:
     dt_s = time_s - float(start.time_s[0])
-    slow, turning = (
+    linear, angular = (
         acceleration_response(dt_s, prior.acceleration_correlation_time_s),
         acceleration_response(dt_s, prior.angular_acceleration_correlation_time_s),
     )
-    turn = start.angular_velocity * dt_s + start.angular_acceleration * turning[0]
+    rotvec = start.angular_velocity * dt_s + start.angular_acceleration * angular[0]
     return States(
         np.array([time_s]),
-        start.position + (start.velocity * dt_s + start.acceleration * slow[0]),
-        start.rotation @ exp_so3(turn),
-        start.velocity + start.acceleration * slow[1],
-        start.angular_velocity + start.angular_acceleration * turning[1],
-        start.acceleration * slow[2],
-        start.angular_acceleration * turning[2],
+        start.position + (start.velocity * dt_s + start.acceleration * linear[0]),
+        start.rotation @ exp_so3(rotvec),
+        start.velocity + start.acceleration * linear[1],
+        start.angular_velocity + start.angular_acceleration * angular[1],
+        start.acceleration * linear[2],
+        start.angular_acceleration * angular[2],
     )
 
 
-def _order(held: Observations, new: Observations) -> NDArray[np.intp]:
-    """Rows of both, put one after the other, in the order of time, those of one instant in the order of the prisms."""
+def _time_order(held: Observations, new: Observations) -> NDArray[np.intp]:
+    """Sorting index of both, concatenated, by time, then prism, then station."""
     keys = [(getattr(held, name), getattr(new, name)) for name in ("station", "prism", "time_s")]
     return np.lexsort([np.concatenate(pair) for pair in keys])
 
 
-def _merged(held: Observations | None, new: Observations) -> Observations:
-    """Put measurements together in the order of time."""
+def _merge(held: Observations | None, new: Observations) -> Observations:
+    """Merge measurements in the order of time."""
     if held is None:
         return new
     names = [field.name for field in fields(Observations) if field.name not in ("frames", "layout")]
-    order = _order(held, new)
+    order = _time_order(held, new)
     return replace(
         held, **{name: np.concatenate([getattr(held, name), getattr(new, name)])[order] for name in names}
     )

@@ -1,7 +1,7 @@
-"""Measurements that contradict each other: until when it is not known where the robot is, and where it never will be. Pure.
+"""Monitor of inconsistent innovations: marks the intervals in which the state is ambiguous. Sans-I/O.
 
-One that is far from what was predicted is wrong, or the robot has done the unexpected. Which it is the next ones tell: those of
-another prism that are as predicted. And where a wrong one was believed, the next ones seem wrong beside it.
+An inconsistent measurement is wrong, or the robot has manoeuvred; later measurements of other prisms decide. After a wrong
+measurement was accepted, later good ones look inconsistent.
 """
 
 from __future__ import annotations
@@ -17,98 +17,104 @@ if TYPE_CHECKING:
     from tsgt.geometry.trajectory.measurement_factors import Observations
 
 AMBIGUITY_MARGIN_S = 1.5
-"""So long before a measurement that contradicts, what it may bend is not known either: a few measurements of each prism."""
+"""Part of an ambiguous interval before its first inconsistent measurement: a few measurements of each prism."""
 
 
 class InnovationMonitor:
-    """Keeps in mind which of the measurements of a window contradicted.
+    """Tracks inconsistent innovations of the window and the intervals in which the state is ambiguous.
 
     Attributes
     ----------
-    prisms
-        Those whose newest measurement contradicts; while there are any, it is not known where the robot goes.
+    inconsistent_prisms
+        Prisms whose newest measurement is inconsistent. While there are any, the state is ambiguous.
     """
 
     def __init__(self) -> None:
-        self.prisms: frozenset[int] = frozenset()
-        self._contradicted_s = np.inf
-        self._accused = np.empty(0, np.bool_)
-        self._contested_s: list[tuple[float, float]] = []
+        self.inconsistent_prisms: frozenset[int] = frozenset()
+        self._inconsistent_from_s = np.inf
+        self._flagged = np.empty(0, np.bool_)
+        self._ambiguous_intervals_s: list[tuple[float, float]] = []
 
     @property
-    def from_s(self) -> float:
-        """From when on it is not known where the robot was, infinite while nothing is doubtful."""
-        return self._contradicted_s - AMBIGUITY_MARGIN_S if self.prisms else np.inf
+    def ambiguous_from_s(self) -> float:
+        """Start of the current ambiguity, infinite while the innovations are consistent."""
+        return self._inconsistent_from_s - AMBIGUITY_MARGIN_S if self.inconsistent_prisms else np.inf
 
     def ambiguous_at(self, time_s: FloatArray) -> NDArray[np.bool_]:
-        """Whether it will never be known where the robot was at some instants, by the doubts that are settled.
+        """Whether the state stays ambiguous at times (N,), by the resolved ambiguities.
 
-        What contradicted is wrong, or what it contradicted. Where all of it is of one prism, and the trajectory has stayed what
-        it was without, it is what is wrong. Otherwise the trajectory went by what came first, or bent to pass by all of it.
+        A resolved ambiguity leaves no interval if all flagged measurements are of one prism and still outliers: then these were
+        wrong. Otherwise the trajectory followed the wrong ones, or was bent towards all of them.
         """
         found = np.zeros(len(time_s), np.bool_)
-        for from_s, until_s in self._contested_s:
+        for from_s, until_s in self._ambiguous_intervals_s:
             found |= (time_s >= from_s) & (time_s <= until_s)
         return found
 
-    def begin(self, observations: Observations) -> None:
-        """Doubt all of a window, as a trajectory is looked for."""
-        self.prisms = frozenset(observations.prism.tolist())
-        self._accused = np.zeros(len(observations), np.bool_)
+    def reset(self, observations: Observations) -> None:
+        """Flag no single measurement of a window, but the state as a whole: the trajectory is being initialised."""
+        self.inconsistent_prisms = frozenset(observations.prism.tolist())
+        self._flagged = np.zeros(len(observations), np.bool_)
 
-    def begun(self, time_s: float) -> None:
-        """Doubt no more than what is after the measurements of that trajectory."""
-        self._contradicted_s = time_s
+    def set_start(self, time_s: float) -> None:
+        """Limit the ambiguity to times after the measurements of the initialised trajectory."""
+        self._inconsistent_from_s = time_s
 
-    def keep(self, rows: NDArray[np.bool_]) -> None:
-        """Let go of the other measurements of the window."""
-        self._accused = self._accused[rows]
+    def select(self, rows: NDArray[np.bool_]) -> None:
+        """Drop the other measurements of the window."""
+        self._flagged = self._flagged[rows]
 
     def discard_before(self, before_s: float) -> None:
-        """Let go of what was before an instant."""
-        self._contested_s = [each for each in self._contested_s if each[1] >= before_s]
+        """Drop ambiguous intervals that end before a time."""
+        self._ambiguous_intervals_s = [each for each in self._ambiguous_intervals_s if each[1] >= before_s]
 
-    def hear(
+    def update(
         self,
         observations: Observations,
-        new: NDArray[np.bool_],
-        unforeseen: NDArray[np.bool_],
-        outlying: NDArray[np.bool_],
+        is_new: NDArray[np.bool_],
+        inconsistent: NDArray[np.bool_],
+        outliers: NDArray[np.bool_],
     ) -> None:
-        """Take note of what new measurements say.
+        """Process new measurements.
 
         Parameters
         ----------
         observations
-            M of the window, those kept so far and new ones.
-        new
-            (M,) which are new.
-        unforeseen
-            (N,) which of these were not as predicted.
-        outlying
-            (M,) which do not fit the trajectory now.
+            M measurements of the window, old and new.
+        is_new
+            (M,).
+        inconsistent
+            (N,) the new measurements whose innovation failed the gate.
+        outliers
+            (M,) outliers of the updated trajectory.
         """
-        accused = np.zeros(len(observations), np.bool_)
-        accused[~new] = self._accused
-        # As predicted each by itself, those that came together may yet contradict each other.
-        accused[new] = unforeseen | outlying[new]
-        self._accused = accused
-        rows = (observations.time_s[new].tolist(), observations.prism[new].tolist(), accused[new].tolist())
-        for time_s, prism, wrong in zip(*rows, strict=True):
-            if not self.prisms:
-                self._contradicted_s = time_s
-            # A station on a wrong prism soon agrees with itself, which says nothing.
-            self.prisms = self.prisms | {prism} if wrong else self.prisms & {prism}
-        # What was as predicted before these had their say tells nothing of where they have bent it.
-        self.prisms |= frozenset(observations.prism[new & accused & ~outlying].tolist())
-        if not self.prisms and accused.any():
-            self._settle(observations, outlying)
+        flagged = np.zeros(len(observations), np.bool_)
+        flagged[~is_new] = self._flagged
+        # Measurements that arrive together may each pass the gate and yet be mutually inconsistent.
+        flagged[is_new] = inconsistent | outliers[is_new]
+        self._flagged = flagged
+        rows = (
+            observations.time_s[is_new].tolist(),
+            observations.prism[is_new].tolist(),
+            flagged[is_new].tolist(),
+        )
+        for time_s, prism, is_flagged in zip(*rows, strict=True):
+            if not self.inconsistent_prisms:
+                self._inconsistent_from_s = time_s
+            # A station on a wrong prism agrees with itself: only other prisms resolve an ambiguity.
+            self.inconsistent_prisms = (
+                self.inconsistent_prisms | {prism} if is_flagged else self.inconsistent_prisms & {prism}
+            )
+        # A flagged measurement that is no outlier has bent the trajectory: consistent innovations before it prove nothing.
+        self.inconsistent_prisms |= frozenset(observations.prism[is_new & flagged & ~outliers].tolist())
+        if not self.inconsistent_prisms and flagged.any():
+            self._resolve(observations, outliers)
 
-    def _settle(self, observations: Observations, outlying: NDArray[np.bool_]) -> None:
-        """Take note of what is contested, if anything is, of what was doubtful until now."""
-        accused = self._accused
-        one_prism = len(np.unique(observations.prism[accused])) == 1
-        if not (one_prism and outlying[accused].all()):
-            times_s = observations.time_s[accused]
-            self._contested_s.append((float(times_s[0]) - AMBIGUITY_MARGIN_S, float(times_s[-1])))
-        self._accused = np.zeros_like(accused)
+    def _resolve(self, observations: Observations, outliers: NDArray[np.bool_]) -> None:
+        """Record the interval of an ambiguity that has just ended, unless its flagged measurements were rejected."""
+        flagged = self._flagged
+        single_prism = len(np.unique(observations.prism[flagged])) == 1
+        if not (single_prism and outliers[flagged].all()):
+            times_s = observations.time_s[flagged]
+            self._ambiguous_intervals_s.append((float(times_s[0]) - AMBIGUITY_MARGIN_S, float(times_s[-1])))
+        self._flagged = np.zeros_like(flagged)

@@ -1,9 +1,8 @@
-"""What a total station says of a robot's trajectory: its range and two angles to a prism as residuals. Pure.
+"""Measurement factors: residuals and Jacobians of polar prism measurements. Sans-I/O.
 
-A prism's measurement is compared with where the robot's motion puts the prism at the time of the measurement:
-``h(T_1k^-1 T_1R(t) p)``. The range's residual stands along the line of sight; those of the two angles stand across it, as
-lengths at the measured distance (horizontally, and in the plane of the zenith angle), so that neither the circle's zero
-nor the direction straight up is a special case.
+The measurement model is ``h(T_1k^-1 T_1R(t) p)`` at the time t of the measurement. The range residual lies along the line of
+sight; the two angle residuals are expressed as lengths across it at the measured distance (horizontally, and in the plane
+of the zenith angle), so that neither the circle's zero nor the vertical is singular.
 """
 
 from __future__ import annotations
@@ -23,26 +22,26 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Observations:
-    """M measurements of prisms, in the order of time.
+    """M prism measurements, in the order of time.
 
     Attributes
     ----------
     time_s
-        (M,) when they were made, in s from the trajectory's origin of time, the station's latency taken off.
+        (M,) from the trajectory's time origin, corrected for the station's latency.
     time_sigma_s
-        (M,) one sigma of it.
+        (M,).
     points_m
-        (M, 3) measured prism in the frame of its station, constants applied.
+        (M, 3) measured prism in the station frame, prism constant and atmospheric correction applied.
     sigmas_m
-        (M, 3) one sigma along the line of sight, and across it: horizontally, and in the plane of the zenith angle.
+        (M, 3) along the line of sight, horizontally across it, and across it in the plane of the zenith angle.
     polar
-        (M,) angles and a range; otherwise the three coordinates themselves were measured.
+        (M,) whether range and angles were measured; otherwise Cartesian coordinates.
     station, prism
-        (M,) rows of ``frames`` and ``layout`` that they belong to.
+        (M,) rows of ``frames`` and ``layout``.
     frames
         (S, 4, 4) ``T_station1_station``.
     layout
-        (P, 3) prisms in m, along the axes of the robot, from the point whose motion is looked for.
+        (P, 3) prisms in m, in the axes of the robot, from the reference point of the states.
     """
 
     time_s: FloatArray
@@ -59,7 +58,7 @@ class Observations:
         return len(self.time_s)
 
     def select(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Observations:
-        """Return some of them."""
+        """Return the measurements of some rows."""
         return Observations(
             self.time_s[rows],
             self.time_sigma_s[rows],
@@ -73,25 +72,25 @@ class Observations:
         )
 
     def in_world(self) -> FloatArray:
-        """(M, 3) measured points in frame ``station1``, in m."""
+        """(M, 3) measured points in frame ``station1`` in m."""
         frames = self.frames[self.station]
         return matvec(frames[:, :3, :3], self.points_m) + frames[:, :3, 3]
 
 
 @dataclass(frozen=True, slots=True)
 class LinearisedMeasurements:
-    """Residuals of M measurements and how they change with the trajectory.
+    """Residuals and Jacobians of M measurements.
 
     Attributes
     ----------
     residuals_m
-        (M, 3) predicted less measured: along the line of sight, horizontally and vertically across it.
+        (M, 3) predicted minus measured: along the line of sight, horizontally and vertically across it.
     jacobian
-        (M, 3, 18) by the error of the knot's state, in the order of :class:`~tsgt.geometry.trajectory.states.States`.
+        (M, 3, 18) by the error of the knot's state.
     by_point
         (M, 3, 3) by the prism's position in frame ``station1``.
     point_m, velocity_mps
-        (M, 3) where the trajectory puts the prism at the time of the measurement, and how fast it is there.
+        (M, 3) predicted position and velocity of the prism at the time of the measurement.
     rotation
         (M, 3, 3) of the robot at that time.
     """
@@ -104,71 +103,69 @@ class LinearisedMeasurements:
     rotation: FloatArray
 
     def covariance(self, observations: Observations) -> FloatArray:
-        """(M, 3, 3) covariance of the residuals in m^2: the instrument's noise, and uncertain times on a moving prism."""
-        moved = matvec(self.by_point, self.velocity_mps) * observations.time_sigma_s[:, None]
-        covariance: FloatArray = moved[:, :, None] * moved[:, None, :]
+        """(M, 3, 3) covariance of the residuals in m^2: instrument noise plus time noise times the prism's velocity."""
+        by_time = matvec(self.by_point, self.velocity_mps) * observations.time_sigma_s[:, None]
+        covariance: FloatArray = by_time[:, :, None] * by_time[:, None, :]
         for axis in range(3):
             covariance[:, axis, axis] += observations.sigmas_m[:, axis] ** 2
         return covariance
 
     def whitened(self, observations: Observations) -> FloatArray:
-        """Residuals and their derivatives in sigmas, (M, 3, 19), the residuals last.
+        """Whitened Jacobians and residuals, (M, 3, 19), the residuals last.
 
-        The covariance is a diagonal one plus the outer product of one vector, whose inverse root has a closed form.
+        The covariance is diagonal plus rank one; its inverse square root has a closed form.
         """
-        deviation_m = observations.sigmas_m
-        along = matvec(self.by_point, self.velocity_mps) * (observations.time_sigma_s[:, None] / deviation_m)
-        root = np.sqrt(1.0 + dot(along, along))
-        found = np.empty((len(along), 3, 19))
-        np.divide(self.jacobian, deviation_m[:, :, None], out=found[:, :, :18])
-        np.divide(self.residuals_m, deviation_m, out=found[:, :, 18])
-        found -= (along / (root * (root + 1.0))[:, None])[:, :, None] * (along[:, None] @ found)
-        return found
+        sigmas_m = observations.sigmas_m
+        by_time = matvec(self.by_point, self.velocity_mps) * (observations.time_sigma_s[:, None] / sigmas_m)
+        root = np.sqrt(1.0 + dot(by_time, by_time))
+        whitened = np.empty((len(by_time), 3, 19))
+        np.divide(self.jacobian, sigmas_m[:, :, None], out=whitened[:, :, :18])
+        np.divide(self.residuals_m, sigmas_m, out=whitened[:, :, 18])
+        whitened -= (by_time / (root * (root + 1.0))[:, None])[:, :, None] * (by_time[:, None] @ whitened)
+        return whitened
 
 
-def linearise(observations: Observations, knots: States, at: NDArray[np.intp]) -> LinearisedMeasurements:
-    """Compare measurements with a trajectory.
+def linearise(
+    observations: Observations, knots: States, knot_index: NDArray[np.intp]
+) -> LinearisedMeasurements:
+    """Residuals and exact Jacobians of measurements at a trajectory.
 
-    Parameters
-    ----------
-    observations
-        M measurements.
-    knots
-        The trajectory.
-    at
-        (M,) which knot each measurement is near; from there the robot's velocity and acceleration carry to its time.
-
-    Returns
-    -------
-    Linearised
-        Exact derivatives; see ``docs/explanation/continuous-trajectory.md``.
+    Each measurement is attached to knot ``knot_index``, (M,); a constant acceleration propagates from there to its time.
+    docs/explanation/continuous-trajectory.md derives the Jacobians.
     """
-    delta_s = (observations.time_s - knots.time_s[at])[:, None]
-    half = 0.5 * delta_s**2
-    arm = observations.layout[observations.prism]
-    near = knots.select(at)
-    turned, by_turned = exp_and_right_jacobian(
-        near.angular_velocity * delta_s + near.angular_acceleration * half
+    delta_s = (observations.time_s - knots.time_s[knot_index])[:, None]
+    half_delta_s2 = 0.5 * delta_s**2
+    lever_arm = observations.layout[observations.prism]
+    states = knots.select(knot_index)
+    delta_rotation, right_jacobian = exp_and_right_jacobian(
+        states.angular_velocity * delta_s + states.angular_acceleration * half_delta_s2
     )
-    rotation = near.rotation @ turned
-    point = near.position + near.velocity * delta_s + near.acceleration * half + matvec(rotation, arm)
-    rate = near.angular_velocity + near.angular_acceleration * delta_s
-    velocity = near.velocity + near.acceleration * delta_s + matvec(rotation, cross(rate, arm))
-    residuals, by_point = _compared(observations, point)
+    rotation = states.rotation @ delta_rotation
+    point = (
+        states.position
+        + states.velocity * delta_s
+        + states.acceleration * half_delta_s2
+        + matvec(rotation, lever_arm)
+    )
+    angular_velocity = states.angular_velocity + states.angular_acceleration * delta_s
+    velocity = (
+        states.velocity + states.acceleration * delta_s + matvec(rotation, cross(angular_velocity, lever_arm))
+    )
+    residuals, by_point = _residuals_by_point(observations, point)
     jacobian = np.empty((len(observations), 3, 18))
-    by_rotation_then = -by_point @ rotation @ skew(arm)
-    by_turn = by_rotation_then @ by_turned
+    by_rotation = -by_point @ rotation @ skew(lever_arm)
+    by_delta_rotation = by_rotation @ right_jacobian
     jacobian[:, :, 0:3] = by_point
-    jacobian[:, :, 3:6] = by_rotation_then @ np.swapaxes(turned, 1, 2)
+    jacobian[:, :, 3:6] = by_rotation @ np.swapaxes(delta_rotation, 1, 2)
     jacobian[:, :, 6:9] = by_point * delta_s[:, None]
-    jacobian[:, :, 9:12] = by_turn * delta_s[:, None]
-    jacobian[:, :, 12:15] = by_point * half[:, None]
-    jacobian[:, :, 15:18] = by_turn * half[:, None]
+    jacobian[:, :, 9:12] = by_delta_rotation * delta_s[:, None]
+    jacobian[:, :, 12:15] = by_point * half_delta_s2[:, None]
+    jacobian[:, :, 15:18] = by_delta_rotation * half_delta_s2[:, None]
     return LinearisedMeasurements(residuals, jacobian, by_point, point, velocity, rotation)
 
 
-def _compared(observations: Observations, point: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Residuals of predicted points in frame ``station1``, (M, 3), and their derivatives by these, (M, 3, 3)."""
+def _residuals_by_point(observations: Observations, point: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Residuals of predicted points in frame ``station1``, (M, 3), and their Jacobians by the points, (M, 3, 3)."""
     frames = observations.frames[observations.station]
     to_station = np.swapaxes(frames[:, :3, :3], 1, 2)
     predicted = matvec(to_station, point - frames[:, :3, 3])
@@ -178,45 +175,40 @@ def _compared(observations: Observations, point: FloatArray) -> tuple[FloatArray
     polar = slice(None) if observations.polar.all() else observations.polar
     if observations.polar.any():
         axes, measured_m = line_of_sight_axes(measured[polar])
-        seen = predicted[polar]
-        distance_m = np.sqrt(dot(seen, seen))
-        away_m = np.where(distance_m > 0, distance_m, 1.0)
-        direction = seen / away_m[:, None]
+        line_of_sight_m = predicted[polar]
+        distance_m = np.sqrt(dot(line_of_sight_m, line_of_sight_m))
+        safe_distance_m = np.where(distance_m > 0, distance_m, 1.0)
+        direction = line_of_sight_m / safe_distance_m[:, None]
         residuals[polar, 0] = distance_m - measured_m
         residuals[polar, 1:] = measured_m[:, None] * matvec(axes, direction)[:, 1:]
-        shrink = (measured_m / away_m)[:, None, None]
-        away = axes[:, 1:] - (axes[:, 1:] @ direction[:, :, None]) * direction[:, None, :]
+        scale = (measured_m / safe_distance_m)[:, None, None]
+        transverse = axes[:, 1:] - (axes[:, 1:] @ direction[:, :, None]) * direction[:, None, :]
         by_predicted[polar, 0] = direction
-        by_predicted[polar, 1:] = shrink * away
+        by_predicted[polar, 1:] = scale * transverse
     return residuals, by_predicted @ to_station
 
 
 def line_of_sight_axes(points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Give unit vectors along and across the lines of sight to points in the station frame.
-
-    Parameters
-    ----------
-    points_m
-        (M, 3).
+    """Return unit vectors along and across the lines of sight to points, (M, 3), in the station frame.
 
     Returns
     -------
     axes : FloatArray
-        (M, 3, 3) rows: along, horizontally across (growing horizontal angle), across with growing zenith angle.
+        (M, 3, 3) rows: along, across in the direction of growing horizontal angle, across in that of growing zenith angle.
     distance_m : FloatArray
         (M,).
     """
     distance_m = np.sqrt(dot(points_m, points_m))
-    # A distance that the prism constant makes zero has no direction; any will do, but the numbers must stay numbers.
-    there = distance_m[:, None] > 0
-    along = np.where(there, points_m, [1.0, 0.0, 0.0]) / np.where(there, distance_m[:, None], 1.0)
-    flat = np.hypot(along[:, 0], along[:, 1])
-    upright = flat == 0
-    safe = flat + upright
-    cosine, sine = along[:, 0] / safe + upright, along[:, 1] / safe
+    # A corrected distance of zero has no direction: any unit vector avoids NaN.
+    nonzero = distance_m[:, None] > 0
+    along = np.where(nonzero, points_m, [1.0, 0.0, 0.0]) / np.where(nonzero, distance_m[:, None], 1.0)
+    horizontal = np.hypot(along[:, 0], along[:, 1])
+    vertical = horizontal == 0
+    safe = horizontal + vertical
+    cosine, sine = along[:, 0] / safe + vertical, along[:, 1] / safe
     axes = np.zeros((len(along), 3, 3))
     axes[:, 0] = along
     # Horizontal angles grow clockwise, seen from above.
     axes[:, 1, 0], axes[:, 1, 1] = sine, -cosine
-    axes[:, 2, 0], axes[:, 2, 1], axes[:, 2, 2] = along[:, 2] * cosine, along[:, 2] * sine, -flat
+    axes[:, 2, 0], axes[:, 2, 1], axes[:, 2, 2] = along[:, 2] * cosine, along[:, 2] * sine, -horizontal
     return axes, distance_m

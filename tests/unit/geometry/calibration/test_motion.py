@@ -10,7 +10,13 @@ import pytest
 
 from tsgt.errors import GeometryError
 from tsgt.geometry import Observations, exp_so3, rotate
-from tsgt.geometry.calibration import Setup, SetupPrior, calibrate_motion, frames_from_motion, unobservable_directions
+from tsgt.geometry.calibration import (
+    Setup,
+    SetupPrior,
+    calibrate_motion,
+    frames_from_motion,
+    unobservable_directions,
+)
 from tsgt.geometry.calibration.motion_parameters import SetupParameters
 from tsgt.geometry.trajectory import initial_guess, knot_times, linearise
 from tsgt.geometry.trajectory.measurement_factors import line_of_sight_axes
@@ -96,8 +102,8 @@ def surprise(
     """Squared distance of a result from the truth in its own sigmas, how many unknowns, error at the robot in m."""
     found = calibrate_motion(found_from, known, start=start, prior=PRIOR, noise_scale=1.0)
     true = Setup(frames(), np.array([0.0, 0.03, 0.0]), LAYOUT)
-    error = found.unknowns.local_coordinates(found.setup) - found.unknowns.local_coordinates(true)
-    missed, _ = found.setup.corrections(true, found.unknowns.pivot)
+    error = found.parameters.local_coordinates(found.setup) - found.parameters.local_coordinates(true)
+    missed, _ = found.setup.corrections(true, found.parameters.pivot)
     return float(error @ np.linalg.solve(found.covariance, error)), len(error), missed
 
 
@@ -122,7 +128,7 @@ def test_stamps_that_wander_are_found_and_allowed_for() -> None:
         observations = wandering(wrong(drive(160.0, seed=seed)), sigma_s=3e-3, piece_s=40.0, seed=seed)
         found = calibrate_motion(observations, REFINE, prior=PRIOR, noise_scale=1.0)
         true = Setup(frames(), np.array([0.0, 0.03, 0.0]), LAYOUT)
-        error = found.unknowns.local_coordinates(found.setup) - found.unknowns.local_coordinates(true)
+        error = found.parameters.local_coordinates(found.setup) - found.parameters.local_coordinates(true)
         distances.append(float(error @ np.linalg.solve(found.covariance, error)))
         wander_s.append(found.wander_s)
     assert 1.5e-3 < np.mean(wander_s) < 5e-3
@@ -149,10 +155,10 @@ def test_levelled_stations_have_four_degrees_of_freedom() -> None:
     observations = drive()
     free = calibrate_motion(observations, REFINE, prior=PRIOR, noise_scale=1.0)
     level = calibrate_motion(observations, replace(REFINE, levelled=True), prior=PRIOR, noise_scale=1.0)
-    assert len(level.unknowns.sigmas) == 10
+    assert len(level.parameters.sigmas) == 10
     assert np.allclose(level.setup.frames[:, 2, :3], [0.0, 0.0, 1.0], atol=1e-12)
-    at = np.concatenate([level.unknowns.translations.ravel(), level.unknowns.rotations.ravel()])
-    same = np.concatenate([free.unknowns.translations.ravel(), free.unknowns.rotations[:, -1]])
+    at = np.concatenate([level.parameters.translations.ravel(), level.parameters.rotations.ravel()])
+    same = np.concatenate([free.parameters.translations.ravel(), free.parameters.rotations[:, -1]])
     assert np.all(np.diag(level.covariance)[at] < 1.05 * np.diag(free.covariance)[same])
 
 
@@ -185,7 +191,11 @@ def test_prisms_are_found_against_each_other() -> None:
 def test_derivatives_are_exact(levelled: bool) -> None:  # noqa: FBT001
     """Each unknown moves the residuals as its derivative says."""
     known = SetupPrior(
-        translation_sigma_m=1.0, rotation_sigma_rad=1.0, latency_sigma_s=1.0, prism_sigma_m=1.0, levelled=levelled
+        translation_sigma_m=1.0,
+        rotation_sigma_rad=1.0,
+        latency_sigma_s=1.0,
+        prism_sigma_m=1.0,
+        levelled=levelled,
     )
     observations = drive(10.0)
     setup = Setup.of(observations)
@@ -215,7 +225,8 @@ def test_what_a_straight_drive_does_not_tell_is_named() -> None:
     straight = calibrate_motion(drive(30.0, straight=True), REFINE, prior=PRIOR, noise_scale=1.0)
     sentences = [direction.description for direction in unobservable_directions(straight)]
     assert any(
-        "station 2 turns by" in description and "mrad about bearing" in description for description in sentences
+        "station 2 turns by" in description and "mrad about bearing" in description
+        for description in sentences
     )
     assert unobservable_directions(calibrate_motion(drive(), REFINE, prior=PRIOR, noise_scale=1.0)) == []
 
@@ -229,7 +240,7 @@ def test_station_1_is_needed() -> None:
 
 def test_something_must_be_unknown() -> None:
     """With everything held there is nothing to do."""
-    with pytest.raises(GeometryError, match="nothing to find"):
+    with pytest.raises(GeometryError, match="nothing to estimate"):
         calibrate_motion(drive(20.0), SetupPrior(), prior=PRIOR)
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.prior_motion import draw_motions, sorted_by_time, measure
+from harness.prior_motion import draw_motions, measure, sorted_by_time
 
 from tsgt.errors import GeometryError
 from tsgt.geometry.trajectory import batch as fitting
@@ -31,15 +31,17 @@ def observations() -> Observations:
 def test_pieces_give_what_one_gives(observations: Observations, monkeypatch: pytest.MonkeyPatch) -> None:
     """States to a hundredth of a millimetre, covariances to a thousandth of theirs, measurements in their order."""
     whole = fit_trajectory(observations, prior=PRIOR, noise_scale=1.0)
-    monkeypatch.setattr("tsgt.geometry.trajectory.batch.KNOTS_AT_ONCE", 150)
-    monkeypatch.setattr("tsgt.geometry.trajectory.batch.OVERLAP", 80)
+    monkeypatch.setattr("tsgt.geometry.trajectory.batch.KNOTS_PER_SEGMENT", 150)
+    monkeypatch.setattr("tsgt.geometry.trajectory.batch.OVERLAP_KNOTS", 80)
     pieces = fit_trajectory(observations, prior=PRIOR, noise_scale=1.0)
     error = pieces.trajectory.knots.local_coordinates_about(whole.trajectory.knots)
     assert np.abs(error[:, :6]).max() < 1e-5
     sigma = np.sqrt(np.diagonal(whole.trajectory.covariance, axis1=1, axis2=2))
     scale = sigma[:, :, None] * sigma[:, None, :]
     assert (np.abs(pieces.trajectory.covariance - whole.trajectory.covariance) / scale).max() < 1e-3
-    cross_covariance = (np.abs(pieces.trajectory.cross_covariance - whole.trajectory.cross_covariance) / scale[:-1]).max()
+    cross_covariance = (
+        np.abs(pieces.trajectory.cross_covariance - whole.trajectory.cross_covariance) / scale[:-1]
+    ).max()
     assert cross_covariance < 1e-2
     np.testing.assert_allclose(pieces.residuals_m, whole.residuals_m, atol=1e-5)
 
@@ -67,7 +69,7 @@ def test_progress_goes_from_nothing_to_all(
     observations: Observations, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Shares rise to 1."""
-    monkeypatch.setattr("tsgt.geometry.trajectory.batch.KNOTS_AT_ONCE", 200)
+    monkeypatch.setattr("tsgt.geometry.trajectory.batch.KNOTS_PER_SEGMENT", 200)
     shares: list[float] = []
     fit_trajectory(observations, prior=PRIOR, noise_scale=1.0, on_progress=shares.append)
     assert shares == sorted(shares)
@@ -91,6 +93,6 @@ def test_no_trajectory_without_three_prisms(observations: Observations) -> None:
 def test_pieces_cover_all_knots_once() -> None:
     """Whatever their number."""
     for count in (1, 2, 4096, 4097, 100_000):
-        kept = [piece.kept for piece in fitting._pieces(count)]
+        kept = [piece.kept for piece in fitting._segments(count)]
         assert (kept[0].start, kept[-1].stop) == (0, count)
         assert all(a.stop == b.start for a, b in pairwise(kept))

@@ -67,7 +67,9 @@ def test_upper_triangles_of_the_diagonal_are_not_looked_at() -> None:
     """What stands above the diagonal of a block on it changes nothing."""
     diagonal, off_diagonal, _ = made_up(4, 3)
     changed = np.tril(diagonal)
-    np.testing.assert_array_equal(factorise(changed, off_diagonal).banded, factorise(diagonal, off_diagonal).banded)
+    np.testing.assert_array_equal(
+        factorise(changed, off_diagonal).banded, factorise(diagonal, off_diagonal).banded
+    )
 
 
 def test_what_is_not_determined_is_an_error() -> None:

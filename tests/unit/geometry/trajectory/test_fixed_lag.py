@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from harness.prior_motion import draw_motions, sorted_by_time, measure, rows_at
+from harness.prior_motion import draw_motions, measure, rows_at, sorted_by_time
 
 from tsgt.geometry import FixedLagSmoother, FloatArray, Observations, Trajectory
 from tsgt.geometry.trajectory import initial_guess, knot_times, solve
@@ -175,7 +175,9 @@ def test_covariances_are_honest() -> None:
         for found, at_s in ((predicted, 8.4), (smoothed, 5.6)):
             at = np.array([at_s])
             state, covariance = window.predict(at_s) if found is predicted else window.trajectory().at(at)
-            found.append(_nees(state.local_coordinates_about(motion.select(rows_at(at)))[:, :6], covariance[:, :6, :6]))
+            found.append(
+                _nees(state.local_coordinates_about(motion.select(rows_at(at)))[:, :6], covariance[:, :6, :6])
+            )
     # 95 % band of the mean of 12 draws of chi-square with 6 degrees of freedom, divided by 12.
     for found in (predicted, smoothed):
         assert 4.2 < np.mean(found) < 8.1

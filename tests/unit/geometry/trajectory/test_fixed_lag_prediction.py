@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from harness.manoeuvre import speeding_up_and_turning_back
-from harness.prior_motion import draw_motions, sorted_by_time, measure, rows_at
+from harness.prior_motion import draw_motions, measure, rows_at, sorted_by_time
 
 from tsgt.geometry import FixedLagSmoother, FloatArray, Observations
-from tsgt.geometry.trajectory.fixed_lag import LIVELIER_AHEAD
+from tsgt.geometry.trajectory.fixed_lag import PREDICTION_NOISE_SCALE
 from tsgt.geometry.trajectory.propagation import Propagator
 from tsgt.model import MotionPrior
 
@@ -42,7 +42,7 @@ def without_surprise(window: FixedLagSmoother, at_s: float) -> FloatArray:
     trajectory = window.trajectory()
     end_s = trajectory.knots.time_s[-1:]
     state, covariance = trajectory.at(end_s)
-    return Propagator(state, covariance[0], PRIOR, process_noise_scale=LIVELIER_AHEAD).at(at_s)[1]
+    return Propagator(state, covariance[0], PRIOR, process_noise_scale=PREDICTION_NOISE_SCALE).at(at_s)[1]
 
 
 def test_a_robot_that_does_the_unexpected_is_predicted_with_less_certainty(

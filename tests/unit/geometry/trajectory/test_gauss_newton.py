@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.prior_motion import SIGMAS_M, STEP_S, as_cartesian, draw_motions, sorted_by_time, measure, rows_at
+from harness.prior_motion import (
+    SIGMAS_M,
+    STEP_S,
+    as_cartesian,
+    draw_motions,
+    measure,
+    rows_at,
+    sorted_by_time,
+)
 from harness.scene import FRAMES, LAYOUT
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
@@ -15,17 +23,25 @@ from scipy.stats import multivariate_normal
 
 from tsgt.errors import GeometryError
 from tsgt.geometry import Observations, Trajectory, cartesian_to_polar, exp_so3
-from tsgt.geometry.trajectory import MIN_KNOT_SPACING_S, STATE_DIM, States, initial_guess, knot_times, nearest_knots, solve
+from tsgt.geometry.trajectory import (
+    MIN_KNOT_SPACING_S,
+    STATE_DIM,
+    States,
+    initial_guess,
+    knot_times,
+    nearest_knots,
+    solve,
+)
 from tsgt.geometry.trajectory.gauss_newton import (
-    REJECTION_THRESHOLD,
-    OUTLIER_THRESHOLD,
     COST_TOLERANCE,
+    OUTLIER_THRESHOLD,
+    REJECTION_THRESHOLD,
     AnchorPrior,
-    log_evidence,
     diffuse_prior,
+    log_evidence,
 )
 from tsgt.geometry.trajectory.motion_prior import process_noise, transition
-from tsgt.geometry.trajectory.states import ProcessFactors, linearise_process, axes_to_state
+from tsgt.geometry.trajectory.states import ProcessFactors, axes_to_state, linearise_process
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:
@@ -175,7 +191,7 @@ def test_six_degrees_of_freedom_are_least_squares(observations: Observations) ->
             axis=-1,
         )
         by_step = (roots @ linearise_process(knots, steps).residuals[..., None])[..., 0]
-        first = anchor_root * knots.select(slice(0, 1)).local_coordinates_about(anchor.near)[0]
+        first = anchor_root * knots.select(slice(0, 1)).local_coordinates_about(anchor.linearisation_point)[0]
         return np.concatenate([(by_measurement / data.sigmas_m).ravel(), by_step.ravel(), first])
 
     diagonal, _ = found.factor.marginals()
@@ -223,7 +239,9 @@ def test_outliers_are_named(observations: Observations, miss_m: float) -> None:
     assert np.argmin(found.weights) == wrong
     assert found.weights[wrong] < 16 / (miss_m / 0.01) ** 2
     little = OUTLIER_THRESHOLD**2 / found.squared_distances[wrong]
-    assert found.weights[wrong] == pytest.approx(0.0 if found.squared_distances[wrong] > REJECTION_THRESHOLD**2 else little)
+    assert found.weights[wrong] == pytest.approx(
+        0.0 if found.squared_distances[wrong] > REJECTION_THRESHOLD**2 else little
+    )
     assert np.count_nonzero((found.weights < 1.0) & (clean.weights == 1.0)) == 1
     arm = LAYOUT.mean(axis=0)
     centroid, clean_centroid = (s.knots.position + s.knots.rotation @ arm for s in (found, clean))

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from harness.prior_motion import STEP_S, sorted_by_time, measure, rows_at
+from harness.prior_motion import STEP_S, measure, rows_at, sorted_by_time
 
 from tsgt.geometry import States, exp_so3, log_so3
-from tsgt.geometry.trajectory import with_noise_floor, fit_trajectory
+from tsgt.geometry.trajectory import fit_trajectory, with_noise_floor
 from tsgt.geometry.trajectory.hyperparameters import partially_occluded
 from tsgt.geometry.trajectory.motion_prior import axis_sigmas
 from tsgt.model import MotionPrior, PipelineParameters
@@ -74,7 +74,10 @@ def test_the_livelier_prior_holds_axis_by_axis() -> None:
     turning = 0.5 * 0.2 * np.sqrt((0.4 / (1 + 0.4**2)) / (0.1 / (1 + 0.1**2)))
     assert found.acceleration_sigma_mps2 == pytest.approx((1.0, 1.0, raised))
     assert found.angular_acceleration_sigma_radps2 == pytest.approx((0.5, 0.5, turning))
-    assert (found.acceleration_correlation_time_s, found.angular_acceleration_correlation_time_s) == (0.2, 0.1)
+    assert (found.acceleration_correlation_time_s, found.angular_acceleration_correlation_time_s) == (
+        0.2,
+        0.1,
+    )
 
 
 def test_a_prior_is_at_least_itself() -> None:
@@ -90,4 +93,11 @@ def test_a_robot_is_hidden_while_fewer_than_three_prisms_are_seen() -> None:
     also = (time_s > 5.0) & (time_s < 9.0) & (prism == 1)
     kept = ~(gone | also)
     at_s = np.array([-1.0, 2.0, 4.0, 6.0, 8.0, 20.0])
-    assert partially_occluded(time_s[kept], prism[kept], at_s).tolist() == [True, False, False, True, False, True]
+    assert partially_occluded(time_s[kept], prism[kept], at_s).tolist() == [
+        True,
+        False,
+        False,
+        True,
+        False,
+        True,
+    ]

@@ -101,7 +101,9 @@ def test_derivatives_by_the_state_are_exact(seed: int) -> None:
     for part in range(STATE_DIM):
         error = np.zeros((2, STATE_DIM))
         error[:, part] = step
-        forth, back = (linearise(observations, knots.retract(sign * error), at).residuals_m for sign in (1, -1))
+        forth, back = (
+            linearise(observations, knots.retract(sign * error), at).residuals_m for sign in (1, -1)
+        )
         np.testing.assert_allclose(found[:, :, part], (forth - back) / (2 * step), atol=3e-8)
 
 

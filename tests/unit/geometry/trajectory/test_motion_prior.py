@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from tsgt.geometry.trajectory.motion_prior import (
-    axis_sigmas,
     axis_correlation_times_s,
+    axis_sigmas,
     interpolation_weights,
     prior_from_axes,
     process_information,
@@ -110,7 +110,9 @@ def test_between_is_dense_conditioning(share: float, time_s: float) -> None:
     on = transition(after_s, time_s)
     q_later, cross = on @ q_here @ on.T + q_on, q_here @ on.T
     gain = np.linalg.solve(q_later, cross.T).T
-    from_earlier, from_later, left = interpolation_weights(np.array(before_s), np.array(after_s), np.array(time_s))
+    from_earlier, from_later, left = interpolation_weights(
+        np.array(before_s), np.array(after_s), np.array(time_s)
+    )
     np.testing.assert_allclose(from_later, gain, rtol=1e-6, atol=1e-7)
     expected = transition(before_s, time_s) - gain @ on @ transition(before_s, time_s)
     np.testing.assert_allclose(from_earlier, expected, rtol=1e-6, atol=1e-7)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pytest
-from harness.prior_motion import STEP_S, draw_motions, sorted_by_time, measure, rows_at
+from harness.prior_motion import STEP_S, draw_motions, measure, rows_at, sorted_by_time
 from scipy.stats import chi2
 
 from tsgt.geometry import exp_so3, log_so3
@@ -15,8 +15,8 @@ from tsgt.geometry.trajectory import (
     STATE_DIM,
     States,
     Trajectory,
-    initial_guess,
     concatenate_states,
+    initial_guess,
     knot_times,
     ros_covariance,
     solve,
@@ -136,10 +136,14 @@ def test_covariances_are_carried_by_exact_derivatives(where: str) -> None:
         error = np.zeros(2 * STATE_DIM)
         error[part] = 1e-6
         forth, back = (
-            Trajectory(knots.retract(sign * error.reshape(2, STATE_DIM)), PRIOR, covariance, cross_covariance).at(asked_s)[0]
+            Trajectory(
+                knots.retract(sign * error.reshape(2, STATE_DIM)), PRIOR, covariance, cross_covariance
+            ).at(asked_s)[0]
             for sign in (1, -1)
         )
-        columns.append((forth.local_coordinates_about(states)[0] - back.local_coordinates_about(states)[0]) / 2e-6)
+        columns.append(
+            (forth.local_coordinates_about(states)[0] - back.local_coordinates_about(states)[0]) / 2e-6
+        )
     derivative = np.stack(columns, axis=-1)
     np.testing.assert_allclose(found - added, [derivative @ joint @ derivative.T], rtol=1e-6, atol=1e-6)
 

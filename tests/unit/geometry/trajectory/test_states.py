@@ -17,8 +17,8 @@ from tsgt.geometry.trajectory.states import (
     LinearisedProcess,
     ProcessFactors,
     add_process_factors,
-    linearise_process,
     axes_to_state,
+    linearise_process,
     rotation_between,
 )
 from tsgt.model import MotionPrior
@@ -104,10 +104,10 @@ def test_derivatives_of_steps_are_exact(seed: int) -> None:
 def whole_derivatives(found: LinearisedProcess, steps: ProcessFactors) -> tuple[FloatArray, FloatArray]:
     """Give derivatives of all residuals by the errors of both knots, (N, 18, 18) each."""
     by_earlier, by_later = -axes_to_state(steps.phi), np.tile(np.eye(STATE_DIM), (len(steps.phi), 1, 1))
-    by_earlier[:, 3:6, 3:6] = found.turn_by_earlier[:, :, :3]
-    by_earlier[:, 3:6, 9:12] += found.turn_by_earlier[:, :, 3:]
-    by_later[:, 3:6, 3:6] = found.turn_by_later[:, :, :3]
-    by_later[:, 3:6, 9:12] = found.turn_by_later[:, :, 3:]
+    by_earlier[:, 3:6, 3:6] = found.rotation_by_earlier[:, :, :3]
+    by_earlier[:, 3:6, 9:12] += found.rotation_by_earlier[:, :, 3:]
+    by_later[:, 3:6, 3:6] = found.rotation_by_later[:, :, :3]
+    by_later[:, 3:6, 9:12] = found.rotation_by_later[:, :, 3:]
     return by_earlier, by_later
 
 
@@ -123,7 +123,10 @@ def test_steps_enter_the_normal_equations_as_squares(seed: int) -> None:
     for row, (earlier, later) in enumerate(zip(*whole_derivatives(found, steps), strict=True)):
         jacobian[row, :, row * STATE_DIM : (row + 2) * STATE_DIM] = np.concatenate([earlier, later], axis=1)
     expected = np.einsum("nia,nij,njb->ab", jacobian, weights, jacobian)
-    diagonal, off_diagonal = np.zeros((count, STATE_DIM, STATE_DIM)), np.zeros((count - 1, STATE_DIM, STATE_DIM))
+    diagonal, off_diagonal = (
+        np.zeros((count, STATE_DIM, STATE_DIM)),
+        np.zeros((count - 1, STATE_DIM, STATE_DIM)),
+    )
     gradient = np.zeros((count, STATE_DIM))
     cost = add_process_factors(found, steps, diagonal, off_diagonal, gradient)
     for row in range(count):

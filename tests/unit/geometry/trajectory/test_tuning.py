@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.prior_motion import draw_motions, sorted_by_time, measure
+from harness.prior_motion import draw_motions, measure, sorted_by_time
 
 from tsgt.errors import GeometryError
 from tsgt.geometry.trajectory import hyperparameters, scale_noise, tune
@@ -35,14 +35,14 @@ def observations() -> Observations:
 def test_the_gradient_is_that_of_the_evidence(observations: Observations) -> None:
     """Central differences of the evidence are the oracle; the noise's scale is a little off where stamps are uncertain."""
     exact = replace(observations, time_sigma_s=np.zeros(len(observations)))
-    stretch = hyperparameters._Stretch(exact.select(slice(0, 150)))
+    segment = hyperparameters._Segment(exact.select(slice(0, 150)))
     at = np.log([0.3, 0.15, 0.5, 0.12, 0.2, 0.4, 1.2])
-    hyperparameters._evidence(stretch, at)
-    _, gradient = hyperparameters._evidence(stretch, at)
+    hyperparameters._evidence(segment, at)
+    _, gradient = hyperparameters._evidence(segment, at)
     step = 1e-3
     for i in range(len(at)):
         aside = step * np.eye(len(at))[i]
-        up, down = (hyperparameters._evidence(stretch, at + sign * aside)[0] for sign in (1, -1))
+        up, down = (hyperparameters._evidence(segment, at + sign * aside)[0] for sign in (1, -1))
         assert gradient[i] == pytest.approx((up - down) / (2 * step), rel=0.05, abs=0.5)
 
 
@@ -76,7 +76,7 @@ def test_where_the_search_begins_matters_little(observations: Observations) -> N
 def test_what_is_given_stays(observations: Observations) -> None:
     """A prior that is fixed is not touched, nor is a noise that is given."""
     few = observations.select(slice(0, 200))
-    kept = tune(few, start=PRIOR, fixed=True)
+    kept = tune(few, start=PRIOR, noise_only=True)
     np.testing.assert_allclose(kept.prior.acceleration_sigma_mps2, PRIOR.acceleration_sigma_mps2)
     assert kept.prior.acceleration_correlation_time_s == pytest.approx(PRIOR.acceleration_correlation_time_s)
     assert tune(few, noise_scale=1.5).noise_scale == pytest.approx(1.5)

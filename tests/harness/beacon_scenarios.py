@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tsgt.radio.superframe import SESSION_EVERY
-from tsgt.radio.superframe.master import SESSION_EVERY_WANTED
-from tsgt.radio.superframe.station_state import TIME_AT_START
+from tsgt.radio.superframe import SESSION_INTERVAL
+from tsgt.radio.superframe.master import SESSION_INTERVAL_JOINING
+from tsgt.radio.superframe.station_state import FULL_TIME_FRAMES
 from tsgt.radio.superframe.wire import TIME_UNIT_US
 from tsgt.timesync import BeaconClock
 from tsgt.timesync.dual_rate import SIGMAS
@@ -23,7 +23,7 @@ from tsgt.timesync.dual_rate import SIGMAS
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from tsgt.timesync.beacon_clock import Instant
+    from tsgt.timesync.beacon_clock import TimeEstimate
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -239,11 +239,11 @@ class _Station:
 
     def learn(self, frame: int, received_ns: int, sent_us: int) -> None:
         """Take a pair, if the time is known in full."""
-        every = SESSION_EVERY if self._clock.known else SESSION_EVERY_WANTED
-        in_full = frame < TIME_AT_START or frame % every == 0
-        full_us = sent_us if in_full else self._clock.unwrap(received_ns, sent_us & 0xFFFF)
+        every = SESSION_INTERVAL if self._clock.initialised else SESSION_INTERVAL_JOINING
+        unambiguous = frame < FULL_TIME_FRAMES or frame % every == 0
+        full_us = sent_us if unambiguous else self._clock.unwrap(received_ns, sent_us & 0xFFFF)
         if full_us is not None:
-            self.refused += not self._clock.add(received_ns, full_us, self._sigma_ns, in_full=in_full)
+            self.refused += not self._clock.add(received_ns, full_us, self._sigma_ns, unambiguous=unambiguous)
 
     def tell(self, beacon: _Beacon) -> None:
         """Tell what can be told, newest first, in the slot after a beacon."""
@@ -259,7 +259,7 @@ class _Station:
             self._queue.pop()
             self._note(index, self._time(self._at_ns[index], beacon, live=live), live=live)
 
-    def _time(self, at_ns: int, beacon: _Beacon, *, live: bool) -> Instant:
+    def _time(self, at_ns: int, beacon: _Beacon, *, live: bool) -> TimeEstimate:
         """Take it from the fit, or from this beacon alone where that is surer."""
         fitted = self._clock.at(at_ns)
         if fitted is not None and not live:
@@ -274,7 +274,7 @@ class _Station:
             bound_us=since.bound_us + stamp_us + SIGMAS * self._master_sigma_us + beacon.late_us,
         )
 
-    def _note(self, index: int, time: Instant, *, live: bool) -> None:
+    def _note(self, index: int, time: TimeEstimate, *, live: bool) -> None:
         truth_us = 1e6 * (self._measured_s[index] - _LINK_S)
         rounded_us = TIME_UNIT_US * round(time.time_us / TIME_UNIT_US)
         self.told.append(

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tsgt.master.classic.scheduler import Cadence
+from tsgt.master.classic.scheduler import SynchronisationSchedule
 from tsgt.model import ClockSample
 from tsgt.radio import airtime_us, symbol_time_ns
-from tsgt.timesync import ArrivalCheck, ClockEstimate, clock_filter
+from tsgt.timesync.two_way import TimestampCheck, ClockEstimate, clock_filter
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -38,8 +38,8 @@ _MEASUREMENT_WAY_S = (
 )
 _CYCLE_S = 0.24
 _REPLY_TIMEOUT_S = 0.25
-_REGRESSION_CADENCE = Cadence(initial_cycles=50, resync_cycles=5, interval_ns=300_000_000_000)
-_CADENCES: dict[FilterName, Cadence] = {
+_REGRESSION_CADENCE = SynchronisationSchedule(initial_cycles=50, resync_cycles=5, interval_ns=300_000_000_000)
+_CADENCES: dict[FilterName, SynchronisationSchedule] = {
     "regression": _REGRESSION_CADENCE,
     "paper": replace(_REGRESSION_CADENCE, first_interval_ns=_REGRESSION_CADENCE.interval_ns),
 }
@@ -219,7 +219,7 @@ class _Run:
         self._clock = _StationClock(scenario)
         self._filter = clock_filter(name)
         self._cadence = _CADENCES[name]
-        self._check = ArrivalCheck()
+        self._check = TimestampCheck()
         self._rng = np.random.default_rng(seed)
         self._unknown = True
         self._synchronisations = 0
@@ -285,7 +285,7 @@ class _Run:
             self._restarts += self._filter.update(samples).restarted
             self._synchronised_s = start_s
             self._unknown = False
-        following_ns = self._cadence.following_ns(self._synchronisations)
+        following_ns = self._cadence.next_interval_ns(self._synchronisations)
         interval_ns = following_ns if samples else self._cadence.first_interval_ns
         self._due_s = now_s + interval_ns / 1e9
         self._synchronisations += bool(samples)
@@ -339,7 +339,7 @@ class _Run:
             )
             if not plausible:
                 self._withheld += 1
-                self._filter.forget()
+                self._filter.reset()
                 self._unknown = True
                 self._synchronisations = 1  # the clock is another one; the station is the same
                 return float(poll_s) + _POLL_S

@@ -13,17 +13,20 @@ from hypothesis import strategies as st
 from tsgt.model import Status
 from tsgt.radio import MeasureCommand
 from tsgt.radio.classic import (
+    ClassicStation,
     CommandMessage,
-    MeasurementMessage,
     CommandTransaction,
+    LinkTiming,
+    MeasurementMessage,
     Poll,
-    Shot,
+    SingleMeasurementPoll,
     Synchronisation,
+    Transaction,
     decode_command,
     status_of,
 )
 from tsgt.radio.classic.messages import (
-    LAST_TIME_NS,
+    MAX_TIME_NS,
     Acknowledgement,
     Letter,
     PingReply,
@@ -31,12 +34,11 @@ from tsgt.radio.classic.messages import (
     decode_reply,
     no_measurement_yet,
 )
-from tsgt.radio.classic.transactions import ClassicStation, Timing, Turn
 
-TIMING = Timing.of(PAPER, 250 * MS)
+TIMING = LinkTiming.from_settings(PAPER, 250 * MS)
 
 stations = st.integers(1, 9)
-times_ns = st.integers(0, LAST_TIME_NS)
+times_ns = st.integers(0, MAX_TIME_NS)
 angles_rad = st.floats(-4 * math.pi, 4 * math.pi)
 commands = st.one_of(
     st.builds(CommandMessage, st.sampled_from(cast("tuple[Letter, ...]", get_args(Letter))), stations),
@@ -93,7 +95,7 @@ def test_every_packet_is_understood_or_not(payload: bytes) -> None:
     if isinstance(reply, MeasurementMessage):
         numbers = (reply.zenith_angle_rad, reply.horizontal_angle_rad, reply.slope_distance_m)
         assert all(map(math.isfinite, numbers))
-        assert 0 <= reply.time_ns <= LAST_TIME_NS
+        assert 0 <= reply.time_ns <= MAX_TIME_NS
 
 
 @given(st.lists(st.tuples(packets, st.integers(0, 3)), max_size=40))
@@ -110,7 +112,7 @@ def test_a_station_survives_every_packet(events: list[tuple[bytes, int]]) -> Non
             under_way = answer
         if under_way is not None and not patience:
             if isinstance(under_way, MeasureCommand):
-                station.shot(no_measurement_yet(1))
+                station.single_measured(no_measurement_yet(1))
             else:
                 assert decode_reply(station.executed(under_way, ok=len(payload) % 2 == 0)) is not None
             under_way = None
@@ -123,9 +125,9 @@ def test_a_station_survives_every_packet(events: list[tuple[bytes, int]]) -> Non
 )
 def test_every_turn_ends(turn: str, answers: list[list[tuple[bytes, int]]]) -> None:
     """Whatever comes back, a turn asks a bounded number of times, and never for a station that is not its own."""
-    turns: dict[str, Turn] = {
+    turns: dict[str, Transaction] = {
         "poll": Poll(1, TIMING),
-        "shot": Shot(1, TIMING),
+        "shot": SingleMeasurementPoll(1, TIMING),
         "order": CommandTransaction(1, CommandMessage("n", 1, 2), 2000 * MS),
         "synchronisation": Synchronisation(1, 5, TIMING),
     }
@@ -139,7 +141,7 @@ def test_every_turn_ends(turn: str, answers: list[list[tuple[bytes, int]]]) -> N
         if request.reply_timeout_ns:
             came = answers.pop(0) if answers else []
             if not any(
-                subject.replied(payload, sent_ns=sent_ns, received_ns=sent_ns + after_ns, exact=True)
+                subject.accept_reply(payload, sent_ns=sent_ns, received_ns=sent_ns + after_ns, exact=True)
                 for payload, after_ns in came
             ):
                 subject.timed_out()
@@ -177,7 +179,7 @@ def test_late_and_lost_packets_never_make_a_wrong_sample(data: st.DataObject, cy
         accepted = False
         while flying and flying[0][0] <= deadline_ns and not accepted:
             at_ns, reply = flying.pop(0)
-            accepted = turn.replied(reply, sent_ns=sent_ns, received_ns=at_ns, exact=True)
+            accepted = turn.accept_reply(reply, sent_ns=sent_ns, received_ns=at_ns, exact=True)
             now_ns = at_ns
         if not accepted:
             now_ns = deadline_ns

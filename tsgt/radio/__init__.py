@@ -1,4 +1,9 @@
-"""The radio: settings, packets, and what the program asks of any LoRa radio."""
+"""The LoRa radio: what the program requires of any radio, and what is common to both protocols.
+
+In: payloads and send times. Out: packets with the timestamps of their reception. `base` has the interface, `sx127x` the
+driver, `airtime` the durations on the air, `classic` and `superframe` the two protocols (sans-I/O), `planning` capacity and
+regional limits, `commands` what a master commands a station, `supervisor` reopens a failed radio, `ping` is a bench test.
+"""
 
 from tsgt.radio.airtime import (
     HEADER_SYMBOLS,
@@ -13,10 +18,10 @@ from tsgt.radio.base import (
     BANDWIDTHS_HZ,
     MAX_PAYLOAD_BYTES,
     LoRaSettings,
-    OpenRadio,
     Packet,
     Radio,
-    Transmitted,
+    RadioOpener,
+    Transmission,
 )
 from tsgt.radio.commands import Command, DirectCommand, Direction, MeasureCommand, SearchCommand, TrackCommand
 
@@ -30,12 +35,12 @@ __all__ = [
     "Direction",
     "LoRaSettings",
     "MeasureCommand",
-    "OpenRadio",
     "Packet",
     "Radio",
+    "RadioOpener",
     "SearchCommand",
     "TrackCommand",
-    "Transmitted",
+    "Transmission",
     "airtime_us",
     "bit_rate_Bps",
     "low_data_rate_required",

@@ -1,41 +1,41 @@
 """Time on air of a LoRa packet, in integers (SX1276 data sheet 4.1.1.6 and 4.1.1.7).
 
-A rate stands as the denominator of the coding rate, 5 to 8 for 4/5 to 4/8. Bandwidths are the data sheet's
-nominal ones in hertz. Results are exact at 31.25, 62.5, 125, 250 and 500 kHz, where a symbol lasts a whole
-number of nanoseconds; elsewhere they are rounded half up.
+A coding rate is given by its denominator, 5 to 8 for 4/5 to 4/8. Bandwidths are the nominal ones of the data sheet.
+Results are exact at 31.25, 62.5, 125, 250 and 500 kHz, where a symbol lasts a whole number of nanoseconds; elsewhere they
+are rounded half up.
 """
 
 from __future__ import annotations
 
-# A symbol longer than this lets the crystals drift apart within it, hence the low data rate optimisation.
-_LONGEST_SYMBOL_MS = 16
+# Within a longer symbol the crystals' drift matters, hence the low data rate optimisation.
+_MAX_SYMBOL_MS = 16
 
 SYNC_QUARTER_SYMBOLS = 17
-"""What follows the preamble's programmed symbols: 2 of sync word and 2.25 of start of frame, in quarters."""
+"""Quarter symbols after the programmed preamble: 2 symbols of sync word and 2.25 of start of frame delimiter."""
 
 HEADER_SYMBOLS = 8
-"""The first symbols after that, always at rate 4/8: header and start of the payload."""
+"""Symbols of the header and the start of the payload, always at rate 4/8."""
 
 TX_DONE_NS = 67_000
-"""From the end of a packet on the air to TxDone of its sender, as Semtech measured it for basicmac."""
+"""From the end of a packet on the air to TxDone of its sender, measured by Semtech for basicmac."""
 
-# From the same measurements, at 125 and 500 kHz; good to a tenth of a symbol, and each chip keeps to its own.
+# From the same measurements, at 125 and 500 kHz; accurate to a tenth of a symbol, and constant for each chip.
 _RX_DONE_SYMBOLS = {7: 0.74, 8: 0.74, 9: 0.76, 10: 0.80, 11: 0.81, 12: 0.90}
 
 
 def symbol_time_ns(spreading_factor: int, bandwidth_hz: int) -> int:
-    """Duration of one symbol, 2^SF / BW, in nanoseconds."""
+    """Return the duration of one symbol, 2^SF / BW."""
     return _divide_half_up((1 << spreading_factor) * 1_000_000_000, bandwidth_hz)
 
 
 def rx_done_ns(spreading_factor: int, bandwidth_hz: int) -> int:
-    """From the end of a packet on the air to RxDone of its receiver, in ns; SF 7 to 12."""
+    """Return the time from the end of a packet on the air to RxDone of its receiver; SF 7 to 12."""
     return round(_RX_DONE_SYMBOLS[spreading_factor] * symbol_time_ns(spreading_factor, bandwidth_hz))
 
 
 def low_data_rate_required(spreading_factor: int, bandwidth_hz: int) -> bool:
-    """Whether a symbol lasts longer than 16 ms, so that the low data rate optimisation must be on."""
-    return (1 << spreading_factor) * 1000 > _LONGEST_SYMBOL_MS * bandwidth_hz
+    """Whether a symbol exceeds 16 ms, so that the low data rate optimisation must be on."""
+    return (1 << spreading_factor) * 1000 > _MAX_SYMBOL_MS * bandwidth_hz
 
 
 def payload_symbols(
@@ -52,22 +52,17 @@ def payload_symbols(
     Parameters
     ----------
     payload_bytes
-        Length of the payload, 1 to 255.
+        1 to 255.
     spreading_factor
         6 to 12.
     coding_rate
-        Denominator of the coding rate, 5 to 8.
+        Denominator, 5 to 8.
     explicit_header
-        The packet says its own length, rate and whether it has a CRC.
+        The packet states its own length, coding rate and CRC flag.
     crc
         Two bytes of CRC follow the payload.
     low_data_rate
         The low data rate optimisation is on: two bits fewer per symbol.
-
-    Returns
-    -------
-    int
-        Number of symbols, at least 8.
     """
     bits = 8 * payload_bytes - 4 * spreading_factor + 28 + 16 * crc - 20 * (not explicit_header)
     bits_per_block = 4 * (spreading_factor - 2 * low_data_rate)
@@ -86,23 +81,14 @@ def airtime_us(
     crc: bool = True,
     low_data_rate: bool | None = None,
 ) -> int:
-    """Time from the first symbol of the preamble to the end of the packet.
+    """Return the time from the first symbol of the preamble to the end of the packet; see :func:`payload_symbols`.
 
     Parameters
     ----------
-    payload_bytes, spreading_factor, coding_rate, explicit_header, crc
-        As for :func:`payload_symbols`.
-    bandwidth_hz
-        Nominal bandwidth in hertz.
     preamble_symbols
         Value of the preamble register; 4.25 symbols more are sent.
     low_data_rate
         The low data rate optimisation; None follows :func:`low_data_rate_required`.
-
-    Returns
-    -------
-    int
-        Microseconds.
     """
     if low_data_rate is None:
         low_data_rate = low_data_rate_required(spreading_factor, bandwidth_hz)
@@ -119,9 +105,9 @@ def airtime_us(
 
 
 def bit_rate_Bps(spreading_factor: int, bandwidth_hz: int, coding_rate: int) -> float:  # noqa: N802 (unit)
-    """Nominal rate of the payload, SF * 4/CR * BW / 2^SF, in bytes per second.
+    """Return the nominal payload rate, SF * 4/CR * BW / 2^SF, in bytes per second.
 
-    Preamble and header are not in it, nor the two bits per symbol that low data rate optimisation takes.
+    It excludes preamble, header and the cost of the low data rate optimisation.
     """
     return spreading_factor * 4 * bandwidth_hz / ((coding_rate << spreading_factor) * 8)
 

@@ -1,4 +1,4 @@
-"""What the program asks of a LoRa radio, and the records that pass between them."""
+"""The interface of a LoRa radio and its records."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ BANDWIDTHS_HZ = (7_800, 10_400, 15_600, 20_800, 31_250, 41_700, 62_500, 125_000,
 """Nominal bandwidths of the SX127x, in the order of their register codes."""
 
 MAX_PAYLOAD_BYTES = 255
-"""Longest payload: the length is one byte of the LoRa header."""
+"""The length is one byte of the LoRa header."""
 
 _LIMITS = {
     "frequency_hz": (137_000_000, 1_020_000_000),
@@ -26,28 +26,28 @@ _LIMITS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoRaSettings:
-    """Settings of the modem; two radios hear each other only if all but power and coding rate agree.
+    """Settings of the modem; two radios receive each other only if all but power and coding rate agree.
 
     Attributes
     ----------
     frequency_hz
-        Carrier, 137 MHz to 1020 MHz; the board and the law leave far less.
+        137 MHz to 1020 MHz; board and regulations allow far less.
     spreading_factor
         7 to 12.
     bandwidth_hz
         One of :data:`BANDWIDTHS_HZ`.
     coding_rate
-        Denominator of the rate: 5 to 8 stand for 4/5 to 4/8.
+        Denominator of the rate: 5 to 8 for 4/5 to 4/8.
     preamble_symbols
-        As programmed, 6 to 65535; 4.25 more are on the air.
+        Programmed number, 6 to 65535; 4.25 more are sent.
     sync_word
-        One byte; 0x34 is that of public LoRaWAN and of the authors' nodes.
+        0x34 is that of public LoRaWAN and of the authors' nodes.
     crc
-        Send a payload CRC and receive nothing without one.
+        Send a payload CRC and drop packets without one.
     inverted_iq
-        Send and receive with inverted chirps, unheard by all radios that do not.
+        Send and receive inverted chirps, which other radios cannot receive.
     low_data_rate
-        Low data rate optimisation. None: as the data sheet demands, on for symbols above 16 ms.
+        Low data rate optimisation. None: on for symbols above 16 ms, as the data sheet requires.
     power_dbm
         At the PA_BOOST pin: 2 to 17, or 20 where the driver allows it.
 
@@ -82,20 +82,17 @@ class LoRaSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Packet:
-    """A packet that arrived.
+    """A received packet.
 
     Attributes
     ----------
-    payload
-        As sent.
-    rssi_dbm, snr_db
-        Strength of the signal, and its ratio to the noise; the SNR of a chip saturates near 10 dB.
+    snr_db
+        Saturates near 10 dB.
     received_at_ns
         CLOCK_MONOTONIC when the radio reported the end of the packet. An SX127x does so 0.65 to 0.95 symbols
         after the end on the air, the same for each packet of one spreading factor and bandwidth.
     stamp_sigma_ns
-        One sigma of ``received_at_ns``. Small where the interrupt line was stamped; large where its edge was lost
-        and the packet was found by polling.
+        One sigma of ``received_at_ns``; large where the edge of the interrupt line was lost and polling found the packet.
     """
 
     payload: bytes
@@ -106,15 +103,15 @@ class Packet:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Transmitted:
-    """A packet that was sent.
+class Transmission:
+    """A sent packet.
 
     Attributes
     ----------
     started_at_ns
-        CLOCK_MONOTONIC just before the radio was told to send: the instant asked for, or later.
+        CLOCK_MONOTONIC just before the command to send: the requested instant, or later.
     done_at_ns
-        CLOCK_MONOTONIC when it reported the end; an SX127x does so 67 microseconds after the end on the air.
+        CLOCK_MONOTONIC of the reported end; an SX127x reports 67 microseconds after the end on the air.
     stamp_sigma_ns
         One sigma of ``done_at_ns``.
     """
@@ -125,7 +122,7 @@ class Transmitted:
 
 
 class Radio(Protocol):
-    """A half-duplex LoRa radio that receives whenever it does not send."""
+    """A half-duplex LoRa radio; it receives whenever it does not send."""
 
     async def configure(self, settings: LoRaSettings) -> None:
         """Change the settings of a running radio.
@@ -133,40 +130,40 @@ class Radio(Protocol):
         Raises
         ------
         RadioError
-            The radio does not take them; it goes on trying in the background.
+            The radio does not accept them; it retries in the background.
         """
         ...
 
-    async def transmit(self, payload: bytes, *, at_ns: int | None = None) -> Transmitted:
-        """Send one packet and return when it is out; the radio then receives again.
+    async def transmit(self, payload: bytes, *, at_ns: int | None = None) -> Transmission:
+        """Send one packet and return after its end; the radio then receives again.
 
-        Calls from several tasks queue up. A call that is cancelled takes its packet off the air.
+        Calls from several tasks are queued. Cancelling a call aborts its packet.
 
         Parameters
         ----------
         payload
             1 to 255 bytes.
         at_ns
-            CLOCK_MONOTONIC of the start; None or an instant that has passed: now.
+            CLOCK_MONOTONIC of the start; None or a past instant: now.
 
         Raises
         ------
         RadioTimeoutError
-            The end was not reported in time; nobody knows whether the packet was heard.
+            The end was not reported in time; the packet may have been received.
         RadioError
             The packet was not sent.
         """
         ...
 
     async def receive(self) -> Packet:
-        """Return the oldest packet that waits, or the next one to arrive."""
+        """Return the oldest queued packet, or wait for the next one."""
         ...
 
     async def close(self) -> None:
-        """Fall silent and let go of the hardware; tasks that wait in :meth:`receive` are not woken."""
+        """Stop and release the hardware; tasks that wait in :meth:`receive` are not woken."""
         ...
 
 
-OpenRadio = Callable[[], AbstractAsyncContextManager[Radio]]
-"""Makes a context that holds a radio which is set up and receives; entering raises :class:`RadioError`, or
-:class:`StreamError` for a simulated radio without its air."""
+RadioOpener = Callable[[], AbstractAsyncContextManager[Radio]]
+"""Makes a context with a radio that is set up and receives; entering raises :class:`RadioError`, or :class:`StreamError`
+for a simulated radio without its air server."""

@@ -1,4 +1,4 @@
-"""What a master may order a station to do, in either protocol."""
+"""The commands of a master to a station, in either protocol."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Direction:
-    """Where a prism is believed to be, seen from a station, in the terms of its own circles.
+    """Predicted direction of a prism in a station's own circles.
 
     Attributes
     ----------
     horizontal_angle_rad
-        Horizontal circle, clockwise from the circle's zero, in rad.
+        Clockwise from the circle's zero.
     zenith_angle_rad
-        Angle from straight up, in rad.
+        From the zenith.
     spread_rad
-        It is within this of the direction, to every side, in rad.
+        Bound of the error to every side.
     """
 
     horizontal_angle_rad: float
@@ -26,25 +26,16 @@ class Direction:
 
 @dataclass(frozen=True, slots=True)
 class TrackCommand:
-    """Go back to tracking.
-
-    Attributes
-    ----------
-    prism
-        The prism to track; None: the one that was tracked before.
-    """
+    """Track a prism; None: the one that was tracked before."""
 
     prism: int | None
 
 
 @dataclass(frozen=True, slots=True)
 class SearchCommand:
-    """Look for the tracked prism anew, even if the instrument seems to have it. Not in the protocol classic.
+    """Search for the tracked prism, even if the instrument reports lock; None: where the station last had it.
 
-    Attributes
-    ----------
-    towards
-        Where to look for it; None: where the station last had it.
+    The protocol classic does not have this command.
     """
 
     towards: Direction | None = None
@@ -52,7 +43,7 @@ class SearchCommand:
 
 @dataclass(frozen=True, slots=True)
 class DirectCommand:
-    """Stop tracking and get ready for single measurements."""
+    """Stop tracking and prepare for single measurements (direct mode)."""
 
 
 @dataclass(frozen=True, slots=True)

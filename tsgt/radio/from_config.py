@@ -1,4 +1,4 @@
-"""From what a configuration says of the radio to what the driver takes."""
+"""From the radio's configuration to the parameters of driver and protocols."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from tsgt.config import ClassicMasterConfig
 from tsgt.errors import ConfigError, RadioSettingsError
 from tsgt.radio.base import LoRaSettings
-from tsgt.radio.classic import Timing
-from tsgt.radio.planning import LOWEST_DBM, classic_cycle, preset_power_dbm, superframe_cycle
+from tsgt.radio.classic import LinkTiming
+from tsgt.radio.planning import MIN_POWER_DBM, classic_cycle, preset_power_dbm, superframe_cycle
 from tsgt.radio.superframe import FrameTiming
 from tsgt.radio.sx127x import Wiring
 
@@ -16,18 +16,11 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tsgt.config import MasterProtocolConfig, ModemConfig, WiringConfig
-    from tsgt.radio.planning import Cycle, Load
+    from tsgt.radio.planning import CycleEstimate, TrafficLoad
 
 
 def lora_settings(config: ModemConfig, path: Path) -> LoRaSettings:
-    """Return the settings of the modem.
-
-    Parameters
-    ----------
-    config
-        What stands under ``[radio]``.
-    path
-        The file that it stands in, for messages.
+    """Return the modem settings of section ``[radio]`` in the file ``path``.
 
     Raises
     ------
@@ -36,7 +29,7 @@ def lora_settings(config: ModemConfig, path: Path) -> LoRaSettings:
     """
     frequency_hz, bandwidth_hz = round(config.frequency_mhz * 1e6), round(config.bandwidth_khz * 1e3)
     try:
-        power_dbm = LOWEST_DBM if config.power_dbm is None else config.power_dbm
+        power_dbm = MIN_POWER_DBM if config.power_dbm is None else config.power_dbm
         if config.region is not None:
             preset = preset_power_dbm(config.region, frequency_hz=frequency_hz, bandwidth_hz=bandwidth_hz)
             power_dbm = preset if config.power_dbm is None else config.power_dbm
@@ -58,7 +51,7 @@ def lora_settings(config: ModemConfig, path: Path) -> LoRaSettings:
 
 
 def wiring(config: WiringConfig) -> Wiring:
-    """Return how the radio is wired."""
+    """Return the wiring of the radio."""
     return Wiring(
         backend=config.backend,
         spi_bus=config.spi_bus,
@@ -71,16 +64,16 @@ def wiring(config: WiringConfig) -> Wiring:
     )
 
 
-def planned_cycle(protocol: MasterProtocolConfig, load: Load, settings: LoRaSettings) -> Cycle:
-    """Compute what a protocol carries with the master's settings."""
+def planned_cycle(protocol: MasterProtocolConfig, load: TrafficLoad, settings: LoRaSettings) -> CycleEstimate:
+    """Predict the cycle of a protocol with the master's settings."""
     if isinstance(protocol, ClassicMasterConfig):
         return classic_cycle(
             load,
-            Timing.of(settings, round(protocol.reply_timeout_ms * 1e6)),
+            LinkTiming.from_settings(settings, round(protocol.reply_timeout_ms * 1e6)),
             resync_cycles=protocol.resync_cycles,
             resync_interval_ns=round(protocol.resync_interval_s * 1e9),
         )
-    timing = FrameTiming.stated(
+    timing = FrameTiming.from_tolerances(
         settings,
         start_jitter_ns=round(protocol.start_jitter_ms * 1e6),
         turnaround_ns=round(protocol.turnaround_ms * 1e6),

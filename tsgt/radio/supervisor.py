@@ -1,4 +1,4 @@
-"""A radio that is opened again and again: what a daemon needs that runs unattended for days."""
+"""Supervision of the radio in a daemon that runs unattended for days."""
 
 from __future__ import annotations
 
@@ -13,40 +13,31 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
     from tsgt.clock import Clock
-    from tsgt.radio.base import OpenRadio, Radio
+    from tsgt.radio.base import Radio, RadioOpener
 
-FIRST_PAUSE_NS = 100_000_000
-MAX_PAUSE_NS = 5_000_000_000
+INITIAL_RETRY_DELAY_NS = 100_000_000
+MAX_RETRY_DELAY_NS = 5_000_000_000
 
 log = structlog.get_logger()
 
 
-async def keep_radio(
-    open_radio: OpenRadio, use: Callable[[Radio], Awaitable[None]], clock: Clock
+async def supervise_radio(
+    open_radio: RadioOpener, use: Callable[[Radio], Awaitable[None]], clock: Clock
 ) -> NoReturn:
-    """Open the radio and use it, for ever; after an error close it, pause, and open it again.
+    """Open the radio and await ``use(radio)``, for ever; after an error or its return, reopen the radio.
 
-    The pause grows from 0.1 s to 5 s, until the radio has worked for longer than that. The error is logged when it
-    is another one than the last, so that a radio that is missing does not fill the log.
-
-    Parameters
-    ----------
-    open_radio
-        See :data:`~tsgt.radio.base.OpenRadio`.
-    use
-        What is done with it. When it returns, it is called again, with a radio that was opened anew.
-    clock
-        Sets the pace.
+    The delay after an error grows from 0.1 s to 5 s, until the radio has worked for longer than that. Only a changed error
+    is logged, so that a missing radio does not fill the log.
 
     Raises
     ------
     RadioSettingsError
-        The radio is asked for something that it cannot do, and never will.
+        The radio will never accept the settings.
     """
-    pause_ns = FIRST_PAUSE_NS
+    delay_ns = INITIAL_RETRY_DELAY_NS
     logged = ""
     while True:
-        began_ns = clock.monotonic_ns()
+        started_ns = clock.monotonic_ns()
         try:
             async with open_radio() as radio:
                 log.info("radio_opened")
@@ -55,12 +46,12 @@ async def keep_radio(
             raise
         except (RadioError, StreamError) as error:
             if (task := asyncio.current_task()) is not None and task.cancelling():
-                # Told to stop in the very moment in which the radio failed: the error took the place of the order.
+                # The radio failed at the moment of the cancellation, and its error replaced the CancelledError.
                 raise asyncio.CancelledError from None
-            if clock.monotonic_ns() - began_ns > MAX_PAUSE_NS:
-                pause_ns, logged = FIRST_PAUSE_NS, ""
+            if clock.monotonic_ns() - started_ns > MAX_RETRY_DELAY_NS:
+                delay_ns, logged = INITIAL_RETRY_DELAY_NS, ""
             if str(error) != logged:
                 logged = str(error)
-                log.error("radio_lost", error=logged)  # noqa: TRY400 (the message says it all)
-            await clock.sleep_until(clock.monotonic_ns() + pause_ns)
-            pause_ns = min(2 * pause_ns, MAX_PAUSE_NS)
+                log.error("radio_lost", error=logged)  # noqa: TRY400 (the message is complete)
+            await clock.sleep_until(clock.monotonic_ns() + delay_ns)
+            delay_ns = min(2 * delay_ns, MAX_RETRY_DELAY_NS)

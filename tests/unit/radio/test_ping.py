@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 from harness.plain_radio import AIRTIME_NS, PlainRadio
 
-from tsgt.radio.ping import Answer, Exchange, Strength, answer, ping, summarise, summarise_answers
+from tsgt.radio.ping import Exchange, Response, SignalStrength, ping, respond, summarise, summarise_responses
 from tsgt.simulation.kernel import VirtualClock
 
 if TYPE_CHECKING:
@@ -31,26 +31,26 @@ async def test_a_reply_tells_how_the_request_was_heard() -> None:
     async with _pair() as (here, _):
         (exchange,) = await _ping(here, count=1)
     assert exchange.reply is not None
-    assert exchange.reply.here == Strength(-80.0, 7.25)
-    assert exchange.reply.there == Strength(-101.3, -11.5)
+    assert exchange.reply.local == SignalStrength(-80.0, 7.25)
+    assert exchange.reply.remote == SignalStrength(-101.3, -11.5)
 
 
 async def test_a_reply_tells_how_long_the_one_before_took() -> None:
     """The turn-round comes with the next reply; the first has none to tell."""
     async with _pair(think_ns=3_000_000) as (here, _):
         exchanges = await _ping(here, count=3)
-    turn_rounds_ns = [exchange.reply and exchange.reply.previous_turn_round_ns for exchange in exchanges]
-    assert turn_rounds_ns == [None, 3_000_000, 3_000_000]
-    assert summarise(exchanges).turn_round_ns == (3_000_000, 3_000_000)
+    turnarounds_ns = [exchange.reply and exchange.reply.previous_turnaround_ns for exchange in exchanges]
+    assert turnarounds_ns == [None, 3_000_000, 3_000_000]
+    assert summarise(exchanges).turnaround_ns == (3_000_000, 3_000_000)
 
 
 async def test_a_new_run_starts_without_turn_round() -> None:
     """What the last reply to somebody else took is not told to a new run."""
     async with _pair() as (here, _):
-        await _ping(here, count=2, run=1)
-        (exchange,) = await _ping(here, count=1, run=2)
+        await _ping(here, count=2, session=1)
+        (exchange,) = await _ping(here, count=1, session=2)
     assert exchange.reply is not None
-    assert exchange.reply.previous_turn_round_ns is None
+    assert exchange.reply.previous_turnaround_ns is None
 
 
 async def test_request_and_reply_have_the_length_asked_for() -> None:
@@ -92,13 +92,13 @@ async def test_packets_of_others_are_ignored_and_counted() -> None:
     other = PlainRadio(VirtualClock(0))
     async with _pair() as (here, there):
         there.on_sent, to_here = other.hear, there.on_sent
-        await _ping(here, count=1, run=8)
+        await _ping(here, count=1, session=8)
         there.on_sent = to_here
         for payload in (b"t1", bytes(34), (await other.receive()).payload, b"\xa5!"):
             here.hear(payload)
-        (exchange,) = await _ping(here, count=1, run=7)
+        (exchange,) = await _ping(here, count=1, session=7)
     assert exchange.reply is not None
-    assert exchange.foreign == 4
+    assert exchange.unknown == 4
 
 
 async def test_packets_of_others_do_not_prolong_the_wait() -> None:
@@ -123,7 +123,7 @@ async def test_a_request_is_answered_once() -> None:
     there, requests = PlainRadio(VirtualClock(0)), PlainRadio(VirtualClock(0))
     there.on_sent = sent.append
     requests.on_sent = there.hear_twice
-    answers: list[Answer] = []
+    answers: list[Response] = []
     answering = asyncio.create_task(_collect(there, answers))
     await _ping(requests, count=1)
     there.hear(b"t1")
@@ -131,13 +131,13 @@ async def test_a_request_is_answered_once() -> None:
     answering.cancel()
     await asyncio.wait([answering])
     assert len(sent) == 1
-    assert [(each.number, each.turn_round_ns is not None) for each in answers] == [
+    assert [(each.number, each.turnaround_ns is not None) for each in answers] == [
         (0, True),
         (0, False),
         (None, False),
     ]
-    summary = summarise_answers(answers)
-    assert (summary.answered, summary.repeated, summary.foreign) == (1, 1, 1)
+    summary = summarise_responses(answers)
+    assert (summary.answered, summary.repeated, summary.unknown) == (1, 1, 1)
 
 
 async def test_the_rate_counts_both_ways() -> None:
@@ -151,19 +151,24 @@ def test_nothing_sent_has_no_figures() -> None:
     """A run that was stopped before its first request has an empty summary."""
     summary = summarise([])
     assert (summary.sent, summary.received, summary.loss, summary.packets_per_s) == (0, 0, None, None)
-    assert summarise_answers([]).turn_round_ns is None
+    assert summarise_responses([]).turnaround_ns is None
 
 
-async def _ping(radio: Radio, *, count: int, run: int = 7, payload_bytes: int = 34) -> list[Exchange]:
+async def _ping(radio: Radio, *, count: int, session: int = 7, payload_bytes: int = 34) -> list[Exchange]:
     requests = ping(
-        radio, VirtualClock(0), run=run, count=count, payload_bytes=payload_bytes, timeout_ns=TIMEOUT_NS
+        radio,
+        VirtualClock(0),
+        session=session,
+        count=count,
+        payload_bytes=payload_bytes,
+        timeout_ns=TIMEOUT_NS,
     )
     async with aclosing(requests) as exchanges:
         return [exchange async for exchange in exchanges]
 
 
-async def _collect(radio: Radio, answers: list[Answer]) -> None:
-    async with aclosing(answer(radio)) as results:
+async def _collect(radio: Radio, answers: list[Response]) -> None:
+    async with aclosing(respond(radio)) as results:
         async for result in results:
             answers.append(result)  # noqa: PERF401 (it is cancelled, and has to leave what it has)
 

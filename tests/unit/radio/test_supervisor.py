@@ -10,7 +10,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from tsgt.errors import RadioError, RadioSettingsError, StreamError, TsgtError
-from tsgt.radio.supervisor import keep_radio
+from tsgt.radio.supervisor import supervise_radio
 from tsgt.simulation.kernel import VirtualClock
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ async def run(attempts: Attempts, use_s: float, error: Exception | None, for_s: 
 
     with pytest.raises(TimeoutError):
         async with asyncio.timeout(for_s):
-            await keep_radio(attempts.open, use, CLOCK)
+            await supervise_radio(attempts.open, use, CLOCK)
 
 
 async def test_a_radio_that_is_missing_is_looked_for_ever_more_slowly() -> None:
@@ -84,7 +84,7 @@ async def test_another_reason_is_logged_again() -> None:
 async def test_what_it_can_never_do_ends_it() -> None:
     """Trying again does not make 20 dBm allowed."""
     with pytest.raises(RadioSettingsError):
-        await keep_radio(Attempts(RadioSettingsError("20 dBm")).open, _never, CLOCK)
+        await supervise_radio(Attempts(RadioSettingsError("20 dBm")).open, _never, CLOCK)
 
 
 async def test_a_radio_that_fails_while_it_is_told_to_stop_stops() -> None:
@@ -96,7 +96,7 @@ async def test_a_radio_that_fails_while_it_is_told_to_stop_stops() -> None:
         except asyncio.CancelledError:
             raise RadioError("gone") from None
 
-    task = asyncio.create_task(keep_radio(Attempts().open, use, CLOCK))
+    task = asyncio.create_task(supervise_radio(Attempts().open, use, CLOCK))
     await asyncio.sleep(1.0)
     task.cancel()
     done, _ = await asyncio.wait([task], timeout=60.0)

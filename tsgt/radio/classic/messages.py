@@ -1,8 +1,7 @@
 """The messages of the paper's protocol, byte for byte as the authors' field nodes send them.
 
-Commands of the master are ASCII: a letter, the digit of the station, and for ``n`` perhaps the digit of a prism.
-Numbers in replies are little-endian and follow each other without gaps. Every byte stands, with examples, in
-docs/reference/radio-protocol.md.
+Commands of the master are ASCII: a letter, the digit of the station, and for ``n`` optionally the digit of a prism.
+Numbers in replies are little-endian and unpadded. docs/reference/radio-protocol.md specifies every byte, with examples.
 """
 
 from __future__ import annotations
@@ -15,20 +14,18 @@ from typing import Literal, cast, get_args
 from tsgt.model import Status, check_finite
 
 Letter = Literal["t", "p", "e", "s", "c", "d", "n"]
-"""t: data, p: begin synchronisation, e: ping, s: stamp of the ping, c: end it, d: single measurements, n: track."""
+"""t: data, p: begin synchronisation, e: ping, s: timestamp of the ping, c: end it, d: direct mode, n: track."""
 
-STATIONS = range(1, 10)
-"""Numbers that a station can have: one ASCII digit, without 0."""
-PRISMS = range(1, 10)
-"""Numbers that a prism can have in a command."""
+STATIONS = PRISMS = range(1, 10)
+"""One ASCII digit, without 0."""
 
 COMMAND_BYTES = 2
 PING_REPLY_BYTES = 2
 TIME_REPLY_BYTES = 9
 MEASUREMENT_BYTES = 34
 
-LAST_TIME_NS = 2**32 * 1_000_000_000 - 1
-"""The latest time that fits into a message, in February 2106."""
+MAX_TIME_NS = 2**32 * 1_000_000_000 - 1
+"""In February 2106."""
 
 _TIME = struct.Struct("<cII")
 _MEASUREMENT = struct.Struct("<BBdddII")
@@ -52,25 +49,16 @@ _RAW_STATUS = {
     Status.ERROR: OTHER,
 }
 
-# What no total station says. It tells a foreign packet of 34 bytes from a measurement.
-_LARGEST_ANGLE_RAD = 4 * math.pi
-_LONGEST_DISTANCE_M = 20_000.0
+# Limits of a total station's values, to reject unknown packets of 34 bytes.
+_MAX_ANGLE_RAD = 4 * math.pi
+_MAX_DISTANCE_M = 20_000.0
 # An authors' node without a measurement converts -1.0 to uint32: 0 on ARM, all ones on x86.
 _NO_SECONDS = (0, 0xFFFF_FFFF)
 
 
 @dataclass(frozen=True, slots=True)
 class CommandMessage:
-    """What the master tells a station.
-
-    Attributes
-    ----------
-    letter
-        Which command.
-    station
-        Number of the station, 1 to 9.
-    prism
-        For ``n`` only: the prism to track, 1 to 9. None leaves it to the station.
+    """A command of the master; ``n`` may name the prism to track.
 
     Raises
     ------
@@ -90,93 +78,71 @@ class CommandMessage:
             raise ValueError(f"only n takes a prism, and only 1 to 9, got {self.letter} with {self.prism}")
 
     def to_bytes(self) -> bytes:
-        """Two bytes, or three with a prism."""
+        """Encode in two bytes, or three with a prism."""
         return f"{self.letter}{self.station}{'' if self.prism is None else self.prism}".encode("ascii")
 
 
 @dataclass(frozen=True, slots=True)
 class PingReply:
-    """A station has heard ``e`` and taken the time; the same two bytes as the command.
-
-    Attributes
-    ----------
-    station
-        Number of the station, 1 to 9.
-    """
+    """The station has received ``e`` and timestamped it; the same two bytes as the command."""
 
     station: int
 
     def __post_init__(self) -> None:
-        """Refuse numbers of more than one digit."""
         _check_station(self.station)
 
     def to_bytes(self) -> bytes:
-        """Two bytes."""
+        """Encode in two bytes."""
         return f"e{self.station}".encode("ascii")
 
 
 @dataclass(frozen=True, slots=True)
 class TimeReply:
-    """When a station heard the last ``e``. It does not say which station it comes from, nor which ``e``.
-
-    Attributes
-    ----------
-    time_ns
-        On the station's Unix clock in ns; 0 where it has heard none.
-    """
+    """Reception of the last ``e`` on the station's Unix clock, or 0. It names neither the station nor the ``e``."""
 
     time_ns: int
 
     def __post_init__(self) -> None:
-        """Refuse times that do not fit."""
         _check_time(self.time_ns)
 
     def to_bytes(self) -> bytes:
-        """Nine bytes."""
+        """Encode in nine bytes."""
         return _TIME.pack(b"s", *divmod(self.time_ns, 1_000_000_000))
 
 
 @dataclass(frozen=True, slots=True)
 class Acknowledgement:
-    """The answer to ``d`` and ``n``. It does not say which station it comes from.
-
-    Attributes
-    ----------
-    letter
-        Which of the two.
-    ok
-        Whether it was done.
-    """
+    """The reply to ``d`` and ``n``: whether the command was executed. It does not name the station."""
 
     letter: Literal["d", "n"]
     ok: bool
 
     def to_bytes(self) -> bytes:
-        """Three bytes."""
+        """Encode in three bytes."""
         return f"{self.letter}{'Ok' if self.ok else 'No'}".encode("ascii")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeasurementMessage:
-    """The answer to ``t``.
+    """The reply to ``t``.
 
     Attributes
     ----------
     station
-        Number of the station, 1 to 9; here a number, not a digit.
+        A binary number, not a digit.
     status
         0 good, 1 tilted, 2 wrong distance, 3 no target or another error, 4 no distance or one below 1 m.
     zenith_angle_rad, horizontal_angle_rad
         As in :class:`~tsgt.model.PolarMeasurement`; the authors call the first one elevation.
     slope_distance_m
-        Without prism constant, in m; 0 with status 4.
+        Without prism constant; 0 with status 4.
     time_ns
-        On the station's Unix clock in ns. 0 stands for none: no measurement yet, or an error of an authors' node.
+        On the station's Unix clock. 0: no measurement yet, or an error of an authors' node.
 
     Raises
     ------
     ValueError
-        A number does not fit into the message, or is none.
+        A number is out of range or not finite.
     """
 
     station: int
@@ -194,7 +160,7 @@ class MeasurementMessage:
         _check_time(self.time_ns)
 
     def to_bytes(self) -> bytes:
-        """34 bytes."""
+        """Encode in 34 bytes."""
         return _MEASUREMENT.pack(
             self.station,
             self.status,
@@ -209,7 +175,7 @@ Reply = PingReply | TimeReply | Acknowledgement | MeasurementMessage
 
 
 def no_measurement_yet(station: int) -> MeasurementMessage:
-    """Return what a station answers before its first: zeros, but unlike the authors' nodes not as a good one."""
+    """Return the reply before the first measurement: zeros, but unlike the authors' nodes not with a good status."""
     return MeasurementMessage(
         station=station,
         status=OTHER,
@@ -221,7 +187,7 @@ def no_measurement_yet(station: int) -> MeasurementMessage:
 
 
 def status_of(message: MeasurementMessage) -> Status:
-    """Verdict in the common vocabulary; a good status without time or distance is not believed."""
+    """Return the common status; a good status without time or distance is rejected."""
     if message.status == OK and message.time_ns == 0:
         return Status.NO_TARGET
     if message.status == OK and message.slope_distance_m == 0:
@@ -230,12 +196,12 @@ def status_of(message: MeasurementMessage) -> Status:
 
 
 def raw_status(status: Status) -> int:
-    """Return the protocol's number for a verdict: seven are put into five."""
+    """Return the protocol's number of a status: seven are mapped to five."""
     return _RAW_STATUS[status]
 
 
 def decode_command(payload: bytes) -> CommandMessage | None:
-    """Return the command that a packet holds; None for anything else."""
+    """Decode a command; None for any other packet."""
     try:
         text = payload.decode("ascii")
     except UnicodeDecodeError:
@@ -250,7 +216,7 @@ def decode_command(payload: bytes) -> CommandMessage | None:
 
 
 def decode_reply(payload: bytes) -> Reply | None:
-    """Return the reply that a packet holds; None for anything else, also for numbers that cannot be."""
+    """Decode a reply; None for any other packet, also for one with impossible values."""
     try:
         match len(payload):
             case 2 if payload[:1] == b"e" and payload[1:].isdigit():
@@ -258,18 +224,13 @@ def decode_reply(payload: bytes) -> Reply | None:
             case 3 if payload in _ACKNOWLEDGEMENTS:
                 return Acknowledgement("d" if payload[:1] == b"d" else "n", payload[1:] == b"Ok")
             case 9 if payload[:1] == b"s":
-                return _decode_time(payload)
+                time_ns = _time_ns(*_TIME.unpack(payload)[1:])
+                return None if time_ns is None else TimeReply(time_ns)
             case 34:
                 return _decode_measurement(payload)
     except ValueError:
         pass
     return None
-
-
-def _decode_time(payload: bytes) -> TimeReply | None:
-    _, seconds, nanoseconds = _TIME.unpack(payload)
-    time_ns = _time_ns(seconds, nanoseconds)
-    return None if time_ns is None else TimeReply(time_ns)
 
 
 def _decode_measurement(payload: bytes) -> MeasurementMessage | None:
@@ -278,8 +239,8 @@ def _decode_measurement(payload: bytes) -> MeasurementMessage | None:
     )
     time_ns = _time_ns(seconds, nanoseconds)
     if status in (OK, NO_DISTANCE):
-        angles_possible = max(abs(zenith_rad), abs(horizontal_rad)) <= _LARGEST_ANGLE_RAD
-        if time_ns is None or not angles_possible or not 0 <= distance_m <= _LONGEST_DISTANCE_M:
+        angles_possible = max(abs(zenith_rad), abs(horizontal_rad)) <= _MAX_ANGLE_RAD
+        if time_ns is None or not angles_possible or not 0 <= distance_m <= _MAX_DISTANCE_M:
             return None
     elif time_ns is None or seconds in _NO_SECONDS:
         time_ns = 0
@@ -303,5 +264,5 @@ def _check_station(station: int) -> None:
 
 
 def _check_time(time_ns: int) -> None:
-    if not 0 <= time_ns <= LAST_TIME_NS:
+    if not 0 <= time_ns <= MAX_TIME_NS:
         raise ValueError(f"a time of {time_ns} ns does not fit into 32 bits of seconds")

@@ -1,41 +1,36 @@
-"""From the power of a sender to what is left of it at a receiver, and how much that one needs.
-
-The signal to noise ratios are those of the SX1276's data sheet, Rev 4.
-"""
+"""Link budget: path loss, noise, and the sensitivity of a receiver (SX1276 data sheet, Rev 4)."""
 
 from __future__ import annotations
 
 import math
 
 REQUIRED_SNR_DB = {6: -5.0, 7: -7.5, 8: -10.0, 9: -12.5, 10: -15.0, 11: -17.5, 12: -20.0}
-"""SNR that the data sheet asks for, by spreading factor."""
+"""SNR that the demodulator needs, by spreading factor."""
 
 NOISE_FIGURE_DB = 6.5
-"""Of the chip's receiver: with it the sensitivity is the data sheet's to 1 dB."""
+"""Of the chip's receiver; reproduces the data sheet's sensitivity to 1 dB."""
 
 _THERMAL_NOISE_DBM_PER_HZ = -174.0
 _LIGHT_MPS = 299_792_458
 
 
 def noise_dbm(bandwidth_hz: float, noise_figure_db: float) -> float:
-    """Noise power of a receiver in its bandwidth."""
+    """Return the noise power of a receiver in its bandwidth."""
     return _THERMAL_NOISE_DBM_PER_HZ + 10 * math.log10(bandwidth_hz) + noise_figure_db
 
 
 def sensitivity_dbm(spreading_factor: int, bandwidth_hz: int) -> float:
-    """Power that a receiver needs to hear nearly everything."""
+    """Return the power above which a receiver decodes nearly all packets."""
     return noise_dbm(bandwidth_hz, NOISE_FIGURE_DB) + REQUIRED_SNR_DB[spreading_factor]
 
 
 def path_loss_db(distance_m: float, frequency_hz: float, exponent: float) -> float:
-    """Loss between two antennas without gain: Friis to one metre, then the exponent; nearer counts as one metre.
+    """Return the loss between two antennas without gain (log-distance model: Friis to one metre, then the exponent).
 
     Parameters
     ----------
     distance_m
-        Between the two.
-    frequency_hz
-        Carrier.
+        Less than one metre counts as one metre.
     exponent
         2 in free space, 2.7 to 3.5 over ground and through trees.
     """

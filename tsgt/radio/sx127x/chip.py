@@ -1,4 +1,4 @@
-"""What to write into an SX127x, in which order, to set it up, to send and to receive; when to do so is the driver's."""
+"""Sequences of register accesses that set up an SX127x, send and receive; the driver decides when."""
 
 from __future__ import annotations
 
@@ -28,52 +28,40 @@ if TYPE_CHECKING:
 log = structlog.get_logger()
 
 RESET_LOW_NS = 1_000_000
-"""How long NRESET is held low; the chip asks for 0.1 ms (section 7.2.2)."""
+"""Duration of the NRESET pulse; the chip needs 0.1 ms (section 7.2.2)."""
 RESET_WAIT_NS = 10_000_000
-"""How long the chip is left alone after it; it asks for 5 ms."""
+"""Pause after the reset; the chip needs 5 ms."""
 MODE_WAIT_NS = 1_000_000
-"""From a change of mode until it is checked; the oscillator takes 0.25 ms to start."""
+"""Pause between a change of mode and its check; the oscillator starts in 0.25 ms."""
 
 # Plain integers: members of IntFlag are slow to combine.
 _RX_DONE = int(Irq.RX_DONE)
 _TX_DONE = int(Irq.TX_DONE)
 _CRC_ERROR = int(Irq.PAYLOAD_CRC_ERROR)
-_ABSENT = 0xFF  # what an open MISO line reads as; no state of the chip has all flags set
+_ABSENT = 0xFF  # an open MISO line; no state of the chip has all flags set
 
 
 @dataclass(frozen=True, slots=True)
-class Arrival:
-    """A packet as the chip holds it.
+class RawPacket:
+    """A packet in the chip.
 
     Attributes
     ----------
     payload
-        Its bytes, right or wrong.
-    has_crc, crc_wrong
-        Whether the sender added a CRC, and whether it contradicts the bytes.
-    rssi_dbm, snr_db
-        Signal strength and signal-to-noise ratio.
+        With bit errors if ``crc_error``.
+    has_crc
+        Whether the sender added a CRC.
     """
 
     payload: bytes
     has_crc: bool
-    crc_wrong: bool
+    crc_error: bool
     rssi_dbm: float
     snr_db: float
 
 
 class Chip:
-    """An SX127x in LoRa mode. All methods raise :class:`~tsgt.errors.RadioError` when the bus fails.
-
-    Parameters
-    ----------
-    hal
-        Bus and pins.
-    clock
-        Times the reset.
-    settings
-        What it is set up with.
-    """
+    """An SX127x in LoRa mode. All methods raise :class:`~tsgt.errors.RadioError` when the bus fails."""
 
     def __init__(self, hal: Hal, clock: Clock, settings: LoRaSettings) -> None:
         self._hal = hal
@@ -88,9 +76,9 @@ class Chip:
         Raises
         ------
         RadioNotFoundError
-            It is not an SX1276/77/78/79, or there is none.
+            There is no chip, or it is not an SX1276/77/78/79.
         RadioError
-            A register does not keep its value.
+            A register does not read back as written.
         """
         self._hal.set_reset(low=True)
         await self._pause(RESET_LOW_NS)
@@ -109,15 +97,15 @@ class Chip:
         self.check_reception()
 
     def sleep(self) -> None:
-        """Fall silent and draw hardly any current."""
+        """Enter the mode with the lowest current."""
         self._write_mode(Mode.SLEEP)
 
     def enter_standby(self) -> None:
-        """Stop receiving or sending; a packet that has ended stays readable."""
+        """Stop receiving or sending; a received packet stays readable."""
         self._write_mode(Mode.STDBY)
 
     def enter_reception(self) -> None:
-        """Receive packet after packet; flags of what was before are gone."""
+        """Clear all flags and receive continuously."""
         self.enter_standby()
         self._tune(receive_frf(self._settings))
         self._registers.write(Register.IRQ_FLAGS, reg.ALL_IRQ_FLAGS)
@@ -125,28 +113,28 @@ class Chip:
         self._write_mode(Mode.RXCONTINUOUS)
 
     def check_reception(self) -> None:
-        """Check that the chip is in reception with our settings and takes what is written.
+        """Check that the chip receives with our settings and accepts writes.
 
-        A receiver that is deaf with all its registers alive cannot be told from silence on the air.
+        A receiver that fails with all its registers intact is indistinguishable from a quiet channel.
 
         Raises
         ------
         RadioError
-            It has reset itself, hangs, or is gone.
+            The chip was reset, hangs, or is disconnected.
         """
         self._registers.verify(self._op_mode(Mode.RXCONTINUOUS))
         self._registers.verify(RegisterValue(Register.SYNC_WORD, self._settings.sync_word))
-        # Nothing depends on this pointer between packets; a hung chip keeps its registers and looks well.
+        # This pointer is unused between packets; a hung chip keeps its registers and only fails a write.
         self._probe ^= 0xFF
         self._registers.write_verified(RegisterValue(Register.FIFO_ADDR_PTR, self._probe))
 
     def load(self, payload: bytes) -> None:
-        """Make ready for :meth:`send`, from standby; flags of what was before are gone.
+        """Clear all flags and load a packet for :meth:`send`, from standby.
 
         Raises
         ------
         RadioError
-            The chip did not take it.
+            The chip did not accept it.
         """
         self._tune(frf(self._settings.frequency_hz))
         self._registers.write(Register.IRQ_FLAGS, reg.ALL_IRQ_FLAGS)
@@ -157,19 +145,19 @@ class Chip:
         self._registers.verify(RegisterValue(Register.FIFO_ADDR_PTR, len(payload)))
 
     def send(self) -> None:
-        """Send the packet that was loaded, now; the chip returns to standby by itself."""
+        """Send the loaded packet now; the chip then returns to standby."""
         self._write_mode(Mode.TX)
 
     def packet_sent(self) -> bool:
         """Whether TxDone is set."""
         return bool(self._flags() & _TX_DONE)
 
-    def packet_waits(self) -> bool:
+    def packet_received(self) -> bool:
         """Whether RxDone is set."""
         return bool(self._flags() & _RX_DONE)
 
-    def take_packet(self) -> Arrival | None:
-        """Read the packet that waits, if there is one, and clear its flags."""
+    def read_packet(self) -> RawPacket | None:
+        """Read the received packet, if there is one, and clear its flags."""
         first = Register.FIFO_RX_CURRENT_ADDR
         status = self._registers.read_burst(first, Register.HOP_CHANNEL - first + 1)
 
@@ -186,10 +174,10 @@ class Chip:
             value(Register.PKT_SNR_VALUE),
             frequency_hz=self._settings.frequency_hz,
         )
-        return Arrival(
+        return RawPacket(
             payload=self._registers.read_burst(Register.FIFO, value(Register.RX_NB_BYTES)),
             has_crc=bool(value(Register.HOP_CHANNEL) & reg.CRC_ON_PAYLOAD),
-            crc_wrong=bool(flags & _CRC_ERROR),
+            crc_error=bool(flags & _CRC_ERROR),
             rssi_dbm=rssi_dbm,
             snr_db=snr_db,
         )
@@ -198,8 +186,8 @@ class Chip:
         version = self._registers.read(Register.VERSION)
         if version in {0x00, 0xFF}:
             raise RadioNotFoundError(
-                f"no radio answers (RegVersion reads 0x{version:02X}): check power and wiring, the NSS pin "
-                "(Dragino HAT: BCM 25), the reset pin, and that no overlay drives NSS or takes the SPI bus"
+                f"no radio responds (RegVersion reads 0x{version:02X}): check power and wiring, the NSS pin "
+                "(Dragino HAT: BCM 25), the reset pin, and that no overlay drives NSS or uses the SPI bus"
             )
         if version == reg.VERSION_SX1272:
             raise RadioNotFoundError(
@@ -208,7 +196,7 @@ class Chip:
             )
         if version not in {reg.VERSION_SX1276, *reg.VERSIONS_LIKE_SX1276}:
             raise RadioNotFoundError(
-                f"RegVersion reads 0x{version:02X}, not 0x12 as that of an SX1276/77/78/79: "
+                f"RegVersion reads 0x{version:02X}, not 0x12 as on an SX1276/77/78/79: "
                 "check the module, the wiring, and a lower spi_hz"
             )
         if version != reg.VERSION_SX1276:

@@ -1,4 +1,4 @@
-"""The bus and the pins of an SX127x behind one small protocol, and its back ends on a Raspberry Pi."""
+"""Hardware abstraction of an SX127x's bus and pins, and its backends on a Raspberry Pi."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ class Edge:
     Attributes
     ----------
     at_ns
-        When it came, on the clock that the driver was given (CLOCK_MONOTONIC).
+        On the driver's clock (CLOCK_MONOTONIC).
     lost
-        How many edges before it were seen by the hardware but could not be reported.
+        Number of edges before it that the hardware detected but could not report.
     """
 
     at_ns: int
@@ -37,15 +37,15 @@ EdgeCallback = Callable[[Edge], None]
 
 
 class Hal(Protocol):
-    """Bus and pins of one SX127x. Everything is called in the event loop's thread."""
+    """Bus and pins of one SX127x. All methods are called in the event loop's thread."""
 
     @property
     def stamp_sigma_ns(self) -> int:
-        """One sigma of the time stamps of edges, in ns."""
+        """One sigma of the edges' timestamps."""
         ...
 
     def transfer(self, data: bytes) -> bytes:
-        """Exchange bytes in one chip-select window; the answer is as long as what was sent.
+        """Exchange bytes in one chip-select window; as many are received as sent.
 
         Raises
         ------
@@ -59,34 +59,32 @@ class Hal(Protocol):
         ...
 
     def dio0(self) -> bool:
-        """Level of DIO0 at this moment."""
+        """Return the level of DIO0."""
         ...
 
     def on_dio0(self, callback: EdgeCallback) -> None:
-        """From now on call ``callback`` in the running event loop's thread for every rising edge of DIO0."""
+        """Call ``callback`` in the running event loop's thread for every further rising edge of DIO0."""
         ...
 
     def close(self) -> None:
-        """Let go of bus and pins."""
+        """Release bus and pins."""
         ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wiring:
-    """How the radio is connected; pins in BCM numbers.
+    """Connection of the radio; pins in BCM numbers.
 
     Attributes
     ----------
     backend
-        ``gpiod``: edges are stamped in the kernel; ``rpi-gpio``: RPi.GPIO or its stand-in rpi-lgpio.
+        ``gpiod``: the kernel timestamps edges; ``rpi-gpio``: RPi.GPIO or its replacement rpi-lgpio.
     spi_bus, spi_device
-        As in /dev/spidev<bus>.<device>.
+        /dev/spidev<bus>.<device>.
     spi_hz
-        SPI clock, at most 10 MHz (data sheet, SPI timing).
-    reset_pin, dio0_pin
-        NRESET and DIO0 of the radio.
+        At most 10 MHz (data sheet, SPI timing).
     nss_pin
-        Pin that is driven by hand as chip select; None where the SPI driver of the kernel does it.
+        Chip select driven as GPIO; None: by the kernel's SPI driver.
     gpio_chip
         Path such as /dev/gpiochip0; None: found by its label. ``gpiod`` only.
     """
@@ -106,7 +104,7 @@ class Wiring:
 
 
 DRAGINO_HAT = Wiring(reset_pin=17, dio0_pin=4, nss_pin=25)
-"""The Dragino LoRa/GPS HAT, whose chip select is on BCM 25 and not on CE0 or CE1."""
+"""The Dragino LoRa/GPS HAT has its chip select on BCM 25, not on CE0 or CE1."""
 
 
 def open_hal(wiring: Wiring) -> Hal:
@@ -117,7 +115,7 @@ def open_hal(wiring: Wiring) -> Hal:
     RadioNotFoundError
         There is no such SPI bus or GPIO chip.
     RadioError
-        A package is missing, the bus or a pin is taken, or permission is lacking.
+        A package is missing, the bus or a pin is in use, or permission is denied.
     """
     spi = _Spi(wiring)
     try:
@@ -129,7 +127,7 @@ def open_hal(wiring: Wiring) -> Hal:
 
 
 class _Pins(Protocol):
-    """What the two packages for pins have in common here."""
+    """Common interface of the two GPIO packages."""
 
     stamp_sigma_ns: int
 
@@ -145,7 +143,7 @@ class _Pins(Protocol):
 
 
 class _PiHal:
-    """The bus and the pins, joined where chip select is a pin that is driven by hand."""
+    """Bus and pins, with chip select as GPIO."""
 
     def __init__(self, spi: _Spi, pins: _Pins) -> None:
         self._spi = spi
@@ -195,11 +193,11 @@ def _busy(pin: int, role: str) -> RadioError:
 
 
 class _Spi:
-    """The SPI bus of the kernel, held for this process alone."""
+    """The kernel's SPI bus, locked by this process."""
 
     def __init__(self, wiring: Wiring) -> None:
         try:
-            import spidev  # noqa: PLC0415 (there is none but on a Pi)
+            import spidev  # noqa: PLC0415 (only on a Pi)
         except ImportError as error:
             raise RadioError(f"the Python package spidev is missing: {_INSTALL}") from error
         self.path = f"/dev/spidev{wiring.spi_bus}.{wiring.spi_device}"
@@ -217,7 +215,7 @@ class _Spi:
         except OSError as error:
             raise RadioError(f"{self.path} cannot be opened: {error}") from error
         try:
-            # Two programs on one radio would each see half of it; the kernel does not mind, so we do.
+            # Two programs on one radio would disturb each other, and the kernel allows it.
             fcntl.flock(self._bus.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
             self._bus.mode = 0
             self._bus.max_speed_hz = wiring.spi_hz
@@ -228,7 +226,7 @@ class _Spi:
             self.close()
             raise RadioError(f"{self.path} cannot be set to mode 0, {wiring.spi_hz} Hz: {error}") from error
         if wiring.nss_pin is not None:
-            with suppress(OSError):  # not every controller can leave its own chip select alone
+            with suppress(OSError):  # some controllers cannot disable their own chip select
                 self._bus.no_cs = True
 
     def transfer(self, data: bytes) -> bytes:
@@ -239,18 +237,18 @@ class _Spi:
 
 
 class _GpiodPins:
-    """Pins through the GPIO character device; the kernel stamps each edge in its interrupt handler."""
+    """Pins of the GPIO character device; the kernel timestamps each edge in its interrupt handler."""
 
     stamp_sigma_ns = 10_000
-    """From the edge to the stamp a Pi takes 2 to 10 us (facts of others; not measured by us)."""
+    """Interrupt latency of a Pi is 2 to 10 us (published figures; not measured by us)."""
 
     _EVENT_BUFFER = 64
     _CHIP_LABELS = ("pinctrl-bcm2835", "pinctrl-bcm2711", "pinctrl-rp1")
-    """Labels of the chip behind the pin header: Pi 0 to 3, 4, 5."""
+    """Labels of the pin header's chip: Pi 0 to 3, 4, 5."""
 
     def __init__(self, wiring: Wiring) -> None:
         try:
-            import gpiod  # noqa: PLC0415 (there is none but on a Pi)
+            import gpiod  # noqa: PLC0415 (only on a Pi)
         except ImportError as error:
             raise RadioError(f"the Python package gpiod is missing: {_INSTALL}") from error
         if not hasattr(gpiod, "request_lines"):
@@ -300,7 +298,7 @@ class _GpiodPins:
         except OSError as error:
             if error.errno == errno.EBUSY:
                 raise _busy(pin, role) from error
-            raise RadioError(f"BCM {pin} ({role}) cannot be had: {error}") from error
+            raise RadioError(f"BCM {pin} ({role}) is not available: {error}") from error
         stack.callback(request.release)
         return request
 
@@ -317,7 +315,7 @@ class _GpiodPins:
     def on_dio0(self, callback: EdgeCallback) -> None:
         def read_edges() -> None:
             for event in self._dio0.read_edge_events():
-                # Numbers count up by one for each edge of the line; a full buffer drops the oldest.
+                # The sequence number increments with each edge; a full buffer drops the oldest.
                 lost = event.line_seqno - self._last_seqno - 1
                 self._last_seqno = event.line_seqno
                 callback(Edge(event.timestamp_ns, lost))
@@ -331,13 +329,13 @@ class _GpiodPins:
 
 
 class _RpiGpioPins:
-    """Pins through RPi.GPIO or rpi-lgpio; edges are stamped in a thread of Python, when it gets to run."""
+    """Pins of RPi.GPIO or rpi-lgpio; a Python thread timestamps edges when it is scheduled."""
 
     stamp_sigma_ns = 1_000_000
 
     def __init__(self, wiring: Wiring) -> None:
         try:
-            from RPi import GPIO  # noqa: PLC0415 (there is none but on a Pi)
+            from RPi import GPIO  # noqa: PLC0415 (only on a Pi)
         except ImportError as error:
             raise RadioError(f"the Python package RPi.GPIO is missing: {_INSTALL}") from error
         except RuntimeError as error:
@@ -346,7 +344,7 @@ class _RpiGpioPins:
             ) from error
         self._gpio = GPIO
         self._nss_pin, self._reset_pin, self._dio0_pin = wiring.nss_pin, wiring.reset_pin, wiring.dio0_pin
-        GPIO.setwarnings(False)  # a program that was killed has left its pins set up
+        GPIO.setwarnings(False)  # a killed program leaves its pins configured
         GPIO.setmode(GPIO.BCM)
         with ExitStack() as stack:
             if self._nss_pin is not None:
@@ -358,12 +356,12 @@ class _RpiGpioPins:
     def _set_up(self, stack: ExitStack, pin: int, role: str, direction: int, **options: int) -> None:
         try:
             self._gpio.setup(pin, direction, **options)
-        except Exception as error:  # rpi-lgpio has a class of its own, which RPi.GPIO does not know
+        except Exception as error:  # rpi-lgpio raises its own class, unknown to RPi.GPIO
             if "busy" in str(error).lower():
                 raise _busy(pin, role) from error
             if "/dev/mem" in str(error) or "permission" in str(error).lower():
                 raise RadioError(_GPIO_GROUP) from error
-            raise RadioError(f"BCM {pin} ({role}) cannot be had: {error}") from error
+            raise RadioError(f"BCM {pin} ({role}) is not available: {error}") from error
         stack.callback(self._gpio.cleanup, pin)
 
     def set_nss(self, *, low: bool) -> None:
@@ -379,13 +377,13 @@ class _RpiGpioPins:
     def on_dio0(self, callback: EdgeCallback) -> None:
         loop = asyncio.get_running_loop()
 
-        def seen_in_thread(_channel: int) -> None:
+        def on_thread_edge(_channel: int) -> None:
             edge = Edge(time.monotonic_ns())
-            with suppress(RuntimeError):  # the loop has just been closed
+            with suppress(RuntimeError):  # the loop was closed
                 loop.call_soon_threadsafe(callback, edge)
 
         try:
-            self._gpio.add_event_detect(self._dio0_pin, self._gpio.RISING, callback=seen_in_thread)
+            self._gpio.add_event_detect(self._dio0_pin, self._gpio.RISING, callback=on_thread_edge)
         except RuntimeError as error:
             raise RadioError(
                 f"RPi.GPIO gets no interrupts ({error}), as on every kernel since 6.6: use gpiod or rpi-lgpio"

@@ -1,7 +1,4 @@
-"""What settings mean in registers of the SX127x, and what registers mean in dBm: arithmetic only.
-
-Reading and writing registers of an SX127x over its bus.
-"""
+"""Registers of an SX127x: settings as register values, access over the bus, and signal strength from register values."""
 
 from __future__ import annotations
 
@@ -19,26 +16,18 @@ if TYPE_CHECKING:
 
 FRF = (Register.FRF_MSB, Register.FRF_MID, Register.FRF_LSB)
 
-# Errata 2.3: register 0x2F, and how far above the carrier a narrow receiver has to be tuned.
+# Errata 2.3: register 0x2F, and the offset above the carrier to which a narrow receiver is tuned.
 _REG_2F = {7_800: 0x48, 10_400: 0x44, 15_600: 0x44, 20_800: 0x44, 31_250: 0x44, 41_700: 0x44}
 _REG_2F_WIDE = 0x40
 _RX_OFFSET_HZ = {7_800: 7_810, 10_400: 10_420, 15_600: 15_620, 20_800: 20_830, 31_250: 31_250, 41_700: 41_670}
 
-# Errata 2.1: lowest and highest carrier, and register 0x3A, for 500 kHz.
+# Errata 2.1: carrier range and register 0x3A for 500 kHz.
 _HIGH_BW_BANDS = ((862_000_000, 1_020_000_000, 0x64), (410_000_000, 525_000_000, 0x7F))
 
 
 @dataclass(frozen=True, slots=True)
 class RegisterValue:
-    """A value that a register has to keep.
-
-    Attributes
-    ----------
-    address, value
-        What to write where.
-    mask
-        The bits that must read back; the chip drives the others itself.
-    """
+    """A register and its value; ``mask`` has the bits that must read back, as the chip drives the others itself."""
 
     address: Register
     value: int
@@ -46,8 +35,8 @@ class RegisterValue:
 
 
 def op_mode(settings: LoRaSettings, mode: reg.Mode) -> int:
-    """Return RegOpMode for a mode: LoRa, with the low-frequency bit for the LF port."""
-    low = reg.LOW_FREQUENCY_MODE_ON if settings.frequency_hz < reg.LOWEST_HF_HZ else 0
+    """Return RegOpMode for a LoRa mode, with the low-frequency bit for the LF port."""
+    low = reg.LOW_FREQUENCY_MODE_ON if settings.frequency_hz < reg.MIN_HF_HZ else 0
     return reg.LONG_RANGE_MODE | low | mode
 
 
@@ -57,32 +46,22 @@ def frf(frequency_hz: int) -> bytes:
 
 
 def receive_frf(settings: LoRaSettings) -> bytes:
-    """Return RegFrf for reception: above the carrier for bandwidths below 62.5 kHz (errata 2.3)."""
+    """Return RegFrf for reception, which is above the carrier for bandwidths below 62.5 kHz (errata 2.3)."""
     return frf(settings.frequency_hz + _RX_OFFSET_HZ.get(settings.bandwidth_hz, 0))
 
 
 def register_values(settings: LoRaSettings) -> tuple[RegisterValue, ...]:
-    """Return every register that reception and transmission depend on, in the order of writing.
+    """Return the values of all registers for reception and transmission, in the order of writing, after a reset.
 
-    Meant for a chip fresh from a reset: what errata leave at its reset value is not in the list.
-
-    Parameters
-    ----------
-    settings
-        As asked for.
-
-    Returns
-    -------
-    tuple of RegisterValue
-        Without RegOpMode, and without the DIO mapping and the payload length of each packet.
+    RegOpMode and the payload length of each packet are excluded, as are registers that errata leave at the reset value.
     """
     values = [
         *map(RegisterValue, FRF, frf(settings.frequency_hz)),
         RegisterValue(Register.PA_RAMP, reg.PA_RAMP_40_US),
         *_power(settings.power_dbm),
-        # The gain is the AGC's.
+        # The AGC sets the gain.
         RegisterValue(Register.LNA, reg.LNA_GAIN_G1 | reg.LNA_BOOST_HF, 0xFF & ~reg.LNA_GAIN_MASK),
-        RegisterValue(Register.FIFO_TX_BASE_ADDR, 0x00),  # one packet at a time: each may have the whole FIFO
+        RegisterValue(Register.FIFO_TX_BASE_ADDR, 0x00),  # one packet at a time may use the whole FIFO
         RegisterValue(Register.FIFO_RX_BASE_ADDR, 0x00),
         RegisterValue(Register.IRQ_FLAGS_MASK, 0x00),
         *_modem(settings),
@@ -97,17 +76,15 @@ def register_values(settings: LoRaSettings) -> tuple[RegisterValue, ...]:
 
 
 def _power(power_dbm: int) -> tuple[RegisterValue, ...]:
-    """Return the three registers of the PA_BOOST pin, which belong together (section 5.4)."""
+    """Return the three registers of the PA_BOOST pin (section 5.4)."""
     if power_dbm == 20:
-        pa_dac, lowest_dbm, ocp_trim = reg.PA_DAC_20_DBM, 5, reg.OCP_TRIM_140_MA
+        pa_dac, min_dbm, ocp_trim = reg.PA_DAC_20_DBM, 5, reg.OCP_TRIM_140_MA
     else:
-        pa_dac, lowest_dbm, ocp_trim = reg.PA_DAC_DEFAULT, 2, reg.OCP_TRIM_100_MA
+        pa_dac, min_dbm, ocp_trim = reg.PA_DAC_DEFAULT, 2, reg.OCP_TRIM_100_MA
     return (
         RegisterValue(Register.OCP, reg.OCP_ON | ocp_trim),
         RegisterValue(Register.PA_DAC, pa_dac),
-        RegisterValue(
-            Register.PA_CONFIG, reg.PA_SELECT_BOOST | reg.MAX_POWER_MASK | (power_dbm - lowest_dbm)
-        ),
+        RegisterValue(Register.PA_CONFIG, reg.PA_SELECT_BOOST | reg.MAX_POWER_MASK | (power_dbm - min_dbm)),
     )
 
 
@@ -148,8 +125,8 @@ def _modem(settings: LoRaSettings) -> list[RegisterValue]:
 
 
 def _high_bandwidth(frequency_hz: int, *, wide: bool) -> list[RegisterValue]:
-    for lowest_hz, highest_hz, optimum in _HIGH_BW_BANDS:
-        if wide and lowest_hz <= frequency_hz <= highest_hz:
+    for min_hz, max_hz, optimum in _HIGH_BW_BANDS:
+        if wide and min_hz <= frequency_hz <= max_hz:
             return [
                 RegisterValue(Register.HIGH_BW_OPTIMIZE_1, 0x02),
                 RegisterValue(Register.HIGH_BW_OPTIMIZE_2, optimum),
@@ -158,47 +135,32 @@ def _high_bandwidth(frequency_hz: int, *, wide: bool) -> list[RegisterValue]:
 
 
 def packet_strength(pkt_rssi: int, pkt_snr: int, *, frequency_hz: int) -> tuple[float, float]:
-    """Strength of a packet from RegPktRssiValue and RegPktSnrValue (section 5.5.5).
+    """Return RSSI in dBm and SNR in dB of a packet from RegPktRssiValue and RegPktSnrValue (section 5.5.5).
 
-    Parameters
-    ----------
-    pkt_rssi, pkt_snr
-        As read, 0 to 255.
-    frequency_hz
-        Carrier; the two ports have different offsets.
-
-    Returns
-    -------
-    rssi_dbm, snr_db : float
-        Signal strength and signal-to-noise ratio.
+    The carrier selects the port, LF or HF, which have different offsets.
     """
-    offset_dbm = reg.RSSI_OFFSET_LF_DBM if frequency_hz < reg.LOWEST_HF_HZ else reg.RSSI_OFFSET_HF_DBM
+    offset_dbm = reg.RSSI_OFFSET_LF_DBM if frequency_hz < reg.MIN_HF_HZ else reg.RSSI_OFFSET_HF_DBM
     snr_db = (pkt_snr - 256 if pkt_snr > 127 else pkt_snr) / 4
-    # Below the noise the RSSI is that of the noise, and the signal lies SNR deeper.
+    # Below the noise the RSSI is that of the noise; the signal is lower by the SNR.
     rssi_dbm = offset_dbm + pkt_rssi * 16 / 15 if snr_db >= 0 else offset_dbm + pkt_rssi + snr_db
     return rssi_dbm, snr_db
 
 
 class RegisterAccess:
-    """Registers by address; each call is one chip-select window (section 2.2).
+    """Register access; each call is one chip-select window (section 2.2).
 
     All methods raise :class:`~tsgt.errors.RadioError` when the bus fails.
-
-    Parameters
-    ----------
-    hal
-        Bus of the chip.
     """
 
     def __init__(self, hal: Hal) -> None:
         self._hal = hal
 
     def read(self, address: int) -> int:
-        """Return one register."""
+        """Read one register."""
         return self.read_burst(address, 1)[0]
 
     def read_burst(self, address: int, count: int) -> bytes:
-        """Return ``count`` consecutive registers, or bytes of the FIFO, whose address stands still."""
+        """Read consecutive registers, or bytes of the FIFO, whose address does not increment."""
         return self._hal.transfer(bytes([address]) + bytes(count))[1:]
 
     def write(self, address: int, *values: int) -> None:
@@ -206,7 +168,7 @@ class RegisterAccess:
         self.write_burst(address, bytes(values))
 
     def write_burst(self, address: int, data: bytes) -> None:
-        """Write consecutive registers, or bytes into the FIFO."""
+        """Write consecutive registers, or bytes of the FIFO."""
         self._hal.transfer(bytes([reg.WRITE | address]) + data)
 
     def write_verified(self, register: RegisterValue) -> None:
@@ -215,18 +177,18 @@ class RegisterAccess:
         Raises
         ------
         RadioError
-            It reads differently.
+            It reads back differently.
         """
         self.write(register.address, register.value)
         self.verify(register)
 
     def verify(self, register: RegisterValue) -> None:
-        """Check that a register reads as it was written.
+        """Check that a register reads back as written.
 
         Raises
         ------
         RadioError
-            It does not.
+            It reads back differently.
         """
         actual = self.read(register.address)
         if (actual ^ register.value) & register.mask:

@@ -1,7 +1,7 @@
-"""Registers of the SX1276/77/78/79 in LoRa mode: addresses, then bit fields. Data only.
+"""Registers of the SX1276/77/78/79 in LoRa mode: addresses, then bit fields.
 
 Names and section numbers are those of the data sheet, Rev. 4 (March 2015); "errata" is Semtech's errata note for
-the chip. What neither names is called after its address.
+the chip. A register without a name is called by its address.
 """
 
 from __future__ import annotations
@@ -10,14 +10,14 @@ from enum import IntEnum, IntFlag
 
 
 class Register(IntEnum):
-    """Addresses; those from 0x0D to 0x3F are of the LoRa page."""
+    """Addresses; 0x0D to 0x3F are the LoRa page."""
 
     # Common to FSK and LoRa mode (section 6.1, table 41)
     FIFO = 0x00
     OP_MODE = 0x01
     FRF_MSB = 0x06
     FRF_MID = 0x07
-    FRF_LSB = 0x08  # the write that makes all three take effect
+    FRF_LSB = 0x08  # writing it applies all three
     PA_CONFIG = 0x09
     PA_RAMP = 0x0A
     OCP = 0x0B
@@ -131,7 +131,7 @@ DIO0_CAD_DONE = 0x80
 # --- RegVersion (section 6.4) ---------------------------------------------------------------------------------
 
 VERSION_SX1276 = 0x12
-VERSIONS_LIKE_SX1276 = frozenset({0x11, 0x13})  # not in the data sheet; RFM95 modules and clones have them
+VERSIONS_LIKE_SX1276 = frozenset({0x11, 0x13})  # not in the data sheet; read from RFM95 modules and clones
 VERSION_SX1272 = 0x22
 
 # --- RegIrqFlags, RegIrqFlagsMask (section 6.4) ---------------------------------------------------------------
@@ -202,5 +202,5 @@ INVERT_IQ_2_INVERTED = 0x19
 
 RSSI_OFFSET_HF_DBM = -157
 RSSI_OFFSET_LF_DBM = -164
-LOWEST_HF_HZ = 525_000_000
+MIN_HF_HZ = 525_000_000
 """Carriers from here on use the HF port."""

@@ -3,9 +3,8 @@ from __future__ import annotations
 import pytest
 
 from tsgt.radio import DirectCommand, MeasureCommand, TrackCommand
-from tsgt.radio.classic import MeasurementMessage
+from tsgt.radio.classic import ClassicStation, MeasurementMessage
 from tsgt.radio.classic.messages import no_measurement_yet
-from tsgt.radio.classic.transactions import ClassicStation
 
 NONE_YET = no_measurement_yet(1).to_bytes()
 SOME = MeasurementMessage(
@@ -126,7 +125,7 @@ def test_requests_in_direct_mode_are_single_measurements(station: ClassicStation
     station.executed(DirectCommand(), ok=True)
     for _ in range(2):
         assert station.received(b"t1", 6) == MeasureCommand()
-        assert station.shot(SOME) == SOME.to_bytes()
+        assert station.single_measured(SOME) == SOME.to_bytes()
 
 
 def test_one_order_at_a_time(station: ClassicStation) -> None:
@@ -139,5 +138,5 @@ def test_one_order_at_a_time(station: ClassicStation) -> None:
     station.executed(DirectCommand(), ok=True)
     station.received(b"t1", 8)
     assert [station.received(payload, 9) for payload in (b"t1", b"d1", b"n1")] == [None] * 3
-    station.shot(SOME)
+    station.single_measured(SOME)
     assert station.received(b"d1", 10) == b"dOk"

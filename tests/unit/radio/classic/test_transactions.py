@@ -6,11 +6,10 @@ from dataclasses import dataclass, field
 import pytest
 from harness.radios import MS, PAPER
 
-from tsgt.radio.classic import Synchronisation
+from tsgt.radio.classic import ClassicStation, LinkTiming, Synchronisation
 from tsgt.radio.classic.messages import TimeReply
-from tsgt.radio.classic.transactions import ClassicStation, Timing
 
-TIMING = Timing.of(PAPER, 250 * MS)
+TIMING = LinkTiming.from_settings(PAPER, 250 * MS)
 PING_NS = TIMING.airtime_ns(2)
 FORWARD_NS = PING_NS + TIMING.rx_done_ns
 TURNAROUND_NS = 3 * MS
@@ -73,7 +72,7 @@ class Link:
                 continue
             for payload, after_ns in sorted(exchange.replies, key=lambda reply: reply[1]):
                 received_ns = exchange.sent_ns + after_ns
-                if turn.replied(
+                if turn.accept_reply(
                     payload, sent_ns=exchange.sent_ns, received_ns=received_ns, exact=exchange.exact
                 ):
                     self._now_ns = received_ns + MS
@@ -93,7 +92,7 @@ def test_four_messages_a_cycle() -> None:
     link, turn = Link(), Synchronisation(1, 2, TIMING)
     link.run(turn)
     assert link.sent == [b"p1", b"e1", b"s1", b"e1", b"s1", b"c1", b"c1"]
-    assert (turn.answered, turn.unanswered) == (True, 0)
+    assert (turn.has_reply, turn.missed_replies) == (True, 0)
 
 
 def test_a_sample_has_what_is_known() -> None:
@@ -106,7 +105,7 @@ def test_a_sample_has_what_is_known() -> None:
 
 def test_a_known_delay_of_the_stamp_is_taken_off() -> None:
     """A station that polls stamps late, and the master is told by how much."""
-    link, turn = Link(), Synchronisation(1, 1, TIMING, stamp_delay_ns=2 * MS)
+    link, turn = Link(), Synchronisation(1, 1, TIMING, timestamp_delay_ns=2 * MS)
     link.late_ns = 2 * MS
     link.run(turn)
     assert _offsets_ns(turn) == [OFFSET_NS]
@@ -121,7 +120,7 @@ def test_a_silent_station_is_given_up() -> None:
     link, turn = Link(deaf), Synchronisation(1, 50, TIMING)
     link.run(turn)
     assert link.sent == [b"p1", b"e1", b"p1", b"s1", b"p1", b"s1", b"c1", b"c1"]
-    assert (turn.answered, turn.unanswered, turn.samples) == (False, 3, [])
+    assert (turn.has_reply, turn.missed_replies, turn.samples) == (False, 3, [])
 
 
 def test_a_lost_ping_is_made_up_for() -> None:
@@ -146,7 +145,7 @@ def test_a_lost_stamp_is_asked_for_again() -> None:
     link, turn = Link(after=lossy), Synchronisation(1, 1, TIMING)
     link.run(turn)
     assert link.sent == [b"p1", b"e1", b"s1", b"s1", b"c1", b"c1"]
-    assert turn.unanswered == 1
+    assert turn.missed_replies == 1
     assert _offsets_ns(turn) == [OFFSET_NS]
 
 
@@ -291,7 +290,7 @@ def test_a_clock_that_is_set_all_the_time_has_no_offset() -> None:
     turn = Synchronisation(1, 5, TIMING)
     link.run(turn)
     assert turn.samples == []
-    assert turn.answered
+    assert turn.has_reply
 
 
 def test_late_stamps_agree_with_early_ones() -> None:
@@ -354,7 +353,7 @@ def test_a_silence_that_no_sample_has_followed_is_told(
     link, turn = Link(unheard_there, lost_here), Synchronisation(1, 5, TIMING)
     link.run(turn)
     assert len(turn.samples) == samples
-    assert turn.silence_ns / MS == pytest.approx(silence_ms, abs=40)
+    assert turn.longest_silence_ns / MS == pytest.approx(silence_ms, abs=40)
 
 
 def test_a_sample_that_is_alone_does_not_count() -> None:
@@ -369,7 +368,7 @@ def test_a_sample_that_is_alone_does_not_count() -> None:
     link, turn = Link(played_back), Synchronisation(1, 5, TIMING)
     link.run(turn)
     assert turn.samples == []
-    assert turn.answered
+    assert turn.has_reply
 
 
 @pytest.mark.parametrize("asked", [b"s1", b"e1"])

@@ -4,10 +4,18 @@ import pytest
 from harness.radios import MS, PAPER
 
 from tsgt.radio import LoRaSettings
-from tsgt.radio.classic import CommandMessage, MeasurementMessage, CommandTransaction, Poll, Shot
-from tsgt.radio.classic.transactions import Request, Timing, Turn
+from tsgt.radio.classic import (
+    CommandMessage,
+    CommandTransaction,
+    LinkTiming,
+    MeasurementMessage,
+    Poll,
+    Request,
+    SingleMeasurementPoll,
+    Transaction,
+)
 
-TIMING = Timing.of(PAPER, 250 * MS)
+TIMING = LinkTiming.from_settings(PAPER, 250 * MS)
 SOME = MeasurementMessage(
     station=1,
     status=0,
@@ -32,7 +40,7 @@ def test_slow_replies_are_waited_for(spreading_factor: int) -> None:
     settings = LoRaSettings(
         frequency_hz=905_000_000, spreading_factor=spreading_factor, bandwidth_hz=250_000, coding_rate=6
     )
-    timing = Timing.of(settings, 250 * MS)
+    timing = LinkTiming.from_settings(settings, 250 * MS)
     assert timing.timeout_ns(34) >= timing.airtime_ns(34) + timing.rx_done_ns + 100 * MS
 
 
@@ -40,9 +48,9 @@ def test_a_poll_asks_once() -> None:
     """A request, its answer, and the turn is over."""
     poll = Poll(1, TIMING)
     assert poll.request() == Request(b"t1", 250 * MS)
-    assert not poll.answered
+    assert not poll.has_reply
     assert _reply(poll, SOME.to_bytes())
-    assert (poll.answered, poll.message, poll.request()) == (True, SOME, None)
+    assert (poll.has_reply, poll.message, poll.request()) == (True, SOME, None)
 
 
 def test_a_poll_without_answer_is_over() -> None:
@@ -50,7 +58,7 @@ def test_a_poll_without_answer_is_over() -> None:
     poll = Poll(1, TIMING)
     poll.request()
     poll.timed_out()
-    assert (poll.answered, poll.request()) == (False, None)
+    assert (poll.has_reply, poll.request()) == (False, None)
 
 
 @pytest.mark.parametrize(
@@ -61,12 +69,12 @@ def test_a_poll_waits_for_its_own_station(payload: bytes) -> None:
     poll = Poll(1, TIMING)
     poll.request()
     assert not _reply(poll, payload)
-    assert not poll.answered
+    assert not poll.has_reply
 
 
 def test_a_single_measurement_has_time() -> None:
     """The instrument takes seconds; the wait is longer than that."""
-    shot = Shot(1, TIMING, 20_000 * MS)
+    shot = SingleMeasurementPoll(1, TIMING, 20_000 * MS)
     request = shot.request()
     assert request is not None
     assert (request.payload, request.reply_timeout_ns) == (b"t1", 20_250 * MS)
@@ -104,5 +112,5 @@ def test_an_order_waits_for_its_own_answer(payload: bytes) -> None:
     assert (turn.ok, turn.request()) == (None, None)
 
 
-def _reply(turn: Turn, payload: bytes) -> bool:
-    return turn.replied(payload, sent_ns=0, received_ns=200 * MS, exact=True)
+def _reply(turn: Transaction, payload: bytes) -> bool:
+    return turn.accept_reply(payload, sent_ns=0, received_ns=200 * MS, exact=True)

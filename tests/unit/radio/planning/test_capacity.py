@@ -7,16 +7,16 @@ from typing import Any
 import pytest
 
 from tsgt.radio import LoRaSettings
-from tsgt.radio.classic.transactions import Timing
-from tsgt.radio.planning import Cycle, Load, classic_cycle, superframe_cycle
+from tsgt.radio.classic import LinkTiming
+from tsgt.radio.planning import CycleEstimate, TrafficLoad, classic_cycle, superframe_cycle
 from tsgt.radio.superframe import FrameTiming
 
 
-def classic(stations: int = 3, loss: float = 0.0, *, rate_hz: float = 2.5, **settings: Any) -> Cycle:
+def classic(stations: int = 3, loss: float = 0.0, *, rate_hz: float = 2.5, **settings: Any) -> CycleEstimate:
     """Plan the paper's protocol, as a master runs it that nothing else is said to."""
     return classic_cycle(
-        Load(stations=stations, rate_hz=rate_hz, loss=loss),
-        Timing.of(modem(**settings), 250_000_000),
+        TrafficLoad(stations=stations, rate_hz=rate_hz, loss=loss),
+        LinkTiming.from_settings(modem(**settings), 250_000_000),
         resync_cycles=5,
         resync_interval_ns=300_000_000_000,
     )
@@ -29,12 +29,14 @@ def superframe(
     phase_lock: bool = True,
     start_jitter_ns: int = 5_000_000,
     **settings: Any,
-) -> Cycle:
+) -> CycleEstimate:
     """Plan the superframe likewise."""
-    timing = FrameTiming.stated(
-        modem(**settings), start_jitter_ns=start_jitter_ns, turn_round_ns=8_000_000, clock_error_ppm=100
+    timing = FrameTiming.from_tolerances(
+        modem(**settings), start_jitter_ns=start_jitter_ns, turnaround_ns=8_000_000, clock_error_ppm=100
     )
-    return superframe_cycle(Load(stations=stations, rate_hz=2.5, loss=loss), timing, phase_lock=phase_lock)
+    return superframe_cycle(
+        TrafficLoad(stations=stations, rate_hz=2.5, loss=loss), timing, phase_lock=phase_lock
+    )
 
 
 def modem(**settings: Any) -> LoRaSettings:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from tsgt.errors import RadioSettingsError
-from tsgt.radio.planning import LOWEST_DBM, REGIONS, preset_power_dbm
-from tsgt.radio.planning.regulations import HIGHEST_DBM
+from tsgt.radio.planning import MIN_POWER_DBM, REGIONS, preset_power_dbm
+from tsgt.radio.planning.regulations import MAX_PRESET_DBM
 
 
 @pytest.mark.parametrize(
@@ -16,7 +16,7 @@ from tsgt.radio.planning.regulations import HIGHEST_DBM
         ("EU868", 869_525_000, 250_000, 17),
         ("EU433", 433_900_000, 250_000, 10),
         ("US915", 905_000_000, 500_000, 17),
-        ("CA915", 905_000_000, 250_000, LOWEST_DBM),
+        ("CA915", 905_000_000, 250_000, MIN_POWER_DBM),
     ],
 )
 def test_a_channel_has_its_power(region: str, frequency_hz: int, bandwidth_hz: int, power_dbm: int) -> None:
@@ -37,4 +37,4 @@ def test_a_channel_outside_is_refused(region: str, frequency_hz: int, bandwidth_
 def test_no_preset_is_beyond_the_chip() -> None:
     """Presets stay within what the chip may do all the time."""
     for bands in REGIONS.values():
-        assert all(LOWEST_DBM <= band.power_dbm <= HIGHEST_DBM for band in bands)
+        assert all(MIN_POWER_DBM <= band.power_dbm <= MAX_PRESET_DBM for band in bands)

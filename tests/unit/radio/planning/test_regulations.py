@@ -8,12 +8,12 @@ import pytest
 
 from tsgt.errors import RadioSettingsError
 from tsgt.radio import LoRaSettings
-from tsgt.radio.planning import DIPOLE_DBI, Use, exceeded
+from tsgt.radio.planning import DIPOLE_DBI, ChannelUse, violations
 
 
 def use(
     *, duty: float = 0.005, master_duty: float = 0.001, gain_dbi: float = DIPOLE_DBI, **settings: Any
-) -> Use:
+) -> ChannelUse:
     """Return a use that keeps to most limits in Europe, or another."""
     usual = {
         "frequency_hz": 869_525_000,
@@ -22,25 +22,25 @@ def use(
         "coding_rate": 6,
         "power_dbm": 14,
     }
-    return Use(LoRaSettings(**{**usual, **settings}), gain_dbi, master_duty, duty)
+    return ChannelUse(LoRaSettings(**{**usual, **settings}), gain_dbi, master_duty, duty)
 
 
 def test_without_a_region_only_the_chip_counts() -> None:
     """Where nothing is said of the place, nothing can be said of its law."""
-    assert exceeded(use(duty=1.0), None, []) == []
+    assert violations(use(duty=1.0), None, []) == []
 
 
 @pytest.mark.parametrize(("duty", "master_duty"), [(0.02, 0.001), (0.001, 0.02)])
 def test_20_dbm_for_more_than_a_hundredth_of_the_time_is_too_much(duty: float, master_duty: float) -> None:
     """It is the chip's limit, whoever transmits that much, and 17 dBm comply."""
-    (text,) = exceeded(use(power_dbm=20, duty=duty, master_duty=master_duty), None, [])
-    assert "the chip bears 20 dBm for 1 % of the time" in text
+    (text,) = violations(use(power_dbm=20, duty=duty, master_duty=master_duty), None, [])
+    assert "the chip allows 20 dBm for 1 % of the time" in text
     assert text.endswith("Would comply: 17 dBm")
 
 
 def test_20_dbm_for_less_is_allowed() -> None:
     """The data sheet's exception."""
-    assert exceeded(use(power_dbm=20), None, []) == []
+    assert violations(use(power_dbm=20), None, []) == []
 
 
 @pytest.mark.parametrize(
@@ -52,21 +52,21 @@ def test_europe_limits_the_duty_cycle(frequency_hz: int, allowed: float) -> None
     region = "EU433" if frequency_hz < 500_000_000 else "EU868"
     power_dbm = 10 if region == "EU433" else 14
     settings = {"frequency_hz": frequency_hz, "power_dbm": power_dbm}
-    assert exceeded(use(duty=allowed, master_duty=0, **settings), region, []) == []
-    (text,) = exceeded(use(duty=1.01 * allowed, master_duty=0, **settings), region, [])
+    assert violations(use(duty=allowed, master_duty=0, **settings), region, []) == []
+    (text,) = violations(use(duty=1.01 * allowed, master_duty=0, **settings), region, [])
     assert f"may transmit for {100 * allowed:g} % of any hour" in text
 
 
 def test_a_channel_in_two_bands_keeps_to_the_stricter() -> None:
     """Across 865 MHz both limits count; only that of 0.1 % is exceeded."""
-    (text,) = exceeded(use(frequency_hz=865_000_000), "EU868", [])
+    (text,) = violations(use(frequency_hz=865_000_000), "EU868", [])
     assert "863 to 865 MHz" in text
 
 
 def test_settings_that_comply_are_named() -> None:
     """The first of the others that keeps to the limit is told, and the band without a limit."""
     others = [use(duty=0.5), use(duty=0.09, spreading_factor=8), use(duty=0.05, spreading_factor=7)]
-    (text,) = exceeded(use(duty=0.24), "EU868", others)
+    (text,) = violations(use(duty=0.24), "EU868", others)
     assert (
         "Would comply: SF 8 with 4/6, 9 % instead of 24 %; 869.7 to 870 MHz with at most 7 dBm e.r.p." in text
     )
@@ -75,13 +75,13 @@ def test_settings_that_comply_are_named() -> None:
 def test_little_power_has_no_duty_limit_in_one_band() -> None:
     """5 mW between 869.7 and 870 MHz are allowed all the time, more is not."""
     settings = {"frequency_hz": 869_850_000, "duty": 0.5}
-    assert exceeded(use(power_dbm=7, **settings), "EU868", []) == []
-    assert len(exceeded(use(power_dbm=8, **settings), "EU868", [])) == 1
+    assert violations(use(power_dbm=7, **settings), "EU868", []) == []
+    assert len(violations(use(power_dbm=8, **settings), "EU868", [])) == 1
 
 
 def test_europe_limits_the_power_with_the_antenna() -> None:
     """What an antenna gains over a dipole comes off the power."""
-    (text,) = exceeded(use(frequency_hz=868_100_000, gain_dbi=8.15), "EU868", [])
+    (text,) = violations(use(frequency_hz=868_100_000, gain_dbi=8.15), "EU868", [])
     assert "14 dBm into 8.15 dBi are 20.0. Would comply: 6.0 dB less power or gain" in text
 
 
@@ -89,24 +89,24 @@ def test_europe_limits_the_power_with_the_antenna() -> None:
 def test_north_america_allows_little_on_a_fixed_narrow_channel(region: str, law: str) -> None:
     """The paper's 250 kHz may radiate -1.25 dBm; each region names its own rule, and 500 kHz comply."""
     channel = {"frequency_hz": 905_000_000, "bandwidth_hz": 250_000, "duty": 0.3}
-    (text,) = exceeded(use(**channel, power_dbm=17), region, [])
+    (text,) = violations(use(**channel, power_dbm=17), region, [])
     assert law in text
     assert "a bandwidth of 500 kHz, then up to 30 dBm" in text
     assert "2 dBm, the least that the chip gives, and 5.4 dB of attenuation" in text
-    assert exceeded(use(**channel, power_dbm=2, gain_dbi=-3.25), region, []) == []
-    (text,) = exceeded(use(**channel, power_dbm=17, gain_dbi=-10), region, [])
+    assert violations(use(**channel, power_dbm=2, gain_dbi=-3.25), region, []) == []
+    (text,) = violations(use(**channel, power_dbm=17, gain_dbi=-10), region, [])
     assert "8.2 dB less power" in text
 
 
 def test_north_america_allows_much_on_a_wide_channel() -> None:
     """500 kHz may have 30 dBm into 6 dBi, and so much less into more."""
     channel = {"frequency_hz": 905_000_000, "bandwidth_hz": 500_000, "duty": 0.3}
-    assert exceeded(use(**channel, power_dbm=17, gain_dbi=6), "US915", []) == []
-    (text,) = exceeded(use(**channel, power_dbm=17, gain_dbi=21), "US915", [])
+    assert violations(use(**channel, power_dbm=17, gain_dbi=6), "US915", []) == []
+    (text,) = violations(use(**channel, power_dbm=17, gain_dbi=21), "US915", [])
     assert "at most 15 dBm; it is 17 dBm. Would comply: 2.0 dB less power or gain" in text
 
 
 def test_a_channel_outside_the_bands_is_refused() -> None:
     """There is no limit to hold it against."""
     with pytest.raises(RadioSettingsError, match="not within a band"):
-        exceeded(use(frequency_hz=905_000_000), "EU868", [])
+        violations(use(frequency_hz=905_000_000), "EU868", [])

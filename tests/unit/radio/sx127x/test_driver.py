@@ -11,7 +11,7 @@ from structlog.testing import capture_logs
 from tsgt.errors import RadioError, RadioSettingsError
 from tsgt.radio import BANDWIDTHS_HZ, LoRaSettings, airtime_us
 from tsgt.radio.sx127x import Register
-from tsgt.radio.sx127x.driver import QUEUE_PACKETS, State
+from tsgt.radio.sx127x.driver import QUEUE_CAPACITY, State
 from tsgt.radio.sx127x.register_io import FRF, receive_frf, register_values
 from tsgt.simulation.lora.frames import Frame, Modulation
 
@@ -67,7 +67,7 @@ async def test_packet_carries_its_strength() -> None:
 async def test_weak_packet_carries_its_strength() -> None:
     """Below the noise the RSSI is corrected by the SNR."""
     async with bench() as b:
-        b.air.link.attenuate("here", "there", 14 - 80 + 119.5)
+        b.air.link.set_attenuation("here", "there", 14 - 80 + 119.5)
         await b.here.radio.transmit(b"hello")
         packet = await b.there.radio.receive()
     assert packet.snr_db == pytest.approx(-119.5 + 113.5, abs=0.3)
@@ -218,7 +218,7 @@ async def test_packet_that_ends_just_before_a_transmission_is_kept(edge_is_lost:
     Its edge is waited for, so that it is counted as lost only if it is.
     """
     async with bench() as b:
-        b.here.hal.lose_edges(int(edge_is_lost), counted=False)
+        b.here.hal.drop_edges(int(edge_is_lost), counted=False)
         await b.there.radio.transmit(b"hello")
         b.timeline.advance(2 * MS)  # RxDone, while the event loop does other things
         await b.here.radio.transmit(b"answer")
@@ -271,7 +271,7 @@ async def test_full_queue_drops_the_oldest() -> None:
     """When nobody receives, the newest packets are kept and the others counted and announced."""
     async with bench(replace(PAPER, spreading_factor=7)) as b:
         with capture_logs() as logs:
-            for number in range(QUEUE_PACKETS + 2):
+            for number in range(QUEUE_CAPACITY + 2):
                 await b.here.radio.transmit(bytes([number]))
             await b.clock.sleep_until(b.clock.monotonic_ns() + 10 * MS)
         assert (await b.there.radio.receive()).payload == bytes([2])
@@ -340,7 +340,7 @@ async def test_radio_that_was_not_started_sends_nothing() -> None:
     """Sending before the start fails and says why."""
     async with bench() as b:
         side = make_side(b.air, "third")
-        with pytest.raises(RadioError, match="has not been started"):
+        with pytest.raises(RadioError, match="down: not started"):
             await side.radio.transmit(b"hello")
 
 
@@ -353,7 +353,7 @@ async def test_closed_radio_is_asleep() -> None:
         assert sending.done()
         assert b.here.register(Register.OP_MODE) == 0x80
         assert (await b.there.radio.receive()).payload == b"hello"
-        with pytest.raises(RadioError, match="has been closed"):
+        with pytest.raises(RadioError, match="down: closed"):
             await b.here.radio.transmit(b"hello")
 
 

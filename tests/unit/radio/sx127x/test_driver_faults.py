@@ -11,7 +11,7 @@ from structlog.testing import capture_logs
 
 from tsgt.errors import RadioError, RadioNotFoundError, RadioTimeoutError
 from tsgt.radio.sx127x import Edge, Register, SX127x
-from tsgt.radio.sx127x.driver import RETRY_NS, State
+from tsgt.radio.sx127x.driver import MAX_RETRY_DELAY_NS, State
 from tsgt.simulation.kernel import VirtualClock
 from tsgt.simulation.lora import Air, LinkModel
 
@@ -70,7 +70,7 @@ class FixedRegisters:
 async def test_missing_chip_is_named_at_the_start(level: bool) -> None:  # noqa: FBT001 (a parameter)
     """A bus on which nothing answers, 0x00 or 0xFF, ends the start with what to check."""
     side = make_side(new_air(), "here")
-    side.chip.lose_bus(level)
+    side.chip.disconnect_bus(level)
     with pytest.raises(RadioNotFoundError, match=r"wiring, the NSS pin .* overlay"):
         await side.radio.start(PAPER)
     await side.radio.close()
@@ -123,7 +123,7 @@ async def test_packet_without_edge_is_found(counted: bool) -> None:  # noqa: FBT
     """A packet whose edge is lost is found within 100 ms, and its stamp covers what really happened."""
     async with bench() as b:
         await wait_ms(b, 1000)
-        b.there.hal.lose_edges(1, counted=counted)
+        b.there.hal.drop_edges(1, counted=counted)
         sent = await b.here.radio.transmit(b"hello")
         packet = await b.there.radio.receive()
         truth_ns = sent.done_at_ns + 0.76 * 2_048_000 - 67_000
@@ -137,8 +137,8 @@ async def test_packet_without_edge_is_found(counted: bool) -> None:  # noqa: FBT
 async def test_dio0_that_is_not_connected_costs_only_time_stamps() -> None:
     """Without any edges packets still pass, each is counted, and no stamp is worse than the polling."""
     async with bench() as b:
-        b.here.hal.lose_edges(1000, counted=False)
-        b.there.hal.lose_edges(1000, counted=False)
+        b.here.hal.drop_edges(1000, counted=False)
+        b.there.hal.drop_edges(1000, counted=False)
         for _ in range(10):
             await b.here.radio.transmit(b"hello")
             assert (await b.there.radio.receive()).stamp_sigma_ns <= 30 * MS
@@ -159,7 +159,7 @@ async def test_edge_that_is_on_its_way_is_not_taken_as_lost() -> None:
 async def test_lost_edge_of_a_transmission_is_noticed() -> None:
     """A TxDone without edge is found a few ms later; its stamp is computed and says that it is less certain."""
     async with bench() as b:
-        b.here.hal.lose_edges(1, counted=False)
+        b.here.hal.drop_edges(1, counted=False)
         sent = await b.here.radio.transmit(bytes(34))
         assert b.clock.monotonic_ns() - sent.done_at_ns <= 6 * MS
         true_done_ns = sent.started_at_ns + 139_776_000 + 247_000
@@ -192,7 +192,7 @@ async def test_stale_edge_is_ignored() -> None:
 async def test_stale_edge_does_not_stamp_the_end_of_a_transmission() -> None:
     """An edge from before a transmission, handed over after its end, is not taken for its TxDone."""
     async with bench() as b:
-        b.here.hal.lose_edges(1, counted=False)
+        b.here.hal.drop_edges(1, counted=False)
         start_ns = b.clock.monotonic_ns()
         sending = asyncio.create_task(b.here.radio.transmit(bytes(34)))
         await wait_ms(b, 141)
@@ -207,7 +207,7 @@ async def test_edge_that_is_handled_too_late_gives_a_wide_stamp() -> None:
     Its stamp must then not claim the first one's edge.
     """
     async with bench() as b:
-        b.there.hal.lose_edges(1, counted=False)
+        b.there.hal.drop_edges(1, counted=False)
         async with b.there.radio._lock:  # the watch is part of the host that is away
             first = await b.here.radio.transmit(b"first")
             sent = await b.here.radio.transmit(b"second")
@@ -226,7 +226,7 @@ async def test_edge_that_is_handled_too_late_gives_a_wide_stamp() -> None:
 async def test_transmission_that_does_not_end_resets_the_chip() -> None:
     """Without TxDone the call fails 50 ms after the packet's end; the radio is reset and works again at once."""
     async with bench() as b:
-        b.here.chip.lose_tx_done()
+        b.here.chip.drop_tx_done()
         start_ns = b.clock.monotonic_ns()
         with capture_logs() as logs, pytest.raises(RadioTimeoutError, match="34 bytes"):
             await b.here.radio.transmit(bytes(34))
@@ -246,7 +246,7 @@ async def test_radio_timeout_is_a_timeout_error() -> None:
 async def test_chip_that_resets_itself_is_set_up_again() -> None:
     """After a dip of the supply the radio works again within 100 ms and the time of a reset."""
     async with bench() as b:
-        b.here.chip.reset_itself()
+        b.here.chip.power_on_reset()
         await wait_ms(b, 120)
         assert b.here.radio.statistics.resets == 1
         await assert_both_ways(b)
@@ -257,7 +257,7 @@ async def test_chip_that_resets_itself_while_sending_is_set_up_again() -> None:
     async with bench() as b:
         sending = asyncio.create_task(b.here.radio.transmit(bytes(34)))
         await wait_ms(b, 50)
-        b.here.chip.reset_itself()
+        b.here.chip.power_on_reset()
         with pytest.raises(RadioTimeoutError):
             await sending
         await assert_both_ways(b)
@@ -286,7 +286,7 @@ async def test_chip_that_hangs_while_sending_is_reset() -> None:
 async def test_chip_that_hangs_with_a_packet_is_reset() -> None:
     """A packet that cannot be taken off the chip is a fault, not a stream of packets."""
     async with bench() as b:
-        b.there.hal.lose_edges(1, counted=False)
+        b.there.hal.drop_edges(1, counted=False)
         await b.here.radio.transmit(b"hello")
         await wait_ms(b, 2)
         assert b.there.chip.dio(0)
@@ -309,7 +309,7 @@ async def test_changed_sync_word_is_noticed() -> None:
 async def test_missing_chip_delivers_no_packets() -> None:
     """All flags set is what an open line reads as, not a packet with a wrong CRC."""
     async with bench() as b:
-        b.here.chip.lose_bus(level=True)
+        b.here.chip.disconnect_bus(level=True)
         b.here.radio._on_edge(Edge(b.clock.monotonic_ns()))
         with pytest.raises(RadioError):
             await b.here.radio.transmit(b"hello")
@@ -321,12 +321,12 @@ async def test_lost_bus_is_survived(level: bool) -> None:  # noqa: FBT001 (a par
     """While nothing answers, sending fails with the reason; when the bus is back, so is the radio."""
     async with bench() as b:
         with capture_logs() as logs:
-            b.here.chip.lose_bus(level)
+            b.here.chip.disconnect_bus(level)
             await wait_ms(b, 60_000)
-            with pytest.raises(RadioError, match="the radio is down: no radio answers"):
+            with pytest.raises(RadioError, match="the radio is down: no radio responds"):
                 await b.here.radio.transmit(b"hello")
-            b.here.chip.restore_bus()
-            await wait_ms(b, RETRY_NS[1] / MS + 100)
+            b.here.chip.reconnect_bus()
+            await wait_ms(b, MAX_RETRY_DELAY_NS / MS + 100)
         assert [entry["event"] for entry in logs] == ["radio_fault", "radio_unreachable", "radio_recovered"]
         assert b.here.radio.statistics.resets < 30
         assert b.here.radio.statistics.received == 0
@@ -339,11 +339,11 @@ async def test_bus_lost_while_sending_is_survived(level: bool) -> None:  # noqa:
     async with bench() as b:
         sending = asyncio.create_task(b.here.radio.transmit(bytes(34)))
         await wait_ms(b, 50)
-        b.here.chip.lose_bus(level)
+        b.here.chip.disconnect_bus(level)
         with pytest.raises(RadioTimeoutError):
             await sending
         assert b.here.radio.state is State.DOWN
-        b.here.chip.restore_bus()
+        b.here.chip.reconnect_bus()
         await wait_ms(b, 500)
         await b.there.radio.receive()
         await assert_both_ways(b)
@@ -358,7 +358,7 @@ async def test_bus_that_fails_is_survived() -> None:
             await wait_ms(b, 1000)
             with pytest.raises(RadioError, match="transfer failed"):
                 await b.there.radio.transmit(b"hello")
-        await wait_ms(b, RETRY_NS[1] / MS)
+        await wait_ms(b, MAX_RETRY_DELAY_NS / MS)
         await assert_both_ways(b)
 
 
@@ -370,11 +370,11 @@ def failing_transfer(_data: bytes) -> bytes:
 async def test_failed_change_of_settings_is_tried_again() -> None:
     """Settings that a chip does not take when asked come into force when it answers again."""
     async with bench() as b:
-        b.here.chip.lose_bus(level=True)
+        b.here.chip.disconnect_bus(level=True)
         faster = replace(PAPER, spreading_factor=7)
         with pytest.raises(RadioNotFoundError):
             await b.here.radio.configure(faster)
-        b.here.chip.restore_bus()
+        b.here.chip.reconnect_bus()
         await wait_ms(b, 500)
         await b.there.radio.configure(faster)
         await assert_both_ways(b)
@@ -383,7 +383,7 @@ async def test_failed_change_of_settings_is_tried_again() -> None:
 async def test_cancelled_recovery_is_taken_up_by_the_watch() -> None:
     """A call that is cancelled while it resets the chip leaves the rest to the background."""
     async with bench() as b:
-        b.here.chip.lose_tx_done()
+        b.here.chip.drop_tx_done()
         sending = asyncio.create_task(b.here.radio.transmit(bytes(34)))
         while b.here.radio.state is not State.DOWN:
             await wait_ms(b, 1)

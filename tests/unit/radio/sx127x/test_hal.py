@@ -176,7 +176,7 @@ def test_missing_permission_for_pins_names_the_group(pi: FakePi, backend: Backen
 def test_other_failures_of_a_pin_are_told_as_they_are(pi: FakePi, backend: Backend) -> None:
     """What we do not know is passed on with pin and role."""
     pi.request_errors[17] = OSError(errno.EINVAL, "Invalid argument")
-    with pytest.raises(RadioError, match=r"BCM 17 \(reset\) cannot be had: .*Invalid argument"):
+    with pytest.raises(RadioError, match=r"BCM 17 \(reset\) is not available: .*Invalid argument"):
         open_hal(hat(backend))
 
 

@@ -1,4 +1,4 @@
-"""Poses from a recording, all measurements taken in the order of time."""
+"""Poses of a recording, and replacing parts of its parameters before processing."""
 
 from __future__ import annotations
 
@@ -32,31 +32,29 @@ Estimator = Literal["linear", "continuous"]
 def process(
     recording: Recording, *, path: Path, on_progress: Callable[[float], None] | None = None
 ) -> PoseBatch:
-    """Compute the poses of a recording with the parameters, and by the estimator, that it holds.
+    """Compute the poses of a recording with its own parameters and estimator.
 
-    Measurements that came late count where they belong. Of ``linear``, without late ones, the poses are those of the
-    live stream; of ``continuous`` each pose knows all measurements on both sides.
+    Measurements are processed in the order of their timestamps. With ``linear`` the poses equal those of the live stream if
+    no measurement arrived late; with ``continuous`` each pose depends on the measurements before and after it.
 
     Parameters
     ----------
-    recording
-        Measurements and the parameters in force.
     path
-        Its file, for messages.
+        The recording's file, for messages.
     on_progress
-        Called now and then with the share of the work that is done, 0 to 1.
+        Called with the completed fraction, 0 to 1.
 
     Returns
     -------
     PoseBatch
-        All epochs, valid or not; at least one of them is valid.
+        All epochs, valid or not; at least one is valid.
 
     Raises
     ------
     RecordingError
-        There are no measurements, none for one of the prisms, they span days, or no epoch has a valid pose.
+        There are no measurements, none of one of the prisms, they span days, or no epoch has a valid pose.
     DegenerateGeometryError
-        The prism layout cannot be used: prisms coincide or lie in a line.
+        The prisms coincide or lie in a line.
     """
     if recording.parameters.pipeline.estimator == "continuous":
         return smooth_recording(recording, path=path, on_progress=on_progress).poses
@@ -68,7 +66,7 @@ def process(
     for measurement in sorted(measurements, key=lambda m: m.stamp_ns):
         pipeline.add(measurement)
     assert recording.end_ns is not None  # noqa: S101 (it has measurements, and each of them arrived)
-    # A master that was left running has nothing to say for the days after the last measurement.
+    # A master may have kept running for days after the last measurement.
     first_ns = min(m.stamp_ns for m in measurements)
     poses = pipeline.advance(min(recording.end_ns, first_ns + MAX_EPOCHS * parameters.pipeline.period_ns))
     if not poses.valid.any():
@@ -77,7 +75,7 @@ def process(
 
 
 def with_estimator(recording: Recording, estimator: Estimator) -> Recording:
-    """Return the same recording, to be processed by another estimator."""
+    """Return the recording with another estimator in its parameters."""
     pipeline = dataclasses.replace(recording.parameters.pipeline, estimator=estimator)
     return dataclasses.replace(
         recording, parameters=dataclasses.replace(recording.parameters, pipeline=pipeline)
@@ -89,8 +87,6 @@ def with_frames(parameters: Parameters, frames: Mapping[int, Matrix4], *, path: 
 
     Parameters
     ----------
-    parameters
-        As recorded.
     frames
         ``T_station1_station`` by station number.
     path
@@ -106,7 +102,7 @@ def with_frames(parameters: Parameters, frames: Mapping[int, Matrix4], *, path: 
         raise ConfigError(
             f"{path}: stations.{missing[0]}: missing; the recording has this station", path=path
         )
-    # Whatever targets the recorded frames were solved from, these come from elsewhere.
+    # The recorded target residuals belong to the replaced frames.
     stations = (
         dataclasses.replace(s, T_station1_station=frames[s.station], targets=()) for s in parameters.stations
     )
@@ -114,13 +110,13 @@ def with_frames(parameters: Parameters, frames: Mapping[int, Matrix4], *, path: 
 
 
 def with_targets(parameters: Parameters, targets: Mapping[int, tuple[TargetResidual, ...]]) -> Parameters:
-    """Replace what is known of the targets that the stations' frames were solved from, by station number."""
+    """Replace the target residuals of the stations' frames, by station number."""
     stations = (dataclasses.replace(s, targets=targets.get(s.station, ())) for s in parameters.stations)
     return dataclasses.replace(parameters, stations=tuple(stations))
 
 
 def with_latencies(parameters: Parameters, latencies_ns: Mapping[int, int]) -> Parameters:
-    """Replace the latencies of those stations that a set-up file has one for, in ns by station number."""
+    """Replace the latencies (ns, by station number) of the stations that ``latencies_ns`` contains."""
     stations = (
         dataclasses.replace(s, latency_ns=latencies_ns.get(s.station, s.latency_ns))
         for s in parameters.stations
@@ -129,12 +125,10 @@ def with_latencies(parameters: Parameters, latencies_ns: Mapping[int, int]) -> P
 
 
 def with_layout(parameters: Parameters, layout: Mapping[int, Vector3], *, path: Path) -> Parameters:
-    """Replace the prism layout by that of a set-up file; its prisms that the recording does not have are left out.
+    """Replace the prism layout by that of a set-up file; prisms that the recording does not have are ignored.
 
     Parameters
     ----------
-    parameters
-        As recorded.
     layout
         Positions in the robot frame in m by prism number.
     path
@@ -143,7 +137,7 @@ def with_layout(parameters: Parameters, layout: Mapping[int, Vector3], *, path: 
     Raises
     ------
     ConfigError
-        A prism of the recording has no position in the file, or no pose can come of the layout.
+        A prism of the recording has no position in the file, or the layout determines no pose.
     """
     missing = [p.prism for p in parameters.prisms if p.prism not in layout]
     if missing:
@@ -158,5 +152,5 @@ def with_layout(parameters: Parameters, layout: Mapping[int, Vector3], *, path: 
 
 
 def has_raw_angles(measurements: Sequence[Measurement]) -> bool:
-    """Tell whether station frames matter to any of the measurements: Cartesian points are in frame 1 already."""
+    """Return whether any measurement depends on a station frame; Cartesian points are in frame ``station1``."""
     return any(isinstance(m, PolarMeasurement) for m in measurements)

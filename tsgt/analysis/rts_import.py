@@ -1,9 +1,9 @@
-"""The authors' published field data as a recording.
+"""Published field data of the paper's authors as measurements.
 
-Their `RTS_project` repository holds what is left after their own processing: per prism a track of Unix time and
-position in the frame of station 1, and the prism positions on the robot. With the targets of the same day the
-station frames can be solved, and each position be taken back to the angles and the distance that its station
-measured; without them the positions stay Cartesian.
+Their ``RTS_project`` repository holds the result of their own processing: per prism a track of Unix time and position in
+the frame of station 1, and the prism positions on the robot. With the targets of the same day the station frames can be
+solved, and each position converted back to the angles and distance that its station measured; without targets the
+positions remain Cartesian.
 """
 
 from __future__ import annotations
@@ -30,20 +30,12 @@ if TYPE_CHECKING:
 
 
 DEFAULT_TRACKED_PRISMS: Final[Mapping[int, int]] = {1: 1, 2: 2, 3: 3}
-"""Which prism each of their stations tracks."""
+"""Prism number by station number, as published."""
 
 
 @dataclass(frozen=True, slots=True)
 class SolvedStations:
-    """Where the stations stood.
-
-    Attributes
-    ----------
-    stations
-        Their frames, and the prism constant that they were given.
-    notes
-        What the user should know of the targets, one sentence each: left out, rejected, weak.
-    """
+    """Stations solved from targets, with one sentence per target that was skipped or rejected and per weak frame."""
 
     stations: tuple[StationParameters, ...]
     notes: tuple[str, ...]
@@ -56,7 +48,7 @@ def stations_from_targets(
     prism_constant_m: float,
     tracked: Mapping[int, int] = DEFAULT_TRACKED_PRISMS,
 ) -> SolvedStations:
-    """Solve where the stations stood from the targets of the day, weighted by the instrument's noise.
+    """Solve the station frames from the targets of the day, weighted by the instrument's noise.
 
     Parameters
     ----------
@@ -65,14 +57,14 @@ def stations_from_targets(
     target_constant_m
         Added to the slope distances of the targets, in m.
     prism_constant_m
-        The prism constant that the stations get, in m.
+        Prism constant assigned to the stations, in m.
     tracked
-        By station number: which prism it tracks.
+        Prism number by station number.
 
     Raises
     ------
     InputFileError
-        The file cannot be used, holds no targets of one of the stations, or its targets contradict each other.
+        The file cannot be used, holds no targets of one of the stations, or its targets are inconsistent.
     DegenerateGeometryError
         A station has too few targets in common with station 1, or they lie in a line.
     """
@@ -88,8 +80,8 @@ def stations_from_targets(
             )
         if not solved[station].consistent:
             raise InputFileError(
-                f"the targets of station {station} contradict each other; "
-                "tsgt calibrate targets shows by how much, check the target constant too",
+                f"the targets of station {station} are inconsistent; "
+                "tsgt calibrate targets shows their residuals; check the target constant too",
                 path=path,
             )
         notes += [
@@ -97,7 +89,7 @@ def stations_from_targets(
         ]
         if solved[station].weak:
             notes.append(
-                f"{path}: station {station} is held weakly; tsgt calibrate targets says in which direction"
+                f"{path}: the frame of station {station} is weakly determined; tsgt calibrate targets shows the direction"
             )
     frames = {1: IDENTITY4} | {station: _matrix4(frame.T) for station, frame in solved.items()}
     stations = (
@@ -114,17 +106,9 @@ def stations_from_targets(
 
 
 def point_measurements(tracks: Sequence[PublishedTrack]) -> list[Measurement]:
-    """Cartesian observations from tracks, in the order of time.
+    """Convert tracks to Cartesian measurements in the order of time; ``received_ns`` is set to ``stamp_ns``.
 
-    Parameters
-    ----------
-    tracks
-        Track k is that of station k and prism k, counted from 1.
-
-    Returns
-    -------
-    list of PointMeasurement
-        When they arrived is not known: ``received_ns`` is ``stamp_ns``.
+    Track k, counted from 1, is that of station k and prism k.
     """
     measurements: list[Measurement] = []
     for station, track in enumerate(tracks, start=1):
@@ -147,24 +131,14 @@ def point_measurements(tracks: Sequence[PublishedTrack]) -> list[Measurement]:
 def polar_measurements(
     tracks: Sequence[PublishedTrack], stations: Sequence[StationParameters]
 ) -> list[Measurement]:
-    """Take the positions back to what each station measured: raw angles and slope distances.
+    """Convert positions back to raw angles and slope distances, in the order of time.
 
-    Parameters
-    ----------
-    tracks
-        As for :func:`point_measurements`.
-    stations
-        Station k of track k: its frame, and the prism constant that is taken off the distances.
-
-    Returns
-    -------
-    list of PolarMeasurement
-        In the order of time. The same stations turn them into the tracks again.
+    The inverse of processing with the same ``stations``: station k, with its frame and prism constant, for track k.
 
     Raises
     ------
     GeometryError
-        A position lies at its station, not even the prism constant away.
+        A position is closer to its station than the prism constant.
     """
     measurements: list[Measurement] = []
     for station, track in zip(stations, tracks, strict=True):
@@ -174,8 +148,8 @@ def polar_measurements(
         if np.any(slope <= 0.0):
             nearest_mm = float(np.min(distance)) * 1e3
             raise GeometryError(
-                f"a position of prism {station.prism} lies {nearest_mm:.1f} mm from station {station.station}, "
-                "which no station measures: check that tracks and targets are of the same day"
+                f"a position of prism {station.prism} is {nearest_mm:.1f} mm from station {station.station}, "
+                "closer than a station can measure: check that tracks and targets are of the same day"
             )
         polar = np.stack([horizontal, zenith, slope], axis=-1)
         for sequence, (stamp_ns, (h, z, d)) in enumerate(

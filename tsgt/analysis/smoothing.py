@@ -1,4 +1,4 @@
-"""Poses of the estimator ``continuous`` from a whole recording: one smooth trajectory through all measurements."""
+"""Estimator ``continuous`` over a whole recording: one smooth trajectory through all measurements."""
 
 from __future__ import annotations
 
@@ -14,7 +14,14 @@ from tsgt.analysis.validation import (
     plausible_measurements,
 )
 from tsgt.errors import GeometryError, RecordingError
-from tsgt.estimation import ContinuousPoseOutput, PoseBatch, MeasurementHistory, build_observations, measured_at_ns, usable
+from tsgt.estimation import (
+    ContinuousPoseOutput,
+    MeasurementHistory,
+    PoseBatch,
+    build_observations,
+    measured_at_ns,
+    usable,
+)
 from tsgt.geometry import check_layout
 from tsgt.geometry.trajectory import NOISE_FLOOR_SHARE, fit_trajectory, tune, with_noise_floor
 
@@ -27,25 +34,22 @@ if TYPE_CHECKING:
     from tsgt.model import Measurement, MotionPrior, Parameters, PipelineParameters
     from tsgt.recording import Recording
 
-# Bounds the memory of a long recording's poses; what is computed on the way to them is to stay in a cache.
-_EPOCHS_AT_ONCE = 1024
+# Bounds the memory of intermediate results, which should fit into the CPU cache.
+_EPOCHS_PER_CHUNK = 1024
 
-# Parts of a state's error that poses tell of.
-_POSE = 6
+_POSE_DIM = 6
 
 
 @dataclass(frozen=True, slots=True)
 class MotionModel:
-    """How a robot moves and how noisy it was measured.
+    """Process noise and measurement noise of a recording.
 
     Attributes
     ----------
-    prior
-        How it moves.
     noise_scale
-        What the stated noise of the instruments is multiplied by.
+        Factor on the stated sigmas of the instruments.
     tuned
-        Found from the measurements; otherwise they were too few for that, and these are the recording's.
+        True: estimated from the measurements. False: they were too few, the values are those of the recording.
     """
 
     prior: MotionPrior
@@ -55,20 +59,16 @@ class MotionModel:
 
 @dataclass(frozen=True, slots=True)
 class SmoothedRecording:
-    """A trajectory fitted to a recording.
+    """Trajectory fitted to a recording.
 
     Attributes
     ----------
     poses
-        At all epochs from the first to the last usable measurement.
-    fit
-        The trajectory.
-    motion
-        What it was fitted with.
+        One per epoch from the first to the last usable measurement.
     sources
-        The measurement of each of the fit's observations.
+        The measurement of each observation of ``fit``.
     origin_ns
-        What the fit's times count from, on the master's Unix clock.
+        Unix time at which the time of ``fit`` is zero.
     """
 
     poses: PoseBatch
@@ -83,26 +83,23 @@ def smooth_recording(
 ) -> SmoothedRecording:
     """Fit a smooth trajectory to all measurements of a recording.
 
-    How the robot moves is found from the measurements themselves. The recording's own motion parameters, with which the
-    live stream was computed, say how lively it must be taken to be: a third of that at least, and all of that while it is
-    hidden.
+    The hyperparameters are estimated from the measurements. Those of the recording, which the live estimator used, bound the
+    process noise: at least a third of them, and all of them while prisms are occluded.
 
     Parameters
     ----------
-    recording
-        Measurements and the parameters in force.
     path
-        Its file, for messages.
+        The recording's file, for messages.
     on_progress
-        Called now and then with the share of the work that is done, 0 to 1.
+        Called with the completed fraction, 0 to 1.
 
     Raises
     ------
     RecordingError
-        There are no measurements, none for one of the prisms, they span days, no trajectory fits them, or no epoch has
+        There are no measurements, none of one of the prisms, they span days, no trajectory fits them, or no epoch has
         a valid pose.
     DegenerateGeometryError
-        The prism layout cannot be used: prisms coincide or lie in a line.
+        The prisms coincide or lie in a line.
     """
     parameters = recording.parameters
     names = [prism.prism for prism in parameters.prisms]
@@ -130,7 +127,7 @@ def smooth_recording(
 
 
 def estimate_motion_model(observations: Observations, pipeline: PipelineParameters) -> MotionModel:
-    """Find how the robot moves; where the measurements are too few to tell, and at least about as lively, as the parameters say."""
+    """Estimate the hyperparameters, with a floor on the process noise; too few measurements: return those of ``pipeline``."""
     try:
         tuned = tune(observations)
     except GeometryError:
@@ -169,8 +166,8 @@ def _poses(
     first, last = -(-int(seen.times_ns[0]) // period_ns), int(seen.times_ns[-1]) // period_ns
     epochs_ns = np.arange(first, last + 1, dtype=np.int64) * period_ns
     chunks, poses = [], ContinuousPoseOutput(parameters)
-    for start in range(0, max(len(epochs_ns), 1), _EPOCHS_AT_ONCE):
-        some_ns = epochs_ns[start : start + _EPOCHS_AT_ONCE]
-        states, covariance = found.trajectory.at((some_ns - origin_ns) / 1e9, dim=_POSE)
+    for start in range(0, max(len(epochs_ns), 1), _EPOCHS_PER_CHUNK):
+        some_ns = epochs_ns[start : start + _EPOCHS_PER_CHUNK]
+        states, covariance = found.trajectory.at((some_ns - origin_ns) / 1e9, dim=_POSE_DIM)
         chunks.append(poses.smoothed(some_ns, seen, states, covariance))
     return PoseBatch.concatenated(chunks)

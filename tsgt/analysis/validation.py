@@ -1,4 +1,4 @@
-"""What of a recording is believed, and why no poses can come of one."""
+"""Which measurements of a recording are plausible, and why a recording yields no poses."""
 
 from __future__ import annotations
 
@@ -20,19 +20,21 @@ if TYPE_CHECKING:
     from tsgt.recording import Recording
 
 MAX_EPOCHS = 2_000_000
-"""More poses at once than this (28 h at 20 Hz, about 1.5 GB) come of a wrong clock, not of field work."""
+"""Upper limit of poses per recording: 28 h at 20 Hz, about 1.5 GB. More indicate a wrong clock."""
 
 
 def plausible_measurements(recording: Recording) -> list[Measurement]:
-    """Measurements that can have been made when their stamps say, those of unknown stations included."""
+    """Return the measurements whose timestamp is plausible given their time of arrival, and those of unknown stations."""
     stations = {station.station: station for station in recording.parameters.stations}
     return [
-        m for m in recording.measurements if m.station not in stations or has_plausible_time(m, stations[m.station])
+        m
+        for m in recording.measurements
+        if m.station not in stations or has_plausible_time(m, stations[m.station])
     ]
 
 
 def check_prisms_measured(parameters: Parameters, measurements: Sequence[Measurement], path: Path) -> None:
-    """Refuse a recording in which a prism of the layout was never measured: no pose can come of it."""
+    """Raise if there are no measurements, or none usable of a prism of the layout."""
     if not measurements:
         raise RecordingError("holds no measurements, so there is nothing to process", path=path)
     known = {station.station for station in parameters.stations}
@@ -40,71 +42,71 @@ def check_prisms_measured(parameters: Parameters, measurements: Sequence[Measure
     for prism in (p.prism for p in parameters.prisms):
         if prism not in seen:
             raise RecordingError(
-                f"prism {prism} has no usable measurement ({_what_came(prism, known, measurements, parameters)}), "
-                "and a pose needs all prisms of the layout; add its station's measurements or take a layout without it",
+                f"prism {prism} has no usable measurement ({_missing_prism_reason(prism, known, measurements, parameters)}), "
+                "and a pose needs all prisms of the layout; add its station's measurements or use a layout without it",
                 path=path,
             )
 
 
 def check_time_span(parameters: Parameters, measurements: Sequence[Measurement], path: Path) -> None:
-    """Refuse more poses than a computer can hold."""
+    """Raise if the measurements span more than :data:`MAX_EPOCHS` epochs."""
     stamps = [m.stamp_ns for m in measurements]
     span_ns = max(stamps) - min(stamps)
     if span_ns > MAX_EPOCHS * parameters.pipeline.period_ns:
         raise RecordingError(
             f"its measurements span {span_ns / 86_400e9:.1f} days, too many for one trajectory: "
-            "leave out those that were stamped by a wrong clock, or process with a lower --rate",
+            "remove those with timestamps of a wrong clock, or process with a lower --rate",
             path=path,
         )
 
 
-def _what_came(
+def _missing_prism_reason(
     prism: int, known: set[int], measurements: Sequence[Measurement], parameters: Parameters
 ) -> str:
-    came = [m for m in measurements if m.prism == prism]
-    strangers = sorted({m.station for m in came} - known)
-    if strangers:
-        return f"station {strangers[0]} measured it, but is not among the parameters"
-    if came:
-        statuses = Counter(m.status.value for m in came)
-        return f"{len(came)} with status " + ", ".join(
+    received = [m for m in measurements if m.prism == prism]
+    unknown = sorted({m.station for m in received} - known)
+    if unknown:
+        return f"station {unknown[0]} measured it, but is not among the parameters"
+    if received:
+        statuses = Counter(m.status.value for m in received)
+        return f"{len(received)} with status " + ", ".join(
             f"{status} ({n})" for status, n in statuses.most_common()
         )
-    homes = [str(s.station) for s in parameters.stations if s.prism == prism]
-    return f"station {' and '.join(homes)} sent none of it" if homes else "no station tracks it"
+    trackers = [str(s.station) for s in parameters.stations if s.prism == prism]
+    return (
+        f"station {' and '.join(trackers)} sent no measurement of it" if trackers else "no station tracks it"
+    )
 
 
 def no_valid_pose_message(poses: PoseBatch, parameters: Parameters) -> str:
-    """Say in one line why there is no valid pose, and what to look at."""
+    """Return one line that names the most frequent reason for invalid poses, and what to check."""
     counts = poses.invalid_counts()
     if not counts:
         return "the measurements of the stations have no pose epoch in common; record for longer"
-    # A pose that was computed and refused tells more than gaps, of which every recording has some.
-    told = (Reason.TILT, Reason.RESIDUAL, Reason.DEGENERATE_GEOMETRY, Reason.UNCERTAIN)
-    computed = [reason for reason in told if reason.word in counts]
+    # Reasons of computed poses are more informative than outages, which every recording has.
+    specific = (Reason.TILT, Reason.RESIDUAL, Reason.DEGENERATE_GEOMETRY, Reason.UNCERTAIN)
+    computed = [reason for reason in specific if reason.word in counts]
     candidates = computed or [r for r in Reason if r.word in counts]
     limits = parameters.pipeline
     match max(candidates, key=lambda reason: counts[reason.word]):
         case Reason.TILT:
             advice = (
-                "the robot would lie upside down: the prism layout is mirrored or two prisms are swapped; "
+                "the robot would be upside down: the prism layout is mirrored or two prisms are swapped; "
                 "check numbers and signs of the prism positions"
             )
         case Reason.RESIDUAL:
             typical_mm = float(np.nanmedian(poses.residual_m)) * 1e3
             advice = (
-                f"the prisms miss their layout by {typical_mm:.0f} mm (median), allowed are "
+                f"the layout residual is {typical_mm:.0f} mm (median), the limit is "
                 f"{limits.residual_limit_m * 1e3:.0f} mm: check for swapped prisms, another robot's layout, "
                 "wrong station frames"
             )
         case Reason.DEGENERATE_GEOMETRY:
-            advice = (
-                "the measured prisms lie in a line or at one place: check which station tracks which prism"
-            )
+            advice = "the measured prisms lie in a line or coincide: check which station tracks which prism"
         case Reason.UNCERTAIN:
             advice = (
-                f"at no epoch the position is known to {limits.position_sigma_limit_m * 1e3:g} mm and the rotation to "
-                f"{math.degrees(limits.rotation_sigma_limit_rad):g} degrees: check that the stations' times overlap, "
+                f"at no epoch is sigma of position at most {limits.position_sigma_limit_m * 1e3:g} mm and of rotation at "
+                f"most {math.degrees(limits.rotation_sigma_limit_rad):g} degrees: check that the stations' times overlap, "
                 "and which station tracks which prism"
             )
         case Reason.STATION_STATUS:

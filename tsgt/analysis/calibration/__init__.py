@@ -1,4 +1,9 @@
-"""TODO face."""
+"""Calibration from field files and recordings: station frames and prisms from targets, the whole set-up from motion.
+
+Comes in: target and prism files, a recording, the state of a target collection. Goes out: frames, prism positions and
+latencies with residuals, a check whether a station has moved, the next target to measure. The solvers are in
+``tsgt.geometry.calibration``.
+"""
 
 from tsgt.analysis.calibration.motion import CalibratedRecording, HeldOutComparison, calibrate_recording
 from tsgt.analysis.calibration.station_check import StationCheck, check_station

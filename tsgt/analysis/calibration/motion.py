@@ -1,4 +1,4 @@
-"""A recording's set-up from the motion of its robot, and whether held-out measurements are predicted better with it."""
+"""Calibrate the set-up from the motion in a recording, and cross-validate the result."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class HeldOutComparison:
-    """How well measurements that were left out are predicted from the rest.
+    """Held-out prediction errors of three methods.
 
     Attributes
     ----------
     linear
-        By straight lines between each prism's own measurements.
+        Straight lines between each prism's own measurements.
     before
-        By the trajectory, with the recording's set-up; None where its frames are not known.
+        Trajectory with the recording's set-up; None if its frames are unknown.
     after
-        By the trajectory, with a set-up that was found without the left-out measurements.
+        Trajectory with a set-up calibrated without the held-out measurements.
     """
 
     linear: HeldOutErrors
@@ -49,21 +49,21 @@ class HeldOutComparison:
 
 @dataclass(frozen=True, slots=True)
 class CalibratedRecording:
-    """What the motion in a recording tells of its set-up.
+    """Set-up from the motion in a recording.
 
     Attributes
     ----------
     calibration
         From all measurements.
     parameters
-        The recording's, with the set-up put in.
-    judgement
-        Whether it predicts better; None where not asked for.
+        Those of the recording, with the calibrated set-up.
+    held_out
+        Held-out prediction; None if not requested.
     """
 
     calibration: MotionCalibration
     parameters: Parameters
-    judgement: HeldOutComparison | None
+    held_out: HeldOutComparison | None
 
 
 def calibrate_recording(
@@ -74,77 +74,84 @@ def calibrate_recording(
     held_out: bool = True,
     on_progress: Callable[[str], None] | None = None,
 ) -> CalibratedRecording:
-    """Calibrate from all measurements, and judge it by calibrating five times more without a fifth of them.
+    """Calibrate from all measurements, and five more times without a fifth of them for cross-validation.
 
     Parameters
     ----------
-    recording
-        With polar measurements.
     known
-        What to find, and what is known of it beforehand.
+        Which parameters to estimate, and their priors.
     frames_known
-        Begin with the recording's frames; otherwise they are not looked at (but that of station 1).
+        Start from the recording's frames; otherwise initialise them from motion (frame 1 remains).
     held_out
-        Judge it.
+        Cross-validate.
     on_progress
-        Called with a few words now and then.
+        Called with a short description of each step.
 
     Raises
     ------
     GeometryError
-        The motion, or what there is of it, does not allow a calibration.
+        The recording has no measurements, or its motion does not determine the set-up.
     """
     if not recording.measurements:
         raise GeometryError("the recording has no measurements")
     origin_ns = min(measurement.stamp_ns for measurement in recording.measurements)
     observations, _ = build_observations(recording.parameters, recording.measurements, origin_ns=origin_ns)
-    tell = on_progress or (lambda _: None)
+    report = on_progress or (lambda _: None)
 
     def calibrated(some: Observations, title: str) -> MotionCalibration:
         start = Setup.of(some)
         if not frames_known:
             start = replace(start, frames=frames_from_motion(some))
-        return calibrate_motion(some, known, start=start, on_progress=lambda words: tell(f"{title}: {words}"))
+        return calibrate_motion(
+            some, known, start=start, on_progress=lambda words: report(f"{title}: {words}")
+        )
 
     whole = calibrated(observations, "all measurements")
-    judgement = None
+    comparison = None
     if held_out:
-        parts = folds(observations)
-        # By number of fold: these have seen nothing of what the folds of that number leave out.
-        seen = {part.number: observations.select(training_rows(observations, part.number)) for part in parts}
-        found = {number: calibrated(some, f"without fifth {number + 1}") for number, some in seen.items()}
+        splits = folds(observations)
+        training = {
+            split.number: observations.select(training_rows(observations, split.number)) for split in splits
+        }
+        setups = {
+            number: calibrated(some, f"without fifth {number + 1}") for number, some in training.items()
+        }
         before = None
         if frames_known:
-            tell("held-out prediction before")
-            tuned = {number: tune(some) for number, some in seen.items()}
-            own = Setup.of(observations)
-            before = _predicted(
-                observations, parts, {n: (own, t.prior, t.noise_scale) for n, t in tuned.items()}
+            report("held-out prediction before")
+            tuned = {number: tune(some) for number, some in training.items()}
+            recorded = Setup.of(observations)
+            before = _cross_validated(
+                observations, splits, {n: (recorded, t.prior, t.noise_scale) for n, t in tuned.items()}
             )
-        tell("held-out prediction after")
-        judgement = HeldOutComparison(
-            cross_validate(parts, lambda fold: interpolation_errors(observations, fold)),
+        report("held-out prediction after")
+        comparison = HeldOutComparison(
+            cross_validate(splits, lambda fold: interpolation_errors(observations, fold)),
             before,
-            _predicted(observations, parts, {n: (c.setup, c.prior, c.noise_scale) for n, c in found.items()}),
+            _cross_validated(
+                observations, splits, {n: (c.setup, c.prior, c.noise_scale) for n, c in setups.items()}
+            ),
         )
-    return CalibratedRecording(whole, _with_setup(recording.parameters, whole), judgement)
+    return CalibratedRecording(whole, _with_setup(recording.parameters, whole), comparison)
 
 
-def _predicted(
-    observations: Observations, parts: list[Fold], by: dict[int, tuple[Setup, MotionPrior, float]]
+def _cross_validated(
+    observations: Observations,
+    splits: list[Fold],
+    models: dict[int, tuple[Setup, MotionPrior, float]],
 ) -> HeldOutErrors:
     def error_m(fold: Fold) -> FloatArray:
-        setup, prior, noise_scale = by[fold.number]
-        kept = setup.applied(observations.select(fold.training))
-        trajectory = fit_trajectory(kept, prior=prior, noise_scale=noise_scale).trajectory
+        setup, prior, noise_scale = models[fold.number]
+        training = setup.applied(observations.select(fold.training))
+        trajectory = fit_trajectory(training, prior=prior, noise_scale=noise_scale).trajectory
         return trajectory_errors(trajectory, setup.applied(observations.select(fold.test)))
 
-    return cross_validate(parts, error_m)
+    return cross_validate(splits, error_m)
 
 
 def _with_setup(parameters: Parameters, calibration: MotionCalibration) -> Parameters:
     setup = calibration.setup
-    bent_m = setup.layout - calibration.initial.layout
+    correction_m = setup.layout - calibration.initial.layout
     stations = tuple(
         replace(
             station,
@@ -154,7 +161,7 @@ def _with_setup(parameters: Parameters, calibration: MotionCalibration) -> Param
         for row, station in enumerate(parameters.stations)
     )
     prisms = tuple(
-        replace(prism, position_m=cast("Vector3", tuple(map(float, prism.position_m + bent_m[row]))))
+        replace(prism, position_m=cast("Vector3", tuple(map(float, prism.position_m + correction_m[row]))))
         for row, prism in enumerate(parameters.prisms)
     )
     return replace(parameters, stations=stations, prisms=prisms)

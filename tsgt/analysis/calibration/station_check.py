@@ -1,7 +1,7 @@
-"""Has a station moved since its targets were measured? The same targets again, seen by the same station, tell.
+"""Check whether a station has moved since its targets were measured, by measuring some of them again. Sans-I/O.
 
-The targets stand still. Where a station sees them shifted, it has moved itself; how it has moved is the frame fit
-of its measurements of now into those of then, as far as the targets hold one.
+The targets are stationary: a shift in the station's frame is a movement of the station. The movement is the fit of the
+current measurements to the reference measurements, with as many degrees of freedom as the targets determine.
 """
 
 from __future__ import annotations
@@ -26,30 +26,30 @@ from tsgt.geometry.calibration import (
 if TYPE_CHECKING:
     from tsgt.geometry.calibration import PointName, PointSet
 
-FEWEST_FOR_HEADING = 2
+MIN_TARGETS_FOR_HEADING = 2
 
 
 @dataclass(frozen=True, slots=True)
 class StationCheck:
-    """What the targets say of a station.
+    """Movement of a station.
 
     Attributes
     ----------
     shifts_m
-        By target: how far the station now sees it from where it saw it then, in m.
+        By target: distance between its reference position and its current one in the station's frame.
     moved_m
-        How far the station has moved, in m. From one target it is that target's shift: a turn of the station and a
-        movement across the line of sight cannot be told apart there.
+        Distance that the station has moved. With one target it is that target's shift: a rotation of the station and
+        a movement across the line of sight cannot be separated.
     moved_sigma_m
-        One sigma of ``moved_m`` along the movement, in m, from the noise of the instrument.
+        One sigma of ``moved_m`` along the movement, from the instrument's noise.
     turned_rad
-        By how much the station has turned, in rad; None from one target.
+        Rotation angle of the station; None with one target.
     levelled
-        ``turned_rad`` is the heading alone: the targets do not hold more, and the station is taken as levelled.
+        ``turned_rad`` is the heading only: the targets do not determine tilt, the station is assumed to be levelled.
     ok
-        The shifts are no more than noise, or none is beyond the limit.
+        The shifts are within noise, or none exceeds the limit.
     consistent
-        One movement of the station explains all shifts. If not, a target has moved or was mistaken for another.
+        One rigid movement of the station explains all shifts. False: a target has moved or was confused with another.
     """
 
     shifts_m: dict[PointName, float]
@@ -61,31 +61,31 @@ class StationCheck:
     consistent: bool
 
 
-def check_station(then: PointSet, now: PointSet, *, limit_m: float = 0.0) -> StationCheck:
-    """Compare a station's targets of now with those of then.
+def check_station(reference: PointSet, current: PointSet, *, limit_m: float = 0.0) -> StationCheck:
+    """Compare a station's current measurements of targets with the reference.
 
     Parameters
     ----------
-    then, now
-        Targets in the station's frame; those of now are all among those of then, at least one.
+    reference, current
+        Targets in the station's frame; the current ones are a subset of the reference, at least one.
     limit_m
-        Shifts up to this in m are tolerated even where they are more than noise.
+        Shifts up to this are accepted even if they exceed noise.
 
     Returns
     -------
     StationCheck
-        The test of the shifts against noise has a false alarm in ten thousand.
+        The chi-square test of the shifts has a false-alarm probability of 1e-4.
     """
-    pairs = PointPairs(now, then.select(now.names), levelled=False)
-    still = FrameFit(np.eye(3), np.zeros(3), np.zeros((6, 6)))
-    shifts_m = np.linalg.norm(still.residuals_m(pairs), axis=1)
+    pairs = PointPairs(current, reference.select(current.names), levelled=False)
+    unmoved = FrameFit(np.eye(3), np.zeros(3), np.zeros((6, 6)))
+    shifts_m = np.linalg.norm(unmoved.residuals_m(pairs), axis=1)
     count = len(pairs.names)
-    noise_only = still.chi_squared(pairs) <= chdtri(3 * count, FALSE_ALARM_RATE)
+    noise_only = unmoved.chi_squared(pairs) <= chdtri(3 * count, FALSE_ALARM_RATE)
     fit, levelled = _fit(pairs)
     if fit is None:
-        # The mean shift; for one target it is that target's own.
-        moved = still.residuals_m(pairs).mean(axis=0)
-        covariance = still.residual_covariances_m2(pairs).mean(axis=0) / count
+        # The mean shift.
+        moved = unmoved.residuals_m(pairs).mean(axis=0)
+        covariance = unmoved.residual_covariances_m2(pairs).mean(axis=0) / count
         consistent = True
     else:
         moved, covariance = fit.translation_m, fit.covariance[:3, :3]
@@ -105,9 +105,9 @@ def check_station(then: PointSet, now: PointSet, *, limit_m: float = 0.0) -> Sta
 
 
 def _fit(pairs: PointPairs) -> tuple[FrameFit | None, bool]:
-    """Fit as much as the targets hold: all, or position and heading (True), or nothing."""
-    for levelled, fewest in ((False, MIN_POINTS), (True, FEWEST_FOR_HEADING)):
-        if len(pairs.names) < fewest:
+    """Fit all degrees of freedom, or position and heading (True), or none, as the targets determine."""
+    for levelled, min_targets in ((False, MIN_POINTS), (True, MIN_TARGETS_FOR_HEADING)):
+        if len(pairs.names) < min_targets:
             continue
         try:
             fit = fit_frame(PointPairs(pairs.source, pairs.target, levelled), weighted=True)

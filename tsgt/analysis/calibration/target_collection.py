@@ -1,7 +1,7 @@
-"""What has been collected of the targets, station by station: the state behind ``tsgt calibrate collect``.
+"""Progress of a target collection, station by station: the state behind ``tsgt calibrate collect``. Sans-I/O but ``resume``.
 
-The file of targets is the whole state. It is written anew after every measurement, so that an interruption costs
-nothing, and whoever goes on begins by reading it.
+The target file is the whole state. It is rewritten after every measurement, so that an interruption loses nothing, and
+read again on resumption.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 HEADER = "station,target,horizontal_angle_rad,zenith_angle_rad,slope_distance_m,constant_mm"
 
 StationTarget = tuple[int, int]
-"""A station and a target."""
+"""Numbers of a station and a target."""
 
 
 class TargetCollection:
@@ -31,11 +31,11 @@ class TargetCollection:
     Parameters
     ----------
     path
-        The file of targets, for messages.
+        The target file.
     stations, targets
         Numbers, in the order in which they are to be measured.
     repeats
-        How often each target is to be measured: 2 for both faces.
+        Measurements per target: 2 for both faces.
     """
 
     def __init__(
@@ -45,16 +45,16 @@ class TargetCollection:
         self.stations = tuple(stations)
         self.targets = tuple(targets)
         self._repeats = repeats
-        self._sights: dict[StationTarget, list[TargetMeasurement]] = {}
+        self._measurements: dict[StationTarget, list[TargetMeasurement]] = {}
         self._comments: list[str] = []
 
     def resume(self) -> None:
-        """Take over what the file holds, if it is there and was written here before; its comments stay, on top.
+        """Read the file if it exists and was written by ``tsgt calibrate collect``; its comments are kept at the top.
 
         Raises
         ------
         InputFileError
-            It is a file of another kind, has a bad line, or cannot be read.
+            It is a file of another kind, has an invalid line, or cannot be read.
         """
         try:
             lines = self.path.read_text(encoding="utf-8").splitlines()
@@ -74,69 +74,71 @@ class TargetCollection:
         self._comments = comments
         if len(rest) > 1:
             file = read_partial_target_file(self.path)
-            self._sights = {
-                (station, target): list(sights)
-                for station, targets in file.sights.items()
-                for target, sights in targets.items()
+            self._measurements = {
+                (station, target): list(measurements)
+                for station, targets in file.measurements.items()
+                for target, measurements in targets.items()
             }
 
-    def add(self, station: int, target: int, sight: TargetMeasurement) -> None:
-        """Take a measurement, one of perhaps several of this target; the line of the sight does not matter."""
-        self._sights.setdefault((station, target), []).append(sight)
+    def add(self, station: int, target: int, measurement: TargetMeasurement) -> None:
+        """Add a measurement of a target; its ``line`` is ignored."""
+        self._measurements.setdefault((station, target), []).append(measurement)
 
-    def drop(self, station: int, target: int) -> bool:
-        """Forget a target of a station; return whether there was anything to forget."""
-        return self._sights.pop((station, target), None) is not None
+    def remove(self, station: int, target: int) -> bool:
+        """Remove the measurements of a target by a station; return whether there were any."""
+        return self._measurements.pop((station, target), None) is not None
 
     def count(self, station: int, target: int) -> int:
         """Return how often a station has measured a target."""
-        return len(self._sights.get((station, target), ()))
+        return len(self._measurements.get((station, target), ()))
 
     def next(self, skipped: Collection[StationTarget] = ()) -> StationTarget | None:
-        """Return which target of which station is to be measured next; None when all is done or skipped."""
-        return next((cell for cell in self.missing() if cell not in skipped), None)
+        """Return the next station and target to measure; None when all are complete or skipped."""
+        return next((pair for pair in self.outstanding() if pair not in skipped), None)
 
-    def missing(self) -> Iterator[StationTarget]:
-        """Yield what has not been measured often enough, station by station."""
+    def outstanding(self) -> Iterator[StationTarget]:
+        """Yield the incomplete stations and targets, station by station."""
         for station in self.stations:
             for target in self.targets:
                 if self.count(station, target) < self._repeats:
                     yield station, target
 
     def text(self) -> str:
-        """Return what the file is to hold; stations and targets beyond those asked for are kept."""
+        """Return the content of the file, including stations and targets beyond the requested ones."""
         return "\n".join(
-            [*self._comments, HEADER, *(_line(*cell, sight) for cell, sight in self._rows()), ""]
+            [*self._comments, HEADER, *(_line(*key, measurement) for key, measurement in self._rows()), ""]
         )
 
     def residuals(self, station: int) -> FrameCalibration | str:
-        """Solve the frame of a station from what there is; a sentence instead where that cannot be done yet."""
+        """Solve the frame of a station from the present measurements; a sentence if that is not yet possible."""
         file = self._file()
-        if station == 1 or not {1, station} <= file.sights.keys():
+        if station == 1 or not {1, station} <= file.measurements.keys():
             return "no targets in common with station 1 yet"
-        pair = dataclasses.replace(file, sights={number: file.sights[number] for number in (1, station)})
+        pair = dataclasses.replace(
+            file, measurements={number: file.measurements[number] for number in (1, station)}
+        )
         try:
             return solve_stations(pair, target_constant_m=0.0)[station]
         except (DegenerateGeometryError, InputFileError) as error:
             return str(error)
 
     def _rows(self) -> Iterator[tuple[StationTarget, TargetMeasurement]]:
-        for cell, sights in sorted(self._sights.items()):
-            for sight in sights:
-                yield cell, sight
+        for key, measurements in sorted(self._measurements.items()):
+            for measurement in measurements:
+                yield key, measurement
 
     def _file(self) -> TargetFile:
-        """Return what reading the file would give."""
-        sights: dict[int, dict[int, list[TargetMeasurement]]] = {}
+        """Return what reading the file would return."""
+        measurements: dict[int, dict[int, list[TargetMeasurement]]] = {}
         first_line = len(self._comments) + 2
-        for line, ((station, target), sight) in enumerate(self._rows(), start=first_line):
-            numbered = dataclasses.replace(sight, line=line)
-            sights.setdefault(station, {}).setdefault(target, []).append(numbered)
-        return TargetFile(self.path, sights, ())
+        for line, ((station, target), measurement) in enumerate(self._rows(), start=first_line):
+            numbered = dataclasses.replace(measurement, line=line)
+            measurements.setdefault(station, {}).setdefault(target, []).append(numbered)
+        return TargetFile(self.path, measurements, ())
 
 
-def _line(station: int, target: int, sight: TargetMeasurement) -> str:
-    # In the shortest form that reads back to the same bits.
-    numbers = (sight.horizontal_angle_rad, sight.zenith_angle_rad, sight.slope_distance_m)
-    constant = "" if sight.constant_m is None else f"{1e3 * sight.constant_m:.6g}"
+def _line(station: int, target: int, measurement: TargetMeasurement) -> str:
+    # repr is the shortest form that reads back to the same bits.
+    numbers = (measurement.horizontal_angle_rad, measurement.zenith_angle_rad, measurement.slope_distance_m)
+    constant = "" if measurement.constant_m is None else f"{1e3 * measurement.constant_m:.6g}"
     return ",".join([str(station), str(target), *map(repr, numbers), constant])

@@ -1,4 +1,4 @@
-"""From hand-made measurement files to station frames and prism positions."""
+"""Station frames and prism positions from measured targets."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ if TYPE_CHECKING:
     from tsgt.geometry.calibration import FrameCalibration, PointName, PrismCalibration
 
 REPEAT_LIMIT_M = 0.02
-"""Two measurements of one target are a mistake when they lie further than this from their mean: another target,
-a mistyped digit. An uncorrected index error of 30" stays within it in two faces up to 130 m."""
+"""Repeated measurements of a target further than this from their mean are a mistake: another target, a typing error. An
+uncorrected index error of 30" in two faces stays within it up to 130 m.
+"""
 
 CAD_SIGMA_M = 0.001
-"""One sigma per axis of a body point on the real robot against its CAD: machining and sticking on the foil."""
+"""One sigma per axis of a body point on the real robot relative to CAD: machining, and the adhesive target."""
 
 
 def solve_stations(
@@ -34,8 +35,6 @@ def solve_stations(
 
     Parameters
     ----------
-    file
-        Targets as measured.
     target_constant_m
         Added to each slope distance whose line has no constant of its own, in m.
     weighted, levelled
@@ -44,18 +43,18 @@ def solve_stations(
     Returns
     -------
     dict
-        By station number, station 1 excepted; ``T`` is ``T_station1_station``.
+        By station number, without station 1; ``T`` is ``T_station1_station``.
 
     Raises
     ------
     DegenerateGeometryError
-        A station, which is named, has fewer than three targets in common with station 1, or they lie in a line.
+        A station has fewer than three targets in common with station 1, or they lie in a line.
     InputFileError
-        Repeated measurements of one target contradict each other, or a constant exceeds a distance.
+        Repeated measurements of one target are inconsistent, or a constant exceeds a distance.
     """
     points = {
         station: mean_points(file.path, targets, target_constant_m, f"target {{}} of station {station}")
-        for station, targets in file.sights.items()
+        for station, targets in file.measurements.items()
     }
     frames: dict[int, FrameCalibration] = {}
     for station, seen in points.items():
@@ -71,7 +70,7 @@ def solve_stations(
 
 
 def target_residuals(frame: FrameCalibration) -> tuple[TargetResidual, ...]:
-    """Tell how well each target fits a station's solved frame; the rejected ones come last."""
+    """Return the residual of each target in a station's solved frame; the rejected ones come last."""
     used = zip(frame.used, frame.residuals_m.tolist(), frame.leave_one_out_m.tolist(), strict=True)
     return (
         *(
@@ -83,7 +82,9 @@ def target_residuals(frame: FrameCalibration) -> tuple[TargetResidual, ...]:
             for name, residual_m, leave_one_out_m in used
         ),
         *(
-            TargetResidual(target=int(bad.name), residual_m=None, leave_one_out_m=float(bad.prediction_error_m))
+            TargetResidual(
+                target=int(bad.name), residual_m=None, leave_one_out_m=float(bad.prediction_error_m)
+            )
             for bad in frame.rejected
         ),
     )
@@ -94,22 +95,20 @@ def solve_prisms(file: PrismFile, *, target_constant_m: float, prism_constant_m:
 
     Parameters
     ----------
-    file
-        Prisms and body points as one station measured them.
     target_constant_m, prism_constant_m
         Added to the slope distances of body points and of prisms whose line has no constant of its own, in m.
 
     Returns
     -------
     PrismCalibration
-        Names of the prisms are their numbers.
+        The names of the prisms are their numbers.
 
     Raises
     ------
     DegenerateGeometryError
         There are fewer than three body points or they lie in a line; or three or more prisms do.
     InputFileError
-        Repeated measurements of one point contradict each other, or a constant exceeds a distance.
+        Repeated measurements of one point are inconsistent, or a constant exceeds a distance.
     """
     body = mean_points(file.path, file.body, target_constant_m, "body point {}")
     prisms = mean_points(file.path, file.prisms, prism_constant_m, "prism {}")
@@ -138,50 +137,51 @@ def mean_points(
     Parameters
     ----------
     path
-        Where the measurements come from, for messages.
-    measured
-        By name of the target: its measurements, at least one.
+        The file, for messages.
     constant_m
         Added to the slope distances that have no constant of their own, in m.
     what
-        How to call a target in messages, with ``{}`` for its name.
+        Name of a target in messages, with ``{}`` for its number.
 
     Raises
     ------
     InputFileError
-        Repeated measurements of one target contradict each other, or a constant exceeds a distance.
+        Repeated measurements of one target are inconsistent, or a constant exceeds a distance.
     """
     names: list[PointName] = []
     points, covariances = [], []
-    for name, sights in measured.items():
-        # Of either face: the formula for the first gives the same point for the angles of the second.
-        h = np.array([sight.horizontal_angle_rad for sight in sights])
-        z = np.array([sight.zenith_angle_rad for sight in sights])
-        constants = [constant_m if sight.constant_m is None else sight.constant_m for sight in sights]
+    for name, repeats in measured.items():
+        # Both faces: the formula of face 1 yields the same point for the angles of face 2.
+        h = np.array([measurement.horizontal_angle_rad for measurement in repeats])
+        z = np.array([measurement.zenith_angle_rad for measurement in repeats])
+        constants = [
+            constant_m if measurement.constant_m is None else measurement.constant_m
+            for measurement in repeats
+        ]
         d = np.array(
             [
-                corrected_distance(sight.slope_distance_m, constant_m=constant, ppm=0.0)
-                for sight, constant in zip(sights, constants, strict=True)
+                corrected_distance(measurement.slope_distance_m, constant_m=constant, ppm=0.0)
+                for measurement, constant in zip(repeats, constants, strict=True)
             ]
         )
         if d.min() <= 0:
             raise InputFileError(
                 f"{what.format(name)}: with its constant the distance is {d.min():.3f} m; correct the constant",
                 path=path,
-                line=sights[int(d.argmin())].line,
+                line=repeats[int(d.argmin())].line,
             )
         positions = polar_to_cartesian(h, z, d)
         mean = positions.mean(axis=0)
-        misses_m = np.linalg.norm(positions - mean, axis=1)
-        worst = int(misses_m.argmax())
-        if misses_m[worst] > REPEAT_LIMIT_M:
+        deviations_m = np.linalg.norm(positions - mean, axis=1)
+        worst = int(deviations_m.argmax())
+        if deviations_m[worst] > REPEAT_LIMIT_M:
             raise InputFileError(
-                f"{what.format(name)}: this measurement lies {1e3 * misses_m[worst]:.0f} mm from the mean of the "
-                f"{len(sights)} of this point; remove the wrong one",
+                f"{what.format(name)}: this measurement is {1e3 * deviations_m[worst]:.0f} mm from the mean of the "
+                f"{len(repeats)} of this point; remove the wrong one",
                 path=path,
-                line=sights[worst].line,
+                line=repeats[worst].line,
             )
         names.append(name)
         points.append(mean)
-        covariances.append(measurement_covariance(h, z, d, TARGET_NOISE).mean(axis=0) / len(sights))
+        covariances.append(measurement_covariance(h, z, d, TARGET_NOISE).mean(axis=0) / len(repeats))
     return PointSet(tuple(names), np.array(points), np.array(covariances))

@@ -1,4 +1,8 @@
-"""TODO face."""
+"""Planning before the field: where to put prisms and stations, and what noise does to poses.
+
+Comes in: a prism layout or an envelope, stations with their noise, robot poses. Goes out: pose covariances and their
+summary, the optimal layout, Monte Carlo error statistics.
+"""
 
 from tsgt.analysis.design.layout_search import Criterion, LayoutProblem, optimal_layout
 from tsgt.analysis.design.layout_study import (

@@ -1,8 +1,8 @@
-"""How well a pose is known, before anybody drives: prisms on the robot, stations around it, noise of the instruments.
+"""First-order accuracy of a pose: prisms on the robot, stations around it, instrument noise. Sans-I/O.
 
-A robot stands, each station measures its prism once, and the pose that fits these measurements best has a covariance
-that follows from geometry and noise alone, to first order. Nothing needs to be drawn or driven. What moving adds
-(measurements at different times) and what all measurements share (station frames, prism constants) is not in it.
+Each station measures its prism once while the robot is stationary; the covariance of the weighted least-squares pose
+follows from geometry and noise. Not included: errors due to motion (measurements at different times) and errors that all
+measurements share (station frames, prism constants).
 """
 
 from __future__ import annotations
@@ -23,49 +23,49 @@ if TYPE_CHECKING:
     from tsgt.model import InstrumentNoise
 
 MAX_POINT_DISTANCE_M = 10_000.0
-"""No point of a robot is further from its prisms."""
+"""Upper limit of the distance between the evaluated point and the prisms."""
 
 HEADING_COUNT = 8
-"""So many headings of the robot at each place, evenly around the circle."""
+"""Number of headings of the robot at each place, evenly around the circle."""
 
 
 @dataclass(frozen=True, slots=True)
 class Station:
-    """A station where it stands.
+    """A station at its place.
 
     Attributes
     ----------
     position_m
-        In the world in m, shape (3,).
+        In the world, (3,).
     noise
-        Of one measurement.
-    slot
-        Which prism it tracks: its index in a layout.
+        Of a single measurement.
+    prism_index
+        Index in the layout of the prism that it tracks.
     """
 
     position_m: FloatArray
     noise: InstrumentNoise
-    slot: int
+    prism_index: int
 
     def __post_init__(self) -> None:
-        """Refuse instruments whose measurements would outweigh everything."""
+        """Reject noise-free instruments, whose weight would be infinite."""
         along, across = max(self.noise.range_sigma_m, self.noise.range_sigma_ppm), self.noise.angle_sigma_rad
         if self.noise.pointing_sigma_m == 0 and (along == 0 or across == 0):
             raise GeometryError(
-                "a station measures without noise along or across its line of sight: give its instrument some"
+                "a station has no noise along or across its line of sight: give its instrument some"
             )
 
 
 @dataclass(frozen=True, slots=True)
 class RobotPoses:
-    """N poses in which a level robot stands.
+    """N poses of a level robot.
 
     Attributes
     ----------
     rotation
-        ``R_world_robot``, shape (N, 3, 3).
+        ``R_world_robot``, (N, 3, 3).
     position_m
-        The robot's origin in the world in m, shape (N, 3).
+        The robot's origin in the world, (N, 3).
     """
 
     rotation: FloatArray
@@ -73,34 +73,30 @@ class RobotPoses:
 
     @classmethod
     def at(cls, places_m: ArrayLike, headings_rad: ArrayLike | None = None) -> RobotPoses:
-        """Stand at each of the places (M, 3) with each of the headings: N = M x headings, place by place."""
+        """Combine each place, (M, 3), with each heading: N = M x headings, place by place."""
         places = np.asarray(places_m, dtype=np.float64)
         if headings_rad is None:
             headings_rad = np.arange(HEADING_COUNT) * (2 * math.pi / HEADING_COUNT)
-        turns = np.zeros((np.size(headings_rad), 3))
-        turns[:, 2] = headings_rad
+        rotation_vectors = np.zeros((np.size(headings_rad), 3))
+        rotation_vectors[:, 2] = headings_rad
         return cls(
-            rotation=np.tile(exp_so3(turns), (len(places), 1, 1)),
-            position_m=np.repeat(places, len(turns), axis=0),
+            rotation=np.tile(exp_so3(rotation_vectors), (len(places), 1, 1)),
+            position_m=np.repeat(places, len(rotation_vectors), axis=0),
         )
 
 
 @dataclass(frozen=True, slots=True)
 class PoseAccuracy:
-    """How well poses are known; root mean squares over the stances of one sigma.
+    """Root mean squares over N robot poses of one sigma.
 
     Attributes
     ----------
-    position_m
-        Of the length of the position error in m.
-    position_axes_m
-        Along x, y, z of the robot in m, shape (3,).
-    rotation_rad
-        Of the angle of the rotation error in rad.
-    rotation_axes_rad
-        About x, y, z of the robot in rad, shape (3,).
+    position_m, rotation_rad
+        Norm of the position error, angle of the rotation error.
+    position_axes_m, rotation_axes_rad
+        Along and about x, y, z of the robot, (3,).
     worst_position_m, worst_rotation_rad
-        The same lengths in the worst of the stances.
+        Norm and angle at the worst of the robot poses.
     """
 
     position_m: float
@@ -112,7 +108,7 @@ class PoseAccuracy:
 
     @classmethod
     def of(cls, covariance: FloatArray) -> PoseAccuracy:
-        """Sum up the covariances (N, 6, 6) of :func:`pose_covariances`."""
+        """Summarise the covariances (N, 6, 6) of :func:`pose_covariances`."""
         variances = np.diagonal(covariance, axis1=1, axis2=2)
         position, rotation = variances[:, :3], variances[:, 3:]
         return cls(
@@ -128,41 +124,43 @@ class PoseAccuracy:
 def pose_covariances(
     layout: FloatArray, stations: tuple[Station, ...], robot_poses: RobotPoses, point_m: FloatArray
 ) -> FloatArray:
-    """Covariance of the pose from one measurement by each station, all of them weighed by their noise.
+    """Return the covariance of the pose from one measurement by each station, weighted by their noise.
 
     Parameters
     ----------
     layout
-        The P >= 3 prisms in the robot frame in m, shape (P, 3).
+        P >= 3 prisms in the robot frame in m, (P, 3).
     stations
-        Who measures; several may track one prism, and each prism needs one at least.
-    stances
-        Where the robot stands.
+        At least one per prism.
     point_m
-        The point of the robot whose position counts, in the robot frame in m, shape (3,).
+        Point of the robot whose position is evaluated, in the robot frame, (3,).
 
     Returns
     -------
     FloatArray
-        Shape (N, 6, 6), in the axes of the robot: position of the point in m, small rotation in rad.
+        (N, 6, 6), in the axes of the robot: position of the point in m, rotation vector in rad.
 
     Raises
     ------
     GeometryError
-        A layout from which no pose follows, a prism that nobody tracks, or a point that is none of the robot.
+        The layout determines no pose, a prism has no station, or the point is far from the robot.
     """
     check_layout(layout)
-    untracked = set(range(len(layout))) - {station.slot for station in stations}
+    untracked = set(range(len(layout))) - {station.prism_index for station in stations}
     if untracked:
         raise GeometryError(
             f"the layout has {len(layout)} prisms for {len(stations)} stations: each prism needs a station of its own"
         )
-    away_m = float(np.linalg.norm(point_m - layout.mean(axis=0)))
-    if away_m > MAX_POINT_DISTANCE_M:
-        raise GeometryError(f"the point is {away_m:g} m from the prisms; give one of the robot, in its frame")
+    distance_m = float(np.linalg.norm(point_m - layout.mean(axis=0)))
+    if distance_m > MAX_POINT_DISTANCE_M:
+        raise GeometryError(
+            f"the point is {distance_m:g} m from the prisms; give one of the robot, in its frame"
+        )
     information = sum(
-        prism_information(layout[slot : slot + 1], slot, stations, robot_poses, point_m)[0]
-        for slot in range(len(layout))
+        prism_information(layout[prism_index : prism_index + 1], prism_index, stations, robot_poses, point_m)[
+            0
+        ]
+        for prism_index in range(len(layout))
     )
     covariance: FloatArray = np.linalg.inv(information)
     return covariance
@@ -170,37 +168,35 @@ def pose_covariances(
 
 def prism_information(
     places_m: FloatArray,
-    slot: int,
+    prism_index: int,
     stations: tuple[Station, ...],
     robot_poses: RobotPoses,
     point_m: FloatArray,
 ) -> FloatArray:
-    """Tell what the measurements of one prism say of the pose, for several places where it could sit.
+    """Return the Fisher information about the pose in the measurements of one prism, for M candidate places of it.
 
     Parameters
     ----------
     places_m
-        In the robot frame in m, shape (M, 3).
-    slot
-        Which prism it is.
-    stations, stances, point_m
-        As for :func:`pose_covariances`.
+        In the robot frame, (M, 3).
+    prism_index, stations, robot_poses, point_m
+        As for :class:`Station` and :func:`pose_covariances`.
 
     Returns
     -------
     FloatArray
-        Information matrices, shape (M, N, 6, 6), in the order and axes of :func:`pose_covariances`.
+        (M, N, 6, 6), in the order and axes of :func:`pose_covariances`.
     """
     in_world = rotate(robot_poses.rotation, places_m[:, None]) + robot_poses.position_m
     weight = np.zeros((*in_world.shape, 3))
     for station in stations:
-        if station.slot != slot:
+        if station.prism_index != prism_index:
             continue
         noise = measurement_covariance(*cartesian_to_polar(in_world - station.position_m), station.noise)
         weight += np.linalg.inv(noise)
     to_robot = np.swapaxes(robot_poses.rotation, 1, 2)
     weight = to_robot @ weight @ robot_poses.rotation
-    # The prism moves with the point and about it: d = [I, -skew(arm)] (translation, rotation).
+    # Displacement of the prism: [I, -skew(lever arm)] (translation, rotation).
     jacobian = np.concatenate(
         [np.broadcast_to(np.eye(3), (len(places_m), 3, 3)), -skew(places_m - point_m)], axis=-1
     )[:, None]
@@ -211,39 +207,31 @@ def prism_information(
 def station_arrangements(
     stations: tuple[Station, ...], centre_m: FloatArray, distance_m: float
 ) -> dict[str, tuple[Station, ...]]:
-    """Move stations to a distance from the robot: all to one side of it, or evenly around it.
+    """Move stations to a horizontal distance from the robot at ``centre_m``: all to one side of it, or evenly around it.
 
-    Parameters
-    ----------
-    stations
-        Where they stand now; the direction of the first one is kept, and so are all heights.
-    centre_m
-        Where the robot stands in the world in m, shape (3,).
-    distance_m
-        Horizontal distance in m.
+    The direction of the first station and the heights of all are kept.
 
     Returns
     -------
     dict
         The stations ``together`` and ``around``.
     """
-    away = stations[0].position_m - centre_m
-    bearing = math.atan2(away[1], away[0])
-    step = 2 * math.pi / len(stations)
-    found = {}
-    for name, turn in (("together", 0.0), ("around", step)):
-        found[name] = tuple(
+    offset = stations[0].position_m - centre_m
+    bearing = math.atan2(offset[1], offset[0])
+    arrangements = {}
+    for name, step in (("together", 0.0), ("around", 2 * math.pi / len(stations))):
+        arrangements[name] = tuple(
             Station(
                 position_m=np.array(
                     [
-                        centre_m[0] + distance_m * math.cos(bearing + i * turn),
-                        centre_m[1] + distance_m * math.sin(bearing + i * turn),
+                        centre_m[0] + distance_m * math.cos(bearing + i * step),
+                        centre_m[1] + distance_m * math.sin(bearing + i * step),
                         station.position_m[2],
                     ]
                 ),
                 noise=station.noise,
-                slot=station.slot,
+                prism_index=station.prism_index,
             )
             for i, station in enumerate(stations)
         )
-    return found
+    return arrangements

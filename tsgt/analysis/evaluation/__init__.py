@@ -1,4 +1,8 @@
-"""TODO face."""
+"""How good poses are: against a reference, and without one by inter-prism distances, held-out prediction and residuals.
+
+Comes in: poses, prism tracks, observations or a trajectory fit of a recording, perhaps a reference trajectory (TUM).
+Goes out: error statistics. docs/reference/evaluate.md defines every figure.
+"""
 
 from tsgt.analysis.evaluation.held_out import (
     Fold,

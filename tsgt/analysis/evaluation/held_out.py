@@ -1,10 +1,8 @@
-"""How well measurements that an estimator has not seen are predicted from the rest. Pure.
+"""Cross-validation: how well the estimators predict measurements that they were not given. Sans-I/O.
 
-No reference is needed, and nothing that all prisms have in common hides: where a prism was measured is compared with where
-the estimator, fitted without that measurement, puts it. Each prism's measurements are dealt out to five folds in turn; a fold
-of one prism is left out at a time. docs/reference/evaluate.md says what the figures mean.
-
-Held-out prediction of a recording's measurements by both estimators.
+Needs no reference, and errors that all prisms share do not cancel: the measured position of a prism is compared with the
+prediction of the estimator fitted without that measurement. The measurements of each prism are dealt in turn into five
+folds; each fold of one prism is held out once. docs/reference/evaluate.md defines the figures.
 """
 
 from __future__ import annotations
@@ -31,24 +29,24 @@ if TYPE_CHECKING:
 FOLDS = 5
 
 EDGE = 5
-"""The first and last so many measurements of a prism are never left out: beyond them there is nothing to predict from."""
+"""This many first and last measurements of a prism are never held out: predicting them would be extrapolation."""
 
 GAP_S = 1.0
-"""A left-out measurement whose remaining neighbours are further apart counts apart, as one at a gap."""
+"""A held-out measurement whose neighbours are further apart counts as one at a gap."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fold:
-    """What is left out at a time: about a fifth of one prism's measurements.
+    """A split of the observations: about a fifth of one prism's measurements is held out.
 
     Attributes
     ----------
     number
-        Which fifth, from 0.
+        0 to 4.
     test, training
-        Rows of the observations that are left out, and all others; increasing.
+        Rows of the observations that are held out, and all others; increasing.
     at_gap
-        For each of ``out``: the prism's remaining measurements before and after it are more than a second apart.
+        For each of ``test``: the prism's neighbours before and after it are more than :data:`GAP_S` apart.
     """
 
     number: int
@@ -59,7 +57,7 @@ class Fold:
 
 @dataclass(frozen=True, slots=True)
 class PredictionErrorStatistics:
-    """Misses of left-out measurements in mm; NaN without any."""
+    """Prediction errors in mm; NaN without any."""
 
     mean: float
     median: float
@@ -68,26 +66,26 @@ class PredictionErrorStatistics:
 
     @classmethod
     def of(cls, error_m: FloatArray) -> PredictionErrorStatistics:
-        """Sum misses in m up."""
+        """Summarise errors in m."""
         if not len(error_m):
             return cls(math.nan, math.nan, math.nan, 0)
-        missed_mm = 1e3 * error_m
+        error_mm = 1e3 * error_m
         return cls(
-            mean=float(np.mean(missed_mm)),
-            median=float(np.median(missed_mm)),
-            p95=float(np.percentile(missed_mm, 95)),
-            n=len(missed_mm),
+            mean=float(np.mean(error_mm)),
+            median=float(np.median(error_mm)),
+            p95=float(np.percentile(error_mm, 95)),
+            n=len(error_mm),
         )
 
 
 @dataclass(frozen=True, slots=True)
 class HeldOutErrors:
-    """Misses of all left-out measurements, in the order of the folds.
+    """Prediction errors of N held-out measurements, in the order of the folds.
 
     Attributes
     ----------
     error_m
-        (N,) distance between where the prism was measured and where it was predicted.
+        (N,) distance between measured and predicted position of the prism.
     at_gap
         (N,) as in :class:`Fold`.
     """
@@ -97,93 +95,82 @@ class HeldOutErrors:
 
     @property
     def statistics(self) -> PredictionErrorStatistics:
-        """Of those that are not at gaps."""
+        """Of the measurements that are not at gaps."""
         return PredictionErrorStatistics.of(self.error_m[~self.at_gap])
 
     @property
     def gaps(self) -> PredictionErrorStatistics:
-        """Of those at gaps."""
+        """Of the measurements at gaps."""
         return PredictionErrorStatistics.of(self.error_m[self.at_gap])
 
 
 def folds(observations: Observations) -> list[Fold]:
-    """Deal the measurements of each prism out; prisms with too few of them have no fold.
+    """Split observations, which must be in the order of time, into at most five folds per prism, sorted by number.
 
-    Parameters
-    ----------
-    observations
-        In the order of time.
-
-    Returns
-    -------
-    list of Fold
-        At most five for each prism, sorted by their number.
+    Prisms with too few measurements have no fold.
     """
-    found = []
+    splits = []
     for number in range(FOLDS):
         for prism in range(len(observations.layout)):
             rows = np.flatnonzero(observations.prism == prism)
-            places = np.arange(number, len(rows), FOLDS)
-            places = places[(places >= EDGE) & (places < len(rows) - EDGE)]
-            if not len(places):
+            indices = np.arange(number, len(rows), FOLDS)
+            indices = indices[(indices >= EDGE) & (indices < len(rows) - EDGE)]
+            if not len(indices):
                 continue
             time_s = observations.time_s[rows]
-            # Its neighbours belong to other folds and stay.
-            at_gap = time_s[places + 1] - time_s[places - 1] > GAP_S
-            kept = np.ones(len(observations), np.bool_)
-            kept[rows[places]] = False
-            found.append(Fold(number, rows[places], np.flatnonzero(kept), at_gap))
-    return found
+            # The neighbours belong to other folds and remain in the training set.
+            at_gap = time_s[indices + 1] - time_s[indices - 1] > GAP_S
+            training = np.ones(len(observations), np.bool_)
+            training[rows[indices]] = False
+            splits.append(Fold(number, rows[indices], np.flatnonzero(training), at_gap))
+    return splits
 
 
 def training_rows(observations: Observations, number: int) -> NDArray[np.intp]:
-    """Rows that no fold of a number leaves out, of whichever prism.
+    """Return the rows that no fold of this number holds out, of any prism.
 
-    What is estimated from these (a prior, stations' frames) may serve all folds of this number: it has seen none of the
-    measurements that they predict.
+    Hyperparameters and frames estimated from these rows may serve all folds of this number.
     """
-    kept = np.ones(len(observations), np.bool_)
+    training = np.ones(len(observations), np.bool_)
     for fold in folds(observations):
         if fold.number == number:
-            kept[fold.test] = False
-    return np.flatnonzero(kept)
+            training[fold.test] = False
+    return np.flatnonzero(training)
 
 
-def cross_validate(parts: Sequence[Fold], error_m: Callable[[Fold], FloatArray]) -> HeldOutErrors:
-    """Collect what an estimator misses.
+def cross_validate(splits: Sequence[Fold], error_m: Callable[[Fold], FloatArray]) -> HeldOutErrors:
+    """Collect prediction errors over folds.
 
     Parameters
     ----------
-    parts
-        From :func:`folds`.
     error_m
-        Given a fold, predicts what it leaves out from what it keeps; by how much it misses each, in m.
+        Predicts the test measurements of a fold from its training measurements; returns the error of each in m.
     """
-    if not parts:
+    if not splits:
         return HeldOutErrors(np.empty(0), np.empty(0, np.bool_))
     return HeldOutErrors(
-        np.concatenate([error_m(fold) for fold in parts]), np.concatenate([fold.at_gap for fold in parts])
+        np.concatenate([error_m(fold) for fold in splits]), np.concatenate([fold.at_gap for fold in splits])
     )
 
 
 def interpolation_errors(observations: Observations, fold: Fold) -> FloatArray:
-    """Predict by straight lines between each prism's own measurements, as the estimator ``linear`` does; misses in m."""
+    """Predict by straight lines between each prism's own measurements, as the estimator ``linear`` does; errors in m."""
     points = observations.in_world()
     prism = observations.prism[fold.test[0]]
-    kept = fold.training[observations.prism[fold.training] == prism]
+    training = fold.training[observations.prism[fold.training] == prism]
     time_s = observations.time_s[fold.test]
-    lines = [np.interp(time_s, observations.time_s[kept], points[kept, axis]) for axis in range(3)]
-    missed: FloatArray = np.linalg.norm(np.stack(lines, axis=1) - points[fold.test], axis=1)
-    return missed
+    lines = [np.interp(time_s, observations.time_s[training], points[training, axis]) for axis in range(3)]
+    error_m: FloatArray = np.linalg.norm(np.stack(lines, axis=1) - points[fold.test], axis=1)
+    return error_m
 
 
-def trajectory_errors(trajectory: Trajectory, left_out: Observations) -> FloatArray:
-    """By how much a trajectory misses measurements of prisms, in m."""
-    states, _ = trajectory.at(left_out.time_s)
-    arms = left_out.layout[left_out.prism]
-    predicted = states.position + (states.rotation @ arms[..., None])[..., 0]
-    missed: FloatArray = np.linalg.norm(predicted - left_out.in_world(), axis=1)
-    return missed
+def trajectory_errors(trajectory: Trajectory, test: Observations) -> FloatArray:
+    """Return the distance in m between measured prism positions and those that a trajectory predicts."""
+    states, _ = trajectory.at(test.time_s)
+    lever_arms = test.layout[test.prism]
+    predicted = states.position + (states.rotation @ lever_arms[..., None])[..., 0]
+    error_m: FloatArray = np.linalg.norm(predicted - test.in_world(), axis=1)
+    return error_m
 
 
 def held_out_errors(
@@ -192,38 +179,38 @@ def held_out_errors(
     *,
     on_progress: Callable[[float], None] | None = None,
 ) -> dict[Estimator, HeldOutErrors]:
-    """Leave measurements out and predict them.
+    """Cross-validate both estimators.
 
-    How the robot moves is found five times, each time without the measurements of one number's folds of all prisms, so
-    that nothing that predicts a measurement has seen it.
+    The hyperparameters are estimated five times, each time without the test measurements of one number's folds of all
+    prisms, so that no prediction depends on the measurement that it is compared with.
 
     Parameters
     ----------
     observations
         In the order of time, with the stated noise.
     pipeline
-        How the robot moves if the measurements are too few to tell, and how lively it is at least.
+        Hyperparameters if the measurements are too few to estimate them, and their lower bounds.
     on_progress
-        Called now and then with the share of the work that is done, 0 to 1.
+        Called with the completed fraction, 0 to 1.
 
     Raises
     ------
     GeometryError
-        No trajectory fits what is kept.
+        No trajectory fits the training measurements.
     """
     report = on_progress or (lambda _: None)
-    parts = folds(observations)
+    splits = folds(observations)
     motions = []
-    for number in range(FOLDS if parts else 0):
+    for number in range(FOLDS if splits else 0):
         report(number / (2 * FOLDS))
         motions.append(
             estimate_motion_model(observations.select(training_rows(observations, number)), pipeline)
         )
     done = 0
 
-    def missed(fold: Fold) -> FloatArray:
+    def smoothing_errors(fold: Fold) -> FloatArray:
         nonlocal done
-        report(0.5 + 0.5 * done / len(parts))
+        report(0.5 + 0.5 * done / len(splits))
         done += 1
         motion = motions[fold.number]
         found = fit_trajectory(
@@ -235,8 +222,8 @@ def held_out_errors(
         return trajectory_errors(found.trajectory, observations.select(fold.test))
 
     result: dict[Estimator, HeldOutErrors] = {
-        "linear": cross_validate(parts, lambda fold: interpolation_errors(observations, fold)),
-        "continuous": cross_validate(parts, missed),
+        "linear": cross_validate(splits, lambda fold: interpolation_errors(observations, fold)),
+        "continuous": cross_validate(splits, smoothing_errors),
     }
     report(1.0)
     return result

@@ -1,8 +1,7 @@
-"""Distances between prisms: the rigid robot as its own reference.
+"""Inter-prism distances: the rigid robot as its own reference. Sans-I/O.
 
-Whatever the robot does, the distances between its prisms do not change. How far the measured ones stray from those
-of the layout says how well time, frames and interpolation fit together, without any other reference. What the
-figures mean is fixed in docs/reference/evaluate.md.
+The distances between prisms on a rigid robot are constant. Their deviation from those of the layout shows how well time,
+frames and interpolation agree, without any other reference. docs/reference/evaluate.md defines the figures.
 """
 
 from __future__ import annotations
@@ -26,8 +25,8 @@ if TYPE_CHECKING:
 
 EPOCH_NS = 50_000_000
 
-# A tracked prism that stands still scatters by a few millimetres; over 0.3 s and more that stays well below this
-# speed, and whoever drives slower moves less between two stations' measurements than the noise of one.
+# The noise of a stationary prism, a few millimetres, stays well below this speed over 0.3 s and more; a robot slower
+# than this moves less between the measurements of two stations than their noise.
 MAX_STATIONARY_SPEED_MPS = 0.05
 SPEED_BASELINE_NS = 300_000_000
 MIN_STATIONARY_NS = 3_000_000_000
@@ -35,7 +34,7 @@ MIN_STATIONARY_NS = 3_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class DistanceStatistics:
-    """Distances between two prisms in figures, in mm, as ``tsgt evaluate`` reports them; NaN without distances.
+    """Inter-prism distances in mm, as ``tsgt evaluate`` prints them; NaN without distances.
 
     Attributes
     ----------
@@ -46,7 +45,7 @@ class DistanceStatistics:
     mean_abs_error, p95
         Mean and 95th percentile of |distance - reference|.
     valid, invalid
-        How many distances there are, and how many epochs had none.
+        Number of distances, and of epochs without one.
     """
 
     reference: float
@@ -60,18 +59,16 @@ class DistanceStatistics:
 
 @dataclass(frozen=True, slots=True)
 class PairDistances:
-    """Measured distances between two prisms.
+    """N measured distances between two prisms.
 
     Attributes
     ----------
     prisms
         Numbers of the two prisms.
-    distances_m
-        (N,) distances in m.
     reference_m
-        Their distance in the prism layout in m.
+        Their distance in the prism layout.
     invalid
-        How many epochs had no valid distance.
+        Number of epochs without a valid distance.
     """
 
     prisms: tuple[int, int]
@@ -81,42 +78,43 @@ class PairDistances:
 
     @property
     def name(self) -> str:
-        """The pair as it is called in reports: ``1-2``."""
+        """Name of the pair in reports: ``1-2``."""
         return "-".join(map(str, self.prisms))
 
     def statistics(self) -> DistanceStatistics:
-        """Sum the distances up."""
-        found = self.distances_m * 1e3
+        """Summarise the distances."""
+        distances = self.distances_m * 1e3
         reference = self.reference_m * 1e3
-        error = np.abs(found - reference)
-        nothing = len(found) == 0
+        if not len(distances):
+            return DistanceStatistics(reference, *(math.nan,) * 4, valid=0, invalid=self.invalid)
+        error = np.abs(distances - reference)
         return DistanceStatistics(
             reference=reference,
-            mean=math.nan if nothing else float(np.mean(found)),
-            std=math.nan if nothing else float(np.std(found)),
-            mean_abs_error=math.nan if nothing else float(np.mean(error)),
-            p95=math.nan if nothing else float(np.percentile(error, 95)),
-            valid=len(found),
+            mean=float(np.mean(distances)),
+            std=float(np.std(distances)),
+            mean_abs_error=float(np.mean(error)),
+            p95=float(np.percentile(error, 95)),
+            valid=len(distances),
             invalid=self.invalid,
         )
 
 
 @dataclass(frozen=True, slots=True)
 class InterPrismDistances:
-    """Distances between all prisms of a recording.
+    """Distances between all pairs of prisms of a recording.
 
     Attributes
     ----------
     dynamic
         Per pair, at 20 Hz from interpolated tracks.
     static
-        Per pair, from raw measurements while the robot stood still.
+        Per pair, from raw measurements in stationary intervals.
     epochs
-        How many 20 Hz epochs lie in the span that all tracks cover.
+        Number of 20 Hz epochs in the span that all tracks cover.
     invalid_epochs
-        At how many of them a track's neighbours are further apart than the outage limit.
-    still_ns
-        Start and end of the intervals in which the robot stood still, in the order of time.
+        Number of epochs at which the neighbours in a track are further apart than the outage limit.
+    stationary_ns
+        Start and end of the stationary intervals, in the order of time.
     """
 
     dynamic: tuple[PairDistances, ...]
@@ -127,7 +125,7 @@ class InterPrismDistances:
 
     @property
     def stationary_s(self) -> float:
-        """For how long the robot stood still, in s."""
+        """Total duration of the stationary intervals."""
         return sum(end - start for start, end in self.stationary_ns) / 1e9
 
 
@@ -138,9 +136,9 @@ class EpochDistances:
     Attributes
     ----------
     stamp_ns
-        (N,) whole multiples of 50 ms in Unix time, in the time that all tracks cover.
+        (N,) whole multiples of 50 ms in Unix time, in the span that all tracks cover.
     valid
-        (N,) no track has a gap there. It takes all of them, so that the pairs are compared over the same stretches.
+        (N,) no track has a gap. All tracks are required, so that the pairs are compared over the same epochs.
     distances_m
         By pair of prisms, (N,); NaN where not valid.
     references_m
@@ -154,7 +152,7 @@ class EpochDistances:
 
 
 def distances_at_epochs(parameters: Parameters, tracks: Mapping[int, Track]) -> EpochDistances:
-    """Measure the distances between all prisms at 20 Hz; arguments as for :func:`inter_prism`."""
+    """Interpolate all tracks at 20 Hz and measure the distances; arguments as for :func:`inter_prism`."""
     layout = {prism.prism: np.array(prism.position_m) for prism in parameters.prisms}
     start, end = _common_span([tracks[prism] for prism in layout])
     epochs = np.arange(-(-start // EPOCH_NS), end // EPOCH_NS + 1, dtype=np.int64) * EPOCH_NS
@@ -177,7 +175,7 @@ def inter_prism(
     stationary_ns: Sequence[tuple[int, int]] | None = None,
     found: EpochDistances | None = None,
 ) -> InterPrismDistances:
-    """Measure the distances between all prisms, moving and standing.
+    """Measure the distances between all prisms, moving and stationary.
 
     Parameters
     ----------
@@ -185,51 +183,50 @@ def inter_prism(
         The prism layout (the reference distances) and the outage limit.
     tracks
         One track per prism of the layout, in frame ``station1``, none of them empty.
-    still_ns
-        When the robot stood still, if something else than the tracks tells it; what of it lies before the first and after
-        the last measurement does not count.
+    stationary_ns
+        Stationary intervals from another source, such as odometry; clipped to the time of the tracks.
     found
-        From :func:`distances_at_epochs`, if it is known already.
+        Result of :func:`distances_at_epochs`, if already computed.
 
     Returns
     -------
-    InterPrism
-        Without epochs where the tracks have no time in common.
+    InterPrismDistances
+        Without epochs where the tracks do not overlap in time.
     """
     chosen = [tracks[prism.prism] for prism in parameters.prisms]
     found = distances_at_epochs(parameters, tracks) if found is None else found
     if stationary_ns is None:
-        still = stationary_intervals(chosen, parameters.pipeline.outage_limit_ns)
+        stationary = stationary_intervals(chosen, parameters.pipeline.outage_limit_ns)
     else:
         start, end = min(int(t.times_ns[0]) for t in chosen), max(int(t.times_ns[-1]) for t in chosen)
-        still = [(max(a, start), min(b, end)) for a, b in stationary_ns if max(a, start) < min(b, end)]
+        stationary = [(max(a, start), min(b, end)) for a, b in stationary_ns if max(a, start) < min(b, end)]
     invalid = int(np.sum(~found.valid))
     dynamic, static = [], []
     for pair, reference_m in found.references_m.items():
         dynamic.append(PairDistances(pair, found.distances_m[pair][found.valid], reference_m, invalid))
-        standing = _raw_distances(tracks[pair[0]], tracks[pair[1]], still)
-        static.append(PairDistances(pair, standing, reference_m, 0))
+        raw_m = _raw_distances(tracks[pair[0]], tracks[pair[1]], stationary)
+        static.append(PairDistances(pair, raw_m, reference_m, 0))
     return InterPrismDistances(
         dynamic=tuple(dynamic),
         static=tuple(static),
         epochs=len(found.stamp_ns),
         invalid_epochs=invalid,
-        stationary_ns=tuple(still),
+        stationary_ns=tuple(stationary),
     )
 
 
 def stationary_intervals(tracks: Sequence[Track], outage_limit_ns: int) -> list[tuple[int, int]]:
-    """Find when all prisms stand still.
+    """Find the intervals of 3 s or more in which no prism moves.
 
-    A track moves from one position to the first one at least 0.3 s later if that is faster than 0.05 m/s; it is
-    unknown, hence not still, across an outage. What no track's motion covers for 3 s or more is still.
+    A track moves between a position and the first one at least 0.3 s later if the speed exceeds 0.05 m/s; across an outage
+    its motion is unknown and counts as moving.
 
     Parameters
     ----------
     tracks
-        Tracks that are not empty.
+        None of them empty.
     outage_limit_ns
-        Positions further apart than this say nothing about the time between them.
+        Positions further apart in time are an outage.
 
     Returns
     -------
@@ -247,13 +244,13 @@ def stationary_intervals(tracks: Sequence[Track], outage_limit_ns: int) -> list[
         moves = (step_m > MAX_STATIONARY_SPEED_MPS * step_ns * 1e-9) | (step_ns > outage_limit_ns)
         moving += zip(times[first][moves].tolist(), times[second][moves].tolist(), strict=True)
     start, end = _common_span(tracks)
-    still = []
-    reached = start
-    for leaves, arrives in [*sorted(moving), (end, end)]:
-        if min(leaves, end) - reached >= MIN_STATIONARY_NS:
-            still.append((reached, min(leaves, end)))
-        reached = max(reached, arrives)
-    return still
+    stationary = []
+    previous_end = start
+    for motion_start, motion_end in [*sorted(moving), (end, end)]:
+        if min(motion_start, end) - previous_end >= MIN_STATIONARY_NS:
+            stationary.append((previous_end, min(motion_start, end)))
+        previous_end = max(previous_end, motion_end)
+    return stationary
 
 
 def _common_span(tracks: Sequence[Track]) -> tuple[int, int]:

@@ -1,7 +1,4 @@
-"""How far poses are from the truth: unaligned, root mean squares over the inner part of a run.
-
-What aligning poses with a reference would hide: errors before and after it. Pure.
-"""
+"""Pose errors against the truth, unaligned and after an alignment. Sans-I/O."""
 
 from __future__ import annotations
 
@@ -18,8 +15,8 @@ if TYPE_CHECKING:
 
     from tsgt.geometry import FloatArray
 
-EDGE_NS = 2_000_000_000
-"""What is left out at the start and at the end of a run, where an estimator lacks one of its sides."""
+EDGE_MARGIN_NS = 2_000_000_000
+"""Excluded at the start and end of a trajectory, where the estimator has measurements on one side only."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,9 +26,9 @@ class PoseErrors:
     Attributes
     ----------
     position_m
-        (N,) length of the position error at the chosen point of the robot, in m.
+        (N,) norm of the position error at the chosen point of the robot.
     rotation_rad
-        (N,) angle of the rotation between estimate and truth, in rad.
+        (N,) angle of the rotation between estimate and truth.
     """
 
     position_m: NDArray[np.float64]
@@ -39,31 +36,31 @@ class PoseErrors:
 
     @property
     def position_rms_mm(self) -> float:
-        """Root mean square of the position error in mm; NaN without poses."""
+        """Root mean square of the position error; NaN without poses."""
         return 1e3 * _rms(self.position_m)
 
     @property
     def orientation_rms_deg(self) -> float:
-        """Root mean square of the rotation error in degrees; NaN without poses."""
+        """Root mean square of the rotation error; NaN without poses."""
         return math.degrees(_rms(self.rotation_rad))
 
 
 NEES_95 = 12.591587
-"""95th percentile of chi-square with 6 degrees of freedom."""
+"""95th percentile of the chi-square distribution with 6 degrees of freedom."""
 
 
 @dataclass(frozen=True, slots=True)
 class NeesStatistics:
-    """Normalised estimation error squared, of position and rotation together; NaN without poses.
+    """Normalised estimation error squared (NEES) of position and rotation; NaN without poses.
+
+    Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, section 5.4.2.
 
     Attributes
     ----------
     mean
-        6 where the covariances are right; above that they promise too much.
+        6 for consistent covariances; larger if they are overconfident.
     above_95
-        Which share is above what 5 % of right ones are above.
-    max
-        The largest one.
+        Share above :data:`NEES_95`; 0.05 for consistent covariances.
     """
 
     mean: float
@@ -72,7 +69,7 @@ class NeesStatistics:
 
     @classmethod
     def of(cls, errors: NDArray[np.float64], covariance: NDArray[np.float64]) -> NeesStatistics:
-        """Weigh errors, (N, 6), with their covariances, (N, 6, 6)."""
+        """Compute the NEES of errors, (N, 6), with covariances, (N, 6, 6)."""
         if not len(errors):
             return cls(math.nan, math.nan, math.nan)
         nees = np.einsum("ni,ni->n", errors, np.linalg.solve(covariance, errors[..., None])[..., 0])
@@ -81,17 +78,7 @@ class NeesStatistics:
 
 @dataclass(frozen=True, slots=True)
 class PoseErrorStatistics:
-    """How far poses are from the truth; NaN where none could be compared.
-
-    Attributes
-    ----------
-    compared
-        How many there are.
-    position_rms_mm, orientation_rms_deg
-        Root mean squares, unaligned.
-    nees
-        Whether the errors are as large as the covariances say.
-    """
+    """Unaligned errors of ``compared`` poses as root mean squares, and their NEES; NaN without poses."""
 
     compared: int
     position_rms_mm: float
@@ -113,16 +100,16 @@ class PoseErrorStatistics:
         estimated, true, point_m
             As for :func:`pose_errors`.
         covariance
-            (N, 6, 6) of the estimated ones, rotations about fixed axes.
+            (N, 6, 6) of ``estimated``, rotations about the axes of the world.
         """
         errors = pose_errors(estimated, true, point_m)
-        turned = log_so3(estimated[:, :3, :3] @ np.swapaxes(true[:, :3, :3], 1, 2))
+        rotation = log_so3(estimated[:, :3, :3] @ np.swapaxes(true[:, :3, :3], 1, 2))
         return cls(
             compared=len(estimated),
             position_rms_mm=errors.position_rms_mm,
             orientation_rms_deg=errors.orientation_rms_deg,
             nees=NeesStatistics.of(
-                np.concatenate([estimated[:, :3, 3] - true[:, :3, 3], turned], axis=1), covariance
+                np.concatenate([estimated[:, :3, 3] - true[:, :3, 3], rotation], axis=1), covariance
             ),
         )
 
@@ -130,26 +117,23 @@ class PoseErrorStatistics:
 def pose_errors(
     estimated: NDArray[np.float64], true: NDArray[np.float64], point_m: NDArray[np.float64]
 ) -> PoseErrors:
-    """Compare poses with the truth at the same instants, without any alignment.
+    """Compare poses with the truth at the same instants, without alignment.
 
     Parameters
     ----------
     estimated, true
         ``T_station1_robot``, (N, 4, 4) each.
     point_m
-        The point of the robot whose position is compared, in the frame ``robot``, (3,): the centroid of the
-        prisms, which is where the stations measure.
+        Point of the robot whose position is compared, in the frame ``robot``, (3,): usually the centroid of the prisms.
     """
     offset = transform_points(estimated, point_m) - transform_points(true, point_m)
-    turned = (invert(true) @ estimated)[:, :3, :3]
-    return PoseErrors(
-        position_m=np.linalg.norm(offset, axis=1), rotation_rad=np.linalg.norm(log_so3(turned), axis=1)
-    )
+    rotation = (invert(true) @ estimated)[:, :3, :3]
+    return PoseErrors(np.linalg.norm(offset, axis=1), np.linalg.norm(log_so3(rotation), axis=1))
 
 
 def interior_mask(stamp_ns: NDArray[np.int64], start_ns: int, end_ns: int) -> NDArray[np.bool_]:
-    """Tell, (N,), which instants count in a run's figures: those :data:`EDGE_NS` away from its start and end."""
-    inner: NDArray[np.bool_] = (stamp_ns >= start_ns + EDGE_NS) & (stamp_ns <= end_ns - EDGE_NS)
+    """Return, (N,), which instants are at least :data:`EDGE_MARGIN_NS` after the start and before the end."""
+    inner: NDArray[np.bool_] = (stamp_ns >= start_ns + EDGE_MARGIN_NS) & (stamp_ns <= end_ns - EDGE_MARGIN_NS)
     return inner
 
 
@@ -162,19 +146,18 @@ Align = Literal["translation", "rigid"]
 
 @dataclass(frozen=True, slots=True)
 class AlignedErrorStatistics:
-    """How far poses are from a reference when they have been brought as close to it as one transform can.
+    """Errors left after aligning poses with a reference by one transform, and what the alignment hides.
 
     Attributes
     ----------
     translation_mm
-        By how much the middle of the compared positions was shifted.
+        Shift of the centroid of the compared positions.
     rotation_deg
-        By how much all of it was turned; 0 where only a shift was allowed.
+        Rotation of the alignment; 0 with ``translation``.
     position_rms_mm, orientation_rms_deg
-        Root mean squares of what is left.
+        Root mean squares after the alignment.
     hidden_position_mm, hidden_orientation_deg
-        Root mean squares before less those after: what an aligned figure does not show. The orientation may be worse
-        after, since only positions are aligned.
+        Root mean squares before minus after. The orientation may be negative, since only positions are aligned.
     """
 
     translation_mm: float
@@ -188,31 +171,30 @@ class AlignedErrorStatistics:
 def aligned_statistics(
     estimated: FloatArray, true: FloatArray, point_m: FloatArray, mode: Align
 ) -> AlignedErrorStatistics:
-    """Align poses with the truth at the same instants, and compare.
+    """Align poses with the truth at the same instants and compare.
 
     Parameters
     ----------
     estimated, true
         ``T_station1_robot``, (N, 4, 4) each.
     point_m
-        The point of the robot whose positions are aligned and compared, in the frame ``robot``, (3,).
+        Point of the robot whose positions are aligned and compared, in the frame ``robot``, (3,).
     mode
-        ``translation``: one shift for all poses. ``rigid``: a shift and a rotation, never a scale; what evo's ``-a`` does
-        with the trajectories of this point (Umeyama 1991).
+        ``translation``: shift only. ``rigid``: shift and rotation without scale (Umeyama 1991), as evo's ``-a`` does.
 
     Raises
     ------
     DegenerateGeometryError
-        ``rigid``, and the positions lie in a line or at one place, or there are fewer than three.
+        ``rigid``, and the positions lie in a line or coincide, or there are fewer than three.
     """
     before = pose_errors(estimated, true, point_m)
-    found, wanted = transform_points(estimated, point_m), transform_points(true, point_m)
+    points, true_points = transform_points(estimated, point_m), transform_points(true, point_m)
     if not len(estimated):
         return AlignedErrorStatistics(*(math.nan,) * 6)
-    rotation = align(found, wanted).rotation if mode == "rigid" else np.eye(3)
-    shift = wanted.mean(axis=0) - found.mean(axis=0)
-    moved = transform_from(rotation, wanted.mean(axis=0) - rotation @ found.mean(axis=0)) @ estimated
-    after = pose_errors(moved, true, point_m)
+    rotation = align(points, true_points).rotation if mode == "rigid" else np.eye(3)
+    shift = true_points.mean(axis=0) - points.mean(axis=0)
+    aligned = transform_from(rotation, true_points.mean(axis=0) - rotation @ points.mean(axis=0)) @ estimated
+    after = pose_errors(aligned, true, point_m)
     return AlignedErrorStatistics(
         translation_mm=1e3 * float(np.linalg.norm(shift)),
         rotation_deg=math.degrees(float(np.linalg.norm(log_so3(rotation)))),

@@ -1,4 +1,4 @@
-"""Another trajectory to compare poses with: a file in the TUM format, in the frame ``station1`` and of the robot."""
+"""Reference trajectory: a file in the TUM format, of the robot frame in frame ``station1``."""
 
 from __future__ import annotations
 
@@ -25,18 +25,17 @@ if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
 
 MAX_INTERPOLATION_GAP_NS = 100_000_000
-"""Reference poses further apart than this say nothing about the time between them: at 0.5 m/s^2 a straight line
-misses by 0.6 mm there."""
+"""Reference poses further apart are not interpolated: at 0.5 m/s^2 a straight line over this time is off by 0.6 mm."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """Poses from elsewhere.
+    """Poses of a reference.
 
     Attributes
     ----------
     stamp_ns
-        (N,) on the Unix clock, strictly increasing.
+        (N,) Unix time, strictly increasing.
     position_m
         (N, 3) in frame ``station1``.
     orientation_xyzw
@@ -48,7 +47,7 @@ class Reference:
     orientation_xyzw: FloatArray
 
     def at(self, stamp_ns: NDArray[np.int64]) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """Return ``T_station1_robot`` at some instants, (N, 4, 4), and whether it is known there, (N,)."""
+        """Return ``T_station1_robot`` interpolated at some instants, (N, 4, 4), and whether it is known there, (N,)."""
         after = np.clip(np.searchsorted(self.stamp_ns, stamp_ns), 1, len(self.stamp_ns) - 1)
         before = after - 1
         step_ns = self.stamp_ns[after] - self.stamp_ns[before]
@@ -58,8 +57,8 @@ class Reference:
         poses = np.broadcast_to(np.eye(4), (len(stamp_ns), 4, 4)).copy()
         if known.any():
             start_ns = self.stamp_ns[0]
-            turns = Slerp((self.stamp_ns - start_ns) / 1e9, Rotation.from_quat(self.orientation_xyzw))
-            rotation = turns((stamp_ns[known] - start_ns) / 1e9).as_matrix()
+            slerp = Slerp((self.stamp_ns - start_ns) / 1e9, Rotation.from_quat(self.orientation_xyzw))
+            rotation = slerp((stamp_ns[known] - start_ns) / 1e9).as_matrix()
             share = ((stamp_ns - self.stamp_ns[before]) / step_ns)[known, None]
             position = (1 - share) * self.position_m[before[known]] + share * self.position_m[after[known]]
             poses[known] = transform_from(rotation, position)
@@ -67,19 +66,19 @@ class Reference:
 
 
 def read_tum(path: Path) -> Reference:
-    """Read a trajectory: ``stamp_s x y z qx qy qz qw`` in each line, ``#`` before comments.
+    """Read a trajectory: ``stamp_s x y z qx qy qz qw`` in each line; ``#`` starts a comment.
 
     Raises
     ------
     InputFileError
-        It cannot be read, has fewer than two poses, or a line is not a pose; times must increase.
+        It cannot be read, has fewer than two poses, a line is not a pose, or times do not increase.
     """
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise InputFileError(f"cannot be read: {error.strerror}", path=path) from error
     except UnicodeDecodeError as error:
-        raise InputFileError("is no text", path=path) from error
+        raise InputFileError("is not a text file", path=path) from error
     stamps: list[int] = []
     rows: list[list[float]] = []
     for number, line in enumerate(text.splitlines(), start=1):
@@ -89,7 +88,7 @@ def read_tum(path: Path) -> Reference:
         stamp_ns, row = _pose(words, path, number)
         if stamps and stamp_ns <= stamps[-1]:
             raise InputFileError(
-                "its time is not after that of the line before; sort the poses", path=path, line=number
+                "its time is not later than that of the previous line; sort the poses", path=path, line=number
             )
         stamps.append(stamp_ns)
         rows.append(row)
@@ -103,24 +102,24 @@ def read_tum(path: Path) -> Reference:
 
 
 def _pose(words: list[str], path: Path, number: int) -> tuple[int, list[float]]:
-    """Read one line: the stamp without a float in between, which would not hold its nanoseconds."""
+    """Parse one line; the timestamp as a decimal, since a float would lose its nanoseconds."""
     try:
         stamp_ns = round(Decimal(words[0]) * 1_000_000_000)
         check_instants(stamp_ns)
         row = [float(word) for word in words[1:]]
-    except (ValueError, ArithmeticError) as error:  # the latter are decimal's too
+    except (ValueError, ArithmeticError) as error:  # decimal raises the latter
         raise InputFileError(
             "is not a pose; expected: stamp_s x y z qx qy qz qw", path=path, line=number
         ) from error
-    # A quaternion far from unit length is none: columns of something else.
-    near = all(abs(coordinate) <= MAX_COORDINATE_M for coordinate in row[:3])  # which no NaN is
-    if len(row) != 7 or not near or not 1e-3 < math.hypot(*row[3:]) < 1e3:
+    # A quaternion far from unit length indicates columns of another format.
+    bounded = all(abs(coordinate) <= MAX_COORDINATE_M for coordinate in row[:3])  # false for NaN
+    if len(row) != 7 or not bounded or not 1e-3 < math.hypot(*row[3:]) < 1e3:
         raise InputFileError("is not a pose; expected: stamp_s x y z qx qy qz qw", path=path, line=number)
     return stamp_ns, row
 
 
 def match_poses(poses: PoseBatch, reference: Reference) -> tuple[NDArray[np.intp], FloatArray]:
-    """Find the valid poses that have a reference, from 2 s after its start to 2 s before its end.
+    """Find the valid poses in the interior of the reference that have a reference pose.
 
     Returns
     -------
@@ -140,12 +139,10 @@ def compare(poses: PoseBatch, reference: Reference, point_m: FloatArray) -> Pose
 
     Parameters
     ----------
-    poses
-        As computed.
     reference
         Poses of the same robot frame in frame ``station1``.
     point_m
-        The point of the robot whose position is compared, (3,): the centroid of the prisms.
+        Point of the robot whose position is compared, (3,): the centroid of the prisms.
     """
     rows, true = match_poses(poses, reference)
     return PoseErrorStatistics.of(_transforms(poses, rows), poses.covariance[rows], true, point_m)
@@ -154,7 +151,7 @@ def compare(poses: PoseBatch, reference: Reference, point_m: FloatArray) -> Pose
 def compare_aligned(
     poses: PoseBatch, reference: Reference, point_m: FloatArray, mode: Align
 ) -> AlignedErrorStatistics:
-    """Compare the same poses as :func:`compare` once they are aligned; see :func:`tsgt.analysis.evaluation.metrics.aligned_statistics`."""
+    """Compare the same poses as :func:`compare` after an alignment; see :func:`aligned_statistics`."""
     rows, true = match_poses(poses, reference)
     return aligned_statistics(_transforms(poses, rows), true, point_m, mode)
 

@@ -1,6 +1,6 @@
-"""How well a fitted trajectory and the measurements agree: residuals by station and axis, and which measurements stray.
+"""Residuals of a fitted trajectory by station and axis, and outliers. Sans-I/O.
 
-Pure. docs/reference/evaluate.md says what the figures mean.
+docs/reference/evaluate.md defines the figures.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ if TYPE_CHECKING:
 POLAR_AXES = ("range", "horizontal_angle", "zenith_angle")
 POINT_AXES = ("x", "y", "z")
 
-MIN_STEP_FRACTION = 1e-3
-"""Where less than this share of a measurement's variance is left to its residual, the trajectory follows it wherever it
-goes, and the residual says nothing."""
+MIN_VARIANCE_SHARE = 1e-3
+"""Residuals whose expected variance is a smaller share of the noise variance carry no information: the trajectory follows
+these measurements exactly.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,11 +36,9 @@ class ResidualStatistics:
     Attributes
     ----------
     mean, std
-        0 and 1 where motion and noise are as supposed.
+        0 and 1 if motion prior and noise are as assumed.
     beyond_3_sigma
-        Which share of them is further from 0 than 3; 0.0027 of a normal distribution.
-    n
-        How many there are.
+        Share with an absolute value above 3; 0.0027 for a normal distribution.
     """
 
     mean: float
@@ -49,7 +48,7 @@ class ResidualStatistics:
 
     @classmethod
     def of(cls, normalised: FloatArray) -> ResidualStatistics:
-        """Sum normalised residuals up."""
+        """Summarise normalised residuals."""
         if not len(normalised):
             return cls(math.nan, math.nan, math.nan, 0)
         return cls(
@@ -62,18 +61,16 @@ class ResidualStatistics:
 
 @dataclass(frozen=True, slots=True)
 class Outlier:
-    """A measurement that strays too far to be noise: a reflection, another prism, a bad status that slipped through.
+    """A rejected measurement: a reflection, another prism, a wrong status.
 
     Attributes
     ----------
-    station, prism
-        Who measured what.
     stamp_ns
-        Its time as recorded, on the master's Unix clock.
+        As recorded, on the master's Unix clock.
     missed_mm
-        By how much the trajectory misses it.
+        Distance between measured and fitted position.
     sigmas
-        The same in sigmas of its noise.
+        The same in sigmas of the measurement noise.
     """
 
     station: int
@@ -84,10 +81,11 @@ class Outlier:
 
 
 def normalised_residuals(fit: TrajectoryFit) -> FloatArray:
-    """Residuals over the sigma that they should have; NaN where a residual says nothing.
+    """Divide residuals by their expected sigma; NaN where a residual carries no information.
 
-    A residual is smaller than the noise that makes it, because the trajectory gives way to it: of the noise's variance,
-    what the trajectory's own at that place takes up is taken off.
+    The expected variance of a residual is the noise variance minus the variance of the trajectory at that point, because the
+    trajectory follows the measurement: Q_vv = Q_ll - A Q_xx A^T (Baarda 1968, A testing procedure for use in geodetic
+    networks).
 
     Returns
     -------
@@ -99,38 +97,33 @@ def normalised_residuals(fit: TrajectoryFit) -> FloatArray:
     noise = np.diagonal(linearised.covariance(fit.observations), axis1=1, axis2=2)
     jacobian = linearised.jacobian
     own = np.einsum("mij,mjk,mik->mi", jacobian, fit.trajectory.covariance[at], jacobian, optimize=True)
-    left = noise - fit.weights[:, None] * own
-    told = left > MIN_STEP_FRACTION * noise
-    return np.where(told, fit.residuals_m / np.sqrt(np.where(told, left, 1.0)), np.nan)
+    expected = noise - fit.weights[:, None] * own
+    informative = expected > MIN_VARIANCE_SHARE * noise
+    return np.where(informative, fit.residuals_m / np.sqrt(np.where(informative, expected, 1.0)), np.nan)
 
 
 def residual_statistics(
     fit: TrajectoryFit, sources: Sequence[Measurement]
 ) -> dict[int, dict[str, ResidualStatistics]]:
-    """Sum the normalised residuals up by station and by what it measured.
+    """Summarise the normalised residuals by station and measured axis.
 
-    Parameters
-    ----------
-    fit
-        The trajectory.
-    sources
-        The measurement of each of its observations.
+    ``sources`` holds the measurement of each observation of the fit.
     """
     normalised = normalised_residuals(fit)
     station = np.array([source.station for source in sources])
-    found: dict[int, dict[str, ResidualStatistics]] = {}
+    statistics: dict[int, dict[str, ResidualStatistics]] = {}
     for number in np.unique(station).tolist():
-        found[number] = {}
+        statistics[number] = {}
         for polar, names in ((True, POLAR_AXES), (False, POINT_AXES)):
             rows = (station == number) & (fit.observations.polar == polar)
             for axis, name in enumerate(names if rows.any() else ()):
                 values = normalised[rows, axis]
-                found[number][name] = ResidualStatistics.of(values[np.isfinite(values)])
-    return found
+                statistics[number][name] = ResidualStatistics.of(values[np.isfinite(values)])
+    return statistics
 
 
 def outliers(fit: TrajectoryFit, sources: Sequence[Measurement]) -> list[Outlier]:
-    """Name the measurements that the fit has taken for outliers, the worst first."""
+    """Return the measurements that the fit rejected, the worst first."""
     rows = np.flatnonzero(fit.weights < 1.0)
     return [
         Outlier(

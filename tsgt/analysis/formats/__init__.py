@@ -1,4 +1,9 @@
-"""TODO face."""
+"""File formats of other programs and set-up files, read and written.
+
+Read: RTKLIB solutions, the authors' published tracks, polar tracks (CSV), target and prism files, odometry. Written: TUM,
+CSV, MCAP with ROS 2 messages, set-up files (TOML). A file that cannot be used raises one line with path, line number, what
+was expected and what was found.
+"""
 
 from tsgt.analysis.formats.export import measurement_csv, pose_csv, tum_lines, valid_records, valid_rows
 from tsgt.analysis.formats.mcap import messages, write_mcap

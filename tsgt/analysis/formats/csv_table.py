@@ -1,7 +1,8 @@
-"""Comma-separated files with named columns, with one clear line for whatever is wrong in them."""
+"""CSV files with named columns, and error messages with path, line and column."""
 
 from __future__ import annotations
 
+import csv
 import math
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -30,13 +31,13 @@ class Header:
     names: list[str]
 
     def expect(self, columns: Sequence[Sequence[str]], optional: Sequence[str]) -> None:
-        """Refuse a header that lacks a column (of each, one of its alternatives), or has an unknown one or one twice."""
+        """Raise unless each tuple of ``columns`` has exactly one of its names, and no name is unknown or doubled."""
         known = {*optional, *(name for alternatives in columns for name in alternatives)}
         for name in self.names:
             if name not in known:
-                asked = ", ".join("|".join(alternatives) for alternatives in columns)
+                expected = ", ".join("|".join(alternatives) for alternatives in columns)
                 raise self.error(
-                    f"unknown column {quoted(name)}; expected {asked} and maybe {', '.join(optional)}"
+                    f"unknown column {quoted(name)}; expected {expected} and optionally {', '.join(optional)}"
                 )
         for alternatives in (*columns, *([name] for name in optional)):
             found = [name for name in self.names if name in alternatives]
@@ -46,7 +47,7 @@ class Header:
                 )
 
     def error(self, message: str) -> InputFileError:
-        """Make an error that names this line."""
+        """Return an error with the number of this line."""
         return InputFileError(message, path=self.path, line=self.line)
 
 
@@ -59,11 +60,11 @@ class Row:
     cells: dict[str, str]
 
     def error(self, message: str) -> InputFileError:
-        """Make an error that names this line."""
+        """Return an error with the number of this line."""
         return InputFileError(message, path=self.path, line=self.line)
 
     def number(self, column: str) -> float:
-        """Read a finite number."""
+        """Parse a finite number."""
         try:
             value = float(self.cells[column])
         except ValueError:
@@ -72,22 +73,22 @@ class Row:
             raise self.error(f"{column} is {quoted(self.cells[column])}; expected a finite number")
         return value
 
-    def within(self, column: str, least: float, most: float) -> float:
-        """Read a number between limits, both of which are allowed."""
+    def within(self, column: str, minimum: float, maximum: float) -> float:
+        """Parse a number between two limits, inclusive."""
         value = self.number(column)
-        if not least <= value <= most:
-            raise self.error(f"{column} is {quoted(self.cells[column])}; expected {least:g} to {most:g}")
+        if not minimum <= value <= maximum:
+            raise self.error(f"{column} is {quoted(self.cells[column])}; expected {minimum:g} to {maximum:g}")
         return value
 
     def positive_integer(self, column: str) -> int:
-        """Read a number of a station, a prism or a target."""
+        """Parse the number of a station, prism or target."""
         text = self.cells[column]
         if not (text.isascii() and text.isdigit() and 0 < len(text) <= 6 and int(text) > 0):
             raise self.error(f"{column} is {quoted(text)}; expected a whole number from 1 to 999999")
         return int(text)
 
-    def whole(self, column: str) -> int:
-        """Read a whole number from 0 on that fits into 64 bits: counts, and times in ns."""
+    def non_negative_integer(self, column: str) -> int:
+        """Parse a non-negative 64-bit integer: counts, and times in ns."""
         text = self.cells[column]
         if not (text.isascii() and text.isdigit() and len(text) <= 19 and int(text) <= MAX_INSTANT_NS):
             raise self.error(
@@ -96,9 +97,9 @@ class Row:
         return int(text)
 
     def seconds_ns(self, column: str) -> int:
-        """Read a Unix time in s to the nanosecond, which a float would not hold."""
+        """Parse a Unix time in s as whole nanoseconds, without a float, which would lose them."""
         try:
-            # Limits first: the power of ten of a huge number would take for ever.
+            # Check the limits first: expanding a huge exponent would take forever.
             time_s = Decimal(self.cells[column])
             inside = time_s.is_finite() and 0 <= time_s <= Decimal(MAX_INSTANT_NS).scaleb(-9)
         except InvalidOperation:
@@ -108,7 +109,7 @@ class Row:
         return int(time_s.scaleb(9).to_integral_value())
 
     def angles_rad(self, horizontal: str | None = None, zenith: str | None = None) -> tuple[float, float]:
-        """Read both angles in rad; without column names those whose names end with their unit."""
+        """Parse horizontal and zenith angle; the default columns are those whose names end with their unit."""
         horizontal = horizontal or next(name for name in HORIZONTAL if name in self.cells)
         zenith = zenith or next(name for name in ZENITH if name in self.cells)
         horizontal_rad = self.number(horizontal) * RAD_PER_UNIT.get(horizontal.rpartition("_")[2], 1.0)
@@ -119,28 +120,30 @@ class Row:
             )
         if not 0 <= zenith_rad <= 2 * math.pi:
             raise self.error(
-                f"{zenith} {self.cells[zenith]} is outside 0 to a full circle; it counts from straight up, "
+                f"{zenith} {self.cells[zenith]} is outside 0 to a full circle; it is measured from the zenith, "
                 "not from the horizon"
             )
         return horizontal_rad, zenith_rad
 
     def distance_m(self, column: str) -> float:
-        """Read a distance above zero."""
+        """Parse a positive distance."""
         distance_m = self.number(column)
         if distance_m <= 0:
             raise self.error(f"{column} is {self.cells[column]}; expected more than zero, remove the line")
         if distance_m > MAX_DISTANCE_M:
-            raise self.error(f"{column} is {quoted(self.cells[column])}; expected at most {MAX_DISTANCE_M:g} m")
+            raise self.error(
+                f"{column} is {quoted(self.cells[column])}; expected at most {MAX_DISTANCE_M:g} m"
+            )
         return distance_m
 
 
 def read_table(path: Path) -> tuple[Header, Iterator[Row]]:
-    """Read header and rows of a comma-separated file; blank lines and those that start with # do not count.
+    """Read header and rows of a CSV file; blank lines and comments (``#``) are ignored.
 
     Raises
     ------
     InputFileError
-        The file cannot be read, or holds no rows; while rows are taken: one has not as many cells as the header.
+        The file cannot be read or has no rows; on iteration: a row has not as many cells as the header.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")  # spreadsheets write a byte order mark
@@ -149,7 +152,7 @@ def read_table(path: Path) -> tuple[Header, Iterator[Row]]:
     except OSError as error:
         raise InputFileError(error.strerror or str(error), path=path) from error
     lines = [
-        (number, [cell.strip() for cell in line.split(",")])
+        (number, _cells(line, path, number))
         for number, line in enumerate(text.splitlines(), start=1)
         if line.strip() and not line.lstrip().startswith("#")
     ]
@@ -161,8 +164,16 @@ def read_table(path: Path) -> tuple[Header, Iterator[Row]]:
     return header, _rows(header, lines[1:])
 
 
+def _cells(line: str, path: Path, number: int) -> list[str]:
+    try:
+        (cells,) = csv.reader([line], skipinitialspace=True)
+    except csv.Error as error:
+        raise InputFileError(f"is not CSV: {error}", path=path, line=number) from error
+    return [cell.strip() for cell in cells]
+
+
 def _rows(header: Header, lines: list[tuple[int, list[str]]]) -> Iterator[Row]:
-    """Cells by column name, line by line, so that a bad header is reported before bad lines."""
+    """Yield rows one by one, so that an invalid header is reported before invalid rows."""
     for number, cells in lines:
         row = Row(header.path, number, dict(zip(header.names, cells, strict=False)))
         if len(cells) != len(header.names):

@@ -1,17 +1,18 @@
 """Poses and measurements in the formats of other programs: TUM for evo, CSV for spreadsheets.
 
-The columns of the CSV files are described in docs/reference/csv.md.
+docs/reference/csv.md describes the columns of the CSV files.
 """
 
 from __future__ import annotations
 
+import csv
 import math
 from typing import TYPE_CHECKING
 
 from tsgt.model import PointMeasurement
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from tsgt.estimation import PoseBatch
     from tsgt.model import Measurement
@@ -44,7 +45,7 @@ def tum_lines(poses: Iterable[tuple[int, Sequence[float], Sequence[float]]]) -> 
     Yields
     ------
     str
-        One line per pose: seconds with nine decimals, exactly the nanoseconds; metres to the nanometre.
+        One line per pose: seconds with nine decimals, exact to the nanosecond; metres to the nanometre.
     """
     row = "{:d}.{:09d} {:.9f} {:.9f} {:.9f} {:.12f} {:.12f} {:.12f} {:.12f}\n".format
     for stamp_ns, position_m, orientation_xyzw in poses:
@@ -61,20 +62,21 @@ def valid_rows(batch: PoseBatch) -> Iterator[tuple[int, Sequence[float], Sequenc
 def valid_records(
     poses: Iterable[PoseRecord],
 ) -> Iterator[tuple[int, Sequence[float], Sequence[float]]]:
-    """Yield time, position and orientation of the valid poses among records, for :func:`tum_lines`."""
+    """Yield time, position and orientation of the valid records, for :func:`tum_lines`."""
     for pose in poses:
         if pose.valid and pose.position_m is not None and pose.orientation_xyzw is not None:
             yield pose.stamp_ns, pose.position_m, pose.orientation_xyzw
 
 
 def pose_csv(poses: Iterable[PoseRecord]) -> Iterator[str]:
-    """Yield the line of column names and a line per pose, valid or not; what a pose does not have stays empty."""
-    yield _line(POSE_COLUMNS)
+    """Yield the header and one CSV line per pose, valid or not; cells without a value are empty."""
+    line = _line_writer()
+    yield line(POSE_COLUMNS)
     for pose in poses:
         sigmas = (
             [None] * 6 if pose.covariance is None else [math.sqrt(pose.covariance[7 * i]) for i in range(6)]
         )
-        yield _line(
+        yield line(
             (
                 *(pose.stamp_ns, int(pose.valid), pose.reason, pose.estimator, pose.kind),
                 *(pose.position_m or [None] * 3),
@@ -88,8 +90,9 @@ def pose_csv(poses: Iterable[PoseRecord]) -> Iterator[str]:
 
 
 def measurement_csv(measurements: Iterable[Measurement]) -> Iterator[str]:
-    """Yield the line of column names and a line per measurement; what it does not have stays empty."""
-    yield _line(MEASUREMENT_COLUMNS)
+    """Yield the header and one CSV line per measurement; cells without a value are empty."""
+    line = _line_writer()
+    yield line(MEASUREMENT_COLUMNS)
     for m in measurements:
         polar: Sequence[float | None] = [None] * 3
         position: Sequence[float | None] = [None] * 3
@@ -99,10 +102,15 @@ def measurement_csv(measurements: Iterable[Measurement]) -> Iterator[str]:
         else:
             polar = (m.horizontal_angle_rad, m.zenith_angle_rad, m.slope_distance_m)
             times = (m.stamp_sigma_ns, m.stamp_bound_ns, m.raw_status, m.host_time_ns, m.instrument_time_ns)
-        who = (m.type, m.station, m.prism, m.sequence, m.stamp_ns, m.received_ns, m.status.value)
-        yield _line((*who, *polar, *position, *times))
+        identification = (m.type, m.station, m.prism, m.sequence, m.stamp_ns, m.received_ns, m.status.value)
+        yield line((*identification, *polar, *position, *times))
 
 
-def _line(row: Iterable[object]) -> str:
-    # Numbers and our own words hold neither commas nor quotes, so there is nothing to escape.
-    return ",".join("" if value is None else str(value) for value in row) + "\n"
+def _line_writer() -> Callable[[Iterable[object]], str]:
+    """Return a function that formats a row as one line of CSV: ``writerow`` returns what ``write`` returns."""
+    return csv.writer(_Echo(), lineterminator="\n").writerow  # type: ignore[return-value]
+
+
+class _Echo:
+    def write(self, line: str) -> str:
+        return line

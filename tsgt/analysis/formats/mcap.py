@@ -1,20 +1,14 @@
-"""Poses and prism positions as an MCAP file with ROS 2 messages: for Foxglove, and what reads ROS 2 bags.
+"""Poses and prism positions as an MCAP file with ROS 2 messages, for Foxglove and readers of ROS 2 bags.
 
-Topics and their contents are described in docs/reference/mcap.md.
-
-The ROS 2 messages that an export holds: their definitions, and their bytes.
-
-ROS 2 writes messages as CDR (OMG DDSI-RTPS 2.3, section 10): here little-endian, each number at a multiple of its size
-counted from after the first four bytes, texts with their length in front and a zero behind. All that is written here is
-an instant, some texts, and numbers of eight bytes, so a general encoder, at ten times the time, is not needed.
+docs/reference/mcap.md describes topics and messages. Message types, their definitions and the CDR encoding are those of
+ROS 2 Humble in rosbags; they have been the same in all distributions.
 """
 
 from __future__ import annotations
 
 import heapq
-import struct
 from functools import cache
-from typing import TYPE_CHECKING, BinaryIO, NamedTuple
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -27,6 +21,8 @@ from tsgt.model import IDENTITY4, ROBOT_FRAME, WORLD_FRAME
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
+    from rosbags.typesys.store import Typestore
+
     from tsgt.analysis.evaluation import Reference
     from tsgt.estimation import Track
     from tsgt.model import Parameters
@@ -36,25 +32,25 @@ POSE_TOPIC = "/tsgt/pose"
 ODOMETRY_TOPIC = "/tsgt/odometry"
 REFERENCE_TOPIC = "/tsgt/reference"
 TRANSFORM_TOPIC = "/tf"
-FIXED_TRANSFORM_TOPIC = "/tf_static"
+STATIC_TRANSFORM_TOPIC = "/tf_static"
 
-# What a player offers for /tf_static: reliable, and transient local so that who comes later gets it too. The numbers
-# are those of bags of ROS 2 Humble, which name their distribution in a record of the name rosbag2; later ones read
-# both old and new bags, and tell them apart by that.
+# Offered QoS of /tf_static: reliable and transient local, so that late subscribers receive it. The numeric values are
+# those of bags of ROS 2 Humble, named in the metadata record rosbag2; later distributions read both notations.
 _BAG_METADATA = {"ROS_DISTRO": "humble"}
-_FOREVER = "{sec: 9223372036, nsec: 854775807}"
-_FIXED_QOS = (
+_INFINITE = "{sec: 9223372036, nsec: 854775807}"
+_STATIC_QOS = (
     "- {history: 1, depth: 1, reliability: 1, durability: 1, "
-    f"deadline: {_FOREVER}, lifespan: {_FOREVER}, liveliness: 1, liveliness_lease_duration: {_FOREVER}, "
+    f"deadline: {_INFINITE}, lifespan: {_INFINITE}, liveliness: 1, liveliness_lease_duration: {_INFINITE}, "
     "avoid_ros_namespace_conventions: false}"
 )
 
-_UNKNOWN = (0.0,) * 36
-_LEVEL = (0.0, 0.0, 0.0, 1.0)
+_UNKNOWN_COVARIANCE = (0.0,) * 36
+_NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
+_MAX_SECOND = 2**31 - 1
 
 
 class Message(NamedTuple):
-    """One message of the file."""
+    """A message of the file: its time, topic and type, and its CDR encoding."""
 
     stamp_ns: int
     topic: str
@@ -63,17 +59,18 @@ class Message(NamedTuple):
 
 
 def write_mcap(file: BinaryIO, messages: Iterable[Message]) -> None:
-    """Write messages in the order given; log time and publish time are the time that they are about.
+    """Write messages in the order given; log time and publish time are ``stamp_ns``.
 
     Raises
     ------
     MissingExtraError
-        The library is not installed.
+        mcap or rosbags is not installed.
     """
     try:
         from mcap.writer import Writer  # noqa: PLC0415 (an extra)
     except ImportError as error:
         raise MissingExtraError("MCAP files", library="mcap", extra="mcap") from error
+    typestore = _typestore()
     writer = Writer(file)
     writer.start(profile="ros2", library=f"tsgt {tsgt.__version__}")
     writer.add_metadata("rosbag2", _BAG_METADATA)
@@ -83,13 +80,13 @@ def write_mcap(file: BinaryIO, messages: Iterable[Message]) -> None:
         channel = channels.get(message.topic)
         if channel is None:
             if message.type not in schemas:
-                text = definition(message.type)
-                schemas[message.type] = writer.register_schema(message.type, "ros2msg", text.encode())
-            qos = {"offered_qos_profiles": _FIXED_QOS} if message.topic == FIXED_TRANSFORM_TOPIC else {}
+                definition, _ = typestore.generate_msgdef(message.type, ros_version=2)
+                schemas[message.type] = writer.register_schema(message.type, "ros2msg", definition.encode())
+            qos = {"offered_qos_profiles": _STATIC_QOS} if message.topic == STATIC_TRANSFORM_TOPIC else {}
             channel = writer.register_channel(message.topic, "cdr", schemas[message.type], qos)
             channels[message.topic] = channel
         writer.add_message(channel, message.stamp_ns, message.data, message.stamp_ns)
-    writer.finish()  # type: ignore[no-untyped-call]  # the library left this one out
+    writer.finish()  # type: ignore[no-untyped-call]  # not annotated in the library
 
 
 def messages(
@@ -100,29 +97,30 @@ def messages(
     Parameters
     ----------
     recording
-        Measurements, from which the prisms' positions come, and the frames of stations and prisms.
+        Measurements, from which the prism positions are computed, and the frames of stations and prisms.
     poses
-        In the order of time; those that are not valid are passed over.
+        In the order of time; invalid ones are skipped.
     reference
-        A trajectory from elsewhere to look at beside them.
+        A reference trajectory for display together with the poses.
 
     Raises
     ------
     MessageError
-        A time is later than ROS 2 can tell.
+        A time is after January 2038, which ROS 2 cannot represent.
+    MissingExtraError
+        rosbags is not installed.
     """
     tracks = build_tracks(recording.parameters, recording.measurements)
-    sources = [_of_poses(poses), *(_of_track(prism, track) for prism, track in tracks.items())]
+    sources = [_pose_messages(poses), *(_track_messages(prism, track) for prism, track in tracks.items())]
     if reference is not None:
-        sources.append(_of_reference(reference))
+        sources.append(_reference_messages(reference))
     ordered = heapq.merge(*sources, key=lambda message: message.stamp_ns)
     first = next(ordered, None)
     if first is None:
         return
-    fixed = _fixed_transforms(recording.parameters)
-    if fixed:
-        data = transforms(first.stamp_ns, fixed)
-        yield Message(first.stamp_ns, FIXED_TRANSFORM_TOPIC, TRANSFORMS, data)
+    transforms = _static_transforms(recording.parameters, first.stamp_ns)
+    if transforms:
+        yield _transforms(first.stamp_ns, STATIC_TRANSFORM_TOPIC, transforms)
     yield first
     yield from ordered
 
@@ -132,50 +130,65 @@ def prism_topic(prism: int) -> str:
     return f"/tsgt/prism{prism}"
 
 
-def _of_poses(poses: Iterable[PoseRecord]) -> Iterator[Message]:
-    for pose in poses:
-        position, orientation = pose.position_m, pose.orientation_xyzw
-        if not pose.valid or position is None or orientation is None:
+def _pose_messages(poses: Iterable[PoseRecord]) -> Iterator[Message]:
+    for record in poses:
+        position, orientation = record.position_m, record.orientation_xyzw
+        if not record.valid or position is None or orientation is None:
             continue
-        at, frame, child = pose.stamp_ns, pose.frame, pose.child_frame
-        where = (*position, *orientation, *(pose.covariance or _UNKNOWN))
-        yield Message(at, POSE_TOPIC, POSE_WITH_COVARIANCE, stamped(at, (frame,), where))
-        turned = Transform(frame, child, position, orientation)
-        yield Message(at, TRANSFORM_TOPIC, TRANSFORMS, transforms(at, [turned]))
-        if pose.velocity_mps is not None and pose.angular_velocity_radps is not None:
-            twist = (*_in_child_frame(pose.velocity_mps, orientation), *pose.angular_velocity_radps)
-            numbers = (*where, *twist, *_UNKNOWN)
-            yield Message(at, ODOMETRY_TOPIC, ODOMETRY, stamped(at, (frame, child), numbers))
+        at, header = record.stamp_ns, _header(record.stamp_ns, record.frame)
+        pose = _new(
+            "geometry_msgs/msg/PoseWithCovariance",
+            _pose(position, orientation),
+            np.array(record.covariance or _UNKNOWN_COVARIANCE),
+        )
+        yield _encode(at, POSE_TOPIC, _new("geometry_msgs/msg/PoseWithCovarianceStamped", header, pose))
+        transform = _transform(at, record.frame, record.child_frame, position, orientation)
+        yield _transforms(at, TRANSFORM_TOPIC, [transform])
+        if record.velocity_mps is not None and record.angular_velocity_radps is not None:
+            twist = _new(
+                "geometry_msgs/msg/Twist",
+                _vector(_in_child_frame(record.velocity_mps, orientation)),
+                _vector(record.angular_velocity_radps),
+            )
+            uncertain = _new("geometry_msgs/msg/TwistWithCovariance", twist, np.array(_UNKNOWN_COVARIANCE))
+            odometry = _new("nav_msgs/msg/Odometry", header, record.child_frame, pose, uncertain)
+            yield _encode(at, ODOMETRY_TOPIC, odometry)
 
 
-def _of_track(prism: int, track: Track) -> Iterator[Message]:
+def _track_messages(prism: int, track: Track) -> Iterator[Message]:
     topic = prism_topic(prism)
-    for at, point in zip(track.times_ns.tolist(), track.points_m.tolist(), strict=True):
-        yield Message(at, topic, POINT, stamped(at, (WORLD_FRAME,), point))
+    for at, position in zip(track.times_ns.tolist(), track.points_m.tolist(), strict=True):
+        point = _new("geometry_msgs/msg/Point", *position)
+        yield _encode(at, topic, _new("geometry_msgs/msg/PointStamped", _header(at, WORLD_FRAME), point))
 
 
-def _of_reference(reference: Reference) -> Iterator[Message]:
-    numbers = np.hstack([reference.position_m, reference.orientation_xyzw])
-    for at, row in zip(reference.stamp_ns.tolist(), numbers.tolist(), strict=True):
-        yield Message(at, REFERENCE_TOPIC, POSE, stamped(at, (WORLD_FRAME,), row))
+def _reference_messages(reference: Reference) -> Iterator[Message]:
+    columns = reference.stamp_ns, reference.position_m, reference.orientation_xyzw
+    for at, position, orientation in zip(*(column.tolist() for column in columns), strict=True):
+        pose = _pose(position, orientation)
+        yield _encode(
+            at, REFERENCE_TOPIC, _new("geometry_msgs/msg/PoseStamped", _header(at, WORLD_FRAME), pose)
+        )
 
 
-def _fixed_transforms(parameters: Parameters) -> list[Transform]:
-    """Where stations and prisms are; a station without a frame of its own (station 1, or points only) is left out."""
-    found = []
+def _static_transforms(parameters: Parameters, stamp_ns: int) -> list[Any]:
+    """Return the frames of stations and prisms; without stations whose frame is the world's (1, or imported points)."""
+    transforms = []
     for station in parameters.stations:
         if station.T_station1_station != IDENTITY4:
             frame = np.array(station.T_station1_station)
-            turned = quaternion_from_rotation(frame[:3, :3]).tolist()
-            found.append(Transform(WORLD_FRAME, f"station{station.station}", frame[:3, 3].tolist(), turned))
-    found.extend(
-        Transform(ROBOT_FRAME, f"prism{prism.prism}", prism.position_m, _LEVEL) for prism in parameters.prisms
-    )
-    return found
+            orientation = quaternion_from_rotation(frame[:3, :3]).tolist()
+            name = f"station{station.station}"
+            transforms.append(_transform(stamp_ns, WORLD_FRAME, name, frame[:3, 3].tolist(), orientation))
+    transforms += [
+        _transform(stamp_ns, ROBOT_FRAME, f"prism{prism.prism}", prism.position_m, _NO_ROTATION)
+        for prism in parameters.prisms
+    ]
+    return transforms
 
 
 def _in_child_frame(vector: Sequence[float], orientation_xyzw: Sequence[float]) -> tuple[float, float, float]:
-    """Coordinates in the child frame of a vector given in the frame: R^T v, by two cross products."""
+    """Rotate a vector from the frame into the child frame: R^T v, by two cross products."""
     vx, vy, vz = vector
     x, y, z, w = orientation_xyzw
     tx, ty, tz = 2 * (z * vy - y * vz), 2 * (x * vz - z * vx), 2 * (y * vx - x * vy)
@@ -186,138 +199,58 @@ def _in_child_frame(vector: Sequence[float], orientation_xyzw: Sequence[float]) 
     )
 
 
-POSE = "geometry_msgs/msg/PoseStamped"
-POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
-ODOMETRY = "nav_msgs/msg/Odometry"
-POINT = "geometry_msgs/msg/PointStamped"
-TRANSFORMS = "tf2_msgs/msg/TFMessage"
-
-_VECTOR = ("float64 x", "float64 y", "float64 z")
-
-# Names and order of the fields are ROS 2's; they have been the same in all its distributions.
-_FIELDS: dict[str, tuple[str, ...]] = {
-    "builtin_interfaces/Time": ("int32 sec", "uint32 nanosec"),
-    "std_msgs/Header": ("builtin_interfaces/Time stamp", "string frame_id"),
-    "geometry_msgs/Point": _VECTOR,
-    "geometry_msgs/Vector3": _VECTOR,
-    "geometry_msgs/Quaternion": ("float64 x 0", "float64 y 0", "float64 z 0", "float64 w 1"),
-    "geometry_msgs/Pose": ("geometry_msgs/Point position", "geometry_msgs/Quaternion orientation"),
-    "geometry_msgs/PoseWithCovariance": ("geometry_msgs/Pose pose", "float64[36] covariance"),
-    "geometry_msgs/Twist": ("geometry_msgs/Vector3 linear", "geometry_msgs/Vector3 angular"),
-    "geometry_msgs/TwistWithCovariance": ("geometry_msgs/Twist twist", "float64[36] covariance"),
-    "geometry_msgs/Transform": ("geometry_msgs/Vector3 translation", "geometry_msgs/Quaternion rotation"),
-    "geometry_msgs/TransformStamped": (
-        "std_msgs/Header header",
-        "string child_frame_id",
-        "geometry_msgs/Transform transform",
-    ),
-    POSE: ("std_msgs/Header header", "geometry_msgs/Pose pose"),
-    POSE_WITH_COVARIANCE: ("std_msgs/Header header", "geometry_msgs/PoseWithCovariance pose"),
-    ODOMETRY: (
-        "std_msgs/Header header",
-        "string child_frame_id",
-        "geometry_msgs/PoseWithCovariance pose",
-        "geometry_msgs/TwistWithCovariance twist",
-    ),
-    POINT: ("std_msgs/Header header", "geometry_msgs/Point point"),
-    TRANSFORMS: ("geometry_msgs/TransformStamped[] transforms",),
-}
-
-_LITTLE_ENDIAN = b"\x00\x01\x00\x00"
-_STAMP = struct.Struct("<iI")
-_LENGTH = struct.Struct("<I")
-_LAST_SECOND = 2**31 - 1
+@cache
+def _typestore() -> Typestore:
+    try:
+        from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415 (an extra)
+    except ImportError as error:
+        raise MissingExtraError("MCAP files", library="rosbags", extra="mcap") from error
+    return get_typestore(Stores.ROS2_HUMBLE)
 
 
-class Transform(NamedTuple):
-    """Where a frame lies in another.
-
-    Attributes
-    ----------
-    frame, child_frame
-        The pose is that of ``child_frame`` in ``frame``.
-    position_m
-        (3,).
-    orientation_xyzw
-        (4,), unit.
-    """
-
-    frame: str
-    child_frame: str
-    position_m: Sequence[float]
-    orientation_xyzw: Sequence[float]
+def _new(name: str, *fields: Any) -> Any:
+    """Create a message from its fields in the order of the definition."""
+    return _typestore().types[name](*fields)
 
 
-def definition(name: str) -> str:
-    """Return a message's definition, followed by those of all types in it, as a bag holds it."""
-    parts = ["\n".join(_FIELDS[name]) + "\n"]
-    parts += [f"{'=' * 80}\nMSG: {part}\n" + "\n".join(_FIELDS[part]) + "\n" for part in _types_in(name)]
-    return "".join(parts)
+def _encode(stamp_ns: int, topic: str, message: Any) -> Message:
+    name: str = message.__msgtype__
+    return Message(stamp_ns, topic, name, bytes(_typestore().serialize_cdr(message, name)))
 
 
-def stamped(stamp_ns: int, texts: tuple[str, ...], numbers: Iterable[float]) -> bytes:
-    """Encode a message that is a header, perhaps a further frame's name, and 64-bit numbers.
-
-    Parameters
-    ----------
-    stamp_ns
-        Unix time in ns.
-    texts
-        Name of the frame, and of the child frame where the message has one.
-    numbers
-        The others of its fields, in their order.
-
-    Raises
-    ------
-    MessageError
-        The time is later than ROS 2 can tell: after January 2038.
-    """
-    values = tuple(numbers)
-    head = _LITTLE_ENDIAN + _time(stamp_ns) + _texts(_STAMP.size, texts)
-    return head + struct.pack(f"<{len(values)}d", *values)
-
-
-def transforms(stamp_ns: int, entries: Sequence[Transform]) -> bytes:
-    """Encode a message of :data:`TRANSFORMS`.
-
-    Raises
-    ------
-    MessageError
-        As for :func:`stamped`.
-    """
-    data = _LENGTH.pack(len(entries))
-    for entry in entries:
-        data += _time(stamp_ns)
-        data += _texts(len(data), (entry.frame, entry.child_frame))
-        data += struct.pack("<7d", *entry.position_m, *entry.orientation_xyzw)
-    return _LITTLE_ENDIAN + data
-
-
-def _types_in(name: str) -> list[str]:
-    """Types of the fields, and of theirs, each once, in the order in which they are first met."""
-    found: dict[str, None] = {}
-    for field in _FIELDS[name]:
-        part = field.split()[0].removesuffix("[]")
-        if part in _FIELDS:
-            found |= dict.fromkeys([part, *_types_in(part)])
-    return list(found)
-
-
-def _time(stamp_ns: int) -> bytes:
+def _header(stamp_ns: int, frame: str) -> Any:
     seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
-    if seconds > _LAST_SECOND:
+    if seconds > _MAX_SECOND:
         raise MessageError(
-            f"a stamp of {seconds} s is after January 2038, where the times of ROS 2 end; "
+            f"a timestamp of {seconds} s is after January 2038, which ROS 2 cannot represent; "
             "was the clock wrong? Other formats can hold it"
         )
-    return _STAMP.pack(seconds, nanoseconds)
+    return _new("std_msgs/msg/Header", _new("builtin_interfaces/msg/Time", seconds, nanoseconds), frame)
 
 
-@cache
-def _texts(offset: int, texts: tuple[str, ...]) -> bytes:
-    """Encode texts that begin at an offset, up to where a number of eight bytes may follow."""
-    data = b""
-    for text in texts:
-        raw = text.encode() + b"\x00"
-        data += bytes(-(offset + len(data)) % 4) + _LENGTH.pack(len(raw)) + raw
-    return data + bytes(-(offset + len(data)) % 8)
+def _vector(vector: Sequence[float]) -> Any:
+    return _new("geometry_msgs/msg/Vector3", *vector)
+
+
+def _quaternion(orientation_xyzw: Sequence[float]) -> Any:
+    return _new("geometry_msgs/msg/Quaternion", *orientation_xyzw)
+
+
+def _pose(position_m: Sequence[float], orientation_xyzw: Sequence[float]) -> Any:
+    point = _new("geometry_msgs/msg/Point", *position_m)
+    return _new("geometry_msgs/msg/Pose", point, _quaternion(orientation_xyzw))
+
+
+def _transform(
+    stamp_ns: int,
+    frame: str,
+    child_frame: str,
+    position_m: Sequence[float],
+    orientation_xyzw: Sequence[float],
+) -> Any:
+    transform = _new("geometry_msgs/msg/Transform", _vector(position_m), _quaternion(orientation_xyzw))
+    return _new("geometry_msgs/msg/TransformStamped", _header(stamp_ns, frame), child_frame, transform)
+
+
+def _transforms(stamp_ns: int, topic: str, transforms: list[Any]) -> Message:
+    return _encode(stamp_ns, topic, _new("tf2_msgs/msg/TFMessage", transforms))

@@ -1,4 +1,4 @@
-"""When a robot stood still, by its own odometry: a CSV file of time, linear and angular speed."""
+"""Stationary intervals from a robot's odometry: a CSV file of time, linear and angular speed."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ if TYPE_CHECKING:
 
 MAX_STATIONARY_SPEED_MPS = 0.01
 MAX_STATIONARY_RATE_RADPS = 0.01
-"""Below both a robot stands: encoders at rest count next to nothing."""
+"""A robot below both limits is stationary: encoders at rest count next to nothing."""
 
 MIN_STATIONARY_NS = 3_000_000_000
 MAX_SAMPLE_GAP_NS = 1_000_000_000
-"""Nobody knows what the robot did between two lines further apart than this."""
+"""Between two lines further apart than this the motion is unknown."""
 
 
 def read_stationary_intervals(path: Path) -> list[tuple[int, int]]:
-    """Read when a robot stood still for 3 s or more.
+    """Read the intervals in which a robot was stationary for 3 s or more.
 
     Parameters
     ----------
     path
-        Lines of ``time_s,linear_mps,angular_radps``: Unix time in s, speed in m/s, angular speed in rad/s. The first line may
-        name the columns; ``#`` stands before comments.
+        Lines of ``time_s,linear_mps,angular_radps``: Unix time in s, speed in m/s, angular rate in rad/s, separated by commas,
+        semicolons or spaces. The first line may name the columns; ``#`` starts a comment.
 
     Returns
     -------
@@ -37,16 +37,16 @@ def read_stationary_intervals(path: Path) -> list[tuple[int, int]]:
     Raises
     ------
     InputFileError
-        It cannot be read, or a line is not three finite numbers; times must increase.
+        It cannot be read, a line is not three finite numbers, or times do not increase.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise InputFileError(f"cannot be read: {error.strerror}", path=path) from error
     except UnicodeDecodeError as error:
-        raise InputFileError("is no text", path=path) from error
-    found: list[tuple[int, int]] = []
-    begun: int | None = None
+        raise InputFileError("is not a text file", path=path) from error
+    intervals: list[tuple[int, int]] = []
+    begin: int | None = None
     last: int | None = None
     first = True
     for number, line in enumerate(text.splitlines(), start=1):
@@ -57,28 +57,28 @@ def read_stationary_intervals(path: Path) -> list[tuple[int, int]]:
             first = False
             continue
         first = False
-        stamp_ns, still = _sample(words, path, number)
+        stamp_ns, stationary = _sample(words, path, number)
         if last is not None and stamp_ns <= last:
             raise InputFileError(
-                "its time is not after that of the line before; sort the lines", path=path, line=number
+                "its time is not later than that of the previous line; sort the lines", path=path, line=number
             )
-        if begun is not None and last is not None and (not still or stamp_ns - last > MAX_SAMPLE_GAP_NS):
-            found.append((begun, last))
-            begun = None
-        if still and begun is None:
-            begun = stamp_ns
+        if begin is not None and last is not None and (not stationary or stamp_ns - last > MAX_SAMPLE_GAP_NS):
+            intervals.append((begin, last))
+            begin = None
+        if stationary and begin is None:
+            begin = stamp_ns
         last = stamp_ns
-    if begun is not None and last is not None:
-        found.append((begun, last))
+    if begin is not None and last is not None:
+        intervals.append((begin, last))
     if last is None:
-        raise InputFileError("holds no lines of odometry", path=path)
-    return [(start, end) for start, end in found if end - start >= MIN_STATIONARY_NS]
+        raise InputFileError("contains no odometry", path=path)
+    return [(start, end) for start, end in intervals if end - start >= MIN_STATIONARY_NS]
 
 
 def _sample(words: list[str], path: Path, number: int) -> tuple[int, bool]:
-    """Read one line: its time, and whether the robot stands."""
+    """Parse one line: its time, and whether the robot is stationary."""
     try:
-        # A float would hold a Unix time to a quarter of a microsecond, which is enough for this.
+        # A float resolves a Unix time to a quarter of a microsecond, which suffices here.
         time_s, linear_mps, angular_radps = map(float, words)
         stamp_ns = round(time_s * 1e9)
         check_instants(stamp_ns)
@@ -86,7 +86,7 @@ def _sample(words: list[str], path: Path, number: int) -> tuple[int, bool]:
             raise ValueError("not finite")
     except (ValueError, OverflowError) as error:
         raise InputFileError(
-            "is no odometry; expected: time_s,linear_mps,angular_radps", path=path, line=number
+            "is not odometry; expected: time_s,linear_mps,angular_radps", path=path, line=number
         ) from error
     return stamp_ns, abs(linear_mps) <= MAX_STATIONARY_SPEED_MPS and abs(
         angular_radps

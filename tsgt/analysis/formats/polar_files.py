@@ -1,6 +1,6 @@
-"""Reading tracks of raw polar measurements: the format that ``tsgt export --format csv --records measurements`` writes.
+"""Tracks of raw polar measurements: what ``tsgt export --format csv --records measurements`` writes.
 
-The columns are described in docs/reference/csv.md.
+docs/reference/csv.md describes the columns.
 """
 
 from __future__ import annotations
@@ -28,38 +28,33 @@ _OPTIONAL = (
 
 
 def read_polar_tracks(paths: Sequence[Path]) -> list[Measurement]:
-    """Read the measurements of one drive.
+    """Read the measurements of one drive in the order of arrival; without ``received_ns`` that is the time of measurement.
 
     Parameters
     ----------
     paths
-        One file of all stations, or several. In a file without a column ``station`` all lines are of the station whose
-        number is the place of the file among them, from 1.
-
-    Returns
-    -------
-    list of PolarMeasurement or PointMeasurement
-        In the order of arrival; those of which it is not said arrived when they were made.
+        One file with all stations, or one per station. In a file without a column ``station`` all lines belong to the
+        station whose number is the position of the file, from 1.
 
     Raises
     ------
     InputFileError
-        A file cannot be read, is empty, has a wrong column or number, or a measurement stands there twice.
+        A file cannot be read, is empty, has a wrong column or number, or contains a measurement twice.
     """
     measurements: list[Measurement] = []
     counts: dict[int, int] = {}
     seen: dict[tuple[int, int, int], str] = {}
-    for place, path in enumerate(paths, start=1):
+    for position, path in enumerate(paths, start=1):
         header, rows = read_table(path)
         header.expect([_TIME, HORIZONTAL, ZENITH, ["slope_distance_m"]], _OPTIONAL)
         for row in rows:
-            station = row.positive_integer("station") if "station" in row.cells else place
+            station = row.positive_integer("station") if "station" in row.cells else position
             found = _measurement(row, station, counts.get(station, 0))
             where = f"{path}, line {row.line}"
             known = seen.setdefault((station, found.prism, found.stamp_ns), where)
             if known != where and found.status.usable:
                 raise row.error(
-                    f"station {station} measured prism {found.prism} at this time already in {known}; keep one of the lines"
+                    f"duplicate of {known}: station {station}, prism {found.prism}, same time; remove one of the lines"
                 )
             counts[station] = counts.get(station, 0) + 1
             measurements.append(found)
@@ -67,11 +62,11 @@ def read_polar_tracks(paths: Sequence[Path]) -> list[Measurement]:
 
 
 def _measurement(row: Row, station: int, count: int) -> Measurement:
-    """Read one line; ``count`` is how many there have been of this station."""
-    stamp_ns = row.whole("stamp_ns") if "stamp_ns" in row.cells else row.seconds_ns("time_s")
+    """Parse one line; ``count`` is the number of previous lines of this station."""
+    stamp_ns = row.non_negative_integer("stamp_ns") if "stamp_ns" in row.cells else row.seconds_ns("time_s")
     prism = row.positive_integer("prism") if "prism" in row.cells else station
-    sequence = _whole(row, "sequence")
-    received_ns = _whole(row, "received_ns")
+    sequence = _optional_integer(row, "sequence")
+    received_ns = _optional_integer(row, "received_ns")
     sequence = count if sequence is None else sequence
     received_ns = stamp_ns if received_ns is None else received_ns
     status = _status(row)
@@ -83,16 +78,16 @@ def _measurement(row: Row, station: int, count: int) -> Measurement:
                 prism=prism,
                 sequence=sequence,
                 stamp_ns=stamp_ns,
-                stamp_sigma_ns=_whole(row, "stamp_sigma_ns") or 0,
-                stamp_bound_ns=_whole(row, "stamp_bound_ns"),
+                stamp_sigma_ns=_optional_integer(row, "stamp_sigma_ns") or 0,
+                stamp_bound_ns=_optional_integer(row, "stamp_bound_ns"),
                 received_ns=received_ns,
                 horizontal_angle_rad=horizontal_rad,
                 zenith_angle_rad=zenith_rad,
                 slope_distance_m=_distance_m(row),
                 status=status,
-                raw_status=_whole(row, "raw_status") or 0,
-                host_time_ns=_whole(row, "host_time_ns"),
-                instrument_time_ns=_whole(row, "instrument_time_ns"),
+                raw_status=_optional_integer(row, "raw_status") or 0,
+                host_time_ns=_optional_integer(row, "host_time_ns"),
+                instrument_time_ns=_optional_integer(row, "instrument_time_ns"),
             )
         case "point" if all(name in row.cells for name in _POINT):
             return PointMeasurement(
@@ -107,11 +102,11 @@ def _measurement(row: Row, station: int, count: int) -> Measurement:
         case "point":
             raise row.error("a point needs the columns x_m, y_m and z_m")
         case other:
-            raise row.error(f"type is {other!r}; it is measurement or point")
+            raise row.error(f"type is {other!r}; expected measurement or point")
 
 
 def _distance_m(row: Row) -> float | None:
-    """Read the slope distance; an empty cell says that there was none."""
+    """Parse the slope distance; an empty cell means that none was measured."""
     if not row.cells["slope_distance_m"]:
         return None
     distance_m = row.number("slope_distance_m")
@@ -122,8 +117,8 @@ def _distance_m(row: Row) -> float | None:
     return distance_m
 
 
-def _whole(row: Row, column: str) -> int | None:
-    return row.whole(column) if row.cells.get(column) else None
+def _optional_integer(row: Row, column: str) -> int | None:
+    return row.non_negative_integer(column) if row.cells.get(column) else None
 
 
 def _status(row: Row) -> Status:
@@ -137,13 +132,7 @@ def _status(row: Row) -> Status:
 
 
 def tracked_prisms(measurements: Sequence[Measurement]) -> dict[int, int]:
-    """Tell which prism each station tracks: the one that it measured most often.
-
-    Returns
-    -------
-    dict
-        Number of the prism by that of the station, sorted.
-    """
+    """Return the prism that each station measured most often, by station number, sorted."""
     counts: dict[int, dict[int, int]] = {}
     for m in measurements:
         by_prism = counts.setdefault(m.station, {})
@@ -155,12 +144,12 @@ def tracked_prisms(measurements: Sequence[Measurement]) -> dict[int, int]:
 
 
 def check_tracks(measurements: Sequence[Measurement], paths: Sequence[Path]) -> None:
-    """Refuse tracks that have no time in common, and such of which none can be used.
+    """Raise if no measurement is usable or the stations' measurements do not overlap in time.
 
     Raises
     ------
     InputFileError
-        As said; it names the stations.
+        Names the stations.
     """
     spans: dict[int, tuple[int, int]] = {}
     for m in measurements:
@@ -168,13 +157,13 @@ def check_tracks(measurements: Sequence[Measurement], paths: Sequence[Path]) -> 
             start, end = spans.get(m.station, (m.stamp_ns, m.stamp_ns))
             spans[m.station] = min(start, m.stamp_ns), max(end, m.stamp_ns)
     if not spans:
-        raise InputFileError("no measurement has a status that can be used", path=paths[0])
+        raise InputFileError("no measurement has a usable status", path=paths[0])
     latest = max(spans, key=lambda station: spans[station][0])
-    first_over = min(spans, key=lambda station: spans[station][1])
-    late_ns = spans[latest][0] - spans[first_over][1]
+    first_to_end = min(spans, key=lambda station: spans[station][1])
+    late_ns = spans[latest][0] - spans[first_to_end][1]
     if late_ns > 0:
         raise InputFileError(
             f"the measurements of station {latest} begin {late_ns / 1e9:.1f} s after the last one of station "
-            f"{first_over}; take the tracks of one drive, on one clock",
+            f"{first_to_end}; use the tracks of one drive, on one clock",
             path=paths[0],
         )

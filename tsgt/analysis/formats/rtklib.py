@@ -1,8 +1,8 @@
-"""Reading RTKLIB's solution files (``.pos``): one satellite receiver's positions, with quality and satellites.
+"""RTKLIB solution files (``.pos``): positions of one GNSS receiver with quality and number of satellites.
 
-A header names the time system and the columns; RTKLIB can be told to write either time of three systems as a calendar
-date or as GPS week and seconds, and positions in three kinds of coordinates. All of that is read from the header, and
-nothing is guessed: a file without one is refused. Formats: RTKLIB 2.4.2 manual, appendix B.1.
+The header names the time system and the columns; times are calendar dates or GPS week and seconds in one of three time
+systems, positions in one of three kinds of coordinates. A file without a header is rejected. Formats: RTKLIB 2.4.2
+manual, appendix B.1.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ QUALITIES = {
     6: "ppp",
     7: "dead reckoning",
 }
-"""What the column Q means; 0 and 7 are not in the files' own legend, but in RTKLIB."""
+"""Meaning of the column Q; 0 and 7 are missing in the files' own legend, but defined in RTKLIB."""
 
 SECOND_NS = 1_000_000_000
 DAY_NS = 86_400 * SECOND_NS
@@ -45,8 +45,8 @@ GPS_EPOCH_NS = 315_964_800 * SECOND_NS  # 1980-01-06
 _UNIX_EPOCH_DAY = date(1970, 1, 1).toordinal()
 _FIRST_YEAR, _LAST_YEAR, _LAST_WEEK = 1980, 2199, 11_000
 
-_FARTHEST_M = 1e8
-"""No receiver is so far from the Earth or from its base; what is beyond is garbage."""
+_MAX_COORDINATE_M = 1e8
+"""Upper limit of coordinates: no receiver is so far from the Earth or its base."""
 
 _FIRST_COLUMN: dict[str, tuple[Coordinates, bool]] = {
     "latitude(deg)": ("geodetic", False),
@@ -62,25 +62,23 @@ _SEPARATORS = str.maketrans(",;\t", "   ")
 
 @dataclass(frozen=True, slots=True)
 class PosFile:
-    """One receiver's positions as they stand in its file, in the order of time.
+    """Positions of one receiver as in its file, in the order of time.
 
     Attributes
     ----------
-    path
-        The file.
     time_system
-        What its times are: GPS time, UTC, or Japan's (UTC + 9 h).
+        GPS time, UTC, or Japan standard time (UTC + 9 h).
     times_ns
         (M,) ns from 1970-01-01 00:00:00 on the calendar of ``time_system``, strictly increasing.
     coordinates
-        ``geodetic``: latitude and longitude in rad, height in m. ``ecef``: x, y, z in m. ``baseline``: east, north and
-        up from the base in m.
+        ``geodetic``: latitude and longitude in rad, height in m. ``ecef``: x, y, z in m. ``baseline``: east, north and up
+        from the base in m.
     positions
         (M, 3) in these coordinates.
     quality
         (M,) RTKLIB's Q, see :data:`QUALITIES`.
     satellites
-        (M,) how many satellites the position is from.
+        (M,) number of satellites.
     base
         Latitude, longitude (rad) and height (m) of the base; None unless the coordinates are relative to it.
     """
@@ -97,7 +95,7 @@ class PosFile:
 
 @dataclass(frozen=True, slots=True)
 class _Columns:
-    """Where in a line what stands."""
+    """Positions of the fields in a line."""
 
     time_system: TimeSystem
     coordinates: Coordinates
@@ -119,24 +117,14 @@ class _Place:
 
 
 def read_pos(path: Path) -> PosFile:
-    """Read a solution file of RTKLIB.
+    """Read a solution file as RTKPOST, rnx2rtkp or RTKNAVI write it with the header switched on, sorted by time.
 
-    Parameters
-    ----------
-    path
-        As RTKPOST, rnx2rtkp or RTKNAVI write it with the output of the header switched on. Columns may be separated by
-        spaces, tabs, commas or semicolons.
-
-    Returns
-    -------
-    PosFile
-        Sorted by time: a backward solution stands in the file last epoch first.
+    Columns are separated by spaces, tabs, commas or semicolons. A backward solution is stored last epoch first.
 
     Raises
     ------
     InputFileError
-        No header or one of another format, a line that is cut off or no position, an epoch that stands twice, no
-        positions at all.
+        No header or one of another format, a truncated or invalid line, a duplicate epoch, no positions at all.
     """
     columns: _Columns | None = None
     base: tuple[list[str], _Place] | None = None
@@ -151,12 +139,12 @@ def read_pos(path: Path) -> PosFile:
         if words[0].startswith("%"):
             named = _columns(words, place)
             if columns is not None and named not in (None, columns):
-                raise place.error("the columns change here; take files apart that were joined")
+                raise place.error("the columns change here; split files that were joined")
             columns = named or columns
             if re.match(r"%\s*(ref|slave) pos\s*:", line):
                 base = line.split(":", 1)[1].translate(_SEPARATORS).split(), place
             if "=Tokyo" in line:
-                raise place.error("is in the datum Tokyo; let RTKLIB write it in WGS84")
+                raise place.error("is in the datum Tokyo; set RTKLIB's output datum to WGS84")
             continue
         if columns is None:
             raise place.error(_no_header(words[0]))
@@ -168,12 +156,12 @@ def read_pos(path: Path) -> PosFile:
         lines.append(number)
         rows.append(_row(words, columns, place))
     if columns is None or not rows:
-        raise InputFileError("holds no positions; expected a solution file of RTKLIB", path=path)
+        raise InputFileError("contains no positions; expected a solution file of RTKLIB", path=path)
     order = np.argsort(times, kind="stable")
     times_ns = np.array(times, dtype=np.int64)[order]
-    again = np.flatnonzero(np.diff(times_ns) == 0)
-    if len(again):
-        first, second = (lines[order[again[0] + k]] for k in (0, 1))
+    duplicates = np.flatnonzero(np.diff(times_ns) == 0)
+    if len(duplicates):
+        first, second = (lines[order[duplicates[0] + k]] for k in (0, 1))
         raise _Place(path, second).error(f"has the time of line {first}; keep one of the two")
     numbers = np.array(rows)[order]
     return PosFile(
@@ -189,7 +177,7 @@ def read_pos(path: Path) -> PosFile:
 
 
 def _text(path: Path) -> str:
-    """Return the file's text; the header holds names of files, in whatever encoding that computer has."""
+    """Return the file's text; file names in the header may have any encoding."""
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -200,7 +188,7 @@ def _text(path: Path) -> str:
 
 
 def _columns(words: Sequence[str], place: _Place) -> _Columns | None:
-    """Read the line of the header that names the columns; None if it is another one."""
+    """Parse the header line that names the columns; None for other lines."""
     names = " ".join(words).lstrip("% ").split()
     kinds = [(i, _FIRST_COLUMN[name]) for i, name in enumerate(names) if name in _FIRST_COLUMN]
     if not kinds:
@@ -213,7 +201,7 @@ def _columns(words: Sequence[str], place: _Place) -> _Columns | None:
         )
     names = names[first:]
     if "Q" not in names[3:] or "ns" not in names[3:]:
-        raise place.error("names no columns Q and ns; let RTKLIB write them")
+        raise place.error("names no columns Q and ns; configure RTKLIB to write them")
     # Degrees, minutes and seconds of latitude and longitude are three fields each.
     shift = _TIME_FIELDS + (4 if sexagesimal else 0)
     return _Columns(
@@ -228,9 +216,9 @@ def _columns(words: Sequence[str], place: _Place) -> _Columns | None:
 
 def _no_header(word: str) -> str:
     if word.startswith("$"):
-        return "is NMEA or a status; let RTKLIB write its solution as lat/lon/height or x/y/z"
+        return "is NMEA or a status; configure RTKLIB to write its solution as lat/lon/height or x/y/z"
     return (
-        "stands before the line that names time system and columns (%  GPST  latitude(deg) ...); "
+        "precedes the line that names time system and columns (%  GPST  latitude(deg) ...); "
         "switch the header on in RTKLIB's output options"
     )
 
@@ -241,15 +229,15 @@ def _row(words: Sequence[str], columns: _Columns, place: _Place) -> tuple[float,
         position = _geodetic(given, place, sexagesimal=columns.sexagesimal)
     else:
         position = _metres(given[0], place), _metres(given[1], place), _metres(given[2], place)
-    quality = _whole(words[columns.quality], "Q", max(QUALITIES), place)
-    return *position, quality, _whole(words[columns.satellites], "ns", 999, place)
+    quality = _integer(words[columns.quality], "Q", max(QUALITIES), place)
+    return *position, quality, _integer(words[columns.satellites], "ns", 999, place)
 
 
 def _base(given: tuple[list[str], _Place] | None, path: Path) -> tuple[float, float, float]:
     if given is None:
         raise InputFileError(
-            "holds positions relative to a base, and no line with its position (% ref pos); "
-            "let RTKLIB write lat/lon/height instead",
+            "contains positions relative to a base, but no line with its position (% ref pos); "
+            "configure RTKLIB to write lat/lon/height instead",
             path=path,
         )
     words, place = given
@@ -264,13 +252,13 @@ def _geodetic(words: Sequence[str], place: _Place, *, sexagesimal: bool) -> tupl
     else:
         latitude, longitude = _number(words[0], place), _number(words[1], place)
     if abs(latitude) > 90.0 or abs(longitude) > 360.0:
-        raise place.error(f"latitude {latitude:g}, longitude {longitude:g} deg is nowhere on Earth")
+        raise place.error(f"latitude {latitude:g}, longitude {longitude:g} deg is not on Earth")
     return math.radians(latitude), math.radians(longitude), _metres(words[6 if sexagesimal else 2], place)
 
 
 def _sexagesimal(words: Sequence[str], place: _Place) -> float:
     degrees, minutes, seconds = (_number(word, place) for word in words)
-    if not (0 <= minutes < 60 and 0 <= seconds <= 60):  # seconds are rounded up to 60
+    if not (0 <= minutes < 60 and 0 <= seconds <= 60):  # RTKLIB may round seconds up to 60
         raise place.error(f"expected degrees, minutes and seconds, got {quoted(' '.join(words))}")
     size = abs(degrees) + minutes / 60 + seconds / 3600
     return -size if words[0].startswith("-") else size  # the sign of -0 counts too
@@ -278,8 +266,8 @@ def _sexagesimal(words: Sequence[str], place: _Place) -> float:
 
 def _metres(word: str, place: _Place) -> float:
     value = _number(word, place)
-    if abs(value) > _FARTHEST_M:
-        raise place.error(f"{word} m is not near the Earth")
+    if abs(value) > _MAX_COORDINATE_M:
+        raise place.error(f"{word} m is too far from the Earth")
     return value
 
 
@@ -293,14 +281,14 @@ def _number(word: str, place: _Place) -> float:
     return value
 
 
-def _whole(word: str, name: str, largest: int, place: _Place) -> int:
+def _integer(word: str, name: str, largest: int, place: _Place) -> int:
     if not (word.isascii() and word.isdigit() and len(word) < 4 and int(word) <= largest):
         raise place.error(f"column {name}: expected 0 to {largest}, got {quoted(word)}")
     return int(word)
 
 
 def _time_ns(words: Sequence[str], place: _Place) -> int:
-    """Return ns since 1970 on the file's own calendar, without a float in between, which would not hold them."""
+    """Return ns since 1970 on the file's own calendar, without a float, which would lose them."""
     text = " ".join(words[:_TIME_FIELDS])
     if found := _CALENDAR.fullmatch(text):
         year, month, day, hour, minute, second = map(int, found.groups()[:6])

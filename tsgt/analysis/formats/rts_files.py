@@ -1,4 +1,4 @@
-"""Reading the files that the authors published: tracks of prisms, and where the prisms sit on the robot."""
+"""Files that the authors published: prism tracks, and prism positions on the robot."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ NS_MAX = 2**63 - 1
 
 @dataclass(frozen=True, slots=True)
 class PublishedTrack:
-    """One prism's track as published.
+    """Track of one prism as published.
 
     Attributes
     ----------
     stamps_ns
-        (M,) Unix times in ns, strictly increasing.
+        (M,) Unix time, strictly increasing.
     points_m
-        (M, 3) positions in the frame ``station1`` in m.
+        (M, 3) in the frame ``station1``.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -43,22 +43,14 @@ class PublishedTrack:
 
 
 def read_track(path: Path) -> PublishedTrack:
-    """Read a published track: no header, separated by spaces: Unix time (s), x, y, z (m) in frame 1.
+    """Read the authors' ``trimble<k>.csv``: no header, separated by spaces: Unix time (s), x, y, z (m) in frame 1.
 
-    Parameters
-    ----------
-    path
-        The authors' ``trimble<k>.csv``.
-
-    Returns
-    -------
-    PublishedTrack
-        The times are the decimal texts to the nanosecond; no float stands between.
+    The times are converted from decimal text to nanoseconds without a float.
 
     Raises
     ------
     InputFileError
-        The file is empty, a line has not four finite numbers, or time does not increase from line to line.
+        The file is empty, a line has not four finite numbers, or times do not increase.
     """
     stamps: list[int] = []
     points: list[list[float]] = []
@@ -70,13 +62,13 @@ def read_track(path: Path) -> PublishedTrack:
         stamp = _nanoseconds(row[0], path, number)
         if stamps and stamp == stamps[-1]:
             raise InputFileError(
-                f"time stamp {row[0]} stands here a second time; keep one of the two lines",
+                f"duplicate time {row[0]}; keep one of the two lines",
                 path=path,
                 line=number,
             )
         if stamps and stamp < stamps[-1]:
             raise InputFileError(
-                f"time runs backwards: {row[0]} is {(stamps[-1] - stamp) / 1e9:.3f} s before the line above; "
+                f"time decreases: {row[0]} is {(stamps[-1] - stamp) / 1e9:.3f} s before the previous line; "
                 "sort the file by time or remove the line",
                 path=path,
                 line=number,
@@ -84,7 +76,9 @@ def read_track(path: Path) -> PublishedTrack:
         stamps.append(stamp)
         points.append([_number(text, path, number) for text in row[1:]])
     if not stamps:
-        raise InputFileError("holds no positions; expected lines of Unix time in s, x, y, z in m", path=path)
+        raise InputFileError(
+            "contains no positions; expected lines of Unix time in s, x, y, z in m", path=path
+        )
     return PublishedTrack(np.array(stamps, dtype=np.int64), np.array(points))
 
 
@@ -94,7 +88,7 @@ def read_tracks(paths: Sequence[Path]) -> tuple[PublishedTrack, ...]:
     Raises
     ------
     InputFileError
-        As :func:`read_track`; also when the tracks have no time in common.
+        As :func:`read_track`; also if the tracks do not overlap in time.
     """
     tracks = tuple(read_track(path) for path in paths)
     latest = max(range(len(tracks)), key=lambda i: int(tracks[i].stamps_ns[0]))
@@ -102,28 +96,23 @@ def read_tracks(paths: Sequence[Path]) -> tuple[PublishedTrack, ...]:
     late_ns = int(tracks[latest].stamps_ns[0] - tracks[first_to_end].stamps_ns[-1])
     if late_ns > 0:
         raise InputFileError(
-            f"begins {late_ns / 1e9:.1f} s after the end of {paths[first_to_end]}; take the tracks of one drive",
+            f"begins {late_ns / 1e9:.1f} s after the end of {paths[first_to_end]}; use the tracks of one drive",
             path=paths[latest],
         )
     return tracks
 
 
 def read_prisms(path: Path, numbers: Sequence[int] = (1, 2, 3)) -> tuple[PrismPosition, ...]:
-    """Read the prism positions on the robot.
+    """Read the prism positions on the robot, in the order of ``numbers``.
 
     Parameters
     ----------
     path
-        The authors' ``sensor_positions.csv``: separated by spaces, rows 1 to 3 are the prisms 1 to 3, and each
-        row starts with x, y, z in m in the robot frame; what follows (other sensors, covariances) is not used.
-        Or, by its ending ``.toml``, our own set-up file of kind ``prism_layout``.
+        The authors' ``sensor_positions.csv``: separated by spaces, rows 1 to 3 are the prisms 1 to 3, starting with x, y, z
+        in m in the robot frame; the rest (other sensors, covariances) is ignored. With the suffix ``.toml`` our own
+        set-up file of kind ``prism_layout``.
     numbers
-        Which prisms are tracked; others are left out.
-
-    Returns
-    -------
-    tuple[PrismPosition, ...]
-        Those, in this order.
+        Tracked prisms; others are ignored.
 
     Raises
     ------
@@ -162,7 +151,7 @@ def _read_sensor_positions(path: Path) -> dict[int, Vector3]:
 
 
 def _rows(path: Path) -> list[tuple[int, list[str]]]:
-    """Line numbers and columns of all lines that are not blank."""
+    """Return line number and columns of all non-blank lines."""
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
@@ -193,7 +182,7 @@ def _coordinate(text: str, path: Path, line: int) -> float:
 
 
 def _nanoseconds(text: str, path: Path, line: int) -> int:
-    """Decimal seconds to whole nanoseconds. A float would be off by up to 120 ns at today's Unix times."""
+    """Convert decimal seconds to whole nanoseconds. A float would be off by up to 120 ns at today's Unix times."""
     try:
         stamp = Decimal(text)
     except InvalidOperation:

@@ -1,13 +1,15 @@
-"""Set-up files: what a calibration found, as TOML. ``tsgt.config`` reads them."""
+"""Writing set-up files (TOML): the results of a calibration, which ``tsgt.config`` reads."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import tomli_w
 
 from tsgt.recording import write_atomically
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from tsgt.geometry import FloatArray
@@ -23,81 +25,77 @@ def write_station_frames(
     latencies_ms: Mapping[int, float] | None = None,
     targets: Mapping[int, Sequence[TargetResidual]] | None = None,
 ) -> None:
-    """Write a file of kind ``station_frames``.
+    """Write a file of kind ``station_frames``, atomically.
 
     Parameters
     ----------
-    path
-        The file; it appears as a whole or not at all.
     frames
         (4, 4) ``T_station1_station`` in m by station number.
     rms_m
-        By how much a station's targets missed those of station 1, root mean square, in m; station 1 has none.
+        Root mean square of the target residuals against station 1, by number of the other stations.
     comment
-        Where the frames come from; one line on top of the file.
+        Origin of the frames, written as one comment line at the top.
     latencies_ms
-        From the measurement to its stamp by station number, where they were found too.
+        From the measurement to its timestamp by station number, if calibrated.
     targets
-        How well the targets fit by station number, where the frames come from targets.
+        Target residuals by station number, if the frames come from targets.
 
     Raises
     ------
     OutputFileError
         The file cannot be written.
     """
-    tables = []
+    tables = {}
     for station, T in sorted(frames.items()):
-        rows = ",\n".join(f"  {_numbers(row)}" for row in T)
-        rms = f"rms_mm = {1e3 * rms_m[station]:.3f}\n" if station in rms_m else ""
-        late = "" if latencies_ms is None else f"latency_ms = {latencies_ms[station]:.6f}\n"
-        fits = "".join(_target(station, target) for target in (targets or {}).get(station, ()))
-        tables.append(f"[stations.{station}]\nT_station1_station = [\n{rows},\n]\n{rms}{late}{fits}")
-    _write(path, "station_frames", tables, comment)
+        table: dict[str, Any] = {"T_station1_station": T.tolist()}
+        if station in rms_m:
+            table["rms_mm"] = _to_mm(rms_m[station])
+        if latencies_ms is not None:
+            table["latency_ms"] = round(float(latencies_ms[station]), 6)
+        if targets is not None and targets.get(station):
+            table["targets"] = [_target(target) for target in targets[station]]
+        tables[str(station)] = table
+    _write(path, {"kind": "station_frames", "stations": tables}, comment)
 
 
 def write_prism_layout(
     path: Path, positions_m: Mapping[int, FloatArray], sigmas_m: Mapping[int, FloatArray], *, comment: str
 ) -> None:
-    """Write a file of kind ``prism_layout``.
+    """Write a file of kind ``prism_layout``, atomically.
 
     Parameters
     ----------
-    path
-        The file; it appears as a whole or not at all.
-    positions_m
-        (3,) position in the frame ``robot`` in m by prism number.
-    sigmas_m
-        (3,) one sigma of each coordinate in m by prism number.
+    positions_m, sigmas_m
+        (3,) position in the frame ``robot`` in m, and one sigma of each coordinate, by prism number.
     comment
-        Where they come from; one line on top of the file.
+        Origin of the positions, written as one comment line at the top.
 
     Raises
     ------
     OutputFileError
         The file cannot be written.
     """
-    tables = [
-        f"[prisms.{prism}]\nposition_m = {_numbers(position)}\nsigma_m = {_numbers(sigmas_m[prism])}\n"
+    tables = {
+        str(prism): {"position_m": list(map(float, position)), "sigma_m": list(map(float, sigmas_m[prism]))}
         for prism, position in sorted(positions_m.items())
-    ]
-    _write(path, "prism_layout", tables, comment)
+    }
+    _write(path, {"kind": "prism_layout", "prisms": tables}, comment)
 
 
-def _target(station: int, fit: TargetResidual) -> str:
-    """Table of one target's fit, to the micrometre."""
-    lengths_m = (("residual_mm", fit.residual_m), ("leave_one_out_mm", fit.leave_one_out_m))
-    keys = "".join(f"{key} = {1e3 * value:.3f}\n" for key, value in lengths_m if value is not None)
-    return f"[[stations.{station}.targets]]\ntarget = {fit.target}\n{keys}"
+def _target(fit: TargetResidual) -> dict[str, Any]:
+    lengths_m = {"residual_mm": fit.residual_m, "leave_one_out_mm": fit.leave_one_out_m}
+    return {"target": fit.target} | {
+        key: _to_mm(value) for key, value in lengths_m.items() if value is not None
+    }
 
 
-def _numbers(values: FloatArray) -> str:
-    """Array of floats in the shortest form that reads back to the same bits."""
-    return f"[{', '.join(repr(float(value)) for value in values)}]"
+def _to_mm(length_m: float) -> float:
+    """Convert to mm, rounded to the micrometre."""
+    return round(1e3 * float(length_m), 3)
 
 
-def _write(path: Path, kind: str, tables: Iterable[str], comment: str) -> None:
-    # A file name may hold a line break; a comment must not.
+def _write(path: Path, content: Mapping[str, Any], comment: str) -> None:
+    # A file name in the comment may contain a line break.
     printable = "".join(character if character.isprintable() else "?" for character in comment)
-    text = "\n".join([f'# {printable}\nkind = "{kind}"\n', *tables])
     with write_atomically(path) as file:
-        file.write(text.encode())
+        file.write(f"# {printable}\n{tomli_w.dumps(content)}".encode())

@@ -1,6 +1,6 @@
-"""Hand-made measurement files: targets seen by several stations, prisms and body points seen by one.
+"""Target files (several stations) and prism files (one station, prisms and body points of the robot).
 
-Both formats and the authors' marker file are described in docs/reference/target-file.md.
+docs/reference/target-file.md describes both formats and the authors' marker file.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ MARKER_COLUMNS = (
 )  # fmt: skip
 """Header of the authors' marker file. Their ``elevation`` is a zenith angle; angles are in rad."""
 
-_SIGHT = [HORIZONTAL, ZENITH, ["slope_distance_m"]]
+_MEASUREMENT_COLUMNS = [HORIZONTAL, ZENITH, ["slope_distance_m"]]
 _CAD = ("x_m", "y_m", "z_m")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TargetMeasurement:
-    """One measurement of a target, raw, in either face.
+    """A raw single-shot measurement of a target, in either face.
 
     Attributes
     ----------
     horizontal_angle_rad
-        Horizontal circle in rad, clockwise.
+        Clockwise.
     zenith_angle_rad
-        Angle from straight up in rad; above pi in the second face.
+        From the zenith; above pi in face 2.
     slope_distance_m
-        As the instrument gave it, in m.
+        Without corrections.
     constant_m
-        Constant to be added to this distance in m; None: that of the command line.
+        Added to this distance; None: use the constant of the command line.
     line
-        Line of the file it stands in, from 1.
+        Line number in the file, from 1.
     """
 
     horizontal_angle_rad: float
@@ -54,37 +54,31 @@ class TargetMeasurement:
 
 @dataclass(frozen=True, slots=True)
 class TargetFile:
-    """What several stations measured of common targets.
+    """Measurements of common targets by several stations.
 
     Attributes
     ----------
-    path
-        Where it was read from.
-    sights
-        By station number and target number: its measurements, at least one.
+    measurements
+        By station number and target number: at least one.
     skipped
-        One sentence for each line that was left out because the instrument reported an error.
+        One sentence for each line that was skipped because of an error status.
     """
 
     path: Path
-    sights: dict[int, dict[int, list[TargetMeasurement]]]
+    measurements: dict[int, dict[int, list[TargetMeasurement]]]
     skipped: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class PrismFile:
-    """What one station measured of the robot's prisms and body points.
+    """Measurements of the robot's prisms and body points by one station.
 
     Attributes
     ----------
-    path
-        Where it was read from.
-    prisms
-        By prism number: its measurements, at least one.
-    body
-        By name of the body point: its measurements, at least one.
+    prisms, body
+        By prism number and by name of the body point: at least one measurement.
     cad_m
-        By name of the body point: its position in the frame ``robot`` from CAD in m.
+        By name of the body point: position in the frame ``robot`` from CAD.
     """
 
     path: Path
@@ -94,18 +88,10 @@ class PrismFile:
 
 
 def read_target_file(path: Path) -> TargetFile:
-    """Read targets seen by several stations, from our CSV or from the authors' marker file.
+    """Read targets measured by station 1 and at least one other, from our CSV or the authors' marker file.
 
-    Parameters
-    ----------
-    path
-        The file. The header line tells which of the two it is.
-
-    Returns
-    -------
-    TargetFile
-        At least station 1 and one other. Marker lines with a status other than 0 are left out and told of:
-        the instrument itself said that they are wrong (paper section III-D, first step).
+    The header line tells the formats apart. Marker lines with a status other than 0 are skipped (paper section III-D,
+    first step).
 
     Raises
     ------
@@ -113,17 +99,17 @@ def read_target_file(path: Path) -> TargetFile:
         The file cannot be read, is empty, has a wrong column or number, or a station is missing.
     """
     file = read_partial_target_file(path)
-    if 1 not in file.sights:
+    if 1 not in file.measurements:
         raise InputFileError(
             "holds no usable target of station 1, whose frame is the world; add them", path=path
         )
-    if len(file.sights) == 1:
+    if len(file.measurements) == 1:
         raise InputFileError("holds targets of station 1 only; add those of the other stations", path=path)
     return file
 
 
 def read_partial_target_file(path: Path) -> TargetFile:
-    """Read a file of targets as :func:`read_target_file` does, whichever stations it holds.
+    """Read a target file as :func:`read_target_file` does, with any stations.
 
     Raises
     ------
@@ -131,45 +117,39 @@ def read_partial_target_file(path: Path) -> TargetFile:
         The file cannot be read, is empty, or has a wrong column or number.
     """
     header, rows = read_table(path)
-    sights: dict[int, dict[int, list[TargetMeasurement]]] = {}
+    measurements: dict[int, dict[int, list[TargetMeasurement]]] = {}
     skipped: list[str] = []
     is_marker_file = tuple(header.names) == MARKER_COLUMNS
     if not is_marker_file:
-        header.expect([["station"], ["target"], *_SIGHT], ["constant_mm"])
+        header.expect([["station"], ["target"], *_MEASUREMENT_COLUMNS], ["constant_mm"])
     for row in rows:
         station = row.positive_integer("theodolite_number" if is_marker_file else "station")
         target = row.positive_integer("marker_number" if is_marker_file else "target")
         if is_marker_file and row.cells["status"] != "0":
             skipped.append(
-                f"{path}, line {row.line}: target {target} of station {station} left out: "
+                f"{path}, line {row.line}: target {target} of station {station} skipped: "
                 f"the instrument reported status {row.cells['status']}"
             )
             continue
-        sight = _sight(row, "azimuth", "elevation", "distance") if is_marker_file else _sight(row)
-        sights.setdefault(station, {}).setdefault(target, []).append(sight)
-    return TargetFile(path, dict(sorted(sights.items())), tuple(skipped))
+        measurement = (
+            _measurement(row, "azimuth", "elevation", "distance") if is_marker_file else _measurement(row)
+        )
+        measurements.setdefault(station, {}).setdefault(target, []).append(measurement)
+    return TargetFile(path, dict(sorted(measurements.items())), tuple(skipped))
 
 
 def read_prism_file(path: Path) -> PrismFile:
-    """Read prisms and body points seen by one station.
+    """Read prisms and body points, at least one each, measured by one station.
 
-    Parameters
-    ----------
-    path
-        Our CSV: each line is a ``prism`` or a ``body`` point, the latter with its place from CAD.
-
-    Returns
-    -------
-    PrismFile
-        At least one prism and one body point.
+    Each line of the CSV is a ``prism`` or a ``body`` point, the latter with its position from CAD.
 
     Raises
     ------
     InputFileError
-        The file cannot be read, is empty, has a wrong column or number, or holds no prism or no body point.
+        The file cannot be read, is empty, has a wrong column or number, or contains no prism or no body point.
     """
     header, rows = read_table(path)
-    header.expect([["point"], ["kind"], *_SIGHT, *([name] for name in _CAD)], ["constant_mm"])
+    header.expect([["point"], ["kind"], *_MEASUREMENT_COLUMNS, *([name] for name in _CAD)], ["constant_mm"])
     prisms: dict[int, list[TargetMeasurement]] = {}
     body: dict[str, list[TargetMeasurement]] = {}
     cad_m: dict[str, Vector3] = {}
@@ -178,19 +158,21 @@ def read_prism_file(path: Path) -> PrismFile:
         if kind == "prism":
             if any(row.cells[column] for column in _CAD):
                 raise row.error(
-                    "a prism has no place from CAD, it is what is looked for; leave x_m, y_m, z_m empty"
+                    "a prism has no position from CAD, it is to be solved; leave x_m, y_m, z_m empty"
                 )
-            prisms.setdefault(row.positive_integer("point"), []).append(_sight(row))
+            prisms.setdefault(row.positive_integer("point"), []).append(_measurement(row))
         elif kind == "body":
             name = row.cells["point"]
             if not name:
                 raise row.error("a body point needs a name in the column point")
-            place = (_place(row, "x_m"), _place(row, "y_m"), _place(row, "z_m"))
-            if cad_m.setdefault(name, place) != place:
-                raise row.error(f"body point {name} has another x_m, y_m, z_m further up; keep one of them")
-            body.setdefault(name, []).append(_sight(row))
+            position_m = (_coordinate(row, "x_m"), _coordinate(row, "y_m"), _coordinate(row, "z_m"))
+            if cad_m.setdefault(name, position_m) != position_m:
+                raise row.error(
+                    f"body point {name} has different x_m, y_m, z_m in a previous line; keep one of them"
+                )
+            body.setdefault(name, []).append(_measurement(row))
         else:
-            raise row.error(f"kind is {quoted(kind)}; it is prism or body")
+            raise row.error(f"kind is {quoted(kind)}; expected prism or body")
     if not prisms:
         raise InputFileError("holds no prism; add lines of kind prism", path=path)
     if not body:
@@ -198,14 +180,14 @@ def read_prism_file(path: Path) -> PrismFile:
     return PrismFile(path, dict(sorted(prisms.items())), body, cad_m)
 
 
-def _place(row: Row, column: str) -> float:
+def _coordinate(row: Row, column: str) -> float:
     return row.within(column, -MAX_COORDINATE_M, MAX_COORDINATE_M)
 
 
-def _sight(
+def _measurement(
     row: Row, horizontal: str | None = None, zenith: str | None = None, distance: str = "slope_distance_m"
 ) -> TargetMeasurement:
-    """Read the measurement of a line; without column names those of our own format."""
+    """Parse the measurement of a line; the default columns are those of our own format."""
     horizontal_rad, zenith_rad = row.angles_rad(horizontal, zenith)
     return TargetMeasurement(
         horizontal_angle_rad=horizontal_rad,

@@ -1,4 +1,8 @@
-"""TODO face."""
+"""Distances between GNSS receivers on a robot, compared with the distances between its prisms.
+
+Comes in: RTKLIB solutions, and prism tracks of a recording of the same drive. Goes out: distances over time with quality,
+on Unix time, cut to the common interval, and their error statistics.
+"""
 
 from tsgt.analysis.gnss.baselines import (
     QUALITY_ORDER,
@@ -9,7 +13,7 @@ from tsgt.analysis.gnss.baselines import (
     receiver_distances,
     receivers,
 )
-from tsgt.analysis.gnss.prism_baselines import common_interval, prism_distances, span
+from tsgt.analysis.gnss.prism_baselines import common_interval, prism_distances, time_span
 
 __all__ = [
     "QUALITY_ORDER",
@@ -21,5 +25,5 @@ __all__ = [
     "quality_shares",
     "receiver_distances",
     "receivers",
-    "span",
+    "time_span",
 ]

@@ -1,9 +1,7 @@
-"""Satellite receivers on a robot: how far the distances between them stray, beside those between its prisms.
+"""Distances between GNSS receivers on a robot.
 
-Whatever the robot does, the distance between two receivers on it does not change, as that between two prisms. So the
-same figure judges both systems, in the open and under trees (Vaidis et al., section IV-F).
-
-From GPS time to UTC: GPS counts every second since 1980, UTC has had leap seconds put in.
+The distance between two receivers on a rigid robot is constant, as that between two prisms: the same figure rates both
+systems, in the open and under trees (Vaidis et al. 2021, section IV-F).
 """
 
 from __future__ import annotations
@@ -28,39 +26,37 @@ if TYPE_CHECKING:
 
     from tsgt.analysis.formats import PosFile, TimeSystem
 
-JST_AHEAD_NS = 9 * 3600 * SECOND_NS
+JST_OFFSET_NS = 9 * 3600 * SECOND_NS
 
 OUTAGE_LIMIT_NS = SECOND_NS
-"""Between two positions further apart nobody knows where the second receiver was; as the paper has it for prisms."""
+"""The second receiver is not interpolated between positions further apart, as the paper does for prisms."""
 
 INSIDE_EARTH_M = 6.3e6
-"""RTKLIB writes the centre of the Earth where it has no position yet; everything on the ground is above this."""
+"""Positions below this distance from the Earth's centre are invalid: RTKLIB writes the centre itself without a solution."""
 
 QUALITY_ORDER = (1, 2, 6, 4, 3, 5, 7, 0)
-"""RTKLIB's Q in the order of what the positions are worth."""
+"""RTKLIB's Q, best first."""
 _RANK = np.argsort(QUALITY_ORDER)
 
 
 @dataclass(frozen=True, slots=True)
 class Receiver:
-    """One receiver's positions.
+    """Positions of one receiver.
 
     Attributes
     ----------
-    name
-        What it is called in reports.
     path, time_system
-        Its file, and what the times there are.
+        The file and its time system.
     times_ns
-        (M,) Unix times in ns, strictly increasing.
+        (M,) Unix time, strictly increasing.
     points_m
-        (M, 3) east, north and up in m, in the local frame that all receivers share.
+        (M, 3) east, north and up in the local frame common to all receivers.
     quality
         (M,) RTKLIB's Q.
     satellites
-        (M,) how many satellites each position is from.
+        (M,) number of satellites.
     without_position
-        How many epochs of the file hold none.
+        Number of epochs in the file without a position.
     """
 
     name: str
@@ -73,7 +69,7 @@ class Receiver:
     without_position: int
 
     def between(self, start_ns: int, end_ns: int) -> Receiver:
-        """Return the part within a span of time; epochs without a position remain those of the file."""
+        """Return the part within a time interval; ``without_position`` remains that of the file."""
         inside = (self.times_ns >= start_ns) & (self.times_ns <= end_ns)
         columns = ("times_ns", "points_m", "quality", "satellites")
         return replace(self, **{name: getattr(self, name)[inside] for name in columns})
@@ -81,14 +77,14 @@ class Receiver:
 
 @dataclass(frozen=True, slots=True)
 class DistanceErrorStatistics:
-    """How far distances stray from what they should be, in mm; NaN without distances.
+    """|distance - reference| in mm; NaN without distances.
 
     Attributes
     ----------
     valid
-        How many distances there are.
-    mean_abs_error, std_abs_error, p95, max
-        Mean, standard deviation (divisor n), 95th percentile and maximum of |distance - reference|.
+        Number of distances.
+    std_abs_error
+        Standard deviation with divisor n.
     """
 
     valid: int
@@ -99,7 +95,7 @@ class DistanceErrorStatistics:
 
     @classmethod
     def of(cls, errors_m: NDArray[np.float64]) -> DistanceErrorStatistics:
-        """Sum up (N,) absolute errors."""
+        """Summarise (N,) absolute errors."""
         if not len(errors_m):
             return cls(0, math.nan, math.nan, math.nan, math.nan)
         errors = 1e3 * errors_m
@@ -119,17 +115,17 @@ class DistanceSeries:
     Attributes
     ----------
     name
-        The pair as it is called in reports.
+        Name of the pair in reports.
     times_ns
-        (N,) Unix times in ns.
+        (N,) Unix time.
     distances_m
-        (N,) distances in m.
+        (N,).
     reference_m
-        What they should be in m; NaN without any distance to tell.
+        True distance; NaN if unknown.
     quality
-        (N,) the worse Q of the positions that each is from; None of prisms.
+        (N,) the worse Q of the two positions; None for prisms.
     invalid_ns
-        (K,) Unix times in ns of the epochs without a distance.
+        (K,) Unix times of the epochs without a distance.
     """
 
     name: str
@@ -141,18 +137,18 @@ class DistanceSeries:
 
     @property
     def errors_m(self) -> NDArray[np.float64]:
-        """(N,) |distance - reference| in m."""
+        """(N,) |distance - reference|."""
         return np.abs(self.distances_m - self.reference_m)
 
     def by_quality(self) -> dict[int, NDArray[np.float64]]:
-        """Errors in m by the worse Q, best first."""
+        """Return the errors in m by Q, best first."""
         if self.quality is None:
             return {}
         errors_m = self.errors_m
         return {q: errors_m[self.quality == q] for q in QUALITY_ORDER if np.any(self.quality == q)}
 
     def between(self, start_ns: int, end_ns: int) -> DistanceSeries:
-        """Return the part within a span of time."""
+        """Return the part within a time interval."""
         inside = (self.times_ns >= start_ns) & (self.times_ns <= end_ns)
         return replace(
             self,
@@ -164,22 +160,12 @@ class DistanceSeries:
 
 
 def receivers(files: Sequence[PosFile]) -> tuple[Receiver, ...]:
-    """Put receivers on one clock and into one local frame.
-
-    Parameters
-    ----------
-    files
-        One per receiver.
-
-    Returns
-    -------
-    tuple of Receiver
-        In the same order. The local frame is tangential to WGS84's ellipsoid at the first position of the first.
+    """Convert solutions to Unix time and one local frame, tangential to the WGS84 ellipsoid at the first position of the first.
 
     Raises
     ------
     InputFileError
-        A file holds no position at all.
+        A file contains no position at all.
     MissingExtraError
         pymap3d is not installed.
     """
@@ -187,35 +173,33 @@ def receivers(files: Sequence[PosFile]) -> tuple[Receiver, ...]:
         from pymap3d import ecef2enu, ecef2geodetic  # noqa: PLC0415 (an extra)
     except ImportError as error:
         raise MissingExtraError("GNSS files", library="pymap3d", extra="gnss") from error
-    places = [_ecef_m(file) for file in files]
+    positions_m = [_ecef_m(file) for file in files]
     usable = [
-        (np.linalg.norm(place, axis=1) > INSIDE_EARTH_M) & (file.quality > 0)
-        for file, place in zip(files, places, strict=True)
+        (np.linalg.norm(position, axis=1) > INSIDE_EARTH_M) & (file.quality > 0)
+        for file, position in zip(files, positions_m, strict=True)
     ]
     for file, rows in zip(files, usable, strict=True):
         if not rows.any():
-            raise InputFileError("RTKLIB found no position in any of its epochs", path=file.path)
+            raise InputFileError("contains no valid position in any epoch", path=file.path)
     names = _names([file.path for file in files])
-    origin = ecef2geodetic(*places[0][usable[0]][0], deg=False)
-    found = []
-    for name, file, place, rows in zip(names, files, places, usable, strict=True):
-        found.append(
-            Receiver(
-                name=name,
-                path=file.path,
-                time_system=file.time_system,
-                times_ns=unix_times_ns(file)[rows],
-                points_m=np.column_stack(ecef2enu(*place[rows].T, *origin, deg=False)),
-                quality=file.quality[rows],
-                satellites=file.satellites[rows],
-                without_position=int(np.sum(~rows)),
-            )
+    origin = ecef2geodetic(*positions_m[0][usable[0]][0], deg=False)
+    return tuple(
+        Receiver(
+            name=name,
+            path=file.path,
+            time_system=file.time_system,
+            times_ns=unix_times_ns(file)[rows],
+            points_m=np.column_stack(ecef2enu(*position[rows].T, *origin, deg=False)),
+            quality=file.quality[rows],
+            satellites=file.satellites[rows],
+            without_position=int(np.sum(~rows)),
         )
-    return tuple(found)
+        for name, file, position, rows in zip(names, files, positions_m, usable, strict=True)
+    )
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
-    """Name files as shortly as they can be told apart."""
+    """Return the shortest names that distinguish the files."""
     for names in (
         [path.stem for path in paths],
         [f"{path.absolute().parent.name}/{path.stem}" for path in paths],
@@ -233,11 +217,11 @@ def unix_times_ns(file: PosFile) -> NDArray[np.int64]:
         case "UTC":
             return file.times_ns
         case "JST":
-            return file.times_ns - JST_AHEAD_NS
+            return file.times_ns - JST_OFFSET_NS
 
 
 def _ecef_m(file: PosFile) -> NDArray[np.float64]:
-    """Return Earth-fixed coordinates in m, (M, 3)."""
+    """Return Earth-centred, Earth-fixed coordinates, (M, 3)."""
     from pymap3d import enu2ecef, geodetic2ecef  # noqa: PLC0415 (an extra)
 
     match file.coordinates:
@@ -246,7 +230,7 @@ def _ecef_m(file: PosFile) -> NDArray[np.float64]:
         case "geodetic":
             return np.column_stack(geodetic2ecef(*file.positions.T, deg=False))
         case "baseline":
-            assert file.base is not None  # noqa: S101 (the reader sees to it)
+            assert file.base is not None  # noqa: S101 (read_pos ensures it)
             return np.column_stack(enu2ecef(*file.positions.T, *file.base, deg=False))
 
 
@@ -255,27 +239,27 @@ def receiver_distances(
 ) -> tuple[DistanceSeries, ...]:
     """Measure the distances between all receivers over time.
 
-    The second receiver of a pair is interpolated by a straight line to the epochs of the first: clocks of cheap
-    receivers drift, so that theirs lie some milliseconds apart.
+    The second receiver of a pair is interpolated linearly to the epochs of the first, because the clocks of low-cost
+    receivers differ by some milliseconds.
 
     Parameters
     ----------
     found
         As :func:`receivers` returns them.
     references_m
-        What the distances should be in m, for the pairs 1-2, 1-3, ..., 2-3, ...; None: the median of those from fixed
-        positions (Q = 1), or of all if none is. A median cannot show an error that is always there.
+        True distances for the pairs 1-2, 1-3, ..., 2-3, ...; None: the median of the distances from fixed positions (Q = 1),
+        or of all without fixed ones. A median hides constant errors.
 
     Returns
     -------
-    tuple of Distances
-        One per pair. Epochs of the first receiver outside the time of the second, and those between two of its
-        positions more than 1 s apart, are counted as invalid.
+    tuple of DistanceSeries
+        One per pair. Invalid are epochs of the first receiver outside the time of the second or between two of its
+        positions more than 1 s apart.
     """
     pairs = []
     for number, (a, b) in enumerate(combinations(found, 2)):
         at_epochs = interpolate(b.times_ns, b.points_m, a.times_ns, OUTAGE_LIMIT_NS)
-        # Where both have the same epochs nothing is interpolated, and no neighbour can be too far away.
+        # Common epochs are not interpolated and therefore valid next to an outage too.
         same, after = np.isin(a.times_ns, b.times_ns), np.searchsorted(b.times_ns, a.times_ns)
         valid = at_epochs.valid | same
         points_m = at_epochs.points.copy()
@@ -306,6 +290,6 @@ def _median(distances_m: NDArray[np.float64], quality: NDArray[np.int64]) -> flo
 
 
 def quality_shares(receiver: Receiver) -> dict[str, float]:
-    """Tell which share of a receiver's positions has which quality, best first."""
+    """Return the share of each quality among a receiver's positions, best first."""
     counts = {QUALITIES[q]: int(np.sum(receiver.quality == q)) for q in QUALITY_ORDER}
     return {name: count / len(receiver.quality) for name, count in counts.items() if count}

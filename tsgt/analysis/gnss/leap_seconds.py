@@ -12,8 +12,8 @@ from tsgt.analysis.formats import SECOND_NS
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-# The day from which GPS is so many seconds ahead of UTC: IERS Bulletin C. None has been announced since that of 2017.
-_AHEAD_FROM = (
+# Month of change and GPS - UTC in s from then on: IERS Bulletin C. No change has been announced since 2017.
+_LEAP_SECONDS = (
     ((1981, 7), 1),
     ((1982, 7), 2),
     ((1983, 7), 3),
@@ -34,28 +34,19 @@ _AHEAD_FROM = (
     ((2017, 1), 18),
 )
 
-_AHEAD_S = np.array([0, *(seconds for _, seconds in _AHEAD_FROM)], dtype=np.int64)
+_OFFSET_S = np.array([0, *(seconds for _, seconds in _LEAP_SECONDS)], dtype=np.int64)
 _FROM_GPS_NS = np.array(
     [
         (round(datetime(year, month, 1, tzinfo=UTC).timestamp()) + seconds) * SECOND_NS
-        for (year, month), seconds in _AHEAD_FROM
+        for (year, month), seconds in _LEAP_SECONDS
     ],
     dtype=np.int64,
 )
 
 
 def utc_from_gps(gps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Convert GPS time to Unix time.
+    """Convert GPS time, (N,) ns from 1970-01-01 00:00:00 on the calendar of GPS time, to Unix time in ns.
 
-    Parameters
-    ----------
-    gps_ns
-        (N,) ns from 1970-01-01 00:00:00 on the calendar of GPS time.
-
-    Returns
-    -------
-    NDArray[np.int64]
-        (N,) Unix time in ns. It has no name of its own for a leap second: within one it runs through the first second
-        of the new day, which then comes again.
+    Unix time cannot represent a leap second: during one it runs through the first second of the new day, which then repeats.
     """
-    return gps_ns - _AHEAD_S[np.searchsorted(_FROM_GPS_NS, gps_ns, side="right")] * SECOND_NS
+    return gps_ns - _OFFSET_S[np.searchsorted(_FROM_GPS_NS, gps_ns, side="right")] * SECOND_NS

@@ -1,4 +1,4 @@
-"""Distances between prisms over time, to stand beside those between satellite receivers."""
+"""Distances between prisms over time, for comparison with those between GNSS receivers."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ def prism_distances(
     Raises
     ------
     RecordingError
-        A prism was not measured, or the layout has one prism only.
+        A prism was not measured, or the layout has only one prism.
     """
     missing = [prism.prism for prism in parameters.prisms if not len(tracks[prism.prism])]
     if missing or len(parameters.prisms) < 2:
-        what = f"prism {missing[0]} was not measured" if missing else "it has one prism only"
-        raise RecordingError(f"no distances between prisms: {what}", path=path)
+        reason = f"prism {missing[0]} was not measured" if missing else "it has one prism only"
+        raise RecordingError(f"no distances between prisms: {reason}", path=path)
     found = distances_at_epochs(parameters, tracks)
     return tuple(
         DistanceSeries(
@@ -58,39 +58,39 @@ def prism_distances(
 def common_interval(
     gnss: Sequence[DistanceSeries], prisms: Sequence[DistanceSeries], path: Path
 ) -> tuple[tuple[DistanceSeries, ...], tuple[DistanceSeries, ...]]:
-    """Cut both to the time that they share, so that their figures are of the same stretch of the way.
+    """Cut distances between receivers and between prisms to the time interval that both cover.
 
     Parameters
     ----------
-    gnss, prisms
-        Distances between receivers, and between prisms.
     path
         The recording, for messages.
 
     Raises
     ------
     RecordingError
-        They share no time.
+        They do not overlap in time.
     """
-    theirs, ours = span(gnss), span(prisms)
-    if theirs is None or ours is None:
-        which = "receivers" if theirs is None else "prisms"
+    gnss_span, prism_span = time_span(gnss), time_span(prisms)
+    if gnss_span is None or prism_span is None:
+        which = "receivers" if gnss_span is None else "prisms"
         raise RecordingError(f"nothing to compare: there are no distances between {which}", path=path)
-    start_ns, end_ns = max(theirs[0], ours[0]), min(theirs[1], ours[1])
+    start_ns, end_ns = max(gnss_span[0], prism_span[0]), min(gnss_span[1], prism_span[1])
     if start_ns > end_ns:
-        late = ours[0] > theirs[1]
+        late = prism_span[0] > gnss_span[1]
         raise RecordingError(
             f"its distances {'begin' if late else 'end'} {(start_ns - end_ns) / 1e9:.1f} s "
             f"{'after the end' if late else 'before the start'} of the receivers'; was the master's clock right?",
             path=path,
         )
     both = tuple(tuple(pair.between(start_ns, end_ns) for pair in pairs) for pairs in (gnss, prisms))
-    if None in map(span, both):
-        raise RecordingError("while its prisms were seen the receivers had no positions in common", path=path)
+    if None in map(time_span, both):
+        raise RecordingError(
+            "while its prisms were measured the receivers had no common positions", path=path
+        )
     return both[0], both[1]
 
 
-def span(pairs: Sequence[DistanceSeries]) -> tuple[int, int] | None:
+def time_span(pairs: Sequence[DistanceSeries]) -> tuple[int, int] | None:
     """Return the first and the last time of any distance; None without one."""
     times = np.concatenate([np.empty(0, np.int64), *(pair.times_ns for pair in pairs)])
     return (int(times.min()), int(times.max())) if len(times) else None

@@ -1,4 +1,7 @@
-"""The journals of one start of a station's computer, against one run of the master: what is in both, and when. Pure."""
+"""Relates the journals of one boot of a station's computer to a session of the master: common measurements, and times.
+
+Sans-I/O.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +13,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from tsgt.analysis.merge.recording_index import identity
 from tsgt.analysis.merge.timing import (
-    Pair,
-    Told,
+    BeaconReception,
+    DeliveredTime,
     add_link_delay,
-    link_constant,
+    link_delay,
     times_consistent,
     times_from_beacons,
     times_from_synchronisations,
@@ -28,130 +31,109 @@ if TYPE_CHECKING:
     from tsgt.recording.journal import Journal
 
 _ROUGH_NS = 5_000_000_000
-"""A delivered measurement tells the station's clock to this, whatever its stamp is worth, unless it is far away."""
+"""A delivered measurement relates the station's clock to the master's within this, even without a timestamp bound."""
 
 _EARLY_NS = 1_000_000_000
-"""What answers so short before a run began, by that clock, may be this run."""
+"""A response this long before the journal's start, on the master's clock, may belong to the journal."""
 
 _DRIFT = 200e-6
-"""No two computers' clocks run apart faster."""
+"""Upper limit of the frequency difference of two computers' clocks."""
 
 _AFTER_NS = 10_000_000_000
-"""A synchronisation so long after a journal's last line is still of this run, if no other has begun."""
+"""A synchronisation this long after a journal's last line still belongs to it, if no other journal has begun."""
 
-# Half a unit on the air, and what is lost in the sums on either side; a distance from 1677.7 m on goes in whole mm.
+# Half a unit of the protocol plus rounding errors of the sums; distances from 1677.7 m on are sent in whole mm.
 _ANGLE_ROUNDING_RAD = math.tau / 2**25 * 1.001
 _DISTANCE_ROUNDING_M = 0.501e-3
 
 
-class Run(NamedTuple):
-    """A journal: one run of the client.
-
-    Attributes
-    ----------
-    number
-        Which of the journals.
-    journal
-        What it holds.
-    """
+class IndexedJournal(NamedTuple):
+    """A journal, which one run of the client wrote, and its position among the journals."""
 
     number: int
     journal: Journal
 
     @property
     def zero_ns(self) -> int:
-        """What its times are ahead of CLOCK_MONOTONIC of the station's computer."""
+        """Offset of its times from CLOCK_MONOTONIC of the station's computer."""
         return self.journal.head.unix_at_zero_ns
 
     @property
     def begin_ns(self) -> int:
-        """When it was begun, on CLOCK_MONOTONIC."""
+        """Time of its creation on CLOCK_MONOTONIC."""
         return self.journal.created_ns - self.zero_ns
 
 
-class Entry(NamedTuple):
-    """A measurement of a journal.
-
-    Attributes
-    ----------
-    local_ns
-        When it was made, on CLOCK_MONOTONIC of the station's computer.
-    run
-        Whose it is.
-    measurement
-        As the journal has it.
-    """
+class JournalMeasurement(NamedTuple):
+    """A measurement of a journal, with its time on CLOCK_MONOTONIC of the station's computer."""
 
     local_ns: int
-    run: Run
+    source: IndexedJournal
     measurement: PolarMeasurement
 
 
 class Boot:
-    """What the journals of one start of a computer hold together.
-
-    Parameters
-    ----------
-    runs
-        Of one station, on one CLOCK_MONOTONIC.
+    """Journals of one station that share a CLOCK_MONOTONIC.
 
     Attributes
     ----------
-    runs
-        In the order in which they began.
+    journals
+        In the order of their creation.
     entries
-        All measurements, in the order of time.
+        All measurements in the order of time.
     """
 
-    def __init__(self, runs: Iterable[Run]) -> None:
-        self.runs = sorted(runs, key=lambda run: run.begin_ns)
+    def __init__(self, journals: Iterable[IndexedJournal]) -> None:
+        self.journals = sorted(journals, key=lambda source: source.begin_ns)
         self.entries = sorted(
             (
-                Entry(measurement.stamp_ns - run.zero_ns, run, measurement)
-                for run in self.runs
-                for measurement in run.journal.measurements
+                JournalMeasurement(measurement.stamp_ns - source.zero_ns, source, measurement)
+                for source in self.journals
+                for measurement in source.journal.measurements
             ),
-            key=lambda entry: (entry.local_ns, entry.run.number),
+            key=lambda entry: (entry.local_ns, entry.source.number),
         )
         self._stamps_ns = [entry.local_ns for entry in self.entries]
-        self._by_identity: dict[object, list[int]] = defaultdict(list)  # several in copies of a journal
+        self._by_identity: dict[object, list[int]] = defaultdict(list)  # several if a journal is given twice
         self._by_sequence: dict[int, list[int]] = defaultdict(list)
-        for place, entry in enumerate(self.entries):
-            if entry.run.journal.head.lineage is None:  # over superframe the station's own time is not sent
-                self._by_identity[identity(entry.measurement)].append(place)
-            self._by_sequence[entry.measurement.sequence].append(place)
+        for index, entry in enumerate(self.entries):
+            if (
+                entry.source.journal.head.stream_id is None
+            ):  # superframe does not transmit the station's own time
+                self._by_identity[identity(entry.measurement)].append(index)
+            self._by_sequence[entry.measurement.sequence].append(index)
 
-    def against(self, session: Session) -> Found:
-        """Compare with a run of the master."""
-        found = Found([None] * len(self.entries))
-        self._find_alike(session, found)
-        self._over_classic(session, found)
+    def against(self, session: Session) -> Match:
+        """Match the measurements with a session of the master, and compute their times."""
+        match = Match([None] * len(self.entries))
+        self._match_content(session, match)
+        self._match_classic(session, match)
         for beacons in session.beacons:
-            self._over_superframe(session, beacons, found)
-        return found
+            self._match_superframe(session, beacons, match)
+        return match
 
     @property
     def station(self) -> int:
         """Number of the station."""
-        return self.runs[0].journal.station
+        return self.journals[0].journal.station
 
     @property
     def superframe(self) -> bool:
-        """Whether any of the runs spoke this protocol."""
-        return any(run.journal.head.lineage is not None for run in self.runs)
+        """Whether any of the journals was written with the protocol superframe."""
+        return any(source.journal.head.stream_id is not None for source in self.journals)
 
     # --- Classic --------------------------------------------------------------------------------------------------
 
-    def _over_classic(self, session: Session, found: Found) -> None:
+    def _match_classic(self, session: Session, match: Match) -> None:
         anchors = []
         for delivered in session.delivered.get(self.station, ()):
             key = identity(delivered)
-            places = [] if key is None else self._by_identity.get(key, [])
-            found.delivered.update(places)
-            for place in places[:1]:
-                # A stamp without a bound is worth nothing; the measurement came within seconds then.
+            indices = [] if key is None else self._by_identity.get(key, [])
+            match.delivered.update(indices)
+            for index in indices[:1]:
+                # Without a bound the timestamp is unusable; the measurement arrived within seconds.
                 at_ns = delivered.received_ns if delivered.stamp_bound_ns is None else delivered.stamp_ns
-                anchors.append((at_ns, self._stamps_ns[place] - at_ns))
+                anchors.append((at_ns, self._stamps_ns[index] - at_ns))
         if not anchors:
             return
         anchors.sort()
@@ -162,102 +144,104 @@ class Boot:
         ]
         if synchronisations:
             synchronisations.sort(key=lambda samples: samples[-1].station_ns)
-            found.take(times_from_synchronisations(synchronisations, self._stamps_ns))
+            match.update(times_from_synchronisations(synchronisations, self._stamps_ns))
 
     def _of_this_boot(
         self, samples: Sequence[ClockSample], anchors: Sequence[tuple[int, int]]
     ) -> list[ClockSample]:
-        """Return those exchanges that this boot has answered, with the station's time on CLOCK_MONOTONIC."""
+        """Return the exchanges that this boot answered, with the station's time on CLOCK_MONOTONIC."""
         answered = []
         for sample in samples:
             after = bisect_left(anchors, (sample.sent_ns, 0))
-            near_ns, ahead_ns = min(
+            anchor_ns, offset_ns = min(
                 anchors[max(after - 1, 0) : after + 1], key=lambda anchor: abs(anchor[0] - sample.sent_ns)
             )
-            about_ns = sample.sent_ns + ahead_ns
-            run = self._run_at(about_ns)
-            allowed_ns = _ROUGH_NS + _DRIFT * abs(sample.sent_ns - near_ns)
-            if run is not None and abs(sample.station_ns - run.zero_ns - about_ns) <= allowed_ns:
-                answered.append(replace(sample, station_ns=sample.station_ns - run.zero_ns))
+            expected_ns = sample.sent_ns + offset_ns
+            source = self._journal_at(expected_ns)
+            allowed_ns = _ROUGH_NS + _DRIFT * abs(sample.sent_ns - anchor_ns)
+            if source is not None and abs(sample.station_ns - source.zero_ns - expected_ns) <= allowed_ns:
+                answered.append(replace(sample, station_ns=sample.station_ns - source.zero_ns))
         return answered
 
-    def _run_at(self, local_ns: int) -> Run | None:
-        """Return which run answered at an instant on CLOCK_MONOTONIC; None where its journal is not here."""
-        after = bisect_right([run.begin_ns - _EARLY_NS for run in self.runs], local_ns)
+    def _journal_at(self, local_ns: int) -> IndexedJournal | None:
+        """Return the journal that was being written at an instant on CLOCK_MONOTONIC; None if it is not available."""
+        after = bisect_right([source.begin_ns - _EARLY_NS for source in self.journals], local_ns)
         if not after:
             return None
-        run = self.runs[after - 1]
-        stamps_ns = [measurement.stamp_ns for measurement in run.journal.measurements[-1:]]
-        end_ns = max([run.journal.created_ns, *stamps_ns]) - run.zero_ns + _AFTER_NS
-        return run if local_ns <= end_ns else None
+        source = self.journals[after - 1]
+        stamps_ns = [measurement.stamp_ns for measurement in source.journal.measurements[-1:]]
+        end_ns = max([source.journal.created_ns, *stamps_ns]) - source.zero_ns + _AFTER_NS
+        return source if local_ns <= end_ns else None
 
     # --- Superframe -----------------------------------------------------------------------------------------------
 
-    def _over_superframe(self, session: Session, on_air: int, found: Found) -> None:
-        beacons = session.beacons[on_air]
-        pairs = sorted(
-            Pair(reception.stamp_ns - run.zero_ns, reception.stamp_sigma_ns, beacon.stamp_ns)
-            for run in self.runs
-            for reception in run.journal.receptions
-            if reception.session == on_air and (beacon := beacons.get(reception.counter)) is not None
+    def _match_superframe(self, session: Session, session_number: int, match: Match) -> None:
+        beacons = session.beacons[session_number]
+        receptions = sorted(
+            BeaconReception(reception.stamp_ns - source.zero_ns, reception.stamp_sigma_ns, beacon.stamp_ns)
+            for source in self.journals
+            for reception in source.journal.receptions
+            if reception.session == session_number and (beacon := beacons.get(reception.counter)) is not None
         )
-        if not pairs:
+        if not receptions:
             return
-        found.heard = True
-        times = times_from_beacons(pairs, self._stamps_ns)
-        told = []
+        match.beacons_received = True
+        times = times_from_beacons(receptions, self._stamps_ns)
+        delivered_times = []
         for delivered in session.delivered.get(self.station, ()):
-            for place in self._by_sequence.get(delivered.sequence, ()):
-                time = times[place]
+            for index in self._by_sequence.get(delivered.sequence, ()):
+                time = times[index]
                 if (
                     time is not None
-                    and same_content(self.entries[place].measurement, delivered)
+                    and same_content(self.entries[index].measurement, delivered)
                     and times_consistent(delivered.stamp_ns, delivered.stamp_bound_ns or 0, time)
                 ):
-                    found.delivered.add(place)
-                    told.append(Told(delivered.stamp_ns, delivered.stamp_bound_ns or 0, time))
-        way = link_constant(told)
-        if way is not None:
-            found.take([None if time is None else add_link_delay(time, *way) for time in times])
+                    match.delivered.add(index)
+                    delivered_times.append(
+                        DeliveredTime(delivered.stamp_ns, delivered.stamp_bound_ns or 0, time)
+                    )
+        delay = link_delay(delivered_times)
+        if delay is not None:
+            match.update([None if time is None else add_link_delay(time, *delay) for time in times])
 
-    def _find_alike(self, session: Session, found: Found) -> None:
-        """Find what is in both by number and content alone, for want of times."""
-        found.alike = {
-            place
+    def _match_content(self, session: Session, match: Match) -> None:
+        """Match measurements by sequence number and content alone, independent of times."""
+        match.same_content = {
+            index
             for delivered in session.delivered.get(self.station, ())
             if delivered.host_time_ns is None
-            for place in self._by_sequence.get(delivered.sequence, ())
-            if same_content(self.entries[place].measurement, delivered)
+            for index in self._by_sequence.get(delivered.sequence, ())
+            if same_content(self.entries[index].measurement, delivered)
         }
 
 
 @dataclass(slots=True)
-class Found:
-    """What a comparison has found.
+class Match:
+    """Result of matching a boot with a session.
 
     Attributes
     ----------
     times
-        When each of the entries was made, on the master's clock; None where nobody can say.
+        Time of each entry on the master's clock; None if unknown.
     delivered
-        Indices of those that came over the radio.
-    alike
-        Indices of those that came by what they look like; their times may say otherwise.
-    tied
-        Synchronisations or beacons tie the station's clock to the master's.
-    heard
-        The station has heard beacons of this run.
+        Indices of entries that were delivered over the radio.
+    same_content
+        Indices of entries whose content was delivered; their times may contradict that.
+    clock_related
+        Synchronisations or beacons relate the station's clock to the master's.
+    beacons_received
+        The station received beacons of this session.
     """
 
     times: list[MasterTime | None]
     delivered: set[int] = field(default_factory=set)
-    alike: set[int] = field(default_factory=set)
-    tied: bool = False
-    heard: bool = False
+    same_content: set[int] = field(default_factory=set)
+    clock_related: bool = False
+    beacons_received: bool = False
 
-    def take(self, times: Sequence[MasterTime | None]) -> None:
-        """Take times where they are better than those that there are."""
-        self.tied = True
+    def update(self, times: Sequence[MasterTime | None]) -> None:
+        """Replace times by those with smaller bounds."""
+        self.clock_related = True
         self.times = [better(one, other) for one, other in zip(self.times, times, strict=True)]
 
 
@@ -269,16 +253,16 @@ def better(one: MasterTime | None, other: MasterTime | None) -> MasterTime | Non
 
 
 def same_content(journalled: PolarMeasurement, delivered: PolarMeasurement) -> bool:
-    """Whether a measurement has come as it stands in the journal, but for what the protocol superframe rounds."""
+    """Return whether a delivered measurement equals a journalled one up to the rounding of the protocol superframe."""
     if (journalled.status, journalled.prism) != (delivered.status, delivered.prism):
         return False
-    turned_rad = (
+    differences_rad = (
         journalled.horizontal_angle_rad - delivered.horizontal_angle_rad,
         journalled.zenith_angle_rad - delivered.zenith_angle_rad,
     )
-    if any(abs(math.remainder(turn, math.tau)) > _ANGLE_ROUNDING_RAD for turn in turned_rad):
+    if any(abs(math.remainder(angle, math.tau)) > _ANGLE_ROUNDING_RAD for angle in differences_rad):
         return False
-    here_m, there_m = journalled.slope_distance_m, delivered.slope_distance_m
-    if here_m is None or there_m is None:
-        return here_m is there_m
-    return abs(here_m - there_m) <= _DISTANCE_ROUNDING_M
+    journalled_m, delivered_m = journalled.slope_distance_m, delivered.slope_distance_m
+    if journalled_m is None or delivered_m is None:
+        return journalled_m is delivered_m
+    return abs(journalled_m - delivered_m) <= _DISTANCE_ROUNDING_M

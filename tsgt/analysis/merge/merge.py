@@ -1,7 +1,7 @@
-"""The stations' journals into the master's recording: what the radio did not carry, on the master's clock.
+"""Merges station journals into a master's recording: adds measurements that the radio did not deliver.
 
-Appending is safe: each line is one write at the end of a file that nobody else may write, and what is there already
-is not added again. So a merge that was killed is simply done once more.
+Appending is safe against interruption: each line is one write at the end of a file locked against other writers, and
+measurements that are present are not added again. A merge that was killed is simply repeated.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections import defaultdict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
-from tsgt.analysis.merge.matching import Boot, Run, better
+from tsgt.analysis.merge.matching import Boot, IndexedJournal, better
 from tsgt.analysis.merge.recording_index import RecordingIndex, identity, index_recording
 from tsgt.errors import RecordingError
 from tsgt.estimation import instrument_time_sigma_s
@@ -24,41 +24,38 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
-    from tsgt.analysis.merge.matching import Entry, Found
+    from tsgt.analysis.merge.matching import JournalMeasurement, Match
     from tsgt.analysis.merge.recording_index import Session
     from tsgt.analysis.merge.timing import MasterTime
     from tsgt.recording.journal import Journal
 
 SESSION_MARGIN_NS = 120_000_000_000
-"""What was measured longer before the master started, or after it ended, is no part of its run. Within two minutes it
-may be: a master that fell over is back by then."""
+"""Measurements longer before the master's start or after its end are not part of its session. Within two minutes they may be:
+a crashed master is restarted by then.
+"""
 
 MAX_TIME_BOUND_NS = 50_000_000
-"""A measurement whose time is less certain is left out: at 1.5 m/s that is 75 mm, and a gap does less harm."""
+"""Measurements with a larger time bound are not merged: at 1.5 m/s that is 75 mm, and a gap does less harm."""
 
 
 @dataclass(slots=True)
 class MergedJournal:
-    """What came of one journal.
+    """Result for one journal.
 
     Attributes
     ----------
-    path
-        Its file.
-    station
-        Whose it is.
     measurements
-        How many it holds.
+        Total number.
     added
-        How many of them have been put into the recording.
+        Written to the recording.
     already_there
-        How many came over the radio, or had been merged before.
+        Delivered over the radio, or merged before.
     outside
-        How many were made long before the recording or after it.
+        Made long before or after the recording.
     untimed
-        How many cannot be put on the master's clock, or not well enough.
+        Without a time on the master's clock, or with too large a bound.
     skipped
-        Why the journal cannot be merged at all, one line; empty where it can.
+        Why the journal cannot be merged at all, one line; empty if it can.
     """
 
     path: Path
@@ -73,16 +70,14 @@ class MergedJournal:
 
 @dataclass(frozen=True, slots=True)
 class Merged:
-    """What came of a merge.
+    """Result of a merge.
 
     Attributes
     ----------
-    journals
-        One entry for each.
     bounds_ns
-        What the times of the added measurements are within of the truth, in rising order.
+        Time bounds of the added measurements, increasing.
     cut_bytes
-        Length of a torn line at the end of the recording that had to go.
+        Length of an incomplete line removed from the end of the recording.
     """
 
     journals: tuple[MergedJournal, ...]
@@ -91,20 +86,20 @@ class Merged:
 
     @property
     def added(self) -> int:
-        """How many measurements have been put into the recording."""
+        """Number of measurements written to the recording."""
         return sum(journal.added for journal in self.journals)
 
     @property
     def already_there(self) -> int:
-        """How many were there before."""
+        """Number of measurements that the recording already had."""
         return sum(journal.already_there for journal in self.journals)
 
 
 class _Addition(NamedTuple):
-    """A line to be added; they go in by time."""
+    """A line to be added, in the order of time."""
 
     stamp_ns: int
-    place: int
+    position: int
     record: MergedRecord
 
 
@@ -116,34 +111,34 @@ def merge(
     keep_going: bool = False,
     on_problem: Callable[[RecordingError], None] | None = None,
 ) -> Merged:
-    """Put into a recording what the journals have besides.
+    """Add the measurements of journals that a recording lacks.
 
     Parameters
     ----------
     recording
-        Of the master; lines are appended to it, if there is no ``output``.
+        Of the master; lines are appended to it unless ``output`` is given.
     journals
-        Of the stations, of any number of runs. All that a computer wrote since it was switched on help each other.
+        Of the stations, of any number of runs; journals of the same boot share clock samples.
     output
-        Gets the recording and what is added, and the recording stays as it is.
+        Receives the recording and the additions; the recording remains unchanged.
     keep_going
-        Skip lines that cannot be read instead of raising.
+        Skip unreadable lines instead of raising.
     on_problem
-        Told of every line that is skipped: a torn last line always, others with ``keep_going``; and of a journal that was
-        only begun.
+        Called with every skipped line: an incomplete last line always, others with ``keep_going``; and with a journal that
+        has no content yet.
 
     Raises
     ------
     RecordingError
-        A file cannot be read or is another one than it should be, none of the journals belongs to the recording, or
-        another program is writing it.
+        A file cannot be read or is of another type, none of the journals belongs to the recording, or another program is
+        writing it.
     """
     paths = []
     for path in {path.resolve(): path for path in journals}.values():
         if not is_unfinished_journal(path):
             paths.append(path)
         elif on_problem is not None:
-            on_problem(RecordingError("was only begun and holds nothing; it is passed over", path=path))
+            on_problem(RecordingError("is empty; skipped", path=path))
     loaded = [load_journal(path, keep_going=keep_going, on_problem=on_problem) for path in paths]
     if output is not None:
         recorded = index_recording(recording, keep_going=keep_going, on_problem=on_problem)
@@ -154,7 +149,7 @@ def merge(
             for addition in additions:
                 file.write(encode_line(addition.record) + b"\n")
         return merged
-    next(read_lines(recording))  # what opens it for writing would make a new one of a name that is mistyped
+    next(read_lines(recording))  # opening for writing would create a file with a mistyped name
     with RecordingWriter(recording) as writer:
         recorded = index_recording(recording, keep_going=keep_going, on_problem=on_problem)
         merged, additions = _additions(recorded, recording, paths, loaded)
@@ -166,83 +161,83 @@ def merge(
 def _additions(
     recorded: RecordingIndex, recording: Path, paths: Sequence[Path], journals: Sequence[Journal]
 ) -> tuple[Merged, list[_Addition]]:
-    """Find out what is to be added."""
-    found = [
+    """Collect the lines to be added."""
+    results = [
         MergedJournal(path, journal.station, len(journal.measurements))
         for path, journal in zip(paths, journals, strict=True)
     ]
     known: set[object] = set(recorded.merged)
     additions: list[_Addition] = []
     for boot in _boots(journals):
-        compared = [(session, boot.against(session)) for session in recorded.sessions]
-        why = _why_not(boot, recorded, compared)
-        if why:
-            for index in {run.number for run in boot.runs}:
-                found[index].skipped = why
+        matches = [(session, boot.against(session)) for session in recorded.sessions]
+        reason = _rejection_reason(boot, recorded, matches)
+        if reason:
+            for index in {source.number for source in boot.journals}:
+                results[index].skipped = reason
             continue
-        for place, entry in enumerate(boot.entries):
-            time = _sort(place, entry, compared, known, found[entry.run.number])
+        for index, entry in enumerate(boot.entries):
+            time = _classify(index, entry, matches, known, results[entry.source.number])
             if time is not None:
-                record = _record(entry, time, paths[entry.run.number])
+                record = _record(entry, time, paths[entry.source.number])
                 additions.append(_Addition(time.unix_ns, len(additions), record))
-    if found and all(each.skipped for each in found):
+    if results and all(result.skipped for result in results):
         raise RecordingError(
-            f"none of the journals can be merged; {found[0].path}: {found[0].skipped}", path=recording
+            f"none of the journals can be merged; {results[0].path}: {results[0].skipped}", path=recording
         )
     bounds_ns = sorted(addition.record.measurement.stamp_bound_ns or 0 for addition in additions)
-    return Merged(tuple(found), tuple(bounds_ns)), sorted(additions)
+    return Merged(tuple(results), tuple(bounds_ns)), sorted(additions)
 
 
 def _boots(journals: Sequence[Journal]) -> Iterator[Boot]:
-    """Put together what was written on one CLOCK_MONOTONIC; where that is not known, each journal stands alone."""
-    boots: dict[object, list[Run]] = defaultdict(list)
+    """Group journals by boot; a journal with an unknown boot is a group of its own."""
+    boots: dict[object, list[IndexedJournal]] = defaultdict(list)
     for index, journal in enumerate(journals):
-        boots[journal.station, journal.head.boot or index].append(Run(index, journal))
+        boots[journal.station, journal.head.boot or index].append(IndexedJournal(index, journal))
     return map(Boot, boots.values())
 
 
-def _why_not(boot: Boot, recorded: RecordingIndex, compared: Sequence[tuple[Session, Found]]) -> str:
-    """Say why nothing can come of some journals; empty where something can, or they are empty."""
+def _rejection_reason(boot: Boot, recorded: RecordingIndex, matches: Sequence[tuple[Session, Match]]) -> str:
+    """Return why the journals of a boot cannot be merged; empty if they can, or have no measurements."""
     station = boot.station
     if station not in recorded.stations:
         numbers = ", ".join(map(str, sorted(recorded.stations)))
-        return f"is of station {station}, and the recording has only {numbers}"
-    if not boot.entries or any(found.tied for _, found in compared):
+        return f"is of station {station}, but the recording has only {numbers}"
+    if not boot.entries or any(match.clock_related for _, match in matches):
         return ""
-    delivered = any(found.delivered for _, found in compared)
+    delivered = any(match.delivered for _, match in matches)
     if boot.superframe:
-        if not any(session.beacons for session, _ in compared):
-            return "is of the protocol superframe, and the recording has no beacons"
-        if not any(run.journal.receptions for run in boot.runs):
-            return "does not say when beacons came: the station never joined, or stamps of the radios are not good to 100 us"
-        if not any(found.heard for _, found in compared):
-            return "knows no beacon of this recording; it is of another mission, or did not hear this master"
-        return "none of its measurements is in the recording, which could tell how long a beacon takes to the station"
-    if not any(session.clocks.get(station) for session, _ in compared):
-        return f"is of the protocol classic, and the recording has no synchronisation with station {station}"
+        if not any(session.beacons for session, _ in matches):
+            return "is of the protocol superframe, but the recording has no beacons"
+        if not any(source.journal.receptions for source in boot.journals):
+            return "has no beacon times: the station never joined, or its radio timestamps are less accurate than 100 us"
+        if not any(match.beacons_received for _, match in matches):
+            return "has no beacon of this recording: it is of another mission, or did not receive this master"
+        return "none of its measurements is in the recording, so the link delay is unknown"
+    if not any(session.clocks.get(station) for session, _ in matches):
+        return f"is of the protocol classic, but the recording has no synchronisation with station {station}"
     if not delivered:
         return (
-            "none of its measurements is in the recording: it is of another mission, or of a start of the computer "
-            "that the radio has not seen"
+            "none of its measurements is in the recording: it is of another mission, or of a boot of the computer "
+            "without radio contact"
         )
-    return "the recording has no synchronisation with the station since this start of its computer"
+    return "the recording has no synchronisation with the station since this boot of its computer"
 
 
-def _sort(
-    place: int,
-    entry: Entry,
-    compared: Sequence[tuple[Session, Found]],
+def _classify(
+    index: int,
+    entry: JournalMeasurement,
+    matches: Sequence[tuple[Session, Match]],
     known: set[object],
     counts: MergedJournal,
 ) -> MasterTime | None:
     """Count a measurement; return its time if it is to be added."""
     key = identity(entry.measurement)
-    times = [(session, found.times[place]) for session, found in compared]
+    times = [(session, match.times[index]) for session, match in matches]
     timed = [(session, time) for session, time in times if time is not None]
     if (
         key in known
-        or any(place in found.delivered for _, found in compared)
-        or (not timed and any(place in found.alike for _, found in compared))
+        or any(index in match.delivered for _, match in matches)
+        or (not timed and any(index in match.same_content for _, match in matches))
     ):
         counts.already_there += 1
         return None
@@ -257,18 +252,18 @@ def _sort(
         counts.untimed += 1
         return None
     counts.added += 1
-    known.add(key)  # it may be there twice, in a copy of the journal
+    known.add(key)  # a journal may be given twice
     return best
 
 
-def _record(entry: Entry, time: MasterTime, path: Path) -> MergedRecord:
-    # What is usual of instruments counts whenever poses are computed, of what was delivered as well.
+def _record(entry: JournalMeasurement, time: MasterTime, path: Path) -> MergedRecord:
+    # Processing adds the instrument's usual time sigma to every measurement: record only the excess.
     usual_ns = 1e9 * instrument_time_sigma_s(entry.measurement.sequence)
-    beyond_ns = math.sqrt(max(entry.measurement.stamp_sigma_ns**2 - usual_ns**2, 0.0))
+    excess_ns = math.sqrt(max(entry.measurement.stamp_sigma_ns**2 - usual_ns**2, 0.0))
     measurement: PolarMeasurement = dataclasses.replace(
         entry.measurement,
         stamp_ns=time.unix_ns,
-        stamp_sigma_ns=round(math.hypot(time.sigma_ns, beyond_ns)),
+        stamp_sigma_ns=round(math.hypot(time.sigma_ns, excess_ns)),
         stamp_bound_ns=time.bound_ns,
         received_ns=time.unix_ns,
     )

@@ -1,4 +1,4 @@
-"""What a master's recording knows that helps to merge journals into it: who was heard, and when."""
+"""Index of a master's recording for merging: what was delivered, synchronisations and beacons."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ Identity = tuple[int, int, float, float, float | None]
 
 @dataclass(slots=True)
 class Session:
-    """One run of the master; its times are on one Unix timeline, those of another run may be on another.
+    """One session of the master. Its times share a Unix timeline; that of another session may differ.
 
     Attributes
     ----------
     start_ns, end_ns
-        From the header to the last line that has a time.
+        From the header to the last line with a time.
     clocks
         Synchronisations by station, in their order.
     beacons
-        By number of the session on the air, and in it by that of the frame.
+        By session number in the protocol, then by frame counter.
     delivered
-        What came over the radio, by station.
+        Measurements received over the radio, by station.
     """
 
     start_ns: int
@@ -44,16 +44,14 @@ class Session:
 
 @dataclass(slots=True)
 class RecordingIndex:
-    """A recording as far as merging needs it.
+    """Content of a recording that merging needs.
 
     Attributes
     ----------
     stations
-        Numbers of those that any parameters name.
-    sessions
-        In their order.
+        Numbers of all stations in the parameters.
     merged
-        What has been merged into it before.
+        Measurements merged before.
     """
 
     stations: set[int] = field(default_factory=set)
@@ -67,9 +65,9 @@ class _Stamped:
 
 
 def identity(measurement: PolarMeasurement) -> Identity | None:
-    """Return what no two measurements share; None where the station's own time did not come over the radio.
+    """Return what identifies a measurement; None if the station's own time was not transmitted.
 
-    The time alone is not enough: a computer without a battery clock may live through the same hour each day.
+    The time alone is ambiguous: a computer without a battery-backed clock may repeat the same hour each day.
     """
     if measurement.host_time_ns is None:
         return None
@@ -78,7 +76,7 @@ def identity(measurement: PolarMeasurement) -> Identity | None:
         measurement.host_time_ns,
         measurement.horizontal_angle_rad,
         measurement.zenith_angle_rad,
-        measurement.slope_distance_m or None,  # over classic 0 stands for none
+        measurement.slope_distance_m or None,  # classic transmits 0 for none
     )
 
 
@@ -95,39 +93,39 @@ def index_recording(
     Raises
     ------
     RecordingError
-        As :func:`~tsgt.recording.load_recording`; also for a file that no master has written.
+        As :func:`~tsgt.recording.load_recording`; also for a file that was not written by a master.
     """
-    recorded = RecordingIndex()
+    index = RecordingIndex()
     for line in read_lines(path, keep_going=keep_going, on_problem=on_problem):
         if line.type == "journal":
             raise RecordingError("is a station's journal; give the master's recording first", path=path)
         try:
-            _take(line, recorded, path)
+            _add(line, index, path)
         except CorruptLineError as problem:
             if not keep_going:
                 raise
             if on_problem is not None:
                 on_problem(problem)
-    if not recorded.stations:
-        raise RecordingError("holds no parameters; the program that wrote it ended too early", path=path)
-    if not any(session.clocks or session.beacons for session in recorded.sessions):
+    if not index.stations:
+        raise RecordingError("contains no parameters; the program that wrote it ended too early", path=path)
+    if not any(session.clocks or session.beacons for session in index.sessions):
         raise RecordingError(
-            "holds neither synchronisations nor beacons, so nothing ties the stations' clocks to it; "
+            "contains neither synchronisations nor beacons, so the stations' clocks cannot be related to it; "
             "give the recording as the master wrote it",
             path=path,
         )
-    return recorded
+    return index
 
 
-def _take(line: Line, recorded: RecordingIndex, path: Path) -> None:
+def _add(line: Line, index: RecordingIndex, path: Path) -> None:
     if line.type == "recording":
         start_ns = decode_line(RecordingHeader, line, path).created_ns
-        recorded.sessions.append(Session(start_ns, start_ns))
-    session = recorded.sessions[-1]  # the first line is a header
+        index.sessions.append(Session(start_ns, start_ns))
+    session = index.sessions[-1]  # the first line is a header
     known_ns = session.end_ns
     match line.type:
         case "parameters":
-            recorded.stations |= {s.station for s in decode_line(Parameters, line, path).stations}
+            index.stations |= {s.station for s in decode_line(Parameters, line, path).stations}
         case "measurement":
             measurement = decode_line(PolarMeasurement, line, path)
             session.delivered[measurement.station].append(measurement)
@@ -135,7 +133,7 @@ def _take(line: Line, recorded: RecordingIndex, path: Path) -> None:
         case "merged":
             key = identity(decode_line(MergedRecord, line, path).measurement)
             if key is not None:
-                recorded.merged.add(key)
+                index.merged.add(key)
         case "clock":
             clock = decode_line(ClockRecord, line, path)
             session.clocks[clock.station].append(clock)

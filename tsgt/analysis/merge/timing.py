@@ -1,8 +1,8 @@
-"""When measurements were made that only a station's journal has. Pure.
+"""Times on the master's clock of measurements that only a station's journal has. Sans-I/O.
 
-Who merges knows more than the master did: what came after. So a time between two synchronisations, or two beacons, is
-taken from both of them. All times of a station are on its CLOCK_MONOTONIC here, which nobody sets; two journals of one
-start of a computer therefore share a clock. docs/how-to/merge.md says what the bounds come to.
+Merging knows the clock samples after a measurement as well, so that times are interpolated between two synchronisations or
+beacons. All station times here are on its CLOCK_MONOTONIC, which is never set; two journals of one boot share that clock.
+docs/how-to/merge.md states the bounds.
 """
 
 from __future__ import annotations
@@ -13,8 +13,7 @@ from statistics import median
 from typing import TYPE_CHECKING, NamedTuple
 
 from tsgt.timesync import BeaconClock
-from tsgt.timesync.offset_regression import interpolation_wander_ns
-from tsgt.timesync.two_way import RegressionFilter
+from tsgt.timesync.two_way import RegressionFilter, interpolate
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -23,144 +22,132 @@ if TYPE_CHECKING:
     from tsgt.timesync.two_way import ClockEstimate
 
 _CONFIRMED = 2
-"""So many stamps of a synchronisation confirm each other; one alone may be late."""
+"""Minimal number of accepted clock samples in a synchronisation; a single one may be delayed."""
 
-_FEWEST_PAIRS = 100
-_LEAST_NS = 60_000_000_000
-"""A time is taken from the beacons before it, and from so many, over at least so long, after it: no others count."""
+_MIN_RECEPTIONS_AFTER = 100
+_MIN_TIME_AFTER_NS = 60_000_000_000
+"""A time depends on the beacons before it and on those after it up to both of these limits."""
 
-_WAY_MOST_NS = 100_000_000
-"""No link constant is longer: RxDone comes within a symbol of the packet's end, and none lasts longer than 33 ms."""
+_MAX_LINK_DELAY_NS = 100_000_000
+"""Upper limit of the link delay: RxDone follows within a symbol of the packet's end, and none lasts longer than 33 ms."""
 
 
 class MasterTime(NamedTuple):
-    """An instant on the master's Unix clock, in ns.
-
-    Attributes
-    ----------
-    unix_ns
-        The instant.
-    sigma_ns
-        One sigma of it.
-    bound_ns
-        The truth is within this.
-    """
+    """An instant on the master's Unix clock, with one sigma and a bound of its error, in ns."""
 
     unix_ns: int
     sigma_ns: int
     bound_ns: int
 
 
-class Pair(NamedTuple):
-    """A beacon: when the station received it, and when the master had sent it on its Unix clock."""
+class BeaconReception(NamedTuple):
+    """A beacon: station time of its reception with sigma, and time of transmission on the master's Unix clock."""
 
     received_ns: int
     sigma_ns: int
     sent_ns: int
 
 
-class Told(NamedTuple):
-    """A measurement that the radio has delivered: when the recording says it was made, and when the beacons do."""
+class DeliveredTime(NamedTuple):
+    """A delivered measurement: its time in the recording, and its time from beacons without link delay."""
 
     recorded_ns: int
     recorded_bound_ns: int
-    found: MasterTime
+    computed: MasterTime
 
 
 def times_from_synchronisations(
     synchronisations: Sequence[Sequence[ClockSample]], stamps_ns: Sequence[int]
 ) -> list[MasterTime | None]:
-    """Put times of a station on the master's clock, by two-way exchanges before and after them.
+    """Convert station times to the master's clock, using two-way exchanges before and after them.
 
     Parameters
     ----------
     synchronisations
-        Exchanges with the station, in the order of time; at least one in each, and at least one.
+        Exchanges with the station in the order of time; at least one, none of them empty.
     stamps_ns
-        In rising order.
+        Increasing.
 
     Returns
     -------
     list[MasterTime | None]
-        One for each; None between two synchronisations that no one clock can have made.
+        One per timestamp; None between two synchronisations that no single clock can explain.
     """
     clock = RegressionFilter()
     times: list[MasterTime | None] = [None] * len(stamps_ns)
-    before: _Known | None = None
-    place, synchronised, broken = 0, 0, False
+    before: _ClockFix | None = None
+    start, synchronised, broken = 0, 0, False
     for samples in synchronisations:
         updated = clock.update(samples)
         broken = broken or (updated.restarted and synchronised > 0)
         synchronised += 1
         if len(samples) - updated.rejected < _CONFIRMED:
             continue
-        known = _Known(samples[-1].station_ns, clock.at(samples[-1].station_ns))
-        until = bisect_right(stamps_ns, known.station_ns)
+        fix = _ClockFix(samples[-1].station_ns, clock.at(samples[-1].station_ns))
+        until = bisect_right(stamps_ns, fix.station_ns)
         if before is not None and not broken:
-            for index in range(place, until):
-                times[index] = _between(before, known, stamps_ns[index])
+            for index in range(start, until):
+                times[index] = _between(before, fix, stamps_ns[index])
         if before is None or (synchronised == 2 and not broken):
-            # The second synchronisation says more of the time before the first than that itself: the frequency.
-            first = until if before is None else place
-            times[:first] = [_on_line(clock, stamp_ns) for stamp_ns in stamps_ns[:first]]
-        before, place, broken = known, until, False
+            # The second synchronisation improves the times before the first: it determines the frequency.
+            first = until if before is None else start
+            times[:first] = [_master_time(clock.at(stamp_ns), stamp_ns) for stamp_ns in stamps_ns[:first]]
+        before, start, broken = fix, until, False
     if not broken:
-        times[place:] = [_on_line(clock, stamp_ns) for stamp_ns in stamps_ns[place:]]
+        times[start:] = [_master_time(clock.at(stamp_ns), stamp_ns) for stamp_ns in stamps_ns[start:]]
     return times
 
 
-class _Known(NamedTuple):
-    """What the clock showed against the master's at the end of a synchronisation."""
+class _ClockFix(NamedTuple):
+    """Station clock relative to the master's at the end of a synchronisation."""
 
     station_ns: int
     estimate: ClockEstimate
 
 
-def _on_line(clock: RegressionFilter, stamp_ns: int) -> MasterTime:
-    estimate = clock.at(stamp_ns)
+def _master_time(estimate: ClockEstimate, stamp_ns: int) -> MasterTime:
     return MasterTime(stamp_ns - estimate.offset_ns, estimate.sigma_ns, estimate.bound_ns)
 
 
-def _between(before: _Known, after: _Known, stamp_ns: int) -> MasterTime:
-    """Return a time on the straight line between two synchronisations, and what a changing frequency may have done."""
-    since_ns, until_ns = stamp_ns - before.station_ns, after.station_ns - stamp_ns
-    share = since_ns / (since_ns + until_ns)
-    one, other = before.estimate, after.estimate
-    offset_ns = one.offset_ns + round(share * (other.offset_ns - one.offset_ns))
-    sag = interpolation_wander_ns(since_ns / 1e9, until_ns / 1e9)
-    return MasterTime(
-        stamp_ns - offset_ns,
-        # The sag is a limit; frequencies change by a third of it at most, as a rule.
-        round(math.hypot((1 - share) * one.sigma_ns + share * other.sigma_ns, sag / 3)),
-        math.ceil((1 - share) * one.bound_ns + share * other.bound_ns + sag),
+def _between(before: _ClockFix, after: _ClockFix, stamp_ns: int) -> MasterTime:
+    """Interpolate linearly between two synchronisations; the bound includes the effect of a changing frequency."""
+    return _master_time(
+        interpolate(before.estimate, before.station_ns, after.estimate, after.station_ns, stamp_ns), stamp_ns
     )
 
 
-def times_from_beacons(pairs: Sequence[Pair], stamps_ns: Sequence[int]) -> list[MasterTime | None]:
-    """Put times of a station on the master's clock, by beacons before and after them, but for the link constant.
+def times_from_beacons(
+    receptions: Sequence[BeaconReception], stamps_ns: Sequence[int]
+) -> list[MasterTime | None]:
+    """Convert station times to the master's clock, without the link delay, using beacons before and after them.
 
     Parameters
     ----------
-    pairs
+    receptions
         Beacons of one session of the master, in the order of reception.
     stamps_ns
-        In rising order.
+        Increasing.
 
     Returns
     -------
     list[MasterTime | None]
-        One for each: when a beacon would have been sent that arrived then. None without pairs.
+        When a beacon received at the timestamp would have been sent. None without receptions.
     """
     clock = BeaconClock()
     times: list[MasterTime | None] = []
-    received_ns = [pair.received_ns for pair in pairs]
+    received_ns = [reception.received_ns for reception in receptions]
     taken = 0
     for stamp_ns in stamps_ns:
-        enough = bisect_right(received_ns, stamp_ns) + _FEWEST_PAIRS
-        while taken < len(pairs) and (taken < enough or received_ns[taken] < stamp_ns + _LEAST_NS):
-            pair = pairs[taken]
+        enough = bisect_right(received_ns, stamp_ns) + _MIN_RECEPTIONS_AFTER
+        while taken < len(receptions) and (
+            taken < enough or received_ns[taken] < stamp_ns + _MIN_TIME_AFTER_NS
+        ):
+            reception = receptions[taken]
             clock.add(
-                pair.received_ns, (pair.sent_ns - pairs[0].sent_ns) // 1000, pair.sigma_ns, unambiguous=True
+                reception.received_ns,
+                (reception.sent_ns - receptions[0].sent_ns) // 1000,
+                reception.sigma_ns,
+                unambiguous=True,
             )
             taken += 1
         instant = clock.at(stamp_ns)
@@ -168,7 +155,7 @@ def times_from_beacons(pairs: Sequence[Pair], stamps_ns: Sequence[int]) -> list[
             None
             if instant is None
             else MasterTime(
-                pairs[0].sent_ns + round(1000 * instant.time_us),
+                receptions[0].sent_ns + round(1000 * instant.time_us),
                 round(1000 * instant.sigma_us),
                 math.ceil(1000 * instant.bound_us) + 1000,  # whole microseconds went in
             )
@@ -176,32 +163,32 @@ def times_from_beacons(pairs: Sequence[Pair], stamps_ns: Sequence[int]) -> list[
     return times
 
 
-def link_constant(told: Sequence[Told]) -> tuple[int, int] | None:
-    """Return what the master has added to the times of a station for the way of a beacon, and a bound of it, in ns.
+def link_delay(delivered: Sequence[DeliveredTime]) -> tuple[int, int] | None:
+    """Return the link delay that the master applied to a station's times, and its bound, in ns; None if unfix.
 
-    The recording has this constant in the times of what was delivered. None where nothing tells it.
+    The recorded times of delivered measurements include it.
     """
-    ways_ns = [each.recorded_ns - each.found.unix_ns for each in told]
-    if not ways_ns:
+    delays_ns = [each.recorded_ns - each.computed.unix_ns for each in delivered]
+    if not delays_ns:
         return None
-    middle_ns = round(median(ways_ns))
-    # What both say is right within the sum of their bounds, for each of them; one is enough.
+    delay_ns = round(median(delays_ns))
+    # Each difference is correct within the sum of the two bounds; the tightest counts.
     bound_ns = min(
-        each.recorded_bound_ns + each.found.bound_ns + abs(way_ns - middle_ns)
-        for each, way_ns in zip(told, ways_ns, strict=True)
+        each.recorded_bound_ns + each.computed.bound_ns + abs(delay_ns - delay_ns)
+        for each, delay_ns in zip(delivered, delays_ns, strict=True)
     )
-    return middle_ns, bound_ns
+    return delay_ns, bound_ns
 
 
-def times_consistent(recorded_ns: int, recorded_bound_ns: int, found: MasterTime) -> bool:
-    """Tell whether a time in the recording can be the one that was found by beacons, without the link constant."""
-    return abs(recorded_ns - found.unix_ns) <= recorded_bound_ns + found.bound_ns + _WAY_MOST_NS
+def times_consistent(recorded_ns: int, recorded_bound_ns: int, computed: MasterTime) -> bool:
+    """Return whether a recorded time can be the one computed from beacons, whose link delay is unfix."""
+    return abs(recorded_ns - computed.unix_ns) <= recorded_bound_ns + computed.bound_ns + _MAX_LINK_DELAY_NS
 
 
-def add_link_delay(found: MasterTime, way_ns: int, bound_ns: int) -> MasterTime:
-    """Add the link constant to a time that was found by beacons."""
+def add_link_delay(computed: MasterTime, delay_ns: int, bound_ns: int) -> MasterTime:
+    """Add the link delay to a time computed from beacons."""
     return MasterTime(
-        found.unix_ns + way_ns,
-        round(math.hypot(found.sigma_ns, bound_ns / 5)),
-        found.bound_ns + bound_ns,
+        computed.unix_ns + delay_ns,
+        round(math.hypot(computed.sigma_ns, bound_ns / 5)),
+        computed.bound_ns + bound_ns,
     )

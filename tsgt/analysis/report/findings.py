@@ -345,9 +345,9 @@ def _pose_noise(recording: Recording, distances: InterPrismDistances | None) -> 
     found = np.concatenate(errors) if errors else np.empty(0)
     mean_m = float(found.mean()) if len(found) else 0.0
     return PoseNoise(
-        perturbation_study(layout, _NOISES_M, draws=_DRAWS, point_m=centroid_m, random=random),
+        perturbation_study(layout, _NOISES_M, samples=_DRAWS, point_m=centroid_m, random=random),
         first_order_sigmas(layout, 1e-3, point_m=centroid_m),
-        equivalent_noise(layout, mean_m, draws=_EQUIVALENT_DRAWS, point_m=centroid_m, random=random)
+        equivalent_noise(layout, mean_m, samples=_EQUIVALENT_DRAWS, point_m=centroid_m, random=random)
         if mean_m > 0.0
         else None,
     )

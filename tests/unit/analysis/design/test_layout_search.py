@@ -1,4 +1,4 @@
-"""The best layout within an envelope."""
+"""The optimal layout within an envelope."""
 
 from __future__ import annotations
 
@@ -33,19 +33,22 @@ def _task(
 
 
 def _variance(task: LayoutProblem, layout: np.ndarray) -> float:
-    told = [task.information(layout[slot][None], slot)[0] for slot in range(task.count)]
-    return float(task.variance(np.sum(told, axis=0)))
+    information = [
+        task.information(layout[prism_index][None], prism_index)[0] for prism_index in range(task.count)
+    ]
+    return float(task.variance(np.sum(information, axis=0)))
 
 
 @pytest.mark.parametrize("criterion", ["rotation", "position"])
 def test_no_layout_of_a_coarse_grid_is_better(criterion: Criterion) -> None:
-    """All 2925 triples of 27 places, tried one by one, do not beat what the search finds."""
+    """All 2925 triples of 27 places, tried one by one, are not better than the result of the search."""
     task = _task(BOX, criterion=criterion)
     least, greatest = task.envelope_m
     grid = np.array(list(product(*zip(least, (least + greatest) / 2, greatest, strict=True))))
-    told = [task.information(grid, slot) for slot in range(3)]
+    information = [task.information(grid, prism_index) for prism_index in range(3)]
     best = min(
-        float(task.variance(told[0][a] + told[1][b] + told[2][c])) for a, b, c in combinations(range(27), 3)
+        float(task.variance(information[0][a] + information[1][b] + information[2][c]))
+        for a, b, c in combinations(range(27), 3)
     )
     found = optimal_layout(task, np.random.default_rng(0))
     # The stations stand a little apart, so that it matters by a hair who tracks which prism.
@@ -54,8 +57,8 @@ def test_no_layout_of_a_coarse_grid_is_better(criterion: Criterion) -> None:
     assert (found <= greatest).all()
 
 
-def test_no_small_move_makes_it_better() -> None:
-    """What is found is a local optimum within the envelope: 300 random shifts of 20 mm find nothing to gain."""
+def test_result_is_a_local_optimum() -> None:
+    """Within the envelope: 300 random shifts of 20 mm give no improvement."""
     task = _task(BOX, criterion="position")
     found = optimal_layout(task, np.random.default_rng(0))
     random = np.random.default_rng(1)
@@ -65,34 +68,34 @@ def test_no_small_move_makes_it_better() -> None:
         assert _variance(task, moved) >= reached * (1 - 1e-3)
 
 
-def test_prisms_keep_their_distance() -> None:
+def test_minimal_separation_is_kept() -> None:
     """A fourth prism would share a corner with another one if it were allowed to."""
     found = optimal_layout(_task(BOX, count=4, min_separation_m=0.6), np.random.default_rng(0))
     for a, b in combinations(found, 2):
         assert np.linalg.norm(a - b) >= 0.6 * (1 - 1e-6)
 
 
-def test_a_flat_envelope_is_one_too() -> None:
+def test_flat_envelope() -> None:
     """Prisms on a plate, all at one height."""
     found = optimal_layout(_task(((-0.5, -0.5, 1.0), (0.5, 0.5, 1.0))), np.random.default_rng(0))
     np.testing.assert_array_equal(found[:, 2], 1.0)
 
 
-def test_the_same_seed_finds_the_same() -> None:
+def test_same_seed_gives_the_same_layout() -> None:
     """Randomness comes from the generator alone."""
     one, two = (optimal_layout(_task(BOX), np.random.default_rng(5)) for _ in "ab")
     np.testing.assert_array_equal(one, two)
 
 
-def test_an_envelope_without_room_is_refused() -> None:
+def test_too_small_envelope_is_rejected() -> None:
     """Three prisms 300 mm apart do not fit into a cube of 100 mm."""
     with pytest.raises(GeometryError, match="no room for 3 prisms at least 300 mm apart"):
         optimal_layout(_task(((0, 0, 1.0), (0.1, 0.1, 1.1))), np.random.default_rng(0))
 
 
-def test_progress_is_told() -> None:
+def test_progress_is_reported() -> None:
     """Start by start, to the end."""
-    told: list[float] = []
-    optimal_layout(_task(BOX), np.random.default_rng(0), on_progress=told.append)
-    assert told == sorted(told)
-    assert told[-1] == 1.0
+    information: list[float] = []
+    optimal_layout(_task(BOX), np.random.default_rng(0), on_progress=information.append)
+    assert information == sorted(information)
+    assert information[-1] == 1.0

@@ -1,4 +1,4 @@
-"""What noise on the prisms does to the pose."""
+"""Pose errors due to noise on the prisms."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ def _random(seed: int = 0) -> np.random.Generator:
 
 @pytest.mark.parametrize("layout", [LAYOUT, FOUR], ids=["three prisms", "four prisms"])
 @pytest.mark.parametrize("point_m", [CENTROID, np.zeros(3)], ids=["centroid", "origin"])
-def test_small_noise_does_what_the_first_order_says(layout: np.ndarray, point_m: np.ndarray) -> None:
-    """Each axis spreads as the propagated covariance; 40000 draws tell a spread to 0.35 %, one sigma."""
-    (found,) = perturbation_study(layout, [0.002], draws=40_000, point_m=point_m, random=_random())
+def test_small_noise_agrees_with_first_order_propagation(layout: np.ndarray, point_m: np.ndarray) -> None:
+    """On each axis; 40000 samples determine a standard deviation to 0.35 %, one sigma."""
+    (found,) = perturbation_study(layout, [0.002], samples=40_000, point_m=point_m, random=_random())
     position_m, rotation_rad = first_order_sigmas(layout, 0.002, point_m=point_m)
     np.testing.assert_allclose(found.position_std_m, position_m, rtol=0.015)
     np.testing.assert_allclose(found.euler_std_rad, rotation_rad, rtol=0.015)
 
 
-def test_the_first_order_of_an_equilateral_triangle_is_known_by_hand() -> None:
+def test_first_order_of_an_equilateral_triangle() -> None:
     """Centroid: sigma / sqrt(3); about axes in the plane: sigma sqrt(2/3) / r, about the normal sigma / (r sqrt(3))."""
     radius_m, sigma_m = 0.5, 0.004
     angles = np.arange(3) * 2 * math.pi / 3
@@ -45,18 +45,18 @@ def test_the_first_order_of_an_equilateral_triangle_is_known_by_hand() -> None:
     np.testing.assert_allclose(rotation_rad, [in_plane, in_plane, normal])
 
 
-def test_no_noise_no_error() -> None:
-    """At 0 mm every figure is nothing but rounding."""
-    (found,) = perturbation_study(LAYOUT, [0.0], draws=10, point_m=CENTROID, random=_random())
+def test_no_noise_gives_no_error() -> None:
+    """At 0 mm every figure is rounding error."""
+    (found,) = perturbation_study(LAYOUT, [0.0], samples=10, point_m=CENTROID, random=_random())
     assert found.position_norm_mean_m < 1e-12
     assert found.rotation_norm_mean_rad < 1e-12
     assert found.inter_prism_mean_m < 1e-12
 
 
-def test_the_position_of_the_centroid_is_never_biased() -> None:
-    """It is the mean of the prisms, however large the noise; another point is drawn towards it."""
+def test_position_of_the_centroid_is_unbiased() -> None:
+    """It is the mean of the prisms, however large the noise; another point is biased towards it."""
     at_centroid, at_origin = (
-        perturbation_study(LAYOUT, [0.3], draws=40_000, point_m=point_m, random=_random())[0]
+        perturbation_study(LAYOUT, [0.3], samples=40_000, point_m=point_m, random=_random())[0]
         for point_m in (CENTROID, np.zeros(3))
     )
     np.testing.assert_allclose(at_centroid.position_mean_m, 0, atol=4 * 0.3 / math.sqrt(3 * 40_000))
@@ -66,7 +66,7 @@ def test_the_position_of_the_centroid_is_never_biased() -> None:
 
 def test_ten_millimetres_between_prisms() -> None:
     """The noise that gives them is found, and what it does to the pose is what first order expects of it."""
-    found = equivalent_noise(LAYOUT, 0.010, draws=50_000, point_m=CENTROID, random=_random())
+    found = equivalent_noise(LAYOUT, 0.010, samples=50_000, point_m=CENTROID, random=_random())
     assert found.inter_prism_mean_m == pytest.approx(0.010, rel=1e-6)
     # |difference of two prisms| along their line: sqrt(2) sigma sqrt(2 / pi) in the mean.
     assert found.noise_m == pytest.approx(0.010 * math.sqrt(math.pi) / 2, rel=0.01)
@@ -80,7 +80,7 @@ def test_ten_millimetres_between_prisms() -> None:
 def test_the_same_seed_gives_the_same_study() -> None:
     """Randomness comes from the generator alone."""
     one, two = (
-        perturbation_study(LAYOUT, [0.01, 0.1], draws=50, point_m=CENTROID, random=_random(7)) for _ in "ab"
+        perturbation_study(LAYOUT, [0.01, 0.1], samples=50, point_m=CENTROID, random=_random(7)) for _ in "ab"
     )
     np.testing.assert_array_equal(one[1].euler_mean_rad, two[1].euler_mean_rad)
 
@@ -89,7 +89,7 @@ def test_the_whole_study_takes_less_than_five_seconds() -> None:
     """101 sizes of noise, 1000 draws each; it takes a tenth of a second on a desk computer."""
     began_s = time.perf_counter()
     study = perturbation_study(
-        LAYOUT, list(0.004 * np.arange(101)), draws=1000, point_m=CENTROID, random=_random()
+        LAYOUT, list(0.004 * np.arange(101)), samples=1000, point_m=CENTROID, random=_random()
     )
     assert len(study) == 101
     assert time.perf_counter() - began_s < 5
@@ -99,7 +99,7 @@ def test_progress_is_told() -> None:
     """From the first noise to the last."""
     told: list[float] = []
     perturbation_study(
-        LAYOUT, [0.0, 0.1], draws=2, point_m=CENTROID, random=_random(), on_progress=told.append
+        LAYOUT, [0.0, 0.1], samples=2, point_m=CENTROID, random=_random(), on_progress=told.append
     )
     assert told == [0.5, 1.0]
 
@@ -108,12 +108,12 @@ def test_prisms_in_a_line_are_refused() -> None:
     """No rotation follows from them."""
     line = np.array([[0.0, 0, 1], [0.5, 0, 1], [1.0, 0, 1]])
     with pytest.raises(DegenerateGeometryError, match="nearly in a line"):
-        perturbation_study(line, [0.01], draws=10, point_m=np.zeros(3), random=_random())
+        perturbation_study(line, [0.01], samples=10, point_m=np.zeros(3), random=_random())
 
 
 def test_errors_beyond_the_layout_have_their_noise_too() -> None:
     """Five metres between prisms that are one apart: absurd, and answered."""
-    found = equivalent_noise(LAYOUT, 5.0, draws=2000, point_m=CENTROID, random=_random())
+    found = equivalent_noise(LAYOUT, 5.0, samples=2000, point_m=CENTROID, random=_random())
     assert found.inter_prism_mean_m == pytest.approx(5.0, rel=1e-6)
 
 

@@ -109,7 +109,7 @@ def test_no_poses_have_no_figures(tmp_path: Path) -> None:
         ("1.0 0 0 0 0 0 0 1\nnan 0 0 0 0 0 0 1\n", "line 2: is not a pose"),
         ("1.0 0 0 0 0 0 0 1\n2.0 0 0 inf 0 0 0 1\n", "line 2: is not a pose"),
         ("1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 0\n", "line 2: is not a pose"),
-        ("2.0 0 0 0 0 0 0 1\n1.0 0 0 0 0 0 0 1\n", "line 2: its time is not after"),
+        ("2.0 0 0 0 0 0 0 1\n1.0 0 0 0 0 0 0 1\n", "line 2: its time is not later than"),
         ("-1.0 0 0 0 0 0 0 1\n1.0 0 0 0 0 0 0 1\n", "line 1: is not a pose"),
     ],
 )

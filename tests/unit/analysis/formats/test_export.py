@@ -30,8 +30,8 @@ def poses() -> PoseBatch:
     return pipeline.advance(START + 3_900_000_000)
 
 
-def test_tum_stamps_are_exact() -> None:
-    """Nine decimals of an integer, with the zeros that a float would drop or invent."""
+def test_tum_timestamps_are_exact() -> None:
+    """Nine decimals of an integer, with leading zeros."""
     stamps = [1_647_269_269_000_000_001, 5, 1_647_269_269_950_000_000]
     lines = tum_lines((stamp, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)) for stamp in stamps)
     assert [line.split()[0] for line in lines] == [
@@ -41,7 +41,7 @@ def test_tum_stamps_are_exact() -> None:
     ]
 
 
-def test_tum_holds_the_valid_poses(poses: PoseBatch) -> None:
+def test_tum_contains_the_valid_poses(poses: PoseBatch) -> None:
     """One line of eight numbers per valid pose, to the nanometre."""
     rows = np.array([line.split() for line in tum_lines(valid_rows(poses))], dtype=np.float64)
     assert 0 < len(rows) < len(poses)
@@ -49,13 +49,13 @@ def test_tum_holds_the_valid_poses(poses: PoseBatch) -> None:
     np.testing.assert_allclose(rows[:, 4:], poses.orientation_xyzw[poses.valid], atol=1e-12)
 
 
-def test_tum_of_records_is_tum_of_arrays(poses: PoseBatch) -> None:
+def test_tum_of_records_equals_tum_of_arrays(poses: PoseBatch) -> None:
     """Exporting recorded poses gives what processing gives, character by character."""
     assert list(tum_lines(valid_records(poses.records()))) == list(tum_lines(valid_rows(poses)))
 
 
-def test_pose_csv_holds_all_poses(poses: PoseBatch) -> None:
-    """Invalid poses stand in it with their reason and empty cells; numbers come back exactly."""
+def test_pose_csv_contains_all_poses(poses: PoseBatch) -> None:
+    """Invalid poses with their reason and empty cells; numbers are read back exactly."""
     rows = list(csv.DictReader(pose_csv(poses.records())))
     assert [int(row["stamp_ns"]) for row in rows] == poses.stamp_ns.tolist()
     assert [row["valid"] == "1" for row in rows] == poses.valid.tolist()
@@ -72,8 +72,8 @@ def test_pose_csv_holds_all_poses(poses: PoseBatch) -> None:
     assert float(last["wz_radps"]) == poses.angular_velocity_radps[index, 2]
 
 
-def test_measurement_csv_keeps_raw_values_and_points_apart() -> None:
-    """A polar measurement has no position in it, a point no angles, and neither is computed."""
+def test_measurement_csv_separates_polar_measurements_and_points() -> None:
+    """A polar measurement has no position, a point no angles."""
     polar = stationary_scene().measure(2, 0.25)
     point = PointMeasurement(
         station=3, prism=3, sequence=7, stamp_ns=1, received_ns=2, position_m=(1.5, -2.0, 0.1)

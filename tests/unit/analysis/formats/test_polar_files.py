@@ -60,7 +60,7 @@ def written(folder: Path, *lines: str, name: str = "polar.csv") -> Path:
         polar | points, min_size=1, max_size=8, unique_by=lambda m: (m.station, m.prism, m.stamp_ns)
     )
 )
-def test_what_export_writes_is_read_back(
+def test_exported_measurements_are_read_back(
     tmp_path: Path, measurements: list[PolarMeasurement | PointMeasurement]
 ) -> None:
     """The same measurements to the last bit, in the order of arrival."""
@@ -72,10 +72,10 @@ def test_what_export_writes_is_read_back(
 @pytest.mark.parametrize(
     ("unit", "half_circle", "quarter"), [("rad", math.pi, math.pi / 2), ("deg", 180, 90), ("gon", 200, 100)]
 )
-def test_units_of_angles_are_in_the_names(
+def test_column_names_state_the_angle_unit(
     tmp_path: Path, unit: str, half_circle: float, quarter: float
 ) -> None:
-    """Radians, degrees and gon; what else a measurement has is made up of what is there."""
+    """Radians, degrees and gon; missing columns get their defaults."""
     path = written(
         tmp_path,
         f"time_s,horizontal_angle_{unit},zenith_angle_{unit},slope_distance_m",
@@ -90,8 +90,8 @@ def test_units_of_angles_are_in_the_names(
     assert found.slope_distance_m == 12.5
 
 
-def test_a_file_for_each_station(tmp_path: Path) -> None:
-    """Without a column of stations the place of the file counts; all together stand in the order of time."""
+def test_file_per_station(tmp_path: Path) -> None:
+    """Without a station column the position of the file counts; the measurements are in the order of time."""
     header = "stamp_ns,prism,horizontal_angle_deg,zenith_angle_deg,slope_distance_m,status"
     one = written(
         tmp_path, header, f"{START_NS + 5},7,1,90,10,", f"{START_NS + 9},7,1,90,,no_target", name="1"
@@ -129,23 +129,23 @@ GOOD = f"{START_NS},1,1.0,1.5,20.0,ok"
         ([HEADER, GOOD.replace(str(START_NS), "1.7e18")], "line 2: stamp_ns is '1.7e18'; expected a whole"),
         ([HEADER, GOOD.replace("20.0", "-2")], "line 2: slope_distance_m is -2; expected a distance"),
         ([HEADER, GOOD.replace("ok", "0")], "line 2: status is '0'; expected one of ok, low_accuracy"),
-        ([HEADER, GOOD, GOOD], "line 3: station 1 measured prism 1 at this time already in .*line 2"),
+        ([HEADER, GOOD, GOOD], "line 3: duplicate of .*line 2: station 1, prism 1, same time"),
         ([f"{HEADER},type", f"{GOOD},point"], "line 2: a point needs the columns x_m, y_m and z_m"),
-        ([f"{HEADER},type", f"{GOOD},pose"], "line 2: type is 'pose'; it is measurement or point"),
+        ([f"{HEADER},type", f"{GOOD},pose"], "line 2: type is 'pose'; expected measurement or point"),
     ],
 )
-def test_what_is_wrong_is_named_with_its_line(tmp_path: Path, lines: list[str], message: str) -> None:
+def test_error_names_the_line(tmp_path: Path, lines: list[str], message: str) -> None:
     """File, line, value, and what was expected."""
     with pytest.raises(InputFileError, match=rf"polar\.csv.*{message}"):
         read_polar_tracks([written(tmp_path, *lines)])
 
 
-def test_tracks_of_different_drives_are_refused(tmp_path: Path) -> None:
-    """So are such as hold nothing that can be used."""
+def test_tracks_without_overlap_are_rejected(tmp_path: Path) -> None:
+    """And tracks without usable measurements."""
     late = GOOD.replace(str(START_NS), str(START_NS + 3_000_000_000)).replace(",1,", ",2,", 1)
     path = written(tmp_path, HEADER, GOOD, late)
     with pytest.raises(InputFileError, match=r"station 2 begin 3\.0 s after the last one of station 1"):
         check_tracks(read_polar_tracks([path]), [path])
     path = written(tmp_path, HEADER, GOOD.replace("ok", "no_target"))
-    with pytest.raises(InputFileError, match="no measurement has a status that can be used"):
+    with pytest.raises(InputFileError, match="no measurement has a usable status"):
         check_tracks(read_polar_tracks([path]), [path])

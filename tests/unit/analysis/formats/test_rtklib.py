@@ -30,20 +30,20 @@ ROW = (
 
 
 def written(folder: Path, text: str) -> Path:
-    """Write a file by hand."""
+    """Write a file."""
     path = folder / "rover.pos"
     path.write_text(text, encoding="utf-8")
     return path
 
 
-def refusal(path: Path) -> str:
-    """Return what is said of a file that cannot be used, without its name."""
+def error_of(path: Path) -> str:
+    """Return the error message of an unusable file, without its path."""
     with pytest.raises(InputFileError) as error:
         read_pos(path)
     return str(error.value).removeprefix(str(path))
 
 
-def test_a_line_is_read_as_it_stands(tmp_path: Path) -> None:
+def test_line_is_parsed(tmp_path: Path) -> None:
     """Time to the nanosecond on the file's own calendar, angles in rad, Q and satellites."""
     found = read_pos(written(tmp_path, HEADER + ROW))
     assert found.time_system == "GPST"
@@ -57,8 +57,8 @@ def test_a_line_is_read_as_it_stands(tmp_path: Path) -> None:
     ("coordinates", "system", "week"),
     list(product(["geodetic", "sexagesimal", "ecef", "baseline"], ["GPST", "UTC", "JST"], [False, True])),
 )
-def test_every_variant_says_the_same(tmp_path: Path, coordinates: str, system: str, week: bool) -> None:  # noqa: FBT001 (a parameter of the test)
-    """Whatever RTKLIB was told to write: times on the named calendar, Q and satellites."""
+def test_every_output_option_is_read(tmp_path: Path, coordinates: str, system: str, week: bool) -> None:  # noqa: FBT001 (a parameter of the test)
+    """Times on the named calendar, Q and satellites, for all options of RTKLIB."""
     times = [1_653_499_242 * SECOND, 1_653_499_242 * SECOND + 200_000_000]
     variant = Variant(coordinates=coordinates, system=system, week=week)
     points = np.array([[3.0, 4.0, 0.5], [3.1, 4.2, 0.5]])
@@ -73,16 +73,16 @@ def test_every_variant_says_the_same(tmp_path: Path, coordinates: str, system: s
 
 @pytest.mark.parametrize("separator", [" ", "\t", ",", ";", " , "])
 @pytest.mark.parametrize("velocity", [False, True])
-def test_fields_may_be_separated_otherwise(tmp_path: Path, separator: str, velocity: bool) -> None:  # noqa: FBT001 (as above)
-    """By what RTKLIB's option for it says; columns of velocity may follow."""
+def test_field_separators(tmp_path: Path, separator: str, velocity: bool) -> None:  # noqa: FBT001 (as above)
+    """Every separator that RTKLIB offers; velocity columns may follow."""
     variant = Variant(coordinates="sexagesimal", separator=separator, velocity=velocity)
     points = np.array([[-3.0, 4.0, 0.5]])
     found = read_pos(write_pos(tmp_path / "a.pos", [GPST_2022], points, variant))
     np.testing.assert_allclose(np.degrees(found.positions[0, :2]), [46.779436, -71.2746393], atol=1e-6)
 
 
-def test_a_baseline_comes_with_its_base(tmp_path: Path) -> None:
-    """East, north and up in m, and where the base stands."""
+def test_baseline_has_its_base(tmp_path: Path) -> None:
+    """East, north and up in m, and the position of the base."""
     points = np.array([[3.0, -4.0, 0.5]])
     found = read_pos(write_pos(tmp_path / "a.pos", [GPST_2022], points, Variant(coordinates="baseline")))
     np.testing.assert_array_equal(found.positions, points)
@@ -97,13 +97,13 @@ def test_minus_zero_degrees_are_west(tmp_path: Path) -> None:
 
 
 def test_all_qualities_are_read(tmp_path: Path) -> None:
-    """None to dead reckoning."""
+    """From none to dead reckoning."""
     times = [GPST_2022 + k * SECOND for k in range(len(QUALITIES))]
     path = write_pos(tmp_path / "a.pos", times, np.zeros((len(times), 3)), quality=list(QUALITIES))
     assert read_pos(path).quality.tolist() == list(QUALITIES)
 
 
-def test_a_backward_solution_is_turned_round(tmp_path: Path) -> None:
+def test_backward_solution_is_sorted(tmp_path: Path) -> None:
     """RTKLIB writes it last epoch first."""
     times = [GPST_2022 + k * SECOND for k in (2, 1, 0)]
     found = read_pos(write_pos(tmp_path / "a.pos", times, np.zeros((3, 3)), satellites=[7, 8, 9]))
@@ -111,8 +111,8 @@ def test_a_backward_solution_is_turned_round(tmp_path: Path) -> None:
     assert np.all(np.diff(found.times_ns) == SECOND)
 
 
-def test_names_of_files_in_the_header_may_be_in_any_encoding(tmp_path: Path) -> None:
-    """RTKPOST on Windows writes them in the computer's own."""
+def test_header_may_have_any_encoding(tmp_path: Path) -> None:
+    """RTKPOST on Windows writes file names in the computer's own encoding."""
     path = tmp_path / "a.pos"
     path.write_bytes("% inp file  : C:\\données\\é.obs\r\n".encode("cp1252") + (HEADER + ROW).encode())
     assert len(read_pos(path).times_ns) == 1
@@ -121,10 +121,10 @@ def test_names_of_files_in_the_header_may_be_in_any_encoding(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", ": holds no positions; expected a solution file of RTKLIB"),
-        (HEADER, ": holds no positions; expected a solution file of RTKLIB"),
-        (ROW, ", line 1: stands before the line that names time system and columns"),
-        ("$GPGGA,123519,4807.038,N\n", ", line 1: is NMEA or a status; let RTKLIB"),
+        ("", ": contains no positions; expected a solution file of RTKLIB"),
+        (HEADER, ": contains no positions; expected a solution file of RTKLIB"),
+        (ROW, ", line 1: precedes the line that names time system and columns"),
+        ("$GPGGA,123519,4807.038,N\n", ", line 1: is NMEA or a status; configure RTKLIB"),
         (HEADER + ROW + ROW, ", line 9: has the time of line 8; keep one of the two"),
         (
             HEADER + ROW[:80],
@@ -134,7 +134,7 @@ def test_names_of_files_in_the_header_may_be_in_any_encoding(tmp_path: Path) -> 
         (HEADER.replace("   Q  ns", "") + ROW, ", line 7: names no columns Q and ns"),
         (
             HEADER.replace("WGS84", "Tokyo") + ROW,
-            ", line 6: is in the datum Tokyo; let RTKLIB write it in WGS84",
+            ", line 6: is in the datum Tokyo; set RTKLIB's output datum to WGS84",
         ),
         (HEADER + ROW + HEADER.replace("GPST  ", "UTC   "), ", line 15: the columns change here"),
         (HEADER + ROW.replace("  2   5", "  8   5"), ", line 8: column Q: expected 0 to 7, got '8'"),
@@ -142,34 +142,34 @@ def test_names_of_files_in_the_header_may_be_in_any_encoding(tmp_path: Path) -> 
         (HEADER + ROW.replace("53.1613", "nan"), ", line 8: expected a finite number, got 'nan'"),
         (
             HEADER + ROW.replace("46.779", "96.779"),
-            ", line 8: latitude 96.7799, longitude -71.2741 deg is nowhere",
+            ", line 8: latitude 96.7799, longitude -71.2741 deg is not on Earth",
         ),
-        (HEADER + ROW.replace("53.1613", "9e30"), ", line 8: 9e30 m is not near the Earth"),
+        (HEADER + ROW.replace("53.1613", "9e30"), ", line 8: 9e30 m is too far from the Earth"),
         (HEADER + ROW.replace("/05/25", "/02/31"), ", line 8: expected a time (2022/03/14 14:47:49.000, or"),
         (HEADER + ROW.replace("17:21:01", "17:61:01"), ", line 8: expected a time"),
         (HEADER + ROW.replace("2022/05/25 17:21:01.600", "2211 604800.000"), ", line 8: expected a time"),
         ("\0" + HEADER, ": is not a text file"),
     ],
 )
-def test_what_cannot_be_used_is_refused(tmp_path: Path, text: str, message: str) -> None:
-    """With the line, and what to do."""
-    assert refusal(written(tmp_path, text)).startswith(message)
+def test_invalid_file_is_rejected(tmp_path: Path, text: str, message: str) -> None:
+    """The message names the line and the remedy."""
+    assert error_of(written(tmp_path, text)).startswith(message)
 
 
-def test_a_baseline_without_its_base_is_refused(tmp_path: Path) -> None:
-    """As of a moving base: two such files have nothing in common."""
+def test_baseline_without_base_is_rejected(tmp_path: Path) -> None:
+    """As from a moving base: two such files have no common frame."""
     header = "%  GPST e-baseline(m) n-baseline(m) u-baseline(m) Q ns\n"
     path = written(tmp_path, header + "2022/05/25 17:21:00 1.0 2.0 3.0 1 12\n")
-    assert refusal(path).startswith(": holds positions relative to a base, and no line with its position")
+    assert error_of(path).startswith(": contains positions relative to a base, but no line with its position")
 
 
-def test_a_base_that_is_no_position_is_refused(tmp_path: Path) -> None:
+def test_invalid_base_is_rejected(tmp_path: Path) -> None:
     """In the header, with its line."""
     header = "% ref pos : 46.0 -71.0\n%  GPST e-baseline(m) n-baseline(m) u-baseline(m) Q ns\n"
     path = written(tmp_path, header + "2022/05/25 17:21:00 1.0 2.0 3.0 1 12\n")
-    assert refusal(path) == ", line 1: expected latitude, longitude and height of the base"
+    assert error_of(path) == ", line 1: expected latitude, longitude and height of the base"
 
 
-def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
-    """As the operating system puts it."""
-    assert refusal(tmp_path / "rover.pos") == ": No such file or directory"
+def test_missing_file_is_rejected(tmp_path: Path) -> None:
+    """With the reason of the operating system."""
+    assert error_of(tmp_path / "rover.pos") == ": No such file or directory"

@@ -34,42 +34,40 @@ def test_times_are_read_to_the_nanosecond(tmp_path: Path, text: str, stamp_ns: i
 
 
 @pytest.mark.parametrize("text", ["nan", "inf", "-1", "1e40", "1_0:0"])
-def test_what_is_no_unix_time_is_refused(tmp_path: Path, text: str) -> None:
-    """The text is shown as it stands in the file."""
+def test_invalid_time_is_rejected(tmp_path: Path, text: str) -> None:
+    """The message quotes the text of the file."""
     path = tmp_path / "track.csv"
     path.write_text(f"{text} 1 2 3\n", encoding="utf-8")
     with pytest.raises(InputFileError, match=f"line 1: expected a Unix time in s, got '{text}'"):
         read_track(path)
 
 
-def test_blank_lines_do_not_count_but_keep_their_number(tmp_path: Path) -> None:
+def test_blank_lines_are_counted_in_line_numbers(tmp_path: Path) -> None:
     """The line number in a message is that of an editor."""
     path = tmp_path / "track.csv"
     path.write_text("\n1.0 1 2 3\n\n0.5 1 2 3\n", encoding="utf-8")
-    with pytest.raises(
-        InputFileError, match=r"line 4: time runs backwards: 0\.5 is 0\.500 s before"
-    ) as error:
+    with pytest.raises(InputFileError, match=r"line 4: time decreases: 0\.5 is 0\.500 s before") as error:
         read_track(path)
     assert (error.value.path, error.value.line) == (path, 4)
 
 
 def test_prisms_are_the_first_three_rows(tmp_path: Path) -> None:
-    """Further rows hold other sensors."""
+    """Further rows contain other sensors."""
     path = write_prisms(tmp_path, np.vstack([LAYOUT, [[9.0, 9.0, 9.0]]]))
     prisms = read_prisms(path)
     assert [prism.prism for prism in prisms] == [1, 2, 3]
     np.testing.assert_array_equal([prism.position_m for prism in prisms], LAYOUT)
 
 
-def test_prisms_come_from_a_set_up_file_as_well(tmp_path: Path) -> None:
-    """The ending .toml tells our own format from the authors'."""
+def test_prisms_are_read_from_a_set_up_file(tmp_path: Path) -> None:
+    """The suffix .toml distinguishes our own format from the authors'."""
     path = tmp_path / "prisms.toml"
     tables = [f"[prisms.{k}]\nposition_m = {row.tolist()}" for k, row in enumerate(LAYOUT, start=1)]
     path.write_text("\n".join(['kind = "prism_layout"', *tables]), encoding="utf-8")
     np.testing.assert_array_equal([prism.position_m for prism in read_prisms(path)], LAYOUT)
 
 
-def test_a_bad_set_up_file_is_a_configuration_error(tmp_path: Path) -> None:
+def test_invalid_set_up_file_is_a_configuration_error(tmp_path: Path) -> None:
     """It is not read as the authors' format instead."""
     path = tmp_path / "prisms.toml"
     path.write_text("1 2 3 1\n" * 3, encoding="utf-8")
@@ -77,7 +75,7 @@ def test_a_bad_set_up_file_is_a_configuration_error(tmp_path: Path) -> None:
         read_prisms(path)
 
 
-def test_field_tracks_are_read_whole(field_data: Path) -> None:
+def test_field_tracks_are_read_exactly(field_data: Path) -> None:
     """All lines of the six field tracks, to the last digit of their times."""
     for path in sorted(field_data.glob("20220314/**/trimble?.csv")):
         track = read_track(path)

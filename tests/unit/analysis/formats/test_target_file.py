@@ -1,4 +1,4 @@
-"""Hand-made target and prism files: units, faces, repeats, and every way in which they can be wrong."""
+"""Target and prism files: units, faces, repeats, and every error."""
 
 from __future__ import annotations
 
@@ -41,23 +41,23 @@ def written(folder: Path, text: str) -> Path:
     return path
 
 
-def test_the_documented_target_file_is_solved(tmp_path: Path) -> None:
-    """The example of the reference page, in both faces, gives the frame it was made from."""
+def test_documented_target_file_is_solved(tmp_path: Path) -> None:
+    """The example of the reference page, in both faces, gives the frame from which it was made."""
     frames = solve_stations(read_target_file(documented(0, tmp_path)), target_constant_m=0.0)
     assert list(frames) == [2]
     assert frames[2].used == (1, 2, 3, 4)
     np.testing.assert_allclose(frames[2].T[:3, 3], [2.0, -1.5, 0.1], atol=0.003)
 
 
-def test_the_documented_marker_file_is_solved(tmp_path: Path) -> None:
-    """The excerpt of the authors' file on the reference page is read as such."""
+def test_documented_marker_file_is_solved(tmp_path: Path) -> None:
+    """The excerpt of the authors' file on the reference page is recognised by its header."""
     frames = solve_stations(read_target_file(documented(1, tmp_path)), target_constant_m=0.01)
     assert frames[2].used == (1, 6, 7)
     assert frames[2].rms_m < 0.002
 
 
-def test_the_documented_prism_file_is_solved(tmp_path: Path) -> None:
-    """The example of the reference page gives the prisms it was made from."""
+def test_documented_prism_file_is_solved(tmp_path: Path) -> None:
+    """The example of the reference page gives the prisms from which it was made."""
     file = read_prism_file(documented(2, tmp_path))
     prisms = solve_prisms(file, target_constant_m=0.0, prism_constant_m=0.01).prisms
     layout = [[-0.4559, -0.1759, 1.1167], [0.4844, -0.1759, 1.4167], [-0.0285, 0.3519, 1.0667]]
@@ -67,18 +67,18 @@ def test_the_documented_prism_file_is_solved(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("unit", "circle"), [("rad", 2 * math.pi), ("deg", 360.0), ("gon", 400.0)])
 def test_angles_are_read_in_each_unit(tmp_path: Path, unit: str, circle: float) -> None:
-    """An eighth of a circle is an eighth of a circle; the order of the columns is free."""
+    """An eighth of a circle in each unit; the order of the columns is free."""
     text = f"zenith_angle_{unit},horizontal_angle_{unit},slope_distance_m,target,station\n" + "".join(
         f"{circle / 4!r},{circle / 8!r},10.5,7,{station}\n" for station in (1, 2)
     )
-    (sight,) = read_target_file(written(tmp_path, text)).sights[2][7]
-    assert sight.horizontal_angle_rad == pytest.approx(math.pi / 4)
-    assert sight.zenith_angle_rad == pytest.approx(math.pi / 2)
-    assert sight.slope_distance_m == 10.5
-    assert sight.line == 3
+    (measurement,) = read_target_file(written(tmp_path, text)).measurements[2][7]
+    assert measurement.horizontal_angle_rad == pytest.approx(math.pi / 4)
+    assert measurement.zenith_angle_rad == pytest.approx(math.pi / 2)
+    assert measurement.slope_distance_m == 10.5
+    assert measurement.line == 3
 
 
-def test_the_two_faces_cancel_an_index_error(tmp_path: Path) -> None:
+def test_two_faces_cancel_an_index_error(tmp_path: Path) -> None:
     """Both faces with a zenith index error of 0.01 degrees give the frame without it."""
     lines = []
     for line in GOOD.splitlines():
@@ -96,8 +96,8 @@ def test_the_two_faces_cancel_an_index_error(tmp_path: Path) -> None:
     np.testing.assert_allclose(both.covariance, plain.covariance / 2, rtol=1e-3)
 
 
-def test_a_constant_in_the_file_overrides_that_of_the_command(tmp_path: Path) -> None:
-    """A line's own constant_mm counts, an empty cell takes the common one."""
+def test_constant_in_the_file_overrides_the_default(tmp_path: Path) -> None:
+    """A line's own constant_mm counts; an empty cell uses the common one."""
     rows = [f"{row},{'10' if row[0] == '1' else ''}" for row in GOOD.splitlines()]
     own = solve_stations(
         read_target_file(written(tmp_path, "\n".join([f"{HEADER},constant_mm", *rows]))),
@@ -107,19 +107,19 @@ def test_a_constant_in_the_file_overrides_that_of_the_command(tmp_path: Path) ->
     np.testing.assert_allclose(own[2].T, common[2].T, atol=1e-12)
 
 
-def test_comments_blank_lines_and_a_byte_order_mark_do_not_count(tmp_path: Path) -> None:
-    """What spreadsheets and people add around the lines is skipped, and line numbers stay those of the file."""
+def test_comments_blank_lines_and_byte_order_mark_are_ignored(tmp_path: Path) -> None:
+    """Line numbers remain those of the file."""
     path = written(tmp_path, f"\ufeff# note\n\n{HEADER}\n  # another\n{GOOD}")
-    assert read_target_file(path).sights[1][1][0].line == 5
+    assert read_target_file(path).measurements[1][1][0].line == 5
 
 
-def test_marker_lines_with_an_error_status_are_left_out_and_told(tmp_path: Path) -> None:
-    """A target whose status is not 0 is skipped, even if its numbers are nonsense."""
+def test_marker_lines_with_an_error_status_are_skipped_with_a_note(tmp_path: Path) -> None:
+    """Even if their numbers are invalid."""
     text = f"{MARKER}\n1,1,0,1.5,0.1,9.0,0,0\n2,1,0,1.5,0.2,9.0,0,0\n2,2,4,1.5,0.2,0.0,0,0\n"
     file = read_target_file(written(tmp_path, text))
-    assert set(file.sights[2]) == {1}
+    assert set(file.measurements[2]) == {1}
     (note,) = file.skipped
-    assert "line 4: target 2 of station 2 left out: the instrument reported status 4" in note
+    assert "line 4: target 2 of station 2 skipped: the instrument reported status 4" in note
 
 
 @pytest.mark.parametrize(
@@ -139,15 +139,15 @@ def test_marker_lines_with_an_error_status_are_left_out_and_told(tmp_path: Path)
         (f"{HEADER}\n1,1,10,90,0\n", "line 2: slope_distance_m is 0"),
         (f"{HEADER}\n1,1,10,90,-5\n", "line 2: slope_distance_m is -5"),
         (f"{HEADER}\n1,1,400,90,5\n", "line 2: horizontal_angle_deg 400 is more than a full circle"),
-        (f"{HEADER}\n1,1,10,-1,5\n", "counts from straight up, not from the horizon"),
+        (f"{HEADER}\n1,1,10,-1,5\n", "is measured from the zenith, not from the horizon"),
         (f"{HEADER}\n0,1,10,90,5\n", "line 2: station is '0'; expected a whole number from 1"),
         (f"{HEADER}\n1,A,10,90,5\n", "line 2: target is 'A'; expected a whole number from 1"),
         (f"{HEADER}\n2,1,10,90,5\n", "no usable target of station 1"),
         (f"{HEADER}\n1,1,10,90,5\n", "targets of station 1 only"),
     ],
 )
-def test_a_bad_target_file_is_refused(tmp_path: Path, text: str, message: str) -> None:
-    """Each mistake gives one line that names the file, the line and the column."""
+def test_invalid_target_file_is_rejected(tmp_path: Path, text: str, message: str) -> None:
+    """One line names the file, the line and the column."""
     path = written(tmp_path, text)
     with pytest.raises(InputFileError, match=re.escape(message)) as raised:
         read_target_file(path)
@@ -156,8 +156,8 @@ def test_a_bad_target_file_is_refused(tmp_path: Path, text: str, message: str) -
 
 
 @pytest.mark.parametrize("content", [b"\xff\xfe\x00", None])
-def test_what_is_no_text_file_is_refused(tmp_path: Path, content: bytes | None) -> None:
-    """Binary content and a missing file are one-line errors too."""
+def test_binary_or_missing_file_is_rejected(tmp_path: Path, content: bytes | None) -> None:
+    """With a one-line error."""
     path = tmp_path / "targets.csv"
     if content is not None:
         path.write_bytes(content)
@@ -165,24 +165,24 @@ def test_what_is_no_text_file_is_refused(tmp_path: Path, content: bytes | None) 
         read_target_file(path)
 
 
-def test_contradictory_repeats_are_refused(tmp_path: Path) -> None:
-    """A second measurement 50 mm from the first is not averaged away."""
+def test_inconsistent_repeats_are_rejected(tmp_path: Path) -> None:
+    """A second measurement 50 mm from the first is not averaged."""
     path = written(tmp_path, f"{HEADER}\n{GOOD}2,3,252.6003,87.1258,19.9917\n")
     with pytest.raises(
-        InputFileError, match="target 3 of station 2: this measurement lies 25 mm from the mean of the 2"
+        InputFileError, match="target 3 of station 2: this measurement is 25 mm from the mean of the 2"
     ):
         solve_stations(read_target_file(path), target_constant_m=0.0)
 
 
-def test_a_constant_larger_than_a_distance_is_refused(tmp_path: Path) -> None:
-    """A constant in the wrong unit does not turn points over."""
+def test_constant_larger_than_a_distance_is_rejected(tmp_path: Path) -> None:
+    """A constant in the wrong unit must not mirror points."""
     path = written(tmp_path, f"{HEADER}\n{GOOD}")
     with pytest.raises(InputFileError, match=r"line 2: target 1 of station 1: .* the distance is -1\.534 m"):
         solve_stations(read_target_file(path), target_constant_m=-20.0)
 
 
-def test_a_station_with_too_few_common_targets_is_named(tmp_path: Path) -> None:
-    """The error says which station, and which targets it shares with station 1."""
+def test_station_with_too_few_common_targets_is_named(tmp_path: Path) -> None:
+    """With the targets that it shares with station 1."""
     path = written(tmp_path, f"{HEADER}\n{GOOD}3,1,10,90,5\n3,9,20,90,5\n")
     with pytest.raises(DegenerateGeometryError, match=r"station 3 against station 1: .* got 1 \(1\)"):
         solve_stations(read_target_file(path), target_constant_m=0.0)
@@ -193,25 +193,25 @@ def test_a_station_with_too_few_common_targets_is_named(tmp_path: Path) -> None:
     [
         ("1,prism,10,90,5,,,\n", "holds no body point"),
         ("a,body,10,90,5,0,0,0\n", "holds no prism"),
-        ("1,prism,10,90,5,1,2,3\n", "line 2: a prism has no place from CAD"),
+        ("1,prism,10,90,5,1,2,3\n", "line 2: a prism has no position from CAD"),
         ("top,prism,10,90,5,,,\n", "line 2: point is 'top'; expected a whole number"),
-        ("a,wheel,10,90,5,0,0,0\n", "line 2: kind is 'wheel'; it is prism or body"),
+        ("a,wheel,10,90,5,0,0,0\n", "line 2: kind is 'wheel'; expected prism or body"),
         ("a,body,10,90,5,0,,0\n", "line 2: y_m is ''; expected a finite number"),
         (",body,10,90,5,0,0,0\n", "line 2: a body point needs a name"),
         (
             "a,body,10,90,5,0,0,0\na,body,10,90,5,0,0,1\n",
-            "line 3: body point a has another x_m, y_m, z_m further up",
+            "line 3: body point a has different x_m, y_m, z_m in a previous line",
         ),
     ],
 )
-def test_a_bad_prism_file_is_refused(tmp_path: Path, rows: str, message: str) -> None:
-    """Each mistake gives one line that names the file, the line and the column."""
+def test_invalid_prism_file_is_rejected(tmp_path: Path, rows: str, message: str) -> None:
+    """One line names the file, the line and the column."""
     with pytest.raises(InputFileError, match=re.escape(message)):
         read_prism_file(written(tmp_path, f"{PRISM_HEADER}\n{rows}"))
 
 
-def test_two_prisms_at_one_place_are_refused(tmp_path: Path) -> None:
-    """A layout from which no pose could be computed is not handed on."""
+def test_coinciding_prisms_are_rejected(tmp_path: Path) -> None:
+    """Such a layout determines no pose."""
     path = documented(2, tmp_path)
     lines = path.read_text(encoding="utf-8").splitlines()
     lines[-1] = lines[-2].replace("2,", "3,", 1)

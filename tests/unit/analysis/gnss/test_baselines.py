@@ -26,13 +26,13 @@ TENTH = SECOND // 10
 
 
 def way(times_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Where a robot is that drives at 1 m/s, (N, 3), as east, north and up from the base."""
+    """Return a robot's positions at 1 m/s, (N, 3), as east, north and up from the base."""
     time_s = (times_ns - START) / 1e9
     return np.column_stack([10 + 0.6 * time_s, 5 + 0.8 * time_s, np.full(len(time_s), 0.2)])
 
 
 def epochs(count: int, step_ns: int = 2 * TENTH, delay_ns: int = 0) -> NDArray[np.int64]:
-    """Return so many epochs."""
+    """Return equally spaced times."""
     return START + delay_ns + step_ns * np.arange(count)
 
 
@@ -45,7 +45,7 @@ def receiver(
     variant: Variant | None = None,
     quality: list[int] | None = None,
 ) -> PosFile:
-    """Write a receiver's file and read it."""
+    """Write and read a receiver's file."""
     return read_pos(write_pos(folder / f"{name}.pos", times_ns.tolist(), points_m, variant, quality=quality))
 
 
@@ -56,7 +56,7 @@ def two(
     count: int = 20,
     **second: object,
 ) -> tuple[Receiver, ...]:
-    """Two receivers that drive, the second one ``offset_m`` from the first."""
+    """Return two receivers on a driving robot, the second one ``offset_m`` from the first."""
     times_ns = epochs(count, **second)  # type: ignore[arg-type]  # step_ns, delay_ns
     return receivers(
         [
@@ -66,7 +66,7 @@ def two(
     )
 
 
-def test_leap_seconds_are_those_of_the_time_zone_database() -> None:
+def test_leap_seconds_equal_the_time_zone_database() -> None:
     """Every leap second since 1980, at its second and not one earlier."""
     lines = resources.files("tzdata").joinpath("zoneinfo/leapseconds").read_text().splitlines()
     days = [line.split()[1:4] for line in lines if line.startswith("Leap")]
@@ -92,7 +92,7 @@ def test_all_time_systems_give_the_same_time(tmp_path: Path, system: str, week: 
     assert found[0].times_ns.tolist() == epochs(3).tolist()
 
 
-def test_coordinates_of_all_kinds_give_the_same_place(tmp_path: Path) -> None:
+def test_all_coordinate_kinds_give_the_same_position(tmp_path: Path) -> None:
     """To RTKLIB's last digit: 0.1 mm in metres, 1e-9 degrees on the ground."""
     kinds = ["geodetic", "sexagesimal", "ecef", "baseline"]
     files = [
@@ -105,8 +105,8 @@ def test_coordinates_of_all_kinds_give_the_same_place(tmp_path: Path) -> None:
     np.testing.assert_allclose(found[0].points_m, way(epochs(5)) - way(epochs(1)), atol=4e-4)
 
 
-def test_places_on_the_ellipsoid_are_where_geodesy_has_them(tmp_path: Path) -> None:
-    """One second of arc along the equator and along a meridian at the pole, by WGS84's axes alone."""
+def test_local_coordinates_follow_the_ellipsoid(tmp_path: Path) -> None:
+    """One second of arc along the equator and along a meridian at the pole, from WGS84's axes alone."""
     a_m, b_m = 6_378_137.0, 6_356_752.314245
     arc = np.radians(1 / 3600)
     equator = PosFile(
@@ -129,7 +129,7 @@ def test_places_on_the_ellipsoid_are_where_geodesy_has_them(tmp_path: Path) -> N
 _FIELDS = tuple(PosFile.__dataclass_fields__)
 
 
-def test_epochs_without_a_position_do_not_count(tmp_path: Path) -> None:
+def test_epochs_without_a_position_are_ignored(tmp_path: Path) -> None:
     """RTKLIB writes the centre of the Earth there: two receivers would be 0 mm apart."""
     header = "\n".join(Variant().header())
     nothing = (
@@ -142,14 +142,14 @@ def test_epochs_without_a_position_do_not_count(tmp_path: Path) -> None:
     assert (len(found.times_ns), found.without_position) == (1, 1)
 
 
-def test_a_file_without_any_position_is_refused(tmp_path: Path) -> None:
-    """It says so."""
+def test_file_without_any_position_is_rejected(tmp_path: Path) -> None:
+    """The message names the reason."""
     file = receiver(tmp_path, "a", epochs(2), way(epochs(2)), quality=[0, 0])
-    with pytest.raises(InputFileError, match="found no position in any of its epochs"):
+    with pytest.raises(InputFileError, match="contains no valid position in any epoch"):
         receivers([file])
 
 
-def test_distances_are_those_on_the_robot(tmp_path: Path) -> None:
+def test_distances_equal_those_on_the_robot(tmp_path: Path) -> None:
     """At common epochs nothing is interpolated, first and last epoch included."""
     (pair,) = receiver_distances(two(tmp_path), [0.8])
     assert len(pair.times_ns) == 20
@@ -157,23 +157,23 @@ def test_distances_are_those_on_the_robot(tmp_path: Path) -> None:
     np.testing.assert_allclose(pair.errors_m, np.hypot(0.8, 0.1) - 0.8, atol=3e-4)
 
 
-def test_clocks_that_are_apart_do_not_matter(tmp_path: Path) -> None:
-    """At 1 m/s, epochs 8 ms apart would be 8 mm."""
+def test_different_epochs_are_interpolated(tmp_path: Path) -> None:
+    """At 1 m/s, epochs 8 ms apart would cause 8 mm."""
     (pair,) = receiver_distances(two(tmp_path, delay_ns=-8_000_000), [0.8])
     assert len(pair.times_ns) == 19
     assert pair.invalid_ns.tolist() == [epochs(20)[-1]]
     np.testing.assert_allclose(pair.distances_m, np.hypot(0.8, 0.1), atol=3e-4)
 
 
-def test_across_an_outage_there_is_no_distance(tmp_path: Path) -> None:
-    """What is between two positions more than 1 s apart is not known; what is on them is."""
+def test_outage_is_not_interpolated(tmp_path: Path) -> None:
+    """Between positions more than 1 s apart there is no distance; at common epochs there is."""
     (pair,) = receiver_distances(two(tmp_path, count=25, step_ns=12 * TENTH))
     assert (np.diff(pair.times_ns) == 12 * TENTH).all()
     assert len(pair.times_ns) + len(pair.invalid_ns) == 25
 
 
-def test_the_reference_is_the_median_of_fixed_distances(tmp_path: Path) -> None:
-    """However many others there are; without any, of all."""
+def test_default_reference_is_the_median_of_fixed_distances(tmp_path: Path) -> None:
+    """However many others there are; without fixed ones, of all."""
     times_ns = epochs(9)
     apart = np.where(np.arange(9) < 6, 2.8, 0.8)[:, None] * [1.0, 0.0, 0.0]
     quality = [2] * 6 + [1] * 3
@@ -188,8 +188,8 @@ def test_the_reference_is_the_median_of_fixed_distances(tmp_path: Path) -> None:
     assert pair.reference_m == pytest.approx(2.8, abs=3e-4)
 
 
-def test_a_distance_is_as_good_as_the_worse_of_its_positions(tmp_path: Path) -> None:
-    """Single is worse than PPP, whatever their numbers."""
+def test_quality_is_that_of_the_worse_position(tmp_path: Path) -> None:
+    """Single is worse than PPP, regardless of their numbers."""
     times_ns = epochs(4)
     files = [
         receiver(tmp_path, "a", times_ns, way(times_ns), quality=[1, 1, 6, 2]),
@@ -201,8 +201,8 @@ def test_a_distance_is_as_good_as_the_worse_of_its_positions(tmp_path: Path) -> 
     assert list(pair.by_quality()) == [1, 2, 6, 5]
 
 
-def test_a_distance_between_two_positions_is_as_good_as_the_worse(tmp_path: Path) -> None:
-    """Both neighbours count where the second receiver is interpolated."""
+def test_quality_includes_both_interpolation_neighbours(tmp_path: Path) -> None:
+    """Both neighbours of the second receiver count."""
     later = epochs(4, delay_ns=TENTH)
     files = [
         receiver(tmp_path, "a", epochs(4), way(epochs(4))),
@@ -213,8 +213,8 @@ def test_a_distance_between_two_positions_is_as_good_as_the_worse(tmp_path: Path
     assert pair.quality.tolist() == [1, 2, 2]
 
 
-def test_names_tell_receivers_apart(tmp_path: Path) -> None:
-    """By their folders where the files have the same name."""
+def test_receiver_names_are_unique(tmp_path: Path) -> None:
+    """Files with the same name are distinguished by their folders."""
     files = []
     for name in ("front", "back"):
         (tmp_path / name).mkdir()
@@ -222,8 +222,8 @@ def test_names_tell_receivers_apart(tmp_path: Path) -> None:
     assert [each.name for each in receivers(files)] == ["front/rover", "back/rover"]
 
 
-def test_both_are_cut_to_the_time_that_they_share(tmp_path: Path) -> None:
-    """So that figures are of the same stretch of the way."""
+def test_both_are_cut_to_the_common_interval(tmp_path: Path) -> None:
+    """So that the statistics cover the same part of the drive."""
     (pair,) = receiver_distances(two(tmp_path))
     later = shifted(pair, SECOND)
     (gnss,), (prisms,) = common_interval([pair], [later], tmp_path / "r.jsonl")
@@ -234,31 +234,31 @@ def test_both_are_cut_to_the_time_that_they_share(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("shift_s", "message"), [(100, "begin 96.2 s after the end"), (-100, "end 96.2 s before the start")]
 )
-def test_what_shares_no_time_is_refused(tmp_path: Path, shift_s: int, message: str) -> None:
-    """It tells by how much, for it may be a clock."""
+def test_series_without_overlap_are_rejected(tmp_path: Path, shift_s: int, message: str) -> None:
+    """The message states the gap, which may be a clock error."""
     (pair,) = receiver_distances(two(tmp_path))
     with pytest.raises(RecordingError, match=message):
         common_interval([pair], [shifted(pair, shift_s * SECOND)], tmp_path / "r.jsonl")
 
 
-def test_no_position_while_prisms_were_seen_is_refused(tmp_path: Path) -> None:
-    """The receivers have positions before and after alone."""
+def test_no_position_during_the_prism_measurements_is_rejected(tmp_path: Path) -> None:
+    """The receivers have positions before and after only."""
     times_ns = np.concatenate([epochs(5), epochs(5, delay_ns=100 * SECOND)])
     files = [receiver(tmp_path, name, times_ns, way(times_ns)) for name in "ab"]
     (pair,) = receiver_distances(receivers(files))
     (prisms,) = receiver_distances(two(tmp_path))
-    with pytest.raises(RecordingError, match="the receivers had no positions in common"):
+    with pytest.raises(RecordingError, match="the receivers had no common positions"):
         common_interval([pair], [shifted(prisms, 50 * SECOND)], tmp_path / "r.jsonl")
 
 
 def shifted(pair: DistanceSeries, by_ns: int) -> DistanceSeries:
-    """Return distances at another time."""
+    """Return distances shifted in time."""
     fields = {name: getattr(pair, name) for name in type(pair).__dataclass_fields__}
     return type(pair)(**(fields | {"times_ns": pair.times_ns + by_ns}))
 
 
-def test_the_library_is_named_where_it_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With what to install."""
+def test_missing_pymap3d_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the command to install it."""
     file = receiver(tmp_path, "a", epochs(2), way(epochs(2)))
     monkeypatch.setitem(sys.modules, "pymap3d", None)
     with pytest.raises(MissingExtraError, match=r"need pymap3d.*pip install 'tsgt\[gnss\]'"):
@@ -266,8 +266,8 @@ def test_the_library_is_named_where_it_is_missing(tmp_path: Path, monkeypatch: p
 
 
 @pytest.mark.parametrize("count", [1, 200])
-def test_a_figure_is_drawn_of_few_and_of_many(tmp_path: Path, count: int) -> None:
-    """With prisms and without; also of a receiver that was off all the time."""
+def test_figure_of_few_and_of_many_epochs(tmp_path: Path, count: int) -> None:
+    """With prisms and without; also with a receiver that was off all the time."""
     found = two(tmp_path, count=count)
     pairs = receiver_distances(found)
     absent = found[0].between(0, 1)

@@ -240,7 +240,7 @@ def test_what_was_long_before_is_left_out(tmp_path: Path) -> None:
 
     async def late_master(mission: Mission) -> None:
         await mission.sleep_until(1.0)
-        await mission.kill("master")
+        await mission.stop("master")
         await mission.sleep_until(180.0)
         mission.start_master()
 
@@ -325,7 +325,7 @@ def test_numbers_that_begin_again(tmp_path: Path) -> None:
 
     async def emptied(mission: Mission) -> None:
         await mission.sleep_until(20.0)
-        await mission.kill("station1")
+        await mission.stop("station1")
         mission.station_logs[1].journals[0].rename(kept)
         mission.start_station(1)
 
@@ -398,7 +398,7 @@ def test_files_in_the_wrong_place(short: MissionResult, tmp_path: Path) -> None:
     path, journal = recording(short, tmp_path / "r.jsonl"), journals(short)[0]
     with pytest.raises(RecordingError, match="is a station's journal; give the master's recording first"):
         merge(journal, [journal])
-    with pytest.raises(RecordingError, match="is no journal of a station"):
+    with pytest.raises(RecordingError, match="is not a station's journal"):
         merge(path, [path])
     missing = tmp_path / "missing.jsonl"
     with pytest.raises(RecordingError, match="cannot be read"):

@@ -1,7 +1,6 @@
-"""How fast prism triplets become poses: the closed form, batched SVD, and a plain loop over triplets.
+"""Throughput of aligning prism triplets: closed form, batched SVD, and a loop over triplets.
 
-All three align the same 200,000 noisy triplets in one run, and must agree. The loop sees only the first part of them;
-its time is scaled up, as it spends the same on each.
+All three align the same 200,000 noisy triplets and must agree. The loop sees a part of them; its time is scaled up.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ LAYOUT = np.array([[-0.4559, -0.1759, 1.1167], [0.4844, -0.1759, 1.4167], [-0.02
 
 
 def measured_triplets() -> FloatArray:
-    """Give the layout at random poses within 100 m, with noise; shape (TRIPLETS, 3, 3)."""
+    """Layout at random poses within 100 m, with noise; (TRIPLETS, 3, 3)."""
     rng = np.random.default_rng(1)
     R = Rotation.random(TRIPLETS, random_state=2).as_matrix()
     points: FloatArray = LAYOUT @ np.swapaxes(R, 1, 2) + rng.uniform(-100, 100, (TRIPLETS, 1, 3))
@@ -37,7 +36,7 @@ def measured_triplets() -> FloatArray:
 
 
 def loop(layout: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Align triplet by triplet, as one writes it first: Arun et al. 1987."""
+    """Align triplet by triplet (Arun et al. 1987)."""
     rotations, translations = np.empty((len(points), 3, 3)), np.empty((len(points), 3))
     layout_mean = layout.mean(axis=0)
     body = layout - layout_mean
@@ -52,7 +51,7 @@ def loop(layout: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray
 
 
 def best_s(work: Callable[[], object], rounds: int) -> float:
-    """Give the shortest wall time in s of several rounds."""
+    """Return the shortest wall time in s of several rounds."""
     times_s = []
     for _ in range(rounds):
         start_s = time.perf_counter()

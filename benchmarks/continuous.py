@@ -1,8 +1,8 @@
-"""What the estimator `continuous` costs: an hour in batch, more hours, more stations; updates with a fixed lag.
+"""CPU time of the estimator `continuous`: batch by duration and by stations, and fixed-lag updates.
 
-A made-up robot drives curves on rough ground; each station measures 2.5 times a second. Times are CPU seconds of this
-process with one thread. The batch is what `tsgt process` does, without reading and writing: tuning of the prior, the
-trajectory with all covariances, and poses 20 times a second.
+A simulated robot drives curves on rough ground; each station measures 2.5 times a second. Times are CPU seconds of this
+process with one thread. The batch is what `tsgt process` does, without input and output: tuning of the prior, the trajectory
+with all covariances, and poses 20 times a second.
 
     python benchmarks/continuous.py [HOURS]
 """
@@ -38,7 +38,7 @@ SIGMAS_M = np.array([0.0025, 0.0011, 0.0011])
 LAYOUT = np.array([[-0.4559, -0.1759, 1.1167], [0.4844, -0.1759, 1.4167], [-0.0285, 0.3519, 1.0667]])
 
 
-def made_up(hours: float, stations: int) -> Observations:
+def synthetic_observations(hours: float, stations: int) -> Observations:
     """Measure a robot that drives curves, rolls and pitches; stations beyond the third track the same prisms in turn."""
     rng = np.random.default_rng(1)
     count = round(hours * 3600 * RATE_HZ)
@@ -73,8 +73,8 @@ def made_up(hours: float, stations: int) -> Observations:
 
 
 def batch(hours: float, stations: int) -> tuple[float, float]:
-    """Give CPU seconds of the fit, and of the poses after it."""
-    observations = made_up(hours, stations)
+    """Return CPU seconds of the fit, and of the poses after it."""
+    observations = synthetic_observations(hours, stations)
     epochs_s = np.arange(observations.time_s[0], observations.time_s[-1], 1 / POSES_HZ)
     start_s = time.process_time()
     found = fit_trajectory(observations)
@@ -85,8 +85,8 @@ def batch(hours: float, stations: int) -> tuple[float, float]:
 
 
 def updates(stations: int) -> FloatArray:
-    """Give CPU ms of each update with a fixed lag: take one measurement, let the oldest go, predict to where it is sent."""
-    observations = made_up(LIVE_S / 3600, stations)
+    """Return CPU ms of each fixed-lag update: add one measurement, marginalise, predict."""
+    observations = synthetic_observations(LIVE_S / 3600, stations)
     filtered = FixedLagSmoother(MotionPrior())
     took_ms: list[float] = []
     for row, time_s in enumerate(observations.time_s):
@@ -100,7 +100,7 @@ def updates(stations: int) -> FloatArray:
 
 
 def main() -> None:
-    """Print how the costs grow with time and with stations."""
+    """Print CPU time by duration and by number of stations."""
     hours_max = int(sys.argv[1]) if len(sys.argv) > 1 else HOURS
     print("3 stations: hours, CPU seconds of the fit, of poses at 20 Hz, both per hour, largest memory in MB")
     hours = 1

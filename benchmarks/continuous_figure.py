@@ -1,4 +1,4 @@
-"""Draw the errors of both estimators over a minute of a simulated recording, with what `continuous` states of itself.
+"""Draw the errors of both estimators over a minute of a simulated recording, with the 95 % bound of `continuous`.
 
 tsgt simulate --protocol superframe --seed 0 --faults none --output dynamic.jsonl --truth dynamic.tum
 python benchmarks/continuous_figure.py dynamic.jsonl dynamic.tum docs/explanation/figures/continuous-errors.svg
@@ -32,7 +32,7 @@ BOUND_SIGMAS = 2.795
 
 
 class Errors(NamedTuple):
-    """Errors of an estimator's poses at some instants; sigmas are square roots of a third of the covariance's trace."""
+    """Errors of an estimator's poses over time; sigmas are square roots of a third of the covariance's trace."""
 
     time_s: FloatArray
     position_mm: FloatArray
@@ -72,7 +72,7 @@ def errors(recording_path: Path, truth_path: Path, estimator: Estimator) -> Erro
 
 
 def main() -> None:
-    """Draw it, and print the figures of what is shown."""
+    """Draw the figure, and print its numbers."""
     recording_path, truth_path, output = map(Path, sys.argv[1:4])
     plt.rcParams.update(
         {"svg.hashsalt": "tsgt", "svg.fonttype": "none", "font.size": 9, "font.family": "sans-serif"}

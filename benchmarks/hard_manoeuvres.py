@@ -1,9 +1,9 @@
-"""Predicted poses of a robot that does the hardest things: how far off they are, squared and in their sigmas (NEES).
+"""NEES of predicted poses during abrupt manoeuvres.
 
-Robots as that of the scenario `dynamic`, told another speed and yaw rate at an instant that nobody knows. Three stations
-at 2.5 Hz; measurements come together, 0.4 s apart and 0.15 to 0.3 s old. Twenty times a second the pose is predicted, once
-as a trajectory goes on by the prior alone, once as the live estimator says it; what is less certain than its default limits
-(0.1 m, 5 degrees) is left out, and so is what is more than 1.2 s from the manoeuvre.
+The robot of the scenario `dynamic` steps its speed and yaw rate at an unknown time. Three stations measure at 2.5 Hz;
+measurements arrive together, 0.4 s apart and 0.15 to 0.3 s old. Poses are predicted twenty times a second, once by the prior
+alone, once by the live estimator; those less certain than its default limits (0.1 m, 5 degrees) or more than 1.2 s from the
+manoeuvre are omitted.
 
     python benchmarks/hard_manoeuvres.py [ROBOTS]
 """
@@ -22,7 +22,7 @@ from tsgt.model import MotionPrior
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from harness.manoeuvre import speeding_up_and_turning_back
-from harness.prior_motion import sorted_by_time, measure, rows_at
+from harness.prior_motion import measure, rows_at, sorted_by_time
 
 MANOEUVRES = {
     "turns back and speeds up": ((0.5, 1.5), (-0.5, 0.5)),
@@ -31,7 +31,7 @@ MANOEUVRES = {
     "starts and turns": ((0.0, 1.5), (0.0, 0.5)),
     "stops in a turn": ((1.5, 0.0), (0.5, 0.0)),
 }
-TOLD_S, UNTIL_S = 9.0, 11.0
+STEP_TIME_S, UNTIL_S = 9.0, 11.0
 BATCH_S, LAG_S, PERIOD_S = 0.4, 3.0, 0.05
 NEAR_S = 1.2
 LIMIT_M, LIMIT_RAD = 0.1, np.radians(5.0)
@@ -39,28 +39,30 @@ ABOVE = (22.46, 38.26, 60.0)
 
 
 def predicted(name: str, seed: int) -> np.ndarray:
-    """Return NEES of the poses near a manoeuvre, (N, 2), by the prior alone and as the live estimator says; NaN if unsure."""
+    """NEES of the poses near a manoeuvre, (N, 2), by the prior alone and by the live estimator; NaN if uncertain."""
     speeds_mps, rates_radps = MANOEUVRES[name]
     motion = speeding_up_and_turning_back(
-        duration_s=UNTIL_S + 0.1, at_s=TOLD_S, speeds_mps=speeds_mps, rates_radps=rates_radps
+        duration_s=UNTIL_S + 0.1, at_s=STEP_TIME_S, speeds_mps=speeds_mps, rates_radps=rates_radps
     )
     measured = sorted_by_time(measure(motion, until_s=UNTIL_S, seed=seed))
     random = np.random.default_rng([seed, 1])
     phase_s, delay_s = random.uniform(0, BATCH_S), random.uniform(0.15, 0.3)
     come_s = phase_s + BATCH_S * np.ceil((measured.time_s + delay_s - phase_s) / BATCH_S)
     window, taken, rows = FixedLagSmoother(MotionPrior()), 0, []
-    for now_s in np.arange(1.0, TOLD_S + NEAR_S, PERIOD_S):
+    for now_s in np.arange(1.0, STEP_TIME_S + NEAR_S, PERIOD_S):
         here = int(np.searchsorted(come_s, now_s, side="right"))
         if here > taken:
             window.update(measured.select(slice(taken, here)))
             window.marginalise_before(now_s - LAG_S)
             taken = here
-        if now_s < TOLD_S - NEAR_S or not window.converged or window.ambiguous:
+        if now_s < STEP_TIME_S - NEAR_S or not window.converged or window.ambiguous:
             continue
         at_s = np.array([now_s])
         truth = motion.select(rows_at(at_s))
         ways = (window.trajectory().at(at_s, dim=6), window.predict(now_s, dim=6))
-        rows.append([_nees(state.local_coordinates_about(truth)[0, :6], covariance[0]) for state, covariance in ways])
+        rows.append(
+            [_nees(state.local_coordinates_about(truth)[0, :6], covariance[0]) for state, covariance in ways]
+        )
     return np.array(rows).reshape(-1, 2)
 
 

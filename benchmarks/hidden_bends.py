@@ -1,7 +1,7 @@
-"""What tuning does not see: batch poses of the paper's drives, simulated, with motion as found and as lively as it must be taken.
+"""Batch poses of the paper's drives, simulated, with and without the process-noise floor.
 
-For each drive: squared errors in sigmas (NEES) of valid poses, their errors, and how many are valid; once with what has the
-most evidence throughout, once as `tsgt process` does it, once with the configured motion throughout.
+For each drive: NEES of valid poses, their errors, and the share of valid poses; once with the maximum-evidence prior, once as
+`tsgt process` does it, once with the configured prior.
 
     python benchmarks/hidden_bends.py [NAME:SEED]...
 """
@@ -64,12 +64,14 @@ def drive(name: str, seed: int) -> None:
         path = run.master_logs[-1].recording()
         if path is None:
             raise RuntimeError(f"{name}: the master made no recording")
-        judge(f"{name} {seed}", load_recording(path), run.world, run.start_ns, run.end_ns)
+        evaluate(f"{name} {seed}", load_recording(path), run.world, run.start_ns, run.end_ns)
 
 
-def judge(name: str, recording: Recording, world: World, start_ns: int, end_ns: int) -> None:
+def evaluate(name: str, recording: Recording, world: World, start_ns: int, end_ns: int) -> None:
     """Print the lines of one recording."""
-    observations, _ = build_observations(recording.parameters, plausible_measurements(recording), origin_ns=start_ns)
+    observations, _ = build_observations(
+        recording.parameters, plausible_measurements(recording), origin_ns=start_ns
+    )
     first_ns, last_ns = (round(1e9 * observations.time_s[row]) + start_ns for row in (0, -1))
     stamp_ns = np.arange(start_ns, end_ns, 50_000_000, dtype=np.int64)
     stamp_ns = stamp_ns[interior_mask(stamp_ns, start_ns, end_ns)]
@@ -86,7 +88,9 @@ def judge(name: str, recording: Recording, world: World, start_ns: int, end_ns: 
         ("as processed", motion.prior, configured),
         ("as configured", configured, None),
     ):
-        found = fit_trajectory(observations, prior=prior, occluded_prior=occluded_prior, noise_scale=motion.noise_scale)
+        found = fit_trajectory(
+            observations, prior=prior, occluded_prior=occluded_prior, noise_scale=motion.noise_scale
+        )
         states, covariance = found.trajectory.at(at_s, dim=6)
         off_m = place_m - states.position
         turned = log_so3(np.swapaxes(states.rotation, 1, 2) @ truth[:, :3, :3])

@@ -1,11 +1,11 @@
-"""Whether `tsgt calibrate motion` is as good as it says: errors planted into simulated drives, and what is left of them.
+"""Accuracy of `tsgt calibrate motion`: errors planted into simulated drives, and what remains of them.
 
     tsgt simulate dynamic --seed 3 --output r3.jsonl
     python benchmarks/motion_calibration.py r3.jsonl ... [--length 300]
 
-Takes recordings whose frames and latencies are true, cuts them into drives of that many seconds, makes station 2 wrong by
-5 mm, 0.5 mrad (each in some direction) and 30 ms, and calibrates. Prints, by drive, the largest error of the shifts (mm), turns
-(mrad) and latencies (ms), the largest error in stated sigmas, and chi-square of all unknowns together.
+Takes recordings with true frames and latencies, cuts them into drives of a length in seconds, displaces station 2 by 5 mm,
+0.5 mrad (each in a random direction) and 30 ms, and calibrates. Prints, per drive, the largest error of translations (mm),
+rotations (mrad) and latencies (ms), the largest error in stated sigmas, and chi-square of all parameters.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SHIFT_M, TURN_RAD, LATE_S = 0.005, 0.0005, 0.03
 
 
 def planted(frame: Matrix4, rng: np.random.Generator) -> Matrix4:
-    """Move and turn a frame."""
+    """Displace and rotate a frame."""
     shift, turn = rng.normal(size=3), rng.normal(size=3)
     wrong = np.array(frame)
     wrong[:3, :3] = exp_so3(turn * TURN_RAD / np.linalg.norm(turn)) @ wrong[:3, :3]
@@ -40,8 +40,8 @@ def planted(frame: Matrix4, rng: np.random.Generator) -> Matrix4:
     return cast("Matrix4", tuple(map(tuple, wrong.tolist())))
 
 
-def judge(name: str, recording: Recording, rng: np.random.Generator) -> tuple[float, FloatArray]:
-    """Chi-square of a drive, and each unknown's error in stated sigmas; prints both."""
+def evaluate(name: str, recording: Recording, rng: np.random.Generator) -> tuple[float, FloatArray]:
+    """Print chi-square of a drive and each parameter's error in stated sigmas; return both."""
     stations = list(recording.parameters.stations)
     stations[1] = replace(
         stations[1],
@@ -54,10 +54,15 @@ def judge(name: str, recording: Recording, rng: np.random.Generator) -> tuple[fl
     late_s = np.zeros(len(frames))
     late_s[1] = LATE_S
     unknowns = found.parameters
-    error = unknowns.local_coordinates(found.setup) - unknowns.local_coordinates(Setup(frames, late_s, found.setup.layout))
+    error = unknowns.local_coordinates(found.setup) - unknowns.local_coordinates(
+        Setup(frames, late_s, found.setup.layout)
+    )
     sigmas = error / np.sqrt(np.diag(found.covariance))
     squared = float(error @ np.linalg.solve(found.covariance, error))
-    largest = [1e3 * np.abs(error[at]).max() for at in (unknowns.translations, unknowns.rotations, unknowns.latencies)]
+    largest = [
+        1e3 * np.abs(error[at]).max()
+        for at in (unknowns.translations, unknowns.rotations, unknowns.latencies)
+    ]
     print(
         name,
         "{:.2f} mm {:.3f} mrad {:.2f} ms".format(*largest),
@@ -71,7 +76,7 @@ def judge(name: str, recording: Recording, rng: np.random.Generator) -> tuple[fl
 
 
 def main() -> None:
-    """Judge all drives."""
+    """Evaluate all drives."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("recordings", nargs="+", type=Path)
     parser.add_argument("--length", type=float, default=300.0)
@@ -90,7 +95,7 @@ def main() -> None:
                 for each in recording.measurements
                 if edges_ns[drive] <= each.stamp_ns < edges_ns[drive + 1]
             ]
-            judged.append(judge(f"{path.stem} {drive + 1}", replace(recording, measurements=inside), rng))
+            judged.append(evaluate(f"{path.stem} {drive + 1}", replace(recording, measurements=inside), rng))
     squared = np.array([each for each, _ in judged])
     sigmas = np.concatenate([each for _, each in judged])
     print(

@@ -1,8 +1,7 @@
-"""Which motion prior explains a recording best: white noise on acceleration, white noise on jerk, or what lies between.
+"""Compare motion priors on recordings: white noise on acceleration, white noise on jerk, tuned correlation time.
 
-For each recording and each prior, its sigmas and the noise's scale are tuned on the same stretches of the recording. The
-table has the log evidence less that of white noise on acceleration, and by how much measurements that were left out are
-missed (folds as `tsgt evaluate` has them; the prior has seen none of what it predicts).
+For each recording and prior, sigmas and noise scale are tuned on the same segments. The table has the log evidence relative to
+white noise on acceleration, and held-out prediction errors (folds as in `tsgt evaluate`; the prior is tuned without them).
 
     python benchmarks/motion_prior.py RECORDING...
 """
@@ -15,7 +14,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.evaluation import folds, cross_validate, interpolation_errors, trajectory_errors, training_rows
+from tsgt.analysis.evaluation import (
+    cross_validate,
+    folds,
+    interpolation_errors,
+    training_rows,
+    trajectory_errors,
+)
 from tsgt.analysis.evaluation.held_out import FOLDS
 from tsgt.estimation import build_observations
 from tsgt.geometry.trajectory import fit_trajectory
@@ -42,7 +47,7 @@ _TIMES = (2, 5)
 
 
 def tuned(observations: Observations, time_s: float | None) -> Hyperparameters:
-    """Tune sigmas and noise with a given correlation time, or with the best."""
+    """Tune sigmas and noise scale with a given correlation time, or with the best."""
     start = log_parameters(MotionPrior(), 1.0)
     limits = [SIGMAS] * 6 + [SCALES]
     for row in _TIMES:
@@ -58,12 +63,16 @@ def tuned(observations: Observations, time_s: float | None) -> Hyperparameters:
 
 
 def missed_m(observations: Observations, time_s: float | None) -> FloatArray:
-    """By how much measurements that were left out are missed, in m, without those at gaps."""
-    seen = [tuned(observations.select(training_rows(observations, number)), time_s) for number in range(FOLDS)]
+    """Held-out prediction errors in m, without those at gaps."""
+    seen = [
+        tuned(observations.select(training_rows(observations, number)), time_s) for number in range(FOLDS)
+    ]
 
     def by_fold(fold: Fold) -> FloatArray:
         own = seen[fold.number]
-        kept = fit_trajectory(observations.select(fold.training), prior=own.prior, noise_scale=own.noise_scale)
+        kept = fit_trajectory(
+            observations.select(fold.training), prior=own.prior, noise_scale=own.noise_scale
+        )
         return trajectory_errors(kept.trajectory, observations.select(fold.test))
 
     held_out = cross_validate(folds(observations), by_fold)
@@ -71,7 +80,7 @@ def missed_m(observations: Observations, time_s: float | None) -> FloatArray:
 
 
 def row(name: str, evidence: str, missed: FloatArray, more: str = "") -> str:
-    """One line of the table."""
+    """Format one line of the table."""
     mean, p95 = 1e3 * missed.mean(), 1e3 * np.percentile(missed, 95)
     return f"  {name:20} {evidence:>9} {mean:8.1f} {p95:8.1f}  {more}"
 

@@ -1,7 +1,7 @@
-"""Are the covariances of the estimator `continuous` what its errors are? Robots drawn from the motion prior itself.
+"""Consistency (NEES) of the covariances of the estimator `continuous`, for robots drawn from the motion prior.
 
-For each kind of pose: the mean of the squared errors in sigmas (NEES) over all robots with its 95 % band, and how many are
-beyond the limit that 5 % should be beyond. Instants one after the other are not independent, so each has its own band.
+For each kind of pose: the mean NEES over all robots with its 95 % band, and the share beyond the 95 % limit. Successive times
+are not independent, so that each has its own band.
 
     python benchmarks/nees.py [ROBOTS]
 """
@@ -19,14 +19,14 @@ from tsgt.geometry.trajectory import Trajectory, initial_guess, knot_times, solv
 from tsgt.model import MotionPrior
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from harness.prior_motion import STEP_S, draw_motions, sorted_by_time, measure, rows_at
+from harness.prior_motion import STEP_S, draw_motions, measure, rows_at, sorted_by_time
 
 ROBOTS = 400
 UNTIL_S = 20.0
 INSIDE_S = np.array([0.5, 2.0, 5.0, 8.0, 11.0, 14.0, 17.0, 19.5])
 AHEAD_S = np.array([0.0, 0.1, 0.2, 0.5, 1.0, 2.0])
 ONE_PRISM_S = (9.0, 10.5)
-"""In this time stations 2 and 3 see nothing."""
+"""Stations 2 and 3 measure nothing in this interval."""
 
 PARTS = {
     "position": slice(0, 3),
@@ -37,7 +37,7 @@ PARTS = {
 
 
 def main() -> None:
-    """Print one table for smoothed and one for predicted poses, and one for poses from one prism."""
+    """Print one table each for smoothed poses, predicted poses, and poses from one prism."""
     robots = int(sys.argv[1]) if len(sys.argv) > 1 else ROBOTS
     prior = MotionPrior()
     tables: dict[str, tuple[str, np.ndarray]] = {
@@ -54,7 +54,9 @@ def main() -> None:
             observations = whole.select(~away) if name.startswith("one") else whole
             last_s = np.floor(observations.time_s[-1] / STEP_S) * STEP_S
             asked_s = instants_s + last_s if name == "predicted" else instants_s
-            solution = solve(observations, initial_guess(observations, knot_times(observations.time_s)), prior)
+            solution = solve(
+                observations, initial_guess(observations, knot_times(observations.time_s)), prior
+            )
             trajectory = Trajectory(solution.knots, prior, *solution.factor.marginals())
             states, covariance = trajectory.at(asked_s)
             error = motion.select(rows_at(asked_s)).local_coordinates_about(states)

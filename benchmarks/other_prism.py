@@ -1,7 +1,7 @@
-"""How often an instrument that has lost its prism takes another one for it, where it cannot tell them apart.
+"""How often an instrument that has lost its prism locks on another one that it cannot distinguish.
 
-In the reference scenario the prism of station 1 is hidden again and again. Unless the telescope has it again by itself, a
-fine adjustment in a window of 5 degrees and locking in follow at once, where the telescope rests.
+In the reference scenario the prism of station 1 is hidden repeatedly. Unless the telescope reacquires it, a fine adjustment in a
+window of 5 degrees and a lock-in follow at once, where the telescope rests.
 
     python benchmarks/other_prism.py [--narrow]
 """
@@ -29,7 +29,7 @@ SCENARIO = ScenarioConfig(
 
 
 async def hide(timeline: VirtualTimeline, hidden_s: float, *, narrow: bool) -> Counter[str]:
-    """Hide the prism so many times for so long; count what the telescope has in the end."""
+    """Hide the prism ``TIMES`` times for a duration; count which prism the telescope locks on."""
     world = scenario_world(SCENARIO, 2000.0, np.random.default_rng(1))
     station = SimulatedTotalStation(
         SCENARIO.stations[0], SCENARIO, world, timeline, np.random.default_rng(2), start_ns=timeline.now_ns()
@@ -63,7 +63,7 @@ async def hide(timeline: VirtualTimeline, hidden_s: float, *, narrow: bool) -> C
 
 
 def main() -> None:
-    """Print a line for each time of hiding."""
+    """Print a line for each duration."""
     for hidden_s in HIDDEN_S:
         timeline = VirtualTimeline()
 

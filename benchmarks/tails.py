@@ -1,8 +1,8 @@
-"""How far off may a pose be? Squared errors in sigmas (NEES) of a robot that starts, stops and turns.
+"""Tails of the NEES of a robot that starts, stops and turns.
 
-Batch poses of the robot of the scenario `dynamic`, whose motion is not Gaussian, measured three times 2.5 Hz, with times that
-are as wrong as the client's fit of the instrument's clock leaves them (benchmarks/instrument_time.py), clients and
-instruments begun anew every ten minutes. Once with the stamps taken at their word, once as the estimator takes them.
+Batch poses of the robot of the scenario `dynamic`, whose motion is not Gaussian, measured three times 2.5 Hz, with the time
+errors of the client's fit of the instrument's clock (benchmarks/instrument_time.py); clients and instruments restart every
+ten minutes. Once with the stated time noise alone, once with that of the estimator.
 
     python benchmarks/tails.py [HOURS] [FIRST_SEED]
 """
@@ -32,14 +32,14 @@ from tsgt.geometry.trajectory import fit_trajectory
 from tsgt.simulation.world import World, scenario_world
 
 HOUR_S = 3600.0
-BEGUN_ANEW_S = 600.0
+RESTART_S = 600.0
 STEP_S = 0.1
 LIMITS = (22.46, 38.26, 60.0)
 SCENARIO = ScenarioConfig()
 
 
 def measured(world: World, seed: int) -> tuple[Observations, np.ndarray]:
-    """Return an hour of measurements, and the number of each since its client began."""
+    """Simulate an hour of measurements, and the number of each since its client's start."""
     random = np.random.default_rng([seed, 1])
     frames = np.array(
         [
@@ -49,9 +49,9 @@ def measured(world: World, seed: int) -> tuple[Observations, np.ndarray]:
     )
     rows = []
     for column, frame in enumerate(frames):
-        for begin_s in np.arange(0.0, HOUR_S, BEGUN_ANEW_S):
+        for begin_s in np.arange(0.0, HOUR_S, RESTART_S):
             found = np.array(errors(Case("as in the scenario"), int(random.integers(2**32))))
-            found = found[found[:, 0] < BEGUN_ANEW_S - 0.1]
+            found = found[found[:, 0] < RESTART_S - 0.1]
             number, time_s = np.arange(len(found)), begin_s + found[:, 0] + random.uniform(0, 0.1)
             seen = transform_points(invert(frame), world.prism_at(time_s, column))
             horizontal, zenith, distance_m = cartesian_to_polar(seen)
@@ -87,7 +87,7 @@ def measured(world: World, seed: int) -> tuple[Observations, np.ndarray]:
 
 
 def figures(observations: Observations, world: World) -> tuple[np.ndarray, np.ndarray]:
-    """Return NEES and squared position errors in m^2 of all poses."""
+    """NEES and squared position errors in m^2 of all poses."""
     found = fit_trajectory(observations).trajectory
     times_s = np.arange(found.knots.time_s[0], found.knots.time_s[-1], STEP_S)
     states, covariance = found.at(times_s)
@@ -99,7 +99,7 @@ def figures(observations: Observations, world: World) -> tuple[np.ndarray, np.nd
 
 
 def main() -> None:
-    """Print a table, a line for each way, after each hour."""
+    """Print a table after each hour."""
     hours, first = (int(each) for each in [*sys.argv[1:3], *("3", "0")[len(sys.argv) - 1 :]])
     kept: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {
         "at their word": [],

@@ -1,4 +1,4 @@
-"""Robots that move as the motion prior says, and what total stations measure of them; no code of the estimator is used."""
+"""Motions drawn from the motion prior, and their measurements; independent of the estimator's code."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ if TYPE_CHECKING:
 STEP_S = 0.005
 SIGMAS_M = np.array([0.0025, 0.0012, 0.0012])
 TIME_SIGMA_S = 0.0005
-PLACE_M = np.array([60.0, 45.0, -1.0])
+CENTRE_M = np.array([60.0, 45.0, -1.0])
 
 
 def draw_motions(prior: MotionPrior, *, count: int, duration_s: float, seed: int) -> list[States]:
-    """Draw motions from the prior on a grid of ``STEP_S``, beginning anywhere and in any direction.
+    """Draw motions from the prior on a grid of ``STEP_S``, at random positions and attitudes.
 
-    The accelerations at the grid are exact draws of the process; between them they are taken as straight lines, and
-    rotations are multiplied up step by step.
+    The accelerations at the grid are exact draws of the process; between them they are linear, and rotations are multiplied step
+    by step.
     """
     rng = np.random.default_rng(seed)
     times = np.arange(round(duration_s / STEP_S) + 1, dtype=np.float64) * STEP_S
@@ -44,14 +44,14 @@ def draw_motions(prior: MotionPrior, *, count: int, duration_s: float, seed: int
         (prior.acceleration_sigma_mps2, prior.acceleration_correlation_time_s),
         (prior.angular_acceleration_sigma_radps2, prior.angular_acceleration_correlation_time_s),
     ):
-        kept = np.exp(-STEP_S / time_s)
-        kicks = rng.normal(size=(count, len(times), 3))
-        kicks[:, 1:] *= np.sqrt(1 - kept**2)
-        parts.append(np.array(sigmas) * lfilter([1.0], [1.0, -kept], kicks, axis=1))
+        decay = np.exp(-STEP_S / time_s)
+        noise = rng.normal(size=(count, len(times), 3))
+        noise[:, 1:] *= np.sqrt(1 - decay**2)
+        parts.append(np.array(sigmas) * lfilter([1.0], [1.0, -decay], noise, axis=1))
     acceleration, angular_acceleration = parts
-    velocity = _summed(acceleration) + rng.normal(size=(count, 1, 3))
-    position = _summed(velocity) + PLACE_M + rng.normal(size=(count, 1, 3))
-    angular_velocity = _summed(angular_acceleration) + rng.normal(scale=0.2, size=(count, 1, 3))
+    velocity = _integrate(acceleration) + rng.normal(size=(count, 1, 3))
+    position = _integrate(velocity) + CENTRE_M + rng.normal(size=(count, 1, 3))
+    angular_velocity = _integrate(angular_acceleration) + rng.normal(scale=0.2, size=(count, 1, 3))
     rotation = np.empty((count, len(times), 3, 3))
     rotation[:, 0] = exp_so3(rng.normal(scale=2.0, size=(count, 3)))
     turns = exp_so3(0.5 * STEP_S * (angular_velocity[:, 1:] + angular_velocity[:, :-1]))
@@ -68,7 +68,7 @@ def draw_motions(prior: MotionPrior, *, count: int, duration_s: float, seed: int
 
 
 def rows_at(time_s: FloatArray) -> NDArray[np.intp]:
-    """Which rows of a drawn motion are at these instants."""
+    """Rows of a drawn motion at these times."""
     return np.round(np.asarray(time_s) / STEP_S).astype(np.intp)
 
 
@@ -79,16 +79,16 @@ def measure(motion: States, *, until_s: float, rate_hz: float = 2.5, seed: int) 
     which: list[NDArray[np.intp]] = []
     for row in range(len(LAYOUT)):
         phase_s = rng.uniform(0, 1 / rate_hz)
-        mine = np.arange(phase_s, until_s, 1 / rate_hz)
-        times.append(np.round(mine / STEP_S) * STEP_S)
-        which.append(np.full(len(mine), row))
+        prism_times = np.arange(phase_s, until_s, 1 / rate_hz)
+        times.append(np.round(prism_times / STEP_S) * STEP_S)
+        which.append(np.full(len(prism_times), row))
     time_s, prism = np.concatenate(times), np.concatenate(which)
     order = np.argsort(time_s, kind="stable")
     time_s, prism = time_s[order], prism[order]
     truth = motion.select(rows_at(time_s))
     world = truth.position + (truth.rotation @ LAYOUT[prism][:, :, None])[:, :, 0]
-    seen = transform_points(invert(FRAMES)[prism], world)
-    noisy = add_polar_noise(seen, SIGMAS_M, rng)
+    in_station = transform_points(invert(FRAMES)[prism], world)
+    noisy = add_polar_noise(in_station, SIGMAS_M, rng)
     count = len(time_s)
     return Observations(
         time_s=time_s + rng.normal(scale=TIME_SIGMA_S, size=count),
@@ -104,12 +104,12 @@ def measure(motion: States, *, until_s: float, rate_hz: float = 2.5, seed: int) 
 
 
 def sorted_by_time(observations: Observations) -> Observations:
-    """Put measurements in the order of time, which uncertain stamps may have upset."""
+    """Sort measurements by time: noisy timestamps may be out of order."""
     return observations.select(np.argsort(observations.time_s, kind="stable"))
 
 
 def add_polar_noise(points_m: FloatArray, sigmas_m: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Points with noise in range and both angles, given as lengths at the point."""
+    """Add noise in range and both angles, given as lengths at the point."""
     horizontal_rad, zenith_rad, distance_m = cartesian_to_polar(points_m)
     noise = rng.normal(size=(len(points_m), 3)) * sigmas_m
     return polar_to_cartesian(
@@ -120,7 +120,7 @@ def add_polar_noise(points_m: FloatArray, sigmas_m: FloatArray, rng: np.random.G
 
 
 def as_cartesian(observations: Observations) -> Observations:
-    """Take the same measurements for Cartesian ones in frame ``station1``, alike in all directions."""
+    """Take the measurements as Cartesian points in frame ``station1`` with isotropic noise."""
     return replace(
         observations,
         points_m=observations.in_world(),
@@ -131,6 +131,6 @@ def as_cartesian(observations: Observations) -> Observations:
     )
 
 
-def _summed(rates: FloatArray) -> FloatArray:
+def _integrate(rates: FloatArray) -> FloatArray:
     means = 0.5 * STEP_S * (rates[:, 1:] + rates[:, :-1])
     return np.concatenate([np.zeros_like(rates[:, :1]), np.cumsum(means, axis=1)], axis=1)

@@ -1,4 +1,4 @@
-"""A small standing or driving robot seen by three stations, for the tests of the master."""
+"""A small stationary or moving robot seen by three stations."""
 
 from __future__ import annotations
 
@@ -37,19 +37,19 @@ Motion = tuple["NDArray[np.float64]", "NDArray[np.float64]"]
 
 
 def standing(time_s: float) -> Motion:  # noqa: ARG001 (a motion is a function of time)
-    """Rotation and position of a robot that stands still."""
+    """Rotation and position of a stationary robot."""
     return exp_so3(np.array([0.02, -0.01, 0.6])), np.array([30.0, 20.0, -1.0])
 
 
 def driving(time_s: float) -> Motion:
-    """Rotation and position of a robot that drives a bend."""
+    """Rotation and position of a robot that drives a curve."""
     yaw = 0.3 * time_s
     return exp_so3(np.array([0.0, 0.0, yaw])), np.array([30.0 + np.sin(yaw), 20.0 - np.cos(yaw), -1.0])
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Makes exact measurements of a moving layout of prisms."""
+    """Exact measurements of a moving layout of prisms."""
 
     parameters: Parameters
     motion: Callable[[float], Motion] = standing
@@ -57,13 +57,13 @@ class Scene:
     def measure(
         self, station: int, time_s: float, *, delay_s: float = 0.1, status: Status = Status.OK, prism: int = 0
     ) -> PolarMeasurement:
-        """Measure a prism (the station's own by default) at so many seconds after the start."""
+        """Measure a prism (the station's own by default) at a time after the start."""
         parameters = self.parameters.stations[station - 1]
         prism = prism or parameters.prism
         rotation, position = self.motion(time_s)
         in_world = rotation @ LAYOUT[prism - 1] + position
-        seen = transform_points(invert(np.array(parameters.T_station1_station)), in_world)
-        horizontal, zenith, distance = cartesian_to_polar(seen)
+        in_station = transform_points(invert(np.array(parameters.T_station1_station)), in_world)
+        horizontal, zenith, distance = cartesian_to_polar(in_station)
         measured_ns = START + round(time_s * SECOND)
         return PolarMeasurement(
             station=station,
@@ -79,17 +79,17 @@ class Scene:
         )
 
     def moving(self, motion: Callable[[float], Motion]) -> Scene:
-        """Return the same scene with another motion."""
+        """Return the scene with another motion."""
         return replace(self, motion=motion)
 
     def with_limits(self, **limits: float | str) -> Scene:
-        """Return the same scene with other limits in the pipeline's parameters."""
+        """Return the scene with other pipeline parameters."""
         pipeline = replace(self.parameters.pipeline, **limits)  # type: ignore[arg-type]
         return replace(self, parameters=replace(self.parameters, pipeline=pipeline))
 
 
 def with_origin(parameters: Parameters, origin_m: NDArray[np.float64]) -> Parameters:
-    """Return parameters whose robot frame has its origin elsewhere, (3,) in the robot frame that it had."""
+    """Return parameters with the robot frame's origin moved to a point, (3,) in the old robot frame."""
     prisms = tuple(
         replace(prism, position_m=tuple((np.array(prism.position_m) - origin_m).tolist()))
         for prism in parameters.prisms
@@ -98,7 +98,7 @@ def with_origin(parameters: Parameters, origin_m: NDArray[np.float64]) -> Parame
 
 
 def stationary_scene() -> Scene:
-    """Three stations around the origin, each with its own yaw, and a standing robot."""
+    """Three stations around the origin, each with its own yaw, and a stationary robot."""
     return Scene(
         Parameters(
             stations=tuple(

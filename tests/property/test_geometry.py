@@ -1,4 +1,4 @@
-"""What must hold for all rotations, points and triangles, not only for those that somebody thought of."""
+"""Properties of all rotations, points and triangles."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from tsgt.geometry import (
     transform_points,
 )
 
-same_every_time = settings(derandomize=True)
+deterministic = settings(derandomize=True)
 
 
 def vectors(limit: float, count: int | None = None) -> st.SearchStrategy[np.ndarray]:
-    """3-vectors, or so many of them, with coordinates up to the limit."""
+    """3-vectors, or a number of them, with coordinates up to the limit."""
     return arrays(np.float64, (3,) if count is None else (count, 3), elements=st.floats(-limit, limit))
 
 
-@same_every_time
+@deterministic
 @given(vectors(10.0))
 def test_exp_gives_proper_rotations(w: np.ndarray) -> None:
     """Every rotation vector gives an orthonormal, right-handed matrix."""
@@ -41,20 +41,20 @@ def test_exp_gives_proper_rotations(w: np.ndarray) -> None:
     assert np.linalg.det(R) > 0
 
 
-@same_every_time
+@deterministic
 @given(vectors(10.0))
 def test_log_then_exp_is_the_same_rotation(w: np.ndarray) -> None:
-    """The rotation vector found is at most pi long and describes the same rotation."""
+    """The rotation vector has a length of at most pi and describes the same rotation."""
     R = exp_so3(w)
     found = log_so3(R)
     assert np.linalg.norm(found) <= np.pi + 1e-15
     np.testing.assert_allclose(exp_so3(found), R, atol=1e-13)
 
 
-@same_every_time
+@deterministic
 @given(vectors(10.0))
 def test_quaternion_round_trip(w: np.ndarray) -> None:
-    """Quaternions have unit length and w >= 0, and give the rotation back."""
+    """Quaternions have unit length and w >= 0, and reproduce the rotation."""
     R = exp_so3(w)
     q = quaternion_from_rotation(R)
     assert q[3] >= 0
@@ -62,27 +62,27 @@ def test_quaternion_round_trip(w: np.ndarray) -> None:
     np.testing.assert_allclose(rotation_from_quaternion(q), R, atol=1e-13)
 
 
-@same_every_time
+@deterministic
 @given(vectors(4.0), vectors(1e4), vectors(1e4, 5))
-def test_inverse_transform_undoes(w: np.ndarray, t: np.ndarray, points: np.ndarray) -> None:
-    """There and back again is where it was."""
+def test_inverse_transform_round_trip(w: np.ndarray, t: np.ndarray, points: np.ndarray) -> None:
+    """Transform and inverse transform reproduce the points."""
     T = transform_from(exp_so3(w), t)
     np.testing.assert_allclose(transform_points(invert(T), transform_points(T, points)), points, atol=1e-10)
 
 
-@same_every_time
+@deterministic
 @given(vectors(1e4))
 def test_polar_round_trip(point: np.ndarray) -> None:
-    """Polar coordinates lie in their ranges and give the point back to rounding."""
+    """Polar coordinates are in range and reproduce the point to rounding."""
     h, z, d = cartesian_to_polar(point)
     assert 0 <= h < 2 * np.pi
     assert 0 <= z <= np.pi
     np.testing.assert_allclose(polar_to_cartesian(h, z, d), point, atol=1e-11)
 
 
-@same_every_time
+@deterministic
 @given(vectors(1.0, 3), vectors(10.0, 3))
-def test_no_rotation_beats_the_closed_form(layout: np.ndarray, points: np.ndarray) -> None:
+def test_closed_form_is_optimal(layout: np.ndarray, points: np.ndarray) -> None:
     """The squared residuals of the closed form are those of the SVD's optimum."""
     for triangle in (layout, points):
         area = np.linalg.norm(np.cross(triangle[1] - triangle[0], triangle[2] - triangle[0]))
@@ -95,10 +95,10 @@ def test_no_rotation_beats_the_closed_form(layout: np.ndarray, points: np.ndarra
     )
 
 
-@same_every_time
+@deterministic
 @given(vectors(4.0), vectors(1e3), vectors(1.0, 3))
-def test_closed_form_moves_with_the_world(w: np.ndarray, t: np.ndarray, points: np.ndarray) -> None:
-    """Moving all measured points moves the pose by just that."""
+def test_closed_form_is_equivariant(w: np.ndarray, t: np.ndarray, points: np.ndarray) -> None:
+    """Transforming all measured points transforms the pose likewise."""
     layout = np.array([[0.4, 0.0, 0.0], [-0.3, 0.5, 0.1], [-0.2, -0.4, 0.3]])
     assume(np.linalg.norm(np.cross(points[1] - points[0], points[2] - points[0])) > 1e-2)
     R = exp_so3(w)
@@ -106,14 +106,14 @@ def test_closed_form_moves_with_the_world(w: np.ndarray, t: np.ndarray, points: 
     np.testing.assert_allclose(after, R @ before, atol=1e-8)
 
 
-@same_every_time
+@deterministic
 @given(
     st.lists(st.integers(0, 10**10), min_size=2, max_size=12, unique=True).map(sorted),
     st.lists(st.integers(-(10**9), 11 * 10**9), max_size=8),
     st.integers(1, 10**10),
 )
 def test_valid_epochs_lie_between_their_samples(times: list[int], epochs: list[int], limit_ns: int) -> None:
-    """An epoch is valid exactly when a pair of neighbours no further apart than the limit encloses it."""
+    """An epoch is valid exactly if neighbouring samples no further apart than the limit enclose it."""
     times_ns, epochs_ns = np.array(times), np.array(epochs, dtype=np.int64)
     found = interpolate(times_ns, np.column_stack([times_ns] * 3) * 1e-9, epochs_ns, limit_ns)
     for epoch_ns, valid, point in zip(epochs, found.valid, found.points, strict=True):

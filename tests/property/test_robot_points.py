@@ -1,4 +1,4 @@
-"""A trajectory is that of one point of the robot; what it says of any other point is exactly that point's motion."""
+"""Motion of other points of the robot: states, covariances and second-order terms against differences and samples."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from tsgt.geometry import exp_so3, state_at_point, skew, with_second_order_terms
+from tsgt.geometry import exp_so3, skew, state_at_point, with_second_order_terms
 from tsgt.geometry.trajectory import States
 
-same_every_time = settings(derandomize=True, max_examples=50)
+deterministic = settings(derandomize=True, max_examples=50)
 STEP = 1e-4
 
 
@@ -33,8 +33,8 @@ covariances = arrays(np.float64, (1, 18, 18), elements=st.floats(-1.0, 1.0)).map
 NONE = np.zeros((1, 18, 18))
 
 
-def later(state: States, dt_s: float) -> States:
-    """Carry a robot on with steady accelerations; rotations to the third order of the time."""
+def propagated(state: States, dt_s: float) -> States:
+    """Propagate a robot with constant accelerations; rotations to third order in time."""
     rate, faster = state.angular_velocity, state.angular_acceleration
     turn = rate * dt_s + faster * dt_s**2 / 2 + np.cross(rate, faster) * dt_s**3 / 12
     return States(
@@ -48,48 +48,50 @@ def later(state: States, dt_s: float) -> States:
     )
 
 
-@same_every_time
+@deterministic
 @given(states, arms)
-def test_another_points_velocity_and_acceleration_are_those_of_its_place(
-    state: States, arm: np.ndarray
-) -> None:
-    """As differences of where it is and how fast a little before and after."""
-    point, before, after = (state_at_point(later(state, dt_s), NONE, arm)[0] for dt_s in (0.0, -STEP, STEP))
+def test_velocity_and_acceleration_are_derivatives_of_the_position(state: States, arm: np.ndarray) -> None:
+    """Central differences of the point's position and velocity."""
+    point, before, after = (
+        state_at_point(propagated(state, dt_s), NONE, arm)[0] for dt_s in (0.0, -STEP, STEP)
+    )
     seen = state.position[0] + state.rotation[0] @ arm
     np.testing.assert_allclose(point.position[0], seen, atol=1e-12)
     np.testing.assert_allclose(point.velocity, (after.position - before.position) / (2 * STEP), atol=1e-5)
     np.testing.assert_allclose(point.acceleration, (after.velocity - before.velocity) / (2 * STEP), atol=1e-5)
 
 
-@same_every_time
+@deterministic
 @given(states, arms, covariances)
-def test_another_points_covariance_is_that_of_its_errors(
+def test_covariance_is_propagated_by_the_exact_jacobian(
     state: States, arm: np.ndarray, covariance: np.ndarray
 ) -> None:
-    """With the derivatives of its error by each part of the state's, as differences."""
+    """Central differences of the point's error by each component of the state's error."""
     point, found = state_at_point(state, covariance, arm)
     by_error = np.empty((6, 18))
     for part in range(18):
         error = np.zeros((1, 18))
         error[0, part] = STEP
         more, less = (state_at_point(state.retract(sign * error), NONE, arm)[0] for sign in (1, -1))
-        by_error[:, part] = (more.local_coordinates_about(point) - less.local_coordinates_about(point))[0, :6] / (2 * STEP)
+        by_error[:, part] = (more.local_coordinates_about(point) - less.local_coordinates_about(point))[
+            0, :6
+        ] / (2 * STEP)
     np.testing.assert_allclose(found[0], by_error @ covariance[0] @ by_error.T, atol=1e-5)
     np.testing.assert_array_equal(state_at_point(state, covariance[:, :6, :6], arm)[1], found)
 
 
-@same_every_time
+@deterministic
 @given(states, arms, covariances)
-def test_there_and_back_is_where_it_was(state: States, arm: np.ndarray, covariance: np.ndarray) -> None:
-    """The same motion, and the same covariance."""
+def test_opposite_lever_arms_round_trip(state: States, arm: np.ndarray, covariance: np.ndarray) -> None:
+    """The opposite lever arm reproduces states and covariance."""
     there, between = state_at_point(state, covariance, arm)
     back, found = state_at_point(there, between, -arm)
     np.testing.assert_allclose(back.local_coordinates_about(state), 0.0, atol=1e-12)
     np.testing.assert_allclose(found, covariance[:, :6, :6], atol=1e-10)
 
 
-def test_a_point_that_turns_about_a_line_comes_nearer_to_it() -> None:
-    """The mean square towards the line is that of a sample, which linear errors do not have at all."""
+def test_second_order_term_of_one_uncertain_rotation() -> None:
+    """The mean square displacement towards the line is that of a sample; first-order errors have none."""
     random = np.random.default_rng(0)
     rotation, axis = exp_so3(np.array([0.3, -0.2, 0.5])), np.array([0.0, 0.6, 0.8])
     arm, sigma_rad = np.array([0.4, 0.3, -0.2]), 0.1
@@ -109,8 +111,8 @@ def test_a_point_that_turns_about_a_line_comes_nearer_to_it() -> None:
     assert to_line @ covariance[0, :3, :3] @ to_line < 1e-3 * np.mean(np.square(sample))
 
 
-def test_a_point_that_turns_about_another_comes_nearer_to_it() -> None:
-    """With one prism seen two turns are unknown at once, and both take the point the same way: their squares add."""
+def test_second_order_terms_of_two_uncertain_rotations_add() -> None:
+    """With one prism seen two rotations are unobserved; their second-order displacements add."""
     random = np.random.default_rng(0)
     rotation, arm = exp_so3(np.array([0.3, -0.2, 0.5])), np.array([0.0, 0.0, -0.9])
     sigmas_rad = np.array([0.1, 0.08, 0.02])

@@ -1,4 +1,4 @@
-"""align(): against brute force and Monte Carlo, and the point sets that have no answer."""
+"""align(): against brute force and Monte Carlo, and degenerate point sets."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ T_TRUE = np.array([40.0, -12.0, 1.5])
 
 
 def noisy_target(seed: int, sigma_m: float = 0.02) -> np.ndarray:
-    """Move the source by the true transform, with white noise."""
+    """Transform the source by the true transform, with white noise."""
     moved: np.ndarray = SOURCE @ R_TRUE.T + T_TRUE
     return moved + np.random.default_rng(seed).normal(scale=sigma_m, size=SOURCE.shape)
 
 
 @pytest.mark.parametrize("n", [3, 4, 5])
 def test_exact_points_are_recovered(n: int) -> None:
-    """Without noise the transform comes back, the residuals vanish and so does the estimated covariance."""
+    """Without noise the transform is exact, and residuals and estimated covariance vanish."""
     found = align(SOURCE[:n], noisy_target(0, 0.0)[:n])
     np.testing.assert_allclose(found.rotation, R_TRUE, atol=1e-14)
     np.testing.assert_allclose(found.translation_m, T_TRUE, atol=1e-13)
@@ -33,7 +33,7 @@ def test_exact_points_are_recovered(n: int) -> None:
 
 @pytest.mark.parametrize("weights", [None, (1.0, 4.0, 0.3, 2.0, 9.0)])
 def test_optimum_is_that_of_brute_force(weights: tuple[float, ...] | None) -> None:
-    """A general minimiser, started elsewhere, ends at the same transform; weighted as well."""
+    """A general minimiser converges to the same transform; weighted as well."""
     target = noisy_target(1, 0.3)
     root = np.sqrt(np.ones(5) if weights is None else weights)[:, None]
 
@@ -48,8 +48,8 @@ def test_optimum_is_that_of_brute_force(weights: tuple[float, ...] | None) -> No
     np.testing.assert_allclose(log_so3(found.rotation), brute[3:], atol=1e-7)
 
 
-def test_residuals_are_target_less_transformed_source() -> None:
-    """T, residuals and rms are consistent with each other."""
+def test_residuals_are_target_minus_transformed_source() -> None:
+    """T, residuals and rms are consistent."""
     target = noisy_target(2)
     found = align(SOURCE, target, weights=[1, 2, 3, 4, 5])
     residuals = target - transform_points(found.T, SOURCE)
@@ -58,7 +58,7 @@ def test_residuals_are_target_less_transformed_source() -> None:
 
 
 def test_only_ratios_of_weights_count() -> None:
-    """Weights a thousand times larger give the same transform and the same covariance."""
+    """Scaling all weights changes neither transform nor covariance."""
     weights = np.array([1.0, 4.0, 0.3, 2.0, 9.0])
     one, other = (align(SOURCE, noisy_target(3), weights=w) for w in (weights, 1000 * weights))
     np.testing.assert_allclose(one.T, other.T, atol=1e-13)
@@ -66,7 +66,7 @@ def test_only_ratios_of_weights_count() -> None:
 
 
 def test_mirrored_target_still_gives_a_proper_rotation() -> None:
-    """A mirrored point set is fitted as well as a rotation can; the residuals tell."""
+    """A mirrored point set is fitted by a proper rotation with large residuals."""
     found = align(SOURCE, SOURCE * (1, 1, -1))
     assert np.linalg.det(found.rotation) == pytest.approx(1.0)
     assert found.rms_m > 0.5
@@ -74,7 +74,7 @@ def test_mirrored_target_still_gives_a_proper_rotation() -> None:
 
 @pytest.mark.parametrize("weights", [None, (1.0, 4.0, 0.3, 2.0, 9.0)])
 def test_covariance_matches_monte_carlo(weights: tuple[float, ...] | None) -> None:
-    """The scatter of 4000 fits with anisotropic noise is the covariance that was propagated, order and axes included."""
+    """Errors of 4000 fits with anisotropic noise have the propagated covariance, order and axes included."""
     rng = np.random.default_rng(4)
     factors = 0.005 * rng.normal(size=(5, 3, 3))
     covariances = factors @ np.swapaxes(factors, 1, 2)
@@ -93,8 +93,8 @@ def test_covariance_matches_monte_carlo(weights: tuple[float, ...] | None) -> No
     np.testing.assert_allclose(sample, np.eye(6), atol=0.1)
 
 
-def test_covariance_from_residuals_is_right_on_average() -> None:
-    """Without covariances the noise is estimated from the residuals, without bias, weights being inverse variances."""
+def test_covariance_from_residuals_is_unbiased() -> None:
+    """Without covariances the noise is estimated from the residuals without bias, weights being inverse variances."""
     rng = np.random.default_rng(5)
     weights = np.array([1.0, 4.0, 0.5, 2.0, 9.0])
     sigma_m = 0.01 / np.sqrt(weights)
@@ -114,7 +114,7 @@ def test_covariance_from_residuals_is_right_on_average() -> None:
 
 
 def test_covariance_far_from_the_origin_keeps_its_precision() -> None:
-    """A station in map coordinates, 500 km from the origin, has the rotation covariance that it has at home."""
+    """In map coordinates, 500 km from the origin, the rotation covariance is the same as at the origin."""
     covariances = np.broadcast_to(1e-6 * np.eye(3), (5, 3, 3))
     near = align(SOURCE, SOURCE, covariances=covariances).covariance
     far = align(SOURCE + 5e5, SOURCE, covariances=covariances).covariance
@@ -122,15 +122,15 @@ def test_covariance_far_from_the_origin_keeps_its_precision() -> None:
     assert np.linalg.eigvalsh(far).min() > -1e-9 * np.linalg.eigvalsh(far).max()
 
 
-def test_large_offset_does_not_cost_the_rotation() -> None:
+def test_large_offset_keeps_the_rotation() -> None:
     """Points 1e6 m from the origin give the rotation to the rounding of their coordinates."""
     found = align(SOURCE + 1e6, (SOURCE @ R_TRUE.T) - 1e6)
     np.testing.assert_allclose(found.rotation, R_TRUE, atol=1e-9)
 
 
 @pytest.mark.parametrize("axis", [(1, 0, 0), (0, 0, 1), (0.6, 0.8, 0)])
-def test_half_a_turn_is_no_special_case(axis: tuple[float, ...]) -> None:
-    """A rotation by pi is found."""
+def test_rotation_by_pi_is_recovered(axis: tuple[float, ...]) -> None:
+    """A rotation by pi is no special case."""
     R = exp_so3(np.pi * np.array(axis))
     np.testing.assert_allclose(align(SOURCE, SOURCE @ R.T).rotation, R, atol=1e-14)
 
@@ -148,14 +148,14 @@ LINE = np.outer([0.0, 1.0, 2.5, 7.0], [1.0, 2.0, -1.0]) + np.array([100.0, 0.0, 
         (SOURCE[:4], LINE, "target points lie in a line"),
     ],
 )
-def test_degenerate_points_are_refused(source: np.ndarray, target: np.ndarray, message: str) -> None:
-    """Too few, coincident and collinear points are refused, saying what was expected and got."""
+def test_degenerate_points_are_rejected(source: np.ndarray, target: np.ndarray, message: str) -> None:
+    """Too few, coincident and collinear points are rejected, with expected and got."""
     with pytest.raises(DegenerateGeometryError, match=message):
         align(source, target)
 
 
 def test_nearly_collinear_points_are_still_aligned() -> None:
-    """Targets a hair off a line are solved; the covariance about that line says how little that is worth."""
+    """Nearly collinear points are aligned; the covariance about their line shows the uncertainty."""
     source = LINE + np.outer([0.0, 1e-4, -1e-4, 0.0], [0.0, 1.0, 2.0])
     along = np.array([1.0, 2.0, -1.0]) / np.sqrt(6)
     variances = np.linalg.eigh(align(source, source, covariances=[1e-6 * np.eye(3)] * 4).covariance[3:, 3:])
@@ -163,8 +163,8 @@ def test_nearly_collinear_points_are_still_aligned() -> None:
     np.testing.assert_allclose(np.abs(variances.eigenvectors[:, -1] @ along), 1.0, atol=1e-3)
 
 
-def test_ambiguous_mirror_image_is_refused() -> None:
-    """A regular tetrahedron and its mirror image fit equally badly in many ways: no rotation is the best."""
+def test_ambiguous_mirror_image_is_rejected() -> None:
+    """A regular tetrahedron and its mirror image have no unique best rotation."""
     tetrahedron = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)])
     with pytest.raises(DegenerateGeometryError, match="mirror image"):
         align(tetrahedron, -tetrahedron)
@@ -183,7 +183,7 @@ def test_ambiguous_mirror_image_is_refused() -> None:
         ({"covariances": np.full((5, 3, 3), np.nan)}, "5 finite 3x3 covariances"),
     ],
 )
-def test_unusable_input_is_refused(changed: dict[str, np.ndarray], message: str) -> None:
-    """Shapes that do not match, NaN and weights that are not positive each give a clear error."""
+def test_invalid_input_is_rejected(changed: dict[str, np.ndarray], message: str) -> None:
+    """Shapes that do not match, NaN and weights that are not positive raise an error."""
     with pytest.raises(GeometryError, match=message):
         align(**{"source": SOURCE, "target": SOURCE, **changed})

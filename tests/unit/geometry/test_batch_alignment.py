@@ -1,4 +1,4 @@
-"""The closed form for triplets and the batched SVD: against each other, against align(), and where no rotation follows."""
+"""Closed form for triplets and batched SVD: against each other, against align(), and degenerate sets."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ R_TRUE = Rotation.random(2000, random_state=1).as_matrix()
 def triplets(
     layout: np.ndarray, *, noise_m: float, offset_m: float, R: np.ndarray = R_TRUE, seed: int = 2
 ) -> np.ndarray:
-    """Measured sets of the layout at random poses, item by item."""
+    """Measure the layout at random poses."""
     rng = np.random.default_rng(seed)
     moved: np.ndarray = layout @ np.swapaxes(R, 1, 2) + offset_m * rng.normal(size=(len(R), 1, 3))
     return moved + rng.normal(scale=noise_m, size=moved.shape)
@@ -25,7 +25,7 @@ def triplets(
 def assert_same(
     one: BatchAlignment, other: BatchAlignment, rotation_atol: float, position_atol_m: float
 ) -> None:
-    """Both found the same transforms, and none is degenerate."""
+    """Both give the same transforms, none degenerate."""
     assert not one.degenerate.any()
     assert not other.degenerate.any()
     np.testing.assert_allclose(one.rotation, other.rotation, rtol=0, atol=rotation_atol)
@@ -34,8 +34,8 @@ def assert_same(
 
 
 @pytest.mark.parametrize("noise_m", [0.0, 0.003, 0.1])
-def test_closed_form_is_the_svd(noise_m: float) -> None:
-    """For three points the closed form is Arun's optimum to rounding, noise being small or large."""
+def test_closed_form_agrees_with_svd(noise_m: float) -> None:
+    """For three points the closed form is the SVD optimum to rounding, at any noise."""
     points = triplets(LAYOUT, noise_m=noise_m, offset_m=50)
     # Coordinates of 100 m are rounded to 1e-14 m; the layout is about 1 m wide.
     assert_same(align_triplets(LAYOUT, points), align_many(LAYOUT, points), 1e-12, 1e-12)
@@ -55,8 +55,8 @@ def test_closed_form_far_from_the_origin() -> None:
     assert_same(align_triplets(LAYOUT, points), align_many(LAYOUT, points), 1e-8, 1e-8)
 
 
-def test_closed_form_of_half_turns() -> None:
-    """Rotations by pi about all kinds of axes, and no rotation at all, are no special cases."""
+def test_closed_form_of_rotations_by_pi() -> None:
+    """Rotations by pi about random axes, and the identity, are no special cases."""
     axes = np.concatenate(
         [np.eye(3), Rotation.random(50, random_state=3).as_matrix()[:, 0], np.zeros((1, 3))]
     )
@@ -65,16 +65,16 @@ def test_closed_form_of_half_turns() -> None:
     np.testing.assert_allclose(found.rotation, R, rtol=0, atol=1e-13)
 
 
-def test_triplet_that_fits_nothing() -> None:
-    """Triangles that have nothing in common with the layout still get the least-squares rotation of the SVD."""
+def test_closed_form_of_unrelated_triangles() -> None:
+    """Triangles unrelated to the layout get the least-squares rotation of the SVD."""
     points = np.random.default_rng(4).normal(size=(2000, 3, 3))
     # A sliver of a random triangle conditions its rotation badly; hence the wider tolerance.
     assert_same(align_triplets(LAYOUT, points), align_many(LAYOUT, points), 1e-8, 1e-8)
 
 
 @pytest.mark.parametrize("count", [3, 4, 7])
-def test_many_agrees_with_align(count: int) -> None:
-    """align_many gives, set by set, what align gives, for any number of points."""
+def test_align_many_agrees_with_align(count: int) -> None:
+    """align_many gives, set by set, the result of align for any number of points."""
     layout = np.random.default_rng(5).normal(size=(count, 3))
     points = triplets(layout, noise_m=0.05, offset_m=5)[:40]
     found = align_many(layout, points)
@@ -85,16 +85,16 @@ def test_many_agrees_with_align(count: int) -> None:
         np.testing.assert_allclose(found.residuals_m[i], single.residuals_m, atol=1e-12)
 
 
-def test_many_never_mirrors() -> None:
-    """Measured mirror images of a solid layout are fitted by proper rotations, with large residuals."""
+def test_align_many_never_mirrors() -> None:
+    """Mirror images of a solid layout are fitted by proper rotations with large residuals."""
     layout = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.7, 0.0], [0.1, 0.2, 0.5]])
     found = align_many(layout, triplets(layout * (1, 1, -1), noise_m=0.0, offset_m=1))
     np.testing.assert_allclose(np.linalg.det(found.rotation), 1.0, atol=1e-12)
     assert np.linalg.norm(found.residuals_m, axis=2).max(axis=1).min() > 0.1
 
 
-def test_mirrored_triplet_is_turned_over() -> None:
-    """Three points are a plane figure: a mirrored triangle fits without residual, by a robot upside down."""
+def test_mirrored_triplet_is_rotated() -> None:
+    """Three points are planar: a mirrored triangle fits without residual, upside down."""
     mirrored = LAYOUT * (1, -1, 1)
     found = align_triplets(LAYOUT, mirrored[None])
     np.testing.assert_allclose(found.residuals_m, 0, atol=1e-15)
@@ -113,7 +113,7 @@ def test_mirrored_triplet_is_turned_over() -> None:
     ids=["origin", "coincident", "collinear", "two-at-one-place"],
 )
 def test_degenerate_set_is_marked(solve: object, measured: np.ndarray) -> None:
-    """A degenerate set is marked, has the identity as rotation and finite numbers, and does not disturb its neighbours."""
+    """A degenerate set is marked, has the identity as rotation and finite numbers, and leaves its neighbours unchanged."""
     assert callable(solve)
     good = triplets(LAYOUT, noise_m=0.001, offset_m=10)[:2]
     found = solve(LAYOUT, np.stack([good[0], measured, good[1]]))
@@ -126,8 +126,8 @@ def test_degenerate_set_is_marked(solve: object, measured: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("solve", [align_triplets, align_many])
-def test_nothing_measured_gives_nothing(solve: object) -> None:
-    """An empty batch is solved: no poses, in the right shapes."""
+def test_empty_batch_gives_empty_arrays(solve: object) -> None:
+    """An empty batch gives empty arrays of the right shapes."""
     assert callable(solve)
     found = solve(LAYOUT, np.empty((0, 3, 3)))
     assert found.rotation.shape == (0, 3, 3)
@@ -145,14 +145,14 @@ def test_nothing_measured_gives_nothing(solve: object) -> None:
         (LAYOUT[:2], "at least 3 layout points, got 2"),
     ],
 )
-def test_degenerate_layout_is_refused(solve: object, layout: np.ndarray, message: str) -> None:
-    """A layout that has no plane is an error, not a batch of degenerate results."""
+def test_degenerate_layout_is_rejected(solve: object, layout: np.ndarray, message: str) -> None:
+    """A layout without a plane raises an error, no batch of degenerate results."""
     assert callable(solve)
     with pytest.raises(DegenerateGeometryError, match=message):
         solve(layout, np.zeros((4, len(layout), 3)))
 
 
-def test_closed_form_refuses_four_points() -> None:
+def test_closed_form_rejects_four_points() -> None:
     """The closed form is for three points only."""
     with pytest.raises(GeometryError, match="3 points, the layout has 4"):
         align_triplets(np.vstack([LAYOUT, [0, 0, 0]]), np.zeros((1, 4, 3)))
@@ -167,8 +167,8 @@ def test_closed_form_refuses_four_points() -> None:
         (np.full((1, 3, 3), np.nan), "NaN"),
     ],
 )
-def test_unusable_points_are_refused(solve: object, points: np.ndarray, message: str) -> None:
-    """Measured points of the wrong shape or with NaN are an error that says what was expected."""
+def test_invalid_points_are_rejected(solve: object, points: np.ndarray, message: str) -> None:
+    """Points of the wrong shape or with NaN raise an error with the expected shape."""
     assert callable(solve)
     with pytest.raises(GeometryError, match=message):
         solve(LAYOUT, points)

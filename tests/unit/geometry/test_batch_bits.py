@@ -1,4 +1,4 @@
-"""Stream, replay and later processing compute in batches of different sizes and must agree bit for bit."""
+"""Bit-identity: stream, replay and post-processing compute in batches of different sizes and must agree exactly."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ Items = slice
 Results = tuple[np.ndarray, ...]
 
 
-def fitted(count: int) -> Callable[[Items], Results]:
-    """Everything that a pose record takes from so many prisms."""
+def pose_quantities(count: int) -> Callable[[Items], Results]:
+    """All quantities of a pose record from a number of prisms."""
     layout = LAYOUT[:count]
 
     def compute(items: Items) -> Results:
@@ -75,8 +75,8 @@ def fitted(count: int) -> Callable[[Items], Results]:
     return compute
 
 
-def measured(items: Items) -> Results:
-    """Positions and their noise from polar measurements, in the world."""
+def measured_points(items: Items) -> Results:
+    """Positions and their covariances in the world from polar measurements."""
     horizontal_rad, zenith_rad, distance_m = POLAR[items].T
     points = polar_to_cartesian(horizontal_rad, zenith_rad, distance_m)
     covariances = measurement_covariance(horizontal_rad, zenith_rad, distance_m, TRACKING_NOISE)
@@ -84,7 +84,7 @@ def measured(items: Items) -> Results:
     return transform_points(T_WORLD, points), R @ covariances @ R.T
 
 
-def interpolated(items: Items) -> Results:
+def interpolated_track(items: Items) -> Results:
     """One prism at the epochs, with its covariance."""
     found = interpolate(TIMES_NS, PRISMS[:, 0], EPOCHS_NS[items], 10**9)
     covariance = interpolated_covariance(
@@ -96,12 +96,12 @@ def interpolated(items: Items) -> Results:
 
 @pytest.mark.parametrize(
     "compute",
-    [measured, interpolated, fitted(3), fitted(4), fitted(9)],
+    [measured_points, interpolated_track, pose_quantities(3), pose_quantities(4), pose_quantities(9)],
     ids=["measured", "interpolated", "three", "four", "nine"],
 )
 @pytest.mark.parametrize("split", ["one by one", "at random"])
 def test_batches_agree_bit_for_bit(compute: Callable[[Items], Results], split: str) -> None:
-    """A thousand items at once, each alone, and in batches of random sizes give the same bits."""
+    """A thousand items at once, one by one, and in batches of random sizes give the same bits."""
     cuts = (
         range(N + 1)
         if split == "one by one"

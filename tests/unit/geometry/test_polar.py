@@ -1,4 +1,4 @@
-"""Polar coordinates: axes, both faces, corrections, Jacobians against differences, noise against Monte Carlo."""
+"""Polar coordinates: axes, both faces, corrections, Jacobians against differences, noise against propagation."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ def test_axes(horizontal_rad: float, zenith_rad: float, expected: tuple[float, .
 
 
 def test_both_faces_give_the_same_point() -> None:
-    """The instrument turned over (zenith above pi, horizontal angle turned by pi) sees the same point."""
+    """Second-face angles (zenith above pi, horizontal angle turned by pi) give the same point."""
     np.testing.assert_allclose(
         polar_to_cartesian(0.7 + np.pi, 2 * np.pi - 1.2, 30.0), polar_to_cartesian(0.7, 1.2, 30.0), atol=1e-13
     )
 
 
 def test_field_data_formula(field_data: object) -> None:
-    """The authors' markers come out as in the formula beside their data, written with elevations."""
+    """The authors' markers agree with the formula beside their data, written with elevations."""
     table = np.loadtxt(f"{field_data}/20220314/GCP.txt", delimiter=",", skiprows=1)
     el, az, d = table[:, 3], table[:, 4], table[:, 5]
     up = np.pi / 2 - el
@@ -54,8 +54,8 @@ def test_field_data_formula(field_data: object) -> None:
 @pytest.mark.parametrize(
     "point", [(0, 0, 0), (0.0, -0.0, 3), (0, 0, -3), (-1, 0, 0), (-1, -0.0, 0), (1, 1e-20, 0)]
 )
-def test_cartesian_to_polar_at_the_seams(point: tuple[float, ...]) -> None:
-    """At the station, on the vertical and at the circle's zero the angles stay in their ranges and map back."""
+def test_cartesian_to_polar_at_singular_points(point: tuple[float, ...]) -> None:
+    """At the station, on the vertical and at the circle's zero the angles stay in range and map back."""
     h, z, d = cartesian_to_polar(point)
     assert 0 <= h < 2 * np.pi
     assert 0 <= z <= np.pi
@@ -63,19 +63,19 @@ def test_cartesian_to_polar_at_the_seams(point: tuple[float, ...]) -> None:
 
 
 def test_constant_is_not_scaled_by_ppm() -> None:
-    """100 ppm of 1000 m are 0.1 m; the constant is added as it is."""
+    """100 ppm of 1000 m are 0.1 m; the constant is added unscaled."""
     assert corrected_distance(1000.0, constant_m=0.01, ppm=100.0) == pytest.approx(1000.11, abs=1e-12)
 
 
-def test_raw_distance_is_what_the_instrument_gave() -> None:
-    """raw_distance takes constant and scale off again."""
+def test_raw_distance_inverts_corrected_distance() -> None:
+    """raw_distance removes constant and scale."""
     raw_m = np.array([0.0, 1.5, 812.3])
     corrected_m = corrected_distance(raw_m, constant_m=-0.0344, ppm=-12.0)
     np.testing.assert_allclose(raw_distance(corrected_m, constant_m=-0.0344, ppm=-12.0), raw_m, atol=1e-12)
 
 
 def test_polar_jacobian_agrees_with_differences() -> None:
-    """Each column is what central differences of polar_to_cartesian give."""
+    """Each column equals central differences of polar_to_cartesian."""
     polar = np.random.default_rng(1).uniform((0, 0.1, 1), (6.2, 3.0, 100), size=(50, 3))
     step = 1e-6
     for column in range(3):
@@ -88,19 +88,19 @@ def test_polar_jacobian_agrees_with_differences() -> None:
 
 
 def test_cartesian_jacobian_inverts_polar_jacobian() -> None:
-    """The two Jacobians are each other's inverse, away from the vertical."""
+    """The two Jacobians are inverse away from the vertical."""
     polar = np.random.default_rng(2).uniform((0, 0.1, 1), (6.2, 3.0, 100), size=(50, 3))
     product = cartesian_jacobian(polar_to_cartesian(*polar.T)) @ polar_jacobian(*polar.T)
     np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), (50, 3, 3)), atol=1e-11)
 
 
-def test_cartesian_jacobian_refuses_the_vertical() -> None:
-    """Straight up there is no horizontal angle to differentiate."""
+def test_cartesian_jacobian_rejects_the_vertical() -> None:
+    """On the vertical the horizontal angle has no derivative."""
     with pytest.raises(GeometryError, match="horizontal angle"):
         cartesian_jacobian([(1.0, 0.0, 0.0), (0.0, 0.0, 5.0)])
 
 
-def test_covariance_is_the_angles_and_ranges_propagated() -> None:
+def test_covariance_is_propagated_from_angles_and_range() -> None:
     """J diag(sigma^2) J' with the horizontal sigma over sin z, plus pointing, gives the same matrix."""
     noise = InstrumentNoise(
         range_sigma_m=0.002, range_sigma_ppm=20.0, angle_sigma_rad=1e-4, pointing_sigma_m=0.001
@@ -116,7 +116,7 @@ def test_covariance_is_the_angles_and_ranges_propagated() -> None:
 
 
 def test_covariance_straight_up_is_finite() -> None:
-    """At zenith 0 the noise across is distance x angle sigma in both directions, and the range noise is vertical."""
+    """At zenith 0 the noise across is distance x angle sigma in both directions."""
     noise = InstrumentNoise(
         range_sigma_m=0.002, range_sigma_ppm=0.0, angle_sigma_rad=1e-5, pointing_sigma_m=0.0
     )
@@ -126,7 +126,7 @@ def test_covariance_straight_up_is_finite() -> None:
 
 
 def test_noise_model_broadcasts_to_one_matrix_per_measurement() -> None:
-    """Arrays of angles and distances give a stack of matrices, each that of its measurement."""
+    """Arrays of angles and distances give one matrix per measurement."""
     h, z, d = np.array([[0.1, 2.0], [1.4, 1.6], [5.0, 70.0]])
     together = measurement_covariance(h, z, d, TRACKING_NOISE)
     np.testing.assert_array_equal(together[1], measurement_covariance(2.0, 1.6, 70.0, TRACKING_NOISE))

@@ -1,4 +1,4 @@
-"""Poses from prisms: residuals, covariance by Monte Carlo and by derivatives, twists, layouts that cannot work."""
+"""Poses from prisms: residuals, covariance by Monte Carlo and by derivatives, twists, degenerate layouts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ rotated_layouts = pytest.mark.parametrize("layout", [LAYOUT, FOUR], ids=["three"
 
 @rotated_layouts
 def test_pose_is_recovered(layout: np.ndarray) -> None:
-    """Exact prisms give back the pose, with residuals of rounding."""
+    """Exact prisms reproduce the pose, with residuals of rounding."""
     found = poses_from_prisms(layout, (layout @ R_TRUE.T + T_TRUE)[None])
     np.testing.assert_allclose(found.rotation[0], R_TRUE, atol=1e-13)
     np.testing.assert_allclose(found.translation_m[0], T_TRUE, atol=1e-13)
@@ -26,7 +26,7 @@ def test_pose_is_recovered(layout: np.ndarray) -> None:
 
 
 @rotated_layouts
-def test_residuals_are_those_of_the_best_fit(layout: np.ndarray) -> None:
+def test_residuals_agree_with_align(layout: np.ndarray) -> None:
     """Residual lengths and rms are those of align for the same prisms."""
     points = layout @ R_TRUE.T + T_TRUE + np.random.default_rng(1).normal(scale=0.02, size=layout.shape)
     found, expected = poses_from_prisms(layout, points[None]), align(layout, points)
@@ -34,7 +34,7 @@ def test_residuals_are_those_of_the_best_fit(layout: np.ndarray) -> None:
     assert found.rms_m[0] == pytest.approx(expected.rms_m, abs=1e-13)
 
 
-def test_coincident_prisms_are_marked() -> None:
+def test_coincident_prisms_are_degenerate() -> None:
     """Prisms measured at one place give a degenerate pose with finite numbers."""
     found = poses_from_prisms(LAYOUT, np.zeros((1, 3, 3)))
     assert found.degenerate.tolist() == [True]
@@ -43,7 +43,7 @@ def test_coincident_prisms_are_marked() -> None:
 
 @rotated_layouts
 def test_covariance_matches_monte_carlo(layout: np.ndarray) -> None:
-    """The scatter of 20000 noisy fits is the covariance, about the robot's origin and the world's axes."""
+    """Errors of 20000 noisy fits have the stated covariance, about the robot's origin and the world's axes."""
     rng = np.random.default_rng(2)
     draws, prisms = 20_000, len(layout)
     factors = 0.001 * rng.normal(size=(prisms, 3, 3))
@@ -59,7 +59,7 @@ def test_covariance_matches_monte_carlo(layout: np.ndarray) -> None:
 
 
 def test_covariance_agrees_with_numerical_derivatives() -> None:
-    """Propagating through central differences of the fit itself gives the same matrix."""
+    """Propagating through central differences of the fit gives the same matrix."""
     rng = np.random.default_rng(3)
     factors = 0.002 * rng.normal(size=(3, 3, 3))
     covariances = factors @ np.swapaxes(factors, 1, 2)
@@ -79,7 +79,7 @@ def test_covariance_agrees_with_numerical_derivatives() -> None:
 
 
 def test_covariance_is_symmetric_to_the_bit() -> None:
-    """A reader may compare the matrix with its transpose."""
+    """The matrix equals its transpose exactly."""
     covariances = np.broadcast_to(np.diag([1e-6, 2e-6, 3e-6]), (1, 3, 3, 3))
     found = pose_covariance(LAYOUT, R_TRUE[None], covariances)[0]
     np.testing.assert_array_equal(found, found.T)
@@ -87,7 +87,7 @@ def test_covariance_is_symmetric_to_the_bit() -> None:
 
 @rotated_layouts
 def test_twist_of_a_rigid_motion(layout: np.ndarray) -> None:
-    """Prism velocities of a turning, driving robot give its velocity in the world and its turning in its own frame."""
+    """Prism velocities of a rigid motion give its velocity in the world and angular velocity in the robot frame."""
     velocity_mps, turning_radps = np.array([1.0, -0.4, 0.1]), np.array([0.05, -0.1, 0.5])
     prism_velocities = velocity_mps + np.cross(turning_radps, layout) @ R_TRUE.T
     found_velocity, found_turning = twists(layout, R_TRUE[None], prism_velocities[None])
@@ -96,7 +96,7 @@ def test_twist_of_a_rigid_motion(layout: np.ndarray) -> None:
 
 
 def test_twist_is_the_derivative_of_the_pose() -> None:
-    """Differencing two poses a millisecond apart gives the twist between them."""
+    """The difference of two poses a millisecond apart gives the twist."""
     step_s, turning_radps = 1e-3, np.array([0.1, 0.2, -0.6])
     R = np.stack(
         [R_TRUE @ exp_so3(-turning_radps * step_s / 2), R_TRUE @ exp_so3(turning_radps * step_s / 2)]
@@ -125,7 +125,7 @@ def test_good_layouts_pass() -> None:
 def test_degenerate_layout_names_the_prisms(
     layout: np.ndarray, names: list[int] | None, message: str
 ) -> None:
-    """Two prisms at one place, prisms in a line and too few prisms are refused by name, with the measure."""
+    """Coincident, collinear and too few prisms are rejected by name, with the measure."""
     with pytest.raises(DegenerateGeometryError, match=message):
         check_layout(layout, names)
 
@@ -133,7 +133,7 @@ def test_degenerate_layout_names_the_prisms(
 @pytest.mark.parametrize(
     ("layout", "message"), [(np.eye(3)[:, :2], "shape"), (np.full((3, 3), np.inf), "finite")]
 )
-def test_unusable_layout_is_refused(layout: np.ndarray, message: str) -> None:
-    """A layout of the wrong shape or with NaN or infinity is an error."""
+def test_invalid_layout_is_rejected(layout: np.ndarray, message: str) -> None:
+    """A layout of the wrong shape or with NaN or infinity raises an error."""
     with pytest.raises(GeometryError, match=message):
         check_layout(layout)

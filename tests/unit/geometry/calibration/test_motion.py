@@ -1,4 +1,4 @@
-"""Set-ups found from a robot's motion: against a made-up drive whose set-up is known."""
+"""Calibration from motion: against a synthetic drive with a known set-up."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def frames() -> FloatArray:
 def drive(
     duration_s: float = 120.0, *, seed: int = 0, straight: bool = False, still: bool = False
 ) -> Observations:
-    """Tracks of a robot that winds its way over uneven ground, 40 m away, with the noise that is stated."""
+    """Tracks of a robot on a winding path over uneven ground, 40 m away, with the stated noise."""
     rng = np.random.default_rng(seed)
     time_s = np.concatenate([np.arange(0.13 * station, duration_s, 0.4) for station in range(3)])
     station = np.concatenate([np.full(len(np.arange(0.13 * s, duration_s, 0.4)), s) for s in range(3)])
@@ -80,8 +80,8 @@ def drive(
     )
 
 
-def wrong(observations: Observations) -> Observations:
-    """Station 2 moved by 5 mm, turned by 0.5 mrad and stamped 30 ms late."""
+def with_errors(observations: Observations) -> Observations:
+    """Station 2 displaced by 5 mm, rotated by 0.5 mrad and stamped 30 ms late."""
     moved = observations.frames.copy()
     moved[1, :3, :3] = exp_so3(np.array([3e-4, -1e-4, 4e-4])) @ moved[1, :3, :3]
     moved[1, :3, 3] += [0.003, -0.002, 0.0035]
@@ -89,17 +89,17 @@ def wrong(observations: Observations) -> Observations:
     return replace(observations, frames=moved, time_s=time_s).select(np.argsort(time_s, kind="stable"))
 
 
-def wandering(observations: Observations, *, sigma_s: float, piece_s: float, seed: int) -> Observations:
-    """Stamps of each station that are late by some time of its own in each stretch of a drive."""
+def with_wander(observations: Observations, *, sigma_s: float, piece_s: float, seed: int) -> Observations:
+    """Add a random latency of each station in each segment of a drive."""
     late_s = np.random.default_rng(seed).normal(0.0, sigma_s, (3, 100))
     time_s = observations.time_s + late_s[observations.station, (observations.time_s // piece_s).astype(int)]
     return replace(observations, time_s=time_s).select(np.argsort(time_s, kind="stable"))
 
 
-def surprise(
+def calibration_error(
     found_from: Observations, known: SetupPrior, start: Setup | None = None
 ) -> tuple[float, int, FloatArray]:
-    """Squared distance of a result from the truth in its own sigmas, how many unknowns, error at the robot in m."""
+    """NEES of a result, its degrees of freedom, and the error at the robot in m."""
     found = calibrate_motion(found_from, known, start=start, prior=PRIOR, noise_scale=1.0)
     true = Setup(frames(), np.array([0.0, 0.03, 0.0]), LAYOUT)
     error = found.parameters.local_coordinates(found.setup) - found.parameters.local_coordinates(true)
@@ -107,25 +107,27 @@ def surprise(
     return float(error @ np.linalg.solve(found.covariance, error)), len(error), missed
 
 
-def test_a_wrong_frame_and_latency_come_back_within_their_uncertainty() -> None:
+def test_frame_and_latency_errors_are_recovered() -> None:
     """5 mm, 0.5 mrad and 30 ms are found to 1 mm at the robot; chi squared is in its 99.9 % band."""
-    distance, unknowns, missed_m = surprise(wrong(drive()), REFINE)
+    distance, unknowns, missed_m = calibration_error(with_errors(drive()), REFINE)
     assert unknowns == 14
     assert distance < 36.1
     assert np.linalg.norm(missed_m, axis=1).max() < 1e-3
 
 
-def test_uncertainties_are_neither_too_small_nor_too_large() -> None:
-    """Over eight drives the mean of chi squared stays in its 99 % band about the number of unknowns."""
-    distances = [surprise(wrong(drive(60.0, seed=seed)), REFINE)[0] for seed in range(8)]
+def test_covariance_is_consistent() -> None:
+    """Over eight drives the mean of chi squared stays in its 99 % band."""
+    distances = [calibration_error(with_errors(drive(60.0, seed=seed)), REFINE)[0] for seed in range(8)]
     assert 9.6 < np.mean(distances) < 19.3
 
 
-def test_stamps_that_wander_are_found_and_allowed_for() -> None:
-    """Where stamps wander by 3 ms every 40 s, that is found, and chi squared is as with white noise: in its 99 % band."""
+def test_wander_is_estimated_and_included() -> None:
+    """Timestamps that wander by 3 ms every 40 s are found, and chi squared stays in its 99 % band."""
     distances, wander_s = [], []
     for seed in range(2):
-        observations = wandering(wrong(drive(160.0, seed=seed)), sigma_s=3e-3, piece_s=40.0, seed=seed)
+        observations = with_wander(
+            with_errors(drive(160.0, seed=seed)), sigma_s=3e-3, piece_s=40.0, seed=seed
+        )
         found = calibrate_motion(observations, REFINE, prior=PRIOR, noise_scale=1.0)
         true = Setup(frames(), np.array([0.0, 0.03, 0.0]), LAYOUT)
         error = found.parameters.local_coordinates(found.setup) - found.parameters.local_coordinates(true)
@@ -135,14 +137,14 @@ def test_stamps_that_wander_are_found_and_allowed_for() -> None:
     assert 6.2 < np.mean(distances) < 25.5
 
 
-def test_stamps_that_do_not_wander_are_not_said_to() -> None:
+def test_no_wander_in_white_noise() -> None:
     """Less than half a millisecond is found in white noise."""
     assert calibrate_motion(drive(), REFINE, prior=PRIOR, noise_scale=1.0).wander_s < 5e-4
 
 
-def test_a_silence_of_all_stations_does_no_harm() -> None:
-    """Nothing is carried over half a minute without measurements: both sides of it agree."""
-    observations = wrong(drive())
+def test_gap_of_all_stations() -> None:
+    """Half a minute without measurements splits the segments; both sides agree."""
+    observations = with_errors(drive())
     heard = observations.select((observations.time_s < 20.0) | (observations.time_s > 52.0))
     found = calibrate_motion(heard, REFINE, prior=PRIOR, noise_scale=1.0)
     assert found.measurements == len(heard)
@@ -151,7 +153,7 @@ def test_a_silence_of_all_stations_does_no_harm() -> None:
 
 
 def test_levelled_stations_have_four_degrees_of_freedom() -> None:
-    """Tilts are not touched, and what is found is as certain or better."""
+    """Tilts are unchanged, and the result is as certain or better."""
     observations = drive()
     free = calibrate_motion(observations, REFINE, prior=PRIOR, noise_scale=1.0)
     level = calibrate_motion(observations, replace(REFINE, levelled=True), prior=PRIOR, noise_scale=1.0)
@@ -162,19 +164,19 @@ def test_levelled_stations_have_four_degrees_of_freedom() -> None:
     assert np.all(np.diag(level.covariance)[at] < 1.05 * np.diag(free.covariance)[same])
 
 
-def test_frames_come_from_nothing_but_the_motion() -> None:
-    """Whatever frames stood there, the rough ones are good to decimetres and the fine ones within their uncertainty."""
-    observations = wrong(drive())
+def test_frames_without_initial_frames() -> None:
+    """Initial frames are good to decimetres, final ones within their covariance."""
+    observations = with_errors(drive())
     observations = replace(observations, frames=np.tile(np.eye(4), (3, 1, 1)))
     rough = frames_from_motion(observations)
     assert np.abs(rough[:, :3, 3] - frames()[:, :3, 3]).max() < 0.3
-    distance, _, missed_m = surprise(observations, FROM_NOTHING, Setup(rough, np.zeros(3), LAYOUT))
+    distance, _, missed_m = calibration_error(observations, FROM_NOTHING, Setup(rough, np.zeros(3), LAYOUT))
     assert distance < 36.1
     assert np.linalg.norm(missed_m, axis=1).max() < 1e-3
 
 
-def test_prisms_are_found_against_each_other() -> None:
-    """A prism that sits 4 mm off is found; where the robot's origin is stays as it was."""
+def test_prism_layout_is_calibrated() -> None:
+    """A prism displaced by 4 mm is found; the robot's origin is unchanged."""
     observations = drive()
     shifted = LAYOUT.copy()
     shifted[2] += [0.004, 0.0, 0.0]
@@ -188,8 +190,8 @@ def test_prisms_are_found_against_each_other() -> None:
 
 
 @pytest.mark.parametrize("levelled", [False, True])
-def test_derivatives_are_exact(levelled: bool) -> None:  # noqa: FBT001
-    """Each unknown moves the residuals as its derivative says."""
+def test_setup_jacobian_is_exact(levelled: bool) -> None:  # noqa: FBT001
+    """Each parameter's derivative equals central differences."""
     known = SetupPrior(
         translation_sigma_m=1.0,
         rotation_sigma_rad=1.0,
@@ -220,8 +222,8 @@ def test_derivatives_are_exact(levelled: bool) -> None:  # noqa: FBT001
         assert exact[:, :, unknown] == pytest.approx((residuals[0] - residuals[1]) / 2e-6, abs=1e-6)
 
 
-def test_what_a_straight_drive_does_not_tell_is_named() -> None:
-    """Driving straight on level ground leaves turns about the way open; winding about leaves nothing open."""
+def test_straight_drive_is_unobservable() -> None:
+    """Driving straight on level ground leaves rotations about the path unobservable; a winding path leaves none."""
     straight = calibrate_motion(drive(30.0, straight=True), REFINE, prior=PRIOR, noise_scale=1.0)
     sentences = [direction.description for direction in unobservable_directions(straight)]
     assert any(
@@ -232,25 +234,25 @@ def test_what_a_straight_drive_does_not_tell_is_named() -> None:
 
 
 def test_station_1_is_needed() -> None:
-    """Frames and latencies are those beside station 1."""
+    """Frames and latencies are relative to station 1."""
     observations = drive(20.0)
     with pytest.raises(GeometryError, match="station 1 has measured nothing"):
         calibrate_motion(observations.select(observations.station > 0), REFINE, prior=PRIOR)
 
 
-def test_something_must_be_unknown() -> None:
-    """With everything held there is nothing to do."""
+def test_nothing_to_estimate_is_rejected() -> None:
+    """With everything fixed there is nothing to estimate."""
     with pytest.raises(GeometryError, match="nothing to estimate"):
         calibrate_motion(drive(20.0), SetupPrior(), prior=PRIOR)
 
 
-def test_a_robot_that_stands_does_not_tell_frames() -> None:
-    """Without a way there is nothing to lay over."""
+def test_stationary_robot_is_rejected() -> None:
+    """Without motion there is nothing to align."""
     with pytest.raises(GeometryError, match="no further than"):
         frames_from_motion(drive(20.0, still=True))
 
 
-def test_stations_that_measured_at_different_times_have_no_common_way() -> None:
+def test_tracks_without_common_epochs_are_rejected() -> None:
     """Two stations need ten seconds in common."""
     observations = drive(40.0)
     apart = (observations.station != 1) == (observations.time_s < 30.0)

@@ -1,4 +1,4 @@
-"""Frames from points in two of them: optimum, covariance, bad points, weak axes, levelled stations, prisms."""
+"""Frames from points in two of them: optimum, covariance, outliers, weak axes, levelled stations, prisms."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ FREE_OF = {True: [0, 1, 2, 5], False: [0, 1, 2, 3, 4, 5]}
 
 @dataclass
 class Field:
-    """Two stations that measure points; station 2 stands at ``T``."""
+    """Two stations that measure points; station 2 is at ``T``."""
 
     points_m: FloatArray
     T: FloatArray
@@ -65,17 +65,17 @@ class Field:
 
 
 def field(points_m: FloatArray = AROUND, T: FloatArray = T_1_2, seed: int = 1) -> Field:
-    """Build a field with its own random numbers."""
+    """Make a field with its own random numbers."""
     return Field(points_m, T, np.random.default_rng(seed))
 
 
 def error_of(T: FloatArray, truth: FloatArray) -> FloatArray:
-    """Error as the covariance means it: T_true = [exp(dtheta) R | t + dt]."""
+    """Error in the sense of the covariance: T_true = [exp(dtheta) R|t + dt]."""
     return np.concatenate([truth[:3, 3] - T[:3, 3], log_so3(truth[:3, :3] @ T[:3, :3].T)])
 
 
-def test_the_unweighted_frame_is_the_alignment_of_arun() -> None:
-    """Without weights the frame is Arun's solution itself."""
+def test_unweighted_frame_is_arun() -> None:
+    """Without weights the frame is Arun's solution."""
     source, target = field().measure()
     solved = calibrate_frame(source, target, weighted=False)
     arun = align(source.points_m, target.points_m)
@@ -84,8 +84,8 @@ def test_the_unweighted_frame_is_the_alignment_of_arun() -> None:
 
 
 @pytest.mark.parametrize(("weighted", "levelled"), list(product([True, False], repeat=2)))
-def test_the_frame_is_the_least_squares_optimum(*, weighted: bool, levelled: bool) -> None:
-    """A general optimiser with its own rotation parameters finds no better frame."""
+def test_frame_is_the_least_squares_optimum(*, weighted: bool, levelled: bool) -> None:
+    """A general optimiser finds no better frame."""
     source, target = field().measure()
     solved = calibrate_frame(source, target, weighted=weighted, levelled=levelled)
     noise = T_1_2[:3, :3] @ source.covariances_m2 @ T_1_2[:3, :3].T + target.covariances_m2
@@ -105,8 +105,8 @@ def test_the_frame_is_the_least_squares_optimum(*, weighted: bool, levelled: boo
 
 
 @pytest.mark.parametrize(("weighted", "levelled"), list(product([True, False], repeat=2)))
-def test_the_covariance_is_that_of_the_errors(*, weighted: bool, levelled: bool) -> None:
-    """Over many simulated campaigns the normalised squared error averages its degrees of freedom (NEES)."""
+def test_nees_is_consistent(*, weighted: bool, levelled: bool) -> None:
+    """Over many simulated campaigns mean NEES equals the degrees of freedom."""
     simulated, free, nees = field(), FREE_OF[levelled], []
     for _ in range(400):
         fit = fit_frame(PointPairs(*simulated.measure(), levelled), weighted=weighted)
@@ -116,8 +116,8 @@ def test_the_covariance_is_that_of_the_errors(*, weighted: bool, levelled: bool)
     assert np.mean(nees) == pytest.approx(1.0, abs=3 * np.sqrt(2 / len(free) / 400))
 
 
-def test_weights_make_the_frame_better() -> None:
-    """With the weights of the noise model position errors are smaller than without, on average."""
+def test_weights_reduce_errors() -> None:
+    """With the noise model's weights position errors are smaller on average."""
     simulated = field()
     errors: dict[bool, list[float]] = {True: [], False: []}
     for _ in range(200):
@@ -128,8 +128,8 @@ def test_weights_make_the_frame_better() -> None:
     assert np.mean(errors[True]) < 0.9 * np.mean(errors[False])
 
 
-def test_leave_one_out_is_the_miss_from_a_frame_without_the_point() -> None:
-    """Each leave-one-out figure equals what a calibration without that point makes of it."""
+def test_leave_one_out_equals_calibration_without_the_point() -> None:
+    """Each leave-one-out figure is the prediction error of a calibration without that point."""
     source, target = field().measure()
     solved = calibrate_frame(source, target)
     others = [1, 2, 4, 5, 6]
@@ -139,7 +139,7 @@ def test_leave_one_out_is_the_miss_from_a_frame_without_the_point() -> None:
 
 
 def test_good_points_are_not_rejected() -> None:
-    """In a hundred clean campaigns nothing is rejected and nothing called contradictory."""
+    """In a hundred clean campaigns no point is rejected and none is inconsistent."""
     simulated = field()
     solved = [calibrate_frame(*simulated.measure()) for _ in range(100)]
     assert all(frame.consistent and not frame.rejected for frame in solved)
@@ -147,7 +147,7 @@ def test_good_points_are_not_rejected() -> None:
 
 @pytest.mark.parametrize("number", range(1, 7))
 @pytest.mark.parametrize("extra_m", [0.05, -0.05])
-def test_a_bad_point_is_named(number: int, extra_m: float) -> None:
+def test_single_outlier_is_rejected(number: int, extra_m: float) -> None:
     """A distance that is 50 mm wrong is rejected, and the frame is that of the other points."""
     solved = calibrate_frame(*field().measure({number: extra_m}))
     assert [point.name for point in solved.rejected] == [number]
@@ -157,35 +157,35 @@ def test_a_bad_point_is_named(number: int, extra_m: float) -> None:
     assert solved.consistent
 
 
-def test_two_bad_points_are_named() -> None:
-    """Two bad points of eight are found one after the other."""
+def test_two_outliers_are_rejected() -> None:
+    """Two outliers of eight are found one after the other."""
     points = np.vstack([AROUND, [[22, -12, 0.5], [-25, -3, 0.8]]])
     solved = calibrate_frame(*field(points).measure({1: 0.05, 4: -0.08}))
     assert {point.name for point in solved.rejected} == {1, 4}
 
 
-def test_a_bad_point_of_four_is_noticed_but_not_named() -> None:
-    """With four points a contradiction cannot be pinned on one: nothing is rejected, the set is contradictory."""
+def test_outlier_of_four_points_is_inconsistent() -> None:
+    """With four points the outlier cannot be identified: nothing is rejected, the set is inconsistent."""
     solved = calibrate_frame(*field(AROUND[:4]).measure({2: 0.05}))
     assert solved.rejected == ()
     assert not solved.consistent
 
 
-def test_three_contradictory_points_are_noticed() -> None:
-    """Three points are exactly what a frame needs, but their mutual distances still check them."""
+def test_three_inconsistent_points_are_detected() -> None:
+    """Three points determine a frame, but their distances are still checked."""
     assert calibrate_frame(*field(AROUND[:3]).measure()).consistent
     assert not calibrate_frame(*field(AROUND[:3]).measure({2: 0.1})).consistent
 
 
-def test_too_many_bad_points_are_not_guessed_at() -> None:
-    """Where half of the points are bad nothing is rejected."""
+def test_too_many_outliers_are_inconsistent() -> None:
+    """Where half of the points are outliers nothing is rejected."""
     solved = calibrate_frame(*field().measure({1: 0.05, 3: -0.08, 5: 0.3}))
     assert solved.rejected == ()
     assert not solved.consistent
 
 
-def test_an_error_that_a_wrong_constant_can_make_is_not_a_bad_point() -> None:
-    """A target 8 mm off stays in even where the noise is said to be 0.1 mm; a stricter limit rejects it."""
+def test_error_below_the_blunder_limit_is_kept() -> None:
+    """A target 8 mm off is kept at any stated noise; a stricter limit rejects it."""
     covariances = np.tile(1e-8 * np.eye(3), (len(AROUND), 1, 1))
     target = PointSet((1, 2, 3, 4, 5, 6), AROUND, covariances)
     source = PointSet(target.names, AROUND + np.outer([0, 0, 1, 0, 0, 0], [0, 0, 0.008]), covariances)
@@ -201,8 +201,8 @@ def test_points_all_around_are_not_weak() -> None:
 
 
 @pytest.mark.parametrize("aside_m", [0.0, 0.01, 0.2, 1.0])
-def test_points_nearly_in_a_line_are_weak_about_that_line(aside_m: float) -> None:
-    """The weak axis is the line through the points, towards them, and its sigma is about noise over offset."""
+def test_nearly_collinear_points_are_weak_about_their_line(aside_m: float) -> None:
+    """The weak axis is the line through the points, towards them; its sigma is about noise over offset."""
     points = IN_LINE + np.outer([0, aside_m, 0, 0], [0.6, 0.8, 0.0])
     solved = calibrate_frame(*field(points).measure())
     (weak,) = solved.weak
@@ -213,8 +213,8 @@ def test_points_nearly_in_a_line_are_weak_about_that_line(aside_m: float) -> Non
         assert 0.3e-3 < weak.sigma_rad * aside_m < 3e-3
 
 
-def test_a_contradiction_is_not_seen_where_the_others_do_not_hold_the_point() -> None:
-    """Of four points, the one beside a line of three cannot be predicted, so that it cannot be suspected."""
+def test_unpredictable_point_is_not_suspected() -> None:
+    """Of four points, the one beside a line of three cannot be predicted."""
     points = IN_LINE + np.outer([0, 2.0, 0, 0], [0.6, 0.8, 0.0])
     solved = [calibrate_frame(*field(points, seed=seed).measure()) for seed in range(20)]
     assert all(frame.consistent for frame in solved)
@@ -230,8 +230,8 @@ def test_levelled_stations_keep_the_vertical() -> None:
     assert not solved.covariance[:, 3:5].any()
 
 
-def test_levelling_helps_where_it_is_true() -> None:
-    """With exact levelling the constrained frame is no worse in the mean, and a line of targets is not weak."""
+def test_levelling_reduces_errors_of_level_stations() -> None:
+    """With exact levelling the constrained frame is better on average, and collinear targets are not weak."""
     simulated = field(IN_LINE + np.outer([0, 0.2, 0, 0], [0.6, 0.8, 0.0]))
     errors: dict[bool, list[float]] = {True: [], False: []}
     for _ in range(20):
@@ -243,15 +243,15 @@ def test_levelling_helps_where_it_is_true() -> None:
     assert np.mean(errors[True]) < np.mean(errors[False])
 
 
-def test_a_station_that_is_not_level_contradicts_the_levelled_solution() -> None:
-    """A tilt of 3 mrad is noticed when levelled stations were promised."""
+def test_tilted_station_is_inconsistent_when_levelled() -> None:
+    """A tilt of 3 mrad is detected."""
     measured = field(T=TILTED).measure()
     assert calibrate_frame(*measured).consistent
     assert not calibrate_frame(*measured, levelled=True).consistent
 
 
 @pytest.mark.parametrize("levelled", [True, False])
-def test_fewer_than_three_common_points_are_refused(*, levelled: bool) -> None:
+def test_fewer_than_three_common_points_are_rejected(*, levelled: bool) -> None:
     """The error says how many there are and which."""
     source, target = field().measure()
     with pytest.raises(DegenerateGeometryError, match=r"at least 3 .* got 2 \(1, 4\)"):
@@ -265,14 +265,14 @@ def exact(points_m: FloatArray) -> tuple[PointSet, PointSet]:
     return points, points
 
 
-def test_points_exactly_in_a_line_are_refused() -> None:
-    """No rotation about the line follows from them."""
+def test_collinear_points_are_rejected() -> None:
+    """The rotation about the line is undetermined."""
     with pytest.raises(DegenerateGeometryError, match="in a line"):
         calibrate_frame(*exact(IN_LINE))
 
 
-def test_points_above_one_another_are_refused_for_levelled_stations() -> None:
-    """No heading follows from them."""
+def test_vertically_aligned_points_are_rejected_when_levelled() -> None:
+    """The heading is undetermined."""
     with pytest.raises(DegenerateGeometryError, match="horizontal spread"):
         calibrate_frame(*exact(np.array([[5.0, 5.0, 0.0], [5.0, 5.0, 1.0], [5.0, 5.0, 3.0]])), levelled=True)
 
@@ -285,15 +285,15 @@ def test_points_above_one_another_are_refused_for_levelled_stations() -> None:
         ((1, 2, 3), np.full((3, 3), np.nan), np.zeros((3, 3, 3)), "NaN"),
     ],
 )
-def test_malformed_point_sets_are_refused(
+def test_malformed_point_sets_are_rejected(
     names: tuple[int, ...], points_m: FloatArray, covariances_m2: FloatArray, message: str
 ) -> None:
-    """Repeated names, wrong shapes and NaN do not get in."""
+    """Repeated names, wrong shapes and NaN raise an error."""
     with pytest.raises(GeometryError, match=message):
         PointSet(names, points_m, covariances_m2)
 
 
-def test_points_without_noise_are_refused() -> None:
+def test_points_without_noise_are_rejected() -> None:
     """A singular covariance cannot be a weight."""
     points, _ = exact(AROUND)
     noiseless = PointSet(points.names, points.points_m, np.zeros((6, 3, 3)))
@@ -307,7 +307,7 @@ T_STATION_ROBOT = transform_from(exp_so3(np.array([0.01, -0.02, 2.4])), np.array
 
 
 def measured_robot(rng: np.random.Generator, bad_m: float = 0.0) -> tuple[PointSet, PointSet, PointSet]:
-    """Body points as measured (the second one off by so much), the same from CAD, and the prisms as measured."""
+    """Body points as measured (the second one off by ``bad_m``), the same from CAD, and the prisms as measured."""
     cad_noise = np.tile(1e-6 * np.eye(3), (len(BODY), 1, 1))
     sets = []
     for points in (BODY + 1e-3 * rng.standard_normal(BODY.shape), PRISMS):
@@ -319,7 +319,7 @@ def measured_robot(rng: np.random.Generator, bad_m: float = 0.0) -> tuple[PointS
     return sets[0], PointSet(sets[0].names, BODY, cad_noise), sets[1]
 
 
-def test_prisms_are_found_in_the_robot_frame_within_their_covariance() -> None:
+def test_prism_nees_is_consistent() -> None:
     """The normalised squared errors of the prisms average their three degrees of freedom."""
     rng = np.random.default_rng(1)
     nees = []
@@ -330,8 +330,8 @@ def test_prisms_are_found_in_the_robot_frame_within_their_covariance() -> None:
     assert np.mean(nees) == pytest.approx(1.0, abs=0.25)
 
 
-def test_a_body_point_that_is_not_where_cad_has_it_is_named() -> None:
-    """A body point 20 mm off is rejected and the prisms are none the worse."""
+def test_wrong_body_point_is_rejected() -> None:
+    """A body point 20 mm off is rejected and the prisms are unaffected."""
     solved = calibrate_prisms(*measured_robot(np.random.default_rng(1), bad_m=0.02))
     assert [point.name for point in solved.body.rejected] == [1]
     np.testing.assert_allclose(solved.prisms.points_m, PRISMS, atol=0.006)

@@ -1,4 +1,4 @@
-"""Wandering time stamps as random effects: against the same thing written out."""
+"""Timestamp drift as a random effect: against dense formulas."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from tsgt.geometry.calibration.timestamp_drift import SegmentInformation, elimin
 LATENCIES = np.array([3, 4])
 
 
-def part(rng: np.random.Generator, *, unknowns: int = 5, size: float = 1.0) -> SegmentInformation:
-    """Return what some piece might tell."""
+def random_segment(rng: np.random.Generator, *, unknowns: int = 5, size: float = 1.0) -> SegmentInformation:
+    """Random information of one segment."""
     rows = size * rng.normal(size=(8, unknowns))
     return SegmentInformation(rows.T @ rows, size * rng.normal(size=unknowns))
 
 
-def test_eliminating_is_the_same_as_noise_on_the_latencies() -> None:
-    """What is left knows the unknowns as well as before, but for times late beside station 1, which wanders as well."""
-    some = part(np.random.default_rng(0))
+def test_elimination_equals_noise_on_the_latencies() -> None:
+    """The posterior covariance grows by the wander's, correlated by station 1; the optimum of the segment stays."""
+    some = random_segment(np.random.default_rng(0))
     wander_s = 0.7
     left = eliminate_wander(some, LATENCIES, wander_s).segment
     noise = np.zeros((5, 5))
@@ -31,9 +31,9 @@ def test_eliminating_is_the_same_as_noise_on_the_latencies() -> None:
     )
 
 
-def test_the_gain_is_what_the_best_times_gain() -> None:
-    """Half the cost falls by what the most probable times late, with what they cost themselves, take away."""
-    some = part(np.random.default_rng(1))
+def test_cost_reduction_is_that_of_the_optimal_latencies() -> None:
+    """Half the cost falls by what the most probable latencies gain, minus their prior's cost."""
+    some = random_segment(np.random.default_rng(1))
     known = np.linalg.inv(0.25 * np.array([[2.0, 1.0], [1.0, 2.0]]))
     normal = known + some.information[np.ix_(LATENCIES, LATENCIES)]
     best = -np.linalg.solve(normal, some.gradient[LATENCIES])
@@ -42,12 +42,12 @@ def test_the_gain_is_what_the_best_times_gain() -> None:
     )
 
 
-def test_the_size_is_found_without_bias() -> None:
-    """The size of random latencies in many pieces comes back to a tenth, whatever else is unknown."""
+def test_wander_estimate_is_unbiased() -> None:
+    """The sigma of random latencies in many segments is recovered within a tenth."""
     rng = np.random.default_rng(2)
     parts = []
     for _ in range(300):
-        information = part(rng, size=300.0).information
+        information = random_segment(rng, size=300.0).information
         late = np.zeros(5)
         late[3:] = 0.01 * (rng.normal(size=2) - rng.normal())
         noise = np.linalg.cholesky(information) @ rng.normal(size=5)
@@ -57,9 +57,9 @@ def test_the_size_is_found_without_bias() -> None:
 
 
 @pytest.mark.parametrize("latencies", [LATENCIES, LATENCIES[:0]])
-def test_without_evidence_nothing_wanders(latencies: np.ndarray) -> None:
-    """Pieces that agree to the digit, or latencies that are held, say nothing of wandering."""
-    some = part(np.random.default_rng(3))._replace(gradient=np.zeros(5))
+def test_no_wander_without_evidence(latencies: np.ndarray) -> None:
+    """Consistent segments, or fixed latencies, give zero."""
+    some = random_segment(np.random.default_rng(3))._replace(gradient=np.zeros(5))
     known = SegmentInformation(np.eye(5), np.zeros(5))
     assert estimate_wander_s([some] * 5, known, latencies) == 0.0
     assert estimate_wander_s([some], known, latencies) == 0.0

@@ -1,4 +1,4 @@
-"""A whole recording: in pieces as in one, with what it says of its measurements."""
+"""Batch fit of a recording: segments, outliers, tuning."""
 
 from __future__ import annotations
 
@@ -23,13 +23,15 @@ PRIOR = MotionPrior()
 
 @pytest.fixture(scope="module")
 def observations() -> Observations:
-    """Measure eighty seconds of a robot, some 600 measurements."""
+    """Eighty seconds of a robot, some 600 measurements."""
     motion = draw_motions(PRIOR, count=1, duration_s=81.0, seed=21)[0]
     return sorted_by_time(measure(motion, until_s=80.0, seed=22))
 
 
-def test_pieces_give_what_one_gives(observations: Observations, monkeypatch: pytest.MonkeyPatch) -> None:
-    """States to a hundredth of a millimetre, covariances to a thousandth of theirs, measurements in their order."""
+def test_segments_agree_with_one_solution(
+    observations: Observations, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """States to a hundredth of a millimetre, covariances to a thousandth of theirs."""
     whole = fit_trajectory(observations, prior=PRIOR, noise_scale=1.0)
     monkeypatch.setattr("tsgt.geometry.trajectory.batch.KNOTS_PER_SEGMENT", 150)
     monkeypatch.setattr("tsgt.geometry.trajectory.batch.OVERLAP_KNOTS", 80)
@@ -46,8 +48,8 @@ def test_pieces_give_what_one_gives(observations: Observations, monkeypatch: pyt
     np.testing.assert_allclose(pieces.residuals_m, whole.residuals_m, atol=1e-5)
 
 
-def test_outliers_are_known_by_their_weights(observations: Observations) -> None:
-    """Exactly the ones that are half a metre off count less than one."""
+def test_outliers_have_small_weights(observations: Observations) -> None:
+    """Exactly the measurements that are half a metre off get small weights."""
     points = observations.points_m.copy()
     spoilt = np.array([50, 200, 201, 420])
     points[spoilt] += 0.5
@@ -57,17 +59,15 @@ def test_outliers_are_known_by_their_weights(observations: Observations) -> None
     assert np.count_nonzero(found.weights < 0.5) == len(spoilt)
 
 
-def test_a_station_that_comes_late_is_no_reason_to_fail(observations: Observations) -> None:
-    """Where one prism is not measured for a minute, the rest carries on, and the covariance says how well."""
+def test_prism_missing_for_a_minute(observations: Observations) -> None:
+    """Without one prism the covariance is larger."""
     late = observations.select((observations.prism != 1) | (observations.time_s > 60.0))
     found = fit_trajectory(late, prior=PRIOR, noise_scale=1.0)
     _, covariance = found.trajectory.at(np.array([30.0, 70.0]))
     assert np.trace(covariance[0, 3:6, 3:6]) > 2 * np.trace(covariance[1, 3:6, 3:6])
 
 
-def test_progress_goes_from_nothing_to_all(
-    observations: Observations, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_progress_goes_from_zero_to_one(observations: Observations, monkeypatch: pytest.MonkeyPatch) -> None:
     """Shares rise to 1."""
     monkeypatch.setattr("tsgt.geometry.trajectory.batch.KNOTS_PER_SEGMENT", 200)
     shares: list[float] = []
@@ -77,21 +77,21 @@ def test_progress_goes_from_nothing_to_all(
     assert len(shares) > 3
 
 
-def test_what_is_not_given_is_found(observations: Observations) -> None:
-    """The noise's scale comes back as it was put in."""
+def test_noise_scale_is_tuned(observations: Observations) -> None:
+    """The noise scale is recovered."""
     found = fit_trajectory(replace(observations, sigmas_m=observations.sigmas_m / 3))
     assert found.noise_scale == pytest.approx(3.0, rel=0.15)
     assert found.squared_distances.mean() < 3.0
 
 
 def test_no_trajectory_without_three_prisms(observations: Observations) -> None:
-    """The message says how many were measured."""
+    """The error says how many prisms were measured."""
     with pytest.raises(GeometryError, match="3 prisms to begin with, 2 have been measured"):
         fit_trajectory(observations.select(observations.prism < 2), prior=PRIOR, noise_scale=1.0)
 
 
-def test_pieces_cover_all_knots_once() -> None:
-    """Whatever their number."""
+def test_segments_cover_all_knots_once() -> None:
+    """For any number of knots."""
     for count in (1, 2, 4096, 4097, 100_000):
         kept = [piece.kept for piece in fitting._segments(count)]
         assert (kept[0].start, kept[-1].stop) == (0, count)

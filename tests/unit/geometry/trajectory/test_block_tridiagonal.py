@@ -1,4 +1,4 @@
-"""Block tridiagonal systems against dense ones."""
+"""Block-tridiagonal systems against dense ones."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
 
 
-def made_up(count: int, size: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Give a positive definite matrix: blocks on its diagonal, right of it, and the whole."""
+def random_system(count: int, size: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Random positive definite matrix: blocks on and right of its diagonal, and dense."""
     rng = np.random.default_rng(count)
     root = np.zeros((count * size, count * size))
     for k in range(count):
@@ -33,9 +33,9 @@ SHAPES = [(1, 1), (1, 4), (2, 3), (7, 5), (30, 18)]
 
 
 @pytest.mark.parametrize(("count", "size"), SHAPES)
-def test_solutions_are_those_of_the_dense_system(count: int, size: int) -> None:
-    """One right hand side and several give what a dense solver gives."""
-    diagonal, off_diagonal, whole = made_up(count, size)
+def test_solve_agrees_with_dense(count: int, size: int) -> None:
+    """One and several right-hand sides."""
+    diagonal, off_diagonal, whole = random_system(count, size)
     factor = factorise(diagonal, off_diagonal)
     right = np.random.default_rng(0).normal(size=(count, size, 3))
     expected = np.linalg.solve(whole, right.reshape(-1, 3)).reshape(right.shape)
@@ -45,8 +45,8 @@ def test_solutions_are_those_of_the_dense_system(count: int, size: int) -> None:
 
 @pytest.mark.parametrize(("count", "size"), SHAPES)
 def test_marginals_are_blocks_of_the_inverse(count: int, size: int) -> None:
-    """Covariances and those of neighbours are the inverse's blocks."""
-    diagonal, off_diagonal, whole = made_up(count, size)
+    """Marginals and cross-covariances are the inverse's blocks."""
+    diagonal, off_diagonal, whole = random_system(count, size)
     own, next_to = factorise(diagonal, off_diagonal).marginals()
     inverse = np.linalg.inv(whole).reshape(count, size, count, size).transpose(0, 2, 1, 3)
     k = np.arange(count)
@@ -55,26 +55,26 @@ def test_marginals_are_blocks_of_the_inverse(count: int, size: int) -> None:
 
 
 @pytest.mark.parametrize(("count", "size"), SHAPES)
-def test_determinant(count: int, size: int) -> None:
-    """The determinant's logarithm is the dense one."""
-    diagonal, off_diagonal, whole = made_up(count, size)
+def test_log_determinant_agrees_with_dense(count: int, size: int) -> None:
+    """The log determinant equals the dense one."""
+    diagonal, off_diagonal, whole = random_system(count, size)
     assert factorise(diagonal, off_diagonal).log_determinant() == pytest.approx(
         np.linalg.slogdet(whole)[1], rel=1e-12
     )
 
 
-def test_upper_triangles_of_the_diagonal_are_not_looked_at() -> None:
-    """What stands above the diagonal of a block on it changes nothing."""
-    diagonal, off_diagonal, _ = made_up(4, 3)
+def test_upper_triangles_of_the_diagonal_are_ignored() -> None:
+    """Only the lower triangles of the diagonal blocks are read."""
+    diagonal, off_diagonal, _ = random_system(4, 3)
     changed = np.tril(diagonal)
     np.testing.assert_array_equal(
         factorise(changed, off_diagonal).banded, factorise(diagonal, off_diagonal).banded
     )
 
 
-def test_what_is_not_determined_is_an_error() -> None:
-    """A matrix that is not positive definite is refused in words."""
-    diagonal, off_diagonal, _ = made_up(4, 3)
+def test_singular_matrix_is_rejected() -> None:
+    """A matrix that is not positive definite raises an error."""
+    diagonal, off_diagonal, _ = random_system(4, 3)
     diagonal[2] = 0.0
     with pytest.raises(GeometryError, match="do not determine"):
         factorise(diagonal, off_diagonal)

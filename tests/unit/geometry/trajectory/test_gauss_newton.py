@@ -1,4 +1,4 @@
-"""The most probable trajectory against dense Gaussian-process regression and scipy's least squares; what goes wrong."""
+"""Maximum a posteriori trajectory against dense Gaussian-process regression and least squares; outliers; degenerate input."""
 
 from __future__ import annotations
 
@@ -53,18 +53,18 @@ MOTION = draw_motions(PRIOR, count=1, duration_s=8.0, seed=3)[0]
 
 @pytest.fixture(scope="module")
 def observations() -> Observations:
-    """Six seconds of a robot, three stations, exact stamps."""
+    """Six seconds of a robot, three stations, exact timestamps."""
     found = sorted_by_time(measure(MOTION, until_s=6.0, seed=4))
     return replace(found, time_sigma_s=np.zeros(len(found)))
 
 
 def guess_of(observations: Observations) -> States:
-    """Give the first guess at the knots of these measurements."""
+    """Return the initial guess at the knots of these measurements."""
     return initial_guess(observations, knot_times(observations.time_s))
 
 
-def a_point(time_s: FloatArray, x_m: FloatArray, sigma_m: float) -> Observations:
-    """Give measurements of the robot's origin itself, alike along all three axes: then only translation is measured."""
+def origin_measurements(time_s: FloatArray, x_m: FloatArray, sigma_m: float) -> Observations:
+    """Isotropic measurements of the robot's origin: only translation is observed."""
     count = len(time_s)
     return Observations(
         time_s=time_s,
@@ -80,13 +80,13 @@ def a_point(time_s: FloatArray, x_m: FloatArray, sigma_m: float) -> Observations
 
 
 def at_rest(time_s: FloatArray) -> States:
-    """Give a robot at the origin."""
+    """Return a robot at rest at the origin."""
     zero = np.zeros((len(time_s), 3))
     return States(time_s, zero, np.broadcast_to(np.eye(3), (len(time_s), 3, 3)), zero, zero, zero, zero)
 
 
 def dense_prior(time_s: FloatArray, first: FloatArray, time_constant_s: float, sigma: float) -> FloatArray:
-    """Joint covariance of one axis's three parts at all instants, (K, 3, K, 3), from that of the first, (3, 3)."""
+    """Joint covariance of one axis's states at all times, (K, 3, K, 3), from that of the first, (3, 3)."""
     count = len(time_s)
     joint = np.zeros((count, 3, count, 3))
     own = first
@@ -103,12 +103,12 @@ def dense_prior(time_s: FloatArray, first: FloatArray, time_constant_s: float, s
     return joint
 
 
-def test_translation_is_dense_gaussian_process_regression() -> None:
-    """Where only positions are measured, means, covariances and evidence are those of the textbook's dense formulas."""
+def test_translation_agrees_with_dense_regression() -> None:
+    """For position measurements, means, covariances and evidence equal dense Gaussian-process regression."""
     rng = np.random.default_rng(5)
     time_s = np.cumsum(rng.uniform(0.05, 0.6, 25))
     measured = np.sin(time_s) + rng.normal(scale=0.05, size=25)
-    data, sigma_m = a_point(time_s, measured, 0.05), 0.05
+    data, sigma_m = origin_measurements(time_s, measured, 0.05), 0.05
     priors = (
         PRIOR,
         replace(PRIOR, acceleration_sigma_mps2=(1.3, 1.3, 1.3), acceleration_correlation_time_s=0.3),
@@ -152,11 +152,8 @@ def test_translation_is_dense_gaussian_process_regression() -> None:
     assert evidence[1] - evidence[0] == pytest.approx(expected_evidence[1] - expected_evidence[0], abs=1e-5)
 
 
-def test_six_degrees_of_freedom_are_least_squares(observations: Observations) -> None:
-    """On polar measurements of a turning robot the states are those that scipy's least squares finds.
-
-    Its residuals are written out with the angles themselves.
-    """
+def test_pose_agrees_with_scipy_least_squares(observations: Observations) -> None:
+    """On polar measurements of a rotating robot the states are those of scipy's least squares on the angles themselves."""
     data = observations.select(observations.time_s < 1.0)
     start = guess_of(data)
     found = solve(data, start, PRIOR)
@@ -209,7 +206,7 @@ def test_six_degrees_of_freedom_are_least_squares(observations: Observations) ->
 
 
 def test_the_order_of_measurements_is_irrelevant(observations: Observations) -> None:
-    """Shuffled measurements give the same trajectory, and each its own distance and weight."""
+    """Shuffled measurements give the same trajectory, distances and weights."""
     start = guess_of(observations)
     order = np.random.default_rng(6).permutation(len(observations))
     found, shuffled = (solve(data, start, PRIOR) for data in (observations, observations.select(order)))
@@ -218,10 +215,10 @@ def test_the_order_of_measurements_is_irrelevant(observations: Observations) -> 
     assert shuffled.cost == pytest.approx(found.cost)
 
 
-def test_good_measurements_are_three_sigmas_squared_away_less_what_they_fit(
+def test_squared_distances_are_chi_square(
     observations: Observations,
 ) -> None:
-    """Distances have the expectation of a chi-square with three degrees of freedom, less the freedom of the fit."""
+    """Mean squared distance of 3 minus the share that the trajectory absorbs."""
     found = solve(observations, guess_of(observations), PRIOR)
     # The trajectory takes what it takes up: six numbers a time, every 0.4 s, of nine that are measured.
     assert 0.8 < found.squared_distances.mean() < 3.0
@@ -229,8 +226,8 @@ def test_good_measurements_are_three_sigmas_squared_away_less_what_they_fit(
 
 
 @pytest.mark.parametrize("miss_m", [0.1, 0.5, 30.0])
-def test_outliers_are_named(observations: Observations, miss_m: float) -> None:
-    """A reflection that is off by so much gets next to no weight, far off none; it alone does so, and bends nothing."""
+def test_single_outlier_is_downweighted(observations: Observations, miss_m: float) -> None:
+    """A reflection gets next to no weight, a distant one none; no other weight changes and the trajectory stays."""
     clean = solve(observations, guess_of(observations), PRIOR)
     wrong = len(observations) // 2
     points = observations.points_m.copy()
@@ -248,8 +245,8 @@ def test_outliers_are_named(observations: Observations, miss_m: float) -> None:
     assert np.linalg.norm(centroid - clean_centroid, axis=1).max() < 0.01
 
 
-def test_a_lock_on_the_wrong_prism_is_named(observations: Observations) -> None:
-    """Measurements of a neighbour's prism under the own number are outliers, and no others."""
+def test_wrong_prism_is_an_outlier(observations: Observations) -> None:
+    """Exactly the measurements of a neighbour's prism are outliers."""
     wrong = np.flatnonzero(observations.prism == 0)[4:7]
     truth = MOTION.select(rows_at(observations.time_s[wrong]))
     world = truth.position + truth.rotation @ LAYOUT[1]
@@ -262,8 +259,8 @@ def test_a_lock_on_the_wrong_prism_is_named(observations: Observations) -> None:
     np.testing.assert_array_equal(named, wrong)
 
 
-def test_a_station_that_stays_on_the_wrong_prism_turns_nothing() -> None:
-    """What two prisms do not tell is not told by many outliers together either: it stays as uncertain as without them."""
+def test_station_on_the_wrong_prism_adds_no_information() -> None:
+    """Many rejected outliers leave the unobserved rotation as uncertain as without them."""
     (motion,) = draw_motions(PRIOR, count=1, duration_s=8.0, seed=4)
     observations = sorted_by_time(measure(motion, until_s=6.0, seed=4))
     wrong = (observations.prism == 0) & (observations.time_s > 3.0)
@@ -286,16 +283,16 @@ def test_a_station_that_stays_on_the_wrong_prism_turns_nothing() -> None:
     assert worst == pytest.approx(expected_worst, rel=0.1)
 
 
-def test_a_solution_from_points_is_near_that_from_polar_ones(observations: Observations) -> None:
-    """Cartesian points, whose noise is known less well, put the robot within millimetres of the same place."""
+def test_cartesian_solution_is_close_to_polar(observations: Observations) -> None:
+    """Cartesian points give the same positions within millimetres."""
     found = solve(observations, guess_of(observations), PRIOR)
     of_points = solve(as_cartesian(observations), guess_of(observations), PRIOR)
     miss = of_points.knots.position - found.knots.position
     assert np.sqrt((miss**2).sum(axis=1).mean()) < 2 * SIGMAS_M[0]
 
 
-def test_a_bad_start_still_finds_it(observations: Observations) -> None:
-    """From metres and tens of degrees away it comes to the same trajectory, with the same covariances."""
+def test_converges_from_a_bad_guess(observations: Observations) -> None:
+    """From metres and tens of degrees away it converges to the same trajectory and covariances."""
     start = guess_of(observations)
     rng = np.random.default_rng(7)
     error = np.zeros((len(start), STATE_DIM))
@@ -310,8 +307,8 @@ def test_a_bad_start_still_finds_it(observations: Observations) -> None:
 
 
 @pytest.mark.parametrize("most", [0, 1, 2, 3])
-def test_covariances_are_never_damped(observations: Observations, most: int) -> None:
-    """Wherever the search is cut short, the covariances are those of the system there, without the search's damping."""
+def test_covariance_is_that_of_the_last_linearisation(observations: Observations, most: int) -> None:
+    """Wherever the search is cut short, the covariance is the inverse of the normal equations there."""
     start = guess_of(observations)
     rng = np.random.default_rng(8)
     error = np.zeros((len(start), STATE_DIM))
@@ -323,14 +320,14 @@ def test_covariances_are_never_damped(observations: Observations, most: int) -> 
     np.testing.assert_allclose(there.factor.banded, cut.factor.banded, rtol=1e-9, atol=1e-9)
 
 
-def test_two_prisms_are_not_enough_to_begin_with(observations: Observations) -> None:
-    """Measurements of two prisms alone are refused, and the message says how many there are."""
+def test_two_prisms_are_rejected(observations: Observations) -> None:
+    """The error says how many prisms were measured."""
     with pytest.raises(GeometryError, match=r"3 prisms.*2 have been measured"):
         guess_of(observations.select(observations.prism != 2))
 
 
-def test_prisms_in_one_place_are_refused(observations: Observations) -> None:
-    """Three stations that all track one prism give no attitude, and the message asks which station tracks which."""
+def test_coincident_prisms_are_rejected(observations: Observations) -> None:
+    """Three stations on one prism determine no attitude; the error asks which station tracks which."""
     points = observations.points_m.copy()
     for station in range(3):
         rows = observations.station == station
@@ -339,16 +336,16 @@ def test_prisms_in_one_place_are_refused(observations: Observations) -> None:
         guess_of(replace(observations, points_m=points))
 
 
-def test_what_nothing_determines_is_an_error(observations: Observations) -> None:
-    """Without any knowledge of the first state and with one measurement there is no trajectory."""
+def test_underdetermined_trajectory_is_rejected(observations: Observations) -> None:
+    """Without an anchor prior and with one measurement there is no trajectory."""
     start = guess_of(observations)
     nothing = AnchorPrior(start.select(slice(0, 1)), np.zeros((STATE_DIM, STATE_DIM)))
     with pytest.raises(GeometryError, match="do not determine the trajectory"):
         solve(observations.select(slice(0, 1)), start, PRIOR, anchor=nothing)
 
 
-def test_one_visible_prism_leaves_a_covariance_that_says_so(observations: Observations) -> None:
-    """When two of three prisms vanish the attitude becomes uncertain, faster than the place of the prism still seen."""
+def test_single_prism_increases_rotation_covariance(observations: Observations) -> None:
+    """With one prism left the rotation becomes uncertain, faster than the prism's position."""
     data = observations.select((observations.time_s < 2.0) | (observations.prism == 0))
     start = initial_guess(data, knot_times(data.time_s))
     diagonal, _ = solve(data, start, PRIOR).factor.marginals()
@@ -364,8 +361,8 @@ def test_one_visible_prism_leaves_a_covariance_that_says_so(observations: Observ
 
 
 @pytest.mark.parametrize("rate_radps", [0.0, 1.5, 2.5])
-def test_a_robot_that_turns_fast_while_one_prism_is_seen_is_not_lost(rate_radps: float) -> None:
-    """The first guess turns on where two prisms are not seen, and puts the robot where the third one is."""
+def test_fast_rotation_with_one_prism_is_tracked(rate_radps: float) -> None:
+    """The initial guess extrapolates the rotation and takes the position from the observed prism."""
     time_s = np.arange(round(8.0 / STEP_S) + 1, dtype=np.float64) * STEP_S
     still = np.zeros((len(time_s), 3))
     velocity, rates = (np.tile(v, (len(time_s), 1)) for v in ([0.8, -0.5, 0.0], [0.3, 0.0, rate_radps]))
@@ -389,14 +386,14 @@ def test_a_robot_that_turns_fast_while_one_prism_is_seen_is_not_lost(rate_radps:
     assert np.linalg.norm(found.knots.local_coordinates_about(truth)[:, 3:6], axis=1).max() < 0.1
 
 
-def test_knots_stand_at_measurements() -> None:
-    """One measurement alone has its knot at its instant; those within the least step share one at their mean."""
+def test_knots_are_at_measurement_times() -> None:
+    """A single measurement has its knot at its time; close ones share a knot at their mean."""
     times = knot_times(np.array([1.0, 1.2, 1.2 + 0.3 * MIN_KNOT_SPACING_S, 3.3]))
     np.testing.assert_allclose(times, [1.0, 1.2 + 0.15 * MIN_KNOT_SPACING_S, 3.3])
 
 
-def test_knots_are_apart_and_near() -> None:
-    """However measurements fall, knots keep a distance and every measurement has one within the least step."""
+def test_knots_are_spaced_and_near() -> None:
+    """Knots keep the minimum spacing, and every measurement has one nearby."""
     time_s = np.sort(np.random.default_rng(9).uniform(0, 20, 2000))
     times = knot_times(time_s)
     assert np.diff(times).min() > 0.2 * MIN_KNOT_SPACING_S

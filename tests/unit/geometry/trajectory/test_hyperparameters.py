@@ -1,16 +1,23 @@
-"""What a drive has not shown: how lively a robot is taken to be, when it is hidden, and a bend that nobody saw."""
+"""Hyperparameters: maximum-evidence tuning, process-noise floor and occlusion."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pytest
-from harness.prior_motion import STEP_S, measure, rows_at, sorted_by_time
+from harness.prior_motion import STEP_S, draw_motions, measure, rows_at, sorted_by_time
 
+from tsgt.errors import GeometryError
 from tsgt.geometry import States, exp_so3, log_so3
-from tsgt.geometry.trajectory import fit_trajectory, with_noise_floor
-from tsgt.geometry.trajectory.hyperparameters import partially_occluded
+from tsgt.geometry.trajectory import fit_trajectory, hyperparameters, scale_noise, tune, with_noise_floor
+from tsgt.geometry.trajectory.hyperparameters import MIN_MEASUREMENTS, partially_occluded
 from tsgt.geometry.trajectory.motion_prior import axis_sigmas
 from tsgt.model import MotionPrior, PipelineParameters
+
+if TYPE_CHECKING:
+    from tsgt.geometry import Observations
 
 PRIOR = MotionPrior()
 UNTIL_S = 80.0
@@ -19,8 +26,8 @@ BEND_RAD = np.radians(70.0)
 HIDDEN_S = (36.0, 44.0)
 
 
-def straight_but_for_a_bend() -> States:
-    """Drive at a metre per second, straight but for one bend."""
+def straight_with_one_bend() -> States:
+    """Drive at 1 m/s, straight except for one bend."""
     time_s = np.arange(0.0, UNTIL_S + 1.0, STEP_S)
     share = np.clip((time_s - BEND_S[0]) / (BEND_S[1] - BEND_S[0]), 0.0, 1.0)
     yaw = BEND_RAD * (share - np.sin(2 * np.pi * share) / (2 * np.pi))
@@ -39,9 +46,9 @@ def straight_but_for_a_bend() -> States:
 
 
 @pytest.mark.parametrize("seen", [(), (0,), (0, 2)])
-def test_a_bend_in_an_outage_gives_no_valid_pose_beyond_six_sigmas(seen: tuple[int, ...]) -> None:
-    """A robot that went straight while it was seen, and bends while at most some prisms are, is not taken to go straight."""
-    motion = straight_but_for_a_bend()
+def test_bend_during_an_outage_stays_within_six_sigmas(seen: tuple[int, ...]) -> None:
+    """A robot that drives straight while observed and bends while occluded stays within the covariance of valid poses."""
+    motion = straight_with_one_bend()
     whole = sorted_by_time(measure(motion, until_s=UNTIL_S, seed=3))
     inside = (whole.time_s > HIDDEN_S[0]) & (whole.time_s < HIDDEN_S[1])
     found = fit_trajectory(whole.select(~inside | np.isin(whole.prism, seen))).trajectory
@@ -61,8 +68,8 @@ def test_a_bend_in_an_outage_gives_no_valid_pose_beyond_six_sigmas(seen: tuple[i
     assert valid[measured].all()
 
 
-def test_the_livelier_prior_holds_axis_by_axis() -> None:
-    """What is livelier stays; what is calmer comes up to the share, at its own correlation time."""
+def test_noise_floor_acts_per_axis() -> None:
+    """Axes above the floor are kept; others are raised to the share at their own correlation time."""
     calm = MotionPrior(
         acceleration_sigma_mps2=(1.0, 1.0, 0.001),
         acceleration_correlation_time_s=0.2,
@@ -80,13 +87,13 @@ def test_the_livelier_prior_holds_axis_by_axis() -> None:
     )
 
 
-def test_a_prior_is_at_least_itself() -> None:
-    """Nothing changes by it."""
+def test_noise_floor_of_the_prior_itself_changes_nothing() -> None:
+    """A prior is not below itself."""
     np.testing.assert_allclose(axis_sigmas(with_noise_floor(PRIOR, PRIOR)), axis_sigmas(PRIOR))
 
 
-def test_a_robot_is_hidden_while_fewer_than_three_prisms_are_seen() -> None:
-    """With four prisms one may be missing; two may not, and before the first measurement none is seen."""
+def test_partially_occluded_below_three_prisms() -> None:
+    """With four prisms one may be missing, two may not; before the first measurement none is observed."""
     time_s = np.arange(0.0, 10.0, 0.1)
     prism = np.arange(len(time_s)) % 4
     gone = (time_s > 3.0) & (time_s < 7.0) & (prism == 0)
@@ -101,3 +108,109 @@ def test_a_robot_is_hidden_while_fewer_than_three_prisms_are_seen() -> None:
         False,
         True,
     ]
+
+
+DRAWN_PRIOR = MotionPrior(
+    acceleration_sigma_mps2=(0.5, 0.5, 0.2),
+    acceleration_correlation_time_s=0.8,
+    angular_acceleration_sigma_radps2=(0.2, 0.2, 0.4),
+    angular_acceleration_correlation_time_s=0.5,
+)
+
+
+@pytest.fixture(scope="module")
+def observations() -> Observations:
+    """Measure a minute and a half of a robot that moves as :data:`DRAWN_PRIOR` says."""
+    motion = draw_motions(DRAWN_PRIOR, count=1, duration_s=91.0, seed=11)[0]
+    return sorted_by_time(measure(motion, until_s=90.0, seed=12))
+
+
+def test_evidence_gradient_agrees_with_differences(observations: Observations) -> None:
+    """Central differences of the evidence; the noise scale deviates slightly where timestamps are uncertain."""
+    exact = replace(observations, time_sigma_s=np.zeros(len(observations)))
+    segment = hyperparameters._Segment(exact.select(slice(0, 150)))
+    at = np.log([0.3, 0.15, 0.5, 0.12, 0.2, 0.4, 1.2])
+    hyperparameters._evidence(segment, at)
+    _, gradient = hyperparameters._evidence(segment, at)
+    step = 1e-3
+    for i in range(len(at)):
+        aside = step * np.eye(len(at))[i]
+        up, down = (hyperparameters._evidence(segment, at + sign * aside)[0] for sign in (1, -1))
+        assert gradient[i] == pytest.approx((up - down) / (2 * step), rel=0.05, abs=0.5)
+
+
+def test_tuning_recovers_the_prior(observations: Observations) -> None:
+    """Acceleration sigmas within 30 %, noise within 15 %."""
+    found = tune(scale_noise(observations, 0.5))
+    np.testing.assert_allclose(
+        found.prior.acceleration_sigma_mps2, DRAWN_PRIOR.acceleration_sigma_mps2, rtol=0.3
+    )
+    np.testing.assert_allclose(
+        found.prior.angular_acceleration_sigma_radps2, DRAWN_PRIOR.angular_acceleration_sigma_radps2, rtol=0.3
+    )
+    assert found.prior.acceleration_correlation_time_s == pytest.approx(
+        DRAWN_PRIOR.acceleration_correlation_time_s, rel=0.5
+    )
+    assert found.prior.angular_acceleration_correlation_time_s == pytest.approx(
+        DRAWN_PRIOR.angular_acceleration_correlation_time_s, rel=0.5
+    )
+    assert found.noise_scale == pytest.approx(2.0, rel=0.15)
+
+
+def test_start_hardly_affects_the_result(observations: Observations) -> None:
+    """From ten times less and ten times more process noise the result is the same."""
+    calm = MotionPrior(acceleration_sigma_mps2=(0.05, 0.05, 0.02), acceleration_correlation_time_s=3.0)
+    wild = MotionPrior(acceleration_sigma_mps2=(5.0, 5.0, 2.0), acceleration_correlation_time_s=0.1)
+    found = [tune(observations, start=start) for start in (calm, wild)]
+    assert found[0].log_evidence == pytest.approx(found[1].log_evidence, abs=2.0)
+    np.testing.assert_allclose(
+        found[0].prior.acceleration_sigma_mps2, found[1].prior.acceleration_sigma_mps2, rtol=0.1
+    )
+
+
+def test_given_values_are_kept(observations: Observations) -> None:
+    """A fixed prior and a given noise scale are not changed."""
+    few = observations.select(slice(0, 200))
+    kept = tune(few, start=DRAWN_PRIOR, noise_only=True)
+    np.testing.assert_allclose(kept.prior.acceleration_sigma_mps2, DRAWN_PRIOR.acceleration_sigma_mps2)
+    assert kept.prior.acceleration_correlation_time_s == pytest.approx(
+        DRAWN_PRIOR.acceleration_correlation_time_s
+    )
+    assert tune(few, noise_scale=1.5).noise_scale == pytest.approx(1.5)
+
+
+def test_outliers_do_not_inflate_the_noise(observations: Observations) -> None:
+    """One outlier of 400 sigmas in thirty measurements does not double the noise."""
+    points = observations.points_m.copy()
+    points[::30] += 0.5
+    found = tune(replace(observations, points_m=points))
+    assert found.noise_scale < 2.0
+    np.testing.assert_allclose(
+        found.prior.acceleration_sigma_mps2, DRAWN_PRIOR.acceleration_sigma_mps2, rtol=0.5
+    )
+
+
+def test_stationary_robot() -> None:
+    """Accelerations become small, the noise scale is right."""
+    still = MotionPrior(
+        acceleration_sigma_mps2=(1e-6, 1e-6, 1e-6), angular_acceleration_sigma_radps2=(1e-6, 1e-6, 1e-6)
+    )
+    motion = draw_motions(still, count=1, duration_s=41.0, seed=5)[0]
+    rest = replace(
+        motion,
+        position=np.tile(motion.position[:1], (len(motion), 1)),
+        rotation=np.tile(motion.rotation[:1], (len(motion), 1, 1)),
+        velocity=np.zeros_like(motion.velocity),
+        angular_velocity=np.zeros_like(motion.angular_velocity),
+    )
+    found = tune(sorted_by_time(measure(rest, until_s=40.0, seed=6)))
+    assert max(found.prior.acceleration_sigma_mps2) < 0.02
+    assert found.noise_scale == pytest.approx(1.0, rel=0.15)
+
+
+def test_too_few_measurements_are_rejected(observations: Observations) -> None:
+    """Some seconds, or two prisms, raise an error that says what is missing."""
+    with pytest.raises(GeometryError, match="too few measurements to tell how the robot moves"):
+        tune(observations.select(slice(0, MIN_MEASUREMENTS - 1)))
+    with pytest.raises(GeometryError, match="of at least 3 prisms"):
+        tune(observations.select(observations.prism < 2))

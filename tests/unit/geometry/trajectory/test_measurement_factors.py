@@ -1,4 +1,4 @@
-"""Measurements as residuals: their derivatives against numerical ones, their axes against the angles themselves."""
+"""Measurement factors: Jacobians against numerical derivatives, residuals against range and angles."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ LAYOUT = np.array([[-0.4559, -0.1759, 1.1167], [0.4844, -0.1759, 1.4167], [-0.02
 
 
 def tumbling(rng: np.random.Generator) -> States:
-    """Give a robot at two instants in any attitude, fast in every respect."""
+    """States at two times in random attitude with large velocities and accelerations."""
     return States(
         np.array([0.0, 0.5]),
         rng.uniform(-30, 30, (2, 3)),
@@ -43,7 +43,7 @@ def tumbling(rng: np.random.Generator) -> States:
 def observed(
     knots: States, rng: np.random.Generator, *, count: int = 8, offset_s: float = 0.2
 ) -> Observations:
-    """Give measurements near both instants that miss the robot by centimetres, from stations in any attitude."""
+    """Measurements near both times with residuals of centimetres, from stations in random attitude."""
     at = rng.integers(0, len(knots), count)
     frames = transform_from(
         Rotation.random(3, random_state=int(rng.integers(2**31))).as_matrix(), rng.uniform(-50, 50, (3, 3))
@@ -64,13 +64,13 @@ def observed(
     )
 
 
-def near(observations: Observations, knots: States) -> NDArray[np.intp]:
-    """Which knot each measurement is near."""
+def knot_index(observations: Observations, knots: States) -> NDArray[np.intp]:
+    """Knot that each measurement is attached to."""
     return np.asarray(np.argmin(np.abs(observations.time_s[:, None] - knots.time_s), axis=1), np.intp)
 
 
 def seen_at(points: FloatArray) -> tuple[Observations, States]:
-    """Give a station that has measured a robot of one prism at each of these points, and that robot, at the first."""
+    """Stations that measured the only prism of a robot at these points, and the robot at the first."""
     count = len(points)
     zero = np.zeros((1, 3))
     knots = States(np.zeros(1), points[:1], np.eye(3)[None], zero, zero, zero, zero)
@@ -90,12 +90,12 @@ def seen_at(points: FloatArray) -> tuple[Observations, States]:
 
 @settings(derandomize=True, max_examples=40)
 @given(st.integers(0, 10**6))
-def test_derivatives_by_the_state_are_exact(seed: int) -> None:
-    """For any attitudes, frames, offsets in time and misfits the 18 derivatives are the numerical ones."""
+def test_jacobian_is_exact(seed: int) -> None:
+    """For random attitudes, frames, time offsets and residuals the Jacobian equals central differences."""
     rng = np.random.default_rng(seed)
     knots = tumbling(rng)
     observations = observed(knots, rng)
-    at = near(observations, knots)
+    at = knot_index(observations, knots)
     found = linearise(observations, knots, at).jacobian
     step = 1e-5
     for part in range(STATE_DIM):
@@ -109,12 +109,12 @@ def test_derivatives_by_the_state_are_exact(seed: int) -> None:
 
 @settings(derandomize=True, max_examples=40)
 @given(st.integers(0, 10**6))
-def test_velocity_and_rotation_are_those_of_the_moving_prism(seed: int) -> None:
-    """The prism's velocity is what its place changes by, and place and rotation are the robot's at that instant."""
+def test_prism_velocity_is_the_derivative_of_its_position(seed: int) -> None:
+    """Position and rotation are the robot's at the time of the measurement."""
     rng = np.random.default_rng(seed)
     knots = tumbling(rng)
     observations = observed(knots, rng)
-    at = near(observations, knots)
+    at = knot_index(observations, knots)
     step = 1e-5
     here = linearise(observations, knots, at)
     later, earlier = (
@@ -136,7 +136,7 @@ def test_velocity_and_rotation_are_those_of_the_moving_prism(seed: int) -> None:
 def test_residuals_are_those_of_range_and_angles(
     around: float, zenith: float, distance_m: float, part: int
 ) -> None:
-    """A prism a little farther, more to the right or lower than measured has just that residual, as a length."""
+    """A prism farther, to the right or lower than measured has that residual as a length."""
     polar = np.array([distance_m, around, zenith])
     lengths = np.array([1.0, distance_m * np.sin(zenith), distance_m])
     moved = polar.copy()
@@ -152,8 +152,8 @@ def test_residuals_are_those_of_range_and_angles(
 
 
 @pytest.mark.parametrize("zenith_rad", [0.0, 1e-9, 1e-3, np.pi - 1e-9, np.pi])
-def test_straight_up_is_no_special_case(zenith_rad: float) -> None:
-    """A prism overhead or underfoot has finite residuals of the right length, and exact derivatives."""
+def test_vertical_line_of_sight_is_no_special_case(zenith_rad: float) -> None:
+    """A prism overhead or underfoot has finite residuals of the right length and an exact Jacobian."""
     measured = polar_to_cartesian(0.3, zenith_rad, 20.0)
     observations, knots = seen_at(measured[None])
     miss = np.array([[0.001, -0.002, 0.003]])
@@ -166,7 +166,7 @@ def test_straight_up_is_no_special_case(zenith_rad: float) -> None:
 
 
 def test_second_face_is_the_same_measurement() -> None:
-    """Angles read in the second face give the residuals and derivatives of the first."""
+    """Second-face angles give the residuals and Jacobian of the first face."""
     first = np.array(polar_to_cartesian(1.2, 1.4, 50.0))
     second = np.array(polar_to_cartesian(1.2 + np.pi, 2 * np.pi - 1.4, 50.0))
     observations, knots = seen_at(np.array([first, second]))
@@ -179,8 +179,8 @@ def test_second_face_is_the_same_measurement() -> None:
 
 @settings(derandomize=True, max_examples=40)
 @given(st.integers(0, 10**6))
-def test_axes_across_the_line_of_sight_are_where_angles_grow(seed: int) -> None:
-    """They are right-angled unit vectors, in the directions in which range and both angles grow."""
+def test_line_of_sight_axes_are_the_angle_gradients(seed: int) -> None:
+    """Orthonormal axes in the directions of growing range and angles."""
     points = np.random.default_rng(seed).uniform(-50, 50, (5, 3))
     axes, distance_m = line_of_sight_axes(points)
     np.testing.assert_allclose(
@@ -198,8 +198,8 @@ def test_axes_across_the_line_of_sight_are_where_angles_grow(seed: int) -> None:
 
 @pytest.mark.parametrize("measured_m", [0.0, 1e-200, 20.0])
 @pytest.mark.parametrize("predicted_m", [0.0, 1e-200, 20.0])
-def test_a_prism_in_the_station_itself_has_finite_residuals(measured_m: float, predicted_m: float) -> None:
-    """A distance that the prism constant has made zero is an outlier, not a number that spoils all others."""
+def test_zero_distance_has_finite_residuals(measured_m: float, predicted_m: float) -> None:
+    """A distance that the prism constant makes zero gives finite residuals, not NaN."""
     observations, knots = seen_at(np.array([[measured_m, 0.0, 0.0]]))
     there = replace(knots, position=np.array([[predicted_m, 0.0, 0.0]]))
     found = linearise(observations, there, np.zeros(1, np.intp))
@@ -207,8 +207,8 @@ def test_a_prism_in_the_station_itself_has_finite_residuals(measured_m: float, p
     assert np.isfinite(found.whitened(observations)).all()
 
 
-def test_an_uncertain_time_counts_along_the_prisms_motion() -> None:
-    """A stamp that may be wrong by 10 ms makes a prism at 2 m/s uncertain by 20 mm along its way, and nowhere else."""
+def test_time_noise_acts_along_the_velocity() -> None:
+    """A time sigma of 10 ms makes a prism at 2 m/s uncertain by 20 mm along its velocity only."""
     observations, knots = seen_at(np.array([[40.0, 0.0, 0.0]]))
     observations = replace(
         observations, time_sigma_s=np.array([0.01]), sigmas_m=np.array([[0.002, 0.001, 0.001]])
@@ -219,12 +219,12 @@ def test_an_uncertain_time_counts_along_the_prisms_motion() -> None:
     np.testing.assert_allclose(covariance, np.diag([0.002**2, 0.001**2 + 0.02**2, 0.001**2]), atol=1e-15)
 
 
-def test_cartesian_points_are_compared_as_they_are() -> None:
-    """Where coordinates were measured, the residual is their difference in the frame that they are in."""
+def test_cartesian_residuals_are_coordinate_differences() -> None:
+    """Cartesian residuals are differences in the station frame."""
     rng = np.random.default_rng(3)
     knots = tumbling(rng)
     observations = replace(observed(knots, rng, offset_s=0.0), polar=np.zeros(8, dtype=bool))
-    found = linearise(observations, knots, near(observations, knots))
+    found = linearise(observations, knots, knot_index(observations, knots))
     expected = (
         transform_points(invert(observations.frames)[observations.station], found.point_m)
         - observations.points_m
@@ -233,7 +233,7 @@ def test_cartesian_points_are_compared_as_they_are() -> None:
 
 
 def test_selected_measurements_keep_frames_and_layout() -> None:
-    """Some of the measurements are still of all stations and prisms."""
+    """Selected measurements refer to all stations and prisms."""
     rng = np.random.default_rng(4)
     observations = observed(tumbling(rng), rng)
     some = observations.select(observations.prism == 1)

@@ -1,4 +1,4 @@
-"""The motion prior's transition and noise against Van Loan's matrix exponential, in both limits, and between instants."""
+"""Motion prior: transition and process noise against Van Loan's matrix exponential, limits, interpolation."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ TIMES_S = np.array([0.08, 0.2, 0.4999, 0.5, 0.8, 2.0, 30.0, 1e4])
 
 
 def van_loan(dt_s: float, time_s: float) -> tuple[FloatArray, FloatArray]:
-    """Transition and noise of an axis from one matrix exponential (C. Van Loan, IEEE TAC 23(3), 1978)."""
+    """Transition and process noise of an axis from one matrix exponential (C. Van Loan, IEEE TAC 23(3), 1978)."""
     A = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0 / time_s]])
     kicks = np.diag([0.0, 0.0, 2.0 / time_s])
     whole = expm(np.block([[-A, kicks], [np.zeros((3, 3)), A.T]]) * dt_s)
@@ -41,7 +41,7 @@ def van_loan(dt_s: float, time_s: float) -> tuple[FloatArray, FloatArray]:
 @pytest.mark.parametrize("time_s", TIMES_S)
 @pytest.mark.parametrize("dt_s", STEPS_S)
 def test_transition_and_noise_agree_with_van_loan(dt_s: float, time_s: float) -> None:
-    """Both are those of the matrix exponential, to its own precision."""
+    """Both equal the matrix exponential's to its precision."""
     phi, q = van_loan(dt_s, time_s)
     np.testing.assert_allclose(transition(dt_s, time_s), phi, rtol=1e-12, atol=1e-13)
     # The exponential grows with exp(dt / time), and its rounding with it.
@@ -52,8 +52,8 @@ def test_transition_and_noise_agree_with_van_loan(dt_s: float, time_s: float) ->
 
 @settings(derandomize=True)
 @given(st.floats(-3.0, 2.0), st.floats(-3.0, 4.0))
-def test_two_steps_are_one(log_dt: float, log_time: float) -> None:
-    """Going on for a time and for as long again is the same as going on for twice the time."""
+def test_steps_compose(log_dt: float, log_time: float) -> None:
+    """Two equal steps equal one of twice the length."""
     dt_s, time_s = 10.0**log_dt, 10.0**log_time
     phi, q = transition(dt_s, time_s), process_noise(dt_s, time_s)
     np.testing.assert_allclose(phi @ phi, transition(2 * dt_s, time_s), rtol=1e-11, atol=1e-15)
@@ -61,15 +61,15 @@ def test_two_steps_are_one(log_dt: float, log_time: float) -> None:
 
 
 @pytest.mark.parametrize("s", [1e-2, 2.0])
-def test_formulas_meet(s: float) -> None:
-    """Where one formula takes over from another nothing jumps."""
+def test_formulas_are_continuous(s: float) -> None:
+    """No jump where one formula takes over from another."""
     below, above = np.array([s * (1 - 1e-12), s * (1 + 1e-12)])
     np.testing.assert_allclose(transition(below, 1.0), transition(above, 1.0), rtol=1e-11)
     np.testing.assert_allclose(process_noise(below, 1.0), process_noise(above, 1.0), rtol=1e-10)
 
 
-def test_acceleration_that_lasts_for_ever_short_is_white_noise_on_acceleration() -> None:
-    """For a correlation time near zero, position and velocity have the noise of white acceleration."""
+def test_short_correlation_is_white_noise_on_acceleration() -> None:
+    """For a correlation time near zero the process noise is that of white acceleration."""
     dt_s, time_s = 0.4, 1e-5
     density = 2 * time_s
     expected = density * np.array([[dt_s**3 / 3, dt_s**2 / 2], [dt_s**2 / 2, dt_s]])
@@ -77,8 +77,8 @@ def test_acceleration_that_lasts_for_ever_short_is_white_noise_on_acceleration()
     np.testing.assert_allclose(transition(dt_s, time_s)[:2, :2], [[1.0, dt_s], [0.0, 1.0]])
 
 
-def test_acceleration_that_lasts_for_ever_long_is_white_noise_on_jerk() -> None:
-    """For a long correlation time, the noise is that of white jerk, and the motion that of a constant acceleration."""
+def test_long_correlation_is_white_noise_on_jerk() -> None:
+    """For a long correlation time the process noise is that of white jerk."""
     t, time_s = 0.4, 1e5
     expected = np.array(
         [[t**5 / 20, t**4 / 8, t**3 / 6], [t**4 / 8, t**3 / 3, t**2 / 2], [t**3 / 6, t**2 / 2, t]]
@@ -92,7 +92,7 @@ def test_acceleration_that_lasts_for_ever_long_is_white_noise_on_jerk() -> None:
 @settings(derandomize=True)
 @given(st.floats(-2.3, 1.0), st.floats(-2.0, 4.0))
 def test_information_is_the_inverse_of_the_noise(log_dt: float, log_time: float) -> None:
-    """Their product is the identity, however small the numbers are."""
+    """Their product is the identity at any scale."""
     dt_s, time_s = 10.0**log_dt, 10.0**log_time
     q = process_noise(dt_s, time_s)
     scale = np.sqrt(np.diag(q))
@@ -102,8 +102,8 @@ def test_information_is_the_inverse_of_the_noise(log_dt: float, log_time: float)
 
 @pytest.mark.parametrize("time_s", [0.05, 0.4, 3.0, 100.0])
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
-def test_between_is_dense_conditioning(share: float, time_s: float) -> None:
-    """Interpolation is the joint Gaussian of the instant and the later one, given both ends."""
+def test_interpolation_is_dense_conditioning(share: float, time_s: float) -> None:
+    """Interpolation equals conditioning the joint Gaussian on both ends."""
     step_s = 0.4
     before_s, after_s = share * step_s, (1 - share) * step_s
     q_here, q_on = process_noise(before_s, time_s), process_noise(after_s, time_s)
@@ -122,8 +122,8 @@ def test_between_is_dense_conditioning(share: float, time_s: float) -> None:
     )
 
 
-def test_between_at_the_ends_is_the_ends() -> None:
-    """At either end the interpolation is that end's state, and nothing is added to its covariance."""
+def test_interpolation_at_the_ends() -> None:
+    """At either end it is that end's state, with zero covariance."""
     zero, step = np.array(0.0), np.array(0.4)
     for before, after, earlier_share in ((zero, step, 1.0), (step, zero, 0.0)):
         from_earlier, from_later, left = interpolation_weights(before, after, np.array(0.5))
@@ -132,8 +132,8 @@ def test_between_at_the_ends_is_the_ends() -> None:
         np.testing.assert_allclose(left, 0.0, atol=1e-12)
 
 
-def test_a_prior_is_its_sigmas_and_times() -> None:
-    """A prior made of sigmas and times gives them back."""
+def test_prior_round_trip() -> None:
+    """A prior made of sigmas and times returns them."""
     prior = MotionPrior()
     times_s = axis_correlation_times_s(prior)
     assert prior_from_axes(axis_sigmas(prior), times_s[[0, 5]]) == prior

@@ -1,4 +1,4 @@
-"""One state at later instants: the same as a trajectory predicts beyond its end, but for rounding."""
+"""Propagation of one state: equal to a trajectory's extrapolation, to rounding."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from tsgt.model import MotionPrior
 PRIOR = MotionPrior(acceleration_correlation_time_s=0.3, angular_acceleration_correlation_time_s=0.9)
 
 
-def turning(rate_radps: float) -> tuple[States, FloatArray]:
-    """Draw a robot anywhere that turns about so fast, and the covariance of its state."""
+def rotating(rate_radps: float) -> tuple[States, FloatArray]:
+    """Draw a random state with a given angular velocity, and its covariance."""
     rng = np.random.default_rng(4)
     parts = rng.normal(size=(5, 1, 3))
     parts[[2, 4]] *= rate_radps
@@ -28,9 +28,9 @@ def turning(rate_radps: float) -> tuple[States, FloatArray]:
 
 @pytest.mark.parametrize("rate_radps", [0.0, 1e-3, 0.3, 5.0])
 @pytest.mark.parametrize("ahead_s", [0.0, 1e-9, 1e-3, 0.05, 0.4, 0.7, 3.0, 30.0])
-def test_it_is_what_a_trajectory_predicts(rate_radps: float, ahead_s: float) -> None:
-    """State and covariance, all parts and those of the pose alone; short and long steps have other formulas."""
-    state, covariance = turning(rate_radps)
+def test_propagation_agrees_with_trajectory(rate_radps: float, ahead_s: float) -> None:
+    """State and covariance, whole and of the pose alone, on both sides of the series' limits."""
+    state, covariance = rotating(rate_radps)
     whole = Trajectory(state, PRIOR, covariance[None], np.empty((0, STATE_DIM, STATE_DIM)))
     time_s = 7.0 + ahead_s
     for dim in (6, STATE_DIM):
@@ -43,9 +43,9 @@ def test_it_is_what_a_trajectory_predicts(rate_radps: float, ahead_s: float) -> 
         np.testing.assert_allclose(spread / scale, expected_spread / scale, rtol=0, atol=1e-12)
 
 
-def test_a_livelier_robot_is_one_of_a_prior_with_larger_sigmas() -> None:
-    """Twice the variance of the accelerations, the same state."""
-    state, covariance = turning(0.3)
+def test_process_noise_scale_acts_on_the_variance() -> None:
+    """A scale of two equals a prior with twice the variance of the accelerations."""
+    state, covariance = rotating(0.3)
     sigma_mps2, sigma_radps2 = PRIOR.acceleration_sigma_mps2, PRIOR.angular_acceleration_sigma_radps2
     x, y, z, roll, pitch, yaw = (float(np.sqrt(2.0)) * each for each in (*sigma_mps2, *sigma_radps2))
     lively = replace(

@@ -1,4 +1,4 @@
-"""A fitted trajectory at any instant: interpolation, prediction, covariances, and whether these are honest."""
+"""Query of a trajectory: interpolation, extrapolation, covariances and their consistency."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ SEEDS = 100
 
 
 def fitted(observations: Observations, start: States, anchor: AnchorPrior | None = None) -> Trajectory:
-    """Give the trajectory through measurements with knots where the start has them."""
+    """Trajectory of measurements with knots at those of the initial states."""
     found = solve(observations, start, PRIOR, anchor=anchor)
     return Trajectory(found.knots, PRIOR, *found.factor.marginals())
 
 
 class Case(NamedTuple):
-    """A short recording, its first guess and its trajectory."""
+    """A short recording, its initial guess and its trajectory."""
 
     observations: Observations
     start: States
@@ -47,7 +47,7 @@ class Case(NamedTuple):
 
 @pytest.fixture(scope="module")
 def case() -> Case:
-    """Four seconds of a turning robot."""
+    """Four seconds of a rotating robot."""
     motion = draw_motions(PRIOR, count=1, duration_s=5.0, seed=11)[0]
     observations = sorted_by_time(measure(motion, until_s=4.0, seed=12))
     start = initial_guess(observations, knot_times(observations.time_s))
@@ -55,26 +55,26 @@ def case() -> Case:
 
 
 def with_knots(start: States, trajectory: Trajectory, added_s: FloatArray) -> States:
-    """Give a start that has knots at further instants."""
+    """Return initial states with additional knots."""
     states, _ = trajectory.at(added_s)
     whole = concatenate_states([start, states])
     return whole.select(np.argsort(whole.time_s))
 
 
 def normalised_difference(states: States, covariance: FloatArray, others: States) -> FloatArray:
-    """Differences in sigmas of each part, (N, 18)."""
+    """Differences in sigmas of each component, (N, 18)."""
     return states.local_coordinates_about(others) / np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
 
 
 def scaled(covariance: FloatArray, by: FloatArray) -> FloatArray:
-    """Covariances in units of the sigmas of others."""
+    """Covariances in units of others' sigmas."""
     sigmas = np.sqrt(np.diagonal(by, axis1=1, axis2=2))
     in_sigmas: FloatArray = covariance / (sigmas[:, :, None] * sigmas[:, None, :])
     return in_sigmas
 
 
-def test_at_its_knots_it_is_its_knots(case: Case) -> None:
-    """Asked for at a knot's own instant it gives that state and covariance."""
+def test_query_at_knots_returns_knots(case: Case) -> None:
+    """At a knot's time the query returns its state and covariance."""
     knots = case.trajectory.knots
     states, covariance = case.trajectory.at(knots.time_s)
     np.testing.assert_allclose(states.local_coordinates_about(knots), 0.0, atol=1e-9)
@@ -85,8 +85,8 @@ def test_at_its_knots_it_is_its_knots(case: Case) -> None:
     )
 
 
-def test_a_knot_without_measurement_changes_nothing(case: Case) -> None:
-    """Between knots it is what a solution with a knot there says: states, velocities and covariances."""
+def test_interpolation_agrees_with_an_additional_knot(case: Case) -> None:
+    """Interpolation equals a solution with a knot there: states, velocities and covariances."""
     added_s = case.start.time_s[3:20] + 0.4 * np.diff(case.start.time_s)[3:20]
     states, covariance = case.trajectory.at(added_s)
     anchor = diffuse_prior(case.start.select(slice(0, 1)), PRIOR)
@@ -102,8 +102,8 @@ def test_a_knot_without_measurement_changes_nothing(case: Case) -> None:
 
 
 @pytest.mark.parametrize("ahead_s", [-1.5, -0.3, 0.3, 1.5])
-def test_prediction_is_a_knot_beyond_the_measurements(case: Case, ahead_s: float) -> None:
-    """After the last knot and before the first it is what a solution with a knot there says."""
+def test_extrapolation_agrees_with_an_additional_knot(case: Case, ahead_s: float) -> None:
+    """Beyond both ends the query equals a solution with a knot there."""
     ends = case.start.time_s[[0, -1]]
     added_s = np.array([ends[1] + ahead_s if ahead_s > 0 else ends[0] + ahead_s])
     states, covariance = case.trajectory.at(added_s)
@@ -118,8 +118,8 @@ def test_prediction_is_a_knot_beyond_the_measurements(case: Case, ahead_s: float
 
 
 @pytest.mark.parametrize("where", ["between", "before", "after"])
-def test_covariances_are_carried_by_exact_derivatives(where: str) -> None:
-    """For any attitudes and velocities, what the knots' covariance adds goes by the numerical derivatives."""
+def test_covariance_is_propagated_by_exact_jacobians(where: str) -> None:
+    """For random states the knots' covariance is propagated by the numerical Jacobian."""
     rng = np.random.default_rng(13)
     first = exp_so3(rng.normal(size=3))
     rotation = np.stack([first, first @ exp_so3(np.array([0.9, -0.5, 0.7]))])
@@ -148,8 +148,8 @@ def test_covariances_are_carried_by_exact_derivatives(where: str) -> None:
     np.testing.assert_allclose(found - added, [derivative @ joint @ derivative.T], rtol=1e-6, atol=1e-6)
 
 
-def test_what_is_predicted_becomes_uncertain(case: Case) -> None:
-    """Covariances grow with every step away from the measurements, in both directions."""
+def test_extrapolated_covariance_grows(case: Case) -> None:
+    """Covariances grow with the distance from the measurements, in both directions."""
     ends = case.start.time_s[[0, -1]]
     ahead_s = np.array([0.0, 0.1, 0.3, 1.0, 3.0, 10.0])
     for times_s in (ends[1] + ahead_s, ends[0] - ahead_s):
@@ -160,7 +160,7 @@ def test_what_is_predicted_becomes_uncertain(case: Case) -> None:
 
 
 def test_an_outage_shows_in_the_covariance(case: Case) -> None:
-    """In the middle of a second without any measurement the pose is several times less certain than before it."""
+    """In the middle of a second without measurements the pose is several times less certain."""
     gap = (case.observations.time_s > 1.5) & (case.observations.time_s < 2.5)
     kept = case.observations.select(~gap)
     trajectory = fitted(kept, initial_guess(kept, knot_times(kept.time_s)))
@@ -169,8 +169,8 @@ def test_an_outage_shows_in_the_covariance(case: Case) -> None:
     assert sigmas[1] > 4 * sigmas[0]
 
 
-def test_turning_on_through_an_outage() -> None:
-    """A robot that turned by 200 degrees while nothing was measured is not taken for one that turned back by 160."""
+def test_rotation_beyond_pi_during_an_outage() -> None:
+    """A robot that rotated by 200 degrees during an outage did not rotate back by 160."""
     time_s = np.arange(round(16.0 / STEP_S) + 1, dtype=np.float64) * STEP_S
     still = np.zeros((len(time_s), 3))
     place, rates = (np.tile(value, (len(time_s), 1)) for value in ([60.0, 45.0, -1.0], [0.0, 0.0, 0.5]))
@@ -181,11 +181,11 @@ def test_turning_on_through_an_outage() -> None:
     asked_s = np.array([3.5, 4.0, 7.5, 11.0, 11.5])
     states, covariance = trajectory.at(asked_s)
     error = motion.select(rows_at(asked_s)).local_coordinates_about(states)
-    assert squared(error[:, :6], covariance[:, :6, :6]).max() < chi2.ppf(0.999, 6)
+    assert nees_of(error[:, :6], covariance[:, :6, :6]).max() < chi2.ppf(0.999, 6)
 
 
-def test_the_order_of_instants_is_irrelevant(case: Case) -> None:
-    """Instants in any order, inside and outside, each get their own state; none get none."""
+def test_order_of_query_times_is_irrelevant(case: Case) -> None:
+    """Times in any order, inside and outside, get their own states; an empty query returns none."""
     asked_s = np.linspace(-1.0, 5.0, 50)
     order = np.random.default_rng(14).permutation(50)
     states, covariance = case.trajectory.at(asked_s)
@@ -197,8 +197,8 @@ def test_the_order_of_instants_is_irrelevant(case: Case) -> None:
     assert no_covariance.shape == (0, STATE_DIM, STATE_DIM)
 
 
-def test_covariance_about_fixed_axes() -> None:
-    """That of the rotation about the fixed axes is that of drawn errors."""
+def test_ros_covariance_is_that_of_drawn_errors() -> None:
+    """The covariance about the fixed axes equals that of a sample."""
     rng = np.random.default_rng(15)
     rotation = exp_so3(rng.normal(size=3))
     root = rng.normal(size=(6, 6)) * 1e-4
@@ -219,8 +219,8 @@ INSIDE_S = np.array([2.0, 3.3, 4.7, 6.0])
 
 
 @pytest.fixture(scope="module")
-def errors_in_sigmas() -> dict[str, FloatArray]:
-    """Squared errors in sigmas, (seeds, instants): of poses and whole states, at knots, between them and ahead."""
+def nees_by_kind() -> dict[str, FloatArray]:
+    """NEES, (seeds, times): of poses and whole states, at knots, between them and predicted."""
     found: dict[str, list[FloatArray]] = {
         "knots": [],
         "pose": [],
@@ -236,19 +236,19 @@ def errors_in_sigmas() -> dict[str, FloatArray]:
         for asked_s, pose, state in ((INSIDE_S, "pose", "state"), (ends_s + AHEAD_S, "ahead", "ahead_state")):
             states, covariance = trajectory.at(asked_s)
             error = motion.select(rows_at(asked_s)).local_coordinates_about(replace(states, time_s=asked_s))
-            found[pose].append(squared(error[:, :6], covariance[:, :6, :6]))
-            found[state].append(squared(error, covariance))
+            found[pose].append(nees_of(error[:, :6], covariance[:, :6, :6]))
+            found[state].append(nees_of(error, covariance))
         rows = np.searchsorted(trajectory.knots.time_s, INSIDE_S)
         near = trajectory.knots.select(rows)
         on_grid = np.round(near.time_s / STEP_S) * STEP_S
         states, covariance = trajectory.at(on_grid)
         error = motion.select(rows_at(on_grid)).local_coordinates_about(states)
-        found["knots"].append(squared(error[:, :6], covariance[:, :6, :6]))
+        found["knots"].append(nees_of(error[:, :6], covariance[:, :6, :6]))
     return {name: np.array(values) for name, values in found.items()}
 
 
-def squared(error: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Squared errors in sigmas, (N,)."""
+def nees_of(error: FloatArray, covariance: FloatArray) -> FloatArray:
+    """NEES of N errors."""
     nees: FloatArray = np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[..., None])[..., 0])
     return nees
 
@@ -256,13 +256,9 @@ def squared(error: FloatArray, covariance: FloatArray) -> FloatArray:
 @pytest.mark.parametrize(
     ("what", "freedom"), [("knots", 6), ("pose", 6), ("state", 18), ("ahead", 6), ("ahead_state", 18)]
 )
-def test_covariances_are_honest(errors_in_sigmas: dict[str, FloatArray], what: str, freedom: int) -> None:
-    """Over 100 robots drawn from the prior, squared errors in sigmas (NEES) have their means within the 95 % band.
-
-    For smoothed poses at and between measurements and for predicted ones, at each instant; for the states with
-    velocities and accelerations too.
-    """
-    nees = errors_in_sigmas[what]
+def test_nees_is_consistent(nees_by_kind: dict[str, FloatArray], what: str, freedom: int) -> None:
+    """Over 100 robots drawn from the prior, mean NEES lies in its 95 % band at each time."""
+    nees = nees_by_kind[what]
     means = nees.mean(axis=0)
     # 95 % for all instants together.
     outside = 0.05 / len(means)

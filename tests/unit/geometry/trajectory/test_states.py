@@ -1,4 +1,4 @@
-"""States, their errors, and how neighbours are compared with the motion prior."""
+"""States, retraction and local coordinates, process factors."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def wild_knots(seed: int, *, count: int = 4, step_s: float = 0.2) -> States:
 
 
 def spinning(step_s: float, *, count: int = 2) -> States:
-    """Exact states under a constant angular acceleration across the angular velocity: the axis of the turn wanders."""
+    """Exact states under a constant angular acceleration across the angular velocity."""
     fine = 2000
     rate, acceleration = np.array([0.8, -0.3, 0.5]), np.array([-0.5, 0.9, 0.4])
     dt_s = step_s / fine
@@ -57,8 +57,8 @@ def spinning(step_s: float, *, count: int = 2) -> States:
     return States(time_s, zero, np.array(kept), zero, rates, zero, np.tile(acceleration, (count, 1)))
 
 
-def numerical(knots: States, steps: ProcessFactors, row: int) -> FloatArray:
-    """Give derivatives of all residuals by the error of one knot, (K - 1, 18, 18)."""
+def numerical_jacobian(knots: States, steps: ProcessFactors, row: int) -> FloatArray:
+    """Jacobian of all residuals by the error of one knot, (K - 1, 18, 18), by central differences."""
     step = 1e-6
     columns = []
     for part in range(STATE_DIM):
@@ -71,15 +71,15 @@ def numerical(knots: States, steps: ProcessFactors, row: int) -> FloatArray:
 
 @settings(derandomize=True, max_examples=30)
 @given(st.integers(0, 10**6))
-def test_error_from_is_the_inverse_of_moved(seed: int) -> None:
-    """The error between two sets of states is what was added to the one to get the other."""
+def test_local_coordinates_invert_retract(seed: int) -> None:
+    """The local coordinates of retracted states are the added errors."""
     knots = wild_knots(seed)
     error = np.random.default_rng(seed).uniform(-1.5, 1.5, (len(knots), STATE_DIM))
     np.testing.assert_allclose(knots.retract(error).local_coordinates_about(knots), error, atol=1e-12)
 
 
-def test_joined_parts_are_the_whole() -> None:
-    """States taken apart and joined again are the same."""
+def test_concatenated_states_are_the_whole() -> None:
+    """States split and concatenated are unchanged."""
     knots = wild_knots(1)
     again = concatenate_states([knots.select(slice(0, 1)), knots.select(slice(1, None))])
     for name in States.__slots__:
@@ -88,21 +88,21 @@ def test_joined_parts_are_the_whole() -> None:
 
 @settings(derandomize=True, max_examples=30)
 @given(st.integers(0, 10**6))
-def test_derivatives_of_steps_are_exact(seed: int) -> None:
-    """By the earlier and by the later state, for any attitudes, turns and velocities, they are the numerical ones."""
+def test_process_jacobians_are_exact(seed: int) -> None:
+    """For random states, by both knots, they equal central differences."""
     knots = wild_knots(seed)
     steps = ProcessFactors.of(knots.time_s, PRIOR)
-    by_earlier, by_later = whole_derivatives(linearise_process(knots, steps), steps)
+    by_earlier, by_later = dense_jacobians(linearise_process(knots, steps), steps)
     for row in range(len(knots)):
-        by_row = numerical(knots, steps, row)
+        by_row = numerical_jacobian(knots, steps, row)
         if row < len(knots) - 1:
             np.testing.assert_allclose(by_earlier[row], by_row[row], atol=2e-8)
         if row > 0:
             np.testing.assert_allclose(by_later[row - 1], by_row[row - 1], atol=2e-8)
 
 
-def whole_derivatives(found: LinearisedProcess, steps: ProcessFactors) -> tuple[FloatArray, FloatArray]:
-    """Give derivatives of all residuals by the errors of both knots, (N, 18, 18) each."""
+def dense_jacobians(found: LinearisedProcess, steps: ProcessFactors) -> tuple[FloatArray, FloatArray]:
+    """Jacobians of all residuals by the errors of both knots, (N, 18, 18) each."""
     by_earlier, by_later = -axes_to_state(steps.phi), np.tile(np.eye(STATE_DIM), (len(steps.phi), 1, 1))
     by_earlier[:, 3:6, 3:6] = found.rotation_by_earlier[:, :, :3]
     by_earlier[:, 3:6, 9:12] += found.rotation_by_earlier[:, :, 3:]
@@ -113,14 +113,14 @@ def whole_derivatives(found: LinearisedProcess, steps: ProcessFactors) -> tuple[
 
 @settings(derandomize=True, max_examples=20)
 @given(st.integers(0, 10**6))
-def test_steps_enter_the_normal_equations_as_squares(seed: int) -> None:
-    """What is added to the system is that of the derivatives, the information and the residuals as whole matrices."""
+def test_process_factors_in_the_normal_equations(seed: int) -> None:
+    """The added terms equal those of dense Jacobians, information and residuals."""
     knots = wild_knots(seed)
     steps = ProcessFactors.of(knots.time_s, PRIOR)
     found = linearise_process(knots, steps)
     count, weights = len(knots), axes_to_state(steps.information)
     jacobian = np.zeros((count - 1, STATE_DIM, count * STATE_DIM))
-    for row, (earlier, later) in enumerate(zip(*whole_derivatives(found, steps), strict=True)):
+    for row, (earlier, later) in enumerate(zip(*dense_jacobians(found, steps), strict=True)):
         jacobian[row, :, row * STATE_DIM : (row + 2) * STATE_DIM] = np.concatenate([earlier, later], axis=1)
     expected = np.einsum("nia,nij,njb->ab", jacobian, weights, jacobian)
     diagonal, off_diagonal = (
@@ -145,8 +145,8 @@ def test_steps_enter_the_normal_equations_as_squares(seed: int) -> None:
     assert cost == pytest.approx(float(np.vdot(pulled, found.residuals)))
 
 
-def test_a_step_as_the_prior_expects_has_no_residual() -> None:
-    """Without noise each axis goes on with its velocity while its acceleration dies away."""
+def test_expected_step_has_no_residual() -> None:
+    """Without noise velocities persist and accelerations decay."""
     dt_s = 0.7
     tau = PRIOR.acceleration_correlation_time_s
     start, speed, push = np.array([[1.0, 2, 3]]), np.array([[0.5, -1, 0.2]]), np.array([[0.3, 0.1, -0.2]])
@@ -167,11 +167,8 @@ def test_a_step_as_the_prior_expects_has_no_residual() -> None:
     )
 
 
-def test_wandering_axis_is_followed_to_fourth_order() -> None:
-    """Under a constant angular acceleration the turn's residual falls with the fifth power of the step.
-
-    Without the correction for the wandering axis it falls with the third.
-    """
+def test_magnus_term_is_of_fourth_order() -> None:
+    """Under a constant angular acceleration the residual falls with the fifth power of the step, without the term with the third."""
     steady = replace(PRIOR, angular_acceleration_correlation_time_s=1e4)
     left, uncorrected = [], []
     for step_s in (0.4, 0.2):
@@ -187,8 +184,8 @@ def test_wandering_axis_is_followed_to_fourth_order() -> None:
 
 
 @pytest.mark.parametrize("turned_rad", [0.0, 0.2, 2.0, 3.1, 3.2, 4.5, 5.9])
-def test_a_robot_that_goes_on_turning_unseen_is_followed(turned_rad: float) -> None:
-    """Up to nearly a whole turn between two states is counted the way that the angular velocities say."""
+def test_rotation_beyond_pi_follows_the_angular_velocity(turned_rad: float) -> None:
+    """Up to nearly a whole revolution between two states."""
     axis, dt_s = np.array([0.6, 0.0, 0.8]), 7.0
     zero, rates = np.zeros((2, 3)), np.tile(0.9 * turned_rad / dt_s * axis, (2, 1))
     rotation = np.stack([np.eye(3), exp_so3(turned_rad * axis)])
@@ -197,8 +194,8 @@ def test_a_robot_that_goes_on_turning_unseen_is_followed(turned_rad: float) -> N
     np.testing.assert_allclose(found[0], turned_rad * axis, atol=1e-9)
 
 
-def test_weights_are_those_of_each_axis() -> None:
-    """An axis with twice the sigma has a quarter of the information, and axes are not coupled."""
+def test_information_per_axis() -> None:
+    """Twice the sigma gives a quarter of the information, and axes are uncoupled."""
     time_s = np.array([0.0, 0.3])
     one = ProcessFactors.of(time_s, replace(PRIOR, acceleration_sigma_mps2=(0.1, 0.2, 0.4))).information
     np.testing.assert_allclose(one[:, 1], one[:, 0] / 4)

@@ -35,7 +35,7 @@ from tsgt.radio.classic.messages import (
     no_measurement_yet,
 )
 
-TIMING = LinkTiming.from_settings(PAPER, 250 * MS)
+TIMING = LinkTiming(PAPER, 250 * MS)
 
 stations = st.integers(1, 9)
 times_ns = st.integers(0, MAX_TIME_NS)

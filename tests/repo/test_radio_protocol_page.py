@@ -11,30 +11,30 @@ from typing import NamedTuple
 import pytest
 
 from tsgt.model import Status
-from tsgt.radio import Direction, DirectOrder, LoRaSettings, MeasureOrder, SearchOrder, TrackOrder
-from tsgt.radio.classic import MeasurementMessage, decode_command, raw_status, status_of
+from tsgt.radio import DirectCommand, Direction, LoRaSettings, MeasureCommand, SearchCommand, TrackCommand
+from tsgt.radio.classic import LinkTiming, MeasurementMessage, decode_command, raw_status, status_of
 from tsgt.radio.classic.messages import Acknowledgement, PingReply, TimeReply, decode_reply
-from tsgt.radio.classic.transactions import Timing
 from tsgt.radio.superframe.wire import (
     GRANT_BYTES,
-    AnswerPart,
     Authenticator,
     Beacon,
-    Confirmation,
-    Introduction,
-    OrderPart,
+    CommandResponse,
+    EncodedCommand,
+    EncodedDirection,
+    EncodedMeasurement,
+    JoinConfirmation,
+    JoinRequest,
+    MeasurementBlock,
     Reply,
-    Run,
-    SessionPart,
-    ShotPart,
-    Sighting,
+    SessionInfo,
+    SingleMeasurement,
     SlotOrder,
-    StatePart,
     StationEntry,
+    StatusReport,
     decode_beacon,
     encode_beacon,
+    encode_command,
     encode_reply,
-    order_part,
 )
 from tsgt.radio.superframe.wire import decode_reply as decode_superframe_reply
 from tsgt.radio.superframe.wire.block_codec import (
@@ -44,7 +44,6 @@ from tsgt.radio.superframe.wire.block_codec import (
     ZENITH_WIDTHS,
 )
 from tsgt.radio.superframe.wire.codec import spread_rad
-from tsgt.radio.superframe.wire.messages import Towards
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "radio-protocol.md").read_text()
 
@@ -132,7 +131,7 @@ def test_airtimes_stand_there(spreading_factor: int, column: int) -> None:
     settings = LoRaSettings(
         frequency_hz=905_000_000, spreading_factor=spreading_factor, bandwidth_hz=250_000, coding_rate=6
     )
-    timing = Timing.of(settings, 250_000_000)
+    timing = LinkTiming(settings, 250_000_000)
     *packets, reported = _rows("packet | bytes")
     assert [row[column] for row in packets] == [
         f"{timing.airtime_ns(int(row[1])) / 1e6:.2f} ms" for row in packets
@@ -156,7 +155,9 @@ def test_every_status_of_the_superframe_stands_there() -> None:
     rows = _rows("status | in tsgt")
     assert {Status(name.strip("`")) for _, name in rows} == set(Status)
     for number, name in rows:
-        content = encode_reply(Reply(shot=ShotPart(0, Status(name.strip("`")), 0, 0, None)))
+        content = encode_reply(
+            Reply(single_measurement=SingleMeasurement(0, Status(name.strip("`")), 0, 0, None))
+        )
         assert int.from_bytes(content[:2], "big") & 0b111 == int(number)
 
 
@@ -164,9 +165,9 @@ def test_every_order_stands_there() -> None:
     """The table of orders is that of the code, and so is how far around a direction to search."""
     rows = _rows("order | the station")
     direction = Direction(1.0, 1.5, math.radians(1.9))
-    orders = (TrackOrder(4), SearchOrder(), DirectOrder(), MeasureOrder(), SearchOrder(direction))
-    parts = [order_part(1, 0, order, tracked=1) for order in orders]
-    assert [part.order for part in parts] == [int(order) for order, *_ in rows]
+    orders = (TrackCommand(4), SearchCommand(), DirectCommand(), MeasureCommand(), SearchCommand(direction))
+    parts = [encode_command(1, 0, order, tracked=1) for order in orders]
+    assert [part.code for part in parts] == [int(order) for order, *_ in rows]
     arguments = [argument for *_, argument in rows]
     assert arguments[:4] == ["its number less 1", "0", "0", "0"]
     assert [part.argument for part in parts] == [3, 0, 0, 0, 6]
@@ -211,46 +212,50 @@ BEACON = Beacon(
     frame=421 % 256,
     sent=160_123_456 % 2**16,
     cumulative=1029 % 256,
-    order=SlotOrder(first=1),
+    slot_order=SlotOrder(first=1),
     stations=(StationEntry(0b1111, 2), StationEntry(0b1110, 4), StationEntry(0b1111, 8)),
 )
 BEACON_WITH_ITEMS = Beacon(
     frame=424 % 256,
     sent=161_296_000 % 2**16,
     cumulative=1035 % 256,
-    order=SlotOrder(first=2, reverse=True),
+    slot_order=SlotOrder(first=2, reverse=True),
     stations=(StationEntry(0b1111, 2), StationEntry(0b1111, 2), StationEntry(0b0100, 8)),
-    session=SessionPart(
-        nonce=0x0123456789AB, counter_high=424 >> 8, sent_high=161_296_000 >> 16, guard=23, turn_round=32
+    session=SessionInfo(
+        nonce=0x0123456789AB, counter_high=424 >> 8, sent_high=161_296_000 >> 16, guard=23, turnaround=32
     ),
-    confirmations=(Confirmation(3, 0x33333333),),
-    orders=(OrderPart(2, 5, 0, 3),),
+    confirmations=(JoinConfirmation(3, 0x33333333),),
+    commands=(EncodedCommand(2, 5, 0, 3),),
 )
 BEACON_WITH_DIRECTION = Beacon(
     frame=425 % 256,
     sent=161_700_000 % 2**16,
     cumulative=144,
-    order=SlotOrder(first=2, reverse=True),
+    slot_order=SlotOrder(first=2, reverse=True),
     stations=(StationEntry(0b1111, 2), StationEntry(0b1111, 2), StationEntry(0b1111, 3)),
-    orders=(OrderPart(3, 6, 4, 6, Towards(19_532, 16_537)),),
+    commands=(EncodedCommand(3, 6, 4, 6, EncodedDirection(19_532, 16_537)),),
 )
-SINGLE = Sighting(1041 % 256, 10_025_000 % 2**17, Status.OK, 5_000_000, 4_233_600, 756_032)
-RUN = Run(
-    sightings=(
-        Sighting(1032 % 256, 57_903, Status.OK, 3_010_000, 4_200_100, 612_300),
-        Sighting(1031 % 256, 57_903 - 25_003, Status.OK, 2_994_895, 4_200_280, 608_057),
-        Sighting(1030 % 256, 57_903 - 50_001, Status.LOW_ACCURACY, 2_979_988, 4_200_430, 603_756),
-        Sighting(1028 % 256, 57_903 - 100_011, Status.LOW_ACCURACY, 2_950_388, 4_200_760, 595_046),
+SINGLE = EncodedMeasurement(1041 % 256, 10_025_000 % 2**17, Status.OK, 5_000_000, 4_233_600, 756_032)
+RUN = MeasurementBlock(
+    measurements=(
+        EncodedMeasurement(1032 % 256, 57_903, Status.OK, 3_010_000, 4_200_100, 612_300),
+        EncodedMeasurement(1031 % 256, 57_903 - 25_003, Status.OK, 2_994_895, 4_200_280, 608_057),
+        EncodedMeasurement(1030 % 256, 57_903 - 50_001, Status.LOW_ACCURACY, 2_979_988, 4_200_430, 603_756),
+        EncodedMeasurement(1028 % 256, 57_903 - 100_011, Status.LOW_ACCURACY, 2_950_388, 4_200_760, 595_046),
     ),
     quality=2,
 )
 JOINING = Reply(
-    introduction=Introduction(nonce=0x33333333, lineage=0xBEEF, run_start=5417, oldest=5417),
-    state=StatePart(prism=3, direct=False, connected=True, late=1, doubted=0, rssi_dbm=-97),
-    runs=(
-        Run(
-            sightings=(Sighting(5418, 2**36 - 9_000, Status.OK, 9_000_000, 4_190_000, 1_843_212),),
-            direct=True,
+    join_request=JoinRequest(nonce=0x33333333, stream_id=0xBEEF, first_sequence=5417, oldest=5417),
+    status_report=StatusReport(
+        prism=3, direct=False, connected=True, missed_slots=1, rejected_beacons=0, rssi_dbm=-97
+    ),
+    blocks=(
+        MeasurementBlock(
+            measurements=(
+                EncodedMeasurement(5418, 2**36 - 9_000, Status.OK, 9_000_000, 4_190_000, 1_843_212),
+            ),
+            beacon_relative=True,
             quality=5,
             wide=True,
             prism=3,
@@ -259,15 +264,17 @@ JOINING = Reply(
     ),
 )
 REPLIES = {
-    "one measurement": Reply(runs=(Run(sightings=(SINGLE,)),)),
-    "a run": Reply(runs=(RUN,)),
+    "one measurement": Reply(blocks=(MeasurementBlock(measurements=(SINGLE,)),)),
+    "a run": Reply(blocks=(RUN,)),
     "a station joins": JOINING,
     "an answer": Reply(
-        state=StatePart(prism=4, direct=False, connected=True, late=0, doubted=0, rssi_dbm=-88),
-        turn_round_us=178_344,
-        answer=AnswerPart(5, ok=True),
+        status_report=StatusReport(
+            prism=4, direct=False, connected=True, missed_slots=0, rejected_beacons=0, rssi_dbm=-88
+        ),
+        turnaround_us=178_344,
+        response=CommandResponse(5, ok=True),
     ),
-    "a shot": Reply(shot=ShotPart(6, Status.OK, 12_345_678, 4_100_000, 423_456)),
+    "a shot": Reply(single_measurement=SingleMeasurement(6, Status.OK, 12_345_678, 4_100_000, 423_456)),
 }
 BEACONS = {
     "a beacon": BEACON,

@@ -8,6 +8,7 @@ regional limits, `commands` what a master commands a station, `supervisor` reope
 from tsgt.radio.airtime import (
     HEADER_SYMBOLS,
     SYNC_QUARTER_SYMBOLS,
+    TX_DONE_NS,
     airtime_us,
     bit_rate_Bps,
     low_data_rate_required,
@@ -30,6 +31,7 @@ __all__ = [
     "HEADER_SYMBOLS",
     "MAX_PAYLOAD_BYTES",
     "SYNC_QUARTER_SYMBOLS",
+    "TX_DONE_NS",
     "Command",
     "DirectCommand",
     "Direction",

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from tsgt.errors import RadioSettingsError
+from tsgt.radio.airtime import airtime_us, rx_done_ns, symbol_time_ns
 
 BANDWIDTHS_HZ = (7_800, 10_400, 15_600, 20_800, 31_250, 41_700, 62_500, 125_000, 250_000, 500_000)
 """Nominal bandwidths of the SX127x, in the order of their register codes."""
@@ -78,6 +79,28 @@ class LoRaSettings:
             raise RadioSettingsError(f"bandwidth_hz must be one of {known}, got {self.bandwidth_hz}")
         if not 2 <= self.power_dbm <= 17 and self.power_dbm != 20:
             raise RadioSettingsError(f"power_dbm must be 2 to 17, or 20, got {self.power_dbm}")
+
+    @property
+    def symbol_ns(self) -> int:
+        """Duration of a symbol."""
+        return symbol_time_ns(self.spreading_factor, self.bandwidth_hz)
+
+    @property
+    def rx_done_ns(self) -> int:
+        """Nominal delay from the end of a packet on the air to RxDone of its receiver."""
+        return rx_done_ns(self.spreading_factor, self.bandwidth_hz)
+
+    def airtime_ns(self, payload_bytes: int) -> int:
+        """Return the airtime of a packet, in whole microseconds."""
+        return 1000 * airtime_us(
+            payload_bytes,
+            spreading_factor=self.spreading_factor,
+            bandwidth_hz=self.bandwidth_hz,
+            coding_rate=self.coding_rate,
+            preamble_symbols=self.preamble_symbols,
+            crc=self.crc,
+            low_data_rate=self.low_data_rate,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -69,7 +69,7 @@ def planned_cycle(protocol: MasterProtocolConfig, load: TrafficLoad, settings: L
     if isinstance(protocol, ClassicMasterConfig):
         return classic_cycle(
             load,
-            LinkTiming.from_settings(settings, round(protocol.reply_timeout_ms * 1e6)),
+            LinkTiming(settings, round(protocol.reply_timeout_ms * 1e6)),
             resync_cycles=protocol.resync_cycles,
             resync_interval_ns=round(protocol.resync_interval_s * 1e9),
         )

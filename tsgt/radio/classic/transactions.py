@@ -16,7 +16,6 @@ from enum import Enum
 from typing import TYPE_CHECKING
 
 from tsgt.model import ClockSample
-from tsgt.radio.airtime import TX_DONE_NS, airtime_us, rx_done_ns, symbol_time_ns
 from tsgt.radio.classic.messages import (
     COMMAND_BYTES,
     MEASUREMENT_BYTES,
@@ -49,37 +48,19 @@ class LinkTiming:
     ----------
     reply_timeout_ns
         From the end of a request to RxDone of its reply, as configured.
-    tx_done_ns, rx_done_ns
-        From the end of a packet to TxDone of its sender and to RxDone of its receiver.
     """
 
     settings: LoRaSettings
     reply_timeout_ns: int
-    tx_done_ns: int
-    rx_done_ns: int
-
-    @classmethod
-    def from_settings(cls, settings: LoRaSettings, reply_timeout_ns: int) -> LinkTiming:
-        """Compute the timing of a modem setting."""
-        lag_ns = rx_done_ns(settings.spreading_factor, settings.bandwidth_hz)
-        return cls(settings, reply_timeout_ns, TX_DONE_NS, lag_ns)
 
     @property
-    def symbol_ns(self) -> int:
-        """Duration of a symbol."""
-        return symbol_time_ns(self.settings.spreading_factor, self.settings.bandwidth_hz)
+    def rx_done_ns(self) -> int:
+        """Nominal delay from the end of a packet to RxDone of its receiver."""
+        return self.settings.rx_done_ns
 
     def airtime_ns(self, payload_bytes: int) -> int:
         """Return the airtime of a packet."""
-        return 1000 * airtime_us(
-            payload_bytes,
-            spreading_factor=self.settings.spreading_factor,
-            bandwidth_hz=self.settings.bandwidth_hz,
-            coding_rate=self.settings.coding_rate,
-            preamble_symbols=self.settings.preamble_symbols,
-            crc=self.settings.crc,
-            low_data_rate=self.settings.low_data_rate,
-        )
+        return self.settings.airtime_ns(payload_bytes)
 
     def timeout_ns(self, reply_bytes: int) -> int:
         """Return the timeout of a reply: as configured, or longer where its airtime demands it (SF 10 and above)."""
@@ -351,7 +332,7 @@ class Synchronisation(Transaction):
         return Request(CommandMessage(letter, self.station).to_bytes(), reply_timeout_ns)
 
     def _earliest_reply_ns(self, sent_ns: int) -> int:
-        tolerance_ns = self.TOLERANCE_NS + self._timing.symbol_ns // 4
+        tolerance_ns = self.TOLERANCE_NS + self._timing.settings.symbol_ns // 4
         return sent_ns + self._forward_ns + self._back_ns - tolerance_ns
 
     def _detect_restart(self, reply: TimeReply) -> None:

@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
+from tsgt.radio.airtime import TX_DONE_NS
 from tsgt.radio.classic import COMMAND_BYTES, MEASUREMENT_BYTES, PING_REPLY_BYTES, TIME_REPLY_BYTES
 from tsgt.radio.superframe import (
     COMPOSE_LEAD_NS,
@@ -128,7 +129,7 @@ def classic_cycle(
     def exchange_ns(reply_bytes: int) -> float:
         """Return the mean duration of a request with its reply or its timeout."""
         replied_ns = timing.airtime_ns(reply_bytes) + 2 * timing.rx_done_ns + host_ns
-        missed_ns = timing.tx_done_ns + timing.timeout_ns(reply_bytes)
+        missed_ns = TX_DONE_NS + timing.timeout_ns(reply_bytes)
         return request_ns + success * replied_ns + (1 - success) * missed_ns + host_ns
 
     cycle_ns = load.stations * exchange_ns(MEASUREMENT_BYTES)

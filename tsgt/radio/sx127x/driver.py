@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, NoReturn
 import structlog
 
 from tsgt.errors import RadioError, RadioSettingsError, RadioTimeoutError
-from tsgt.radio.airtime import airtime_us
 from tsgt.radio.base import MAX_PAYLOAD_BYTES, LoRaSettings, Packet, Transmission
 from tsgt.radio.sx127x.chip import Chip
 
@@ -147,7 +146,7 @@ class SX127x:
         async with self._lock:
             self._settings = settings
             self._chip = Chip(self._hal, self._clock, settings)
-            self._min_packet_ns = self._airtime_ns(1)
+            self._min_packet_ns = settings.airtime_ns(1)
             try:
                 await self._set_up()
             except RadioError as error:
@@ -167,7 +166,7 @@ class SX127x:
                 await self._prepare(payload)
                 if at_ns is not None:
                     await self._clock.sleep_until(at_ns)
-                transmitted = await self._send(self._airtime_ns(len(payload)))
+                transmitted = await self._send(self._settings.airtime_ns(len(payload)))
             except RadioError as error:
                 self._fail(str(error))
                 raise
@@ -369,18 +368,6 @@ class SX127x:
         """Let the event loop deliver detected edges: one iteration to poll, one for the callbacks."""
         await asyncio.sleep(0)
         await asyncio.sleep(0)
-
-    def _airtime_ns(self, payload_bytes: int) -> int:
-        settings = self._settings
-        return 1000 * airtime_us(
-            payload_bytes,
-            spreading_factor=settings.spreading_factor,
-            bandwidth_hz=settings.bandwidth_hz,
-            coding_rate=settings.coding_rate,
-            preamble_symbols=settings.preamble_symbols,
-            crc=settings.crc,
-            low_data_rate=settings.low_data_rate,
-        )
 
     async def _pause(self, duration_ns: int) -> None:
         await self._clock.sleep_until(self._clock.monotonic_ns() + duration_ns)

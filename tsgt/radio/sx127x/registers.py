@@ -109,7 +109,6 @@ MAX_POWER_MASK = 0x70
 OUTPUT_POWER_MASK = 0x0F
 PA_RAMP_40_US = 0x09
 OCP_ON = 0x20
-OCP_TRIM_MASK = 0x1F
 OCP_TRIM_100_MA = 11
 OCP_TRIM_140_MA = 17
 PA_DAC_DEFAULT = 0x84
@@ -123,10 +122,8 @@ LNA_BOOST_HF = 0x03
 
 # --- RegDioMapping1 (table 18) --------------------------------------------------------------------------------
 
-DIO0_MASK = 0xC0
 DIO0_RX_DONE = 0x00
 DIO0_TX_DONE = 0x40
-DIO0_CAD_DONE = 0x80
 
 # --- RegVersion (section 6.4) ---------------------------------------------------------------------------------
 
@@ -163,9 +160,7 @@ SIGNAL_DETECTED = 0x01
 
 # --- RegHopChannel (section 6.4) ------------------------------------------------------------------------------
 
-PLL_TIMEOUT = 0x80
 CRC_ON_PAYLOAD = 0x40
-FHSS_PRESENT_CHANNEL_MASK = 0x3F
 
 # --- RegModemConfig1, 2, 3 (section 6.4) ----------------------------------------------------------------------
 
@@ -186,9 +181,7 @@ AGC_AUTO_ON = 0x04
 AUTOMATIC_IF_ON = 0x80
 DETECT_OPTIMIZE_RESERVED = 0x40  # bits 6-3 as after a reset
 DETECT_OPTIMIZE_SF7_TO_SF12 = 0x03
-DETECT_OPTIMIZE_SF6 = 0x05
 DETECTION_THRESHOLD_SF7_TO_SF12 = 0x0A
-DETECTION_THRESHOLD_SF6 = 0x0C
 
 # --- RegInvertIQ, RegInvertIQ2 (section 6.4) ------------------------------------------------------------------
 

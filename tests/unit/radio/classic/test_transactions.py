@@ -9,7 +9,7 @@ from harness.radios import MS, PAPER
 from tsgt.radio.classic import ClassicStation, LinkTiming, Synchronisation
 from tsgt.radio.classic.messages import TimeReply
 
-TIMING = LinkTiming.from_settings(PAPER, 250 * MS)
+TIMING = LinkTiming(PAPER, 250 * MS)
 PING_NS = TIMING.airtime_ns(2)
 FORWARD_NS = PING_NS + TIMING.rx_done_ns
 TURNAROUND_NS = 3 * MS

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 from harness.radios import MS, PAPER
 
-from tsgt.radio import LoRaSettings
+from tsgt.radio import TX_DONE_NS, LoRaSettings
 from tsgt.radio.classic import (
     CommandMessage,
     CommandTransaction,
@@ -15,7 +15,7 @@ from tsgt.radio.classic import (
     Transaction,
 )
 
-TIMING = LinkTiming.from_settings(PAPER, 250 * MS)
+TIMING = LinkTiming(PAPER, 250 * MS)
 SOME = MeasurementMessage(
     station=1,
     status=0,
@@ -30,7 +30,7 @@ def test_timing_of_the_paper() -> None:
     """At SF 9 the airtimes are those of the paper, and 250 ms are enough for every reply."""
     assert [TIMING.airtime_ns(size) for size in (2, 9, 34)] == [53_760_000, 78_336_000, 139_776_000]
     assert [TIMING.timeout_ns(size) for size in (2, 9, 34)] == [250 * MS] * 3
-    assert TIMING.tx_done_ns == 67_000
+    assert TX_DONE_NS == 67_000
     assert TIMING.rx_done_ns == pytest.approx(0.76 * 2.048e6, abs=1)
 
 
@@ -40,7 +40,7 @@ def test_slow_replies_are_waited_for(spreading_factor: int) -> None:
     settings = LoRaSettings(
         frequency_hz=905_000_000, spreading_factor=spreading_factor, bandwidth_hz=250_000, coding_rate=6
     )
-    timing = LinkTiming.from_settings(settings, 250 * MS)
+    timing = LinkTiming(settings, 250 * MS)
     assert timing.timeout_ns(34) >= timing.airtime_ns(34) + timing.rx_done_ns + 100 * MS
 
 

@@ -16,7 +16,7 @@ def classic(stations: int = 3, loss: float = 0.0, *, rate_hz: float = 2.5, **set
     """Plan the paper's protocol, as a master runs it that nothing else is said to."""
     return classic_cycle(
         TrafficLoad(stations=stations, rate_hz=rate_hz, loss=loss),
-        LinkTiming.from_settings(modem(**settings), 250_000_000),
+        LinkTiming(modem(**settings), 250_000_000),
         resync_cycles=5,
         resync_interval_ns=300_000_000_000,
     )

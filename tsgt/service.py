@@ -1,7 +1,4 @@
-"""What a long-running program owes the system.
-
-An orderly end, signs of life to systemd, data on the disk, and sockets that belong to one program at a time.
-"""
+"""Services to a daemon: orderly shutdown, systemd notifications, periodic sync to disk, and exclusive UNIX sockets."""
 
 from __future__ import annotations
 
@@ -28,47 +25,37 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 SYNC_INTERVAL_S = 1.0
-"""How often a recording is brought to the disk: the most that a power cut can take."""
+"""Interval of syncs to disk: the most that a power cut can lose."""
 
 STATUS_INTERVAL_S = 1.0
-"""How often systemd is told how the service does."""
+"""Interval of the status reports to systemd."""
 
 MAX_SOCKET_PATH_BYTES = 107
-"""What sockaddr_un holds, less the end of the string: unix(7)."""
+"""Capacity of sockaddr_un without the terminating zero: unix(7)."""
 
 _BACKLOG = 100
 
-_FOLDER_LOCK_LIMIT_S = 1.0
-"""How long to wait for another program that opens a socket in the same folder; it takes a millisecond."""
+_FOLDER_LOCK_TIMEOUT_S = 1.0
+"""Another program that opens a socket in the same folder holds the lock for a millisecond."""
 
 log = structlog.get_logger()
 
 
 def run(main: Callable[[], Awaitable[T]]) -> T:
-    """Run a coroutine to its end in an event loop of its own; SIGINT, SIGTERM and SIGHUP cancel it.
-
-    Parameters
-    ----------
-    main
-        Makes the coroutine. What it holds open belongs into ``async with`` or ``finally``.
-
-    Returns
-    -------
-    T
-        What the coroutine returned, also when it did so on being cancelled.
+    """Run a coroutine in a new event loop and return its result; SIGINT, SIGTERM and SIGHUP cancel it.
 
     Raises
     ------
     TsgtError
-        The first one that ended a task group of the coroutine; a user wants its line, not the group's tree.
+        The first one in an exception group: a user needs its message, not the group's traceback.
     KeyboardInterrupt
-        SIGINT ended it.
+        SIGINT cancelled it.
     SystemExit
-        SIGTERM or SIGHUP ended it, with status 0: a service that was told to stop has not failed.
+        SIGTERM or SIGHUP cancelled it; the status is 0, as a requested stop is no failure.
     """
     terminated = False
 
-    async def cancelled_by_sigterm() -> T:
+    async def main_with_signals() -> T:
         loop = asyncio.get_running_loop()
         task = asyncio.current_task()
 
@@ -79,13 +66,11 @@ def run(main: Callable[[], Awaitable[T]]) -> T:
                 task.cancel()
 
         loop.add_signal_handler(signal.SIGTERM, terminate)
-        loop.add_signal_handler(
-            signal.SIGHUP, terminate
-        )  # the terminal, or the connection to this Pi, is gone
+        loop.add_signal_handler(signal.SIGHUP, terminate)  # the terminal or the SSH connection is gone
         return await main()
 
     try:
-        return asyncio.run(cancelled_by_sigterm())  # which treats SIGINT in the same way
+        return asyncio.run(main_with_signals())  # handles SIGINT in the same way
     except asyncio.CancelledError:
         if not terminated:
             raise
@@ -94,29 +79,27 @@ def run(main: Callable[[], Awaitable[T]]) -> T:
         known, others = group.split(TsgtError)
         if known is None or others is not None:
             raise
-        raise _first(known) from group
+        raise _first_error(known) from group
 
 
-def _first(group: ExceptionGroup[TsgtError]) -> TsgtError:
+def _first_error(group: ExceptionGroup[TsgtError]) -> TsgtError:
     first = group.exceptions[0]
-    return _first(first) if isinstance(first, ExceptionGroup) else first
+    return _first_error(first) if isinstance(first, ExceptionGroup) else first
 
 
-async def keep_synced(
+async def sync_periodically(
     sync: Callable[[], None], clock: Clock, interval_s: float = SYNC_INTERVAL_S
 ) -> NoReturn:
-    """Bring a recording to the disk again and again, in a thread, because a slow SD card takes seconds.
+    """Sync a recording to disk periodically, in a thread, because a slow SD card takes seconds.
 
-    A disk that fails is logged once, and once more when it is well again.
+    Logs a failing disk once, and its recovery.
 
     Parameters
     ----------
     sync
-        Returns when everything is on the disk; raises a :class:`~tsgt.errors.TsgtError` when it cannot.
-    clock
-        Sets the pace.
+        Returns when all data is on the disk; raises :class:`~tsgt.errors.TsgtError` on failure.
     interval_s
-        From the end of one sync to the start of the next, in s.
+        From the end of one sync to the start of the next.
     """
     failing = False
     while True:
@@ -134,17 +117,11 @@ async def keep_synced(
 
 
 def sd_notify(*assignments: str) -> None:
-    """Tell systemd how the service does; does nothing where nobody asked for it.
-
-    Parameters
-    ----------
-    assignments
-        As in sd_notify(3): ``READY=1``, ``STATUS=...``, ``WATCHDOG=1``, ``STOPPING=1``.
-    """
+    """Notify systemd with assignments as in sd_notify(3), such as ``READY=1``; without effect outside of systemd."""
     address = os.environ.get("NOTIFY_SOCKET")
     if not address:
         return
-    if address.startswith("@"):  # systemd's way of writing an abstract socket
+    if address.startswith("@"):  # an abstract socket
         address = "\0" + address[1:]
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
@@ -155,7 +132,7 @@ def sd_notify(*assignments: str) -> None:
 
 
 def watchdog_interval_s() -> float | None:
-    """How often systemd wants ``WATCHDOG=1`` from this process, in s, with half the time in hand; None for never."""
+    """Return half the watchdog timeout that systemd has set for this process; None without one."""
     timeout_us = os.environ.get("WATCHDOG_USEC", "")
     pid = os.environ.get("WATCHDOG_PID")
     if not timeout_us.isdecimal() or (pid is not None and pid != str(os.getpid())):
@@ -163,16 +140,8 @@ def watchdog_interval_s() -> float | None:
     return int(timeout_us) / 2e6
 
 
-async def keep_notified(status: Callable[[], str], clock: Clock) -> NoReturn:
-    """Tell systemd that the service is ready, then how it does and that it lives, and at the end that it stops.
-
-    Parameters
-    ----------
-    status
-        One line for people, asked for each second.
-    clock
-        Sets the pace.
-    """
+async def notify_systemd(status: Callable[[], str], clock: Clock) -> NoReturn:
+    """Notify systemd of readiness, then each second of the status line and of being alive, and at the end of stopping."""
     interval_s = min(STATUS_INTERVAL_S, watchdog_interval_s() or STATUS_INTERVAL_S)
     sd_notify("READY=1", f"STATUS={status()}")
     try:
@@ -184,24 +153,19 @@ async def keep_notified(status: Callable[[], str], clock: Clock) -> NoReturn:
 
 
 class UnixListener:
-    """A UNIX socket that listens, and that no other program listens on.
+    """A listening UNIX socket that no other program serves.
 
     Parameters
     ----------
     path
-        Where. A stale socket of an earlier run is replaced; the folder is created if need be.
+        A stale socket is replaced; the folder is created if missing.
     mode
-        Its permissions.
-
-    Attributes
-    ----------
-    socket
-        To be given to an event loop.
+        File permissions.
 
     Raises
     ------
     StreamError
-        Another program serves the socket, or it cannot be made.
+        Another program serves the socket, or it cannot be created.
     """
 
     def __init__(self, path: Path, mode: int) -> None:
@@ -216,23 +180,23 @@ class UnixListener:
             raise
         except OSError as error:
             raise StreamError(
-                f"{path}: the socket cannot be made ({error.strerror}); choose another path"
+                f"{path}: the socket cannot be created ({error.strerror}); choose another path"
             ) from error
 
     def remove(self) -> None:
-        """Remove the file, unless another program has put its own there."""
-        with suppress(OSError):  # it is gone, or its folder is: then there is nothing of ours to remove
+        """Remove the file, unless another program has replaced it."""
+        with suppress(OSError):  # it is gone, or its folder is
             if self._path.lstat().st_ino == self._inode:
                 self._path.unlink()
 
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Keep another program from opening the same socket between our look at it and our listening."""
+    """Lock a folder, so that no other program opens the same socket between our check and our bind."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
-        deadline_s = time.monotonic() + _FOLDER_LOCK_LIMIT_S
-        while True:  # daemons that start together meet here
+        deadline_s = time.monotonic() + _FOLDER_LOCK_TIMEOUT_S
+        while True:  # daemons that start together compete here
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break
@@ -255,7 +219,7 @@ def _bind(path: Path, mode: int) -> socket.socket:
     _remove_stale(path)
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
-        # bind() gives the file the mode of the socket less the umask: it is never open to more than `mode` says.
+        # bind() creates the file with the mode of the socket less the umask: it is never more accessible than `mode`.
         os.fchmod(listener.fileno(), mode)
         listener.bind(os.fspath(path))
         path.chmod(mode)
@@ -266,13 +230,13 @@ def _bind(path: Path, mode: int) -> socket.socket:
 
 
 def _remove_stale(path: Path) -> None:
-    """Remove a socket that nobody answers; leave everything else alone."""
+    """Remove a socket that no program serves, and nothing else."""
     try:
         is_socket = stat.S_ISSOCK(path.lstat().st_mode)
     except FileNotFoundError:
         return
     if not is_socket:
-        raise StreamError(f"{path}: is not a socket and is left alone; remove it or choose another path")
+        raise StreamError(f"{path}: is not a socket; remove it or choose another path")
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         try:
@@ -282,5 +246,5 @@ def _remove_stale(path: Path) -> None:
             log.info("stale_socket_replaced", path=str(path))
             return
         except BlockingIOError:
-            pass  # so many wait there that it does not answer, but it is there
+            pass  # served, but its backlog is full
     raise StreamError(f"{path}: another program serves this socket; stop it or choose another path")

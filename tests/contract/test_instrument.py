@@ -117,7 +117,7 @@ async def test_single_measurements(kind: str) -> None:
         await day.instrument.direct()
         before_ns = day.far.clock.monotonic_ns()
         nothing = await day.instrument.measure()
-        day.far.station.aim(1)
+        day.far.station.aim_at_target(1)
         shot = await day.instrument.measure()
     assert (nothing.prism, nothing.status, nothing.slope_distance_m) == (None, Status.NO_TARGET, None)
     assert (shot.prism, shot.status) == (None, Status.OK)

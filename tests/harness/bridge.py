@@ -49,7 +49,7 @@ class FakeProgram:
     def print(self, data: bytes) -> None:
         """Print bytes."""
         if not self.ended:
-            self._listener.said(data, self._clock.monotonic_ns())
+            self._listener.output_received(data, self._clock.monotonic_ns())
 
     def measure(self, distance_m: float = 10.0, **more: Any) -> None:
         """Print a measurement that was made just now."""
@@ -67,7 +67,7 @@ class FakeProgram:
     def exit(self, how: str = "exit status 1") -> None:
         """End."""
         self.ended = True
-        self._listener.ended(how)
+        self._listener.exited(how)
 
     # --- Program ----------------------------------------------------------------------------------------------
 
@@ -82,7 +82,7 @@ class FakeProgram:
         """End."""
         self.ended = True
 
-    async def end(self) -> None:
+    async def terminate(self) -> None:
         """End."""
         self.ended = True
 
@@ -155,7 +155,7 @@ class _Serving:
         """End."""
         self._task.cancel()
 
-    async def end(self) -> None:
+    async def terminate(self) -> None:
         """End."""
         self._task.cancel()
         await asyncio.wait([self._task])
@@ -170,7 +170,7 @@ class _Serving:
                     await self._stop()
                 await self._do(command)
         except InstrumentError as error:
-            self._listener.ended(f"exit status 1: {error}")
+            self._listener.exited(f"exit status 1: {error}")
         finally:
             await self._stop()
             await self._instrument.close()
@@ -208,7 +208,7 @@ class _Serving:
                 reading = await self._instrument.read()
                 self._say({"type": "measurement", "prism": reading.prism} | _fields(reading))
         except InstrumentError as error:
-            self._listener.ended(f"exit status 1: {error}")
+            self._listener.exited(f"exit status 1: {error}")
 
     async def _stop(self) -> None:
         task, self._reading = self._reading, None
@@ -218,7 +218,7 @@ class _Serving:
                 await task
 
     def _say(self, record: dict[str, Any]) -> None:
-        self._listener.said(_line(record) + b"\n", self._clock.monotonic_ns())
+        self._listener.output_received(_line(record) + b"\n", self._clock.monotonic_ns())
 
 
 def measured(distance_m: float = 10.0, **more: Any) -> dict[str, Any]:

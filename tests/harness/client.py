@@ -23,12 +23,11 @@ from tsgt.radio.classic.messages import decode_reply
 from tsgt.recording.journal import load_journal
 from tsgt.simulation.instrument import SimulatedLine, SimulatedTotalStation
 from tsgt.simulation.kernel import DriftingClock, VirtualClock
-from tsgt.simulation.lora import Air, LinkModel, opener
+from tsgt.simulation.lora import Air, LinkModel, radio_opener
 from tsgt.simulation.mission import instrument_config
-from tsgt.simulation.mission.run_log import WatchedInstrument
+from tsgt.simulation.mission.run_log import ObservedInstrument
 from tsgt.simulation.world import scenario_world
-from tsgt.station import run_client
-from tsgt.station.leica import LeicaInstrument
+from tsgt.station import ClientDependencies, run_client
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
@@ -38,7 +37,7 @@ if TYPE_CHECKING:
 
     from tsgt.config import ProtocolConfig
     from tsgt.model import PolarMeasurement
-    from tsgt.radio import OpenRadio
+    from tsgt.radio import RadioOpener
     from tsgt.radio.classic.messages import Reply
     from tsgt.station import Reading
 
@@ -92,7 +91,7 @@ class Field:
     line: SimulatedLine
     clock: DriftingClock
     master: Side
-    open_radio: OpenRadio
+    open_radio: RadioOpener
     read: list[Reading]
     protocol: ProtocolConfig | None = None
     key: bytes | None = None
@@ -103,16 +102,18 @@ class Field:
         """Start the client."""
         config = client_config(self.folder, protocol=self.protocol)
         assert isinstance(config.instrument, LeicaInstrumentConfig)
-        driver = LeicaInstrument(config.instrument, self.line.open, self.clock)
+        instrument = ObservedInstrument(config.instrument, self.line.open, self.clock, self.read.append)
         self.client = asyncio.create_task(
             run_client(
                 config,
                 PAPER,
-                instrument=WatchedInstrument(driver, self.read.append),
-                open_radio=self.open_radio,
-                clock=self.clock,
-                key=self.key,
-                boot=self.boot,
+                ClientDependencies(
+                    instrument=instrument,
+                    open_radio=self.open_radio,
+                    clock=self.clock,
+                    key=self.key,
+                    boot=self.boot,
+                ),
             )
         )
 
@@ -173,7 +174,7 @@ async def field_day(
         line=SimulatedLine(instrument, timeline, clock),
         clock=clock,
         master=master,
-        open_radio=opener(air, "station1", clock, rng, PAPER),
+        open_radio=radio_opener(air, "station1", clock, rng, PAPER),
         read=[],
         protocol=protocol,
         key=key,

@@ -1,6 +1,6 @@
 """Two hundred scripts of what goes wrong between a client and its instrument, and what has to hold in each.
 
-A script lets the real driver and its keeper measure with a simulated Leica on virtual time, does something to line or
+A script lets the real driver and its supervisor measure with a simulated Leica on virtual time, does something to line or
 instrument, and ends it at a known instant. Every distance that is given must be one that the instrument has answered with,
 once, with the time at which it was measured; and the first one after the end must come within the time stated for the
 kind of fault. ``python benchmarks/serial_faults.py`` runs all of them.
@@ -18,18 +18,18 @@ import numpy as np
 
 from tsgt.config import LeicaInstrumentConfig, ScenarioConfig
 from tsgt.simulation.instrument import LineFault, SimulatedLine, SimulatedTotalStation
-from tsgt.simulation.instrument.geocom.server import Forced
+from tsgt.simulation.instrument.geocom import ForcedResponse
 from tsgt.simulation.kernel import DriftingClock, VirtualClock, VirtualTimeline, run_virtual
 from tsgt.simulation.world import scenario_world
 from tsgt.station.geocom import ReturnCode, Rpc
-from tsgt.station.instrument_supervisor import InstrumentKeeper
+from tsgt.station.instrument_supervisor import InstrumentSupervisor
 from tsgt.station.leica import LeicaInstrument
-from tsgt.station.session import Session
+from tsgt.station.session import ClientSession
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
 
-    from tsgt.simulation.instrument.geocom import Offered
+    from tsgt.simulation.instrument import ReportedDistance
     from tsgt.station import Reading
 
 SETTLE_S: Final = 10.0
@@ -130,24 +130,24 @@ async def _run(script: Script, timeline: VirtualTimeline) -> Outcome:
         latency_ms=_LATENCY_MS,
     )
     readings: list[tuple[int, Reading]] = []
-    keeper = InstrumentKeeper(
+    supervisor = InstrumentSupervisor(
         LeicaInstrument(config, line.open, clock),
-        Session(1, 1),
+        ClientSession(1, 1),
         clock,
         on_reading=lambda reading: readings.append((timeline.now_ns(), reading)),
         on_record=_ignore,
-        on_done=_ignore,
+        on_result=_ignore,
     )
-    keeping = asyncio.create_task(keeper.keep())
+    running = asyncio.create_task(supervisor.run())
     try:
         await asyncio.sleep(SETTLE_S)
         await script.act(Bench(station, line, script_rng))
         ended_ns = timeline.now_ns()
         await asyncio.sleep(AFTER_S)
     finally:
-        keeping.cancel()
-        await asyncio.wait([keeping])
-    outcome = Outcome(offered=len(station.offered))
+        running.cancel()
+        await asyncio.wait([running])
+    outcome = Outcome(offered=len(station.reported_distances))
     _judge(outcome, [reading for _, reading in readings if reading.status.usable], station, clock)
     usable_ns = [at_ns for at_ns, reading in readings if reading.status.usable and at_ns >= ended_ns]
     if usable_ns:
@@ -165,9 +165,9 @@ def _judge(
     outcome: Outcome, usable: Iterable[Reading], station: SimulatedTotalStation, clock: DriftingClock
 ) -> None:
     """Compare what was given with what was offered."""
-    seen: set[Offered] = set()
-    offered: dict[int, list[Offered]] = {}
-    for each in station.offered:
+    seen: set[ReportedDistance] = set()
+    offered: dict[int, list[ReportedDistance]] = {}
+    for each in station.reported_distances:
         offered.setdefault(each.instrument_ms, []).append(each)
     for reading in usable:
         outcome.given += 1
@@ -187,7 +187,7 @@ def _judge(
             outcome.wrong.append(f"stamped {late_ns / 1e6:.1f} ms after it was measured: {reading}")
 
 
-def _same(offered: Offered, reading: Reading) -> bool:
+def _same(offered: ReportedDistance, reading: Reading) -> bool:
     pairs = (
         (offered.horizontal_angle_rad, reading.horizontal_angle_rad),
         (offered.zenith_angle_rad, reading.zenith_angle_rad),
@@ -207,8 +207,8 @@ def all_scripts() -> list[Script]:
         (16, "all of these, with checksums", 3.0, partial(_spoil, _LINE_FAULTS, 0.05), True),
         (8, "answers with other digits, with checksums", 3.0, _change_digits, True),
         *((4, f"codes of {name}", 3.0, partial(_force, codes), False) for name, codes in _families().items()),
-        (12, "no answers", 5.0, partial(_silence, "mute"), False),
-        (8, "nothing reaches the instrument", 5.0, partial(_silence, "deaf"), False),
+        (12, "no answers", 5.0, partial(_silence, "drop_responses"), False),
+        (8, "nothing reaches the instrument", 5.0, partial(_silence, "drop_requests"), False),
         (20, "unplugged", 3.0, _unplug, False),
         (12, "switched off and on, locked by hand", 3.0, _switch_off, False),
         (4, "another speed", 12.0, _change_baud, False),
@@ -219,7 +219,9 @@ def all_scripts() -> list[Script]:
     return scripts
 
 
-_LINE_FAULTS: Final = tuple(fault for fault in LineFault if fault not in (LineFault.NONE, LineFault.DIGIT))
+_LINE_FAULTS: Final = tuple(
+    fault for fault in LineFault if fault not in (LineFault.NONE, LineFault.WRONG_DIGIT)
+)
 
 _FAMILY_NAMES: Final = {
     0: "TPS",
@@ -255,7 +257,7 @@ async def _spoil(faults: tuple[LineFault, ...], share: float, bench: Bench) -> N
         await asyncio.sleep(1.0)
         script.clear()
     # What is late is still on its way.
-    await asyncio.sleep(bench.line.faults.late_s)
+    await asyncio.sleep(bench.line.faults.delay_s)
 
 
 async def _change_digits(bench: Bench) -> None:
@@ -263,7 +265,7 @@ async def _change_digits(bench: Bench) -> None:
     bench.line.faults.script.clear()
     for _ in range(15):
         bench.line.faults.script.extend(
-            LineFault.DIGIT if bench.rng.random() < 0.1 else LineFault.NONE for _ in range(60)
+            LineFault.WRONG_DIGIT if bench.rng.random() < 0.1 else LineFault.NONE for _ in range(60)
         )
         await asyncio.sleep(1.0)
         bench.line.faults.script.clear()
@@ -277,7 +279,9 @@ async def _force(codes: list[ReturnCode], bench: Bench) -> None:
         for rpc in (Rpc.TMC_GET_FULL_MEAS, Rpc.MOT_READ_LOCK_STATUS, None):
             if bench.rng.random() < 0.5:
                 times = int(bench.rng.integers(1, 4))
-                forced = Forced(code=0 if com else code, com_code=code if com else 0, rpc=rpc, times=times)
+                forced = ForcedResponse(
+                    code=0 if com else code, com_code=code if com else 0, rpc=rpc, times=times
+                )
                 bench.station.server.forced.append(forced)
         await asyncio.sleep(1.0)
     bench.station.server.forced.clear()
@@ -303,7 +307,7 @@ async def _switch_off(bench: Bench) -> None:
     await asyncio.sleep(bench.rng.uniform(0.5, 30.0))
     bench.station.switch_on()
     await asyncio.sleep(bench.rng.uniform(5.5, 8.0))
-    bench.station.lock_by_hand(1)
+    bench.station.lock_manually(1)
 
 
 async def _change_baud(bench: Bench) -> None:

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from structlog.testing import capture_logs
 
 from tsgt.simulation.kernel import VirtualClock, run_virtual
-from tsgt.station.bridge.messages import LineCutter
-from tsgt.station.bridge.run import BridgeRun, Refusals
-from tsgt.station.bridge.timing import OLDEST_NS, Stamper
+from tsgt.station.bridge.messages import LineSplitter
+from tsgt.station.bridge.session import BridgeSession, RejectedLines
+from tsgt.station.bridge.timing import MAX_AGE_NS, LineTimestamper
 
 if TYPE_CHECKING:
     from tsgt.station import Reading
@@ -28,7 +28,7 @@ STAMPS = ("host", "instrument", "arrival")
 @given(st.binary(max_size=300), st.lists(st.integers(0, 300)), st.integers(1, 50))
 def test_pieces_do_not_matter(data: bytes, cuts: list[int], limit_bytes: int) -> None:
     """However the output is cut into pieces, the lines are the same, and none is longer than its limit."""
-    cutter = LineCutter(limit_bytes)
+    cutter = LineSplitter(limit_bytes)
     lines = []
     for begin, end in pairwise(sorted({0, len(data), *(cut for cut in cuts if cut < len(data))})):
         lines += cutter.push(data[begin:end])
@@ -60,16 +60,16 @@ def test_readings_are_what_can_have_been_measured(
 
     async def main() -> None:
         clock = VirtualClock(0)
-        run = BridgeRun("bridge", clock, Stamper(0), readings, Refusals(clock))
+        run = BridgeSession("bridge", clock, LineTimestamper(0), readings, RejectedLines(clock))
         now_ns = 20 * 10**9
-        run.said(json.dumps(HELLO | {"stamps": stamps}).encode() + b"\n", now_ns)
-        run.switch(tracking=1)
+        run.output_received(json.dumps(HELLO | {"stamps": stamps}).encode() + b"\n", now_ns)
+        run.set_tracking(1)
         for kind, wrong, after_ns, age_ns in said:
             record = measured() | {"type": kind, "id": 1} | wrong
             now_ns += after_ns
             if age_ns is not None:
                 record |= {"host_time_ns": now_ns - age_ns, "instrument_time_ns": now_ns - age_ns + 77}
-            run.said(rubbish + b"\n" + json.dumps(record).encode() + b"\n", now_ns)
+            run.output_received(rubbish + b"\n" + json.dumps(record).encode() + b"\n", now_ns)
 
     with capture_logs():
         run_virtual(main)
@@ -82,7 +82,7 @@ def test_readings_are_what_can_have_been_measured(
         assert reading.slope_distance_m is not None
         assert reading.slope_distance_m > 0
         assert reading.received_ns is not None
-        assert 0 <= reading.received_ns - reading.at_ns <= OLDEST_NS
+        assert 0 <= reading.received_ns - reading.at_ns <= MAX_AGE_NS
 
 
 TRANSCRIPT = [
@@ -110,13 +110,13 @@ def test_damaged_output_does_no_harm(damage: Damage, cuts: list[int]) -> None:
 
     async def main() -> None:
         clock = VirtualClock(0)
-        run = BridgeRun("bridge", clock, Stamper(0), readings, Refusals(clock))
+        run = BridgeSession("bridge", clock, LineTimestamper(0), readings, RejectedLines(clock))
         now_ns = 20 * 10**9
-        run.switch(tracking=1)
+        run.set_tracking(1)
         for begin, end in pairwise(sorted({0, len(output), *(cut for cut in cuts if cut < len(output))})):
             now_ns += 10**6
-            run.said(output[begin:end], now_ns)
-        run.said(b"\n", now_ns)
+            run.output_received(output[begin:end], now_ns)
+        run.output_received(b"\n", now_ns)
 
     with capture_logs():
         run_virtual(main)

@@ -28,7 +28,7 @@ from hypothesis import strategies as st
 
 from tsgt.errors import InstrumentError, MessageError
 from tsgt.simulation.kernel import VirtualClock, run_virtual
-from tsgt.station.geocom import GeoComConnection, Rpc, Verdict, name_of, verdict
+from tsgt.station.geocom import GeoComConnection, Outcome, Rpc, name_of, outcome_of
 from tsgt.station.geocom.codec import (
     MAX_TRANSACTION,
     Byte,
@@ -161,7 +161,7 @@ def test_a_line_without_end_does_not_fill_the_memory() -> None:
 @given(code=st.integers(-10, 70_000), has_values=st.booleans())
 def test_every_code_has_a_verdict_and_a_name(code: int, has_values: bool) -> None:  # noqa: FBT001
     """No code is unknown to the program to the point of an error."""
-    assert isinstance(verdict(code, has_values=has_values), Verdict)
+    assert isinstance(outcome_of(code, has_values=has_values), Outcome)
     assert name_of(code).startswith(str(code))
 
 

@@ -11,27 +11,27 @@ import pytest
 
 from tsgt.config import BridgeInstrumentConfig
 from tsgt.station.bridge.messages import (
-    AtmosphereCommand,
-    Command,
-    DirectCommand,
+    AtmosphereLine,
+    CommandLine,
+    DirectLine,
     DoneLine,
-    Hello,
-    MeasureCommand,
+    HelloLine,
+    MeasureLine,
     MeasurementLine,
     SettingsLine,
-    ShotLine,
+    SingleMeasurementLine,
     StatusLine,
-    TrackCommand,
+    TrackLine,
     decode_program_line,
 )
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "bridge.md").read_text()
 
-COMMANDS: dict[str, type[Command]] = {
-    "track": TrackCommand,
-    "direct": DirectCommand,
-    "measure": MeasureCommand,
-    "atmosphere": AtmosphereCommand,
+COMMANDS: dict[str, type[CommandLine]] = {
+    "track": TrackLine,
+    "direct": DirectLine,
+    "measure": MeasureLine,
+    "atmosphere": AtmosphereLine,
 }
 
 
@@ -40,7 +40,7 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", PAGE, flags=re.MULTILINE | re.DOTALL)
 
 
-@pytest.mark.parametrize("line", [Hello, MeasurementLine, DoneLine, StatusLine, SettingsLine])
+@pytest.mark.parametrize("line", [HelloLine, MeasurementLine, DoneLine, StatusLine, SettingsLine])
 def test_every_field_is_in_its_table(line: type) -> None:
     """The tables have the fields of the lines, and no others."""
     (name,) = (field.default for field in dataclasses.fields(line) if field.name == "type")
@@ -53,7 +53,7 @@ def test_every_field_is_in_its_table(line: type) -> None:
 def test_a_shot_has_the_fields_of_a_measurement() -> None:
     """As the page says: all but the prism, and an id."""
     shot, measurement = (
-        {field.name for field in dataclasses.fields(line)} for line in (ShotLine, MeasurementLine)
+        {field.name for field in dataclasses.fields(line)} for line in (SingleMeasurementLine, MeasurementLine)
     )
     assert shot == measurement - {"prism"} | {"id"}
 
@@ -82,7 +82,7 @@ def test_the_script_on_the_page_works() -> None:
         check=True,
     )
     hello, measurement = map(decode_program_line, run.stdout.splitlines())
-    assert isinstance(hello, Hello)
+    assert isinstance(hello, HelloLine)
     assert isinstance(measurement, MeasurementLine)
 
 

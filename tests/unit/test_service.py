@@ -14,10 +14,10 @@ from structlog.testing import capture_logs
 from tsgt.errors import RecordingError, StreamError
 from tsgt.service import (
     UnixListener,
-    keep_notified,
-    keep_synced,
+    notify_systemd,
     run,
     sd_notify,
+    sync_periodically,
     watchdog_interval_s,
 )
 
@@ -58,7 +58,7 @@ class StepClock:
 async def synced(sync: Callable[[], None], steps: int) -> StepClock:
     """Keep something synced for so many intervals."""
     clock = StepClock()
-    task = asyncio.create_task(keep_synced(sync, clock, interval_s=1.0))
+    task = asyncio.create_task(sync_periodically(sync, clock, interval_s=1.0))
     await asyncio.sleep(0)
     for _ in range(steps):
         await clock.step()
@@ -160,7 +160,7 @@ async def test_systemd_hears_ready_alive_and_stopping(
         monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
         monkeypatch.setenv("WATCHDOG_USEC", "1000000")
         clock = StepClock()
-        telling = asyncio.create_task(keep_notified(lambda: "well", clock))
+        telling = asyncio.create_task(notify_systemd(lambda: "well", clock))
         await asyncio.sleep(0)
         await clock.step()
         telling.cancel()

@@ -1,4 +1,4 @@
-"""What earlier runs of a station's client have left behind: read from their journals at the start."""
+"""Recovers undelivered measurements and beacon receptions from the journals of earlier runs of a station's client."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import structlog
 
 from tsgt.model import PolarMeasurement
-from tsgt.radio.superframe import KNOWN_LINEAGES, Queued, Reception
+from tsgt.radio.superframe import MAX_STREAMS, BeaconReception, QueuedMeasurement
 from tsgt.radio.superframe.wire import RESTART_SKIP, angle_code
 from tsgt.recording import MAX_LINE_BYTES, Typed, decode
 from tsgt.recording.journal import AcknowledgedRecord, JournalRecord, ReceptionRecord
@@ -17,54 +17,44 @@ from tsgt.recording.journal import AcknowledgedRecord, JournalRecord, ReceptionR
 if TYPE_CHECKING:
     from pathlib import Path
 
-MOST_MEASUREMENTS = 10_000
-"""More than an hour; what is older stays in the journals."""
+MAX_MEASUREMENTS = 10_000
+"""More than an hour; older ones stay in the journals."""
 
-LINEAGE_BITS = 16
+STREAM_ID_BITS = 16
 
 _TAIL_BYTES = 8_000_000
-_MORE = 4
-"""So many measurements take at most so much of a journal, with the beacons between them. Where there are fewer it is read
-from further back: beacons alone fill so much in six hours."""
-
-_HEAD_LINES = 2
+_TAIL_GROWTH = 4
+"""The tail of a journal that holds this many measurements with the beacons between them. Where it holds fewer, a longer tail
+is read: beacons alone fill it in six hours."""
 
 log = structlog.get_logger()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Backlog:
-    """What a new run of the client goes on from.
+    """State that a new run of the client continues from.
 
     Attributes
     ----------
-    lineage
-        Of the sequence numbers that go on; None where there are none.
-    run_start
-        Number of the first measurement of this run.
+    stream_id
+        Identifies the sequence numbers that are continued; None to start new ones.
+    first_sequence
+        Sequence number of this run's first measurement.
     queued
-        What has not been acknowledged, oldest first.
+        Unacknowledged measurements, oldest first.
     receptions
-        Of beacons; those by one clock in the order in which they were made.
+        Receptions of beacons; those on one clock in chronological order.
     """
 
-    lineage: int | None = None
-    run_start: int = 0
-    queued: tuple[Queued, ...] = ()
-    receptions: tuple[Reception, ...] = ()
+    stream_id: int | None = None
+    first_sequence: int = 0
+    queued: tuple[QueuedMeasurement, ...] = ()
+    receptions: tuple[BeaconReception, ...] = ()
 
 
-def queued(measurement: PolarMeasurement, unix_at_zero_ns: int, boot: str) -> Queued:
-    """Return a measurement of a journal as it is delivered.
-
-    Parameters
-    ----------
-    measurement
-        Its ``stamp_ns`` is on the Unix clock of the run that made it.
-    unix_at_zero_ns, boot
-        See :class:`~tsgt.recording.journal.JournalRecord`.
-    """
-    return Queued(
+def queued_measurement(measurement: PolarMeasurement, unix_at_zero_ns: int, boot: str) -> QueuedMeasurement:
+    """Return a journalled measurement as it is delivered; see :class:`~tsgt.recording.journal.JournalRecord`."""
+    return QueuedMeasurement(
         sequence=measurement.sequence,
         at_ns=measurement.stamp_ns - unix_at_zero_ns,
         boot=boot,
@@ -77,15 +67,7 @@ def queued(measurement: PolarMeasurement, unix_at_zero_ns: int, boot: str) -> Qu
 
 
 def read_backlog(directory: Path, station: int) -> Backlog:
-    """Read what is left from a folder of journals; lines and files that cannot be read are passed over.
-
-    Parameters
-    ----------
-    directory
-        The folder.
-    station
-        Number of the station.
-    """
+    """Read the backlog from a folder of journals; unreadable lines and files are skipped."""
     journals = [
         (head, path)
         for path in sorted(directory.glob(f"station{station}-*.jsonl"))
@@ -93,124 +75,106 @@ def read_backlog(directory: Path, station: int) -> Backlog:
     ]
     if not journals:
         return Backlog()
-    # A run that began while the disk took nothing has a lineage of its own, and what was left before is still left.
-    lineages = list(dict.fromkeys(head.lineage for head, _ in reversed(journals)))[:KNOWN_LINEAGES]
-    left = max((_left(journals, lineage) for lineage in lineages), key=lambda each: len(each.undelivered))
-    undelivered, receptions = left.undelivered, left.receptions
-    if len(undelivered) > MOST_MEASUREMENTS:
-        log.warning("measurements_discarded", measurements=len(undelivered) - MOST_MEASUREMENTS)
-    # A run that has heard no master leaves measurements whose time rests on what the runs before it have heard.
+    # A run that started while the disk was full has a stream of its own; the stream before it may still have a backlog.
+    stream_ids = list(dict.fromkeys(head.stream_id for head, _ in reversed(journals)))[:MAX_STREAMS]
+    stream = max(
+        (_read_stream(journals, each) for each in stream_ids), key=lambda each: len(each.undelivered)
+    )
+    undelivered, receptions = stream.undelivered, stream.receptions
+    if len(undelivered) > MAX_MEASUREMENTS:
+        log.warning("measurements_discarded", measurements=len(undelivered) - MAX_MEASUREMENTS)
+    # The times of a run that received no beacon rest on the receptions of earlier runs on the same clock.
     boots = {each.boot for each in undelivered}
     for head, path in reversed(journals):
-        if path not in left.read and head.boot in boots and len(receptions) < MOST_MEASUREMENTS:
+        if path not in stream.paths and head.boot in boots and len(receptions) < MAX_MEASUREMENTS:
             receptions = _tail(head, path).receptions + receptions
     return Backlog(
-        lineage=left.lineage,
-        run_start=left.last + 1 + RESTART_SKIP,
-        queued=tuple(undelivered[-MOST_MEASUREMENTS:]),
-        receptions=tuple(sorted(receptions[-MOST_MEASUREMENTS:], key=attrgetter("received_ns"))),
+        stream_id=stream.stream_id,
+        first_sequence=stream.last_sequence + 1 + RESTART_SKIP,
+        queued=tuple(undelivered[-MAX_MEASUREMENTS:]),
+        receptions=tuple(sorted(receptions[-MAX_MEASUREMENTS:], key=attrgetter("received_ns"))),
     )
 
 
-class _Left(NamedTuple):
-    """What the runs of one lineage have left.
+class _Stream(NamedTuple):
+    """The backlog of the runs that share a stream id, in the order of the runs, and the journals read for it."""
 
-    Attributes
-    ----------
-    lineage
-        Of the sequence numbers.
-    last
-        The highest of them.
-    undelivered, receptions
-        In the order of the runs.
-    read
-        The journals that had to be read for that.
-    """
-
-    lineage: int | None
-    last: int
-    undelivered: list[Queued]
-    receptions: list[Reception]
-    read: set[Path]
+    stream_id: int | None
+    last_sequence: int
+    undelivered: list[QueuedMeasurement]
+    receptions: list[BeaconReception]
+    paths: set[Path]
 
 
-def _left(journals: list[tuple[JournalRecord, Path]], lineage: int | None) -> _Left:
-    # The names tell the order only as well as the computer's Unix clock; the numbers do, within a lineage.
+def _read_stream(journals: list[tuple[JournalRecord, Path]], stream_id: int | None) -> _Stream:
+    # File names are in the order of the computer's Unix clock, which may be wrong; sequence numbers are reliable.
     runs = sorted(
-        (journal for journal in journals if journal[0].lineage == lineage),
-        key=lambda journal: journal[0].run_start,
+        (journal for journal in journals if journal[0].stream_id == stream_id),
+        key=lambda journal: journal[0].first_sequence,
         reverse=True,
     )
-    oldest, last = 0, runs[0][0].run_start - 1
-    measurements: list[Queued] = []
-    receptions: list[Reception] = []
-    read: set[Path] = set()
+    oldest, last_sequence = 0, runs[0][0].first_sequence - 1
+    measurements: list[QueuedMeasurement] = []
+    receptions: list[BeaconReception] = []
+    paths: set[Path] = set()
     for head, path in runs:
         tail = _tail(head, path)
-        read.add(path)
+        paths.add(path)
         measurements = tail.measurements + measurements
         receptions = tail.receptions + receptions
-        last = max((last, *(each.sequence for each in tail.measurements[-1:])))
+        last_sequence = max((last_sequence, *(each.sequence for each in tail.measurements[-1:])))
         oldest = max(oldest, tail.oldest)
-        if oldest >= head.run_start or len(measurements) > MOST_MEASUREMENTS:
+        if oldest >= head.first_sequence or len(measurements) > MAX_MEASUREMENTS:
             break
     undelivered = [each for each in measurements if each.sequence >= oldest]
-    return _Left(lineage, last, undelivered, receptions, read)
+    return _Stream(stream_id, last_sequence, undelivered, receptions, paths)
 
 
 def _head(path: Path, station: int) -> JournalRecord | None:
-    """Return whose journal this is; None for one of another station or without a lineage."""
+    """Return a journal's second line; None for another station's journal, or one without a stream id."""
     try:
         with path.open("rb") as file:
-            lines = [file.readline(MAX_LINE_BYTES) for _ in range(_HEAD_LINES)]
-        head = decode(JournalRecord, lines[-1])
+            file.readline(MAX_LINE_BYTES)
+            head = decode(JournalRecord, file.readline(MAX_LINE_BYTES))
     except (OSError, ValueError):
         return None
     if not head.boot:  # then no two runs are known to share a clock
         head = replace(head, boot=path.name)
-    return head if head.station == station and head.lineage is not None else None
+    return head if head.station == station and head.stream_id is not None else None
 
 
 class _Tail(NamedTuple):
-    """What the end of a journal holds, in the order of the file.
+    """The content of a journal's end, in the order of the file; measurements before ``oldest`` are acknowledged."""
 
-    Attributes
-    ----------
-    measurements, receptions
-        Those.
-    oldest
-        All measurements below it are acknowledged, or were given up.
-    """
-
-    measurements: list[Queued]
-    receptions: list[Reception]
+    measurements: list[QueuedMeasurement]
+    receptions: list[BeaconReception]
     oldest: int
 
 
 def _tail(head: JournalRecord, path: Path) -> _Tail:
-    """Read a journal from as far back as it takes to know its last number and what is acknowledged."""
-    back = _TAIL_BYTES
+    """Read as much of a journal's end as needed for its last sequence number and the last acknowledgement."""
+    size = _TAIL_BYTES
     while True:
-        tail, enough = _read_last(back, head, path)
-        if enough:
+        tail, complete = _read_last(size, head, path)
+        if complete:
             return tail
-        back *= _MORE
+        size *= _TAIL_GROWTH
 
 
-def _read_last(back: int, head: JournalRecord, path: Path) -> tuple[_Tail, bool]:
-    """Return what so many bytes at the end of a journal hold, and whether there is no use in reading more of it."""
+def _read_last(size: int, head: JournalRecord, path: Path) -> tuple[_Tail, bool]:
+    """Return the content of the last ``size`` bytes of a journal, and whether it is sufficient."""
     tail, acknowledged = _Tail([], [], 0), False
     zero_ns = head.unix_at_zero_ns
     try:
         with path.open("rb") as file:
-            place = max(0, path.stat().st_size - back)
-            file.seek(place)
+            start = max(0, path.stat().st_size - size)
+            file.seek(start)
             for line in file:
                 try:
                     match decode(Typed, line).type:
                         case "measurement":
                             measurement = decode(PolarMeasurement, line)
-                            tail.measurements.append(queued(measurement, zero_ns, head.boot))
+                            tail.measurements.append(queued_measurement(measurement, zero_ns, head.boot))
                         case "reception":
                             tail.receptions.append(
                                 _reception(decode(ReceptionRecord, line), zero_ns, head.boot)
@@ -219,16 +183,16 @@ def _read_last(back: int, head: JournalRecord, path: Path) -> tuple[_Tail, bool]
                             tail = tail._replace(oldest=decode(AcknowledgedRecord, line).oldest)
                             acknowledged = True
                 except ValueError:
-                    continue  # torn, or the rest of a line that begins before the tail
+                    continue  # torn, or the end of a line that begins before the tail
     except OSError as error:
         log.warning("journal_unreadable", path=str(path), error=error.strerror or str(error))
         return tail, True
-    told = acknowledged and len(tail.measurements) > 0
-    return tail, told or place == 0 or len(tail.measurements) > MOST_MEASUREMENTS
+    sufficient = acknowledged and len(tail.measurements) > 0
+    return tail, sufficient or start == 0 or len(tail.measurements) > MAX_MEASUREMENTS
 
 
-def _reception(record: ReceptionRecord, zero_ns: int, boot: str) -> Reception:
-    return Reception(
+def _reception(record: ReceptionRecord, zero_ns: int, boot: str) -> BeaconReception:
+    return BeaconReception(
         session=record.session,
         counter=record.counter,
         received_ns=record.stamp_ns - zero_ns,

@@ -1,9 +1,7 @@
-"""The socket on which a station's client says how it does, and takes a request.
+"""The control socket of a station's client: reports its status and takes requests, one JSON line each.
 
-Whoever connects gets one JSON line, the status. Whoever then says something within a second gets a line that answers
-it. Then the connection ends.
-
-What people can ask of a running client over its status socket, and what it answers: one JSON line each.
+A client of the socket receives one line, the status. If it sends a request within a second, it receives a response. Then
+the connection is closed.
 """
 
 from __future__ import annotations
@@ -25,29 +23,53 @@ if TYPE_CHECKING:
 
     from tsgt.station.status import ClientStatus
 
-PATIENCE_S = 1.0
-"""Whoever only wants the status closes at once, or when the end comes."""
+REQUEST_TIMEOUT_S = 1.0
+"""Clients that only want the status close at once, or are disconnected after this time."""
 
 MAX_REQUEST_BYTES = 4096
 
-MOST_TALKS = 32
-"""More at a time are let go at once, so that file descriptors are left for instrument and radio."""
+MAX_CONNECTIONS = 32
+"""Further ones are closed at once, so that file descriptors remain for instrument and radio."""
 
 
-class StatusSocket:
-    """The open socket; it is removed with the end of its block.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AtmosphereRequest:
+    """Request to set the atmospheric correction; see :class:`~tsgt.station.instrument.Atmosphere`."""
+
+    type: Literal["atmosphere"] = "atmosphere"
+    temperature_c: TemperatureC
+    pressure_hpa: PressureHpa
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AtmosphereResponse:
+    """Response to a request.
+
+    Attributes
+    ----------
+    problem
+        The reason why the setting was not applied, or not yet; empty when it was.
+    settings
+        Identity and settings of the instrument as read back; null where unknown.
+    """
+
+    type: Literal["answer"] = "answer"
+    problem: str = ""
+    settings: InstrumentRecord | None = None
+
+
+class ControlSocket:
+    """The open socket, a context manager that removes it on exit.
 
     Parameters
     ----------
     path
-        Where. A stale one of an earlier run is replaced; its folder is created if need be.
-    mode
-        Its permissions.
+        A stale socket is replaced; the folder is created if missing.
 
     Raises
     ------
     StreamError
-        Another program serves the socket, or it cannot be made.
+        Another program serves the socket, or it cannot be created.
     """
 
     def __init__(self, path: Path, *, mode: int = 0o660) -> None:
@@ -61,59 +83,55 @@ class StatusSocket:
         self._listener.remove()
         self._listener.socket.close()
 
-    async def keep_answering(
-        self, status: Callable[[], ClientStatus], request: Callable[[bytes], Awaitable[Answer]]
+    async def serve(
+        self,
+        status: Callable[[], ClientStatus],
+        handle_request: Callable[[bytes], Awaitable[AtmosphereResponse]],
     ) -> NoReturn:
-        """Let everybody in, for ever.
-
-        Parameters
-        ----------
-        status
-            Makes the first line.
-        request
-            Does what a line asks for.
-        """
+        """Accept connections, for ever."""
         loop = asyncio.get_running_loop()
         listener = self._listener.socket
-        talking: set[asyncio.Task[None]] = set()
+        connections: set[asyncio.Task[None]] = set()
 
-        def let_in() -> None:
-            with suppress(OSError):  # who asked is gone already
+        def accept() -> None:
+            with suppress(OSError):  # the client is gone already
                 connection, _ = listener.accept()
-                if len(talking) >= MOST_TALKS:
+                if len(connections) >= MAX_CONNECTIONS:
                     connection.close()
                     return
                 connection.setblocking(False)
-                talk = talks.create_task(_talk(connection, status, request))
-                talking.add(talk)
-                talk.add_done_callback(talking.discard)
-                talk.add_done_callback(lambda _: connection.close())
+                task = group.create_task(_serve_connection(connection, status, handle_request))
+                connections.add(task)
+                task.add_done_callback(connections.discard)
+                task.add_done_callback(lambda _: connection.close())
 
-        async with asyncio.TaskGroup() as talks:
-            loop.add_reader(listener, let_in)
+        async with asyncio.TaskGroup() as group:
+            loop.add_reader(listener, accept)
             try:
                 await asyncio.Event().wait()
             finally:
                 loop.remove_reader(listener)
-        raise AssertionError  # which nobody reaches
+        raise AssertionError  # unreachable
 
 
-async def _talk(
-    connection: socket, status: Callable[[], ClientStatus], request: Callable[[bytes], Awaitable[Answer]]
+async def _serve_connection(
+    connection: socket,
+    status: Callable[[], ClientStatus],
+    handle_request: Callable[[bytes], Awaitable[AtmosphereResponse]],
 ) -> None:
     loop = asyncio.get_running_loop()
-    with suppress(OSError):  # whoever asked is gone, or says nothing, which is a TimeoutError
-        async with asyncio.timeout(PATIENCE_S):
+    with suppress(OSError):  # the client is gone, or sends nothing: TimeoutError
+        async with asyncio.timeout(REQUEST_TIMEOUT_S):
             await loop.sock_sendall(connection, encode_line(status()) + b"\n")
-            line = await _line(connection)
+            line = await _receive_line(connection)
         if line:
-            answer = await request(line)
-            async with asyncio.timeout(PATIENCE_S):
-                await loop.sock_sendall(connection, encode_line(answer) + b"\n")
+            response = await handle_request(line)
+            async with asyncio.timeout(REQUEST_TIMEOUT_S):
+                await loop.sock_sendall(connection, encode_line(response) + b"\n")
 
 
-async def _line(connection: socket) -> bytes:
-    """Return what comes up to the first line end, the end, or the limit."""
+async def _receive_line(connection: socket) -> bytes:
+    """Return the data up to the first line end, the end of the stream, or the size limit."""
     loop = asyncio.get_running_loop()
     received = b""
     while b"\n" not in received and len(received) < MAX_REQUEST_BYTES:
@@ -122,39 +140,3 @@ async def _line(connection: socket) -> bytes:
             break
         received += data
     return received.partition(b"\n")[0]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AtmosphereRequest:
-    """The instrument is to correct distances for this air from now on.
-
-    Attributes
-    ----------
-    type
-        Always ``atmosphere``.
-    temperature_c, pressure_hpa
-        As in :class:`~tsgt.station.instrument.Atmosphere`.
-    """
-
-    type: Literal["atmosphere"] = "atmosphere"
-    temperature_c: TemperatureC
-    pressure_hpa: PressureHpa
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Answer:
-    """What became of a request.
-
-    Attributes
-    ----------
-    type
-        Always ``answer``.
-    problem
-        Why it was not done, or not yet; empty when it was.
-    settings
-        What is known of the instrument and of its settings now, as read back from it; null where nothing is.
-    """
-
-    type: Literal["answer"] = "answer"
-    problem: str = ""
-    settings: InstrumentRecord | None = None

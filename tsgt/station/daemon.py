@@ -1,11 +1,11 @@
-"""The client beside a total station: reads it, journals every measurement, answers the master over the radio."""
+"""The client daemon of a station: reads the total station, journals every measurement, and replies to the master."""
 
 from __future__ import annotations
 
 import asyncio
 import secrets
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -15,300 +15,293 @@ import tsgt
 from tsgt import service
 from tsgt.clock import UnixTimeline
 from tsgt.errors import RecordingError
-from tsgt.radio import MeasureOrder, Order
-from tsgt.radio.superframe import Outbox, Situation, SuperframeStation
+from tsgt.radio import Command, MeasureCommand
+from tsgt.radio.superframe import InstrumentState, SendQueue, SuperframeStation
 from tsgt.radio.superframe.wire import Authenticator
-from tsgt.radio.supervisor import keep_radio
+from tsgt.radio.supervisor import supervise_radio
 from tsgt.recording import RecordingHeader, RecordingWriter, decode, encode_line, new_recording_path
 from tsgt.recording.journal import InstrumentRecord, JournalRecord
 from tsgt.recording.recorder import Recorder
-from tsgt.station.backlog import LINEAGE_BITS, Backlog, read_backlog
-from tsgt.station.control_socket import Answer, AtmosphereRequest, StatusSocket
+from tsgt.station.backlog import STREAM_ID_BITS, Backlog, read_backlog
+from tsgt.station.control_socket import AtmosphereRequest, AtmosphereResponse, ControlSocket
 from tsgt.station.instrument import Atmosphere
-from tsgt.station.instrument_supervisor import Done, InstrumentKeeper
-from tsgt.station.journal import PATIENCE_S, JournalQueue
+from tsgt.station.instrument_supervisor import CommandResult, InstrumentSupervisor
+from tsgt.station.journal import WRITE_TIMEOUT_S, JournalQueue
 from tsgt.station.links import ClassicLink, SuperframeLink
-from tsgt.station.session import Session
+from tsgt.station.session import ClientSession
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine
+    from collections.abc import Callable
     from pathlib import Path
-    from typing import Any, NoReturn
+    from typing import NoReturn
 
     from tsgt.clock import Clock
     from tsgt.config import ClientConfig
-    from tsgt.radio import LoRaSettings, OpenRadio, Radio
+    from tsgt.radio import LoRaSettings, Radio, RadioOpener
     from tsgt.station.instrument import Instrument, Reading
     from tsgt.station.links import Link
     from tsgt.station.status import ClientStatus
 
 _SKIP_BITS = 22
-"""So many random bits of the 32 of a sequence number: a run of a thousand measurements meets another one in 4000."""
+"""Random bits added to a 32-bit sequence number: two streams of a thousand measurements collide once in 4000 times."""
 
 log = structlog.get_logger()
 
 
-async def run_client(
-    config: ClientConfig,
-    settings: LoRaSettings,
-    *,
-    instrument: Instrument,
-    open_radio: OpenRadio,
-    clock: Clock,
-    key: bytes | None = None,
-    random_bits: Callable[[int], int] = secrets.randbits,
-    boot: str = "",
-    write: Callable[[int, memoryview], int] | None = None,
-) -> None:
-    """Run a station's client until it is cancelled.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClientDependencies:
+    """Everything a station's client is given from outside.
 
-    Instrument, radio and disk may fail and come back; the other parts go on meanwhile.
-
-    Parameters
+    Attributes
     ----------
-    config
-        Station, prism, protocol, journal and status socket; the rest is given by what follows.
-    settings
-        Those of the radio.
-    instrument
-        The total station.
-    open_radio
-        Opens the radio.
     clock
-        Its Unix time is read once, here, and need not be right.
+        Its Unix time is read once, at the start, and need not be right.
     key
-        What the radios of a mission share, where the protocol has one; None: whoever speaks the protocol is believed.
+        Key shared by the radios of a mission, for protocols with authentication; None: every sender is accepted.
     random_bits
-        Returns a number with so many random bits.
+        Returns a random number of so many bits.
     boot
-        Which start of this computer its clock counts from; empty where unknown, and then no other run's clock is
-        taken for this one.
+        Identifies the start of this computer from which ``clock`` counts; empty where unknown: no other run is then
+        assumed to share the clock.
     write
         See :class:`~tsgt.recording.RecordingWriter`.
+    """
+
+    instrument: Instrument
+    open_radio: RadioOpener
+    clock: Clock
+    key: bytes | None = None
+    random_bits: Callable[[int], int] = secrets.randbits
+    boot: str = ""
+    write: Callable[[int, memoryview], int] | None = None
+
+
+async def run_client(config: ClientConfig, settings: LoRaSettings, dependencies: ClientDependencies) -> None:
+    """Run a station's client until it is cancelled.
+
+    Instrument, radio and disk may fail and recover; the other parts continue meanwhile.
 
     Raises
     ------
     RecordingError
-        The journal cannot be begun: no such folder, no permission.
+        The journal cannot be created: missing folder, no permission.
     StreamError
-        The status socket cannot be made: another client serves it.
+        The control socket cannot be created: another client serves it.
     """
+    clock, random_bits = dependencies.clock, dependencies.random_bits
     timeline = UnixTimeline.fixed_now(clock)
     now_ns = timeline.unix_ns(clock.monotonic_ns())
-    superframe = config.protocol.kind == "superframe"
-    # What earlier runs have left; over the protocol classic each begins anew.
-    backlog = read_backlog(config.journal.directory, config.station) if superframe else Backlog()
-    lineage = backlog.lineage
-    if superframe and lineage is None:
-        lineage = random_bits(LINEAGE_BITS)
+    backlog, write_timeout_s = Backlog(), None
+    if config.protocol.kind == "superframe":
+        backlog = read_backlog(config.journal.directory, config.station)
+        if backlog.stream_id is None:
+            backlog = replace(backlog, stream_id=random_bits(STREAM_ID_BITS))
+    else:
+        # A classic master polls for the newest measurement only: a delayed one is worthless to it.
+        write_timeout_s = WRITE_TIMEOUT_S
     path = new_recording_path(config.journal.directory, f"station{config.station}", now_ns)
-    with RecordingWriter(path, write=write) as writer:
+    with RecordingWriter(path, write=dependencies.write) as writer:
         recorder = Recorder(writer)
-        # To a classic master, which asks for the newest measurement only, one that has waited is worth nothing.
-        journal = JournalQueue(recorder, patience_s=None if superframe else PATIENCE_S)
+        journal = JournalQueue(recorder, write_timeout_s=write_timeout_s)
         header = RecordingHeader(
             software=f"tsgt {tsgt.__version__}",
             created_ns=now_ns,
             source=f"tsgt-client, station {config.station}",
         )
         recorder.write_line(encode_line(header))
-        run_start = backlog.run_start
-        if superframe and recorder.failing:
-            # Where nothing can be written, the next run would not know which numbers this one has given away. So this one
-            # begins anew, with numbers of its own, and leaves what earlier runs have left to the next one.
-            backlog, lineage, run_start = (
-                Backlog(),
-                random_bits(LINEAGE_BITS),
-                run_start + random_bits(_SKIP_BITS),
+        if backlog.stream_id is not None and recorder.failing:
+            # Without a journal the next run could not know which sequence numbers this one has used. So this run starts a
+            # stream of its own and leaves the backlog to the next run.
+            backlog = Backlog(
+                stream_id=random_bits(STREAM_ID_BITS),
+                first_sequence=backlog.first_sequence + random_bits(_SKIP_BITS),
             )
-        session = Session(config.station, config.prism, run_start)
-        client = _Client(session, instrument, clock, timeline, recorder, journal, path)
-        client.write(
+        journal.write(
             JournalRecord(
                 station=config.station,
                 unix_at_zero_ns=timeline.unix_at_zero_ns,
-                boot=boot,
-                lineage=lineage,
-                run_start=run_start,
+                boot=dependencies.boot,
+                stream_id=backlog.stream_id,
+                first_sequence=backlog.first_sequence,
             )
         )
-        # The next run goes on from here, even if the power goes before the first regular sync: otherwise it would
-        # give numbers again that the master has.
+        # On disk before the first sequence number is used: after a power cut before the first regular sync the next run
+        # would otherwise use the same numbers again.
         recorder.flush()
         with suppress(RecordingError):
             writer.sync()
-        if lineage is None:
-            client.link = ClassicLink(session, clock, timeline, on_order=client.give, begin=client.begin)
-        else:
-            authenticator = Authenticator(key)
-            outbox = Outbox(run_start, backlog.queued)
-            station = SuperframeStation(
-                config.station,
-                settings,
-                authenticator,
-                outbox,
-                lineage=lineage,
-                boot=boot,
-                receptions=backlog.receptions,
-                random_bits=random_bits,
-            )
-            client.link = SuperframeLink(
-                station,
-                outbox,
-                boot,
-                clock,
-                timeline,
-                authenticated=authenticator.authentic,
-                situation=client.situation,
-                on_order=client.give,
-                write=client.write,
-            )
         try:
-            with StatusSocket(config.status_socket) as status_socket:
-                log.info("client_started", station=config.station, journal=str(path))
+            with ControlSocket(config.status_socket) as control_socket:
                 async with asyncio.TaskGroup() as group:
-                    client.tasks = group
-                    group.create_task(journal.keep_writing())
-                    group.create_task(
-                        service.keep_synced(writer.sync, clock, config.journal.fsync_interval_s)
+                    client = _StationClient(
+                        config, settings, dependencies, timeline, recorder, journal, path, backlog, group
                     )
-                    group.create_task(client.keeper.keep())
-                    group.create_task(keep_radio(open_radio, client.talk, clock))
-                    group.create_task(status_socket.keep_answering(client.status, client.asked))
-                    group.create_task(service.keep_notified(client.status_line, clock))
+                    log.info("client_started", station=config.station, journal=str(path))
+                    group.create_task(journal.run())
+                    group.create_task(
+                        service.sync_periodically(writer.sync, clock, config.journal.fsync_interval_s)
+                    )
+                    group.create_task(client.supervisor.run())
+                    group.create_task(supervise_radio(dependencies.open_radio, client.run_link, clock))
+                    group.create_task(control_socket.serve(client.status, client.handle_request))
+                    group.create_task(service.notify_systemd(client.status_line, clock))
         finally:
             recorder.close()
             log.info("client_stopped", station=config.station)
 
 
-class _Client:
-    """What ties instrument, journal and radio together.
-
-    Attributes
-    ----------
-    link
-        The protocol.
-    tasks
-        What runs beside each other.
-    """
-
-    link: Link
-    tasks: asyncio.TaskGroup
+class _StationClient:
+    """Connects instrument, journal and radio link."""
 
     def __init__(
         self,
-        session: Session,
-        instrument: Instrument,
-        clock: Clock,
+        config: ClientConfig,
+        settings: LoRaSettings,
+        dependencies: ClientDependencies,
         timeline: UnixTimeline,
         recorder: Recorder,
         journal: JournalQueue,
         path: Path,
+        backlog: Backlog,
+        group: asyncio.TaskGroup,
     ) -> None:
-        self._session = session
-        self._clock = clock
+        self._clock = dependencies.clock
         self._timeline = timeline
         self._recorder = recorder
         self._journal = journal
         self._path = path
         self._radio_ok = False
         self._record: InstrumentRecord | None = None
-        self.keeper = InstrumentKeeper(
-            instrument,
-            session,
-            clock,
-            on_reading=self._measured,
-            on_record=self._set,
-            on_done=self._done,
+        self._session = ClientSession(config.station, config.prism, backlog.first_sequence)
+        self.supervisor = InstrumentSupervisor(
+            dependencies.instrument,
+            self._session,
+            self._clock,
+            on_reading=self._on_reading,
+            on_record=self._on_record,
+            on_result=self._on_result,
+        )
+        self._link: Link = (
+            ClassicLink(
+                self._session,
+                self._clock,
+                timeline,
+                on_command=self._on_command,
+                create_task=group.create_task,
+            )
+            if backlog.stream_id is None
+            else self._superframe_link(config.station, settings, dependencies, backlog, backlog.stream_id)
         )
 
-    def write(self, record: object) -> None:
-        """Put a record into the journal that nothing follows from."""
-        self._journal.write(record, _nothing)
+    def _superframe_link(
+        self,
+        station: int,
+        settings: LoRaSettings,
+        dependencies: ClientDependencies,
+        backlog: Backlog,
+        stream_id: int,
+    ) -> SuperframeLink:
+        authenticator = Authenticator(dependencies.key)
+        send_queue = SendQueue(backlog.first_sequence, backlog.queued)
+        core = SuperframeStation(
+            station,
+            settings,
+            authenticator,
+            send_queue,
+            stream_id=stream_id,
+            boot=dependencies.boot,
+            receptions=backlog.receptions,
+            random_bits=dependencies.random_bits,
+        )
+        return SuperframeLink(
+            core,
+            send_queue,
+            dependencies.boot,
+            self._clock,
+            self._timeline,
+            authenticated=authenticator.authentic,
+            instrument_state=self._instrument_state,
+            on_command=self._on_command,
+            write=self._journal.write,
+        )
 
     # --- Instrument -------------------------------------------------------------------------------------------
 
-    def _measured(self, reading: Reading) -> None:
-        measurement = self._session.measured(reading, self._timeline.unix_ns(reading.at_ns))
-        self._journal.write(measurement, partial(self.link.offer, measurement))
+    def _on_reading(self, reading: Reading) -> None:
+        measurement = self._session.measurement(reading, self._timeline.unix_ns(reading.at_ns))
+        self._journal.write(measurement, partial(self._link.offer, measurement))
 
-    def _set(self, record: InstrumentRecord) -> None:
-        """Keep how the instrument is set from now on."""
+    def _on_record(self, record: InstrumentRecord) -> None:
         self._record = replace(record, stamp_ns=self._now_ns())
-        self.write(self._record)
+        self._journal.write(self._record)
 
-    def give(self, order: Order) -> None:
-        """Have an order of the master carried out."""
-        log.info("order_received", order=type(order).__name__)
-        self.keeper.give(order)
-
-    def _done(self, done: Done) -> None:
-        """Answer an order, a measurement when it is journalled."""
-        if not isinstance(done.order, MeasureOrder):
-            if done.ok:
-                self._session.executed(done.order)
-            self.link.executed(done.order, ok=done.ok)
-        elif done.reading is None:
-            self.link.shot(None)
+    def _on_result(self, result: CommandResult) -> None:
+        """Respond to a command; with a measurement only when that is journalled."""
+        if not isinstance(result.command, MeasureCommand):
+            if result.ok:
+                self._session.apply(result.command)
+            self._link.respond(result.command, ok=result.ok)
+        elif result.reading is None:
+            self._link.respond_single(None)
         else:
-            target = self._session.shot(done.reading, self._timeline.unix_ns(done.reading.at_ns))
-            self._journal.write(target, partial(self.link.shot, target))
-
-    def situation(self) -> Situation:
-        """Say what the instrument is doing."""
-        return Situation(
-            prism=self._session.prism,
-            direct=self._session.mode == "direct",
-            connected=self.keeper.description is not None,
-        )
+            reading = result.reading
+            target = self._session.single_measurement(reading, self._timeline.unix_ns(reading.at_ns))
+            self._journal.write(target, partial(self._link.respond_single, target))
 
     # --- Radio ------------------------------------------------------------------------------------------------
 
-    async def talk(self, radio: Radio) -> NoReturn:
-        """Answer the master over this radio."""
+    async def run_link(self, radio: Radio) -> NoReturn:
+        """Reply to the master over this radio."""
         self._radio_ok = True
         try:
-            await self.link.talk(radio)
+            await self._link.run(radio)
         finally:
             self._radio_ok = False
 
-    def begin(self, coroutine: Coroutine[Any, Any, None]) -> None:
-        """Run something beside the radio's own task, and beside the instrument's."""
-        self.tasks.create_task(coroutine)
+    def _on_command(self, command: Command) -> None:
+        log.info("command_received", command=type(command).__name__)
+        self.supervisor.submit(command)
 
-    # --- People -----------------------------------------------------------------------------------------------
+    def _instrument_state(self) -> InstrumentState:
+        return InstrumentState(
+            prism=self._session.prism,
+            direct=self._session.mode == "direct",
+            connected=self.supervisor.description is not None,
+        )
+
+    # --- Control socket and systemd ---------------------------------------------------------------------------
 
     def status(self) -> ClientStatus:
-        """Say how it goes."""
+        """Return the client's status."""
         return self._session.status(
             self._now_ns(),
-            self.link.status(),
-            instrument=self.keeper.description,
-            condition=self.keeper.condition,
+            self._link.status(),
+            instrument=self.supervisor.description,
+            condition=self.supervisor.condition,
             settings=self._settings(),
             journal=str(self._path),
             journal_ok=not self._recorder.failing,
-            journal_waiting=self._recorder.waiting,
+            journal_waiting=self._recorder.pending,
             journal_lost=self._recorder.lost,
             radio_ok=self._radio_ok,
         )
 
     def _settings(self) -> InstrumentRecord | None:
-        return None if self.keeper.description is None else self._record
+        return None if self.supervisor.description is None else self._record
 
-    async def asked(self, line: bytes) -> Answer:
-        """Do what somebody asks for over the status socket."""
+    async def handle_request(self, line: bytes) -> AtmosphereResponse:
+        """Carry out a request from the control socket."""
         try:
             request = decode(AtmosphereRequest, line)
         except ValueError as error:
-            return Answer(problem=f"not understood: {error}", settings=self._settings())
-        problem = await self.keeper.set_atmosphere(
+            return AtmosphereResponse(problem=f"invalid request: {error}", settings=self._settings())
+        problem = await self.supervisor.set_atmosphere(
             Atmosphere(temperature_c=request.temperature_c, pressure_hpa=request.pressure_hpa)
         )
-        return Answer(problem=problem, settings=self._settings())
+        return AtmosphereResponse(problem=problem, settings=self._settings())
 
     def status_line(self) -> str:
-        """Say the same in one line, for systemd."""
+        """Return the status in one line, for systemd."""
         status = self.status()
         instrument = "no instrument" if status.instrument is None else f"prism {status.prism}"
         if status.instrument is not None and status.mode == "direct":
@@ -317,23 +310,22 @@ class _Client:
             "no measurement yet" if status.last is None else f"{status.last.status}, {status.rate_hz:.1f} Hz"
         )
         master = (
-            "master not heard yet"
+            "no packet from the master yet"
             if status.master_heard_s is None
             else f"master {status.master_heard_s:.0f} s ago"
         )
-        queued = f", {status.queued} queued" if status.queued else ""
-        problems = (f", {status.problem}" if status.problem else "") + (
-            "" if status.radio_ok else ", no radio"
-        )
+        parts = [instrument, last, master]
+        if status.queued:
+            parts.append(f"{status.queued} queued")
+        if status.problem:
+            parts.append(status.problem)
+        if not status.radio_ok:
+            parts.append("no radio")
         if not status.journal_ok:
-            problems += f", disk fails: {status.journal_waiting} lines not written"
+            parts.append(f"disk fails: {status.journal_waiting} lines not written")
         if status.journal_lost:
-            problems += f", {status.journal_lost} lines lost"
-        return f"station {status.station}: {instrument}, {last}, {master}{queued}{problems}"
+            parts.append(f"{status.journal_lost} lines lost")
+        return f"station {status.station}: {', '.join(parts)}"
 
     def _now_ns(self) -> int:
         return self._timeline.unix_ns(self._clock.monotonic_ns())
-
-
-def _nothing() -> None:
-    """Follows the lines that nothing follows from."""

@@ -1,4 +1,4 @@
-"""What the client asks of a total station, and the records that pass between them."""
+"""The instrument protocol that every total station driver implements, and its data types."""
 
 from __future__ import annotations
 
@@ -15,15 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Atmosphere:
-    """The air between instrument and prism.
-
-    Attributes
-    ----------
-    temperature_c
-        In degrees Celsius, in the shade.
-    pressure_hpa
-        In hPa as a barometer beside the instrument shows it: not reduced to sea level.
-    """
+    """Air temperature (degrees Celsius, in the shade) and pressure (hPa at the instrument, not reduced to sea level)."""
 
     temperature_c: float
     pressure_hpa: float
@@ -31,17 +23,16 @@ class Atmosphere:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Condition:
-    """How an instrument does, for people.
+    """An instrument's state, for the operator.
 
     Attributes
     ----------
     activity
-        What it is doing: ``tracking``, ``looking for the prism around its last direction``, ...
+        Current activity: ``tracking``, ``searching around its last direction``, ...
     problem
-        What a person should see to: not level, battery low, licence missing, point the telescope at the prism; empty
-        when there is nothing.
+        Action required of the operator: level the instrument, change the battery, point the telescope; empty for none.
     battery_percent
-        Charge of its battery; None where it does not say.
+        None where the instrument does not report it.
     """
 
     activity: str = ""
@@ -51,26 +42,26 @@ class Condition:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reading:
-    """One measurement as the instrument gave it.
+    """One measurement as the instrument reported it; angles and distance as in :class:`~tsgt.model.PolarMeasurement`.
 
     Attributes
     ----------
     at_ns
-        When it was taken, as well as the host can tell, on CLOCK_MONOTONIC of the station's computer.
+        Estimated time of the measurement, on CLOCK_MONOTONIC of the station's computer.
     prism
-        Number of the prism that was tracked; None for a single measurement of a target.
+        None for a single measurement of a target.
     horizontal_angle_rad, zenith_angle_rad
-        As in :class:`~tsgt.model.PolarMeasurement`; 0 where the instrument gave none.
+        0 where the instrument reported none.
     slope_distance_m
-        As in :class:`~tsgt.model.PolarMeasurement`; None where the instrument gave none.
-    status, raw_status
-        The verdict, in the common vocabulary and as the instrument's own number.
+        None where the instrument reported none.
+    raw_status
+        The instrument's own status code.
     instrument_time_ns
-        The instrument's own stamp, None where it has none.
+        Timestamp of the instrument's clock; None without one.
     received_ns
-        When its first byte reached the host, on the same clock as ``at_ns``; None where no line tells.
+        Arrival of the first byte at the host, on the clock of ``at_ns``; None where unknown.
     sigma_ns
-        One standard error of ``at_ns``, as far as the instrument's times tell; 0 where nothing does.
+        Standard error of ``at_ns`` from the instrument clock's fit; 0 where there is no estimate.
     """
 
     at_ns: int
@@ -85,67 +76,65 @@ class Reading:
     sigma_ns: int = 0
 
     def __post_init__(self) -> None:
-        """Refuse what no instrument can have measured."""
+        """Reject values that no instrument can have measured."""
         check_instants(self.at_ns, self.received_ns or 0)
         check_finite(self.horizontal_angle_rad, self.zenith_angle_rad, self.slope_distance_m or 0.0)
 
 
 class Instrument(Protocol):
-    """A robotic total station. One owner, one call at a time; :meth:`read` alone may be cancelled at any time.
+    """A robotic total station with one owner. Calls do not overlap; only :meth:`read` may be cancelled at any time.
 
-    Every method raises :class:`~tsgt.errors.InstrumentError` when the instrument is gone or does not answer. After that
-    :meth:`connect` is tried again, as often as need be. :class:`~tsgt.errors.InstrumentRefusedError` says instead that
-    it answers and will not do this; it goes on with what it did before.
+    Every method raises :class:`~tsgt.errors.InstrumentError` when the instrument is lost or does not respond; the owner
+    then calls :meth:`connect` again. :class:`~tsgt.errors.InstrumentRefusedError` means that the instrument responds but
+    does not carry out the command; it continues what it did before.
     """
 
     async def connect(self) -> str:
-        """Find and identify the instrument; return its name and number for people. Nothing is tracked yet."""
+        """Find and identify the instrument; return its name and serial number. It does not track yet."""
         ...
 
     async def track(self, prism: int, towards: Direction | None = None) -> None:
-        """Track a prism and measure it continuously, as fast as the instrument can.
+        """Track a prism and measure it continuously at the instrument's highest rate.
 
-        It returns as soon as the instrument is set up; that the prism is not found yet is what readings say.
+        Returns when the instrument is set up; readings report whether it has found the prism.
 
         Parameters
         ----------
-        prism
-            Its number.
         towards
-            Where it is believed to be; None: where the telescope points, or where it was last.
+            Expected direction of the prism; None: where the telescope points, or the prism's last direction.
         """
         ...
 
     async def read(self) -> Reading:
-        """Return the next measurement while tracking. None is given twice; one without a target has its status."""
+        """Return the next reading while tracking, each exactly once; one without a target has that status."""
         ...
 
     async def direct(self) -> None:
-        """Stop tracking and get ready for single measurements of targets that a person aims at."""
+        """Enter direct mode: stop tracking and prepare for single measurements of targets that the operator aims at."""
         ...
 
     async def measure(self) -> Reading:
-        """Measure the target that the instrument points at, once; only after :meth:`direct`."""
+        """Measure the target in the line of sight once; only in direct mode."""
         ...
 
     async def check(self) -> None:
-        """See whether the instrument is still there; called every few seconds after :meth:`direct`."""
+        """Check that the instrument still responds; called every few seconds in direct mode."""
         ...
 
     async def set_atmosphere(self, atmosphere: Atmosphere) -> None:
-        """Let the instrument correct distances for this air from now on; also while tracking, between two readings."""
+        """Set the atmospheric correction of distances, also while tracking, between two readings."""
         ...
 
     @property
     def condition(self) -> Condition:
-        """How it does at the moment."""
+        """Current state, for the operator."""
         ...
 
     @property
     def record(self) -> InstrumentRecord | None:
-        """What is known of it and of its settings, for the journal; None before :meth:`connect`. Changes with them."""
+        """Identity and settings for the journal, updated when they change; None before :meth:`connect`."""
         ...
 
     async def close(self) -> None:
-        """Let go of the instrument; it may be connected again. It stays on, and keeps its lock."""
+        """Disconnect; :meth:`connect` may follow. The instrument stays on and keeps its lock."""
         ...

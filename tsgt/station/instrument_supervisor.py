@@ -1,4 +1,4 @@
-"""A total station that is connected again and again, read, and told what people want between two readings."""
+"""The supervisor of a total station: connects and reconnects it, reads it, and executes commands between two readings."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NoReturn
 import structlog
 
 from tsgt.errors import InstrumentError, InstrumentRefusedError
-from tsgt.radio import DirectOrder, MeasureOrder, Order, SearchOrder, TrackOrder
+from tsgt.radio import Command, DirectCommand, MeasureCommand, SearchCommand, TrackCommand
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -18,93 +18,84 @@ if TYPE_CHECKING:
     from tsgt.clock import Clock
     from tsgt.recording.journal import InstrumentRecord
     from tsgt.station.instrument import Atmosphere, Condition, Instrument, Reading
-    from tsgt.station.session import Session
+    from tsgt.station.session import ClientSession
 
-FIRST_PAUSE_NS = 100_000_000
+INITIAL_RETRY_DELAY_NS = 100_000_000
 
-LONGEST_PAUSE_NS = 1_000_000_000
-"""An instrument that was unplugged is to measure again within three seconds of being back."""
+MAX_RETRY_DELAY_NS = 1_000_000_000
+"""An instrument that was unplugged must measure again within three seconds of its return."""
 
-STEADY_NS = 5_000_000_000
-"""After a connection that has lasted longer, pauses are short again and an error is worth a line in the log again."""
+STABLE_CONNECTION_NS = 5_000_000_000
+"""A connection that lasted longer resets the retry delay, and its error is logged again."""
 
-CHECK_S = 2.0
-"""While single measurements are made nothing else would tell that the instrument is gone."""
+CHECK_INTERVAL_S = 2.0
+"""Interval of the checks in direct mode, where no reading would reveal that the instrument is lost."""
 
 CLOSE_TIMEOUT_S = 0.5
-"""How long an instrument has to be let go at the end; the program ends within a second."""
+"""The client must end within a second."""
 
-NOT_CONNECTED = "no instrument is connected; it gets this when it is"
+NOT_CONNECTED = "no instrument is connected; the setting is applied after the next connection"
 
 log = structlog.get_logger()
 
 
 @dataclass(frozen=True, slots=True)
-class Done:
-    """What became of an order.
+class CommandResult:
+    """The result of a command.
 
     Attributes
     ----------
-    order
-        The order.
-    ok
-        Whether the instrument has done it.
     reading
-        What a :class:`~tsgt.radio.commands.MeasureOrder` has given; None for others, and when it failed.
+        Result of a successful :class:`~tsgt.radio.commands.MeasureCommand`; None for all others.
     """
 
-    order: Order
+    command: Command
     ok: bool
     reading: Reading | None = None
 
 
-class InstrumentKeeper:
-    """The one owner of an instrument.
+class InstrumentSupervisor:
+    """The only owner of an instrument.
 
     Parameters
     ----------
-    instrument
-        It is connected here, and closed at the end.
     session
-        Knows what the instrument is to do.
-    clock
-        Sets the pace of new attempts.
+        Supplies mode and prism after each connection.
     on_reading
-        Gets every reading of the tracked prism, within the same step of the event loop that read it.
+        Called with each reading of the tracked prism, in the same step of the event loop.
     on_record
-        Gets what is known of the instrument and of its settings, after each connection and each change, before the
-        first reading that it applies to.
-    on_done
-        Gets what became of each order, exactly once.
+        Called with identity and settings after each connection and change, before the first reading they apply to.
+    on_result
+        Called exactly once for each command.
 
     Attributes
     ----------
     description
-        Name and number of the instrument; None while there is no connection.
+        Name and serial number of the instrument; None while disconnected.
     """
 
     def __init__(
         self,
         instrument: Instrument,
-        session: Session,
+        session: ClientSession,
         clock: Clock,
         *,
         on_reading: Callable[[Reading], None],
         on_record: Callable[[InstrumentRecord], None],
-        on_done: Callable[[Done], None],
+        on_result: Callable[[CommandResult], None],
     ) -> None:
         self._instrument = instrument
         self._session = session
         self._clock = clock
         self._on_reading = on_reading
         self._on_record = on_record
-        self._on_done = on_done
-        self._order: Order | None = None
-        # What was asked for while running; it is set again after each connection.
+        self._on_result = on_result
+        self._command: Command | None = None
+        # The atmosphere last requested; applied again after each connection.
         self._atmosphere: Atmosphere | None = None
-        self._atmosphere_due = False
-        self._atmosphere_answer: asyncio.Future[str] | None = None
-        self._wanted = asyncio.Event()
+        self._atmosphere_pending = False
+        self._atmosphere_response: asyncio.Future[str] | None = None
+        self._work_pending = asyncio.Event()
         self._reading: asyncio.Timeout | None = None
         self._record: InstrumentRecord | None = None
         self._connected_ns = 0
@@ -113,67 +104,70 @@ class InstrumentKeeper:
 
     @property
     def condition(self) -> Condition:
-        """How the instrument does; without a connection the problem is why there is none."""
+        """The instrument's condition; while disconnected, the problem is the connection error."""
         condition = self._instrument.condition
         return condition if self.description is not None else replace(condition, problem=self._error)
 
-    def give(self, order: Order) -> None:
-        """Have an order carried out, as soon as the instrument is free; one at a time.
+    def submit(self, command: Command) -> None:
+        """Execute a command as soon as the instrument is free; one at a time.
 
-        It fails at once without an instrument, and so does a single measurement while a prism is tracked.
+        Fails at once without an instrument, and for a single measurement while a prism is tracked.
         """
         tracking = self._session.mode == "tracking"
-        if self.description is None or (tracking and isinstance(order, MeasureOrder)):
-            self._on_done(Done(order, ok=False))
+        if self.description is None or (tracking and isinstance(command, MeasureCommand)):
+            self._on_result(CommandResult(command, ok=False))
             return
-        self._order = order
+        self._command = command
         self._interrupt()
 
     async def set_atmosphere(self, atmosphere: Atmosphere) -> str:
-        """Have the instrument correct for this air as soon as it is free, and again after each connection.
+        """Set the atmospheric correction as soon as the instrument is free, and again after each connection.
 
         Returns
         -------
         str
-            Why it does not yet, or will not; empty when it does.
+            The reason why it is not set, or not yet; empty when it is.
         """
-        _answer(self._atmosphere_answer, "another request came after this one")
+        _respond(self._atmosphere_response, "superseded by a later request")
         self._atmosphere = atmosphere
         if self.description is None:
             return NOT_CONNECTED
-        self._atmosphere_due = True
-        answer: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-        self._atmosphere_answer = answer
+        self._atmosphere_pending = True
+        response: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        self._atmosphere_response = response
         self._interrupt()
-        return await answer
+        return await response
 
-    async def keep(self) -> NoReturn:
-        """Connect, read, and after an error connect again, for ever; the pause grows from 0.1 s to 1 s."""
-        pause_ns, logged = FIRST_PAUSE_NS, ""
+    async def run(self) -> NoReturn:
+        """Connect and read; after an error reconnect, for ever, with a delay that grows from 0.1 s to 1 s."""
+        delay_ns, logged = INITIAL_RETRY_DELAY_NS, ""
         try:
             while True:
                 try:
-                    await self._use()
+                    await self._operate()
                 except InstrumentError as error:
                     if (task := asyncio.current_task()) is not None and task.cancelling():
-                        # Told to stop in the very moment in which the instrument failed: the error took the place of that.
+                        # The instrument failed while this task was being cancelled; the error replaced the cancellation.
                         raise asyncio.CancelledError from None
-                    if self.description and self._clock.monotonic_ns() - self._connected_ns > STEADY_NS:
-                        pause_ns, logged = FIRST_PAUSE_NS, ""
+                    if (
+                        self.description
+                        and self._clock.monotonic_ns() - self._connected_ns > STABLE_CONNECTION_NS
+                    ):
+                        delay_ns, logged = INITIAL_RETRY_DELAY_NS, ""
                     self._error = str(error)
                     if self._error != logged:
                         logged = self._error
                         log.error("instrument_lost", error=logged)  # noqa: TRY400 (the message says it all)
                 self.description = None
-                self._refuse()
+                self._fail_pending()
                 await self._close()
-                await self._clock.sleep_until(self._clock.monotonic_ns() + pause_ns)
-                pause_ns = min(2 * pause_ns, LONGEST_PAUSE_NS)
+                await self._clock.sleep_until(self._clock.monotonic_ns() + delay_ns)
+                delay_ns = min(2 * delay_ns, MAX_RETRY_DELAY_NS)
         finally:
             await self._close()
 
-    async def _use(self) -> NoReturn:
-        self._record, self._atmosphere_due = None, False
+    async def _operate(self) -> NoReturn:
+        self._record, self._atmosphere_pending = None, False
         description = await self._instrument.connect()
         if self._session.mode == "tracking":
             await self._instrument.track(self._session.prism)
@@ -182,103 +176,103 @@ class InstrumentKeeper:
         self.description = description
         self._connected_ns = self._clock.monotonic_ns()
         log.info("instrument_connected", instrument=description)
-        self._atmosphere_due = self._atmosphere is not None
+        self._atmosphere_pending = self._atmosphere is not None
         while True:
-            self._note_record()
-            if self._atmosphere_due and self._atmosphere is not None:
+            self._publish_record()
+            if self._atmosphere_pending and self._atmosphere is not None:
                 await self._set_atmosphere(self._atmosphere)
-            elif self._order is not None:
-                await self._execute(self._order)
+            elif self._command is not None:
+                await self._execute(self._command)
             elif self._session.mode == "direct":
-                await self._wait()
+                await self._idle()
             elif (reading := await self._read()) is not None:
-                self._note_record()
+                self._publish_record()
                 self._on_reading(reading)
 
-    async def _wait(self) -> None:
-        """Wait until somebody wants something, and see now and then whether the instrument is still there."""
+    async def _idle(self) -> None:
+        """Wait for work in direct mode; check the instrument now and then."""
         try:
-            async with asyncio.timeout(CHECK_S):
-                await self._wanted.wait()
+            async with asyncio.timeout(CHECK_INTERVAL_S):
+                await self._work_pending.wait()
         except TimeoutError:
             await self._instrument.check()
         else:
-            self._wanted.clear()
+            self._work_pending.clear()
 
-    def _note_record(self) -> None:
+    def _publish_record(self) -> None:
         record = self._instrument.record
         if record is not None and record != self._record:
             self._record = record
             self._on_record(record)
 
     def _interrupt(self) -> None:
-        """Wake whoever waits for a reading, or for somebody to want something."""
-        self._wanted.set()
+        """Interrupt the reading or the wait in progress."""
+        self._work_pending.set()
         if self._reading is not None and not self._reading.expired():
-            self._reading.reschedule(0)  # which cancels the reading
+            self._reading.reschedule(0)  # cancels the reading
 
     async def _read(self) -> Reading | None:
-        """Return the next reading, or None as soon as somebody wants something."""
+        """Return the next reading; None when interrupted."""
         try:
             async with asyncio.timeout(None) as self._reading:
                 return await self._instrument.read()
         except TimeoutError:
-            if self._order is None and not self._atmosphere_due:
+            if self._command is None and not self._atmosphere_pending:
                 raise
             return None
         finally:
             self._reading = None
 
-    async def _execute(self, order: Order) -> None:
+    async def _execute(self, command: Command) -> None:
         reading, ok = None, True
         try:
-            if not self._session.is_done_already(order):
-                reading = await self._obey(order)
+            if not self._session.is_satisfied(command):
+                reading = await self._dispatch(command)
         except InstrumentRefusedError as error:
-            log.warning("order_refused", order=type(order).__name__, error=str(error))
+            log.warning("command_refused", command=type(command).__name__, error=str(error))
             ok = False
-        self._order = None
-        self._note_record()
-        self._on_done(Done(order, ok=ok, reading=reading))
+        self._command = None
+        self._publish_record()
+        self._on_result(CommandResult(command, ok=ok, reading=reading))
 
-    async def _obey(self, order: Order) -> Reading | None:
-        match order:
-            case TrackOrder(prism):
+    async def _dispatch(self, command: Command) -> Reading | None:
+        match command:
+            case TrackCommand(prism):
                 await self._instrument.track(prism or self._session.prism)
-            case SearchOrder(towards):
+            case SearchCommand(towards):
                 await self._instrument.track(self._session.prism, towards)
-            case DirectOrder():
+            case DirectCommand():
                 await self._instrument.direct()
-            case MeasureOrder():
+            case MeasureCommand():
                 return await self._instrument.measure()
         return None
 
     async def _set_atmosphere(self, atmosphere: Atmosphere) -> None:
-        answer, self._atmosphere_answer = self._atmosphere_answer, None
-        self._atmosphere_due = False
-        air = {"temperature_c": atmosphere.temperature_c, "pressure_hpa": atmosphere.pressure_hpa}
+        response, self._atmosphere_response = self._atmosphere_response, None
+        self._atmosphere_pending = False
+        values = {"temperature_c": atmosphere.temperature_c, "pressure_hpa": atmosphere.pressure_hpa}
         problem = NOT_CONNECTED
         try:
             await self._instrument.set_atmosphere(atmosphere)
         except InstrumentRefusedError as error:
             problem = str(error)
-            log.warning("atmosphere_refused", **air, error=problem)
+            log.warning("atmosphere_refused", **values, error=problem)
             if self._atmosphere is atmosphere:
                 self._atmosphere = None
         else:
             problem = ""
-            log.info("atmosphere_set", **air)
-            self._note_record()
+            log.info("atmosphere_set", **values)
+            self._publish_record()
         finally:
-            _answer(answer, problem)
+            _respond(response, problem)
 
-    def _refuse(self) -> None:
-        """Answer those whom the instrument failed, or did not come to."""
-        _answer(self._atmosphere_answer, NOT_CONNECTED)
-        self._atmosphere_answer = None
-        if (order := self._order) is not None:
-            self._order = None
-            self._on_done(Done(order, ok=False))
+    def _fail_pending(self) -> None:
+        """Respond to the request and the command that the lost instrument did not carry out."""
+        _respond(self._atmosphere_response, NOT_CONNECTED)
+        self._atmosphere_response = None
+        if (command := self._command) is not None:
+            self._command = None
+            self._on_result(CommandResult(command, ok=False))
 
     async def _close(self) -> None:
         with suppress(InstrumentError, TimeoutError):
@@ -286,6 +280,6 @@ class InstrumentKeeper:
                 await self._instrument.close()
 
 
-def _answer(answer: asyncio.Future[str] | None, problem: str) -> None:
-    if answer is not None and not answer.done():  # done: whoever asked is gone
-        answer.set_result(problem)
+def _respond(response: asyncio.Future[str] | None, problem: str) -> None:
+    if response is not None and not response.done():  # done: the requester was cancelled
+        response.set_result(problem)

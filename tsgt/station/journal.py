@@ -1,4 +1,4 @@
-"""The station's journal: a line is on its way to the disk before anything else is done with it."""
+"""The queue of a station's journal: each line is handed to the disk before anything else is done with its content."""
 
 from __future__ import annotations
 
@@ -13,59 +13,57 @@ if TYPE_CHECKING:
 
     from tsgt.recording.recorder import Recorder
 
-PATIENCE_S = 0.05
-"""A card takes a millisecond for a line, but now and then a second, while it tidies up. A measurement that waits for
-that is worth nothing to a robot that drives, and the master would take the station's clock for another one."""
+WRITE_TIMEOUT_S = 0.05
+"""An SD card takes a millisecond for a line, but now and then a second for housekeeping. A measurement delayed that long
+is worthless to a moving robot, and the master would detect a reset of the station's clock."""
 
-
-RETRY_S = 1.0
-"""A disk that refuses lines is tried again so often."""
+RETRY_INTERVAL_S = 1.0
+"""Interval of the attempts on a disk that refuses lines."""
 
 
 class JournalQueue:
-    """Writes in a thread, because a slow card must hold up neither the instrument nor the radio.
+    """Writes in a thread, so that a slow disk delays neither the instrument nor the radio.
 
     Parameters
     ----------
-    recorder
-        Takes the lines; also what is still here when it is closed.
-    patience_s
-        How long a measurement waits for the disk before it is worth more to the robot than to the journal; None: until
-        the disk has taken or refused it.
+    write_timeout_s
+        How long a measurement waits for the disk before its callback is called anyway; None: until the disk has accepted
+        or refused it.
     """
 
-    def __init__(self, recorder: Recorder, *, patience_s: float | None) -> None:
+    def __init__(self, recorder: Recorder, *, write_timeout_s: float | None) -> None:
         self._recorder = recorder
-        self._patience_s = patience_s
-        self._followed: list[Callable[[], None]] = []
+        self._write_timeout_s = write_timeout_s
+        self._callbacks: list[Callable[[], None]] = []
         self._pending = asyncio.Event()
 
-    def write(self, record: object, then: Callable[[], None]) -> None:
-        """Take a record; call back when the disk has taken or refused it, or patience ends; never wait."""
+    def write(self, record: object, then: Callable[[], None] | None = None) -> None:
+        """Queue a record; call back when the disk has accepted or refused it, or the timeout expires."""
         self._recorder.put(encode_line(record))
-        self._followed.append(then)
+        if then is not None:
+            self._callbacks.append(then)
         self._pending.set()
 
-    async def keep_writing(self) -> NoReturn:
-        """Write whatever there is, for ever."""
+    async def run(self) -> NoReturn:
+        """Write queued lines, for ever."""
         while True:
             with suppress(TimeoutError):
-                # A disk that takes lines again need not wait for the next measurement.
-                async with asyncio.timeout(RETRY_S if self._recorder.failing else None):
+                # A disk that accepts lines again must not wait for the next measurement.
+                async with asyncio.timeout(RETRY_INTERVAL_S if self._recorder.failing else None):
                     await self._pending.wait()
             self._pending.clear()
-            followed, self._followed = self._followed, []
+            callbacks, self._callbacks = self._callbacks, []
             writing = asyncio.ensure_future(asyncio.to_thread(self._recorder.flush))
             try:
-                while not (await asyncio.wait([writing], timeout=self._patience_s))[0]:
-                    followed += self._followed
-                    self._followed = []
-                    _call(followed)
+                while not (await asyncio.wait([writing], timeout=self._write_timeout_s))[0]:
+                    callbacks += self._callbacks
+                    self._callbacks = []
+                    _call(callbacks)
             finally:
                 writing.cancel()  # at the end of the program; the thread ends when the disk lets it
                 await asyncio.wait([writing])
-            writing.result()  # a defect of ours must not pass unseen
-            _call(followed)
+            writing.result()  # raises what a bug of ours raised in the thread
+            _call(callbacks)
 
 
 def _call(callbacks: list[Callable[[], None]]) -> None:

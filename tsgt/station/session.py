@@ -1,16 +1,17 @@
-"""What a station's client knows and decides, whatever the protocol: readings in, records and status out.
+"""Mode, prism and sequence numbers of a station's client, whatever the protocol: readings in, records and status out.
 
-All instants are on the station's Unix timeline, in ns, fixed when the client starts. The instrument is not touched
-here: orders of the master are carried out by the caller, and reported back.
+Sans-I/O. All times are on the station's Unix timeline, in ns, fixed when the client starts. The caller executes the
+master's commands and reports them with :meth:`ClientSession.apply`.
 """
 
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from tsgt.model import PolarMeasurement, Status
-from tsgt.radio import DirectOrder, MeasureOrder, Order, SearchOrder, TrackOrder
+from tsgt.radio import Command, DirectCommand, MeasureCommand, SearchCommand, TrackCommand
 from tsgt.recording.journal import TargetRecord
 from tsgt.station.status import ClientStatus, LastMeasurement
 
@@ -22,52 +23,48 @@ if TYPE_CHECKING:
 RATE_WINDOW_NS = 10_000_000_000
 
 
-class Session:
-    """One station's client, from its start to its end.
+class ClientSession:
+    """One run of a station's client.
 
     Parameters
     ----------
-    station
-        Number of the station.
     prism
-        Number of the prism that it tracks from the start.
-    run_start
+        Prism that is tracked from the start.
+    first_sequence
         Sequence number of the first measurement.
 
     Attributes
     ----------
-    station, prism, mode
-        What it is, and what its instrument is to do; changed by orders that have been carried out.
+    mode, prism
+        What the instrument is to do; changed by executed commands.
     """
 
-    def __init__(self, station: int, prism: int, run_start: int = 0) -> None:
+    def __init__(self, station: int, prism: int, first_sequence: int = 0) -> None:
         self.station = station
         self.prism = prism
         self.mode: Mode = "tracking"
-        self._run_start = run_start
+        self._first_sequence = first_sequence
         self._measurements = 0
         self._first_ns: int | None = None
         self._stamps_ns: deque[int] = deque()
         self._last: PolarMeasurement | TargetRecord | None = None
 
-    # --- Instrument -------------------------------------------------------------------------------------------
+    # --- Measurements -----------------------------------------------------------------------------------------
 
-    def measured(self, reading: Reading, stamp_ns: int) -> PolarMeasurement:
-        """Return what stands in the journal of a reading of the tracked prism.
+    def measurement(self, reading: Reading, stamp_ns: int) -> PolarMeasurement:
+        """Return the journal's record of a reading of the tracked prism, and count it.
 
         Parameters
         ----------
-        reading
-            As the instrument gave it, whatever its status.
         stamp_ns
-            Its ``at_ns`` on the station's Unix timeline.
+            The reading's ``at_ns`` on the station's Unix timeline.
         """
-        # Raw, so that the desk can put the instrument's time on this computer's clock anew.
+        # The raw arrival, so that post-processing can map the instrument's time to this computer's clock again.
         received_ns = reading.at_ns if reading.received_ns is None else reading.received_ns
         measurement = PolarMeasurement(
             station=self.station,
             prism=self.prism if reading.prism is None else reading.prism,
-            sequence=self._run_start + self._measurements,
+            sequence=self._first_sequence + self._measurements,
             stamp_ns=stamp_ns,
             stamp_sigma_ns=reading.sigma_ns,
             received_ns=stamp_ns + received_ns - reading.at_ns,
@@ -82,12 +79,12 @@ class Session:
         self._measurements += 1
         self._first_ns = stamp_ns if self._first_ns is None else self._first_ns
         self._stamps_ns.append(stamp_ns)
-        self._forget_before(stamp_ns - RATE_WINDOW_NS)
+        self._trim_window(stamp_ns)
         self._last = measurement
         return measurement
 
-    def shot(self, reading: Reading, stamp_ns: int) -> TargetRecord:
-        """Return what stands in the journal of a single measurement; see :meth:`measured`."""
+    def single_measurement(self, reading: Reading, stamp_ns: int) -> TargetRecord:
+        """Return the journal's record of a single measurement; see :meth:`measurement`."""
         self._last = TargetRecord(
             station=self.station,
             stamp_ns=stamp_ns,
@@ -100,28 +97,28 @@ class Session:
         )
         return self._last
 
-    # --- Orders -----------------------------------------------------------------------------------------------
+    # --- Commands ---------------------------------------------------------------------------------------------
 
-    def is_done_already(self, order: Order) -> bool:
-        """Whether the instrument does what an order asks for, so that it need not be disturbed."""
-        match order:
-            case TrackOrder(prism):
+    def is_satisfied(self, command: Command) -> bool:
+        """Whether the instrument already does what a command asks for."""
+        match command:
+            case TrackCommand(prism):
                 return self.mode == "tracking" and prism in (None, self.prism)
-            case DirectOrder():
+            case DirectCommand():
                 return self.mode == "direct"
-            case SearchOrder() | MeasureOrder():
+            case SearchCommand() | MeasureCommand():
                 return False
 
-    def executed(self, order: TrackOrder | SearchOrder | DirectOrder) -> None:
-        """Take it that an order has been carried out."""
-        if isinstance(order, DirectOrder):
+    def apply(self, command: TrackCommand | SearchCommand | DirectCommand) -> None:
+        """Update mode and prism after a command was executed."""
+        if isinstance(command, DirectCommand):
             self.mode = "direct"
             return
         self.mode = "tracking"
-        if isinstance(order, TrackOrder):
-            self.prism = order.prism or self.prism
+        if isinstance(command, TrackCommand):
+            self.prism = command.prism or self.prism
 
-    # --- People -----------------------------------------------------------------------------------------------
+    # --- Status -----------------------------------------------------------------------------------------------
 
     def status(
         self,
@@ -137,28 +134,15 @@ class Session:
         journal_lost: int,
         radio_ok: bool,
     ) -> ClientStatus:
-        """Say how it goes.
-
-        Parameters
-        ----------
-        now_ns
-            On the station's Unix timeline.
-        link
-            How it goes over the radio; its ``heard_ns`` on the same timeline.
-        condition
-            Of the instrument.
-        instrument, settings, journal, journal_ok, journal_waiting, journal_lost, radio_ok
-            Fields of :class:`ClientStatus`.
-        """
-        self._forget_before(now_ns - RATE_WINDOW_NS)
+        """Return the client's status; parameters as in :class:`ClientStatus`, times on the station's Unix timeline."""
+        self._trim_window(now_ns)
         last = self._last
+        link_fields = asdict(link)
+        master_received_ns = link_fields.pop("master_received_ns")
         return ClientStatus(
             stamp_ns=now_ns,
             station=self.station,
             instrument=instrument,
-            activity=condition.activity,
-            problem=condition.problem,
-            battery_percent=condition.battery_percent,
             settings=settings,
             mode=self.mode,
             prism=self.prism,
@@ -166,7 +150,7 @@ class Session:
             last=None
             if last is None
             else LastMeasurement(
-                age_s=_seconds(now_ns - last.stamp_ns),
+                age_s=(now_ns - last.stamp_ns) / 1e9,
                 prism=last.prism if isinstance(last, PolarMeasurement) else None,
                 horizontal_angle_rad=last.horizontal_angle_rad,
                 zenith_angle_rad=last.zenith_angle_rad,
@@ -179,32 +163,17 @@ class Session:
             journal_ok=journal_ok,
             journal_waiting=journal_waiting,
             journal_lost=journal_lost,
-            master_heard_s=None if link.heard_ns is None else _seconds(now_ns - link.heard_ns),
-            rssi_dbm=link.rssi_dbm,
-            snr_db=link.snr_db,
-            unknown_packets=link.unknown_packets,
+            master_heard_s=None if master_received_ns is None else (now_ns - master_received_ns) / 1e9,
             radio_ok=radio_ok,
-            protocol=link.protocol,
-            authenticated=link.authenticated,
-            joined=link.joined,
-            queued=link.queued,
-            late=link.late,
-            doubted=link.doubted,
-            refused=link.refused,
-            clock_bound_ns=link.clock_bound_ns,
+            **asdict(condition),
+            **link_fields,
         )
 
     def _rate_hz(self, now_ns: int) -> float:
         if self._first_ns is None:
             return 0.0
-        return len(self._stamps_ns) / _seconds(
-            min(max(now_ns - self._first_ns, 1_000_000_000), RATE_WINDOW_NS)
-        )
+        return len(self._stamps_ns) / (min(max(now_ns - self._first_ns, 1_000_000_000), RATE_WINDOW_NS) / 1e9)
 
-    def _forget_before(self, oldest_ns: int) -> None:
-        while self._stamps_ns and self._stamps_ns[0] <= oldest_ns:
+    def _trim_window(self, now_ns: int) -> None:
+        while self._stamps_ns and self._stamps_ns[0] <= now_ns - RATE_WINDOW_NS:
             self._stamps_ns.popleft()
-
-
-def _seconds(duration_ns: int) -> float:
-    return duration_ns / 1e9

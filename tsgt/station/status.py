@@ -1,4 +1,4 @@
-"""How a station's client does, as it tells whoever asks."""
+"""The status of a station's client, as its control socket reports it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 
 import tsgt
 from tsgt.model import Status, check_instants
-from tsgt.recording.journal import InstrumentRecord  # noqa: TC001 (pydantic looks it up when the program runs)
+from tsgt.recording.journal import InstrumentRecord  # noqa: TC001 (pydantic resolves annotations at run time)
 
 Mode = Literal["tracking", "direct"]
 
@@ -16,44 +16,42 @@ ProtocolName = Literal["classic", "superframe"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkStatus:
-    """How a station's client does over the radio; fields as in :class:`ClientStatus`.
+    """The radio link's part of :class:`ClientStatus`.
 
     Attributes
     ----------
-    heard_ns
-        RxDone of the last packet of the master for this station, on its Unix clock; None before the first one.
+    master_received_ns
+        RxDone of the master's last packet for this station, on the station's Unix clock; None before the first.
     """
 
     protocol: ProtocolName
-    heard_ns: int | None
+    master_received_ns: int | None
     rssi_dbm: float | None
     snr_db: float | None
     unknown_packets: int = 0
     authenticated: bool | None = None
     joined: bool | None = None
     queued: int | None = None
-    late: int | None = None
-    doubted: int | None = None
+    missed_slots: int | None = None
+    rejected_beacons: int | None = None
     refused: int | None = None
     clock_bound_ns: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LastMeasurement:
-    """What the instrument gave last.
+    """The last measurement of the instrument.
 
     Attributes
     ----------
     age_s
-        From the measurement to this record, in s.
+        Time from the measurement to this record.
     prism
-        Number of the prism that was tracked; null for a single measurement of a target.
+        Null for a single measurement of a target.
     horizontal_angle_rad, zenith_angle_rad
-        As the instrument gave them, in rad; 0 where it gave none.
+        0 where the instrument reported none.
     slope_distance_m
-        As the instrument gave it, in m, without prism constant; null where it gave none.
-    status
-        The instrument's verdict.
+        Without prism constant; null where the instrument reported none.
     """
 
     __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
@@ -68,78 +66,70 @@ class LastMeasurement:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClientStatus:
-    """How a station's client does at this moment.
+    """The current status of a station's client.
 
     Attributes
     ----------
-    type
-        Always ``client_status``.
     version
-        Of the program.
+        Software version.
     stamp_ns
-        Time of the record on the station's own Unix clock in ns, which need not be right.
-    station
-        Number of the station, from 1.
+        Time of the record on the station's own Unix clock, which need not be right.
     instrument
-        Name and number of the instrument; null while there is no connection to it.
+        Name and serial number of the instrument; null while disconnected.
     activity
-        What the instrument is doing, in a few words; empty where it does not say.
+        Current activity of the instrument; empty where it does not report one.
     problem
-        What a person should see to, as the instrument says; without a connection why there is none. Empty when there is
-        nothing.
+        Action required of the operator, or the connection error; empty for none.
     battery_percent
-        Charge of the instrument's battery; null where it does not say.
+        Null where the instrument does not report it.
     settings
-        What is known of the instrument and of its settings, as read back from it and journalled; null where nothing is.
+        Identity and settings of the instrument as read back and journalled; null where unknown.
     mode
-        ``tracking`` a prism, or ``direct``: single measurements of targets.
+        ``tracking``, or ``direct`` for single measurements of targets.
     prism
-        Number of the prism that is tracked, or was before direct mode.
+        The tracked prism, or the one tracked before direct mode.
     locked
-        Whether there was a target at the last measurement; null before the first one.
+        Whether the last measurement had a target; null before the first.
     last
-        The last measurement; null before the first one.
+        Null before the first measurement.
     measurements
-        How many have been read since the client started.
+        Number of measurements since the client started.
     rate_hz
-        Measurements of the last ten seconds, per second.
+        Measurement rate over the last ten seconds.
     journal
         Path of the journal.
     journal_ok
-        Whether the disk took the last line that was to be written.
+        Whether the disk accepted the last write.
     journal_waiting
-        How many lines are not in the journal yet; a disk that is full lets them pile up.
+        Number of lines still to be written; they pile up while the disk is full.
     journal_lost
-        How many lines will never be, because too many were waiting already.
+        Number of lines lost because the queue was full.
     master_heard_s
-        From the last packet of the master for this station to this record, in s; null before the first one.
-    rssi_dbm
-        Strength of that packet in dBm; null before the first one.
-    snr_db
-        Its ratio to the noise in dB; null before the first one.
+        Time since the master's last packet for this station; null before the first.
+    rssi_dbm, snr_db
+        Signal strength and signal-to-noise ratio of that packet.
     unknown_packets
-        How many packets of anybody have come since the master's last one. If it is not heard and these become more, it
-        speaks another protocol, or has another key.
+        Number of packets from other senders since the master's last one. If it grows while the master stays silent, the
+        master uses another protocol or another key.
     radio_ok
-        Whether the radio is open and answered when it was used last.
+        Whether the radio is open and worked when last used.
     protocol
-        What is spoken over the radio, ``classic`` or ``superframe``. The protocol classic has none of the following,
-        and they are null.
+        ``classic`` or ``superframe``; the fields below are null for ``classic``.
     authenticated
         Whether there is a key; without one anybody can take part.
     joined
         Whether a master has confirmed this station in its session.
     queued
-        How many measurements are still to be delivered.
-    late
-        In how many of its slots the station was silent, or overran, because its computer was late.
-    doubted
-        How many beacons came at a time at which they cannot have been sent: somebody holds packets back, or a clock
-        has been set.
+        Number of measurements still to be delivered.
+    missed_slots
+        Number of slots missed or overrun because this computer was late.
+    rejected_beacons
+        Number of beacons whose arrival contradicts their time of transmission: delayed by an adversary, or a clock was
+        set.
     refused
-        How many packets looked like a beacon with a wrong code: the master has another key, or somebody forges beacons.
+        Number of beacons whose authentication failed: the master has another key, or somebody forges beacons.
     clock_bound_ns
-        How well the master's time is known, in ns; null where it is not yet.
+        Bound on the error of the master's time; null before the first synchronisation.
     """
 
     __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
@@ -172,11 +162,11 @@ class ClientStatus:
     authenticated: bool | None
     joined: bool | None
     queued: int | None
-    late: int | None
-    doubted: int | None
+    missed_slots: int | None
+    rejected_beacons: int | None
     refused: int | None
     clock_bound_ns: int | None
 
     def __post_init__(self) -> None:
-        """Refuse instants that no clock shows."""
+        """Reject instants that no clock shows."""
         check_instants(self.stamp_ns)

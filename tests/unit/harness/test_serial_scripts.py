@@ -12,7 +12,7 @@ from harness.serial_scripts import Bench, Script, all_scripts, run_script
 from tsgt.simulation.instrument import LineFault
 
 if TYPE_CHECKING:
-    from tsgt.simulation.instrument.geocom import Offered
+    from tsgt.simulation.instrument import ReportedDistance
 
 SCRIPTS = all_scripts()
 KINDS = sorted({script.kind for script in SCRIPTS})
@@ -35,14 +35,14 @@ def test_a_fault_is_survived(kind: str) -> None:
 
 async def _wrong_digits(bench: Bench) -> None:
     for _ in range(300):
-        bench.line.faults.script.append(LineFault.DIGIT)
+        bench.line.faults.script.append(LineFault.WRONG_DIGIT)
         await asyncio.sleep(0.31)
 
 
 async def _lie_about_time(bench: Bench) -> None:
     real = bench.station.offer
 
-    def offer(result: Offered) -> None:
+    def offer(result: ReportedDistance) -> None:
         real(result._replace(true_ns=result.true_ns + 10**9))
 
     bench.station.offer = offer  # type: ignore[method-assign]

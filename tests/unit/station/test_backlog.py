@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 from harness.records import HEADER, measurement
 from structlog.testing import capture_logs
 
-from tsgt.radio.superframe import Reception
+from tsgt.radio.superframe import BeaconReception
 from tsgt.radio.superframe.wire import RESTART_SKIP
 from tsgt.recording import encode_line
 from tsgt.recording.journal import AcknowledgedRecord, JournalRecord, ReceptionRecord
 from tsgt.station import backlog as backlog_module
-from tsgt.station.backlog import Backlog, queued, read_backlog
+from tsgt.station.backlog import Backlog, queued_measurement, read_backlog
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -25,11 +25,20 @@ ZERO_NS = 1_000
 
 
 def head(
-    run_start: int, *, station: int = 1, boot: str = "b", lineage: int | None = 7, zero_ns: int = ZERO_NS
+    first_sequence: int,
+    *,
+    station: int = 1,
+    boot: str = "b",
+    stream_id: int | None = 7,
+    zero_ns: int = ZERO_NS,
 ) -> JournalRecord:
     """Make the line that says whose journal it is."""
     return JournalRecord(
-        station=station, unix_at_zero_ns=zero_ns, boot=boot, lineage=lineage, run_start=run_start
+        station=station,
+        unix_at_zero_ns=zero_ns,
+        boot=boot,
+        stream_id=stream_id,
+        first_sequence=first_sequence,
     )
 
 
@@ -64,7 +73,7 @@ def measured(*sequences: int) -> list[PolarMeasurement]:
 def test_without_journals_everything_begins(tmp_path: Path) -> None:
     """Also where there are only those of another station, or of the protocol classic, or none at all."""
     assert read_backlog(tmp_path / "missing", 1) == Backlog()
-    journal(tmp_path, "station1-a", head(0, lineage=None), *measured(0, 1))
+    journal(tmp_path, "station1-a", head(0, stream_id=None), *measured(0, 1))
     journal(tmp_path, "station1-b", head(0, station=2), *measured(0, 1))
     (tmp_path / "station1-c.jsonl").write_bytes(b"\0" * 100)
     (tmp_path / "station1-d.jsonl").write_bytes(b"")
@@ -77,9 +86,9 @@ def test_what_is_not_acknowledged_is_left(tmp_path: Path) -> None:
         tmp_path, "station1-a", head(0), acknowledged(0), *measured(0, 1, 2), acknowledged(2), *measured(3)
     )
     backlog = read_backlog(tmp_path, 1)
-    assert (backlog.lineage, backlog.run_start) == (7, 4 + RESTART_SKIP)
+    assert (backlog.stream_id, backlog.first_sequence) == (7, 4 + RESTART_SKIP)
     assert numbers(backlog) == [2, 3]
-    assert backlog.queued[0] == queued(measurement(2), ZERO_NS, "b")
+    assert backlog.queued[0] == queued_measurement(measurement(2), ZERO_NS, "b")
     assert backlog.queued[0].at_ns == measurement(2).stamp_ns - ZERO_NS
 
 
@@ -91,17 +100,17 @@ def test_several_runs_are_left_in_order(tmp_path: Path) -> None:
     backlog = read_backlog(tmp_path, 1)
     assert numbers(backlog) == [1, 1002, 2003]
     assert [each.boot for each in backlog.queued] == ["b", "c", "b"]
-    assert backlog.run_start == 2004 + RESTART_SKIP
+    assert backlog.first_sequence == 2004 + RESTART_SKIP
     journal(tmp_path, "station1-6", head(3004), acknowledged(3004))
     backlog = read_backlog(tmp_path, 1)
-    assert (numbers(backlog), backlog.run_start) == ([], 3004 + RESTART_SKIP)
+    assert (numbers(backlog), backlog.first_sequence) == ([], 3004 + RESTART_SKIP)
 
 
 def test_receptions_of_beacons_come_back(tmp_path: Path) -> None:
     """On the computer's own clock, with what names its start."""
     journal(tmp_path, "station1-a", head(0), reception(5))
     assert read_backlog(tmp_path, 1).receptions == (
-        Reception(session=77, counter=5, received_ns=8_000, sigma_ns=3, sent_us=400, boot="b"),
+        BeaconReception(session=77, counter=5, received_ns=8_000, sigma_ns=3, sent_us=400, boot="b"),
     )
 
 
@@ -117,7 +126,7 @@ def test_receptions_go_as_far_back_as_the_clock_of_what_is_left(tmp_path: Path) 
 
 def test_receptions_of_one_clock_are_in_order_whatever_the_names_say(tmp_path: Path) -> None:
     """Also those of a run that had numbers of its own, as its disk took nothing at first."""
-    journal(tmp_path, "station1-a", head(500, lineage=8), reception(3, received_ns=700), *measured(500))
+    journal(tmp_path, "station1-a", head(500, stream_id=8), reception(3, received_ns=700), *measured(500))
     journal(tmp_path, "station1-b", head(0), reception(2, received_ns=500), *measured(0))
     journal(tmp_path, "station1-c", head(1001), acknowledged(1001), *measured(1001))
     assert [each.counter for each in read_backlog(tmp_path, 1).receptions] == [2, 3]
@@ -134,7 +143,7 @@ def test_what_has_been_heard_is_not_sought_without_need(
         read.append(path.stem)
         return tail(head, path)
 
-    monkeypatch.setattr(backlog_module, "MOST_MEASUREMENTS", 2)
+    monkeypatch.setattr(backlog_module, "MAX_MEASUREMENTS", 2)
     monkeypatch.setattr(backlog_module, "_tail", noted)
     journal(tmp_path, "station1-a", head(0), reception(1), *measured(0))
     journal(tmp_path, "station1-b", head(1001), reception(2), reception(3, received_ns=9_000))
@@ -178,7 +187,7 @@ def test_an_unreadable_journal_is_told(tmp_path: Path, monkeypatch: pytest.Monke
 
 def test_what_is_too_much_stays_in_the_journal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The oldest; and it is said."""
-    monkeypatch.setattr(backlog_module, "MOST_MEASUREMENTS", 3)
+    monkeypatch.setattr(backlog_module, "MAX_MEASUREMENTS", 3)
     journal(tmp_path, "station1-a", head(0), *measured(*range(5)))
     with capture_logs() as logs:
         assert numbers(read_backlog(tmp_path, 1)) == [2, 3, 4]
@@ -191,7 +200,7 @@ def test_of_a_long_journal_the_end_is_read(tmp_path: Path, monkeypatch: pytest.M
     journal(tmp_path, "station1-a", head(0), *measured(*range(99)), acknowledged(5), *measured(99))
     backlog = read_backlog(tmp_path, 1)
     assert 1 <= len(backlog.queued) < 10
-    assert backlog.run_start == 100 + RESTART_SKIP
+    assert backlog.first_sequence == 100 + RESTART_SKIP
 
 
 def test_numbers_go_on_however_long_beacons_were_heard_after_the_last_measurement(
@@ -202,7 +211,7 @@ def test_numbers_go_on_however_long_beacons_were_heard_after_the_last_measuremen
     heard = [reception(number, received_ns=8_000 + number) for number in range(50)]
     journal(tmp_path, "station1-a", head(0), *measured(*range(3000)), acknowledged(3000), *heard)
     backlog = read_backlog(tmp_path, 1)
-    assert (numbers(backlog), backlog.run_start) == ([], 3000 + RESTART_SKIP)
+    assert (numbers(backlog), backlog.first_sequence) == ([], 3000 + RESTART_SKIP)
 
 
 def test_what_was_delivered_long_ago_is_not_left_again(
@@ -219,14 +228,14 @@ def test_what_was_delivered_long_ago_is_not_left_again(
 def test_what_was_left_before_a_run_with_numbers_of_its_own_is_still_left(tmp_path: Path) -> None:
     """It began while the disk took nothing, and later the disk took its journal all the same."""
     journal(tmp_path, "station1-a", head(0), acknowledged(0), *measured(0, 1, 2))
-    anew = head(700_000, lineage=8)
+    anew = head(700_000, stream_id=8)
     journal(tmp_path, "station1-b", anew, *measured(700_000, 700_001), acknowledged(700_001))
     backlog = read_backlog(tmp_path, 1)
-    assert (backlog.lineage, numbers(backlog)) == (7, [0, 1, 2])
-    assert backlog.run_start == 3 + RESTART_SKIP
+    assert (backlog.stream_id, numbers(backlog)) == (7, [0, 1, 2])
+    assert backlog.first_sequence == 3 + RESTART_SKIP
 
 
 def test_numbers_that_are_on_the_air_and_on_no_disk_are_not_given_again(tmp_path: Path) -> None:
     """Even if a disk has taken nothing for a quarter of an hour, 20 times a second."""
     journal(tmp_path, "station1-a", head(0), acknowledged(0), *measured(*range(10)))
-    assert read_backlog(tmp_path, 1).run_start > 10 + 15 * 60 * 20
+    assert read_backlog(tmp_path, 1).first_sequence > 10 + 15 * 60 * 20

@@ -16,8 +16,8 @@ from tsgt.errors import InstrumentRefusedError, RadioError, RecordingError
 from tsgt.recording import RecordingWriter, encode_line, read_lines
 from tsgt.recording.recorder import Recorder
 from tsgt.simulation.kernel import VirtualClock
-from tsgt.station import AtmosphereRequest, Condition, run_client
-from tsgt.station.control_socket import MOST_TALKS
+from tsgt.station import AtmosphereRequest, ClientDependencies, Condition, run_client
+from tsgt.station.control_socket import MAX_CONNECTIONS
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
@@ -42,7 +42,7 @@ async def client(folder: Path) -> AsyncGenerator[ScriptedInstrument]:
     instrument = ScriptedInstrument(clock)
     config = client_config(folder)
     running = asyncio.create_task(
-        run_client(config, PAPER, instrument=instrument, open_radio=no_radio, clock=clock)
+        run_client(config, PAPER, ClientDependencies(instrument=instrument, open_radio=no_radio, clock=clock))
     )
     try:
         await asyncio.sleep(2.0)
@@ -72,10 +72,12 @@ def journalled(folder: Path, kind: str) -> list[dict[str, Any]]:
 async def test_a_crowd_is_let_go(tmp_path: Path) -> None:
     """So many are let in and the others not; a second later there is room again."""
     async with client(tmp_path):
-        crowd = [await asyncio.open_unix_connection(tmp_path / "client.sock") for _ in range(MOST_TALKS + 5)]
+        crowd = [
+            await asyncio.open_unix_connection(tmp_path / "client.sock") for _ in range(MAX_CONNECTIONS + 5)
+        ]
         async with asyncio.timeout(0.01):
             lines = [await reader.readline() for reader, _ in crowd]
-        assert [bool(line) for line in lines] == [True] * MOST_TALKS + [False] * 5
+        assert [bool(line) for line in lines] == [True] * MAX_CONNECTIONS + [False] * 5
         await asyncio.sleep(1.1)
         assert len(await talk(tmp_path, b"?\n")) == 2
         for _, writer in crowd:
@@ -124,11 +126,11 @@ async def test_what_is_refused_is_said(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("request_line", "words"),
     [
-        (b"hello\n", "not understood"),
+        (b"hello\n", "invalid request"),
         (b'{"type":"reboot"}\n', "field type"),
         (b'{"type":"atmosphere","temperature_c":20.0}\n', "field pressure_hpa"),
         (b'{"type":"atmosphere","temperature_c":1013.0,"pressure_hpa":20.0}\n', "field temperature_c"),
-        (b'{"type":"atmosphere","temperature_c":NaN,"pressure_hpa":1000.0}\n', "not understood"),
+        (b'{"type":"atmosphere","temperature_c":NaN,"pressure_hpa":1000.0}\n', "invalid request"),
     ],
 )
 async def test_nonsense_is_answered(tmp_path: Path, request_line: bytes, words: str) -> None:
@@ -189,7 +191,7 @@ async def test_a_full_disk_is_said_with_what_is_not_journalled(
         write_line(writer, line)
 
     monkeypatch.setattr(RecordingWriter, "write_line", write_if_room)
-    monkeypatch.setattr(Recorder.__init__, "__kwdefaults__", {"waiting_lines": 10})
+    monkeypatch.setattr(Recorder.__init__, "__kwdefaults__", {"max_pending_lines": 10})
     said: list[str] = []
     monkeypatch.setattr("tsgt.service.sd_notify", lambda *assignments: said.extend(assignments))
     async with client(tmp_path) as instrument:

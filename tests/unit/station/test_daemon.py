@@ -21,7 +21,7 @@ from tsgt.radio.classic import MeasurementMessage
 from tsgt.radio.classic.messages import Acknowledgement, PingReply, TimeReply
 from tsgt.recording import RecordingWriter, read_lines
 from tsgt.recording.journal import load_journal
-from tsgt.station import run_client
+from tsgt.station import ClientDependencies, run_client
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable
@@ -145,12 +145,12 @@ async def test_orders_change_what_is_measured(tmp_path: Path) -> None:
         await asyncio.sleep(1.0)
         assert await day.ask(b"d1", timeout_s=2.0) == Acknowledgement("d", ok=True)
         before = len(day.read)
-        day.instrument.aim(1)
+        day.instrument.aim_at_target(1)
         shot = await day.ask(b"t1", timeout_s=5.0)
         assert isinstance(shot, MeasurementMessage)
         assert shot.slope_distance_m == pytest.approx(20.6216, abs=0.01)
         assert len(day.read) == before
-        day.instrument.aim(2)
+        day.instrument.aim_at_target(2)
         near = await day.ask(b"t1", timeout_s=20.0)
         assert isinstance(near, MeasurementMessage)
         assert (near.status, near.slope_distance_m) == (3, 0.0)  # too near to give a distance
@@ -158,7 +158,7 @@ async def test_orders_change_what_is_measured(tmp_path: Path) -> None:
         assert await day.ask(b"n12", timeout_s=2.0) == Acknowledgement("n", ok=True)
         next_ns = (await day.poll()).time_ns
         assert next_ns == 0 or next_ns > ordered_ns  # not one of the other prism
-        day.instrument.lock_by_hand(2)
+        day.instrument.lock_manually(2)
         await asyncio.sleep(4.0)
         assert (await day.poll()).status == 0
         await day.kill()
@@ -189,7 +189,7 @@ async def test_a_shot_that_fails_is_answered(tmp_path: Path) -> None:
         await asyncio.sleep(1.0)
         assert await day.ask(b"d1", timeout_s=2.0) == Acknowledgement("d", ok=True)
         day.line.plugged = False
-        day.instrument.aim(1)
+        day.instrument.aim_at_target(1)
         failed = await day.ask(b"t1", timeout_s=5.0)
         assert isinstance(failed, MeasurementMessage)
         assert failed.status == 3
@@ -297,8 +297,8 @@ async def test_the_journal_begins_with_what_a_merge_needs(tmp_path: Path) -> Non
         "station": 1,
         "unix_at_zero_ns": START_NS + OFFSET_NS,
         "boot": "boot",
-        "lineage": None,
-        "run_start": 0,
+        "stream_id": None,
+        "first_sequence": 0,
     }
 
 
@@ -332,9 +332,9 @@ async def test_a_second_client_does_not_take_the_socket(tmp_path: Path) -> None:
             await run_client(
                 client_config(tmp_path),
                 PAPER,
-                instrument=ScriptedInstrument(day.clock),
-                open_radio=day.open_radio,
-                clock=day.clock,
+                ClientDependencies(
+                    instrument=ScriptedInstrument(day.clock), open_radio=day.open_radio, clock=day.clock
+                ),
             )
 
 

@@ -1,4 +1,4 @@
-"""The keeper of an instrument: connections, orders, air and settings, whatever the instrument is."""
+"""The supervisor of an instrument: connections, orders, air and settings, whatever the instrument is."""
 
 from __future__ import annotations
 
@@ -12,11 +12,16 @@ from harness.shots import RECORD, ScriptedInstrument
 from structlog.testing import capture_logs
 
 from tsgt.errors import InstrumentError, InstrumentRefusedError
-from tsgt.radio import Direction, DirectOrder, MeasureOrder, SearchOrder, TrackOrder
+from tsgt.radio import DirectCommand, Direction, MeasureCommand, SearchCommand, TrackCommand
 from tsgt.simulation.kernel import VirtualClock
 from tsgt.station import Atmosphere, Condition, Reading
-from tsgt.station.instrument_supervisor import CHECK_S, NOT_CONNECTED, Done, InstrumentKeeper
-from tsgt.station.session import Session
+from tsgt.station.instrument_supervisor import (
+    CHECK_INTERVAL_S,
+    NOT_CONNECTED,
+    CommandResult,
+    InstrumentSupervisor,
+)
+from tsgt.station.session import ClientSession
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
@@ -30,36 +35,38 @@ GONE = "the instrument is gone"
 
 @dataclass
 class Bench:
-    """A keeper, its instrument, and all that it has handed out, in that order."""
+    """A supervisor, its instrument, and all that it has handed out, in that order."""
 
     instrument: ScriptedInstrument
-    session: Session = field(default_factory=lambda: Session(1, 1))
-    out: list[Reading | InstrumentRecord | Done] = field(default_factory=list)
+    session: ClientSession = field(default_factory=lambda: ClientSession(1, 1))
+    out: list[Reading | InstrumentRecord | CommandResult] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.keeper = InstrumentKeeper(
+        self.supervisor = InstrumentSupervisor(
             self.instrument,
             self.session,
             VirtualClock(0),
             on_reading=self.out.append,
             on_record=self.out.append,
-            on_done=self.done,
+            on_result=self.record_result,
         )
 
-    def done(self, done: Done) -> None:
-        """Do what the client does."""
-        self.out.append(done)
-        if done.ok and not isinstance(done.order, MeasureOrder):
-            self.session.executed(done.order)
+    def record_result(self, result: CommandResult) -> None:
+        """Apply a result as the client does."""
+        self.out.append(result)
+        if result.ok and not isinstance(result.command, MeasureCommand):
+            self.session.apply(result.command)
 
-    async def ordered(self, order: TrackOrder | SearchOrder | DirectOrder | MeasureOrder) -> Done:
-        """Give an order and wait for what becomes of it."""
-        self.keeper.give(order)
-        while not (self.out and isinstance(self.out[-1], Done)):  # noqa: ASYNC110 (virtual time)
+    async def execute(
+        self, command: TrackCommand | SearchCommand | DirectCommand | MeasureCommand
+    ) -> CommandResult:
+        """Submit a command and wait for its result."""
+        self.supervisor.submit(command)
+        while not (self.out and isinstance(self.out[-1], CommandResult)):  # noqa: ASYNC110 (virtual time)
             await asyncio.sleep(0.01)
-        done = self.out.pop()
-        assert isinstance(done, Done)
-        return done
+        result = self.out.pop()
+        assert isinstance(result, CommandResult)
+        return result
 
 
 @asynccontextmanager
@@ -68,17 +75,17 @@ async def bench(
 ) -> AsyncGenerator[Bench]:
     """Keep an instrument; it is connected and tracks, after the second that this takes."""
     made = Bench(instrument or ScriptedInstrument(VirtualClock(0)))
-    keeping = asyncio.create_task(made.keeper.keep())
+    running = asyncio.create_task(made.supervisor.run())
     try:
         await asyncio.sleep(1.5)
         if connected:
-            assert made.keeper.description == "scripted"
+            assert made.supervisor.description == "scripted"
             assert made.out.pop(0) == RECORD
         yield made
     finally:
-        keeping.cancel()
-        await asyncio.wait([keeping])
-    assert keeping.cancelled()
+        running.cancel()
+        await asyncio.wait([running])
+    assert running.cancelled()
 
 
 async def test_an_order_that_is_refused_leaves_the_instrument_as_it_is() -> None:
@@ -86,29 +93,29 @@ async def test_an_order_that_is_refused_leaves_the_instrument_as_it_is() -> None
     async with bench() as day:
         day.instrument.refusal = InstrumentRefusedError("there is no prism 9")
         with capture_logs() as logs:
-            assert await day.ordered(TrackOrder(9)) == Done(TrackOrder(9), ok=False)
+            assert await day.execute(TrackCommand(9)) == CommandResult(TrackCommand(9), ok=False)
             day.instrument.refusal = None
             reading = day.instrument.give()
             await asyncio.sleep(0.1)
         assert day.out == [reading]
-    assert [entry["event"] for entry in logs] == ["order_refused"]
+    assert [entry["event"] for entry in logs] == ["command_refused"]
 
 
 async def test_a_single_measurement_that_is_refused_is_answered() -> None:
     """There is none, and the instrument stays ready for the next one."""
     async with bench() as day:
-        assert (await day.ordered(DirectOrder())).ok
+        assert (await day.execute(DirectCommand())).ok
         day.instrument.target = InstrumentRefusedError("no target there")
-        assert await day.ordered(MeasureOrder()) == Done(MeasureOrder(), ok=False)
-        assert day.keeper.description == "scripted"
+        assert await day.execute(MeasureCommand()) == CommandResult(MeasureCommand(), ok=False)
+        assert day.supervisor.description == "scripted"
 
 
 async def test_a_search_is_told_where_to_look() -> None:
     """The direction in the order reaches the instrument; without one it looks where it last had the prism."""
     towards = Direction(1.0, 1.5, 0.05)
     async with bench() as day:
-        assert (await day.ordered(SearchOrder(towards))).ok
-        assert (await day.ordered(SearchOrder())).ok
+        assert (await day.execute(SearchCommand(towards))).ok
+        assert (await day.execute(SearchCommand())).ok
     assert day.instrument.prisms == [1, 1, 1]
     assert day.instrument.towards == [None, towards, None]
 
@@ -119,10 +126,10 @@ async def test_an_instrument_that_is_back_is_used_within_a_second() -> None:
         day.instrument.plugged = False
         day.instrument.fail()
         await asyncio.sleep(600.0)
-        assert day.keeper.description is None
+        assert day.supervisor.description is None
         day.instrument.plugged = True
         await asyncio.sleep(1.0 + 1.0 + 0.01)  # the longest pause, and what tracking takes
-        assert day.keeper.description == "scripted"
+        assert day.supervisor.description == "scripted"
 
 
 async def test_without_a_connection_the_problem_is_why() -> None:
@@ -130,11 +137,11 @@ async def test_without_a_connection_the_problem_is_why() -> None:
     instrument = ScriptedInstrument(VirtualClock(0))
     instrument.plugged = False
     async with bench(instrument, connected=False) as day:
-        assert day.keeper.condition.problem == "nobody answers; is the cable in?"
+        assert day.supervisor.condition.problem == "nobody answers; is the cable in?"
         instrument.plugged = True
         instrument.condition = Condition(problem="battery low", battery_percent=9)
         await asyncio.sleep(3.0)
-        assert day.keeper.condition == instrument.condition
+        assert day.supervisor.condition == instrument.condition
 
 
 async def test_settings_are_handed_out_before_what_was_measured_with_them() -> None:
@@ -156,7 +163,7 @@ async def test_settings_are_handed_out_before_what_was_measured_with_them() -> N
 async def test_the_air_is_set_between_two_readings() -> None:
     """No reading is lost, the settings are handed out, and whoever asked is told that it is done."""
     async with bench() as day:
-        assert await day.keeper.set_atmosphere(WARM) == ""
+        assert await day.supervisor.set_atmosphere(WARM) == ""
         day.instrument.give()
         await asyncio.sleep(0.1)
         settings, reading = day.out
@@ -167,23 +174,23 @@ async def test_the_air_is_set_between_two_readings() -> None:
 async def test_the_air_is_set_while_nothing_is_measured() -> None:
     """In direct mode too, where nobody reads."""
     async with bench() as day:
-        assert (await day.ordered(DirectOrder())).ok
-        assert await day.keeper.set_atmosphere(WARM) == ""
-        assert (await day.ordered(MeasureOrder())).ok
+        assert (await day.execute(DirectCommand())).ok
+        assert await day.supervisor.set_atmosphere(WARM) == ""
+        assert (await day.execute(MeasureCommand())).ok
 
 
 async def test_an_instrument_that_goes_while_nothing_is_measured_is_missed() -> None:
     """In direct mode nobody reads: it is asked now and then, and connected again when it is back."""
     async with bench() as day:
-        assert (await day.ordered(DirectOrder())).ok
+        assert (await day.execute(DirectCommand())).ok
         day.instrument.plugged = False
-        await asyncio.sleep(CHECK_S + 0.1)
-        assert "is the cable in?" in day.keeper.condition.problem
+        await asyncio.sleep(CHECK_INTERVAL_S + 0.1)
+        assert "is the cable in?" in day.supervisor.condition.problem
         day.instrument.plugged = True
         await asyncio.sleep(3.0)
-        assert not day.keeper.condition.problem
+        assert not day.supervisor.condition.problem
         assert day.instrument.prisms[-1] is None
-        assert (await day.ordered(MeasureOrder())).ok
+        assert (await day.execute(MeasureCommand())).ok
 
 
 async def test_the_air_is_set_again_after_each_connection() -> None:
@@ -191,7 +198,7 @@ async def test_the_air_is_set_again_after_each_connection() -> None:
     instrument = ScriptedInstrument(VirtualClock(0))
     instrument.plugged = False
     async with bench(instrument, connected=False) as day:
-        assert await day.keeper.set_atmosphere(COLD) == NOT_CONNECTED
+        assert await day.supervisor.set_atmosphere(COLD) == NOT_CONNECTED
         instrument.plugged = True
         for _ in range(2):
             await asyncio.sleep(3.0)
@@ -204,7 +211,7 @@ async def test_an_air_that_is_refused_is_forgotten() -> None:
     """Whoever asked is told why, and it is not tried again with the next connection."""
     async with bench() as day:
         day.instrument.air_refusal = InstrumentRefusedError("it has no such setting")
-        assert await day.keeper.set_atmosphere(WARM) == "it has no such setting"
+        assert await day.supervisor.set_atmosphere(WARM) == "it has no such setting"
         day.instrument.air_refusal = None
         day.instrument.fail()
         await asyncio.sleep(3.0)
@@ -215,7 +222,7 @@ async def test_an_instrument_that_goes_while_the_air_is_set_gets_it_later() -> N
     """Whoever asked is not left waiting."""
     async with bench() as day:
         day.instrument.air_refusal = InstrumentError(GONE)
-        assert await day.keeper.set_atmosphere(WARM) == NOT_CONNECTED
+        assert await day.supervisor.set_atmosphere(WARM) == NOT_CONNECTED
         day.instrument.air_refusal = None
         await asyncio.sleep(3.0)
         assert day.instrument.record is not None
@@ -226,9 +233,9 @@ async def test_an_instrument_that_goes_while_the_air_is_set_gets_it_later() -> N
 async def test_of_two_requests_the_later_one_counts(after_s: float) -> None:
     """Before or while the first one is carried out; both are answered."""
     async with bench() as day, asyncio.TaskGroup() as group:
-        first = group.create_task(day.keeper.set_atmosphere(WARM))
+        first = group.create_task(day.supervisor.set_atmosphere(WARM))
         await asyncio.sleep(after_s)
-        second = group.create_task(day.keeper.set_atmosphere(COLD))
+        second = group.create_task(day.supervisor.set_atmosphere(COLD))
         await asyncio.sleep(1.0)
         assert first.done()
         assert second.result() == ""
@@ -239,8 +246,8 @@ async def test_of_two_requests_the_later_one_counts(after_s: float) -> None:
 async def test_an_order_and_the_air_together() -> None:
     """Neither is lost when both come in the same moment."""
     async with bench() as day, asyncio.TaskGroup() as group:
-        setting = group.create_task(day.keeper.set_atmosphere(WARM))
-        assert (await day.ordered(TrackOrder(2))).ok
+        setting = group.create_task(day.supervisor.set_atmosphere(WARM))
+        assert (await day.execute(TrackCommand(2))).ok
         assert await setting == ""
     assert day.instrument.prisms == [1, 2]
 

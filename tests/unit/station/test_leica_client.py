@@ -14,7 +14,7 @@ from structlog.testing import capture_logs
 from unit.station.test_control_socket import WARM, journalled, no_radio, talk
 
 from tsgt.recording.journal import load_journal
-from tsgt.station import run_client
+from tsgt.station import ClientDependencies, run_client
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
@@ -31,9 +31,7 @@ async def client(folder: Path, *, rate_hz: float = 2.5, seed: int = 2) -> AsyncG
             run_client(
                 client_config(folder),
                 PAPER,
-                instrument=bench.instrument,
-                open_radio=no_radio,
-                clock=bench.clock,
+                ClientDependencies(instrument=bench.instrument, open_radio=no_radio, clock=bench.clock),
             )
         )
         try:
@@ -54,7 +52,7 @@ async def test_what_was_offered_is_journalled_once(tmp_path: Path, rate_hz: floa
     """With the instrument's time, the arrival of the answer, and a stamp between measurement and arrival."""
     async with client(tmp_path, rate_hz=rate_hz) as bench:
         await asyncio.sleep(60.0)
-        true_ns = {1_000_000 * each.instrument_ms: each.true_ns for each in bench.station.offered}
+        true_ns = {1_000_000 * each.instrument_ms: each.true_ns for each in bench.station.reported_distances}
     journal = [each for each in measurements(tmp_path) if each.slope_distance_m is not None]
     times = [each.instrument_time_ns for each in journal]
     assert len(set(times)) == len(times) >= rate_hz * 45
@@ -99,7 +97,7 @@ async def test_an_instrument_that_was_switched_off_comes_back(tmp_path: Path) ->
         assert status["problem"]
         bench.station.switch_on()
         await asyncio.sleep(6.0)
-        bench.station.lock_by_hand(1)
+        bench.station.lock_manually(1)
         await asyncio.sleep(20.0)
     usable = [each for each in measurements(tmp_path) if each.status.usable]
     stamps = [each.stamp_ns for each in usable]

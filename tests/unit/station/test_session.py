@@ -7,17 +7,17 @@ from dataclasses import replace
 import pytest
 
 from tsgt.model import PolarMeasurement, Status
-from tsgt.radio import DirectOrder, MeasureOrder, SearchOrder, TrackOrder
+from tsgt.radio import DirectCommand, MeasureCommand, SearchCommand, TrackCommand
 from tsgt.recording.journal import InstrumentRecord
 from tsgt.station import ClientStatus, Condition, Reading
-from tsgt.station.session import Session
+from tsgt.station.session import ClientSession
 from tsgt.station.status import LinkStatus
 
 SECOND = 1_000_000_000
 START = 1_600_000_000 * SECOND
 ZERO = START - 77
 SETTINGS = InstrumentRecord(make="i")
-SILENT = LinkStatus(protocol="classic", heard_ns=None, rssi_dbm=None, snr_db=None)
+SILENT = LinkStatus(protocol="classic", master_received_ns=None, rssi_dbm=None, snr_db=None)
 
 
 def reading(seconds: float, *, prism: int | None = 1, status: Status = Status.OK) -> Reading:
@@ -35,13 +35,13 @@ def reading(seconds: float, *, prism: int | None = 1, status: Status = Status.OK
     )
 
 
-def measure(session: Session, seconds: float, *, status: Status = Status.OK) -> PolarMeasurement:
+def measure(session: ClientSession, seconds: float, *, status: Status = Status.OK) -> PolarMeasurement:
     """Let the session take a reading."""
     made = reading(seconds, status=status)
-    return session.measured(made, ZERO + made.at_ns)
+    return session.measurement(made, ZERO + made.at_ns)
 
 
-def status(session: Session, seconds: float, link: LinkStatus = SILENT) -> ClientStatus:
+def status(session: ClientSession, seconds: float, link: LinkStatus = SILENT) -> ClientStatus:
     """Ask how it goes."""
     return session.status(
         START + round(seconds * SECOND),
@@ -59,7 +59,7 @@ def status(session: Session, seconds: float, link: LinkStatus = SILENT) -> Clien
 
 def test_the_journal_gets_what_the_instrument_said() -> None:
     """Raw values, three times the one stamp, and running numbers."""
-    session = Session(3, 1)
+    session = ClientSession(3, 1)
     first, second = measure(session, 0.0), measure(session, 0.4)
     assert first == PolarMeasurement(
         station=3,
@@ -81,13 +81,13 @@ def test_the_journal_gets_what_the_instrument_said() -> None:
 def test_the_journal_gets_when_the_first_byte_came() -> None:
     """Raw beside the stamp, so that the desk can make the stamp anew from the instrument's time."""
     made = replace(reading(0.0), received_ns=77 + 95_000_000)
-    measurement = Session(3, 1).measured(made, ZERO + made.at_ns)
+    measurement = ClientSession(3, 1).measurement(made, ZERO + made.at_ns)
     assert (measurement.stamp_ns, measurement.received_ns) == (START, START + 95_000_000)
 
 
 def test_the_numbers_go_on_from_those_of_earlier_runs() -> None:
     """Where the protocol identifies measurements by them."""
-    session = Session(3, 1, 1501)
+    session = ClientSession(3, 1, 1501)
     assert [measure(session, at).sequence for at in (0.0, 0.4)] == [1501, 1502]
     assert status(session, 1.0).measurements == 2
 
@@ -95,41 +95,41 @@ def test_the_numbers_go_on_from_those_of_earlier_runs() -> None:
 @pytest.mark.parametrize("verdict", Status)
 def test_the_journal_keeps_every_status(verdict: Status) -> None:
     """In the common vocabulary and as the instrument's own number."""
-    measurement = measure(Session(3, 1), 0.0, status=verdict)
+    measurement = measure(ClientSession(3, 1), 0.0, status=verdict)
     assert (measurement.status, measurement.raw_status) == (verdict, 12)
 
 
 def test_orders_move_the_mode() -> None:
     """Direct mode and back, to another prism or the same; the session knows what is done already."""
-    session = Session(3, 1)
-    assert not session.is_done_already(DirectOrder())
-    session.executed(DirectOrder())
+    session = ClientSession(3, 1)
+    assert not session.is_satisfied(DirectCommand())
+    session.apply(DirectCommand())
     assert (status(session, 0.0).mode, session.prism) == ("direct", 1)
-    assert session.is_done_already(DirectOrder())
-    assert not session.is_done_already(TrackOrder(1))
-    session.executed(TrackOrder(7))
+    assert session.is_satisfied(DirectCommand())
+    assert not session.is_satisfied(TrackCommand(1))
+    session.apply(TrackCommand(7))
     assert (status(session, 0.0).mode, session.prism) == ("tracking", 7)
-    assert session.is_done_already(TrackOrder(None))
-    assert session.is_done_already(TrackOrder(7))
-    assert not session.is_done_already(TrackOrder(1))
-    assert not session.is_done_already(MeasureOrder())
-    assert not session.is_done_already(SearchOrder())
-    session.executed(DirectOrder())
-    session.executed(SearchOrder())
+    assert session.is_satisfied(TrackCommand(None))
+    assert session.is_satisfied(TrackCommand(7))
+    assert not session.is_satisfied(TrackCommand(1))
+    assert not session.is_satisfied(MeasureCommand())
+    assert not session.is_satisfied(SearchCommand())
+    session.apply(DirectCommand())
+    session.apply(SearchCommand())
     assert (status(session, 0.0).mode, session.prism) == ("tracking", 7)
 
 
 def test_a_shot_goes_to_the_journal() -> None:
     """It belongs to no prism and has no running number."""
-    session = Session(3, 1)
-    target = session.shot(reading(1.0, prism=None), START + SECOND)
+    session = ClientSession(3, 1)
+    target = session.single_measurement(reading(1.0, prism=None), START + SECOND)
     assert (target.station, target.stamp_ns, target.slope_distance_m) == (3, START + SECOND, 42.123456789)
     assert status(session, 1.0).measurements == 0
 
 
 def test_the_status_before_anything_has_happened() -> None:
     """What is not known is null."""
-    assert status(Session(3, 1), 0.0) == ClientStatus(
+    assert status(ClientSession(3, 1), 0.0) == ClientStatus(
         stamp_ns=START,
         station=3,
         instrument="i",
@@ -156,8 +156,8 @@ def test_the_status_before_anything_has_happened() -> None:
         authenticated=None,
         joined=None,
         queued=None,
-        late=None,
-        doubted=None,
+        missed_slots=None,
+        rejected_beacons=None,
         refused=None,
         clock_bound_ns=None,
     )
@@ -165,13 +165,15 @@ def test_the_status_before_anything_has_happened() -> None:
 
 def test_the_status_knows_lock_rate_and_master() -> None:
     """The rate is that of the last ten seconds, and sinks when nothing comes any more."""
-    session = Session(3, 1)
+    session = ClientSession(3, 1)
     for number in range(100):
         measure(session, number * 0.4)
-    heard_ns = START + 39 * SECOND
-    link = LinkStatus(protocol="superframe", heard_ns=heard_ns, rssi_dbm=-80.5, snr_db=9.25, queued=3)
+    master_received_ns = START + 39 * SECOND
+    link = LinkStatus(
+        protocol="superframe", master_received_ns=master_received_ns, rssi_dbm=-80.5, snr_db=9.25, queued=3
+    )
     now = status(session, 40.0, link)
-    assert (now.protocol, now.queued, now.late) == ("superframe", 3, None)
+    assert (now.protocol, now.queued, now.missed_slots) == ("superframe", 3, None)
     assert now.rate_hz == pytest.approx(2.5, abs=0.11)
     assert (now.locked, now.measurements) == (True, 100)
     assert (now.master_heard_s, now.rssi_dbm, now.snr_db) == (1.0, -80.5, 9.25)

@@ -16,7 +16,7 @@ from unit.station.test_daemon import asked
 from tsgt.clock import UnixTimeline
 from tsgt.config import SuperframeConfig
 from tsgt.errors import RecordingError
-from tsgt.radio.superframe.wire import RESTART_SKIP, AnswerPart, OrderPart
+from tsgt.radio.superframe.wire import RESTART_SKIP, CommandResponse, EncodedCommand
 from tsgt.recording import RecordingWriter, read_lines
 from tsgt.recording.journal import load_journal
 from tsgt.simulation.kernel import VirtualClock
@@ -41,10 +41,10 @@ class OnAir:
         self._clock = VirtualClock(START_NS)
         self.master = HandMaster(stations=1, station=1, session_every=4)
 
-    async def frame(self, orders: Sequence[OrderPart] = ()) -> Answered | None:
+    async def frame(self, commands: Sequence[EncodedCommand] = ()) -> Answered | None:
         """Play one frame, from beacon to reply."""
         radio = self._day.master.radio
-        payload = self.master.beacon(orders=orders)
+        payload = self.master.beacon(commands=commands)
         self.master.left(await radio.transmit(payload))
         deadline_ns = self.master.beacon_done_ns + 400 * MS
         with suppress(TimeoutError):
@@ -153,25 +153,25 @@ async def test_orders_are_carried_out_and_answered(tmp_path: Path) -> None:
     async with superframe_day(tmp_path) as (day, air):
         await air.frames(3.0)
 
-        async def order(ticket: int, kind: int, argument: int = 0) -> Answered:
+        async def order(command_id: int, kind: int, argument: int = 0) -> Answered:
             for _ in range(20):
-                answered = await air.frame([OrderPart(1, ticket, kind, argument)])
-                if answered and (answered.reply.answer or answered.reply.shot):
+                answered = await air.frame([EncodedCommand(1, command_id, kind, argument)])
+                if answered and (answered.reply.response or answered.reply.single_measurement):
                     await air.frame()  # which acknowledges it
                     return answered
             raise AssertionError
 
-        assert (await order(1, 2)).reply.answer == AnswerPart(1, ok=True)
+        assert (await order(1, 2)).reply.response == CommandResponse(1, ok=True)
         assert (await asked(tmp_path / "client.sock"))["mode"] == "direct"
-        day.instrument.aim(1)
-        shot = (await order(2, 3)).reply.shot
+        day.instrument.aim_at_target(1)
+        shot = (await order(2, 3)).reply.single_measurement
         assert shot is not None
         assert shot.distance == pytest.approx(206_216, abs=100)
-        assert (await order(3, 0, 1)).reply.answer == AnswerPart(3, ok=True)
+        assert (await order(3, 0, 1)).reply.response == CommandResponse(3, ok=True)
         assert (await asked(tmp_path / "client.sock"))["prism"] == 2
         day.instrument.aim_at_prism(2)
-        assert (await order(4, 1)).reply.answer == AnswerPart(4, ok=True)
-        assert (await order(5, 3)).reply.answer == AnswerPart(5, ok=False)  # it is not in direct mode
+        assert (await order(4, 1)).reply.response == CommandResponse(4, ok=True)
+        assert (await order(5, 3)).reply.response == CommandResponse(5, ok=False)  # it is not in direct mode
         await air.frames(5.0)
         await day.kill()
         (path,) = (tmp_path / "journals").iterdir()
@@ -198,9 +198,9 @@ async def test_a_run_whose_disk_takes_nothing_at_its_start_has_numbers_of_its_ow
         await asyncio.sleep(3.0)
         await day.kill()
     heads = [load_journal(path).head for path in (tmp_path / "journals").iterdir()]
-    before, after = sorted(heads, key=lambda head: head.run_start)
-    assert after.lineage != before.lineage
-    assert after.run_start > before.run_start + 2 * RESTART_SKIP
+    before, after = sorted(heads, key=lambda head: head.first_sequence)
+    assert after.stream_id != before.stream_id
+    assert after.first_sequence > before.first_sequence + 2 * RESTART_SKIP
 
 
 async def test_what_the_disk_holds_up_is_not_delivered(
@@ -247,7 +247,7 @@ async def test_the_status_says_how_delivery_goes(tmp_path: Path) -> None:
         await air.frames(20.0)
         after = await asked(day.folder / "client.sock")
     assert after["joined"]
-    assert (after["late"], after["doubted"]) == (0, 0)
+    assert (after["missed_slots"], after["rejected_beacons"]) == (0, 0)
     assert after["queued"] <= 2
     assert 0 < after["clock_bound_ns"] < 200_000
     assert after["master_heard_s"] < 0.5
@@ -274,7 +274,7 @@ async def test_replies_begin_on_time(tmp_path: Path) -> None:
         air.master.left(await day.master.radio.transmit(payload))
         packet = await day.master.radio.receive()
         began_ns = packet.received_at_ns - TIMING.reception_ns - TIMING.airtime_ns(len(packet.payload))
-        slot_ns = air.master.beacon_done_ns - 67_000 + TIMING.turn_round_ns
+        slot_ns = air.master.beacon_done_ns - 67_000 + TIMING.turnaround_ns
         assert abs(began_ns - slot_ns) < MS
         air.master.take(packet.payload)
 
@@ -295,5 +295,5 @@ async def test_the_numbers_of_a_run_are_on_the_disk_before_the_first_is_used(
     async with superframe_day(tmp_path) as (day, air):
         await air.frame()
         await day.kill()
-    assert b"run_start" in synced[0]
+    assert b"first_sequence" in synced[0]
     assert b"measurement" not in synced[0]

@@ -1,6 +1,6 @@
-"""What a bridge program and the client say to each other: JSON lines, as docs/reference/bridge.md specifies them.
+"""The JSON lines between a bridge program and the client, as docs/reference/bridge.md specifies them. Sans-I/O.
 
-Lines of a type that is not known here are passed over, and so are keys, so that the format can grow.
+Lines of unknown type and unknown keys are ignored, so that the format can grow.
 """
 
 from __future__ import annotations
@@ -11,44 +11,40 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from tsgt.model import LARGEST_NUMBER, LAST_INSTANT_NS, Status
-from tsgt.radio import Direction  # noqa: TC001 (pydantic looks it up when the program runs)
+from tsgt.model import MAX_INSTANT_NS, MAX_NUMBER, Status
+from tsgt.radio import Direction  # noqa: TC001 (pydantic resolves annotations at run time)
 from tsgt.recording import Typed, decode
 
 FORMAT_VERSION = 1
-"""Of the lines. It changes when a client of the old one would misunderstand the new one."""
+"""Changes when a client of the old version would misunderstand the new one."""
 
 MAX_LINE_BYTES = 16_384
-"""What is kept of a line; a measurement takes three hundred."""
+"""Longer lines are truncated; a measurement takes 300 bytes."""
 
 MAX_TEXT = 200
-"""What is kept of a text for people."""
+"""Longer texts are truncated."""
 
-FARTHEST_M = 20_000.0
-"""No total station measures so far: such a number is in mm, or none."""
+MAX_DISTANCE_M = 20_000.0
+"""Beyond the range of any total station: a larger number is in mm, or invalid."""
 
-Stamps = Literal["host", "instrument", "arrival"]
+TimestampSource = Literal["host", "instrument", "arrival"]
 
-Nanoseconds = Annotated[int, Field(ge=0, le=LAST_INSTANT_NS)]
-Identifier = Annotated[int, Field(ge=0, le=LARGEST_NUMBER)]
+Nanoseconds = Annotated[int, Field(ge=0, le=MAX_INSTANT_NS)]
+Identifier = Annotated[int, Field(ge=0, le=MAX_NUMBER)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Hello:
-    """The program's first line: what it speaks and which instrument it has.
+class HelloLine:
+    """The program's first line: version of the format, identity of the instrument, source of timestamps, and commands.
 
     Attributes
     ----------
-    bridge
-        Version of the format, :data:`FORMAT_VERSION`.
-    make, model, serial_number, firmware
-        Of the instrument; empty where unknown.
     stamps
-        Where the times of measurements come from: ``host_time_ns``, ``instrument_time_ns``, or the arrival of the line.
+        Source of the times of measurements: ``host_time_ns``, ``instrument_time_ns``, or the arrival of the line.
     clock
-        Name of the instrument's clock, for people; empty where it has none.
+        Name of the instrument's clock, for the operator; empty where it has none.
     commands
-        What the program can be told; those that are not known here do no harm.
+        The commands that the program supports; unknown ones are ignored.
     """
 
     type: Literal["hello"] = "hello"
@@ -57,25 +53,23 @@ class Hello:
     model: str = ""
     serial_number: str = ""
     firmware: str = ""
-    stamps: Stamps
+    stamps: TimestampSource
     clock: str = ""
     commands: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Measured:
-    """What both kinds of measurements have; see :class:`~tsgt.station.instrument.Reading`.
+class _Measurement:
+    """Common fields of both kinds of measurements; see :class:`~tsgt.station.instrument.Reading`.
 
     Attributes
     ----------
     horizontal_angle_rad, zenith_angle_rad
-        0 to 2 pi; null where there are none.
+        0 to 2 pi; null without angles.
     slope_distance_m
-        Above 0; null where there is none.
-    status, raw_status
-        The verdict, in the common vocabulary and as the instrument's own number.
+        Positive; null without a distance.
     host_time_ns
-        When it was taken, on CLOCK_MONOTONIC; null where the program does not know.
+        Time of the measurement on CLOCK_MONOTONIC; null where unknown.
     instrument_time_ns
         The same on the instrument's clock.
     """
@@ -86,16 +80,16 @@ class _Measured:
     zenith_angle_rad: float | None = None
     slope_distance_m: float | None = None
     status: Status
-    raw_status: Annotated[int, Field(ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)] = 0
+    raw_status: Annotated[int, Field(ge=-MAX_NUMBER, le=MAX_NUMBER)] = 0
     host_time_ns: Nanoseconds | None = None
     instrument_time_ns: Nanoseconds | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what no instrument can have measured, and say which unit is meant."""
+        """Reject impossible values with a message that names the unit."""
         for angle_rad in (self.horizontal_angle_rad, self.zenith_angle_rad):
             if angle_rad is not None and not 0 <= angle_rad <= 2 * math.pi:
                 raise ValueError(f"an angle of {angle_rad:g}; expected 0 to 2 pi rad, or null")
-        if self.slope_distance_m is not None and not 0 < self.slope_distance_m <= FARTHEST_M:
+        if self.slope_distance_m is not None and not 0 < self.slope_distance_m <= MAX_DISTANCE_M:
             raise ValueError(
                 f"a distance of {self.slope_distance_m:g}; expected metres above 0, or null for none"
             )
@@ -105,22 +99,16 @@ class _Measured:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MeasurementLine(_Measured):
-    """A measurement of the tracked prism.
-
-    Attributes
-    ----------
-    prism
-        Which one; null: that of the last ``track`` that was done.
-    """
+class MeasurementLine(_Measurement):
+    """A measurement of the tracked prism; ``prism`` null: that of the last executed ``track``."""
 
     type: Literal["measurement"] = "measurement"
     prism: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ShotLine(_Measured):
-    """The answer to ``measure``: a single measurement, also one that found no target."""
+class SingleMeasurementLine(_Measurement):
+    """The response to ``measure``: a single measurement, with or without a target."""
 
     type: Literal["shot"] = "shot"
     id: Identifier
@@ -128,13 +116,7 @@ class ShotLine(_Measured):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DoneLine:
-    """The answer to every other command, and to a ``measure`` that came to nothing.
-
-    Attributes
-    ----------
-    error
-        Why it was not done, for people; empty when it was.
-    """
+    """The response to every other command, and to a failed ``measure``; ``error`` is empty when it was executed."""
 
     type: Literal["done"] = "done"
     id: Identifier
@@ -143,7 +125,7 @@ class DoneLine:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StatusLine:
-    """How the instrument does; see :class:`~tsgt.station.instrument.Condition`."""
+    """The instrument's condition; see :class:`~tsgt.station.instrument.Condition`."""
 
     type: Literal["status"] = "status"
     activity: str = ""
@@ -153,7 +135,7 @@ class StatusLine:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SettingsLine:
-    """How the instrument is set; see :class:`~tsgt.recording.journal.InstrumentRecord`."""
+    """The instrument's settings; see :class:`~tsgt.recording.journal.InstrumentRecord`."""
 
     __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
@@ -167,12 +149,12 @@ class SettingsLine:
     angle_delay_ns: int = 0
 
 
-ProgramLine = Hello | MeasurementLine | ShotLine | DoneLine | StatusLine | SettingsLine
+ProgramLine = HelloLine | MeasurementLine | SingleMeasurementLine | DoneLine | StatusLine | SettingsLine
 
 _KINDS: dict[str, type[ProgramLine]] = {
-    "hello": Hello,
+    "hello": HelloLine,
     "measurement": MeasurementLine,
-    "shot": ShotLine,
+    "shot": SingleMeasurementLine,
     "done": DoneLine,
     "status": StatusLine,
     "settings": SettingsLine,
@@ -180,13 +162,10 @@ _KINDS: dict[str, type[ProgramLine]] = {
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TrackCommand:
-    """Track a prism from now on; the one that is tracked already: look for it anew.
+class TrackLine:
+    """Track a prism; if it is tracked already, search for it again.
 
-    Attributes
-    ----------
-    towards
-        Where it is believed to be; null: where the telescope points, or where it was last.
+    ``towards`` is its expected direction; null: where the telescope points, or its last direction.
     """
 
     type: Literal["track"] = "track"
@@ -196,24 +175,24 @@ class TrackCommand:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DirectCommand:
-    """Stop tracking and get ready for single measurements of targets that a person aims at."""
+class DirectLine:
+    """Stop tracking and prepare for single measurements of targets that the operator aims at."""
 
     type: Literal["direct"] = "direct"
     id: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MeasureCommand:
-    """Measure the target that the instrument points at, once."""
+class MeasureLine:
+    """Measure the target in the line of sight once."""
 
     type: Literal["measure"] = "measure"
     id: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AtmosphereCommand:
-    """Correct distances for this air from now on; see :class:`~tsgt.station.instrument.Atmosphere`."""
+class AtmosphereLine:
+    """Set the atmospheric correction; see :class:`~tsgt.station.instrument.Atmosphere`."""
 
     type: Literal["atmosphere"] = "atmosphere"
     id: int
@@ -221,7 +200,7 @@ class AtmosphereCommand:
     pressure_hpa: float
 
 
-Command = TrackCommand | DirectCommand | MeasureCommand | AtmosphereCommand
+CommandLine = TrackLine | DirectLine | MeasureLine | AtmosphereLine
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,63 +209,57 @@ class _Versioned:
 
 
 @dataclass(frozen=True, slots=True)
-class _Addressed:
+class _Identified:
     id: int
 
 
 class BridgeVersionError(ValueError):
-    """The program speaks another version of the format: nothing that it says can be used."""
+    """The program uses another version of the format: none of its lines can be used."""
 
 
 def decode_program_line(data: bytes) -> ProgramLine | None:
-    """Read a line of a program; None for one of a type that is not known here.
+    """Decode a line of a program; None for an unknown type.
 
     Raises
     ------
     BridgeVersionError
         It is the ``hello`` of another version.
     ValueError
-        In one line: it is not JSON, or the first field that is missing or wrong.
+        It is not JSON, or a field is missing or invalid; the message, one line, names the first.
     """
     kind = decode(Typed, data).type
     if kind == "hello" and (version := decode(_Versioned, data).bridge) != FORMAT_VERSION:
         raise BridgeVersionError(
-            f"speaks version {version} of the bridge's lines, and this client version {FORMAT_VERSION}"
+            f"uses version {version} of the bridge's lines, and this client version {FORMAT_VERSION}"
         )
     return decode(_KINDS[kind], data) if kind in _KINDS else None
 
 
-def command_answered(data: bytes) -> int | None:
-    """Return the ``id`` of the command that a line answers, even if the rest of it cannot be used; None for others."""
+def response_id(data: bytes) -> int | None:
+    """Return the ``id`` of a response, even if its other fields are invalid; None for other lines."""
     try:
-        answers = decode(Typed, data).type in ("done", "shot")
-        return decode(_Addressed, data).id if answers else None
+        is_response = decode(Typed, data).type in ("done", "shot")
+        return decode(_Identified, data).id if is_response else None
     except ValueError:
         return None
 
 
-def for_people(text: str) -> str:
-    """Return a text from outside as one line that does no harm to a terminal, cut where it is very long."""
+def printable(text: str) -> str:
+    """Return text from outside as one truncated line without control characters."""
     return "".join(sign if sign.isprintable() else " " for sign in text[:MAX_TEXT]).strip()
 
 
-class LineCutter:
-    """Cuts what a program prints into lines; of one that never ends only the beginning is kept.
-
-    Parameters
-    ----------
-    limit_bytes
-        So much of a line is kept. What is cut off is no JSON any more, and refused as that.
-    """
+class LineSplitter:
+    """Splits output into lines, truncated to ``limit_bytes``; a truncated line is invalid JSON and rejected as such."""
 
     def __init__(self, limit_bytes: int = MAX_LINE_BYTES) -> None:
         self._limit_bytes = limit_bytes
-        self._begun = b""
+        self._partial = b""
 
     def push(self, data: bytes) -> list[bytes]:
-        """Take more bytes, return the lines that are whole now, without their ends and without empty ones."""
+        """Add data; return the lines completed by it, without line ends and empty lines."""
         first, *others = data.split(b"\n")
-        lines = [self._begun + first[: self._limit_bytes - len(self._begun)]]
+        lines = [self._partial + first[: self._limit_bytes - len(self._partial)]]
         lines += [line[: self._limit_bytes] for line in others]
-        self._begun = lines.pop()
+        self._partial = lines.pop()
         return [line for line in lines if line.strip()]

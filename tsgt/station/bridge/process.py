@@ -1,4 +1,4 @@
-"""A program of the user's as a child process: its lines come in as they are printed, its stderr goes to the log."""
+"""A bridge program as a child process: passes its output on as it arrives, and its stderr to the log."""
 
 from __future__ import annotations
 
@@ -12,51 +12,51 @@ from typing import TYPE_CHECKING, Any, Protocol
 import structlog
 
 from tsgt.errors import InstrumentError
-from tsgt.station.bridge.messages import LineCutter, for_people
+from tsgt.station.bridge.messages import LineSplitter, printable
 
 if TYPE_CHECKING:
     from tsgt.clock import Clock
 
 END_TIMEOUT_S = 0.3
-"""How long it has to end when it is told to; the client itself has to end within a second."""
+"""Time from SIGTERM to SIGKILL; the client itself must end within a second."""
 
 KILL_TIMEOUT_S = 0.1
-"""How long is waited for it to be gone after it was killed."""
+"""How long to wait for the end of a killed program."""
 
-LAST_WORDS_S = 0.2
-"""How long is waited for what it has printed before it ended; a child of its own may keep the pipes open."""
+OUTPUT_DRAIN_S = 0.2
+"""How long to wait for output printed before the program ended; its own children may keep the pipes open."""
 
 STDERR_LINES_PER_S = 20
-"""More are counted, and not logged."""
+"""Further lines are counted, and not logged."""
 
 log = structlog.get_logger()
 
 
 class Listener(Protocol):
-    """Is told what a program does; never waits."""
+    """Receives the output and the end of a program; must not block."""
 
-    def said(self, data: bytes, at_ns: int) -> None:
-        """Take what it has printed to stdout, and when that was here, on CLOCK_MONOTONIC in ns."""
+    def output_received(self, data: bytes, at_ns: int) -> None:
+        """Handle data from stdout, which arrived at this time on CLOCK_MONOTONIC."""
         ...
 
-    def ended(self, how: str) -> None:
-        """Take it that it has ended, or can say no more, in words for people: once, after all that it has printed."""
+    def exited(self, reason: str) -> None:
+        """Handle the end of the program, or of its output: called once, after all its output."""
         ...
 
 
 class Program(Protocol):
-    """A program that runs."""
+    """A running program."""
 
     def write(self, data: bytes) -> None:
-        """Put bytes into its stdin; they are queued, nothing is waited for. Without effect when it has ended."""
+        """Queue data for its stdin, without waiting; no effect after its end."""
         ...
 
     def kill(self) -> None:
-        """End it at once, with what it has started."""
+        """Kill it and its children at once."""
         ...
 
-    async def end(self) -> None:
-        """Tell it to end, and kill it when it does not; when this returns or is cancelled, it is no more."""
+    async def terminate(self) -> None:
+        """Terminate it, and kill it if it does not end; when this returns or is cancelled, it has ended."""
         ...
 
 
@@ -65,7 +65,7 @@ StartProgram = Callable[[Sequence[str], Listener], Coroutine[Any, Any, Program]]
 
 
 async def start_process(command: Sequence[str], listener: Listener, clock: Clock) -> Program:
-    """Start a program as a child process, in a session of its own so that nobody's Ctrl-C is meant for it.
+    """Start a program as a child process, in a session of its own so that Ctrl-C does not reach it.
 
     Raises
     ------
@@ -73,7 +73,7 @@ async def start_process(command: Sequence[str], listener: Listener, clock: Clock
         It cannot be started: no such program, no permission.
     """
     environment = dict(os.environ)
-    environment.pop("NOTIFY_SOCKET", None)  # it is not the service, and must not speak for it
+    environment.pop("NOTIFY_SOCKET", None)  # it must not notify systemd on behalf of the service
     try:
         _, process = await asyncio.get_running_loop().subprocess_exec(
             lambda: _Process(listener, clock), *command, env=environment, start_new_session=True
@@ -81,7 +81,7 @@ async def start_process(command: Sequence[str], listener: Listener, clock: Clock
     except (OSError, ValueError) as error:  # ValueError: a zero byte among the arguments
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise InstrumentError(
-            f"{command[0]}: cannot be started ({reason}); see to instrument.command in the configuration"
+            f"{command[0]}: cannot be started ({reason}); check instrument.command in the configuration"
         ) from error
     return process
 
@@ -95,7 +95,7 @@ class _Process(asyncio.SubprocessProtocol):
         self._listener = listener
         self._clock = clock
         self._exited = asyncio.Event()
-        self._told = False
+        self._reported = False
         self._stderr = _Stderr(clock)
 
     # --- Program ----------------------------------------------------------------------------------------------
@@ -109,7 +109,7 @@ class _Process(asyncio.SubprocessProtocol):
         if not self._exited.is_set():
             self._signal(signal.SIGKILL)
 
-    async def end(self) -> None:
+    async def terminate(self) -> None:
         try:
             if not self._exited.is_set():
                 if (stdin := self._transport.get_pipe_transport(0)) is not None:
@@ -118,7 +118,7 @@ class _Process(asyncio.SubprocessProtocol):
                 await self._wait(END_TIMEOUT_S)
         finally:
             self.kill()
-            self._told = True
+            self._reported = True
             self._transport.close()
         await self._wait(KILL_TIMEOUT_S)
 
@@ -128,8 +128,8 @@ class _Process(asyncio.SubprocessProtocol):
                 await self._exited.wait()
 
     def _signal(self, number: signal.Signals) -> None:
-        """To all of its session, which a script may have filled: a child that stays would keep the instrument."""
-        with suppress(ProcessLookupError, PermissionError):  # it may have become another user's
+        """Signal its whole session: a surviving child would keep the instrument."""
+        with suppress(ProcessLookupError, PermissionError):  # the id may be another user's by now
             os.killpg(self._transport.get_pid(), number)
 
     # --- asyncio.SubprocessProtocol ---------------------------------------------------------------------------
@@ -140,64 +140,58 @@ class _Process(asyncio.SubprocessProtocol):
 
     def pipe_data_received(self, fd: int, data: bytes) -> None:
         if fd == 1:
-            self._listener.said(data, self._clock.monotonic_ns())
+            self._listener.output_received(data, self._clock.monotonic_ns())
         else:
-            self._stderr.said(data)
+            self._stderr.add(data)
 
     def pipe_connection_lost(self, fd: int, exc: Exception | None) -> None:  # noqa: ARG002 (it is closed in any case)
         if fd == 1:
-            self._tell_soon()
+            self._report_soon()
 
     def process_exited(self) -> None:
-        self._signal(signal.SIGKILL)  # now, while the number of its session cannot be another's yet
+        self._signal(signal.SIGKILL)  # now, before its session id can be reused
         self._exited.set()
-        self._tell_soon()
+        self._report_soon()
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 (it has ended in any case)
-        """Tell at once: it has ended, and all that it had to say is here."""
-        self._tell()
+        """Report at once: it has ended, and all its output has arrived."""
+        self._report_end()
 
-    def _tell_soon(self) -> None:
-        asyncio.get_running_loop().call_later(LAST_WORDS_S, self._tell)
+    def _report_soon(self) -> None:
+        asyncio.get_running_loop().call_later(OUTPUT_DRAIN_S, self._report_end)
 
-    def _tell(self) -> None:
-        if self._told:
+    def _report_end(self) -> None:
+        if self._reported:
             return
-        self._told = True
+        self._reported = True
         status = self._transport.get_returncode()
         if status is None:
-            how = "it has closed its output"
+            reason = "it has closed its output"
         elif status < 0:
-            how = f"killed by signal {-status}"
+            reason = f"killed by signal {-status}"
         else:
-            how = f"exit status {status}"
-        self._listener.ended(f"{how}: {self._stderr.last}" if self._stderr.last else how)
+            reason = f"exit status {status}"
+        self._listener.exited(f"{reason}: {self._stderr.last}" if self._stderr.last else reason)
 
 
 class _Stderr:
-    """Puts what a program complains of into the log, but not all of it.
-
-    Attributes
-    ----------
-    last
-        The last line.
-    """
+    """Logs a program's stderr, up to a rate; ``last`` is the last line."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
-        self._cutter = LineCutter()
+        self._splitter = LineSplitter()
         self._second = -1
         self._logged = 0
         self._dropped = 0
         self.last = ""
 
-    def said(self, data: bytes) -> None:
-        """Take bytes."""
+    def add(self, data: bytes) -> None:
+        """Log the lines completed by this data."""
         second = self._clock.monotonic_ns() // 1_000_000_000
         if second != self._second:
             self._second, self._logged = second, 0
-        for line in self._cutter.push(data):
-            self.last = for_people(line.decode(errors="replace"))
+        for line in self._splitter.push(data):
+            self.last = printable(line.decode(errors="replace"))
             if self._logged == STDERR_LINES_PER_S:
                 self._dropped += 1
                 continue

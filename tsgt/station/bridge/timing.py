@@ -1,117 +1,103 @@
-"""When a bridge program's measurements were made, and which of its lines say the same once more.
+"""Timestamps of a bridge program's measurements, and detection of repeated lines. Sans-I/O.
 
-A wrong time bends a pose more than a missing measurement does, so a line whose time cannot be right is refused.
+A wrong time bends a trajectory more than a missing measurement does: a line with an implausible time is rejected.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from tsgt.timesync import LATEST_NS, InstrumentClock
+from tsgt.timesync import MAX_DELAY_NS, InstrumentClock
 
 if TYPE_CHECKING:
-    from tsgt.station.bridge.messages import Hello, MeasurementLine
+    from tsgt.station.bridge.messages import HelloLine, MeasurementLine
 
-OLDEST_NS = 10_000_000_000
-"""A measurement that is older when it arrives was not held up on its way: its time counts from somewhere else."""
+MAX_AGE_NS = 10_000_000_000
+"""A measurement older than this on arrival was not delayed: its time counts from another epoch."""
 
-UNUSABLE_EVERY_NS = 500_000_000
-"""That there still is no target is worth a reading so often."""
+STATUS_INTERVAL_NS = 500_000_000
+"""An unchanged status without a target is reported at this interval."""
 
 _MS_NS = 1_000_000
 
-_SLACK_NS = 1_000
-"""A time in whole ms that a program has had as seconds in a floating-point number is off by less than this."""
+_ROUNDING_NS = 1_000
+"""Bound on the error of a time in whole ms that was converted to floating-point seconds and back."""
 
-_NONE_UNUSABLE = ("", 0)
+_NO_STATUS = ("", 0)
 
-_HELD_MAX = 64
+_MAX_PENDING = 64
 
 
-class Stamped(NamedTuple):
-    """A measurement that is new and has a time.
-
-    Attributes
-    ----------
-    line
-        What the program said.
-    prism
-        What it is of.
-    at_ns
-        When it was made, on the host's CLOCK_MONOTONIC, in ns.
-    arrived_ns
-        When the line came, on the same clock.
-    """
+class TimestampedLine(NamedTuple):
+    """A new measurement with its time and arrival, both on the host's CLOCK_MONOTONIC."""
 
     line: MeasurementLine
     prism: int
     at_ns: int
-    arrived_ns: int
+    received_ns: int
 
 
-class Stamper:
-    """Finds the time of each measurement; it outlives the program, so that nothing counts twice after a restart.
+class LineTimestamper:
+    """Determines the time of each measurement; outlives the program, so that a restart repeats none.
 
     Parameters
     ----------
     latency_ns
-        From a measurement to the time that the program gives, taken off.
+        Time from a measurement to the program's timestamp; subtracted.
     """
 
     def __init__(self, latency_ns: int) -> None:
         self._latency_ns = latency_ns
-        self._stamps = ""
-        self._whose = ("", "", "", "")
+        self._source = ""
+        self._clock_identity = ("", "", "", "")
         self._clock = InstrumentClock()
-        self._held: list[tuple[MeasurementLine, int, int]] = []
+        self._pending: list[tuple[MeasurementLine, int, int]] = []
         self._last: tuple[int, float | None, float | None, float | None] | None = None
         self._last_at_ns: int | None = None
-        self._unusable = _NONE_UNUSABLE
+        self._last_status = _NO_STATUS
 
-    def begin(self, hello: Hello) -> None:
-        """Take it that a program was started. The clock of the same instrument need not be learnt again."""
-        self._stamps = hello.stamps
-        self._held = []
-        whose = (hello.make, hello.model, hello.serial_number, hello.clock)
-        if whose != self._whose:
-            self._whose, self._clock, self._last = whose, InstrumentClock(), None
+    def program_started(self, hello: HelloLine) -> None:
+        """Start with a program's hello; keep the clock fit of the same instrument."""
+        self._source = hello.stamps
+        self._pending = []
+        identity = (hello.make, hello.model, hello.serial_number, hello.clock)
+        if identity != self._clock_identity:
+            self._clock_identity, self._clock, self._last = identity, InstrumentClock(), None
 
-    def forget_others(self, prism: int) -> None:
-        """Forget what waits for the instrument's clock to be known and is of another prism."""
-        self._held = [held for held in self._held if held[1] == prism]
+    def drop_other_prisms(self, prism: int) -> None:
+        """Drop measurements of other prisms that wait for the clock fit."""
+        self._pending = [pending for pending in self._pending if pending[1] == prism]
 
     def push(
-        self, line: MeasurementLine, prism: int, arrived_ns: int, *, together: bool
-    ) -> list[Stamped | str]:
-        """Take a line; return what can be used now, which may be earlier lines too, or why one is refused.
+        self, line: MeasurementLine, prism: int, received_ns: int, *, together: bool
+    ) -> list[TimestampedLine | str]:
+        """Add a line; return the measurements ready now, which may include earlier ones, or why one is rejected.
 
         Parameters
         ----------
-        line, prism
-            What the program said, and what it is of.
-        arrived_ns
-            When the line came.
+        received_ns
+            Arrival of the line.
         together
-            Whether another measurement came in the same piece: then nobody knows when either was printed.
+            Whether another measurement arrived in the same piece, so that neither arrival is exact.
         """
         if not line.status.usable:
-            return self._without_target(line, prism, arrived_ns)
+            return self._without_target(line, prism, received_ns)
         if self._is_repeat(line):
             return []
-        if self._stamps == "instrument":
-            return self._by_instrument(line, prism, arrived_ns)
-        if self._stamps == "host":
+        if self._source == "instrument":
+            return self._by_instrument(line, prism, received_ns)
+        if self._source == "host":
             if line.host_time_ns is None:
                 return ["it has no host_time_ns, which hello has promised"]
-            return [self._checked(line, prism, line.host_time_ns, arrived_ns, OLDEST_NS)]
+            return [self._checked(line, prism, line.host_time_ns, received_ns, MAX_AGE_NS)]
         if together:
             return [
-                "it came together with others, so nobody knows when; print each at once (flush the output)"
+                "it arrived together with others, so that its time is unknown; flush the output after each line"
             ]
-        return [self._checked(line, prism, arrived_ns, arrived_ns, OLDEST_NS)]
+        return [self._checked(line, prism, received_ns, received_ns, MAX_AGE_NS)]
 
     def _is_repeat(self, line: MeasurementLine) -> bool:
-        """Whether this measurement was here just before: the same time, the instrument's best, and the same values.
+        """Whether this measurement has the time and the values of the one before it.
 
         One with the same time and other values is new, and its time is too coarse.
         """
@@ -122,55 +108,59 @@ class Stamper:
         self._last = (time_ns, line.horizontal_angle_rad, line.zenith_angle_rad, line.slope_distance_m)
         return before == self._last
 
-    def _without_target(self, line: MeasurementLine, prism: int, arrived_ns: int) -> list[Stamped | str]:
-        """Pass on what says that there is nothing to measure, when that is news; no pose depends on its time."""
-        status, last_ns = self._unusable
-        news = line.status != status or arrived_ns - last_ns >= UNUSABLE_EVERY_NS
-        at_ns = arrived_ns - self._latency_ns
-        if not news or at_ns < 0:
+    def _without_target(
+        self, line: MeasurementLine, prism: int, received_ns: int
+    ) -> list[TimestampedLine | str]:
+        """Report a changed status at once, and an unchanged one now and then; no pose depends on its time."""
+        status, last_ns = self._last_status
+        due = line.status != status or received_ns - last_ns >= STATUS_INTERVAL_NS
+        at_ns = received_ns - self._latency_ns
+        if not due or at_ns < 0:
             return []
-        self._unusable = (line.status, arrived_ns)
-        return [Stamped(line, prism, at_ns, arrived_ns)]
+        self._last_status = (line.status, received_ns)
+        return [TimestampedLine(line, prism, at_ns, received_ns)]
 
-    def _by_instrument(self, line: MeasurementLine, prism: int, arrived_ns: int) -> list[Stamped | str]:
-        """Put the instrument's time on the host's clock, as soon as enough lines have told how the two lie."""
+    def _by_instrument(
+        self, line: MeasurementLine, prism: int, received_ns: int
+    ) -> list[TimestampedLine | str]:
+        """Map the instrument's time to the host's clock, once enough lines have initialised the clock fit."""
         if line.instrument_time_ns is None:
             return ["it has no instrument_time_ns, which hello has promised"]
-        time_ms, rest_ns = divmod(line.instrument_time_ns, _MS_NS)
-        # One is enough: an instrument that counts finer than in ms has few whole ones. Of what is held nothing is told yet.
-        if _SLACK_NS <= rest_ns < _MS_NS - _SLACK_NS:
-            self._clock.expect_parts()
-        self._clock.add(time_ms, arrived_ns - rest_ns)
-        self._held.append((line, prism, arrived_ns))
-        if not self._clock.stands:
-            if len(self._held) <= _HELD_MAX:
+        time_ms, fraction_ns = divmod(line.instrument_time_ns, _MS_NS)
+        # One is conclusive: a clock finer than ms rarely shows whole ones. Pending lines have no time yet.
+        if _ROUNDING_NS <= fraction_ns < _MS_NS - _ROUNDING_NS:
+            self._clock.use_fractional_milliseconds()
+        self._clock.add(time_ms, received_ns - fraction_ns)
+        self._pending.append((line, prism, received_ns))
+        if not self._clock.initialised:
+            if len(self._pending) <= _MAX_PENDING:
                 return []
-            del self._held[0]
+            del self._pending[0]
             return ["its instrument_time_ns does not fit those of the others"]
-        held, self._held = self._held, []
-        return [self._mapped(*each) for each in held]
+        pending, self._pending = self._pending, []
+        return [self._mapped(*each) for each in pending]
 
-    def _mapped(self, line: MeasurementLine, prism: int, arrived_ns: int) -> Stamped | str:
-        assert line.instrument_time_ns is not None  # noqa: S101 (only such lines are held)
-        time_ms, rest_ns = divmod(line.instrument_time_ns, _MS_NS)
+    def _mapped(self, line: MeasurementLine, prism: int, received_ns: int) -> TimestampedLine | str:
+        assert line.instrument_time_ns is not None  # noqa: S101 (only such lines are pending)
+        time_ms, fraction_ns = divmod(line.instrument_time_ns, _MS_NS)
         mapped = self._clock.at(time_ms)
-        assert mapped is not None  # noqa: S101 (the clock stands)
-        # To whole ms half of one is added: nearest to the envelope that is after the arrival.
-        host_ns = mapped.host_ns + rest_ns
-        at_ns = arrived_ns if 0 < host_ns - arrived_ns < _MS_NS else host_ns
-        return self._checked(line, prism, at_ns, arrived_ns, LATEST_NS)
+        assert mapped is not None  # noqa: S101 (the clock is initialised)
+        # Half a ms is added to truncated whole ms: near the envelope that lies after the arrival.
+        host_ns = mapped.host_ns + fraction_ns
+        at_ns = received_ns if 0 < host_ns - received_ns < _MS_NS else host_ns
+        return self._checked(line, prism, at_ns, received_ns, MAX_DELAY_NS)
 
     def _checked(
-        self, line: MeasurementLine, prism: int, time_ns: int, arrived_ns: int, oldest_ns: int
-    ) -> Stamped | str:
-        ahead_s = (time_ns - arrived_ns) / 1e9
-        if time_ns > arrived_ns:
+        self, line: MeasurementLine, prism: int, time_ns: int, received_ns: int, max_age_ns: int
+    ) -> TimestampedLine | str:
+        ahead_s = (time_ns - received_ns) / 1e9
+        if time_ns > received_ns:
             return f"its time is {ahead_s:.6f} s ahead of its arrival, by this computer's CLOCK_MONOTONIC"
-        if time_ns < arrived_ns - oldest_ns:
+        if time_ns < received_ns - max_age_ns:
             return f"its time is {-ahead_s:.3f} s before its arrival, by this computer's CLOCK_MONOTONIC"
         at_ns = time_ns - self._latency_ns
         if at_ns < 0 or (self._last_at_ns is not None and at_ns <= self._last_at_ns):
             return "its time is not after that of the measurement before it"
         self._last_at_ns = at_ns
-        self._unusable = _NONE_UNUSABLE
-        return Stamped(line, prism, at_ns, arrived_ns)
+        self._last_status = _NO_STATUS
+        return TimestampedLine(line, prism, at_ns, received_ns)

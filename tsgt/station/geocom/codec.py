@@ -1,10 +1,10 @@
-"""GeoCOM in ASCII, as Leica total stations speak it on a serial line: numbers and text to lines and back.
+"""Encodes requests and decodes replies of GeoCOM's ASCII protocol, which Leica total stations use on a serial line. Sans-I/O.
 
 A request is ``%R1Q,<rpc>,<transaction>:<parameters>``, its reply ``%R1P,<com code>,<transaction>:<code>,<values>``; both
-end in CR LF. The com code says whether the request was delivered and understood, the code what came of it. With
-checksums the header of either has a third number. Lengths are in metres, angles in radians.
+end in CR LF. The com code reports whether the request was delivered and understood, the return code its result. With
+checksums both headers have a third number. Lengths are in metres, angles in radians.
 
-Source: Leica, TPS1200 GeoCOM Reference Manual, version 1.20; the checksum as GeoComPy 1.0 found it by trying.
+Source: Leica, TPS1200 GeoCOM Reference Manual, version 1.20; the checksum was found by experiment (GeoComPy 1.0).
 """
 
 from __future__ import annotations
@@ -21,12 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 MAX_TRANSACTION: Final = 32_767
-"""Largest number of a transaction: instruments keep it in 16 bits with a sign."""
-
-MAX_DECIMALS: Final = 15
-"""Digits right of the point that GeoCOM can be told to use."""
-
-_BITS_OF_A_BYTE: Final = 8
+"""Largest transaction number: instruments store it in a signed 16-bit integer."""
 
 _HEADER: Final = re.compile(
     r"%R1P,(?P<com_code>\d{1,5})(?:,(?P<transaction>-?\d{1,5}))?(?:,(?P<checksum>\d{1,5}))?:"
@@ -34,14 +29,14 @@ _HEADER: Final = re.compile(
 _STRING: Final = re.compile(r'"((?:[^"\\]|\\.)*)"')
 _ESCAPE: Final = re.compile(r"\\(x[0-9a-fA-F]{2}|.)")
 _BYTE: Final = re.compile(r"'([0-9a-fA-F]{1,2})'")
-_WHOLE: Final = re.compile(r"[+-]?\d{1,20}")
+_INTEGER: Final = re.compile(r"[+-]?\d{1,20}")
 _HEX: Final = re.compile(r"0[xX][0-9a-fA-F]{1,16}")
 _REAL: Final = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
-_TO_ESCAPE: Final = re.compile(r'[^ -~]|[\\"%~]')
+_UNSAFE: Final = re.compile(r'[^ -~]|[\\"%~]')
 
 
 class Rpc(IntEnum):
-    """Numbers of the remote procedures, by the names of the manual."""
+    """Numbers of the remote procedure calls, by the names of the manual."""
 
     COM_NULL_PROC = 0
     COM_SET_DOUBLE_PRECISION = 107
@@ -162,29 +157,29 @@ class Rpc(IntEnum):
 
 
 class Byte(int):
-    """0 to 255, in GeoCOM two hexadecimal digits in single quotes."""
+    """0 to 255; in GeoCOM two hexadecimal digits in single quotes."""
 
     __slots__ = ()
 
 
 Parameter = int | float | bool | str | Byte
-"""What a request carries, and a reply: a truth value travels as 0 or 1."""
+"""A value in a request or reply; a bool is sent as 0 or 1."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReplyLine:
-    """What a reply says.
+    """A decoded reply.
 
     Attributes
     ----------
     com_code
-        How the line was carried and understood; 0 is well.
+        Result of the transport; 0: the request was delivered and understood.
     transaction
-        That of the request; 0 where that had none.
+        Number of the request; 0 where that had none.
     code
-        What came of the procedure.
+        Return code of the procedure.
     values
-        Its results. A real number may come as an int: instruments leave zeros out.
+        Its results. A real number may be an int: instruments omit trailing zeros.
     """
 
     com_code: int
@@ -194,11 +189,11 @@ class ReplyLine:
 
 
 def crc16_arc(data: bytes) -> int:
-    """Return the CRC-16/ARC: polynomial 0x8005, bits reflected, from 0; ``b"123456789"`` has 0xBB3D."""
+    """Return the CRC-16/ARC: polynomial 0x8005, reflected, initial value 0; check value of ``b"123456789"``: 0xBB3D."""
     crc = 0
     for byte in data:
         crc ^= byte
-        for _ in range(_BITS_OF_A_BYTE):
+        for _ in range(8):
             crc = crc >> 1 ^ 0xA001 if crc & 1 else crc >> 1
     return crc
 
@@ -211,119 +206,115 @@ def encode_request(
     checksum: bool = False,
     decimals: int = 10,
 ) -> bytes:
-    """Return the line of a request, with CR LF.
+    """Return a request line, with CR LF.
 
     Parameters
     ----------
-    rpc
-        Number of the procedure.
-    parameters
-        Its parameters.
     transaction
-        1 to 32767; the reply repeats it. None: none.
+        1 to 32767, repeated by the reply; None for none.
     checksum
-        Whether the header has a checksum; it needs a transaction then.
+        Whether the header has a checksum, which requires a transaction.
     decimals
-        Digits right of the point, 0 to 15.
+        Number of decimals, 0 to 15.
 
     Raises
     ------
     MessageError
-        A number is not finite, a byte or the transaction is out of range, or a text is not Latin-1.
+        A number is not finite, a byte or the transaction is out of range, or a string is not Latin-1.
     """
     if transaction is not None and not 0 < transaction <= MAX_TRANSACTION:
         raise MessageError(f"transaction {transaction} is not between 1 and {MAX_TRANSACTION}")
     if checksum and transaction is None:
         raise MessageError("a request with a checksum needs a transaction")
     header = f"%R1Q,{int(rpc)}" if transaction is None else f"%R1Q,{int(rpc)},{transaction}"
-    body = ",".join(_text(value, decimals) for value in parameters)
+    body = ",".join(_encode_value(value, decimals) for value in parameters)
     if checksum:
         header = f"{header},{crc16_arc(f'{header}:{body}'.encode('ascii'))}"
     return f"{header}:{body}\r\n".encode("ascii")
 
 
 def decode_reply(line: bytes, *, checksum: bool = False) -> ReplyLine:
-    """Return what a reply says.
+    """Decode a reply.
 
     Parameters
     ----------
     line
-        From ``%R1P`` on, with or without its end.
+        From ``%R1P``, with or without the line end.
     checksum
-        Whether it must have a checksum, unless it says that the request did not get through; one that is there must be
-        right in any case.
+        Whether a checksum is required, unless the com code reports that the request was not delivered. A checksum that is
+        present is always verified.
 
     Raises
     ------
     MessageError
-        It is no reply, or damaged.
+        It is not a reply, or damaged.
     """
     stripped = line.rstrip(b"\r\n")
     text = stripped.decode("ascii", errors="replace")
     if not (text.isascii() and text.isprintable()):
-        raise MessageError(f"a reply with bytes that GeoCOM does not use: {line!r}")
+        raise MessageError(f"reply with bytes that GeoCOM does not use: {line!r}")
     header = _HEADER.match(text)
     if header is None:
-        raise MessageError(f"no reply of GeoCOM: {line!r}")
+        raise MessageError(f"not a GeoCOM reply: {line!r}")
     com_code = int(header["com_code"])
-    _check(header, needed=checksum and com_code == 0)
-    values = _values(text[header.end() :])
+    _verify_checksum(header, needed=checksum and com_code == 0)
+    values = _decode_values(text[header.end() :])
     if not values and com_code == 0:
-        raise MessageError(f"a reply without a return code: {line!r}")
+        raise MessageError(f"reply without a return code: {line!r}")
     code = values[0] if values else 0
     if type(code) is not int:
-        raise MessageError(f"a reply whose return code is {code!r}: {line!r}")
+        raise MessageError(f"reply with the return code {code!r}: {line!r}")
     return ReplyLine(com_code, int(header["transaction"] or 0), code, values[1:])
 
 
-def _text(value: Parameter, decimals: int) -> str:
+def _encode_value(value: Parameter, decimals: int) -> str:
     match value:
         case Byte():
             if not 0 <= value <= 0xFF:
-                raise MessageError(f"{int(value)} does not go into a byte")
+                raise MessageError(f"{int(value)} is not a byte")
             return f"'{value:02X}'"
-        case int():  # a truth value and an enumeration as well
+        case int():  # also bool and IntEnum
             return f"{int(value):d}"
         case float():
             if not math.isfinite(value):
-                raise MessageError(f"{value} is no number that GeoCOM can carry")
+                raise MessageError(f"{value} is not a finite number")
             digits = f"{value:.{decimals}f}"
             whole, _, fraction = digits.partition(".")
             return f"{whole}.{fraction.rstrip('0') or '0'}"
         case str():
-            return f'"{_TO_ESCAPE.sub(_escaped, value)}"'
+            return f'"{_UNSAFE.sub(_escape, value)}"'
 
 
-def _escaped(found: re.Match[str]) -> str:
+def _escape(found: re.Match[str]) -> str:
     code = ord(found.group())
     if code > 0xFF:
-        raise MessageError(f"{found.group()!r} cannot be sent: GeoCOM's texts are Latin-1")
-    # The one form that no firmware can take for the end of the text or the beginning of a line.
+        raise MessageError(f"{found.group()!r} cannot be sent: GeoCOM strings are Latin-1")
+    # The only form that no firmware mistakes for the end of the string or the start of a line.
     return f"\\x{code:02x}"
 
 
-def _unescaped(found: re.Match[str]) -> str:
+def _unescape(found: re.Match[str]) -> str:
     escape = found.group(1)
     return chr(int(escape[1:], 16)) if len(escape) > 1 else escape
 
 
-def _check(header: re.Match[str], *, needed: bool) -> None:
+def _verify_checksum(header: re.Match[str], *, needed: bool) -> None:
     line, checksum = header.string, header["checksum"]
     if checksum is None:
         if needed:
-            raise MessageError(f"a reply without its checksum: {line!r}")
+            raise MessageError(f"reply without its checksum: {line!r}")
         return
     start, end = header.span("checksum")
     expected = crc16_arc(f"{line[: start - 1]}{line[end:]}".encode("ascii"))
     if int(checksum) != expected:
-        raise MessageError(f"a reply whose checksum is {checksum}, not {expected}: {line!r}")
+        raise MessageError(f"the checksum is {checksum}, not {expected}: {line!r}")
 
 
-def _values(text: str) -> tuple[int | float | str, ...]:
+def _decode_values(text: str) -> tuple[int | float | str, ...]:
     if not text:
         return ()
     if '"' not in text:
-        return tuple(map(_value, text.split(",")))
+        return tuple(map(_decode_value, text.split(",")))
     values: list[int | float | str] = []
     position = 0
     while True:
@@ -331,20 +322,20 @@ def _values(text: str) -> tuple[int | float | str, ...]:
         if found is None:
             end = text.find(",", position)
             end = len(text) if end < 0 else end
-            values.append(_value(text[position:end]))
+            values.append(_decode_value(text[position:end]))
         else:
-            values.append(_ESCAPE.sub(_unescaped, found.group(1)))
+            values.append(_ESCAPE.sub(_unescape, found.group(1)))
             end = found.end()
         if end == len(text):
             return tuple(values)
         if text[end] != ",":
-            raise MessageError(f"no comma after a text: {text!r}")
+            raise MessageError(f"no comma after a string: {text!r}")
         position = end + 1
 
 
-def _value(text: str) -> int | float:
+def _decode_value(text: str) -> int | float:
     text = text.strip()
-    if _WHOLE.fullmatch(text):
+    if _INTEGER.fullmatch(text):
         return int(text)
     if _REAL.fullmatch(text):
         number = float(text)
@@ -354,4 +345,4 @@ def _value(text: str) -> int | float:
         return Byte(byte.group(1), 16)
     if _HEX.fullmatch(text):
         return int(text, 16)
-    raise MessageError(f"no value of GeoCOM: {text!r}")
+    raise MessageError(f"not a GeoCOM value: {text!r}")

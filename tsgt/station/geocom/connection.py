@@ -1,8 +1,8 @@
-"""The one owner of a line to a GeoCOM instrument: a request, then its reply, and whatever goes wrong in between.
+"""A connection to a GeoCOM instrument: requests and replies over a line that may lose, delay, duplicate and damage them.
 
-Every request has a transaction number, which its reply repeats: a reply that comes late or twice is known by it and
-dropped. An instrument takes one request at a time. When a caller has given up waiting, the next request therefore waits
-until the reply has come or cannot come any more.
+Every request has a transaction number, which its reply repeats; late and duplicate replies are dropped by it. An instrument
+takes one request at a time: after a cancelled call the next request waits until the pending reply has come or cannot come
+any more.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ if TYPE_CHECKING:
 
 log = structlog.get_logger()
 
-_CLEAR: Final = b"\n"  # empties the instrument's buffer
+_CLEAR: Final = b"\n"  # clears the instrument's input buffer
 _ABORT: Final = b"c\r\n"
 
 _TRIES: Final = 3
-_ATTENTION_S: Final = 1.0  # above the longest pause of an instrument that does well, 0.7 s
-_PROBE_S: Final = 0.5  # two in turn, so that the wanted speed is tried every second
-_ABORT_S: Final = 5.0  # a telescope that turns has to stop
-_BEHIND_S: Final = 4.0  # hardly anything but a search takes longer
+_RESPONSE_TIMEOUT_S: Final = 1.0  # above the longest pause of a healthy instrument, 0.7 s
+_BAUD_TIMEOUT_S: Final = 0.5  # two in turn: the configured baud rate is tried every second
+_ABORT_TIMEOUT_S: Final = 5.0  # a turning telescope has to stop
+_PROBE_INTERVAL_S: Final = 4.0  # only searches take longer
 _PAUSE_S: Final = 0.05
-_WAKING_S: Final = 0.5
+_WAKE_UP_S: Final = 0.5
 
 _BAUDS: Final = (115_200, 19_200, 9600, 57_600, 38_400, 230_400, 460_800, 921_600, 4800, 2400)
-"""Speeds of Leica instruments, the usual ones first."""
+"""Baud rates of Leica instruments, common ones first."""
 
-_NOT_TAKEN: Final = frozenset(
+_NOT_EXECUTED: Final = frozenset(
     {
         ReturnCode.COM_CANT_DECODE,
         ReturnCode.COM_CANT_RECV,
@@ -57,11 +57,11 @@ _NOT_TAKEN: Final = frozenset(
         ReturnCode.COM_SRVR_IS_OFF,
     }
 )
-"""The line has damaged the request, or it came at a bad time: nothing was carried out, and it may go well next time."""
+"""The request was damaged, or came at a bad time: it was not executed, and a retry may succeed."""
 
 _ASLEEP: Final = frozenset({ReturnCode.COM_SRVR_IS_SLEEPING, ReturnCode.COM_SRVR_IS_OFF})
 
-_NOT_REPEATED: Final = frozenset(
+_NOT_IDEMPOTENT: Final = frozenset(
     {
         Rpc.COM_SWITCH_ON_TPS,
         Rpc.COM_SWITCH_OFF_TPS,
@@ -76,24 +76,21 @@ _NOT_REPEATED: Final = frozenset(
         Rpc.BAP_SEARCH_TARGET,
     }
 )
-"""What moves the telescope or takes long is asked for by the caller alone: a second face change would undo the first."""
+"""Procedures that move the telescope or take long are never repeated here: a second face change would undo the first."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """What an instrument answered.
+    """An instrument's reply.
 
     Attributes
     ----------
     code
-        What came of the procedure; where the request was not taken, why not (3072 to 3110: 3081 is a procedure that the
-        instrument does not know).
+        Return code of the procedure, or the com code (3072 to 3110) of a request that was not executed.
     values
-        Its results. There may be some with an error and none with a good code, and a real number may come as an int.
-    sent_ns
-        When the request was handed to the line, on CLOCK_MONOTONIC, in ns.
-    first_byte_ns
-        When the first byte of the reply had come, on the same clock.
+        Results. An error may come with values and success without any, and a real number may be an int.
+    sent_ns, first_byte_ns
+        When the request was written, and when the first byte of the reply arrived, on CLOCK_MONOTONIC.
     """
 
     code: int
@@ -110,33 +107,22 @@ class _Failure(Enum):
 
 @dataclass(slots=True)
 class _Pending:
-    """A request whose reply has not come, and the numbers of those that were sent behind it to see whether it still can."""
+    """A request without a reply yet, and the transactions of the probes sent after it to detect that its reply is lost."""
 
     transaction: int
     sent_ns: int
     until_s: float  # on the event loop's clock
-    ask_s: float  # likewise
-    behind: list[int] = field(default_factory=list)
+    probe_s: float  # likewise
+    probes: list[int] = field(default_factory=list)
 
 
 class GeoComConnection:
-    """Requests and their replies on a line that may lose, delay, double and damage them.
-
-    Parameters
-    ----------
-    port
-        The line, which belongs to this connection from now on.
-    clock
-        Stamps the requests.
-    checksum
-        Whether every line carries a checksum.
+    """The owner of a port to a GeoCOM instrument.
 
     Attributes
     ----------
-    port
-        The line.
     decimals
-        Digits right of the point of what is sent; to be kept at what the instrument was told.
+        Number of decimals sent; must equal the instrument's setting.
     """
 
     def __init__(self, port: Port, clock: Clock, *, checksum: bool = False) -> None:
@@ -146,91 +132,80 @@ class GeoComConnection:
         self._checksum = checksum
         self._lines = ReplyLines(port.baud)
         self._pending: _Pending | None = None
-        self._turn = asyncio.Lock()
-        # Not from 1: a reply to the connection before this one must not look like one of ours.
+        self._exclusive = asyncio.Lock()
+        # Not from 1: a late reply to the previous connection must not match a transaction of this one.
         self._transaction = clock.monotonic_ns() // 1_000_000 % MAX_TRANSACTION
 
     async def call(self, rpc: Rpc, *parameters: Parameter, timeout_s: float = 3.0) -> Reply:
-        """Have a procedure carried out; return its reply.
+        """Call a procedure and return its reply; may be cancelled at any time.
 
-        A request that did not get through is sent again, at most twice, and so is one whose reply is damaged or did not
-        come in time; but not where the procedure moves the telescope. It may be cancelled at any time.
-
-        Parameters
-        ----------
-        rpc
-            The procedure.
-        *parameters
-            Its parameters.
-        timeout_s
-            How long the reply may take.
+        Repeats a request up to twice if it was not delivered, or its reply is damaged or late, unless the procedure moves
+        the telescope.
 
         Raises
         ------
         InstrumentError
-            The line is gone, no whole reply came, or the instrument does not answer at all any more.
+            The line is lost, there was no valid reply, or the instrument does not respond any more.
         MessageError
-            The parameters cannot be sent.
+            A parameter cannot be encoded.
         """
         silent = False
-        async with self._turn:
-            await self._settle()
+        async with self._exclusive:
+            await self._await_pending()
             for _ in range(_TRIES):
                 got = await self._exchange(rpc, parameters, timeout_s)
                 if isinstance(got, Reply):
-                    # A late error of an earlier request has no number to know it by: what moves may move already.
-                    if got.code not in _NOT_TAKEN or (rpc in _NOT_REPEATED and got.code not in _ASLEEP):
+                    # An error without a transaction may belong to an earlier request: the telescope may be moving already.
+                    if got.code not in _NOT_EXECUTED or (rpc in _NOT_IDEMPOTENT and got.code not in _ASLEEP):
                         return got
-                    await asyncio.sleep(_WAKING_S if got.code in _ASLEEP else _PAUSE_S)
-                elif rpc in _NOT_REPEATED:
+                    await asyncio.sleep(_WAKE_UP_S if got.code in _ASLEEP else _PAUSE_S)
+                elif rpc in _NOT_IDEMPOTENT:
                     break
                 elif got is _Failure.SILENCE:
                     if silent:
                         break
                     silent = True
                     log.info("instrument_silent", port=self.port.name, rpc=rpc.name, for_s=timeout_s)
-                    await self._attend()
+                    await self._resynchronise()
                 self.port.write(_CLEAR)
         if isinstance(got, Reply):
             return got
         if got is _Failure.LOST:
             raise InstrumentError(
-                f"{self.port.name}: the instrument's answer to {rpc.name} was lost, or it was switched off and on meanwhile;"
+                f"{self.port.name}: the reply to {rpc.name} was lost, or the instrument was switched off and on;"
                 " check cable and plugs"
             )
-        what = "no answer" if got is _Failure.SILENCE else "only damaged answers"
+        what = "no reply" if got is _Failure.SILENCE else "only damaged replies"
         raise InstrumentError(
             f"{self.port.name}: {what} from the instrument to {rpc.name} within {timeout_s:g} s; check cable and plugs"
         )
 
     async def abort(self) -> None:
-        """End a search or another long procedure, whose caller was cancelled or still waits, and let it answer.
+        """Abort a search or another long procedure, whether its caller still waits or was cancelled, and await its reply.
 
         Raises
         ------
         InstrumentError
-            The line is gone, or the instrument does not answer any more.
+            The line is lost, or the instrument does not respond any more.
         """
         self.port.write(_ABORT)
-        async with self._turn:
+        async with self._exclusive:
             if self._pending is not None:
-                self._pending.until_s = min(self._pending.until_s, _now_s() + _ABORT_S)
-                await self._settle()
+                self._pending.until_s = min(self._pending.until_s, _now_s() + _ABORT_TIMEOUT_S)
+                await self._await_pending()
 
-    async def answers(self, *, abort: bool, timeout_s: float = _ATTENTION_S) -> bool:
-        """Return whether the instrument answers, whatever was on the line before.
+    async def is_responding(self, *, abort: bool, timeout_s: float = _RESPONSE_TIMEOUT_S) -> bool:
+        """Clear the line and return whether the instrument responds.
 
         Parameters
         ----------
         abort
-            Whether to end what it is at; it answers nothing while it searches.
-        timeout_s
-            How long it may take.
+            Whether to abort its current procedure; it does not respond during a search.
 
         Raises
         ------
         InstrumentError
-            The line is gone, or the instrument cannot do checksums.
+            The line is lost, or the instrument does not support checksums.
         """
         self.port.drain()
         self._lines.clear()
@@ -240,36 +215,36 @@ class GeoComConnection:
             return False
         if got.code == ReturnCode.COM_NO_CHECKSUM:
             raise InstrumentError(
-                f"{self.port.name}: this instrument knows no checksums ({name_of(got.code)});"
+                f"{self.port.name}: this instrument does not support checksums ({name_of(got.code)});"
                 " set checksum = false in the configuration"
             )
         return True
 
     async def close(self) -> None:
-        """Close the line; the instrument goes on with what it does."""
+        """Close the port; the instrument continues its procedure."""
         await self.port.close()
 
-    async def _attend(self) -> None:
+    async def _resynchronise(self) -> None:
         for abort in (False, False, True):
-            if await self.answers(abort=abort):
+            if await self.is_responding(abort=abort):
                 return
         raise InstrumentError(
-            f"{self.port.name}: the instrument does not answer any more; is it on, is the cable plugged in?"
+            f"{self.port.name}: the instrument does not respond any more; check that it is on and the cable plugged in"
         )
 
-    async def _settle(self) -> None:
-        """Wait for the reply to a request that nobody waits for any more."""
-        if self._pending is not None and await self._answer(self._pending) is _Failure.SILENCE:
-            await self._attend()
+    async def _await_pending(self) -> None:
+        """Await the reply to the request of a cancelled call."""
+        if self._pending is not None and await self._receive(self._pending) is _Failure.SILENCE:
+            await self._resynchronise()
 
     async def _exchange(
         self, rpc: Rpc, parameters: Sequence[Parameter], timeout_s: float
     ) -> Reply | _Failure:
         request, now_s = self._request(rpc, parameters), _now_s()
         sent_ns = self._clock.monotonic_ns()
-        self._pending = _Pending(self._transaction, sent_ns, now_s + timeout_s, now_s + _BEHIND_S)
+        self._pending = _Pending(self._transaction, sent_ns, now_s + timeout_s, now_s + _PROBE_INTERVAL_S)
         self.port.write(request)
-        return await self._answer(self._pending)
+        return await self._receive(self._pending)
 
     def _request(self, rpc: Rpc, parameters: Sequence[Parameter]) -> bytes:
         self._transaction = self._transaction % MAX_TRANSACTION + 1
@@ -281,17 +256,17 @@ class GeoComConnection:
             decimals=self.decimals,
         )
 
-    def _ask_behind(self, pending: _Pending) -> None:
-        """Send a request behind one that takes long. Answers come in turn: once this has its own, the other's is lost."""
-        pending.ask_s = _now_s() + _BEHIND_S
+    def _send_probe(self, pending: _Pending) -> None:
+        """Send a request after one that takes long. Replies come in order: when this reply comes first, the other is lost."""
+        pending.probe_s = _now_s() + _PROBE_INTERVAL_S
         self.port.write(_CLEAR + self._request(Rpc.COM_NULL_PROC, ()))
-        pending.behind.append(self._transaction)
+        pending.probes.append(self._transaction)
 
-    async def _answer(self, pending: _Pending) -> Reply | _Failure:
-        """Return the reply to a request; it is pending no more then. Nothing is lost when this is cancelled."""
+    async def _receive(self, pending: _Pending) -> Reply | _Failure:
+        """Return the reply to the pending request. Nothing is lost when this is cancelled."""
         while True:
             try:
-                async with asyncio.timeout_at(min(pending.until_s, pending.ask_s)):
+                async with asyncio.timeout_at(min(pending.until_s, pending.probe_s)):
                     while True:
                         for line in self._lines.push(await self.port.read()):
                             got = self._reply(line, pending)
@@ -299,43 +274,39 @@ class GeoComConnection:
                                 self._pending = None
                                 return got
             except TimeoutError:
-                if pending.until_s <= pending.ask_s:  # not by the clock: a timeout may come a little early
+                if pending.until_s <= pending.probe_s:  # not by the clock: a timeout may fire slightly early
                     self._pending = None
                     return _Failure.SILENCE
-                self._ask_behind(pending)
+                self._send_probe(pending)
 
     def _reply(self, line: StampedLine, pending: _Pending) -> Reply | _Failure | None:
         try:
             reply = decode_reply(line.data, checksum=self._checksum)
         except MessageError:
             return _Failure.DAMAGE
-        if reply.transaction in pending.behind:
+        if reply.transaction in pending.probes:
             return _Failure.LOST if not reply.com_code else None
         if reply.transaction != pending.transaction and not (reply.com_code and reply.transaction == 0):
-            return None  # it is late, or a second one
-        # A line over USB alone has no pace: what comes faster than the stated speed allows still came after the request.
+            return None  # late, or a duplicate
+        # USB ignores the baud rate: data that arrives faster than it allows still arrived after the request.
         first_byte_ns = max(line.first_byte_ns, pending.sent_ns)
         return Reply(reply.com_code or reply.code, reply.values, pending.sent_ns, first_byte_ns)
 
 
 async def connect(open_port: OpenPort, baud: int, clock: Clock, *, checksum: bool) -> GeoComConnection:
-    """Open a line at the speed at which an instrument answers on it.
+    """Open a port and find the baud rate at which an instrument responds.
 
     Parameters
     ----------
-    open_port
-        Opens the line.
     baud
-        The speed that is tried first and, between all others, again and again.
-    clock
-        Stamps the requests.
+        Tried first, and again between all others.
     checksum
         Whether every line carries a checksum.
 
     Raises
     ------
     InstrumentError
-        The line cannot be opened, or no instrument answers at any speed; that takes ten seconds.
+        The port cannot be opened, or no instrument responds at any baud rate; that takes ten seconds.
     """
     opened = ""
     for number, candidate in enumerate(_candidates(baud)):
@@ -344,23 +315,24 @@ async def connect(open_port: OpenPort, baud: int, clock: Clock, *, checksum: boo
         except InstrumentError:
             if candidate == baud:
                 raise
-            continue  # not every adapter has every speed
+            continue  # not every adapter supports every baud rate
         opened = port.name
         connection = GeoComConnection(port, clock, checksum=checksum)
         try:
-            # A search that a client before this one had started keeps the instrument from answering.
-            answers = await connection.answers(abort=number > 0 and candidate == baud, timeout_s=_PROBE_S)
+            # A search started by an earlier client keeps the instrument from responding.
+            abort = number > 0 and candidate == baud
+            responds = await connection.is_responding(abort=abort, timeout_s=_BAUD_TIMEOUT_S)
         except BaseException:
             await connection.close()
             raise
-        if answers:
+        if responds:
             if candidate != baud:
                 log.warning("instrument_baud_found", port=opened, baud=candidate, configured=baud)
             return connection
         await connection.close()
     raise InstrumentError(
-        f"{opened}: no instrument answers at {baud} baud, nor at other speeds; is it on, is its interface set to this port"
-        " and to GeoCOM, is it this cable?"
+        f"{opened}: no instrument responds at {baud} baud or at other rates; check that it is on, that its interface is set to"
+        " this port and to GeoCOM, and the cable"
     )
 
 

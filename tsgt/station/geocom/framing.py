@@ -1,4 +1,4 @@
-"""What comes on the line, cut into the replies of a GeoCOM instrument, each with its arrival."""
+"""Splits the data from a GeoCOM instrument into reply lines with arrival times. Sans-I/O."""
 
 from __future__ import annotations
 
@@ -8,35 +8,22 @@ if TYPE_CHECKING:
     from tsgt.station.serial import Chunk
 
 _REPLY_MARK: Final = b"%R1P"
-_MAX_LINE: Final = 4096  # far more than the longest reply; more than that without an end is no line
+_MAX_LINE: Final = 4096  # far longer than any reply; longer data without a line end is dropped
 _NS_PER_BYTE_AT_1_BAUD: Final = 10_000_000_000  # start bit, eight bits, stop bit
 
 
 class StampedLine(NamedTuple):
-    """A line and its arrival.
-
-    Attributes
-    ----------
-    data
-        From ``%R1P`` to its end, which is left out.
-    first_byte_ns
-        When its first byte had come, on CLOCK_MONOTONIC, in ns.
-    """
+    """A line from ``%R1P`` to its end, excluded, and the arrival of its first byte on CLOCK_MONOTONIC."""
 
     data: bytes
     first_byte_ns: int
 
 
 class ReplyLines:
-    """Cuts what comes on the line into replies, whatever else comes with them.
+    """Extracts replies from the data of a line.
 
-    A reply begins at ``%R1P`` and ends at CR or LF. What stands before it is dropped, and so is the beginning of a reply in
-    the middle of which another one begins.
-
-    Parameters
-    ----------
-    baud
-        Bits per second of the line, from which the arrival of a byte inside a chunk follows.
+    A reply starts at ``%R1P`` and ends at CR or LF. Data before it is dropped, and so is an incomplete reply that another
+    one interrupts. The arrival of a byte within a chunk follows from the baud rate.
     """
 
     __slots__ = ("_arrivals", "_buffer", "_byte_ns")
@@ -44,10 +31,10 @@ class ReplyLines:
     def __init__(self, baud: int) -> None:
         self._byte_ns = _NS_PER_BYTE_AT_1_BAUD / baud
         self._buffer = b""
-        self._arrivals: list[tuple[int, int]] = []  # where a chunk ends in the buffer, and when that was
+        self._arrivals: list[tuple[int, int]] = []  # end of each chunk in the buffer, and its arrival
 
     def push(self, chunk: Chunk) -> list[StampedLine]:
-        """Take what came; return the replies that are complete now."""
+        """Add data; return the replies completed by it."""
         self._buffer += chunk.data
         self._arrivals.append((len(self._buffer), chunk.at_ns))
         *ended, rest = self._buffer.replace(b"\n", b"\r").split(b"\r")
@@ -62,7 +49,7 @@ class ReplyLines:
         return lines
 
     def clear(self) -> None:
-        """Forget what has come of an incomplete line."""
+        """Drop an incomplete line."""
         self._keep(b"")
 
     def _keep(self, rest: bytes) -> None:

@@ -1,11 +1,9 @@
-"""Who a Leica instrument is, what it can do, and how it is fed.
-
-What is known of Leica's instruments by model: what no instrument says of itself.
+"""Identity, capabilities and power supply of a Leica instrument: what it reports, and what is known of its model.
 
 Sources: the delays between distance and angles are constants of the University of Bonn's open tracking software
-(rts-network), found by calibration there; how a name begins is as instruments of each series give it. No latency from a
-measurement to the fastest answer is known of any model: published figures contain the line. It has to be measured, or
-found from a recording in motion, and put into the configuration.
+(rts-network), calibrated there; the prefixes of names are as instruments of each series report them. The latency from a
+measurement to the fastest reply is unknown for every model: published figures include the serial line. Measure it, or
+estimate it from a recording in motion, and configure it.
 """
 
 from __future__ import annotations
@@ -14,7 +12,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from tsgt.station.geocom import ReturnCode, Rpc, Verdict, verdict
+from tsgt.station.geocom import Outcome, ReturnCode, Rpc, outcome_of
 
 if TYPE_CHECKING:
     from tsgt.station.geocom import GeoComConnection, Reply
@@ -23,30 +21,53 @@ Numbers = tuple[float, ...]
 
 _ATR, _POWER_SEARCH = 0x8, 0x800
 
-_WARNINGS: Final = {
+_POWER_PROBLEMS: Final = {
     int(ReturnCode.LOW_POWER): "its battery lasts for some 30 minutes more; change it",
     int(ReturnCode.BATT_EMPTY): "its battery is empty; it switches off within a minute",
 }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Identity:
-    """Who an instrument is and what it can do.
+class ModelProperties(NamedTuple):
+    """Properties of a model that the instrument does not report.
 
     Attributes
     ----------
-    model, serial_number, firmware, geocom_release
-        As it says them; empty where it does not.
+    angle_delay_ns
+        Time of the angles minus time of the distance.
+    latency_ns
+        Time from a measurement to the fastest reply.
+    precise_tape
+        Whether it has the EDM mode for precise distances to tape, introduced with the TS30.
+    """
+
+    angle_delay_ns: int = 0
+    latency_ns: int = 0
+    precise_tape: bool = False
+
+
+_MODELS: Final = {
+    "TS16": ModelProperties(angle_delay_ns=7_220_000),
+    "TS60": ModelProperties(angle_delay_ns=4_980_000, precise_tape=True),
+    **dict.fromkeys(("MS60", "TS30", "TM30", "MS50", "TS50", "TM50"), ModelProperties(precise_tape=True)),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Identity:
+    """Identity and capabilities of an instrument; text is empty where the instrument does not report it.
+
+    Attributes
+    ----------
     robotic
-        Whether it may be moved and made to search: the licence GeoCOM Robotic. None: not known.
+        Whether it has the licence GeoCOM Robotic, without which it must not be moved or made to search. None: unknown.
     atr, power_search
-        Whether it has target recognition and PowerSearch; true where it does not say.
+        Whether it has target recognition and PowerSearch; True where it does not report it.
     battery_percent
-        Charge; None where it does not say.
+        None where it does not report it.
     external_power
-        Whether it is fed from outside.
+        Whether it has an external power supply.
     power_problem
-        What a person should see to about that; empty when there is nothing.
+        Action required of the operator; empty for none.
     """
 
     model: str = ""
@@ -60,137 +81,76 @@ class Identity:
     external_power: bool = False
     power_problem: str = ""
 
-    def fed(self, power: Power) -> Identity:
-        """Return the same instrument, fed like this."""
-        return replace(
-            self,
-            battery_percent=power.percent,
-            external_power=power.external,
-            power_problem=power.problem,
+    @property
+    def properties(self) -> ModelProperties:
+        """Properties of its model, by the prefix of the name; the defaults for an unknown model."""
+        name = self.model.upper().replace(" ", "").removeprefix("LEICA").removeprefix("NOVA")
+        return next(
+            (model for prefix, model in _MODELS.items() if name.startswith(prefix)), ModelProperties()
         )
 
 
-class Power(NamedTuple):
-    """How an instrument is fed.
-
-    Attributes
-    ----------
-    percent
-        Charge of the battery; None where it does not say.
-    external
-        Whether it is fed from outside.
-    problem
-        What a person should see to; empty when there is nothing.
-    """
-
-    percent: int | None
-    external: bool
-    problem: str
-
-
-def numbers(reply: Reply, count: int) -> Numbers | None:
-    """Return the first values of a reply; None if there are fewer, or one is no finite number."""
+def numeric_values(reply: Reply, count: int) -> Numbers | None:
+    """Return the first values of a reply; None if there are fewer, or one is not a finite number."""
     values = reply.values[:count]
     if len(values) < count or any(isinstance(value, str) or not math.isfinite(value) for value in values):
         return None
     return tuple(float(value) for value in values)
 
 
-def done(reply: Reply) -> bool:
-    """Tell whether a procedure has been carried out."""
-    return verdict(reply.code, has_values=bool(reply.values)) is Verdict.USABLE
+def succeeded(reply: Reply) -> bool:
+    """Whether a procedure was carried out."""
+    return outcome_of(reply.code, has_values=bool(reply.values)) is Outcome.USABLE
 
 
 async def identify(line: GeoComConnection, before: Identity | None = None) -> Identity:
-    """Ask an instrument who it is.
-
-    Parameters
-    ----------
-    line
-        To it.
-    before
-        Whom this computer had met before; if it is the same one, only what changes is asked.
+    """Query an instrument's identity; only what changes, if it is the one met before.
 
     Raises
     ------
     InstrumentError
-        It does not answer.
+        It does not respond.
     """
     serial = await line.call(Rpc.CSV_GET_INSTRUMENT_NO)
     serial_number = str(serial.values[0]) if serial.values else ""
-    robotic = await may_search(line)
-    power = await check_power(line)
+    robotic = await _has_robotic_licence(line)
     if before is not None and serial_number and serial_number == before.serial_number:
-        return replace(before, robotic=robotic).fed(power)
+        return await read_power(line, replace(before, robotic=robotic))
+    identity = await read_power(line, Identity(serial_number=serial_number, robotic=robotic))
     name = await line.call(Rpc.CSV_GET_INSTRUMENT_NAME)
-    device = numbers(await line.call(Rpc.CSV_GET_DEVICE_CONFIG), 2)
-    return Identity(
+    device = numeric_values(await line.call(Rpc.CSV_GET_DEVICE_CONFIG), 2)
+    return replace(
+        identity,
         model=str(name.values[0]).strip() if name.values else "",
-        serial_number=serial_number,
         firmware=_version(await line.call(Rpc.CSV_GET_SW_VERSION)),
         geocom_release=_version(await line.call(Rpc.COM_GET_SW_VERSION)),
-        robotic=robotic,
         atr=device is None or bool(int(device[1]) & _ATR),
         power_search=device is None or bool(int(device[1]) & _POWER_SEARCH),
-    ).fed(power)
+    )
 
 
-async def may_search(line: GeoComConnection) -> bool | None:
-    """Ask whether the instrument has the licence GeoCOM Robotic; None where that cannot be told."""
+async def _has_robotic_licence(line: GeoComConnection) -> bool | None:
     reply = await line.call(Rpc.AUT_GET_FINE_ADJUST_MODE)
-    if done(reply):
+    if succeeded(reply):
         return True
-    return False if verdict(reply.code, has_values=False) is Verdict.LICENCE else None
+    return False if outcome_of(reply.code, has_values=False) is Outcome.LICENCE else None
 
 
-async def check_power(line: GeoComConnection) -> Power:
-    """Ask how the instrument is fed."""
+async def read_power(line: GeoComConnection, identity: Identity) -> Identity:
+    """Return the identity with the current state of the power supply."""
     reply = await line.call(Rpc.CSV_CHECK_POWER)
-    values = numbers(reply, 2)
-    percent = round(values[0]) if values is not None and 0 <= values[0] <= 100 else None
-    problem = _WARNINGS.get(reply.code, "")
-    return Power(percent, values is not None and values[1] == 1, problem)
+    values = numeric_values(reply, 2)
+    return replace(
+        identity,
+        battery_percent=round(values[0]) if values is not None and 0 <= values[0] <= 100 else None,
+        external_power=values is not None and values[1] == 1,
+        power_problem=_POWER_PROBLEMS.get(reply.code, ""),
+    )
 
 
 def _version(reply: Reply) -> str:
-    values = numbers(reply, 3)
+    values = numeric_values(reply, 3)
     if values is None:
         return ""
     release, version, sub = (int(value) for value in values)
     return f"{release}.{version:02d}" + (f".{sub}" if sub else "")
-
-
-class Model(NamedTuple):
-    """What is known of a model.
-
-    Attributes
-    ----------
-    angle_delay_ns
-        By how much its angles are newer than its distance, in ns.
-    latency_ns
-        From a measurement to the fastest answer, in ns.
-    precise_tape
-        Whether it has the EDM mode for precise distances to tape, which came with the TS30.
-    """
-
-    angle_delay_ns: int = 0
-    latency_ns: int = 0
-    precise_tape: bool = False
-
-
-_MODELS: Final = (
-    ("TS16", Model(angle_delay_ns=7_220_000)),
-    ("TS60", Model(angle_delay_ns=4_980_000, precise_tape=True)),
-    ("MS60", Model(precise_tape=True)),
-    ("TS30", Model(precise_tape=True)),
-    ("TM30", Model(precise_tape=True)),
-    ("MS50", Model(precise_tape=True)),
-    ("TS50", Model(precise_tape=True)),
-    ("TM50", Model(precise_tape=True)),
-)
-
-
-def model_of(name: str) -> Model:
-    """Return what is known of the model with this name, as the instrument gives it."""
-    plain = name.upper().replace(" ", "").removeprefix("LEICA").removeprefix("NOVA")
-    return next((model for begin, model in _MODELS if plain.startswith(begin)), Model())

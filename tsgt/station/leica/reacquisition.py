@@ -1,9 +1,9 @@
-"""How a lost prism is found again, and how a person hands the telescope another one: what to do next, and nothing else.
+"""Which search window to try next after the target is lost, and when an operator has pointed the telescope. Sans-I/O.
 
-An instrument that loses its prism goes on along the path for some seconds (prediction) and locks in by itself if the prism
-comes back into view. After that somebody has to look for it. The order is: a small window where the telescope points, a
-window where the master's other stations say the prism is, one about its last direction, a wide one, the whole circle if
-the configuration allows it; then a beep for a person, a pause, and all over again.
+An instrument that loses its target predicts the target's path for some seconds and locks on by itself if it reappears. After
+that the driver searches: a small window at the current pointing, a window at the direction from the master's poses, one
+around the last direction, a wide one, and the full circle if the configuration allows it. Then it calls the operator, pauses,
+and starts over.
 """
 
 from __future__ import annotations
@@ -16,30 +16,27 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 if TYPE_CHECKING:
     from tsgt.radio import Direction
 
-NARROWEST_RAD: Final = math.radians(1.5)
-"""The field of view of the target recognition: a narrower window needs no search."""
+ATR_FIELD_OF_VIEW_RAD: Final = math.radians(1.5)
+"""Field of view of the automatic target recognition (ATR): a smaller window needs no search."""
 
-WIDEST_ADJUST_RAD: Final = math.radians(10.0)
-"""In a larger window the fine adjustment, which ends after 5 s, does not come round."""
+MAX_FINE_ADJUST_RAD: Final = math.radians(10.0)
+"""The fine adjustment ends after 5 s and does not cover a larger window."""
 
-ROUND_RAD: Final = math.radians(359.0)
+FULL_CIRCLE_RAD: Final = math.radians(359.0)
 
-PREDICTION_NS: Final = 10_000_000_000
-"""Instruments predict for 1 to 5 s, as a person has set them; after this they are not waited for any longer."""
+PREDICTION_TIMEOUT_NS: Final = 10_000_000_000
+"""Instruments predict for 1 to 5 s, as set by the operator."""
 
-FRESH_NS: Final = 15_000_000_000
-"""A direction from the master's poses is worth looking at for so long."""
+DIRECTION_MAX_AGE_NS: Final = 15_000_000_000
+"""A direction from the master's poses is used for this long."""
 
-PAUSES_NS: Final = (2_000_000_000, 5_000_000_000, 10_000_000_000, 20_000_000_000)
-"""Between one round of searches and the next; the last one for ever."""
+ROUND_PAUSES_NS: Final = (2_000_000_000, 5_000_000_000, 10_000_000_000, 20_000_000_000)
+"""Pauses after each round of searches; the last one repeats."""
 
-TURNED_RAD: Final = math.radians(0.3)
-"""A telescope that a person turns has turned by more than this; one that was let go may drift by less."""
-RESTING_RAD: Final = math.radians(0.03)
-RESTING_NS: Final = 1_500_000_000
-
-
-LOOKING: Final = "looking where the telescope points"
+TURN_THRESHOLD_RAD: Final = math.radians(0.3)
+"""A telescope turned by hand moves by more; an unlocked one may drift by less."""
+REST_TOLERANCE_RAD: Final = math.radians(0.03)
+REST_DURATION_NS: Final = 1_500_000_000
 
 
 class Pointing(NamedTuple):
@@ -50,7 +47,7 @@ class Pointing(NamedTuple):
 
 
 class Lock(IntEnum):
-    """What MOT_ReadLockStatus says."""
+    """Lock state as returned by MOT_ReadLockStatus."""
 
     OUT = 0
     IN = 1
@@ -58,19 +55,19 @@ class Lock(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
-    """A search.
+class SearchWindow:
+    """One search.
 
     Attributes
     ----------
     name
-        What is done, for people.
+        Description for the operator.
     sweep
-        Whether PowerSearch sweeps it; else the target recognition looks there.
+        Whether PowerSearch sweeps the window; otherwise the target recognition searches it.
     centre
-        Of its window; None: where the telescope points.
+        None: the current pointing.
     width_rad, height_rad
-        Of its window, full; a width of :data:`ROUND_RAD` or more is the whole circle.
+        Full width and height; a width of at least :data:`FULL_CIRCLE_RAD` is the full circle.
     """
 
     name: str
@@ -80,18 +77,30 @@ class Look:
     height_rad: float
 
     @property
-    def is_round(self) -> bool:
-        """Whether it is the whole circle."""
-        return self.width_rad >= ROUND_RAD
+    def is_full_circle(self) -> bool:
+        """Whether it covers the full circle."""
+        return self.width_rad >= FULL_CIRCLE_RAD
 
 
-class LossSequence:
-    """What to do about a prism that is not locked in on.
+def window_at_pointing(centre: Pointing | None = None) -> SearchWindow:
+    """Return the window for the target recognition at the current pointing, or at a known one."""
+    size_rad = 2 * ATR_FIELD_OF_VIEW_RAD
+    return SearchWindow("looking where the telescope points", False, centre, size_rad, size_rad)
+
+
+def window_at_direction(direction: Direction) -> SearchWindow:
+    """Return the window for the target recognition at a direction from the master."""
+    size_rad = min(max(2 * direction.spread_rad, ATR_FIELD_OF_VIEW_RAD), MAX_FINE_ADJUST_RAD)
+    return SearchWindow("looking where the master says", False, centre_of(direction), size_rad, size_rad)
+
+
+class ReacquisitionSequence:
+    """Sequence of search windows while the instrument is not locked on.
 
     Parameters
     ----------
     width_rad, height_rad
-        The widest window, full.
+        Full width and height of the widest window.
     """
 
     def __init__(self, *, width_rad: float, height_rad: float) -> None:
@@ -104,152 +113,137 @@ class LossSequence:
         self._step = 0
         self._rounds = 0
         self._resume_ns = 0
-        self._turned_away = False
+        self._telescope_moved = False
 
     @property
     def rounds(self) -> int:
-        """How many rounds have found nothing since the last lock."""
+        """Number of rounds without a target since the last lock."""
         return self._rounds
 
-    @property
-    def last(self) -> Pointing | None:
-        """Where the prism was last seen, or where somebody has told to look."""
-        return self._last
-
-    def seen(self, pointing: Pointing) -> None:
-        """Note where the prism is: it is locked in on."""
+    def lock_acquired(self, pointing: Pointing) -> None:
+        """Record the direction of the locked target."""
+        self.reset()
         self._last = pointing
-        self._towards = None
-        self._predicting_since_ns = None
-        self._step = self._rounds = self._resume_ns = 0
-        self._turned_away = False
 
-    def turned_away(self) -> None:
-        """Note that the telescope has been pointed at something else meanwhile."""
-        self._turned_away = True
+    def telescope_moved(self) -> None:
+        """Record that the telescope was pointed at something else."""
+        self._telescope_moved = True
 
     def restart(self, towards: Direction | None, now_ns: int) -> bool:
-        """Look at once, from the beginning, and where the master believes the prism to be if it says so.
+        """Search at once, from the first window, at the master's direction if there is one.
 
-        One that points to where the one before it did, as far as that was sure, only puts that right: a search that it
-        has interrupted counts as done, so that orders every few seconds cannot keep the later searches from being reached.
+        A direction within the spread of the previous one only corrects that: an interrupted search counts as done, so that
+        frequent commands cannot keep the sequence from reaching its later windows.
 
         Returns
         -------
         bool
-            Whether this is such an order.
+            Whether this direction only corrects the previous one.
         """
-        again = self._is_fresh(now_ns) and towards is not None and self._near(towards)
+        correction = self._has_direction(now_ns) and towards is not None and self._near(towards)
         self._towards, self._towards_ns = towards, now_ns
         self._resume_ns = 0
         self._predicting_since_ns = None
-        if not again:
+        if not correction:
             self._step = self._rounds = 0
-        return again
+        return correction
 
-    def forget(self) -> None:
-        """Forget where the prism was: from now on it is another one."""
+    def reset(self) -> None:
+        """Forget the target's direction: another prism is tracked from now on."""
         self._last = self._towards = self._predicting_since_ns = None
         self._step = self._rounds = self._resume_ns = 0
-        self._turned_away = False
+        self._telescope_moved = False
 
-    def next(self, lock: Lock, now_ns: int) -> Look | None:
-        """Return what to do now; None: nothing but to measure and to ask for the lock again, soon.
+    def next(self, lock: Lock, now_ns: int) -> SearchWindow | None:
+        """Return the window to search now; None: keep measuring and query the lock again soon.
 
-        A search that is returned counts as done, whatever becomes of it.
+        A returned window counts as done, whatever its result.
         """
         if lock is Lock.IN:
             self._predicting_since_ns = None
             return None
-        if lock is Lock.PREDICTION and not self._is_fresh(now_ns):
+        if lock is Lock.PREDICTION and not self._has_direction(now_ns):
             if self._predicting_since_ns is None:
                 self._predicting_since_ns = now_ns
-            if now_ns - self._predicting_since_ns < PREDICTION_NS:
+            if now_ns - self._predicting_since_ns < PREDICTION_TIMEOUT_NS:
                 return None
         if now_ns < self._resume_ns:
             return None
-        looks = self._looks(now_ns)
-        if self._step >= len(looks):
-            self._resume_ns = now_ns + PAUSES_NS[min(self._rounds, len(PAUSES_NS) - 1)]
+        windows = self._windows(now_ns)
+        if self._step >= len(windows):
+            self._resume_ns = now_ns + ROUND_PAUSES_NS[min(self._rounds, len(ROUND_PAUSES_NS) - 1)]
             self._rounds += 1
             self._step = 0
-            self._turned_away = False  # from now on a person points it
+            self._telescope_moved = False  # from now on the operator points it
             return None
         self._step += 1
-        return looks[self._step - 1]
+        return windows[self._step - 1]
 
-    def _is_fresh(self, now_ns: int) -> bool:
-        return self._towards is not None and now_ns - self._towards_ns < FRESH_NS
+    def _has_direction(self, now_ns: int) -> bool:
+        return self._towards is not None and now_ns - self._towards_ns < DIRECTION_MAX_AGE_NS
 
     def _near(self, towards: Direction) -> bool:
         before = self._towards
         return (
-            before is not None and apart_rad(pointing_at(before), pointing_at(towards)) <= before.spread_rad
+            before is not None
+            and angular_distance_rad(centre_of(before), centre_of(towards)) <= before.spread_rad
         )
 
-    def _looks(self, now_ns: int) -> list[Look]:
-        looks = []
-        if self._towards is not None and self._is_fresh(now_ns):
-            centre = pointing_at(self._towards)
-            size = max(2 * self._towards.spread_rad, NARROWEST_RAD)
-            adjusted = min(size, WIDEST_ADJUST_RAD)
-            looks.append(Look("looking where the master says", False, centre, adjusted, adjusted))
-            looks.append(
-                Look("searching where the master says", True, centre, max(size, 2 * NARROWEST_RAD), size)
-            )
+    def _windows(self, now_ns: int) -> list[SearchWindow]:
+        width_rad, height_rad, last = self._width_rad, self._height_rad, self._last
+        if self._towards is not None and self._has_direction(now_ns):
+            centre = centre_of(self._towards)
+            size = max(2 * self._towards.spread_rad, ATR_FIELD_OF_VIEW_RAD)
+            width = max(size, 2 * ATR_FIELD_OF_VIEW_RAD)
+            windows = [
+                window_at_direction(self._towards),
+                SearchWindow("searching where the master says", True, centre, width, size),
+            ]
         else:
-            where = self._last if self._turned_away else None
-            looks.append(Look(LOOKING, False, where, 2 * NARROWEST_RAD, 2 * NARROWEST_RAD))
-        narrow_rad = max(0.1 * self._width_rad, NARROWEST_RAD)
-        looks.append(
-            Look(
-                "searching around its last direction",
-                True,
-                self._last,
-                narrow_rad,
-                min(narrow_rad, self._height_rad),
-            )
+            windows = [window_at_pointing(last if self._telescope_moved else None)]
+        narrow_rad = max(0.1 * width_rad, ATR_FIELD_OF_VIEW_RAD)
+        narrow_height_rad = min(narrow_rad, height_rad)
+        windows.append(
+            SearchWindow("searching around its last direction", True, last, narrow_rad, narrow_height_rad)
         )
-        if self._width_rad > narrow_rad and self._width_rad < ROUND_RAD:
-            looks.append(Look("searching wide", True, self._last, self._width_rad, self._height_rad))
-        if self._width_rad >= ROUND_RAD:
-            looks.append(Look("searching all around", True, None, math.tau, self._height_rad))
-        return looks
+        if narrow_rad < width_rad < FULL_CIRCLE_RAD:
+            windows.append(SearchWindow("searching wide", True, last, width_rad, height_rad))
+        if width_rad >= FULL_CIRCLE_RAD:
+            windows.append(SearchWindow("searching all around", True, None, math.tau, height_rad))
+        return windows
 
 
-class Handover:
-    """Tells when a person who was asked to has turned the telescope to another prism.
+class ManualPointingDetector:
+    """Detects when the operator has turned the telescope to another prism: it has moved, and rests.
 
     Parameters
     ----------
-    begun
-        Where it pointed when that was asked for; None: not known, the first direction counts.
-    now_ns
-        When that was.
+    initial
+        Pointing when the operator was called; None: the first pointing passed to :meth:`update`.
     """
 
-    def __init__(self, begun: Pointing | None, now_ns: int) -> None:
-        self._from = begun
+    def __init__(self, initial: Pointing | None, now_ns: int) -> None:
+        self._initial = initial
         self._rest: Pointing | None = None
         self._rest_ns = now_ns
         self._turned = False
 
-    def points(self, pointing: Pointing, now_ns: int) -> bool:
-        """Take where the telescope points; return whether it has been turned, and rests."""
-        if self._from is None:
-            self._from = pointing
-        if self._rest is None or apart_rad(self._rest, pointing) > RESTING_RAD:
+    def update(self, pointing: Pointing, now_ns: int) -> bool:
+        """Return whether the telescope has been turned, and rests."""
+        if self._initial is None:
+            self._initial = pointing
+        if self._rest is None or angular_distance_rad(self._rest, pointing) > REST_TOLERANCE_RAD:
             self._rest, self._rest_ns = pointing, now_ns
-        self._turned = self._turned or apart_rad(self._from, pointing) > TURNED_RAD
-        return self._turned and now_ns - self._rest_ns >= RESTING_NS
+        self._turned = self._turned or angular_distance_rad(self._initial, pointing) > TURN_THRESHOLD_RAD
+        return self._turned and now_ns - self._rest_ns >= REST_DURATION_NS
 
 
-def pointing_at(direction: Direction) -> Pointing:
-    """Return the middle of a direction."""
+def centre_of(direction: Direction) -> Pointing:
+    """Return a direction without its spread."""
     return Pointing(direction.horizontal_angle_rad, direction.zenith_angle_rad)
 
 
-def apart_rad(a: Pointing, b: Pointing) -> float:
-    """Return the angle between two directions, for small ones; in rad."""
+def angular_distance_rad(a: Pointing, b: Pointing) -> float:
+    """Return the angle between two directions in rad, to first order in their difference."""
     across = math.remainder(a.horizontal_angle_rad - b.horizontal_angle_rad, math.tau)
     return math.hypot(across * math.sin(a.zenith_angle_rad), a.zenith_angle_rad - b.zenith_angle_rad)

@@ -1,168 +1,137 @@
-"""Making a Leica instrument look for its prism and lock in on it: a look of the loss sequence, carried out."""
+"""Target search with a Leica instrument: executes a search window of the reacquisition sequence and locks on."""
 
 from __future__ import annotations
 
 import math
 from typing import TYPE_CHECKING, Final
 
-from tsgt.station.geocom import ReturnCode, Rpc, Verdict, verdict
-from tsgt.station.leica.identity import done, numbers
-from tsgt.station.leica.reacquisition import NARROWEST_RAD, WIDEST_ADJUST_RAD, Lock, Look, Pointing
+from tsgt.station.geocom import Outcome, ReturnCode, Rpc, outcome_of
+from tsgt.station.leica.identity import numeric_values, succeeded
+from tsgt.station.leica.reacquisition import (
+    ATR_FIELD_OF_VIEW_RAD,
+    MAX_FINE_ADJUST_RAD,
+    Lock,
+    Pointing,
+    SearchWindow,
+)
 
 if TYPE_CHECKING:
     from tsgt.station.geocom import GeoComConnection, Parameter, Reply
 
 _TRIES: Final = 3
-_TURN_S: Final = 30.0
-_ADJUST_S: Final = 15.0  # it gives up by itself after 5 s
-_WINDOW_S: Final = 90.0
-_ROUND_S: Final = 120.0
+_TURN_TIMEOUT_S: Final = 30.0
+_FINE_ADJUST_TIMEOUT_S: Final = 15.0  # the instrument gives up after 5 s
+_WINDOW_TIMEOUT_S: Final = 90.0
+_FULL_CIRCLE_TIMEOUT_S: Final = 120.0
 _CLOCKWISE, _WITH_SWING = 1, 1
-_CHASES: Final = 3
-_HERE: Final = Look("pointing at it", False, None, NARROWEST_RAD, NARROWEST_RAD)
-_NEARBY: Final = Look("searching where it was found", True, None, WIDEST_ADJUST_RAD, WIDEST_ADJUST_RAD)
+_MAX_SWEEPS: Final = 3
+_HERE: Final = SearchWindow("pointing at it", False, None, ATR_FIELD_OF_VIEW_RAD, ATR_FIELD_OF_VIEW_RAD)
+_NEARBY: Final = SearchWindow(
+    "searching where it was found", True, None, MAX_FINE_ADJUST_RAD, MAX_FINE_ADJUST_RAD
+)
 
 
-class LicenceMissing(Exception):  # noqa: N818 (it is no error: there is another way to go on)
-    """The instrument may not be moved or made to search."""
+class RoboticLicenceMissing(Exception):  # noqa: N818 (not an error: the operator takes over)
+    """The instrument lacks the licence GeoCOM Robotic: it must not be moved and cannot search."""
 
 
-class Finder:
-    """Searches with one connection.
+class TargetSearch:
+    """Searches over one connection. Methods raise :class:`RoboticLicenceMissing` where the instrument lacks the licence.
 
     Parameters
     ----------
-    line
-        To the instrument.
     power_search
-        Whether it has PowerSearch; else the target recognition looks in the same windows, which takes longer.
+        Whether the instrument has PowerSearch; otherwise the target recognition searches the same windows, more slowly.
 
     Attributes
     ----------
-    has_found
-        Whether the search has come upon a prism, and only has to lock in.
+    target_found
+        Whether the current search has found a target and only has to lock on.
     """
 
     def __init__(self, line: GeoComConnection, *, power_search: bool) -> None:
         self._line = line
         self._power_search = power_search
-        self.has_found = False
+        self.target_found = False
 
-    async def lock(self) -> Lock | None:
-        """Ask whether the instrument is locked in on a prism; None where it does not say."""
+    async def lock_state(self) -> Lock | None:
+        """Query the lock state; None where the instrument does not report it."""
         for _ in range(_TRIES):
-            values = numbers(await self._line.call(Rpc.MOT_READ_LOCK_STATUS), 1)
+            values = numeric_values(await self._line.call(Rpc.MOT_READ_LOCK_STATUS), 1)
             if values is not None and values[0] in (0, 1, 2):
                 return Lock(int(values[0]))
         return None
 
-    async def release(self) -> None:
-        """Let the prism go; the telescope stays where it is, or where a person turns it.
+    async def release_lock(self) -> None:
+        """Release the target; the telescope stays where it is, or where the operator turns it."""
+        await self._call(Rpc.AUS_SET_USER_LOCK_STATE, 0)
 
-        Raises
-        ------
-        LicenceMissing
-            It may not be told to.
+    async def search(self, window: SearchWindow) -> bool:
+        """Search a window and lock on; return whether the instrument is locked on now.
+
+        Switches the target recognition on first: doing that after the lock would release it.
         """
-        await self._ask(Rpc.AUS_SET_USER_LOCK_STATE, 0)
-
-    async def look(self, look: Look) -> bool:
-        """Carry out a search and lock in; return whether the instrument is locked in now.
-
-        Target recognition goes on before the lock, for switching it on afterwards would end that.
-
-        Raises
-        ------
-        LicenceMissing
-            It may not be made to search.
-        InstrumentError
-            It does not answer.
-        """
-        self.has_found = False
-        await self._ask(Rpc.AUS_SET_USER_LOCK_STATE, 0)
-        await self._ask(Rpc.AUS_SET_USER_ATR_STATE, 1)
-        if look.centre is not None and not (look.sweep and self._power_search):
-            await self.position(look.centre)
-        if not await (self._sweep_and_adjust(look) if look.sweep else self._adjust(look)):
+        self.target_found = False
+        await self._call(Rpc.AUS_SET_USER_LOCK_STATE, 0)
+        await self._call(Rpc.AUS_SET_USER_ATR_STATE, 1)
+        if window.centre is not None and not (window.sweep and self._power_search):
+            await self._call(Rpc.AUT_MAKE_POSITIONING, *window.centre, 0, 0, 0, timeout_s=_TURN_TIMEOUT_S)
+        if not await (self._sweep_and_adjust(window) if window.sweep else self._adjust(window)):
             return False
-        self.has_found = True
-        await self._ask(Rpc.AUS_SET_USER_LOCK_STATE, 1)
-        await self._ask(Rpc.AUT_LOCK_IN, timeout_s=_ADJUST_S)
-        return await self.lock() is Lock.IN
+        self.target_found = True
+        await self._call(Rpc.AUS_SET_USER_LOCK_STATE, 1)
+        await self._call(Rpc.AUT_LOCK_IN, timeout_s=_FINE_ADJUST_TIMEOUT_S)
+        return await self.lock_state() is Lock.IN
 
-    async def _sweep_and_adjust(self, look: Look) -> bool:
-        """Sweep, and point at what was found; a robot that has driven on before that is looked for nearby, at once."""
-        sweeping = look
-        for _ in range(_CHASES):
-            if not done(await self._sweep(sweeping)):
+    async def _sweep_and_adjust(self, window: SearchWindow) -> bool:
+        """Sweep and point at the target; sweep again nearby if the robot has moved on meanwhile."""
+        for _ in range(_MAX_SWEEPS):
+            if not succeeded(await self._sweep(window)):
                 return False
-            self.has_found = True
-            # A person may have locked in meanwhile, which a sweep would undo.
-            if await self._adjust(_HERE) or await self.lock() is Lock.IN:
+            self.target_found = True
+            # The operator may have locked on meanwhile; another sweep would release that lock.
+            if await self._adjust(_HERE) or await self.lock_state() is Lock.IN:
                 return True
-            sweeping = _NEARBY
-        self.has_found = False
+            window = _NEARBY
+        self.target_found = False
         return False
 
-    async def _adjust(self, look: Look) -> bool:
-        area = look.width_rad, look.height_rad, 0
-        return done(await self._ask(Rpc.AUT_FINE_ADJUST, *area, timeout_s=_ADJUST_S))
+    async def _adjust(self, window: SearchWindow) -> bool:
+        area = window.width_rad, window.height_rad, 0
+        return succeeded(await self._call(Rpc.AUT_FINE_ADJUST, *area, timeout_s=_FINE_ADJUST_TIMEOUT_S))
 
-    async def position(self, to: Pointing) -> None:
-        """Turn the telescope there; a lock is let go.
+    async def disable_atr(self) -> None:
+        """Switch the target recognition off, for targets that it does not recognise."""
+        await self._call(Rpc.AUS_SET_USER_ATR_STATE, 0)
 
-        Raises
-        ------
-        LicenceMissing
-            It may not be moved.
-        """
-        await self._ask(Rpc.AUT_MAKE_POSITIONING, *to, 0, 0, 0, timeout_s=_TURN_S)
-
-    async def stop_recognising(self) -> None:
-        """Switch the target recognition off, for targets that it does not know.
-
-        Raises
-        ------
-        LicenceMissing
-            It may not be told to.
-        """
-        await self._ask(Rpc.AUS_SET_USER_ATR_STATE, 0)
-
-    async def adjust(self) -> None:
-        """Point exactly at the prism in the field of view, if there is one; it is not locked in on.
-
-        Raises
-        ------
-        LicenceMissing
-            It may not be moved.
-        """
-        await self._ask(Rpc.AUS_SET_USER_ATR_STATE, 1)
+    async def fine_adjust(self) -> None:
+        """Point exactly at the prism in the field of view, if there is one, without locking on."""
+        await self._call(Rpc.AUS_SET_USER_ATR_STATE, 1)
         await self._adjust(_HERE)
 
-    async def _sweep(self, look: Look) -> Reply:
+    async def _sweep(self, window: SearchWindow) -> Reply:
         if not self._power_search:
-            area = min(look.width_rad, math.pi), look.height_rad, 0
-            return await self._ask(Rpc.AUT_SEARCH, *area, timeout_s=_WINDOW_S)
-        if look.is_round:
-            return await self._ask(Rpc.AUT_PS_SEARCH_NEXT, _CLOCKWISE, _WITH_SWING, timeout_s=_ROUND_S)
-        centre = look.centre or await self._here()
-        await self._ask(Rpc.AUT_SET_SEARCH_AREA, *centre, look.width_rad, look.height_rad, 1)
-        return await self._ask(Rpc.AUT_PS_SEARCH_WINDOW, timeout_s=_WINDOW_S)
+            area = min(window.width_rad, math.pi), window.height_rad, 0
+            return await self._call(Rpc.AUT_SEARCH, *area, timeout_s=_WINDOW_TIMEOUT_S)
+        if window.is_full_circle:
+            return await self._call(
+                Rpc.AUT_PS_SEARCH_NEXT, _CLOCKWISE, _WITH_SWING, timeout_s=_FULL_CIRCLE_TIMEOUT_S
+            )
+        centre = window.centre or await pointing(self._line) or Pointing(0.0, math.pi / 2)
+        await self._call(Rpc.AUT_SET_SEARCH_AREA, *centre, window.width_rad, window.height_rad, 1)
+        return await self._call(Rpc.AUT_PS_SEARCH_WINDOW, timeout_s=_WINDOW_TIMEOUT_S)
 
-    async def _here(self) -> Pointing:
-        return await pointing(self._line) or Pointing(0.0, math.pi / 2)
-
-    async def _ask(self, rpc: Rpc, *parameters: Parameter, timeout_s: float = 3.0) -> Reply:
+    async def _call(self, rpc: Rpc, *parameters: Parameter, timeout_s: float = 3.0) -> Reply:
         reply = await self._line.call(rpc, *parameters, timeout_s=timeout_s)
-        if verdict(reply.code, has_values=False) is Verdict.LICENCE:
-            raise LicenceMissing
+        if outcome_of(reply.code, has_values=False) is Outcome.LICENCE:
+            raise RoboticLicenceMissing
         return reply
 
 
 async def pointing(line: GeoComConnection) -> Pointing | None:
-    """Ask where the telescope points; None where the instrument cannot tell."""
+    """Query where the telescope points; None where the instrument has no valid angles."""
     reply = await line.call(Rpc.TMC_GET_ANGLE5, 1)
-    values = numbers(reply, 2)
+    values = numeric_values(reply, 2)
     if values is None or reply.code == ReturnCode.TMC_ANGLE_ERROR:
         return None
     return Pointing(*values)

@@ -1,4 +1,4 @@
-"""Single measurements of a target that a person aims at, with a Leica instrument."""
+"""Single-shot and two-face measurements of targets with a Leica instrument."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Final
 from tsgt.errors import InstrumentRefusedError
 from tsgt.model import Status
 from tsgt.station.geocom import Rpc, name_of
-from tsgt.station.leica.identity import done
-from tsgt.station.leica.measurement import full_measurement
-from tsgt.station.leica.setup import clear
+from tsgt.station.leica.identity import succeeded
+from tsgt.station.leica.measurement import decode_full_measurement
+from tsgt.station.leica.setup import clear_distance
 
 if TYPE_CHECKING:
     from tsgt.clock import Clock
@@ -18,121 +18,122 @@ if TYPE_CHECKING:
     from tsgt.station.leica.measurement import FullMeasurement
 
 _WAIT_MS: Final = 1000
-_SHOT_NS: Final = 8_000_000_000
-"""A precise distance to a foil takes 1 to 3 s, and in bad air some more."""
+_MEASUREMENT_TIMEOUT_NS: Final = 8_000_000_000
+"""A precise distance to a reflective tape takes 1 to 3 s, and more in turbulent air."""
 
-_FACE_S: Final = 30.0
+_CHANGE_FACE_TIMEOUT_S: Final = 30.0
 _TRIES: Final = 3
 _CLEAR, _MEASURE = 3, 1
 
-_APART_RAD: Final = math.radians(0.2)
-_APART_M: Final = 0.05
-"""The errors of an instrument's axes are a tenth of this: two faces that differ by more saw two targets."""
+_FACE_TOLERANCE_RAD: Final = math.radians(0.2)
+_FACE_TOLERANCE_M: Final = 0.05
+"""Ten times the axis errors of an instrument: faces that differ by more measured different targets."""
 
 
-async def shoot(line: GeoComConnection, clock: Clock) -> FullMeasurement:
-    """Measure what the telescope points at, once; it takes some seconds.
+async def measure_target(line: GeoComConnection, clock: Clock) -> FullMeasurement:
+    """Measure the target in the line of sight once; takes some seconds.
 
     Raises
     ------
     InstrumentRefusedError
-        It does not begin; the distance that it still has may be one to another target.
+        The instrument does not start: its stored distance may be that of another target.
     InstrumentError
-        The instrument does not answer.
+        The instrument does not respond.
     """
-    await _do(line, _CLEAR)
-    await _do(line, _MEASURE)
-    until_ns = clock.monotonic_ns() + _SHOT_NS
+    await _start_program(line, _CLEAR)
+    await _start_program(line, _MEASURE)
+    until_ns = clock.monotonic_ns() + _MEASUREMENT_TIMEOUT_NS
     while True:
-        shot = full_measurement(await line.call(Rpc.TMC_GET_FULL_MEAS, _WAIT_MS, 1))
-        waits = shot.status is Status.ANGLE_ONLY or shot.status is Status.ERROR
-        if not waits or clock.monotonic_ns() >= until_ns:
+        measured = decode_full_measurement(await line.call(Rpc.TMC_GET_FULL_MEAS, _WAIT_MS, 1))
+        pending = measured.status is Status.ANGLE_ONLY or measured.status is Status.ERROR
+        if not pending or clock.monotonic_ns() >= until_ns:
             break
         await clock.sleep_until(clock.monotonic_ns() + 50_000_000)
-    await clear(line)
-    if shot.status is Status.ANGLE_ONLY:  # for so long: there is nothing that reflects
-        shot = shot._replace(status=Status.NO_TARGET)
-    return shot
+    await clear_distance(line)
+    if measured.status is Status.ANGLE_ONLY:  # until the timeout: nothing reflects
+        measured = measured._replace(status=Status.NO_TARGET)
+    return measured
 
 
-async def shoot_in_two_faces(line: GeoComConnection, clock: Clock, *, at_prism: bool) -> FullMeasurement:
-    """Measure in one face, then in the other, and come back; return the mean, as seen in the first face.
+async def measure_in_two_faces(line: GeoComConnection, clock: Clock, *, at_prism: bool) -> FullMeasurement:
+    """Measure in both faces and return to the first; return the mean in terms of the first face.
 
     Raises
     ------
     InstrumentRefusedError
-        The instrument cannot change its face, or sees another target in it.
+        The instrument cannot change its face, or the faces measured different targets.
     InstrumentError
-        The instrument does not answer.
+        The instrument does not respond.
     """
-    first = await shoot(line, clock)
+    first = await measure_target(line, clock)
     if first.distance_m is None:
         return first
     await _change_face(line, at_prism=at_prism)
-    second = await shoot(line, clock)
+    second = await measure_target(line, clock)
     await _change_face(line, at_prism=False)
     check_same_target(first, second)
-    return both_faces(first, second)
+    return mean_of_two_faces(first, second)
 
 
-def both_faces(first: FullMeasurement, second: FullMeasurement) -> FullMeasurement:
-    """Return the mean of a target in two faces, as seen in the first; without the second if that saw nothing.
+def mean_of_two_faces(first: FullMeasurement, second: FullMeasurement) -> FullMeasurement:
+    """Return the mean of a two-face measurement in terms of the first face; the first alone if the second has no distance.
 
-    The errors of the collimation, of the tilting axis and of the zenith index have opposite signs in the two.
+    Collimation, tilting-axis and vertical-index errors have opposite signs in the two faces and cancel.
     """
     if first.distance_m is None or second.distance_m is None:
         return first if first.distance_m is None else second
-    across_rad, up_rad = _apart_rad(first, second)
+    horizontal_rad, vertical_rad = _face_difference_rad(first, second)
     worse = second if second.status is Status.LOW_ACCURACY else first
     return first._replace(
-        horizontal_angle_rad=(first.horizontal_angle_rad + across_rad / 2) % math.tau,
-        zenith_angle_rad=first.zenith_angle_rad + up_rad / 2,
+        horizontal_angle_rad=(first.horizontal_angle_rad + horizontal_rad / 2) % math.tau,
+        zenith_angle_rad=first.zenith_angle_rad + vertical_rad / 2,
         distance_m=(first.distance_m + second.distance_m) / 2,
         status=worse.status,
         code=worse.code,
     )
 
 
-def _apart_rad(first: FullMeasurement, second: FullMeasurement) -> tuple[float, float]:
-    """Return by how much the second face points elsewhere, about the plumb line and in height."""
+def _face_difference_rad(first: FullMeasurement, second: FullMeasurement) -> tuple[float, float]:
+    """Return horizontal and zenith angle of the second face minus the first, both in terms of the first."""
     turned_rad = second.horizontal_angle_rad + math.pi
-    across_rad = math.remainder(turned_rad - first.horizontal_angle_rad, math.tau)
-    return across_rad, math.tau - second.zenith_angle_rad - first.zenith_angle_rad
+    horizontal_rad = math.remainder(turned_rad - first.horizontal_angle_rad, math.tau)
+    return horizontal_rad, math.tau - second.zenith_angle_rad - first.zenith_angle_rad
 
 
 def check_same_target(first: FullMeasurement, second: FullMeasurement) -> None:
-    """Refuse two faces that cannot be of one target.
+    """Check that two faces measured the same target.
 
     Raises
     ------
     InstrumentRefusedError
-        They are too far apart.
+        They differ by more than the instrument's axis errors.
     """
     if first.distance_m is None or second.distance_m is None:
         return
-    across_rad, up_rad = _apart_rad(first, second)
-    apart_rad = math.hypot(across_rad * math.sin(first.zenith_angle_rad), up_rad)
-    apart_m = abs(first.distance_m - second.distance_m)
-    if apart_rad > _APART_RAD or apart_m > _APART_M:
+    horizontal_rad, vertical_rad = _face_difference_rad(first, second)
+    difference_rad = math.hypot(horizontal_rad * math.sin(first.zenith_angle_rad), vertical_rad)
+    difference_m = abs(first.distance_m - second.distance_m)
+    if difference_rad > _FACE_TOLERANCE_RAD or difference_m > _FACE_TOLERANCE_M:
         raise InstrumentRefusedError(
-            f"the two faces saw different things, {math.degrees(apart_rad):.2f} degrees and {apart_m:.3f} m apart: the"
-            " telescope was turned, or something came in between; measure again"
+            f"the two faces measured different targets, {math.degrees(difference_rad):.2f} degrees and"
+            f" {difference_m:.3f} m apart: the telescope was turned, or something interrupted the line of sight;"
+            " measure again"
         )
 
 
-async def _do(line: GeoComConnection, program: int) -> None:
+async def _start_program(line: GeoComConnection, program: int) -> None:
     for _ in range(_TRIES):
         reply = await line.call(Rpc.TMC_DO_MEASURE, program, 1)
-        if done(reply):
+        if succeeded(reply):
             return
     raise InstrumentRefusedError(
-        f"the instrument begins no new measurement: {name_of(reply.code)}; measure again"
+        f"the instrument does not start a new measurement: {name_of(reply.code)}; measure again"
     )
 
 
 async def _change_face(line: GeoComConnection, *, at_prism: bool) -> None:
-    reply = await line.call(Rpc.AUT_CHANGE_FACE, 0, int(at_prism), 0, timeout_s=_FACE_S)
-    if not done(reply):
+    reply = await line.call(Rpc.AUT_CHANGE_FACE, 0, int(at_prism), 0, timeout_s=_CHANGE_FACE_TIMEOUT_S)
+    if not succeeded(reply):
         raise InstrumentRefusedError(
             f"the instrument does not change its face: {name_of(reply.code)}; measure in one face (target_faces = 1)"
         )

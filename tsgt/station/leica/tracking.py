@@ -1,148 +1,189 @@
-"""Tracking with a Leica instrument: its distances, each once, its lock watched, its prism looked for when it is lost."""
+"""Tracking with a Leica instrument: polls distances, each once, monitors the lock, and reacquires a lost target."""
 
 from __future__ import annotations
 
 import asyncio
+from collections import deque
 from typing import TYPE_CHECKING, Final
 
 import structlog
 
 from tsgt.errors import InstrumentError
 from tsgt.model import Status
-from tsgt.station.geocom import Rpc, Verdict, name_of, verdict
-from tsgt.station.leica.measurement import REPEAT_NS, FullMeasurement, Readings, full_measurement
-from tsgt.station.leica.reacquisition import (
-    LOOKING,
-    NARROWEST_RAD,
-    WIDEST_ADJUST_RAD,
-    Handover,
-    Lock,
-    Look,
-    LossSequence,
-    Pointing,
-    apart_rad,
-    pointing_at,
+from tsgt.station.geocom import Outcome, Rpc, name_of, outcome_of
+from tsgt.station.leica.measurement import (
+    STATUS_INTERVAL_NS,
+    FullMeasurement,
+    ReadingFactory,
+    decode_full_measurement,
 )
-from tsgt.station.leica.search import Finder, LicenceMissing, pointing
-from tsgt.station.leica.setup import clear
-from tsgt.station.leica.timing import IDLE_NS, Pace
+from tsgt.station.leica.reacquisition import (
+    Lock,
+    ManualPointingDetector,
+    Pointing,
+    ReacquisitionSequence,
+    SearchWindow,
+    angular_distance_rad,
+    centre_of,
+    window_at_direction,
+    window_at_pointing,
+)
+from tsgt.station.leica.search import RoboticLicenceMissing, TargetSearch, pointing
+from tsgt.station.leica.setup import clear_distance
 
 if TYPE_CHECKING:
     from tsgt.clock import Clock
     from tsgt.radio import Direction
     from tsgt.station.geocom import GeoComConnection
     from tsgt.station.instrument import Reading
-    from tsgt.station.leica.timing import InstrumentTimes
+    from tsgt.station.leica.timing import DistanceTimestamper
 
 log = structlog.get_logger()
 
 WAIT_MS: Final = 100
-"""How long an instrument without a distance waits for one before it answers: lost prisms are noticed this fast."""
+"""How long an instrument without a distance waits for one before it replies; bounds the delay of noticing a lost target."""
 
-_POLL_S: Final = 1.5  # instruments pause for 0.7 s now and then
-_LOCK_NS: Final = 2_000_000_000  # between two looks at the lock, while distances come
-_LOST_LOCK_NS: Final = 250_000_000  # and while they do not
-_STALE_NS: Final = 1_500_000_000  # the same distance for longer than this is no tracking
+_POLL_TIMEOUT_S: Final = 1.5  # instruments pause for 0.7 s now and then
+_IDLE_NS: Final = 100_000_000  # between two polls without a distance
+_LOCK_INTERVAL_NS: Final = 2_000_000_000  # between two lock queries while distances arrive
+_NO_LOCK_INTERVAL_NS: Final = 250_000_000  # and while they do not
+_STALE_NS: Final = 1_500_000_000  # an unchanged distance for longer than this is no tracking
 _GAP_NS: Final = 600_000_000
 _RESTART_NS: Final = 3_000_000_000
-_STARTING_NS: Final = 600_000_000
-_SURE: Final = 3  # an answer that nothing can be done about is asked for again
-_UNSAID: Final = 12  # asked so often, an instrument that never says whether it is locked in is taken at not
-_ROOM_NS: Final = 120_000_000
-_ADJUST = 2 * NARROWEST_RAD
+_STARTUP_NS: Final = 600_000_000
+_MAX_UNAVAILABLE: Final = 3  # a single such reply is not conclusive
+_MAX_LOCK_QUERIES: Final = (
+    12  # an instrument that never reports its lock state is then taken as not locked on
+)
+_LOCK_QUERY_NS: Final = 120_000_000
+
+_INTERVALS: Final = 16
+_MIN_INTERVALS: Final = 4
+_MAX_INTERVAL_MS: Final = 5_000
+_EARLY_NS: Final = 10_000_000  # polling starts this long before the next distance is due, as intervals vary
+_PROBE_EVERY: Final = (
+    24  # after this many distances one interval is polled throughout, to detect a higher rate
+)
+
+
+class PollScheduler:
+    """Schedules polls from the intervals of the instrument's distances.
+
+    Between two distances the instrument repeats the last one. Where distances arrive more slowly than replies, most polls
+    would be useless.
+    """
+
+    def __init__(self) -> None:
+        self._last_ms: int | None = None
+        self._intervals_ms: deque[int] = deque(maxlen=_INTERVALS)
+        self._count = 0
+
+    @property
+    def interval_ns(self) -> int | None:
+        """The shortest recent interval between two distances; None where it is unknown."""
+        return min(self._intervals_ms) * 1_000_000 if len(self._intervals_ms) >= _MIN_INTERVALS else None
+
+    def add_distance(self, instrument_ms: int) -> None:
+        """Add the instrument's time of a new distance."""
+        if self._last_ms is not None and 0 < instrument_ms - self._last_ms < _MAX_INTERVAL_MS:
+            self._intervals_ms.append(instrument_ms - self._last_ms)
+        self._last_ms = instrument_ms
+        self._count += 1
+
+    def next_ns(self, distance_ns: int, round_trip_ns: int) -> int:
+        """Return when to poll for the distance after one; 0: at once.
+
+        Parameters
+        ----------
+        distance_ns
+            When the fastest reply with that one could have arrived.
+        round_trip_ns
+            From a request to the fastest reply.
+        """
+        interval_ns = self.interval_ns
+        if interval_ns is None or self._count % _PROBE_EVERY == 0:
+            return 0
+        return distance_ns + interval_ns - round_trip_ns - _EARLY_NS
 
 
 class Tracking:
-    """What tracks, over one connection.
-
-    Parameters
-    ----------
-    line
-        To the instrument.
-    clock
-        Of the host.
-    times
-        Puts distances in time; outlives the connection.
-    sequence
-        Says what to do about a lost prism; outlives the connection.
-    finder
-        Searches; None without the licence for it: a person points then, and nothing is moved.
+    """Tracking over one connection. ``timestamper`` and ``sequence`` outlive the connection.
 
     Attributes
     ----------
     activity
-        What is being done, for people.
-    call_for
-        What a person is asked to do; empty when nothing.
+        Current activity, for the operator.
+    operator_request
+        Action required of the operator; empty for none.
     tilted
-        Whether the instrument says that it is not level.
-    finder
-        The same; gone when the instrument says that the licence is missing.
+        Whether the instrument reports that it is not level.
+    target_search
+        None without the licence for it: the operator points the telescope then, and nothing is moved.
     """
 
     def __init__(
         self,
         line: GeoComConnection,
         clock: Clock,
-        times: InstrumentTimes,
-        sequence: LossSequence,
-        finder: Finder | None,
+        timestamper: DistanceTimestamper,
+        sequence: ReacquisitionSequence,
+        target_search: TargetSearch | None,
     ) -> None:
         self._line = line
         self._clock = clock
-        self._times = times
+        self._timestamper = timestamper
         self._sequence = sequence
-        self.finder = finder
+        self.target_search = target_search
         self.activity = ""
-        self.call_for = ""
+        self.operator_request = ""
         self.tilted = False
-        self._pace = Pace()
+        self._poll_scheduler = PollScheduler()
         self._lock = Lock.OUT
-        self._lock_unsaid = _UNSAID
-        self._lock_asked_ns = 0
-        self._good_from_ns = 0
+        self._lock_queries_left = _MAX_LOCK_QUERIES  # 0 once the lock state is known
+        self._lock_queried_ns = 0
+        self._valid_from_ns = 0
         self._lost_ns: int | None = None
-        self._handover: Handover | None = None
+        self._manual_pointing: ManualPointingDetector | None = None
         self._search: asyncio.Task[bool] | None = None
         self._rounds = 0
-        self._round_trip_ns = _ROOM_NS
-        self._next_ns = 0
+        self._round_trip_ns = _LOCK_QUERY_NS
+        self._next_poll_ns = 0
         self._started_ns = 0
-        self._last_new_ns = 0
+        self._last_distance_ns = 0
         self._unavailable = 0
-        self._readings = Readings(0, times.latency_ns)
+        self._readings = ReadingFactory(0, timestamper.latency_ns)
 
-    # --- What is tracked --------------------------------------------------------------------------------------
+    # --- Commands ---------------------------------------------------------------------------------------------
 
     async def start(self, prism: int) -> None:
-        """Begin with a prism. An instrument that is locked in on one already keeps that."""
+        """Start with a prism; an instrument that is locked on keeps its lock."""
         self._readings.prism = prism
         self.activity = f"beginning with prism {prism}"
-        if self.finder is not None:
-            await self._ask_lock(self.finder)
-        await self.measure()
+        if self.target_search is not None:
+            await self._query_lock(self.target_search)
+        await self.start_measuring()
 
-    async def measure(self) -> None:
-        """Have distances taken, from now on, whatever has stopped that."""
+    async def start_measuring(self) -> None:
+        """Start continuous measurements."""
         await self._line.call(Rpc.TMC_DO_MEASURE, 1, 1)
-        self._started_ns = self._last_new_ns = self._clock.monotonic_ns()
-        self._next_ns = 0
+        self._started_ns = self._last_distance_ns = self._clock.monotonic_ns()
+        self._next_poll_ns = 0
 
     @property
     def prism(self) -> int:
-        """Number of the prism."""
+        """Number of the tracked prism."""
         return self._readings.prism
 
     @property
-    def waits_for_person(self) -> bool:
+    def awaits_operator(self) -> bool:
         """Whether the prism was changed, and the new one has not been found."""
-        return self._handover is not None
+        return self._manual_pointing is not None
 
-    async def look_for(self, towards: Direction | None) -> None:
-        """Look for the prism now, unless it is locked in on, and where it is believed to be."""
-        if self._handover is not None:
+    async def search_for(self, towards: Direction | None) -> None:
+        """Search for the prism now, at its expected direction, unless the instrument is locked on it."""
+        if self._manual_pointing is not None:
             if towards is not None:
-                await self._look_once(towards)
+                await self._search_once(towards)
             return
         if towards is None:
             if self._lock is not Lock.IN and self._search is None:
@@ -150,37 +191,33 @@ class Tracking:
             return
         if self._lock is Lock.IN and await self._points_at(towards):
             return
-        again = self._sequence.restart(towards, self._clock.monotonic_ns())
-        # While it locks in, it is not sent elsewhere: with an order every few seconds it might never come to an end.
-        if not again and not (self.finder is not None and self.finder.has_found):
+        correction = self._sequence.restart(towards, self._clock.monotonic_ns())
+        # A search that only has to lock on is not interrupted: commands every few seconds might never let it finish.
+        if not correction and not (self.target_search is not None and self.target_search.target_found):
             await self.stop_search()
         if self._lock is Lock.IN:
-            await self._let_go()
+            await self._release_lock()
 
-    async def change(self, prism: int, towards: Direction | None) -> None:
-        """Let the prism go and take another; a person points at it unless its direction is known."""
+    async def change_prism(self, prism: int, towards: Direction | None) -> None:
+        """Release the prism and track another one; the operator points at it unless its direction is known."""
         await self.stop_search()
-        await self._let_go()
-        self._sequence.forget()
+        await self._release_lock()
+        self._sequence.reset()
         self._readings.prism = prism
-        self._handover = Handover(await pointing(self._line), self._clock.monotonic_ns())
-        if towards is None or not await self._look_once(towards):
-            await self._call(f"point the telescope at prism {prism}")
+        self._manual_pointing = ManualPointingDetector(await pointing(self._line), self._clock.monotonic_ns())
+        if towards is None or not await self._search_once(towards):
+            await self._call_operator(f"point the telescope at prism {prism}")
 
-    async def _look_once(self, towards: Direction) -> bool:
-        """Look for a prism that was not tracked before in one place alone: elsewhere there may be others."""
-        if self.finder is None:
+    async def _search_once(self, towards: Direction) -> bool:
+        """Search for a new prism at its expected direction only: elsewhere there may be other prisms."""
+        if self.target_search is None:
             return False
         await self.stop_search()
-        size_rad = min(max(2 * towards.spread_rad, NARROWEST_RAD), WIDEST_ADJUST_RAD)
-        self._begin(
-            self.finder,
-            Look("looking where the master says", False, pointing_at(towards), size_rad, size_rad),
-        )
+        self._start_search(self.target_search, window_at_direction(towards))
         return True
 
-    async def stop_search(self, *, go_on: bool = True) -> None:
-        """End a search that is under way, and go on measuring."""
+    async def stop_search(self, *, resume: bool = True) -> None:
+        """Abort a search in progress, and resume measuring."""
         search, self._search = self._search, None
         if search is None:
             return
@@ -191,23 +228,23 @@ class Tracking:
             search.exception()
         if running:
             await self._line.abort()
-            if go_on:
-                await self.measure()
+            if resume:
+                await self.start_measuring()
 
-    async def _let_go(self) -> None:
-        if self.finder is not None:
+    async def _release_lock(self) -> None:
+        if self.target_search is not None:
             try:
-                await self.finder.release()
-            except LicenceMissing:
-                self._give_up_searching()
-        await clear(self._line)
+                await self.target_search.release_lock()
+            except RoboticLicenceMissing:
+                self._disable_search()
+        await clear_distance(self._line)
         self._lock = Lock.OUT
-        await self.measure()
-        self._good_from_ns = self._started_ns
+        await self.start_measuring()
+        self._valid_from_ns = self._started_ns
 
     async def _points_at(self, towards: Direction) -> bool:
         here = await pointing(self._line)
-        return here is not None and apart_rad(here, pointing_at(towards)) <= towards.spread_rad
+        return here is not None and angular_distance_rad(here, centre_of(towards)) <= towards.spread_rad
 
     # --- Readings ---------------------------------------------------------------------------------------------
 
@@ -220,178 +257,184 @@ class Tracking:
 
     async def _poll(self) -> Reading | None:
         now_ns = self._clock.monotonic_ns()
-        # Now and then, while no distance can be there; or else less often.
-        lock_ns = _LOCK_NS if self._next_ns - now_ns >= _ROOM_NS else 2 * _LOCK_NS
-        if self.finder is not None and now_ns - self._lock_asked_ns >= lock_ns:
-            await self._ask_lock(self.finder)
+        # The lock is queried while no distance is due, otherwise at half the rate.
+        idle = self._next_poll_ns - now_ns >= _LOCK_QUERY_NS
+        lock_interval_ns = _LOCK_INTERVAL_NS if idle else 2 * _LOCK_INTERVAL_NS
+        if self.target_search is not None and now_ns - self._lock_queried_ns >= lock_interval_ns:
+            await self._query_lock(self.target_search)
         else:
-            await self._times.keep_known(self._line, self._clock, self._next_ns)
+            await self._timestamper.maintain(self._line, self._clock, self._next_poll_ns)
         now_ns = self._clock.monotonic_ns()
-        if self._next_ns - now_ns > 1_000_000:
-            await self._clock.sleep_until(self._next_ns)
-        reply = await self._line.call(Rpc.TMC_GET_FULL_MEAS, WAIT_MS, 1, timeout_s=_POLL_S)
+        if self._next_poll_ns - now_ns > 1_000_000:
+            await self._clock.sleep_until(self._next_poll_ns)
+        reply = await self._line.call(Rpc.TMC_GET_FULL_MEAS, WAIT_MS, 1, timeout_s=_POLL_TIMEOUT_S)
         self._round_trip_ns = min(self._round_trip_ns, reply.first_byte_ns - reply.sent_ns)
-        judged = verdict(reply.code, has_values=bool(reply.values))
-        if judged is Verdict.SHUT_DOWN:
+        outcome = outcome_of(reply.code, has_values=bool(reply.values))
+        if outcome is Outcome.SHUT_DOWN:
             raise InstrumentError("the instrument is switching off")
-        self._unavailable = self._unavailable + 1 if judged is Verdict.UNAVAILABLE else 0
-        if self._unavailable >= _SURE:
+        self._unavailable = self._unavailable + 1 if outcome is Outcome.UNAVAILABLE else 0
+        if self._unavailable >= _MAX_UNAVAILABLE:
             raise InstrumentError(
-                f"the instrument does not know TMC_GetFullMeas ({name_of(reply.code)}), so that distances have no times;"
-                " it takes a TPS1200+ or newer"
+                f"the instrument does not support TMC_GetFullMeas ({name_of(reply.code)}), so that distances have no times;"
+                " a TPS1200+ or newer is required"
             )
-        if judged is Verdict.BUSY and reply.first_byte_ns - self._last_new_ns < _STALE_NS:
-            self._next_ns = self._clock.monotonic_ns() + IDLE_NS
+        if outcome is Outcome.BUSY and reply.first_byte_ns - self._last_distance_ns < _STALE_NS:
+            self._next_poll_ns = self._clock.monotonic_ns() + _IDLE_NS
             return None
-        measured = full_measurement(reply)
+        measured = decode_full_measurement(reply)
         self.tilted = measured.status is Status.TILT
         if measured.time_ms is None:
-            return await self._without(measured)
+            return await self._without_distance(measured)
         return await self._with_distance(measured, measured.time_ms)
 
     async def _with_distance(self, measured: FullMeasurement, time_ms: int) -> Reading | None:
-        if not self._times.is_new(time_ms):
-            if measured.first_byte_ns - self._last_new_ns < max(_STALE_NS, 3 * (self._pace.interval_ns or 0)):
+        since_last_ns = measured.first_byte_ns - self._last_distance_ns
+        interval_ns = self._poll_scheduler.interval_ns or 0
+        if not self._timestamper.is_new(time_ms):
+            if since_last_ns < max(_STALE_NS, 3 * interval_ns):
                 return None
-            return await self._without(measured._replace(status=Status.NO_TARGET))
-        stamp = self._times.stamp(measured)
-        # After a gap the prism may be gone, and another one cross the line of sight.
-        gap = measured.first_byte_ns - self._last_new_ns > max(_GAP_NS, 3 * (self._pace.interval_ns or 0))
-        if self.finder is not None and (gap or self._lock is not Lock.IN) and self._handover is None:
-            await self._ask_lock(self.finder)
-        self._times.given(time_ms)
-        self._pace.distance(time_ms)
-        self._last_new_ns = measured.first_byte_ns
-        if stamp is None:
+            return await self._without_distance(measured._replace(status=Status.NO_TARGET))
+        time = self._timestamper.timestamp(measured)
+        # After a gap the target may be lost, and another one cross the line of sight.
+        gap = since_last_ns > max(_GAP_NS, 3 * interval_ns)
+        if self.target_search is not None and (gap or self._lock is not Lock.IN) and not self.awaits_operator:
+            await self._query_lock(self.target_search)
+        self._timestamper.mark_reported(time_ms)
+        self._poll_scheduler.add_distance(time_ms)
+        self._last_distance_ns = measured.first_byte_ns
+        if time is None:
             return None
-        if self._handover is not None or (self.finder is not None and self._lock is not Lock.IN):
-            return await self._without(measured._replace(status=Status.NO_TARGET))
-        if stamp.at_ns < self._good_from_ns:
+        if self.awaits_operator or (self.target_search is not None and self._lock is not Lock.IN):
+            return await self._without_distance(measured._replace(status=Status.NO_TARGET))
+        if time.at_ns < self._valid_from_ns:
             return None
-        self._next_ns = self._pace.next_ns(stamp.at_ns + self._times.latency_ns, self._round_trip_ns)
-        self._found(Pointing(measured.horizontal_angle_rad, measured.zenith_angle_rad))
-        return self._readings.with_distance(measured, stamp)
+        self._next_poll_ns = self._poll_scheduler.next_ns(
+            time.at_ns + self._timestamper.latency_ns, self._round_trip_ns
+        )
+        self._target_found(Pointing(measured.horizontal_angle_rad, measured.zenith_angle_rad))
+        return self._readings.with_distance(measured, time)
 
-    async def _without(self, measured: FullMeasurement) -> Reading | None:
-        """Do what is to be done without a distance, and tell why there is none, unless that was told just now."""
+    async def _without_distance(self, measured: FullMeasurement) -> Reading | None:
+        """Reacquire the target, and report why there is no distance, unless it was reported just now."""
         now_ns = self._clock.monotonic_ns()
-        self._next_ns = now_ns + IDLE_NS
-        if self._handover is not None:
-            await self._hand_over(self._handover)
-        elif self.finder is not None:
-            if now_ns - self._lock_asked_ns >= _LOST_LOCK_NS:
-                await self._ask_lock(self.finder)
-            if measured.status is not Status.TILT and not self._lock_unsaid:
-                await self._look(self.finder)
-        if self._search is None and now_ns - self._last_new_ns > _RESTART_NS:
-            await self.measure()
-        starting = (self.finder is None or self._lock is Lock.IN) and now_ns - self._started_ns < _STARTING_NS
+        self._next_poll_ns = now_ns + _IDLE_NS
+        if self._manual_pointing is not None:
+            await self._await_manual_pointing(self._manual_pointing)
+        elif self.target_search is not None:
+            if now_ns - self._lock_queried_ns >= _NO_LOCK_INTERVAL_NS:
+                await self._query_lock(self.target_search)
+            if measured.status is not Status.TILT and not self._lock_queries_left:
+                await self._search_next(self.target_search)
+        if self._search is None and now_ns - self._last_distance_ns > _RESTART_NS:
+            await self.start_measuring()
+        locked = self.target_search is None or self._lock is Lock.IN
         status = measured.status
-        if status is Status.ANGLE_ONLY and self.finder is not None and self._lock is not Lock.IN:
+        if status is Status.ANGLE_ONLY and not locked:
             status = Status.NO_TARGET
+        starting = locked and now_ns - self._started_ns < _STARTUP_NS
         if starting and status in (Status.ANGLE_ONLY, Status.NO_TARGET):
             return None
-        return self._readings.without(measured._replace(status=status))
+        return self._readings.without_distance(measured._replace(status=status))
 
-    # --- The lock ---------------------------------------------------------------------------------------------
+    # --- Lock and reacquisition -------------------------------------------------------------------------------
 
-    async def _ask_lock(self, finder: Finder) -> None:
-        lock = await finder.lock()
-        if lock is not None:  # what was so is still so: a search would end a lock
+    async def _query_lock(self, target_search: TargetSearch) -> None:
+        lock = await target_search.lock_state()
+        if lock is not None:  # otherwise keep the last known state: a search would release a lock
             self._lock = lock
-        self._lock_unsaid = max(self._lock_unsaid - 1, 0) if lock is None else 0
-        self._lock_asked_ns = self._clock.monotonic_ns()
+        self._lock_queries_left = max(self._lock_queries_left - 1, 0) if lock is None else 0
+        self._lock_queried_ns = self._clock.monotonic_ns()
         if self._lock is Lock.IN:
-            self.call_for = ""
+            self.operator_request = ""
         elif self._lost_ns is None:
-            self._lost_ns = self._lock_asked_ns
+            self._lost_ns = self._lock_queried_ns
             log.info("prism_lost", prism=self.prism)
 
-    def _found(self, where: Pointing) -> None:
+    def _target_found(self, where: Pointing) -> None:
         if self._lost_ns is not None:
             after_s = (self._clock.monotonic_ns() - self._lost_ns) / 1e9
             log.info("prism_found", prism=self.prism, after_s=round(after_s, 1))
             self._lost_ns = None
         self._rounds = 0
-        self.call_for = ""
+        self.operator_request = ""
         self.activity = f"tracking prism {self.prism}"
-        self._sequence.seen(where)
+        self._sequence.lock_acquired(where)
 
-    async def _look(self, finder: Finder) -> None:
-        """Start the next search, if it is time for one."""
-        look = self._sequence.next(self._lock, self._clock.monotonic_ns())
-        if look is not None:
-            self._begin(finder, look)
-            return
-        if self._lock is Lock.PREDICTION:
+    async def _search_next(self, target_search: TargetSearch) -> None:
+        """Start the next search if one is due."""
+        window = self._sequence.next(self._lock, self._clock.monotonic_ns())
+        if window is not None:
+            self._start_search(target_search, window)
+        elif self._lock is Lock.PREDICTION:
             self.activity = "waiting for the prism to come back"
         elif self._lock is Lock.OUT:
             self.activity = "pausing between searches"
             if self._sequence.rounds > self._rounds:
                 self._rounds = self._sequence.rounds
-                await self._call(f"point the telescope at prism {self.prism}, it is not found")
+                await self._call_operator(f"point the telescope at prism {self.prism}, it is not found")
 
-    async def _hand_over(self, handover: Handover) -> None:
-        """See whether a person has pointed the telescope at the other prism."""
+    async def _await_manual_pointing(self, detector: ManualPointingDetector) -> None:
+        """Check whether the operator has pointed the telescope at the new prism."""
         self.activity = f"waiting for the telescope to be pointed at prism {self.prism}"
-        finder, now_ns = self.finder, self._clock.monotonic_ns()
-        if finder is not None and now_ns - self._lock_asked_ns > 1_000_000_000:
-            await self._ask_lock(finder)
-            if self._lock is Lock.IN:  # by hand
-                self._take_over()
+        target_search, now_ns = self.target_search, self._clock.monotonic_ns()
+        if target_search is not None and now_ns - self._lock_queried_ns > 1_000_000_000:
+            await self._query_lock(target_search)
+            if self._lock is Lock.IN:  # locked on by hand
+                self._accept_prism()
                 return
         here = await pointing(self._line)
-        if here is None or not handover.points(here, now_ns):
+        if here is None or not detector.update(here, now_ns):
             return
-        if finder is not None:
-            self._begin(
-                finder, Look(LOOKING, sweep=False, centre=None, width_rad=_ADJUST, height_rad=_ADJUST)
-            )
+        if target_search is not None:
+            self._start_search(target_search, window_at_pointing())
         else:
-            self._take_over()
+            self._accept_prism()
 
-    def _take_over(self) -> None:
-        self._handover = None
-        self.call_for = ""
-        self._good_from_ns = self._clock.monotonic_ns()
+    def _accept_prism(self) -> None:
+        self._manual_pointing = None
+        self.operator_request = ""
+        self._valid_from_ns = self._clock.monotonic_ns()
 
-    def _begin(self, finder: Finder, look: Look) -> None:
-        self.activity = look.name
-        self._search = asyncio.create_task(finder.look(look))
+    def _start_search(self, target_search: TargetSearch, window: SearchWindow) -> None:
+        self.activity = window.name
+        self._search = asyncio.create_task(target_search.search(window))
 
     async def _wait_for(self, search: asyncio.Task[bool]) -> Reading | None:
-        """Wait for a search to end, but not longer than until it is time to say that there is no prism."""
-        await asyncio.wait({search}, timeout=REPEAT_NS / 1e9)
+        """Wait for a search to end, at most until the missing target has to be reported again."""
+        await asyncio.wait({search}, timeout=STATUS_INTERVAL_NS / 1e9)
         if not search.done():
             now_ns = self._clock.monotonic_ns()
-            return self._readings.without(FullMeasurement(0.0, 0.0, None, None, Status.NO_TARGET, 0, now_ns))
+            return self._readings.without_distance(
+                FullMeasurement(0.0, 0.0, None, None, Status.NO_TARGET, 0, now_ns)
+            )
         self._search = None
         try:
             locked = search.result()
-        except LicenceMissing:
+        except RoboticLicenceMissing:
             locked = False
-            self._give_up_searching()
+            self._disable_search()
         now_ns = self._clock.monotonic_ns()
         self._lock = Lock.IN if locked else Lock.OUT
-        # One that has found nothing does not tell whether a person has locked in meanwhile: the next would undo that.
-        self._lock_asked_ns = now_ns if locked else 0
+        # A failed search does not reveal whether the operator has locked on meanwhile, so query the lock at once: another
+        # search would release it.
+        self._lock_queried_ns = now_ns if locked else 0
         if locked:
-            self._take_over()
-        elif self._handover is not None:
-            # It may have been turned by itself: only from here on it is a person who turns it.
-            self._handover = Handover(await pointing(self._line), now_ns)
-            await self._call(f"point the telescope at prism {self.prism}")
-        await self.measure()
+            self._accept_prism()
+        elif self.awaits_operator:
+            # The search may have turned the telescope; only later movements are the operator's.
+            self._manual_pointing = ManualPointingDetector(await pointing(self._line), now_ns)
+            await self._call_operator(f"point the telescope at prism {self.prism}")
+        await self.start_measuring()
         return None
 
-    async def _call(self, for_what: str) -> None:
-        """Ask a person to do something, and beep."""
-        self.call_for = for_what
-        log.warning("operator_required", what=for_what)
+    async def _call_operator(self, request: str) -> None:
+        """Ask the operator to act, and beep."""
+        self.operator_request = request
+        log.warning("operator_required", what=request)
         await self._line.call(Rpc.BMM_BEEP_ALARM)
 
-    def _give_up_searching(self) -> None:
-        """Go on without: the licence is missing."""
-        if self.finder is not None:
+    def _disable_search(self) -> None:
+        """Continue without searches: the licence is missing."""
+        if self.target_search is not None:
             log.warning("licence_missing")
-        self.finder = None
+        self.target_search = None

@@ -1,4 +1,4 @@
-"""The seam between a station's client and the protocol that it speaks over the radio."""
+"""The interface between a station's client and its radio protocol."""
 
 from __future__ import annotations
 
@@ -6,36 +6,36 @@ from typing import TYPE_CHECKING, NoReturn, Protocol
 
 if TYPE_CHECKING:
     from tsgt.model import PolarMeasurement
-    from tsgt.radio import DirectOrder, Radio, SearchOrder, TrackOrder
+    from tsgt.radio import DirectCommand, Radio, SearchCommand, TrackCommand
     from tsgt.recording.journal import TargetRecord
     from tsgt.station.status import LinkStatus
 
 
 class Link(Protocol):
-    """Answers the master. It hands out one order at a time, and is told what became of it."""
+    """Replies to the master. It hands out one command at a time and is given its result."""
 
     def offer(self, measurement: PolarMeasurement) -> None:
-        """Take a measurement of a tracked prism, which has been journalled."""
+        """Take a journalled measurement of a tracked prism for delivery."""
         ...
 
-    def executed(self, order: TrackOrder | SearchOrder | DirectOrder, *, ok: bool) -> None:
-        """Answer an order that has been carried out, or has failed."""
+    def respond(self, command: TrackCommand | SearchCommand | DirectCommand, *, ok: bool) -> None:
+        """Respond to a command that was executed or has failed."""
         ...
 
-    def shot(self, target: TargetRecord | None) -> None:
-        """Answer an order for a single measurement, which has been journalled; None: it has failed."""
+    def respond_single(self, target: TargetRecord | None) -> None:
+        """Respond with a journalled single measurement; None: it has failed."""
         ...
 
-    async def talk(self, radio: Radio) -> NoReturn:
-        """Answer the master over this radio, until it fails.
+    async def run(self, radio: Radio) -> NoReturn:
+        """Reply to the master over this radio until the radio fails.
 
         Raises
         ------
         RadioError
-            It has failed.
+            The radio has failed.
         """
         ...
 
     def status(self) -> LinkStatus:
-        """Say how it goes."""
+        """Return the link's current status."""
         ...

@@ -1,4 +1,4 @@
-"""A station's client on the paper's protocol: it answers whatever it is asked, at once."""
+"""The classic link of a station: replies at once to each request of the paper's polling protocol."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ import structlog
 
 from tsgt.errors import RadioError
 from tsgt.model import Status
-from tsgt.radio import SearchOrder
-from tsgt.radio.classic import MeasurementMessage, decode_command, raw_status
-from tsgt.radio.classic.transactions import TURN_ROUND_NS, ClassicStation
-from tsgt.station.links.traffic_monitor import Strangers
+from tsgt.radio import SearchCommand
+from tsgt.radio.classic import TURNAROUND_NS, ClassicStation, MeasurementMessage, decode_command, raw_status
+from tsgt.station.links.traffic_monitor import UnknownTrafficMonitor
 from tsgt.station.status import LinkStatus
 
 if TYPE_CHECKING:
@@ -19,103 +18,99 @@ if TYPE_CHECKING:
 
     from tsgt.clock import Clock, UnixTimeline
     from tsgt.model import PolarMeasurement
-    from tsgt.radio import DirectOrder, Order, Packet, Radio, TrackOrder
+    from tsgt.radio import Command, DirectCommand, Packet, Radio, TrackCommand
     from tsgt.recording.journal import TargetRecord
-    from tsgt.station.session import Session
+    from tsgt.station.session import ClientSession
 
-LATEST_ANSWER_NS = 20_000_000_000
-"""An answer to an order that took longer is not sent: the master has given up, and asks others meanwhile."""
+RESPONSE_TIMEOUT_NS = 20_000_000_000
+"""A later response is not sent: the master has given up and polls other stations."""
 
-EXACT_SIGMA_NS = 1_000_000
-"""RPi.GPIO's edges have this; the stamp of a packet that was found without its edge is a guess, tens of ms wide."""
+MAX_EDGE_SIGMA_NS = 1_000_000
+"""The jitter of edges from RPi.GPIO. A packet found without its edge has a timestamp uncertain by tens of ms."""
 
 log = structlog.get_logger()
 
 
 class ClassicLink:
-    """The shell around :class:`~tsgt.radio.classic.station.ClassicStation`; see :class:`~tsgt.station.links.base.Link`.
+    """The asyncio half of :class:`~tsgt.radio.classic.ClassicStation`; a :class:`~tsgt.station.links.base.Link`.
 
     Parameters
     ----------
     session
-        Knows what is tracked.
-    clock, timeline
-        Of this computer.
-    on_order
-        Gets the master's orders.
-    begin
-        Runs a coroutine beside the radio's own task, which goes on answering.
+        Supplies mode and prism.
+    on_command
+        Called with each command of the master.
+    create_task
+        Runs a coroutine concurrently with the radio's task, which keeps replying.
     """
 
     def __init__(
         self,
-        session: Session,
+        session: ClientSession,
         clock: Clock,
         timeline: UnixTimeline,
         *,
-        on_order: Callable[[Order], None],
-        begin: Callable[[Coroutine[Any, Any, None]], object],
+        on_command: Callable[[Command], None],
+        create_task: Callable[[Coroutine[Any, Any, None]], object],
     ) -> None:
         self._session = session
         self._clock = clock
         self._timeline = timeline
-        self._on_order = on_order
-        self._begin = begin
+        self._on_command = on_command
+        self._create_task = create_task
         self._station = ClassicStation(session.station)
         self._radio: Radio | None = None
-        self._heard: Packet | None = None
-        self._strangers = Strangers(clock)
-        self._ordered_ns = 0
+        self._last_packet: Packet | None = None
+        self._traffic_monitor = UnknownTrafficMonitor(clock)
+        self._command_ns = 0
 
     def offer(self, measurement: PolarMeasurement) -> None:
-        """Answer the master with this one from now on.
-
-        One that the disk held up until the station did something else is not offered any more.
-        """
+        """Reply with this measurement from now on, unless mode or prism have changed while the disk delayed it."""
         if self._session.mode == "tracking" and measurement.prism == self._session.prism:
             self._station.measured(_message(measurement))
 
-    def executed(self, order: TrackOrder | SearchOrder | DirectOrder, *, ok: bool) -> None:
-        """See the protocol; the master cannot order a search."""
-        if not isinstance(order, SearchOrder):
-            self._answer(self._station.executed(order, ok=ok))
+    def respond(self, command: TrackCommand | SearchCommand | DirectCommand, *, ok: bool) -> None:
+        """Send the response; this protocol has no search command."""
+        if not isinstance(command, SearchCommand):
+            self._send_response(self._station.executed(command, ok=ok))
 
-    def shot(self, target: TargetRecord | None) -> None:
-        """See the protocol."""
-        if target is not None:
-            self._answer(self._station.shot(_message(target)))
-            return
-        failed = MeasurementMessage(
-            station=self._session.station,
-            status=raw_status(Status.ERROR),
-            zenith_angle_rad=0.0,
-            horizontal_angle_rad=0.0,
-            slope_distance_m=0.0,
-            time_ns=self._now_ns(),
+    def respond_single(self, target: TargetRecord | None) -> None:
+        """Send a single measurement, or an error status."""
+        message = (
+            _message(target)
+            if target is not None
+            else MeasurementMessage(
+                station=self._session.station,
+                status=raw_status(Status.ERROR),
+                zenith_angle_rad=0.0,
+                horizontal_angle_rad=0.0,
+                slope_distance_m=0.0,
+                time_ns=self._now_ns(),
+            )
         )
-        self._answer(self._station.shot(failed))
+        self._send_response(self._station.single_measured(message))
 
-    def _answer(self, answer: bytes) -> None:
-        late_ns = self._now_ns() - self._ordered_ns
-        if self._radio is None or late_ns > LATEST_ANSWER_NS:
-            log.warning("order_unanswered", late_s=late_ns / 1e9)
+    def _send_response(self, payload: bytes) -> None:
+        late_ns = self._now_ns() - self._command_ns
+        if self._radio is None or late_ns > RESPONSE_TIMEOUT_NS:
+            log.warning("response_not_sent", late_s=late_ns / 1e9)
             return
-        self._begin(self._send(self._radio, answer))
+        self._create_task(self._transmit(self._radio, payload))
 
-    async def _send(self, radio: Radio, answer: bytes) -> None:
+    async def _transmit(self, radio: Radio, payload: bytes) -> None:
         try:
-            await radio.transmit(answer)
+            await radio.transmit(payload)
         except RadioError as error:
-            log.warning("order_unanswered", error=str(error))
+            log.warning("response_not_sent", error=str(error))
 
-    async def talk(self, radio: Radio) -> NoReturn:
-        """See the protocol; nothing on this way waits for anything but the radio."""
+    async def run(self, radio: Radio) -> NoReturn:
+        """Reply to each request; nothing here waits for anything but the radio."""
         self._radio = radio
         try:
             while True:
                 packet = await radio.receive()
-                if self._clock.monotonic_ns() - packet.received_at_ns > TURN_ROUND_NS:
-                    # This computer was busy; the master asks somebody else by now.
+                if self._clock.monotonic_ns() - packet.received_at_ns > TURNAROUND_NS:
+                    # This computer was busy; the master polls another station by now.
                     log.warning("request_expired")
                     continue
                 await self._received(packet, radio)
@@ -123,31 +118,31 @@ class ClassicLink:
             self._radio = None
 
     async def _received(self, packet: Packet, radio: Radio) -> None:
-        command = decode_command(packet.payload)
-        self._strangers.heard(master=command is not None)
-        if command is not None and command.station == self._session.station:
-            self._heard = packet
+        message = decode_command(packet.payload)
+        self._traffic_monitor.received(from_master=message is not None)
+        if message is not None and message.station == self._session.station:
+            self._last_packet = packet
         received_ns = self._timeline.unix_ns(packet.received_at_ns)
-        if packet.stamp_sigma_ns > EXACT_SIGMA_NS:
-            # What the master finds out of our clock rests on stamps that are never early. One that is late makes
-            # the exchange longer, and so counts in the bound.
+        if packet.stamp_sigma_ns > MAX_EDGE_SIGMA_NS:
+            # The master's offset bounds require timestamps that are never early. A late one lengthens the exchange and
+            # so widens the bound.
             received_ns = self._now_ns()
-        answer = self._station.received(packet.payload, received_ns)
-        if isinstance(answer, bytes):
-            await radio.transmit(answer)
-        elif answer is not None:
-            self._ordered_ns = received_ns
-            self._on_order(answer)
+        reply = self._station.received(packet.payload, received_ns)
+        if isinstance(reply, bytes):
+            await radio.transmit(reply)
+        elif reply is not None:
+            self._command_ns = received_ns
+            self._on_command(reply)
 
     def status(self) -> LinkStatus:
-        """See the protocol."""
-        heard = self._heard
+        """Return the link's current status."""
+        packet = self._last_packet
         return LinkStatus(
             protocol="classic",
-            heard_ns=None if heard is None else self._timeline.unix_ns(heard.received_at_ns),
-            rssi_dbm=None if heard is None else heard.rssi_dbm,
-            snr_db=None if heard is None else heard.snr_db,
-            unknown_packets=self._strangers.packets,
+            master_received_ns=None if packet is None else self._timeline.unix_ns(packet.received_at_ns),
+            rssi_dbm=None if packet is None else packet.rssi_dbm,
+            snr_db=None if packet is None else packet.snr_db,
+            unknown_packets=self._traffic_monitor.packets,
         )
 
     def _now_ns(self) -> int:
@@ -155,7 +150,7 @@ class ClassicLink:
 
 
 def _message(measurement: PolarMeasurement | TargetRecord) -> MeasurementMessage:
-    """Raw values, as the authors' nodes send them: no prism constant, 0 for a distance that is missing."""
+    """Encode raw values as the authors' nodes do: no prism constant, 0 for a missing distance."""
     return MeasurementMessage(
         station=measurement.station,
         status=raw_status(measurement.status),

@@ -1,4 +1,4 @@
-"""The seam between what speaks to an instrument and the line that carries it: a serial port, or a simulated one."""
+"""The interface of an instrument driver to its serial port, real or simulated."""
 
 from __future__ import annotations
 
@@ -7,53 +7,44 @@ from typing import Any, NamedTuple, Protocol
 
 
 class Chunk(NamedTuple):
-    """Bytes that came together.
-
-    Attributes
-    ----------
-    data
-        At least one byte.
-    at_ns
-        When this program was told of them, on CLOCK_MONOTONIC, in ns: at or after the end of the last one.
-    """
+    """Data received at once, at least one byte; ``at_ns`` (CLOCK_MONOTONIC) is not before the end of the last byte."""
 
     data: bytes
     at_ns: int
 
 
 class Port(Protocol):
-    """An open line with one owner.
+    """An open port with one owner.
 
-    Every method raises :class:`~tsgt.errors.InstrumentError` when the line is gone, and keeps doing so; it is closed
-    and opened again then.
+    Every method raises :class:`~tsgt.errors.InstrumentError` once the line is lost; the owner then closes and reopens it.
     """
 
     @property
     def name(self) -> str:
-        """Its name for people."""
+        """Name for messages."""
         ...
 
     @property
     def baud(self) -> int:
-        """Bits per second; a byte takes ten of them."""
+        """Bits per second; a byte takes ten bits."""
         ...
 
     def write(self, data: bytes) -> None:
-        """Send bytes; they are queued, nothing is waited for."""
+        """Queue data for sending; does not wait."""
         ...
 
     async def read(self) -> Chunk:
-        """Return the next bytes; may be cancelled without losing any."""
+        """Return the next data; may be cancelled without loss."""
         ...
 
     def drain(self) -> bytes:
-        """Return what has come and was not read, and forget it; nothing is waited for."""
+        """Return and discard unread data; does not wait."""
         ...
 
     async def close(self) -> None:
-        """Close it. What is still to be sent is lost."""
+        """Close the port; unsent data is lost."""
         ...
 
 
 OpenPort = Callable[[int], Coroutine[Any, Any, Port]]
-"""Opens the line at a number of bits per second; raises InstrumentError."""
+"""Opens the port at a baud rate; raises InstrumentError."""

@@ -1,4 +1,4 @@
-"""A serial port: opened for this program alone, with as little delay as its adapter allows, and closed whatever happens."""
+"""A serial port on asyncio: opened exclusively, and with the lowest latency that its adapter allows."""
 
 from __future__ import annotations
 
@@ -28,41 +28,32 @@ log = structlog.get_logger()
 
 _ROOT: Final = Path("/")
 _GOOD_LATENCY_MS: Final = 2
-_KEPT_CHUNKS: Final = 1024  # of 1 KiB at most; what nobody reads must not fill the memory
+_KEPT_CHUNKS: Final = 1024  # of at most 1 KiB; unread data must not fill the memory
 _PTY_MAJORS: Final = range(136, 144)
 
 _FAILURES: Final = (OSError, ValueError, termios.error)
-"""What pyserial lets through, its own SerialException being an OSError; ``termios.error`` is none."""
+"""Exceptions of pyserial: SerialException is an OSError, ``termios.error`` is not."""
 
 
 async def open_serial_port(path: Path, baud: int, clock: Clock) -> Port:
-    """Open a serial port: 8 bits, no parity, one stop bit, for this program alone.
-
-    Parameters
-    ----------
-    path
-        The device, or a link to it.
-    baud
-        Bits per second.
-    clock
-        Stamps what comes.
+    """Open a serial port exclusively, with 8 data bits, no parity and one stop bit.
 
     Raises
     ------
     InstrumentError
-        There is none, it is taken, or it may not be opened, or cannot at this speed.
+        The port does not exist, is in use, may not be opened, or does not support the baud rate.
     """
     try:
         device = serial.Serial(os.fspath(path), baud, timeout=0, exclusive=True)
     except _FAILURES as error:
-        raise InstrumentError(_why_not(path, baud, error)) from error
+        raise InstrumentError(_open_error(path, baud, error)) from error
     try:
         if os.major(os.fstat(device.fileno()).st_rdev) not in _PTY_MAJORS:
-            # The lock of above is heeded by those alone who ask for it. A pseudo-terminal would stay closed for ever.
+            # The lock above is advisory. On a pseudo-terminal TIOCEXCL would outlive this process.
             fcntl.ioctl(device.fileno(), termios.TIOCEXCL)
     except _FAILURES as error:
         device.close()
-        raise InstrumentError(_why_not(path, baud, error)) from error
+        raise InstrumentError(_open_error(path, baud, error)) from error
     _lower_latency(path, device)
     port = _SerialPort(str(path), baud, clock)
     serial_asyncio.SerialTransport(asyncio.get_running_loop(), port, device)
@@ -71,21 +62,13 @@ async def open_serial_port(path: Path, baud: int, clock: Clock) -> Port:
 
 
 def port_holder(path: Path, *, root: Path = _ROOT) -> str | None:
-    """Return which process has a port open, as ``minicom (process 123)``; None where nobody has, or it cannot be told.
-
-    Parameters
-    ----------
-    path
-        The device, or a link to it.
-    root
-        Where the machine's files are.
-    """
+    """Return the process that has a port open, as ``minicom (process 123)``; None if there is none, or it is unknown."""
     device = os.path.realpath(path)
     for descriptor in root.glob("proc/[0-9]*/fd/*"):
-        with suppress(OSError):  # another user's, or gone in the meantime
+        with suppress(OSError):  # another user's, or gone meanwhile
             if str(descriptor.readlink()) == device:
                 return _process(descriptor.parents[1])
-    # Other users' processes do not show what they have open, but whoever has a lock is told to all.
+    # Other users' processes hide their open files, but /proc/locks is public.
     with suppress(OSError, ValueError):
         status = Path(device).stat()
         place = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
@@ -97,18 +80,9 @@ def port_holder(path: Path, *, root: Path = _ROOT) -> str | None:
 
 
 def latency_timer_ms(path: Path, *, root: Path = _ROOT) -> int | None:
-    """Return for how long a USB adapter holds bytes back to send more of them at once; None where it has no such timer.
+    """Return the latency timer of a USB adapter, for which it holds data back; None without one.
 
-    Parameters
-    ----------
-    path
-        The device, or a link to it.
-    root
-        Where the machine's files are.
-
-    Notes
-    -----
-    Adapters of FTDI have one: 16 ms unless told otherwise. Others have a fixed one, or none.
+    FTDI adapters have one, 16 ms by default. Others have a fixed delay, or none.
     """
     try:
         return int(_latency_timer(path, root).read_text(encoding="ascii"))
@@ -129,7 +103,7 @@ class _SerialPort(asyncio.Protocol):
         self._transport: Any = None
         self._chunks: deque[Chunk] = deque(maxlen=_KEPT_CHUNKS)
         self._waiter: asyncio.Future[None] | None = None
-        self._lost = ""
+        self._error = ""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = transport
@@ -141,20 +115,20 @@ class _SerialPort(asyncio.Protocol):
         self._wake()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._lost = self._lost or _gone(self.name, exc)
+        self._error = self._error or _lost_message(self.name, exc)
         self._closed.set_result(None)
         self._wake()
 
     def write(self, data: bytes) -> None:
         self._check()
         try:
-            # Not by the transport: it would put a plug that has just been pulled into the log with all its callers.
+            # Not by the transport: it would log a traceback when the cable has just been unplugged.
             os.write(self._transport.serial.fileno(), data)
         except BlockingIOError:
-            pass  # the line takes nothing; the lost request is found by its missing reply
+            pass  # the output buffer is full; the missing reply reveals the lost request
         except _FAILURES as error:
-            self._lost = _gone(self.name, error)
-            raise InstrumentError(self._lost) from error
+            self._error = _lost_message(self.name, error)
+            raise InstrumentError(self._error) from error
 
     async def read(self) -> Chunk:
         while not self._chunks:
@@ -173,29 +147,29 @@ class _SerialPort(asyncio.Protocol):
         return data
 
     async def close(self) -> None:
-        self._lost = self._lost or f"{self.name}: closed"
+        self._error = self._error or f"{self.name}: closed"
         if not self._transport.is_closing():
             with suppress(*_FAILURES):
-                # What the kernel still has to send would be waited for, with the whole program.
+                # Closing would otherwise block until the kernel has sent its buffer.
                 self._transport.serial.reset_output_buffer()
             self._transport.abort()
         await asyncio.shield(self._closed)
 
     def _check(self) -> None:
-        if self._lost:
-            raise InstrumentError(self._lost)
+        if self._error:
+            raise InstrumentError(self._error)
 
     def _wake(self) -> None:
         if self._waiter is not None and not self._waiter.done():
             self._waiter.set_result(None)
 
 
-def _gone(name: str, error: Exception | None) -> str:
+def _lost_message(name: str, error: Exception | None) -> str:
     return f"{name}: the line is gone, probably unplugged ({error})"
 
 
 def _lower_latency(path: Path, device: serial.Serial) -> None:
-    with suppress(*_FAILURES):  # a port that has no such setting
+    with suppress(*_FAILURES):  # not supported by every port
         device.set_low_latency_mode(True)
     latency_ms = latency_timer_ms(path, root=_ROOT)
     if latency_ms is not None and latency_ms > _GOOD_LATENCY_MS:
@@ -203,11 +177,11 @@ def _lower_latency(path: Path, device: serial.Serial) -> None:
             _latency_timer(path, _ROOT).write_text("1", encoding="ascii")
             latency_ms = latency_timer_ms(path, root=_ROOT)
     if latency_ms is not None and latency_ms > _GOOD_LATENCY_MS:
-        _warn_of_latency(str(path), latency_ms)
+        _warn_latency(str(path), latency_ms)
 
 
-@cache  # said once, not at every speed that is tried
-def _warn_of_latency(port: str, latency_ms: int) -> None:
+@cache  # once, not at every baud rate tried
+def _warn_latency(port: str, latency_ms: int) -> None:
     log.warning("serial_latency", port=port, latency_ms=latency_ms)
 
 
@@ -222,13 +196,13 @@ def _process(folder: Path) -> str:
     return f"{name} (process {folder.name})"
 
 
-def _why_not(path: Path, baud: int, error: Exception) -> str:
+def _open_error(path: Path, baud: int, error: Exception) -> str:
     number = getattr(error, "errno", None)
     if number == errno.ENOENT:
-        return f"there is no {path}: plug the cable in, or look for its name with: ls /dev/serial/by-id/"
+        return f"there is no {path}: plug the cable in, or list the ports with: ls /dev/serial/by-id/"
     if number in (errno.EACCES, errno.EPERM):
-        return f"no permission for {path}: put the user into the group of the device (dialout or uucp)"
+        return f"no permission for {path}: add the user to the group of the device (dialout or uucp)"
     if number in (errno.EBUSY, errno.EAGAIN):
         holder = port_holder(path) or "a process of another user"
-        return f"{path} is taken by {holder}: end it, a port can have one user only"
+        return f"{path} is taken by {holder}: stop it, a port can have one user only"
     return f"{path} cannot be opened at {baud} baud: {error}"

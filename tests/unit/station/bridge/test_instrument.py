@@ -15,8 +15,8 @@ from tsgt.radio import Direction
 from tsgt.simulation.kernel import VirtualClock
 from tsgt.station import Atmosphere
 from tsgt.station.bridge import BridgeInstrument
-from tsgt.station.instrument_supervisor import InstrumentKeeper
-from tsgt.station.session import Session
+from tsgt.station.instrument_supervisor import InstrumentSupervisor
+from tsgt.station.session import ClientSession
 
 if TYPE_CHECKING:
     from tsgt.station import Reading
@@ -53,9 +53,9 @@ async def test_connecting_says_who_is_behind_the_program() -> None:
     """The name comes from hello, and with it how measurements get their times."""
     hello = {"model": "S7", "serial_number": "12", "firmware": "1.2", "make": "Acme"}
     for stamps, how in (
-        ({"stamps": "host"}, "stamped by the bridge"),
-        ({"stamps": "instrument", "clock": "UTC"}, "stamped by its clock UTC"),
-        ({"stamps": "arrival"}, "stamped on arrival"),
+        ({"stamps": "host"}, "timestamped by the bridge"),
+        ({"stamps": "instrument", "clock": "UTC"}, "timestamped by its clock UTC"),
+        ({"stamps": "arrival"}, "timestamped on arrival"),
     ):
         instrument = BridgeInstrument(CONFIG, CLOCK, FakeStart(CLOCK, HELLO | hello | stamps))
         assert await instrument.connect() == f"Acme S7 12, {how}"
@@ -139,7 +139,7 @@ async def test_a_single_measurement() -> None:
     assert (reading.status, reading.slope_distance_m) == (Status.NO_TARGET, None)
     for answer in (shot | {"slope_distance_m": -1.0}, {"type": "done"}, {"type": "done", "error": "no foil"}):
         program.on_command = lambda command, answer=answer: program.say(answer | {"id": command["id"]})  # type: ignore[misc]
-        with pytest.raises(InstrumentRefusedError, match=r"expected metres|gives no measurement|no foil"):
+        with pytest.raises(InstrumentRefusedError, match=r"expected metres|contains no measurement|no foil"):
             await instrument.measure()
 
 
@@ -228,7 +228,7 @@ async def test_silence_while_tracking_is_a_stall() -> None:
 
     talking = asyncio.create_task(talk())
     with pytest.raises(
-        InstrumentError, match=r"has said nothing for 5 s \(a line of the program cannot be used"
+        InstrumentError, match=r"has printed nothing usable for 5 s \(a line of the program was rejected"
     ):
         await instrument.read()
     assert CLOCK.monotonic_ns() - began_ns == 9_000_000_000
@@ -261,7 +261,7 @@ async def test_a_command_without_an_answer_is_a_stall() -> None:
     instrument, program, _ = await tracking()
     program.on_command = lambda _: program.say({"type": "done", "id": 77})
     began_ns = CLOCK.monotonic_ns()
-    with pytest.raises(InstrumentError, match="does not answer to direct"):
+    with pytest.raises(InstrumentError, match="does not respond to direct"):
         await instrument.direct()
     assert CLOCK.monotonic_ns() - began_ns == 30_000_000_000
     assert program.ended
@@ -279,7 +279,7 @@ async def test_a_program_may_take_its_time_to_find_the_instrument() -> None:
     start.programs[0].say(HELLO)
     await connecting
     began_ns = CLOCK.monotonic_ns()
-    with pytest.raises(InstrumentError, match="has not said hello"):
+    with pytest.raises(InstrumentError, match="has not sent hello"):
         await instrument.connect()
     assert CLOCK.monotonic_ns() - began_ns == 30_000_000_000
 
@@ -289,7 +289,7 @@ async def test_another_version_is_refused() -> None:
     start = FakeStart(CLOCK, {"type": "hello", "bridge": 2})
     instrument = BridgeInstrument(CONFIG, CLOCK, start)
     with pytest.raises(
-        InstrumentError, match=r"speaks version 2 of the bridge's lines, and this client version 1"
+        InstrumentError, match=r"uses version 2 of the bridge's lines, and this client version 1"
     ):
         await instrument.connect()
     assert start.programs[0].ended
@@ -299,7 +299,7 @@ async def test_a_second_hello_ends_the_run() -> None:
     """A wrapper has started its program anew, which knows nothing of what it was told."""
     instrument, program, _ = await tracking()
     program.say(FULL)
-    with pytest.raises(InstrumentError, match="begun anew"):
+    with pytest.raises(InstrumentError, match="second hello"):
         await instrument.read()
 
 
@@ -338,11 +338,11 @@ async def test_a_line_that_cannot_be_is_refused(wrong: bytes | dict[str, Any]) -
         instrument, program, _ = await tracking()
         program.say(wrong if isinstance(wrong, bytes) else program.measurement() | wrong)
         assert await waiting(instrument) == []
-        assert "cannot be used" in instrument.condition.problem
+        assert "was rejected" in instrument.condition.problem
         await asyncio.sleep(0.4)
         program.measure()
         assert len(await waiting(instrument)) == 1
-    assert [entry["event"] for entry in logs] == ["bridge_line_refused"]
+    assert [entry["event"] for entry in logs] == ["bridge_line_rejected"]
     assert len(logs[0]["line"]) <= 200
     assert instrument.condition.problem == ""
 
@@ -354,7 +354,7 @@ async def test_refusals_are_logged_once_a_minute() -> None:
         for _ in range(130):
             await asyncio.sleep(1.0)
             program.say(b"rubbish")
-    assert [entry["refused"] for entry in logs] == [1, 61, 121]
+    assert [entry["rejected"] for entry in logs] == [1, 61, 121]
 
 
 @pytest.mark.parametrize("flood", [b"{}\n" * 2000, b"x" * 2_000_000, b"\n" * 3000])
@@ -482,16 +482,16 @@ async def test_a_cancelled_reading_takes_nothing_away() -> None:
 
 
 async def test_a_program_that_always_ends_is_started_with_pauses() -> None:
-    """The keeper starts it about once a second, for ever, and says why once."""
+    """The supervisor starts it about once a second, for ever, and says why once."""
     start = FakeStart(CLOCK)
     instrument = BridgeInstrument(CONFIG, CLOCK, start)
-    keeper = InstrumentKeeper(
+    supervisor = InstrumentSupervisor(
         instrument,
-        Session(1, 1),
+        ClientSession(1, 1),
         CLOCK,
         on_reading=lambda _: None,
         on_record=lambda _: None,
-        on_done=lambda _: None,
+        on_result=lambda _: None,
     )
 
     async def end_each() -> None:
@@ -502,14 +502,14 @@ async def test_a_program_that_always_ends_is_started_with_pauses() -> None:
                     program.exit("exit status 1: no licence")
 
     with capture_logs() as logs:
-        tasks = [asyncio.create_task(keeper.keep()), asyncio.create_task(end_each())]
+        tasks = [asyncio.create_task(supervisor.run()), asyncio.create_task(end_each())]
         await asyncio.sleep(60.0)
         for task in tasks:
             task.cancel()
         await asyncio.wait(tasks)
     assert 55 <= len(start.programs) <= 65
     assert [entry["event"] for entry in logs] == ["instrument_lost"]
-    assert "no licence" in keeper.condition.problem
+    assert "no licence" in supervisor.condition.problem
 
 
 async def test_a_program_that_ends_at_random_loses_and_doubles_nothing() -> None:
@@ -518,15 +518,15 @@ async def test_a_program_that_ends_at_random_loses_and_doubles_nothing() -> None
     start = FakeStart(CLOCK, FULL)
     instrument = BridgeInstrument(CONFIG, CLOCK, start)
     readings: list[Reading] = []
-    keeper = InstrumentKeeper(
+    supervisor = InstrumentSupervisor(
         instrument,
-        Session(1, 1),
+        ClientSession(1, 1),
         CLOCK,
         on_reading=readings.append,
         on_record=lambda _: None,
-        on_done=lambda _: None,
+        on_result=lambda _: None,
     )
-    keeping = asyncio.create_task(keeper.keep())
+    running = asyncio.create_task(supervisor.run())
     said: list[float] = []
     last: dict[str, Any] | None = None
     with capture_logs():
@@ -544,7 +544,7 @@ async def test_a_program_that_ends_at_random_loses_and_doubles_nothing() -> None
             if generator.random() < 0.05:
                 program.exit()
         await asyncio.sleep(3.0)
-        keeping.cancel()
-        await asyncio.wait([keeping])
+        running.cancel()
+        await asyncio.wait([running])
     assert len(start.programs) > 50
     assert [reading.slope_distance_m for reading in readings] == said

@@ -11,8 +11,8 @@ import pytest
 from harness.bridge import HELLO, measured
 
 from tsgt.recording import decode
-from tsgt.station.bridge.messages import Hello, MeasurementLine
-from tsgt.station.bridge.timing import Stamped, Stamper
+from tsgt.station.bridge.messages import HelloLine, MeasurementLine
+from tsgt.station.bridge.timing import LineTimestamper, TimestampedLine
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -24,8 +24,8 @@ FASTEST_NS = 20 * MS
 def error_ms(told_ns: Callable[[int], int], seed: int, count: int = 300) -> float:
     """Return by how much stamps are after the fastest answer's way, in ms; the instrument tells its times in some form."""
     random = np.random.default_rng(seed)
-    stamper = Stamper(latency_ns=FASTEST_NS)
-    stamper.begin(decode(Hello, json.dumps(HELLO | {"stamps": "instrument"}).encode()))
+    stamper = LineTimestamper(latency_ns=FASTEST_NS)
+    stamper.program_started(decode(HelloLine, json.dumps(HELLO | {"stamps": "instrument"}).encode()))
     true_ns: dict[float, int] = {}
     errors = []
     for number in range(count):
@@ -36,7 +36,7 @@ def error_ms(told_ns: Callable[[int], int], seed: int, count: int = 300) -> floa
         arrived_ns = at_ns + FASTEST_NS + int(random.uniform(0, 2 * MS))
         line = decode(MeasurementLine, json.dumps(told).encode())
         for stamped in stamper.push(line, 1, arrived_ns, together=False):
-            assert isinstance(stamped, Stamped)
+            assert isinstance(stamped, TimestampedLine)
             assert stamped.line.slope_distance_m is not None
             errors.append((stamped.at_ns - true_ns[stamped.line.slope_distance_m]) / MS)
     assert len(errors) == count

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tsgt.errors import MessageError
-from tsgt.station.geocom import ReturnCode, Rpc, Verdict, name_of, verdict
+from tsgt.station.geocom import Outcome, ReturnCode, Rpc, name_of, outcome_of
 from tsgt.station.geocom.codec import Byte, decode_reply, encode_request
 
 
@@ -122,39 +122,39 @@ def test_a_checksum_is_checked_where_there_is_one() -> None:
 @pytest.mark.parametrize(
     ("code", "with_values", "without"),
     [
-        (0, Verdict.USABLE, Verdict.USABLE),
-        (16, Verdict.USABLE, Verdict.USABLE),
-        (1283, Verdict.LOW_ACCURACY, Verdict.NOTHING),
-        (1284, Verdict.LOW_ACCURACY, Verdict.NOTHING),
-        (1285, Verdict.ANGLE_ONLY, Verdict.NOTHING),
-        (1288, Verdict.ANGLE_ONLY, Verdict.NOTHING),
-        (1289, Verdict.ANGLE_ONLY, Verdict.NOTHING),
-        (1290, Verdict.TILT, Verdict.TILT),
-        (1291, Verdict.WRONG_DISTANCE, Verdict.WRONG_DISTANCE),
-        (1292, Verdict.NO_TARGET, Verdict.NO_TARGET),
-        (1293, Verdict.BUSY, Verdict.BUSY),
-        (1294, Verdict.ERROR, Verdict.ERROR),
-        (1381, Verdict.LOW_ACCURACY, Verdict.ERROR),
-        (1399, Verdict.LOW_ACCURACY, Verdict.ERROR),
-        (517, Verdict.NO_TARGET, Verdict.NO_TARGET),
-        (524, Verdict.NO_TARGET, Verdict.NO_TARGET),
-        (8710, Verdict.NO_TARGET, Verdict.NO_TARGET),
-        (27, Verdict.LICENCE, Verdict.LICENCE),
-        (5, Verdict.UNAVAILABLE, Verdict.UNAVAILABLE),
-        (3081, Verdict.UNAVAILABLE, Verdict.UNAVAILABLE),
-        (12, Verdict.SHUT_DOWN, Verdict.SHUT_DOWN),
-        (13, Verdict.BUSY, Verdict.BUSY),
-        (3108, Verdict.ASLEEP, Verdict.ASLEEP),
-        (22, Verdict.TILT, Verdict.TILT),
-        (770, Verdict.ERROR, Verdict.ERROR),
-        (8714, Verdict.ERROR, Verdict.ERROR),
-        (4711, Verdict.ERROR, Verdict.ERROR),
+        (0, Outcome.USABLE, Outcome.USABLE),
+        (16, Outcome.USABLE, Outcome.USABLE),
+        (1283, Outcome.LOW_ACCURACY, Outcome.NO_VALUES),
+        (1284, Outcome.LOW_ACCURACY, Outcome.NO_VALUES),
+        (1285, Outcome.ANGLE_ONLY, Outcome.NO_VALUES),
+        (1288, Outcome.ANGLE_ONLY, Outcome.NO_VALUES),
+        (1289, Outcome.ANGLE_ONLY, Outcome.NO_VALUES),
+        (1290, Outcome.TILT, Outcome.TILT),
+        (1291, Outcome.WRONG_DISTANCE, Outcome.WRONG_DISTANCE),
+        (1292, Outcome.NO_TARGET, Outcome.NO_TARGET),
+        (1293, Outcome.BUSY, Outcome.BUSY),
+        (1294, Outcome.ERROR, Outcome.ERROR),
+        (1381, Outcome.LOW_ACCURACY, Outcome.ERROR),
+        (1399, Outcome.LOW_ACCURACY, Outcome.ERROR),
+        (517, Outcome.NO_TARGET, Outcome.NO_TARGET),
+        (524, Outcome.NO_TARGET, Outcome.NO_TARGET),
+        (8710, Outcome.NO_TARGET, Outcome.NO_TARGET),
+        (27, Outcome.LICENCE, Outcome.LICENCE),
+        (5, Outcome.UNAVAILABLE, Outcome.UNAVAILABLE),
+        (3081, Outcome.UNAVAILABLE, Outcome.UNAVAILABLE),
+        (12, Outcome.SHUT_DOWN, Outcome.SHUT_DOWN),
+        (13, Outcome.BUSY, Outcome.BUSY),
+        (3108, Outcome.ASLEEP, Outcome.ASLEEP),
+        (22, Outcome.TILT, Outcome.TILT),
+        (770, Outcome.ERROR, Outcome.ERROR),
+        (8714, Outcome.ERROR, Outcome.ERROR),
+        (4711, Outcome.ERROR, Outcome.ERROR),
     ],
 )
-def test_what_a_code_means(code: int, with_values: Verdict, without: Verdict) -> None:
+def test_what_a_code_means(code: int, with_values: Outcome, without: Outcome) -> None:
     """Which measurements may be used, which have angles only, and what else is to be told apart."""
-    assert verdict(code, has_values=True) is with_values
-    assert verdict(code, has_values=False) is without
+    assert outcome_of(code, has_values=True) is with_values
+    assert outcome_of(code, has_values=False) is without
 
 
 def test_codes_have_names_and_families() -> None:

@@ -120,7 +120,7 @@ async def test_a_late_reply_is_not_taken_for_the_next() -> None:
     """A reply that comes after its caller has been told of the silence is dropped; the line is in step again."""
     connection, instrument = await connected()
     instrument.faults.extend([late(4.5), silent, silent, silent])
-    with pytest.raises(InstrumentError, match="does not answer"):
+    with pytest.raises(InstrumentError, match="does not respond"):
         await connection.call(Rpc.TMC_GET_FULL_MEAS, 1, timeout_s=1.0)
     assert now_s() == pytest.approx(4.0)
     await asyncio.sleep(0.495)
@@ -162,7 +162,9 @@ async def test_silence_ends_in_an_error_that_says_what_to_do() -> None:
     """Without an answer the call fails after its time and three attempts to get the instrument's attention."""
     connection, instrument = await connected()
     instrument.faults.extend([silent] * 100)
-    with pytest.raises(InstrumentError, match="line: the instrument does not answer any more; is it on"):
+    with pytest.raises(
+        InstrumentError, match="line: the instrument does not respond any more; check that it is on"
+    ):
         await connection.call(Rpc.TMC_GET_FULL_MEAS, 1, timeout_s=1.0)
     assert now_s() == pytest.approx(4.0)
 
@@ -171,7 +173,7 @@ async def test_a_procedure_that_stays_silent_is_asked_for_twice() -> None:
     """The instrument answers other requests, but not this one: once more, then an error."""
     connection, instrument = await connected()
     instrument.faults.extend([silent, garbage_before(b"x"), silent])
-    with capture_logs() as logs, pytest.raises(InstrumentError, match=r"no answer .* to TMC_GET_FULL_MEAS"):
+    with capture_logs() as logs, pytest.raises(InstrumentError, match=r"no reply .* to TMC_GET_FULL_MEAS"):
         await connection.call(Rpc.TMC_GET_FULL_MEAS, 1, timeout_s=1.0)
     assert len(instrument.requests) == 2
     assert [entry["event"] for entry in logs] == ["instrument_silent"]
@@ -210,7 +212,7 @@ async def test_damaged_answers_only_end_in_an_error() -> None:
     """Three damaged replies in a row are a fault of the cable."""
     connection, instrument = await connected()
     instrument.faults.extend([damaged] * 3)
-    with pytest.raises(InstrumentError, match="only damaged answers"):
+    with pytest.raises(InstrumentError, match="only damaged replies"):
         await connection.call(Rpc.TMC_GET_FULL_MEAS, 1)
     await echoed(connection, 2)
 
@@ -358,7 +360,7 @@ async def test_connecting_tries_the_wanted_speed_every_second() -> None:
 async def test_connecting_gives_up_when_nothing_answers_at_any_speed() -> None:
     """Every speed has been tried; the message says what to look at, and no port stays open."""
     cable = Cable(FakeInstrument(faults=deque([silent] * 100)))
-    with pytest.raises(InstrumentError, match="line: no instrument answers at 115200 baud"):
+    with pytest.raises(InstrumentError, match="line: no instrument responds at 115200 baud"):
         await connect(cable.open, 115_200, VirtualClock(0), checksum=False)
     assert {port.baud for port in cable.ports} >= {2400, 4800, 9600, 921_600}
     assert all(port.closed for port in cable.ports)

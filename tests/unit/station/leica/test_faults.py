@@ -11,7 +11,7 @@ from harness.leica import leica_bench, leica_config
 
 from tsgt.errors import InstrumentError
 from tsgt.simulation.instrument import LineFault
-from tsgt.simulation.instrument.geocom.server import Forced
+from tsgt.simulation.instrument.geocom import ForcedResponse
 from tsgt.simulation.instrument.total_station import BOOT_NS
 from tsgt.station.geocom import ReturnCode, Rpc
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from tsgt.station import Reading
 
 # A digit that is another one takes a checksum to be seen: see simulation/serial_scripts.py.
-FAULTS = [fault for fault in LineFault if fault not in (LineFault.NONE, LineFault.DIGIT)]
+FAULTS = [fault for fault in LineFault if fault not in (LineFault.NONE, LineFault.WRONG_DIGIT)]
 
 
 async def keep(day: LeicaBench, seconds: float) -> list[Reading]:
@@ -48,7 +48,7 @@ async def keep(day: LeicaBench, seconds: float) -> list[Reading]:
 
 def check(day: LeicaBench, readings: list[Reading], *, latency_ms: float = 20.0) -> None:
     """Every distance was offered, is given once, and has its time."""
-    offered = {offered.instrument_ms: offered for offered in day.station.offered}
+    offered = {offered.instrument_ms: offered for offered in day.station.reported_distances}
     usable = [reading for reading in readings if reading.status.usable]
     times = [reading.instrument_time_ns for reading in usable]
     assert len(times) == len(set(times))
@@ -98,7 +98,11 @@ async def test_any_code_is_survived(code: ReturnCode) -> None:
         readings = await keep(day, 3.0)
         com = 3072 <= code < 3328
         for rpc in (Rpc.TMC_GET_FULL_MEAS, Rpc.MOT_READ_LOCK_STATUS):
-            forced = Forced(com_code=code, rpc=rpc, times=8) if com else Forced(code=code, rpc=rpc, times=8)
+            forced = (
+                ForcedResponse(com_code=code, rpc=rpc, times=8)
+                if com
+                else ForcedResponse(code=code, rpc=rpc, times=8)
+            )
             day.station.server.forced.append(forced)
         readings += await keep(day, 30.0)
         check(day, readings)
@@ -111,7 +115,7 @@ async def test_a_silent_line_raises() -> None:
     async with leica_bench() as day:
         await day.begin()
         await day.read_for(5.0)
-        day.line.faults.mute = True
+        day.line.faults.drop_responses = True
         begun_s = day.now_s
         with pytest.raises(InstrumentError):
             await day.read_for(30.0)
@@ -119,7 +123,7 @@ async def test_a_silent_line_raises() -> None:
         await day.instrument.close()
         with pytest.raises(InstrumentError):
             await day.instrument.connect()
-        day.line.faults.mute = False
+        day.line.faults.drop_responses = False
         await day.begin()
         assert (await day.instrument.read()).status.usable
 

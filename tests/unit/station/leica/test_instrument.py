@@ -15,13 +15,13 @@ from tsgt.config.scenario import StatusFaultConfig
 from tsgt.errors import InstrumentError, InstrumentRefusedError
 from tsgt.model import Status
 from tsgt.radio import Direction
-from tsgt.simulation.instrument.geocom.server import Forced
+from tsgt.simulation.instrument.geocom import ForcedResponse
 from tsgt.station import Atmosphere
 from tsgt.station.geocom import Reply, ReturnCode, Rpc
-from tsgt.station.instrument_supervisor import InstrumentKeeper
-from tsgt.station.leica.reacquisition import Look
-from tsgt.station.leica.search import Finder
-from tsgt.station.session import Session
+from tsgt.station.instrument_supervisor import InstrumentSupervisor
+from tsgt.station.leica.reacquisition import SearchWindow
+from tsgt.station.leica.search import TargetSearch
+from tsgt.station.session import ClientSession
 
 if TYPE_CHECKING:
     from tsgt.station.geocom import GeoComConnection
@@ -41,7 +41,7 @@ async def test_every_distance_that_was_offered_is_read_once(rate_hz: float) -> N
     async with leica_bench(rate_hz=rate_hz) as day:
         await day.begin()
         readings = await day.read_for(60.0)
-    offered = day.station.offered
+    offered = day.station.reported_distances
     assert 0 <= len(offered) - len(readings) <= 1
     for reading, source in zip(readings, offered, strict=False):
         assert reading.instrument_time_ns == source.instrument_ms * 1_000_000
@@ -63,7 +63,7 @@ async def test_times_are_those_of_the_distances() -> None:
         await day.begin()
         await day.read_for(30.0)
         readings = await day.read_for(60.0)
-    true_ns = {offered.instrument_ms: offered.true_ns for offered in day.station.offered}
+    true_ns = {offered.instrument_ms: offered.true_ns for offered in day.station.reported_distances}
     errors_ms = [(r.at_ns - true_ns[(r.instrument_time_ns or 0) // 1_000_000]) / 1e6 for r in readings]
     assert np.median(errors_ms) == pytest.approx(0.0, abs=0.9)
     assert max(errors_ms) - min(errors_ms) < 5
@@ -98,7 +98,7 @@ async def test_a_cancelled_reading_costs_nothing() -> None:
             times += [reading.instrument_time_ns for reading in await day.read_for(0.13)]
     assert len(times) == len(set(times))
     assert [time // 1_000_000 for time in times if time] == [
-        offered.instrument_ms for offered in day.station.offered[: len(times)]
+        offered.instrument_ms for offered in day.station.reported_distances[: len(times)]
     ]
 
 
@@ -177,22 +177,22 @@ async def test_an_order_leaves_a_search_alone_that_has_found_the_prism() -> None
 
 async def test_a_lock_by_hand_during_a_search_that_fails_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     """The next search would begin with letting go of it."""
-    looks = []
+    windows = []
     async with leica_bench() as day:
 
-        async def fail(_: Finder, look: Look) -> bool:
-            looks.append(look)
+        async def fail(_: TargetSearch, look: SearchWindow) -> bool:
+            windows.append(look)
             day.station.blocked = False
-            day.station.lock_by_hand(1)
+            day.station.lock_manually(1)
             return False
 
-        monkeypatch.setattr(Finder, "look", fail)
+        monkeypatch.setattr(TargetSearch, "search", fail)
         await day.begin()
         await day.read_for(3.0)
         day.station.blocked = True
         await day.read_until(Status.NO_TARGET, within_s=5.0)
         await day.read_until(Status.OK, within_s=20.0)
-    assert len(looks) == 1
+    assert len(windows) == 1
 
 
 async def test_a_lock_by_hand_during_a_search_ends_that() -> None:
@@ -206,7 +206,7 @@ async def test_a_lock_by_hand_during_a_search_ends_that() -> None:
         ):
             await day.instrument.read()
         day.station.blocked = False
-        day.station.lock_by_hand(1)
+        day.station.lock_manually(1)
         await day.read_until(Status.OK, within_s=2.0)
 
 
@@ -221,7 +221,7 @@ async def test_a_robot_that_drives_on_after_a_sweep_is_swept_for_again(misses: i
             await day.instrument.read()
         day.station.blocked = False
         day.station.server.forced.append(
-            Forced(code=ReturnCode.AUT_NO_TARGET, rpc=Rpc.AUT_FINE_ADJUST, times=misses)
+            ForcedResponse(code=ReturnCode.AUT_NO_TARGET, rpc=Rpc.AUT_FINE_ADJUST, times=misses)
         )
         await day.read_until(Status.OK, within_s=60.0)
         assert bool(day.station.beeps) == called
@@ -244,8 +244,10 @@ class LockedByHand:
 async def test_a_lock_by_hand_after_a_sweep_is_kept() -> None:
     """A prism that could not be pointed at is swept for again only while nobody has locked in on it."""
     line = LockedByHand()
-    finder = Finder(cast("GeoComConnection", line), power_search=True)
-    assert await finder.look(Look("searching", sweep=True, centre=None, width_rad=0.1, height_rad=0.1))
+    target_search = TargetSearch(cast("GeoComConnection", line), power_search=True)
+    assert await target_search.search(
+        SearchWindow("searching", sweep=True, centre=None, width_rad=0.1, height_rad=0.1)
+    )
     assert line.asked.count(Rpc.AUT_PS_SEARCH_WINDOW) == 1
 
 
@@ -257,7 +259,7 @@ async def test_a_person_is_called_when_nothing_helps() -> None:
         assert day.station.beeps
         assert "point the telescope at prism 1" in day.instrument.condition.problem
         await day.read_for(200.0 - day.now_s)
-        day.station.lock_by_hand(1)
+        day.station.lock_manually(1)
         await day.read_until(Status.OK, within_s=60.0)
         assert day.instrument.condition.problem == ""
 
@@ -313,7 +315,7 @@ async def test_another_prism_is_found_where_the_master_says() -> None:
         await day.read_for(2.0)
         day.station.aim_at_prism(3)
         horizontal_rad, zenith_rad = day.station.telescope.direction()
-        day.station.aim(None)
+        day.station.aim_at_target(None)
         await day.instrument.track(3, Direction(horizontal_rad, zenith_rad, 0.002))
         found = await day.read_until(Status.OK, within_s=15.0)
         assert found.prism == 3
@@ -355,7 +357,7 @@ async def test_it_is_set_up_as_configured() -> None:
     settings = day.station.settings
     assert (settings.prism_type, settings.prism_constant_m) == (3, 0.0231)
     assert (settings.edm_mode, settings.power_mode, settings.incline) == (9, 0, True)
-    assert settings.air[:3] == (6.58e-7, 900.0, 25.0)
+    assert settings.atmosphere[:3] == (6.58e-7, 900.0, 25.0)
     assert settings.reduced_field_of_view
     assert record is not None
     assert (record.make, record.prism_type, record.prism_constant_m) == ("Leica", "360", 0.0231)
@@ -370,7 +372,7 @@ async def test_the_air_can_change_while_it_tracks() -> None:
         await day.begin()
         await day.instrument.read()
         await day.instrument.set_atmosphere(Atmosphere(temperature_c=30.0, pressure_hpa=950.0))
-        assert day.station.settings.air[1:3] == (950.0, 30.0)
+        assert day.station.settings.atmosphere[1:3] == (950.0, 30.0)
         record = day.instrument.record
         assert record is not None
         assert record.pressure_hpa == 950.0
@@ -399,9 +401,9 @@ async def test_single_measurements_of_a_foil(faces: int) -> None:
         await day.begin()
         await day.read_for(3.0)
         await day.instrument.direct()
-        day.station.aim(None)
+        day.station.aim_at_target(None)
         assert (await day.instrument.measure()).status is Status.NO_TARGET
-        day.station.aim(1)
+        day.station.aim_at_target(1)
         shot = await day.instrument.measure()
         assert shot.status.usable
         assert shot.slope_distance_m == pytest.approx(20.6216, abs=0.01)
@@ -418,13 +420,13 @@ async def test_the_distance_of_the_last_shot_is_not_given_again(code: ReturnCode
     async with leica_bench() as day:
         await day.begin()
         await day.instrument.direct()
-        day.station.aim(1)
+        day.station.aim_at_target(1)
         first = await day.instrument.measure()
-        day.station.server.forced.append(Forced(code=code, rpc=Rpc.TMC_DO_MEASURE, times=1))
+        day.station.server.forced.append(ForcedResponse(code=code, rpc=Rpc.TMC_DO_MEASURE, times=1))
         second = await day.instrument.measure()
         assert second.instrument_time_ns != first.instrument_time_ns
-        day.station.server.forced.append(Forced(code=code, rpc=Rpc.TMC_DO_MEASURE, times=20))
-        with pytest.raises(InstrumentRefusedError, match="begins no new measurement"):
+        day.station.server.forced.append(ForcedResponse(code=code, rpc=Rpc.TMC_DO_MEASURE, times=20))
+        with pytest.raises(InstrumentRefusedError, match="does not start a new measurement"):
             await day.instrument.measure()
 
 
@@ -433,13 +435,13 @@ async def test_a_shot_is_set_up_anew_after_a_power_cycle() -> None:
     async with leica_bench() as day:
         await day.begin()
         await day.instrument.direct()
-        day.station.aim(1)
+        day.station.aim_at_target(1)
         before = await day.instrument.measure()
         day.station.switch_off()
         day.station.switch_on()
         await asyncio.sleep(6.0)
         day.station.settings.prism_type, day.station.settings.prism_constant_m = 0, 0.0
-        day.station.aim(1)
+        day.station.aim_at_target(1)
         after = await day.instrument.measure()
     assert before.slope_distance_m is not None
     assert after.slope_distance_m == pytest.approx(before.slope_distance_m, abs=0.01)
@@ -451,7 +453,7 @@ async def test_the_wrap_of_its_time_costs_some_seconds() -> None:
         day.station._on_since_ns = day.clock.monotonic_ns() - (2**31 - 15_000) * 1_000_000
         await day.begin()
         readings = [reading for reading in await day.read_for(40.0) if reading.status.usable]
-        truths = {each.instrument_ms: each.true_ns for each in day.station.offered}
+        truths = {each.instrument_ms: each.true_ns for each in day.station.reported_distances}
         late_ms = [
             (reading.at_ns - truths[reading.instrument_time_ns // 1_000_000]) / 1e6
             for reading in readings
@@ -513,11 +515,11 @@ async def test_a_power_cycle_begins_the_time_anew() -> None:
         await day.instrument.close()
         day.station.switch_on()
         await asyncio.sleep(6.0)
-        day.station.lock_by_hand(1)
-        begun = len(day.station.offered)
+        day.station.lock_manually(1)
+        begun = len(day.station.reported_distances)
         await day.begin()
         readings = [r for r in await day.read_for(20.0) if r.status.usable]
-    true_ns = {offered.instrument_ms: offered.true_ns for offered in day.station.offered[begun:]}
+    true_ns = {offered.instrument_ms: offered.true_ns for offered in day.station.reported_distances[begun:]}
     assert len(readings) > 40
     for reading in readings:
         assert reading.instrument_time_ns is not None
@@ -540,15 +542,15 @@ async def test_the_client_reads_again_within_three_seconds(away_s: float) -> Non
     """From the device being back to the first reading, whenever in the client's pauses that happens."""
     readings: list[tuple[float, Status]] = []
     async with leica_bench() as day:
-        keeper = InstrumentKeeper(
+        supervisor = InstrumentSupervisor(
             day.instrument,
-            Session(1, 1),
+            ClientSession(1, 1),
             day.clock,
             on_reading=lambda reading: readings.append((day.now_s, reading.status)),
             on_record=lambda _: None,
-            on_done=lambda _: None,
+            on_result=lambda _: None,
         )
-        task = asyncio.create_task(keeper.keep())
+        task = asyncio.create_task(supervisor.run())
         await asyncio.sleep(20.0)
         day.line.plugged = False
         await asyncio.sleep(away_s)

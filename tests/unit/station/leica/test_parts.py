@@ -1,4 +1,4 @@
-"""The smaller parts of the driver for Leica instruments: replies, faces, pace, models, wet thermometers."""
+"""The smaller parts of the driver for Leica instruments: replies, faces, scheduler, models, wet thermometers."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from tsgt.config import LeicaInstrumentConfig
 from tsgt.errors import InstrumentRefusedError
 from tsgt.model import Status
 from tsgt.station.geocom import Reply
-from tsgt.station.leica.identity import model_of
-from tsgt.station.leica.measurement import FullMeasurement, Readings, full_measurement
-from tsgt.station.leica.setup import PRISM_TYPES, TRACKING_MODES, wet_temperature_c
-from tsgt.station.leica.target import both_faces, check_same_target
-from tsgt.station.leica.timing import Pace
+from tsgt.station.leica import Identity
+from tsgt.station.leica.measurement import FullMeasurement, ReadingFactory, decode_full_measurement
+from tsgt.station.leica.setup import PRISM_TYPES, TRACKING_MODES, wet_bulb_temperature_c
+from tsgt.station.leica.target import check_same_target, mean_of_two_faces
+from tsgt.station.leica.tracking import PollScheduler
 
 MS = 1_000_000
 GOOD = (1.5, 1.6, 1e-6, 0.0, 0.0, 1e-6, 50.5, 12_345)
@@ -28,7 +28,7 @@ def reply(code: int, *values: float | str) -> Reply:
 @pytest.mark.parametrize("code", [0, 1283, 1284])
 def test_usable_codes_give_the_distance(code: int) -> None:
     """In motion accuracy is not guaranteed, and the distance is as good as it gets."""
-    got = full_measurement(reply(code, *GOOD))
+    got = decode_full_measurement(reply(code, *GOOD))
     assert got.status.usable
     assert (got.distance_m, got.time_ms) == (50.5, 12_345)
 
@@ -48,7 +48,7 @@ def test_usable_codes_give_the_distance(code: int) -> None:
 )
 def test_other_codes_give_none(code: int, status: Status) -> None:
     """Whatever stands in the place of the distance."""
-    got = full_measurement(reply(code, *GOOD))
+    got = decode_full_measurement(reply(code, *GOOD))
     assert got.status is status
     assert (got.distance_m, got.time_ms) == (None, None)
 
@@ -71,7 +71,7 @@ def test_other_codes_give_none(code: int, status: Status) -> None:
 )
 def test_a_good_code_with_bad_values_gives_no_distance(values: tuple[float | str, ...]) -> None:
     """A distance of zero is none, and a part of a reply is not filled up."""
-    got = full_measurement(reply(0, *values))
+    got = decode_full_measurement(reply(0, *values))
     assert not got.status.usable
     assert got.distance_m is None
 
@@ -92,7 +92,7 @@ def test_the_mean_of_two_faces_is_free_of_the_axes_errors() -> None:
             1284,
             0,
         )
-        mean = both_faces(first, second)
+        mean = mean_of_two_faces(first, second)
         apart = math.remainder(mean.horizontal_angle_rad - horizontal_rad, math.tau)
         assert apart == pytest.approx(0.0, abs=1e-12)
         assert mean.zenith_angle_rad == pytest.approx(1.4)
@@ -116,12 +116,12 @@ def test_two_faces_of_different_things_are_no_mean() -> None:
 
 def test_a_status_is_repeated_now_and_then() -> None:
     """At once when it changes, else every half second: enough for people, little for journal and radio."""
-    readings = Readings(1, 0)
+    readings = ReadingFactory(1, 0)
     given = []
     for number in range(100):
         status = Status.NO_TARGET if number < 50 else Status.TILT
         measured = FullMeasurement(0.0, 0.0, None, None, status, 0, number * 50 * MS)
-        reading = readings.without(measured)
+        reading = readings.without_distance(measured)
         if reading is not None:
             given.append((number, reading.status))
     assert given[0] == (0, Status.NO_TARGET)
@@ -131,41 +131,41 @@ def test_a_status_is_repeated_now_and_then() -> None:
 
 def test_the_pace_follows_the_instrument() -> None:
     """Nothing is waited for until it is known how often distances come, and shortly before the next is asked."""
-    pace = Pace()
+    scheduler = PollScheduler()
     for number in range(5):
-        assert pace.next_ns(0, 0) == 0
-        pace.distance(1000 + 400 * number)
-    assert pace.interval_ns == 400 * MS
-    assert pace.next_ns(1_000 * MS, 50 * MS) == 1_340 * MS
-    pace.distance(1000 + 1650)
-    assert pace.interval_ns == 50 * MS
+        assert scheduler.next_ns(0, 0) == 0
+        scheduler.add_distance(1000 + 400 * number)
+    assert scheduler.interval_ns == 400 * MS
+    assert scheduler.next_ns(1_000 * MS, 50 * MS) == 1_340 * MS
+    scheduler.add_distance(1000 + 1650)
+    assert scheduler.interval_ns == 50 * MS
 
 
 def test_a_faster_instrument_is_noticed() -> None:
     """Whoever sleeps until the next distance sees none between: once in a while nothing is waited for."""
-    pace = Pace()
+    scheduler = PollScheduler()
     for number in range(30):
-        pace.distance(400 * number)
+        scheduler.add_distance(400 * number)
     waits = []
     for number in range(30, 80):
-        pace.distance(400 * number)
-        waits.append(pace.next_ns(1, 0) != 0)
+        scheduler.add_distance(400 * number)
+        waits.append(scheduler.next_ns(1, 0) != 0)
     assert 0 < waits.count(False) <= 3
 
 
 def test_models_are_known_by_the_beginning_of_their_names() -> None:
     """As instruments give them; whoever is unknown has no delays."""
-    assert model_of('TS16 P 1" R500').angle_delay_ns == 7_220_000
-    assert model_of("Leica TS60 I").angle_delay_ns == 4_980_000
-    assert model_of("MS60").angle_delay_ns == 0
-    assert model_of("TCRP1201+").latency_ns == 0
-    assert model_of("").angle_delay_ns == 0
+    assert Identity(model='TS16 P 1" R500').properties.angle_delay_ns == 7_220_000
+    assert Identity(model="Leica TS60 I").properties.angle_delay_ns == 4_980_000
+    assert Identity(model="MS60").properties.angle_delay_ns == 0
+    assert Identity(model="TCRP1201+").properties.latency_ns == 0
+    assert Identity(model="").properties.angle_delay_ns == 0
 
 
 @pytest.mark.parametrize(("dry_c", "wet_c"), [(12.0, 8.2), (20.0, 15.1), (30.0, 23.9), (0.0, -2.3)])
 def test_a_wet_thermometer_shows_less(dry_c: float, wet_c: float) -> None:
     """At 60 % relative humidity, by the psychrometric tables."""
-    assert wet_temperature_c(dry_c) == pytest.approx(wet_c, abs=0.8)
+    assert wet_bulb_temperature_c(dry_c) == pytest.approx(wet_c, abs=0.8)
 
 
 def test_every_configured_word_is_known() -> None:

@@ -12,18 +12,18 @@ from harness.radios import MS
 from tsgt.clock import UnixTimeline
 from tsgt.errors import RadioError
 from tsgt.model import PolarMeasurement, Status
-from tsgt.radio import DirectOrder, MeasureOrder, Packet, SearchOrder, TrackOrder, Transmitted
+from tsgt.radio import DirectCommand, MeasureCommand, Packet, SearchCommand, TrackCommand, Transmission
 from tsgt.radio.classic import MeasurementMessage
 from tsgt.radio.classic.messages import Acknowledgement, TimeReply, decode_reply
 from tsgt.recording.journal import TargetRecord
 from tsgt.simulation.kernel import VirtualClock
 from tsgt.station.links import ClassicLink
-from tsgt.station.session import Session
+from tsgt.station.session import ClientSession
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
 
-    from tsgt.radio import LoRaSettings, Order
+    from tsgt.radio import Command, LoRaSettings
     from tsgt.radio.classic.messages import Reply
 
 START = 1_600_000_000_000_000_000
@@ -40,12 +40,12 @@ class Air:
     async def configure(self, settings: LoRaSettings) -> None:
         """Do nothing."""
 
-    async def transmit(self, payload: bytes, *, at_ns: int | None = None) -> Transmitted:
+    async def transmit(self, payload: bytes, *, at_ns: int | None = None) -> Transmission:
         """Hand the packet to the test."""
         if self.broken:
             raise RadioError("it is broken")
         self.sent.put_nowait(payload)
-        return Transmitted(started_at_ns=at_ns or 0, done_at_ns=at_ns or 0, stamp_sigma_ns=1)
+        return Transmission(started_at_ns=at_ns or 0, done_at_ns=at_ns or 0, stamp_sigma_ns=1)
 
     async def receive(self) -> Packet:
         """Return what the test sends."""
@@ -61,14 +61,14 @@ class Client:
     def __init__(self, group: asyncio.TaskGroup) -> None:
         self.air = Air()
         self.clock = VirtualClock(START)
-        self.session = Session(3, 1)
-        self.orders: list[Order] = []
+        self.session = ClientSession(3, 1)
+        self.commands: list[Command] = []
         self.link = ClassicLink(
             self.session,
             self.clock,
             UnixTimeline(START),
-            on_order=self.orders.append,
-            begin=group.create_task,
+            on_command=self.commands.append,
+            create_task=group.create_task,
         )
 
     def measure(self, stamp_ns: int, *, prism: int = 1, status: Status = Status.OK) -> PolarMeasurement:
@@ -121,7 +121,7 @@ async def client() -> AsyncGenerator[Client]:
     """Run a link on a radio."""
     async with asyncio.TaskGroup() as group:
         made = Client(group)
-        talking = group.create_task(made.link.talk(made.air))
+        talking = group.create_task(made.link.run(made.air))
         yield made
         talking.cancel()
 
@@ -167,15 +167,15 @@ async def test_what_the_disk_held_up_is_not_offered_as_another_prism() -> None:
     async with client() as made:
         late = made.measure(START)
         await made.say(b"n32")
-        assert made.orders == [TrackOrder(2)]
-        made.session.executed(TrackOrder(2))
-        made.link.executed(TrackOrder(2), ok=True)
+        assert made.commands == [TrackCommand(2)]
+        made.session.apply(TrackCommand(2))
+        made.link.respond(TrackCommand(2), ok=True)
         assert await made.answer() == Acknowledgement("n", ok=True)
         made.link.offer(late)
         assert (await made.poll()).time_ns == 0
         made.link.offer(made.measure(START + MS, prism=2))
         assert (await made.poll()).time_ns == START + MS
-        made.session.executed(DirectOrder())
+        made.session.apply(DirectCommand())
         made.link.offer(made.measure(START + 2 * MS, prism=2))
         assert (await made.poll()).time_ns == START + MS
 
@@ -204,11 +204,11 @@ async def test_a_shot_is_answered_whatever_becomes_of_it() -> None:
     """In direct mode `t` is an order for one single measurement; its answer carries it, or says that there is none."""
     async with client() as made:
         await made.say(b"d3")
-        made.link.executed(DirectOrder(), ok=True)
+        made.link.respond(DirectCommand(), ok=True)
         assert await made.answer() == Acknowledgement("d", ok=True)
         await made.say(b"t3")
-        assert made.orders == [DirectOrder(), MeasureOrder()]
-        made.link.shot(
+        assert made.commands == [DirectCommand(), MeasureCommand()]
+        made.link.respond_single(
             TargetRecord(
                 station=3,
                 stamp_ns=START + MS,
@@ -224,7 +224,7 @@ async def test_a_shot_is_answered_whatever_becomes_of_it() -> None:
         assert isinstance(message, MeasurementMessage)
         assert (message.status, message.time_ns, message.slope_distance_m) == (0, START + MS, 7.5)
         await made.say(b"t3")
-        made.link.shot(None)
+        made.link.respond_single(None)
         failed = await made.answer()
         assert isinstance(failed, MeasurementMessage)
         assert failed.status == 3
@@ -233,7 +233,7 @@ async def test_a_shot_is_answered_whatever_becomes_of_it() -> None:
 async def test_what_the_master_cannot_order_is_not_answered() -> None:
     """There is no search in this protocol."""
     async with client() as made:
-        made.link.executed(SearchOrder(), ok=True)
+        made.link.respond(SearchCommand(), ok=True)
         assert await made.answer() is None
 
 
@@ -242,23 +242,23 @@ async def test_an_answer_that_nobody_waits_for_is_not_sent() -> None:
     async with client() as made:
         await made.say(b"d3")
         await asyncio.sleep(21.0)
-        made.link.executed(DirectOrder(), ok=True)
+        made.link.respond(DirectCommand(), ok=True)
         assert await made.answer() is None
         await made.say(b"n3")
         made.air.broken = True
-        made.link.executed(TrackOrder(None), ok=True)
+        made.link.respond(TrackCommand(None), ok=True)
         assert await made.answer() is None
 
 
 async def test_the_status_tells_of_the_master() -> None:
     """Of packets for this station only; what the protocol does not have is null."""
     async with client() as made:
-        assert made.link.status().heard_ns is None
+        assert made.link.status().master_received_ns is None
         await made.say(b"t2")
-        assert made.link.status().heard_ns is None
+        assert made.link.status().master_received_ns is None
         await made.say(b"t3")
         status = made.link.status()
-        assert status.heard_ns is not None
-        assert abs(status.heard_ns - START) < 10 * MS
+        assert status.master_received_ns is not None
+        assert abs(status.master_received_ns - START) < 10 * MS
         assert (status.protocol, status.rssi_dbm, status.snr_db) == ("classic", -80.5, 9.25)
         assert (status.joined, status.queued, status.authenticated) == (None, None, None)

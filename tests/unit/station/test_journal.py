@@ -11,7 +11,7 @@ from harness.records import HEADER
 
 from tsgt.recording import RecordingWriter
 from tsgt.recording.recorder import Recorder
-from tsgt.station.journal import RETRY_S, JournalQueue
+from tsgt.station.journal import RETRY_INTERVAL_S, JournalQueue
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -28,13 +28,13 @@ async def test_what_waits_for_the_disk_is_written_without_another_line(tmp_path:
 
     with RecordingWriter(tmp_path / "journal.jsonl", write=write) as writer:
         recorder = Recorder(writer)
-        queue = JournalQueue(recorder, patience_s=None)
-        writing = asyncio.create_task(queue.keep_writing())
+        queue = JournalQueue(recorder, write_timeout_s=None)
+        writing = asyncio.create_task(queue.run())
         queue.write(HEADER, lambda: None)
         await asyncio.sleep(5.0)
-        assert recorder.waiting == 1
+        assert recorder.pending == 1
         full = False
-        await asyncio.sleep(2 * RETRY_S)
-        assert recorder.waiting == 0
+        await asyncio.sleep(2 * RETRY_INTERVAL_S)
+        assert recorder.pending == 0
         writing.cancel()
         await asyncio.wait([writing])

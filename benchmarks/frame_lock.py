@@ -17,17 +17,18 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from tsgt.radio import LoRaSettings
-from tsgt.radio.superframe import COMPOSED_NS, FrameLock, FrameTiming
-from tsgt.radio.superframe.grants import expected
-from tsgt.radio.superframe.phase_lock import Plan
+from tsgt.radio.superframe import COMPOSE_LEAD_NS, FramePlan, FrameTiming, PhaseLock
+from tsgt.radio.superframe.demand import expected_measurements
 from tsgt.radio.superframe.wire import GRANT_BYTES, SlotOrder
-from tsgt.timesync import Beat
+from tsgt.timesync import Period
 
 if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
 
 SETTINGS = LoRaSettings(frequency_hz=905_000_000, spreading_factor=9, bandwidth_hz=250_000, coding_rate=6)
-TIMING = FrameTiming.stated(SETTINGS, start_jitter_ns=5_000_000, turn_round_ns=8_000_000, clock_error_ppm=100)
+TIMING = FrameTiming.from_tolerances(
+    SETTINGS, start_jitter_ns=5_000_000, turnaround_ns=8_000_000, clock_error_ppm=100
+)
 MASTER_NS = 6_000_000
 
 REPLY_BYTES = (5, 17, 26, 33, 39, 45, 51, 57, 65)
@@ -99,10 +100,10 @@ class Station:
             self.missing = len(self.queue)  # as the sequence numbers tell
 
 
-def grant(station: Station, slot_ns: int, beat: Beat, most_bytes: int) -> int:
+def grant(station: Station, slot_ns: int, beat: Period, most_bytes: int) -> int:
     """Return the grant for what a station is expected to have."""
     newest_us, heard_us = station.newest_ns // 1000, station.heard_ns // 1000
-    due = expected(beat, newest_us=newest_us, heard_us=heard_us, slot_us=slot_ns // 1000)
+    due = expected_measurements(beat, newest_us=newest_us, replied_us=heard_us, slot_us=slot_ns // 1000)
     needed_bytes = REPLY_BYTES[min(due + station.missing, len(REPLY_BYTES) - 1)]
     return bisect_left(GRANT_BYTES, min(needed_bytes, most_bytes))
 
@@ -116,34 +117,38 @@ def run(case: Case, seed: int, *, locked: bool) -> tuple[FloatArray, float]:
         times = rng.uniform(0, period_ns) + np.arange(0, DURATION_NS, period_ns)
         times += rng.normal(0, 1e6 * case.jitter_ms, len(times))
         stations.append(Station([round(time) for time in np.sort(times)], 1e6 * case.latency_ms))
-    lock, beacon_bytes = FrameLock(TIMING, case.stations), BEACON_BYTES[case.stations]
+    lock, beacon_bytes = PhaseLock(TIMING, case.stations), BEACON_BYTES[case.stations]
     beacon_ns, most_bytes = TIMING.airtime_ns(beacon_bytes), MOST_BYTES[case.stations < 8]
-    beat = Beat(1e6 / case.rate_hz, 0, 1e3 * case.jitter_ms)
-    plan, grants = Plan(0, SlotOrder()), [2] * case.stations
+    beat = Period(1e6 / case.rate_hz, 0, 1e3 * case.jitter_ms)
+    plan, grants = FramePlan(0, SlotOrder()), [2] * case.stations
     ages, starts, earliest_ns = [], [], 0
     while earliest_ns < DURATION_NS:
         begin_ns = lock.forecast(earliest_ns, beacon_bytes) if locked else earliest_ns
-        spans = [span for span in TIMING.slots(grants, plan.order) if span is not None]
+        spans = [span for span in TIMING.slots(grants, plan.slot_order) if span is not None]
         grants = [
             grant(station, begin_ns + beacon_ns + span.start_ns, beat, most_bytes)
             for station, span in zip(stations, spans, strict=True)
         ]
-        plan = lock.plan(earliest_ns, grants, beacon_bytes) if locked else Plan(earliest_ns, plan.order)
+        plan = (
+            lock.plan(earliest_ns, grants, beacon_bytes)
+            if locked
+            else FramePlan(earliest_ns, plan.slot_order)
+        )
         starts.append(plan.start_ns)
         end_ns = earliest_ns = plan.start_ns + beacon_ns
-        spans = [span for span in TIMING.slots(grants, plan.order) if span is not None]
+        spans = [span for span in TIMING.slots(grants, plan.slot_order) if span is not None]
         for index in sorted(range(case.stations), key=lambda index: spans[index].start_ns):
             station, span = stations[index], spans[index]
-            sent = station.reply(end_ns + span.start_ns - COMPOSED_NS, span.reply_bytes)
+            sent = station.reply(end_ns + span.start_ns - COMPOSE_LEAD_NS, span.max_reply_bytes)
             if rng.random() < case.loss:
                 earliest_ns = end_ns + span.end_ns + TIMING.guard_ns + TIMING.reception_ns + MASTER_NS
                 continue
             done_ns = end_ns + span.start_ns + TIMING.airtime_ns(REPLY_BYTES[len(sent)]) + TIMING.reception_ns
             earliest_ns = done_ns + MASTER_NS
             station.taken(sent, end_ns + span.start_ns)
-            lock.answered(index)
+            lock.reply_received(index)
             for time_ns in sent:
-                lock.measured(index, time_ns // 1000)
+                lock.add_measurement(index, time_ns // 1000)
                 ages.append(1e-6 * (done_ns - time_ns))
     return np.array(ages), 1e-6 * float(np.mean(np.diff(starts)))
 

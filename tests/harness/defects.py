@@ -16,21 +16,20 @@ from tsgt.errors import RadioError, StreamError
 from tsgt.estimation import observations, pose_output, tracks
 from tsgt.master import stream_server
 from tsgt.master.classic import ingest
-from tsgt.master.recording_thread import Disk
+from tsgt.master.recording_thread import RecordingThread
 from tsgt.master.superframe import link
 from tsgt.model import Status
-from tsgt.radio.superframe import SuperframeStation, master, session
-from tsgt.radio.superframe.receive_window import Inbox, Numbers
-from tsgt.radio.superframe.send_queue import Delivery
+from tsgt.radio.superframe import SuperframeStation, master, station
+from tsgt.radio.superframe.receive_window import ReceiveWindow, SequenceSet
+from tsgt.radio.superframe.send_queue import DeliveryProgress
 from tsgt.radio.superframe.session import StationSession
-from tsgt.radio.superframe.station_state import Peer
 from tsgt.radio.superframe.wire import TIME_UNIT_US
 from tsgt.recording import RecordingWriter
 from tsgt.simulation.mission import mission
 from tsgt.station import backlog, daemon
-from tsgt.station.leica.timing import InstrumentTimes
+from tsgt.station.leica.timing import DistanceTimestamper
 from tsgt.station.links import superframe as station_link
-from tsgt.timesync.offset_regression import Line
+from tsgt.timesync.offset_regression import RegressionLine
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -65,8 +64,8 @@ class Planting:
 
 def no_acknowledgement(planting: Planting) -> None:
     """Never tell a station what is in the recording."""
-    planting.put(Peer, "history", lambda _: lambda _peer, _counter: 0)
-    planting.put(Inbox, "cumulative", lambda _: property(lambda _inbox: -1))
+    planting.put(ReceiveWindow, "ack_bitmap", lambda _: lambda _peer, _counter: 0)
+    planting.put(ReceiveWindow, "cumulative", lambda _: property(lambda _inbox: -1))
 
 
 def acknowledged_before_written(planting: Planting) -> None:
@@ -75,14 +74,14 @@ def acknowledged_before_written(planting: Planting) -> None:
     def settle(link: Any) -> None:
         while link._unwritten:
             reply = link._unwritten.popleft()
-            link._master.peer(reply.station).inbox.written(reply.sequences)
+            link._master.station(reply.station).window.mark_written(reply.sequences)
 
     planting.put(link.SuperframeLink, "_settle", lambda _: settle)
 
 
 def acknowledged_to_the_highest(planting: Planting) -> None:
     """Acknowledge what is missing below the highest number."""
-    planting.put(Numbers, "cumulative", lambda _: property(lambda numbers: numbers.highest))
+    planting.put(SequenceSet, "cumulative", lambda _: property(lambda numbers: numbers.highest))
 
 
 def deleted_when_sent(planting: Planting) -> None:
@@ -91,20 +90,20 @@ def deleted_when_sent(planting: Planting) -> None:
     def sent(right: Any) -> Any:
         def wrong(delivery: Any, sequences: Any) -> None:
             right(delivery, sequences)
-            delivery._outbox.remove(sequences)
+            delivery._queue.remove(sequences)
 
         return wrong
 
-    planting.put(Delivery, "sent", sent)
+    planting.put(DeliveryProgress, "mark_sent", sent)
 
 
 def repeats_kept(planting: Planting) -> None:
     """Hand on whatever comes."""
 
     def take(right: Any) -> Any:
-        return lambda inbox, number: right(inbox, number) or True
+        return lambda window, number: right(window, number) or True
 
-    planting.put(Inbox, "take", take)
+    planting.put(ReceiveWindow, "accept", take)
 
 
 def repeats_kept_classic(planting: Planting) -> None:
@@ -127,7 +126,7 @@ def numbers_again(planting: Planting) -> None:
     """Begin with number 0 after each start."""
 
     def read(right: Any) -> Any:
-        return lambda *arguments: replace(right(*arguments), run_start=0, queued=())
+        return lambda *arguments: replace(right(*arguments), first_sequence=0, queued=())
 
     planting.put(daemon, "read_backlog", read)
 
@@ -136,19 +135,19 @@ def nonce_again(planting: Planting) -> None:
     """Introduce a station to each session with the same nonce."""
 
     def init(right: Any) -> Any:
-        def wrong(keeper: Any, *arguments: Any) -> None:
-            right(keeper, *arguments)
-            keeper._random_bits = lambda _bits: 7
+        def wrong(client: Any, *arguments: Any, **named: Any) -> None:
+            right(client, *arguments, **named)
+            client._random_bits = lambda _bits: 7
 
         return wrong
 
-    planting.put(session.SessionKeeper, "__init__", init)
+    planting.put(SuperframeStation, "__init__", init)
 
 
 def code_not_compared(planting: Planting) -> None:
     """Take each code for the right one, at the master and at the stations."""
     anything = SimpleNamespace(compare_digest=lambda _one, _other: True)
-    for module in (master, session):
+    for module in (master, station):
         planting.put(module, "hmac", lambda _: anything)
 
 
@@ -156,7 +155,7 @@ def old_beacon_accepted(planting: Planting) -> None:
     """Find the frame number of a beacon that is not new."""
 
     def counter_of(session: Any, beacon: Any) -> Any:
-        newest = session.heard.counter
+        newest = session.beacon.counter
         if beacon.session is None:
             return max(newest + (beacon.frame - newest + 128) % 256 - 128, 0)
         counter = beacon.session.counter_high << 8 | beacon.frame
@@ -187,7 +186,7 @@ def frequency_reversed(planting: Planting) -> None:
     def at_ns(line: Any, station_ns: int) -> int:
         return int(line.base_ns + round(line.offset_ns - line.frequency * line._seconds(station_ns)))
 
-    planting.put(Line, "at_ns", lambda _: at_ns)
+    planting.put(RegressionLine, "at_ns", lambda _: at_ns)
 
 
 def beacon_beside(planting: Planting) -> None:
@@ -196,7 +195,7 @@ def beacon_beside(planting: Planting) -> None:
     def reception(right: Any) -> Any:
         def wrong(session: Any) -> Any:
             found = right(session)
-            return found and replace(found, received_ns=session.heard.received_ns)
+            return found and replace(found, received_ns=session.beacon.received_ns)
 
         return wrong
 
@@ -207,19 +206,19 @@ def slot_beside(planting: Planting) -> None:
     """Reply a slot too late."""
 
     def slot_of(right: Any) -> Any:
-        def wrong(station: Any, session: Any) -> Any:
-            slot = right(station, session)
+        def wrong(session: Any) -> Any:
+            slot = right(session)
             if slot is None:
                 return None
-            late_ns = slot.span.end_ns - slot.span.start_ns + session.timing.guard_ns
-            span = slot.span._replace(
-                start_ns=slot.span.start_ns + late_ns, end_ns=slot.span.end_ns + late_ns
+            late_ns = slot.slot.end_ns - slot.slot.start_ns + session.timing.guard_ns
+            moved = slot.slot._replace(
+                start_ns=slot.slot.start_ns + late_ns, end_ns=slot.slot.end_ns + late_ns
             )
-            return slot._replace(span=span, start_ns=slot.start_ns + late_ns)
+            return slot._replace(slot=moved, start_ns=slot.start_ns + late_ns)
 
         return wrong
 
-    planting.put(SuperframeStation, "_slot_of", slot_of)
+    planting.put(StationSession, "_reply_slot", slot_of)
 
 
 def whole_milliseconds(planting: Planting) -> None:
@@ -233,7 +232,7 @@ def whole_milliseconds(planting: Planting) -> None:
 
         return wrong
 
-    planting.put(StationSession, "timed", timed)
+    planting.put(StationSession, "timestamped", timed)
 
 
 def latency_left_in(planting: Planting) -> None:
@@ -246,7 +245,7 @@ def latency_left_in(planting: Planting) -> None:
 
         return wrong
 
-    planting.put(InstrumentTimes, "stamp", stamp)
+    planting.put(DistanceTimestamper, "timestamp", stamp)
 
 
 # --- Values ---------------------------------------------------------------------------------------------------
@@ -311,7 +310,7 @@ def smoothed_now(planting: Planting) -> None:
 
         return wrong
 
-    planting.put(pose_output.ContinuousPoses, "smoothed", smoothed)
+    planting.put(pose_output.ContinuousPoseOutput, "smoothed", smoothed)
 
 
 # --- Files, queues, radios ------------------------------------------------------------------------------------
@@ -323,7 +322,7 @@ def another_order(planting: Planting) -> None:
 
     def put(right: Any) -> Any:
         def wrong(disk: Any, line: bytes) -> None:
-            if disk not in held and disk.taken % 50 == 49:
+            if disk not in held and disk.line_count % 50 == 49:
                 held[disk] = line
                 return
             right(disk, line)
@@ -332,18 +331,18 @@ def another_order(planting: Planting) -> None:
 
         return wrong
 
-    planting.put(Disk, "put", put)
+    planting.put(RecordingThread, "put", put)
 
 
 def journalled_afterwards(planting: Planting) -> None:
     """Deliver at once, and write half a second later."""
 
     def measured(client: Any, reading: Any) -> None:
-        measurement = client._session.measured(reading, client._timeline.unix_ns(reading.at_ns))
-        client.link.offer(measurement)
-        asyncio.get_running_loop().call_later(0.5, client.write, measurement)
+        measurement = client._session.measurement(reading, client._timeline.unix_ns(reading.at_ns))
+        client._link.offer(measurement)
+        asyncio.get_running_loop().call_later(0.5, client._journal.write, measurement)
 
-    planting.put(daemon._Client, "_measured", lambda _: measured)
+    planting.put(daemon._StationClient, "_on_reading", lambda _: measured)
 
 
 def torn_line_kept(planting: Planting) -> None:
@@ -359,10 +358,10 @@ def endless_queue(planting: Planting) -> None:
 def radio_given_up(planting: Planting) -> None:
     """Use a station's radio until its first fault, and never again."""
 
-    async def keep_radio(open_radio: Any, use: Any, _clock: Any) -> None:
+    async def supervise_radio(open_radio: Any, use: Any, _clock: Any) -> None:
         with contextlib.suppress(RadioError, StreamError):
             async with open_radio() as radio:
                 await use(radio)
         await asyncio.Event().wait()
 
-    planting.put(daemon, "keep_radio", lambda _: keep_radio)
+    planting.put(daemon, "supervise_radio", lambda _: supervise_radio)

@@ -10,15 +10,20 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from tsgt.model import Status
-from tsgt.radio import Packet, Transmitted
+from tsgt.radio import Packet, Transmission
 from tsgt.radio.airtime import TX_DONE_NS
-from tsgt.radio.superframe import Outbox, Queued, Situation, SuperframeMaster, SuperframeStation
+from tsgt.radio.superframe import (
+    InstrumentState,
+    QueuedMeasurement,
+    SendQueue,
+    SuperframeMaster,
+    SuperframeStation,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from tsgt.radio.superframe import FrameTiming, TimedSighting
-    from tsgt.radio.superframe.reception import Heard
+    from tsgt.radio.superframe import FrameTiming, ReceivedReply, TimedMeasurement
     from tsgt.radio.superframe.wire import Authenticator
 
 MS = 1_000_000
@@ -49,11 +54,11 @@ class Member:
 
     number: int
     core: SuperframeStation
-    outbox: Outbox
+    send_queue: SendQueue
     offset_ns: int
     drift_ppm: int
     made_ns: dict[int, int] = field(default_factory=dict)
-    received: dict[int, TimedSighting] = field(default_factory=dict)
+    received: dict[int, TimedMeasurement] = field(default_factory=dict)
     next_ns: int = 0
 
     def local_ns(self, true_ns: int) -> int:
@@ -70,7 +75,7 @@ class Member:
         while self.next_ns <= until_ns:
             number = len(self.made_ns)
             self.made_ns[number] = self.next_ns
-            queued = Queued(
+            queued = QueuedMeasurement(
                 sequence=number,
                 at_ns=self.local_ns(self.next_ns),
                 boot=_BOOT,
@@ -80,7 +85,7 @@ class Member:
                 zenith=4_000_000,
                 distance_m=40.0 + 0.001 * number,
             )
-            self.outbox.add(queued)
+            self.send_queue.add(queued)
             self.next_ns += PERIOD_NS
 
     def errors_ns(self) -> dict[int, int]:
@@ -141,7 +146,7 @@ class Exchange:
         self.beacon = b""
         self.done_ns = 0
         self.replies: dict[int, bytes] = {}
-        self.heard: dict[int, Heard] = {}
+        self.heard: dict[int, ReceivedReply] = {}
 
     def begin(self, *, sigma_ns: int = _STAMP_SIGMA_NS) -> bytes:
         """Send a beacon, of whose TxDone the master knows one sigma; return it."""
@@ -182,14 +187,14 @@ class Exchange:
         slot_ns = member.true_ns(heard.slot_ns)
         member.measure(slot_ns - _LEAD_NS)
         reply = member.core.compose(
-            Situation(prism=number, direct=False, connected=True), heard.slot_ns - _LEAD_NS
+            InstrumentState(prism=number, direct=False, connected=True), heard.slot_ns - _LEAD_NS
         )
         if reply is None:
             return None
         self.replies[number] = reply
         done_ns = slot_ns + self.timing.airtime_ns(len(reply)) + TX_DONE_NS
         member.core.sent(
-            Transmitted(
+            Transmission(
                 started_at_ns=heard.slot_ns,
                 done_at_ns=member.local_ns(done_ns),
                 stamp_sigma_ns=_STAMP_SIGMA_NS,
@@ -197,7 +202,9 @@ class Exchange:
         )
         return done_ns + self.timing.link_ns
 
-    def deliver(self, number: int, received_ns: int, *, sigma_ns: int = _STAMP_SIGMA_NS) -> Heard | None:
+    def deliver(
+        self, number: int, received_ns: int, *, sigma_ns: int = _STAMP_SIGMA_NS
+    ) -> ReceivedReply | None:
         """Hand a station's reply to the master, if it still waits for one.
 
         Parameters
@@ -207,21 +214,21 @@ class Exchange:
         received_ns, sigma_ns
             RxDone as the master knows it, and one sigma.
         """
-        until_ns = self.master.waits_until_ns
+        until_ns = self.master.reply_deadline_ns
         if until_ns is None or received_ns > until_ns:
             return None
         heard = self.master.received(self.replies[number], received_ns, sigma_ns)
         self.now_ns = max(self.now_ns, received_ns)
         if heard is not None:
             self.heard[number] = heard
-            self.members[number].received |= {got.sequence: got for got in heard.sightings}
-            self.master.peer(number).inbox.written([got.sequence for got in heard.sightings])
+            self.members[number].received |= {got.sequence: got for got in heard.measurements}
+            self.master.station(number).window.mark_written([got.sequence for got in heard.measurements])
         return heard
 
     def end(self) -> None:
         """End the frame."""
-        self.now_ns = max(self.now_ns, self.master.waits_until_ns or 0) + 5 * MS
-        self.master.finished()
+        self.now_ns = max(self.now_ns, self.master.reply_deadline_ns or 0) + 5 * MS
+        self.master.finish()
 
     def frame(self, *, late_ns: dict[int, int] | None = None, deaf: Sequence[int] = ()) -> None:
         """Run a frame; the beacon is held back from some stations, and kept from others."""
@@ -241,20 +248,20 @@ def _member(
     random_bits: Callable[[int], int],
     start_ns: int,
 ) -> Member:
-    outbox = Outbox(0)
+    send_queue = SendQueue(0)
     core = SuperframeStation(
         number,
         timing.settings,
         authenticator,
-        outbox,
-        lineage=number,
+        send_queue,
+        stream_id=number,
         boot=_BOOT,
         random_bits=random_bits,
     )
     return Member(
         number,
         core,
-        outbox,
+        send_queue,
         offset_ns=number * 777_000 * MS,
         drift_ppm=10 * number,
         next_ns=start_ns + 100 * number * MS,

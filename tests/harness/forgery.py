@@ -46,7 +46,7 @@ _OLD_FRAMES = 200
 _REMEMBERED = 2000
 _LONG_AGO_NS = 1_000_000_000_000
 
-_COUNTERS = frozenset({"foreign", "refused"})
+_COUNTERS = frozenset({"rejected_packets", "authentication_failures"})
 """What is there to count such packets."""
 
 
@@ -177,14 +177,14 @@ class _Attack:
     def _reply(self, authenticator: Authenticator, content: bytes, exchange: Exchange) -> bytes:
         """Make a reply that is right but for the key."""
         number = int(self._rng.integers(1, len(exchange.members) + 1))
-        peer = exchange.master.peer(number)
+        station_state = exchange.master.station(number)
         return content + authenticator.reply_code(
             session=exchange.master.session,
             station=number,
-            station_nonce=peer.nonce or 0,
+            station_nonce=station_state.nonce or 0,
             counter=exchange.master.counter,
             beacon_code=exchange.beacon[-CODE_BYTES:],
-            sequence=peer.first_number(decode_reply(content)),
+            sequence=station_state.first_sequence(decode_reply(content)),
             content=content,
         )
 
@@ -231,7 +231,7 @@ def state(thing: object) -> object:
         return {state(key): state(value) for key, value in thing.items()}
     if isinstance(thing, list | tuple | deque):
         return tuple(state(each) for each in thing)
-    if not type(thing).__module__.startswith("tsgt.") or isinstance(thing, Enum):
+    if not type(thing).__module__.startswith(("tsgt.", "harness.")) or isinstance(thing, Enum):
         return None if callable(thing) else thing
     names = {slot for cls in type(thing).__mro__ for slot in getattr(cls, "__slots__", ())}
     names |= set(getattr(thing, "__dict__", ()))

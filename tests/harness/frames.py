@@ -17,10 +17,10 @@ from tsgt.radio.superframe.wire import (
     TIME_UNIT_US,
     WIDE_TIME_BITS,
     Authenticator,
-    Introduction,
+    EncodedMeasurement,
+    JoinRequest,
+    MeasurementBlock,
     Reply,
-    Run,
-    Sighting,
     angle_code,
     decode_beacon,
     distance_code,
@@ -30,13 +30,14 @@ from tsgt.radio.superframe.wire import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from tsgt.radio.superframe import FrameLock
-    from tsgt.radio.superframe.reception import Heard
-    from tsgt.radio.superframe.slots import SlotSpan
+    from tsgt.radio.superframe import PhaseLock, ReceivedReply
+    from tsgt.radio.superframe.slots import Slot
     from tsgt.radio.superframe.wire import Beacon
 
 KEY = bytes(range(32))
-TIMING = FrameTiming.stated(PAPER, start_jitter_ns=5 * MS, turn_round_ns=8 * MS, clock_error_ppm=100.0)
+TIMING = FrameTiming.from_tolerances(
+    PAPER, start_jitter_ns=5 * MS, turnaround_ns=8 * MS, clock_error_ppm=100.0
+)
 EXACT_NS = 3_000
 ZERO_NS = 1_000_000 * MS
 """The master starts when its clock has run for a quarter of an hour."""
@@ -48,9 +49,11 @@ def counted() -> Callable[[int], int]:
     return lambda bits: next(numbers) % (1 << bits)
 
 
-def sighting(sequence: int, session_us: int, *, origin_us: int = 0, wide: bool = False) -> Sighting:
+def measurement(
+    sequence: int, session_us: int, *, origin_us: int = 0, wide: bool = False
+) -> EncodedMeasurement:
     """Make a measurement whose angles tell its number, with its time as it goes over the air."""
-    return Sighting(
+    return EncodedMeasurement(
         sequence=sequence % (1 << 32 if wide else 1 << 8),
         time=round((session_us - origin_us) / TIME_UNIT_US) % (1 << (WIDE_TIME_BITS if wide else TIME_BITS)),
         status=Status.OK,
@@ -60,7 +63,7 @@ def sighting(sequence: int, session_us: int, *, origin_us: int = 0, wide: bool =
     )
 
 
-def older(newest: Sighting, back: int) -> Sighting:
+def older(newest: EncodedMeasurement, back: int) -> EncodedMeasurement:
     """Make the measurement so many numbers before another one in its run, at 2.5 Hz."""
     return replace(
         newest,
@@ -76,16 +79,16 @@ class Station:
 
     number: int
     nonce: int = 0x5EED
-    lineage: int = 7
-    run_start: int = 0
+    stream_id: int = 7
+    first_sequence: int = 0
     oldest: int = 0
     sequence: int = 0
 
     @property
-    def introduction(self) -> Introduction:
+    def join_request(self) -> JoinRequest:
         """Say who it is."""
-        return Introduction(
-            nonce=self.nonce, lineage=self.lineage, run_start=self.run_start, oldest=self.oldest
+        return JoinRequest(
+            nonce=self.nonce, stream_id=self.stream_id, first_sequence=self.first_sequence, oldest=self.oldest
         )
 
     def next_number(self) -> int:
@@ -117,7 +120,7 @@ class Frames:
     beacon: Beacon = field(init=False)
     sent_ns: int = 0
     link_ns: int = TIMING.link_ns + 100_000
-    turn_rounds_us: dict[int, int] = field(default_factory=dict)
+    turnarounds_us: dict[int, int] = field(default_factory=dict)
     """By station: from RxDone of the last beacon that it answered to TxDone of its reply."""
 
     @property
@@ -136,10 +139,10 @@ class Frames:
             self.master.sent(self.sent_ns, sigma_ns)
         return self.beacon
 
-    def span(self, station: int) -> SlotSpan:
+    def span(self, station: int) -> Slot:
         """Return a station's slot."""
         grants = [entry.grant for entry in self.beacon.stations]
-        span = TIMING.slots(grants, self.beacon.order)[station - 1]
+        span = TIMING.slots(grants, self.beacon.slot_order)[station - 1]
         assert span is not None
         return span
 
@@ -158,20 +161,20 @@ class Frames:
 
     def arrive(
         self, station: int, packet: bytes, *, late_ns: int = 0, sigma_ns: int = EXACT_NS
-    ) -> Heard | None:
+    ) -> ReceivedReply | None:
         """Let a packet arrive as one in the station's slot does."""
         begins_ns = self.sent_ns + self.link_ns - TIMING.reception_ns + self.span(station).start_ns + late_ns
         ends_ns = begins_ns + TIMING.airtime_ns(len(packet)) + TX_DONE_NS + self.link_ns
         heard = self.master.received(packet, ends_ns, sigma_ns)
-        self.turn_rounds_us[station] = round((ends_ns - self.sent_ns - 2 * self.link_ns) / 1000)
+        self.turnarounds_us[station] = round((ends_ns - self.sent_ns - 2 * self.link_ns) / 1000)
         self.now_ns = max(self.now_ns, ends_ns)
         if heard is not None and self.writes:
-            self.master.peer(station).inbox.written([each.sequence for each in heard.sightings])
+            self.master.station(station).window.mark_written([each.sequence for each in heard.measurements])
         return heard
 
-    def answer(
+    def reply(
         self, station: int, reply: Reply, *, sequence: int = 0, late_ns: int = 0, sigma_ns: int = EXACT_NS
-    ) -> Heard:
+    ) -> ReceivedReply:
         """Let a station answer, which the master has to accept."""
         packet = self.packet(station, reply, sequence=sequence)
         heard = self.arrive(station, packet, late_ns=late_ns, sigma_ns=sigma_ns)
@@ -180,20 +183,22 @@ class Frames:
 
     def measure(
         self, station: int, *, age_ms: float = 100, introduce: bool = False, wide: bool | None = None
-    ) -> Heard:
+    ) -> ReceivedReply:
         """Let a station answer with a new measurement, made so long before its slot."""
         sender = self.stations[station]
         number = sender.next_number()
         wide = introduce if wide is None else wide
         slot_us = self.sent_us + self.span(station).start_ns // 1000
-        run = Run(sightings=(sighting(number, slot_us - round(1000 * age_ms), wide=wide),), wide=wide)
-        introduction = sender.introduction if introduce else None
-        return self.answer(station, Reply(runs=(run,), introduction=introduction), sequence=number)
+        run = MeasurementBlock(
+            measurements=(measurement(number, slot_us - round(1000 * age_ms), wide=wide),), wide=wide
+        )
+        join_request = sender.join_request if introduce else None
+        return self.reply(station, Reply(blocks=(run,), join_request=join_request), sequence=number)
 
     def end(self) -> list[int]:
         """End the frame; return who was silent."""
-        self.now_ns = max(self.now_ns, self.master.waits_until_ns or 0) + 5 * MS
-        return self.master.finished()
+        self.now_ns = max(self.now_ns, self.master.reply_deadline_ns or 0) + 5 * MS
+        return self.master.finish()
 
     def join(self) -> None:
         """Have all stations introduce themselves, each with a measurement, and be confirmed."""
@@ -216,7 +221,7 @@ def frames_of(
     stations: Sequence[int] = (1, 2, 3),
     *,
     key: bytes | None = KEY,
-    lock: FrameLock | None = None,
+    phase_lock: PhaseLock | None = None,
     zero_ns: int = ZERO_NS,
     **options: bool,
 ) -> Frames:
@@ -228,7 +233,7 @@ def frames_of(
         authenticator,
         counted(),
         zero_ns,
-        lock=lock,
+        phase_lock=phase_lock,
         **options,
     )
     made = {number: Station(number, nonce=0x5EED + number) for number in stations}

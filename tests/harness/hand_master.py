@@ -8,9 +8,15 @@ from typing import TYPE_CHECKING
 from harness.radios import MS, PAPER
 
 from tsgt.model import Status
-from tsgt.radio import Packet, Transmitted
+from tsgt.radio import Packet, Transmission
 from tsgt.radio.airtime import TX_DONE_NS
-from tsgt.radio.superframe import FrameTiming, Outbox, Queued, Situation, SuperframeStation
+from tsgt.radio.superframe import (
+    FrameTiming,
+    InstrumentState,
+    QueuedMeasurement,
+    SendQueue,
+    SuperframeStation,
+)
 from tsgt.radio.superframe.slots import GUARD_UNIT_NS
 from tsgt.radio.superframe.wire import (
     CODE_BYTES,
@@ -21,8 +27,8 @@ from tsgt.radio.superframe.wire import (
     WIDE_TIME_BITS,
     Authenticator,
     Beacon,
-    Confirmation,
-    SessionPart,
+    JoinConfirmation,
+    SessionInfo,
     SlotOrder,
     StationEntry,
     decode_reply,
@@ -32,15 +38,14 @@ from tsgt.radio.superframe.wire import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from tsgt.radio.superframe import Reception
-    from tsgt.radio.superframe.station import Heard
-    from tsgt.radio.superframe.wire import OrderPart, Reply, Run
+    from tsgt.radio.superframe import BeaconReception, ReceivedBeacon
+    from tsgt.radio.superframe.wire import EncodedCommand, MeasurementBlock, Reply
 
 SECOND = 1_000_000_000
 KEY = bytes(range(32))
 AUTHENTICATOR = Authenticator(KEY)
 TIMING = FrameTiming(PAPER, 20 * GUARD_UNIT_NS, 32 * GUARD_UNIT_NS)
-TRACKING = Situation(prism=1, direct=False, connected=True)
+TRACKING = InstrumentState(prism=1, direct=False, connected=True)
 
 OFFSET_NS = 777 * SECOND
 DRIFT_PPM = 30
@@ -58,10 +63,10 @@ def counted() -> Callable[[int], int]:
 
 
 def make_station(
-    outbox: Outbox,
+    send_queue: SendQueue,
     *,
     boot: str = "boot",
-    receptions: Sequence[Reception] = (),
+    receptions: Sequence[BeaconReception] = (),
     authenticator: Authenticator = AUTHENTICATOR,
     random_bits: Callable[[int], int] | None = None,
 ) -> SuperframeStation:
@@ -70,17 +75,17 @@ def make_station(
         2,
         PAPER,
         authenticator,
-        outbox,
-        lineage=9,
+        send_queue,
+        stream_id=9,
         boot=boot,
         receptions=receptions,
         random_bits=random_bits or counted(),
     )
 
 
-def queued(sequence: int, true_ns: int, *, prism: int = 1, boot: str = "boot") -> Queued:
+def queued(sequence: int, true_ns: int, *, prism: int = 1, boot: str = "boot") -> QueuedMeasurement:
     """Make a measurement of a robot that moves on."""
-    return Queued(
+    return QueuedMeasurement(
         sequence=sequence,
         at_ns=local_ns(true_ns),
         boot=boot,
@@ -146,16 +151,16 @@ class HandMaster:
             number += 1
         return number - 1
 
-    def beacon(self, *, orders: Sequence[OrderPart] = (), session: bool | None = None) -> bytes:
+    def beacon(self, *, commands: Sequence[EncodedCommand] = (), session: bool | None = None) -> bytes:
         """Begin the next frame; return its beacon."""
         self.counter += 1
         self.now_ns += self.frame_ns
         with_session = self.counter % self.session_every == 0 if session is None else session
         confirmations = (
-            () if self._confirmation is None else (Confirmation(self.station, self._confirmation),)
+            () if self._confirmation is None else (JoinConfirmation(self.station, self._confirmation),)
         )
         self._confirmation = None
-        history = sum(
+        ack_bitmap = sum(
             1 << j
             for j in range(4)
             if self.counter - 1 - j in self.replies
@@ -166,22 +171,22 @@ class HandMaster:
                 frame=self.counter % 256,
                 sent=self.sent_us % (1 << 16),
                 cumulative=self.cumulative % 256,
-                order=SlotOrder(),
+                slot_order=SlotOrder(),
                 stations=tuple(
-                    StationEntry(history, self.grant) if index == self.station - 1 else StationEntry(0, 2)
+                    StationEntry(ack_bitmap, self.grant) if index == self.station - 1 else StationEntry(0, 2)
                     for index in range(self.stations)
                 ),
-                session=SessionPart(
+                session=SessionInfo(
                     nonce=self.session,
                     counter_high=self.counter >> 8,
                     sent_high=self.sent_us >> 16,
                     guard=20,
-                    turn_round=32,
+                    turnaround=32,
                 )
                 if with_session
                 else None,
                 confirmations=confirmations,
-                orders=tuple(orders),
+                commands=tuple(commands),
             )
         )
         self.code = self.authenticator.beacon_code(
@@ -191,7 +196,7 @@ class HandMaster:
         self._left(self.now_ns + TIMING.airtime_ns(len(payload)) + TX_DONE_NS)
         return payload
 
-    def left(self, transmitted: Transmitted) -> None:
+    def left(self, transmitted: Transmission) -> None:
         """Take it that the beacon was sent by a radio."""
         self.now_ns = transmitted.started_at_ns
         self._left(transmitted.done_at_ns)
@@ -214,9 +219,9 @@ class HandMaster:
     def frame(
         self,
         station: SuperframeStation,
-        situation: Situation = TRACKING,
+        instrument_state: InstrumentState = TRACKING,
         *,
-        orders: Sequence[OrderPart] = (),
+        commands: Sequence[EncodedCommand] = (),
         beacon_lost: bool = False,
         reply_lost: bool = False,
         not_written: bool = False,
@@ -224,24 +229,24 @@ class HandMaster:
         session: bool | None = None,
     ) -> Answered | None:
         """Play a frame; return the reply, None where there is none or it is lost."""
-        payload = self.beacon(orders=orders, session=session)
+        payload = self.beacon(commands=commands, session=session)
         if beacon_lost:
             return None
         heard = station.received(self.packet(payload, late_ns=late_ns))
         if heard is None or heard.slot_ns is None:
             return None
-        reply = self.compose(station, heard, situation)
+        reply = self.compose(station, heard, instrument_state)
         return None if reply is None or reply_lost else self.take(reply, not_written=not_written)
 
     def compose(
-        self, station: SuperframeStation, heard: Heard, situation: Situation = TRACKING
+        self, station: SuperframeStation, heard: ReceivedBeacon, instrument_state: InstrumentState = TRACKING
     ) -> bytes | None:
         """Let the station answer in time."""
         assert heard.slot_ns is not None
-        reply = station.compose(situation, heard.slot_ns - 6 * MS)
+        reply = station.compose(instrument_state, heard.slot_ns - 6 * MS)
         if reply is not None:
             done_ns = heard.slot_ns + TIMING.airtime_ns(len(reply)) + TX_DONE_NS
-            station.sent(Transmitted(started_at_ns=heard.slot_ns, done_at_ns=done_ns, stamp_sigma_ns=20_000))
+            station.sent(Transmission(started_at_ns=heard.slot_ns, done_at_ns=done_ns, stamp_sigma_ns=20_000))
         return reply
 
     def take(self, payload: bytes, *, not_written: bool = False) -> Answered:
@@ -249,15 +254,15 @@ class HandMaster:
         assert len(payload) <= GRANT_BYTES[self.grant]
         content, code = payload[:-CODE_BYTES], payload[-CODE_BYTES:]
         reply = decode_reply(content)
-        introduction = reply.introduction
-        if introduction is not None:
-            start = introduction.run_start
-            self.settled |= {*range(introduction.oldest), *range(max(0, start - RESTART_SKIP), start)}
-            self.nonce = introduction.nonce
-            self._confirmation = introduction.nonce if self.confirm else None
+        join_request = reply.join_request
+        if join_request is not None:
+            start = join_request.first_sequence
+            self.settled |= {*range(join_request.oldest), *range(max(0, start - RESTART_SKIP), start)}
+            self.nonce = join_request.nonce
+            self._confirmation = join_request.nonce if self.confirm else None
         assert self.nonce is not None
         times_ns: dict[int, int] = {}
-        for run in reply.runs:
+        for run in reply.blocks:
             times_ns |= self._times_ns(run)
         sequences = tuple(times_ns)
         right = self.authenticator.reply_code(
@@ -277,18 +282,18 @@ class HandMaster:
             self.written |= set(sequences)
         return Answered(reply, sequences, times_ns, len(payload))
 
-    def _times_ns(self, run: Run) -> dict[int, int]:
-        newest = run.sightings[0]
+    def _times_ns(self, run: MeasurementBlock) -> dict[int, int]:
+        newest = run.measurements[0]
         number = newest.sequence
         if not run.wide:
             number = self.highest + (number - self.highest + 128) % 256 - 128
         span_us = TIME_UNIT_US << (WIDE_TIME_BITS if run.wide else TIME_BITS)
         sent_us = (self.beacon_done_ns - self.zero_ns) // 1000
-        time_us = TIME_UNIT_US * newest.time + (sent_us if run.direct else 0)
+        time_us = TIME_UNIT_US * newest.time + (sent_us if run.beacon_relative else 0)
         end_us = sent_us + 700_000  # later than any slot of three stations
         time_us = end_us - (end_us - time_us) % span_us
         result = {number: time_us}
-        for older in run.sightings[1:]:
+        for older in run.measurements[1:]:
             back = newest.sequence - older.sequence
             result[number - back] = time_us + TIME_UNIT_US * (older.time - newest.time)
         return {

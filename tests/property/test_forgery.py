@@ -15,20 +15,20 @@ from tsgt.errors import MessageError
 from tsgt.model import Status
 from tsgt.radio.superframe.wire import (
     CODE_BYTES,
-    AnswerPart,
     Authenticator,
     Beacon,
-    Confirmation,
-    Introduction,
-    OrderPart,
+    CommandResponse,
+    EncodedCommand,
+    EncodedMeasurement,
+    JoinConfirmation,
+    JoinRequest,
+    MeasurementBlock,
     Reply,
-    Run,
-    SessionPart,
-    ShotPart,
-    Sighting,
+    SessionInfo,
+    SingleMeasurement,
     SlotOrder,
-    StatePart,
     StationEntry,
+    StatusReport,
     decode_reply,
     encode_beacon,
     encode_reply,
@@ -59,7 +59,7 @@ def test_two_states_are_told_apart() -> None:
         exchange.frame()
         exchange.frame()
     assert state(one) == state(other)
-    other.members[3].core.late += 1
+    other.members[3].core.missed_slots += 1
     assert state(one) != state(other)
 
 
@@ -86,18 +86,18 @@ class _Anybody:
         """Make one that the station takes to be its master's, or that begins another session."""
         entries = int(self._rng.integers(1, 17)) if self.chance(0.2) else len(exchange.members)
         core = exchange.members[number].core
-        session = core._sessions.current
+        session = core.session
         assert session is not None
-        counter = session.heard.counter + 1 + (self.bits(3) if self.chance() else 0)
+        counter = session.beacon.counter + 1 + (self.bits(3) if self.chance() else 0)
         if self.chance(0.05):
             counter = self.bits(24)
         master = self.bits(48) if self.chance(0.05) else session.master_nonce
-        part = SessionPart(
+        part = SessionInfo(
             nonce=master,
             counter_high=counter >> 8 & 0xFFFF,
             sent_high=self.bits(24),
             guard=self.bits(8),
-            turn_round=self.bits(8),
+            turnaround=self.bits(8),
         )
         numbers = [1 + self.bits(4) % entries for _ in range(3)]
         sent = self.bits(16)
@@ -106,62 +106,66 @@ class _Anybody:
                 frame=counter % 256,
                 sent=sent,
                 cumulative=self.bits(8),
-                order=SlotOrder(self.bits(4), self.chance()),
+                slot_order=SlotOrder(self.bits(4), self.chance()),
                 stations=tuple(StationEntry(self.bits(4), self.bits(4)) for _ in range(entries)),
                 session=replace(part, sent_high=part.sent_high if sent else 0) if self.chance() else None,
-                confirmations=(Confirmation(min(number, entries), session.nonce),) if self.chance() else (),
-                orders=tuple(OrderPart(n, self.bits(4), self.bits(2) and 1 + self.bits(1)) for n in numbers),
+                confirmations=(JoinConfirmation(min(number, entries), session.nonce),)
+                if self.chance()
+                else (),
+                commands=tuple(
+                    EncodedCommand(n, self.bits(4), self.bits(2) and 1 + self.bits(1)) for n in numbers
+                ),
             )
         )
         return content + self._authenticator.beacon_code(session=master, counter=counter, content=content)
 
     def reply(self, exchange: Exchange, number: int) -> bytes:
         """Make one that the master takes to be a station's."""
-        peer = exchange.master.peer(number)
-        introduction = Introduction(
-            nonce=self.bits(32), lineage=self.bits(2), run_start=self.bits(32), oldest=self.bits(32)
+        station_state = exchange.master.station(number)
+        join_request = JoinRequest(
+            nonce=self.bits(32), stream_id=self.bits(2), first_sequence=self.bits(32), oldest=self.bits(32)
         )
-        state_part = StatePart(
+        state_part = StatusReport(
             prism=1 + self.bits(4),
             direct=self.chance(),
             connected=self.chance(),
-            late=self.bits(8),
-            doubted=self.bits(4),
+            missed_slots=self.bits(8),
+            rejected_beacons=self.bits(4),
             rssi_dbm=-self.bits(7),
         )
         values = (self.bits(24), self.bits(24), self.bits(24) or None)
         reply = Reply(
-            runs=tuple(self._run() for _ in range(self.bits(2))),
-            introduction=introduction if self.chance(0.2) else None,
-            state=state_part if self.chance() else None,
-            turn_round_us=self.bits(22) if self.chance() else None,
-            answer=AnswerPart(self.bits(4), self.chance()) if self.chance() else None,
-            shot=ShotPart(self.bits(4), Status.OK, *values) if self.chance() else None,
+            blocks=tuple(self._run() for _ in range(self.bits(2))),
+            join_request=join_request if self.chance(0.2) else None,
+            status_report=state_part if self.chance() else None,
+            turnaround_us=self.bits(22) if self.chance() else None,
+            response=CommandResponse(self.bits(4), self.chance()) if self.chance() else None,
+            single_measurement=SingleMeasurement(self.bits(4), Status.OK, *values) if self.chance() else None,
         )
         content = encode_reply(reply)
-        nonce = peer.nonce if reply.introduction is None else reply.introduction.nonce
+        nonce = station_state.nonce if reply.join_request is None else reply.join_request.nonce
         return content + self._authenticator.reply_code(
             session=exchange.master.session,
             station=number,
             station_nonce=nonce or 0,
             counter=exchange.master.counter,
             beacon_code=exchange.beacon[-CODE_BYTES:],
-            sequence=peer.first_number(decode_reply(content)),
+            sequence=station_state.first_sequence(decode_reply(content)),
             content=content,
         )
 
-    def _run(self) -> Run:
+    def _run(self) -> MeasurementBlock:
         wide = self.chance()
         sequence, time = self.bits(32 if wide else 8), self.bits(36 if wide else 17)
-        sightings = []
+        measurements = []
         for _ in range(1 + self.bits(4)):
             values = (self.bits(24), self.bits(24), self.bits(24) or None)
-            sightings.append(Sighting(sequence, time, Status.OK, *values))
+            measurements.append(EncodedMeasurement(sequence, time, Status.OK, *values))
             sequence -= 1 + self.bits(int(self._rng.integers(1, 32)))
             time -= self.bits(int(self._rng.integers(1, 35)))
-        return Run(
-            sightings=tuple(sightings),
-            direct=self.chance(),
+        return MeasurementBlock(
+            measurements=tuple(measurements),
+            beacon_relative=self.chance(),
             quality=self.bits(4),
             wide=wide,
             prism=1 + self.bits(4) if self.chance() else None,
@@ -183,7 +187,7 @@ def test_without_a_key_nothing_falls_over() -> None:
             with suppress(MessageError):
                 beacon = anybody.beacon(exchange, number)
                 exchange.hear(number, beacon=beacon, late_ns=anybody.bits(33) if anybody.chance(0.1) else 0)
-            if member.core.next_order() is not None:
+            if member.core.next_command() is not None:
                 member.core.executed(ok=anybody.chance())
             if own is not None and anybody.chance():
                 exchange.deliver(number, own)
@@ -195,6 +199,8 @@ def test_without_a_key_nothing_falls_over() -> None:
                 )
                 if heard is not None:
                     believed += 1
-                    exchange.master.peer(number).inbox.written([got.sequence for got in heard.sightings])
+                    exchange.master.station(number).window.mark_written(
+                        [got.sequence for got in heard.measurements]
+                    )
         exchange.end()
     assert believed > 200

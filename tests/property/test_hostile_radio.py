@@ -23,7 +23,7 @@ from tsgt.radio.superframe.wire import CODE_BYTES, Authenticator, decode_reply
 
 if TYPE_CHECKING:
     from tsgt.radio import Radio
-    from tsgt.simulation.mission import Mission, Run
+    from tsgt.simulation.mission import Mission, MissionResult
 
 REMEMBERED = 50
 SETTLING_FRAMES = 15
@@ -83,7 +83,7 @@ class Channel(RuleBasedStateMachine):
         heard = core.received(self.exchange.packet(station, packet[:255], late_ns=late_ns))
         if self.authenticated:
             assert heard is None or packet == self.exchange.beacon or packet in self.beacons
-        if core.next_order() is not None:
+        if core.next_command() is not None:
             core.executed(ok=damage.sample % 2 == 0)
         self.exchange.end()
 
@@ -98,14 +98,14 @@ class Channel(RuleBasedStateMachine):
         if right:
             content = packet[:-CODE_BYTES]
             try:
-                peer = exchange.master.peer(station)
+                station_state = exchange.master.station(station)
                 packet = content + Authenticator(None).reply_code(
                     session=exchange.master.session,
                     station=station,
-                    station_nonce=peer.nonce or 0,
+                    station_nonce=station_state.nonce or 0,
                     counter=exchange.master.counter,
                     beacon_code=exchange.beacon[-CODE_BYTES:],
-                    sequence=peer.first_number(decode_reply(content)),
+                    sequence=station_state.first_sequence(decode_reply(content)),
                     content=content,
                 )
             except MessageError:
@@ -113,7 +113,9 @@ class Channel(RuleBasedStateMachine):
         heard = exchange.master.received(packet[:255], exchange.done_ns + after_ns, 3000)
         if heard is not None:
             assert not self.authenticated
-            exchange.master.peer(heard.station).inbox.written([got.sequence for got in heard.sightings])
+            exchange.master.station(heard.station).window.mark_written(
+                [got.sequence for got in heard.measurements]
+            )
         exchange.end()
 
     def teardown(self) -> None:
@@ -166,7 +168,7 @@ async def attack(mission: Mission, script: list[tuple[Damage, int]]) -> None:
             heard.append((await radio.receive()).payload)
 
     await mission.sleep_until(0.5)
-    async with mission.stranger("attacker")() as radio:
+    async with mission.interferer_radio("attacker")() as radio:
         listening = asyncio.create_task(listen(radio))
         try:
             await mission.sleep_until(HOSTILE_S[0])
@@ -180,11 +182,13 @@ async def attack(mission: Mission, script: list[tuple[Damage, int]]) -> None:
             await asyncio.wait([listening])
 
 
-def delivered(run: Run, since_s: float) -> int:
+def delivered(run: MissionResult, since_s: float) -> int:
     """Count the measurements that were made since then and reached the pipeline."""
     since_ns = run.start_ns + round(since_s * 1e9)
     return sum(
-        measurement.stamp_ns >= since_ns for session in run.sessions for measurement in session.measurements
+        measurement.stamp_ns >= since_ns
+        for session in run.master_logs
+        for measurement in session.measurements
     )
 
 

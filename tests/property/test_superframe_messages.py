@@ -12,26 +12,26 @@ from tsgt.errors import MessageError
 from tsgt.model import Status
 from tsgt.radio.superframe.wire import (
     SINGLE_QUALITY,
-    AnswerPart,
     Beacon,
-    Confirmation,
-    Introduction,
-    OrderPart,
+    CommandResponse,
+    EncodedCommand,
+    EncodedDirection,
+    EncodedMeasurement,
+    JoinConfirmation,
+    JoinRequest,
+    MeasurementBlock,
     Reply,
-    Run,
-    SessionPart,
-    ShotPart,
-    Sighting,
+    SessionInfo,
+    SingleMeasurement,
     SlotOrder,
-    StatePart,
     StationEntry,
+    StatusReport,
     decode_beacon,
     decode_reply,
     encode_beacon,
     encode_reply,
     reply_bytes,
 )
-from tsgt.radio.superframe.wire.messages import Towards
 
 LONGEST_PACKET_BYTES = 255
 
@@ -42,12 +42,12 @@ def _bits(width: int) -> st.SearchStrategy[int]:
 
 entries = st.builds(StationEntry, _bits(4), _bits(4))
 sessions = st.builds(
-    SessionPart,
+    SessionInfo,
     nonce=_bits(48),
     counter_high=_bits(16),
     sent_high=_bits(24),
     guard=_bits(8),
-    turn_round=_bits(8),
+    turnaround=_bits(8),
 )
 
 
@@ -56,19 +56,19 @@ def beacons(draw: st.DrawFn) -> Beacon:
     """Any beacon; what it says to single stations it says to such as there are."""
     stations = draw(st.lists(entries, min_size=1, max_size=16).map(tuple))
     numbers = st.integers(1, len(stations))
-    tracks = st.builds(OrderPart, numbers, _bits(4), st.just(0), _bits(4))
-    others = st.builds(OrderPart, numbers, _bits(4), st.integers(1, 3))
-    directions = st.builds(Towards, _bits(16), _bits(16))
-    searches = st.builds(OrderPart, numbers, _bits(4), st.just(4), _bits(4), directions)
+    tracks = st.builds(EncodedCommand, numbers, _bits(4), st.just(0), _bits(4))
+    others = st.builds(EncodedCommand, numbers, _bits(4), st.integers(1, 3))
+    directions = st.builds(EncodedDirection, _bits(16), _bits(16))
+    searches = st.builds(EncodedCommand, numbers, _bits(4), st.just(4), _bits(4), directions)
     return Beacon(
         frame=draw(_bits(8)),
         sent=draw(st.integers(1, 2**16 - 1)),
         cumulative=draw(_bits(8)),
-        order=SlotOrder(draw(_bits(4)), draw(st.booleans())),
+        slot_order=SlotOrder(draw(_bits(4)), draw(st.booleans())),
         stations=stations,
         session=draw(st.none() | sessions),
-        confirmations=draw(st.lists(st.builds(Confirmation, numbers, _bits(32)), max_size=3).map(tuple)),
-        orders=draw(st.lists(tracks | others | searches, max_size=3).map(tuple)),
+        confirmations=draw(st.lists(st.builds(JoinConfirmation, numbers, _bits(32)), max_size=3).map(tuple)),
+        commands=draw(st.lists(tracks | others | searches, max_size=3).map(tuple)),
     )
 
 
@@ -83,11 +83,11 @@ distance_steps = st.integers(-100, 100) | st.integers(-(2**15), 2**15)
 
 
 @st.composite
-def runs(draw: st.DrawFn, *, plain: bool = False) -> Run:
+def blocks(draw: st.DrawFn, *, plain: bool = False) -> MeasurementBlock:
     """Any run, with measurements near to each other, or far away; or one without anything special."""
     flags = st.just(False) if plain else st.booleans()
     wide = draw(flags)
-    newer = Sighting(
+    newer = EncodedMeasurement(
         draw(_bits(32 if wide else 8)),
         draw(_bits(36 if wide else 17)),
         draw(statuses),
@@ -95,10 +95,10 @@ def runs(draw: st.DrawFn, *, plain: bool = False) -> Run:
         draw(angles),
         draw(distances),
     )
-    sightings = [newer]
+    measurements = [newer]
     for _ in range(draw(st.integers(0, 15))):
         distance = draw(distances) if newer.distance is None else newer.distance + draw(distance_steps)
-        newer = Sighting(
+        newer = EncodedMeasurement(
             newer.sequence - draw(number_steps),
             newer.time - draw(time_steps),
             draw(st.just(newer.status) | statuses),
@@ -106,10 +106,10 @@ def runs(draw: st.DrawFn, *, plain: bool = False) -> Run:
             (newer.zenith + draw(angle_steps)) % 2**24,
             distance if distance is not None and 0 < distance < 2**24 else None,
         )
-        sightings.append(newer)
-    return Run(
-        sightings=tuple(sightings),
-        direct=draw(flags),
+        measurements.append(newer)
+    return MeasurementBlock(
+        measurements=tuple(measurements),
+        beacon_relative=draw(flags),
         quality=draw(_bits(4)),
         wide=wide,
         prism=None if plain else draw(st.none() | st.integers(1, 16)),
@@ -119,32 +119,42 @@ def runs(draw: st.DrawFn, *, plain: bool = False) -> Run:
 
 replies = st.builds(
     Reply,
-    runs=st.lists(runs(), max_size=3).map(tuple),
-    introduction=st.none()
-    | st.builds(Introduction, nonce=_bits(32), lineage=_bits(16), run_start=_bits(32), oldest=_bits(32)),
-    state=st.none()
+    blocks=st.lists(blocks(), max_size=3).map(tuple),
+    join_request=st.none()
     | st.builds(
-        StatePart,
+        JoinRequest, nonce=_bits(32), stream_id=_bits(16), first_sequence=_bits(32), oldest=_bits(32)
+    ),
+    status_report=st.none()
+    | st.builds(
+        StatusReport,
         prism=st.integers(1, 16),
         direct=st.booleans(),
         connected=st.booleans(),
-        late=_bits(8),
-        doubted=_bits(4),
+        missed_slots=_bits(8),
+        rejected_beacons=_bits(4),
         rssi_dbm=st.integers(-127, 0),
     ),
-    turn_round_us=st.none() | _bits(22),
-    answer=st.none() | st.builds(AnswerPart, _bits(4), st.booleans()),
-    shot=st.none() | st.builds(ShotPart, _bits(4), statuses, angles, angles, distances),
+    turnaround_us=st.none() | _bits(22),
+    response=st.none() | st.builds(CommandResponse, _bits(4), st.booleans()),
+    single_measurement=st.none()
+    | st.builds(SingleMeasurement, _bits(4), statuses, angles, angles, distances),
 )
-plain_replies = runs(plain=True).map(lambda run: Reply(runs=(run,)))
+plain_replies = blocks(plain=True).map(lambda run: Reply(blocks=(run,)))
 
 
 def _as_decoded(reply: Reply) -> Reply:
     """Return what a reply comes back as: a single plain measurement claims no better quality than any other one."""
-    if reply == Reply(runs=reply.runs) and len(reply.runs) == 1 and len(reply.runs[0].sightings) == 1:
-        run = reply.runs[0]
-        if run == Run(sightings=run.sightings, quality=run.quality) and run.quality < SINGLE_QUALITY:
-            return Reply(runs=(replace(run, quality=SINGLE_QUALITY),))
+    if (
+        reply == Reply(blocks=reply.blocks)
+        and len(reply.blocks) == 1
+        and len(reply.blocks[0].measurements) == 1
+    ):
+        run = reply.blocks[0]
+        if (
+            run == MeasurementBlock(measurements=run.measurements, quality=run.quality)
+            and run.quality < SINGLE_QUALITY
+        ):
+            return Reply(blocks=(replace(run, quality=SINGLE_QUALITY),))
     return reply
 
 

@@ -1,32 +1,41 @@
-"""TODO face."""
+"""The superframe: the TDMA protocol between one master and up to 16 stations, both sides, sans-I/O.
 
-from tsgt.radio.superframe.command_exchange import Situation
-from tsgt.radio.superframe.master import SESSION_EVERY, SuperframeMaster
-from tsgt.radio.superframe.phase_lock import COMPOSED_NS, LEAST_MARGIN_NS, WORTH, FrameLock
-from tsgt.radio.superframe.receive_window import KNOWN_LINEAGES
-from tsgt.radio.superframe.reception import TimedSighting
-from tsgt.radio.superframe.send_queue import MOST_QUEUED, Outbox, Queued
-from tsgt.radio.superframe.session import Reception
-from tsgt.radio.superframe.slots import FrameTiming, slot_sequence
+In: packets with their timestamps, measurements, commands, time, random bits. Out: beacons, replies, start and end of
+slots, measurements on the master's clock. The master sends a beacon with grants and acknowledgements in each frame; the
+stations reply in their slots. :class:`SuperframeMaster` and :class:`SuperframeStation` are the two sides, ``wire`` encodes
+and authenticates their messages.
+"""
+
+from tsgt.radio.superframe.command_exchange import InstrumentState
+from tsgt.radio.superframe.demand import EXCHANGE_INTERVAL
+from tsgt.radio.superframe.master import SESSION_INTERVAL, SuperframeMaster
+from tsgt.radio.superframe.phase_lock import MIN_GAIN, MIN_MARGIN_NS, FramePlan, PhaseLock
+from tsgt.radio.superframe.receive_window import MAX_STREAMS
+from tsgt.radio.superframe.reception import ReceivedReply, TimedMeasurement
+from tsgt.radio.superframe.send_queue import QUEUE_CAPACITY, QueuedMeasurement, SendQueue
+from tsgt.radio.superframe.session import BeaconReception, ReceivedBeacon
+from tsgt.radio.superframe.slots import COMPOSE_LEAD_NS, FrameTiming, slot_sequence
 from tsgt.radio.superframe.station import SuperframeStation
-from tsgt.radio.superframe.station_state import EXCHANGE_EVERY
 
 __all__ = [
-    "COMPOSED_NS",
-    "EXCHANGE_EVERY",
-    "KNOWN_LINEAGES",
-    "LEAST_MARGIN_NS",
-    "MOST_QUEUED",
-    "SESSION_EVERY",
-    "WORTH",
-    "FrameLock",
+    "COMPOSE_LEAD_NS",
+    "EXCHANGE_INTERVAL",
+    "MAX_STREAMS",
+    "MIN_GAIN",
+    "MIN_MARGIN_NS",
+    "QUEUE_CAPACITY",
+    "SESSION_INTERVAL",
+    "BeaconReception",
+    "FramePlan",
     "FrameTiming",
-    "Outbox",
-    "Queued",
-    "Reception",
-    "Situation",
+    "InstrumentState",
+    "PhaseLock",
+    "QueuedMeasurement",
+    "ReceivedBeacon",
+    "ReceivedReply",
+    "SendQueue",
     "SuperframeMaster",
     "SuperframeStation",
-    "TimedSighting",
+    "TimedMeasurement",
     "slot_sequence",
 ]

@@ -1,34 +1,41 @@
-"""What a station and a master have to say to each other besides measurements: orders, answers, how the station does."""
+"""Commands, responses and status reports of a station in one session of a master. Sans-I/O.
+
+The station repeats responses, measurements and status reports until the master acknowledges them.
+"""
 
 from __future__ import annotations
 
 from collections import deque
 from typing import TYPE_CHECKING, NamedTuple
 
-from tsgt.radio.superframe.wire import order_of
+from tsgt.radio.superframe.wire import decode_command
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from tsgt.radio.commands import Order
-    from tsgt.radio.superframe.wire import AnswerPart, OrderPart, Reply, ShotPart, StatePart
+    from tsgt.radio.commands import Command
+    from tsgt.radio.superframe.wire import (
+        CommandResponse,
+        EncodedCommand,
+        Reply,
+        SingleMeasurement,
+        StatusReport,
+    )
 
-LONGEST_TURN_ROUND_PAUSE = 48
-"""The master makes room for a turn-round in one of 32 replies. After so many without it the backlog waits; it
-waits for the first one too, and when a beacon has been doubted, for nothing else shows a delay that is always there."""
+MAX_REPLIES_WITHOUT_TURNAROUND = 48
+"""The master has room for a turnaround in one of 32 replies. After this many without one it takes precedence over the
+backlog; so does the first one, and one after a rejected beacon, because only a turnaround reveals a constant delay."""
 
 
-class Situation(NamedTuple):
-    """What the instrument is doing.
+class InstrumentState(NamedTuple):
+    """State of the instrument.
 
     Attributes
     ----------
     prism
-        Number of the prism that it tracks, or did before direct mode.
+        The tracked prism, or the last one before direct mode.
     direct
         It is in direct mode.
-    connected
-        There is one.
     """
 
     prism: int
@@ -36,80 +43,86 @@ class Situation(NamedTuple):
     connected: bool
 
 
-class Conversation:
-    """The station's side of it, in one session of a master. Everything is said until it is acknowledged.
+class CommandExchange:
+    """The station's side.
 
     Attributes
     ----------
-    answers, shots
-        What became of orders, oldest first, not acknowledged yet.
+    responses, single_measurements
+        Not acknowledged, oldest first.
     """
 
     def __init__(self) -> None:
-        self.answers: deque[AnswerPart] = deque()
-        self.shots: deque[ShotPart] = deque()
-        self._tickets: frozenset[int] = frozenset()
-        self._orders: deque[tuple[int, Order]] = deque()
-        self._told: Situation | None = None
-        self._said: dict[
-            int, int
-        ] = {}  # prisms that the master may take for the tracked one, by the latest frame
-        self._replies_since = LONGEST_TURN_ROUND_PAUSE
+        self.responses: deque[CommandResponse] = deque()
+        self.single_measurements: deque[SingleMeasurement] = deque()
+        self._command_ids: frozenset[int] = frozenset()
+        self._commands: deque[tuple[int, Command]] = deque()
+        self._acknowledged: InstrumentState | None = None
+        # Prisms that the master may assume to be tracked, with the latest frame that reported them.
+        self._reported_prisms: dict[int, int] = {}
+        self._replies_without_turnaround = MAX_REPLIES_WITHOUT_TURNAROUND
 
-    # --- Orders -----------------------------------------------------------------------------------------------
+    # --- Commands ---------------------------------------------------------------------------------------------
 
-    def take(self, parts: Iterable[OrderPart]) -> None:
-        """Take a beacon's orders to this station; those that have come before are passed over.
+    def receive(self, encoded: Iterable[EncodedCommand]) -> None:
+        """Queue the new ones among a beacon's commands to this station.
 
-        An order stands in each beacon until it is answered or another one takes its place, and then never again. So a
-        ticket that was not in the last beacon with orders is another order's, however often tickets have come round.
+        Every beacon repeats a command until its response is received or another command replaces it. So an id that was
+        not in the last beacon with commands belongs to a new command, even after the ids have wrapped.
         """
-        parts = tuple(parts)
-        self._orders.extend(
-            (part.ticket, order_of(part)) for part in parts if part.ticket not in self._tickets
+        encoded = tuple(encoded)
+        self._commands.extend(
+            (each.command_id, decode_command(each))
+            for each in encoded
+            if each.command_id not in self._command_ids
         )
-        if parts:
-            self._tickets = frozenset(part.ticket for part in parts)
+        if encoded:
+            self._command_ids = frozenset(each.command_id for each in encoded)
 
-    def next_order(self) -> tuple[int, Order] | None:
-        """Return the next order and its ticket, once; None without any."""
-        return self._orders.popleft() if self._orders else None
+    def next_command(self) -> tuple[int, Command] | None:
+        """Remove and return the next command and its id; None without one."""
+        return self._commands.popleft() if self._commands else None
 
     # --- Replies ----------------------------------------------------------------------------------------------
 
-    def must_tell(self, situation: Situation) -> bool:
-        """Whether the master does not know, or may not know, what the instrument is doing."""
-        return situation != self._told or any(prism != situation.prism for prism in self._said)
+    def needs_report(self, state: InstrumentState) -> bool:
+        """Whether the master may not know the state of the instrument."""
+        return state != self._acknowledged or any(prism != state.prism for prism in self._reported_prisms)
 
     @property
-    def turn_round_is_overdue(self) -> bool:
-        """Whether a turn-round, and a word of how the station does, are wanted more than the backlog."""
-        return self._replies_since >= LONGEST_TURN_ROUND_PAUSE
+    def turnaround_overdue(self) -> bool:
+        """Whether a turnaround and a status report take precedence over the backlog."""
+        return self._replies_without_turnaround >= MAX_REPLIES_WITHOUT_TURNAROUND
 
-    def doubt(self) -> None:
-        """Want a turn-round, and a word of how the station does, at once."""
-        self._replies_since = LONGEST_TURN_ROUND_PAUSE
+    def request_turnaround(self) -> None:
+        """Let a turnaround and a status report take precedence at once."""
+        self._replies_without_turnaround = MAX_REPLIES_WITHOUT_TURNAROUND
 
-    def plain_prism(self, state: StatePart | None) -> int | None:
-        """Return the prism that the master is certain to take for the tracked one, in a reply with this part."""
-        prisms = set(self._said)
-        if state is not None:
-            prisms.add(state.prism)
-        return None if self._told is None or prisms - {self._told.prism} else self._told.prism
+    def known_prism(self, report: StatusReport | None) -> int | None:
+        """Return the prism that the master certainly assumes to be tracked, given a reply with this report."""
+        prisms = set(self._reported_prisms)
+        if report is not None:
+            prisms.add(report.prism)
+        acknowledged = self._acknowledged
+        return None if acknowledged is None or prisms - {acknowledged.prism} else acknowledged.prism
 
-    def said(self, reply: Reply, counter: int) -> None:
-        """Take it that a reply is on the air in this frame."""
-        if reply.state is not None:
-            self._said[reply.state.prism] = counter
-        self._replies_since = 0 if reply.turn_round_us is not None else self._replies_since + 1
+    def sent(self, reply: Reply, counter: int) -> None:
+        """Take the reply of this frame as sent."""
+        if reply.status_report is not None:
+            self._reported_prisms[reply.status_report.prism] = counter
+        has_turnaround = reply.turnaround_us is not None
+        self._replies_without_turnaround = 0 if has_turnaround else self._replies_without_turnaround + 1
 
     def acknowledged(self, reply: Reply, counter: int) -> None:
-        """Take it that the master has the reply of this frame."""
-        state = reply.state
-        if state is not None:
-            self._told = Situation(state.prism, state.direct, state.connected)
-            self._said = {prism: said for prism, said in self._said.items() if said > counter}
-        if reply.answer is not None and reply.answer in self.answers:
-            self.answers.remove(reply.answer)
-        if reply.shot is not None and reply.shot in self.shots:
-            self.shots.remove(reply.shot)
+        """Take the reply of this frame as acknowledged."""
+        report = reply.status_report
+        if report is not None:
+            self._acknowledged = InstrumentState(report.prism, report.direct, report.connected)
+            self._reported_prisms = {
+                prism: sent for prism, sent in self._reported_prisms.items() if sent > counter
+            }
+        if reply.response is not None and reply.response in self.responses:
+            self.responses.remove(reply.response)
+        single = reply.single_measurement
+        if single is not None and single in self.single_measurements:
+            self.single_measurements.remove(single)

@@ -1,13 +1,13 @@
-"""The master's side of the superframe: beacons out, replies in. Pure: instants and random bits are handed in.
+"""The master's side of the superframe: sends beacons, receives replies. Sans-I/O: time and random bits are passed in.
 
-Each frame goes the same way. :meth:`SuperframeMaster.prepare` decides who gets which slot and when the beacon should
-begin. :meth:`~SuperframeMaster.compose` makes the beacon, as late as possible, so that it acknowledges what was written
-until then. :meth:`~SuperframeMaster.sent` says when it was out; :meth:`~SuperframeMaster.received` takes what comes back
-until all slots are over; :meth:`~SuperframeMaster.finished` names those who were silent. A frame may break off at any
-point: the next one begins with ``prepare`` again, and nothing that was acknowledged is taken back.
+A frame goes through these steps. :meth:`SuperframeMaster.prepare` plans slots and the start of the beacon.
+:meth:`~SuperframeMaster.compose` returns the beacon, as late as possible, so that it acknowledges what has been recorded
+until then. :meth:`~SuperframeMaster.sent` takes its TxDone, :meth:`~SuperframeMaster.received` the replies, and
+:meth:`~SuperframeMaster.finish` returns the silent stations. A frame may be aborted at any step: the next one starts
+with ``prepare``, and no acknowledgement is revoked.
 
-A reply does not name its station. It is that one's whose code fits: the code covers session, frame, beacon and station,
-so that a packet of another frame, another station, or somebody without the key fits none.
+A reply does not contain its station. The station is the one whose authentication code matches: the code covers session,
+frame, beacon and station.
 """
 
 from __future__ import annotations
@@ -19,118 +19,110 @@ from typing import TYPE_CHECKING
 
 from tsgt.errors import MessageError
 from tsgt.radio.airtime import TX_DONE_NS, symbol_time_ns
-from tsgt.radio.superframe.grants import UNKNOWN_GRANT, asked_again, longest_grant
-from tsgt.radio.superframe.slots import GUARD_UNIT_NS, slot_sequence
-from tsgt.radio.superframe.station_state import EXACT_SIGMA_NS, Peer, Reception
+from tsgt.radio.superframe.demand import DEFAULT_GRANT, DemandEstimator, max_grant, retry_stations
+from tsgt.radio.superframe.reception import ReplyTiming
+from tsgt.radio.superframe.slots import EXACT_SIGMA_NS, GUARD_UNIT_NS, slot_sequence
+from tsgt.radio.superframe.station_state import StationState
+from tsgt.radio.superframe.timing import StationTiming
 from tsgt.radio.superframe.wire import (
     CODE_BYTES,
     GRANT_BYTES,
     SESSION_TIME_BITS,
     Beacon,
-    SessionPart,
+    SessionInfo,
     SlotOrder,
     StationEntry,
     decode_reply,
     encode_beacon,
 )
-from tsgt.timesync import RoundTrip
+from tsgt.timesync import LinkDelayEstimator
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from tsgt.radio.commands import Order
-    from tsgt.radio.superframe.phase_lock import FrameLock
-    from tsgt.radio.superframe.reception import Heard
-    from tsgt.radio.superframe.slots import FrameTiming, SlotSpan
+    from tsgt.radio.superframe.phase_lock import PhaseLock
+    from tsgt.radio.superframe.reception import ReceivedReply
+    from tsgt.radio.superframe.slots import FrameTiming, Slot
     from tsgt.radio.superframe.wire import Authenticator, Reply
 
 NONCE_BITS = 48
 
-FRAMES_PER_SESSION = (1 << 24) - 1
-"""The frame counter has 24 bits on the air; before it would begin again, a new session does."""
+MAX_FRAMES_PER_SESSION = (1 << 24) - 1
+"""The frame counter has 24 bits; a new session starts before it wraps."""
 
-SESSION_EVERY = 32
-SESSION_EVERY_WANTED = 4
-SESSION_AT_START = 12
-"""Each so manieth beacon says what a station needs to join; more often while one is not there, and at the start each."""
+SESSION_INTERVAL = 32
+SESSION_INTERVAL_JOINING = 4
+SESSION_STARTUP_FRAMES = 12
+"""Beacons with session info, which a station needs to join: one in 32, one in 4 while a station is missing, and all of
+the first 12."""
 
-CALIBRATED_AT_ONCE = 3
-"""More stations than this do not make their replies longer for the first self-calibrations in the same frame."""
+EXCHANGES_PER_FRAME = 3
+"""With more stations their initial two-way exchanges are spread over several frames."""
 
-WANTED_AFTER_FRAMES = 4
-"""A station that was silent for longer may have to join again."""
+REJOIN_FRAMES = 4
+"""A station that was silent for more frames may have to join again."""
 
-ABSENT_AFTER_FRAMES = 20
-"""A station that was silent for longer has a slot only in frames whose beacon it could join by."""
+ABSENT_FRAMES = 20
+"""A station that was silent for more frames has a slot only in frames with session info."""
 
 IDLE_FRAME_NS = 400_000_000
-"""How long a frame lasts in which nobody has a slot."""
+"""Length of a frame without slots."""
 
 
 @dataclass(slots=True)
 class _Frame:
-    """A frame under way; instants on the master's CLOCK_MONOTONIC.
+    """A frame; instants on the master's CLOCK_MONOTONIC.
 
     Attributes
     ----------
-    counter
-        Its number in the session.
     start_ns
-        When its beacon is to begin.
-    grants, order
-        Of its slots.
+        Planned start of the beacon.
     draft
-        Its beacon as far as it is known beforehand.
+        The beacon without station entries, slot order and cumulative acknowledgement.
     code
-        Of the beacon, when it is composed.
+        Authentication code of the beacon.
     sent_ns, sent_sigma_ns
         TxDone of the beacon; None before.
-    spans
-        The slots, by index of the station.
-    open
-        The stations that have a slot and have not been heard.
+    slots, pending
+        By station index; ``pending`` are the stations whose reply has not been received.
     """
 
     counter: int
     start_ns: int
     grants: tuple[int, ...]
-    order: SlotOrder
+    slot_order: SlotOrder
     draft: Beacon
     code: bytes = b""
     sent_ns: int | None = None
     sent_sigma_ns: int = 0
-    spans: list[SlotSpan | None] = field(default_factory=list)
-    open: dict[int, Peer] = field(default_factory=dict)
+    slots: list[Slot | None] = field(default_factory=list)
+    pending: dict[int, StationState] = field(default_factory=dict)
 
 
 class SuperframeMaster:
-    """Runs the frames of a session, and the next session when its numbers are used up.
+    """Runs the frames of a session, and a new session when the frame counter is exhausted.
 
     Parameters
     ----------
     prisms
-        Number of the prism by number of the station, 1 to 16, that tracks it unless it says otherwise.
-    timing
-        Of the frames.
-    authenticator
-        Makes the codes.
+        Default prism by station number, 1 to 16.
     random_bits
-        Returns so many random bits, for nonces.
+        Returns a number of this many random bits.
     now_ns
-        The present on the master's CLOCK_MONOTONIC in ns, as all instants here. The session time begins here.
-    lock
-        Says when frames begin; None: each as soon as it can.
+        On the master's CLOCK_MONOTONIC, as all instants here; zero of the session time.
+    phase_lock
+        Plans the start of frames; None: as early as possible.
     records
-        Measurements are written. Otherwise none is acknowledged, and stations are granted what answers to orders need.
+        Measurements are recorded. Otherwise none is acknowledged, and all stations get the default grant.
 
     Attributes
     ----------
     session
-        The nonce of the session.
+        Session nonce.
     counter
-        Number of the present frame in the session; -1 before the first.
-    foreign
-        How many packets were not what this frame waits for: of others, forged, late, repeated.
+        Frame counter of the session; -1 before the first frame.
+    rejected_packets
+        Packets that were not a reply to the present beacon: of others, forged, late, repeated.
     """
 
     def __init__(
@@ -141,51 +133,43 @@ class SuperframeMaster:
         random_bits: Callable[[int], int],
         now_ns: int,
         *,
-        lock: FrameLock | None = None,
+        phase_lock: PhaseLock | None = None,
         records: bool = True,
     ) -> None:
         symbol_ns = symbol_time_ns(timing.settings.spreading_factor, timing.settings.bandwidth_hz)
-        pace = math.ceil(len(prisms) / CALIBRATED_AT_ONCE)
-        self._peers = {
-            number: Peer(number, prism, RoundTrip(timing.link_ns, symbol_ns), now_ns, pace)
+        interval = math.ceil(len(prisms) / EXCHANGES_PER_FRAME)
+        self._stations = {
+            number: StationState(
+                number,
+                prism,
+                StationTiming(LinkDelayEstimator(timing.link_ns, symbol_ns), now_ns),
+                DemandEstimator(number, interval),
+            )
             for number, prism in prisms.items()
         }
         self._entries = max(prisms)
         self._timing = timing
-        self._cap = longest_grant(timing, len(prisms))
+        self._max_grant = max_grant(timing, len(prisms))
         self._authenticator = authenticator
         self._random_bits = random_bits
         self._zero_ns = now_ns
-        self._lock = lock
+        self._phase_lock = phase_lock
         self._records = records
-        self._order = SlotOrder()
-        self._frame = self._next = _no_frame(now_ns)
-        self.foreign = 0
+        self._slot_order = SlotOrder()
+        self._frame = self._next = _initial_frame(now_ns)
+        self.rejected_packets = 0
         self.session = random_bits(NONCE_BITS)
         self.counter = -1
 
-    def peer(self, station: int) -> Peer:
-        """Return what is known of a station."""
-        return self._peers[station]
-
-    def order(self, station: int, order: Order) -> int:
-        """Give a station an order, in the place of one that it has not answered; return its ticket.
-
-        The answer comes in :attr:`~tsgt.radio.superframe.reception.Heard.answer`, or ``shot``, of the same ticket.
-        """
-        return self._peers[station].order(order)
+    def station(self, number: int) -> StationState:
+        """Return the state of a station."""
+        return self._stations[number]
 
     # --- Beacons --------------------------------------------------------------------------------------------------
 
     def prepare(self, earliest_ns: int) -> int:
-        """Plan the next frame; return when its beacon should begin.
-
-        Parameters
-        ----------
-        earliest_ns
-            Before this it cannot.
-        """
-        if self.counter + 1 >= FRAMES_PER_SESSION:
+        """Plan the next frame; return the start of its beacon, at the earliest ``earliest_ns``."""
+        if self.counter + 1 >= MAX_FRAMES_PER_SESSION:
             self._begin_session()
         counter = self.counter + 1
         draft = self._draft(counter)
@@ -193,101 +177,93 @@ class SuperframeMaster:
         if not any(self._frame.grants):
             earliest_ns = max(earliest_ns, self._frame.start_ns + IDLE_FRAME_NS)
         start_ns = earliest_ns
-        if self._lock is not None:  # the longer a frame waits, the more there is to say in it
-            start_ns = self._zero_ns + self._lock.forecast(earliest_ns - self._zero_ns, beacon_bytes)
-        grants = self._grants(counter, start_ns, beacon_bytes, invites=draft.session is not None)
-        if self._lock is not None and any(grants):
-            plan = self._lock.plan(earliest_ns - self._zero_ns, grants, beacon_bytes)
-            start_ns, self._order = self._zero_ns + plan.start_ns, plan.order
-            # In another order, or later than was foreseen, the stations will have more to say.
-            grants = self._grants(counter, start_ns, beacon_bytes, invites=draft.session is not None)
-        self._next = _Frame(counter, start_ns, grants, self._order, draft)
+        if self._phase_lock is not None:  # a later start increases the demand
+            start_ns = self._zero_ns + self._phase_lock.forecast(earliest_ns - self._zero_ns, beacon_bytes)
+        invites = draft.session is not None
+        grants = self._grants(counter, start_ns, beacon_bytes, invites=invites)
+        if self._phase_lock is not None and any(grants):
+            plan = self._phase_lock.plan(earliest_ns - self._zero_ns, grants, beacon_bytes)
+            start_ns, self._slot_order = self._zero_ns + plan.start_ns, plan.slot_order
+            # The demand depends on the start of the slots.
+            grants = self._grants(counter, start_ns, beacon_bytes, invites=invites)
+        self._next = _Frame(counter, start_ns, grants, self._slot_order, draft)
         return start_ns
 
     def compose(self) -> bytes:
-        """Return the beacon of the frame that was prepared; the frame begins."""
+        """Start the prepared frame; return its beacon."""
         frame = self._next
         entries = []
         for index, grant in enumerate(frame.grants):
-            peer = self._peers.get(index + 1)
-            history = 0 if peer is None else peer.history(frame.counter)
-            entries.append(StationEntry(history, grant))
-            if grant and peer is not None:
-                frame.open[index] = peer
-        of_all = self._peers.get(frame.counter % self._entries + 1)
+            station = self._stations.get(index + 1)
+            ack_bitmap = 0 if station is None else station.window.ack_bitmap(frame.counter)
+            entries.append(StationEntry(ack_bitmap, grant))
+            if grant and station is not None:
+                frame.pending[index] = station
+        acknowledged = self._stations.get(frame.counter % self._entries + 1)
         content = encode_beacon(
             replace(
                 frame.draft,
-                cumulative=0 if of_all is None else of_all.inbox.cumulative % 256,
-                order=frame.order,
+                cumulative=0 if acknowledged is None else acknowledged.window.cumulative % 256,
+                slot_order=frame.slot_order,
                 stations=tuple(entries),
             )
         )
         frame.code = self._authenticator.beacon_code(
             session=self.session, counter=frame.counter, content=content
         )
-        frame.spans = self._timing.slots(frame.grants, frame.order)
+        frame.slots = self._timing.slots(frame.grants, frame.slot_order)
         self.counter, self._frame = frame.counter, frame
         return content + frame.code
 
     def sent(self, done_ns: int, sigma_ns: int) -> None:
-        """Take TxDone of the beacon.
-
-        Parameters
-        ----------
-        done_ns, sigma_ns
-            As the radio says; one that was found without its edge is not told to the stations.
-        """
+        """Take TxDone of the beacon; an inexact one is not sent to the stations."""
         frame = self._frame
         frame.sent_ns, frame.sent_sigma_ns = done_ns, sigma_ns
         for confirmation in frame.draft.confirmations:
-            self._peers[confirmation.station].confirmed()
+            self._stations[confirmation.station].confirmation_sent()
 
     # --- Replies --------------------------------------------------------------------------------------------------
 
     @property
-    def waits_until_ns(self) -> int | None:
-        """Until when a reply to this frame's beacon may come; None when all have come."""
+    def reply_deadline_ns(self) -> int | None:
+        """Latest RxDone of a reply in this frame; None when all have been received."""
         frame, timing = self._frame, self._timing
-        ends_ns = [span.end_ns for index in frame.open if (span := frame.spans[index]) is not None]
+        ends_ns = [slot.end_ns for index in frame.pending if (slot := frame.slots[index]) is not None]
         if not ends_ns or frame.sent_ns is None:
             return None
         return frame.sent_ns - TX_DONE_NS + max(ends_ns) + timing.guard_ns + timing.reception_ns
 
-    def received(self, payload: bytes, received_ns: int, sigma_ns: int) -> Heard | None:
-        """Take a packet; return what it brought, None where it is no reply to this frame's beacon.
-
-        Parameters
-        ----------
-        payload
-            As it came.
-        received_ns, sigma_ns
-            RxDone, and one sigma of it.
-        """
+    def received(self, payload: bytes, received_ns: int, sigma_ns: int) -> ReceivedReply | None:
+        """Take a packet with its RxDone; return its content, None if it is no reply to this frame's beacon."""
         frame = self._frame
-        heard = None
+        received = None
         if frame.sent_ns is not None and received_ns > frame.sent_ns:
-            heard = self._reply(frame, frame.sent_ns, payload, received_ns, sigma_ns)
-        self.foreign += heard is None
-        return heard
+            received = self._take_reply(frame, frame.sent_ns, payload, received_ns, sigma_ns)
+        self.rejected_packets += received is None
+        return received
 
-    def _reply(
+    def _take_reply(
         self, frame: _Frame, sent_ns: int, payload: bytes, received_ns: int, sigma_ns: int
-    ) -> Heard | None:
+    ) -> ReceivedReply | None:
         content, code = payload[:-CODE_BYTES], payload[-CODE_BYTES:]
         try:
             reply = decode_reply(content)
         except MessageError:
             return None
         index = next(
-            (i for i, peer in frame.open.items() if self._fits(peer, frame, reply, content, code)), None
+            (
+                i
+                for i, station in frame.pending.items()
+                if self._matches(station, frame, reply, content, code)
+            ),
+            None,
         )
-        span = None if index is None else frame.spans[index]
-        if index is None or span is None:
+        slot = None if index is None else frame.slots[index]
+        if index is None or slot is None:
             return None
-        slot_ns = sent_ns - TX_DONE_NS + span.start_ns
+        slot_ns = sent_ns - TX_DONE_NS + slot.start_ns
         airtime_ns = self._timing.airtime_ns(len(payload))
-        at = Reception(
+        at = ReplyTiming(
             counter=frame.counter,
             sent_ns=sent_ns,
             sent_sigma_ns=frame.sent_sigma_ns,
@@ -296,106 +272,111 @@ class SuperframeMaster:
             received_sigma_ns=sigma_ns,
             lateness_ns=received_ns - slot_ns - airtime_ns - self._timing.reception_ns,
             payload_bytes=len(payload),
-            granted_bytes=span.reply_bytes,
+            granted_bytes=slot.max_reply_bytes,
         )
-        if frame.open[index].may_be_older(reply, at):
+        if frame.pending[index].timing.is_ambiguous(reply, at):
             return None
-        heard = frame.open.pop(index).take(reply, at)
-        if self._lock is not None:
-            self._lock.answered(index)
-            for sighting in heard.sightings:
-                self._lock.measured(index, (sighting.measured_ns - self._zero_ns) // 1000)
-        return heard
+        received = frame.pending.pop(index).take(reply, at)
+        if self._phase_lock is not None:
+            self._phase_lock.reply_received(index)
+            for measurement in received.measurements:
+                self._phase_lock.add_measurement(index, (measurement.measured_ns - self._zero_ns) // 1000)
+        return received
 
-    def _fits(self, peer: Peer, frame: _Frame, reply: Reply, content: bytes, code: bytes) -> bool:
-        """Tell whether a reply's code is this station's in this frame."""
-        nonce = peer.nonce if reply.introduction is None else reply.introduction.nonce
+    def _matches(
+        self, station: StationState, frame: _Frame, reply: Reply, content: bytes, code: bytes
+    ) -> bool:
+        """Whether a reply's authentication code is this station's in this frame."""
+        nonce = station.nonce if reply.join_request is None else reply.join_request.nonce
         if nonce is None:
             return False
-        right = self._authenticator.reply_code(
+        expected = self._authenticator.reply_code(
             session=self.session,
-            station=peer.number,
+            station=station.number,
             station_nonce=nonce,
             counter=frame.counter,
             beacon_code=frame.code,
-            sequence=peer.first_number(reply),
+            sequence=station.first_sequence(reply),
             content=content,
         )
-        return hmac.compare_digest(right, code)
+        return hmac.compare_digest(expected, code)
 
-    def finished(self) -> list[int]:
+    def finish(self) -> list[int]:
         """End the frame; return the stations that had a slot and were silent."""
-        silent = list(self._frame.open.values())
-        self._frame.open = {}
-        for peer in silent:
-            peer.silent += 1
-        return [peer.number for peer in silent]
+        silent = list(self._frame.pending.values())
+        self._frame.pending = {}
+        for station in silent:
+            station.silent_frames += 1
+        return [station.number for station in silent]
 
-    # --- What a beacon says ---------------------------------------------------------------------------------------
+    # --- Contents of a beacon -------------------------------------------------------------------------------------
 
     def _draft(self, counter: int) -> Beacon:
-        """Return the next beacon but for what is not known yet: entries, order, cumulative."""
+        """Return the next beacon without station entries, slot order and cumulative acknowledgement."""
         before, sent_us = self._frame, 0
         if before.sent_ns is not None and before.sent_sigma_ns <= EXACT_SIGMA_NS:
             sent_us = (before.sent_ns - self._zero_ns + 500) // 1000 % (1 << SESSION_TIME_BITS)
-            sent_us += not sent_us % (1 << 16)  # 0 stands for not known
-        peers = self._peers.values()
-        wanted = any(
-            peer.nonce is None or peer.introducing or peer.lacks_time or peer.silent > WANTED_AFTER_FRAMES
-            for peer in peers
+            sent_us += not sent_us % (1 << 16)  # low bits 0 mean unknown
+        stations = self._stations.values()
+        incomplete = any(
+            station.nonce is None
+            or station.join_pending
+            or station.lacks_time
+            or station.silent_frames > REJOIN_FRAMES
+            for station in stations
         )
-        at_once = any(peer.wants_time(counter) for peer in peers)
-        at_the_start = wanted and counter < SESSION_AT_START
+        interval = SESSION_INTERVAL_JOINING if incomplete else SESSION_INTERVAL
         invites = (
-            at_once or at_the_start or counter % (SESSION_EVERY_WANTED if wanted else SESSION_EVERY) == 0
+            any(station.needs_full_time(counter) for station in stations)
+            or (incomplete and counter < SESSION_STARTUP_FRAMES)
+            or counter % interval == 0
         )
-        session = SessionPart(
+        commands = (station.encoded_command for station in stations)
+        session = SessionInfo(
             nonce=self.session,
             counter_high=counter >> 8,
             sent_high=sent_us >> 16,
             guard=self._timing.guard_ns // GUARD_UNIT_NS,
-            turn_round=self._timing.turn_round_ns // GUARD_UNIT_NS,
+            turnaround=self._timing.turnaround_ns // GUARD_UNIT_NS,
         )
-        confirmations = (peer.confirmation for peer in peers)
-        orders = (peer.order_part for peer in peers)
         return Beacon(
             frame=counter % 256,
             sent=sent_us % (1 << 16),
             cumulative=0,
-            order=SlotOrder(),
+            slot_order=SlotOrder(),
             stations=(StationEntry(0, 0),) * self._entries,
             session=session if invites else None,
-            confirmations=tuple(part for part in confirmations if part is not None),
-            orders=tuple(part for part in orders if part is not None),
+            confirmations=tuple(each.confirmation for each in stations if each.confirmation is not None),
+            commands=tuple(each for each in commands if each is not None),
         )
 
     def _grants(self, counter: int, start_ns: int, beacon_bytes: int, *, invites: bool) -> tuple[int, ...]:
-        """Return the grants by index for a beacon that begins then."""
+        """Return the grants by station index for a beacon with this start."""
         grants = [0] * self._entries
-        slot_ns = start_ns + self._timing.airtime_ns(beacon_bytes) + self._timing.turn_round_ns
-        silent = {number - 1: peer.silent for number, peer in self._peers.items()}
-        again = asked_again(silent, self._frame.grants)
-        for index in slot_sequence(self._entries, self._order):
-            peer = self._peers.get(index + 1)
-            if peer is None or (peer.silent > ABSENT_AFTER_FRAMES and not invites):
+        slot_ns = start_ns + self._timing.airtime_ns(beacon_bytes) + self._timing.turnaround_ns
+        silent_frames = {number - 1: station.silent_frames for number, station in self._stations.items()}
+        retries = retry_stations(silent_frames, self._frame.grants)
+        for index in slot_sequence(self._entries, self._slot_order):
+            station = self._stations.get(index + 1)
+            if station is None or (station.silent_frames > ABSENT_FRAMES and not invites):
                 continue
-            if again and index not in again:
+            if retries and index not in retries:
                 continue
-            grants[index] = UNKNOWN_GRANT
+            grants[index] = DEFAULT_GRANT
             if self._records:
-                grants[index] = peer.grant(counter, slot_ns, cap=self._cap)
+                grants[index] = station.grant(counter, slot_ns, cap=self._max_grant)
             slot_ns += self._timing.airtime_ns(GRANT_BYTES[grants[index]]) + self._timing.guard_ns
         return tuple(grants)
 
     def _begin_session(self) -> None:
         self.session = self._random_bits(NONCE_BITS)
         self.counter = -1
-        self._frame = _no_frame(self._frame.start_ns)
-        for peer in self._peers.values():
-            peer.forget_session()
+        self._frame = _initial_frame(self._frame.start_ns)
+        for station in self._stations.values():
+            station.reset_session()
 
 
-def _no_frame(start_ns: int) -> _Frame:
-    """Return what stands for the frame before the first one."""
-    no_beacon = Beacon(frame=0, sent=0, cumulative=0, order=SlotOrder(), stations=())
-    return _Frame(-1, start_ns - IDLE_FRAME_NS, (), SlotOrder(), no_beacon)
+def _initial_frame(start_ns: int) -> _Frame:
+    """Return a placeholder for the frame before the first one."""
+    draft = Beacon(frame=0, sent=0, cumulative=0, slot_order=SlotOrder(), stations=())
+    return _Frame(-1, start_ns - IDLE_FRAME_NS, (), SlotOrder(), draft)

@@ -1,13 +1,12 @@
-"""When a frame begins, so that the instruments' measurements wait as short as can be for their slots.
+"""Starts frames in phase with the instruments, which minimises the age of measurements on arrival. Sans-I/O.
 
-Frames that follow each other at once drift past the instruments' beat: a measurement waits half a frame on average.
-Frames as long as the beat, or a few beats, meet each instrument at the same point every time. Then order of slots and
-time of the beacon can be chosen so that one station's measurement is just ready when its slot comes, and the others'
-are as near as their phases allow. It pays where the frames that are needed, grants and all, are not much shorter.
+Frames that follow each other immediately drift through the instruments' measurement phase: a measurement waits half a
+frame on average. Frames as long as the measurement period, or a multiple, keep their phase. The slot order and the start
+of the beacon are then chosen so that the measurement of one station, the reference, is ready when its slot comes, and the
+others are as young as their phases allow. This pays off where frames have to be nearly as long as the period anyway.
 
-The lock is held to one station, the leader. Which one, and in which order the stations answer, changes only when that
-gains something; the clocks' slow drift is followed from frame to frame. A frame that took too long is made good by
-starting the next ones at once, until they are on the beat again. Where a whole frame fits in before the beat, it is run.
+Reference and slot order change only for a gain; the clocks' slow drift is followed from frame to frame. After a frame
+that took too long, frames start immediately until they are in phase again. A whole frame that fits in before is inserted.
 """
 
 from __future__ import annotations
@@ -17,305 +16,285 @@ from collections import deque
 from statistics import fmean, median
 from typing import TYPE_CHECKING, NamedTuple
 
+from tsgt.radio.superframe.slots import COMPOSE_LEAD_NS
 from tsgt.radio.superframe.wire import SlotOrder
-from tsgt.timesync import Rhythm
+from tsgt.timesync import Periodicity
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from tsgt.radio.superframe.slots import FrameTiming
 
-COMPOSED_NS = 6_000_000
-"""A station decides this long before its slot what it sends."""
+MAX_SILENCE_NS = 5_000_000_000
+"""An instrument that has not measured for longer is ignored; no frame is as long."""
 
-STOPPED_NS = 5_000_000_000
-"""Whoever has not measured for so long does not count; and a frame is never so long."""
+MIN_MARGIN_NS = 2_000_000
+MAX_MARGIN_NS = 150_000_000
+MARGIN_INCREASE_NS = 3_000_000
+MARGIN_DECREASE_NS = 30_000
+"""The time that a measurement needs from its timestamp to the composed reply is learnt for each station: a measurement
+that was made in time and missed its reply increases the margin, one that just made it decreases it; one in 100 misses."""
 
-LEAST_MARGIN_NS = 2_000_000
-LARGEST_MARGIN_NS = 150_000_000
-LONGER_NS = 3_000_000
-SHORTER_NS = 30_000
-"""How long before it is composed a reply's measurement has to be made is learnt for each station: one that was made
-in time and missed its reply makes it longer, one that just made it shorter, so that one in a hundred misses."""
+JITTER_SIGMAS = 3.0
+"""Margin for the jitter of an instrument's period."""
 
-LATE_SIGMAS = 3.0
-"""An instrument whose measurements come now a little sooner, now later is waited for so much of its spread."""
+PERIOD_TOLERANCE = 0.01
+"""Instruments whose periods differ by a smaller part share a phase lock."""
 
-SAME_PERIOD = 0.01
-"""Instruments whose periods agree to this part are met together; others pass each other too fast."""
+MIN_GAIN = 0.02
+"""Minimum gain of a change in mean age, as a part of the period."""
 
-WORTH = 0.02
-"""A change must gain this part of a period in mean age."""
+GRANT_WINDOW = 4
+"""Number of frames whose median grants count."""
 
-GRANTS_KEPT = 4
-"""Of so many frames the grants are looked at for what is usual."""
-
-USUAL_FRAMES = 32
-"""What a frame needs is judged by so many: the usual one, and how long those take to be made good that need more."""
+FRAME_WINDOW = 32
+"""Number of frames that the usual frame length, and the usual lag behind the period, are taken from."""
 
 
-class Plan(NamedTuple):
-    """How the next frame begins.
-
-    Attributes
-    ----------
-    start_ns
-        When the beacon begins, session time.
-    order
-        Of the slots.
-    """
+class FramePlan(NamedTuple):
+    """Start of a frame's beacon in session time, and its slot order."""
 
     start_ns: int
-    order: SlotOrder
+    slot_order: SlotOrder
 
 
-class _Beat(NamedTuple):
-    """At which instants a station has a new measurement ready for its reply."""
+class _ReadyTimes(NamedTuple):
+    """Periodic instants at which a station has a new measurement ready for its reply."""
 
     period_ns: float
     ready_ns: float
 
     def until_ns(self, now_ns: int) -> int:
-        """How long it is from now to the next of these instants; a microsecond more, so that it is past for certain."""
+        """Return the time to the next of these instants, plus a microsecond."""
         return round((self.ready_ns - now_ns) % self.period_ns) + 1000
 
 
-class _Choice(NamedTuple):
-    """Order of slots, and the station whose measurement is met as soon as it is ready."""
+class _Alignment(NamedTuple):
+    """Slot order, and the index of the station whose measurements are met as soon as they are ready."""
 
-    order: SlotOrder
-    leader: int
+    slot_order: SlotOrder
+    reference: int
 
 
 class _Frame(NamedTuple):
-    """A frame as planned, when the stations decide what they send in it, and whose reply has come."""
+    """A planned frame: when its replies are composed, by station index, and which of them have been received."""
 
     start_ns: int
     lasts_ns: int
     composed_ns: Mapping[int, int]
-    heard: set[int]
+    replied: set[int]
 
 
-class FrameLock:
-    """Begins frames on the instruments' beat where that makes measurements arrive younger.
-
-    Parameters
-    ----------
-    timing
-        Of the frames.
-    stations
-        How many have a slot, from index 0.
+class PhaseLock:
+    """Plans the start and slot order of frames.
 
     Attributes
     ----------
     locked
-        Frames follow the beat; otherwise they begin as early as they can.
+        Frames keep their phase to the instruments; otherwise they start as early as possible.
     """
 
     def __init__(self, timing: FrameTiming, stations: int) -> None:
         self._timing = timing
-        self._rhythms = [Rhythm() for _ in range(stations)]
-        self._margins_ns = [LEAST_MARGIN_NS] * stations
-        self._orders = _orders(stations)
-        self._choice = _Choice(SlotOrder(), 0)
+        self._periodicities = [Periodicity() for _ in range(stations)]
+        self._margins_ns = [MIN_MARGIN_NS] * stations
+        self._slot_orders = _slot_orders(stations)
+        self._alignment = _Alignment(SlotOrder(), 0)
         self._frames: list[_Frame] = []
         self._planned = 0
-        self._grants: deque[tuple[int, ...]] = deque([(0,) * stations], maxlen=GRANTS_KEPT)
-        self._needs_ns: deque[int] = deque(maxlen=USUAL_FRAMES)
-        self._behind_ns: deque[float] = deque((0.0,), maxlen=USUAL_FRAMES)
+        self._grants: deque[tuple[int, ...]] = deque([(0,) * stations], maxlen=GRANT_WINDOW)
+        self._needs_ns: deque[int] = deque(maxlen=FRAME_WINDOW)
+        self._behind_ns: deque[float] = deque((0.0,), maxlen=FRAME_WINDOW)
         self._need_ns = 0.0
         self._overhead_ns = 0
         self.locked = False
 
-    def answered(self, index: int) -> None:
-        """Note that a station's reply in the present frame has come, with measurements or without.
-
-        Parameters
-        ----------
-        index
-            Of the station.
-        """
+    def reply_received(self, index: int) -> None:
+        """Take that the station with this index has replied in the present frame."""
         if self._frames:
-            self._frames[-1].heard.add(index)
+            self._frames[-1].replied.add(index)
 
-    def measured(self, index: int, time_us: int) -> None:
-        """Take the time of a measurement that a reply in the present frame has brought.
-
-        Parameters
-        ----------
-        index
-            Of the station.
-        time_us
-            When it was made, session time.
-        """
-        newest_us = self._rhythms[index].newest_us
-        self._rhythms[index].add(time_us)
+    def add_measurement(self, index: int, time_us: int) -> None:
+        """Take the session time of a measurement from a reply of the station with this index in the present frame."""
+        newest_us = self._periodicities[index].newest_us
+        self._periodicities[index].add(time_us)
         if self._frames and (newest_us is None or time_us > newest_us):
             self._learn_margin(index, 1000 * time_us)
 
-    def plan(self, earliest_ns: int, grants: Sequence[int], beacon_bytes: int) -> Plan:
+    def plan(self, earliest_ns: int, grants: Sequence[int], beacon_bytes: int) -> FramePlan:
         """Plan the next frame.
 
         Parameters
         ----------
         earliest_ns
-            Before this the beacon cannot begin, session time.
+            Earliest start of the beacon, session time.
         grants
-            By station index, as the beacon will say.
+            By station index.
         beacon_bytes
-            Length of the beacon, code and all.
+            Length of the beacon, authentication code included.
         """
-        self._note_need(earliest_ns)
+        self._update_frame_length(earliest_ns)
         self._grants.append(tuple(grants))
-        beats, measuring = self._beats(earliest_ns)
-        # Orders, leaders and stations make many combinations, whose worth changes slowly.
-        if self._planned % len(self._rhythms) == 0 or self._choice.leader not in beats:
-            self._choose(earliest_ns, beacon_bytes, beats, measuring)
+        ready, active = self._ready_times(earliest_ns)
+        # There are many combinations of slot order and reference, and their gains change slowly.
+        if self._planned % len(self._periodicities) == 0 or self._alignment.reference not in ready:
+            self._align(earliest_ns, beacon_bytes, ready, active)
         self._planned += 1
-        frame = self._frame(earliest_ns, grants, beacon_bytes, beats)
+        frame = self._frame(earliest_ns, grants, beacon_bytes, ready)
         self._frames = [*self._frames[-1:], frame]
-        return Plan(frame.start_ns, self._choice.order)
+        return FramePlan(frame.start_ns, self._alignment.slot_order)
 
     def forecast(self, earliest_ns: int, beacon_bytes: int) -> int:
-        """Return when the next frame begins, in session time, if its grants are those of the last; as :meth:`plan`."""
-        beats, _ = self._beats(earliest_ns)
-        return self._frame(earliest_ns, self._grants[-1], beacon_bytes, beats).start_ns
+        """Return the start that :meth:`plan` would choose with the grants of the last frame."""
+        ready, _ = self._ready_times(earliest_ns)
+        return self._frame(earliest_ns, self._grants[-1], beacon_bytes, ready).start_ns
 
     def _frame(
-        self, earliest_ns: int, grants: Sequence[int], beacon_bytes: int, beats: Mapping[int, _Beat]
+        self, earliest_ns: int, grants: Sequence[int], beacon_bytes: int, ready: Mapping[int, _ReadyTimes]
     ) -> _Frame:
-        """Return the next frame as things are."""
-        lasts_ns, composed_ns = self._layout(grants, self._choice.order, beacon_bytes)
+        lasts_ns, composed_ns = self._layout(grants, self._alignment.slot_order, beacon_bytes)
         start_ns = earliest_ns
-        beat, offset_ns = beats.get(self._choice.leader), composed_ns.get(self._choice.leader)
-        if self.locked and beat is not None and offset_ns is not None:
-            start_ns += self._pause_ns(beat, earliest_ns + offset_ns, lasts_ns)
+        reference = self._alignment.reference
+        times, offset_ns = ready.get(reference), composed_ns.get(reference)
+        if self.locked and times is not None and offset_ns is not None:
+            start_ns += self._wait_ns(times, earliest_ns + offset_ns, lasts_ns)
         at_ns = {index: start_ns + offset_ns for index, offset_ns in composed_ns.items()}
         return _Frame(start_ns, lasts_ns, at_ns, set())
 
     def _layout(
         self, grants: Sequence[int], order: SlotOrder, beacon_bytes: int
     ) -> tuple[int, dict[int, int]]:
-        """Return from the beginning of a beacon: the end of the last slot, and when each reply is composed, in ns."""
+        """Return, in ns from the start of the beacon, the end of the last slot and when each reply is composed."""
         beacon_ns = self._timing.airtime_ns(beacon_bytes)
-        spans = self._timing.slots(grants, order)
+        slots = self._timing.slots(grants, order)
         return (
-            beacon_ns + max((span.end_ns for span in spans if span), default=0),
-            {index: beacon_ns + span.start_ns - COMPOSED_NS for index, span in enumerate(spans) if span},
+            beacon_ns + max((slot.end_ns for slot in slots if slot), default=0),
+            {index: beacon_ns + slot.start_ns - COMPOSE_LEAD_NS for index, slot in enumerate(slots) if slot},
         )
 
-    # --- What is known of frames and stations -----------------------------------------------------------------
+    # --- Estimates --------------------------------------------------------------------------------------------
 
-    def _note_need(self, earliest_ns: int) -> None:
-        """Note how long a frame really takes, and by how much frames on the beat would run behind."""
-        if not self._frames or (need_ns := earliest_ns - self._frames[-1].start_ns) > STOPPED_NS:
+    def _update_frame_length(self, earliest_ns: int) -> None:
+        """Update the real frame length, and by how much frames in phase would lag behind."""
+        if not self._frames or (need_ns := earliest_ns - self._frames[-1].start_ns) > MAX_SILENCE_NS:
             return
         self._needs_ns.append(need_ns)
         self._need_ns = median(self._needs_ns)
         self._overhead_ns = max(need_ns - self._frames[-1].lasts_ns, 0)
-        beat = self._rhythms[self._choice.leader].beat
-        period_ns = self._need_ns if beat is None else 1e3 * beat.period_us
-        behind_ns = self._behind_ns[-1] + need_ns - _whole_ns(self._need_ns, period_ns)
+        period = self._periodicities[self._alignment.reference].period
+        period_ns = self._need_ns if period is None else 1e3 * period.period_us
+        behind_ns = self._behind_ns[-1] + need_ns - _whole_periods_ns(self._need_ns, period_ns)
         self._behind_ns.append(min(max(behind_ns, 0.0), period_ns / 2))
 
     def _learn_margin(self, index: int, time_ns: int) -> None:
-        """Compare a new measurement with the reply that it came in and the one before that."""
+        """Compare a new measurement with its own reply and the reply before."""
         before, present = self._frames[0], self._frames[-1]
         missed_ns = before.composed_ns.get(index, time_ns) - time_ns
         made_ns = present.composed_ns.get(index, time_ns) - time_ns
         margin_ns = self._margins_ns[index]
-        if index in before.heard and before is not present and 0 < missed_ns < LARGEST_MARGIN_NS:
-            margin_ns += LONGER_NS
-        elif made_ns < margin_ns + LONGER_NS:
-            margin_ns -= SHORTER_NS
-        self._margins_ns[index] = min(max(margin_ns, LEAST_MARGIN_NS), LARGEST_MARGIN_NS)
+        if index in before.replied and before is not present and 0 < missed_ns < MAX_MARGIN_NS:
+            margin_ns += MARGIN_INCREASE_NS
+        elif made_ns < margin_ns + MARGIN_INCREASE_NS:
+            margin_ns -= MARGIN_DECREASE_NS
+        self._margins_ns[index] = min(max(margin_ns, MIN_MARGIN_NS), MAX_MARGIN_NS)
 
-    def _beats(self, now_ns: int) -> tuple[dict[int, _Beat], int]:
-        """Return the beats of those that have one, and how many measure at present, with or without."""
-        beats: dict[int, _Beat] = {}
-        measuring = 0
-        for index, (rhythm, margin_ns) in enumerate(zip(self._rhythms, self._margins_ns, strict=True)):
-            if rhythm.newest_us is None or now_ns - 1000 * rhythm.newest_us > STOPPED_NS:
+    def _ready_times(self, now_ns: int) -> tuple[dict[int, _ReadyTimes], int]:
+        """Return the ready times of the periodic instruments by index, and the number of active ones, periodic or not."""
+        ready: dict[int, _ReadyTimes] = {}
+        active = 0
+        for index, (periodicity, margin_ns) in enumerate(
+            zip(self._periodicities, self._margins_ns, strict=True)
+        ):
+            if periodicity.newest_us is None or now_ns - 1000 * periodicity.newest_us > MAX_SILENCE_NS:
                 continue
-            measuring += 1
-            if (beat := rhythm.beat) is not None:
-                late_us = LATE_SIGMAS * beat.spread_us
-                beats[index] = _Beat(1e3 * beat.period_us, 1e3 * (beat.phase_us + late_us) + margin_ns)
-        return beats, measuring
+            active += 1
+            if (period := periodicity.period) is not None:
+                late_us = JITTER_SIGMAS * period.jitter_us
+                ready[index] = _ReadyTimes(
+                    1e3 * period.period_us, 1e3 * (period.phase_us + late_us) + margin_ns
+                )
+        return ready, active
 
-    # --- What is best -----------------------------------------------------------------------------------------
+    # --- Optimisation -----------------------------------------------------------------------------------------
 
-    def _choose(
-        self, earliest_ns: int, beacon_bytes: int, beats: Mapping[int, _Beat], measuring: int
+    def _align(
+        self, earliest_ns: int, beacon_bytes: int, ready: Mapping[int, _ReadyTimes], active: int
     ) -> None:
-        """Choose order and leader, and whether it is worth while to follow them."""
-        costs_ns = {leader: self._longer_ns(beat.period_ns) for leader, beat in beats.items()}
-        leaders = {leader for leader, cost_ns in costs_ns.items() if cost_ns < beats[leader].period_ns / 2}
-        gains_ns: dict[_Choice, float] = {}
-        # One long reply now and then must not turn the order round for a frame.
+        """Choose the alignment with the largest gain in mean age, and lock to it if the gain is positive."""
+        costs_ns = {index: self._cost_ns(times.period_ns) for index, times in ready.items()}
+        references = {index for index, cost_ns in costs_ns.items() if cost_ns < ready[index].period_ns / 2}
+        gains_ns: dict[_Alignment, float] = {}
+        # Median grants: a single long reply must not change the slot order for one frame.
         usual = [sorted(of_one)[len(of_one) // 2] for of_one in zip(*self._grants, strict=True)]
-        for order in self._orders if leaders else ():
+        for order in self._slot_orders if references else ():
             _, composed_ns = self._layout(usual, order, beacon_bytes)
-            for leader in leaders & composed_ns.keys():
-                aligned_ns = self._aligned_ns(earliest_ns, composed_ns, leader, beats) / measuring
-                gains_ns[_Choice(order, leader)] = aligned_ns - costs_ns[leader]
+            for reference in references & composed_ns.keys():
+                gain_ns = self._gain_ns(earliest_ns, composed_ns, reference, ready) / active
+                gains_ns[_Alignment(order, reference)] = gain_ns - costs_ns[reference]
         if not gains_ns:
             self.locked = False
             return
         best = max(gains_ns, key=gains_ns.__getitem__)
-        present_ns = gains_ns.get(self._choice, -math.inf) if self.locked else 0.0
-        if gains_ns[best] > max(present_ns, 0.0) + WORTH * beats[best.leader].period_ns:
-            self._choice, self.locked = best, True
+        present_ns = gains_ns.get(self._alignment, -math.inf) if self.locked else 0.0
+        if gains_ns[best] > max(present_ns, 0.0) + MIN_GAIN * ready[best.reference].period_ns:
+            self._alignment, self.locked = best, True
         elif present_ns < 0:
             self.locked = False
 
-    # Measurements wait N / 2 on average for the next of frames of length N, when they are as likely to be made at one
-    # time of the frame as at any other. Where N is a whole number of their periods P, so that the newest is always
-    # w old when its reply is composed, the mean is N / 2 - P / 2 + w.
+    # Without a lock, measurements are uniformly distributed over a frame of length N and wait N / 2 on average. With N a
+    # multiple of the period P, and the newest measurement of age w when its reply is composed, the mean is
+    # N / 2 - P / 2 + w.
 
-    def _aligned_ns(
-        self, earliest_ns: int, composed_ns: Mapping[int, int], leader: int, beats: Mapping[int, _Beat]
+    def _gain_ns(
+        self,
+        earliest_ns: int,
+        composed_ns: Mapping[int, int],
+        reference: int,
+        ready: Mapping[int, _ReadyTimes],
     ) -> float:
-        """Return P / 2 - w of all stations that share the leader's beat, in sum."""
-        led = beats[leader]
-        start_ns = earliest_ns + led.until_ns(earliest_ns + composed_ns[leader])
+        """Return the sum of P / 2 - w over the stations that share the reference's period."""
+        locked_to = ready[reference]
+        start_ns = earliest_ns + locked_to.until_ns(earliest_ns + composed_ns[reference])
         gain_ns = 0.0
-        for index in beats.keys() & composed_ns.keys():
-            beat = beats[index]
-            times = round(led.period_ns / beat.period_ns)
-            if abs(led.period_ns - times * beat.period_ns) <= SAME_PERIOD * led.period_ns:
-                newest_ns = (start_ns + composed_ns[index] - beat.ready_ns) % beat.period_ns
-                gain_ns += beat.period_ns / 2 - newest_ns
+        for index in ready.keys() & composed_ns.keys():
+            times = ready[index]
+            multiple = round(locked_to.period_ns / times.period_ns)
+            if (
+                abs(locked_to.period_ns - multiple * times.period_ns)
+                <= PERIOD_TOLERANCE * locked_to.period_ns
+            ):
+                newest_ns = (start_ns + composed_ns[index] - times.ready_ns) % times.period_ns
+                gain_ns += times.period_ns / 2 - newest_ns
         return gain_ns
 
-    def _longer_ns(self, period_ns: float) -> float:
-        """Return what longer frames, and those that come too late for the beat, cost in mean age.
+    def _cost_ns(self, period_ns: float) -> float:
+        """Return the cost of longer and of lagging frames in mean age.
 
-        A frame of several periods needs part of its time for the measurements that it is so long for; in shorter ones
-        less would be needed. They are taken for twice as short.
+        A frame of several periods carries more measurements, which take part of its time; the extra length of a frame of
+        one period counts half.
         """
-        frame_ns = _whole_ns(self._need_ns, period_ns)
+        frame_ns = _whole_periods_ns(self._need_ns, period_ns)
         longer_ns = frame_ns - self._need_ns
         return (longer_ns if frame_ns > period_ns else longer_ns / 2) + fmean(self._behind_ns)
 
-    def _pause_ns(self, beat: _Beat, composed_ns: int, lasts_ns: int) -> int:
-        """Return how long to wait before the beacon, so that the leader's reply is composed on its beat."""
-        pause_ns = beat.until_ns(composed_ns)
-        if lasts_ns + self._overhead_ns <= pause_ns:
+    def _wait_ns(self, times: _ReadyTimes, composed_ns: int, lasts_ns: int) -> int:
+        """Return how long to delay the beacon so that the reference's reply is composed at a ready time."""
+        wait_ns = times.until_ns(composed_ns)
+        if lasts_ns + self._overhead_ns <= wait_ns:
             return 0  # a whole frame fits in before
-        usual_ns = _whole_ns(self._need_ns, beat.period_ns) - self._need_ns
-        if self._need_ns > beat.period_ns and usual_ns > beat.period_ns / 2:
-            return 0  # frames have become longer than the beat, which is about to be given up
-        # Much more than usual means that the beat has just been missed: better late now than not until the next.
-        return pause_ns if pause_ns <= usual_ns + beat.period_ns / 4 else 0
+        usual_ns = _whole_periods_ns(self._need_ns, times.period_ns) - self._need_ns
+        if self._need_ns > times.period_ns and usual_ns > times.period_ns / 2:
+            return 0  # frames have become longer than the period: the lock is about to be released
+        # A much longer wait than usual means that the ready time was just missed: start late instead of waiting a period.
+        return wait_ns if wait_ns <= usual_ns + times.period_ns / 4 else 0
 
 
-def _whole_ns(need_ns: float, period_ns: float) -> float:
-    """Return the shortest whole number of periods that is long enough."""
+def _whole_periods_ns(need_ns: float, period_ns: float) -> float:
+    """Return the smallest multiple of the period that is at least ``need_ns``, and at least one period."""
     return max(math.ceil(need_ns / period_ns), 1) * period_ns
 
 
-def _orders(stations: int) -> list[SlotOrder]:
-    """Return the orders that differ."""
+def _slot_orders(stations: int) -> list[SlotOrder]:
+    """Return all distinct slot orders."""
     directions = (False,) if stations <= 2 else (False, True)
     return [SlotOrder(first, reverse) for reverse in directions for first in range(stations)]

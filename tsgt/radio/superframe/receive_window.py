@@ -1,7 +1,7 @@
-"""Which of a station's measurements the master has, and which of them are safe in its recording. Pure.
+"""The master's receive window of one station: what has been received, recorded and acknowledged. Sans-I/O.
 
-A station deletes what the master acknowledges, so the master acknowledges what is written and nothing else. What it
-has received but not yet written is known too: it must not be handed on twice.
+A station deletes what the master acknowledges, so the master acknowledges recorded measurements only. It also tracks
+received measurements that are not recorded yet, to publish each one once.
 """
 
 from __future__ import annotations
@@ -11,28 +11,28 @@ from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import TYPE_CHECKING
 
-from tsgt.radio.superframe.wire import RESTART_SKIP
+from tsgt.radio.superframe.wire import ACK_FRAMES, RESTART_SKIP
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
-    from tsgt.radio.superframe.wire import Introduction
+    from tsgt.radio.superframe.wire import JoinRequest, MeasurementBlock, Reply
 
-NARROW_BITS = 8
+SEQUENCE_BITS = 8
 
-KNOWN_LINEAGES = 8
-"""So many are remembered: a station whose disk took nothing when it started has one of its own until it starts again."""
+MAX_STREAMS = 8
+"""Number of remembered streams: a station that cannot write when it starts gets a new stream id for that run."""
 
 _start = attrgetter("start")
 
 
-class Numbers:
-    """A set of sequence numbers that is complete but for some gaps, however long they are.
+class SequenceSet:
+    """Set of sequence numbers, stored as its gaps.
 
     Parameters
     ----------
     first
-        All numbers below it count as in the set.
+        All lower numbers are in the set.
 
     Attributes
     ----------
@@ -54,16 +54,16 @@ class Numbers:
 
     @property
     def cumulative(self) -> int:
-        """The number up to which, itself included, none is missing."""
+        """The number up to which, inclusive, the set is complete."""
         return self._gaps[0].start - 1 if self._gaps else self.highest
 
     @property
     def missing(self) -> int:
-        """How many numbers below the highest are missing."""
+        """How many numbers below the highest are not in the set."""
         return sum(map(len, self._gaps))
 
     def add(self, numbers: range) -> None:
-        """Put numbers that follow each other into the set."""
+        """Add consecutive numbers."""
         if not numbers:
             return
         if numbers.start > self.highest + 1:
@@ -72,7 +72,7 @@ class Numbers:
         first = bisect_right(self._gaps, numbers.start, key=_start)
         first -= bool(first)
         last = bisect_right(self._gaps, numbers.stop - 1, key=_start)
-        rests = [
+        self._gaps[first:last] = [
             rest
             for gap in self._gaps[first:last]
             for rest in (
@@ -81,123 +81,153 @@ class Numbers:
             )
             if rest
         ]
-        self._gaps[first:last] = rests
 
     def remove(self, number: int) -> None:
-        """Take a number out again."""
+        """Remove a number."""
         if number in self:
             self._gaps.insert(bisect_right(self._gaps, number, key=_start), range(number, number + 1))
 
 
 @dataclass(slots=True)
-class _Lineage:
-    """What has come of one lineage of numbers: received, in the recording, and on the way there."""
+class _Stream:
+    """Numbers of one stream id: received, recorded, and received but not recorded."""
 
-    received: Numbers
-    written: Numbers
-    waiting: set[int] = field(default_factory=set)
+    received: SequenceSet
+    recorded: SequenceSet
+    pending: set[int] = field(default_factory=set)
 
 
-class Inbox:
-    """What has come from one station.
+class ReceiveWindow:
+    """Received and recorded measurements of one station.
 
     Attributes
     ----------
-    lineage
-        See :class:`~tsgt.radio.superframe.wire.messages.Introduction`; None before the first one.
+    stream_id
+        See :class:`~tsgt.radio.superframe.wire.messages.JoinRequest`; None before the first one.
     """
 
     def __init__(self) -> None:
-        self.lineage: int | None = None
-        self._run_start = 0
-        self._present = _Lineage(Numbers(0), Numbers(0))
-        self._known: dict[int, _Lineage] = {}
+        self.stream_id: int | None = None
+        self._first_sequence = 0
+        self._current = _Stream(SequenceSet(0), SequenceSet(0))
+        self._streams: dict[int, _Stream] = {}
+        self._replies: dict[int, tuple[int, ...]] = {}
+
+    def forget_replies(self) -> None:
+        """Forget the replies of the session, not what was received in it."""
+        self._replies.clear()
 
     @property
     def cumulative(self) -> int:
-        """Up to this number, itself included, nothing is missing in the recording; -1 at the beginning."""
-        return self._present.written.cumulative
+        """Number up to which, inclusive, the recording is complete; -1 at the start."""
+        return self._current.recorded.cumulative
 
     @property
-    def missing(self) -> int:
-        """How many measurements are known to have been made and have not come."""
-        return self._present.received.missing
+    def outstanding(self) -> int:
+        """How many measurements are known to exist and have not been received."""
+        return self._current.received.missing
 
     @property
     def unwritten(self) -> int:
-        """How many have come and are not written yet."""
-        return len(self._present.waiting)
+        """How many measurements have been received and are not recorded yet."""
+        return len(self._current.pending)
 
-    def introduced(self, introduction: Introduction) -> None:
-        """Take what a station says of its numbers after a start, its own or the master's."""
-        if introduction.lineage != self.lineage:
-            self._turn_to(introduction)
+    def join(self, request: JoinRequest) -> None:
+        """Take a join request: the stream may be another one, or have lost numbers at its end."""
+        if request.stream_id != self.stream_id:
+            self._switch_stream(request)
         elif (
-            introduction.run_start != self._run_start
-            and introduction.run_start <= self._present.received.highest
+            request.first_sequence != self._first_sequence
+            and request.first_sequence <= self._current.received.highest
         ):
-            # A station that lost more than its last numbers gives some of them again.
-            self._begin(introduction)
-        self._run_start = introduction.run_start
-        never_given = range(max(introduction.run_start - RESTART_SKIP, 0), introduction.run_start)
-        for numbers in (self._present.received, self._present.written):
-            numbers.add(range(introduction.oldest))
-            numbers.add(never_given)
-        # What the station has no more need not wait for the disk; all else must, lest the station deletes it.
-        for number in self._present.waiting:
-            if number >= introduction.oldest and number not in never_given:
-                self._present.written.remove(number)
+            # The station lost more than it skipped and reuses numbers.
+            self._reset(request)
+        self._first_sequence = request.first_sequence
+        skipped = range(max(request.first_sequence - RESTART_SKIP, 0), request.first_sequence)
+        for numbers in (self._current.received, self._current.recorded):
+            numbers.add(range(request.oldest))
+            numbers.add(skipped)
+        # The station still has these, and would delete them if they counted as recorded before they are.
+        for number in self._current.pending:
+            if number >= request.oldest and number not in skipped:
+                self._current.recorded.remove(number)
 
-    def _turn_to(self, introduction: Introduction) -> None:
-        """Go on with a lineage that is another one than before, but may be one of before that."""
-        self.lineage = introduction.lineage
-        known = self._known.pop(introduction.lineage, None)
-        if known is None or introduction.run_start <= known.received.highest:
-            self._begin(introduction)
+    def _switch_stream(self, request: JoinRequest) -> None:
+        """Continue a remembered stream, or start a new one."""
+        self.stream_id = request.stream_id
+        known = self._streams.pop(request.stream_id, None)
+        if known is None or request.first_sequence <= known.received.highest:
+            self._reset(request)
         else:
-            self._present = self._known[introduction.lineage] = known
-        while len(self._known) > KNOWN_LINEAGES:
-            del self._known[next(iter(self._known))]
+            self._current = self._streams[request.stream_id] = known
+        while len(self._streams) > MAX_STREAMS:
+            del self._streams[next(iter(self._streams))]
 
-    def _begin(self, introduction: Introduction) -> None:
-        self._present = _Lineage(Numbers(introduction.oldest), Numbers(introduction.oldest))
-        self._known[introduction.lineage] = self._present
+    def _reset(self, request: JoinRequest) -> None:
+        self._current = _Stream(SequenceSet(request.oldest), SequenceSet(request.oldest))
+        self._streams[request.stream_id] = self._current
 
-    def unwrapped(self, low_bits: int, introduction: Introduction | None = None) -> int:
-        """Return the number with these low bits that is nearest to those that have come, or were announced."""
-        near = self._present.received.highest
-        if introduction is not None:
-            known = near if introduction.lineage == self.lineage else -1
-            near = max(known, introduction.oldest, introduction.run_start)
-        half = 1 << (NARROW_BITS - 1)
+    def unwrap(self, low_bits: int, request: JoinRequest | None = None) -> int:
+        """Return the number with these low bits that is nearest to the highest one received or in the join request."""
+        near = self._current.received.highest
+        if request is not None:
+            known = near if request.stream_id == self.stream_id else -1
+            near = max(known, request.oldest, request.first_sequence)
+        half = 1 << (SEQUENCE_BITS - 1)
         number = near + (low_bits - near + half) % (2 * half) - half
         return number if number >= 0 else number + 2 * half
 
-    def take(self, number: int) -> bool:
-        """Take a measurement; return whether it is new."""
-        if number in self._present.received:
+    def newest_sequence(self, block: MeasurementBlock, reply: Reply) -> int:
+        """Return the full number of the first measurement of a block."""
+        sequence = block.measurements[0].sequence
+        return sequence if block.wide else self.unwrap(sequence, reply.join_request)
+
+    def accept(self, number: int) -> bool:
+        """Mark a measurement as received; return whether it is new."""
+        if number in self._current.received:
             return False
-        self._present.received.add(range(number, number + 1))
-        self._present.waiting.add(number)
+        self._current.received.add(range(number, number + 1))
+        self._current.pending.add(number)
         return True
 
-    def written(self, numbers: Iterable[int]) -> None:
-        """Take note that measurements are in the recording."""
-        for number in numbers:
-            for lineage in self._known.values() or (self._present,):
-                if number in lineage.waiting:
-                    lineage.waiting.remove(number)
-                    lineage.written.add(range(number, number + 1))
+    def mark_written(self, numbers: Iterable[int]) -> None:
+        """Mark measurements as recorded."""
+        for number, stream in self._pending(numbers):
+            stream.recorded.add(range(number, number + 1))
 
-    def lost(self, numbers: Iterable[int]) -> None:
-        """Take note that measurements will never be in the recording: they may come again, if the station has them."""
+    def mark_lost(self, numbers: Iterable[int]) -> None:
+        """Mark measurements that will not be recorded as not received: the station may send them again."""
+        for number, stream in self._pending(numbers):
+            if number not in stream.recorded:
+                stream.received.remove(number)
+
+    def _pending(self, numbers: Iterable[int]) -> Iterable[tuple[int, _Stream]]:
         for number in numbers:
-            for lineage in self._known.values() or (self._present,):
-                if number in lineage.waiting:
-                    lineage.waiting.remove(number)
-                    if number not in lineage.written:
-                        lineage.received.remove(number)
+            for stream in self._streams.values() or (self._current,):
+                if number in stream.pending:
+                    stream.pending.remove(number)
+                    yield number, stream
+
+    def add_reply(self, counter: int, sequences: Sequence[int]) -> None:
+        """Remember the measurements of the reply in a frame."""
+        self._replies[counter] = tuple(sequences)
+        for old in [old for old in self._replies if old < counter - ACK_FRAMES]:
+            del self._replies[old]
+
+    @property
+    def last_reply_measurements(self) -> int:
+        """Number of measurements in the last reply."""
+        return len(self._replies[max(self._replies)]) if self._replies else 0
 
     def is_written(self, numbers: Iterable[int]) -> bool:
-        """Tell whether all of these measurements are in the recording."""
-        return all(number in self._present.written for number in numbers)
+        """Whether all of these measurements are recorded."""
+        return all(number in self._current.recorded for number in numbers)
+
+    def ack_bitmap(self, counter: int) -> int:
+        """Return which replies of the frames before this one are recorded; see ``StationEntry``."""
+        bits = 0
+        for bit in range(ACK_FRAMES):
+            sequences = self._replies.get(counter - 1 - bit)
+            if sequences is not None and self.is_written(sequences):
+                bits |= 1 << bit
+        return bits

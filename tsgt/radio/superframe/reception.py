@@ -1,34 +1,62 @@
-"""What a reply of the superframe brings to the master, in SI units and on the master's clock."""
+"""What the master receives in a slot: a reply's timing, and its content in SI units on the master's clock."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     from tsgt.model import Status
-    from tsgt.radio.commands import Order
-    from tsgt.radio.superframe.wire import AnswerPart, ShotPart, StatePart
+    from tsgt.radio.commands import Command
+    from tsgt.radio.superframe.wire import CommandResponse, SingleMeasurement, StatusReport
+
+
+class ReplyTiming(NamedTuple):
+    """Instants of a reply and of its frame, on the master's CLOCK_MONOTONIC.
+
+    Attributes
+    ----------
+    counter
+        Of the frame.
+    sent_ns, sent_sigma_ns
+        TxDone of the beacon.
+    slot_ns
+        Start of the station's slot.
+    received_ns, received_sigma_ns
+        RxDone of the reply.
+    lateness_ns
+        RxDone minus its nominal instant.
+    payload_bytes, granted_bytes
+        Length of the reply, and of the longest one that was granted.
+    """
+
+    counter: int
+    sent_ns: int
+    sent_sigma_ns: int
+    slot_ns: int
+    received_ns: int
+    received_sigma_ns: int
+    lateness_ns: int
+    payload_bytes: int
+    granted_bytes: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TimedSighting:
-    """A measurement with its time.
+class TimedMeasurement:
+    """A measurement with its timestamp.
 
     Attributes
     ----------
     sequence
-        Running number, in full.
-    prism
-        Number of the prism.
+        Full sequence number.
     measured_ns
-        When it was made, on the master's CLOCK_MONOTONIC; may lie before the master's start, even below zero.
+        On the master's CLOCK_MONOTONIC; may be negative, before the start of that clock.
     sigma_ns
-        One sigma of that.
+        Standard deviation of ``measured_ns``.
     bound_ns
-        ``measured_ns`` is within this of the truth.
-    status, horizontal_angle_rad, zenith_angle_rad, slope_distance_m
-        As the instrument gave them, within half a unit of the air: 0.19 microradians, 0.05 mm (0.5 mm beyond 1.6 km).
+        Maximum error of ``measured_ns``.
+    horizontal_angle_rad, zenith_angle_rad, slope_distance_m
+        Rounded to the resolution of the air interface: 0.37 microradians, 0.1 mm (1 mm beyond 1.6 km).
     """
 
     sequence: int
@@ -43,39 +71,35 @@ class TimedSighting:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Heard:
-    """What a reply brought.
+class ReceivedReply:
+    """Content of an authentic reply.
 
     Attributes
     ----------
-    station
-        Number of the sender.
-    sightings
-        Those that are new, in the order in which they were made.
+    measurements
+        The new ones, in ascending order of sequence numbers.
     repeated
-        How many it held that had come before.
+        Number of measurements received before.
     joined
-        The station has just introduced itself: it, or this master, is new.
-    state
-        How it does, where the reply says so.
-    order, answer, shot
-        What became of an order, and which it was: given once, however often the station says it.
-    doubted_beacons
-        How many beacons it has received since its last word at a time at which they cannot have been sent.
+        The station joined this session with this reply.
+    command, response, single_measurement
+        The command that this reply completes, with its response or measurement; set once per command.
+    rejected_beacons
+        Beacons that the station has rejected for an impossible time since its last report.
     link_delay_anomaly
-        A self-calibration came to something that cannot be: somebody may be delaying packets.
+        The measured link delay is impossible: packets may be delayed on purpose.
     lateness_ns
-        By how much it came later than its slot foresees.
+        RxDone minus its nominal instant.
     """
 
     station: int
-    sightings: tuple[TimedSighting, ...] = ()
+    measurements: tuple[TimedMeasurement, ...] = ()
     repeated: int = 0
     joined: bool = False
-    state: StatePart | None = None
-    order: Order | None = None
-    answer: AnswerPart | None = None
-    shot: ShotPart | None = None
-    doubted_beacons: int = 0
+    status_report: StatusReport | None = None
+    command: Command | None = None
+    response: CommandResponse | None = None
+    single_measurement: SingleMeasurement | None = None
+    rejected_beacons: int = 0
     link_delay_anomaly: bool = False
     lateness_ns: int = 0

@@ -1,179 +1,240 @@
-"""Which measurements go into a reply: as many as fit, in runs of what belongs together."""
+"""Builds a station's reply: pending control messages, then measurements, then what else fits. Sans-I/O."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import replace
+from itertools import islice
+from typing import TYPE_CHECKING
 
 from tsgt.radio.superframe.wire import (
+    MAX_NARROW_AGE_NS,
     WIDE_TIME_BITS,
+    EncodedMeasurement,
+    JoinRequest,
+    MeasurementBlock,
     Reply,
-    Run,
-    Sighting,
     distance_code,
     is_far,
-    quality_bound_us,
     reply_bytes,
 )
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from tsgt.radio.superframe.send_queue import Queued
+    from tsgt.radio.superframe.command_exchange import InstrumentState
+    from tsgt.radio.superframe.send_queue import SendQueue, StampedMeasurement
+    from tsgt.radio.superframe.session import ReplySlot, StationSession
+    from tsgt.radio.superframe.wire import StatusReport
 
-NARROW_AGE_NS = 2_000_000_000
-"""A measurement that is older than this when the reply begins needs a wide run: narrow times repeat after 2.1 s."""
+MAX_BLOCK_MEASUREMENTS = 16
+MAX_BLOCKS = 15
 
-WORST_QUALITY = 15
-LONGEST_RUN = 16
-MOST_RUNS = 15
-
-LEAST_SIGHTING_BYTES = 6
-USUAL_SIGHTING_BYTES = 8
-"""What a measurement takes at least, and as a rule, that is not the newest of its run."""
+MIN_MEASUREMENT_BYTES = 6
+TYPICAL_MEASUREMENT_BYTES = 8
+"""Length of a measurement that is not the first of its block."""
 
 _QUALITY_SPREAD = 2
 _GOOD_QUALITY = 7
-"""A run tells its worst quality. A measurement that is better than this, 2 ms, may be told so; otherwise one that is
-worse than the newest of its run by more than the spread gets another run, which takes three times the room."""
+"""A block has the worst quality of its measurements. Measurements up to this quality, 2 ms, share a block; a worse one
+that differs by more than the spread from the newest of the block gets a block of its own, which takes three times the
+room."""
+
+MAX_SHORT_QUEUE = 8
+"""A longer queue is a backlog, delivered newest first."""
+
+MAX_SKIPPED_REPLIES = 2
+"""After this many replies without the oldest of a short queue it takes precedence for one reply."""
 
 
-class Timed(NamedTuple):
-    """A measurement with its time as it goes over the air.
+class ReplyBuilder:
+    """Builds the replies of one station.
 
-    Attributes
+    Parameters
     ----------
-    queued
-        The measurement.
-    time
-        In :data:`~tsgt.radio.superframe.wire.messages.TIME_UNIT_US`, in full: of the master's session, or from the beacon with ``direct``.
-    quality
-        How good it is, 0 to 15.
-    direct
-        See :class:`~tsgt.radio.superframe.wire.messages.Run`.
-    age_ns
-        How old it is when the reply begins; None where this computer's clock cannot tell.
+    stream_id
+        See :class:`~tsgt.radio.superframe.wire.messages.JoinRequest`.
     """
 
-    queued: Queued
-    time: int
-    quality: int
-    direct: bool
-    age_ns: int | None
+    def __init__(self, send_queue: SendQueue, stream_id: int) -> None:
+        self._queue = send_queue
+        self._stream_id = stream_id
+        self._skipped_replies = 0
 
+    def build(
+        self, session: StationSession, slot: ReplySlot, state: InstrumentState, report: StatusReport
+    ) -> tuple[Reply, tuple[int, ...]]:
+        """Return the reply, and the sequence numbers in it.
 
-def quality_of(bound_us: float) -> int | None:
-    """Return the best quality that claims no more than this bound; None where none does."""
-    for quality in range(WORST_QUALITY + 1):
-        if bound_us <= quality_bound_us(quality):
-            return quality
-    return None
+        A turnaround comes with a status report, and after the measurements unless it is overdue.
+        """
+        limit_bytes = slot.slot.max_reply_bytes
+        parts = self._control_parts(session, state, report, limit_bytes)
+        urgent = self._by_urgency(session, slot.start_ns, limit_bytes // MIN_MEASUREMENT_BYTES)
+        prism = session.commands.known_prism(parts.status_report or report)
+        narrow = session.delivery.may_be_narrow
+        reply, packed = pack(parts, urgent, limit_bytes, prism=prism, is_narrow=narrow)
+        turnaround_us = session.turnaround_us()
+        if turnaround_us is not None:
+            extended = replace(parts, status_report=report, turnaround_us=turnaround_us)
+            longer, still = pack(extended, urgent, limit_bytes, prism=prism, is_narrow=narrow)
+            fits = reply_bytes(longer) <= limit_bytes
+            if fits and (len(still) == len(packed) or session.commands.turnaround_overdue):
+                reply, packed = longer, still
+        sequences = tuple(stamped.queued.sequence for stamped in packed)
+        oldest = min((stamped.queued.sequence for stamped in urgent), default=None)
+        self._skipped_replies = 0 if oldest is None or oldest in sequences else self._skipped_replies + 1
+        return reply, sequences
+
+    def _control_parts(
+        self, session: StationSession, state: InstrumentState, report: StatusReport, limit_bytes: int
+    ) -> Reply:
+        """Return join request, response, single measurement and status report, as far as pending and as they fit."""
+        commands, delivery = session.commands, session.delivery
+        if delivery.outdated and not delivery.join_pending:
+            delivery.request_join()
+        pending: list[dict[str, object]] = []
+        if not session.confirmed or delivery.join_pending:
+            pending.append({"join_request": self._join_request(session)})
+        # The newest: a master waits for the response to its last command only.
+        pending += [{"response": response} for response in list(commands.responses)[-1:]]
+        pending += [{"single_measurement": single} for single in list(commands.single_measurements)[-1:]]
+        if commands.needs_report(state):
+            pending.append({"status_report": report})
+        reply = Reply()
+        for part in pending:
+            longer = replace(reply, **part)  # type: ignore[arg-type]  # mypy cannot see that name and type agree
+            if reply_bytes(longer) <= limit_bytes:
+                reply = longer
+        return reply
+
+    def _join_request(self, session: StationSession) -> JoinRequest:
+        return JoinRequest(
+            nonce=session.nonce,
+            stream_id=self._stream_id,
+            first_sequence=self._queue.first_sequence,
+            oldest=session.delivery.oldest,
+        )
+
+    def _by_urgency(
+        self, session: StationSession, slot_ns: int, max_measurements: int
+    ) -> list[StampedMeasurement]:
+        """Return the measurements that have a time on this master's clock, most urgent first.
+
+        The newest is the most urgent: it serves the robot's control. Then come, in a short queue, the oldest, so that none
+        waits long; in a backlog the next newer ones, so that a lost one is soon repeated. An old one that needs a block of
+        its own may never fit behind the newest, and takes precedence once in a while.
+        """
+        deliverable = filter(session.can_timestamp, self._queue.newest_first())
+        urgent: list[StampedMeasurement] = []
+        for queued in islice(deliverable, max_measurements):
+            stamped = session.timestamped(queued, slot_ns, urgent[0] if urgent else None)
+            if stamped is not None:
+                urgent.append(stamped)
+        if 1 < len(self._queue) <= MAX_SHORT_QUEUE:
+            urgent[1:] = urgent[:0:-1]
+            if self._skipped_replies >= MAX_SKIPPED_REPLIES:
+                urgent[:2] = urgent[1::-1]
+        return urgent
 
 
 def pack(
     parts: Reply,
-    by_urgency: Sequence[Timed],
+    by_urgency: Sequence[StampedMeasurement],
     limit_bytes: int,
     *,
     prism: int | None,
     is_narrow: Callable[[int, int], bool],
-) -> tuple[Reply, tuple[Timed, ...]]:
-    """Fill a reply with measurements.
+) -> tuple[Reply, tuple[StampedMeasurement, ...]]:
+    """Fill a reply with measurements; return it and the measurements in it, newest first.
 
     Parameters
     ----------
     parts
-        What else it says; it fits.
+        The rest of the reply, which fits.
     by_urgency
-        The measurements, the one that is wanted most first.
+        Most urgent first.
     limit_bytes
-        What the reply may take, code and all.
+        Maximum length, authentication code included.
     prism
-        The one that need not be named; None: each is.
+        The prism that the master assumes; None: each block names its own.
     is_narrow
-        Whether the master finds a sequence number again from its low bits; the second number is the newest in the reply.
-
-    Returns
-    -------
-    Reply, tuple of Timed
-        The reply, and the measurements in it in their order.
+        Whether the master can reconstruct a sequence number from its low bits; the second number is the highest in the
+        reply.
     """
 
-    def filled(count: int) -> tuple[Reply, tuple[Timed, ...]]:
+    def filled(count: int) -> tuple[Reply, tuple[StampedMeasurement, ...]]:
         newest_first = tuple(sorted(by_urgency[:count], key=_sequence, reverse=True))
-        reply = Reply(
-            runs=_runs(newest_first, prism, is_narrow),
-            introduction=parts.introduction,
-            state=parts.state,
-            turn_round_us=parts.turn_round_us,
-            answer=parts.answer,
-            shot=parts.shot,
-        )
-        return reply, newest_first
+        return replace(parts, blocks=_blocks(newest_first, prism, is_narrow)), newest_first
 
     fits, best = 0, filled(0)
     too_many = len(by_urgency) + 1
-    count = min(len(by_urgency), limit_bytes // USUAL_SIGHTING_BYTES + 1)
+    count = min(len(by_urgency), limit_bytes // TYPICAL_MEASUREMENT_BYTES + 1)
     while fits < count < too_many:
         reply, newest_first = filled(count)
         length = reply_bytes(reply)
-        if len(reply.runs) <= MOST_RUNS and length <= limit_bytes:
+        if len(reply.blocks) <= MAX_BLOCKS and length <= limit_bytes:
             fits, best, count = count, (reply, newest_first), count + 1
         else:
             too_many, count = count, max(fits + 1, min(count - 1, count * limit_bytes // length + 1))
     return best
 
 
-def _sequence(timed: Timed) -> int:
-    return timed.queued.sequence
+def _sequence(stamped: StampedMeasurement) -> int:
+    return stamped.queued.sequence
 
 
-def _runs(
-    newest_first: Sequence[Timed], prism: int | None, is_narrow: Callable[[int, int], bool]
-) -> tuple[Run, ...]:
-    groups: list[list[Timed]] = []
-    for timed in newest_first:
-        if groups and _belong_together(groups[-1], timed):
-            groups[-1].append(timed)
+def _blocks(
+    newest_first: Sequence[StampedMeasurement], prism: int | None, is_narrow: Callable[[int, int], bool]
+) -> tuple[MeasurementBlock, ...]:
+    groups: list[list[StampedMeasurement]] = []
+    for stamped in newest_first:
+        if groups and _share_block(groups[-1], stamped):
+            groups[-1].append(stamped)
         else:
-            groups.append([timed])
-    return tuple(_run(group, prism, is_narrow, _sequence(newest_first[0])) for group in groups)
+            groups.append([stamped])
+    return tuple(_block(group, prism, is_narrow, _sequence(newest_first[0])) for group in groups)
 
 
-def _belong_together(group: list[Timed], timed: Timed) -> bool:
+def _share_block(group: list[StampedMeasurement], stamped: StampedMeasurement) -> bool:
     newest = group[0]
     return (
-        len(group) < LONGEST_RUN
-        and timed.queued.prism == newest.queued.prism
-        and timed.direct == newest.direct
-        and is_far(timed.queued.distance_m) == is_far(newest.queued.distance_m)
-        and max(timed.quality, newest.quality)
-        <= max(min(timed.quality, newest.quality) + _QUALITY_SPREAD, _GOOD_QUALITY)
-        and abs(timed.time - group[-1].time) < 1 << WIDE_TIME_BITS - 1
+        len(group) < MAX_BLOCK_MEASUREMENTS
+        and stamped.queued.prism == newest.queued.prism
+        and stamped.beacon_relative == newest.beacon_relative
+        and is_far(stamped.queued.distance_m) == is_far(newest.queued.distance_m)
+        and max(stamped.quality, newest.quality)
+        <= max(min(stamped.quality, newest.quality) + _QUALITY_SPREAD, _GOOD_QUALITY)
+        and abs(stamped.time - group[-1].time) < 1 << WIDE_TIME_BITS - 1
     )
 
 
-def _run(group: list[Timed], prism: int | None, is_narrow: Callable[[int, int], bool], highest: int) -> Run:
+def _block(
+    group: list[StampedMeasurement],
+    prism: int | None,
+    is_narrow: Callable[[int, int], bool],
+    highest: int,
+) -> MeasurementBlock:
     newest = group[0]
     far = is_far(newest.queued.distance_m)
     narrow = (
         newest.age_ns is not None
-        and newest.age_ns <= NARROW_AGE_NS
+        and newest.age_ns <= MAX_NARROW_AGE_NS
         and is_narrow(newest.queued.sequence, highest)
     )
-    return Run(
-        sightings=tuple(
-            Sighting(
-                timed.queued.sequence,
-                timed.time,
-                timed.queued.status,
-                timed.queued.horizontal,
-                timed.queued.zenith,
-                distance_code(timed.queued.distance_m, far=far),
+    return MeasurementBlock(
+        measurements=tuple(
+            EncodedMeasurement(
+                stamped.queued.sequence,
+                stamped.time,
+                stamped.queued.status,
+                stamped.queued.horizontal,
+                stamped.queued.zenith,
+                distance_code(stamped.queued.distance_m, far=far),
             )
-            for timed in group
+            for stamped in group
         ),
-        direct=newest.direct,
-        quality=max(timed.quality for timed in group),
+        beacon_relative=newest.beacon_relative,
+        quality=max(stamped.quality for stamped in group),
         wide=not narrow,
         prism=None if newest.queued.prism == prism else newest.queued.prism,
         far=far,

@@ -1,7 +1,7 @@
-"""What a station has measured and still has to deliver, and what is known of how far that has come.
+"""A station's send queue, and how far one master has acknowledged it. Sans-I/O.
 
-A queue outlives the masters that it is delivered to: it is cut down by what one of them acknowledges, and goes on with
-the next. What holds for one master only is in :class:`Delivery`.
+The queue outlives the masters that it is delivered to: each continues with what earlier ones left unacknowledged.
+:class:`DeliveryProgress` holds what applies to one master only.
 """
 
 from __future__ import annotations
@@ -10,41 +10,36 @@ from dataclasses import dataclass
 from itertools import pairwise, takewhile
 from typing import TYPE_CHECKING, NamedTuple
 
-from tsgt.radio.superframe.wire import RESTART_SKIP
+from tsgt.radio.superframe.wire import RESTART_SKIP, quality_bound_us
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from tsgt.model import Status
 
-MOST_QUEUED = 100_000
-"""Eleven hours of measurements, and some 30 MB."""
+QUEUE_CAPACITY = 100_000
+"""Eleven hours of measurements, about 30 MB."""
 
-_LOW_BITS = 8
+_MAX_QUALITY = 15
+_SEQUENCE_BITS = 8
 
 Gaps = tuple[tuple[int, int], ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Queued:
-    """A measurement that stands in the journal and has to be delivered.
+class QueuedMeasurement:
+    """A journalled measurement that is to be delivered.
 
     Attributes
     ----------
-    sequence
-        Its running number.
     at_ns
-        When it was made, on CLOCK_MONOTONIC of the station's computer.
+        On CLOCK_MONOTONIC of the station's computer.
     boot
-        Since which start of that computer its clock has run like this.
-    prism
-        Number of the prism.
-    status
-        The instrument's verdict.
+        Boot id that this clock belongs to.
     horizontal, zenith
-        Angles as they go over the air.
+        Encoded by :func:`~tsgt.radio.superframe.wire.codec.angle_code`.
     distance_m
-        Slope distance in m; None where the instrument gave none.
+        Slope distance; None: angles only.
     """
 
     sequence: int
@@ -57,212 +52,232 @@ class Queued:
     distance_m: float | None
 
 
-class Extent(NamedTuple):
-    """Which numbers a master has to wait for.
+class StampedMeasurement(NamedTuple):
+    """A queued measurement with its encoded time.
+
+    Attributes
+    ----------
+    time
+        In units of :data:`~tsgt.radio.superframe.wire.messages.TIME_UNIT_US`, not wrapped: session time, or from the end
+        of the beacon if ``beacon_relative``.
+    quality
+        Of the time, 0 to 15.
+    age_ns
+        At the start of the reply; None for a measurement of an earlier boot.
+    """
+
+    queued: QueuedMeasurement
+    time: int
+    quality: int
+    beacon_relative: bool
+    age_ns: int | None
+
+
+def quality_of(bound_us: float) -> int | None:
+    """Return the best quality whose bound is not below this one; None: there is none."""
+    return next((q for q in range(_MAX_QUALITY + 1) if bound_us <= quality_bound_us(q)), None)
+
+
+class PendingRange(NamedTuple):
+    """Sequence numbers that a master waits for.
 
     Attributes
     ----------
     oldest
         The lowest.
     gaps
-        First and last number of each stretch after it that will never come, in their order.
+        First and last number of each higher range that will never be sent, ascending.
     """
 
     oldest: int
     gaps: Gaps
 
 
-class Outbox:
-    """What has not been acknowledged, by number.
+class SendQueue:
+    """Measurements that are not acknowledged, by sequence number.
 
     Parameters
     ----------
-    run_start
-        Number of the first measurement that this run of the client will add.
+    first_sequence
+        First sequence number of this run of the client.
     backlog
-        What earlier runs have left, oldest first; numbers below ``run_start``.
+        What earlier runs left, oldest first; numbers below ``first_sequence``.
 
     Attributes
     ----------
-    run_start
-        As given.
-    left_through
-        Highest number that had to leave undelivered because there were too many; -1 without any.
+    dropped_through
+        Highest number dropped because the queue was full; -1: none.
     """
 
-    def __init__(self, run_start: int, backlog: Iterable[Queued] = ()) -> None:
-        self.run_start = run_start
+    def __init__(self, first_sequence: int, backlog: Iterable[QueuedMeasurement] = ()) -> None:
+        self.first_sequence = first_sequence
         self._queue = {queued.sequence: queued for queued in backlog}
-        self._next = run_start
-        self.left_through = -1
+        self._next = first_sequence
+        self.dropped_through = -1
 
     def __len__(self) -> int:
         return len(self._queue)
 
     @property
     def oldest(self) -> int:
-        """The lowest number that is still to be delivered, or the next to be added."""
+        """The lowest queued number, or the next to be added."""
         return next(iter(self._queue), self._next)
 
-    def add(self, queued: Queued) -> None:
-        """Append the next measurement, for which the oldest leaves if there are :data:`MOST_QUEUED`.
+    def add(self, queued: QueuedMeasurement) -> None:
+        """Append a measurement; drop the oldest beyond :data:`QUEUE_CAPACITY`.
 
         Raises
         ------
         ValueError
-            Its number is not higher than those before.
+            The sequence number is not higher than all before.
         """
         if queued.sequence < self._next:
             raise ValueError(f"measurement {queued.sequence} comes after {self._next - 1}")
         self._queue[queued.sequence] = queued
         self._next = queued.sequence + 1
-        if len(self._queue) > MOST_QUEUED:
-            self.left_through = self.oldest
-            del self._queue[self.left_through]
+        if len(self._queue) > QUEUE_CAPACITY:
+            self.dropped_through = self.oldest
+            del self._queue[self.dropped_through]
 
-    def oldest_first(self) -> Iterator[Queued]:
-        """Go through what is queued; nothing may change meanwhile."""
+    def oldest_first(self) -> Iterator[QueuedMeasurement]:
+        """Iterate over the queue, which must not change meanwhile."""
         return iter(self._queue.values())
 
-    def newest_first(self) -> Iterator[Queued]:
-        """Go through what is queued; nothing may change meanwhile."""
+    def newest_first(self) -> Iterator[QueuedMeasurement]:
+        """Iterate over the queue, which must not change meanwhile."""
         return reversed(self._queue.values())
 
     def remove(self, sequences: Iterable[int]) -> None:
-        """Forget what has been delivered; numbers that are not there are passed over."""
+        """Remove these numbers where they are queued."""
         for sequence in sequences:
             self._queue.pop(sequence, None)
 
     def remove_through(self, sequence: int) -> None:
-        """Forget everything up to a number, itself included."""
+        """Remove all numbers up to this one, inclusive."""
         self.remove(list(takewhile(lambda queued: queued <= sequence, self._queue)))
 
-    def keep(self, wanted: Callable[[Queued], bool]) -> int:
-        """Forget what is not wanted; return how many that were."""
+    def retain(self, deliverable: Callable[[QueuedMeasurement], bool]) -> int:
+        """Remove what is not deliverable; return how many measurements that were."""
         before = len(self._queue)
-        self._queue = {sequence: queued for sequence, queued in self._queue.items() if wanted(queued)}
+        self._queue = {sequence: queued for sequence, queued in self._queue.items() if deliverable(queued)}
         return before - len(self._queue)
 
-    def extent(self, wanted: Callable[[Queued], bool]) -> Extent:
-        """Tell which numbers a master has to wait for, of those that are wanted."""
-        numbers = [queued.sequence for queued in self._queue.values() if wanted(queued)]
+    def pending_range(self, deliverable: Callable[[QueuedMeasurement], bool]) -> PendingRange:
+        """Return which numbers a master waits for."""
+        numbers = [queued.sequence for queued in self._queue.values() if deliverable(queued)]
         numbers.append(self._next)
         gaps = []
         for before, after in pairwise(numbers):
             first, last = before + 1, after - 1
-            if first < self.run_start <= after:  # a master knows of what the restart has left out
-                gaps += [(first, min(last, self.run_start - RESTART_SKIP - 1)), (self.run_start, last)]
+            if first < self.first_sequence <= after:  # a master knows of the numbers that the restart skipped
+                gaps += [
+                    (first, min(last, self.first_sequence - RESTART_SKIP - 1)),
+                    (self.first_sequence, last),
+                ]
             else:
                 gaps.append((first, last))
-        return Extent(numbers[0], tuple((first, last) for first, last in gaps if first <= last))
+        return PendingRange(numbers[0], tuple((first, last) for first, last in gaps if first <= last))
 
 
-class Delivery:
-    """How far one master has got with an outbox.
+class DeliveryProgress:
+    """How far one master has acknowledged a send queue.
 
-    Problem: the cumulative acknowledgement is eight bits of a number that the station has to find again. It reads the
-    lowest number that has these bits and that the master is certain to have reached, so that it never takes more for
-    delivered than what is. What the master is certain to have reached is everything below the oldest number in the
-    outbox, unless numbers are missing that the master waits for and that never come: delivered to an earlier master,
-    or lost. Then nothing beyond such a gap counts, until the gap lies behind and the station introduces itself anew,
-    with a higher oldest number, below which everything is settled. It does so at once behind what a restart has left
-    out, and else when all gaps lie behind.
-
-    Parameters
-    ----------
-    outbox
-        What is to be delivered.
-    wanted
-        Of its measurements those that can be delivered to this master.
+    Problem: the cumulative acknowledgement carries the low eight bits of a sequence number, and the station must not
+    delete anything that the master has not recorded. It therefore reads the lowest number with these bits that is not
+    below a number that the master has certainly reached: everything below the oldest queued number. The exception are
+    gaps, numbers that the master waits for and that are never sent, because an earlier master has them or they were lost.
+    Nothing beyond a gap counts until a new join request, with a higher oldest number, tells the master not to wait. The
+    station sends one as soon as it has delivered everything below the numbers that a restart skipped, and otherwise when
+    all gaps are below its oldest queued number.
 
     Attributes
     ----------
     oldest
-        For the introduction: lowest number that is still to be delivered.
-    introducing
-        The master has to be told anew.
+        For the join request: lowest number that is still to be delivered.
+    join_pending
+        A join request has to be sent.
     """
 
-    def __init__(self, outbox: Outbox, wanted: Callable[[Queued], bool]) -> None:
-        self._outbox = outbox
-        self._wanted = wanted
+    def __init__(self, send_queue: SendQueue, deliverable: Callable[[QueuedMeasurement], bool]) -> None:
+        self._queue = send_queue
+        self._deliverable = deliverable
         self._acknowledged: int | None = None
-        self._highest_sent = outbox.run_start - 1  # earlier runs may have sent all of these
-        self.oldest, self._gaps = outbox.extent(wanted)
-        self._settled = self.oldest  # as far as the master knows
-        self.introducing = False
+        self._highest_sent = send_queue.first_sequence - 1  # earlier runs may have sent all of these
+        self.oldest, self._gaps = send_queue.pending_range(deliverable)
+        self._known_oldest = self.oldest  # to the master
+        self.join_pending = False
         self._reached = self.oldest - 1
 
-    # --- Introduction -----------------------------------------------------------------------------------------
+    # --- Join requests ----------------------------------------------------------------------------------------
 
     @property
     def outdated(self) -> bool:
-        """Whether the master waits for numbers that never come, and another introduction tells it so."""
-        gaps = self._gaps_now()
-        behind = [(first, last) for first, last in gaps if last < self._outbox.oldest]
-        all_behind = bool(behind) and len(behind) == len(gaps)
-        return all_behind or any(last - first >= RESTART_SKIP - 1 for first, last in behind)
+        """Whether the master waits for numbers that are never sent, and a join request would tell it so."""
+        gaps = self._current_gaps()
+        passed = [(first, last) for first, last in gaps if last < self._queue.oldest]
+        all_passed = bool(passed) and len(passed) == len(gaps)
+        return all_passed or any(last - first >= RESTART_SKIP - 1 for first, last in passed)
 
-    def introduce(self) -> None:
-        """Set :attr:`oldest` to what is true now; the master does not know yet."""
-        self.oldest, gaps = self._outbox.extent(self._wanted)
-        # Until it does, it waits for what was left behind, if anything was.
-        behind = ((self._settled, self.oldest - 1),) if self.oldest > self._settled else ()
-        self._gaps = _union(self._gaps_now(), (*behind, *gaps))
-        self.introducing = True
+    def request_join(self) -> None:
+        """Update :attr:`oldest` for a join request."""
+        self.oldest, gaps = self._queue.pending_range(self._deliverable)
+        # Until the master has the request, it also waits for what was discarded.
+        discarded = ((self._known_oldest, self.oldest - 1),) if self.oldest > self._known_oldest else ()
+        self._gaps = _union(self._current_gaps(), (*discarded, *gaps))
+        self.join_pending = True
 
-    def introduced(self, oldest: int) -> None:
-        """Take it that the master has an introduction with this oldest number."""
-        self._settled = max(self._settled, oldest)
-        self.introducing = False
+    def join_acknowledged(self, oldest: int) -> None:
+        """Take the acknowledgement of a join request with this oldest number."""
+        self._known_oldest = max(self._known_oldest, oldest)
+        self.join_pending = False
         self._reached = max(self._reached, oldest - 1)
         self._gaps = tuple((max(first, oldest), last) for first, last in self._gaps if last >= oldest)
 
     # --- Sequence numbers -------------------------------------------------------------------------------------
 
     def may_be_narrow(self, sequence: int, newest: int) -> bool:
-        """Whether the master finds a number again from its low bits, next to the highest that it has.
+        """Whether the master can reconstruct a number from its low bits and the highest number that it has.
 
         Parameters
         ----------
-        sequence
-            The number.
         newest
-            The highest that is sent along with it.
+            The highest number of the same reply.
         """
         if self._acknowledged is None:
             return False
-        half = 1 << _LOW_BITS - 1
+        half = 1 << _SEQUENCE_BITS - 1
         highest = max(self._highest_sent, newest)
         return abs(sequence - self._acknowledged) < half and highest + 1 - sequence < half
 
-    def sent(self, sequences: Iterable[int]) -> None:
-        """Take it that these numbers are on the air."""
+    def mark_sent(self, sequences: Iterable[int]) -> None:
+        """Mark numbers as sent."""
         self._highest_sent = max((self._highest_sent, *sequences))
 
     # --- Acknowledgement --------------------------------------------------------------------------------------
 
-    def delivered(self, sequences: Sequence[int]) -> None:
-        """Take it that the master has these numbers."""
-        self._outbox.remove(sequences)
+    def acknowledge(self, sequences: Sequence[int]) -> None:
+        """Remove measurements that the master has recorded."""
+        self._queue.remove(sequences)
         known = () if self._acknowledged is None else (self._acknowledged,)
         self._acknowledged = max((*sequences, *known), default=None)
 
-    def delivered_through(self, low_bits: int) -> None:
-        """Take the low bits of the number up to which the master has everything."""
-        certain = self._outbox.oldest - 1
-        if gaps := self._gaps_now():
+    def acknowledge_through(self, low_bits: int) -> None:
+        """Take the cumulative acknowledgement."""
+        certain = self._queue.oldest - 1
+        if gaps := self._current_gaps():
             certain = min(certain, gaps[0][0] - 1)
         self._reached = max(self._reached, certain)
-        number = self._reached + (low_bits - self._reached) % (1 << _LOW_BITS)
+        number = self._reached + (low_bits - self._reached) % (1 << _SEQUENCE_BITS)
         if number <= self._highest_sent:
             self._reached = number
-            self._outbox.remove_through(number)
+            self._queue.remove_through(number)
 
-    def _gaps_now(self) -> Gaps:
-        """Return the gaps, with what has left the outbox since."""
-        left = self._outbox.left_through
-        return self._gaps if left < self._settled else _union(self._gaps, ((self._settled, left),))
+    def _current_gaps(self) -> Gaps:
+        """Return the gaps, including what the full queue has dropped since."""
+        dropped = self._queue.dropped_through
+        if dropped < self._known_oldest:
+            return self._gaps
+        return _union(self._gaps, ((self._known_oldest, dropped),))
 
 
 def _union(one: Gaps, other: Gaps) -> Gaps:

@@ -1,73 +1,65 @@
-"""What a station knows of one session of a master: its frames, its time, and what it has of this station.
-
-Which session of a master a station is in, and whether a beacon belongs to it.
-"""
+"""One session of a master at a station: clock, acknowledgements, timestamps, slots. Sans-I/O."""
 
 from __future__ import annotations
 
-import hmac
 from collections import deque
 from dataclasses import dataclass
 from itertools import takewhile
 from typing import TYPE_CHECKING, NamedTuple
 
-from tsgt.radio.superframe.command_exchange import Conversation
-from tsgt.radio.superframe.reply_builder import Timed, quality_of
-from tsgt.radio.superframe.send_queue import Delivery
+from tsgt.radio.superframe.command_exchange import CommandExchange
+from tsgt.radio.superframe.send_queue import DeliveryProgress, StampedMeasurement, quality_of
 from tsgt.radio.superframe.slots import GUARD_UNIT_NS, FrameTiming
 from tsgt.radio.superframe.wire import (
-    CODE_BYTES,
+    ACK_FRAMES,
     SESSION_TIME_BITS,
     TIME_UNIT_US,
-    TURN_ROUND_BITS,
-    Confirmation,
+    TURNAROUND_BITS,
+    JoinConfirmation,
 )
 from tsgt.timesync import BeaconClock
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Mapping
 
-    from tsgt.radio.base import LoRaSettings, Packet
-    from tsgt.radio.superframe.send_queue import Outbox, Queued
-    from tsgt.radio.superframe.wire import Authenticator, Beacon, Reply, SessionPart
+    from tsgt.radio.base import LoRaSettings
+    from tsgt.radio.superframe.send_queue import QueuedMeasurement, SendQueue
+    from tsgt.radio.superframe.slots import Slot
+    from tsgt.radio.superframe.wire import Beacon, Reply, SessionInfo
 
-HISTORY = 4
-"""A beacon tells of so many frames before it whether the reply is in the recording."""
+MAX_SLOT_SIGMA_NS = 1_000_000
+"""A beacon with a less exact timestamp gives no slot."""
 
-FRAME_BITS = 8
+_FRAME_BITS = 8
 _SENT_BITS = 16
 
-_DIRECT_EXTRA_US = 2000.0
-"""A time that rests on one beacon is worse than it looks, by as much as the reply may start late."""
+_BEACON_RELATIVE_EXTRA_US = 2000.0
+"""Additional error of a beacon-relative time: the start jitter of the reply."""
 
-_REACH_NS = int(4.4 * 3600e9)
-"""What was measured longer before the first beacon gets no time to half a second, however well they tell the rate."""
+_MAX_REACH_NS = int(4.4 * 3600e9)
+"""Measurements made longer before the first beacon have no timestamp within half a second, whatever the skew bound."""
 
-_TOLD_NS = 60_000_000_000
-"""Beacons that come later than this after an instant tell no more of its time."""
+_USEFUL_BEACONS_NS = 60_000_000_000
+"""Beacons later than this after an instant do not improve its timestamp."""
 
 _SIGMAS = 4
-"""A bound is so many sigma."""
+"""Sigmas in a bound."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Reception:
-    """When a beacon left, by the master's clock, and when it came, by the station's.
+class BeaconReception:
+    """A clock sample: a beacon's TxDone on the master's clock and its RxDone on the station's.
 
     Attributes
     ----------
     session
-        The master's nonce.
-    counter
-        Number of the frame in the session.
-    received_ns
+        Session nonce.
+    received_ns, sigma_ns
         RxDone on CLOCK_MONOTONIC of the station's computer.
-    sigma_ns
-        One sigma of that.
     sent_us
         TxDone in session time.
     boot
-        Since which start of the station's computer its clock has run like this.
+        Boot id of the station's clock.
     """
 
     session: int
@@ -78,8 +70,8 @@ class Reception:
     boot: str
 
 
-class HeardBeacon(NamedTuple):
-    """A beacon that has been found authentic; times on CLOCK_MONOTONIC."""
+class AuthenticBeacon(NamedTuple):
+    """An authenticated beacon with its RxDone on CLOCK_MONOTONIC."""
 
     beacon: Beacon
     code: bytes
@@ -88,23 +80,44 @@ class HeardBeacon(NamedTuple):
     sigma_ns: int
 
 
-@dataclass(slots=True)
-class SentReply:
-    """A reply that is on the air, or was.
+class ReplySlot(NamedTuple):
+    """The station's slot on its CLOCK_MONOTONIC; ``beacon_end_ns`` is the end of the beacon on the air."""
+
+    slot: Slot
+    beacon_end_ns: int
+    start_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class ReceivedBeacon:
+    """Result of an authentic beacon.
 
     Attributes
     ----------
-    heard
-        The beacon that it answers.
-    reply
-        What it says.
-    sequences
-        The measurements in it.
-    done_ns
-        TxDone on CLOCK_MONOTONIC; None while it is not known to better than a millisecond.
+    slot_ns
+        Start of the station's slot on its CLOCK_MONOTONIC; None: no slot.
+    reception
+        Clock sample of the previous beacon, for the journal.
+    time_rejected
+        The time of the previous beacon is impossible and was rejected.
+    joined
+        The beacon confirms the station.
+    discarded
+        Number of measurements removed from the queue because they cannot be timestamped for this master.
     """
 
-    heard: HeardBeacon
+    slot_ns: int | None
+    reception: BeaconReception | None
+    time_rejected: bool
+    joined: bool
+    discarded: int
+
+
+@dataclass(slots=True)
+class SentReply:
+    """A reply that was sent; ``done_ns`` is its TxDone on CLOCK_MONOTONIC if that is exact."""
+
+    beacon: AuthenticBeacon
     reply: Reply
     sequences: tuple[int, ...]
     done_ns: int | None = None
@@ -115,97 +128,115 @@ class StationSession:
 
     Parameters
     ----------
-    heard
-        A beacon with a session part.
-    part
-        That part.
+    station
+        Number of the station.
+    beacon
+        The first beacon, with session info.
     nonce
-        The station's own nonce for this session, 32 bits.
-    settings
-        Of the modem.
-    outbox
-        What is to be delivered.
+        The station's nonce in this session, 32 bits.
     boot
-        Since which start of this computer its clock has run like this.
+        Boot id of this computer's clock.
     clocks
-        What earlier runs of the program knew of this master's time, by the start of this computer.
+        Clocks of this session by boot id, from journalled receptions.
 
     Attributes
     ----------
-    master_nonce, nonce
-        The master's and the station's.
     confirmed
-        The master has proved that it has heard this station in this session; it is no recording.
-    heard
-        The newest beacon.
-    timing
-        Of the frames.
+        A beacon has repeated the station's nonce: the session is not a replay.
+    beacon
+        The newest one.
     clock
-        The master's time on this computer's clock.
-    delivery
-        What the master has.
-    conversation
-        What else there is to say.
-    last_reply
-        The latest reply; None before the first.
+        Of the present boot.
+    slot
+        For the reply to the newest beacon; None: no slot.
     """
 
     def __init__(
         self,
-        heard: HeardBeacon,
-        part: SessionPart,
+        station: int,
+        beacon: AuthenticBeacon,
+        info: SessionInfo,
         nonce: int,
         settings: LoRaSettings,
-        outbox: Outbox,
+        send_queue: SendQueue,
         boot: str,
         clocks: Mapping[str, BeaconClock],
     ) -> None:
-        self.master_nonce = part.nonce
+        self.master_nonce = info.nonce
         self.nonce = nonce
         self.confirmed = False
-        self.heard = heard
-        self._before: HeardBeacon | None = None
-        self.timing = _timing(settings, part)
+        self.beacon = beacon
+        self.slot: ReplySlot | None = None
+        self.timing = _frame_timing(settings, info)
+        self._station = station
+        self._previous: AuthenticBeacon | None = None
         self._boot = boot
-        self._outbox = outbox
+        self._queue = send_queue
         self._clocks = dict(clocks)
         self.clock = self._clocks.setdefault(boot, BeaconClock())
-        self.delivery = Delivery(outbox, self.can_time)
-        self.conversation = Conversation()
+        self.delivery = DeliveryProgress(send_queue, self.can_timestamp)
+        self.commands = CommandExchange()
         self.last_reply: SentReply | None = None
-        self._unanswered: deque[SentReply] = deque(maxlen=HISTORY)
-        self._sifted = False
+        self._unacknowledged: deque[SentReply] = deque(maxlen=ACK_FRAMES)
+        self._queue_checked = False
 
     # --- Beacons ----------------------------------------------------------------------------------------------
 
     def counter_of(self, beacon: Beacon) -> int | None:
-        """Return the number of the frame, if the beacon is of this session; None for one that is not, or is not new."""
+        """Return the frame counter of a beacon; None if it is of another session or not newer than the newest."""
         if beacon.session is None:
-            following = self.heard.counter + 1
-            return following + (beacon.frame - following) % (1 << FRAME_BITS)
+            following = self.beacon.counter + 1
+            return following + (beacon.frame - following) % (1 << _FRAME_BITS)
         counter = full_counter(beacon.session, beacon)
-        of_this = beacon.session.nonce == self.master_nonce
-        return counter if of_this and counter > self.heard.counter else None
+        same_session = beacon.session.nonce == self.master_nonce
+        return counter if same_session and counter > self.beacon.counter else None
 
-    def listen(self, heard: HeardBeacon) -> None:
-        """Take the next authentic beacon."""
-        self._before, self.heard = self.heard, heard
-        if heard.beacon.session is not None:
-            self.timing = _timing(self.timing.settings, heard.beacon.session)
+    def take(self, authentic: AuthenticBeacon) -> ReceivedBeacon:
+        """Take an authentic beacon of this session."""
+        beacon = authentic.beacon
+        if authentic is not self.beacon:
+            self._previous, self.beacon = self.beacon, authentic
+            if beacon.session is not None:
+                self.timing = _frame_timing(self.timing.settings, beacon.session)
+        joined = self._confirm(beacon)
+        discarded = self._queue.retain(self.can_timestamp) if joined else 0
+        reception = self.reception()
+        time_rejected = reception is not None and not self._add_sample(reception)
+        if time_rejected:
+            self.commands.request_turnaround()
+        if self.confirmed:
+            self._take_acknowledgements(beacon)
+            self.commands.receive(each for each in beacon.commands if each.station == self._station)
+        discarded += self._discard_untimeable()
+        self.slot = self._reply_slot()
+        return ReceivedBeacon(
+            slot_ns=None if self.slot is None else self.slot.start_ns,
+            reception=None if time_rejected else reception,
+            time_rejected=time_rejected,
+            joined=joined,
+            discarded=discarded,
+        )
 
-    def reception(self) -> Reception | None:
-        """Return when the beacon before the newest came and had left, if the newest tells.
+    def _confirm(self, beacon: Beacon) -> bool:
+        """Return whether the beacon confirms the session for the first time."""
+        confirmation = JoinConfirmation(self._station, self.nonce)
+        joined = not self.confirmed and confirmation in beacon.confirmations
+        self.confirmed = self.confirmed or joined
+        return joined
 
-        None also before the master is confirmed: it may be a recording, whose times would bend the clock.
+    def reception(self) -> BeaconReception | None:
+        """Return the clock sample of the previous beacon if the newest carries its time.
+
+        None before the session is confirmed: the times of a replay would corrupt the clock.
         """
-        before, beacon = self._before, self.heard.beacon
-        follows = before is not None and before.counter + 1 == self.heard.counter
+        before, beacon = self._previous, self.beacon.beacon
+        follows = before is not None and before.counter + 1 == self.beacon.counter
         if before is None or not follows or not self.confirmed or not beacon.sent:
             return None
         sent_us = self._unwrap(before.received_ns, beacon)
         if sent_us is None:
             return None
-        return Reception(
+        return BeaconReception(
             session=self.master_nonce,
             counter=before.counter,
             received_ns=before.received_ns,
@@ -221,240 +252,142 @@ class StationSession:
         now = self.clock.at(received_ns)
         if now is None:
             return sent_us
-        half = 1 << SESSION_TIME_BITS - 1  # in a session of 13 days and more
+        half = 1 << SESSION_TIME_BITS - 1  # session time wraps after 12.7 days
         return sent_us + (round(now.time_us) - sent_us + half >> SESSION_TIME_BITS << SESSION_TIME_BITS)
 
-    # --- Acknowledgement --------------------------------------------------------------------------------------
+    def _add_sample(self, reception: BeaconReception) -> bool:
+        """Add a clock sample; return False if the clock rejects it."""
+        beacon, mine = self.beacon.beacon, self._station - 1
+        return self.clock.add(
+            reception.received_ns,
+            reception.sent_us,
+            reception.sigma_ns,
+            unambiguous=beacon.session is not None,
+            live=mine < len(beacon.stations) and bool(beacon.stations[mine].ack_bitmap & 1),
+        )
 
-    def replied(self, reply: Reply, sequences: tuple[int, ...]) -> None:
-        """Take it that the newest beacon is answered like this."""
-        self.last_reply = SentReply(self.heard, reply, sequences)
-        self._unanswered.append(self.last_reply)
-        self.delivery.sent(sequences)
-        self.conversation.said(reply, self.heard.counter)
+    def _reply_slot(self) -> ReplySlot | None:
+        received, entries = self.beacon, self.beacon.beacon.stations
+        if self._station > len(entries) or received.sigma_ns > MAX_SLOT_SIGMA_NS:
+            return None
+        grants = [entry.grant for entry in entries]
+        slot = self.timing.slots(grants, received.beacon.slot_order)[self._station - 1]
+        if slot is None:
+            return None
+        end_ns = received.received_ns - self.timing.reception_ns
+        return ReplySlot(slot, end_ns, end_ns + slot.start_ns)
 
-    def acknowledge(self, history: int) -> None:
-        """Take which of the latest replies are in the recording, as the newest beacon says."""
-        for sent in list(self._unanswered):
-            age = self.heard.counter - sent.heard.counter - 1
-            if age < HISTORY and history >> age & 1:
-                self._unanswered.remove(sent)
-                self.delivery.delivered(sent.sequences)
-                if sent.reply.introduction is not None:
-                    self.delivery.introduced(sent.reply.introduction.oldest)
-                self.conversation.acknowledged(sent.reply, sent.heard.counter)
+    # --- Acknowledgements -------------------------------------------------------------------------------------
 
-    # --- Time -------------------------------------------------------------------------------------------------
+    def reply_sent(self, reply: Reply, sequences: tuple[int, ...]) -> None:
+        """Take the reply to the newest beacon as sent."""
+        self.last_reply = SentReply(self.beacon, reply, sequences)
+        self._unacknowledged.append(self.last_reply)
+        self.delivery.mark_sent(sequences)
+        self.commands.sent(reply, self.beacon.counter)
 
-    def can_time(self, queued: Queued) -> bool:
-        """Whether this master's time of a measurement can be told, now or soon.
+    def _take_acknowledgements(self, beacon: Beacon) -> None:
+        mine = self._station - 1
+        if mine >= len(beacon.stations):
+            return
+        for sent in list(self._unacknowledged):
+            age = self.beacon.counter - sent.beacon.counter - 1
+            if age < ACK_FRAMES and beacon.stations[mine].ack_bitmap >> age & 1:
+                self._unacknowledged.remove(sent)
+                self.delivery.acknowledge(sent.sequences)
+                if sent.reply.join_request is not None:
+                    self.delivery.join_acknowledged(sent.reply.join_request.oldest)
+                self.commands.acknowledged(sent.reply, sent.beacon.counter)
+        if self.beacon.counter % len(beacon.stations) == mine:
+            self.delivery.acknowledge_through(beacon.cumulative)
 
-        Not if it is so far from all beacons that no quality is bad enough. Nor if it is of another start of this computer,
-        which had not learnt this master's time, or only just: what could have shown that the first beacons were held back
-        did not come any more.
+    # --- Timestamps -------------------------------------------------------------------------------------------
+
+    def can_timestamp(self, queued: QueuedMeasurement) -> bool:
+        """Whether a measurement has, or may soon have, a time on this master's clock.
+
+        Not if it is too far from all beacons for any quality. A measurement of an earlier boot needs the clock of that
+        boot to have converged: otherwise its beacons may have been delayed, and no later one can show it.
         """
         clock = self._clocks.get(queued.boot)
         if clock is None:
             return False
         if queued.boot == self._boot:
             first_ns = clock.first_received_ns
-            return first_ns is None or first_ns - queued.at_ns <= _REACH_NS
-        time = clock.at(queued.at_ns) if clock.settled else None
+            return first_ns is None or first_ns - queued.at_ns <= _MAX_REACH_NS
+        time = clock.at(queued.at_ns) if clock.converged else None
         return time is not None and quality_of(time.bound_us) is not None
 
-    def sift(self) -> int:
-        """Leave behind what will never have a time, as soon as that is known; return how many measurements that were.
+    def _discard_untimeable(self) -> int:
+        """Discard measurements that will never have a timestamp; return how many.
 
-        It would wait for ever, and the master for it. How far back times reach depends on what the first beacons told of
-        the rate, which takes a minute to know. The oldest go: the newest are told first, so what can be told behind them is.
+        How far back timestamps reach depends on the skew bound of the first minute's beacons. The oldest measurements are
+        discarded first: newer ones get the better timestamps.
         """
-        if not self.confirmed or not self.clock.settled:
+        if not self.confirmed or not self.clock.converged:
             return 0
-        left = 0 if self._sifted else self._outbox.keep(self.can_time)
-        self._sifted = True
-        hopeless = [queued.sequence for queued in takewhile(self._is_hopeless, self._outbox.oldest_first())]
-        self._outbox.remove(hopeless)
-        left += len(hopeless)
-        if left:
-            self.delivery.introduce()
-        return left
+        discarded = 0 if self._queue_checked else self._queue.retain(self.can_timestamp)
+        self._queue_checked = True
+        untimeable = [
+            queued.sequence for queued in takewhile(self._is_untimeable, self._queue.oldest_first())
+        ]
+        self._queue.remove(untimeable)
+        discarded += len(untimeable)
+        if discarded:
+            self.delivery.request_join()
+        return discarded
 
-    def _is_hopeless(self, queued: Queued) -> bool:
-        """Whether nothing useful is known of when a measurement was made, and no beacon will tell."""
+    def _is_untimeable(self, queued: QueuedMeasurement) -> bool:
+        """Whether a measurement has no useful timestamp, and later beacons will not improve it."""
         first_ns, last_ns = self.clock.first_received_ns, self.clock.last_received_ns
         if queued.boot != self._boot or first_ns is None or last_ns is None:
             return False
-        told = last_ns - max(first_ns, queued.at_ns) > _TOLD_NS
-        return told and self.timed(queued, self.heard.received_ns) is None
+        final = last_ns - max(first_ns, queued.at_ns) > _USEFUL_BEACONS_NS
+        return final and self.timestamped(queued, self.beacon.received_ns) is None
 
-    def timed(self, queued: Queued, slot_ns: int, newest: Timed | None = None) -> Timed | None:
-        """Return a measurement with its time for a slot that begins then; None where nothing useful is known.
+    def timestamped(
+        self, queued: QueuedMeasurement, slot_ns: int, newest: StampedMeasurement | None = None
+    ) -> StampedMeasurement | None:
+        """Return a measurement with its time for a slot that starts then; None without a useful one.
 
-        A change between direct times and others costs a run of its own, so it keeps to what ``newest`` in the reply has,
-        unless it is better otherwise. As long as held-back beacons would not have been outvoted there are direct times only:
-        to those the master adds by how much the reply came late.
+        A block has either session times or beacon-relative ones, so a measurement prefers the kind of the reply's newest.
+        Before the clock has converged all times are beacon-relative: the beacons may have been delayed, and the master
+        adds the lateness of the reply to the bound of such times.
         """
         clock = self._clocks[queued.boot]
-        live = queued.boot == self._boot
-        time = clock.at(queued.at_ns) if clock.settled else None
-        direct = False
-        extra_us = 0.0 if newest is not None and newest.direct else _DIRECT_EXTRA_US
-        if newest is not None and not newest.direct:
-            live = live and time is None
-        if live and (time is None or time.bound_us > extra_us):
-            alone = clock.elapsed(self.heard.received_ns, queued.at_ns)
-            stamp_us = _SIGMAS * self.heard.sigma_ns / 1000
-            if time is None or alone.bound_us + stamp_us + extra_us < time.bound_us:
-                time, direct = alone._replace(bound_us=alone.bound_us + stamp_us), True
+        same_boot = queued.boot == self._boot
+        time = clock.at(queued.at_ns) if clock.converged else None
+        beacon_relative = False
+        extra_us = 0.0 if newest is not None and newest.beacon_relative else _BEACON_RELATIVE_EXTRA_US
+        try_relative = same_boot
+        if newest is not None and not newest.beacon_relative:
+            try_relative = same_boot and time is None
+        if try_relative and (time is None or time.bound_us > extra_us):
+            elapsed = clock.elapsed(self.beacon.received_ns, queued.at_ns)
+            timestamp_us = _SIGMAS * self.beacon.sigma_ns / 1000
+            if time is None or elapsed.bound_us + timestamp_us + extra_us < time.bound_us:
+                time, beacon_relative = elapsed._replace(bound_us=elapsed.bound_us + timestamp_us), True
         quality = None if time is None else quality_of(time.bound_us)
         if time is None or quality is None:
             return None
-        age_ns = slot_ns - queued.at_ns if queued.boot == self._boot else None
-        return Timed(queued, round(time.time_us / TIME_UNIT_US), quality, direct, age_ns)
-
-    def turn_round_us(self) -> int | None:
-        """Return what the previous reply took from RxDone of its beacon to its TxDone, if it was in the frame before."""
-        last = self.last_reply
-        if last is None or last.done_ns is None or last.heard.counter + 1 != self.heard.counter:
-            return None
-        took_us = round(self.clock.elapsed(last.heard.received_ns, last.done_ns).time_us)
-        return took_us if took_us < 1 << TURN_ROUND_BITS else None
-
-
-def _timing(settings: LoRaSettings, part: SessionPart) -> FrameTiming:
-    return FrameTiming(settings, part.guard * GUARD_UNIT_NS, part.turn_round * GUARD_UNIT_NS)
-
-
-def full_counter(part: SessionPart, beacon: Beacon) -> int:
-    """Return the number of a beacon's frame in the session that it tells of."""
-    return part.counter_high << FRAME_BITS | beacon.frame
-
-
-PATIENCE_NS = 3_000_000_000
-"""Another session is tried only when the confirmed one has been silent for so long."""
-
-_NONCE_BITS = 32
-
-
-class SessionKeeper:
-    """Keeps the session that is confirmed, and beside it one that is tried.
-
-    Whoever has recorded a session can play it back, so that one that is merely authentic is tried only while the
-    confirmed one is silent, and forgotten as soon as that is heard again.
-
-    Parameters
-    ----------
-    station
-        Number of the station.
-    settings, outbox, boot
-        For new sessions; see :class:`~tsgt.radio.superframe.session.StationSession`.
-    authenticator
-        Has the key.
-    receptions
-        What earlier runs of the program have journalled, in the order in which they were made.
-    random_bits
-        Returns a number with so many random bits.
-
-    Attributes
-    ----------
-    confirmed, candidate
-        The two; None where there is none.
-    refused
-        How many packets looked like a beacon with a session and had a wrong code.
-    """
-
-    def __init__(
-        self,
-        station: int,
-        settings: LoRaSettings,
-        authenticator: Authenticator,
-        outbox: Outbox,
-        boot: str,
-        receptions: Iterable[Reception],
-        random_bits: Callable[[int], int],
-    ) -> None:
-        self._station = station
-        self._settings = settings
-        self._authenticator = authenticator
-        self._outbox = outbox
-        self._boot = boot
-        self._random_bits = random_bits
-        self._clocks: dict[int, dict[str, BeaconClock]] = {}
-        for reception in receptions:
-            clock = self._clocks.setdefault(reception.session, {}).setdefault(reception.boot, BeaconClock())
-            clock.add(reception.received_ns, reception.sent_us, reception.sigma_ns, in_full=True)
-        self.confirmed: StationSession | None = None
-        self.candidate: StationSession | None = None
-        self.refused = 0
-
-    @property
-    def current(self) -> StationSession | None:
-        """The session that is answered."""
-        return self.candidate or self.confirmed
-
-    def find(self, beacon: Beacon, packet: Packet) -> StationSession | None:
-        """Return the session of an authentic beacon, which is its newest from now on; None for any other beacon.
-
-        Parameters
-        ----------
-        beacon
-            What the packet says.
-        packet
-            As it came.
-        """
-        for session in (self.confirmed, self.candidate):
-            if session is None or (counter := session.counter_of(beacon)) is None:
-                continue
-            if self._is_authentic(session.master_nonce, counter, packet):
-                if session is self.confirmed:
-                    self.candidate = None
-                session.listen(_heard(beacon, counter, packet))
-                return session
-        return self._begin(beacon, packet)
-
-    def _begin(self, beacon: Beacon, packet: Packet) -> StationSession | None:
-        part = beacon.session
-        if part is None or not self._may_try(part.nonce, packet.received_at_ns):
-            return None
-        counter = full_counter(part, beacon)
-        if not self._is_authentic(part.nonce, counter, packet):
-            self.refused += 1
-            return None
-        self.candidate = StationSession(
-            _heard(beacon, counter, packet),
-            part,
-            self._random_bits(_NONCE_BITS),
-            self._settings,
-            self._outbox,
-            self._boot,
-            self._clocks.get(part.nonce, {}),
+        age_ns = slot_ns - queued.at_ns if same_boot else None
+        return StampedMeasurement(
+            queued, round(time.time_us / TIME_UNIT_US), quality, beacon_relative, age_ns
         )
-        return self.candidate
 
-    def _is_authentic(self, master_nonce: int, counter: int, packet: Packet) -> bool:
-        content, code = packet.payload[:-CODE_BYTES], packet.payload[-CODE_BYTES:]
-        right = self._authenticator.beacon_code(session=master_nonce, counter=counter, content=content)
-        return hmac.compare_digest(right, code)
-
-    def _may_try(self, master_nonce: int, now_ns: int) -> bool:
-        """Whether a beacon of another session is looked at."""
-        known = [session for session in (self.confirmed, self.candidate) if session is not None]
-        if any(session.master_nonce == master_nonce for session in known):
-            return False  # it has been heard before
-        return self.confirmed is None or now_ns - self.confirmed.heard.received_ns >= PATIENCE_NS
-
-    def confirm(self, session: StationSession) -> bool:
-        """Look whether the newest beacon of a session confirms it for the first time."""
-        confirmation = Confirmation(self._station, session.nonce)
-        if session.confirmed or confirmation not in session.heard.beacon.confirmations:
-            return False
-        session.confirmed = True
-        self.confirmed, self.candidate = session, None
-        self._clocks.clear()  # no other session will need them
-        return True
+    def turnaround_us(self) -> int | None:
+        """Return the turnaround of the previous frame: from RxDone of its beacon to TxDone of its reply."""
+        last = self.last_reply
+        if last is None or last.done_ns is None or last.beacon.counter + 1 != self.beacon.counter:
+            return None
+        turnaround_us = round(self.clock.elapsed(last.beacon.received_ns, last.done_ns).time_us)
+        return turnaround_us if turnaround_us < 1 << TURNAROUND_BITS else None
 
 
-def _heard(beacon: Beacon, counter: int, packet: Packet) -> HeardBeacon:
-    return HeardBeacon(
-        beacon, packet.payload[-CODE_BYTES:], counter, packet.received_at_ns, packet.stamp_sigma_ns
-    )
+def _frame_timing(settings: LoRaSettings, info: SessionInfo) -> FrameTiming:
+    return FrameTiming(settings, info.guard * GUARD_UNIT_NS, info.turnaround * GUARD_UNIT_NS)
+
+
+def full_counter(info: SessionInfo, beacon: Beacon) -> int:
+    """Return the full frame counter of a beacon with session info."""
+    return info.counter_high << _FRAME_BITS | beacon.frame

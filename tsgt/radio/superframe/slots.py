@@ -1,11 +1,9 @@
-"""The time plan of a superframe: when the beacon ends, whose slot is when, how late is too late.
+"""Slot plan of a frame: start and end of each slot, guard times, latest start of a reply.
 
-Everything counts from the end of the beacon on the air. Master and stations compute the same plan from the same
-beacon, so that nobody has to be told when its slot is.
+All times count from the end of the beacon on the air. Master and stations compute the same plan from the same beacon.
 
-A slot lasts as long as the longest reply that it is granted for, and is followed by a guard time. The guard is what the
-two computers on either side of it can be wrong by, as their configuration states: how late one of them starts a
-transmission, and how far their clocks run apart within a frame.
+A slot lasts as long as the longest reply of its grant and is followed by a guard time, which covers the start jitter of
+two transmitters and the drift of their clocks within a frame.
 """
 
 from __future__ import annotations
@@ -24,77 +22,69 @@ if TYPE_CHECKING:
     from tsgt.radio.superframe.wire import SlotOrder
 
 GUARD_UNIT_NS = 250_000
-"""Guard and turn-round are told to the stations in these units."""
+"""Unit of guard time and turnaround in a beacon."""
+
+COMPOSE_LEAD_NS = 6_000_000
+"""How long before its slot a station composes its reply."""
+
+EXACT_SIGMA_NS = 100_000
+"""A timestamp with a larger sigma was made without the edge or without kernel support, and measures no delay."""
 
 OVERLAP_SYMBOLS = 1.2
-"""A packet may end this far into the next one's preamble: twelve symbols, of which a receiver needs six."""
+"""Tolerated overlap with the next preamble: it has twelve symbols, of which a receiver needs six."""
 
-LONGEST_FRAME_NS = 5_000_000_000
+MAX_FRAME_NS = 5_000_000_000
 
-_STAMP_SYMBOLS = 0.1
-"""When a radio reports the end of a packet is known beforehand to this."""
+_TIMESTAMP_SYMBOLS = 0.1
+"""Uncertainty of the nominal delay from the end of a packet to RxDone."""
 
 
-class SlotSpan(NamedTuple):
-    """A station's slot, in ns from the end of the beacon on the air.
-
-    Attributes
-    ----------
-    start_ns
-        When its reply begins.
-    end_ns
-        When the longest reply that it is granted ends; the guard comes after that.
-    reply_bytes
-        The longest reply.
-    """
+class Slot(NamedTuple):
+    """A station's slot, in ns from the end of the beacon; ``end_ns`` is the end of the longest reply, without guard time."""
 
     start_ns: int
     end_ns: int
-    reply_bytes: int
+    max_reply_bytes: int
 
 
 @dataclass(frozen=True, slots=True)
 class FrameTiming:
-    """How long the parts of a frame last.
+    """Durations of the parts of a frame.
 
     Attributes
     ----------
-    settings
-        Of the modem.
     guard_ns
-        Between two slots, and after the last.
-    turn_round_ns
+        After each slot.
+    turnaround_ns
         From the end of the beacon to the first slot.
     """
 
     settings: LoRaSettings
     guard_ns: int
-    turn_round_ns: int
+    turnaround_ns: int
 
     @classmethod
-    def stated(
-        cls, settings: LoRaSettings, *, start_jitter_ns: int, turn_round_ns: int, clock_error_ppm: float
+    def from_tolerances(
+        cls, settings: LoRaSettings, *, start_jitter_ns: int, turnaround_ns: int, clock_error_ppm: float
     ) -> FrameTiming:
-        """Compute the guard from what is stated of computers and clocks.
+        """Compute the guard time.
 
         Parameters
         ----------
-        settings
-            Of the modem.
         start_jitter_ns
-            How late a transmission starts at worst.
-        turn_round_ns
+            Maximum delay of the start of a transmission.
+        turnaround_ns
             What a station needs between the beacon and the first slot.
         clock_error_ppm
-            By how much two clocks run apart.
+            Maximum rate difference of two clocks.
         """
         symbol_ns = symbol_time_ns(settings.spreading_factor, settings.bandwidth_hz)
-        drift_ns = LONGEST_FRAME_NS * clock_error_ppm * 1e-6
-        guard_ns = start_jitter_ns + drift_ns + _STAMP_SYMBOLS * symbol_ns
-        return cls(settings, in_units(guard_ns) * GUARD_UNIT_NS, in_units(turn_round_ns) * GUARD_UNIT_NS)
+        drift_ns = MAX_FRAME_NS * clock_error_ppm * 1e-6
+        guard_ns = start_jitter_ns + drift_ns + _TIMESTAMP_SYMBOLS * symbol_ns
+        return cls(settings, _rounded_up(guard_ns), _rounded_up(turnaround_ns))
 
     def airtime_ns(self, payload_bytes: int) -> int:
-        """Return how long a packet is on the air."""
+        """Return the airtime of a packet."""
         settings = self.settings
         return 1000 * airtime_us(
             payload_bytes,
@@ -108,51 +98,43 @@ class FrameTiming:
 
     @property
     def reception_ns(self) -> int:
-        """From the end of a packet on the air to RxDone, as known beforehand."""
+        """Nominal delay from the end of a packet on the air to RxDone."""
         return rx_done_ns(self.settings.spreading_factor, self.settings.bandwidth_hz)
 
     @property
     def link_ns(self) -> int:
-        """From TxDone of a sender to RxDone of its receiver, as known beforehand; the true one is measured."""
+        """Nominal link delay: from TxDone of the sender to RxDone of the receiver."""
         return self.reception_ns - TX_DONE_NS
 
     @property
     def tolerance_ns(self) -> int:
-        """How far into the next packet's preamble a late one may reach without harm, in ns."""
+        """By how much a late packet may overlap the next preamble without loss."""
         symbol_ns = symbol_time_ns(self.settings.spreading_factor, self.settings.bandwidth_hz)
         return round(OVERLAP_SYMBOLS * symbol_ns)
 
-    def slots(self, grants: Sequence[int], order: SlotOrder) -> list[SlotSpan | None]:
-        """Return the slot of each station, by index; None for those without one.
-
-        Parameters
-        ----------
-        grants
-            By station index, as in the beacon.
-        order
-            As in the beacon.
-        """
-        spans: list[SlotSpan | None] = [None] * len(grants)
-        start_ns = self.turn_round_ns
+    def slots(self, grants: Sequence[int], order: SlotOrder) -> list[Slot | None]:
+        """Return the slots by station index; None for a station without a slot."""
+        slots: list[Slot | None] = [None] * len(grants)
+        start_ns = self.turnaround_ns
         for index in slot_sequence(len(grants), order):
             reply_bytes = GRANT_BYTES[grants[index]]
             if reply_bytes:
                 end_ns = start_ns + self.airtime_ns(reply_bytes)
-                spans[index] = SlotSpan(start_ns, end_ns, reply_bytes)
+                slots[index] = Slot(start_ns, end_ns, reply_bytes)
                 start_ns = end_ns + self.guard_ns
-        return spans
+        return slots
 
-    def latest_start_ns(self, slot: SlotSpan, reply_bytes: int) -> int:
-        """Return until when a reply of this length may begin without harming the next slot, from the beacon's end."""
+    def latest_start_ns(self, slot: Slot, reply_bytes: int) -> int:
+        """Return the latest start of a reply of this length that leaves the next slot intact."""
         return slot.end_ns + self.guard_ns + self.tolerance_ns - self.airtime_ns(reply_bytes)
 
 
 def slot_sequence(stations: int, order: SlotOrder) -> list[int]:
-    """Return the indices of the stations in the order of their slots."""
+    """Return the station indices in the order of their slots."""
     step = -1 if order.reverse else 1
     return [(order.first + step * k) % stations for k in range(stations)]
 
 
-def in_units(duration_ns: float) -> int:
-    """Return guard or turn-round as it goes over the air: in :data:`GUARD_UNIT_NS`, rounded up, 8 bits at most."""
-    return min(math.ceil(duration_ns / GUARD_UNIT_NS), 255)
+def _rounded_up(duration_ns: float) -> int:
+    """Round up to :data:`GUARD_UNIT_NS`, at most 255 units."""
+    return min(math.ceil(duration_ns / GUARD_UNIT_NS), 255) * GUARD_UNIT_NS

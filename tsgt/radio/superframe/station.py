@@ -1,121 +1,79 @@
-"""The station's side of the superframe: packets, their instants and measurements in, replies and orders out.
+"""The station's side of the superframe: packets, times and measurements in, replies and commands out. Sans-I/O.
 
-A station answers whoever can prove to have the key. Proof that it is not a recording of yesterday takes one exchange:
-the station introduces itself with a number of its own, and a beacon with this number confirms it. Until then it sends
-what it measures, for nobody gains by that, but takes nothing for delivered, obeys no order and keeps no time.
+A station replies to everybody who proves to have the key. That the packets are not a replay takes one exchange: the
+station sends a join request with a nonce, and a beacon with this nonce confirms it. Until then the station sends its
+measurements, but accepts no acknowledgement, command or time. A recorded session can be replayed, so another authentic
+session is a candidate only while the confirmed one is silent, and dropped as soon as that is received again.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from itertools import islice
-from typing import TYPE_CHECKING, NamedTuple
+import hmac
+from typing import TYPE_CHECKING
 
 from tsgt.errors import MessageError
-from tsgt.radio.superframe.reply_builder import LEAST_SIGHTING_BYTES, pack
-from tsgt.radio.superframe.session import SessionKeeper
+from tsgt.radio.superframe.reply_builder import ReplyBuilder
+from tsgt.radio.superframe.session import AuthenticBeacon, StationSession, full_counter
+from tsgt.radio.superframe.slots import EXACT_SIGMA_NS
 from tsgt.radio.superframe.wire import (
     CODE_BYTES,
-    AnswerPart,
-    Introduction,
-    Reply,
-    ShotPart,
-    StatePart,
+    CommandResponse,
+    SingleMeasurement,
+    StatusReport,
     decode_beacon,
     distance_code,
     encode_reply,
-    reply_bytes,
 )
+from tsgt.timesync import BeaconClock
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from tsgt.model import Status
-    from tsgt.radio.base import LoRaSettings, Packet, Transmitted
-    from tsgt.radio.commands import Order
-    from tsgt.radio.superframe.command_exchange import Conversation, Situation
-    from tsgt.radio.superframe.reply_builder import Timed
-    from tsgt.radio.superframe.send_queue import Outbox
-    from tsgt.radio.superframe.session import Reception, StationSession
-    from tsgt.radio.superframe.slots import SlotSpan
-    from tsgt.radio.superframe.wire import Authenticator
+    from tsgt.radio.base import LoRaSettings, Packet, Transmission
+    from tsgt.radio.commands import Command
+    from tsgt.radio.superframe.command_exchange import CommandExchange, InstrumentState
+    from tsgt.radio.superframe.send_queue import SendQueue
+    from tsgt.radio.superframe.session import BeaconReception, ReceivedBeacon
+    from tsgt.radio.superframe.wire import Authenticator, Beacon
 
-WORST_STAMP_NS = 1_000_000
-"""A beacon whose stamp has a larger sigma tells no slot."""
-
-EXACT_SIGMA_NS = 100_000
-"""A stamp with a larger sigma was found without its edge, and measures nothing."""
+SESSION_TIMEOUT_NS = 3_000_000_000
+"""Another session becomes a candidate only when the confirmed one has been silent for longer."""
 
 PREPARATION_NS = 1_000_000
-"""What a radio needs to start a transmission that is late already."""
+"""What a radio needs to start a transmission immediately."""
 
-FEW = 8
-"""With more than so many measurements the older ones are a backlog."""
-LONGEST_WAIT = 2
-"""When the oldest of few did not fit in so many replies in a row, it goes first for once."""
-
-
-@dataclass(frozen=True, slots=True)
-class Heard:
-    """What an authentic beacon has brought.
-
-    Attributes
-    ----------
-    slot_ns
-        When the station's slot begins, on its CLOCK_MONOTONIC; None without a slot.
-    reception
-        Of the beacon before it, for the journal.
-    doubted
-        The beacon before it came at a time that cannot be.
-    joined
-        This beacon has confirmed the station.
-    left_behind
-        How many measurements have left the queue because nobody can put them on this master's clock.
-    """
-
-    slot_ns: int | None
-    reception: Reception | None
-    doubted: bool
-    joined: bool
-    left_behind: int
-
-
-class _Slot(NamedTuple):
-    span: SlotSpan
-    end_ns: int  # of the beacon on the air
-    start_ns: int
+_NONCE_BITS = 32
 
 
 class SuperframeStation:
-    """What a station answers.
+    """Decides what a station sends.
 
     Parameters
     ----------
     station
-        Its number, 1 to 16.
-    settings
-        Of the modem.
-    authenticator
-        Has the key.
-    outbox
-        What is to be delivered; measurements are added to it as soon as they are journalled.
-    lineage
-        16 bits: the same as long as sequence numbers go on.
+        Number of the station, 1 to 16.
+    send_queue
+        Measurements are added to it as soon as they are journalled.
+    stream_id
+        16 bits, constant while sequence numbers continue across restarts.
     boot
-        Since which start of this computer its clock has run like this.
+        Boot id of this computer's clock.
     receptions
-        What earlier runs of the program have journalled, in the order in which they were made.
+        Clock samples journalled by earlier runs, in their order.
     random_bits
-        Returns a number with so many random bits.
+        Returns a number of this many random bits.
 
     Attributes
     ----------
-    late
-        How many slots were left empty because the computer was late, or overrun.
-    doubted
-        How many beacons came at a time that cannot be.
+    authentication_failures
+        Packets that looked like a beacon with session info and had a wrong code.
+    missed_slots
+        Slots left empty because the computer was late, or overrun.
+    rejected_beacons
+        Beacons rejected for an impossible time.
     heard_ns, rssi_dbm, snr_db
-        RxDone and strength of the latest authentic beacon; None before the first.
+        RxDone and signal of the latest authentic beacon; None before the first.
     """
 
     def __init__(
@@ -123,258 +81,199 @@ class SuperframeStation:
         station: int,
         settings: LoRaSettings,
         authenticator: Authenticator,
-        outbox: Outbox,
+        send_queue: SendQueue,
         *,
-        lineage: int,
+        stream_id: int,
         boot: str,
-        receptions: Iterable[Reception] = (),
+        receptions: Iterable[BeaconReception] = (),
         random_bits: Callable[[int], int],
     ) -> None:
         self._station = station
+        self._settings = settings
         self._authenticator = authenticator
-        self._outbox = outbox
-        self._lineage = lineage
-        self._sessions = SessionKeeper(
-            station, settings, authenticator, outbox, boot, receptions, random_bits
-        )
-        self._slot: _Slot | None = None
-        self._latest_ns = 0
-        self._passed_over = 0
-        self._under_way: tuple[Conversation, int] | None = None
-        self.late = self.doubted = 0
+        self._queue = send_queue
+        self._boot = boot
+        self._random_bits = random_bits
+        self._builder = ReplyBuilder(send_queue, stream_id)
+        self._clocks: dict[int, dict[str, BeaconClock]] = {}
+        for reception in receptions:
+            clock = self._clocks.setdefault(reception.session, {}).setdefault(reception.boot, BeaconClock())
+            clock.add(reception.received_ns, reception.sent_us, reception.sigma_ns, unambiguous=True)
+        self._confirmed: StationSession | None = None
+        self._candidate: StationSession | None = None
+        self._latest_start_ns = 0
+        self._executing: tuple[CommandExchange, int] | None = None
+        self.missed_slots = self.rejected_beacons = self.authentication_failures = 0
         self.heard_ns: int | None = None
         self.rssi_dbm: float | None = None
         self.snr_db: float | None = None
 
     @property
-    def refused(self) -> int:
-        """How many packets looked like a beacon with a session and had a wrong code."""
-        return self._sessions.refused
+    def session(self) -> StationSession | None:
+        """The session that the station replies to: the candidate, or else the confirmed one."""
+        return self._candidate or self._confirmed
 
     @property
     def joined(self) -> bool:
-        """Whether a master has confirmed the station, and no other is tried."""
-        session = self._sessions.current
+        """Whether a master has confirmed the station, and there is no other candidate."""
+        session = self.session
         return session is not None and session.confirmed
 
     def clock_bound_us(self, now_ns: int) -> float | None:
-        """Return how well the master's time is known; None where it is not."""
-        session = self._sessions.current
+        """Return the bound of the master's time on this clock; None if it is unknown."""
+        session = self.session
         time = None if session is None else session.clock.at(now_ns)
         return None if time is None else time.bound_us
 
     # --- Beacons ----------------------------------------------------------------------------------------------
 
-    def received(self, packet: Packet) -> Heard | None:
-        """Take a packet, whatever it is; return what it brings if it is a beacon for this station."""
+    def received(self, packet: Packet) -> ReceivedBeacon | None:
+        """Take any packet; return None if it is no authentic beacon of an acceptable session."""
         try:
             beacon = decode_beacon(packet.payload[:-CODE_BYTES])
         except MessageError:
             return None
-        session = self._sessions.find(beacon, packet)
-        if session is None:
+        found = self._identify(beacon, packet) or self._begin_session(beacon, packet)
+        if found is None:
             return None
+        session, authentic = found
+        if session is self._confirmed:
+            self._candidate = None
+        received = session.take(authentic)
+        if received.joined:
+            self._confirmed, self._candidate = session, None
+            self._clocks.clear()  # no other session needs them
         self.heard_ns, self.rssi_dbm, self.snr_db = packet.received_at_ns, packet.rssi_dbm, packet.snr_db
-        joined = self._sessions.confirm(session)
-        left_behind = self._outbox.keep(session.can_time) if joined else 0
-        reception = session.reception()
-        mine = self._station - 1
-        doubted = reception is not None and not session.clock.add(
-            reception.received_ns,
-            reception.sent_us,
-            reception.sigma_ns,
-            in_full=beacon.session is not None,
-            live=mine < len(beacon.stations) and bool(beacon.stations[mine].history & 1),
-        )
-        if doubted:
-            self.doubted += 1
-            session.conversation.doubt()
-        if session.confirmed and mine < len(beacon.stations):
-            session.acknowledge(beacon.stations[mine].history)
-            if session.heard.counter % len(beacon.stations) == mine:
-                session.delivery.delivered_through(beacon.cumulative)
-            session.conversation.take(order for order in beacon.orders if order.station == self._station)
-        left_behind += session.sift()
-        self._slot = self._slot_of(session)
-        return Heard(
-            slot_ns=None if self._slot is None else self._slot.start_ns,
-            reception=None if doubted else reception,
-            doubted=doubted,
-            joined=joined,
-            left_behind=left_behind,
-        )
+        self.rejected_beacons += received.time_rejected
+        return received
 
-    def _slot_of(self, session: StationSession) -> _Slot | None:
-        heard = session.heard
-        entries = heard.beacon.stations
-        if self._station > len(entries) or heard.sigma_ns > WORST_STAMP_NS:
+    def _identify(self, beacon: Beacon, packet: Packet) -> tuple[StationSession, AuthenticBeacon] | None:
+        """Return the known session in which a beacon is authentic."""
+        for session in (self._confirmed, self._candidate):
+            if session is None or (counter := session.counter_of(beacon)) is None:
+                continue
+            if authentic := self._authenticated(beacon, session.master_nonce, counter, packet):
+                return session, authentic
+        return None
+
+    def _begin_session(self, beacon: Beacon, packet: Packet) -> tuple[StationSession, AuthenticBeacon] | None:
+        """Start a candidate session with a beacon."""
+        info = beacon.session
+        if info is None or not self._accepts_session(info.nonce, packet.received_at_ns):
             return None
-        grants = [entry.grant for entry in entries]
-        span = session.timing.slots(grants, heard.beacon.order)[self._station - 1]
-        if span is None:
+        authentic = self._authenticated(beacon, info.nonce, full_counter(info, beacon), packet)
+        if authentic is None:
+            self.authentication_failures += 1
             return None
-        end_ns = heard.received_ns - session.timing.reception_ns
-        return _Slot(span, end_ns, end_ns + span.start_ns)
+        self._candidate = StationSession(
+            self._station,
+            authentic,
+            info,
+            self._random_bits(_NONCE_BITS),
+            self._settings,
+            self._queue,
+            self._boot,
+            self._clocks.get(info.nonce, {}),
+        )
+        return self._candidate, authentic
 
-    # --- Orders -----------------------------------------------------------------------------------------------
+    def _authenticated(
+        self, beacon: Beacon, master_nonce: int, counter: int, packet: Packet
+    ) -> AuthenticBeacon | None:
+        content, code = packet.payload[:-CODE_BYTES], packet.payload[-CODE_BYTES:]
+        expected = self._authenticator.beacon_code(session=master_nonce, counter=counter, content=content)
+        if not hmac.compare_digest(expected, code):
+            return None
+        return AuthenticBeacon(beacon, code, counter, packet.received_at_ns, packet.stamp_sigma_ns)
 
-    def next_order(self) -> Order | None:
-        """Return the next order, to be carried out and then reported; None while another one is under way."""
-        session = self._sessions.confirmed
-        following = None if self._under_way or session is None else session.conversation.next_order()
+    def _accepts_session(self, master_nonce: int, now_ns: int) -> bool:
+        """Whether an unknown session may become the candidate."""
+        known = [session for session in (self._confirmed, self._candidate) if session is not None]
+        if any(session.master_nonce == master_nonce for session in known):
+            return False  # a replayed beacon of a known session
+        return self._confirmed is None or now_ns - self._confirmed.beacon.received_ns >= SESSION_TIMEOUT_NS
+
+    # --- Commands ---------------------------------------------------------------------------------------------
+
+    def next_command(self) -> Command | None:
+        """Return the next command to execute; None while another one is being executed."""
+        session = self._confirmed
+        following = None if self._executing or session is None else session.commands.next_command()
         if following is None or session is None:
             return None
-        ticket, order = following
-        self._under_way = session.conversation, ticket
-        return order
+        command_id, command = following
+        self._executing = session.commands, command_id
+        return command
 
     def executed(self, *, ok: bool) -> None:
-        """Report what became of the order under way; of a single measurement only that it failed."""
-        conversation, ticket = self._finish()
-        conversation.answers.append(AnswerPart(ticket, ok))
+        """Report the result of the command; of a single measurement only a failure."""
+        commands, command_id = self._complete()
+        commands.responses.append(CommandResponse(command_id, ok))
 
-    def shot(self, status: Status, horizontal: int, zenith: int, distance_m: float | None) -> None:
-        """Report the single measurement under way; angles as they go over the air."""
-        conversation, ticket = self._finish()
+    def measured(self, status: Status, horizontal: int, zenith: int, distance_m: float | None) -> None:
+        """Report the result of a single measurement; angles encoded."""
+        commands, command_id = self._complete()
         distance = distance_code(distance_m, far=False)
-        conversation.shots.append(ShotPart(ticket, status, horizontal, zenith, distance))
+        commands.single_measurements.append(
+            SingleMeasurement(command_id, status, horizontal, zenith, distance)
+        )
 
-    def _finish(self) -> tuple[Conversation, int]:
-        if self._under_way is None:
-            raise RuntimeError("nothing can be reported of an order when none is under way")
-        under_way, self._under_way = self._under_way, None
-        return under_way
+    def _complete(self) -> tuple[CommandExchange, int]:
+        if self._executing is None:
+            raise RuntimeError("a result was reported while no command is being executed")
+        executing, self._executing = self._executing, None
+        return executing
 
-    # --- Reply ------------------------------------------------------------------------------------------------
+    # --- Replies ----------------------------------------------------------------------------------------------
 
-    def compose(self, situation: Situation, now_ns: int) -> bytes | None:
-        """Return the reply for the slot; None where there is no slot, it is too late for it, or it is too small.
+    def compose(self, instrument_state: InstrumentState, now_ns: int) -> bytes | None:
+        """Return the reply for the slot; None without a slot, and if it is too late or the slot too short.
 
-        Called as shortly before the slot as can be, and once.
-
-        Parameters
-        ----------
-        situation
-            What the instrument is doing.
-        now_ns
-            CLOCK_MONOTONIC.
+        Called once, as shortly before the slot as possible; ``now_ns`` is CLOCK_MONOTONIC.
         """
-        session, slot, self._slot = self._sessions.current, self._slot, None
-        if session is None or slot is None:
+        session = self.session
+        if session is None or session.slot is None:
             return None
-        reply, sequences = self._fill(session, situation, slot)
-        if not session.confirmed and reply.introduction is None:
-            return None  # nobody would know whose it is; a master grants more to those that it does not know
+        slot, session.slot = session.slot, None
+        report = self._status_report(instrument_state)
+        reply, sequences = self._builder.build(session, slot, instrument_state, report)
+        if not session.confirmed and reply.join_request is None:
+            return None  # the master could not authenticate it; it grants more to unknown stations
         content = encode_reply(reply)
-        latest_ns = slot.end_ns + session.timing.latest_start_ns(slot.span, len(content) + CODE_BYTES)
-        if now_ns + PREPARATION_NS > latest_ns:
-            self.late += 1
+        length = len(content) + CODE_BYTES
+        latest_start_ns = slot.beacon_end_ns + session.timing.latest_start_ns(slot.slot, length)
+        if now_ns + PREPARATION_NS > latest_start_ns:
+            self.missed_slots += 1
             return None
-        self._latest_ns = latest_ns
-        session.replied(reply, sequences)
+        self._latest_start_ns = latest_start_ns
+        session.reply_sent(reply, sequences)
         return content + self._authenticator.reply_code(
             session=session.master_nonce,
             station=self._station,
             station_nonce=session.nonce,
-            counter=session.heard.counter,
-            beacon_code=session.heard.code,
+            counter=session.beacon.counter,
+            beacon_code=session.beacon.code,
             sequence=sequences[0] if sequences else 0,
             content=content,
         )
 
-    def sent(self, transmitted: Transmitted) -> None:
-        """Take note that the reply that was composed last is out."""
-        self.late += transmitted.started_at_ns > self._latest_ns
-        session = self._sessions.current
+    def sent(self, transmission: Transmission) -> None:
+        """Take the transmission of the last composed reply."""
+        self.missed_slots += transmission.started_at_ns > self._latest_start_ns
+        session = self.session
         if (
             session is not None
             and session.last_reply is not None
-            and transmitted.stamp_sigma_ns <= EXACT_SIGMA_NS
+            and transmission.stamp_sigma_ns <= EXACT_SIGMA_NS
         ):
-            session.last_reply.done_ns = transmitted.done_at_ns
+            session.last_reply.done_ns = transmission.done_at_ns
 
-    def _fill(
-        self, session: StationSession, situation: Situation, slot: _Slot
-    ) -> tuple[Reply, tuple[int, ...]]:
-        """Choose what to say: what is owed, measurements, and where there is room other news."""
-        limit_bytes = slot.span.reply_bytes
-        conversation = session.conversation
-        parts = self._owed(session, situation, limit_bytes)
-        urgent = self._by_urgency(session, slot.start_ns, limit_bytes // LEAST_SIGHTING_BYTES)
-        prism = conversation.plain_prism(parts.state or self._state(situation))
-        narrow = session.delivery.may_be_narrow
-        reply, taken = pack(parts, urgent, limit_bytes, prism=prism, is_narrow=narrow)
-        turn_round_us = session.turn_round_us()
-        if turn_round_us is not None:
-            news = replace(parts, state=self._state(situation), turn_round_us=turn_round_us)
-            longer, still = pack(news, urgent, limit_bytes, prism=prism, is_narrow=narrow)
-            fits = reply_bytes(longer) <= limit_bytes
-            if fits and (len(still) == len(taken) or conversation.turn_round_is_overdue):
-                reply, taken = longer, still
-        sequences = tuple(timed.queued.sequence for timed in taken)
-        oldest = min((timed.queued.sequence for timed in urgent), default=None)
-        self._passed_over = 0 if oldest is None or oldest in sequences else self._passed_over + 1
-        return reply, sequences
-
-    def _owed(self, session: StationSession, situation: Situation, limit_bytes: int) -> Reply:
-        """Return what the master has to be told before anything else, as far as it fits."""
-        conversation, delivery = session.conversation, session.delivery
-        if delivery.outdated and not delivery.introducing:
-            delivery.introduce()
-        owed = []
-        if not session.confirmed or delivery.introducing:
-            owed.append(Reply(introduction=self._introduction(session)))
-        # The newest: a master waits for no more than that one.
-        owed += [Reply(answer=answer) for answer in list(conversation.answers)[-1:]]
-        owed += [Reply(shot=shot) for shot in list(conversation.shots)[-1:]]
-        if conversation.must_tell(situation):
-            owed.append(Reply(state=self._state(situation)))
-        reply = Reply()
-        for part in owed:
-            longer = Reply(
-                introduction=reply.introduction or part.introduction,
-                answer=reply.answer or part.answer,
-                shot=reply.shot or part.shot,
-                state=reply.state or part.state,
-            )
-            if reply_bytes(longer) <= limit_bytes:
-                reply = longer
-        return reply
-
-    def _introduction(self, session: StationSession) -> Introduction:
-        return Introduction(
-            nonce=session.nonce,
-            lineage=self._lineage,
-            run_start=self._outbox.run_start,
-            oldest=session.delivery.oldest,
-        )
-
-    def _state(self, situation: Situation) -> StatePart:
-        return StatePart(
-            prism=situation.prism,
-            direct=situation.direct,
-            connected=situation.connected,
-            late=self.late % 256,
-            doubted=self.doubted % 16,
+    def _status_report(self, state: InstrumentState) -> StatusReport:
+        return StatusReport(
+            prism=state.prism,
+            direct=state.direct,
+            connected=state.connected,
+            missed_slots=self.missed_slots % 256,
+            rejected_beacons=self.rejected_beacons % 16,
             rssi_dbm=min(max(round(self.rssi_dbm or 0), -127), 0),
         )
-
-    def _by_urgency(self, session: StationSession, slot_ns: int, most: int) -> list[Timed]:
-        """Return measurements that this master can be told of, the one that is wanted most first.
-
-        That is the newest, because a robot drives by it. After it come, if there are few, those that have waited
-        longest, so that none waits long; after an outage the next newer ones, so that what is lost on the way of
-        those does not grow old as well. An old one that needs a run of its own may never fit behind the newest, and
-        goes first then, for once.
-        """
-        newest = islice(filter(session.can_time, self._outbox.newest_first()), most)
-        urgent: list[Timed] = []
-        for queued in newest:
-            timed = session.timed(queued, slot_ns, urgent[0] if urgent else None)
-            if timed is not None:
-                urgent.append(timed)
-        if 1 < len(self._outbox) <= FEW:
-            urgent[1:] = urgent[:0:-1]
-            if self._passed_over >= LONGEST_WAIT:
-                urgent[:2] = urgent[1::-1]
-        return urgent

@@ -6,22 +6,22 @@ from typing import TYPE_CHECKING
 
 from harness.radios import MS
 
-from tsgt.radio.superframe.station_state import HeldBack
+from tsgt.radio.superframe.timing import BeaconDelayMonitor
 
 if TYPE_CHECKING:
     from collections.abc import Collection
 
 
-def by_ms(*late_ms: int | None, untold: Collection[int] = ()) -> list[int]:
+def by_ms(*late_ms: int | None, untimed: Collection[int] = ()) -> list[int]:
     """Return what is thought after each frame, by how late its reply came; None: there was none.
 
     Of some frames, by their index, the next beacon does not tell when theirs left.
     """
-    held, found = HeldBack(), []
+    held, found = BeaconDelayMonitor(), []
     for index, late in enumerate(late_ms):
         if late is not None:
-            held.add(7 + index, late * MS, told=index not in untold)
-        found.append(held.by_ns // MS)
+            held.add(7 + index, late * MS, beacon_time_sent=index not in untimed)
+        found.append(held.delay_ns // MS)
     return found
 
 
@@ -42,5 +42,5 @@ def test_two_that_are_not_in_a_row_do_not_count() -> None:
 
 def test_the_first_one_on_time_counts_only_if_the_station_is_told_when_its_beacon_left() -> None:
     """Else it has nothing to compare."""
-    assert by_ms(80, 0, 0, 0, untold=[1]) == [80, 80, 80, 0]
-    assert by_ms(80, 0, 0, untold=[2]) == [80, 80, 0]
+    assert by_ms(80, 0, 0, 0, untimed=[1]) == [80, 80, 80, 0]
+    assert by_ms(80, 0, 0, untimed=[2]) == [80, 80, 0]

@@ -5,18 +5,25 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from harness.frames import TIMING, ZERO_NS, Frames, frames_of, older, sighting
+from harness.frames import TIMING, ZERO_NS, Frames, frames_of, measurement, older
 from harness.radios import MS
 
 from tsgt.model import Status
-from tsgt.radio import MeasureOrder
-from tsgt.radio.superframe.wire import GRANT_BYTES, Reply, Run, Sighting, StatePart, angle_code
+from tsgt.radio import MeasureCommand
+from tsgt.radio.superframe.wire import (
+    GRANT_BYTES,
+    EncodedMeasurement,
+    MeasurementBlock,
+    Reply,
+    StatusReport,
+    angle_code,
+)
 
-STATE = StatePart(prism=1, direct=False, connected=True, late=0, doubted=0, rssi_dbm=-80)
+STATE = StatusReport(prism=1, direct=False, connected=True, missed_slots=0, rejected_beacons=0, rssi_dbm=-80)
 US = 1_000
 LINK_NS = TIMING.link_ns
 LINK_BOUND_NS = 0.2 * 2_048_000
-"""While it has not been measured; see :class:`~tsgt.timesync.link_delay.RoundTrip`."""
+"""While it has not been measured; see :class:`~tsgt.timesync.link_delay.LinkDelayEstimator`."""
 
 
 @pytest.fixture
@@ -41,7 +48,7 @@ def test_a_narrow_time_is_found_again(frames: Frames, age_ms: float) -> None:
     frames.run(20)
     frames.begin()
     made_us = slot_us(frames) - round(1000 * age_ms)
-    (found,) = frames.measure(1, age_ms=age_ms).sightings
+    (found,) = frames.measure(1, age_ms=age_ms).measurements
     assert found.measured_ns == pytest.approx(ZERO_NS + 1000 * made_us + LINK_NS, abs=9 * US)
     assert found.bound_ns == pytest.approx(128 * US + 9 * US + LINK_BOUND_NS, abs=60 * US)
     assert 30 * US < found.sigma_ns < found.bound_ns / 3
@@ -51,8 +58,8 @@ def test_a_measurement_made_within_the_slot_of_a_late_reply_is_not_two_seconds_o
     """A short reply in a long slot may begin late, and say what was measured meanwhile."""
     frames.begin()
     made_us = slot_us(frames) + 50_000
-    run = Run(sightings=(sighting(1, made_us),))
-    (found,) = frames.answer(1, Reply(runs=(run,)), sequence=1, late_ns=60 * MS).sightings
+    run = MeasurementBlock(measurements=(measurement(1, made_us),))
+    (found,) = frames.reply(1, Reply(blocks=(run,)), sequence=1, late_ns=60 * MS).measurements
     assert found.measured_ns == pytest.approx(ZERO_NS + 1000 * made_us + LINK_NS, abs=9 * US)
 
 
@@ -61,7 +68,7 @@ def test_a_wide_time_may_lie_long_before_the_masters_start(frames: Frames, age_s
     """Even before its clock was at zero."""
     frames.begin()
     made_us = slot_us(frames) - age_s * 1_000_000
-    (found,) = frames.measure(1, age_ms=1000 * age_s, wide=True).sightings
+    (found,) = frames.measure(1, age_ms=1000 * age_s, wide=True).measurements
     assert found.measured_ns == pytest.approx(ZERO_NS + 1000 * made_us + LINK_NS, abs=9 * US)
 
 
@@ -75,7 +82,7 @@ def test_session_time_may_go_round() -> None:
     frames.end()
     frames.begin()
     assert frames.sent_us < 10_000_000
-    (found,) = frames.measure(1, age_ms=1500).sightings
+    (found,) = frames.measure(1, age_ms=1500).measurements
     made_ns = frames.sent_ns + frames.span(1).start_ns - 1500 * MS
     assert found.measured_ns == pytest.approx(made_ns + LINK_NS, abs=9 * US)
 
@@ -85,9 +92,11 @@ def test_the_measurements_of_a_run_follow_each_other(frames: Frames) -> None:
     frames.run(4)
     frames.begin()
     newest_us = slot_us(frames) - 50_000
-    newest = sighting(7, newest_us)
-    sightings = (newest, older(newest, 1), older(newest, 2))
-    found = frames.answer(1, Reply(runs=(Run(sightings=sightings),)), sequence=7).sightings
+    newest = measurement(7, newest_us)
+    measurements = (newest, older(newest, 1), older(newest, 2))
+    found = frames.reply(
+        1, Reply(blocks=(MeasurementBlock(measurements=measurements),)), sequence=7
+    ).measurements
     assert [each.sequence for each in found] == [5, 6, 7]
     assert [(found[-1].measured_ns - each.measured_ns) / MS for each in found] == pytest.approx(
         [800, 400, 0], abs=0.02
@@ -102,9 +111,11 @@ def test_a_direct_time_counts_from_this_frames_beacon(frames: Frames, late_ms: f
     """It is worth no more than the beacon was on time, which the reply's lateness tells."""
     frames.begin()
     made_us = slot_us(frames) - 120_000
-    run = Run(sightings=(sighting(1, made_us, origin_us=frames.sent_us),), direct=True, quality=0)
-    heard = frames.answer(1, Reply(runs=(run,)), sequence=1, late_ns=round(late_ms * MS))
-    (found,) = heard.sightings
+    run = MeasurementBlock(
+        measurements=(measurement(1, made_us, origin_us=frames.sent_us),), beacon_relative=True, quality=0
+    )
+    heard = frames.reply(1, Reply(blocks=(run,)), sequence=1, late_ns=round(late_ms * MS))
+    (found,) = heard.measurements
     assert found.measured_ns == pytest.approx(ZERO_NS + 1000 * made_us + LINK_NS, abs=9 * US)
     assert heard.lateness_ns == pytest.approx(late_ms * MS + 200 * US, abs=US)
     on_time_ns = 16 * US + 9 * US + LINK_BOUND_NS + 12 * US
@@ -119,19 +130,25 @@ def test_a_delay_does_not_hide_in_a_short_link(frames: Frames) -> None:
     late_us = 200
     frames.begin()
     made_us = slot_us(frames) - 120_000
-    run = Run(sightings=(sighting(1, made_us - late_us, origin_us=frames.sent_us),), direct=True, quality=0)
-    heard = frames.answer(1, Reply(runs=(run,)), sequence=1, late_ns=late_us * US)
+    run = MeasurementBlock(
+        measurements=(measurement(1, made_us - late_us, origin_us=frames.sent_us),),
+        beacon_relative=True,
+        quality=0,
+    )
+    heard = frames.reply(1, Reply(blocks=(run,)), sequence=1, late_ns=late_us * US)
     assert heard.lateness_ns == pytest.approx(0, abs=US)
-    assert heard.sightings[0].bound_ns > late_us * US
+    assert heard.measurements[0].bound_ns > late_us * US
 
 
 def test_a_direct_time_is_worth_no_more_than_the_masters_stamp(frames: Frames) -> None:
     """Where the edge of the beacon's end was lost, four milliseconds."""
     frames.begin(sigma_ns=MS)
-    run = Run(
-        sightings=(sighting(1, slot_us(frames) - 9000, origin_us=frames.sent_us),), direct=True, quality=0
+    run = MeasurementBlock(
+        measurements=(measurement(1, slot_us(frames) - 9000, origin_us=frames.sent_us),),
+        beacon_relative=True,
+        quality=0,
     )
-    (found,) = frames.answer(1, Reply(runs=(run,)), sequence=1).sightings
+    (found,) = frames.reply(1, Reply(blocks=(run,)), sequence=1).measurements
     assert 4 * MS < found.bound_ns < 5 * MS
 
 
@@ -139,9 +156,9 @@ def test_a_direct_time_is_worth_no_more_than_the_masters_stamp(frames: Frames) -
 def test_a_worse_time_says_so(frames: Frames, quality: int, bound_us: int) -> None:
     """The quality is what the station claims; the master adds what it knows of its own part."""
     frames.begin()
-    newest = sighting(2, slot_us(frames))
-    run = Run(sightings=(newest, older(newest, 1)), quality=quality)
-    found = frames.answer(1, Reply(runs=(run,)), sequence=2).sightings[-1]
+    newest = measurement(2, slot_us(frames))
+    run = MeasurementBlock(measurements=(newest, older(newest, 1)), quality=quality)
+    found = frames.reply(1, Reply(blocks=(run,)), sequence=2).measurements[-1]
     assert found.bound_ns == pytest.approx(bound_us * US + 9 * US + LINK_BOUND_NS, abs=60 * US)
     assert found.sigma_ns >= bound_us * US / 4
 
@@ -149,20 +166,20 @@ def test_a_worse_time_says_so(frames: Frames, quality: int, bound_us: int) -> No
 def test_numbers_are_found_again_far_beyond_their_bits(frames: Frames) -> None:
     """After hundreds of measurements, and across a gap."""
     frames.run(600)
-    assert frames.master.peer(2).inbox.cumulative == 600
+    assert frames.master.station(2).window.cumulative == 600
     frames.stations[2].sequence += 120
     frames.begin()
-    assert frames.measure(2).sightings[0].sequence == 721
-    assert frames.master.peer(2).inbox.missing == 120
+    assert frames.measure(2).measurements[0].sequence == 721
+    assert frames.master.station(2).window.outstanding == 120
 
 
 def test_a_run_that_reaches_below_zero_is_cut(frames: Frames) -> None:
     """No station has measurements before its first; one that says so is believed in the rest."""
     frames.begin()
-    newest = sighting(1, slot_us(frames))
-    run = Run(sightings=(newest, older(newest, 2)))
-    heard = frames.answer(1, Reply(runs=(run,)), sequence=1)
-    assert [each.sequence for each in heard.sightings] == [1]
+    newest = measurement(1, slot_us(frames))
+    run = MeasurementBlock(measurements=(newest, older(newest, 2)))
+    heard = frames.reply(1, Reply(blocks=(run,)), sequence=1)
+    assert [each.sequence for each in heard.measurements] == [1]
 
 
 # --- Prisms, state --------------------------------------------------------------------------------------------------
@@ -171,28 +188,30 @@ def test_a_run_that_reaches_below_zero_is_cut(frames: Frames) -> None:
 def test_the_prism_is_what_the_station_told(frames: Frames) -> None:
     """That of the configuration, until the station has told another; a run may name one itself."""
     frames.begin()
-    assert frames.measure(2).sightings[0].prism == 2
+    assert frames.measure(2).measurements[0].prism == 2
     frames.end()
     frames.begin()
-    frames.answer(2, Reply(state=replace(STATE, prism=5)))
+    frames.reply(2, Reply(status_report=replace(STATE, prism=5)))
     frames.end()
     frames.begin()
-    run = Run(sightings=(sighting(2, slot_us(frames, 2)),))
-    other = Run(sightings=(sighting(3, slot_us(frames, 2)),), prism=3)
-    heard = frames.answer(2, Reply(runs=(run, other)), sequence=2)
-    assert [(each.sequence, each.prism) for each in heard.sightings] == [(2, 5), (3, 3)]
+    run = MeasurementBlock(measurements=(measurement(2, slot_us(frames, 2)),))
+    other = MeasurementBlock(measurements=(measurement(3, slot_us(frames, 2)),), prism=3)
+    heard = frames.reply(2, Reply(blocks=(run, other)), sequence=2)
+    assert [(each.sequence, each.prism) for each in heard.measurements] == [(2, 5), (3, 3)]
 
 
-def test_late_slots_and_doubted_beacons_are_counted_on(frames: Frames) -> None:
+def test_late_slots_and_rejected_beacons_are_counted_on(frames: Frames) -> None:
     """What the station tells are low bits; what it counted before it was first heard does not matter."""
     told = []
     for late, doubted in ((250, 14), (3, 1), (3, 1), (4, 1)):
         frames.begin()
-        heard = frames.answer(1, Reply(state=replace(STATE, late=late, doubted=doubted)))
-        told.append(heard.doubted_beacons)
+        heard = frames.reply(
+            1, Reply(status_report=replace(STATE, missed_slots=late, rejected_beacons=doubted))
+        )
+        told.append(heard.rejected_beacons)
         frames.end()
     assert told == [0, 3, 0, 0]
-    assert (frames.master.peer(1).late, frames.master.peer(1).doubted) == (10, 3)
+    assert (frames.master.station(1).missed_slots, frames.master.station(1).rejected_beacons) == (10, 3)
 
 
 # --- Link constant --------------------------------------------------------------------------------------------------
@@ -203,8 +222,8 @@ def exchange(
 ) -> bool:
     """Run a frame in which the station says how long its last reply took; return whether that is doubted."""
     frames.begin(sigma_ns=sent_sigma_ns)
-    turn_round_us = frames.turn_rounds_us[1] + off_us
-    heard = frames.answer(1, Reply(turn_round_us=turn_round_us), late_ns=late_ns, sigma_ns=sigma_ns)
+    turnaround_us = frames.turnarounds_us[1] + off_us
+    heard = frames.reply(1, Reply(turnaround_us=turnaround_us), late_ns=late_ns, sigma_ns=sigma_ns)
     frames.end()
     return heard.link_delay_anomaly
 
@@ -213,7 +232,7 @@ def link_error_ns(frames: Frames) -> float:
     """How far the constant is off that a measurement is stamped with."""
     frames.begin()
     made_us = slot_us(frames) - 100_000
-    (found,) = frames.measure(1).sightings
+    (found,) = frames.measure(1).measurements
     frames.end()
     return found.measured_ns - (ZERO_NS + 1000 * made_us + frames.link_ns)
 
@@ -268,7 +287,7 @@ def settled() -> Frames:
     for _ in range(9):
         frames.begin()
         for station in (1, 2, 3):
-            frames.answer(station, Reply(turn_round_us=frames.turn_rounds_us[station]))
+            frames.reply(station, Reply(turnaround_us=frames.turnarounds_us[station]))
         frames.end()
     frames.run(12)
     return frames
@@ -309,8 +328,8 @@ def test_what_an_instrument_needs_is_learnt_from_its_replies() -> None:
         for station in frames.stations:
             frames.measure(station, age_ms=300)
         frames.end()
-    peer = frames.master._peers[1]
-    assert peer._ready_us() == pytest.approx(300_000, abs=12_000)
+    station_state = frames.master._stations[1]
+    assert station_state.demand.ready_us == pytest.approx(300_000, abs=12_000)
     assert granted(frames) <= room
 
 
@@ -334,8 +353,10 @@ def test_a_station_that_sends_what_was_missing_is_granted_on() -> None:
     station.sequence += 50
     frames.run(1)
     frames.begin()
-    old = sighting(first_missing + 20, slot_us(frames) - 10_000_000, wide=True)
-    frames.answer(1, Reply(runs=(Run(sightings=(old,), wide=True),)), sequence=first_missing + 20)
+    old = measurement(first_missing + 20, slot_us(frames) - 10_000_000, wide=True)
+    frames.reply(
+        1, Reply(blocks=(MeasurementBlock(measurements=(old,), wide=True),)), sequence=first_missing + 20
+    )
     frames.end()
     assert granted(frames) == 71
 
@@ -353,15 +374,15 @@ def test_what_an_earlier_run_has_left_comes_again() -> None:
     frames = settled()
     station = frames.stations[1]
     last = station.sequence - 1
-    station.nonce, station.oldest, station.run_start = 0xF00D, last - 9, last + 1001
-    station.sequence = station.run_start
+    station.nonce, station.oldest, station.first_sequence = 0xF00D, last - 9, last + 1001
+    station.sequence = station.first_sequence
     frames.begin()
     frames.measure(1, introduce=True)
     frames.end()
     frames.begin()
-    newest = sighting(last, slot_us(frames) - 10_000_000, wide=True)
-    run = Run(sightings=(newest, *(older(newest, back) for back in (1, 2, 3))), wide=True)
-    assert frames.answer(1, Reply(runs=(run,)), sequence=last).repeated == 4
+    newest = measurement(last, slot_us(frames) - 10_000_000, wide=True)
+    run = MeasurementBlock(measurements=(newest, *(older(newest, back) for back in (1, 2, 3))), wide=True)
+    assert frames.reply(1, Reply(blocks=(run,)), sequence=last).repeated == 4
     frames.end()
     assert granted(frames) == 71
     frames.begin()
@@ -375,9 +396,9 @@ def test_a_measurement_of_a_worse_quality_gets_the_room_that_it_takes() -> None:
     frames = settled()
     frames.begin()
     number = frames.stations[1].next_number()
-    run = Run(sightings=(sighting(number, slot_us(frames)),), quality=5)
-    frames.answer(1, Reply(runs=(run,)), sequence=number)
-    frames.answer(2, Reply())
+    run = MeasurementBlock(measurements=(measurement(number, slot_us(frames)),), quality=5)
+    frames.reply(1, Reply(blocks=(run,)), sequence=number)
+    frames.reply(2, Reply())
     frames.end()
     frames.begin()
     assert [GRANT_BYTES[entry.grant] for entry in frames.beacon.stations[:2]] == [21, 30]  # and a turn-round
@@ -386,7 +407,7 @@ def test_a_measurement_of_a_worse_quality_gets_the_room_that_it_takes() -> None:
 def test_an_order_gets_room_for_its_answer() -> None:
     """A shot takes more."""
     frames = settled()
-    frames.master.order(1, MeasureOrder())
+    frames.master.station(1).submit(MeasureCommand())
     assert granted(frames) >= 30
 
 
@@ -398,9 +419,9 @@ def test_many_stations_may_send_more_at_once_but_not_all_of_them() -> None:
         frames.join()
         frames.begin()
         for station in range(1, count + 1):
-            newest = sighting(60, slot_us(frames, station))
-            run = Run(sightings=(newest, *(older(newest, back) for back in range(1, 4))))
-            frames.answer(station, Reply(runs=(run,)), sequence=60)
+            newest = measurement(60, slot_us(frames, station))
+            run = MeasurementBlock(measurements=(newest, *(older(newest, back) for back in range(1, 4))))
+            frames.reply(station, Reply(blocks=(run,)), sequence=60)
         frames.end()
         caps[count] = granted(frames)
     assert caps == {7: 71, 8: 107, 16: 89}
@@ -409,9 +430,12 @@ def test_many_stations_may_send_more_at_once_but_not_all_of_them() -> None:
 def test_angles_and_distance_come_back_as_they_were(frames: Frames) -> None:
     """Within half a unit of the air, far and near; no distance stays none."""
     frames.begin()
-    far = Run(sightings=(Sighting(1, 0, Status.OK, angle_code(6.2), angle_code(4.0), 2_000_000),), far=True)
-    none = Run(sightings=(Sighting(2, 0, Status.ANGLE_ONLY, 1, 2, None),))
-    heard = frames.answer(1, Reply(runs=(none, far)), sequence=2)
-    assert [each.slope_distance_m for each in heard.sightings] == [2000.0, None]
-    assert heard.sightings[0].horizontal_angle_rad == pytest.approx(6.2, abs=2e-7)
-    assert heard.sightings[1].status is Status.ANGLE_ONLY
+    far = MeasurementBlock(
+        measurements=(EncodedMeasurement(1, 0, Status.OK, angle_code(6.2), angle_code(4.0), 2_000_000),),
+        far=True,
+    )
+    none = MeasurementBlock(measurements=(EncodedMeasurement(2, 0, Status.ANGLE_ONLY, 1, 2, None),))
+    heard = frames.reply(1, Reply(blocks=(none, far)), sequence=2)
+    assert [each.slope_distance_m for each in heard.measurements] == [2000.0, None]
+    assert heard.measurements[0].horizontal_angle_rad == pytest.approx(6.2, abs=2e-7)
+    assert heard.measurements[1].status is Status.ANGLE_ONLY

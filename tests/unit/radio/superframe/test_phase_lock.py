@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from harness.radios import MS, PAPER
 
-from tsgt.radio.superframe import COMPOSED_NS, FrameLock, FrameTiming
-from tsgt.radio.superframe.phase_lock import Plan
+from tsgt.radio.superframe import COMPOSE_LEAD_NS, FramePlan, FrameTiming, PhaseLock
 from tsgt.radio.superframe.wire import GRANT_BYTES, SlotOrder
 
-TIMING = FrameTiming.stated(PAPER, start_jitter_ns=5 * MS, turn_round_ns=8 * MS, clock_error_ppm=100)
+TIMING = FrameTiming.from_tolerances(PAPER, start_jitter_ns=5 * MS, turnaround_ns=8 * MS, clock_error_ppm=100)
 BEACON_BYTES = 12
 ONE, TWO = GRANT_BYTES.index(17), GRANT_BYTES.index(26)
 MASTER_NS = 6 * MS
@@ -34,12 +33,12 @@ class Field:
     seed: int = 0
     grants: list[int] = field(default_factory=list)
     follow: bool = True
-    plans: list[Plan] = field(default_factory=list)
+    plans: list[FramePlan] = field(default_factory=list)
     earliest: list[int] = field(default_factory=list)
     ages_ms: list[float] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.lock = FrameLock(TIMING, len(self.made))
+        self.lock = PhaseLock(TIMING, len(self.made))
         self._random = np.random.default_rng(self.seed)
         self._ready = [0] * len(self.made)
         self._queues: list[list[int]] = [[] for _ in self.made]
@@ -62,22 +61,22 @@ class Field:
         grants = [TWO if queue else grant for queue, grant in zip(self._queues, self.grants, strict=True)]
         plan = self.lock.plan(self._earliest_ns, grants, BEACON_BYTES)
         if not self.follow:
-            plan = Plan(self._earliest_ns, SlotOrder())
+            plan = FramePlan(self._earliest_ns, SlotOrder())
         self.earliest.append(self._earliest_ns)
         self.plans.append(plan)
         beacon_end_ns = plan.start_ns + TIMING.airtime_ns(BEACON_BYTES)
-        spans = TIMING.slots(grants, plan.order)
+        spans = TIMING.slots(grants, plan.slot_order)
         end_ns = beacon_end_ns
         for index, span in enumerate(spans):
             assert span is not None
             end_ns = max(end_ns, beacon_end_ns + span.end_ns)
-            self._make_ready(index, beacon_end_ns + span.start_ns - COMPOSED_NS)
+            self._make_ready(index, beacon_end_ns + span.start_ns - COMPOSE_LEAD_NS)
             if self._random.random() < self.loss:
                 continue
-            self.lock.answered(index)
-            queue, fits = self._queues[index], 1 if span.reply_bytes < GRANT_BYTES[TWO] else 3
+            self.lock.reply_received(index)
+            queue, fits = self._queues[index], 1 if span.max_reply_bytes < GRANT_BYTES[TWO] else 3
             for time_ns in queue[-fits:]:
-                self.lock.measured(index, time_ns // 1000)
+                self.lock.add_measurement(index, time_ns // 1000)
                 self.ages_ms.append((beacon_end_ns + span.end_ns + TIMING.reception_ns - time_ns) / MS)
             del queue[-fits:]
         self._earliest_ns = end_ns + TIMING.reception_ns + MASTER_NS
@@ -113,7 +112,7 @@ def shortest_wait_ms(phases_ms: list[float], slot_ms: float) -> float:
     return min(waits)
 
 
-def frames_apart_ns(plans: list[Plan]) -> list[int]:
+def frames_apart_ns(plans: list[FramePlan]) -> list[int]:
     """From one beacon to the next."""
     return [after.start_ns - before.start_ns for before, after in itertools.pairwise(plans)]
 
@@ -133,7 +132,7 @@ def test_measurements_wait_as_short_as_any_order_and_start_allow(seed: int) -> N
     phases_ms = list(generator.uniform(0, 400, 3))
     world, free = Field(beats(phases_ms)), Field(beats(phases_ms), follow=False)
     slot_ms = (TIMING.airtime_ns(17) + TIMING.guard_ns) / MS
-    on_air_ms = (COMPOSED_NS + TIMING.airtime_ns(17) + TIMING.reception_ns) / MS
+    on_air_ms = (COMPOSE_LEAD_NS + TIMING.airtime_ns(17) + TIMING.reception_ns) / MS
     age_ms = statistics.fmean(world.ages_after(20, 60))
     assert age_ms < shortest_wait_ms(phases_ms, slot_ms) + on_air_ms + 5
     assert age_ms < statistics.fmean(free.ages_after(20, 60)) - 80

@@ -9,9 +9,11 @@ from harness.hand_master import queued
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tsgt.radio.superframe.reply_builder import LONGEST_RUN, NARROW_AGE_NS, Timed, pack, quality_of
+from tsgt.radio.superframe.reply_builder import MAX_BLOCK_MEASUREMENTS, pack
+from tsgt.radio.superframe.send_queue import StampedMeasurement, quality_of
 from tsgt.radio.superframe.wire import (
-    AnswerPart,
+    MAX_NARROW_AGE_NS,
+    CommandResponse,
     Reply,
     decode_reply,
     encode_reply,
@@ -22,26 +24,30 @@ from tsgt.radio.superframe.wire import (
 PERIOD = 25_000
 
 
-def timed(
+def stamped(
     sequence: int,
     *,
     prism: int = 1,
     quality: int = 2,
-    direct: bool = False,
+    beacon_relative: bool = False,
     distance_m: float | None = None,
     age_ns: int | None = 0,
     time: int | None = None,
-) -> Timed:
+) -> StampedMeasurement:
     """Make a measurement every 0.4 s."""
     made = queued(sequence, 0, prism=prism)
     made = made if distance_m is None else replace(made, distance_m=distance_m)
-    return Timed(made, PERIOD * sequence if time is None else time, quality, direct, age_ns)
+    return StampedMeasurement(
+        made, PERIOD * sequence if time is None else time, quality, beacon_relative, age_ns
+    )
 
 
-def packed(*by_urgency: Timed, limit: int = 125, prism: int | None = 1, narrow: bool = True) -> Reply:
+def packed(
+    *by_urgency: StampedMeasurement, limit: int = 125, prism: int | None = 1, narrow: bool = True
+) -> Reply:
     """Fill a reply that says nothing else."""
     reply, taken = pack(Reply(), by_urgency, limit, prism=prism, is_narrow=lambda _sequence, _newest: narrow)
-    assert len(taken) == sum(len(run.sightings) for run in reply.runs)
+    assert len(taken) == sum(len(run.measurements) for run in reply.blocks)
     assert reply_bytes(reply) <= limit
     decode_reply(encode_reply(reply))
     return reply
@@ -49,7 +55,7 @@ def packed(*by_urgency: Timed, limit: int = 125, prism: int | None = 1, narrow: 
 
 def lengths(reply: Reply) -> list[int]:
     """Return how many measurements each run has."""
-    return [len(run.sightings) for run in reply.runs]
+    return [len(run.measurements) for run in reply.blocks]
 
 
 @pytest.mark.parametrize(
@@ -64,12 +70,12 @@ def test_the_best_quality_that_is_true(bound_us: float, quality: int | None) -> 
 
 def test_as_many_as_fit_go_along() -> None:
     """The newest first, all in one run."""
-    newest_first = [timed(number) for number in range(40, 0, -1)]
+    newest_first = [stamped(number) for number in range(40, 0, -1)]
     reply = packed(*newest_first, limit=71)
-    assert len(reply.runs) == 1
-    assert reply.runs[0].sightings[0].sequence == 40
+    assert len(reply.blocks) == 1
+    assert reply.blocks[0].measurements[0].sequence == 40
     longer = lengths(packed(*newest_first, limit=80))
-    assert lengths(reply)[0] < longer[0] <= LONGEST_RUN
+    assert lengths(reply)[0] < longer[0] <= MAX_BLOCK_MEASUREMENTS
     assert lengths(packed(*newest_first[:2], limit=125)) == [2]
     assert packed(limit=5) == Reply()
     assert packed(*newest_first, limit=16) == Reply()
@@ -81,70 +87,70 @@ def test_as_many_as_fit_go_along() -> None:
 def test_no_other_number_would_do(limit: int, kinds: list[tuple[int, int, bool]]) -> None:
     """One more does not fit, whatever there is."""
     newest_first = [
-        timed(1000 - index, prism=prism, quality=quality, direct=direct)
-        for index, (prism, quality, direct) in enumerate(kinds)
+        stamped(1000 - index, prism=prism, quality=quality, beacon_relative=beacon_relative)
+        for index, (prism, quality, beacon_relative) in enumerate(kinds)
     ]
     reply = packed(*newest_first, limit=limit)
     count = sum(lengths(reply))
     if count < len(newest_first):
         more = packed(*newest_first[: count + 1], limit=255)
-        assert reply_bytes(more) > limit or len(more.runs) > 15
+        assert reply_bytes(more) > limit or len(more.blocks) > 15
 
 
 @pytest.mark.parametrize(
     "other",
     [
-        timed(1, prism=2),
-        timed(1, direct=True),
-        timed(1, distance_m=2000.0),
-        timed(1, quality=9),
-        timed(1, time=-(1 << 36)),
+        stamped(1, prism=2),
+        stamped(1, beacon_relative=True),
+        stamped(1, distance_m=2000.0),
+        stamped(1, quality=9),
+        stamped(1, time=-(1 << 36)),
     ],
 )
-def test_what_does_not_belong_together_gets_runs_of_its_own(other: Timed) -> None:
+def test_what_does_not_belong_together_gets_runs_of_its_own(other: StampedMeasurement) -> None:
     """Another prism, another way of telling time, far away, worse by orders, or of another age."""
-    assert lengths(packed(timed(3), timed(2), other)) == [2, 1]
+    assert lengths(packed(stamped(3), stamped(2), other)) == [2, 1]
 
 
 def test_a_little_worse_is_told_of_all() -> None:
     """A run of its own would take more than that is worth."""
-    reply = packed(timed(2, quality=1), timed(1, quality=6))
+    reply = packed(stamped(2, quality=1), stamped(1, quality=6))
     assert lengths(reply) == [2]
-    assert reply.runs[0].quality == 6
+    assert reply.blocks[0].quality == 6
 
 
 def test_the_prism_is_named_where_it_is_another() -> None:
     """Or where the master cannot be sure."""
-    assert [run.prism for run in packed(timed(2), timed(1, prism=4)).runs] == [None, 4]
-    assert [run.prism for run in packed(timed(2), prism=None).runs] == [1]
+    assert [run.prism for run in packed(stamped(2), stamped(1, prism=4)).blocks] == [None, 4]
+    assert [run.prism for run in packed(stamped(2), prism=None).blocks] == [1]
 
 
 @pytest.mark.parametrize(
     ("age_ns", "narrow", "wide"),
     [
         (0, True, False),
-        (NARROW_AGE_NS, True, False),
-        (NARROW_AGE_NS + 1, True, True),
+        (MAX_NARROW_AGE_NS, True, False),
+        (MAX_NARROW_AGE_NS + 1, True, True),
         (None, True, True),
         (0, False, True),
     ],
 )
 def test_what_could_be_mistaken_is_wide(age_ns: int | None, narrow: bool, wide: bool) -> None:  # noqa: FBT001 (a case)
     """Old times, times of another clock, and numbers that the master may not find again."""
-    assert packed(timed(5, age_ns=age_ns), narrow=narrow).runs[0].wide is wide
+    assert packed(stamped(5, age_ns=age_ns), narrow=narrow).blocks[0].wide is wide
 
 
 def test_the_most_urgent_goes_along() -> None:
     """In the order of time all the same."""
-    (run,) = packed(timed(9), timed(1), timed(2), timed(8), limit=32).runs
-    assert [sighting.sequence for sighting in run.sightings] == [9, 2, 1]
-    (run,) = packed(timed(1), timed(9), limit=17).runs
-    assert run.sightings[0].sequence == 1
+    (run,) = packed(stamped(9), stamped(1), stamped(2), stamped(8), limit=32).blocks
+    assert [measurement.sequence for measurement in run.measurements] == [9, 2, 1]
+    (run,) = packed(stamped(1), stamped(9), limit=17).blocks
+    assert run.measurements[0].sequence == 1
 
 
 def test_the_rest_of_the_reply_stays() -> None:
     """And takes its room."""
-    parts = Reply(answer=AnswerPart(3, ok=True))
-    reply, taken = pack(parts, [timed(1)], 125, prism=1, is_narrow=lambda _sequence, _newest: True)
-    assert (reply.answer, len(taken)) == (parts.answer, 1)
-    assert pack(parts, [timed(1)], 17, prism=1, is_narrow=lambda _sequence, _newest: True) == (parts, ())
+    parts = Reply(response=CommandResponse(3, ok=True))
+    reply, taken = pack(parts, [stamped(1)], 125, prism=1, is_narrow=lambda _sequence, _newest: True)
+    assert (reply.response, len(taken)) == (parts.response, 1)
+    assert pack(parts, [stamped(1)], 17, prism=1, is_narrow=lambda _sequence, _newest: True) == (parts, ())

@@ -9,43 +9,43 @@ from harness.hand_master import queued
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tsgt.radio.superframe import Outbox
-from tsgt.radio.superframe import send_queue as outbox_module
-from tsgt.radio.superframe.receive_window import Inbox
-from tsgt.radio.superframe.send_queue import Delivery, Extent
-from tsgt.radio.superframe.wire import RESTART_SKIP, Introduction
+from tsgt.radio.superframe import SendQueue
+from tsgt.radio.superframe import send_queue
+from tsgt.radio.superframe.receive_window import ReceiveWindow
+from tsgt.radio.superframe.send_queue import DeliveryProgress, PendingRange
+from tsgt.radio.superframe.wire import RESTART_SKIP, JoinRequest
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from tsgt.radio.superframe import Queued
+    from tsgt.radio.superframe import QueuedMeasurement
 
 
 START = 7 + RESTART_SKIP
 """Of a run after one whose last number was 6."""
 
 
-def of(numbers: Iterable[int], *, run_start: int = 0, backlog: Iterable[int] = ()) -> Outbox:
+def of(numbers: Iterable[int], *, first_sequence: int = 0, backlog: Iterable[int] = ()) -> SendQueue:
     """Make an outbox with these numbers."""
-    box = Outbox(run_start, [queued(number, number) for number in backlog])
+    box = SendQueue(first_sequence, [queued(number, number) for number in backlog])
     for number in numbers:
         box.add(queued(number, number))
     return box
 
 
-def anything(_: Queued) -> bool:
+def anything(_: QueuedMeasurement) -> bool:
     """Want everything."""
     return True
 
 
-def left(box: Outbox) -> list[int]:
+def left(box: SendQueue) -> list[int]:
     """Return what is queued, newest first."""
     return [each.sequence for each in box.newest_first()]
 
 
 def test_the_newest_comes_first() -> None:
     """What earlier runs have left comes after what this one has measured."""
-    box = of([1007, 1008], run_start=1007, backlog=[3, 5])
+    box = of([1007, 1008], first_sequence=1007, backlog=[3, 5])
     assert left(box) == [1008, 1007, 5, 3]
     assert (len(box), box.oldest) == (4, 3)
 
@@ -58,7 +58,7 @@ def test_what_is_removed_is_gone() -> None:
     assert left(box) == [8, 7, 6, 5]
     box.remove_through(100)
     assert (len(box), box.oldest) == (0, 10)
-    assert of([], run_start=40).oldest == 40
+    assert of([], first_sequence=40).oldest == 40
 
 
 def test_numbers_rise() -> None:
@@ -70,70 +70,70 @@ def test_numbers_rise() -> None:
 
 def test_the_oldest_leaves_when_there_are_too_many(monkeypatch: pytest.MonkeyPatch) -> None:
     """The queue does not grow for ever, and says what it let go."""
-    monkeypatch.setattr(outbox_module, "MOST_QUEUED", 3)
+    monkeypatch.setattr(send_queue, "QUEUE_CAPACITY", 3)
     box = of(range(5))
-    assert (left(box), box.left_through) == ([4, 3, 2], 1)
+    assert (left(box), box.dropped_through) == ([4, 3, 2], 1)
 
 
 @pytest.mark.parametrize(
-    ("numbers", "run_start", "backlog", "expected"),
+    ("numbers", "first_sequence", "backlog", "expected"),
     [
-        ([], 0, [], Extent(0, ())),
-        ([0, 1, 2], 0, [], Extent(0, ())),
-        ([1, 2, 5], 0, [], Extent(1, ((3, 4),))),
-        ([1, 3, 9], 0, [], Extent(1, ((2, 2), (4, 8)))),
+        ([], 0, [], PendingRange(0, ())),
+        ([0, 1, 2], 0, [], PendingRange(0, ())),
+        ([1, 2, 5], 0, [], PendingRange(1, ((3, 4),))),
+        ([1, 3, 9], 0, [], PendingRange(1, ((2, 2), (4, 8)))),
         # Numbers that the restart has left out are known to be missing, those beyond are not.
-        ([START], START, [6], Extent(6, ())),
-        ([START], START, [5], Extent(5, ((6, 6),))),
-        ([], START, [5], Extent(5, ((6, 6),))),
-        ([START + 2], START, [5], Extent(5, ((6, 6), (START, START + 1)))),
-        ([START + 2], START, [6], Extent(6, ((START, START + 1),))),
+        ([START], START, [6], PendingRange(6, ())),
+        ([START], START, [5], PendingRange(5, ((6, 6),))),
+        ([], START, [5], PendingRange(5, ((6, 6),))),
+        ([START + 2], START, [5], PendingRange(5, ((6, 6), (START, START + 1)))),
+        ([START + 2], START, [6], PendingRange(6, ((START, START + 1),))),
     ],
 )
 def test_what_a_master_waits_for(
-    numbers: list[int], run_start: int, backlog: list[int], expected: Extent
+    numbers: list[int], first_sequence: int, backlog: list[int], expected: PendingRange
 ) -> None:
     """From the oldest on, and which numbers after it never come."""
-    assert of(numbers, run_start=run_start, backlog=backlog).extent(anything) == expected
+    assert of(numbers, first_sequence=first_sequence, backlog=backlog).pending_range(anything) == expected
 
 
 def test_the_cumulative_number_is_the_lowest_that_it_can_be() -> None:
     """Eight bits are read from what is certain on; what has not been sent is not delivered."""
     box = of(range(1000))
-    delivery = Delivery(box, anything)
-    delivery.sent(range(600))
-    delivery.delivered_through(300 % 256)
+    delivery = DeliveryProgress(box, anything)
+    delivery.mark_sent(range(600))
+    delivery.acknowledge_through(300 % 256)
     assert box.oldest == 45  # it might be 300 too
-    delivery.delivered_through(300 % 256)
+    delivery.acknowledge_through(300 % 256)
     assert box.oldest == 45
-    delivery.delivered_through(200)
-    delivery.delivered_through(300 % 256)
+    delivery.acknowledge_through(200)
+    delivery.acknowledge_through(300 % 256)
     assert box.oldest == 301
-    delivery.delivered_through(500 % 256)
+    delivery.acknowledge_through(500 % 256)
     assert box.oldest == 501
-    delivery.delivered_through(600 % 256)  # it has not been sent
+    delivery.acknowledge_through(600 % 256)  # it has not been sent
     assert box.oldest == 501
-    delivery.delivered_through(599 % 256)
+    delivery.acknowledge_through(599 % 256)
     assert box.oldest == 600
 
 
 def test_a_gap_stops_the_cumulative_number_until_the_master_knows_of_it() -> None:
     """A number that never comes holds the master up; nothing beyond is taken for delivered meanwhile."""
     box = of([*range(10), *range(300, 400)])
-    delivery = Delivery(box, anything)
-    delivery.sent(range(400))
-    delivery.delivered(range(10))
+    delivery = DeliveryProgress(box, anything)
+    delivery.mark_sent(range(400))
+    delivery.acknowledge(range(10))
     told = [delivery.outdated]
-    delivery.delivered_through(300 % 256)  # which the master says of 44, if at all
+    delivery.acknowledge_through(300 % 256)  # which the master says of 44, if at all
     assert box.oldest == 300
-    delivery.delivered_through(9)
+    delivery.acknowledge_through(9)
     assert box.oldest == 300
     told.append(delivery.outdated)
-    delivery.introduce()
+    delivery.request_join()
     assert delivery.oldest == 300
-    delivery.introduced(300)
+    delivery.join_acknowledged(300)
     assert [*told, delivery.outdated] == [True, True, False]
-    delivery.delivered_through(350 % 256)
+    delivery.acknowledge_through(350 % 256)
     assert box.oldest == 351
 
 
@@ -141,71 +141,71 @@ def test_a_restart_that_lies_behind_is_told_before_those_that_do_not() -> None:
     """What a run in between has left, and the master has, need not come again until its restart lies behind as well."""
     first, second, third = (start + n * RESTART_SKIP for n, start in enumerate((2148, 2166, 2314), 1))
     left_before = [*range(2140, 2148), *range(first, first + 18), *range(second, second + 148)]
-    box = of([third], run_start=third, backlog=left_before)
-    delivery = Delivery(box, anything)
-    delivery.sent([third])
-    delivery.delivered_through(2147 % 256)
+    box = of([third], first_sequence=third, backlog=left_before)
+    delivery = DeliveryProgress(box, anything)
+    delivery.mark_sent([third])
+    delivery.acknowledge_through(2147 % 256)
     assert box.oldest == first
     assert delivery.outdated
-    delivery.introduce()
-    delivery.introduced(delivery.oldest)
+    delivery.request_join()
+    delivery.join_acknowledged(delivery.oldest)
     for _ in range(2):  # of a master that has all of it
-        delivery.delivered_through(third % 256)
+        delivery.acknowledge_through(third % 256)
     assert box.oldest == second
-    delivery.introduce()
-    delivery.introduced(delivery.oldest)
-    delivery.delivered_through(third % 256)
+    delivery.request_join()
+    delivery.join_acknowledged(delivery.oldest)
+    delivery.acknowledge_through(third % 256)
     assert box.oldest > second
 
 
 def test_a_small_gap_behind_is_not_told_as_long_as_there_are_others() -> None:
     """A backlog that goes out with losses has many, and an introduction takes the room of measurements."""
     box = of([*range(10), *range(20, 30), *range(40, 50)])
-    delivery = Delivery(box, anything)
-    delivery.sent(range(50))
-    delivery.delivered(range(10))
+    delivery = DeliveryProgress(box, anything)
+    delivery.mark_sent(range(50))
+    delivery.acknowledge(range(10))
     assert not delivery.outdated
-    delivery.delivered(range(20, 30))
+    delivery.acknowledge(range(20, 30))
     assert delivery.outdated
 
 
 def test_what_had_to_leave_is_a_gap_too(monkeypatch: pytest.MonkeyPatch) -> None:
     """The master waits for it until it is told not to."""
-    monkeypatch.setattr(outbox_module, "MOST_QUEUED", 3)
+    monkeypatch.setattr(send_queue, "QUEUE_CAPACITY", 3)
     box = of(range(3))
-    delivery = Delivery(box, anything)
+    delivery = DeliveryProgress(box, anything)
     told = [delivery.outdated]
     box.add(queued(3, 3))
     told.append(delivery.outdated)
-    delivery.introduce()
-    delivery.introduced(delivery.oldest)
+    delivery.request_join()
+    delivery.join_acknowledged(delivery.oldest)
     assert [*told, delivery.outdated] == [False, True, False]
 
 
 def test_what_is_left_behind_is_a_gap_until_the_master_knows_of_it() -> None:
     """It waits for the first number, and what it says of that is not of one that is 256 higher."""
     box = of(range(1000))
-    delivery = Delivery(box, anything)
-    delivery.sent(range(900, 1000))
-    box.keep(lambda each: each.sequence >= 300)
-    delivery.introduce()
-    delivery.delivered_through(-1 % 256)
+    delivery = DeliveryProgress(box, anything)
+    delivery.mark_sent(range(900, 1000))
+    box.retain(lambda each: each.sequence >= 300)
+    delivery.request_join()
+    delivery.acknowledge_through(-1 % 256)
     assert box.oldest == 300
-    delivery.introduced(delivery.oldest)
-    delivery.delivered_through(310 % 256)
+    delivery.join_acknowledged(delivery.oldest)
+    delivery.acknowledge_through(310 % 256)
     assert box.oldest == 311
 
 
 def test_a_number_is_narrow_only_if_it_can_be_nothing_else() -> None:
     """Next to anything that the master may have as its highest."""
-    delivery = Delivery(of(range(1000)), anything)
+    delivery = DeliveryProgress(of(range(1000)), anything)
     assert not delivery.may_be_narrow(0, 0)
-    delivery.sent(range(100))
-    delivery.delivered([50])
+    delivery.mark_sent(range(100))
+    delivery.acknowledge([50])
     assert delivery.may_be_narrow(100, 100)
     assert not delivery.may_be_narrow(200, 200)
     assert not delivery.may_be_narrow(60, 200)
-    delivery.delivered([150])
+    delivery.acknowledge([150])
     assert delivery.may_be_narrow(200, 200)
 
 
@@ -213,7 +213,7 @@ class Station:
     """A client that is killed now and then, with a disk that at times takes nothing."""
 
     def __init__(self) -> None:
-        self.box = Outbox(0)
+        self.box = SendQueue(0)
         self._next = 0
         self._journalled = -1
         self.disk = True
@@ -235,26 +235,26 @@ class Station:
         backlog = [each for each in self.box.newest_first() if each.sequence <= self._journalled]
         self._next = self._journalled + 1 + RESTART_SKIP
         self._journalled = self._next - 1
-        self.box = Outbox(self._next, backlog[::-1])
+        self.box = SendQueue(self._next, backlog[::-1])
 
 
 class Master:
     """One whose disk takes what has come at once, later, or never."""
 
     def __init__(self, recorded: Iterable[int] = ()) -> None:
-        self.inbox = Inbox()
+        self.window = ReceiveWindow()
         self.recorded = set(recorded)
         self._waiting: list[int] = []
 
-    def introduced(self, delivery: Delivery, box: Outbox) -> None:
+    def introduced(self, delivery: DeliveryProgress, box: SendQueue) -> None:
         """Take an introduction."""
-        self.inbox.introduced(
-            Introduction(nonce=1, lineage=7, run_start=box.run_start, oldest=delivery.oldest)
+        self.window.join(
+            JoinRequest(nonce=1, stream_id=7, first_sequence=box.first_sequence, oldest=delivery.oldest)
         )
 
     def receive(self, batch: Iterable[int]) -> None:
         """Take measurements."""
-        self._waiting += [number for number in batch if self.inbox.take(number)]
+        self._waiting += [number for number in batch if self.window.accept(number)]
 
     def settle(self, disk: str) -> None:
         """Hear of the disk, which takes, waits or refuses."""
@@ -262,9 +262,9 @@ class Master:
             return
         if disk == "takes":
             self.recorded |= set(self._waiting)
-            self.inbox.written(self._waiting)
+            self.window.mark_written(self._waiting)
         else:
-            self.inbox.lost(self._waiting)
+            self.window.mark_lost(self._waiting)
         self._waiting = []
 
 
@@ -273,7 +273,7 @@ class Exchange:
 
     def __init__(self, station: Station, master: Master) -> None:
         self._box, self._master = station.box, master
-        self._delivery = Delivery(station.box, anything)
+        self._delivery = DeliveryProgress(station.box, anything)
         self._introduces = True
         self._joined = False
 
@@ -281,34 +281,34 @@ class Exchange:
         """Leave so many of the oldest in the journal, undelivered."""
         left = [each.sequence for each, _ in zip(self._box.oldest_first(), range(count), strict=False)]
         self._box.remove(left)
-        self._delivery.introduce()
+        self._delivery.request_join()
         self._introduces = True
 
     def frame(self, *, heard: bool, disk: str, acknowledged: bool, cumulative: bool) -> None:
         """Send the newest; the master hears it or not, and what its next beacon says comes or not."""
         box, master, delivery = self._box, self._master, self._delivery
         if delivery.outdated and not self._introduces:
-            delivery.introduce()
+            delivery.request_join()
             self._introduces = True
         batch = [each.sequence for each, _ in zip(box.newest_first(), range(12), strict=False)]
         narrow = [number for number in batch if delivery.may_be_narrow(number, max(batch))]
-        delivery.sent(batch)
+        delivery.mark_sent(batch)
         if heard:
             if self._introduces:
                 master.introduced(delivery, box)
-            assert [master.inbox.unwrapped(number % 256) for number in narrow] == narrow
+            assert [master.window.unwrap(number % 256) for number in narrow] == narrow
             master.receive(batch)
         master.settle(disk)
         self._joined = self._joined or (heard and acknowledged)
         if not self._joined:
             return
-        if heard and acknowledged and master.inbox.is_written(batch):
-            delivery.delivered(batch)
+        if heard and acknowledged and master.window.is_written(batch):
+            delivery.acknowledge(batch)
             if self._introduces:
-                delivery.introduced(delivery.oldest)
+                delivery.join_acknowledged(delivery.oldest)
                 self._introduces = False
         if cumulative:
-            delivery.delivered_through(master.inbox.cumulative % 256)
+            delivery.acknowledge_through(master.window.cumulative % 256)
 
 
 @given(st.data())

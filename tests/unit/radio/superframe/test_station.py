@@ -21,22 +21,22 @@ from harness.hand_master import (
 from harness.radios import MS
 
 from tsgt.model import Status
-from tsgt.radio import DirectOrder, MeasureOrder, SearchOrder, TrackOrder, Transmitted
-from tsgt.radio.superframe import Outbox, Situation
+from tsgt.radio import DirectCommand, MeasureCommand, SearchCommand, TrackCommand, Transmission
+from tsgt.radio.superframe import InstrumentState, SendQueue
 from tsgt.radio.superframe.wire import (
     GRANT_BYTES,
     RESTART_SKIP,
-    AnswerPart,
     Authenticator,
-    OrderPart,
-    ShotPart,
+    CommandResponse,
+    EncodedCommand,
+    SingleMeasurement,
     quality_bound_us,
 )
 
 if TYPE_CHECKING:
     from harness.hand_master import Answered
 
-    from tsgt.radio.superframe import Reception, SuperframeStation
+    from tsgt.radio.superframe import BeaconReception, SuperframeStation
 
 PERIOD_NS = 400 * MS
 
@@ -44,8 +44,8 @@ PERIOD_NS = 400 * MS
 class Instrument:
     """Fills an outbox in the course of the master's time."""
 
-    def __init__(self, outbox: Outbox, first: int = 0) -> None:
-        self._outbox = outbox
+    def __init__(self, send_queue: SendQueue, first: int = 0) -> None:
+        self._outbox = send_queue
         self._next = first
         self._due_ns: int | None = None
         self.made_ns: dict[int, int] = {}
@@ -61,49 +61,49 @@ class Instrument:
             self._due_ns += PERIOD_NS
 
 
-def joined() -> tuple[HandMaster, SuperframeStation, Outbox]:
+def joined() -> tuple[HandMaster, SuperframeStation, SendQueue]:
     """Return a station that a master has confirmed, and that has nothing to say."""
-    outbox = Outbox(0)
-    master, station = HandMaster(), make_station(outbox)
+    send_queue = SendQueue(0)
+    master, station = HandMaster(), make_station(send_queue)
     for _ in range(3):
         master.frame(station)
     assert station.joined
-    return master, station, outbox
+    return master, station, send_queue
 
 
 def test_a_station_joins_in_two_frames() -> None:
     """It introduces itself with its first reply, measurement and all, and is confirmed by the next beacon."""
-    outbox = Outbox(0)
-    master, station = HandMaster(grant=GRANT_BYTES.index(44)), make_station(outbox)
-    outbox.add(queued(0, master.now_ns))
+    send_queue = SendQueue(0)
+    master, station = HandMaster(grant=GRANT_BYTES.index(44)), make_station(send_queue)
+    send_queue.add(queued(0, master.now_ns))
     first = master.frame(station)
     assert first is not None
-    assert first.reply.introduction is not None
-    assert (first.reply.introduction.lineage, first.reply.introduction.oldest) == (9, 0)
-    assert (first.reply.state is not None, first.sequences) == (True, (0,))
-    assert first.reply.runs[0].wide
-    assert first.reply.runs[0].prism == 1
+    assert first.reply.join_request is not None
+    assert (first.reply.join_request.stream_id, first.reply.join_request.oldest) == (9, 0)
+    assert (first.reply.status_report is not None, first.sequences) == (True, (0,))
+    assert first.reply.blocks[0].wide
+    assert first.reply.blocks[0].prism == 1
     joined_before = station.joined
-    outbox.add(queued(1, master.now_ns))
+    send_queue.add(queued(1, master.now_ns))
     second = master.frame(station)
     assert second is not None
     assert (joined_before, station.joined) == (False, True)
-    assert second.reply.introduction is None
+    assert second.reply.join_request is None
     assert second.sequences == (1,)  # the other one is acknowledged with the same beacon
-    assert not second.reply.runs[0].wide
-    assert second.reply.runs[0].prism is None
-    assert len(outbox) == 1
+    assert not second.reply.blocks[0].wide
+    assert second.reply.blocks[0].prism is None
+    assert len(send_queue) == 1
 
 
 def test_nothing_is_taken_for_delivered_before_the_master_is_known() -> None:
     """Without a confirmation acknowledgements are not believed, whoever sends them."""
-    outbox = Outbox(0)
-    master, station = HandMaster(confirm=False), make_station(outbox)
-    Instrument(outbox).until(master.now_ns + SECOND)
-    before = len(outbox)
+    send_queue = SendQueue(0)
+    master, station = HandMaster(confirm=False), make_station(send_queue)
+    Instrument(send_queue).until(master.now_ns + SECOND)
+    before = len(send_queue)
     for _ in range(20):
         assert master.frame(station) is not None
-    assert len(outbox) == before
+    assert len(send_queue) == before
     assert not station.joined
 
 
@@ -112,8 +112,12 @@ def test_nothing_is_taken_for_delivered_before_the_master_is_known() -> None:
 def test_everything_arrives_with_its_time(loss: float, seed: int) -> None:
     """At any loss, beyond where eight bits of sequence number begin anew, and never off by more than is claimed."""
     rng = np.random.default_rng(seed)
-    outbox = Outbox(0)
-    master, station, instrument = HandMaster(session_every=4), make_station(outbox), Instrument(outbox)
+    send_queue = SendQueue(0)
+    master, station, instrument = (
+        HandMaster(session_every=4),
+        make_station(send_queue),
+        Instrument(send_queue),
+    )
     for _ in range(700):
         instrument.until(master.now_ns + master.frame_ns)
         answered = master.frame(station, beacon_lost=rng.random() < loss, reply_lost=rng.random() < loss)
@@ -122,15 +126,15 @@ def test_everything_arrives_with_its_time(loss: float, seed: int) -> None:
     for _ in range(30):
         master.frame(station)
     assert set(master.received) == set(instrument.made_ns)
-    assert len(outbox) == 0
-    assert station.doubted == 0
+    assert len(send_queue) == 0
+    assert station.rejected_beacons == 0
 
 
 def check_times(answered: Answered, instrument: Instrument) -> None:
     """Compare with the truth; the unit of time and the master's rounding come on top of what is claimed."""
-    for run in answered.reply.runs:
+    for run in answered.reply.blocks:
         bound_us = quality_bound_us(run.quality) + 10
-        low_bits = {sighting.sequence % 256 for sighting in run.sightings}
+        low_bits = {measurement.sequence % 256 for measurement in run.measurements}
         numbers = [number for number in answered.sequences if number % 256 in low_bits]
         assert numbers
         for number in numbers:
@@ -139,8 +143,8 @@ def check_times(answered: Answered, instrument: Instrument) -> None:
 
 def test_what_is_not_written_is_sent_again() -> None:
     """The master acknowledges what is in its recording, and nothing else."""
-    master, station, outbox = joined()
-    outbox.add(queued(0, master.now_ns))
+    master, station, send_queue = joined()
+    send_queue.add(queued(0, master.now_ns))
     for _ in range(3):
         answered = master.frame(station, not_written=True)
         assert answered is not None
@@ -162,8 +166,8 @@ def test_a_reply_without_anything_is_five_bytes() -> None:
 
 def test_a_plain_measurement_is_seventeen_bytes() -> None:
     """Once the clock has settled."""
-    outbox = Outbox(0)
-    master, station, instrument = HandMaster(), make_station(outbox), Instrument(outbox)
+    send_queue = SendQueue(0)
+    master, station, instrument = HandMaster(), make_station(send_queue), Instrument(send_queue)
     for _ in range(40):
         instrument.until(master.now_ns + master.frame_ns)
         master.frame(station)
@@ -179,17 +183,21 @@ def test_a_plain_measurement_is_seventeen_bytes() -> None:
 
 def test_after_an_outage_the_newest_comes_first() -> None:
     """A thousand measurements of backlog arrive in all, and what is measured meanwhile does not wait for them."""
-    outbox = Outbox(0)
-    master, station, instrument = HandMaster(session_every=4), make_station(outbox), Instrument(outbox)
+    send_queue = SendQueue(0)
+    master, station, instrument = (
+        HandMaster(session_every=4),
+        make_station(send_queue),
+        Instrument(send_queue),
+    )
     for _ in range(50):
         instrument.until(master.now_ns + master.frame_ns)
         master.frame(station)
     for _ in range(1000):
         instrument.until(master.now_ns + master.frame_ns)
         master.frame(station, beacon_lost=True)
-    assert len(outbox) >= 1000
+    assert len(send_queue) >= 1000
     frames = 0
-    while len(outbox) > 3:
+    while len(send_queue) > 3:
         instrument.until(master.now_ns + master.frame_ns)
         answered = master.frame(station)
         frames += 1
@@ -207,18 +215,18 @@ def test_after_an_outage_the_newest_comes_first() -> None:
 
 def test_a_late_slot_stays_empty() -> None:
     """What would harm the next slot is not sent; it is counted, told, and sent in the next frame."""
-    master, station, outbox = joined()
-    outbox.add(queued(0, master.now_ns))
+    master, station, send_queue = joined()
+    send_queue.add(queued(0, master.now_ns))
     heard = station.received(master.packet(master.beacon()))
     assert heard is not None
     assert heard.slot_ns is not None
     assert station.compose(TRACKING, heard.slot_ns + 400 * MS) is None
-    assert station.late == 1
-    answered = master.frame(station, Situation(1, direct=False, connected=False))
+    assert station.missed_slots == 1
+    answered = master.frame(station, InstrumentState(1, direct=False, connected=False))
     assert answered is not None
     assert answered.sequences == (0,)
-    assert answered.reply.state is not None
-    assert answered.reply.state.late == 1
+    assert answered.reply.status_report is not None
+    assert answered.reply.status_report.missed_slots == 1
 
 
 def test_a_reply_that_began_too_late_is_counted() -> None:
@@ -229,8 +237,8 @@ def test_a_reply_that_began_too_late_is_counted() -> None:
     assert heard.slot_ns is not None
     assert station.compose(TRACKING, heard.slot_ns - MS) is not None
     started_ns = heard.slot_ns + 400 * MS
-    station.sent(Transmitted(started_at_ns=started_ns, done_at_ns=started_ns + MS, stamp_sigma_ns=20_000))
-    assert station.late == 1
+    station.sent(Transmission(started_at_ns=started_ns, done_at_ns=started_ns + MS, stamp_sigma_ns=20_000))
+    assert station.missed_slots == 1
 
 
 def test_the_slot_counts_from_the_end_of_the_beacon() -> None:
@@ -242,7 +250,7 @@ def test_the_slot_counts_from_the_end_of_the_beacon() -> None:
     assert heard.slot_ns is not None
     end_ns = master.now_ns + TIMING.airtime_ns(len(payload))
     first_slot_ns = TIMING.airtime_ns(17) + TIMING.guard_ns
-    expected_ns = local_ns(end_ns) + TIMING.turn_round_ns + first_slot_ns
+    expected_ns = local_ns(end_ns) + TIMING.turnaround_ns + first_slot_ns
     assert abs(heard.slot_ns - expected_ns) < 10_000
 
 
@@ -258,9 +266,9 @@ def test_a_beacon_with_a_poor_stamp_gives_no_slot() -> None:
 @pytest.mark.parametrize("grant", range(len(GRANT_BYTES)))
 def test_a_reply_never_exceeds_its_grant(grant: int) -> None:
     """Whatever there is to say; a station that is not known says nothing where its introduction does not fit."""
-    outbox = Outbox(0)
-    master, station = HandMaster(grant=grant), make_station(outbox)
-    Instrument(outbox).until(master.now_ns + 3 * SECOND)
+    send_queue = SendQueue(0)
+    master, station = HandMaster(grant=grant), make_station(send_queue)
+    Instrument(send_queue).until(master.now_ns + 3 * SECOND)
     answered = master.frame(station)
     if GRANT_BYTES[grant] < 21:
         assert answered is None
@@ -270,101 +278,101 @@ def test_a_reply_never_exceeds_its_grant(grant: int) -> None:
     master.grant = len(GRANT_BYTES) - 1
     for _ in range(3):
         master.frame(station)
-    Instrument(outbox, 100).until(master.now_ns + 3 * SECOND)
+    Instrument(send_queue, 100).until(master.now_ns + 3 * SECOND)
     master.grant = grant
     answered = master.frame(station, replace_prism(2))
     if answered is not None:
         assert answered.payload_bytes <= GRANT_BYTES[grant]
 
 
-def replace_prism(prism: int) -> Situation:
+def replace_prism(prism: int) -> InstrumentState:
     """Return a situation that the master has to be told."""
-    return Situation(prism, direct=False, connected=True)
+    return InstrumentState(prism, direct=False, connected=True)
 
 
 def test_another_prism_is_named_until_the_master_knows() -> None:
     """What was measured before an order stays with its prism, whenever it is delivered."""
-    master, station, outbox = joined()
-    outbox.add(queued(0, master.now_ns, prism=1))
-    outbox.add(queued(1, master.now_ns + 1, prism=3))
+    master, station, send_queue = joined()
+    send_queue.add(queued(0, master.now_ns, prism=1))
+    send_queue.add(queued(1, master.now_ns + 1, prism=3))
     lost = master.frame(station, replace_prism(3), not_written=True)
     assert lost is not None
-    assert lost.reply.state is not None
-    assert [run.prism for run in lost.reply.runs] == [3, 1]
+    assert lost.reply.status_report is not None
+    assert [run.prism for run in lost.reply.blocks] == [3, 1]
     known = master.frame(station, replace_prism(3))
     assert known is not None
-    assert [run.prism for run in known.reply.runs] == [3, 1]
-    outbox.add(queued(2, master.now_ns + 2, prism=3))
+    assert [run.prism for run in known.reply.blocks] == [3, 1]
+    send_queue.add(queued(2, master.now_ns + 2, prism=3))
     plain = master.frame(station, replace_prism(3))
     assert plain is not None
-    assert [run.prism for run in plain.reply.runs] == [None]
+    assert [run.prism for run in plain.reply.blocks] == [None]
 
 
 def test_an_order_is_carried_out_once() -> None:
     """However often it is repeated; the answer is repeated until it is acknowledged."""
     master, station, _ = joined()
-    order = OrderPart(2, ticket=5, order=0, argument=2)
-    assert master.frame(station, orders=[order, OrderPart(1, 6, 2)]) is not None
-    assert station.next_order() == TrackOrder(3)
-    assert station.next_order() is None
-    master.frame(station, orders=[order])
-    assert station.next_order() is None
+    order = EncodedCommand(2, command_id=5, code=0, argument=2)
+    assert master.frame(station, commands=[order, EncodedCommand(1, 6, 2)]) is not None
+    assert station.next_command() == TrackCommand(3)
+    assert station.next_command() is None
+    master.frame(station, commands=[order])
+    assert station.next_command() is None
     station.executed(ok=True)
     for _ in range(6):
-        master.frame(station, orders=[order], reply_lost=True)
-    answered = master.frame(station, orders=[order])
+        master.frame(station, commands=[order], reply_lost=True)
+    answered = master.frame(station, commands=[order])
     assert answered is not None
-    assert answered.reply.answer == AnswerPart(5, ok=True)
-    assert station.next_order() is None
+    assert answered.reply.response == CommandResponse(5, ok=True)
+    assert station.next_command() is None
     answered = master.frame(station)
     assert answered is not None
-    assert answered.reply.answer is None
+    assert answered.reply.response is None
 
 
 def test_a_ticket_that_has_come_round_is_another_order() -> None:
     """While the station did not hear the master, fifteen orders have come to nothing."""
     master, station, _ = joined()
-    master.frame(station, orders=[OrderPart(2, ticket=5, order=0, argument=2)])
-    assert station.next_order() == TrackOrder(3)
+    master.frame(station, commands=[EncodedCommand(2, command_id=5, code=0, argument=2)])
+    assert station.next_command() == TrackCommand(3)
     station.executed(ok=True)
-    master.frame(station, orders=[OrderPart(2, ticket=6, order=1)])
-    assert station.next_order() == SearchOrder()
+    master.frame(station, commands=[EncodedCommand(2, command_id=6, code=1)])
+    assert station.next_command() == SearchCommand()
     station.executed(ok=True)
-    master.frame(station, orders=[OrderPart(2, ticket=5, order=2)])
-    assert station.next_order() == DirectOrder()
+    master.frame(station, commands=[EncodedCommand(2, command_id=5, code=2)])
+    assert station.next_command() == DirectCommand()
 
 
 def test_orders_are_carried_out_one_after_the_other() -> None:
     """Each kind, and each has its own answer."""
     master, station, _ = joined()
-    parts = [OrderPart(2, ticket, kind) for ticket, kind in ((1, 1), (2, 2), (3, 3))]
-    master.frame(station, orders=parts)
-    assert station.next_order() == SearchOrder()
+    parts = [EncodedCommand(2, command_id, kind) for command_id, kind in ((1, 1), (2, 2), (3, 3))]
+    master.frame(station, commands=parts)
+    assert station.next_command() == SearchCommand()
     station.executed(ok=False)
     answered = master.frame(station)
     assert answered is not None
-    assert answered.reply.answer == AnswerPart(1, ok=False)
-    assert station.next_order() == DirectOrder()
+    assert answered.reply.response == CommandResponse(1, ok=False)
+    assert station.next_command() == DirectCommand()
     station.executed(ok=True)
     answered = master.frame(station)
     assert answered is not None
-    assert answered.reply.answer == AnswerPart(2, ok=True)
-    assert station.next_order() == MeasureOrder()
-    station.shot(Status.OK, 123, 456, 7.25)
+    assert answered.reply.response == CommandResponse(2, ok=True)
+    assert station.next_command() == MeasureCommand()
+    station.measured(Status.OK, 123, 456, 7.25)
     answered = master.frame(station)
     assert answered is not None
-    assert answered.reply.shot == ShotPart(3, Status.OK, 123, 456, 72_500)
-    assert station.next_order() is None
-    with pytest.raises(RuntimeError, match="none is under way"):
+    assert answered.reply.single_measurement == SingleMeasurement(3, Status.OK, 123, 456, 72_500)
+    assert station.next_command() is None
+    with pytest.raises(RuntimeError, match="no command is being executed"):
         station.executed(ok=True)
 
 
 def test_an_order_of_an_unknown_master_is_not_obeyed() -> None:
     """It may be a recording."""
-    master, station = HandMaster(confirm=False), make_station(Outbox(0))
+    master, station = HandMaster(confirm=False), make_station(SendQueue(0))
     for _ in range(3):
-        master.frame(station, orders=[OrderPart(2, 1, 2)])
-    assert station.next_order() is None
+        master.frame(station, commands=[EncodedCommand(2, 1, 2)])
+    assert station.next_command() is None
 
 
 def test_a_beacon_with_a_wrong_bit_is_no_beacon() -> None:
@@ -391,10 +399,10 @@ def test_noise_is_no_beacon() -> None:
 
 def test_a_master_with_another_key_is_refused() -> None:
     """And noticed, for somebody has to put the right key there."""
-    station = make_station(Outbox(0))
+    station = make_station(SendQueue(0))
     master = HandMaster(authenticator=Authenticator(KEY[::-1]))
     assert master.frame(station) is None
-    assert station.refused == 1
+    assert station.authentication_failures == 1
     assert station.heard_ns is None
 
 
@@ -409,18 +417,18 @@ def test_a_beacon_is_heard_once() -> None:
 
 def test_an_old_session_that_is_played_back_does_no_harm() -> None:
     """While the master is silent it is answered, but neither believed nor obeyed; then all is as before."""
-    outbox = Outbox(0)
-    station = make_station(outbox)
+    send_queue = SendQueue(0)
+    station = make_station(send_queue)
     old = HandMaster(session=0x111)
-    recorded = [old.beacon(orders=[OrderPart(2, 1, 2)]) for _ in range(30)]
+    recorded = [old.beacon(commands=[EncodedCommand(2, 1, 2)]) for _ in range(30)]
     master = HandMaster()
-    instrument = Instrument(outbox)
+    instrument = Instrument(send_queue)
     for _ in range(20):
         instrument.until(master.now_ns + master.frame_ns)
         master.frame(station)
     assert station.received(master.packet(recorded[0])) is None  # the master has just been heard
     instrument.until(master.now_ns + 4 * SECOND)
-    before = len(outbox)
+    before = len(send_queue)
     for payload in recorded:
         master.now_ns += 4 * SECOND
         master.beacon_done_ns = master.now_ns
@@ -429,28 +437,28 @@ def test_an_old_session_that_is_played_back_does_no_harm() -> None:
         assert heard.reception is None
         if heard.slot_ns is not None:
             station.compose(TRACKING, heard.slot_ns - 6 * MS)
-    assert station.next_order() is None
+    assert station.next_command() is None
     joined_meanwhile = station.joined
-    assert len(outbox) == before
+    assert len(send_queue) == before
     answered = master.frame(station)
     assert answered is not None
-    assert answered.reply.introduction is None
+    assert answered.reply.join_request is None
     assert (joined_meanwhile, station.joined) == (False, True)
-    assert station.doubted == 0
+    assert station.rejected_beacons == 0
 
 
 def test_a_new_master_is_joined_after_three_seconds() -> None:
     """It was started anew; everything that the old one has not acknowledged goes to the new one."""
-    master, station, outbox = joined()
+    master, station, send_queue = joined()
     master.frame(station)
-    outbox.add(queued(0, master.now_ns))
+    send_queue.add(queued(0, master.now_ns))
     new = HandMaster(session=0x222, now_ns=master.now_ns, zero_ns=master.now_ns)
     answers = [new.frame(station) for _ in range(12)]
     first = next(index for index, answered in enumerate(answers) if answered is not None)
     assert first == 7
     assert station.joined
     assert set(new.received) == {0}
-    assert len(outbox) == 0
+    assert len(send_queue) == 0
 
 
 def test_a_beacon_that_was_held_back_is_doubted() -> None:
@@ -458,15 +466,15 @@ def test_a_beacon_that_was_held_back_is_doubted() -> None:
     master, station, _ = joined()
     for _ in range(30):
         master.frame(station)
-    assert station.doubted == 0
+    assert station.rejected_beacons == 0
     master.frame(station, late_ns=20 * MS)
     payload = master.beacon()
     heard = station.received(master.packet(payload))
     assert heard is not None
-    assert (heard.doubted, heard.reception, station.doubted) == (True, None, 1)
+    assert (heard.time_rejected, heard.reception, station.rejected_beacons) == (True, None, 1)
     for _ in range(5):
         master.frame(station)
-    assert station.doubted == 1
+    assert station.rejected_beacons == 1
 
 
 def test_a_long_outage_ends_with_the_next_beacon_that_tells_of_the_session() -> None:
@@ -482,7 +490,7 @@ def test_a_long_outage_ends_with_the_next_beacon_that_tells_of_the_session() -> 
 
 def collect(
     master: HandMaster, station: SuperframeStation, instrument: Instrument, frames: int
-) -> list[Reception]:
+) -> list[BeaconReception]:
     """Play frames; return the receptions that a journal would have."""
     receptions = []
     for _ in range(frames):
@@ -499,24 +507,24 @@ def collect(
 
 def test_a_restarted_station_goes_on() -> None:
     """What it measured before is delivered with times as good as before, what it had delivered is not sent again."""
-    outbox = Outbox(0)
-    master, instrument = HandMaster(session_every=4), Instrument(outbox)
+    send_queue = SendQueue(0)
+    master, instrument = HandMaster(session_every=4), Instrument(send_queue)
     source = counted()
-    station = make_station(outbox, random_bits=source)
+    station = make_station(send_queue, random_bits=source)
     receptions = collect(master, station, instrument, 60)
     for _ in range(10):
         instrument.until(master.now_ns + master.frame_ns)
         master.frame(station, beacon_lost=True)
-    backlog = list(outbox.newest_first())[::-1]
+    backlog = list(send_queue.newest_first())[::-1]
     assert len(backlog) > 5
-    run_start = max(instrument.made_ns) + 1 + RESTART_SKIP
-    again = Outbox(run_start, backlog)
+    first_sequence = max(instrument.made_ns) + 1 + RESTART_SKIP
+    again = SendQueue(first_sequence, backlog)
     station = make_station(again, receptions=receptions, random_bits=source)
     answers = [master.frame(station) for _ in range(8)]
     taken = [answered for answered in answers if answered is not None]
-    assert taken[0].reply.introduction is not None
-    assert taken[0].reply.introduction.run_start == run_start
-    assert taken[0].reply.introduction.oldest == backlog[0].sequence
+    assert taken[0].reply.join_request is not None
+    assert taken[0].reply.join_request.first_sequence == first_sequence
+    assert taken[0].reply.join_request.oldest == backlog[0].sequence
     assert len(again) == 0
     for answered in taken:
         for number in answered.sequences:
@@ -525,29 +533,29 @@ def test_a_restarted_station_goes_on() -> None:
 
 def test_a_restart_of_the_computer_keeps_times_that_can_be_told() -> None:
     """Measurements of before are timed by the clock of before; where that is unknown they stay in the journal."""
-    outbox = Outbox(0)
-    master, instrument = HandMaster(session_every=4), Instrument(outbox)
+    send_queue = SendQueue(0)
+    master, instrument = HandMaster(session_every=4), Instrument(send_queue)
     source = counted()
-    station = make_station(outbox, random_bits=source)
+    station = make_station(send_queue, random_bits=source)
     receptions = collect(master, station, instrument, 60)
     for _ in range(6):
         instrument.until(master.now_ns + master.frame_ns)
         master.frame(station, beacon_lost=True)
-    old = [replace(each, boot="old") for each in outbox.newest_first()][::-1]
+    old = [replace(each, boot="old") for each in send_queue.newest_first()][::-1]
     older = [replace(queued(number, number), boot="older") for number in range(2)]
-    again = Outbox(5000, [*older, *old])
+    again = SendQueue(5000, [*older, *old])
     moved = [replace(reception, boot="old") for reception in receptions]
     station = make_station(again, boot="new", receptions=moved, random_bits=source)
     heard = station.received(master.packet(master.beacon(session=True)))
     assert heard is not None
     reply = master.compose(station, heard)
     assert reply is not None
-    introduction = master.take(reply).reply.introduction
-    assert introduction is not None
-    assert introduction.oldest == old[0].sequence
+    join_request = master.take(reply).reply.join_request
+    assert join_request is not None
+    assert join_request.oldest == old[0].sequence
     heard = station.received(master.packet(master.beacon()))
     assert heard is not None
-    assert (heard.joined, heard.left_behind) == (True, 2)
+    assert (heard.joined, heard.discarded) == (True, 2)
     for number, time_ns in master.received.items():
         assert abs(time_ns - instrument.made_ns[number]) < 150_000
     for _ in range(5):
@@ -561,13 +569,13 @@ def test_a_clock_of_a_few_beacons_does_not_outlive_a_restart_of_the_computer(
     beacons: int, expected: set[int]
 ) -> None:
     """They may have been held back, and what would have shown that was not heard any more."""
-    outbox = Outbox(0)
-    master, instrument = HandMaster(session_every=1), Instrument(outbox)
+    send_queue = SendQueue(0)
+    master, instrument = HandMaster(session_every=1), Instrument(send_queue)
     source = counted()
-    station = make_station(outbox, random_bits=source)
+    station = make_station(send_queue, random_bits=source)
     receptions = collect(master, station, instrument, 12)[:beacons]
     left = [replace(queued(1000, receptions[-1].received_ns), boot="old")]
-    again = Outbox(RESTART_SKIP + 1001, left)
+    again = SendQueue(RESTART_SKIP + 1001, left)
     moved = [replace(reception, boot="old") for reception in receptions]
     station = make_station(again, boot="new", receptions=moved, random_bits=source)
     for _ in range(5):
@@ -578,15 +586,15 @@ def test_a_clock_of_a_few_beacons_does_not_outlive_a_restart_of_the_computer(
 
 def test_what_can_be_timed_does_not_wait_behind_what_cannot() -> None:
     """Of another start of the computer: minutes after the last beacon then, and hours."""
-    outbox = Outbox(0)
-    master, instrument = HandMaster(session_every=4), Instrument(outbox)
+    send_queue = SendQueue(0)
+    master, instrument = HandMaster(session_every=4), Instrument(send_queue)
     source = counted()
-    station = make_station(outbox, random_bits=source)
+    station = make_station(send_queue, random_bits=source)
     moved = [replace(each, boot="old") for each in collect(master, station, instrument, 60)]
     now_ns = master.now_ns
     near = [queued(1000 + n, now_ns + n * SECOND, boot="old") for n in range(5)]
     far = [queued(1005 + n, now_ns + (6 * 3600 + n) * SECOND, boot="old") for n in range(30)]
-    again = Outbox(RESTART_SKIP + 1035, [*near, *far])
+    again = SendQueue(RESTART_SKIP + 1035, [*near, *far])
     station = make_station(again, boot="new", receptions=moved, random_bits=source)
     for _ in range(40):
         master.frame(station)
@@ -598,26 +606,26 @@ def test_what_can_be_timed_does_not_wait_behind_what_cannot() -> None:
 
 def test_what_was_measured_long_before_the_master_came_is_left_behind() -> None:
     """Its time could not be told to half a second; what is younger is delivered, and the master waits for nothing else."""
-    outbox = Outbox(0)
+    send_queue = SendQueue(0)
     master = HandMaster(session_every=4, now_ns=6 * 3600 * SECOND)
     for number in range(20):
-        outbox.add(queued(number, number * SECOND))
+        send_queue.add(queued(number, number * SECOND))
     for number in range(20, 40):
-        outbox.add(queued(number, (2 * 3600 + number) * SECOND))
-    station = make_station(outbox)
+        send_queue.add(queued(number, (2 * 3600 + number) * SECOND))
+    station = make_station(send_queue)
     for _ in range(100):
         master.frame(station)
-    assert len(outbox) == 0
+    assert len(send_queue) == 0
     assert set(master.received) == set(range(20, 40))
 
 
 def test_a_few_old_measurements_do_not_wait_for_ever() -> None:
     """One that needs a run of its own, behind which a new one never fits, goes first for once."""
-    master, station, outbox = joined()
-    outbox.add(queued(0, master.now_ns - 40 * SECOND, prism=5))
+    master, station, send_queue = joined()
+    send_queue.add(queued(0, master.now_ns - 40 * SECOND, prism=5))
     master.grant = GRANT_BYTES.index(26)
     for number in range(1, 8):
-        outbox.add(queued(number, master.now_ns + master.frame_ns))
+        send_queue.add(queued(number, master.now_ns + master.frame_ns))
         master.frame(station)
     assert 0 in master.received
 
@@ -627,12 +635,12 @@ def test_how_long_the_reply_before_took_is_told() -> None:
     master, station, _ = joined()
     answered = master.frame(station)
     assert answered is not None
-    told_us = answered.reply.turn_round_us
+    told_us = answered.reply.turnaround_us
     assert told_us is not None
-    before_ns = TIMING.turn_round_ns + TIMING.airtime_ns(17) + TIMING.guard_ns
+    before_ns = TIMING.turnaround_ns + TIMING.airtime_ns(17) + TIMING.guard_ns
     reply_ns = 1000 * told_us - before_ns + TIMING.reception_ns
     assert any(abs(reply_ns - TIMING.airtime_ns(length)) < 2 * MS for length in range(5, 30))
     master.frame(station, beacon_lost=True)
     answered = master.frame(station)
     assert answered is not None
-    assert answered.reply.turn_round_us is None
+    assert answered.reply.turnaround_us is None

@@ -1,11 +1,8 @@
-"""The codes by which master and stations know each other's packets of the superframe.
+"""Message authentication codes of the superframe.
 
-Each packet ends with four bytes that only those who have the key can compute: keyed BLAKE2s over the content and over
-all that makes this packet the only one of its kind: who sends it, in which session, in which frame, and for a reply
-which beacon it answers. What was recorded on the air therefore fits at no other time.
-
-A code proves who wrote a packet, not when it left: whoever holds a packet back and sends it a little later is found by
-its time, which is not a matter of this module.
+Each packet ends with four bytes of keyed BLAKE2s (RFC 7693, section 2.9) over the content and over what makes the packet
+unique: sender, session, frame, and for a reply the beacon it replies to. A recorded packet is therefore valid at no
+other time. A code does not prove when a packet was sent; the time checks of the session reject delayed beacons.
 """
 
 from __future__ import annotations
@@ -14,12 +11,12 @@ import hashlib
 import struct
 
 CODE_BYTES = 4
-"""Of 2^32 forged packets one gets through: at 1000 a second, which is more than the channel bears, one in 50 days."""
+"""One of 2^32 forged packets is accepted: one in 50 days at 1000 packets per second, more than the channel carries."""
 
 KEY_BYTES = 32
 
 _PERSON = b"tsgt sf1"
-"""Keeps these codes apart from what else may be computed with the same key."""
+"""BLAKE2 personalisation: separates these codes from other uses of the same key."""
 
 _BEACON, _REPLY = 1, 2
 
@@ -27,23 +24,23 @@ _HEADER = struct.Struct(">BQBIQ4sQH")
 
 
 class Authenticator:
-    """Computes the codes of one mission. Compare them by :func:`hmac.compare_digest`.
+    """Computes the codes of one mission; compare them with :func:`hmac.compare_digest`.
 
     Parameters
     ----------
     key
-        :data:`KEY_BYTES` bytes that all radios of the mission share. None: codes without a key, which anybody can
-        compute; they still tell packets of one session, frame and station from those of another.
+        :data:`KEY_BYTES` bytes, shared by all radios of the mission. None: anybody can compute the codes, which then only
+        separate sessions, frames and stations.
 
     Attributes
     ----------
     authentic : bool
-        Whether there is a key.
+        There is a key.
 
     Raises
     ------
     ValueError
-        A key of another length.
+        The key has another length.
     """
 
     __slots__ = ("_key", "authentic")
@@ -55,18 +52,16 @@ class Authenticator:
         self.authentic = key is not None
 
     def beacon_code(self, *, session: int, counter: int, content: bytes) -> bytes:
-        """Return the code of a beacon.
+        """Return the code of a beacon with this content.
 
         Parameters
         ----------
         session
-            The master's nonce, 48 bits.
+            Session nonce, 48 bits.
         counter
-            Number of the frame in the session, in full.
-        content
-            The packet without its code.
+            Full frame counter.
         """
-        return self._code(_BEACON, session, 0, 0, counter, bytes(CODE_BYTES), 0, content)
+        return self._code(content, _BEACON, session, 0, 0, counter, bytes(CODE_BYTES), 0)
 
     def reply_code(
         self,
@@ -79,42 +74,28 @@ class Authenticator:
         sequence: int,
         content: bytes,
     ) -> bytes:
-        """Return the code of a reply.
+        """Return the code of a reply with this content.
 
         Parameters
         ----------
         session
-            The master's nonce, 48 bits.
+            Session nonce, 48 bits.
         station
-            Number of the station; the reply itself does not name it.
+            Number of the station, which the reply itself does not contain.
         station_nonce
-            That of the station's introduction to this session, 32 bits.
+            Nonce of the station's join request in this session, 32 bits.
         counter
-            Number of the frame in the session, in full.
+            Full frame counter.
         beacon_code
-            The code of the beacon that is answered.
+            Code of the beacon replied to.
         sequence
-            Number of the first sighting of the first run, in full, of which the reply may carry the low bits only;
-            0 without runs.
-        content
-            The packet without its code.
+            Full number of the first measurement of the first block, of which the reply may carry only the low bits;
+            0 without blocks.
         """
-        return self._code(_REPLY, session, station, station_nonce, counter, beacon_code, sequence, content)
+        return self._code(content, _REPLY, session, station, station_nonce, counter, beacon_code, sequence)
 
-    def _code(
-        self,
-        kind: int,
-        session: int,
-        station: int,
-        station_nonce: int,
-        counter: int,
-        beacon_code: bytes,
-        sequence: int,
-        content: bytes,
-    ) -> bytes:
-        header = _HEADER.pack(
-            kind, session, station, station_nonce, counter, beacon_code, sequence, len(content)
-        )
+    def _code(self, content: bytes, *fields: int | bytes) -> bytes:
+        header = _HEADER.pack(*fields, len(content))
         return hashlib.blake2s(
             header + content, digest_size=CODE_BYTES, key=self._key, person=_PERSON
         ).digest()

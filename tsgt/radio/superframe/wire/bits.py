@@ -1,4 +1,4 @@
-"""Numbers of any width, packed into bytes: the most significant bit first, without gaps."""
+"""Bit fields of any width, most significant bit first, without gaps."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ _BYTE = 8
 
 
 class BitWriter:
-    """Appends numbers to a string of bits."""
+    """Appends unsigned integers to a bit string."""
 
     __slots__ = ("_bits", "_value")
 
@@ -17,19 +17,12 @@ class BitWriter:
         self._bits = 0
 
     def put(self, value: int, width: int) -> None:
-        """Append a number.
-
-        Parameters
-        ----------
-        value
-            0 to 2**width - 1.
-        width
-            In bits, 0 and more.
+        """Append a number as ``width`` bits.
 
         Raises
         ------
         MessageError
-            The number does not fit.
+            The number is not in 0 to 2**width - 1.
         """
         if value < 0 or value >> width:
             raise MessageError(f"{value} does not fit into {width} bits")
@@ -37,45 +30,35 @@ class BitWriter:
         self._bits += width
 
     def to_bytes(self) -> bytes:
-        """Return everything so far, filled up with zeros to whole bytes."""
+        """Return the bit string, zero-padded to whole bytes."""
         padding = -self._bits % _BYTE
         return (self._value << padding).to_bytes((self._bits + padding) // _BYTE, "big")
 
 
 class BitReader:
-    """Takes numbers from a string of bits, in the order in which they were appended.
+    """Reads unsigned integers from a bit string.
 
-    Parameters
+    Attributes
     ----------
-    content
-        Whole bytes.
+    remaining
+        Number of unread bits.
     """
 
-    __slots__ = ("_remaining", "_value")
+    __slots__ = ("_value", "remaining")
 
     def __init__(self, content: bytes) -> None:
         self._value = int.from_bytes(content, "big")
-        self._remaining = _BYTE * len(content)
-
-    @property
-    def remaining(self) -> int:
-        """How many bits are left."""
-        return self._remaining
+        self.remaining = _BYTE * len(content)
 
     def take(self, width: int) -> int:
-        """Return the next number.
-
-        Parameters
-        ----------
-        width
-            In bits, 0 and more.
+        """Return the next ``width`` bits.
 
         Raises
         ------
         MessageError
-            There are not that many bits any more.
+            Fewer bits are left.
         """
-        self._remaining -= width
-        if self._remaining < 0:
+        self.remaining -= width
+        if self.remaining < 0:
             raise MessageError("the message is cut off")
-        return self._value >> self._remaining & (1 << width) - 1
+        return self._value >> self.remaining & (1 << width) - 1

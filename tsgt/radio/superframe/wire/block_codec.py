@@ -1,10 +1,9 @@
-"""How runs of measurements are packed into bits.
+"""Measurement blocks as bit fields.
 
-The newest measurement of a run stands in full. Of each older one there is only how far it is from where the two before
-it lead: a straight line in time. A robot that keeps its speed costs little more than the noise of the instrument. Such
-a residual takes a field of one of four widths, of which the last holds any number.
-
-The widths fit tracks of real robots and of simulated ones, at 10 to 500 m and up to 2 m/s.
+Linear predictive coding: the newest measurement of a block is sent in full, each older one as its residual from a linear
+extrapolation of the two before it. At constant velocity a residual is little more than the instrument's noise. A residual
+takes the narrowest of four field widths that holds it; the last one holds any number. The widths were fitted to tracks
+of real and simulated robots at 10 to 500 m and up to 2 m/s.
 """
 
 from __future__ import annotations
@@ -13,7 +12,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from tsgt.errors import MessageError
 from tsgt.model import Status
-from tsgt.radio.superframe.wire.messages import TIME_BITS, WIDE_TIME_BITS, Run, Sighting
+from tsgt.radio.superframe.wire.messages import (
+    TIME_BITS,
+    WIDE_TIME_BITS,
+    EncodedMeasurement,
+    MeasurementBlock,
+)
 
 if TYPE_CHECKING:
     from tsgt.radio.superframe.wire.bits import BitReader, BitWriter
@@ -21,29 +25,29 @@ if TYPE_CHECKING:
 SEQUENCE_BITS = 8
 WIDE_SEQUENCE_BITS = 32
 VALUE_BITS = 24
-"""Of an angle and of a distance; 0 is no distance."""
+"""Of an angle and of a distance; distance 0: none."""
 
 NOMINAL_STEP = 25_000
-"""Where the first step back in time is expected, in units of 16 us: 0.4 s, as usual for a total station that tracks."""
+"""Predicted first time step, in units of 16 us: 0.4 s, the usual period of a tracking total station."""
 
 TIME_WIDTHS = (8, 12, 18, WIDE_TIME_BITS)
 HORIZONTAL_WIDTHS = (7, 13, 17, VALUE_BITS)
 ZENITH_WIDTHS = (7, 11, 14, VALUE_BITS)
 DISTANCE_WIDTHS = (8, 11, 14, VALUE_BITS)
-"""Of residuals, in bits, in two's complement."""
+"""Field widths of residuals in bits, two's complement."""
 
 _QUALITY_BITS = 4
 _COUNT_BITS = 4
 _PRISM_BITS = 4
 _STATUS_BITS = 3
-_CHOICE_BITS = 2
+_WIDTH_INDEX_BITS = 2
 
 _STATUSES = tuple(Status)
 _STATUS_CODES = {status: code for code, status in enumerate(_STATUSES)}
 
 
 class _Step(NamedTuple):
-    """From a measurement of a run to the next older one: sequence number back, the rest as it changes."""
+    """Difference from a measurement to the next older one; ``numbers`` counts the sequence number backwards."""
 
     numbers: int
     time: int
@@ -51,23 +55,30 @@ class _Step(NamedTuple):
     zenith: int
     distance: int
 
+    def predicted(self, change: int, time: int) -> int:
+        """Extrapolate a change of this step linearly to the time of the next one."""
+        return change * time // self.time if self.time else 0
 
-_FIRST = _Step(1, -NOMINAL_STEP, 0, 0, 0)
-"""As if before the first step."""
+    def predicted_time(self, numbers: int) -> int:
+        """Extrapolate the time step to a difference of sequence numbers."""
+        return self.time // self.numbers * numbers
+
+
+_INITIAL_STEP = _Step(1, -NOMINAL_STEP, 0, 0, 0)
 
 
 def put_status(writer: BitWriter, status: Status) -> None:
-    """Append a verdict."""
+    """Append a status."""
     writer.put(_STATUS_CODES[status], _STATUS_BITS)
 
 
 def take_status(reader: BitReader) -> Status:
-    """Return the next verdict.
+    """Return the next status.
 
     Raises
     ------
     MessageError
-        There is none with this number.
+        The code is not assigned.
     """
     code = reader.take(_STATUS_BITS)
     if code >= len(_STATUSES):
@@ -87,76 +98,85 @@ def take_values(reader: BitReader) -> tuple[int, int, int | None]:
     return reader.take(VALUE_BITS), reader.take(VALUE_BITS), reader.take(VALUE_BITS) or None
 
 
-def put_newest(writer: BitWriter, sighting: Sighting, *, wide: bool) -> None:
+def put_newest(writer: BitWriter, measurement: EncodedMeasurement, *, wide: bool) -> None:
     """Append a measurement in full."""
     sequence_bits, time_bits = _widths(wide=wide)
-    writer.put(sighting.sequence % (1 << sequence_bits), sequence_bits)
-    writer.put(sighting.time % (1 << time_bits), time_bits)
-    put_status(writer, sighting.status)
-    put_values(writer, sighting.horizontal, sighting.zenith, sighting.distance)
+    writer.put(measurement.sequence % (1 << sequence_bits), sequence_bits)
+    writer.put(measurement.time % (1 << time_bits), time_bits)
+    put_status(writer, measurement.status)
+    put_values(writer, measurement.horizontal, measurement.zenith, measurement.distance)
 
 
-def take_newest(reader: BitReader, *, wide: bool) -> Sighting:
-    """Return the next measurement that stands in full."""
+def take_newest(reader: BitReader, *, wide: bool) -> EncodedMeasurement:
+    """Return the next measurement in full."""
     sequence_bits, time_bits = _widths(wide=wide)
     sequence, time = reader.take(sequence_bits), reader.take(time_bits)
-    return Sighting(sequence, time, take_status(reader), *take_values(reader))
+    return EncodedMeasurement(sequence, time, take_status(reader), *take_values(reader))
 
 
-def put_run(writer: BitWriter, run: Run) -> None:
-    """Append a run.
+def put_block(writer: BitWriter, block: MeasurementBlock) -> None:
+    """Append a block.
 
     Raises
     ------
     MessageError
-        It has no measurement or more than 16, they are not newest first, or a number does not go into its field.
+        The block has no measurement or more than 16, they are not newest first, or a number does not fit its field.
     """
-    writer.put(run.quality, _QUALITY_BITS)
-    flags = (run.direct, run.wide, run.far, run.prism is not None)
+    writer.put(block.quality, _QUALITY_BITS)
+    flags = (block.beacon_relative, block.wide, block.far, block.prism is not None)
     writer.put(any(flags), 1)
     if any(flags):
         for flag in flags:
             writer.put(flag, 1)
-        if run.prism is not None:
-            writer.put(run.prism - 1, _PRISM_BITS)
-    writer.put(len(run.sightings) - 1, _COUNT_BITS)
-    newer = run.sightings[0]
-    put_newest(writer, newer, wide=run.wide)
-    step = _FIRST
-    for older in run.sightings[1:]:
+        if block.prism is not None:
+            writer.put(block.prism - 1, _PRISM_BITS)
+    writer.put(len(block.measurements) - 1, _COUNT_BITS)
+    newer = block.measurements[0]
+    put_newest(writer, newer, wide=block.wide)
+    step = _INITIAL_STEP
+    for older in block.measurements[1:]:
         step = _put_older(writer, newer, older, step)
         newer = older
 
 
-def take_run(reader: BitReader) -> Run:
-    """Return the next run.
+def take_block(reader: BitReader) -> MeasurementBlock:
+    """Return the next block.
 
     Raises
     ------
     MessageError
-        The bits are no run.
+        The bits are not a block.
     """
     quality = reader.take(_QUALITY_BITS)
-    direct = wide = far = named = False
+    beacon_relative = wide = far = has_prism = False
     if reader.take(1):
-        direct, wide, far, named = (bool(reader.take(1)) for _ in range(4))
-    prism = reader.take(_PRISM_BITS) + 1 if named else None
-    older_ones = reader.take(_COUNT_BITS)
-    sightings = [take_newest(reader, wide=wide)]
-    step = _FIRST
-    for _ in range(older_ones):
-        older, step = _take_older(reader, sightings[-1], step)
-        sightings.append(older)
-    return Run(sightings=tuple(sightings), direct=direct, quality=quality, wide=wide, prism=prism, far=far)
+        beacon_relative, wide, far, has_prism = (bool(reader.take(1)) for _ in range(4))
+    prism = reader.take(_PRISM_BITS) + 1 if has_prism else None
+    older_count = reader.take(_COUNT_BITS)
+    measurements = [take_newest(reader, wide=wide)]
+    step = _INITIAL_STEP
+    for _ in range(older_count):
+        older, step = _take_older(reader, measurements[-1], step)
+        measurements.append(older)
+    return MeasurementBlock(
+        measurements=tuple(measurements),
+        beacon_relative=beacon_relative,
+        quality=quality,
+        wide=wide,
+        prism=prism,
+        far=far,
+    )
 
 
-def _put_older(writer: BitWriter, newer: Sighting, older: Sighting, before: _Step) -> _Step:
+def _put_older(
+    writer: BitWriter, newer: EncodedMeasurement, older: EncodedMeasurement, before: _Step
+) -> _Step:
     numbers = newer.sequence - older.sequence
     if numbers < 1:
-        raise MessageError(f"measurement {older.sequence} cannot stand behind {newer.sequence} in a run")
-    other = numbers > 1 or older.status is not newer.status
-    writer.put(other, 1)
-    if other:
+        raise MessageError(f"measurement {older.sequence} cannot follow {newer.sequence} in a block")
+    irregular = numbers > 1 or older.status is not newer.status
+    writer.put(irregular, 1)
+    if irregular:
         put_status(writer, older.status)
         _put_count(writer, numbers)
     step = _Step(
@@ -167,32 +187,38 @@ def _put_older(writer: BitWriter, newer: Sighting, older: Sighting, before: _Ste
         _signed((older.distance or 0) - (newer.distance or 0), VALUE_BITS),
     )
     if _signed(step.time, WIDE_TIME_BITS) != step.time:
-        raise MessageError(f"measurement {older.sequence} is days away from {newer.sequence} in the same run")
+        raise MessageError(f"measurements {older.sequence} and {newer.sequence} of a block are days apart")
     if (older.horizontal | older.zenith | (older.distance or 0)) >> VALUE_BITS:
         raise MessageError(
             f"measurement {older.sequence} has a value that does not fit into {VALUE_BITS} bits"
         )
-    _put_residual(writer, step.time - before.time // before.numbers * numbers, TIME_WIDTHS)
-    _put_residual(
-        writer, step.horizontal - _expected(before.horizontal, before, step.time), HORIZONTAL_WIDTHS
-    )
-    _put_residual(writer, step.zenith - _expected(before.zenith, before, step.time), ZENITH_WIDTHS)
-    _put_residual(writer, step.distance - _expected(before.distance, before, step.time), DISTANCE_WIDTHS)
+    _put_residual(writer, step.time - before.predicted_time(numbers), TIME_WIDTHS)
+    for change, change_before, widths in (
+        (step.horizontal, before.horizontal, HORIZONTAL_WIDTHS),
+        (step.zenith, before.zenith, ZENITH_WIDTHS),
+        (step.distance, before.distance, DISTANCE_WIDTHS),
+    ):
+        _put_residual(writer, change - before.predicted(change_before, step.time), widths)
     return step
 
 
-def _take_older(reader: BitReader, newer: Sighting, before: _Step) -> tuple[Sighting, _Step]:
+def _take_older(
+    reader: BitReader, newer: EncodedMeasurement, before: _Step
+) -> tuple[EncodedMeasurement, _Step]:
     numbers, status = 1, newer.status
     if reader.take(1):
         status = take_status(reader)
         numbers = _take_count(reader)
-    time = _signed(
-        _take_residual(reader, TIME_WIDTHS) + before.time // before.numbers * numbers, WIDE_TIME_BITS
+    time = _signed(_take_residual(reader, TIME_WIDTHS) + before.predicted_time(numbers), WIDE_TIME_BITS)
+    horizontal, zenith, distance = (
+        _take_residual(reader, widths) + before.predicted(change_before, time)
+        for change_before, widths in (
+            (before.horizontal, HORIZONTAL_WIDTHS),
+            (before.zenith, ZENITH_WIDTHS),
+            (before.distance, DISTANCE_WIDTHS),
+        )
     )
-    horizontal = _take_residual(reader, HORIZONTAL_WIDTHS) + _expected(before.horizontal, before, time)
-    zenith = _take_residual(reader, ZENITH_WIDTHS) + _expected(before.zenith, before, time)
-    distance = _take_residual(reader, DISTANCE_WIDTHS) + _expected(before.distance, before, time)
-    older = Sighting(
+    older = EncodedMeasurement(
         newer.sequence - numbers,
         newer.time + time,
         status,
@@ -204,13 +230,8 @@ def _take_older(reader: BitReader, newer: Sighting, before: _Step) -> tuple[Sigh
     return older, _Step(numbers, time, *changes)
 
 
-def _expected(change: int, before: _Step, time: int) -> int:
-    """Return how an angle or a distance changes in this time at the rate of the step before."""
-    return change * time // before.time if before.time else 0
-
-
 def _put_count(writer: BitWriter, count: int) -> None:
-    """Append a number from 1 on: one zero less than it has bits, then itself."""
+    """Append a number from 1 on in Elias gamma code."""
     bits = count.bit_length()
     if bits > WIDE_SEQUENCE_BITS:
         raise MessageError(f"{count} is too large a step of the sequence number")
@@ -226,22 +247,22 @@ def _take_count(reader: BitReader) -> int:
 
 
 def _put_residual(writer: BitWriter, residual: int, widths: tuple[int, ...]) -> None:
-    """Append a number, counted modulo the last width: which width, then itself."""
+    """Append a number modulo the last width: index of the width, then the number in two's complement."""
     residual = _signed(residual, widths[-1])
-    for choice, width in enumerate(widths):
+    for index, width in enumerate(widths):
         if _signed(residual, width) == residual:
-            writer.put(choice, _CHOICE_BITS)
+            writer.put(index, _WIDTH_INDEX_BITS)
             writer.put(residual % (1 << width), width)
             return
 
 
 def _take_residual(reader: BitReader, widths: tuple[int, ...]) -> int:
-    width = widths[reader.take(_CHOICE_BITS)]
+    width = widths[reader.take(_WIDTH_INDEX_BITS)]
     return _signed(reader.take(width), width)
 
 
 def _signed(number: int, bits: int) -> int:
-    """Return the number from -2^(bits-1) on that is the same modulo 2^bits."""
+    """Return the number modulo 2^bits, from -2^(bits-1) on."""
     half = 1 << bits - 1
     return (number + half) % (1 << bits) - half
 

@@ -1,93 +1,101 @@
-"""Beacons and replies of the superframe as bytes, without their code.
+"""Beacons and replies of the superframe as bytes, without their authentication code. Sans-I/O.
 
-A message has one form in bytes only. What would be encoded in another way is refused, so that no bit of a packet is
-without meaning.
-
-Orders as beacons of the superframe say them, and back.
+The encoding is canonical: a message has exactly one form, and decoding rejects every other one, so that no bit of a
+packet is without meaning.
 """
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from tsgt.errors import MessageError
-from tsgt.radio.commands import Direction, DirectOrder, MeasureOrder, SearchOrder, TrackOrder
+from tsgt.radio.commands import DirectCommand, Direction, MeasureCommand, SearchCommand, TrackCommand
 from tsgt.radio.superframe.wire.authentication import CODE_BYTES
 from tsgt.radio.superframe.wire.bits import BitReader, BitWriter
 from tsgt.radio.superframe.wire.block_codec import (
     VALUE_BITS,
+    put_block,
     put_newest,
-    put_run,
     put_status,
     put_values,
+    take_block,
     take_newest,
-    take_run,
     take_status,
     take_values,
 )
 from tsgt.radio.superframe.wire.messages import (
-    MOST_STATIONS,
+    MAX_STATIONS,
     SINGLE_QUALITY,
-    TURN_ROUND_BITS,
+    TURNAROUND_BITS,
     VERSION,
-    AnswerPart,
     Beacon,
-    Confirmation,
-    Introduction,
-    OrderPart,
+    CommandResponse,
+    EncodedCommand,
+    EncodedDirection,
+    JoinConfirmation,
+    JoinRequest,
+    MeasurementBlock,
     Reply,
-    Run,
-    SessionPart,
-    ShotPart,
+    SessionInfo,
+    SingleMeasurement,
     SlotOrder,
-    StatePart,
     StationEntry,
-    Towards,
+    StatusReport,
 )
 
 if TYPE_CHECKING:
-    from tsgt.radio.commands import Order
+    from tsgt.radio.commands import Command
 
 _VERSION_BITS = 2
 _BEACON_BYTES = 5
 _PADDING_BITS = 8
 
-_SINGLE, _RUNS, _EXTENDED = range(3)
-_END, _SESSION, _CONFIRMATION, _ORDER = range(4)
-_ORDERS = 5
-_TRACK, _SEARCH_TOWARDS = 0, 4
+_SINGLE, _BLOCKS, _EXTENDED = range(3)
+_END, _SESSION, _CONFIRMATION, _COMMAND = range(4)
+_TRACK, _SEARCH, _DIRECT, _MEASURE, _SEARCH_TOWARDS = _COMMAND_CODES = range(5)
+
+_SESSION_FIELDS = {"nonce": 48, "counter_high": 16, "sent_high": 24, "guard": 8, "turnaround": 8}
+_JOIN_FIELDS = {"nonce": 32, "stream_id": 16, "first_sequence": 32, "oldest": 32}
+"""Fields of a message part in their order, with their widths in bits."""
 
 _FULL_CIRCLE = 1 << VALUE_BITS
-_LONGEST = (1 << VALUE_BITS) - 1
+_COMMAND_CIRCLE = 1 << 16
+_MAX_DISTANCE = (1 << VALUE_BITS) - 1
 _NEAR_UNITS_PER_M = 10_000
 _FAR_UNITS_PER_M = 1_000
 
+MIN_SPREAD_RAD = math.radians(0.25)
+MAX_SPREAD_CODE = 15
+_ROUNDING_RAD = math.hypot(0.5, 0.5) * math.tau / _COMMAND_CIRCLE
+
+# --- Beacons ----------------------------------------------------------------------------------------------------------
+
 
 def encode_beacon(beacon: Beacon) -> bytes:
-    """Return the content of a beacon, without code.
+    """Return the content of a beacon.
 
     Raises
     ------
     MessageError
-        A number does not go into its field.
+        A number does not fit its field.
     """
     stations = len(beacon.stations)
-    if not 1 <= stations <= MOST_STATIONS:
-        raise MessageError(f"a beacon speaks to 1 to {MOST_STATIONS} stations, got {stations}")
-    extended = beacon.session is not None or bool(beacon.confirmations) or bool(beacon.orders)
+    if not 1 <= stations <= MAX_STATIONS:
+        raise MessageError(f"a beacon addresses 1 to {MAX_STATIONS} stations, got {stations}")
+    extended = beacon.session is not None or bool(beacon.confirmations) or bool(beacon.commands)
     writer = BitWriter()
     writer.put(VERSION, _VERSION_BITS)
     writer.put(beacon.frame, 8)
     writer.put(extended, 1)
     writer.put(beacon.sent, 16)
     writer.put(beacon.cumulative, 8)
-    writer.put(beacon.order.reverse, 1)
-    writer.put(beacon.order.first, 4)
+    writer.put(beacon.slot_order.reverse, 1)
+    writer.put(beacon.slot_order.first, 4)
     if extended:
         writer.put(stations - 1, 4)
     for entry in beacon.stations:
-        writer.put(entry.history, 4)
+        writer.put(entry.ack_bitmap, 4)
         writer.put(entry.grant, 4)
     if extended:
         _put_items(writer, beacon)
@@ -100,7 +108,7 @@ def decode_beacon(content: bytes) -> Beacon:
     Raises
     ------
     MessageError
-        It is none that :func:`encode_beacon` would return.
+        :func:`encode_beacon` returns this content for no beacon.
     """
     reader = BitReader(content)
     _take_version(reader)
@@ -110,61 +118,112 @@ def decode_beacon(content: bytes) -> Beacon:
     reverse, first = bool(reader.take(1)), reader.take(4)
     stations = reader.take(4) + 1 if extended else len(content) - _BEACON_BYTES
     entries = tuple(StationEntry(reader.take(4), reader.take(4)) for _ in range(stations))
-    session: SessionPart | None = None
-    confirmations: list[Confirmation] = []
-    orders: list[OrderPart] = []
+    session: SessionInfo | None = None
+    confirmations: list[JoinConfirmation] = []
+    commands: list[EncodedCommand] = []
     while extended and (item := reader.take(2)) != _END:
         if item == _SESSION:
-            session = SessionPart(
-                nonce=reader.take(48),
-                counter_high=reader.take(16),
-                sent_high=reader.take(24),
-                guard=reader.take(8),
-                turn_round=reader.take(8),
-            )
+            session = SessionInfo(**_take_fields(reader, _SESSION_FIELDS))
         elif item == _CONFIRMATION:
-            confirmations.append(Confirmation(reader.take(4) + 1, reader.take(32)))
+            confirmations.append(JoinConfirmation(reader.take(4) + 1, reader.take(32)))
         else:
-            orders.append(_take_order(reader))
+            commands.append(_take_command(reader))
     beacon = Beacon(
         frame=frame,
         sent=sent,
         cumulative=cumulative,
-        order=SlotOrder(first, reverse),
+        slot_order=SlotOrder(first, reverse),
         stations=entries,
         session=session,
         confirmations=tuple(confirmations),
-        orders=tuple(orders),
+        commands=tuple(commands),
     )
-    _refuse_other_forms(encode_beacon(beacon), content)
+    _require_canonical(encode_beacon(beacon), content)
     return beacon
 
 
-def encode_reply(reply: Reply) -> bytes:
-    """Return the content of a reply, without code, in the shortest form that holds it.
+def _put_items(writer: BitWriter, beacon: Beacon) -> None:
+    if beacon.session is not None:
+        writer.put(_SESSION, 2)
+        sent = {} if beacon.sent else {"sent_high": 0}
+        _put_fields(writer, beacon.session, _SESSION_FIELDS, **sent)
+    for confirmation in beacon.confirmations:
+        writer.put(_CONFIRMATION, 2)
+        _put_station(writer, confirmation.station, beacon)
+        writer.put(confirmation.nonce, 32)
+    for command in beacon.commands:
+        _check_command(command)
+        writer.put(_COMMAND, 2)
+        _put_station(writer, command.station, beacon)
+        writer.put(command.command_id, 4)
+        writer.put(command.code, 4)
+        writer.put(command.argument, 4)
+        if command.towards is not None:
+            writer.put(command.towards.horizontal, 16)
+            writer.put(command.towards.zenith, 16)
+    writer.put(_END, 2)
 
-    A single plain measurement of a quality better than :data:`SINGLE_QUALITY` comes back with that one.
+
+def _check_command(command: EncodedCommand) -> None:
+    has_argument = command.argument and command.code not in (_TRACK, _SEARCH_TOWARDS)
+    has_direction = command.towards is not None
+    if (
+        command.code not in _COMMAND_CODES
+        or has_argument
+        or has_direction != (command.code == _SEARCH_TOWARDS)
+    ):
+        direction = "a direction" if has_direction else "no direction"
+        raise MessageError(
+            f"there is no command {command.code} with argument {command.argument} and {direction}"
+        )
+
+
+def _take_command(reader: BitReader) -> EncodedCommand:
+    station, command_id, code, argument = reader.take(4) + 1, reader.take(4), reader.take(4), reader.take(4)
+    towards = EncodedDirection(reader.take(16), reader.take(16)) if code == _SEARCH_TOWARDS else None
+    return EncodedCommand(station, command_id, code, argument, towards)
+
+
+def _put_station(writer: BitWriter, station: int, beacon: Beacon) -> None:
+    if not 1 <= station <= len(beacon.stations):
+        raise MessageError(f"a beacon to {len(beacon.stations)} stations addresses station {station}")
+    writer.put(station - 1, 4)
+
+
+# --- Replies ----------------------------------------------------------------------------------------------------------
+
+
+def encode_reply(reply: Reply) -> bytes:
+    """Return the content of a reply in its shortest form.
+
+    A single plain measurement of a quality better than :data:`SINGLE_QUALITY` is decoded with that quality.
 
     Raises
     ------
     MessageError
-        A number does not go into its field, or a run is none.
+        A number does not fit its field, or a block is invalid.
     """
     writer = BitWriter()
     writer.put(VERSION, _VERSION_BITS)
-    parts = (reply.introduction, reply.state, reply.turn_round_us, reply.answer, reply.shot)
+    parts = (
+        reply.join_request,
+        reply.status_report,
+        reply.turnaround_us,
+        reply.response,
+        reply.single_measurement,
+    )
     extended = any(part is not None for part in parts)
-    if not extended and len(reply.runs) == 1 and _is_single(reply.runs[0]):
+    if not extended and len(reply.blocks) == 1 and _is_single(reply.blocks[0]):
         writer.put(_SINGLE, 2)
-        put_newest(writer, reply.runs[0].sightings[0], wide=False)
+        put_newest(writer, reply.blocks[0].measurements[0], wide=False)
         return writer.to_bytes()
-    writer.put(_EXTENDED if extended else _RUNS, 2)
+    writer.put(_EXTENDED if extended else _BLOCKS, 2)
     if extended:
         for part in parts:
             writer.put(part is not None, 1)
         _put_parts(writer, reply)
-    for run in reply.runs:
-        put_run(writer, run)
+    for block in reply.blocks:
+        put_block(writer, block)
     return writer.to_bytes()
 
 
@@ -174,58 +233,206 @@ def decode_reply(content: bytes) -> Reply:
     Raises
     ------
     MessageError
-        It is none that :func:`encode_reply` would return.
+        :func:`encode_reply` returns this content for no reply.
     """
     reader = BitReader(content)
     _take_version(reader)
     form = reader.take(2)
     if form == _SINGLE:
-        reply = Reply(runs=(Run(sightings=(take_newest(reader, wide=False),)),))
-    elif form == _RUNS:
-        reply = Reply(runs=_take_runs(reader))
+        reply = Reply(blocks=(MeasurementBlock(measurements=(take_newest(reader, wide=False),)),))
+    elif form == _BLOCKS:
+        reply = Reply(blocks=_take_blocks(reader))
     elif form == _EXTENDED:
         reply = _take_extended(reader)
     else:
         raise MessageError(f"there is no reply of form {form}")
-    _refuse_other_forms(encode_reply(reply), content)
+    _require_canonical(encode_reply(reply), content)
     return reply
 
 
 def reply_bytes(reply: Reply) -> int:
-    """Return how long a reply is on the air, code and all, in bytes."""
+    """Return the length of a reply in bytes, authentication code included."""
     return len(encode_reply(reply)) + CODE_BYTES
 
 
+def _is_single(block: MeasurementBlock) -> bool:
+    plain = not (block.beacon_relative or block.wide or block.far or block.prism is not None)
+    return plain and len(block.measurements) == 1 and block.quality <= SINGLE_QUALITY
+
+
+def _put_parts(writer: BitWriter, reply: Reply) -> None:
+    report, response, single = reply.status_report, reply.response, reply.single_measurement
+    if reply.join_request is not None:
+        _put_fields(writer, reply.join_request, _JOIN_FIELDS)
+    if report is not None:
+        writer.put(report.prism - 1, 4)
+        writer.put(report.direct, 1)
+        writer.put(report.connected, 1)
+        writer.put(report.missed_slots, 8)
+        writer.put(report.rejected_beacons, 4)
+        writer.put(-report.rssi_dbm, 7)
+    if reply.turnaround_us is not None:
+        writer.put(reply.turnaround_us, TURNAROUND_BITS)
+    if response is not None:
+        writer.put(response.command_id, 4)
+        writer.put(response.ok, 1)
+    if single is not None:
+        writer.put(single.command_id, 4)
+        put_status(writer, single.status)
+        put_values(writer, single.horizontal, single.zenith, single.distance)
+
+
+def _take_extended(reader: BitReader) -> Reply:
+    joins, reports, has_turnaround, responds, has_single = (reader.take(1) for _ in range(5))
+    # Keyword arguments are evaluated in this order, which is that of the fields.
+    return Reply(
+        join_request=JoinRequest(**_take_fields(reader, _JOIN_FIELDS)) if joins else None,
+        status_report=_take_status_report(reader) if reports else None,
+        turnaround_us=reader.take(TURNAROUND_BITS) if has_turnaround else None,
+        response=CommandResponse(reader.take(4), bool(reader.take(1))) if responds else None,
+        single_measurement=(
+            SingleMeasurement(reader.take(4), take_status(reader), *take_values(reader))
+            if has_single
+            else None
+        ),
+        blocks=_take_blocks(reader),
+    )
+
+
+def _take_status_report(reader: BitReader) -> StatusReport:
+    return StatusReport(
+        prism=reader.take(4) + 1,
+        direct=bool(reader.take(1)),
+        connected=bool(reader.take(1)),
+        missed_slots=reader.take(8),
+        rejected_beacons=reader.take(4),
+        rssi_dbm=-reader.take(7),
+    )
+
+
+def _take_blocks(reader: BitReader) -> tuple[MeasurementBlock, ...]:
+    """Read blocks until less than a byte is left: only padding."""
+    blocks = []
+    while reader.remaining >= _PADDING_BITS:
+        blocks.append(take_block(reader))
+    return tuple(blocks)
+
+
+# --- Commands ---------------------------------------------------------------------------------------------------------
+
+
+def spread_rad(code: int) -> float:
+    """Return the search half-width of a code 0 to 15, in rad: 0.25 degrees, doubled every two steps."""
+    return MIN_SPREAD_RAD * math.exp2(code / 2)
+
+
+def encode_command(station: int, command_id: int, command: Command, tracked: int) -> EncodedCommand:
+    """Return a command as a beacon carries it.
+
+    Parameters
+    ----------
+    station
+        1 to 16.
+    command_id
+        4 bits.
+    command
+        The spread of a direction is increased by the rounding of its angles, and limited to 45 degrees.
+    tracked
+        Prism, 1 to 16, of a :class:`~tsgt.radio.commands.TrackCommand` that names none.
+    """
+    match command:
+        case TrackCommand(prism):
+            return EncodedCommand(station, command_id, _TRACK, (prism or tracked) - 1)
+        case SearchCommand(towards):
+            if towards is None:
+                return EncodedCommand(station, command_id, _SEARCH)
+            spread = _spread_code(towards.spread_rad + _ROUNDING_RAD)
+            direction = EncodedDirection(
+                _encode_angle(towards.horizontal_angle_rad, _COMMAND_CIRCLE),
+                _encode_angle(towards.zenith_angle_rad, _COMMAND_CIRCLE),
+            )
+            return EncodedCommand(station, command_id, _SEARCH_TOWARDS, spread, direction)
+        case DirectCommand():
+            return EncodedCommand(station, command_id, _DIRECT)
+        case MeasureCommand():
+            return EncodedCommand(station, command_id, _MEASURE)
+
+
+def decode_command(encoded: EncodedCommand) -> Command:
+    """Return the command of a decoded beacon."""
+    if encoded.towards is not None:
+        return SearchCommand(
+            Direction(
+                horizontal_angle_rad=_decode_angle(encoded.towards.horizontal, _COMMAND_CIRCLE),
+                zenith_angle_rad=_decode_angle(encoded.towards.zenith, _COMMAND_CIRCLE),
+                spread_rad=spread_rad(encoded.argument),
+            )
+        )
+    match encoded.code:
+        case 0:
+            return TrackCommand(encoded.argument + 1)
+        case 1:
+            return SearchCommand()
+        case 2:
+            return DirectCommand()
+        case _:  # decode_beacon rejects codes above 4
+            return MeasureCommand()
+
+
+def _spread_code(spread_rad: float) -> int:
+    steps = math.ceil(2 * math.log2(max(spread_rad, MIN_SPREAD_RAD) / MIN_SPREAD_RAD))
+    return min(steps, MAX_SPREAD_CODE)
+
+
+# --- Angles, distances, fields ----------------------------------------------------------------------------------------
+
+
 def angle_code(angle_rad: float) -> int:
-    """Return an angle as it goes over the air: in 2 pi / 2^24, 0 to 2^24 - 1."""
-    return round(angle_rad / math.tau * _FULL_CIRCLE) % _FULL_CIRCLE
+    """Return an angle in units of 2 pi / 2^24, 0 to 2^24 - 1."""
+    return _encode_angle(angle_rad, _FULL_CIRCLE)
 
 
 def angle_rad(code: int) -> float:
-    """Return an angle in rad, from 0 to below 2 pi."""
-    return code * math.tau / _FULL_CIRCLE
+    """Return the angle of a code in rad, 0 <= angle < 2 pi."""
+    return _decode_angle(code, _FULL_CIRCLE)
 
 
 def is_far(distance_m: float | None) -> bool:
-    """Whether a slope distance needs a far run: from 1677.7 m on."""
-    return distance_m is not None and round(distance_m * _NEAR_UNITS_PER_M) > _LONGEST
+    """Whether a slope distance needs a far block: from 1677.7 m on."""
+    return distance_m is not None and round(distance_m * _NEAR_UNITS_PER_M) > _MAX_DISTANCE
 
 
 def distance_code(distance_m: float | None, *, far: bool) -> int | None:
-    """Return a slope distance as it goes over the air: in 0.1 mm, or 1 mm in a far run.
+    """Return a slope distance in units of 0.1 mm, or 1 mm in a far block.
 
-    None where there is none, or none that fits: nothing below one unit and, near, nothing for which :func:`is_far`
-    holds, far, nothing above 16.7 km.
+    None without a distance, below one unit, and above 1677.7 m, or 16.7 km in a far block.
     """
     if distance_m is None:
         return None
     code = round(distance_m * (_FAR_UNITS_PER_M if far else _NEAR_UNITS_PER_M))
-    return code if 0 < code <= _LONGEST else None
+    return code if 0 < code <= _MAX_DISTANCE else None
 
 
 def distance_m(code: int | None, *, far: bool) -> float | None:
-    """Return a slope distance in m."""
+    """Return the slope distance of a code in m."""
     return None if code is None else code / (_FAR_UNITS_PER_M if far else _NEAR_UNITS_PER_M)
+
+
+def _encode_angle(angle_rad: float, circle: int) -> int:
+    return round(angle_rad / math.tau * circle) % circle
+
+
+def _decode_angle(code: int, circle: int) -> float:
+    return code * math.tau / circle
+
+
+def _put_fields(writer: BitWriter, part: object, widths: dict[str, int], **replaced: int) -> None:
+    for name, width in widths.items():
+        writer.put(replaced.get(name, getattr(part, name)), width)
+
+
+def _take_fields(reader: BitReader, widths: dict[str, int]) -> dict[str, Any]:
+    return {name: reader.take(width) for name, width in widths.items()}
 
 
 def _take_version(reader: BitReader) -> None:
@@ -234,204 +441,7 @@ def _take_version(reader: BitReader) -> None:
         raise MessageError(f"the message has version {version} of the protocol, expected {VERSION}")
 
 
-def _refuse_other_forms(canonical: bytes, content: bytes) -> None:
-    """Refuse padding that is not zero, items in another order, numbers in a wider field than they need, and so on."""
+def _require_canonical(canonical: bytes, content: bytes) -> None:
+    """Reject non-zero padding, items in another order, fields wider than necessary and the like."""
     if canonical != content:
-        raise MessageError("the message is not in the form in which it would be sent")
-
-
-def _put_items(writer: BitWriter, beacon: Beacon) -> None:
-    session = beacon.session
-    if session is not None:
-        writer.put(_SESSION, 2)
-        writer.put(session.nonce, 48)
-        writer.put(session.counter_high, 16)
-        writer.put(session.sent_high if beacon.sent else 0, 24)
-        writer.put(session.guard, 8)
-        writer.put(session.turn_round, 8)
-    for confirmation in beacon.confirmations:
-        writer.put(_CONFIRMATION, 2)
-        _put_station(writer, confirmation.station, beacon)
-        writer.put(confirmation.nonce, 32)
-    for order in beacon.orders:
-        _refuse_no_order(order)
-        writer.put(_ORDER, 2)
-        _put_station(writer, order.station, beacon)
-        writer.put(order.ticket, 4)
-        writer.put(order.order, 4)
-        writer.put(order.argument, 4)
-        if order.towards is not None:
-            writer.put(order.towards.horizontal, 16)
-            writer.put(order.towards.zenith, 16)
-    writer.put(_END, 2)
-
-
-def _refuse_no_order(part: OrderPart) -> None:
-    argued = part.argument and part.order not in (_TRACK, _SEARCH_TOWARDS)
-    directed = part.towards is not None
-    if part.order >= _ORDERS or argued or directed != (part.order == _SEARCH_TOWARDS):
-        kind = "a direction" if directed else "no direction"
-        raise MessageError(f"there is no order {part.order} with argument {part.argument} and {kind}")
-
-
-def _take_order(reader: BitReader) -> OrderPart:
-    station, ticket, order, argument = reader.take(4) + 1, reader.take(4), reader.take(4), reader.take(4)
-    towards = Towards(reader.take(16), reader.take(16)) if order == _SEARCH_TOWARDS else None
-    return OrderPart(station, ticket, order, argument, towards)
-
-
-def _put_station(writer: BitWriter, station: int, beacon: Beacon) -> None:
-    if not 1 <= station <= len(beacon.stations):
-        raise MessageError(f"a beacon to {len(beacon.stations)} stations says something to station {station}")
-    writer.put(station - 1, 4)
-
-
-def _is_single(run: Run) -> bool:
-    plain = not (run.direct or run.wide or run.far or run.prism is not None)
-    return plain and len(run.sightings) == 1 and run.quality <= SINGLE_QUALITY
-
-
-def _put_parts(writer: BitWriter, reply: Reply) -> None:
-    introduction, state, answer, shot = reply.introduction, reply.state, reply.answer, reply.shot
-    if introduction is not None:
-        writer.put(introduction.nonce, 32)
-        writer.put(introduction.lineage, 16)
-        writer.put(introduction.run_start, 32)
-        writer.put(introduction.oldest, 32)
-    if state is not None:
-        writer.put(state.prism - 1, 4)
-        writer.put(state.direct, 1)
-        writer.put(state.connected, 1)
-        writer.put(state.late, 8)
-        writer.put(state.doubted, 4)
-        writer.put(-state.rssi_dbm, 7)
-    if reply.turn_round_us is not None:
-        writer.put(reply.turn_round_us, TURN_ROUND_BITS)
-    if answer is not None:
-        writer.put(answer.ticket, 4)
-        writer.put(answer.ok, 1)
-    if shot is not None:
-        writer.put(shot.ticket, 4)
-        put_status(writer, shot.status)
-        put_values(writer, shot.horizontal, shot.zenith, shot.distance)
-
-
-def _take_extended(reader: BitReader) -> Reply:
-    introduced, stated, timed, answered, shot = (reader.take(1) for _ in range(5))
-    # The parts are read in the order in which they stand here.
-    return Reply(
-        introduction=_take_introduction(reader) if introduced else None,
-        state=_take_state(reader) if stated else None,
-        turn_round_us=reader.take(TURN_ROUND_BITS) if timed else None,
-        answer=AnswerPart(reader.take(4), bool(reader.take(1))) if answered else None,
-        shot=_take_shot(reader) if shot else None,
-        runs=_take_runs(reader),
-    )
-
-
-def _take_introduction(reader: BitReader) -> Introduction:
-    return Introduction(
-        nonce=reader.take(32),
-        lineage=reader.take(16),
-        run_start=reader.take(32),
-        oldest=reader.take(32),
-    )
-
-
-def _take_state(reader: BitReader) -> StatePart:
-    return StatePart(
-        prism=reader.take(4) + 1,
-        direct=bool(reader.take(1)),
-        connected=bool(reader.take(1)),
-        late=reader.take(8),
-        doubted=reader.take(4),
-        rssi_dbm=-reader.take(7),
-    )
-
-
-def _take_shot(reader: BitReader) -> ShotPart:
-    return ShotPart(reader.take(4), take_status(reader), *take_values(reader))
-
-
-def _take_runs(reader: BitReader) -> tuple[Run, ...]:
-    """Take runs until less than a byte is left, which no run fits into."""
-    runs = []
-    while reader.remaining >= _PADDING_BITS:
-        runs.append(take_run(reader))
-    return tuple(runs)
-
-
-NARROWEST_RAD = math.radians(0.25)
-WIDEST_CODE = 15
-
-_COMMAND_CIRCLE = 1 << 16
-_ROUNDING_RAD = math.hypot(0.5, 0.5) * math.tau / _COMMAND_CIRCLE
-
-
-def spread_rad(code: int) -> float:
-    """Return how wide a search of this code, 0 to 15, is to every side, in rad: 0.25 degrees, doubled every two steps."""
-    return NARROWEST_RAD * math.exp2(code / 2)
-
-
-def order_part(station: int, ticket: int, order: Order, tracked: int) -> OrderPart:
-    """Return an order as a beacon says it.
-
-    Parameters
-    ----------
-    station
-        Number of the station, 1 to 16.
-    ticket
-        4 bits.
-    order
-        What it is to do. A direction is rounded and its spread made wider, so that it covers at least what it did; but
-        not beyond the widest that can be said, 45 degrees.
-    tracked
-        Number of the prism, 1 to 16, that a :class:`~tsgt.radio.commands.TrackOrder` without a prism means.
-    """
-    match order:
-        case TrackOrder(prism):
-            return OrderPart(station, ticket, 0, (prism or tracked) - 1)
-        case SearchOrder(towards):
-            if towards is None:
-                return OrderPart(station, ticket, 1)
-            spread = _spread_code(towards.spread_rad + _ROUNDING_RAD)
-            angles = _angle_code(towards.horizontal_angle_rad), _angle_code(towards.zenith_angle_rad)
-            return OrderPart(station, ticket, 4, spread, Towards(*angles))
-        case DirectOrder():
-            return OrderPart(station, ticket, 2)
-        case MeasureOrder():
-            return OrderPart(station, ticket, 3)
-
-
-def order_of(part: OrderPart) -> Order:
-    """Return the order that a beacon says."""
-    if part.towards is not None:
-        return SearchOrder(
-            Direction(
-                horizontal_angle_rad=_angle_rad(part.towards.horizontal),
-                zenith_angle_rad=_angle_rad(part.towards.zenith),
-                spread_rad=spread_rad(part.argument),
-            )
-        )
-    match part.order:
-        case 0:
-            return TrackOrder(part.argument + 1)
-        case 1:
-            return SearchOrder()
-        case 2:
-            return DirectOrder()
-        case _:  # the message codec lets no other through
-            return MeasureOrder()
-
-
-def _spread_code(spread_rad: float) -> int:
-    steps = math.ceil(2 * math.log2(max(spread_rad, NARROWEST_RAD) / NARROWEST_RAD))
-    return min(steps, WIDEST_CODE)
-
-
-def _angle_code(angle_rad: float) -> int:
-    return round(angle_rad / math.tau * _COMMAND_CIRCLE) % _COMMAND_CIRCLE
-
-
-def _angle_rad(code: int) -> float:
-    return code * math.tau / _COMMAND_CIRCLE
+        raise MessageError("the message is not in canonical form")

@@ -9,19 +9,20 @@ from tsgt.errors import MessageError
 from tsgt.model import Status
 from tsgt.radio.superframe.wire import (
     GRANT_BYTES,
-    AnswerPart,
     Beacon,
-    Confirmation,
-    Introduction,
-    OrderPart,
+    CommandResponse,
+    EncodedCommand,
+    EncodedDirection,
+    EncodedMeasurement,
+    JoinConfirmation,
+    JoinRequest,
+    MeasurementBlock,
     Reply,
-    Run,
-    SessionPart,
-    ShotPart,
-    Sighting,
+    SessionInfo,
+    SingleMeasurement,
     SlotOrder,
-    StatePart,
     StationEntry,
+    StatusReport,
     angle_code,
     angle_rad,
     decode_beacon,
@@ -34,34 +35,35 @@ from tsgt.radio.superframe.wire import (
     reply_bytes,
 )
 from tsgt.radio.superframe.wire.bits import BitReader, BitWriter
-from tsgt.radio.superframe.wire.messages import Towards
 
-SIGHTING = Sighting(200, 100_000, Status.OK, 5_000_000, 4_194_304, 750_000)
-SINGLE = Reply(runs=(Run(sightings=(SIGHTING,)),))
-INTRODUCTION = Introduction(nonce=0x89ABCDEF, lineage=0x1234, run_start=2**32 - 1, oldest=2**32 - 1)
-STATE = StatePart(prism=16, direct=True, connected=True, late=255, doubted=15, rssi_dbm=-127)
-SESSION = SessionPart(nonce=2**48 - 1, counter_high=1, sent_high=2, guard=3, turn_round=4)
+SIGHTING = EncodedMeasurement(200, 100_000, Status.OK, 5_000_000, 4_194_304, 750_000)
+SINGLE = Reply(blocks=(MeasurementBlock(measurements=(SIGHTING,)),))
+INTRODUCTION = JoinRequest(nonce=0x89ABCDEF, stream_id=0x1234, first_sequence=2**32 - 1, oldest=2**32 - 1)
+STATE = StatusReport(
+    prism=16, direct=True, connected=True, missed_slots=255, rejected_beacons=15, rssi_dbm=-127
+)
+SESSION = SessionInfo(nonce=2**48 - 1, counter_high=1, sent_high=2, guard=3, turnaround=4)
 
 BEACON = Beacon(
     frame=0xA5,
     sent=0x1234,
     cumulative=0x56,
-    order=SlotOrder(first=2, reverse=True),
+    slot_order=SlotOrder(first=2, reverse=True),
     stations=(StationEntry(0xF, 2), StationEntry(0, 15), StationEntry(5, 0)),
 )
 
 
-def robot(count: int) -> Run:
+def robot(count: int) -> MeasurementBlock:
     """Return measurements of a robot at 75 m that drives at 1.5 m/s at 45 degrees to the line of sight."""
-    sightings = []
+    measurements = []
     for k in range(count):
         ahead_m, aside_m = 75.0 - 0.424 * k, 0.424 * k
         direction = (angle_code(1.0 + math.atan2(aside_m, ahead_m)), angle_code(1.55 + 2e-4 * k))
         distance = distance_code(math.hypot(ahead_m, aside_m), far=False)
-        sightings.append(
-            Sighting(200 - k, 100_000 - 25_000 * k - k % 3 * 30, Status.OK, *direction, distance)
+        measurements.append(
+            EncodedMeasurement(200 - k, 100_000 - 25_000 * k - k % 3 * 30, Status.OK, *direction, distance)
         )
-    return Run(sightings=tuple(sightings))
+    return MeasurementBlock(measurements=tuple(measurements))
 
 
 # --- Sizes -------------------------------------------------------------------------------------------------------
@@ -88,13 +90,15 @@ def test_one_measurement_takes_thirteen_bytes() -> None:
 @pytest.mark.parametrize(("count", "length"), [(2, 26), (3, 33), (4, 39), (8, 62)])
 def test_measurements_of_a_moving_robot_share_their_bits(count: int, length: int) -> None:
     """Each further one costs about eight bytes instead of thirteen."""
-    assert reply_bytes(Reply(runs=(robot(count),))) <= length
+    assert reply_bytes(Reply(blocks=(robot(count),))) <= length
 
 
 def test_a_station_that_joins_can_send_a_measurement_at_once() -> None:
     """Introduction, state and a measurement with everything that can be said of it fit the grant of 44 bytes."""
-    run = Run(sightings=(SIGHTING,), direct=True, quality=15, wide=True, prism=16, far=True)
-    assert reply_bytes(Reply(introduction=INTRODUCTION, state=STATE, runs=(run,))) <= 44
+    run = MeasurementBlock(
+        measurements=(SIGHTING,), beacon_relative=True, quality=15, wide=True, prism=16, far=True
+    )
+    assert reply_bytes(Reply(join_request=INTRODUCTION, status_report=STATE, blocks=(run,))) <= 44
 
 
 # --- What comes back ---------------------------------------------------------------------------------------------
@@ -106,9 +110,14 @@ def test_a_station_that_joins_can_send_a_measurement_at_once() -> None:
         BEACON,
         replace(BEACON, stations=(StationEntry(0, 1),) * 16),
         replace(BEACON, session=SESSION),
-        replace(BEACON, confirmations=(Confirmation(3, 2**32 - 1), Confirmation(1, 0))),
-        replace(BEACON, orders=(OrderPart(1, 15, 0, 15), OrderPart(2, 0, 3))),
-        replace(BEACON, session=SESSION, confirmations=(Confirmation(2, 7),), orders=(OrderPart(3, 1, 1),)),
+        replace(BEACON, confirmations=(JoinConfirmation(3, 2**32 - 1), JoinConfirmation(1, 0))),
+        replace(BEACON, commands=(EncodedCommand(1, 15, 0, 15), EncodedCommand(2, 0, 3))),
+        replace(
+            BEACON,
+            session=SESSION,
+            confirmations=(JoinConfirmation(2, 7),),
+            commands=(EncodedCommand(3, 1, 1),),
+        ),
     ],
 )
 def test_beacons_come_back(beacon: Beacon) -> None:
@@ -122,14 +131,25 @@ def test_beacons_come_back(beacon: Beacon) -> None:
         Reply(),
         SINGLE,
         Reply(
-            runs=(robot(16), replace(robot(2), direct=True, quality=0), Run(sightings=(SIGHTING,), far=True))
+            blocks=(
+                robot(16),
+                replace(robot(2), beacon_relative=True, quality=0),
+                MeasurementBlock(measurements=(SIGHTING,), far=True),
+            )
         ),
         Reply(
-            introduction=INTRODUCTION, state=STATE, turn_round_us=2**22 - 1, answer=AnswerPart(15, ok=True)
+            join_request=INTRODUCTION,
+            status_report=STATE,
+            turnaround_us=2**22 - 1,
+            response=CommandResponse(15, ok=True),
         ),
-        Reply(state=STATE, shot=ShotPart(9, Status.ERROR, 1, 2**24 - 1, None), runs=SINGLE.runs),
-        Reply(turn_round_us=0),
-        Reply(answer=AnswerPart(0, ok=False)),
+        Reply(
+            status_report=STATE,
+            single_measurement=SingleMeasurement(9, Status.ERROR, 1, 2**24 - 1, None),
+            blocks=SINGLE.blocks,
+        ),
+        Reply(turnaround_us=0),
+        Reply(response=CommandResponse(0, ok=False)),
     ],
 )
 def test_replies_come_back(reply: Reply) -> None:
@@ -146,15 +166,19 @@ def test_a_session_time_of_nothing_has_no_high_bits() -> None:
 @pytest.mark.parametrize(("quality", "back"), [(0, 3), (3, 3), (4, 4)])
 def test_a_plain_single_measurement_claims_what_all_of_them_do(quality: int, back: int) -> None:
     """A better quality is not worth the bits; a worse one is."""
-    reply = decode_reply(encode_reply(Reply(runs=(Run(sightings=(SIGHTING,), quality=quality),))))
-    assert reply.runs[0].quality == back
+    reply = decode_reply(
+        encode_reply(Reply(blocks=(MeasurementBlock(measurements=(SIGHTING,), quality=quality),)))
+    )
+    assert reply.blocks[0].quality == back
 
 
 def test_the_newest_measurement_goes_modulo_its_fields() -> None:
     """Sequence number and time keep their low bits: 8 and 17, or 32 and 36 in a wide run."""
-    sighting = replace(SIGHTING, sequence=2**40 + 300, time=2**40 + 2**20 + 5)
+    measurement = replace(SIGHTING, sequence=2**40 + 300, time=2**40 + 2**20 + 5)
     narrow, wide = (
-        decode_reply(encode_reply(Reply(runs=(Run(sightings=(sighting,), wide=wide),)))).runs[0].sightings[0]
+        decode_reply(encode_reply(Reply(blocks=(MeasurementBlock(measurements=(measurement,), wide=wide),))))
+        .blocks[0]
+        .measurements[0]
         for wide in (False, True)
     )
     assert (narrow.sequence, narrow.time) == (300 - 256, 5)
@@ -163,40 +187,42 @@ def test_the_newest_measurement_goes_modulo_its_fields() -> None:
 
 def test_older_measurements_keep_their_distance_to_the_newest() -> None:
     """However far back they are, over any gap, also below zero."""
-    run = Run(
-        sightings=(
+    run = MeasurementBlock(
+        measurements=(
             SIGHTING,
             replace(SIGHTING, sequence=SIGHTING.sequence - 9_000, time=SIGHTING.time - 225_000_000),
             replace(SIGHTING, sequence=SIGHTING.sequence - 9_001, time=SIGHTING.time - 225_025_000),
         )
     )
-    back = decode_reply(encode_reply(Reply(runs=(run,)))).runs[0]
-    assert back.sightings == run.sightings
-    assert reply_bytes(Reply(runs=(run,))) < 35
+    back = decode_reply(encode_reply(Reply(blocks=(run,)))).blocks[0]
+    assert back.measurements == run.measurements
+    assert reply_bytes(Reply(blocks=(run,))) < 35
 
 
 def test_differences_go_round_the_circle() -> None:
     """From just above 0 to just below a full turn is a small step."""
-    across = Run(
-        sightings=(replace(SIGHTING, horizontal=3), replace(SIGHTING, sequence=199, horizontal=2**24 - 3))
+    across = MeasurementBlock(
+        measurements=(replace(SIGHTING, horizontal=3), replace(SIGHTING, sequence=199, horizontal=2**24 - 3))
     )
-    beside = Run(sightings=(replace(SIGHTING, horizontal=9), replace(SIGHTING, sequence=199, horizontal=3)))
-    assert decode_reply(encode_reply(Reply(runs=(across,)))).runs == (across,)
-    assert reply_bytes(Reply(runs=(across,))) == reply_bytes(Reply(runs=(beside,)))
+    beside = MeasurementBlock(
+        measurements=(replace(SIGHTING, horizontal=9), replace(SIGHTING, sequence=199, horizontal=3))
+    )
+    assert decode_reply(encode_reply(Reply(blocks=(across,)))).blocks == (across,)
+    assert reply_bytes(Reply(blocks=(across,))) == reply_bytes(Reply(blocks=(beside,)))
 
 
 def test_measurements_without_distance_stay_without() -> None:
     """Between measurements that have one, and before them."""
     bare = replace(SIGHTING, status=Status.ANGLE_ONLY, distance=None)
-    run = Run(
-        sightings=(
+    run = MeasurementBlock(
+        measurements=(
             SIGHTING,
             replace(bare, sequence=199, time=75_000),
             replace(bare, sequence=198, time=50_000),
             replace(SIGHTING, sequence=197, time=25_000),
         )
     )
-    assert decode_reply(encode_reply(Reply(runs=(run,)))).runs == (run,)
+    assert decode_reply(encode_reply(Reply(blocks=(run,)))).blocks == (run,)
 
 
 # --- What is refused ---------------------------------------------------------------------------------------------
@@ -209,14 +235,14 @@ def test_measurements_without_distance_stay_without() -> None:
         replace(BEACON, sent=-1),
         replace(BEACON, stations=()),
         replace(BEACON, stations=(StationEntry(0, 0),) * 17),
-        replace(BEACON, confirmations=(Confirmation(4, 0),)),
-        replace(BEACON, orders=(OrderPart(0, 0, 0),)),
-        replace(BEACON, orders=(OrderPart(1, 0, 4),)),
-        replace(BEACON, orders=(OrderPart(1, 0, 5),)),
-        replace(BEACON, orders=(OrderPart(1, 0, 1, 1),)),
-        replace(BEACON, orders=(OrderPart(1, 0, 1, 0, Towards(1, 2)),)),
-        replace(BEACON, orders=(OrderPart(1, 0, 4, 16, Towards(1, 2)),)),
-        replace(BEACON, orders=(OrderPart(1, 0, 4, 0, Towards(2**16, 2)),)),
+        replace(BEACON, confirmations=(JoinConfirmation(4, 0),)),
+        replace(BEACON, commands=(EncodedCommand(0, 0, 0),)),
+        replace(BEACON, commands=(EncodedCommand(1, 0, 4),)),
+        replace(BEACON, commands=(EncodedCommand(1, 0, 5),)),
+        replace(BEACON, commands=(EncodedCommand(1, 0, 1, 1),)),
+        replace(BEACON, commands=(EncodedCommand(1, 0, 1, 0, EncodedDirection(1, 2)),)),
+        replace(BEACON, commands=(EncodedCommand(1, 0, 4, 16, EncodedDirection(1, 2)),)),
+        replace(BEACON, commands=(EncodedCommand(1, 0, 4, 0, EncodedDirection(2**16, 2)),)),
     ],
 )
 def test_beacons_that_do_not_fit_are_refused(beacon: Beacon) -> None:
@@ -228,24 +254,24 @@ def test_beacons_that_do_not_fit_are_refused(beacon: Beacon) -> None:
 @pytest.mark.parametrize(
     "run",
     [
-        Run(sightings=()),
-        Run(sightings=tuple(replace(SIGHTING, sequence=k) for k in range(17, 0, -1))),
-        Run(sightings=(SIGHTING, SIGHTING)),
-        Run(sightings=(SIGHTING, replace(SIGHTING, sequence=201))),
-        Run(sightings=(SIGHTING, replace(SIGHTING, sequence=200 - 2**32))),
-        Run(sightings=(SIGHTING, replace(SIGHTING, sequence=199, time=-(2**36)))),
-        Run(sightings=(SIGHTING,), quality=16),
-        Run(sightings=(SIGHTING,), prism=17),
-        Run(sightings=(replace(SIGHTING, distance=2**24),)),
-        Run(sightings=(replace(SIGHTING, zenith=-1),)),
-        Run(sightings=(SIGHTING, replace(SIGHTING, sequence=199, distance=2**24))),
-        Run(sightings=(SIGHTING, replace(SIGHTING, sequence=199, horizontal=-1))),
+        MeasurementBlock(measurements=()),
+        MeasurementBlock(measurements=tuple(replace(SIGHTING, sequence=k) for k in range(17, 0, -1))),
+        MeasurementBlock(measurements=(SIGHTING, SIGHTING)),
+        MeasurementBlock(measurements=(SIGHTING, replace(SIGHTING, sequence=201))),
+        MeasurementBlock(measurements=(SIGHTING, replace(SIGHTING, sequence=200 - 2**32))),
+        MeasurementBlock(measurements=(SIGHTING, replace(SIGHTING, sequence=199, time=-(2**36)))),
+        MeasurementBlock(measurements=(SIGHTING,), quality=16),
+        MeasurementBlock(measurements=(SIGHTING,), prism=17),
+        MeasurementBlock(measurements=(replace(SIGHTING, distance=2**24),)),
+        MeasurementBlock(measurements=(replace(SIGHTING, zenith=-1),)),
+        MeasurementBlock(measurements=(SIGHTING, replace(SIGHTING, sequence=199, distance=2**24))),
+        MeasurementBlock(measurements=(SIGHTING, replace(SIGHTING, sequence=199, horizontal=-1))),
     ],
 )
-def test_runs_that_do_not_fit_are_refused(run: Run) -> None:
+def test_runs_that_do_not_fit_are_refused(run: MeasurementBlock) -> None:
     """None or too many measurements, not newest first, weeks apart, numbers beyond their fields."""
     with pytest.raises(MessageError):
-        encode_reply(Reply(runs=(run,)))
+        encode_reply(Reply(blocks=(run,)))
 
 
 def _bits(*fields: tuple[int, int]) -> bytes:
@@ -265,13 +291,13 @@ _EXTENDED = ((1, 2), (7, 8), (1, 1), (9, 16), (3, 8), (0, 5), (0, 4), (0x12, 8))
         (b"", "cut off"),
         (_bits(*_PLAIN), "1 to 16 stations, got 0"),
         (_bits((2, 2), *_PLAIN[1:], (0x12, 8)), "version 2"),
-        (_bits(*_EXTENDED, (0, 2)), "not in the form"),
-        (_bits(*_EXTENDED, (3, 2), (0, 4), (0, 4), (0, 4), (0, 4), (0, 2), (1, 1)), "not in the form"),
+        (_bits(*_EXTENDED, (0, 2)), "canonical form"),
+        (_bits(*_EXTENDED, (3, 2), (0, 4), (0, 4), (0, 4), (0, 4), (0, 2), (1, 1)), "canonical form"),
         (_bits(*_EXTENDED, (3, 2), (1, 4), (0, 4), (0, 4), (0, 4), (0, 2)), "station 2"),
         (_bits(*_EXTENDED, (2, 2), (0, 4), (0, 16)), "cut off"),
         (_bits(*_EXTENDED, (3, 2), (0, 4), (0, 4), (4, 4), (0, 4), (0, 16)), "cut off"),
-        (_bits(*_EXTENDED, (3, 2), (0, 4), (0, 4), (5, 4), (0, 4), (0, 2)), "no order 5"),
-        (_bits(*_EXTENDED, (2, 2), (0, 4), (0, 32), (1, 2), *[(0, 8)] * 13, (0, 2)), "not in the form"),
+        (_bits(*_EXTENDED, (3, 2), (0, 4), (0, 4), (5, 4), (0, 4), (0, 2)), "no command 5"),
+        (_bits(*_EXTENDED, (2, 2), (0, 4), (0, 32), (1, 2), *[(0, 8)] * 13, (0, 2)), "canonical form"),
     ],
 )
 def test_foreign_beacons_are_refused(content: bytes, message: str) -> None:
@@ -290,14 +316,14 @@ _RUN = ((3, 4), (0, 1), (1, 4), (200, 8), (100_000, 17), (0, 3), (5, 24), (6, 24
         (b"", "cut off"),
         (_bits((0, 2), (1, 2)), "version 0"),
         (_bits((1, 2), (3, 2)), "form 3"),
-        (_bits(*_HEADER, (1, 4)), "not in the form"),
-        (_bits((1, 2), (2, 2), (0, 5)), "not in the form"),
+        (_bits(*_HEADER, (1, 4)), "canonical form"),
+        (_bits((1, 2), (2, 2), (0, 5)), "canonical form"),
         (_bits((1, 2), (0, 2), (200, 8), (5, 17), (7, 3), (0, 72)), "status 7"),
-        (_bits((1, 2), (0, 2), (200, 8), (5, 17), (0, 3), (0, 72), (0, 8)), "not in the form"),
-        (_bits(*_HEADER, (3, 4), (0, 1), (0, 4), (200, 8), (5, 17), (0, 3), (0, 72)), "not in the form"),
+        (_bits((1, 2), (0, 2), (200, 8), (5, 17), (0, 3), (0, 72), (0, 8)), "canonical form"),
+        (_bits(*_HEADER, (3, 4), (0, 1), (0, 4), (200, 8), (5, 17), (0, 3), (0, 72)), "canonical form"),
         (_bits(*_HEADER, *_RUN, (0, 1), (0, 10), (0, 9), (0, 9)), "cut off"),
-        (_bits(*_HEADER, *_RUN, (0, 1), (1, 2), (0, 12), (0, 9), (0, 9), (0, 10)), "not in the form"),
-        (_bits(*_HEADER, *_RUN, (1, 1), (0, 3), (1, 1), (0, 10), (0, 9), (0, 9), (0, 10)), "not in the form"),
+        (_bits(*_HEADER, *_RUN, (0, 1), (1, 2), (0, 12), (0, 9), (0, 9), (0, 10)), "canonical form"),
+        (_bits(*_HEADER, *_RUN, (1, 1), (0, 3), (1, 1), (0, 10), (0, 9), (0, 9), (0, 10)), "canonical form"),
     ],
 )
 def test_foreign_replies_are_refused(content: bytes, message: str) -> None:

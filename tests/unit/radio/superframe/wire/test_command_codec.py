@@ -6,34 +6,34 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tsgt.radio import Direction, DirectOrder, MeasureOrder, SearchOrder, TrackOrder
-from tsgt.radio.superframe.wire import order_of, order_part
+from tsgt.radio import DirectCommand, Direction, MeasureCommand, SearchCommand, TrackCommand
+from tsgt.radio.superframe.wire import decode_command, encode_command
 from tsgt.radio.superframe.wire.codec import spread_rad
 
 
 @pytest.mark.parametrize(
     "order",
     [
-        TrackOrder(16),
-        SearchOrder(),
-        SearchOrder(Direction(math.pi, 1.5 * math.pi, spread_rad(5))),
-        DirectOrder(),
-        MeasureOrder(),
+        TrackCommand(16),
+        SearchCommand(),
+        SearchCommand(Direction(math.pi, 1.5 * math.pi, spread_rad(5))),
+        DirectCommand(),
+        MeasureCommand(),
     ],
 )
-def test_orders_come_back(order: TrackOrder | SearchOrder | DirectOrder | MeasureOrder) -> None:
+def test_orders_come_back(order: TrackCommand | SearchCommand | DirectCommand | MeasureCommand) -> None:
     """As they were; a direction to within its rounding, which makes the spread one step wider."""
-    part = order_part(3, 9, order, tracked=2)
-    assert (part.station, part.ticket) == (3, 9)
-    back = order_of(part)
-    if isinstance(order, SearchOrder) and order.towards is not None:
-        order = SearchOrder(Direction(math.pi, 1.5 * math.pi, spread_rad(6)))
+    part = encode_command(3, 9, order, tracked=2)
+    assert (part.station, part.command_id) == (3, 9)
+    back = decode_command(part)
+    if isinstance(order, SearchCommand) and order.towards is not None:
+        order = SearchCommand(Direction(math.pi, 1.5 * math.pi, spread_rad(6)))
     assert back == order
 
 
 def test_to_track_without_a_prism_means_the_tracked_one() -> None:
     """A station that knows of another one would otherwise take that."""
-    assert order_of(order_part(1, 0, TrackOrder(None), tracked=7)) == TrackOrder(7)
+    assert decode_command(encode_command(1, 0, TrackCommand(None), tracked=7)) == TrackCommand(7)
 
 
 @given(
@@ -43,10 +43,10 @@ def test_to_track_without_a_prism_means_the_tracked_one() -> None:
 )
 def test_a_direction_covers_what_it_did(horizontal_rad: float, zenith_rad: float, wide_rad: float) -> None:
     """All that was within the spread of the direction is so after its way over the air, and not much more."""
-    order = order_of(
-        order_part(1, 0, SearchOrder(Direction(horizontal_rad, zenith_rad, wide_rad)), tracked=1)
+    order = decode_command(
+        encode_command(1, 0, SearchCommand(Direction(horizontal_rad, zenith_rad, wide_rad)), tracked=1)
     )
-    assert isinstance(order, SearchOrder)
+    assert isinstance(order, SearchCommand)
     back = order.towards
     assert back is not None
     aside = [
@@ -62,7 +62,7 @@ def test_a_direction_covers_what_it_did(horizontal_rad: float, zenith_rad: float
 
 def test_no_spread_is_wider_than_can_be_said() -> None:
     """45 degrees to every side; nobody looks for a prism in more than that."""
-    order = order_of(order_part(1, 0, SearchOrder(Direction(0.0, 1.5, 3.0)), tracked=1))
-    assert isinstance(order, SearchOrder)
+    order = decode_command(encode_command(1, 0, SearchCommand(Direction(0.0, 1.5, 3.0)), tracked=1))
+    assert isinstance(order, SearchCommand)
     assert order.towards is not None
     assert math.degrees(order.towards.spread_rad) == pytest.approx(45.25, abs=0.01)

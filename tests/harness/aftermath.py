@@ -19,14 +19,14 @@ from tsgt.radio.superframe.wire import RESTART_SKIP
 from tsgt.recording import Typed, decode, load_recording
 from tsgt.recording.journal import load_journal
 from tsgt.simulation.checks import Violation
-from tsgt.simulation.checks.invariants import altered, beyond_bound, delivered_twice, misread
-from tsgt.simulation.mission import Measured, Session, StationWitness
+from tsgt.simulation.checks.invariants import journal_mismatches, timestamp_violations, duplicate_deliveries, reading_mismatches
+from tsgt.simulation.mission import JournalIndex, MasterLog, StationLog
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from tsgt.recording.journal import Journal
-    from tsgt.simulation.instrument.geocom import Offered
+    from tsgt.simulation.instrument import ReportedDistance
 
 _HEAD_LINES = 2
 """A file that ends within these, the header and whose it is, holds nothing else."""
@@ -51,7 +51,7 @@ class Found:
 def aftermath(
     recordings: Sequence[Path],
     journals: Mapping[int, Path],
-    offered: Mapping[int, Sequence[Offered]],
+    reported_distances: Mapping[int, Sequence[ReportedDistance]],
     queued: Mapping[int, int],
 ) -> Found:
     """Check what masters and clients of one computer have left, over the protocol superframe.
@@ -69,17 +69,17 @@ def aftermath(
     """
     found = Found([], Counter())
     begun = {path for path in recordings if not _whole(path, "recordings", found)}
-    sessions = [_session(path) for path in sorted(set(recordings) - begun)]
-    recorded = {(m.station, m.sequence) for session in sessions for m in session.measurements}
+    master_logs = [_session(path) for path in sorted(set(recordings) - begun)]
+    recorded = {(m.station, m.sequence) for session in master_logs for m in session.measurements}
     found.counts["measurements recorded"] = len(recorded)
-    for session in sessions:
+    for session in master_logs:
         found.counts["recorded again by a later master"] += len(session.measurements)
-        found.violations += delivered_twice(session)
+        found.violations += duplicate_deliveries(session)
     found.counts["recorded again by a later master"] -= len(recorded)
-    stations: dict[int, Measured] = {}
+    stations: dict[int, JournalIndex] = {}
     for station, folder in journals.items():
         kept = [path for path in sorted(folder.glob("*.jsonl")) if _whole(path, "journals", found)]
-        runs = sorted((load_journal(path) for path in kept), key=lambda journal: journal.head.run_start)
+        runs = sorted((load_journal(path) for path in kept), key=lambda journal: journal.head.first_sequence)
         found.violations += reused(station, runs)
         # One computer has one CLOCK_MONOTONIC.
         stamps_ns = {
@@ -87,11 +87,11 @@ def aftermath(
             for journal in runs
             for m in journal.measurements
         }
-        witness = _Kept(station, folder, offered[station], stamps_ns, kept=kept)
-        measured = stations[station] = Measured(witness)
+        station_log = _Kept(station, folder, reported_distances[station], stamps_ns, kept=kept)
+        measured = stations[station] = JournalIndex(station_log)
         found.counts["measurements journalled"] += len(measured.journalled)
-        found.violations += misread(witness, measured)
-        found.violations += altered(witness, measured, sessions)
+        found.violations += reading_mismatches(station_log, measured)
+        found.violations += journal_mismatches(station_log, measured, master_logs)
         missing = sorted(m.sequence for m in measured.journalled if (station, m.sequence) not in recorded)
         found.counts["still in a queue"] += len(missing)
         if len(missing) > queued[station]:
@@ -102,12 +102,12 @@ def aftermath(
                     f"{queued[station]} were in its queue; the first is number {missing[0]}",
                 )
             )
-    for session in sessions:
+    for session in master_logs:
         found.violations += _mistimed(session, stations)
     return found
 
 
-def _mistimed(session: Session, stations: Mapping[int, Measured]) -> Iterator[Violation]:
+def _mistimed(session: MasterLog, stations: Mapping[int, JournalIndex]) -> Iterator[Violation]:
     """Compare the times of a recording with those of the journals, but for the master's Unix time at the start."""
     apart_ns = [
         m.stamp_ns - true_ns
@@ -115,7 +115,7 @@ def _mistimed(session: Session, stations: Mapping[int, Measured]) -> Iterator[Vi
         if (true_ns := stations[m.station].true_ns(m)) is not None
     ]
     if apart_ns:
-        yield from beyond_bound(session, stations, start_ns=median_low(apart_ns))
+        yield from timestamp_violations(session, stations, start_ns=median_low(apart_ns))
 
 
 def reused(station: int, runs: Sequence[Journal]) -> Iterator[Violation]:
@@ -128,29 +128,29 @@ def reused(station: int, runs: Sequence[Journal]) -> Iterator[Violation]:
     runs
         Its journals, by their first number.
     """
-    lineages = {journal.head.lineage for journal in runs}
-    if len(lineages) > 1:
+    stream_ids = {journal.head.stream_id for journal in runs}
+    if len(stream_ids) > 1:
         yield Violation(
-            "number", f"station {station} has begun to number anew: lineages {sorted(map(str, lineages))}"
+            "number", f"station {station} has begun to number anew: stream_ids {sorted(map(str, stream_ids))}"
         )
     for journal in runs:
         numbers = [m.sequence for m in journal.measurements]
-        first = journal.head.run_start
+        first = journal.head.first_sequence
         if numbers != list(range(first, first + len(numbers))):
             yield Violation(
                 "number", f"station {station}, run from {first}: numbers do not run on: {numbers[:20]} ..."
             )
     for before, after in pairwise(runs):
-        last = max((m.sequence for m in before.measurements), default=before.head.run_start - 1)
-        if after.head.run_start <= last + RESTART_SKIP:
+        last = max((m.sequence for m in before.measurements), default=before.head.first_sequence - 1)
+        if after.head.first_sequence <= last + RESTART_SKIP:
             yield Violation(
                 "number",
-                f"station {station} has begun a run at {after.head.run_start}, after {last} was given in the one before",
+                f"station {station} has begun a run at {after.head.first_sequence}, after {last} was given in the one before",
             )
 
 
 @dataclass(slots=True)
-class _Kept(StationWitness):
+class _Kept(StationLog):
     """Of a folder only the journals that have a head."""
 
     kept: list[Path] = field(default_factory=list)
@@ -161,8 +161,8 @@ class _Kept(StationWitness):
         return self.kept
 
 
-def _session(path: Path) -> Session:
-    session = Session(path.parent, lambda: 0, 0)
+def _session(path: Path) -> MasterLog:
+    session = MasterLog(path.parent, lambda: 0, 0)
     session.measurements += [m for m in load_recording(path).measurements if isinstance(m, PolarMeasurement)]
     return session
 

@@ -9,11 +9,11 @@ import numpy as np
 
 from tsgt.simulation.kernel import VirtualTimeline
 from tsgt.simulation.lora import Air, LinkModel
-from tsgt.simulation.lora.frames import Frame, Header, Listening, Modulation, Reception
+from tsgt.simulation.lora.frames import Frame, Header, ReceiverSettings, Modulation, Reception
 from tsgt.simulation.lora.link import FixedLoss
 
 if TYPE_CHECKING:
-    from tsgt.simulation.lora.frames import Port
+    from tsgt.simulation.lora.frames import AirPort
 
 PAPER = Modulation(
     frequency_hz=905e6,
@@ -43,7 +43,7 @@ def frame(start_symbols: float = 0.0, **changes: Any) -> Frame:
     return Frame(**(settings | changes))
 
 
-def listening(since_symbols: float = 0.0, **changes: Any) -> Listening:
+def listening(since_symbols: float = 0.0, **changes: Any) -> ReceiverSettings:
     """Make a receiver's settings that match :func:`frame`."""
     settings: dict[str, Any] = {
         "modulation": PAPER,
@@ -54,7 +54,7 @@ def listening(since_symbols: float = 0.0, **changes: Any) -> Listening:
         "coding_rate": 6,
         "crc": True,
     }
-    return Listening(**(settings | changes))
+    return ReceiverSettings(**(settings | changes))
 
 
 def modulation(**changes: Any) -> Modulation:
@@ -62,7 +62,7 @@ def modulation(**changes: Any) -> Modulation:
     return replace(PAPER, **changes)
 
 
-class RecordingAntenna:
+class RecordingListener:
     """Writes down what the air tells."""
 
     def __init__(self) -> None:
@@ -100,14 +100,14 @@ class Scene:
         self.timeline = VirtualTimeline()
         self.link = link or LinkModel()
         self.air = Air(self.timeline, np.random.default_rng(seed), self.link)
-        self.antenna = RecordingAntenna()
+        self.antenna = RecordingListener()
         self.rx = self.air.join(self.antenna, "rx")
-        self._senders: dict[str, Port] = {}
+        self._senders: dict[str, AirPort] = {}
 
-    def sender(self, name: str, *, crystal_ppm: float = 0.0) -> Port:
+    def sender(self, name: str, *, crystal_ppm: float = 0.0) -> AirPort:
         """Return the sender of that name."""
         if name not in self._senders:
-            self._senders[name] = self.air.join(RecordingAntenna(), name, crystal_ppm=crystal_ppm)
+            self._senders[name] = self.air.join(RecordingListener(), name, crystal_ppm=crystal_ppm)
         return self._senders[name]
 
     def send(self, sent: Frame, name: str = "tx") -> Frame:

@@ -15,7 +15,7 @@ from tsgt.simulation.lora.modem import ChipTiming
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from tsgt.simulation.lora.frames import Antenna, Listening, Modulation, Port
+    from tsgt.simulation.lora.frames import FrameListener, ReceiverSettings, Modulation, AirPort
 
 PREAMBLE_SYMBOLS_TO_LOCK = 5
 NO_JITTER = ChipTiming(jitter_sigma_ns=0)
@@ -28,15 +28,15 @@ class FakePort:
     """Keeps what the chip sends, and lets it hear what the test sends."""
 
     def __init__(self, timeline: VirtualTimeline) -> None:
-        self.antenna: Antenna
+        self.antenna: FrameListener
         self.frames: list[Frame] = []
         self.stopped_ns: list[int] = []
-        self.listening: Listening | None = None
+        self.listening: ReceiverSettings | None = None
         self.channel_dbm = -110.0
         self.preamble = False
         self._timeline = timeline
 
-    def join(self, antenna: Antenna) -> FakePort:
+    def join(self, antenna: FrameListener) -> FakePort:
         """Be the air that the chip joins."""
         self.antenna = antenna
         return self
@@ -49,7 +49,7 @@ class FakePort:
         """Keep the time."""
         self.stopped_ns.append(at_ns)
 
-    def listen(self, listening: Listening | None) -> None:
+    def listen(self, listening: ReceiverSettings | None) -> None:
         """Keep what it listens to."""
         self.listening = listening
 
@@ -117,7 +117,7 @@ class Bench:
         timing: ChipTiming = NO_JITTER,
         *,
         timeline: VirtualTimeline | None = None,
-        join: Callable[[Antenna], Port] | None = None,
+        join: Callable[[FrameListener], AirPort] | None = None,
     ) -> None:
         self.timeline = timeline or VirtualTimeline()
         self.port = FakePort(self.timeline)

@@ -10,34 +10,36 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from harness.authors_master import AuthorsMaster
 from harness.radios import MS, running_timeline
 from harness.shots import READING, ScriptedInstrument
 
 from tsgt.clock import UnixTimeline
 from tsgt.errors import InstrumentError
-from tsgt.master.classic import Collector
+from tsgt.master.classic import Transport
 from tsgt.model import Status
-from tsgt.radio import LoRaSettings, MeasureOrder
+from tsgt.radio import LoRaSettings, MeasureCommand
 from tsgt.radio.classic import (
-    Command,
+    ClassicStation,
+    CommandMessage,
+    CommandTransaction,
+    LinkTiming,
     MeasurementMessage,
-    Ordered,
     Poll,
-    Shot,
+    SingleMeasurementPoll,
     Synchronisation,
     raw_status,
     status_of,
 )
-from tsgt.radio.classic.transactions import ClassicStation, Timing
 from tsgt.simulation.kernel import DriftingClock, VirtualClock
-from tsgt.simulation.lora import Air, LinkModel, opener
-from tsgt.simulation.mission.authors_node import AUTHORS_STAMP_DELAY_MS, AuthorsMaster, AuthorsNode
+from tsgt.simulation.lora import Air, LinkModel, radio_opener
+from tsgt.simulation.mission.authors_node import AUTHORS_TIMESTAMP_DELAY_MS, AuthorsNode
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Coroutine
 
     from tsgt.radio import Radio
-    from tsgt.radio.classic.station import ClassicOrder
+    from tsgt.radio.classic import ClassicCommand
     from tsgt.station import Reading
 
 SECOND = 1000 * MS
@@ -81,25 +83,25 @@ class Field:
         clock = self.clocks[station] = DriftingClock(self.clock, offset_ns=AHEAD_NS)
         instrument = self.instruments[station] = ScriptedInstrument(clock)
         rng = np.random.default_rng(10 + station)
-        open_radio = opener(self.air, f"station{station}", clock, rng, self.settings)
+        open_radio = radio_opener(self.air, f"station{station}", clock, rng, self.settings)
         return await self.stack.enter_async_context(open_radio()), clock, instrument
 
     async def _start(self, program: Coroutine[None, None, None]) -> None:
         self.tasks.append(asyncio.create_task(program))
         await asyncio.sleep(1.1)  # the instrument takes a second until it tracks
 
-    def our_master(self) -> Collector:
+    def our_master(self) -> Transport:
         """Return what runs turns of ours."""
-        return Collector(self.radio, self.clock, UnixTimeline.fixed_now(self.clock), self.timing)
+        return Transport(self.radio, self.clock, UnixTimeline.fixed_now(self.clock), self.timing)
 
     def their_master(self, *stations: int) -> AuthorsMaster:
         """Return a master of the authors'."""
         return AuthorsMaster(stations, self.radio, self.clock, np.random.default_rng(5))
 
     @property
-    def timing(self) -> Timing:
+    def timing(self) -> LinkTiming:
         """Of the turns."""
-        return Timing.of(self.settings, 250 * MS)
+        return LinkTiming(self.settings, 250 * MS)
 
 
 @asynccontextmanager
@@ -107,7 +109,7 @@ async def _field(spreading_factor: int = 9) -> AsyncGenerator[Field]:
     air = Air(running_timeline(), np.random.default_rng(0), LinkModel())
     clock, settings = VirtualClock(START_NS), _settings(spreading_factor)
     async with AsyncExitStack() as stack:
-        open_radio = opener(air, "master", clock, np.random.default_rng(1), settings)
+        open_radio = radio_opener(air, "master", clock, np.random.default_rng(1), settings)
         site = Field(await stack.enter_async_context(open_radio()), clock, settings, air, stack)
         try:
             yield site
@@ -133,9 +135,9 @@ async def _serve(station: int, radio: Radio, clock: DriftingClock, instrument: S
             time_ns=timeline.unix_ns(reading.at_ns),
         )
 
-    async def carry_out(order: ClassicOrder) -> bytes:
-        if isinstance(order, MeasureOrder):
-            return core.shot(message(await instrument.measure()))
+    async def carry_out(order: ClassicCommand) -> bytes:
+        if isinstance(order, MeasureCommand):
+            return core.single_measured(message(await instrument.measure()))
         await instrument.direct()
         return core.executed(order, ok=True)
 
@@ -160,7 +162,7 @@ async def _serve(station: int, radio: Radio, clock: DriftingClock, instrument: S
 
 async def _polled(site: Field, station: int = 1) -> MeasurementMessage | None:
     poll = Poll(station, site.timing)
-    await site.our_master().take(poll)
+    await site.our_master().run(poll)
     return poll.message
 
 
@@ -256,8 +258,8 @@ async def test_our_master_synchronises_their_node(spreading_factor: int) -> None
     """Each cycle brings a sample; with the known delay of polling the mean offset is right to 0.1 ms."""
     async with _field(spreading_factor) as site:
         await site.add_authors_node(1)
-        turn = Synchronisation(1, 50, site.timing, stamp_delay_ns=round(AUTHORS_STAMP_DELAY_MS * MS))
-        await site.our_master().take(turn)
+        turn = Synchronisation(1, 50, site.timing, timestamp_delay_ns=round(AUTHORS_TIMESTAMP_DELAY_MS * MS))
+        await site.our_master().run(turn)
         message = await _polled(site)
     offsets_ns = [sample.station_ns - sample.sent_ns - sample.forward_ns for sample in turn.samples]
     assert len(offsets_ns) == 50
@@ -273,7 +275,7 @@ async def test_a_step_of_their_clock_is_in_the_next_samples() -> None:
         await site.add_authors_node(1)
         site.clocks[1].step(7 * SECOND)
         turn = Synchronisation(1, 5, site.timing)
-        await site.our_master().take(turn)
+        await site.our_master().run(turn)
     for sample in turn.samples:
         offset_ns = sample.station_ns - sample.sent_ns - sample.forward_ns
         assert offset_ns - AHEAD_NS == pytest.approx(7 * SECOND, abs=2 * MS)
@@ -285,14 +287,14 @@ async def test_our_master_takes_their_node_to_targets_and_back() -> None:
         await site.add_authors_node(1)
         instrument, master = site.instruments[1], site.our_master()
         instrument.target = replace(READING, instrument_time_ns=123_456_789_012)
-        to_targets = Ordered(1, Command("d", 1), 3 * SECOND)
-        await master.take(to_targets)
-        shot = Shot(1, site.timing)
-        await master.take(shot)
-        back = Ordered(1, Command("n", 1, 4), 3 * SECOND)
-        await master.take(back)
-        again = Ordered(1, Command("n", 1, 5), 3 * SECOND)
-        await master.take(again)
+        to_targets = CommandTransaction(1, CommandMessage("d", 1), 3 * SECOND)
+        await master.run(to_targets)
+        shot = SingleMeasurementPoll(1, site.timing)
+        await master.run(shot)
+        back = CommandTransaction(1, CommandMessage("n", 1, 4), 3 * SECOND)
+        await master.run(back)
+        again = CommandTransaction(1, CommandMessage("n", 1, 5), 3 * SECOND)
+        await master.run(again)
     assert (to_targets.ok, back.ok, again.ok) == (True, True, True)
     assert shot.message is not None
     assert (status_of(shot.message), shot.message.time_ns) == (Status.OK, 123 * SECOND)
@@ -305,13 +307,13 @@ async def test_a_failed_target_of_theirs_is_an_error() -> None:
         await site.add_authors_node(1)
         instrument, master = site.instruments[1], site.our_master()
         instrument.refusal = InstrumentError("busy")
-        refused = Ordered(1, Command("d", 1), 3 * SECOND)
-        await master.take(refused)
+        refused = CommandTransaction(1, CommandMessage("d", 1), 3 * SECOND)
+        await master.run(refused)
         instrument.refusal = None
-        await master.take(Ordered(1, Command("d", 1), 3 * SECOND))
+        await master.run(CommandTransaction(1, CommandMessage("d", 1), 3 * SECOND))
         instrument.target = InstrumentError("nothing there")
-        shot = Shot(1, site.timing)
-        await master.take(shot)
+        shot = SingleMeasurementPoll(1, site.timing)
+        await master.run(shot)
     assert refused.ok is False
     assert shot.message is not None
     assert not status_of(shot.message).usable
@@ -323,8 +325,8 @@ async def test_a_node_left_in_synchronisation_is_got_out() -> None:
         await site.add_authors_node(1)
         await site.radio.transmit(b"p1")
         assert await _polled(site) is None
-        order = Ordered(1, Command("n", 1, 1), 3 * SECOND)
-        await site.our_master().take(order)
+        order = CommandTransaction(1, CommandMessage("n", 1, 1), 3 * SECOND)
+        await site.our_master().run(order)
         assert order.ok
         assert await _polled(site) is not None
 
@@ -385,13 +387,13 @@ async def test_their_master_takes_our_station_to_targets_and_back() -> None:
     async with _field() as site:
         await site.add_our_station(1)
         master = site.their_master(1)
-        assert await master.ask(b"n1") == b"nOk"
-        assert await master.ask(b"d1", 2 * SECOND) == b"dOk"
-        assert await master.ask(b"d1") == b"dOk"
+        assert await master.request(b"n1") == b"nOk"
+        assert await master.request(b"d1", 2 * SECOND) == b"dOk"
+        assert await master.request(b"d1") == b"dOk"
         shot = await master.poll(1, 10 * SECOND)
         assert shot is not None
         assert shot.slope_distance_m == 99.5
-        assert await master.ask(b"n1", 2 * SECOND) == b"nOk"
+        assert await master.request(b"n1", 2 * SECOND) == b"nOk"
         assert await master.poll(1) == (1, 3, 0.0, 0.0, 0.0, 0, 0)
 
 

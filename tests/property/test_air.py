@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from harness.air import RecordingAntenna, frame, modulation
+from harness.air import RecordingListener, frame, modulation
 from hypothesis import given
 from hypothesis import strategies as st
 
 from tsgt.simulation.kernel import VirtualTimeline
 from tsgt.simulation.lora import Air, LinkModel
-from tsgt.simulation.lora.frames import Frame, Listening, Modulation
+from tsgt.simulation.lora.frames import Frame, ReceiverSettings, Modulation
 from tsgt.simulation.lora.link import FixedLoss
 
 NAMES = ("a", "b", "c")
@@ -75,7 +75,7 @@ def deeds(modulations: st.SearchStrategy[Modulation]) -> st.SearchStrategy[list[
     )
 
 
-class StrictAntenna(RecordingAntenna):
+class StrictListener(RecordingListener):
     """Checks that what it is told makes sense: a lock, perhaps a header, an end, in the order of time."""
 
     def __init__(self) -> None:
@@ -110,7 +110,7 @@ def test_arbitrary_traffic(sequence: list[Deed], seed: int, loss_db: float) -> N
     timeline = VirtualTimeline()
     link = LinkModel(path_loss=FixedLoss(default_db=loss_db), fading_sigma_db=3.0, rayleigh_fading=True)
     air = Air(timeline, np.random.default_rng(seed), link)
-    antennas = {name: StrictAntenna() for name in NAMES}
+    antennas = {name: StrictListener() for name in NAMES}
     ports = {name: air.join(antennas[name], name) for name in NAMES}
     for deed in sequence:
         timeline.advance(deed.after_ns)
@@ -124,7 +124,7 @@ def test_arbitrary_traffic(sequence: list[Deed], seed: int, loss_db: float) -> N
             port.preamble_present(PLAIN, now_ns)
         else:
             antenna.locked = False
-            port.listen(Listening(since_ns=now_ns, **deed.settings) if deed.what == "listen" else None)
+            port.listen(ReceiverSettings(since_ns=now_ns, **deed.settings) if deed.what == "listen" else None)
             if deed.what == "leave":
                 air.leave(deed.radio)
                 ports[deed.radio] = air.join(antenna, deed.radio)

@@ -1,1 +1,1 @@
-"""A simulated world: the robot that drives, the prisms on it, the stations that see them."""
+"""Simulation of whole missions: ground truth, radio channel, total stations, computers, faults, invariant checks."""

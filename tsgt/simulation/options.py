@@ -1,62 +1,46 @@
-"""What may be set of a simulated run besides its scenario, and how people write it."""
+"""Options of a simulated mission in addition to its scenario, and their notation on the command line."""
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from dataclasses import dataclass
+from typing import Annotated, Literal
 
-from tsgt.config import SuperframeMasterConfig
+from pydantic import Field
+
+from tsgt.config import ClassicMasterConfig, Model, SuperframeMasterConfig
 from tsgt.errors import ConfigError
-from tsgt.simulation.faults.catalogue import FaultKind  # noqa: TC001
+from tsgt.simulation.faults.catalogue import FaultKind
 from tsgt.simulation.mission.computer import MASTER
 
-if TYPE_CHECKING:
-    from tsgt.config import ClassicMasterConfig
-
-Node = Literal["ours", "authors"]
+StationSoftware = Literal["ours", "authors"]
 
 
 @dataclass(frozen=True, slots=True)
 class Outage:
-    """A time in which the master on the robot and some stations do not hear each other: the robot is behind a hill.
-
-    Attributes
-    ----------
-    stations
-        Their numbers.
-    start_s, seconds
-        From when, and for how long.
-    """
+    """A time without radio contact between the master and some stations."""
 
     stations: tuple[int, ...]
     start_s: float
-    seconds: float
+    duration_s: float
 
     @property
     def end_s(self) -> float:
-        """When it is over."""
-        return self.start_s + self.seconds
+        """End of the outage."""
+        return self.start_s + self.duration_s
 
     def covers(self, time_s: float) -> bool:
-        """Whether it lasts at that time."""
+        """Whether the outage is active at this time."""
         return self.start_s <= time_s < self.end_s
 
     @classmethod
     def parse(cls, text: str, stations: tuple[int, ...]) -> Outage:
-        """Read ``STATIONS:START:SECONDS``; stations are ``all``, or numbers with commas between them.
-
-        Parameters
-        ----------
-        text
-            As written.
-        stations
-            All that there are.
+        """Parse ``STATIONS:START:SECONDS``; STATIONS is ``all`` or comma-separated numbers.
 
         Raises
         ------
         ConfigError
-            It says something else, or names a station that there is not.
+            Syntax error, or a station that is not in ``stations``.
         """
         match = re.fullmatch(r"(all|\d+(?:,\d+)*):(\d+(?:\.\d+)?):(\d+(?:\.\d+)?)", text)
         if match is None:
@@ -71,14 +55,12 @@ class Outage:
 
 @dataclass(frozen=True, slots=True)
 class Restart:
-    """A daemon that ends in the middle of its work, and is started again.
+    """A stop and restart of a daemon.
 
     Attributes
     ----------
     station
-        Number of the station; None: the master.
-    at_s
-        When it ends.
+        None: the master.
     """
 
     station: int | None
@@ -86,7 +68,7 @@ class Restart:
 
     @classmethod
     def parse(cls, text: str, stations: tuple[int, ...]) -> Restart:
-        """Read ``STATION:AT``; the station is a number, or ``master``. See :meth:`Outage.parse`."""
+        """Parse ``STATION:AT``; STATION is a number or ``master``. Raises as :meth:`Outage.parse`."""
         match = re.fullmatch(r"(master|\d+):(\d+(?:\.\d+)?)", text)
         if match is None:
             raise ConfigError(f"restart {text!r}: expected STATION:AT, such as 2:120 or master:120")
@@ -101,48 +83,30 @@ def _check_station(number: int, stations: tuple[int, ...], where: str) -> None:
         raise ConfigError(f"{where}: there is no station {number}; there are {', '.join(map(str, stations))}")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Options:
-    """What may be set of a run besides its scenario.
+class SimulationOptions(Model):
+    """Options of a mission in addition to its scenario; the command line makes its options from these fields."""
 
-    Attributes
-    ----------
-    duration_s
-        How long it measures.
-    drift_ppm
-        Of the stations' clocks against the master's: plus this for the first, minus this for the second, and so on.
-    drift_ramp_ppm_per_min
-        By how much that drift grows, and falls again, see :func:`~tsgt.simulation.kernel.clocks.ramped`; signs in turn as well.
-    stamp_jitter_us
-        One sigma of what every computer's stamp of an interrupt of its radio is off by, in us, besides the chip's own
-        3 us.
-    seed
-        Of everything that is drawn.
-    node
-        What the stations run: our client, or the authors' node.
-    protocol
-        What the master speaks, and our clients with it.
-    authenticated
-        Whether all radios share a key; of the protocol ``superframe``.
-    outages, restarts
-        What goes wrong.
-    foreign_per_s
-        How many packets a second somebody else sends on the same channel, on average.
-    faults
-        Kinds of faults that are drawn from the seed.
-    """
-
-    duration_s: float
-    drift_ppm: float = 10.0
-    drift_ramp_ppm_per_min: float = 0.0
-    stamp_jitter_us: float = 0.0
-    seed: int = 0
-    node: Node = "ours"
-    protocol: ClassicMasterConfig | SuperframeMasterConfig = field(
-        default_factory=lambda: SuperframeMasterConfig(kind="superframe")
-    )
+    duration_s: Annotated[float, Field(gt=0)]
+    """Duration of the measurements in s."""
+    drift_ppm: Annotated[float, Field(ge=-1000, le=1000)] = 10.0
+    """Frequency offset of the stations' clocks against the master's; the sign alternates from station to station."""
+    drift_ramp_ppm_per_min: Annotated[float, Field(ge=-50, le=50)] = 0.0
+    """Slope of a drift ramp, as of a computer that warms up for ten minutes, then cools; the sign alternates as well."""
+    stamp_jitter_us: Annotated[float, Field(ge=0, le=10_000)] = 0.0
+    """One sigma of the interrupt timestamps of every computer's radio, in addition to the chip's own 3 us."""
+    seed: Annotated[int, Field(ge=0)] = 0
+    """Seed of all random numbers."""
+    station_software: StationSoftware = "ours"
+    """Software of the stations: our client, or the authors' node, which speaks classic only."""
+    protocol: ClassicMasterConfig | SuperframeMasterConfig = SuperframeMasterConfig(kind="superframe")
+    """Protocol of master and stations."""
     authenticated: bool = True
+    """Whether all radios share a key; protocol superframe only."""
     outages: tuple[Outage, ...] = ()
+    """Times without radio contact."""
     restarts: tuple[Restart, ...] = ()
-    interference_rate_hz: float = 0.0
+    """Daemons that end and start again."""
+    interference_rate_hz: Annotated[float, Field(ge=0, le=100)] = 0.0
+    """Average rate of packets from an interferer on the same channel: noise, and replayed, cut or altered packets."""
     faults: frozenset[FaultKind] = frozenset()
+    """Kinds of faults to draw from the seed."""

@@ -1,4 +1,4 @@
-"""A whole mission in virtual time, from its start to its end: the same seed gives the same one."""
+"""Runs a mission on virtual time from start to end."""
 
 from __future__ import annotations
 
@@ -10,103 +10,101 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.config import SuperframeMasterConfig
-from tsgt.simulation.checks import overgrown
-from tsgt.simulation.faults import CALM_S, act, draw_faults, see_to_instruments
+from tsgt.simulation.checks import oversized_collections
+from tsgt.simulation.faults import FAULT_FREE_TAIL_S, draw_faults, inject_fault, relock_instruments
 from tsgt.simulation.kernel import VirtualTimeline, run_virtual
-from tsgt.simulation.mission import DRAIN_S, Mission, Run
+from tsgt.simulation.mission import DRAIN_S, Mission, MissionResult
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
     from pathlib import Path
 
     from tsgt.config import ScenarioConfig
-    from tsgt.simulation.options import Options
+    from tsgt.simulation.options import SimulationOptions
 
 
 MEMORY_CHECK_S = 60
-"""How often the memory of the daemons is looked at."""
+"""Interval of the memory checks."""
 
 
 def simulate(
     scenario: ScenarioConfig,
-    options: Options,
+    options: SimulationOptions,
     *,
     folder: Path,
-    progress: Callable[[float], None] = lambda now_s: None,  # noqa: ARG005 (nobody looks)
+    progress: Callable[[float], None] = lambda now_s: None,  # noqa: ARG005 (default: not reported)
     script: Callable[[Mission], Coroutine[None, None, None]] | None = None,
-) -> Run:
-    """Run a mission on virtual time; the same scenario, options and script give the same run.
+) -> MissionResult:
+    """Simulate a mission on virtual time; the same scenario, options and script give the same result.
 
     Parameters
     ----------
-    scenario, options
-        What happens.
     folder
         An empty folder for recordings, journals and sockets.
     progress
-        Told of the virtual time in s, each virtual second.
+        Called with the virtual time in s, every virtual second.
     script
-        Runs beside the daemons: kills and starts them, steps clocks.
+        Runs concurrently with the daemons: stops and starts them, steps clocks.
 
     Raises
     ------
     ExceptionGroup
-        A daemon has ended with an error.
+        A daemon ended with an error.
     """
     timeline = VirtualTimeline()
 
-    async def run() -> Run:
+    async def run() -> MissionResult:
         mission = Mission(scenario, options, folder=folder, timeline=timeline)
         for station in scenario.stations:
             mission.start_station(station.station)
         mission.start_master()
         faults = draw_faults(
             options.faults,
-            np.random.default_rng([options.seed, 0xFA]),  # whatever else is drawn
+            np.random.default_rng([options.seed, 0xFA]),  # independent of all other draws
             duration_s=options.duration_s,
-            stations=list(mission.witnesses),
+            stations=list(mission.station_logs),
         )
-        acts = [
+        scenario_tasks = [
             *([script(mission)] if script is not None else []),
-            *(mission.interrupt(outage) for outage in options.outages),
+            *(mission.apply_outage(outage) for outage in options.outages),
             *(mission.restart(restart.station, restart.at_s) for restart in options.restarts),
-            *(act(mission, fault) for fault in faults),
-            *([mission.be_foreign()] if options.interference_rate_hz else []),
-            *([see_to_instruments(mission, options.duration_s - CALM_S)] if faults else []),
+            *(inject_fault(mission, fault) for fault in faults),
+            *([mission.run_interference()] if options.interference_rate_hz else []),
+            *([relock_instruments(mission, options.duration_s - FAULT_FREE_TAIL_S)] if faults else []),
         ]
-        acting = [asyncio.create_task(each) for each in acts]
-        grown: set[str] = set()
+        fault_tasks = [asyncio.create_task(each) for each in scenario_tasks]
+        oversized: set[str] = set()
         try:
             for second in range(1, math.ceil(options.duration_s) + 1):
-                await mission.until(min(second, options.duration_s))
+                await mission.run_until(min(second, options.duration_s))
                 progress(mission.now_s)
                 if second % MEMORY_CHECK_S == 0:
-                    grown.update(overgrown())
+                    oversized.update(oversized_collections())
             airtime_s = mission.air.airtime_ns / 1e9
-            await mission.until(options.duration_s + DRAIN_S)
+            await mission.run_until(options.duration_s + DRAIN_S)
             if script is not None:
-                await acting[0]
-            for acted in acting:
-                if acted.done():
-                    acted.result()
+                await fault_tasks[0]
+            for task in fault_tasks:
+                if task.done():
+                    task.result()
         finally:
-            for acted in acting:
-                acted.cancel()
-            await asyncio.gather(*acting, return_exceptions=True)
-            await mission.end()
-        return Run(
+            for task in fault_tasks:
+                task.cancel()
+            await asyncio.gather(*fault_tasks, return_exceptions=True)
+            await mission.stop_all()
+        return MissionResult(
             parameters=mission.parameters,
             world=mission.world,
             duration_s=options.duration_s,
-            sessions=mission.sessions,
-            witnesses=mission.witnesses,
+            master_logs=mission.master_logs,
+            station_logs=mission.station_logs,
             airtime_s=airtime_s,
             superframe=isinstance(options.protocol, SuperframeMasterConfig),
             outages=options.outages,
             faults=Counter(fault.kind for fault in faults),
-            calm_s=options.duration_s - CALM_S if faults else None,
+            faults_end_s=options.duration_s - FAULT_FREE_TAIL_S if faults else None,
             rate_hz={station.station: station.rate_hz for station in scenario.stations},
-            overgrown=tuple(sorted(grown)),
+            oversized_collections=tuple(sorted(oversized)),
         )
 
-    return run_virtual(run, timeline, alone=True)
+    return run_virtual(run, timeline, isolated=True)

@@ -1,4 +1,4 @@
-"""Scenarios by name, with as many stations as wanted."""
+"""Scenarios by name, with any number of stations."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tsgt.config import LARGEST_NUMBERS, ScenarioConfig, load
+from tsgt.config import MAX_STATION_NUMBERS, ScenarioConfig, load
 from tsgt.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -14,29 +14,24 @@ if TYPE_CHECKING:
 
 _FILES = Path(__file__).parent / "scenarios"
 
-MOST_STATIONS = LARGEST_NUMBERS["superframe"]
+MAX_STATIONS = MAX_STATION_NUMBERS["superframe"]
 
 _GOLDEN_ANGLE_RAD = math.pi * (3 - math.sqrt(5))
 _EXTRA_STATION_RADIUS_M = 5.0
 
 
 def scenario_names() -> list[str]:
-    """Names of the scenarios that come with the program."""
+    """Names of the built-in scenarios."""
     return sorted(path.stem for path in _FILES.glob("*.toml"))
 
 
 def find_scenario(name: str) -> ScenarioConfig:
-    """Read a scenario by its name, or from a file of one's own.
-
-    Parameters
-    ----------
-    name
-        One of :func:`scenario_names`, or a path: anything with a slash or with the ending ``.toml``.
+    """Load a built-in scenario by name, or a scenario file by its path (contains a slash or ends in ``.toml``).
 
     Raises
     ------
     ConfigError
-        There is no scenario of that name, or its file cannot be used.
+        There is no such scenario, or its file is invalid.
     """
     if "/" in name or name.endswith(".toml"):
         return load(Path(name), ScenarioConfig)
@@ -48,10 +43,9 @@ def find_scenario(name: str) -> ScenarioConfig:
 
 
 def with_stations(scenario: ScenarioConfig, count: int) -> ScenarioConfig:
-    """Return the scenario with so many stations.
+    """Return the scenario with ``count`` stations.
 
-    Those that it lacks stand around the others and track the prisms in turn, each with the instrument of the
-    station that tracks the same prism already.
+    Additional stations stand around the first one, track the prisms in turn, and copy the settings of an existing station.
     """
     stations = list(scenario.stations[:count])
     while len(stations) < count:
@@ -60,15 +54,15 @@ def with_stations(scenario: ScenarioConfig, count: int) -> ScenarioConfig:
 
 
 def _extra_station(scenario: ScenarioConfig, index: int) -> SimulatedStation:
-    like = scenario.stations[index % len(scenario.stations)]
+    template = scenario.stations[index % len(scenario.stations)]
     prism = scenario.prisms[index % len(scenario.prisms)].prism
     numbers = {station.station for station in scenario.stations}
-    free = next(n for n in range(1, MOST_STATIONS + 1) if n > index and n not in numbers)
+    number = next(n for n in range(1, MAX_STATIONS + 1) if n > index and n not in numbers)
     angle = index * _GOLDEN_ANGLE_RAD
     x, y, z = scenario.stations[0].position_m
-    return like.model_copy(
+    return template.model_copy(
         update={
-            "station": free,
+            "station": number,
             "prism": prism,
             "position_m": (
                 x + _EXTRA_STATION_RADIUS_M * math.cos(angle),

@@ -1,8 +1,8 @@
-"""The truth: where the simulated robot and its prisms are at any instant.
+"""Ground truth: poses of the simulated robot and positions of its prisms at any instant.
 
-The robot gets commands (speed and yaw rate, constant for some seconds) or speeds along a route, follows them
-smoothly, and is shaken by the ground while it moves. Its motion is computed on a fine grid and joined by cubic
-splines; the splines *are* the truth, so that it can be asked for at any instant and is smooth there.
+The robot follows velocity commands (speed and yaw rate, each constant for some seconds) or drives along a route, with
+smooth transitions and vibration from the ground. The motion is integrated on a fine grid and interpolated by cubic
+splines. The splines are the ground truth: defined at every instant, and smooth.
 """
 
 from __future__ import annotations
@@ -27,27 +27,21 @@ STEP_S = 0.02
 
 ROUTE_STEP_M = 0.05
 
-# Towards the area, a robot outside turns at the rate that would take away its error of heading in this time.
-STEERING_TIME_S = 1.0
+# A robot outside its area turns back at a rate of its heading error divided by this time.
+STEERING_TIME_CONSTANT_S = 1.0
 
 
 class World:
-    """A robot that drives; frames ``station1`` (the world) and ``robot``.
-
-    The robot's origin lies on the ground under it, as that of the prism layout does.
+    """Ground truth of a driving robot; frames ``station1`` (the world) and ``robot`` (origin on the ground below it).
 
     Parameters
     ----------
-    motion
-        How it drives.
     prisms_m
         Prism positions in the frame ``robot``, (P, 3).
     duration_s
-        The truth reaches from 0 to here.
-    generator
-        Source of all randomness; the same state gives the same world.
+        The truth covers 0 to this time.
     occlusions_s
-        By station number: when its prism is hidden from it, from and to in s from the start, (K, 2).
+        Occlusions by station number: start and end in s from the start, (K, 2).
     """
 
     def __init__(
@@ -61,42 +55,42 @@ class World:
         self.prisms_m = prisms_m
         self.duration_s = duration_s
         self.occlusions_s = occlusions_s or {}
-        # Two steps more, so that the last instant lies inside the splines whatever rounding does.
+        # Two extra steps keep the last instant inside the splines despite rounding.
         times_s = np.arange(math.ceil(duration_s / STEP_S) + 3) * STEP_S
-        self._spline = CubicSpline(times_s, _motion(motion, len(times_s), generator))
+        self._spline = CubicSpline(times_s, _integrate_motion(motion, len(times_s), generator))
 
     def pose_at(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return ``T_station1_robot`` at N instants, seconds from the start: (N, 4, 4).
+        """Return ``T_station1_robot`` at N instants in s from the start: (N, 4, 4).
 
         Raises
         ------
         ValueError
-            An instant lies outside the truth.
+            An instant is outside the covered time.
         """
         times_s = np.asarray(times_s, dtype=np.float64)
         if times_s.size and not (times_s.min() >= 0.0 and times_s.max() <= self.duration_s):
             raise ValueError(
-                f"the truth reaches from 0 to {self.duration_s} s, asked for {times_s.min()} to {times_s.max()} s"
+                f"the ground truth covers 0 to {self.duration_s} s, got {times_s.min()} to {times_s.max()} s"
             )
         state = self._spline(times_s)
         return transform_from(_rotation(state[:, 3], state[:, 4], state[:, 5]), state[:, :3])
 
     def prism_at(self, times_s: NDArray[np.float64], index: int) -> NDArray[np.float64]:
-        """Return the position of one prism, by its row in the layout, in ``station1`` at N instants: (N, 3)."""
+        """Return the position of a prism, by its row in the layout, in ``station1`` at N instants: (N, 3)."""
         return transform_points(self.pose_at(times_s), self.prisms_m[index])
 
 
 def scenario_world(scenario: ScenarioConfig, duration_s: float, generator: np.random.Generator) -> World:
-    """Make the world of a scenario: its robot, its prisms in their order, and what hides them."""
-    # The drive does not depend on what hides the robot on its way.
-    drive, hiding = generator.spawn(2)
+    """Build the ground truth of a scenario: robot, prisms in their order, occlusions."""
+    # Separate generators: the motion does not depend on the occlusions.
+    motion_rng, occlusion_rng = generator.spawn(2)
     numbers = [station.station for station in scenario.stations]
     return World(
         scenario.motion,
         np.array([prism.position_m for prism in scenario.prisms]),
         duration_s,
-        drive,
-        draw_occlusions(scenario.occlusions, numbers, duration_s, hiding),
+        motion_rng,
+        draw_occlusions(scenario.occlusions, numbers, duration_s, occlusion_rng),
     )
 
 
@@ -106,33 +100,24 @@ def draw_occlusions(
     duration_s: float,
     generator: np.random.Generator,
 ) -> dict[int, NDArray[np.float64]]:
-    """Draw when the prisms are hidden.
+    """Draw the occlusions of each station.
 
-    Parameters
-    ----------
-    occlusions
-        What hides them, how often and for how long.
-    stations
-        Their numbers; each keeps its draws when another one is added after it.
-    duration_s
-        Nothing begins later than this.
-    generator
-        Source of all randomness.
+    Each station keeps its draws when further stations are added. None starts after ``duration_s``.
 
     Returns
     -------
     dict
-        By station number: from and to in s, (K, 2). They may overlap.
+        By station number: start and end in s, (K, 2); they may overlap.
     """
-    shared = _spans([o for o in occlusions if o.common], duration_s, generator.spawn(1)[0])
+    shared = _draw_intervals([o for o in occlusions if o.common], duration_s, generator.spawn(1)[0])
     own = [o for o in occlusions if not o.common]
     return {
-        station: np.concatenate([shared, _spans(own, duration_s, generator.spawn(1)[0])])
+        station: np.concatenate([shared, _draw_intervals(own, duration_s, generator.spawn(1)[0])])
         for station in stations
     }
 
 
-def _spans(
+def _draw_intervals(
     occlusions: Sequence[OcclusionConfig], duration_s: float, generator: np.random.Generator
 ) -> NDArray[np.float64]:
     spans = [np.empty((0, 2))]
@@ -144,16 +129,18 @@ def _spans(
     return np.concatenate(spans)
 
 
-def _motion(motion: MotionConfig, n: int, generator: np.random.Generator) -> NDArray[np.float64]:
+def _integrate_motion(motion: MotionConfig, n: int, generator: np.random.Generator) -> NDArray[np.float64]:
     """State on the grid, (n, 6): x, y, z in m, yaw, pitch, roll in rad."""
     start_yaw = generator.uniform(-math.pi, math.pi)
     if motion.route_m:
         speeds = _route_commands(motion, n, generator)
-        state = _along(motion, np.cumsum(_smoothed(speeds[:, None], motion.command_smoothing_s)) * STEP_S)
+        state = _state_along_route(
+            motion, np.cumsum(_smoothed(speeds[:, None], motion.command_smoothing_s)) * STEP_S
+        )
     else:
         commands = _commands(motion, n, start_yaw, generator)
         speeds = commands[:, 0]
-        state = _driven(motion, _smoothed(commands, motion.command_smoothing_s), start_yaw)
+        state = _state_from_commands(motion, _smoothed(commands, motion.command_smoothing_s), start_yaw)
     shaking = _unit_noise(n, 3, motion.attitude_smoothing_s, generator)
     shaking *= _smoothed((speeds[:, None] > 0).astype(np.float64), motion.command_smoothing_s)
     state[:, 2] += shaking[:, 0] * motion.heave_rms_mm / 1e3
@@ -161,8 +148,10 @@ def _motion(motion: MotionConfig, n: int, generator: np.random.Generator) -> NDA
     return state
 
 
-def _driven(motion: MotionConfig, commands: NDArray[np.float64], start_yaw: float) -> NDArray[np.float64]:
-    """State of a robot that follows speeds and yaw rates (n, 2) from the centre of its area, without shaking."""
+def _state_from_commands(
+    motion: MotionConfig, commands: NDArray[np.float64], start_yaw: float
+) -> NDArray[np.float64]:
+    """State after speeds and yaw rates (n, 2) from the centre of the area, without vibration."""
     speed, yaw_rate = commands.T
     yaw = start_yaw + np.cumsum(yaw_rate) * STEP_S
     x, y, z = motion.area_centre_m
@@ -174,41 +163,41 @@ def _driven(motion: MotionConfig, commands: NDArray[np.float64], start_yaw: floa
     return state
 
 
-def _along(motion: MotionConfig, driven_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """State of a robot that has driven so far along its route, (n,), without shaking; it looks ahead and uphill."""
-    way_m, points = _path(motion)
-    path = CubicSpline(way_m, points)
-    driven_m = np.clip(driven_m, 0.0, way_m[-1])
-    ahead = path(driven_m, 1)
+def _state_along_route(motion: MotionConfig, driven_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """State after these distances along the route, (n,), without vibration; heading and pitch are tangential."""
+    arc_length_m, points = _path(motion)
+    path = CubicSpline(arc_length_m, points)
+    driven_m = np.clip(driven_m, 0.0, arc_length_m[-1])
+    tangent = path(driven_m, 1)
     state = np.zeros((len(driven_m), 6))
     state[:, :3] = path(driven_m)
-    state[:, 3] = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
-    state[:, 4] = -np.arctan2(ahead[:, 2], np.hypot(ahead[:, 0], ahead[:, 1]))  # nose up is negative
+    state[:, 3] = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
+    state[:, 4] = -np.arctan2(tangent[:, 2], np.hypot(tangent[:, 0], tangent[:, 1]))  # nose up is negative
     return state
 
 
 def _path(motion: MotionConfig) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the route with its corners rounded: way from its start in m, (m,), and positions, (m, 3)."""
+    """Return the route with rounded corners: arc length in m, (m,), and positions, (m, 3)."""
     corners = np.array(motion.route_m)
-    at_corner_m = _lengths(corners)
+    at_corner_m = _arc_lengths(corners)
     count = max(2, round(at_corner_m[-1] / ROUTE_STEP_M) + 1)
     steps_m = np.linspace(0.0, at_corner_m[-1], count)
     points = np.column_stack([np.interp(steps_m, at_corner_m, column) for column in corners.T])
     points = gaussian_filter1d(points, motion.corner_smoothing_m / ROUTE_STEP_M, axis=0, mode="nearest")
-    # At both ends the filter squeezes the points; equal steps along the way keep the speed what it is.
-    way_m = _lengths(points)
-    steps_m = np.linspace(0.0, way_m[-1], count)
-    return steps_m, np.column_stack([np.interp(steps_m, way_m, column) for column in points.T])
+    # The filter compresses the points at both ends; resample at equal arc lengths to keep the speed.
+    arc_length_m = _arc_lengths(points)
+    steps_m = np.linspace(0.0, arc_length_m[-1], count)
+    return steps_m, np.column_stack([np.interp(steps_m, arc_length_m, column) for column in points.T])
 
 
-def _lengths(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Way from the first of the points to each of them, (n,)."""
+def _arc_lengths(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Arc length from the first point to each point, (n,)."""
     steps_m = np.linalg.norm(np.diff(points, axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps_m)])
 
 
 def _route_commands(motion: MotionConfig, n: int, generator: np.random.Generator) -> NDArray[np.float64]:
-    """Speed in m/s before smoothing, (n,); 0 from the end of the route on."""
+    """Speed in m/s before smoothing, (n,); 0 after the end of the route."""
     end_m = _path(motion)[0][-1]
     weights = np.array(motion.speed_weights) / sum(motion.speed_weights)
     speeds = np.zeros(n)
@@ -228,21 +217,21 @@ def _route_commands(motion: MotionConfig, n: int, generator: np.random.Generator
 def _commands(
     motion: MotionConfig, n: int, start_yaw: float, generator: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Speed in m/s and yaw rate in rad/s before smoothing, (n, 2); steers back a robot that leaves the area."""
+    """Speed in m/s and yaw rate in rad/s before smoothing, (n, 2); a robot outside the area is steered back."""
     weights = np.array(motion.speed_weights) / sum(motion.speed_weights)
-    fastest_turn = max(abs(rate) for rate in motion.yaw_rates_radps)
+    max_rate = max(abs(rate) for rate in motion.yaw_rates_radps)
     commands = np.empty((n, 2))
     x = y = 0.0  # from the centre of the area
-    yaw, speed, drawn_rate, next_draw = start_yaw, 0.0, 0.0, motion.start_after_s
+    yaw, speed, commanded_rate, next_draw = start_yaw, 0.0, 0.0, motion.start_after_s
     for step in range(n):
         if step * STEP_S >= next_draw:
             speed = float(generator.choice(motion.speeds_mps, p=weights))
-            drawn_rate = float(generator.choice(motion.yaw_rates_radps)) if speed else 0.0
+            commanded_rate = float(generator.choice(motion.yaw_rates_radps)) if speed else 0.0
             next_draw += generator.uniform(motion.interval_min_s, motion.interval_max_s)
-        rate = drawn_rate
+        rate = commanded_rate
         if speed and math.hypot(x, y) > motion.area_radius_m:
-            off_course = math.remainder(math.atan2(-y, -x) - yaw, math.tau)
-            rate = max(-fastest_turn, min(fastest_turn, off_course / STEERING_TIME_S))
+            heading_error = math.remainder(math.atan2(-y, -x) - yaw, math.tau)
+            rate = max(-max_rate, min(max_rate, heading_error / STEERING_TIME_CONSTANT_S))
         commands[step] = speed, rate
         yaw += rate * STEP_S
         x += speed * math.cos(yaw) * STEP_S
@@ -251,8 +240,8 @@ def _commands(
 
 
 def _unit_noise(n: int, columns: int, sigma_s: float, generator: np.random.Generator) -> NDArray[np.float64]:
-    """White noise smoothed with a Gaussian, scaled so that its standard deviation is 1, (n, columns)."""
-    # A Gaussian kernel leaves white noise the variance sum(k^2), which is step / (2 sqrt(pi) sigma).
+    """White noise smoothed with a Gaussian and scaled to a standard deviation of 1, (n, columns)."""
+    # A Gaussian kernel reduces the variance of white noise to sum(k^2) = step / (2 sqrt(pi) sigma).
     scale = math.sqrt(2.0 * math.sqrt(math.pi) * sigma_s / STEP_S)
     return scale * _smoothed(generator.standard_normal((n, columns)), sigma_s)
 

@@ -12,7 +12,7 @@ from harness.records import HEADER, PARAMETERS, measurement
 from tsgt.radio.superframe.wire import RESTART_SKIP
 from tsgt.recording import encode_line
 from tsgt.recording.journal import JournalRecord
-from tsgt.simulation.instrument.geocom import Offered
+from tsgt.simulation.instrument import ReportedDistance
 from tsgt.station.geocom import ReturnCode
 
 if TYPE_CHECKING:
@@ -66,10 +66,10 @@ class Left:
         self.recording("a", [delivered(number) for number in range(4)])
         self.recording("b", [delivered(number) for number in (3, 4, *range(SECOND_RUN, SECOND_RUN + 5))])
 
-    def journal(self, name: str, run_start: int, numbers: Sequence[int], *, lineage: int = 7) -> Path:
+    def journal(self, name: str, first_sequence: int, numbers: Sequence[int], *, stream_id: int = 7) -> Path:
         """Write one."""
         head = JournalRecord(
-            station=1, unix_at_zero_ns=ZERO_NS, boot="boot", lineage=lineage, run_start=run_start
+            station=1, unix_at_zero_ns=ZERO_NS, boot="boot", stream_id=stream_id, first_sequence=first_sequence
         )
         return self._write(self.journals / f"{name}.jsonl", [HEADER, head, *map(made, numbers)])
 
@@ -85,7 +85,7 @@ class Left:
         """Check it."""
         numbers = (*range(5), *range(SECOND_RUN, SECOND_RUN + 5))
         offered = [
-            Offered(
+            ReportedDistance(
                 instrument_ms=400 * number,
                 true_ns=400 * MS * number,
                 horizontal_angle_rad=made(number).horizontal_angle_rad,
@@ -151,14 +151,14 @@ def test_what_is_lost_is_found(left: Left) -> None:
 def test_what_is_recorded_twice_is_found(left: Left) -> None:
     """By one master."""
     left.recording("a", [delivered(number) for number in (0, 1, 2, 3, 3)])
-    assert left.checks() == {"twice"}
+    assert left.checks() == {"duplicate"}
 
 
 def test_a_number_that_is_given_again_is_found(left: Left) -> None:
     """By a run that goes on too early, or begins anew, or leaves one out."""
     left.journal("b", SECOND_RUN - 1, range(SECOND_RUN, SECOND_RUN + 5))
     assert "number" in left.checks()
-    left.journal("b", SECOND_RUN, range(SECOND_RUN, SECOND_RUN + 5), lineage=8)
+    left.journal("b", SECOND_RUN, range(SECOND_RUN, SECOND_RUN + 5), stream_id=8)
     assert left.checks() == {"number"}
     left.journal(
         "b", SECOND_RUN, (SECOND_RUN, SECOND_RUN + 2, SECOND_RUN + 1, SECOND_RUN + 3, SECOND_RUN + 4)

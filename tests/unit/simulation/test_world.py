@@ -132,7 +132,7 @@ def test_prisms_ride_on_the_robot() -> None:
 @pytest.mark.parametrize("time_s", [-0.001, 20.001, math.nan])
 def test_outside_its_time_there_is_no_truth(time_s: float) -> None:
     """Asking before the start, after the end or at no time at all is an error, not an extrapolation."""
-    with pytest.raises(ValueError, match="the truth reaches from 0 to 20"):
+    with pytest.raises(ValueError, match="the ground truth covers 0 to 20"):
         _world(duration_s=20.0).pose_at(np.array([1.0, time_s]))
 
 

@@ -1,10 +1,14 @@
-"""TODO face."""
+"""Invariants of simulated missions: what must hold whatever faults occur.
 
-from tsgt.simulation.checks.invariants import Violation, violations
-from tsgt.simulation.checks.memory_bounds import overgrown
+In: a :class:`MissionResult`. Out: violations, each with subject, measured value and limit. `invariants` checks data and
+files, `pose_consistency` poses against the truth, `liveness` recovery after faults, `memory_bounds` collection sizes.
+"""
+
+from tsgt.simulation.checks.invariants import Violation, check_invariants
+from tsgt.simulation.checks.memory_bounds import oversized_collections
 
 __all__ = [
     "Violation",
-    "overgrown",
-    "violations",
+    "check_invariants",
+    "oversized_collections",
 ]

@@ -1,6 +1,6 @@
-"""What must hold in every simulated run, whatever goes wrong in it.
+"""Invariants of every simulated mission, whatever faults occur.
 
-Each check goes its own way to what it checks: journals are read from disk, poses fitted again from scratch.
+Each check uses its own path to the data: journals are read from disk, poses are fitted anew.
 """
 
 from __future__ import annotations
@@ -11,263 +11,289 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from tsgt.errors import RecordingError
 from tsgt.estimation import usable
-from tsgt.master import replayed
 from tsgt.master.classic import UNTIMED_SIGMA_NS
+from tsgt.master.replay import replayed
 from tsgt.model import Status
 from tsgt.recording import load_recording
-from tsgt.simulation.checks.liveness import stuck
-from tsgt.simulation.checks.pose_consistency import doubtful_poses
-from tsgt.simulation.mission import Measured
+from tsgt.simulation.checks.liveness import liveness_failures
+from tsgt.simulation.checks.pose_consistency import pose_failures
+from tsgt.simulation.mission import JournalIndex
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
     from tsgt.model import PolarMeasurement
-    from tsgt.simulation.instrument.geocom import Offered
-    from tsgt.simulation.mission import Run, Session, StationWitness
+    from tsgt.simulation.instrument import ReportedDistance
+    from tsgt.simulation.mission import MasterLog, MissionResult, StationLog
 
 _ROUNDING_NS = 1_000
-# Half of a unit on the air, and what is lost in the sums on either side.
+# Half a unit of the radio encoding, plus floating-point rounding.
 _ANGLE_ROUNDING_RAD = math.tau / 2**25 * 1.001
 _DISTANCE_ROUNDING_M = 0.0501e-3
-# More than any station's latency, which is taken off the stamps.
-_LATENCY_NS = 5_000_000_000
-# Ten digits behind the point are on the line.
+# Above the latency of any station, which is subtracted from the timestamps.
+_MAX_LATENCY_NS = 5_000_000_000
+# GeoCOM sends ten decimals or more.
 _LINE_ROUNDING = 1e-9
-# A stamp is less than this before or after the measurement: the slowest answer against the fastest, when few have come.
-_STAMP_LIMIT_NS = 40_000_000
-# Of so many stamps of a station half are less than this off, on either side: a whole run's are within 1 ms.
-_FEWEST_STAMPS = 40
-_MIDDLE_STAMP_NS = 5_000_000
+# Spread of response times, which limits the first timestamps.
+_MAX_TIMESTAMP_ERROR_NS = 40_000_000
+# Limit of the median over at least this number; the median of a whole mission is within 1 ms.
+_MIN_TIMESTAMPS = 40
+_MAX_MEDIAN_ERROR_NS = 5_000_000
 
 
 class Violation(NamedTuple):
-    """Something that must not happen has happened.
+    """A violated invariant.
 
     Attributes
     ----------
     check
-        Name of the check.
+        Name of the invariant.
     detail
-        What was found, one line.
+        Subject, measured value and limit, in one line.
     """
 
     check: str
     detail: str
 
 
-def violations(run: Run) -> list[Violation]:
-    """Check a run.
+def check_invariants(result: MissionResult) -> list[Violation]:
+    """Check all invariants of a mission.
 
-    What a client has read is in its journal, once, as its instrument gave it and with the time at which it was measured;
-    and as it is there it was delivered; none is delivered twice; over the
-    protocol ``superframe`` all that was not delivered still waits; none has a time stamp off by more than its bound; no
-    valid pose rests on an unusable measurement; poses are where the robot was, as well as they say; a replay of the
-    recording gives the stream again.
+    - Every reading of a client is journalled once, with the instrument's values and the time of the measurement.
+    - Measurements are delivered as journalled, and at most once.
+    - Over ``superframe``, every measurement is recorded or still queued.
+    - Timestamp errors are within the stated bounds.
+    - Valid poses rest on usable measurements and agree with the truth within their covariance.
+    - A replay of the recording reproduces the stream.
+    - After the faults, rates recover; collections in memory stay bounded.
     """
     found: list[Violation] = []
-    measured = {number: Measured(witness) for number, witness in run.witnesses.items()}
-    recorded = recorded_numbers(run.sessions) if run.superframe else set()
-    for number, witness in run.witnesses.items():
-        if witness.journals:
-            found += altered(witness, measured[number], run.sessions)
-            found += misread(witness, measured[number])
-        if run.superframe:
-            found += lost(witness, measured[number], recorded, run.sessions[-1].number)
-    for session in run.sessions:
-        found += delivered_twice(session)
-        found += beyond_bound(session, measured, start_ns=session.zero_ns)
-        found += (Violation("pose", what) for what in doubtful_poses(session, run))
-        found += replayed_otherwise(session)
-    found += (Violation("stuck", what) for what in stuck(run, measured))
-    found += (Violation("memory", what) for what in run.overgrown)
+    indices = {number: JournalIndex(station_log) for number, station_log in result.station_logs.items()}
+    recorded = recorded_sequences(result.master_logs) if result.superframe else set()
+    for number, station_log in result.station_logs.items():
+        if station_log.journals:
+            found += journal_mismatches(station_log, indices[number], result.master_logs)
+            found += reading_mismatches(station_log, indices[number])
+        if result.superframe:
+            found += lost_measurements(
+                station_log, indices[number], recorded, result.master_logs[-1].session_number
+            )
+    for master_log in result.master_logs:
+        found += duplicate_deliveries(master_log)
+        found += timestamp_violations(master_log, indices, start_ns=master_log.unix_at_zero_ns)
+        found += (Violation("pose", what) for what in pose_failures(master_log, result))
+        found += replay_mismatches(master_log)
+    found += (Violation("liveness", what) for what in liveness_failures(result, indices))
+    found += (Violation("memory", what) for what in result.oversized_collections)
     return found
 
 
-def altered(witness: StationWitness, measured: Measured, sessions: Sequence[Session]) -> Iterator[Violation]:
-    """Compare what was read and what was delivered of one station with its journals."""
-    for host_time_ns in sorted(witness.stamps_ns.keys() - {m.host_time_ns for m in measured.journalled}):
-        if witness.may_be_unwritten(witness.read_ns.get(host_time_ns, 0)):
+def journal_mismatches(
+    station_log: StationLog, journal_index: JournalIndex, master_logs: Sequence[MasterLog]
+) -> Iterator[Violation]:
+    """Compare readings and deliveries of a station with its journals."""
+    for host_time_ns in sorted(
+        station_log.true_times_ns.keys() - {m.host_time_ns for m in journal_index.journalled}
+    ):
+        if station_log.may_be_unwritten(station_log.read_times_ns.get(host_time_ns, 0)):
             continue
         yield Violation(
             "journal",
-            f"not in the journal of station {witness.station}, which has read it at {host_time_ns} ns",
+            f"station {station_log.station}: reading at host time {host_time_ns} ns is not in its journals",
         )
-    for session in sessions:
-        for measurement in session.measurements:
-            if measurement.station != witness.station:
+    for master_log in master_logs:
+        for measurement in master_log.measurements:
+            if measurement.station != station_log.station:
                 continue
-            journalled = measured.in_journal(measurement)
-            if journalled is None and _may_be_lost(witness, measurement, session.zero_ns):
+            journalled = journal_index.find(measurement)
+            if journalled is None and _may_be_unwritten(station_log, measurement, master_log.unix_at_zero_ns):
                 continue
             if journalled is None or not _same_content(journalled, measurement):
                 yield Violation(
-                    "journal", f"not in the journal of station {witness.station} as delivered: {measurement}"
+                    "journal",
+                    f"station {station_log.station}: journalled as {journalled}, delivered as {measurement}",
                 )
 
 
-def _may_be_lost(witness: StationWitness, delivered: PolarMeasurement, start_ns: int) -> bool:
-    """Whether what was delivered need not be in a journal, because its client was killed soon after.
+def _may_be_unwritten(station_log: StationLog, delivered: PolarMeasurement, start_ns: int) -> bool:
+    """Whether a delivered measurement may be missing in the journals because its client was killed.
 
-    Over ``superframe``, which has no host times, a measurement waits for the disk to take or to refuse it.
+    Over ``superframe`` (no host time) a measurement is delivered only after its write has succeeded or failed.
     """
-    return witness.may_be_unwritten(
-        delivered.stamp_ns - start_ns, before_ns=_LATENCY_NS, refused=delivered.host_time_ns is None
+    return station_log.may_be_unwritten(
+        delivered.stamp_ns - start_ns,
+        before_ns=_MAX_LATENCY_NS,
+        write_errors_only=delivered.host_time_ns is None,
     )
 
 
-def misread(witness: StationWitness, measured: Measured) -> Iterator[Violation]:
-    """Compare the distances in a station's journals with those that its instrument has answered with."""
-    seen: set[Offered] = set()
-    off_ns: list[int] = []
-    offered: dict[int, list[Offered]] = {}
-    for each in witness.offered:
-        offered.setdefault(each.instrument_ms, []).append(each)
-    for journalled in measured.journalled:
+def reading_mismatches(station_log: StationLog, journal_index: JournalIndex) -> Iterator[Violation]:
+    """Compare the distances in a station's journals with those that its instrument reported."""
+    seen: set[ReportedDistance] = set()
+    errors_ns: list[int] = []
+    by_time_ms: dict[int, list[ReportedDistance]] = {}
+    for each in station_log.reported_distances:
+        by_time_ms.setdefault(each.instrument_ms, []).append(each)
+    for journalled in journal_index.journalled:
         if journalled.slope_distance_m is None or journalled.instrument_time_ns is None:
             continue
-        candidates = offered.get(journalled.instrument_time_ns // 1_000_000, [])
-        truth = next((each for each in candidates if _same_values(each, journalled)), None)
+        candidates = by_time_ms.get(journalled.instrument_time_ns // 1_000_000, [])
+        truth = next((each for each in candidates if _matches(each, journalled)), None)
         if truth is None:
-            yield Violation("read", f"the instrument has never given this: {journalled}")
+            yield Violation(
+                "reading",
+                f"station {station_log.station}: journalled, but never reported by the instrument: {journalled}",
+            )
             continue
         if truth in seen:
-            yield Violation("read", f"in the journals of station {witness.station} twice: {journalled}")
+            yield Violation("reading", f"station {station_log.station}: journalled twice: {journalled}")
         seen.add(truth)
-        stamp_ns = measured.true_ns(journalled)
+        stamp_ns = journal_index.true_ns(journalled)
         if stamp_ns is None:
             continue
-        off_ns.append(stamp_ns - truth.true_ns)
-        if abs(off_ns[-1]) > _STAMP_LIMIT_NS:
+        errors_ns.append(stamp_ns - truth.true_ns)
+        if abs(errors_ns[-1]) > _MAX_TIMESTAMP_ERROR_NS:
             yield Violation(
-                "read",
-                f"station {witness.station} has stamped a measurement {off_ns[-1] / 1e6:.1f} ms after "
-                f"it was made: {journalled}",
+                "reading",
+                f"station {station_log.station}: timestamp error {errors_ns[-1] / 1e6:.1f} ms, "
+                f"limit {_MAX_TIMESTAMP_ERROR_NS / 1e6:g} ms: {journalled}",
             )
-    if len(off_ns) >= _FEWEST_STAMPS and abs(middle_ns := median(off_ns)) > _MIDDLE_STAMP_NS:
+    if len(errors_ns) >= _MIN_TIMESTAMPS and abs(median_ns := median(errors_ns)) > _MAX_MEDIAN_ERROR_NS:
         yield Violation(
-            "read",
-            f"station {witness.station} stamps its measurements {middle_ns / 1e6:.1f} ms after they were made, "
-            f"half of {len(off_ns)} by more than that",
+            "reading",
+            f"station {station_log.station}: median timestamp error of {len(errors_ns)} measurements "
+            f"{median_ns / 1e6:.1f} ms, limit {_MAX_MEDIAN_ERROR_NS / 1e6:g} ms",
         )
 
 
-def _same_values(offered: Offered, journalled: PolarMeasurement) -> bool:
+def _matches(reported: ReportedDistance, journalled: PolarMeasurement) -> bool:
     pairs = (
-        (offered.horizontal_angle_rad, journalled.horizontal_angle_rad),
-        (offered.zenith_angle_rad, journalled.zenith_angle_rad),
-        (offered.distance_m, journalled.slope_distance_m),
+        (reported.horizontal_angle_rad, journalled.horizontal_angle_rad),
+        (reported.zenith_angle_rad, journalled.zenith_angle_rad),
+        (reported.distance_m, journalled.slope_distance_m),
     )
     return all(value is not None and abs(given - value) < _LINE_ROUNDING for given, value in pairs)
 
 
-def recorded_numbers(sessions: Sequence[Session]) -> set[tuple[int, int]]:
-    """Return station and sequence number of all that is in the recordings."""
+def recorded_sequences(master_logs: Sequence[MasterLog]) -> set[tuple[int, int]]:
+    """Return station and sequence number of all recorded measurements."""
     return {
         (measurement.station, measurement.sequence)
-        for session in sessions
-        if (path := session.recording()) is not None and _begun(path)
+        for master_log in master_logs
+        if (path := master_log.recording()) is not None and _has_complete_line(path)
         for measurement in load_recording(path).measurements
     }
 
 
-def lost(
-    witness: StationWitness, measured: Measured, recorded: set[tuple[int, int]], session: int | None
+def lost_measurements(
+    station_log: StationLog,
+    journal_index: JournalIndex,
+    recorded: set[tuple[int, int]],
+    session_number: int | None,
 ) -> Iterator[Violation]:
-    """Count what is in a station's journals and in no recording: so many must still wait in its queue.
+    """Compare the number of journalled but unrecorded measurements of a station with the length of its queue.
 
-    A master acknowledges what it has recorded, and a station keeps what is not acknowledged; so a measurement that is
-    missing on both sides was acknowledged and lost; but for one of which nobody can tell the time any more.
+    The master acknowledges what it has recorded, and the station keeps what is not acknowledged. A measurement missing on
+    both sides was acknowledged and lost, unless it has no timestamp in the master's session.
     """
     missing = [
         m.sequence
-        for m in measured.journalled
-        if (witness.station, m.sequence) not in recorded and not measured.timeless(m.sequence, session)
+        for m in journal_index.journalled
+        if (station_log.station, m.sequence) not in recorded
+        and not journal_index.has_no_timestamp(m.sequence, session_number)
     ]
-    queued = (witness.statuses[-1].queued or 0) if witness.statuses else 0
+    queued = (station_log.statuses[-1].queued or 0) if station_log.statuses else 0
     if len(missing) > queued:
         yield Violation(
             "lost",
-            f"station {witness.station} has journalled {len(missing)} measurements that no recording has, but only "
-            f"{queued} wait in its queue; the first is number {missing[0]}",
+            f"station {station_log.station}: {len(missing)} journalled measurements are in no recording, "
+            f"{queued} are in its queue; first sequence number {missing[0]}",
         )
 
 
-def delivered_twice(session: Session) -> Iterator[Violation]:
-    """Look for measurements that the pipeline was handed more than once."""
+def duplicate_deliveries(master_log: MasterLog) -> Iterator[Violation]:
+    """Find measurements that were delivered more than once."""
     seen = set()
-    for measurement in session.measurements:
+    for measurement in master_log.measurements:
         over_superframe = measurement.host_time_ns is None
         identity = measurement.sequence if over_superframe else (measurement.host_time_ns, measurement.status)
         key = (measurement.station, identity)
         if measurement.stamp_sigma_ns < UNTIMED_SIGMA_NS and key in seen:
-            yield Violation("twice", f"delivered again: {measurement}")
+            yield Violation("duplicate", f"station {measurement.station}: delivered twice: {measurement}")
         seen.add(key)
 
 
-def beyond_bound(session: Session, measured: Mapping[int, Measured], *, start_ns: int) -> Iterator[Violation]:
-    """Compare time stamps with the truth and with the bound that each of them states."""
-    for measurement in session.measurements:
+def timestamp_violations(
+    master_log: MasterLog, indices: Mapping[int, JournalIndex], *, start_ns: int
+) -> Iterator[Violation]:
+    """Compare timestamp errors with the stated bounds."""
+    for measurement in master_log.measurements:
         if measurement.stamp_sigma_ns >= UNTIMED_SIGMA_NS and not usable(measurement):
-            continue  # an error without a time of its own claims none
-        true_ns = measured[measurement.station].true_ns(measurement)
+            continue  # a failed measurement without a time states none
+        index = indices[measurement.station]
+        true_ns = index.true_ns(measurement)
         if true_ns is None:
-            if _may_be_lost(measured[measurement.station].witness, measurement, start_ns):
+            if _may_be_unwritten(index.station_log, measurement, start_ns):
                 continue
-            yield Violation("time", f"nobody has read this measurement: {measurement}")
+            yield Violation(
+                "time",
+                f"station {measurement.station}: delivered, but never read by the client: {measurement}",
+            )
             continue
         error_ns = measurement.stamp_ns - start_ns - true_ns
         bound_ns = measurement.stamp_bound_ns
         if bound_ns is None:
-            yield Violation("time", f"delivered without a bound of its time: {measurement}")
+            yield Violation(
+                "time", f"station {measurement.station}: delivered without a timestamp bound: {measurement}"
+            )
         elif abs(error_ns) > bound_ns + _ROUNDING_NS:
             yield Violation(
                 "time",
-                f"station {measurement.station} at {(measurement.stamp_ns - start_ns) / 1e9:.3f} s: stamp off by "
-                f"{error_ns / 1e3:.0f} us, stated were {bound_ns / 1e3:.0f} us",
+                f"station {measurement.station} at {(measurement.stamp_ns - start_ns) / 1e9:.3f} s: timestamp error "
+                f"{error_ns / 1e3:.0f} us, bound {bound_ns / 1e3:.0f} us",
             )
 
 
-def replayed_otherwise(session: Session) -> Iterator[Violation]:
-    """Compare the lines of the stream with those of a replay of the recording."""
-    path = session.recording()
+def replay_mismatches(master_log: MasterLog) -> Iterator[Violation]:
+    """Compare the stream with a replay of the recording."""
+    path = master_log.recording()
     if path is None:
-        if session.measurements or session.poses:
-            yield Violation("replay", "there is no recording of what was streamed")
+        if master_log.measurements or master_log.pose_counts:
+            yield Violation("replay", "the master published records but has no recording")
         return
-    if session.crashed and not _begun(path):
-        return  # it was killed before its disk took the first line
+    if master_log.crashed and not _has_complete_line(path):
+        return  # killed before the first line was written
     count = 0
     try:
         for _, lines in replayed(path):
             for line in lines:
-                if count == len(session.lines) or hash(line) != session.lines[count]:
+                if count == len(master_log.line_hashes) or hash(line) != master_log.line_hashes[count]:
                     yield Violation(
                         "replay",
-                        f"line {count + 1} of a replay of {path.name} is not what was streamed: {line[:200]!r}",
+                        f"{path.name}: line {count + 1} of the replay differs from the stream: {line[:200]!r}",
                     )
                     return
                 count += 1
     except RecordingError as error:
         yield Violation("replay", str(error))
         return
-    if count < len(session.lines) and not session.crashed:
+    if count < len(master_log.line_hashes) and not master_log.crashed:
         yield Violation(
             "replay",
-            f"a replay of {path.name} has {count} of the {len(session.lines)} lines that were streamed",
+            f"{path.name}: the replay has {count} lines, the stream {len(master_log.line_hashes)}",
         )
 
 
-def _begun(path: Path) -> bool:
-    """Whether a file has a whole line."""
+def _has_complete_line(path: Path) -> bool:
+    """Whether the first line of a file is complete."""
     with path.open("rb") as file:
         return file.readline().endswith(b"\n")
 
 
 def _same_content(journalled: PolarMeasurement, delivered: PolarMeasurement) -> bool:
-    """Whether a measurement has come as it stands in the journal, but for what the protocol rounds."""
-    # The protocol classic has no word for a low accuracy.
+    """Whether a measurement was delivered as journalled, up to the rounding of the protocol."""
+    # Protocol classic cannot encode LOW_ACCURACY.
     statuses = {
         Status.OK if delivered.host_time_ns and m.status.usable else m.status for m in (journalled, delivered)
     }
@@ -277,8 +303,8 @@ def _same_content(journalled: PolarMeasurement, delivered: PolarMeasurement) -> 
     distances_m = (journalled.slope_distance_m, delivered.slope_distance_m)
     if delivered.host_time_ns is not None:
         return angles_rad[0] == angles_rad[1] and distances_m[0] == distances_m[1]
-    turned_rad = [abs(math.remainder(a - b, math.tau)) for a, b in zip(*angles_rad, strict=True)]
-    if journalled.prism != delivered.prism or max(turned_rad) > _ANGLE_ROUNDING_RAD:
+    angle_errors_rad = [abs(math.remainder(a - b, math.tau)) for a, b in zip(*angles_rad, strict=True)]
+    if journalled.prism != delivered.prism or max(angle_errors_rad) > _ANGLE_ROUNDING_RAD:
         return False
     if distances_m[0] is None or distances_m[1] is None:
         return distances_m[0] is distances_m[1]

@@ -1,36 +1,41 @@
-"""Whether anything in the daemons' memory grows without a bound that is stated."""
+"""Bounds on the collections in the daemons' memory."""
 
 from __future__ import annotations
 
 import gc
 from collections import deque
 
-from tsgt.master import QUEUE_LINES
-from tsgt.master.classic import KNOWN_MEASUREMENTS
-from tsgt.radio.superframe import MOST_QUEUED
-from tsgt.recording.recorder import HUNG_FACTOR, WAITING_LINES
-from tsgt.timesync import MOST_PAIRS
+from tsgt.master.classic import DUPLICATE_WINDOW
+from tsgt.master.stream_server import QUEUE_LINES
+from tsgt.radio.superframe import QUEUE_CAPACITY
+from tsgt.recording.recorder import HUNG_DISK_FACTOR, MAX_PENDING_LINES
+from tsgt.timesync import MAX_SAMPLES
 
-MOST_ENTRIES = 500
-"""A list, queue or table of a daemon has at most so many entries, if nothing else is stated."""
+MAX_ENTRIES = 500
+"""Default bound of a collection."""
 
-STATED = {
+STATED_BOUNDS = {
     ("_Reader", "_queue"): QUEUE_LINES,
-    ("_Station", "_known"): KNOWN_MEASUREMENTS,
-    ("Recorder", "_waiting"): HUNG_FACTOR * WAITING_LINES,
-    ("Outbox", "_queue"): MOST_QUEUED,
-    **dict.fromkeys((("Stretch", name) for name in ("_before", "_pairs", "_received_ns")), MOST_PAIRS),
+    ("_Station", "_known"): DUPLICATE_WINDOW,
+    ("Recorder", "_queue"): HUNG_DISK_FACTOR * MAX_PENDING_LINES,
+    ("SendQueue", "_queue"): QUEUE_CAPACITY,
+    **dict.fromkeys(
+        (("ClockSegment", name) for name in ("_forward", "_samples", "_received_ns")), MAX_SAMPLES
+    ),
 }
-"""Those with a bound of their own: class and attribute, and how many entries it may have."""
+"""Bounds of other collections, by class and attribute."""
 
 _SIZED = (list, deque, dict, set, bytearray, tuple)
-_PACKAGES = ("tsgt.master.", "tsgt.radio.", "tsgt.station.", "tsgt.recording.", "tsgt.geometry.")
+_PACKAGES = tuple(
+    f"tsgt.{room}."
+    for room in ("master", "estimation", "radio", "timesync", "station", "recording", "geometry")
+)
 
 
-def overgrown() -> tuple[str, ...]:
-    """Look at all objects of the daemons that live in this process, one line for each that has too much in it."""
+def oversized_collections() -> tuple[str, ...]:
+    """Return the collections of all daemon objects in this process that exceed their bound, one line each."""
     found = []
-    kinds: dict[type, bool] = {}  # whether it is one of a daemon's
+    kinds: dict[type, bool] = {}  # whether the class belongs to a daemon
     for thing in gc.get_objects():
         kind = type(thing)
         ours = kinds.get(kind)
@@ -43,6 +48,7 @@ def overgrown() -> tuple[str, ...]:
         ]
         for name in names:
             value = getattr(thing, name, None)
-            if isinstance(value, _SIZED) and len(value) > STATED.get((kind.__name__, name), MOST_ENTRIES):
-                found.append(f"{kind.__module__}.{kind.__name__}.{name} has {len(value)} entries")
+            bound = STATED_BOUNDS.get((kind.__name__, name), MAX_ENTRIES)
+            if isinstance(value, _SIZED) and len(value) > bound:
+                found.append(f"{kind.__module__}.{kind.__name__}.{name}: {len(value)} entries, limit {bound}")
     return tuple(sorted(set(found)))

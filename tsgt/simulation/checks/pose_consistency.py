@@ -1,4 +1,4 @@
-"""Whether valid poses are where the robot was, as well as they say, and rest on what was measured."""
+"""Consistency of valid poses: with the measurements, with the ground truth, and with the stated covariance."""
 
 from __future__ import annotations
 
@@ -16,109 +16,110 @@ if TYPE_CHECKING:
 
     from tsgt.estimation import Track
     from tsgt.model import Parameters
-    from tsgt.simulation.mission import Run, Session, ValidPoses
+    from tsgt.simulation.mission import MasterLog, MissionResult, ValidPoses
 
-# More than any station's latency, which is taken off the stamps.
-_LATENCY_NS = 5_000_000_000
+# Above the latency of any station, which is subtracted from the timestamps.
+_MAX_LATENCY_NS = 5_000_000_000
 _RESIDUAL_TOLERANCE_M = 1e-6
-# Squared error of a pose in its sigmas, six degrees of freedom. A robot that does what its motion prior thinks unlikely is
-# now and then off by more than honest sigmas would allow in a lifetime: in them, 60 has a chance of 5e-11.
-_MOST_NEES = 60.0
-# In m and rad. Times of an instrument's first seconds, and those of the authors' nodes, are off by milliseconds that no
-# sigma states; of a moving robot that is millimetres.
+# NEES with six degrees of freedom exceeds 60 with a probability of 5e-11. A motion that is unlikely under the prior may
+# exceed it nevertheless, hence the additional tolerance.
+_MAX_NEES = 60.0
+# In m and rad. Timestamps of an instrument's first seconds, and of the authors' nodes, have errors of milliseconds beyond
+# the stated covariance: millimetres for a moving robot.
 _STATE_TOLERANCE = 0.02
-# Of so many poses (half a minute) half have a squared error below this. What is honest has half of them below 5.3.
-_FEWEST_POSES = 600
-_MIDDLE_NEES = 12.0
-# In m and rad: what they are off by in the middle of all, but for those that guess what comes; noise leaves a fifth of it.
-_MIDDLE_ERROR = 0.005
+# Limit of the median NEES over at least this number of poses (half a minute); the expected median is 5.3.
+_MIN_POSES = 600
+_MAX_MEDIAN_NEES = 12.0
+# In m and rad: limit of the median error of all but predicted poses; noise causes a fifth of it.
+_MAX_MEDIAN_ERROR = 0.005
 
 
-def doubtful_poses(session: Session, run: Run) -> Iterator[str]:
-    """Look at all valid poses of a session; yield what is wrong with them, one line each."""
-    yield from wrong_poses(session, run.parameters)
-    yield from wrong_states(session, run)
-    yield from too_sure(session, run)
+def pose_failures(master_log: MasterLog, result: MissionResult) -> Iterator[str]:
+    """Yield the inconsistent valid poses of a master's process, one line each."""
+    yield from refit_mismatches(master_log, result.parameters)
+    yield from nees_outliers(master_log, result)
+    yield from distribution_failures(master_log, result)
 
 
-def wrong_poses(session: Session, parameters: Parameters) -> Iterator[str]:
-    """Fit the prisms of each valid pose of the estimator ``linear`` again, from usable measurements alone."""
-    poses = session.valid_poses()
+def refit_mismatches(master_log: MasterLog, parameters: Parameters) -> Iterator[str]:
+    """Refit each valid pose of the estimator ``linear`` from usable measurements and compare the residual."""
+    poses = master_log.valid_poses()
     poses = poses.select(poses.kind == "interpolated")
-    tracks = build_tracks(parameters, [m for m in session.measurements if usable(m)])
-    missed = np.flatnonzero(~_explained(poses, slice(None), tracks, parameters))
-    stamps_ns = np.array([m.stamp_ns for m in session.measurements], dtype=np.int64)
-    around_ns = parameters.pipeline.outage_limit_ns + _LATENCY_NS
-    for index in missed.tolist():
-        # Later measurements may have come between those that the pose was made from: look at the past alone.
-        before = stamps_ns[: poses.after[index]]
+    tracks = build_tracks(parameters, [m for m in master_log.measurements if usable(m)])
+    mismatched = np.flatnonzero(~_matches_refit(poses, slice(None), tracks, parameters))
+    stamps_ns = np.array([m.stamp_ns for m in master_log.measurements], dtype=np.int64)
+    around_ns = parameters.pipeline.outage_limit_ns + _MAX_LATENCY_NS
+    for index in mismatched.tolist():
+        # Refit from the measurements before the pose only: later ones may lie between them.
+        before = stamps_ns[: poses.measurements_before[index]]
         near = np.flatnonzero(np.abs(before - poses.stamp_ns[index]) <= around_ns).tolist()
-        tracks = build_tracks(parameters, [m for i in near if usable(m := session.measurements[i])])
-        if not _explained(poses, [index], tracks, parameters)[0]:
+        tracks = build_tracks(parameters, [m for i in near if usable(m := master_log.measurements[i])])
+        if not _matches_refit(poses, [index], tracks, parameters)[0]:
             yield (
-                f"the pose at {poses.stamp_ns[index]} ns is called valid, but no usable measurements explain it"
+                f"interpolated pose at {poses.stamp_ns[index]} ns: valid, but a refit from usable measurements "
+                f"differs by more than {_RESIDUAL_TOLERANCE_M:g} m"
             )
 
 
-def wrong_states(session: Session, run: Run) -> Iterator[str]:
-    """Compare each valid pose of the estimator ``continuous`` with the truth and with the uncertainty that it states."""
-    poses = session.valid_poses()
+def nees_outliers(master_log: MasterLog, result: MissionResult) -> Iterator[str]:
+    """Compare each valid pose of the estimator ``continuous`` with the truth and its covariance (NEES)."""
+    poses = master_log.valid_poses()
     poses = poses.select(poses.kind != "interpolated")
-    errors, nees = _errors(poses, session, run)
-    off = np.linalg.norm(errors.reshape(-1, 2, 3), axis=2)
-    for index in np.flatnonzero((nees > _MOST_NEES) & (off.max(axis=1) > _STATE_TOLERANCE)).tolist():
+    errors, nees = _errors(poses, master_log, result)
+    error_norms = np.linalg.norm(errors.reshape(-1, 2, 3), axis=2)
+    for index in np.flatnonzero((nees > _MAX_NEES) & (error_norms.max(axis=1) > _STATE_TOLERANCE)).tolist():
         yield (
-            f"the {poses.kind[index]} pose at {poses.stamp_ns[index]} ns is called valid and off by "
-            f"{off[index, 0]:.4f} m and {off[index, 1]:.4f} rad; its squared error in sigmas is {nees[index]:.0f}"
+            f"{poses.kind[index]} pose at {poses.stamp_ns[index]} ns: error {error_norms[index, 0]:.4f} m and "
+            f"{error_norms[index, 1]:.4f} rad, limit {_STATE_TOLERANCE:g}; NEES {nees[index]:.0f}, limit {_MAX_NEES:g}"
         )
 
 
-def too_sure(session: Session, run: Run) -> Iterator[str]:
-    """Compare all valid poses of a kind with the truth, and with what they state.
+def distribution_failures(master_log: MasterLog, result: MissionResult) -> Iterator[str]:
+    """Compare the medians of error and NEES of each kind of pose with their limits.
 
-    What chance excuses in a single pose it does not in half of them; and what noise leaves in the middle of half a minute,
-    with a robot that turns this way and that, is a wrong set-up. The authors' nodes, which keep no journals, stamp what they
-    read when it comes: their poses are late, and no sigma says so.
+    Chance can explain a single pose, but not the median; and a median error over half a minute, with a robot that turns,
+    indicates a wrong setup. Skips the authors' nodes, which keep no journals: they timestamp readings on arrival, so their
+    poses are late beyond the stated covariance.
     """
-    if any(witness.folder is None for witness in run.witnesses.values()):
+    if any(station_log.folder is None for station_log in result.station_logs.values()):
         return
-    every = session.valid_poses()
+    every = master_log.valid_poses()
     for kind in ("interpolated", "predicted", "smoothed"):
         poses = every.select(every.kind == kind)
-        if len(poses.stamp_ns) < _FEWEST_POSES:
+        if len(poses.stamp_ns) < _MIN_POSES:
             continue
-        errors, nees = _errors(poses, session, run)
-        middle = np.median(nees)
-        beside_m, beside_rad = np.linalg.norm(np.median(errors, axis=0).reshape(2, 3), axis=1)
-        if kind != "predicted" and max(beside_m, beside_rad) > _MIDDLE_ERROR:
+        errors, nees = _errors(poses, master_log, result)
+        median_nees = np.median(nees)
+        median_m, median_rad = np.linalg.norm(np.median(errors, axis=0).reshape(2, 3), axis=1)
+        if kind != "predicted" and max(median_m, median_rad) > _MAX_MEDIAN_ERROR:
             yield (
-                f"the {len(nees)} {kind} poses are {beside_m:.4f} m and {beside_rad:.4f} rad beside the truth in the middle"
+                f"{len(nees)} {kind} poses: median error {median_m:.4f} m and {median_rad:.4f} rad, "
+                f"limit {_MAX_MEDIAN_ERROR:g}"
             )
-        if middle > _MIDDLE_NEES:
-            yield (
-                f"half of {len(nees)} {kind} poses have a squared error in sigmas above {middle:.1f}: they "
-                "are not where they should be, or state too little uncertainty"
-            )
+        if median_nees > _MAX_MEDIAN_NEES:
+            yield f"{len(nees)} {kind} poses: median NEES {median_nees:.1f}, limit {_MAX_MEDIAN_NEES:g}"
 
 
-def _errors(poses: ValidPoses, session: Session, run: Run) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(N, 6) errors in place and rotation in m and rad, and (N,) their squares in the sigmas that the poses state."""
-    truth = run.world.pose_at((poses.stamp_ns - session.zero_ns) / 1e9)
-    turned = rotation_from_quaternion(poses.orientation_xyzw) @ np.swapaxes(truth[:, :3, :3], 1, 2)
-    errors = np.concatenate([poses.position_m - truth[:, :3, 3], log_so3(turned)], axis=1)
+def _errors(
+    poses: ValidPoses, master_log: MasterLog, result: MissionResult
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return (N, 6) position errors in m and rotation errors in rad, and their NEES, (N,)."""
+    truth = result.world.pose_at((poses.stamp_ns - master_log.unix_at_zero_ns) / 1e9)
+    rotation_error = rotation_from_quaternion(poses.orientation_xyzw) @ np.swapaxes(truth[:, :3, :3], 1, 2)
+    errors = np.concatenate([poses.position_m - truth[:, :3, 3], log_so3(rotation_error)], axis=1)
     return errors, np.einsum("ni,ni->n", errors, np.linalg.solve(poses.covariance, errors[..., None])[..., 0])
 
 
-def _explained(
+def _matches_refit(
     poses: ValidPoses,
     rows: slice | list[int],
     tracks: dict[int, Track],
     parameters: Parameters,
 ) -> NDArray[np.bool_]:
-    """Tell, for the given poses, whether the prisms lie where measurements put them, to the residual stated."""
+    """Return whether each pose's prisms lie on the interpolated measurements, to the stated residual."""
     stamps = poses.stamp_ns[rows]
     rotation = rotation_from_quaternion(poses.orientation_xyzw[rows])
-    explained = np.ones(len(stamps), dtype=np.bool_)
+    matches = np.ones(len(stamps), dtype=np.bool_)
     squares = np.zeros(len(stamps))
     for prism in parameters.prisms:
         track = tracks[prism.prism]
@@ -128,12 +129,14 @@ def _explained(
         before = after - 1
         after = np.minimum(after, len(track) - 1)
         from_ns, to_ns = track.times_ns[before], track.times_ns[after]
-        explained &= (from_ns <= stamps) & (stamps <= to_ns)
-        explained &= to_ns - from_ns <= parameters.pipeline.outage_limit_ns
+        matches &= (from_ns <= stamps) & (stamps <= to_ns)
+        matches &= to_ns - from_ns <= parameters.pipeline.outage_limit_ns
         fraction = (stamps - from_ns) / np.maximum(to_ns - from_ns, 1)
-        seen = track.points_m[before] + fraction[:, None] * (track.points_m[after] - track.points_m[before])
+        recorded_points = track.points_m[before] + fraction[:, None] * (
+            track.points_m[after] - track.points_m[before]
+        )
         placed = poses.position_m[rows] + rotation @ np.array(prism.position_m)
-        squares += np.sum((placed - seen) ** 2, axis=1)
+        squares += np.sum((placed - recorded_points) ** 2, axis=1)
     residual_m = np.sqrt(squares / len(parameters.prisms))
-    explained &= np.abs(residual_m - poses.residual_m[rows]) <= _RESIDUAL_TOLERANCE_M
-    return explained
+    matches &= np.abs(residual_m - poses.residual_m[rows]) <= _RESIDUAL_TOLERANCE_M
+    return matches

@@ -1,4 +1,4 @@
-"""The folder of a demonstration: configuration files as a mission has them, for simulated radios and instruments."""
+"""Configuration files of a demonstration, for simulated radios and instruments."""
 
 from __future__ import annotations
 
@@ -17,33 +17,31 @@ if TYPE_CHECKING:
 
 Protocol = Literal["superframe", "classic"]
 
-INITIAL_CYCLES = 8
-"""Fewer than the paper's 50, which take half a minute: nobody wants to wait so long for a demonstration."""
+DEMO_SYNC_CYCLES = 8
+"""The paper's 50 cycles take half a minute, which is too long for a demonstration."""
 
 _SUPERFRAME = """\
 [protocol]
-kind = "superframe"     # every measurement gets through; `tsgt demo --protocol classic` shows the paper's
-key_file = "radio.key"  # the same for all
+kind = "superframe"     # delivers every measurement; `tsgt demo --protocol classic` runs the paper's
+key_file = "radio.key"  # shared by all radios
 """
 
 _CLASSIC = """\
 [protocol]
-kind = "classic"        # the paper's
+kind = "classic"        # the paper's protocol
 """
 
 
 @dataclass(frozen=True, slots=True)
 class DemoFiles:
-    """What stands where in the folder of a demonstration.
+    """Paths in the folder of a demonstration.
 
     Attributes
     ----------
     folder
-        Everything lies in here: configuration, sockets, logs, journals and recordings.
+        Configuration, sockets, logs, journals and recordings.
     socket
         UNIX socket of the pose stream.
-    stations
-        Numbers of the stations.
     """
 
     folder: Path
@@ -52,7 +50,7 @@ class DemoFiles:
 
     @property
     def air_socket(self) -> Path:
-        """UNIX socket of the air."""
+        """UNIX socket of the simulated radio channel."""
         return self.folder / "air.sock"
 
     @property
@@ -62,7 +60,7 @@ class DemoFiles:
 
     @property
     def key(self) -> Path:
-        """Key of all radios, where the protocol has one."""
+        """Key of all radios; protocol ``superframe`` only."""
         return self.folder / "radio.key"
 
     @property
@@ -79,7 +77,7 @@ class DemoFiles:
         return self.folder / f"instrument{station}.tty"
 
     def status_socket(self, station: int) -> Path:
-        """Return the UNIX socket on which a station's client says how it does."""
+        """Return the UNIX socket of a client's status."""
         return self.folder / f"client{station}.sock"
 
     def journals(self, station: int) -> Path:
@@ -90,19 +88,7 @@ class DemoFiles:
 def write_demo_files(
     folder: Path, scenario: ScenarioConfig, socket: Path, protocol: Protocol = "superframe"
 ) -> DemoFiles:
-    """Write all configuration and set-up files of a scenario into a folder, and a key.
-
-    Parameters
-    ----------
-    folder
-        Exists.
-    scenario
-        Stations, prisms and limits.
-    socket
-        Where the poses are to go.
-    protocol
-        What master and stations speak.
-    """
+    """Write the configuration and setup files of a scenario, and a key, into an existing folder."""
     files = DemoFiles(folder, socket, tuple(station.station for station in scenario.stations))
     parameters = scenario_parameters(scenario)
     frames = [
@@ -133,7 +119,7 @@ def _master(files: DemoFiles, scenario: ScenarioConfig, protocol: Protocol) -> s
     limits = scenario.pipeline.model_dump(mode="json")
     motion = limits.pop("motion")
     pipeline = "\n".join(f"{key} = {json.dumps(value)}" for key, value in limits.items())
-    classic = f"{_CLASSIC}initial_cycles = {INITIAL_CYCLES}      # the paper's 50 take half a minute\n"
+    classic = f"{_CLASSIC}initial_cycles = {DEMO_SYNC_CYCLES}      # the paper's 50 take half a minute\n"
     return f"""\
 kind = "master"
 

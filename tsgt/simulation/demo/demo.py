@@ -1,7 +1,7 @@
-"""The demonstration: the real daemons as processes, with air, instruments and robot simulated in this one.
+"""Runs the daemons as processes, with channel, instruments and robot simulated in this process.
 
-Everything that the daemons touch outside themselves is real: sockets, serial ports (pseudo-terminals), files, signals,
-time. Radios and instruments are simulated; so a daemon can be killed and started again like one in the field.
+Everything outside the daemons' radios and instruments is real: sockets, serial ports (pseudo-terminals), files, signals,
+time. A daemon can be killed and restarted as in the field.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ from tsgt.errors import StreamError
 from tsgt.simulation.demo.processes import Process
 from tsgt.simulation.instrument import PtyLine, SimulatedTotalStation
 from tsgt.simulation.kernel import LoopTimeline
-from tsgt.simulation.lora import AirServer
-from tsgt.simulation.mission import scenario_link
+from tsgt.simulation.lora import AirServer, scenario_link
 from tsgt.simulation.world import scenario_world
 
 if TYPE_CHECKING:
@@ -28,12 +27,12 @@ if TYPE_CHECKING:
     from tsgt.simulation.demo.config_files import DemoFiles
     from tsgt.simulation.lora import LinkModel
 
-STARTUP_LIMIT_S = 60.0
+STARTUP_TIMEOUT_S = 60.0
 """From the start of the daemons to the first pose; a slow machine takes five seconds."""
 
 _MAX_LINE_BYTES = 1 << 20
-_RECONNECT_S = 0.2
-_LAST_LINES_S = 2.0
+_RECONNECT_DELAY_S = 0.2
+_FINAL_READ_TIMEOUT_S = 2.0
 
 
 class Demo:
@@ -41,25 +40,21 @@ class Demo:
 
     Parameters
     ----------
-    scenario
-        World, stations and prisms.
     files
-        Configuration of the daemons, written already.
+        Configuration of the daemons, already written.
     duration_s
         From the first pose to the end.
-    seed
-        Of everything that is drawn.
     clock
         CLOCK_MONOTONIC of this machine, which all processes share.
 
     Attributes
     ----------
     world
-        The truth; its zero is ``start_ns``.
+        Ground truth; its zero is ``start_ns``.
     start_ns
         CLOCK_MONOTONIC at the start of the world, in ns.
     processes
-        The daemons: the clients in the order of the stations, then the master.
+        The clients in the order of the stations, then the master.
     """
 
     def __init__(
@@ -72,7 +67,7 @@ class Demo:
         world_rng, self._air_rng, *self._instrument_rngs = np.random.default_rng(seed).spawn(
             2 + len(scenario.stations)
         )
-        self.world = scenario_world(scenario, duration_s + STARTUP_LIMIT_S + 10, world_rng)
+        self.world = scenario_world(scenario, duration_s + STARTUP_TIMEOUT_S + 10, world_rng)
         self.start_ns = clock.monotonic_ns()
         self.processes = [
             Process(
@@ -95,17 +90,17 @@ class Demo:
         self._ending = False
 
     async def run(self, on_line: Callable[[bytes], None]) -> None:
-        """Run to the end, or until cancelled, which ends the daemons in order too.
+        """Run to the end or until cancelled; stops the daemons in either case.
 
         Parameters
         ----------
         on_line
-            Gets each line of the master's stream.
+            Called with each line of the master's stream.
 
         Raises
         ------
         StreamError
-            A socket cannot be made, or no pose comes.
+            A socket cannot be created, or no pose arrives.
         """
         timeline = LoopTimeline(asyncio.get_running_loop())
         async with AsyncExitStack() as stack:
@@ -119,34 +114,34 @@ class Demo:
             tasks = [asyncio.create_task(process.keep_running()) for process in self.processes]
             reading = asyncio.create_task(self._read(on_line))
             try:
-                await self._until_the_end()
+                await self._wait_until_end()
             finally:
                 self._ending = True
                 for task in tasks:
                     task.cancel()
                 await asyncio.wait(tasks)
-                await asyncio.wait([reading], timeout=_LAST_LINES_S)
+                await asyncio.wait([reading], timeout=_FINAL_READ_TIMEOUT_S)
                 reading.cancel()
                 await asyncio.wait([reading])
 
     def _link(self) -> LinkModel:
-        """Return the scenario's conditions; the robot's radio stays in the middle of its area."""
-        places = {f"station{s.station}": s.position_m for s in self._scenario.stations}
-        places["master"] = self._scenario.motion.area_centre_m
-        return scenario_link(self._scenario.radio, places, self._air_rng)
+        """Return the scenario's link model; the robot's radio stays at the centre of its area."""
+        positions_m = {f"station{s.station}": s.position_m for s in self._scenario.stations}
+        positions_m["master"] = self._scenario.motion.area_centre_m
+        return scenario_link(self._scenario.radio, positions_m, self._air_rng)
 
-    async def _until_the_end(self) -> None:
+    async def _wait_until_end(self) -> None:
         try:
-            async with asyncio.timeout(STARTUP_LIMIT_S):
+            async with asyncio.timeout(STARTUP_TIMEOUT_S):
                 await self._first_pose.wait()
         except TimeoutError:
             raise StreamError(
-                f"{self._files.folder}: no pose within {STARTUP_LIMIT_S:g} s; see the logs in this folder"
+                f"{self._files.folder}: no pose within {STARTUP_TIMEOUT_S:g} s; see the logs in this folder"
             ) from None
         await asyncio.sleep(self._duration_s)
 
     async def _read(self, on_line: Callable[[bytes], None]) -> None:
-        """Follow the stream, also of a master that was started again, until the end."""
+        """Read the stream until the end; reconnect after a restart of the master."""
         while not self._ending:
             with suppress(OSError):
                 reader, writer = await asyncio.open_unix_connection(self._files.socket, limit=_MAX_LINE_BYTES)
@@ -158,4 +153,4 @@ class Demo:
                 finally:
                     writer.close()
             if not self._ending:
-                await asyncio.sleep(_RECONNECT_S)
+                await asyncio.sleep(_RECONNECT_DELAY_S)

@@ -1,4 +1,4 @@
-"""Daemons as processes of their own, started again when they die, as systemd does it in the field."""
+"""Daemons as processes, restarted when they end, as systemd does in the field."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from typing import TYPE_CHECKING, NoReturn
 if TYPE_CHECKING:
     from pathlib import Path
 
-RESTART_AFTER_S = 1.0
+RESTART_DELAY_S = 1.0
 """From the end of a process to its next start."""
 
 STOP_TIMEOUT_S = 5.0
-"""How long a process has to end after SIGTERM; it should take one second."""
+"""From SIGTERM to SIGKILL; a daemon should stop within one second."""
 
-# Stdin is a pipe that ends when we do, however that happens; nobody would stop the daemon after that.
+# Stdin is a pipe that closes when this process ends, even by SIGKILL; then the daemon stops itself.
 _PROGRAM = """
 import os, signal, threading
-def outlived():
+def stop_with_parent():
     os.read(0, 1)
     os.kill(os.getpid(), signal.SIGTERM)
-threading.Thread(target=outlived, daemon=True).start()
+threading.Thread(target=stop_with_parent, daemon=True).start()
 from tsgt.cli.daemons import {entry_point} as main
 main()
 """
@@ -31,22 +31,18 @@ main()
 
 @dataclass(slots=True)
 class Process:
-    """A daemon that is kept running.
+    """A daemon process that is kept running.
 
     Attributes
     ----------
-    name
-        For people.
     entry_point
         Function of :mod:`tsgt.cli.daemons` that the process runs.
-    arguments
-        Its command line.
     log_path
-        Gets what it writes to stderr and stdout.
+        File for its stderr and stdout.
     pid
-        Of the process that runs now; None while none does.
+        None: not running.
     starts
-        How often it has been started.
+        Number of starts.
     """
 
     name: str
@@ -57,7 +53,7 @@ class Process:
     starts: int = field(default=0, init=False)
 
     async def keep_running(self) -> NoReturn:
-        """Start the process, again and again when it ends; on being cancelled end it and wait for it."""
+        """Start the process whenever it is not running; stop it when cancelled."""
         while True:
             with self.log_path.open("ab") as log_file:
                 process = await asyncio.create_subprocess_exec(
@@ -68,7 +64,7 @@ class Process:
                     stdin=asyncio.subprocess.PIPE,
                     stdout=log_file,
                     stderr=log_file,
-                    start_new_session=True,  # Ctrl-C is for the demonstration, which ends them in order
+                    start_new_session=True,  # Ctrl-C must not reach it: the demonstration stops the daemons in order
                 )
             self.pid, self.starts = process.pid, self.starts + 1
             try:
@@ -78,7 +74,7 @@ class Process:
                 raise
             finally:
                 self.pid = None
-            await asyncio.sleep(RESTART_AFTER_S)
+            await asyncio.sleep(RESTART_DELAY_S)
 
 
 async def _end(process: asyncio.subprocess.Process) -> None:

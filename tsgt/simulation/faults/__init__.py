@@ -1,22 +1,25 @@
-"""TODO face."""
+"""Faults of a mission: drawn from the seed, injected at their times, removed before the fault-free tail.
+
+In: kinds of faults, a random generator, a running mission. Out: `draw_faults` gives the faults, `inject_fault` applies one.
+"""
 
 from tsgt.simulation.faults.catalogue import (
-    CALM_S,
-    QUICK_CYCLES,
-    SETTLE_S,
+    FAST_SYNC_CYCLES,
+    FAULT_FREE_START_S,
+    FAULT_FREE_TAIL_S,
     FaultKind,
     draw_faults,
     parse_faults,
 )
-from tsgt.simulation.faults.injection import act, see_to_instruments
+from tsgt.simulation.faults.injection import inject_fault, relock_instruments
 
 __all__ = [
-    "CALM_S",
-    "QUICK_CYCLES",
-    "SETTLE_S",
+    "FAST_SYNC_CYCLES",
+    "FAULT_FREE_START_S",
+    "FAULT_FREE_TAIL_S",
     "FaultKind",
-    "act",
     "draw_faults",
+    "inject_fault",
     "parse_faults",
-    "see_to_instruments",
+    "relock_instruments",
 ]

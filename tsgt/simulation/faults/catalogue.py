@@ -1,7 +1,7 @@
-"""What goes wrong in a simulated mission, drawn from its seed: which faults, when, of whom, for how long.
+"""Kinds of faults and their rates; draws which faults occur in a mission, when, where and for how long.
 
-How often each kind comes is a rate per hour of each target. A swarm of seeds varies the rates widely, and leaves some
-kinds out of each run: a fault that only shows without another one is found that way.
+Rates are per hour and target. Each seed scales the rates randomly and omits some kinds: a fault that is only visible
+without another one is found this way.
 """
 
 from __future__ import annotations
@@ -17,148 +17,146 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-CALM_S = 40.0
-"""Before the end of a run all faults are over for so long: what they broke has to work again by then."""
+FAULT_FREE_TAIL_S = 40.0
+"""No fault in this time before the end: everything must work again by then."""
 
-AFTER_BOOT_S = (5.5, 8.0)
-"""When a person locks an instrument that was switched on: it takes five seconds to start."""
+RELOCK_DELAY_S = (5.5, 8.0)
+"""From power-on of an instrument, which boots for five seconds, to the operator's relock; minimum and maximum."""
 
-SETTLE_S = 5.0
-"""Before any fault."""
+FAULT_FREE_START_S = 5.0
+"""No fault in this time after the start."""
 
 
-QUICK_CYCLES = 8
-"""Of the first synchronisation of classic: a master that is killed every other minute must not take longer."""
+FAST_SYNC_CYCLES = 8
+"""Cycles of the first synchronisation of ``classic``, short because the master is killed every few minutes."""
 
 
 class FaultKind(StrEnum):
     """A kind of fault."""
 
     LOSS = "loss"
-    """Packets between the master and a station are lost, each with a probability."""
+    """Packets between the master and a station are lost with a random probability."""
     JAMMING = "jamming"
-    """Somebody sends long packets, much stronger than everybody else, without a pause."""
+    """A much stronger radio transmits long packets continuously."""
     COLLISIONS = "collisions"
-    """Another LoRa network on the same channel, with the same settings and the same sync word."""
+    """Another LoRa network uses the same channel, settings and sync word."""
     FORGERY = "forgery"
-    """Somebody plays back what he has heard, whole, cut short or changed."""
+    """A replay attacker transmits captured packets, whole, truncated or altered."""
     CHIP_RESET = "chip-reset"
-    """The radio's supply dips: its registers are as after a reset."""
+    """A supply dip resets the radio's registers."""
     CHIP_HANG = "chip-hang"
-    """The radio takes no commands any more."""
+    """The radio accepts no commands."""
     BUS = "bus"
-    """The SPI bus is dead: every register reads as all zeros or all ones."""
+    """The SPI bus is dead: all registers read as zeros or ones."""
     INTERRUPTS = "interrupts"
-    """Interrupts of the radio do not reach the host."""
+    """Interrupts of the radio are lost."""
     UNPLUG = "unplug"
-    """Somebody stumbles over the instrument's cable."""
+    """The instrument's cable is unplugged."""
     LINE = "line"
-    """Answers of the instrument are cut, spoilt, torn, late, doubled, or missing."""
+    """Responses of the instrument are truncated, corrupted, split, delayed, duplicated or lost."""
     STALL = "stall"
-    """The instrument is silent, or deaf."""
+    """All responses of the instrument, or all requests, are lost."""
     POWER = "power"
-    """The instrument is switched off and on; a person locks it on its prism again."""
+    """The instrument is switched off and on, and relocked by an operator."""
     PRISM_LOSS = "prism-loss"
-    """Something stands between the instrument and its prism."""
+    """The line of sight to the prism is blocked."""
     WRONG_PRISM = "wrong-prism"
-    """The instrument follows another station's prism."""
+    """The instrument tracks another station's prism."""
     DRIFT = "drift"
-    """A station's crystal runs fast or slow, and changes as it gets warm."""
+    """The drift of a station's clock changes."""
     CLOCK_STEP = "clock-step"
-    """Somebody sets a station's Unix clock."""
+    """A station's Unix clock is stepped."""
     REBOOT = "reboot"
-    """A station's computer is switched off and on: CLOCK_MONOTONIC begins at zero, the Unix clock where it was."""
+    """A station's computer is powered off and on: CLOCK_MONOTONIC restarts at zero, the Unix clock where it stopped."""
     MASTER_CLOCK_STEP = "master-clock-step"
-    """Somebody sets the master's Unix clock."""
+    """The master's Unix clock is stepped."""
     CLIENT_CRASH = "client-crash"
-    """A client is killed, and started again."""
+    """A client is killed and restarted."""
     MASTER_CRASH = "master-crash"
-    """The master is killed, and started again."""
+    """The master is killed and restarted."""
     TORN_WRITE = "torn-write"
-    """A daemon is killed in the middle of a line that it writes to its disk, and started again."""
+    """A daemon is killed during a write, and restarted."""
     DISK_FULL = "disk-full"
-    """There is no room on a disk."""
+    """A disk is full."""
     DISK_READ_ONLY = "disk-read-only"
-    """A disk has turned read-only after an error."""
+    """A disk is read-only after an error."""
     SLOW_READER = "slow-reader"
-    """A reader of the stream stops reading."""
+    """A stream subscriber stops reading."""
     VANISHING_READER = "vanishing-reader"
-    """A reader of the stream goes away without a word, in the middle of a line."""
+    """A stream subscriber aborts its connection."""
 
 
-class _Habit(NamedTuple):
-    """How a kind of fault comes: per hour and target; of whom; how long, from and to, in s."""
+class _FaultRate(NamedTuple):
+    """Rate per hour and target, targets, and minimum and maximum duration in s of a kind of fault."""
 
     per_hour: float
-    of: str
-    seconds: tuple[float, float]
+    targets: str
+    duration_s: tuple[float, float]
 
 
 _M, _S, _B = "master", "stations", "both"
-_HABITS: Final = {
-    FaultKind.LOSS: _Habit(40, _S, (0.5, 20)),
-    FaultKind.JAMMING: _Habit(10, _M, (0.2, 8)),
-    FaultKind.COLLISIONS: _Habit(20, _M, (2, 40)),
-    FaultKind.FORGERY: _Habit(20, _M, (2, 40)),
-    FaultKind.CHIP_RESET: _Habit(15, _B, (0, 0)),
-    FaultKind.CHIP_HANG: _Habit(10, _B, (0, 0)),
-    FaultKind.BUS: _Habit(6, _B, (0.05, 8)),
-    FaultKind.INTERRUPTS: _Habit(40, _B, (0, 0)),
-    FaultKind.UNPLUG: _Habit(10, _S, (0.05, 15)),
-    FaultKind.LINE: _Habit(20, _S, (1, 20)),
-    FaultKind.STALL: _Habit(10, _S, (0.2, 15)),
-    FaultKind.POWER: _Habit(4, _S, (0.5, 20)),
-    FaultKind.PRISM_LOSS: _Habit(20, _S, (0.2, 15)),
-    FaultKind.WRONG_PRISM: _Habit(6, _S, (2, 20)),
-    FaultKind.DRIFT: _Habit(10, _S, (5, 120)),
-    FaultKind.CLOCK_STEP: _Habit(10, _S, (0, 0)),
-    FaultKind.REBOOT: _Habit(4, _S, (1, 20)),
-    FaultKind.MASTER_CLOCK_STEP: _Habit(10, _M, (0, 0)),
-    FaultKind.CLIENT_CRASH: _Habit(15, _S, (0.5, 10)),
-    FaultKind.MASTER_CRASH: _Habit(15, _M, (0.5, 10)),
-    FaultKind.TORN_WRITE: _Habit(8, _B, (0.5, 5)),
-    FaultKind.DISK_FULL: _Habit(8, _B, (0.5, 30)),
-    FaultKind.DISK_READ_ONLY: _Habit(4, _B, (0.5, 30)),
-    FaultKind.SLOW_READER: _Habit(20, _M, (1, 60)),
-    FaultKind.VANISHING_READER: _Habit(20, _M, (0, 5)),
+_RATES: Final = {
+    FaultKind.LOSS: _FaultRate(40, _S, (0.5, 20)),
+    FaultKind.JAMMING: _FaultRate(10, _M, (0.2, 8)),
+    FaultKind.COLLISIONS: _FaultRate(20, _M, (2, 40)),
+    FaultKind.FORGERY: _FaultRate(20, _M, (2, 40)),
+    FaultKind.CHIP_RESET: _FaultRate(15, _B, (0, 0)),
+    FaultKind.CHIP_HANG: _FaultRate(10, _B, (0, 0)),
+    FaultKind.BUS: _FaultRate(6, _B, (0.05, 8)),
+    FaultKind.INTERRUPTS: _FaultRate(40, _B, (0, 0)),
+    FaultKind.UNPLUG: _FaultRate(10, _S, (0.05, 15)),
+    FaultKind.LINE: _FaultRate(20, _S, (1, 20)),
+    FaultKind.STALL: _FaultRate(10, _S, (0.2, 15)),
+    FaultKind.POWER: _FaultRate(4, _S, (0.5, 20)),
+    FaultKind.PRISM_LOSS: _FaultRate(20, _S, (0.2, 15)),
+    FaultKind.WRONG_PRISM: _FaultRate(6, _S, (2, 20)),
+    FaultKind.DRIFT: _FaultRate(10, _S, (5, 120)),
+    FaultKind.CLOCK_STEP: _FaultRate(10, _S, (0, 0)),
+    FaultKind.REBOOT: _FaultRate(4, _S, (1, 20)),
+    FaultKind.MASTER_CLOCK_STEP: _FaultRate(10, _M, (0, 0)),
+    FaultKind.CLIENT_CRASH: _FaultRate(15, _S, (0.5, 10)),
+    FaultKind.MASTER_CRASH: _FaultRate(15, _M, (0.5, 10)),
+    FaultKind.TORN_WRITE: _FaultRate(8, _B, (0.5, 5)),
+    FaultKind.DISK_FULL: _FaultRate(8, _B, (0.5, 30)),
+    FaultKind.DISK_READ_ONLY: _FaultRate(4, _B, (0.5, 30)),
+    FaultKind.SLOW_READER: _FaultRate(20, _M, (1, 60)),
+    FaultKind.VANISHING_READER: _FaultRate(20, _M, (0, 5)),
 }
 
-OFTEN = 3.0
-_LEFT_OUT = 0.3
-_SPREAD = 8.0
+RATE_FACTOR = 3.0
+_OMIT_PROBABILITY = 0.3
+_RATE_SPREAD = 8.0
 
 
 class Fault(NamedTuple):
-    """One fault.
+    """A fault.
 
     Attributes
     ----------
     at_s
-        When it begins, from the start of the run, in s.
-    kind
-        Which.
+        Start in s from the start of the mission.
     station
-        Number of the station that it is of; None: the master, or the channel.
-    seconds
-        How long it lasts, in s; 0: an instant.
+        None: the master, or the channel.
+    duration_s
+        0: instantaneous.
     seed
-        Of whatever else is drawn.
+        Seed of further draws.
     """
 
     at_s: float
     kind: FaultKind
     station: int | None
-    seconds: float
+    duration_s: float
     seed: int
 
 
 def parse_faults(text: str) -> frozenset[FaultKind]:
-    """Read which kinds of faults somebody wants: ``none``, ``all``, or names with commas between them.
+    """Parse kinds of faults: ``none``, ``all``, or comma-separated names.
 
     Raises
     ------
     ConfigError
-        There is no fault of that name.
+        Unknown name.
     """
     if text in {"none", "all"}:
         return frozenset(FaultKind if text == "all" else ())
@@ -172,50 +170,39 @@ def parse_faults(text: str) -> frozenset[FaultKind]:
 def draw_faults(
     kinds: Iterable[FaultKind], rng: np.random.Generator, *, duration_s: float, stations: Sequence[int]
 ) -> tuple[Fault, ...]:
-    """Draw the faults of a run.
+    """Draw the faults of a mission, sorted by start.
 
-    Each kind's rate is the usual one times a factor between an eighth and eight, the same for the whole run. With more
-    than one kind, three in ten of them are left out.
-
-    Parameters
-    ----------
-    kinds
-        Those that may come.
-    rng
-        Draws.
-    duration_s
-        Of the run; all are over :data:`CALM_S` before its end.
-    stations
-        Their numbers.
-
-    Returns
-    -------
-    tuple[Fault, ...]
-        In the order in which they begin.
+    The rate of each kind is scaled by a random factor between 1/8 and 8. With more than one kind, each is omitted with a
+    probability of 0.3. All faults end :data:`FAULT_FREE_TAIL_S` before ``duration_s``.
     """
     ordered = sorted(set(kinds), key=list(FaultKind).index)
-    end_s = duration_s - CALM_S
+    end_s = duration_s - FAULT_FREE_TAIL_S
     faults = []
     for kind in ordered:
-        factor, left_out = _SPREAD ** rng.uniform(-1, 1), rng.random() < _LEFT_OUT
-        habit = _HABITS[kind]
-        for station in [*([None] if habit.of in (_M, _B) else []), *(stations if habit.of != _M else [])]:
-            count = rng.poisson(max(0.0, OFTEN * habit.per_hour * factor * (end_s - SETTLE_S) / 3600))
-            if left_out and len(ordered) > 1:
+        factor, omitted = _RATE_SPREAD ** rng.uniform(-1, 1), rng.random() < _OMIT_PROBABILITY
+        rate = _RATES[kind]
+        for station in [
+            *([None] if rate.targets in (_M, _B) else []),
+            *(stations if rate.targets != _M else []),
+        ]:
+            count = rng.poisson(
+                max(0.0, RATE_FACTOR * rate.per_hour * factor * (end_s - FAULT_FREE_START_S) / 3600)
+            )
+            if omitted and len(ordered) > 1:
                 continue
             for _ in range(count):
-                until_s = end_s - AFTER_BOOT_S[1] if kind == FaultKind.POWER else end_s
-                at_s = rng.uniform(SETTLE_S, max(SETTLE_S, until_s))
-                shortest, longest = habit.seconds
-                # Short ones as often as long ones.
-                seconds = shortest and math.exp(rng.uniform(math.log(shortest), math.log(longest)))
-                seconds = seconds or (rng.uniform(0, longest) if longest else 0.0)
+                until_s = end_s - RELOCK_DELAY_S[1] if kind == FaultKind.POWER else end_s
+                at_s = rng.uniform(FAULT_FREE_START_S, max(FAULT_FREE_START_S, until_s))
+                shortest, longest = rate.duration_s
+                # Log-uniform durations.
+                duration_s = shortest and math.exp(rng.uniform(math.log(shortest), math.log(longest)))
+                duration_s = duration_s or (rng.uniform(0, longest) if longest else 0.0)
                 faults.append(
                     Fault(
                         float(at_s),
                         kind,
                         station,
-                        float(max(0.0, min(seconds, until_s - at_s))),
+                        float(max(0.0, min(duration_s, until_s - at_s))),
                         int(rng.integers(2**63)),
                     )
                 )

@@ -1,7 +1,4 @@
-"""When a simulated total station takes distances, and what it adds to them.
-
-The noise of a total station's measurements.
-"""
+"""Electronic distance measurement: when distances are measured, their noise, and the atmospheric correction."""
 
 from __future__ import annotations
 
@@ -17,39 +14,33 @@ if TYPE_CHECKING:
 
     from tsgt.model import InstrumentNoise
 
-CONTINUOUS: Final = frozenset({6, 7, 8, 9})
-"""EDM modes that go on measuring until stopped."""
+CONTINUOUS_MODES: Final = frozenset({6, 7, 8, 9})
+"""EDM modes that measure until stopped."""
 
-WITHOUT_PRISM: Final = frozenset({1, 5, 8, 12, 14})
-"""EDM modes for reflector tape and without any reflector; the others need a prism."""
+NON_PRISM_MODES: Final = frozenset({1, 5, 8, 12, 14})
+"""EDM modes for reflector tape and reflectorless measurement; the others need a prism."""
 
 START_NS: Final = 200_000_000
-"""From the order to the first distance that can come; an assumption."""
+"""From the command to the earliest first distance; an assumption."""
 
-SHOT_S: Final = (1.0, 2.0)
-"""A single measurement takes a time between these: 1.2 s in the data sheet of a Trimble S7."""
+SINGLE_MEASUREMENT_S: Final = (1.0, 2.0)
+"""Minimum and maximum duration of a single measurement: 1.2 s in the data sheet of a Trimble S7."""
 
 RANGE_M: Final = (1.0, 1000.0)
-"""Nearer and farther than this there is no distance."""
+"""Measuring range."""
 
-_JITTERS: Final = 1024
+_JITTER_COUNT: Final = 1024
 
 
-class DistanceMeter:
-    """The instants at which distances are taken: every tick while it measures continuously, or one.
-
-    Ticks come at even intervals that nobody can shift, each a little early or late. They are computed when asked for.
+class EdmSchedule:
+    """Times of distance measurements: evenly spaced with jitter in continuous mode, or a single one. Computed on request.
 
     Parameters
     ----------
-    period_ns
-        From tick to tick.
     jitter_ns
-        One sigma of what a tick is early or late.
+        One sigma; limited to 40 % of the period.
     phase_ns
-        True time of one of them without jitter.
-    generator
-        Source of all randomness.
+        True time of a measurement without jitter.
     """
 
     def __init__(
@@ -57,49 +48,49 @@ class DistanceMeter:
     ) -> None:
         self._period_ns = period_ns
         self._phase_ns = phase_ns
-        limit_ns = 0.4 * period_ns  # ticks keep their order
-        drawn = generator.normal(0.0, jitter_ns, _JITTERS).clip(-limit_ns, limit_ns)
-        self._jitters_ns: list[int] = [round(jitter) for jitter in drawn.tolist()]
+        limit_ns = 0.4 * period_ns  # keeps the measurements in order
+        drawn = generator.normal(0.0, jitter_ns, _JITTER_COUNT).clip(-limit_ns, limit_ns)
+        self._jitter_ns: list[int] = [round(jitter) for jitter in drawn.tolist()]
         self._from_ns: int | None = None
         self._to_ns: int | None = None
-        self._shot_ns: int | None = None
+        self._single_ns: int | None = None
 
     @property
     def running(self) -> bool:
-        """Whether it measures continuously, or a single measurement has been made or is under way."""
-        return (self._from_ns is not None and self._to_ns is None) or self._shot_ns is not None
+        """Whether it measures continuously, or a single measurement was started and not cleared."""
+        return (self._from_ns is not None and self._to_ns is None) or self._single_ns is not None
 
     @property
-    def holds(self) -> bool:
-        """Whether anything was measured that has not been cleared."""
-        return self._from_ns is not None or self._shot_ns is not None
+    def has_measurement(self) -> bool:
+        """Whether a measurement was started and not cleared."""
+        return self._from_ns is not None or self._single_ns is not None
 
     def start(self, now_ns: int) -> None:
-        """Measure continuously from now on; a measurement that runs goes on."""
+        """Start continuous measurement; no effect while it runs."""
         if self._from_ns is None or self._to_ns is not None:
             self.clear()
             self._from_ns = now_ns + START_NS
 
-    def shoot(self, done_ns: int) -> None:
-        """Take one distance, at that time."""
+    def start_single(self, done_ns: int) -> None:
+        """Take one distance at ``done_ns``."""
         self.clear()
-        self._shot_ns = done_ns
+        self._single_ns = done_ns
 
     def stop(self, now_ns: int) -> None:
-        """Measure no longer; what was measured last stays."""
-        if self._shot_ns is not None and self._shot_ns > now_ns:
-            self._shot_ns = None
+        """Stop measuring; the last measurement stays."""
+        if self._single_ns is not None and self._single_ns > now_ns:
+            self._single_ns = None
         if self._from_ns is not None and self._to_ns is None:
             self._to_ns = now_ns
 
     def clear(self) -> None:
-        """Measure no longer, and forget what was measured."""
-        self._from_ns = self._to_ns = self._shot_ns = None
+        """Stop measuring and clear the last measurement."""
+        self._from_ns = self._to_ns = self._single_ns = None
 
     def newest(self, now_ns: int) -> int | None:
-        """Return when the newest distance was taken, or tried to be; None: there is none."""
-        if self._shot_ns is not None:
-            return self._shot_ns if self._shot_ns <= now_ns else None
+        """Return the time of the newest measurement, successful or not; None: there is none."""
+        if self._single_ns is not None:
+            return self._single_ns if self._single_ns <= now_ns else None
         if self._from_ns is None:
             return None
         if self._to_ns is not None:
@@ -111,9 +102,9 @@ class DistanceMeter:
         return tick_ns if tick_ns >= self._from_ns else None
 
     def next_after(self, now_ns: int) -> int | None:
-        """Return when the next distance is taken after an instant; None: not at all."""
-        if self._shot_ns is not None:
-            return self._shot_ns if self._shot_ns > now_ns else None
+        """Return the time of the next measurement after an instant; None: there is none."""
+        if self._single_ns is not None:
+            return self._single_ns if self._single_ns > now_ns else None
         if self._from_ns is None or self._to_ns is not None:
             return None
         after_ns = max(now_ns, self._from_ns - 1)
@@ -123,46 +114,28 @@ class DistanceMeter:
         return self._tick(number)
 
     def _tick(self, number: int) -> int:
-        return self._phase_ns + number * self._period_ns + self._jitters_ns[number % _JITTERS]
+        return self._phase_ns + number * self._period_ns + self._jitter_ns[number % _JITTER_COUNT]
 
 
 def atmospheric_ppm(temperature_c: float, pressure_hpa: float) -> float:
-    """Return the correction of distances for the air, in 1e-6, at 60 % relative humidity.
+    """Return the atmospheric correction of distances in 1e-6, at 60 % relative humidity.
 
-    Parameters
-    ----------
-    temperature_c
-        In degrees Celsius.
-    pressure_hpa
-        In hPa, not reduced to sea level.
-
-    Notes
-    -----
-    The infrared distance meter of the TPS1200, by its manual; zero at 12 degrees and 1013.25 hPa.
+    Infrared EDM of the TPS1200, by its manual; zero at 12 degrees Celsius and 1013.25 hPa (not reduced to sea level).
     """
     alpha = 1.0 + temperature_c / 273.15
     vapour = 7.5 * temperature_c / (237.3 + temperature_c) + 0.7857
     return 283.05 - (0.29196 * pressure_hpa / alpha - 4.126e-4 * 60.0 / alpha * math.pow(10.0, vapour))
 
 
-def with_noise(
+def measure_polar(
     points: NDArray[np.float64], noise: InstrumentNoise, generator: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Measure points as a total station does.
-
-    Parameters
-    ----------
-    points
-        (N, 3) in the frame of the station, in m.
-    noise
-        One sigma; all of it white.
-    generator
-        Source of the noise.
+    """Return noisy polar measurements of points (N, 3), in m in the frame of the station.
 
     Returns
     -------
     tuple
-        Horizontal angle from 0 to 2 pi and zenith angle in rad, distance to the point in m; each (N,).
+        Horizontal angle from 0 to 2 pi and zenith angle in rad, distance to the point in m; each (N,). Noise is white.
     """
     points = points + generator.normal(0.0, noise.pointing_sigma_m, points.shape)
     horizontal, zenith, distance = cartesian_to_polar(points)

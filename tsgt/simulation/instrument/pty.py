@@ -1,7 +1,7 @@
-"""A simulated total station behind a pseudo-terminal, in real time: to other programs it is a serial port.
+"""A simulated total station behind a pseudo-terminal, in real time: a serial port for other programs.
 
-A pseudo-terminal knows no speed; the pace is kept here. The speed that a program has set on its end counts: a wrong one
-gives garbage, as on a real line.
+A pseudo-terminal has no bit rate, so the bytes are paced here. If the program sets another bit rate than the
+instrument's, both ends receive garbage, as on a real line.
 """
 
 from __future__ import annotations
@@ -30,25 +30,25 @@ _BAUDS = {
     for baud in (2400, 4800, 9600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 921_600)
     if hasattr(termios, f"B{baud}")
 }
-"""By the constants that terminals are set with."""
+"""Bit rates by their termios constants."""
 
 
 class PtyLine:
-    """A cable with a pseudo-terminal at its near end; an async context manager.
+    """A cable to a pseudo-terminal; an async context manager.
 
     Parameters
     ----------
     instrument
-        At the far end, on a :class:`~tsgt.simulation.kernel.timeline.LoopTimeline`.
+        Its timeline is a :class:`~tsgt.simulation.kernel.timeline.LoopTimeline`.
     link
-        Symbolic link that names the terminal; like the names in /dev/serial/by-id it stays the same.
+        Symbolic link to the terminal, stable like the names in /dev/serial/by-id.
     """
 
     def __init__(self, instrument: SimulatedTotalStation, link: Path) -> None:
         self._instrument = instrument
         self._link = link
-        self._near: int | None = None
-        self._far: int | None = None
+        self._slave: int | None = None
+        self._master: int | None = None
         self._wire: Wire | None = None
 
     async def __aenter__(self) -> Self:
@@ -68,55 +68,55 @@ class PtyLine:
 
     @property
     def faults(self) -> LineFaults:
-        """What goes wrong with the instrument's answers."""
+        """Faults of the instrument's responses."""
         assert self._wire is not None, "enter the line first"  # noqa: S101
         return self._wire.faults
 
     def plug(self) -> None:
-        """Plug in; the terminal may be another one than before, the link names it."""
+        """Plug in; the terminal device may change, the link does not."""
         assert self._wire is not None, "enter the line first"  # noqa: S101
-        if self._far is not None:
+        if self._master is not None:
             return
-        # As long as one descriptor of the near end is open here, programs may close and open theirs as they like.
-        self._far, self._near = pty.openpty()
-        tty.setraw(self._near)
-        os.set_blocking(self._far, False)
+        # Keeping the slave open here lets programs close and reopen it.
+        self._master, self._slave = pty.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
         self._wire.plugged = True
-        beside = self._link.with_name(f".{self._link.name}.new")
-        beside.unlink(missing_ok=True)
-        beside.symlink_to(os.ttyname(self._near))
-        beside.replace(self._link)
-        asyncio.get_running_loop().add_reader(self._far, self._read)
+        temporary = self._link.with_name(f".{self._link.name}.new")
+        temporary.unlink(missing_ok=True)
+        temporary.symlink_to(os.ttyname(self._slave))
+        temporary.replace(self._link)
+        asyncio.get_running_loop().add_reader(self._master, self._read)
 
     def unplug(self) -> None:
-        """Pull the cable: programs that have the terminal open get an error, and the link is gone."""
-        if self._far is None or self._near is None or self._wire is None:
+        """Unplug: reads and writes of the open terminal fail, and the link disappears."""
+        if self._master is None or self._slave is None or self._wire is None:
             return
         self._wire.plugged = False
         self._link.unlink(missing_ok=True)
-        asyncio.get_running_loop().remove_reader(self._far)
-        os.close(self._near)
-        os.close(self._far)
-        self._near = self._far = None
+        asyncio.get_running_loop().remove_reader(self._master)
+        os.close(self._slave)
+        os.close(self._master)
+        self._slave = self._master = None
 
     def _read(self) -> None:
-        assert self._far is not None  # noqa: S101 (it is the reader's)
+        assert self._master is not None  # noqa: S101 (only read while open)
         assert self._wire is not None  # noqa: S101
         try:
-            data = os.read(self._far, _READ_SIZE)
+            data = os.read(self._master, _READ_SIZE)
         except OSError:
             return
         self._wire.host_baud = self._host_baud()
         self._wire.send(data)
 
     def _deliver(self, data: bytes) -> None:
-        if self._far is None or self._wire is None:
+        if self._master is None or self._wire is None:
             return
         try:
-            os.write(self._far, data)
+            os.write(self._master, data)
         except OSError:
-            return  # nobody reads, and the terminal is full: a serial port loses bytes then too
+            return  # the terminal's buffer is full: drop the bytes, as a serial port does
 
     def _host_baud(self) -> int:
-        assert self._near is not None  # noqa: S101 (it is open as long as the far end is)
-        return _BAUDS.get(termios.tcgetattr(self._near)[5], 0) or 9600
+        assert self._slave is not None  # noqa: S101 (open whenever the master is)
+        return _BAUDS.get(termios.tcgetattr(self._slave)[5], 0) or 9600

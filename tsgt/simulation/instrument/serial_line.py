@@ -1,10 +1,4 @@
-"""A cable between a simulated total station and a program in the same process, with the pace of a real one.
-
-Bytes take as long as at the line's speed, in both directions. The cable can be pulled, the two ends may have different
-speeds, and what goes wrong on cables can be ordered (:class:`~tsgt.simulation.instrument.serial_line.LineFaults`).
-
-What can go wrong with an answer on its way through a cable.
-"""
+"""A serial line between a simulated total station and a program in the same process: transfer times, unplugging, faults."""
 
 from __future__ import annotations
 
@@ -29,85 +23,81 @@ if TYPE_CHECKING:
     from tsgt.station.serial import Port
 
 GARBAGE = b"\x00\xff\x1a%R1\x81,7"
-"""Bytes that are no answer, though they begin like one."""
+"""Noise bytes that begin like a response."""
 
 
 class LineFault(StrEnum):
-    """A fault of one answer."""
+    """Fault of one response."""
 
     NONE = "none"
-    """It comes as it is."""
-    CUT = "cut"
-    """Its second half does not come."""
+    """No fault."""
+    TRUNCATED = "truncated"
+    """The second half is lost."""
     GARBAGE = "garbage"
-    """Bytes that nobody sent come right before it."""
-    SPOILT = "spoilt"
-    """Bytes in its middle are others."""
-    LATE = "late"
-    """It comes long after."""
+    """Noise bytes precede it."""
+    CORRUPTED = "corrupted"
+    """Bytes in its middle are changed."""
+    DELAYED = "delayed"
+    """It is delayed by seconds."""
     DUPLICATED = "duplicated"
-    """It comes twice."""
-    TORN = "torn"
-    """Its second half comes a while after the first."""
-    DIGIT = "digit"
-    """One of its digits is another one; without a checksum nobody can see that."""
-    SILENCE = "silence"
-    """It does not come."""
+    """It is sent twice."""
+    SPLIT = "split"
+    """The second half is delayed."""
+    WRONG_DIGIT = "wrong-digit"
+    """One digit is changed, which only a checksum detects."""
+    DROPPED = "dropped"
+    """It is lost."""
 
 
 @dataclass(slots=True)
 class LineFaults:
-    """The faults of a line, all of which can be changed at any time.
+    """Faults of a line; may be changed at any time.
 
     Attributes
     ----------
     script
-        The next answers' faults, in order; answers after that have none.
-    late_s
-        How much later a late answer comes.
-    torn_s
-        How long the second half of a torn one takes.
-    deaf
-        Whether nothing reaches the instrument.
-    mute
-        Whether nothing comes back from it.
+        Faults of the next responses, in order; later responses have none.
+    drop_requests
+        Whether requests are lost.
+    drop_responses
+        Whether responses are lost.
     """
 
     script: deque[LineFault] = field(default_factory=deque)
-    late_s: float = 4.0
-    torn_s: float = 0.3
-    deaf: bool = False
-    mute: bool = False
+    delay_s: float = 4.0
+    split_delay_s: float = 0.3
+    drop_requests: bool = False
+    drop_responses: bool = False
 
     def apply(self, data: bytes) -> list[tuple[int, bytes]]:
-        """Return what comes of an answer: parts, each with the ns after which it is sent."""
-        if self.mute:
+        """Return the parts of a response that arrive, each with its delay in ns."""
+        if self.drop_responses:
             return []
         fault = self.script.popleft() if self.script else LineFault.NONE
         half = len(data) // 2
         match fault:
-            case LineFault.CUT:
+            case LineFault.TRUNCATED:
                 return [(0, data[:half])]
             case LineFault.GARBAGE:
                 return [(0, GARBAGE + data)]
-            case LineFault.SPOILT:
+            case LineFault.CORRUPTED:
                 return [(0, data[:half] + b"\x80\xfe" + data[half + 2 :])]
-            case LineFault.LATE:
-                return [(round(self.late_s * 1e9), data)]
+            case LineFault.DELAYED:
+                return [(round(self.delay_s * 1e9), data)]
             case LineFault.DUPLICATED:
                 return [(0, data), (0, data)]
-            case LineFault.TORN:
-                return [(0, data[:half]), (round(self.torn_s * 1e9), data[half:])]
-            case LineFault.DIGIT:
-                return [(0, _other_digit(data))]
-            case LineFault.SILENCE:
+            case LineFault.SPLIT:
+                return [(0, data[:half]), (round(self.split_delay_s * 1e9), data[half:])]
+            case LineFault.WRONG_DIGIT:
+                return [(0, _with_wrong_digit(data))]
+            case LineFault.DROPPED:
                 return []
             case LineFault.NONE:
                 return [(0, data)]
 
 
-def _other_digit(data: bytes) -> bytes:
-    """Return an answer with another digit somewhere; where, hangs on the answer."""
+def _with_wrong_digit(data: bytes) -> bytes:
+    """Return a response with one digit changed, at a position that depends on the response."""
     digits = [i for i in range(len(data)) if data[i : i + 1].isdigit()]
     if not digits:
         return data
@@ -119,25 +109,17 @@ BITS_PER_BYTE = 10
 
 
 class Wire:
-    """What carries the bytes, at a line's pace.
+    """Carries bytes between program and instrument at the line's bit rate.
 
     Parameters
     ----------
-    instrument
-        At the far end.
-    timeline
-        When bytes arrive.
     deliver
-        Takes what has arrived at the near end.
+        Called with bytes that arrive at the program's end.
 
     Attributes
     ----------
     host_baud
-        Bits per second at the near end; another number than the instrument's makes garbage of everything.
-    plugged
-        Whether it is in.
-    faults
-        What goes wrong with the instrument's answers.
+        Bit rate at the program's end in bits per second; if it differs from the instrument's, all bytes are garbage.
     """
 
     def __init__(
@@ -149,57 +131,57 @@ class Wire:
         self._instrument = instrument
         self._timeline = timeline
         self._deliver = deliver
-        self._sent_until_ns = 0
-        self._answered_until_ns = 0
+        self._requests_until_ns = 0
+        self._responses_until_ns = 0
         self._garbage = np.random.default_rng(0)
         self.host_baud = instrument.baud
         self.plugged = True
         self.faults = LineFaults()
-        instrument.on_send = self._answer
+        instrument.server.on_send = self._send_response
 
     def send(self, data: bytes) -> None:
         """Carry bytes from the program to the instrument."""
-        arrives_ns = max(self._timeline.now_ns(), self._sent_until_ns) + line_ns(len(data), self.host_baud)
-        self._sent_until_ns = arrives_ns
-        if self.faults.deaf:
+        arrives_ns = max(self._timeline.now_ns(), self._requests_until_ns) + line_ns(
+            len(data), self.host_baud
+        )
+        self._requests_until_ns = arrives_ns
+        if self.faults.drop_requests:
             return
         if self.host_baud != self._instrument.baud:
-            # The far end may take a part of it for a request that makes no sense.
-            self._timeline.call_at(arrives_ns, lambda: self._answer(b"%R1P,3078,0:0\r\n"))
-            data = self._spoil(data)
+            # The instrument may take part of the garbage for a malformed request.
+            self._timeline.call_at(arrives_ns, lambda: self._send_response(b"%R1P,3078,0:0\r\n"))
+            data = self._randomise(data)
         self._timeline.call_at(arrives_ns, lambda: self._instrument.receive(data) if self.plugged else None)
 
-    def _answer(self, data: bytes) -> None:
+    def _send_response(self, data: bytes) -> None:
         """Carry what the instrument sends."""
         now_ns = self._timeline.now_ns()
         for after_ns, part in self.faults.apply(data):
-            begins_ns = max(now_ns + after_ns, self._answered_until_ns)
+            begins_ns = max(now_ns + after_ns, self._responses_until_ns)
             arrives_ns = begins_ns + line_ns(len(part), self._instrument.baud)
             if not after_ns:
-                self._answered_until_ns = arrives_ns
+                self._responses_until_ns = arrives_ns
             self._timeline.call_at(arrives_ns, partial(self._arrive, part))
 
     def _arrive(self, data: bytes) -> None:
         if self.plugged:
-            self._deliver(data if self.host_baud == self._instrument.baud else self._spoil(data))
+            self._deliver(data if self.host_baud == self._instrument.baud else self._randomise(data))
 
-    def _spoil(self, data: bytes) -> bytes:
+    def _randomise(self, data: bytes) -> bytes:
         return self._garbage.integers(128, 256, len(data), dtype=np.uint8).tobytes()
 
 
 class SimulatedLine:
-    """A cable in memory; one program at a time may use it.
+    """A serial line in memory, for one program at a time.
 
     Parameters
     ----------
-    instrument
-        At the far end.
     timeline
-        The true time.
+        True time.
     clock
-        Of the host at the near end.
+        Clock of the program's host.
     name
-        For people.
+        Name in error messages.
     """
 
     def __init__(
@@ -212,33 +194,33 @@ class SimulatedLine:
 
     @property
     def faults(self) -> LineFaults:
-        """What goes wrong with the instrument's answers."""
+        """Faults of the instrument's responses."""
         return self._wire.faults
 
     @property
     def plugged(self) -> bool:
-        """Whether the cable is in; pulling it breaks the open port."""
+        """Whether the cable is plugged in; unplugging disconnects the open port."""
         return self._wire.plugged
 
     @plugged.setter
     def plugged(self, plugged: bool) -> None:
         self._wire.plugged = plugged
         if not plugged and self._port is not None:
-            self._port.break_off("was unplugged")
+            self._port.disconnect("was unplugged")
             self._port = None
 
     async def open(self, baud: int) -> Port:
-        """Open the near end at a number of bits per second.
+        """Open the program's end at a bit rate in bits per second.
 
         Raises
         ------
         InstrumentError
-            The cable is not in, or somebody has the port already.
+            The cable is unplugged, or the port is open already.
         """
         if not self._wire.plugged:
             raise InstrumentError(f"{self._name}: no such device; plug the cable in")
         if self._port is not None:
-            raise InstrumentError(f"{self._name} is taken; it can be opened once")
+            raise InstrumentError(f"{self._name} is already open")
         self._wire.host_baud = baud
         self._port = _SimulatedPort(self._wire, self._name, baud, self._closed)
         return self._port
@@ -249,18 +231,18 @@ class SimulatedLine:
 
     def _deliver(self, data: bytes) -> None:
         if self._port is not None:
-            self._port.take(Chunk(data, self._clock.monotonic_ns()))
+            self._port.receive(Chunk(data, self._clock.monotonic_ns()))
 
 
 class _SimulatedPort:
-    """The near end of a line."""
+    """The program's end of a line."""
 
     def __init__(self, wire: Wire, name: str, baud: int, closed: Callable[[_SimulatedPort], None]) -> None:
         self._wire = wire
         self._closed = closed
         self._chunks: deque[Chunk] = deque()
-        self._waiting: asyncio.Future[None] | None = None
-        self._gone = ""
+        self._waiter: asyncio.Future[None] | None = None
+        self._disconnect_reason = ""
         self.name = name
         self.baud = baud
 
@@ -273,45 +255,45 @@ class _SimulatedPort:
         """Return the next bytes."""
         while not self._chunks:
             self._check()
-            self._waiting = asyncio.get_running_loop().create_future()
+            self._waiter = asyncio.get_running_loop().create_future()
             try:
-                await self._waiting
+                await self._waiter
             finally:
-                self._waiting = None
+                self._waiter = None
         return self._chunks.popleft()
 
     def drain(self) -> bytes:
-        """Return what has come and was not read, and forget it."""
+        """Return and discard the bytes that have arrived."""
         self._check()
         data = b"".join(chunk.data for chunk in self._chunks)
         self._chunks.clear()
         return data
 
     async def close(self) -> None:
-        """Close it."""
-        self.break_off("is closed")
+        """Close the port."""
+        self.disconnect("is closed")
         self._closed(self)
 
-    def take(self, chunk: Chunk) -> None:
-        """Take bytes that have come."""
+    def receive(self, chunk: Chunk) -> None:
+        """Queue bytes that have arrived."""
         self._chunks.append(chunk)
         self._wake()
 
-    def break_off(self, why: str) -> None:
-        """Be of no use any more."""
-        self._gone = self._gone or why
+    def disconnect(self, why: str) -> None:
+        """Make all further calls fail."""
+        self._disconnect_reason = self._disconnect_reason or why
         self._chunks.clear()
         self._wake()
 
     def _check(self) -> None:
-        if self._gone:
-            raise InstrumentError(f"{self.name} {self._gone}; plug it in and open it again")
+        if self._disconnect_reason:
+            raise InstrumentError(f"{self.name} {self._disconnect_reason}; plug it in and open it again")
 
     def _wake(self) -> None:
-        if self._waiting is not None and not self._waiting.done():
-            self._waiting.set_result(None)
+        if self._waiter is not None and not self._waiter.done():
+            self._waiter.set_result(None)
 
 
 def line_ns(count: int, baud: int) -> int:
-    """Return how long bytes take on a line."""
+    """Return the transfer time of ``count`` bytes in ns."""
     return count * BITS_PER_BYTE * 1_000_000_000 // baud

@@ -1,4 +1,4 @@
-"""What can be set in a simulated total station."""
+"""Settings of a simulated total station, and constants of its manual."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from tsgt.model import ARCSECOND_RAD
 from tsgt.simulation.instrument.edm import atmospheric_ppm
 
 ANGLE_SIGMA_RAD: Final = 1.0 * ARCSECOND_RAD
-"""What it claims of its angles."""
+"""Angle accuracy that it reports."""
 
 COMPENSATOR_SIGMA_RAD: Final = 0.5 * ARCSECOND_RAD
 
@@ -17,7 +17,7 @@ TAPE: Final = 2
 USER_PRISM: Final = 9
 
 OFF: Final = 2
-"""What it may do when nobody speaks to it: go off."""
+"""Power mode: switch off when idle."""
 
 PRISM_CONSTANTS_M: Final = {
     0: 0.0,
@@ -30,45 +30,45 @@ PRISM_CONSTANTS_M: Final = {
     11: 0.0231,
     12: 0.0281,
 }
-"""By the number of the prism type: what Leica instruments add, in m. The user's own type has the user's constant."""
+"""Leica prism constants by prism type; user-defined types have their own."""
 
 EDM_MODES: Final = frozenset({1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12})
-"""Those of a TPS1200+; 13 and 14 came with the TS30."""
+"""Modes of a TPS1200+; 13 and 14 came with the TS30."""
 
 MODE_OF_PROGRAM: Final = {0: 2, 1: 3, 2: 4, 3: 5, 4: 7, 6: 8, 7: 10, 8: 11, 9: 12, 10: 9}
-"""The EDM mode that a measuring program of the BAP chapter sets; a TPS1200+ has no program 5 (fast tracking)."""
+"""EDM mode by BAP measuring program; a TPS1200+ has no program 5 (fast tracking)."""
 
 
 @dataclass(slots=True)
 class Settings:
-    """Everything that GeoCOM can set, at what it is when an instrument has been switched on and set up by a person.
+    """GeoCOM settings, initially those of an instrument that an operator has set up.
 
     Attributes
     ----------
     decimals
-        Digits right of the point, in both directions.
+        Decimal places of doubles in requests and responses.
     atr, lock
-        The user's switches: target recognition, following.
+        User switches: automatic target recognition, tracking.
     edm_mode, program, target_type
-        How distances are measured: by the numbers of TMC, of BAP; 0 with a reflector, 1 without.
-    prism_type, prism_constant_m, user_constant_m
-        Which reflector, the constant that is added, and that of the user's own type.
+        Distance measurement: numbers of TMC and of BAP; target type 0 reflector, 1 reflectorless.
+    prism_constant_m, user_constant_m
+        Constant that is added; constant of the user-defined prism type.
     search_area
-        Window of PowerSearch: centre and range in both angles in rad, and whether it is used.
+        PowerSearch window: centre and range of both angles in rad, and whether it is enabled.
     spiral_rad
-        Window of the search with the target recognition, full width and height.
-    search_range_m, search_range_on
-        Between these distances PowerSearch takes a prism for one.
-    air
-        Wavelength in m, pressure in hPa, dry and wet temperature in degrees, as TMC_SetAtmCorr has them.
+        ATR search window, full width and height.
+    search_range_m
+        Nearest and farthest prism that PowerSearch accepts.
+    atmosphere
+        Wavelength in m, pressure in hPa, dry and wet temperature in degrees Celsius (TMC_SetAtmCorr).
     geometric_ppm, atmospheric_ppm
-        Scale corrections in 1e-6; the second one belongs to ``air``, unless it was set by itself.
+        Scale corrections in 1e-6; the latter follows from ``atmosphere`` unless set directly.
     incline, angle_switches
-        Compensator; correction of angles for tilt, standing axis, collimation, tilting axis.
+        Compensator; corrections of tilt, standing axis, collimation and tilting axis.
     orientation_rad
-        What the horizontal circle shows for the true direction zero.
+        Horizontal circle reading of the true direction zero.
     power_mode, power_timeout_ms
-        What it does when nobody speaks to it for so long: 0 nothing, 2 off.
+        Action after this idle time: 0 none, 2 off.
     """
 
     decimals: int = 15
@@ -90,7 +90,7 @@ class Settings:
     search_range_on: bool = False
     atr_setting: int = 0
     reduced_field_of_view: bool = False
-    air: tuple[float, float, float, float] = (6.58e-7, 1013.25, 12.0, 8.6)
+    atmosphere: tuple[float, float, float, float] = (6.58e-7, 1013.25, 12.0, 8.6)
     atmospheric_ppm: float = field(default_factory=lambda: atmospheric_ppm(12.0, 1013.25))
     geometric_ppm: float = 0.0
     refraction: tuple[int, float, float] = (1, 6_378_000.0, 0.13)
@@ -106,12 +106,12 @@ class Settings:
     power_timeout_ms: int = 900_000
 
     def power_cycle(self) -> None:
-        """Forget what does not survive being switched off."""
+        """Reset the settings that do not survive power-off."""
         self.decimals = 15
         self.atr = self.lock = False
         self.timeout_s = (10.0, 10.0)
         self.laser = False
 
     def ppm(self) -> float:
-        """Return the scale correction of distances, in 1e-6."""
+        """Return the total scale correction of distances, in 1e-6."""
         return self.atmospheric_ppm + self.geometric_ppm

@@ -1,4 +1,4 @@
-"""What there is to be seen from one simulated station: prisms, foil targets, and the faults that the scenario has."""
+"""Targets in view of a simulated station: prisms, foil targets, and the scenario's faults."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from tsgt.config import level_frame
 from tsgt.geometry import cartesian_to_polar, invert, transform_points
 from tsgt.simulation.instrument.telescope import Lock
-from tsgt.simulation.instrument.visibility import Sight, apart_rad
+from tsgt.simulation.instrument.visibility import PrismVisibility, angular_separation_rad
 from tsgt.station.geocom import ReturnCode
 
 if TYPE_CHECKING:
@@ -18,92 +18,82 @@ if TYPE_CHECKING:
 
     from tsgt.config import ScenarioConfig, SimulatedStation
     from tsgt.simulation.instrument.telescope import Telescope
-    from tsgt.simulation.instrument.visibility import Direction2
+    from tsgt.simulation.instrument.visibility import PolarDirection
     from tsgt.simulation.world import World
 
 BEAM_M: Final = 0.05
 BEAM_RAD: Final = 0.0005
-"""A prism or target so far beside the crosshairs still reflects: by so much, and by so much more per metre."""
+"""Beam radius: a target within BEAM_M plus BEAM_RAD times the distance of the line of sight reflects."""
 
 FAULT_CODES: Final = {
     "tilt": ReturnCode.TMC_ANGLE_OK,
     "wrong_distance": ReturnCode.TMC_DIST_PPM,
     "angle_only": ReturnCode.TMC_ANGLE_OK,
 }
-"""What becomes of a distance that is due; as long as it is tilted too far it gives no angles either."""
+"""Return code of a distance during a fault of the scenario; "tilt" suppresses the angles as well."""
 
 
-class Seen(NamedTuple):
-    """What the telescope was at when a distance was due.
+class TargetObservation(NamedTuple):
+    """What reflects at the time of a distance measurement.
 
     Attributes
     ----------
     point
-        What reflects, in the frame of the station, (3,) in m; None: nothing.
+        Position of the target in the frame of the station, (3,) in m; None: no target.
     prism
-        Its number; None for a target.
+        None: a foil target.
     followed
-        Whether the telescope followed it.
+        Whether the telescope is locked on it.
     direction
-        Where the telescope pointed.
+        Direction of the telescope.
     code
-        Why there is nothing.
+        GeoCOM return code; of the failure if there is no target.
     """
 
     point: NDArray[np.float64] | None
     prism: int | None
     followed: bool
-    direction: Direction2
+    direction: PolarDirection
     code: ReturnCode
 
 
-class Scenery:
-    """Prisms and targets around a station.
-
-    Parameters
-    ----------
-    station
-        Which of the scenario's stations it is.
-    scenario
-        Prisms, targets and faults.
-    world
-        The truth.
+class TargetsInView:
+    """Prisms and foil targets around a station.
 
     Attributes
     ----------
-    sights
-        By the prisms' numbers.
-    targets
+    prisms
+        Visibility by prism number.
+    foils
         Foil targets in the frame of the station, each (3,) in m.
     """
 
     def __init__(self, station: SimulatedStation, scenario: ScenarioConfig, world: World) -> None:
         faults = [fault for fault in scenario.faults if fault.station == station.station]
         self._faults = [fault for fault in faults if fault.status != "no_target"]
-        # What hides its prism from a station hides the whole robot.
+        # An occlusion hides all prisms of the robot from this station.
         spans_s = world.occlusions_s.get(station.station, np.empty((0, 2))).tolist()
         spans_s += [[fault.start_s, fault.end_s] for fault in faults if fault.status == "no_target"]
-        hidden_s = [(from_s, to_s) for from_s, to_s in spans_s]
-        self.sights = {
-            prism.prism: Sight(station, world, row, hidden_s) for row, prism in enumerate(scenario.prisms)
+        occluded_s = [(from_s, to_s) for from_s, to_s in spans_s]
+        self.prisms = {
+            prism.prism: PrismVisibility(station, world, row, occluded_s)
+            for row, prism in enumerate(scenario.prisms)
         }
         T_station_station1 = invert(np.array(level_frame(station)))
-        self.targets = [
-            transform_points(T_station_station1, np.array(target)) for target in scenario.targets_m
-        ]
+        self.foils = [transform_points(T_station_station1, np.array(target)) for target in scenario.targets_m]
 
     def fault_at(self, world_s: float) -> str | None:
-        """Return the fault of an instant; hidden prisms are none."""
+        """Return the scenario's fault at an instant, occlusions excluded."""
         if not self._faults:
             return None
         return next((f.status for f in self._faults if f.start_s <= world_s < f.end_s), None)
 
-    def look(self, world_s: float, telescope: Telescope, *, foil: bool) -> Seen:
-        """See what reflects at an instant to which the telescope has advanced: a prism, or with ``foil`` a target."""
+    def observe(self, world_s: float, telescope: Telescope, *, foil: bool) -> TargetObservation:
+        """Return the reflecting target at an instant to which the telescope has advanced: a prism, or with ``foil`` a foil target."""
         direction = telescope.direction()
 
-        def nothing(code: ReturnCode) -> Seen:
-            return Seen(None, None, followed=False, direction=direction, code=code)
+        def nothing(code: ReturnCode) -> TargetObservation:
+            return TargetObservation(None, None, followed=False, direction=direction, code=code)
 
         fault = self.fault_at(world_s)
         if fault is not None:
@@ -113,63 +103,67 @@ class Scenery:
         if telescope.blocked or telescope.moving:
             return nothing(ReturnCode.TMC_DIST_ERROR)
         if foil:
-            for point in self.targets:
+            for point in self.foils:
                 if _in_beam(point, direction):
-                    return Seen(point, None, followed=False, direction=direction, code=ReturnCode.OK)
+                    return TargetObservation(
+                        point, None, followed=False, direction=direction, code=ReturnCode.OK
+                    )
         elif telescope.lock is Lock.IN and telescope.prism is not None:
-            point = self.sights[telescope.prism].point_at(world_s)
-            return Seen(point, telescope.prism, followed=True, direction=direction, code=ReturnCode.OK)
+            point = self.prisms[telescope.prism].point_at(world_s)
+            return TargetObservation(
+                point, telescope.prism, followed=True, direction=direction, code=ReturnCode.OK
+            )
         else:
-            for prism, sight in self.sights.items():
-                point = sight.point_at(world_s)
-                if sight.visible_at(world_s) and _in_beam(point, direction):
-                    return Seen(point, prism, followed=False, direction=direction, code=ReturnCode.OK)
+            for prism, visibility in self.prisms.items():
+                point = visibility.point_at(world_s)
+                if visibility.visible_at(world_s) and _in_beam(point, direction):
+                    return TargetObservation(
+                        point, prism, followed=False, direction=direction, code=ReturnCode.OK
+                    )
         return nothing(ReturnCode.TMC_DIST_ERROR)
 
-    def met_on_the_way(
+    def power_search(
         self,
         world_s: float,
         way_rad: tuple[float, float],
         height_rad: tuple[float, float],
         range_m: tuple[float, float],
-        only: int | None,
+        target_id: int | None,
     ) -> tuple[int, float] | None:
-        """Return the first prism that PowerSearch comes across, and how far it has turned until then; None: none.
+        """Return the first prism that PowerSearch meets and the angle turned until then; None: there is none.
 
         Parameters
         ----------
-        world_s
-            When.
         way_rad
-            Horizontal direction that it starts at, and how far it turns; positive: clockwise.
+            Initial horizontal direction and angle to turn; positive: clockwise.
         height_rad
-            Zenith angle of the middle and half the height of the strip that it sees.
+            Zenith angle of the centre of the search strip, and half its height.
         range_m
-            Between these distances a reflection is taken for a prism.
-        only
-            The only prism that counts; None: all.
+            Accepted distances.
+        target_id
+            Number of the only prism accepted; None: all.
         """
         start_rad, turn_rad = way_rad
         met: list[tuple[float, int]] = []
-        for prism, sight in self.sights.items():
-            horizontal, zenith = sight.direction_at(world_s)
+        for prism, visibility in self.prisms.items():
+            horizontal, zenith = visibility.direction_at(world_s)
             until_rad = math.copysign(1.0, turn_rad) * (horizontal - start_rad) % math.tau
             inside = until_rad <= abs(turn_rad) and abs(zenith - height_rad[0]) <= height_rad[1]
-            if inside and only in (None, prism) and not sight.lost_at(world_s):
-                distance_m = float(np.linalg.norm(sight.point_at(world_s)))
+            if inside and target_id in (None, prism) and not visibility.lost_at(world_s):
+                distance_m = float(np.linalg.norm(visibility.point_at(world_s)))
                 if range_m[0] <= distance_m <= range_m[1]:
                     met.append((until_rad, prism))
         return (min(met)[1], min(met)[0]) if met else None
 
 
-def direction_of(point: NDArray[np.float64]) -> Direction2:
+def direction_to(point: NDArray[np.float64]) -> PolarDirection:
     """Return the direction of a point in the frame of the station."""
     horizontal, zenith, _ = cartesian_to_polar(point)
     return float(horizontal), float(zenith)
 
 
-def _in_beam(point: NDArray[np.float64], direction: Direction2) -> bool:
-    """Tell whether a point reflects what is sent out in a direction."""
+def _in_beam(point: NDArray[np.float64], direction: PolarDirection) -> bool:
+    """Whether a point reflects a beam in this direction."""
     distance_m = float(np.linalg.norm(point))
-    beside_m = math.hypot(*apart_rad(direction_of(point), direction)) * distance_m
-    return beside_m < BEAM_M + BEAM_RAD * distance_m
+    offset_m = math.hypot(*angular_separation_rad(direction_to(point), direction)) * distance_m
+    return offset_m < BEAM_M + BEAM_RAD * distance_m

@@ -1,4 +1,4 @@
-"""Where simulated events wait for their time: virtual time for whole systems, real time for processes."""
+"""Timelines on which simulated events are scheduled: virtual time for whole systems, real time for processes."""
 
 from __future__ import annotations
 
@@ -10,32 +10,32 @@ if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable
 
-# Cancelled events stay in the heap until their time comes; more than these many, and more than half, are swept.
-_CANCELLED_KEPT = 1_000
+# Cancelled events stay in the heap until due; they are purged when there are more than this and more than half.
+_MAX_CANCELLED = 1_000
 
 
 class Handle(Protocol):
-    """An event that has been scheduled."""
+    """A scheduled event."""
 
     def cancel(self) -> None:
-        """Let it not happen; nothing changes when it already has."""
+        """Cancel the event; no effect if it has happened."""
         ...
 
 
 class Timeline(Protocol):
-    """What simulated hardware knows of time."""
+    """Time and scheduling as simulated hardware sees them."""
 
     def now_ns(self) -> int:
         """Nanoseconds since the timeline's zero."""
         ...
 
     def call_at(self, at_ns: int, callback: Callable[[], object]) -> Handle:
-        """Call back at that time, as soon as possible when it has passed."""
+        """Call back at a time, or as soon as possible if it has passed."""
         ...
 
 
 class VirtualTimeline:
-    """Time that passes only when told to, from event to event; it starts at zero."""
+    """Virtual time from zero; it passes only through :meth:`advance` and :meth:`advance_to`."""
 
     def __init__(self) -> None:
         self._now_ns = 0
@@ -48,9 +48,9 @@ class VirtualTimeline:
         return self._now_ns
 
     def call_at(self, at_ns: int, callback: Callable[[], object]) -> Handle:
-        """Call back when time reaches the given instant; events of one instant keep their order of scheduling.
+        """Call back at an instant; events of the same instant keep their scheduling order.
 
-        An instant in the past counts as now, and now comes with the next advance, even one of no length.
+        An instant in the past counts as now; an event for now is due at the next advance, even one of zero length.
         """
         event = _Event(callback, self)
         self._scheduled += 1
@@ -58,7 +58,7 @@ class VirtualTimeline:
         return event
 
     def next_ns(self) -> int | None:
-        """When the next event is due; None if nothing is scheduled."""
+        """Return when the next event is due; None: nothing is scheduled."""
         heap = self._heap
         while heap and heap[0][2].callback is None:
             heapq.heappop(heap)
@@ -66,14 +66,14 @@ class VirtualTimeline:
         return heap[0][0] if heap else None
 
     def advance(self, duration_ns: int) -> None:
-        """Let that much time pass."""
+        """Advance by a duration."""
         self.advance_to(self._now_ns + duration_ns)
 
     def advance_to(self, until_ns: int) -> None:
-        """Let time pass until the given instant and call back what is due, at its time.
+        """Advance to an instant and make the callbacks that are due, each at its time.
 
-        Time never runs backwards: until an instant in the past, only what is due now is called. A callback may
-        itself advance the time; what it jumps over is called on the way.
+        Time never runs backwards: for an instant in the past, only events that are due now are called. A callback may itself
+        advance the time; the events it skips are called on the way.
         """
         heap = self._heap
         if until_ns < self._now_ns:
@@ -91,17 +91,17 @@ class VirtualTimeline:
         if until_ns > self._now_ns:
             self._now_ns = until_ns
 
-    def _sweep(self) -> None:
-        """Forget cancelled events, so that time-outs which never expire do not pile up."""
+    def _purge_cancelled(self) -> None:
+        """Remove cancelled events when they dominate the heap, so that unexpired timeouts do not accumulate."""
         self._cancelled += 1
-        if self._cancelled > max(_CANCELLED_KEPT, len(self._heap) // 2):
+        if self._cancelled > max(_MAX_CANCELLED, len(self._heap) // 2):
             self._heap[:] = [entry for entry in self._heap if entry[2].callback is not None]
             heapq.heapify(self._heap)
             self._cancelled = 0
 
 
 class _Event:
-    """One call on a virtual timeline; the callback is None once it has been made or cancelled."""
+    """A scheduled call; the callback is None once it has been made or cancelled."""
 
     __slots__ = ("_timeline", "callback")
 
@@ -110,16 +110,16 @@ class _Event:
         self._timeline = timeline
 
     def cancel(self) -> None:
-        """Let it not happen."""
+        """Cancel the call."""
         if self.callback is not None:
             self.callback = None
-            self._timeline._sweep()  # noqa: SLF001 (the timeline's own event)
+            self._timeline._purge_cancelled()  # noqa: SLF001 (the timeline's own event)
 
 
 class LoopTimeline:
     """CLOCK_MONOTONIC on an asyncio loop in real time, for simulated hardware in real processes.
 
-    Callbacks come up to a millisecond late, as timers of a loop do; what happens at an exact time must carry it.
+    Callbacks may be up to a millisecond late, as loop timers are; an event that needs an exact time must carry it.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:

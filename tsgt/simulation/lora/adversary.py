@@ -1,4 +1,4 @@
-"""Somebody else on the same channel, who means no good: noise, and what the mission's radios have said, again."""
+"""A replay attacker on the mission's channel: sends noise, and captured packets whole, truncated or with a flipped bit."""
 
 from __future__ import annotations
 
@@ -10,67 +10,63 @@ if TYPE_CHECKING:
     import numpy as np
 
     from tsgt.clock import Clock
-    from tsgt.radio import OpenRadio, Radio
+    from tsgt.radio import Radio, RadioOpener
 
-LONGEST_NOISE_BYTES = 40
-_REMEMBERED = 64
+MAX_NOISE_BYTES = 40
+_CAPTURE_CAPACITY = 64
 
 
-class ForeignRadio:
-    """Sends at random times: random bytes, or a packet that it has heard, whole, cut short or with a bit turned over.
+class ReplayAttacker:
+    """Sends at random times random bytes or a captured packet, whole, truncated or with one bit flipped.
 
     Parameters
     ----------
-    clock
-        Time.
-    rng
-        What is sent, and when.
-    per_s
-        Packets per second, on average.
+    rate_hz
+        Average packet rate.
 
     Attributes
     ----------
     sent
-        How many it has sent.
+        Number of packets sent.
     """
 
-    def __init__(self, clock: Clock, rng: np.random.Generator, per_s: float) -> None:
+    def __init__(self, clock: Clock, rng: np.random.Generator, rate_hz: float) -> None:
         self._clock = clock
         self._rng = rng
-        self._per_s = per_s
-        self._heard: deque[bytes] = deque(maxlen=_REMEMBERED)
+        self._rate_hz = rate_hz
+        self._captured: deque[bytes] = deque(maxlen=_CAPTURE_CAPACITY)
         self.sent = 0
 
-    async def run(self, open_radio: OpenRadio) -> None:
-        """Listen and send until cancelled."""
+    async def run(self, open_radio: RadioOpener) -> None:
+        """Open the radio, receive and send until cancelled."""
         async with open_radio() as radio:
-            await self.use(radio)
+            await self.attack(radio)
 
-    async def use(self, radio: Radio) -> None:
-        """Listen and send with a radio that is open, until cancelled."""
+    async def attack(self, radio: Radio) -> None:
+        """Receive and send with an open radio until cancelled."""
         async with asyncio.TaskGroup() as group:
             group.create_task(self._listen(radio))
             group.create_task(self._send(radio))
 
     async def _listen(self, radio: Radio) -> NoReturn:
         while True:
-            self._heard.append((await radio.receive()).payload)
+            self._captured.append((await radio.receive()).payload)
 
     async def _send(self, radio: Radio) -> NoReturn:
         while True:
-            wait_ns = round(1e9 * self._rng.exponential(1 / self._per_s))
+            wait_ns = round(1e9 * self._rng.exponential(1 / self._rate_hz))
             await self._clock.sleep_until(self._clock.monotonic_ns() + wait_ns)
             await radio.transmit(self.packet())
             self.sent += 1
 
     def packet(self) -> bytes:
-        """Return the next packet that it would send."""
+        """Return the next packet to send."""
         kind = self._rng.integers(4)
-        if kind == 0 or not self._heard:
-            return self._rng.bytes(int(self._rng.integers(1, LONGEST_NOISE_BYTES + 1)))
-        # The newest as often as any other: it is the one that has a chance.
+        if kind == 0 or not self._captured:
+            return self._rng.bytes(int(self._rng.integers(1, MAX_NOISE_BYTES + 1)))
+        # The newest packet as often as all others: it has the best chance of being accepted.
         newest = self._rng.random() < 0.5
-        payload = self._heard[-1 if newest else int(self._rng.integers(len(self._heard)))]
+        payload = self._captured[-1 if newest else int(self._rng.integers(len(self._captured)))]
         if kind == 1:
             return payload
         if kind == 2:

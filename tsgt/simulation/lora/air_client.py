@@ -1,4 +1,4 @@
-"""A simulated radio's way to the air of other processes: see :mod:`tsgt.simulation.lora.air_server`."""
+"""Connection of a simulated radio to the channel of other processes: see :mod:`tsgt.simulation.lora.air_server`."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from tsgt.errors import StreamError
 from tsgt.recording import encode_line
 from tsgt.simulation.lora.air import Air
 from tsgt.simulation.lora.air_messages import (
-    FrameLine,
+    FrameMessage,
     FromClient,
     FromServer,
     Incoming,
     Join,
     Left,
     LineBuffer,
-    Refused,
+    Rejected,
     Stop,
     Stopped,
     Transmit,
@@ -35,10 +35,18 @@ if TYPE_CHECKING:
 
     from tsgt.simulation.kernel import Timeline
     from tsgt.simulation.lora.air import Transceiver
-    from tsgt.simulation.lora.frames import Antenna, Frame, Header, Listening, Modulation, Port, Reception
+    from tsgt.simulation.lora.frames import (
+        AirPort,
+        Frame,
+        FrameListener,
+        Header,
+        Modulation,
+        ReceiverSettings,
+        Reception,
+    )
 
 WELCOME_TIMEOUT_S = 5.0
-"""How long a server may take to answer; it has nothing else to do."""
+"""Timeout of the server's response to a join."""
 
 log = structlog.get_logger()
 
@@ -48,19 +56,17 @@ class AirClient:
 
     Parameters
     ----------
-    path
-        The server's socket.
     name
         The radio's name in the server's link model.
     timeline
-        CLOCK_MONOTONIC, the chip's timeline as well.
+        CLOCK_MONOTONIC; shared with the chip.
     crystal_ppm
-        How far the radio's carrier and receiver lie above what they are set to.
+        Offset of the radio's carrier and receiver frequency in 1e-6.
 
     Raises
     ------
     StreamError
-        On entering: nobody serves the socket, or the server refuses the radio.
+        On entering: no server on this socket, or it rejects the radio.
     """
 
     def __init__(self, path: Path, name: str, timeline: Timeline, *, crystal_ppm: float = 0.0) -> None:
@@ -68,70 +74,72 @@ class AirClient:
         self._name = name
         self._timeline = timeline
         self._crystal_ppm = crystal_ppm
-        self._losses = _Losses()
+        self._losses = _ServerPathLoss()
         self._senders: dict[str, Transceiver] = {}
         self._radio: Transceiver | None = None
 
     async def __aenter__(self) -> Self:
         loop = asyncio.get_running_loop()
         self._welcomed: asyncio.Future[None] = loop.create_future()
-        self._lost: asyncio.Future[str] = loop.create_future()
+        self._disconnected: asyncio.Future[str] = loop.create_future()
         try:
             _, self._connection = await loop.create_unix_connection(
-                lambda: _Connection(self._received, self._lose), os.fspath(self._path)
+                lambda: _Connection(self._received, self._disconnect), os.fspath(self._path)
             )
         except OSError as error:
-            raise StreamError(f"{self._path}: no air server answers ({error.strerror}); start one") from error
+            raise StreamError(f"{self._path}: no air server ({error.strerror}); start one") from error
         try:
             self._connection.send(Join(name=self._name, crystal_ppm=self._crystal_ppm))
             await asyncio.wait(
-                (self._welcomed, self._lost),
+                (self._welcomed, self._disconnected),
                 timeout=WELCOME_TIMEOUT_S,
                 return_when=asyncio.FIRST_COMPLETED,
             )
             if not self._welcomed.done():
-                self._lose("the server does not answer")
-                await self.wait_lost()
+                self._disconnect("the server does not respond")
+                await self.wait_disconnected()
         except BaseException:
             await self._connection.close()
             raise
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        if not self._lost.done():
-            self._lost.set_result("it has been left")
+        if not self._disconnected.done():
+            self._disconnected.set_result("closed by the client")
         await self._connection.close()
 
-    def join(self, antenna: Antenna) -> Port:
-        """Connect the radio's chip; it can be done once."""
-        self._radio = self._air.join(antenna, self._name, crystal_ppm=self._crystal_ppm)
+    def join(self, listener: FrameListener) -> AirPort:
+        """Connect the radio's chip; only once."""
+        self._radio = self._air.join(listener, self._name, crystal_ppm=self._crystal_ppm)
         return _RemotePort(self._radio, self._connection)
 
-    async def wait_lost(self) -> NoReturn:
-        """Wait until the server is gone, which leaves the radio deaf and dumb.
+    async def wait_disconnected(self) -> NoReturn:
+        """Wait until the connection is lost; then the radio neither sends nor receives.
 
         Raises
         ------
         StreamError
-            Then, with the reason.
+            When it is lost, with the reason.
         """
-        reason = await asyncio.shield(self._lost)
-        raise StreamError(f"{self._path}: the simulated air is lost to radio {self._name!r}: {reason}")
+        reason = await asyncio.shield(self._disconnected)
+        raise StreamError(
+            f"{self._path}: radio {self._name!r} is disconnected from the simulated channel: {reason}"
+        )
 
-    def _lose(self, reason: str) -> None:
-        if self._lost.done():
+    def _disconnect(self, reason: str) -> None:
+        if self._disconnected.done():
             return
-        self._lost.set_result(reason)
+        self._disconnected.set_result(reason)
         if self._radio is not None:
             self._radio.listen(None)
             log.error("air_lost", name=self._name, reason=reason)
 
     def _received(self, line: FromServer) -> None:
-        if isinstance(line, Refused):
-            self._lose(line.reason)
+        if isinstance(line, Rejected):
+            self._disconnect(line.reason)
         elif not self._welcomed.done():
             if not isinstance(line, Welcome):
-                raise ValueError("it does not begin with a welcome")  # noqa: TRY004 (what came is at fault)
+                raise ValueError("the first message is not a welcome")  # noqa: TRY004 (invalid input)
             self._link = LinkModel(path_loss=self._losses, noise_figure_db=line.noise_figure_db)
             self._air = Air(self._timeline, np.random.default_rng(line.seed), self._link)
             self._welcomed.set_result(None)
@@ -147,22 +155,22 @@ class AirClient:
 
     def _sender(self, name: str, crystal_ppm: float) -> Transceiver:
         if name not in self._senders:
-            self._senders[name] = self._air.join(_NoAntenna(), name, crystal_ppm=crystal_ppm)
+            self._senders[name] = self._air.join(_NullListener(), name, crystal_ppm=crystal_ppm)
         return self._senders[name]
 
 
-class _Losses:
-    """What the server says of the way from each sender to here."""
+class _ServerPathLoss:
+    """Path loss from each sender to this radio, as reported by the server."""
 
     def __init__(self) -> None:
         self.losses_db: dict[str, float] = {}
 
-    def loss_db(self, sender: str, receiver: str, frequency_hz: float) -> float:  # noqa: ARG002 (the server knows)
+    def loss_db(self, sender: str, receiver: str, frequency_hz: float) -> float:  # noqa: ARG002 (of the protocol)
         return self.losses_db[sender]
 
 
-class _NoAntenna:
-    """The other processes' radios listen there, not here."""
+class _NullListener:
+    """Listener of the remote senders, whose receivers are in their own processes."""
 
     def preamble_detected(self, at_ns: int) -> None:
         raise NotImplementedError
@@ -175,19 +183,19 @@ class _NoAntenna:
 
 
 class _RemotePort:
-    """A port whose receiver is here and whose sender is with the server."""
+    """A port with a local receiver and a remote sender."""
 
     def __init__(self, receiver: Transceiver, connection: _Connection) -> None:
         self._receiver = receiver
         self._connection = connection
 
     def transmit(self, frame: Frame) -> None:
-        self._connection.send(Transmit(frame=FrameLine.of(frame)))
+        self._connection.send(Transmit(frame=FrameMessage.of(frame)))
 
     def stop_transmitting(self, at_ns: int) -> None:
         self._connection.send(Stop(at_ns=at_ns))
 
-    def listen(self, listening: Listening | None) -> None:
+    def listen(self, listening: ReceiverSettings | None) -> None:
         self._receiver.listen(listening if self._connection.is_open else None)
 
     def rssi_dbm(self, at_ns: int) -> float:
@@ -198,13 +206,13 @@ class _RemotePort:
 
 
 class _Connection(asyncio.Protocol):
-    """Lines to and from the server; a reason for its end, once."""
+    """Message stream to and from the server; reports the first reason of disconnection."""
 
     transport: asyncio.WriteTransport
 
-    def __init__(self, received: Callable[[FromServer], None], lose: Callable[[str], None]) -> None:
+    def __init__(self, received: Callable[[FromServer], None], disconnect: Callable[[str], None]) -> None:
         self._received = received
-        self._lose = lose
+        self._disconnect = disconnect
         self._lines = LineBuffer()
         self._closed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
 
@@ -229,15 +237,15 @@ class _Connection(asyncio.Protocol):
             for line in self._lines.lines(data):
                 self._received(decode_from_server(line))
         except ValueError as error:
-            self._abort(f"the server says what no air server says ({error})")
+            self._abort(f"invalid message from the server ({error})")
 
     def pause_writing(self) -> None:
         self._abort("the server does not read")
 
-    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 (it is gone in any case)
-        self._lose("the server has closed the connection")
+    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 (of asyncio)
+        self._disconnect("the server has closed the connection")
         self._closed.set_result(None)
 
     def _abort(self, reason: str) -> None:
-        self._lose(reason)
+        self._disconnect(reason)
         self.transport.abort()

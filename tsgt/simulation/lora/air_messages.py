@@ -1,4 +1,4 @@
-"""What an air server and its clients say to each other: one JSON object a line, checked on arrival."""
+"""Messages between air server and clients: one JSON object per line, validated on arrival."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tsgt.simulation.lora.frames import Frame, Modulation
 T = TypeVar("T")
 
 MAX_LINE_BYTES = 4096
-"""Longest line; a frame of 255 bytes takes less than a thousand."""
+"""Maximum line length; a frame of 255 bytes takes less than 1000."""
 
 Name = Annotated[str, Field(min_length=1, max_length=64)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -21,8 +21,8 @@ Nanoseconds = Annotated[int, Field(ge=-(2**63), lt=2**63)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FrameLine:
-    """A frame, flat; the fields are those of :class:`Frame` and :class:`Modulation`."""
+class FrameMessage:
+    """A :class:`Frame` with its :class:`Modulation` as flat fields."""
 
     frequency_hz: Annotated[float, Field(ge=0, allow_inf_nan=False)]
     spreading_factor: Annotated[int, Field(ge=6, le=12)]
@@ -40,7 +40,7 @@ class FrameLine:
 
     @classmethod
     def of(cls, frame: Frame) -> Self:
-        """Make the line of a frame."""
+        """Convert a frame to its message."""
         modulation = frame.modulation
         return cls(
             frequency_hz=modulation.frequency_hz,
@@ -59,7 +59,7 @@ class FrameLine:
         )
 
     def frame(self) -> Frame:
-        """Make the frame of a line."""
+        """Convert the message to a frame."""
         return Frame(
             modulation=Modulation(
                 frequency_hz=self.frequency_hz,
@@ -81,7 +81,7 @@ class FrameLine:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Join:
-    """The first line of a client: what its radio is called and how far off its crystal is."""
+    """First message of a client: name and crystal offset of its radio."""
 
     type: Literal["join"] = "join"
     name: Name
@@ -90,15 +90,15 @@ class Join:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Transmit:
-    """A client's radio sends a frame."""
+    """The client's radio transmits a frame."""
 
     type: Literal["transmit"] = "transmit"
-    frame: FrameLine
+    frame: FrameMessage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stop:
-    """It stops sending before the frame has ended."""
+    """The client's radio cuts its frame."""
 
     type: Literal["stop"] = "stop"
     at_ns: Nanoseconds
@@ -106,7 +106,7 @@ class Stop:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Welcome:
-    """The server's answer to :class:`Join`: what all receivers have in common."""
+    """Response to :class:`Join`: what all receivers share."""
 
     type: Literal["welcome"] = "welcome"
     seed: int
@@ -114,29 +114,25 @@ class Welcome:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Refused:
-    """Its other answer: why not. Also said when it drops a client later."""
+class Rejected:
+    """Rejection of a join or a message; the server closes the connection."""
 
-    type: Literal["refused"] = "refused"
+    type: Literal["rejected"] = "rejected"
     reason: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Incoming:
-    """Another radio sends a frame.
+    """Another radio transmits a frame.
 
     Attributes
     ----------
-    sender
-        Its name.
     crystal_ppm
-        How far its carrier lies above what it is set to.
+        Offset of the sender's carrier in 1e-6.
     loss_db
-        Between the two, fading included.
+        Path loss to this radio, fading included.
     loss_probability
-        That the frame is not heard nevertheless.
-    frame
-        What it sends.
+        Probability that the frame is lost in addition.
     """
 
     type: Literal["incoming"] = "incoming"
@@ -144,12 +140,12 @@ class Incoming:
     crystal_ppm: Finite
     loss_db: Finite
     loss_probability: Finite
-    frame: FrameLine
+    frame: FrameMessage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stopped:
-    """Another radio cut its frame short."""
+    """Another radio cut its frame."""
 
     type: Literal["stopped"] = "stopped"
     sender: Name
@@ -158,19 +154,19 @@ class Stopped:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Left:
-    """Another radio is gone, and with it the frame that it was sending."""
+    """Another radio left the channel; its frame is cut."""
 
     type: Literal["left"] = "left"
     sender: Name
 
 
 FromClient = Join | Transmit | Stop
-FromServer = Welcome | Refused | Incoming | Stopped | Left
+FromServer = Welcome | Rejected | Incoming | Stopped | Left
 
 _FROM_CLIENT: dict[str, type[FromClient]] = {"join": Join, "transmit": Transmit, "stop": Stop}
 _FROM_SERVER: dict[str, type[FromServer]] = {
     "welcome": Welcome,
-    "refused": Refused,
+    "rejected": Rejected,
     "incoming": Incoming,
     "stopped": Stopped,
     "left": Left,
@@ -178,31 +174,31 @@ _FROM_SERVER: dict[str, type[FromServer]] = {
 
 
 def decode_from_client(data: bytes) -> FromClient:
-    """Read a client's line; raise ValueError, in one line, on anything else."""
+    """Decode a client's message; raise ValueError with a one-line text if it is invalid."""
     return _decode(_FROM_CLIENT, data)
 
 
 def decode_from_server(data: bytes) -> FromServer:
-    """Read a server's line; raise ValueError, in one line, on anything else."""
+    """Decode a server's message; raise ValueError with a one-line text if it is invalid."""
     return _decode(_FROM_SERVER, data)
 
 
 def _decode(kinds: dict[str, type[T]], data: bytes) -> T:
     kind = decode(Typed, data).type
     if kind not in kinds:
-        raise ValueError(f"there is no line of type {kind!r}")
+        raise ValueError(f"unknown message type {kind!r}")
     return decode(kinds[kind], data)
 
 
 class LineBuffer:
-    """Cuts what a socket delivers into lines."""
+    """Splits a byte stream into lines."""
 
     def __init__(self) -> None:
         self._data = b""
 
     def lines(self, data: bytes) -> list[bytes]:
-        """Take more bytes, return the lines that are whole now; raise ValueError if one is too long to be ours."""
+        """Add bytes and return the lines completed; raise ValueError if a line exceeds the limit."""
         *lines, self._data = (self._data + data).split(b"\n")
         if max(map(len, (*lines, self._data))) > MAX_LINE_BYTES:
-            raise ValueError(f"a line is longer than {MAX_LINE_BYTES} bytes")
+            raise ValueError(f"line longer than {MAX_LINE_BYTES} bytes")
         return lines

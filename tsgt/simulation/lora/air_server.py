@@ -1,10 +1,10 @@
-"""One air for simulated radios in several processes, in real time, over a UNIX socket.
+"""One radio channel for simulated radios in several processes, in real time, over a UNIX socket.
 
-Problem: a chip asks its receiver questions that cannot wait for an answer through a socket (RSSI, activity), and it
-must not matter that a message takes a while. Idea: the server only passes on who sends what and how much of it
-reaches whom; each client keeps an :class:`~tsgt.simulation.lora.air.Air` of its own, in which the other processes'
-radios are senders and nothing else. All times are CLOCK_MONOTONIC of the one machine and travel with what happened,
-so the same model decides as in one process, at true times; a message that is late makes events late, not wrong.
+Problem: a chip queries its receiver synchronously (RSSI, channel activity), and the delay of a message must not affect
+the result. Idea: the server only forwards transmissions and their path loss; each client keeps an
+:class:`~tsgt.simulation.lora.air.Air` of its own, in which the other processes' radios are senders only. All times are
+CLOCK_MONOTONIC of the machine and travel with the messages, so that the same model decides as within one process. A
+delayed message delays events but does not change them.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from tsgt.simulation.lora.air_messages import (
     Join,
     Left,
     LineBuffer,
-    Refused,
+    Rejected,
     Stopped,
     Transmit,
     Welcome,
     decode_from_client,
 )
-from tsgt.simulation.lora.link import uniforms
+from tsgt.simulation.lora.link import uniform_draws
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -42,12 +42,12 @@ if TYPE_CHECKING:
     from tsgt.simulation.lora.link import LinkModel
 
 MODE = 0o600
-"""Only its own user's processes are on the air."""
+"""Only processes of the same user may connect."""
 
 MAX_WAITING_BYTES = 1 << 20
-"""A client that leaves more than this unread is dropped."""
+"""A client with more unread bytes is disconnected."""
 
-_FARTHEST_START_NS = 1_000_000_000
+_MAX_START_OFFSET_NS = 1_000_000_000
 
 _ANY_FREQUENCY_HZ = 868e6
 
@@ -55,23 +55,23 @@ log = structlog.get_logger()
 
 
 class AirServer:
-    """Passes frames between the processes that have joined; an async context manager.
+    """Forwards frames between the connected processes; an async context manager.
 
     Parameters
     ----------
     path
-        The socket. A stale one of an earlier run is replaced.
+        The socket; a stale one is replaced.
     link
-        Powers, losses and fading between radios, by their names; may be changed while the server runs.
+        Path loss, fading and packet loss by radio names; may be changed at any time.
     rng
-        Gives the seed, one number.
+        One draw gives the seed.
     now_ns
         CLOCK_MONOTONIC.
 
     Raises
     ------
     StreamError
-        On entering: another program serves the socket, or it cannot be made.
+        On entering: another program serves the socket, or it cannot be created.
     """
 
     def __init__(
@@ -100,45 +100,45 @@ class AirServer:
     async def __aexit__(self, *_: object) -> None:
         self._server.close()
         self._listener.remove()
-        lost = [connection.lost for connection in self._connections]
+        closed = [connection.closed for connection in self._connections]
         for connection in list(self._connections):
             connection.transport.abort()
-        await asyncio.gather(*lost)
+        await asyncio.gather(*closed)
 
     @property
-    def names(self) -> set[str]:
-        """Who is on the air."""
+    def radio_names(self) -> set[str]:
+        """Names of the radios that have joined."""
         return set(self._members)
 
     def connected(self, connection: _Connection) -> None:
-        """Take note of a connection, which has yet to join."""
+        """Add a connection, which has yet to join."""
         self._connections.add(connection)
 
     def disconnected(self, connection: _Connection) -> None:
-        """Take a radio off the air, and with it the frame that it is sending."""
+        """Remove a radio and cut its frame."""
         self._connections.discard(connection)
         if connection.name is not None:
             del self._members[connection.name]
-            self._tell_others(connection, Left(sender=connection.name))
+            self._broadcast(connection, Left(sender=connection.name))
             log.info("air_left", name=connection.name)
 
     def received(self, connection: _Connection, line: FromClient) -> None:
-        """Act on what a client says; raise ValueError if it may not say that."""
+        """Process a client's message; raise ValueError if it is out of order."""
         if isinstance(line, Join):
             self._join(connection, line)
         elif connection.name is None:
-            raise ValueError("the first line must be of type 'join'")
+            raise ValueError("the first message must be of type 'join'")
         elif isinstance(line, Transmit):
             self._transmit(connection, connection.name, line)
         else:
-            self._tell_others(connection, Stopped(sender=connection.name, at_ns=line.at_ns))
+            self._broadcast(connection, Stopped(sender=connection.name, at_ns=line.at_ns))
 
     def _join(self, connection: _Connection, line: Join) -> None:
         if connection.name is not None:
             raise ValueError(f"this connection has joined as {connection.name!r} already")
         if line.name in self._members:
-            raise ValueError(f"there is a radio {line.name!r} on the air already; each needs its own name")
-        # At the first frame that would reach it, it would be the sender who is dropped.
+            raise ValueError(f"radio {line.name!r} has joined already; each radio needs a unique name")
+        # Without this check, the first frame towards an unknown name would disconnect its sender.
         self.link.path_loss.loss_db(line.name, line.name, _ANY_FREQUENCY_HZ)
         connection.name = line.name
         connection.crystal_ppm = line.crystal_ppm
@@ -147,12 +147,12 @@ class AirServer:
         log.info("air_joined", name=line.name)
 
     def _transmit(self, sender: _Connection, name: str, line: Transmit) -> None:
-        if abs(line.frame.start_ns - self._now_ns()) > _FARTHEST_START_NS:
+        if abs(line.frame.start_ns - self._now_ns()) > _MAX_START_OFFSET_NS:
             raise ValueError("the frame's start is not now; times are CLOCK_MONOTONIC in ns")
         self._sent[name] += 1
         for receiver, connection in list(self._members.items()):
             if connection is not sender:
-                draws = uniforms(self._seed, name, self._sent[name], receiver)
+                draws = uniform_draws(self._seed, name, self._sent[name], receiver)
                 incoming = Incoming(
                     sender=name,
                     crystal_ppm=sender.crystal_ppm,
@@ -162,21 +162,21 @@ class AirServer:
                 )
                 connection.send(incoming)
 
-    def _tell_others(self, connection: _Connection, line: Stopped | Left) -> None:
+    def _broadcast(self, connection: _Connection, line: Stopped | Left) -> None:
         for other in list(self._members.values()):
             if other is not connection:
                 other.send(line)
 
 
 class _Connection(asyncio.Protocol):
-    """One client, from its connection on."""
+    """One client's connection."""
 
     transport: asyncio.WriteTransport
 
     def __init__(self, server: AirServer) -> None:
         self.name: str | None = None
         self.crystal_ppm = 0.0
-        self.lost: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self.closed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._server = server
         self._lines = LineBuffer()
 
@@ -195,17 +195,17 @@ class _Connection(asyncio.Protocol):
             for line in self._lines.lines(data):
                 self._server.received(self, decode_from_client(line))
         except ValueError as error:
-            self._drop(str(error))
+            self._reject(str(error))
 
     def pause_writing(self) -> None:
         log.warning("air_client_dropped", name=self.name, reason="it does not read")
         self.transport.abort()
 
-    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 (a client may go as it likes)
+    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 (of asyncio)
         self._server.disconnected(self)
-        self.lost.set_result(None)
+        self.closed.set_result(None)
 
-    def _drop(self, reason: str) -> None:
+    def _reject(self, reason: str) -> None:
         log.warning("air_client_dropped", name=self.name, reason=reason)
-        self.send(Refused(reason=reason))
+        self.send(Rejected(reason=reason))
         self.transport.close()

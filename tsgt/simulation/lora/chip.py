@@ -1,9 +1,9 @@
-"""A simulated SX1276 (RFM95, Dragino HAT) at register level: its SPI bus, its pins and its modes.
+"""A simulated SX1276 (RFM95, Dragino HAT) at register level: SPI bus, pins, modes.
 
-It takes bytes between edges of NSS as the real chip does, so that drivers written for real chips work on it
-unchanged (facts/radio.md 1 to 4 and 12). Not simulated: sending and receiving in FSK mode, frequency hopping, the
-analogue side (LNA gain, ramp, over-current trim, intermediate frequency change nothing), edges of DIO4 PllLock and
-DIO5 ModeReady (their levels are right), ClkOut.
+It exchanges bytes within an NSS window as the real chip does, so that drivers for real chips run unchanged
+(facts/radio.md 1 to 4 and 12). Not simulated: FSK transmission and reception, frequency hopping, the analogue side (LNA
+gain, ramp, over-current trim and intermediate frequency have no effect), edges of DIO4 PllLock and DIO5 ModeReady
+(their levels are right), ClkOut.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ if TYPE_CHECKING:
     import numpy as np
 
     from tsgt.simulation.kernel import Timeline
-    from tsgt.simulation.lora.frames import Antenna, Port
+    from tsgt.simulation.lora.frames import AirPort, FrameListener
 
 log = structlog.get_logger()
 
-HIGHEST_SCK_HZ = 10_000_000
-SHORTEST_RESET_NS = 100_000
+MAX_SCK_HZ = 10_000_000
+MIN_RESET_NS = 100_000
 BOOT_NS = 5_000_000
 """From the end of a reset until the chip may be used (data sheet 7.2.2)."""
 
-# What each DIO follows, by the two bits of its mapping (data sheet table 18). DIO0 with 11 is not documented;
+# Flag on each DIO, by the two bits of its mapping (data sheet table 18). DIO0 with 11 is not documented;
 # programs in the field depend on it (facts/radio.md 2.3).
 _FHSS = int(reg.Irq.FHSS_CHANGE_CHANNEL)
 _DIO_FLAGS = (
@@ -55,12 +55,12 @@ _DIO_FLAGS = (
 )
 
 IMAGE_CAL_BUSY = 0x60
-"""RegImageCal: start a calibration, a calibration runs."""
+"""RegImageCal: start of a calibration, calibration running."""
 
 FAST_HOP_ON = 0x80
-"""RegPllHop: a new carrier takes effect at once."""
+"""RegPllHop: a new carrier frequency takes effect at once."""
 
-# Bits of RegOpMode that hold what is written: the modulation type in FSK mode, AccessSharedReg in LoRa mode.
+# Writable bits of RegOpMode: the modulation type in FSK mode, AccessSharedReg in LoRa mode.
 _FSK_MODE_BITS = 0x6F
 _LORA_MODE_BITS = 0x4F
 
@@ -70,25 +70,21 @@ class SX1276Chip:
 
     Parameters
     ----------
-    timeline
-        Where its time passes.
     join
-        Connects it to an air; called once, with the chip's antenna.
+        Connects it to a channel; called once.
     rng
-        Jitter of its interrupts.
-    timing
-        How long everything takes.
+        Interrupt jitter.
 
     Attributes
     ----------
     warnings
-        What the program that drives it does against the data sheet, each kind once.
+        Violations of the data sheet by the driver, each kind once.
     """
 
     def __init__(
         self,
         timeline: Timeline,
-        join: Callable[[Antenna], Port],
+        join: Callable[[FrameListener], AirPort],
         rng: np.random.Generator,
         *,
         timing: ChipTiming | None = None,
@@ -102,7 +98,7 @@ class SX1276Chip:
             join,
             rng,
             self._memory,
-            report=self._on_modem,
+            report=self._on_modem_event,
             warn=self._warn,
             timing=self._timing,
         )
@@ -121,7 +117,7 @@ class SX1276Chip:
         self._pll_locked_ns = timeline.now_ns()
         self._fsk_page = True
         self._booting = False
-        self._watched: dict[int, list[Callable[[int, bool], None]]] = {}
+        self._pin_callbacks: dict[int, list[Callable[[int, bool], None]]] = {}
         self._levels: dict[int, bool] = {}
         self._writers: list[Callable[[int], None] | None] = [None] * 0x80
         for address in READ_ONLY:
@@ -145,11 +141,11 @@ class SX1276Chip:
                 self._warn("SPI access within 5 ms after the end of a reset")
 
     def deselect(self) -> None:
-        """NSS rises: the access is over."""
+        """NSS rises: the access ends."""
         self._selected = False
 
     def exchange(self, byte: int) -> int:
-        """Take one byte from MOSI and return what is on MISO meanwhile: the register's content before."""
+        """Shift in one byte on MOSI and return the byte on MISO: the register's previous content."""
         if not self._selected or self._reset_since_ns is not None:
             return 0x00
         if self._dead_bus_level is not None:
@@ -168,15 +164,17 @@ class SX1276Chip:
         return value
 
     def transfer(self, data: bytes) -> bytes:
-        """Exchange bytes in one window of NSS."""
+        """Exchange bytes in one NSS window."""
         self.select()
-        answer = self._access(data) if self._well(data) else bytes(map(self.exchange, data))
+        response = (
+            self._transfer_plain(data) if self._is_plain_access(data) else bytes(map(self.exchange, data))
+        )
         self.deselect()
-        return answer
+        return response
 
     def set_sck(self, frequency_hz: int) -> None:
-        """Set the clock of the bus; it carries any, and warns of one too fast."""
-        if frequency_hz > HIGHEST_SCK_HZ:
+        """Set the bus clock; warns above 10 MHz."""
+        if frequency_hz > MAX_SCK_HZ:
             self._warn("SCK faster than 10 MHz")
 
     # --- the pins -------------------------------------------------------------------------------------------------
@@ -186,16 +184,16 @@ class SX1276Chip:
         now_ns = self._timeline.now_ns()
         if low and self._reset_since_ns is None:
             self._reset_since_ns = now_ns
-            self.reset_itself()
+            self.power_on_reset()
         elif not low and self._reset_since_ns is not None:
-            if now_ns - self._reset_since_ns < SHORTEST_RESET_NS:
+            if now_ns - self._reset_since_ns < MIN_RESET_NS:
                 self._warn("NRESET low for less than 100 us")
             self._reset_since_ns = None
             self._booted_ns = now_ns + BOOT_NS
             self._booting = True
 
     def dio(self, n: int) -> bool:
-        """Level of DIO0 to DIO5 at this moment."""
+        """Return the level of DIO0 to DIO5."""
         lora = self._memory.lora
         if not lora[Register.OP_MODE] & reg.LONG_RANGE_MODE or self._reset_since_ns is not None:
             return False
@@ -208,31 +206,31 @@ class SX1276Chip:
         return bool(_DIO_FLAGS[n][mapping] & lora[Register.IRQ_FLAGS] & ~lora[Register.IRQ_FLAGS_MASK])
 
     def on_dio(self, n: int, callback: Callable[[int, bool], None]) -> None:
-        """From now on call back with time and new level whenever DIO ``n`` changes."""
-        self._watched.setdefault(n, []).append(callback)
+        """Call back with time and new level whenever DIO ``n`` changes."""
+        self._pin_callbacks.setdefault(n, []).append(callback)
         self._levels[n] = self.dio(n)
 
     # --- faults ---------------------------------------------------------------------------------------------------
 
-    def lose_bus(self, level: bool) -> None:  # noqa: FBT001 (a level)
-        """Stop listening to the bus, as if NSS or power were gone: MISO is 0x00 or 0xFF from now on."""
+    def disconnect_bus(self, level: bool) -> None:  # noqa: FBT001 (a level)
+        """Ignore the bus as if NSS or power were disconnected: MISO is constantly 0x00 or 0xFF."""
         self._dead_bus_level = 0xFF if level else 0x00
 
-    def restore_bus(self) -> None:
-        """End :meth:`lose_bus`."""
+    def reconnect_bus(self) -> None:
+        """End :meth:`disconnect_bus`."""
         self._dead_bus_level = None
 
     def hang(self) -> None:
-        """Freeze: nothing is sent, received or written any more until a reset by pin."""
+        """Freeze: no transmission, reception or register write until a reset by pin."""
         self._modem.stop()
         self._hung = True
 
-    def lose_tx_done(self, count: int = 1) -> None:
-        """Let the next ``count`` transmissions end without TxDone; the chip stays in TX."""
-        self._modem.tx_done_to_lose = count
+    def drop_tx_done(self, count: int = 1) -> None:
+        """Suppress TxDone of the next ``count`` transmissions; the chip stays in TX."""
+        self._modem.tx_done_to_drop = count
 
-    def reset_itself(self) -> None:
-        """Fall back to power-on values, as after a dip of the supply."""
+    def power_on_reset(self) -> None:
+        """Reset to power-on values, as after a supply dip."""
         self._modem.stop()
         self._memory.reset()
         self._hung = False
@@ -250,7 +248,7 @@ class SX1276Chip:
     def _write(self, address: int, value: int) -> None:
         if self._fsk_page and FIRST_PAGED <= address < FIRST_AFTER_PAGED:
             if address == REG_IMAGE_CAL:
-                value &= ~IMAGE_CAL_BUSY  # done in no time
+                value &= ~IMAGE_CAL_BUSY  # completes immediately
             self._memory.fsk[address] = value
             return
         writer = self._writers[address]
@@ -259,8 +257,8 @@ class SX1276Chip:
         else:
             writer(value)
 
-    def _well(self, data: bytes) -> bool:
-        """Whether an access needs no look at every byte: to the LoRa page of a chip that works, not beyond its end."""
+    def _is_plain_access(self, data: bytes) -> bool:
+        """Whether :meth:`_transfer_plain` may serve an access: to the LoRa page of a working chip, not beyond its end."""
         return bool(data) and not (
             self._fsk_page
             or self._hung
@@ -269,8 +267,8 @@ class SX1276Chip:
             or (data[0] & ~reg.WRITE) + len(data) > REGISTERS
         )
 
-    def _access(self, data: bytes) -> bytes:
-        """Do at once what :meth:`exchange` does byte by byte."""
+    def _transfer_plain(self, data: bytes) -> bytes:
+        """Do in one step what :meth:`exchange` does byte by byte."""
         address, count = data[0] & ~reg.WRITE, len(data) - 1
         if address == Register.FIFO:
             return b"\0" + self._access_fifo(count, data[1:] if data[0] >= reg.WRITE else None)
@@ -281,18 +279,18 @@ class SX1276Chip:
                 self._write(register, byte)
             return bytes(before)
         end = address + count
-        answer = bytearray(1) + self._memory.lora[address:end]
+        response = bytearray(1) + self._memory.lora[address:end]
         if address <= Register.RSSI_WIDEBAND and end > Register.RSSI_VALUE:
             for register, measured in self._measured.items():
                 if address <= register < end:
-                    answer[1 + register - address] = measured()
-        return bytes(answer)
+                    response[1 + register - address] = measured()
+        return bytes(response)
 
     def _exchange_fifo(self, byte: int) -> int:
         return self._access_fifo(1, bytes([byte]) if self._writing else None)[0]
 
     def _access_fifo(self, count: int, written: bytes | None) -> bytes:
-        """Read or write where RegFifoAddrPtr points, and move it on; return what was there."""
+        """Read or write at RegFifoAddrPtr and advance it; return the previous content."""
         lora = self._memory.lora
         op_mode = lora[Register.OP_MODE]
         if not op_mode & reg.LONG_RANGE_MODE or not op_mode & reg.MODE_MASK:
@@ -307,7 +305,7 @@ class SX1276Chip:
         return before
 
     def _write_op_mode(self, value: int) -> None:
-        """Change mode by the rule of facts/radio.md 3.1: LongRangeMode changes in SLEEP only."""
+        """Change mode; LongRangeMode changes in SLEEP only (facts/radio.md 3.1)."""
         old = self._memory.lora[Register.OP_MODE]
         lora_mode = (old if old & reg.MODE_MASK else value) & reg.LONG_RANGE_MODE
         new = lora_mode | value & (_LORA_MODE_BITS if lora_mode else _FSK_MODE_BITS)
@@ -334,7 +332,7 @@ class SX1276Chip:
                 self._warn("sending and receiving in FSK mode is not simulated")
 
     def _write_frf(self, address: int, value: int) -> None:
-        """Change the carrier, which the last of three bytes puts in force."""
+        """Write the carrier frequency, which takes effect with the last of its three bytes."""
         lora = self._memory.lora
         lora[address] = value
         mode = lora[Register.OP_MODE] & reg.MODE_MASK
@@ -353,8 +351,8 @@ class SX1276Chip:
         self._memory.lora[address] = value
         self._update_pins(self._timeline.now_ns())
 
-    def _on_modem(self, flags: int, at_ns: int, *, standby: bool) -> None:
-        """Set flags that are not masked, and show the mode that the modem has gone to by itself."""
+    def _on_modem_event(self, flags: int, at_ns: int, *, standby: bool) -> None:
+        """Set the flags that are not masked; ``standby``: the modem has entered STDBY."""
         lora = self._memory.lora
         lora[Register.IRQ_FLAGS] |= flags & ~lora[Register.IRQ_FLAGS_MASK]
         if standby:
@@ -362,7 +360,7 @@ class SX1276Chip:
         self._update_pins(at_ns)
 
     def _update_pins(self, at_ns: int) -> None:
-        for n, callbacks in self._watched.items():
+        for n, callbacks in self._pin_callbacks.items():
             level = self.dio(n)
             if level != self._levels[n]:
                 self._levels[n] = level
@@ -376,4 +374,4 @@ class SX1276Chip:
 
 
 def _ignore(_: int) -> None:
-    """Leave a register alone that cannot be written."""
+    """Ignore a write to a read-only register."""

@@ -1,4 +1,4 @@
-"""What the simulated SX1276 holds: its two register pages as after a reset, and the FIFO."""
+"""Memory of a simulated SX1276: both register pages with their reset values, and the FIFO."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ from tsgt.radio.sx127x import Register
 
 FIFO_BYTES = 256
 FIFO_PATTERN = 0xA5
-"""Fills the FIFO in SLEEP, where the real content is undefined, so that nobody relies on it."""
+"""FIFO content in SLEEP, which is undefined on the real chip."""
 
 FIRST_PAGED = 0x0D
 FIRST_AFTER_PAGED = 0x40
-"""Registers from the first to before the second exist on an FSK page and on a LoRa page."""
+"""Registers from FIRST_PAGED up to this one exist on an FSK page and on a LoRa page."""
 
 REG_IMAGE_CAL = 0x3B
-"""RegImageCal of the FSK page: bit 6 starts a calibration, bit 5 tells that it runs."""
+"""RegImageCal of the FSK page: bit 6 starts a calibration, bit 5 is set while it runs."""
 
 REGISTERS = 0x80
-"""How many addresses there are."""
+"""Number of addresses."""
 
-# Data sheet table 41 and section 6.4; those that it calls reserved are as drivers have found them
+# Data sheet table 41 and section 6.4; reserved ones as found by drivers
 # (facts/radio.md 2.1, 2.2).
 _COMMON_RESET = {
     Register.OP_MODE: 0x09,  # FSK, low-frequency registers, STDBY
@@ -66,7 +66,7 @@ READ_ONLY = frozenset(
         0x5B,  # RegFormerTemp
     }
 )
-"""Registers of the LoRa page and common ones that ignore writes."""
+"""Registers of the LoRa page and common registers that ignore writes."""
 
 
 class ChipMemory:
@@ -75,13 +75,11 @@ class ChipMemory:
     Attributes
     ----------
     lora
-        Registers by address: the common ones and the LoRa page.
+        Common registers and the LoRa page, by address.
     fsk
-        Registers by address, of which the FSK page is used.
-    fifo
-        256 bytes, for sending and receiving alike.
+        By address; only the FSK page is used.
     frf
-        The carrier in force, in steps of the synthesizer: RegFrf as it was when its last byte was written.
+        Carrier frequency in effect, in synthesizer steps: RegFrf when its last byte was written.
     """
 
     def __init__(self) -> None:
@@ -92,7 +90,7 @@ class ChipMemory:
         self.reset()
 
     def reset(self) -> None:
-        """Set everything as it is after power-on; the FIFO keeps what chance left in it."""
+        """Set the power-on values; the FIFO keeps its content."""
         self.lora[:] = bytes(REGISTERS)
         self.fsk[:] = bytes(REGISTERS)
         for address, value in (_COMMON_RESET | _LORA_RESET).items():
@@ -102,26 +100,26 @@ class ChipMemory:
         self.latch_frf()
 
     def latch_frf(self) -> None:
-        """Put the three bytes of RegFrf in force."""
+        """Let the three bytes of RegFrf take effect."""
         self.frf = int.from_bytes(self.lora[Register.FRF_MSB : Register.FRF_LSB + 1], "big")
 
     def sleep(self) -> None:
-        """Lose what the chip loses in SLEEP: the FIFO and the counts of headers and packets."""
+        """Clear what SLEEP clears: the FIFO and the counters of headers and packets."""
         self.fifo[:] = bytes([FIFO_PATTERN]) * FIFO_BYTES
         self.lora[Register.RX_HEADER_CNT_VALUE_MSB : Register.RX_PACKET_CNT_VALUE_LSB + 1] = bytes(4)
 
     def count(self, msb: int) -> None:
-        """Add one to a 16-bit counter, which wraps."""
+        """Increment a 16-bit counter, which wraps."""
         value = int.from_bytes(self.lora[msb : msb + 2], "big") + 1
         self.lora[msb : msb + 2] = (value & 0xFFFF).to_bytes(2, "big")
 
     def read_fifo(self, start: int, length: int) -> bytes:
-        """Copy bytes out of the FIFO, whose addresses wrap."""
+        """Read bytes from the FIFO; addresses wrap."""
         end = start + length
         return bytes(self.fifo[start:end] if end <= FIFO_BYTES else (self.fifo + self.fifo)[start:end])
 
     def write_fifo(self, start: int, data: bytes) -> int:
-        """Copy bytes into the FIFO and return the address after the last."""
+        """Write bytes to the FIFO; return the address after the last."""
         end = start + len(data)
         if end <= FIFO_BYTES:
             self.fifo[start:end] = data

@@ -1,4 +1,4 @@
-"""What the radios and the air between them say to each other: frames, listening, receptions."""
+"""Interface between radios and channel: frames, receiver settings, receptions."""
 
 from __future__ import annotations
 
@@ -11,24 +11,22 @@ from tsgt.radio import HEADER_SYMBOLS, payload_symbols, symbol_time_ns
 
 @dataclass(frozen=True)
 class Modulation:
-    """What sender and receiver must have in common to hear each other (facts/radio.md 3.3).
+    """What sender and receiver must share (facts/radio.md 3.3).
 
     Attributes
     ----------
     frequency_hz
-        Carrier as the radio believes to have set it.
+        Nominal carrier frequency.
     spreading_factor
         6 to 12.
-    bandwidth_hz
-        Occupied bandwidth.
     inverted_iq
-        Whether up-chirps and down-chirps change places.
+        Whether up-chirps and down-chirps are swapped.
     sync_word
-        One byte, mapped to two symbols at the end of the preamble.
+        One byte, in two symbols at the end of the preamble.
     explicit_header
-        Whether the frame says itself how long it is and how it is coded.
+        Whether the frame carries its length and coding.
     low_data_rate
-        Whether low-data-rate optimisation is on.
+        Low-data-rate optimisation.
     """
 
     frequency_hz: float
@@ -42,24 +40,20 @@ class Modulation:
 
 @dataclass(frozen=True)
 class Frame:
-    """One packet on the air, from the first symbol of its preamble on.
+    """A packet on the air, from the first symbol of its preamble.
 
     Attributes
     ----------
-    modulation
-        How it is sent.
     coding_rate
-        Denominator of the code of its payload, 5 to 8 for 4/5 to 4/8.
-    crc
-        Whether the payload has a checksum.
+        Denominator of the payload's code rate, 5 to 8 for 4/5 to 4/8.
     preamble_symbols
         As programmed; 4.25 symbols more are on the air.
     payload
-        Its bytes, 1 to 255.
+        1 to 255 bytes.
     power_dbm
         At the sender's antenna connector.
     start_ns
-        When it starts, on the air's timeline.
+        Start, on the channel's timeline.
     """
 
     modulation: Modulation
@@ -72,36 +66,36 @@ class Frame:
 
     @cached_property
     def symbol_ns(self) -> int:
-        """Duration of one symbol."""
+        """Symbol duration."""
         return symbol_time_ns(self.modulation.spreading_factor, int(self.modulation.bandwidth_hz))
 
     @cached_property
     def programmed_preamble_end_ns(self) -> int:
-        """When the last preamble symbol ends that the receiver may use to find it; the sync word follows."""
+        """End of the programmed preamble, which the receiver may use for detection; the sync word follows."""
         return self.start_ns + self.preamble_symbols * self.symbol_ns
 
     @cached_property
     def preamble_end_ns(self) -> int:
-        """When the preamble with its sync word has ended: 4.25 symbols after the programmed ones."""
+        """End of preamble and sync word: 4.25 symbols after the programmed preamble."""
         return self.start_ns + (4 * self.preamble_symbols + 17) * self.symbol_ns // 4
 
     @cached_property
     def header_end_ns(self) -> int:
-        """When the first eight symbols after the preamble have ended, which hold an explicit header."""
+        """End of the first eight symbols after the preamble, which hold an explicit header."""
         return self.preamble_end_ns + HEADER_SYMBOLS * self.symbol_ns
 
     @cached_property
     def header(self) -> Header:
-        """What an explicit header says of it."""
+        """Content of an explicit header."""
         return Header(len(self.payload), self.coding_rate, self.crc)
 
     @cached_property
     def end_ns(self) -> int:
-        """When its last symbol ends, if nobody cuts it short."""
-        return self.end_as_read_ns(self.header, low_data_rate=self.modulation.low_data_rate)
+        """Nominal end of the last symbol."""
+        return self.end_by_header_ns(self.header, low_data_rate=self.modulation.low_data_rate)
 
-    def end_as_read_ns(self, header: Header, *, low_data_rate: bool) -> int:
-        """When a receiver believes that it ends, which knows no more of it than this."""
+    def end_by_header_ns(self, header: Header, *, low_data_rate: bool) -> int:
+        """Return the end that a receiver expects from this header."""
         symbols = payload_symbols(
             header.payload_bytes,
             spreading_factor=self.modulation.spreading_factor,
@@ -114,21 +108,19 @@ class Frame:
 
 
 @dataclass(frozen=True, slots=True)
-class Listening:
-    """What a receiver is set to hear.
+class ReceiverSettings:
+    """Settings of a listening receiver.
 
     Attributes
     ----------
-    modulation
-        What it demodulates.
     since_ns
-        When it began to listen.
+        When it started to listen.
     preamble_symbols
-        As programmed; a sender's longer preamble is not recognised.
+        As programmed; a longer preamble is not recognised.
     max_payload_bytes
-        A header that announces more is dropped.
+        Frames whose header announces more are dropped.
     payload_bytes, coding_rate, crc
-        What it takes for granted where there is no header to tell.
+        Assumed for frames without a header.
     """
 
     modulation: Modulation
@@ -142,7 +134,7 @@ class Listening:
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """What a frame says of itself: payload length, denominator of its coding rate, checksum or not."""
+    """Payload length, code rate denominator, and presence of a checksum."""
 
     payload_bytes: int
     coding_rate: int
@@ -151,20 +143,20 @@ class Header:
 
 @dataclass(frozen=True, slots=True)
 class Reception:
-    """A frame whose end a receiver has reached.
+    """A frame that a receiver has received to its end.
 
     Attributes
     ----------
     payload
-        The bytes as the receiver has them, damaged where they are.
+        As received, possibly damaged.
     crc_ok
-        Whether checksum and payload agree; always true of a frame without checksum.
+        Whether the checksum matches; True for a frame without one.
     header
-        As received, or as taken for granted.
+        As received, or as assumed.
     snr_db, rssi_dbm
-        Signal to noise ratio and power of the frame itself at the receiver.
+        Of the frame itself at the receiver.
     frequency_error_hz
-        Positive: the sender's carrier lies above the receiver's.
+        Positive: the sender's carrier is above the receiver's.
     """
 
     payload: bytes
@@ -175,41 +167,41 @@ class Reception:
     frequency_error_hz: float
 
 
-class Antenna(Protocol):
-    """What the air tells a radio, each at the time when it happens."""
+class FrameListener(Protocol):
+    """Callbacks from the channel to a radio, each at the time of the event."""
 
     def preamble_detected(self, at_ns: int) -> None:
-        """Lock: a preamble was found."""
+        """Handle the detection of a preamble; the receiver is locked."""
         ...
 
     def header_received(self, at_ns: int, header: Header) -> None:
-        """Take an explicit header that arrived with its checksum right."""
+        """Handle an explicit header that arrived intact."""
         ...
 
     def frame_ended(self, at_ns: int, reception: Reception | None) -> None:
-        """End of the frame that it was locked to, on the air; None: the lock was lost, nothing to report."""
+        """Handle the end of the frame; None: it was lost."""
         ...
 
 
-class Port(Protocol):
-    """What a radio does to the air."""
+class AirPort(Protocol):
+    """A radio's interface to the channel."""
 
     def transmit(self, frame: Frame) -> None:
-        """Put a frame on the air."""
+        """Transmit a frame."""
         ...
 
     def stop_transmitting(self, at_ns: int) -> None:
-        """Cut the frame that is on the air; nothing happens when there is none."""
+        """Cut the frame on the air; no effect if there is none."""
         ...
 
-    def listen(self, listening: Listening | None) -> None:
-        """Listen from now on, anew, or become deaf (None); the frame it was locked to is lost silently."""
+    def listen(self, listening: ReceiverSettings | None) -> None:
+        """Restart the receiver with these settings, or stop it (None); the frame it is locked to is lost without callback."""
         ...
 
     def rssi_dbm(self, at_ns: int) -> float:
-        """Power on the channel now, the receiver's noise included."""
+        """Return the current power on the channel, receiver noise included."""
         ...
 
     def preamble_present(self, modulation: Modulation, at_ns: int) -> bool:
-        """Whether a channel activity detection finds a preamble in the symbol that ends at this moment."""
+        """Whether channel activity detection finds a preamble in the symbol that ends now."""
         ...

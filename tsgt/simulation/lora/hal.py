@@ -1,4 +1,4 @@
-"""Bus and pins of a simulated chip, as the driver sees those of a real one."""
+"""SPI bus and pins of a simulated chip, as the driver sees a real one."""
 
 from __future__ import annotations
 
@@ -15,18 +15,16 @@ if TYPE_CHECKING:
 
 
 class SimulatedHal:
-    """A :class:`tsgt.radio.sx127x.hal.Hal` on a chip in this process; transfers take no time.
+    """A :class:`tsgt.radio.sx127x.hal.Hal` on a simulated chip; transfers take no time.
 
-    Edges are stamped with the time at which the simulated chip raised the pin.
+    Edges are timestamped with the time at which the chip raised the pin.
 
     Parameters
     ----------
-    chip
-        What is on the bus.
     stamp_sigma_ns
-        What the host claims of its time stamps; the chip's own jitter is in them already.
+        One sigma that the host states for its timestamps, the chip's jitter included.
     local_ns
-        From the chip's timeline to the host's CLOCK_MONOTONIC; the same unless the host's clock has an error.
+        Converts the chip's timeline to the host's CLOCK_MONOTONIC.
     """
 
     def __init__(
@@ -39,9 +37,9 @@ class SimulatedHal:
         self.stamp_sigma_ns = stamp_sigma_ns
         self._local_ns = local_ns
         self._chip = chip
-        self._edges_to_lose = 0
-        self._edges_lost = 0
-        self._losses_counted = True
+        self._edges_to_drop = 0
+        self._edges_dropped = 0
+        self._count_dropped = True
 
     def transfer(self, data: bytes) -> bytes:
         """Exchange bytes in one chip-select window."""
@@ -52,37 +50,35 @@ class SimulatedHal:
         self._chip.set_reset(low)
 
     def dio0(self) -> bool:
-        """Level of DIO0 now."""
+        """Return the level of DIO0."""
         return self._chip.dio(0)
 
     def on_dio0(self, callback: EdgeCallback) -> None:
-        """Call back in the running loop, but as from an interrupt never in the middle of the driver's own work."""
+        """Call back in the running loop; like an interrupt, never within the driver's own code."""
         loop = asyncio.get_running_loop()
 
         def changed(at_ns: int, level: bool) -> None:  # noqa: FBT001 (a level)
             if not level:
                 return
-            if self._edges_to_lose > 0:
-                self._edges_to_lose -= 1
-                self._edges_lost += self._losses_counted
+            if self._edges_to_drop > 0:
+                self._edges_to_drop -= 1
+                self._edges_dropped += self._count_dropped
                 return
-            loop.call_soon(callback, Edge(self._local_ns(at_ns), self._edges_lost))
-            self._edges_lost = 0
+            loop.call_soon(callback, Edge(self._local_ns(at_ns), self._edges_dropped))
+            self._edges_dropped = 0
 
         self._chip.on_dio(0, changed)
 
-    def lose_edges(self, count: int, *, counted: bool = True) -> None:
-        """Let the next rising edges go unreported, a fault that drivers must survive.
+    def drop_edges(self, count: int, *, counted: bool = True) -> None:
+        """Suppress the next rising edges.
 
         Parameters
         ----------
-        count
-            How many.
         counted
-            Whether the edge after them tells how many were lost, as gpiod does and RPi.GPIO does not.
+            Whether the next reported edge carries the number of missed ones, as with gpiod but not with RPi.GPIO.
         """
-        self._edges_to_lose = count
-        self._losses_counted = counted
+        self._edges_to_drop = count
+        self._count_dropped = counted
 
     def close(self) -> None:
         """Do nothing; the chip stays on."""

@@ -1,4 +1,4 @@
-"""The LoRa modem of a simulated SX1276: sending, receiving and activity detection, with their timing."""
+"""LoRa modem of a simulated SX1276: transmission, reception and channel activity detection, with their timing."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from tsgt.radio.sx127x import Mode, Register
 from tsgt.radio.sx127x import registers as reg
-from tsgt.simulation.lora.frames import Frame, Header, Listening, Reception
+from tsgt.simulation.lora.frames import Frame, Header, ReceiverSettings, Reception
 from tsgt.simulation.lora.register_map import (
     frequency_error_registers,
     modem_settings,
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
     from tsgt.simulation.kernel import Handle, Timeline
     from tsgt.simulation.lora.chip_memory import ChipMemory
-    from tsgt.simulation.lora.frames import Antenna, Port
+    from tsgt.simulation.lora.frames import AirPort, FrameListener
     from tsgt.simulation.lora.register_map import ModemSettings
 
-# Plain integers: members of IntFlag are slow to combine.
+# Plain integers, because combining IntFlag members is slow.
 RX_TIMEOUT = int(reg.Irq.RX_TIMEOUT)
 RX_DONE = int(reg.Irq.RX_DONE)
 PAYLOAD_CRC_ERROR = int(reg.Irq.PAYLOAD_CRC_ERROR)
@@ -45,22 +45,22 @@ _HEADER_KNOWN = _LOCKED | reg.HEADER_INFO_VALID
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChipTiming:
-    """How long the chip takes (facts/radio.md 3.3, 3.5, 7.1, 7.2).
+    """Processing times of the chip (facts/radio.md 3.3, 3.5, 7.1, 7.2).
 
     Attributes
     ----------
     oscillator_ns, pll_ns
-        From SLEEP until the oscillator runs; from there until the synthesizer has locked.
+        From SLEEP to a running oscillator; from there to a locked synthesizer.
     tx_start_ns, rx_start_ns
-        From there until the frame starts on the air; until the receiver listens.
+        From there to the start of the frame on the air; to a listening receiver.
     tx_done_ns
-        TxDone after the end of the frame on the air.
+        From the end of the frame to TxDone.
     rx_done_symbols
-        RxDone after the end of the frame, by spreading factor.
+        From the end of the frame to RxDone in symbols, by spreading factor.
     rx_timeout_ns
-        RxTimeout after the symbols that it was set to.
+        From the programmed number of symbols to RxTimeout.
     cad_processing_symbols
-        Duration of an activity detection after it has listened.
+        Processing time of channel activity detection after listening.
     jitter_sigma_ns
         One sigma of TxDone and RxDone.
     """
@@ -79,36 +79,30 @@ class ChipTiming:
 
 
 class Report(Protocol):
-    """How the modem tells the chip what has happened."""
+    """Callback of the modem to the chip."""
 
     def __call__(self, flags: int, at_ns: int, *, standby: bool) -> None:
-        """Set flags; ``standby``: the modem has gone to STDBY by itself."""
+        """Set flags; ``standby``: the modem has entered STDBY."""
         ...
 
 
 class Modem:
-    """Sender and receiver; to the air it is the antenna.
+    """Transmitter and receiver; the channel's frame listener.
 
     Parameters
     ----------
-    timeline
-        Where its time passes.
     join
-        Connects it to an air.
+        Connects it to a channel.
     rng
-        Jitter of its interrupts.
-    memory
-        Registers and FIFO of the chip.
+        Interrupt jitter.
     report, warn
-        Where flags and misuse go.
-    timing
-        How long everything takes.
+        Called with flags; called with violations of the data sheet.
     """
 
     def __init__(
         self,
         timeline: Timeline,
-        join: Callable[[Antenna], Port],
+        join: Callable[[FrameListener], AirPort],
         rng: np.random.Generator,
         memory: ChipMemory,
         *,
@@ -122,8 +116,8 @@ class Modem:
         self._report = report
         self._warn = warn
         self._timing = timing
-        self.tx_done_to_lose = 0
-        """How many more transmissions end without TxDone, a fault that drivers must survive."""
+        self.tx_done_to_drop = 0
+        """Number of transmissions without TxDone still to come."""
         self._settings: ModemSettings | None = None
         self._mode = Mode.STDBY
         self._pending: Handle | None = None
@@ -134,7 +128,7 @@ class Modem:
         self._port = join(self)
 
     def start(self, mode: Mode, ready_ns: int) -> None:
-        """Send, receive or detect activity with the present settings once the synthesizer has locked."""
+        """Transmit, receive or detect activity with the current settings once the synthesizer has locked."""
         settings, problems = modem_settings(self._memory)
         for problem in problems:
             self._warn(problem)
@@ -144,17 +138,17 @@ class Modem:
             self._write_address = self._memory.lora[Register.FIFO_RX_BASE_ADDR]
             self._set_status(_SEARCHING)
         if settings is None:
-            return  # neither sends nor hears anything until it is told to stop
+            return  # unusable settings: idle until stopped
         if mode == Mode.TX:
-            self._at(ready_ns + self._timing.tx_start_ns, self._send)
+            self._schedule(ready_ns + self._timing.tx_start_ns, self._send)
         elif mode == Mode.CAD:
             listening_ns = settings.symbol_ns + int(32e9 / settings.receiving.bandwidth_hz)
-            self._at(ready_ns + self._timing.rx_start_ns + listening_ns, self._detect_activity)
+            self._schedule(ready_ns + self._timing.rx_start_ns + listening_ns, self._detect_activity)
         elif mode in (Mode.RXCONTINUOUS, Mode.RXSINGLE):
-            self._at(ready_ns + self._timing.rx_start_ns, self._listen)
+            self._schedule(ready_ns + self._timing.rx_start_ns, self._listen)
 
     def stop(self) -> None:
-        """Leave off whatever is going on, silently."""
+        """Abort the current operation without setting flags."""
         if self._pending is not None:
             self._pending.cancel()
             self._pending = None
@@ -168,13 +162,13 @@ class Modem:
         self._set_status(_IDLE)
 
     def retune(self) -> None:
-        """Take over a new carrier in the middle of reception (FastHopOn)."""
+        """Apply a new carrier frequency during reception (FastHopOn)."""
         if self._listening_since_ns is not None:
             self._settings, _ = modem_settings(self._memory)
             self._listen(self._timeline.now_ns())
 
     def rssi_register(self) -> int:
-        """RegRssiValue: the channel now while receiving, else what the register held."""
+        """RegRssiValue: the channel's power while receiving, otherwise the last content."""
         if self._listening_since_ns is None or self._settings is None:
             return self._memory.lora[Register.RSSI_VALUE]
         rssi_dbm = self._port.rssi_dbm(self._timeline.now_ns())
@@ -195,13 +189,13 @@ class Modem:
             self._pending = None
 
     def header_received(self, at_ns: int, header: Header) -> None:
-        """Show what the header says and set ValidHeader."""
+        """Store the header and set ValidHeader."""
         if self._locked:
             self._take_header(header)
             self._report(VALID_HEADER, at_ns, standby=False)
 
     def frame_ended(self, at_ns: int, reception: Reception | None) -> None:
-        """Set RxDone a little later; without a reception search on, or time out in RXSINGLE."""
+        """Set RxDone after a delay; without a reception, resume the search, or time out in RXSINGLE."""
         if not self._locked or self._settings is None:
             return
         self._locked = False
@@ -211,7 +205,7 @@ class Modem:
         if reception is not None:
             symbols = self._timing.rx_done_symbols[self._settings.receiving.spreading_factor]
             rx_done_ns = at_ns + round(symbols * self._settings.symbol_ns)
-            self._at_with_jitter(rx_done_ns, partial(self._received, reception))
+            self._schedule_with_jitter(rx_done_ns, partial(self._received, reception))
         elif single:
             self._report_standby(RX_TIMEOUT, at_ns)
         else:
@@ -233,11 +227,11 @@ class Modem:
         self._sending = frame
         self._port.transmit(frame)
         if settings.continuous:
-            self._at(frame.end_ns, self._send)
-        elif self.tx_done_to_lose > 0:
-            self.tx_done_to_lose -= 1
+            self._schedule(frame.end_ns, self._send)
+        elif self.tx_done_to_drop > 0:
+            self.tx_done_to_drop -= 1
         else:
-            self._at_with_jitter(frame.end_ns + self._timing.tx_done_ns, self._sent)
+            self._schedule_with_jitter(frame.end_ns + self._timing.tx_done_ns, self._sent)
 
     def _sent(self, at_ns: int) -> None:
         self._sending = None
@@ -249,7 +243,7 @@ class Modem:
         self._listening_since_ns = at_ns
         self._locked = False
         self._port.listen(
-            Listening(
+            ReceiverSettings(
                 modulation=settings.receiving,
                 since_ns=at_ns,
                 preamble_symbols=settings.preamble_symbols,
@@ -261,7 +255,7 @@ class Modem:
         )
         if self._mode == Mode.RXSINGLE:
             waiting_ns = settings.timeout_symbols * settings.symbol_ns + self._timing.rx_timeout_ns
-            self._at(at_ns + waiting_ns, self._timed_out)
+            self._schedule(at_ns + waiting_ns, self._on_rx_timeout)
 
     def _stop_listening(self) -> None:
         if self._listening_since_ns is not None:
@@ -269,12 +263,12 @@ class Modem:
             self._locked = False
             self._port.listen(None)
 
-    def _timed_out(self, at_ns: int) -> None:
+    def _on_rx_timeout(self, at_ns: int) -> None:
         self._stop_listening()
         self._report_standby(RX_TIMEOUT, at_ns)
 
     def _received(self, reception: Reception, at_ns: int) -> None:
-        """Write packet and registers, then set all flags of the packet at once."""
+        """Store packet and registers, then set all flags of the packet at once."""
         if (settings := self._settings) is None:
             return
         memory, lora = self._memory, self._memory.lora
@@ -316,7 +310,7 @@ class Modem:
         found = self._port.preamble_present(settings.receiving, at_ns)
         flags = CAD_DONE | CAD_DETECTED if found else CAD_DONE
         processing_ns = round(self._timing.cad_processing_symbols * settings.symbol_ns)
-        self._at(at_ns + processing_ns, partial(self._report_standby, flags))
+        self._schedule(at_ns + processing_ns, partial(self._report_standby, flags))
 
     def _report_standby(self, flags: int, at_ns: int) -> None:
         self._mode = Mode.STDBY
@@ -324,15 +318,15 @@ class Modem:
         self._report(flags, at_ns, standby=True)
 
     def _set_status(self, status: int) -> None:
-        """Change the low bits of RegModemStat; the coding rate of the last header stays."""
+        """Set the low bits of RegModemStat; the coding rate of the last header stays."""
         lora = self._memory.lora
         lora[Register.MODEM_STAT] = lora[Register.MODEM_STAT] & 0xE0 | status
 
-    def _at_with_jitter(self, at_ns: int, action: Callable[[int], None]) -> None:
-        self._at(at_ns + round(self._rng.normal(0.0, self._timing.jitter_sigma_ns)), action)
+    def _schedule_with_jitter(self, at_ns: int, action: Callable[[int], None]) -> None:
+        self._schedule(at_ns + round(self._rng.normal(0.0, self._timing.jitter_sigma_ns)), action)
 
-    def _at(self, at_ns: int, action: Callable[[int], None]) -> None:
-        """Do the modem's one next thing at its time, and tell it this time, however late it is called."""
+    def _schedule(self, at_ns: int, action: Callable[[int], None]) -> None:
+        """Schedule the modem's next action; it gets its nominal time, however late it is called."""
         if self._pending is not None:
             self._pending.cancel()
         self._pending = self._timeline.call_at(at_ns, partial(action, at_ns))

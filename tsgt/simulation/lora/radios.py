@@ -1,4 +1,4 @@
-"""The real driver on simulated chips that share one simulated air, on virtual time."""
+"""The real SX127x driver on simulated chips."""
 
 from __future__ import annotations
 
@@ -15,32 +15,30 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from tsgt.radio import LoRaSettings, OpenRadio, Packet, Radio, Transmitted
+    from tsgt.radio import LoRaSettings, Packet, Radio, RadioOpener, Transmission
     from tsgt.simulation.kernel import SimulatedClock, Timeline
     from tsgt.simulation.lora.air import Air
 
 
 class HostDelay(NamedTuple):
-    """How long a host takes before it sends, log-normally distributed: usually short, with a tail.
+    """Delay of a host before it transmits, log-normally distributed.
 
-    The default is an assumption, not a measurement: a Pi with Python needs about a millisecond of CPU and of SPI
-    transfers for a packet and its answer, and its scheduler adds some milliseconds now and then. Median 3 ms; one
-    answer in twenty takes 7 ms and more, one in a thousand 14 ms.
+    The defaults are an assumption, not a measurement: a Pi with Python needs about a millisecond of CPU and SPI time per
+    packet, and its scheduler occasionally adds some milliseconds. Median 3 ms; one in twenty takes 7 ms or more, one in a
+    thousand 14 ms.
 
-    What is to begin at an instant is prepared before it. The host is woken for that, and works for a millisecond; and it
-    is woken again for the start. Each time it is late, by 0.3 ms in the median, by 3 ms and more once in a hundred, by
-    5 ms and more once in four hundred: what four such programs do on two cores that are busy with other things.
+    A transmission at a given instant is prepared before it. The host wakes up for the preparation, which takes a
+    millisecond, and again for the start. Each wake-up is late by 0.3 ms in the median, by 3 ms or more once in a hundred,
+    by 5 ms or more once in four hundred: as measured with four such programs on two busy cores.
 
     Attributes
     ----------
-    median_ms
-        Half of the answers take longer.
     sigma
         Of the natural logarithm.
     work_ms
-        What it takes to prepare what begins at an instant.
+        Duration of the preparation.
     wake_median_ms, wake_sigma
-        As for an answer, of how late the host is woken.
+        Distribution of the wake-up delay.
     """
 
     median_ms: float = 3.0
@@ -50,44 +48,30 @@ class HostDelay(NamedTuple):
     wake_sigma: float = 1.0
 
     def draw_ns(self, rng: np.random.Generator) -> int:
-        """Draw the delay of an answer in nanoseconds."""
+        """Draw the delay of a transmission in ns."""
         return round(self.median_ms * 1e6 * math.exp(self.sigma * rng.standard_normal()))
 
     def draw_wake_ns(self, rng: np.random.Generator) -> int:
-        """Draw in nanoseconds how late the host is woken."""
+        """Draw a wake-up delay in ns."""
         return round(self.wake_median_ms * 1e6 * math.exp(self.wake_sigma * rng.standard_normal()))
 
 
 class RadioHardware(NamedTuple):
-    """What is behind an open radio.
-
-    Attributes
-    ----------
-    chip, hal
-        The chip, and the host's bus and pins.
-    """
+    """The hardware of an open radio: chip, and the host's bus and pins."""
 
     chip: SX1276Chip
     hal: SimulatedHal
 
 
-class StampJitter(NamedTuple):
-    """What a host's stamps of its radio's interrupts are off by.
-
-    Attributes
-    ----------
-    sigma_ns
-        One sigma.
-    rng
-        Draws it.
-    """
+class TimestampJitter(NamedTuple):
+    """Random error of a host's interrupt timestamps."""
 
     sigma_ns: int
     rng: np.random.Generator
 
 
 CHIP_SIGMA_NS = 3_000
-"""One sigma of the interrupts of the simulated chip itself."""
+"""One sigma of the simulated chip's interrupts."""
 
 
 def simulated_radio(
@@ -96,22 +80,18 @@ def simulated_radio(
     timeline: Timeline,
     clock: SimulatedClock,
     rng: np.random.Generator,
-    jitter: StampJitter | None = None,
+    jitter: TimestampJitter | None = None,
 ) -> SX127x:
-    """Make a radio on the air, which is still to be started.
+    """Create a radio on the channel, not yet started.
 
     Parameters
     ----------
-    air
-        What it shares with others.
-    name
-        Its own, by which the air's link model knows it.
     timeline, clock
-        What the chip waits on, and what the driver's host takes for the time; edges are stamped with the host's.
+        Timeline of the chip; clock of the driver's host, which timestamps the edges.
     rng
-        Of the chip's jitter.
+        Interrupt jitter of the chip.
     jitter
-        Of the host's stamps; None: they are as good as the chip.
+        Of the host's timestamps; None: no more than the chip's.
     """
     return SX127x(_hardware(air, name, timeline, clock, rng, jitter).hal, clock)
 
@@ -122,41 +102,39 @@ def _hardware(
     timeline: Timeline,
     clock: SimulatedClock,
     rng: np.random.Generator,
-    jitter: StampJitter | None,
+    jitter: TimestampJitter | None,
 ) -> RadioHardware:
-    chip = SX1276Chip(timeline, lambda antenna: air.join(antenna, name), rng)
+    chip = SX1276Chip(timeline, lambda listener: air.join(listener, name), rng)
     if jitter is None:
         return RadioHardware(chip, SimulatedHal(chip, local_ns=clock.local_ns))
 
-    def stamped_ns(true_ns: int) -> int:
+    def timestamp_ns(true_ns: int) -> int:
         return clock.local_ns(true_ns) + round(jitter.sigma_ns * jitter.rng.standard_normal())
 
     sigma_ns = round(math.hypot(CHIP_SIGMA_NS, jitter.sigma_ns))
-    return RadioHardware(chip, SimulatedHal(chip, stamp_sigma_ns=sigma_ns, local_ns=stamped_ns))
+    return RadioHardware(chip, SimulatedHal(chip, stamp_sigma_ns=sigma_ns, local_ns=timestamp_ns))
 
 
-def opener(
+def radio_opener(
     air: Air,
     name: str,
     clock: SimulatedClock,
     rng: np.random.Generator,
     settings: LoRaSettings,
     host_delay: HostDelay | None = None,
-    jitter: StampJitter | None = None,
+    jitter: TimestampJitter | None = None,
     on_open: Callable[[RadioHardware], None] = lambda _: None,
-) -> OpenRadio:
-    """Return what opens a radio on the air, as a daemon does; it can be opened again after it was closed.
+) -> RadioOpener:
+    """Return a callable that opens a radio on the channel, as a daemon does; it may be reopened after closing.
 
     Parameters
     ----------
     air, name, clock, rng, jitter
-        As for :func:`simulated_radio`; the chip waits on the air's timeline.
-    settings
-        Of the modem.
+        As for :func:`simulated_radio`, on the channel's timeline.
     host_delay
-        The time that the host takes before it sends; None: none, as virtual hosts are.
+        None: the host transmits without delay.
     on_open
-        Told each time what is behind the radio.
+        Called with the hardware on each opening.
     """
 
     @asynccontextmanager
@@ -166,7 +144,7 @@ def opener(
         radio = SX127x(hardware.hal, clock)
         try:
             await radio.start(settings)
-            yield radio if host_delay is None else _SlowHost(radio, clock, host_delay, rng)
+            yield radio if host_delay is None else _DelayedRadio(radio, clock, host_delay, rng)
         finally:
             await radio.close()
             air.leave(name)
@@ -174,8 +152,8 @@ def opener(
     return open_radio
 
 
-class _SlowHost:
-    """A radio whose host takes its time before it sends."""
+class _DelayedRadio:
+    """A radio whose host delays transmissions."""
 
     def __init__(
         self, radio: Radio, clock: SimulatedClock, delay: HostDelay, rng: np.random.Generator
@@ -188,8 +166,8 @@ class _SlowHost:
     async def configure(self, settings: LoRaSettings) -> None:
         await self._radio.configure(settings)
 
-    async def transmit(self, payload: bytes, *, at_ns: int | None = None) -> Transmitted:
-        """Send later; at the instant asked for, or when this host is ready or woken for it."""
+    async def transmit(self, payload: bytes, *, at_ns: int | None = None) -> Transmission:
+        """Transmit after a delay, or at the given instant if the host wakes up in time."""
         if at_ns is None:
             delay_ns = self._delay.draw_ns(self._rng)
         else:

@@ -1,6 +1,6 @@
-"""What the registers of an SX1276 mean on the air, and what the air means in its registers: pure arithmetic.
+"""Conversion between SX1276 registers and physical quantities.
 
-Frequencies and bandwidths are in hertz, powers in dBm at the module's antenna connector.
+Frequencies and bandwidths in Hz, powers in dBm at the module's antenna connector.
 """
 
 from __future__ import annotations
@@ -17,10 +17,9 @@ from tsgt.simulation.lora.frames import Modulation
 if TYPE_CHECKING:
     from tsgt.simulation.lora.chip_memory import ChipMemory
 
-SHORTEST_PREAMBLE_SYMBOLS = 6
-SHORTEST_TIMEOUT_SYMBOLS = 4
+MIN_PREAMBLE_SYMBOLS = 6
 
-# Errata 2.3: with automatic IF off and 0x2F set for it, a narrow receiver hears one bandwidth below its carrier.
+# Errata 2.3: with automatic IF off and 0x2F set for it, a narrow receiver is tuned one bandwidth below its carrier.
 _NARROW_RX_OFFSET_HZ = {
     (7_800, 0x48): 7_810,
     (10_400, 0x44): 10_420,
@@ -31,33 +30,31 @@ _NARROW_RX_OFFSET_HZ = {
 }
 
 # RegPktSnrValue is signed, in quarters of a dB; real ones saturate (facts/radio.md 2.4).
-_LOWEST_SNR_QUARTERS = -128
-_HIGHEST_SNR_QUARTERS = 56
+_MIN_SNR_QUARTERS = -128
+_MAX_SNR_QUARTERS = 56
 
-# RFM95 and Dragino HAT connect PA_BOOST only; what leaks from RFO is an estimate.
+# RFM95 and Dragino HAT connect PA_BOOST only; the leakage from RFO is an estimate.
 _RFO_LEAK_DB = -40.0
 
 
 @dataclass(frozen=True, slots=True)
 class ModemSettings:
-    """The LoRa page decoded.
+    """Decoded registers of the LoRa page.
 
     Attributes
     ----------
     sending, receiving
         Modulations of transmitter and receiver; they differ in IQ and, at narrow bandwidths, in frequency.
-    symbol_ns
-        Duration of a symbol.
     coding_rate
         Denominator, 5 to 8.
     crc
-        RxPayloadCrcOn, which rules sending as well.
+        RxPayloadCrcOn, which applies to transmission as well.
     preamble_symbols
         As programmed.
     payload_bytes, max_payload_bytes
         RegPayloadLength and RegMaxPayloadLength.
     timeout_symbols
-        How long RXSINGLE waits for a preamble.
+        Preamble timeout of RXSINGLE.
     continuous
         TxContinuousMode.
     """
@@ -75,7 +72,7 @@ class ModemSettings:
 
 
 def modem_settings(memory: ChipMemory) -> tuple[ModemSettings | None, tuple[str, ...]]:
-    """Decode the settings; None where the modem cannot work with them. Then what is illegal about them, in words."""
+    """Decode the settings; None: the modem cannot work with them. Second item: violations of the data sheet."""
     page = memory.lora
     return _modem_settings(
         memory.frf,
@@ -89,7 +86,7 @@ def modem_settings(memory: ChipMemory) -> tuple[ModemSettings | None, tuple[str,
 def _modem_settings(
     frf: int, settings: bytes, config_3: int, detection: bytes
 ) -> tuple[ModemSettings | None, tuple[str, ...]]:
-    """Decode registers 0x1D to 0x24, 0x26, and 0x2F to 0x39; a driver asks for the same few over and over."""
+    """Decode registers 0x1D to 0x24, 0x26, and 0x2F to 0x39; cached, because drivers use few combinations."""
     config_1, config_2, timeout_lsb, preamble_msb, preamble_lsb, payload, max_payload, hop_period = settings
     problems = []
     bandwidth_code = config_1 >> reg.BW_SHIFT
@@ -100,12 +97,12 @@ def _modem_settings(
     preamble = preamble_msb << 8 | preamble_lsb
     if hop_period:
         problems.append("frequency hopping is not simulated")
-    if preamble < SHORTEST_PREAMBLE_SYMBOLS:
-        problems.append(f"a preamble of {preamble} symbols; the shortest is {SHORTEST_PREAMBLE_SYMBOLS}")
+    if preamble < MIN_PREAMBLE_SYMBOLS:
+        problems.append(f"a preamble of {preamble} symbols; the shortest is {MIN_PREAMBLE_SYMBOLS}")
     if payload == 0:
         problems.append("PayloadLength 0")
     if bandwidth_code >= len(BANDWIDTHS_HZ) or not 5 <= coding_rate <= 8 or not 6 <= spreading_factor <= 12:
-        problems.append("bandwidth, coding rate or spreading factor of no meaning")
+        problems.append("undefined bandwidth, coding rate or spreading factor")
         return None, tuple(problems)
     bandwidth_hz = BANDWIDTHS_HZ[bandwidth_code]
     if low_data_rate != low_data_rate_required(spreading_factor, bandwidth_hz):
@@ -155,7 +152,7 @@ def _modem_settings(
 
 
 def output_power_dbm(pa_config: int, pa_dac: int) -> float:
-    """Power of the transmitter (data sheet 5.4.2, 5.4.3)."""
+    """Return the transmitter's power (data sheet 5.4.2, 5.4.3)."""
     output_power = pa_config & reg.OUTPUT_POWER_MASK
     if pa_config & reg.PA_SELECT_BOOST:
         return (5.0 if pa_dac & 7 == reg.PA_DAC_20_DBM & 7 else 2.0) + output_power
@@ -164,26 +161,26 @@ def output_power_dbm(pa_config: int, pa_dac: int) -> float:
 
 
 def rssi_register(rssi_dbm: float, frequency_hz: float) -> int:
-    """RegRssiValue for a power on the channel (data sheet 5.5.5)."""
+    """Return RegRssiValue for a power on the channel (data sheet 5.5.5)."""
     return _clamp(round(rssi_dbm - _rssi_offset_dbm(frequency_hz)), 0, 255)
 
 
 def packet_strength_registers(rssi_dbm: float, snr_db: float, frequency_hz: float) -> tuple[int, int]:
-    """RegPktSnrValue and RegPktRssiValue, which data sheet 5.5.5 turns back into what they were made from."""
-    quarters = _clamp(round(4 * snr_db), _LOWEST_SNR_QUARTERS, _HIGHEST_SNR_QUARTERS)
+    """Return RegPktSnrValue and RegPktRssiValue (inverse of data sheet 5.5.5)."""
+    quarters = _clamp(round(4 * snr_db), _MIN_SNR_QUARTERS, _MAX_SNR_QUARTERS)
     above_offset_db = rssi_dbm - _rssi_offset_dbm(frequency_hz)
     strength = above_offset_db - quarters / 4 if quarters < 0 else above_offset_db * 15 / 16
     return quarters & 0xFF, _clamp(round(strength), 0, 255)
 
 
 def frequency_error_registers(error_hz: float, bandwidth_hz: float) -> bytes:
-    """RegFei, 20 bits with sign in three bytes (data sheet 4.1.5): positive where the sender is above the receiver."""
+    """Return RegFei, 20-bit signed in three bytes (data sheet 4.1.5); positive: the sender is above the receiver."""
     steps = round(error_hz * reg.F_XOSC_HZ / 2**24 * 500_000 / bandwidth_hz)
     return (_clamp(steps, -(2**19), 2**19 - 1) & 0xFFFFF).to_bytes(3, "big")
 
 
 def _rssi_offset_dbm(frequency_hz: float) -> int:
-    return reg.RSSI_OFFSET_HF_DBM if frequency_hz >= reg.LOWEST_HF_HZ else reg.RSSI_OFFSET_LF_DBM
+    return reg.RSSI_OFFSET_HF_DBM if frequency_hz >= reg.MIN_HF_HZ else reg.RSSI_OFFSET_LF_DBM
 
 
 def _clamp(value: int, low: int, high: int) -> int:

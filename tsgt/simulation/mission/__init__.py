@@ -1,22 +1,23 @@
-"""TODO face."""
+"""A simulated mission: the real daemons on simulated computers, with everything around them simulated from one seed.
+
+In: a scenario, options, a folder. Out: recordings, journals, and a :class:`MissionResult` with what the daemons did and
+the ground truth. `Mission` also starts, stops, kills and reboots computers for scripts and fault injection.
+"""
 
 from tsgt.simulation.mission.computer import MASTER
-from tsgt.simulation.mission.disk import FULL, READ_ONLY
-from tsgt.simulation.mission.mission import DRAIN_S, Mission, instrument_config, scenario_link, station_name
-from tsgt.simulation.mission.run_log import Measured, Run, Session, StationWitness, ValidPoses
+from tsgt.simulation.mission.daemon_configs import instrument_config, station_name
+from tsgt.simulation.mission.mission import DRAIN_S, Mission
+from tsgt.simulation.mission.run_log import JournalIndex, MasterLog, MissionResult, StationLog, ValidPoses
 
 __all__ = [
     "DRAIN_S",
-    "FULL",
     "MASTER",
-    "READ_ONLY",
-    "Measured",
+    "JournalIndex",
+    "MasterLog",
     "Mission",
-    "Run",
-    "Session",
-    "StationWitness",
+    "MissionResult",
+    "StationLog",
     "ValidPoses",
     "instrument_config",
-    "scenario_link",
     "station_name",
 ]

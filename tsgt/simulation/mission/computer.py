@@ -1,54 +1,46 @@
-"""A computer of a simulated mission: radio, disk, clock, and the daemon that runs on it until somebody ends it."""
+"""A computer of a simulated mission: radio, disk, clock, and the daemon that runs on it."""
 
 from __future__ import annotations
 
 import asyncio
 from typing import TYPE_CHECKING
 
-from tsgt.simulation.lora import HostDelay, opener
-from tsgt.simulation.mission.disk import Killed, ProgramWrites, SimulatedDisk
+from tsgt.simulation.lora import HostDelay, radio_opener
+from tsgt.simulation.mission.disk import DiskWriter, ProcessKilled, SimulatedDisk
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
 
     import numpy as np
 
-    from tsgt.radio import LoRaSettings, OpenRadio
+    from tsgt.radio import LoRaSettings, RadioOpener
     from tsgt.simulation.kernel import DriftingClock, VirtualClock
-    from tsgt.simulation.lora import Air, RadioHardware, StampJitter
+    from tsgt.simulation.lora import Air, RadioHardware, TimestampJitter
 
 MASTER = "master"
 """Name of the master's computer."""
 
 
 class Computer:
-    """One computer; what is on it outlives the daemons that it runs one after the other.
+    """A computer; its state outlives the daemons that run on it.
 
     Parameters
     ----------
     name
-        Of its radio and of its daemon: ``master``, ``station1``, ...
-    clock
-        Its own.
-    air, settings, jitter
-        Of its radio, see :func:`~tsgt.simulation.lora.radios.opener`.
+        Name of its radio and daemon: ``master``, ``station1``, ...
     rng
-        Of its radio and of how long it takes for everything.
+        Draws of its radio and of its host delays.
 
     Attributes
     ----------
-    name, clock, rng
-        Those.
-    disk
-        Its disk.
     task
-        The daemon that runs; None: there is none.
-    away
-        Whether somebody has ended the daemon and will start it again.
+        The running daemon; None: there is none.
+    is_down
+        Whether the daemon was ended by the simulation and will be restarted.
     hardware
-        What is behind its radio, since that was opened last; None before.
-    writes
-        How the daemon that runs, or ran last, writes to the disk; None before.
+        Radio hardware, since it was last opened.
+    disk_writer
+        Disk access of the current or last daemon.
     """
 
     def __init__(
@@ -58,24 +50,24 @@ class Computer:
         air: Air,
         settings: LoRaSettings,
         rng: np.random.Generator,
-        jitter: StampJitter | None,
+        jitter: TimestampJitter | None,
     ) -> None:
         self.name = name
         self.clock = clock
         self.rng = rng
         self.disk = SimulatedDisk()
         self.task: asyncio.Task[None] | None = None
-        self.away = False
+        self.is_down = False
         self.hardware: RadioHardware | None = None
-        self.writes: ProgramWrites | None = None
+        self.disk_writer: DiskWriter | None = None
         self._air = air
         self._settings = settings
         self._jitter = jitter
 
-    def radio(self, *, slow: bool = True) -> OpenRadio:
-        """Return what opens the radio; that of a program which takes its time before it sends, or of one at once."""
+    def radio(self, *, slow: bool = True) -> RadioOpener:
+        """Return the opener of the radio; ``slow``: with the delays of a real host."""
         delay = HostDelay() if slow else None
-        return opener(
+        return radio_opener(
             self._air,
             self.name,
             self.clock,
@@ -89,22 +81,22 @@ class Computer:
     def _opened(self, hardware: RadioHardware) -> None:
         self.hardware = hardware
 
-    def new_program(self) -> Callable[[int, memoryview], int]:
-        """Return with what the next program writes to the disk."""
-        self.writes = ProgramWrites(self.disk)
-        return self.writes.write
+    def new_writer(self) -> Callable[[int, memoryview], int]:
+        """Return the write function of the next daemon."""
+        self.disk_writer = DiskWriter(self.disk)
+        return self.disk_writer.write
 
     def start(self, daemon: Coroutine[None, None, None]) -> None:
-        """Run a daemon."""
+        """Start a daemon."""
         self.task = asyncio.create_task(daemon, name=self.name)
 
-    async def end(self) -> None:
-        """Ask the daemon to end, as systemd does, and wait until it has; it may be none.
+    async def stop(self) -> None:
+        """Cancel the daemon, as systemd's stop does, and wait for its end; no effect without one.
 
         Raises
         ------
         BaseException
-            With what it has ended before, or now, unless it was killed in the middle of a line.
+            The daemon's error, unless the daemon was killed during a write.
         """
         task, self.task = self.task, None
         if task is not None:
@@ -114,28 +106,28 @@ class Computer:
             if error is not None and not _is_killed(error):
                 raise error
 
-    async def crash(self) -> None:
-        """Kill the daemon: what it has given to its disk is there, and nothing that it would have written.
+    async def kill(self) -> None:
+        """Kill the daemon: completed writes stay on the disk, later ones do not happen.
 
         Raises
         ------
         Exception
-            With what it has ended before.
+            The daemon had already ended with this error.
         """
         task, self.task = self.task, None
         if task is None:
             return
-        if self.writes is not None:
-            self.writes.die()
+        if self.disk_writer is not None:
+            self.disk_writer.kill()
         task.cancel()
         await asyncio.wait([task])
-        # Programs that are no more fail to write in whatever they do last: that is no Exception.
+        # ProcessKilled of a final write is not an Exception.
         if not task.cancelled() and isinstance(error := task.exception(), Exception):
             raise error
 
 
 def _is_killed(error: BaseException) -> bool:
-    """Whether nothing else has happened to a program."""
+    """Whether a daemon's errors are all :class:`ProcessKilled`."""
     if isinstance(error, BaseExceptionGroup):
         return all(map(_is_killed, error.exceptions))
-    return isinstance(error, Killed)
+    return isinstance(error, ProcessKilled)

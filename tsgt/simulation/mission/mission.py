@@ -1,9 +1,7 @@
-"""A whole mission on virtual time: the real daemons, with simulated radios, instruments, clocks and robot.
+"""A mission on virtual time: the real daemons, with simulated radios, instruments, clocks and robot.
 
-Each daemon runs as a task, with radio and instrument handed to it as on a real computer. It can be killed and
-started again at any instant; what it then finds (its journal's folder, the air, the instrument) is as it left it.
-
-What the configuration files of a mission's daemons would say; radios and instruments are handed to them anyway.
+Each daemon runs as a task, with radio and instrument handed over as on a real computer. It can be killed and restarted
+at any instant, and then finds its journals, the channel and the instrument as it left them.
 """
 
 from __future__ import annotations
@@ -12,208 +10,90 @@ import asyncio
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.config import (
-    ClassicConfig,
-    ClassicMasterConfig,
-    ClientConfig,
-    JournalConfig,
-    LeicaInstrumentConfig,
-    MasterConfig,
-    RecordingConfig,
-    SetupConfig,
-    SimulatedRadioConfig,
-    StationConfig,
-    StreamConfig,
-    SuperframeConfig,
-    SuperframeMasterConfig,
-    scenario_parameters,
-)
-from tsgt.master import run_master
+from tsgt.config import SuperframeMasterConfig, scenario_parameters
+from tsgt.master.daemon import MasterDependencies, run_master
 from tsgt.radio.from_config import lora_settings
 from tsgt.recording import decode
 from tsgt.simulation.instrument import SimulatedLine, SimulatedTotalStation
-from tsgt.simulation.kernel import DriftingClock, VirtualClock, ramped
-from tsgt.simulation.lora import Air, LinkModel, LogDistanceLoss, StampJitter, opener
-from tsgt.simulation.lora.adversary import ForeignRadio
-from tsgt.simulation.mission.authors_node import AUTHORS_STAMP_DELAY_MS, AuthorsNode
+from tsgt.simulation.kernel import DriftingClock, VirtualClock, drift_ramp
+from tsgt.simulation.lora import Air, TimestampJitter, radio_opener, scenario_link
+from tsgt.simulation.lora.adversary import ReplayAttacker
+from tsgt.simulation.mission.authors_node import AuthorsNode
 from tsgt.simulation.mission.computer import MASTER, Computer
-from tsgt.simulation.mission.run_log import START_UNIX_NS, Session, StationWitness, WatchedInstrument
+from tsgt.simulation.mission.daemon_configs import (
+    STATUS_SOCKET,
+    client_config,
+    instrument_config,
+    master_config,
+    radio_config,
+    station_name,
+)
+from tsgt.simulation.mission.run_log import START_UNIX_NS, MasterLog, ObservedInstrument, StationLog
 from tsgt.simulation.world import scenario_world
-from tsgt.station import ClientStatus, run_client
-from tsgt.station.leica import LeicaInstrument
+from tsgt.station import ClientDependencies, ClientStatus, run_client
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine
+    from collections.abc import Callable, Coroutine
 
-    from tsgt.config import Baud, ScenarioConfig, ScenarioRadioConfig, SimulatedStation
-    from tsgt.radio import OpenRadio
+    from tsgt.config import ScenarioConfig, SimulatedStation
+    from tsgt.radio import RadioOpener
     from tsgt.simulation.kernel import Timeline
-    from tsgt.simulation.options import Options, Outage
+    from tsgt.simulation.options import Outage, SimulationOptions
     from tsgt.simulation.world import World
     from tsgt.station import Reading
 
-STATUS_SOCKET = "client.sock"
-
-_RARELY_S = 1e6  # of fsync, which a simulation has no use for
-
-
-def station_name(station: int) -> str:
-    """Return the name of a station's radio and daemon."""
-    return f"station{station}"
-
-
-def radio_config(scenario: ScenarioConfig, name: str, folder: Path) -> SimulatedRadioConfig:
-    """Say of the radio what a file would; the radio itself is handed to the daemon."""
-    radio = scenario.radio
-    return SimulatedRadioConfig(
-        kind="simulated",
-        air_socket=folder / "air.sock",
-        name=name,
-        frequency_mhz=radio.frequency_mhz,
-        spreading_factor=radio.spreading_factor,
-        bandwidth_khz=radio.bandwidth_khz,
-        coding_rate=radio.coding_rate,
-        power_dbm=radio.power_dbm,
-    )
-
-
-def master_config(scenario: ScenarioConfig, options: Options, folder: Path) -> MasterConfig:
-    """Return the master's, with its recording and its socket in a folder."""
-    return MasterConfig(
-        kind="master",
-        # Not read: the parameters are handed to the daemon.
-        setup=SetupConfig(station_frames=folder / "frames.toml", prism_layout=folder / "layout.toml"),
-        stations=tuple(
-            StationConfig(
-                station=s.station,
-                prism=s.prism,
-                prism_constant_mm=s.prism_constant_mm,
-                timestamp_delay_ms=AUTHORS_STAMP_DELAY_MS if options.node == "authors" else 0.0,
-                noise=s.noise,
-            )
-            for s in scenario.stations
-        ),
-        radio=radio_config(scenario, MASTER, folder),
-        protocol=options.protocol,
-        pipeline=scenario.pipeline,
-        stream=StreamConfig(socket=folder / "poses.sock"),
-        recording=RecordingConfig(directory=folder, fsync_interval_s=_RARELY_S),
-    )
-
-
-def client_config(
-    scenario: ScenarioConfig, entry: SimulatedStation, options: Options, folder: Path
-) -> ClientConfig:
-    """Return that of a station's client, with its journal and its socket in a folder."""
-    classic = isinstance(options.protocol, ClassicMasterConfig)
-    return ClientConfig(
-        kind="client",
-        station=entry.station,
-        prism=entry.prism,
-        instrument=instrument_config(entry, folder / "instrument.tty"),
-        radio=radio_config(scenario, station_name(entry.station), folder),
-        protocol=ClassicConfig(kind="classic") if classic else SuperframeConfig(kind="superframe"),
-        journal=JournalConfig(directory=folder, fsync_interval_s=_RARELY_S),
-        status_socket=folder / STATUS_SOCKET,
-    )
-
-
-def instrument_config(entry: SimulatedStation, port: Path) -> LeicaInstrumentConfig:
-    """Return how a client sets its station's simulated instrument, of which it knows everything.
-
-    The instrument adds no prism constant; the master does.
-    """
-    model = entry.instrument
-    return LeicaInstrumentConfig(
-        kind="leica",
-        port=port,
-        baud=cast("Baud", model.baud),
-        prism_type="user",
-        prism_constant_mm=0.0,
-        latency_ms=model.processing_min_ms,
-        angle_delay_ms=model.angle_delay_ms,
-    )
-
-
-def scenario_link(
-    radio: ScenarioRadioConfig, places: dict[str, tuple[float, float, float]], rng: np.random.Generator
-) -> LinkModel:
-    """Make what lies between the radios of a scenario; ``places`` by radio, in m, may change meanwhile."""
-    return LinkModel(
-        path_loss=LogDistanceLoss(
-            positions_m=places,
-            exponent=radio.path_loss_exponent,
-            shadowing_sigma_db=radio.shadowing_sigma_db,
-            antenna_gain_db=radio.antenna_gain_db,
-            seed=int(rng.integers(2**31)),
-        ),
-        rayleigh_fading=radio.rayleigh_fading,
-        loss_probability=radio.loss_probability,
-    )
-
-
 DRAIN_S = 5.0
-"""How long a run goes on after its end, so that what is under way can arrive."""
+"""Simulated time after the end of the measurements, in which pending deliveries arrive."""
 
-RESTART_S = 2.0
-"""How long a daemon is away that is started again, as systemd does it."""
+RESTART_DELAY_S = 2.0
+"""Downtime of a restart, as with systemd."""
 
-FOREIGN = "foreign"
-"""Name of the radio that does not belong to the mission."""
+INTERFERER = "foreign"
+"""Radio name of the interferer. Random draws depend on it: another name would change recordings."""
 
-_OUT_OF_REACH_DB = 300.0
-_FOREIGN_PLACE_M = (30.0, -20.0, 1.5)
+_OUTAGE_DB = 300.0
+_INTERFERER_POSITION_M = (30.0, -20.0, 1.5)
 _KEY_BYTES = 32
 _YEAR_NS = 365 * 86_400 * 10**9
 
 
 class Mission:
-    """The parts of a mission; has to be made and used in a running event loop on virtual time.
+    """A mission; create and use it in a running event loop on virtual time.
 
     Parameters
     ----------
-    scenario
-        World, stations, radio conditions.
-    options
-        What else may be set.
     folder
         For recordings, journals and sockets.
     timeline
-        That of the running loop.
+        Timeline of the running loop.
 
     Attributes
     ----------
     world
-        The truth; its time is the true time.
+        Ground truth on true time.
     clock
-        The master's.
+        The master's clock.
     computers
-        By the names of their daemons.
+        By name.
     instruments, lines, prisms
-        The total stations, their cables, and the prisms that they are to follow, by station number.
-    warming
-        Numbers of the stations whose crystals get warmer, or colder, at the moment.
-    superframe
-        Whether that protocol is spoken.
-    sessions
-        What the master sent out, one entry for each time that it was started.
-    witnesses
-        What was read from the instruments, by station number.
-    air
-        The channel.
+        Total stations, their serial lines, and the prisms they track, by station number.
+    drifting
+        Stations whose clock drift is changing.
+    master_logs
+        One per start of the master.
     """
 
     def __init__(
-        self, scenario: ScenarioConfig, options: Options, *, folder: Path, timeline: Timeline
+        self, scenario: ScenarioConfig, options: SimulationOptions, *, folder: Path, timeline: Timeline
     ) -> None:
         rng = np.random.default_rng(options.seed)
         world_rng, air_rng, master_rng, clock_rng, *station_rngs = rng.spawn(4 + len(scenario.stations))
-        # Spawned after the others, so that an option that draws nothing changes nothing for the rest.
-        self._foreign_rng, key_rng, self._bits_rng, *jitter_rngs = rng.spawn(4 + len(scenario.stations))
+        # Spawned last, so that unused options do not change the other draws.
+        self._interferer_rng, key_rng, self._bits_rng, *jitter_rngs = rng.spawn(4 + len(scenario.stations))
         self._scenario = scenario
         self._options = options
         self._folder = folder
@@ -230,11 +110,11 @@ class Mission:
         self.parameters = scenario_parameters(scenario)
         until_s = options.duration_s + 2 * DRAIN_S
         self.world: World = scenario_world(scenario, until_s, world_rng)
-        self._places = {station_name(s.station): s.position_m for s in scenario.stations}
-        self._places[FOREIGN] = _FOREIGN_PLACE_M
-        self.air = Air(timeline, air_rng, scenario_link(scenario.radio, self._places, air_rng))
+        self._positions_m = {station_name(s.station): s.position_m for s in scenario.stations}
+        self._positions_m[INTERFERER] = _INTERFERER_POSITION_M
+        self.air = Air(timeline, air_rng, scenario_link(scenario.radio, self._positions_m, air_rng))
         self._timeline = timeline
-        # A Pi has no battery clock: it wakes up in the past.
+        # A Pi has no battery-backed clock and boots with an old time.
         clocks: list[VirtualClock | DriftingClock] = [self.clock]
         clocks += [self._station_clock(n, offset_ns=-int(clock_rng.integers(3 * _YEAR_NS))) for n in numbers]
         self.computers = {
@@ -244,15 +124,15 @@ class Mission:
         self.instruments = {s.station: self._instrument(s) for s in scenario.stations}
         self.lines = {number: self._line(number) for number in numbers}
         self._boots = dict.fromkeys(numbers, 1)
-        self.sessions: list[Session] = []
+        self.master_logs: list[MasterLog] = []
         self.prisms = {s.station: s.prism for s in scenario.stations}
-        self.warming: set[int] = set()
+        self.drifting: set[int] = set()
         self.superframe = isinstance(options.protocol, SuperframeMasterConfig)
-        self.witnesses = {
-            number: StationWitness(
+        self.station_logs = {
+            number: StationLog(
                 number,
-                None if options.node == "authors" else folder / station_name(number),
-                self.instruments[number].offered,
+                None if options.station_software == "authors" else folder / station_name(number),
+                self.instruments[number].reported_distances,
             )
             for number in numbers
         }
@@ -261,12 +141,12 @@ class Mission:
         options = self._options
         sign = -1 if self._index(station) % 2 else 1
         drift_ppm, ramp_ppm_per_min = sign * options.drift_ppm, sign * options.drift_ramp_ppm_per_min
-        steps = ramped(drift_ppm, ramp_ppm_per_min, round((options.duration_s + 2 * DRAIN_S) * 1e9))
+        steps = drift_ramp(drift_ppm, ramp_ppm_per_min, round((options.duration_s + 2 * DRAIN_S) * 1e9))
         return DriftingClock(
             self._true,
             offset_ns=offset_ns,
             drift_ppm=drift_ppm,
-            drift_steps=steps if ramp_ppm_per_min else (),
+            drift_changes=steps if ramp_ppm_per_min else (),
             booted_ns=booted_ns,
         )
 
@@ -283,16 +163,16 @@ class Mission:
         )
 
     def _entry(self, station: int) -> SimulatedStation:
-        """Return what the scenario says of a station; the authors' instrument calls their node at once."""
+        """Return a station of the scenario; the authors' instrument responds without processing time."""
         entry = self._scenario.stations[self._index(station)]
-        if self._options.node != "authors":
+        if self._options.station_software != "authors":
             return entry
         model = entry.instrument.model_copy(update={"processing_min_ms": 0.0, "processing_max_ms": 1.0})
         return entry.model_copy(update={"instrument": model})
 
-    def _jitter(self, rng: np.random.Generator) -> StampJitter | None:
+    def _jitter(self, rng: np.random.Generator) -> TimestampJitter | None:
         sigma_ns = round(self._options.stamp_jitter_us * 1e3)
-        return StampJitter(sigma_ns, rng) if sigma_ns else None
+        return TimestampJitter(sigma_ns, rng) if sigma_ns else None
 
     def _computer(self, station: int) -> Computer:
         return self.computers[station_name(station)]
@@ -302,22 +182,22 @@ class Mission:
 
     @property
     def now_s(self) -> float:
-        """The true time, from the start."""
+        """True time in s from the start."""
         return self._true.monotonic_ns() / 1e9
 
-    async def until(self, time_s: float) -> None:
-        """Let it run until then; the robot's radio moves with the robot.
+    async def run_until(self, time_s: float) -> None:
+        """Run until a true time; the robot's radio moves with the robot.
 
         Raises
         ------
         ExceptionGroup
-            A daemon has ended with an error.
+            A daemon ended with an error.
         """
         while self.now_s < time_s:
-            self._places[MASTER] = tuple(self.world.pose_at(np.array([self.now_s]))[0, :3, 3].tolist())
+            self._positions_m[MASTER] = tuple(self.world.pose_at(np.array([self.now_s]))[0, :3, 3].tolist())
             step_s = min(1.0, time_s - self.now_s)
             tasks = [computer.task for computer in self.computers.values() if computer.task is not None]
-            if not tasks:  # all of them are away
+            if not tasks:  # all daemons are down
                 await asyncio.sleep(step_s)
                 continue
             ended, _ = await asyncio.wait(tasks, timeout=step_s, return_when=asyncio.FIRST_EXCEPTION)
@@ -328,18 +208,18 @@ class Mission:
             ]
             if errors:
                 raise ExceptionGroup("a daemon has ended", errors)
-            await asyncio.sleep(0)  # one that was killed is about to be taken away
+            await asyncio.sleep(0)  # lets the caller of a kill remove its task
 
     async def sleep_until(self, time_s: float) -> None:
-        """Return at a true time, from the start; for whoever acts beside the daemons."""
+        """Sleep until a true time in s from the start."""
         await self._true.sleep_until(round(time_s * 1e9))
 
     def start_master(self) -> None:
-        """Start the master, with a recording of its own."""
-        folder = self._folder / f"master{len(self.sessions)}"
-        zero_ns = self.clock.realtime_ns() - self.clock.monotonic_ns()
-        session = Session(folder, self._true.monotonic_ns, zero_ns)
-        self.sessions.append(session)
+        """Start the master with a new recording."""
+        folder = self._folder / f"master{len(self.master_logs)}"
+        unix_at_zero_ns = self.clock.realtime_ns() - self.clock.monotonic_ns()
+        master_log = MasterLog(folder, self._true.monotonic_ns, unix_at_zero_ns)
+        self.master_logs.append(master_log)
         config = master_config(self._scenario, self._options, folder)
         folder.mkdir()
         computer = self.computers[MASTER]
@@ -348,150 +228,155 @@ class Mission:
                 config,
                 self.parameters,
                 self._settings,
-                open_radio=computer.radio(),
-                clock=self.clock,
-                key=self._key,
-                random_bits=self._random_bits,
-                observe=session.take,
-                write=computer.new_program(),
+                MasterDependencies(
+                    open_radio=computer.radio(),
+                    clock=self.clock,
+                    key=self._key,
+                    random_bits=self._random_bits,
+                    observe=master_log.observe,
+                    write=computer.new_writer(),
+                ),
             ),
         )
 
     def start_station(self, station: int) -> None:
-        """Start a station's client, with a journal of its own beside the earlier ones, or the authors' node."""
+        """Start a station's client with a new journal, or the authors' node."""
         entry = self._entry(station)
-        authors = self._options.node == "authors"
+        authors = self._options.station_software == "authors"
         self._computer(station).start(self._authors_node(entry) if authors else self._client(entry))
 
-    async def be_foreign(self) -> None:
-        """Use the channel as somebody else, until cancelled."""
-        radio = ForeignRadio(self._true, self._foreign_rng, self._options.interference_rate_hz)
-        await radio.run(self.stranger(FOREIGN))
+    async def run_interference(self) -> None:
+        """Run the interferer until cancelled."""
+        radio = ReplayAttacker(self._true, self._interferer_rng, self._options.interference_rate_hz)
+        await radio.run(self.interferer_radio(INTERFERER))
 
-    def stranger(self, name: str, gain_db: float = 0.0, sync_word: int | None = None) -> OpenRadio:
-        """Return what opens a radio that does not belong to the mission.
+    def interferer_radio(self, name: str, gain_db: float = 0.0, sync_word: int | None = None) -> RadioOpener:
+        """Return the opener of a radio that does not belong to the mission.
 
         Parameters
         ----------
-        name
-            Its own.
         gain_db
-            By how much everybody hears it better than from its place.
+            Gain of its signal at all receivers.
         sync_word
-            That of its packets; None: the mission's.
+            None: the mission's.
         """
-        self._places[name] = _FOREIGN_PLACE_M
+        self._positions_m[name] = _INTERFERER_POSITION_M
         for other in self.computers:
-            self.air.link.attenuate(name, other, -gain_db)
+            self.air.link.set_attenuation(name, other, -gain_db)
         settings = self._settings if sync_word is None else replace(self._settings, sync_word=sync_word)
-        return opener(self.air, name, self._true, self._foreign_rng, settings)
+        return radio_opener(self.air, name, self._true, self._interferer_rng, settings)
 
     def _random_bits(self, count: int) -> int:
         return int.from_bytes(self._bits_rng.bytes(-(-count // 8))) >> -count % 8
 
     def _client(self, entry: SimulatedStation) -> Coroutine[None, None, None]:
         station = entry.station
-        witness, computer = self.witnesses[station], self._computer(station)
+        station_log, computer = self.station_logs[station], self._computer(station)
         clock = computer.clock
         folder = self._folder / station_name(station)
         folder.mkdir(exist_ok=True)
         unix_at_zero_ns = clock.realtime_ns() - clock.monotonic_ns()
 
-        def watch(reading: Reading) -> None:
-            witness.stamps_ns[unix_at_zero_ns + reading.at_ns] = clock.true_ns(reading.at_ns)
-            witness.read_ns[unix_at_zero_ns + reading.at_ns] = self._true.monotonic_ns()
+        def on_reading(reading: Reading) -> None:
+            station_log.true_times_ns[unix_at_zero_ns + reading.at_ns] = clock.true_ns(reading.at_ns)
+            station_log.read_times_ns[unix_at_zero_ns + reading.at_ns] = self._true.monotonic_ns()
 
         return run_client(
             client_config(self._scenario, entry, self._options, folder),
             self._settings,
-            instrument=WatchedInstrument(self._driver(entry), watch),
-            open_radio=computer.radio(),
-            clock=clock,
-            key=self._key,
-            random_bits=self._random_bits,
-            boot=f"{station_name(station)}-{self._boots[station]}",
-            write=computer.new_program(),
+            ClientDependencies(
+                instrument=self._driver(entry, on_reading),
+                open_radio=computer.radio(),
+                clock=clock,
+                key=self._key,
+                random_bits=self._random_bits,
+                boot=f"{station_name(station)}-{self._boots[station]}",
+                write=computer.new_writer(),
+            ),
         )
 
-    def _driver(self, entry: SimulatedStation) -> LeicaInstrument:
+    def _driver(self, entry: SimulatedStation, on_reading: Callable[[Reading], None]) -> ObservedInstrument:
         config = instrument_config(entry, self._folder / station_name(entry.station))
-        return LeicaInstrument(config, self.lines[entry.station].open, self._computer(entry.station).clock)
+        line, clock = self.lines[entry.station], self._computer(entry.station).clock
+        return ObservedInstrument(config, line.open, clock, on_reading)
 
     async def _authors_node(self, entry: SimulatedStation) -> None:
         station = entry.station
-        witness, computer = self.witnesses[station], self._computer(station)
+        station_log, computer = self.station_logs[station], self._computer(station)
         clock = computer.clock
 
-        def watch(_reading: Reading) -> None:
-            witness.stamps_ns[clock.realtime_ns()] = self._true.monotonic_ns()  # stamped on arrival
+        def on_reading(_reading: Reading) -> None:
+            station_log.true_times_ns[clock.realtime_ns()] = (
+                self._true.monotonic_ns()
+            )  # timestamped on arrival
 
-        instrument = WatchedInstrument(self._driver(entry), watch)
+        instrument = self._driver(entry, on_reading)
         async with computer.radio(slow=False)() as radio:
             await AuthorsNode(station, radio, clock, instrument, entry.prism, computer.rng).run()
 
-    async def kill(self, name: str) -> None:
-        """End a daemon (``master``, ``station1``, ...) in the middle of whatever it does, as systemd does."""
-        await self._ask(name)
-        await self.computers[name].end()
+    async def stop(self, name: str) -> None:
+        """Stop a daemon by the name of its computer, as systemd does."""
+        await self._record_status(name)
+        await self.computers[name].stop()
 
-    async def crash(self, name: str, *, away_s: float) -> None:
-        """Kill a daemon as ``kill -9`` does, and start it again; nothing happens to one that is away already."""
+    async def crash(self, name: str, *, down_s: float) -> None:
+        """Kill a daemon as ``kill -9`` does, and restart it after ``down_s``; no effect on one that is down."""
         computer = self.computers[name]
-        if computer.away:
+        if computer.is_down:
             return
-        computer.away = True
+        computer.is_down = True
         if name == MASTER:
-            self.sessions[-1].crashed = True
+            self.master_logs[-1].crashed = True
         else:
-            self._excuse(computer)
-        await computer.crash()  # which takes time of its own, in which nothing is written
-        await asyncio.sleep(away_s)
-        computer.away = False
-        self._start_again(name)
+            self._record_crash_window(computer)
+        await computer.kill()
+        await asyncio.sleep(down_s)
+        computer.is_down = False
+        self._start(name)
 
-    def _excuse(self, computer: Computer) -> None:
-        """Note that what a client has read before it was ended need not be on its disk."""
+    def _record_crash_window(self, computer: Computer) -> None:
+        """Record that recent readings of a client need not be on its disk."""
         now_ns = self._true.monotonic_ns()
-        witness = self.witnesses[self._station(computer.name)]
-        witness.crashed_ns.append((computer.disk.unwritten_since_ns(now_ns), now_ns))
+        station_log = self.station_logs[self._station(computer.name)]
+        station_log.crash_windows_ns.append((computer.disk.failing_since_ns(now_ns), now_ns))
 
-    async def _ask(self, name: str) -> None:
-        """Note what a client says of itself, as people ask it; the authors' node says nothing."""
-        for witness in self.witnesses.values():
-            if name == station_name(witness.station) and witness.folder is not None:
-                with suppress(OSError):  # it has only just been started
-                    reader, writer = await asyncio.open_unix_connection(witness.folder / STATUS_SOCKET)
-                    witness.statuses.append(decode(ClientStatus, await reader.readline()))
+    async def _record_status(self, name: str) -> None:
+        """Record a client's status before it ends; the authors' node has none."""
+        for station_log in self.station_logs.values():
+            if name == station_name(station_log.station) and station_log.folder is not None:
+                with suppress(OSError):  # just started, not listening yet
+                    reader, writer = await asyncio.open_unix_connection(station_log.folder / STATUS_SOCKET)
+                    station_log.statuses.append(decode(ClientStatus, await reader.readline()))
                     writer.close()
 
     async def restart(self, station: int | None, at_s: float) -> None:
-        """Kill a station's client, or the master, at a true time from the start, and start it again."""
+        """Stop a client (None: the master) at a true time in s from the start, and restart it."""
         await self.sleep_until(at_s)
-        await self.kill(MASTER if station is None else station_name(station))
-        await self.sleep_until(at_s + RESTART_S)
-        self._start_again(MASTER if station is None else station_name(station))
+        await self.stop(MASTER if station is None else station_name(station))
+        await self.sleep_until(at_s + RESTART_DELAY_S)
+        self._start(MASTER if station is None else station_name(station))
 
-    def _start_again(self, name: str) -> None:
+    def _start(self, name: str) -> None:
         if name == MASTER:
             self.start_master()
         else:
             self.start_station(self._station(name))
 
     def _station(self, name: str) -> int:
-        return next(number for number in self.witnesses if station_name(number) == name)
+        return next(number for number in self.station_logs if station_name(number) == name)
 
     async def reboot(self, station: int, at_s: float, off_s: float) -> None:
-        """Switch a station's computer off, and on again: its clocks begin anew, where its files end."""
+        """Power a station's computer off and on: CLOCK_MONOTONIC restarts at zero, the Unix clock continues where it stopped."""
         await self.sleep_until(at_s)
         computer = self._computer(station)
-        if computer.away:
+        if computer.is_down:
             return
-        computer.away = True
-        await self.kill(computer.name)
-        self._excuse(computer)
+        computer.is_down = True
+        await self.stop(computer.name)
+        self._record_crash_window(computer)
         unix_ns = computer.clock.realtime_ns()
         await self.sleep_until(at_s + off_s)
-        computer.away = False
+        computer.is_down = False
         now_ns = self._true.monotonic_ns()
         computer.clock = self._station_clock(station, offset_ns=unix_ns - START_UNIX_NS, booted_ns=now_ns)
         self.lines[station] = self._line(station)
@@ -499,21 +384,21 @@ class Mission:
         self.start_station(station)
 
     def stream_socket(self) -> Path:
-        """Return the socket of the master that runs, or ran last."""
+        """Return the stream socket of the current or last master."""
         return master_config(
-            self._scenario, self._options, self._folder / f"master{len(self.sessions) - 1}"
+            self._scenario, self._options, self._folder / f"master{len(self.master_logs) - 1}"
         ).stream.socket
 
-    async def interrupt(self, outage: Outage) -> None:
-        """Put a hill between the master and some stations, and take it away."""
+    async def apply_outage(self, outage: Outage) -> None:
+        """Interrupt the radio contact between the master and the stations of an outage."""
         for at_s in (outage.start_s, outage.end_s):
             await self.sleep_until(at_s)
             for station in outage.stations:
                 hidden = any(station in o.stations and o.covers(at_s) for o in self._options.outages)
-                self.air.link.attenuate(MASTER, station_name(station), _OUT_OF_REACH_DB if hidden else 0.0)
+                self.air.link.set_attenuation(MASTER, station_name(station), _OUTAGE_DB if hidden else 0.0)
 
-    async def end(self) -> None:
-        """End everything that still runs: the master first, so that no station seems lost to it."""
+    async def stop_all(self) -> None:
+        """Stop all daemons, the master first, so that it reports no lost stations."""
         for name in self.computers:
             if self.computers[name].task is not None:
-                await self.kill(name)
+                await self.stop(name)

@@ -1,4 +1,4 @@
-"""What a simulated run leaves behind for figures and checkers: what went in, and what came out."""
+"""Logs of a simulated mission for figures and invariant checks: what the daemons read and published, with the ground truth."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ import numpy as np
 from tsgt.model import PolarMeasurement
 from tsgt.recording import BeaconRecord, ClockRecord, Kind, PoseRecord, StatusRecord, decode_line, read_lines
 from tsgt.recording.journal import AcknowledgedRecord, load_journal
-from tsgt.simulation.mission.disk import UNWRITTEN_NS
+from tsgt.simulation.mission.disk import UNWRITTEN_WINDOW_NS
+from tsgt.station.leica import LeicaInstrument
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -21,25 +22,26 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from tsgt.clock import Clock
+    from tsgt.config import LeicaInstrumentConfig
     from tsgt.model import Parameters
-    from tsgt.radio import Direction
-    from tsgt.recording.journal import InstrumentRecord
     from tsgt.simulation.faults.catalogue import FaultKind
-    from tsgt.simulation.instrument.geocom import Offered
+    from tsgt.simulation.instrument import ReportedDistance
     from tsgt.simulation.options import Outage
     from tsgt.simulation.world import World
-    from tsgt.station import Atmosphere, ClientStatus, Condition, Instrument, Reading
+    from tsgt.station import ClientStatus, Reading
+    from tsgt.station.serial import OpenPort
 
 START_UNIX_NS = 1_800_000_000_000_000_000
-"""Unix time at which each simulated mission starts, on the master's clock: 15 January 2027."""
+"""Unix time at the start of each simulated mission, on the master's clock: 15 January 2027."""
 
 _HEAD_LINES = 2
-# What is left of a program that is killed lives on for an instant.
-_LAST_NS = 5_000_000
-# Two beacons agree to within this, whatever the clock of a station did in between.
-_APART_US = 20_000
-# A station that is started again believes what it knew before if it rests on five beacons; some may have been outliers.
-_TELL = 8
+# Tasks of a killed daemon may run a little longer.
+_SHUTDOWN_NS = 5_000_000
+# Clock offsets from two valid beacons agree to within this.
+_MAX_DISAGREEMENT_US = 20_000
+# A restarted station accepts a journalled clock offset based on five beacons; some may have been outliers.
+_MIN_RECEPTIONS = 8
 
 _KINDS: tuple[Kind, ...] = get_args(Kind)
 
@@ -57,86 +59,82 @@ class ValidPoses:
     orientation_xyzw
         (N, 4).
     residual_m
-        (N,) as stated.
-    after
-        (N,) how many measurements stood in the stream before each pose.
+        (N,) as published.
+    measurements_before
+        (N,) number of measurements published before each pose.
     kind
-        (N,) how each came about, in the word of the stream.
-    newest_s
-        (N,) age of the newest measurement before each.
+        (N,) kind of pose, as published.
+    newest_age_s
+        (N,) age of the newest measurement.
     covariance
-        (N, 6, 6) as stated.
+        (N, 6, 6) as published.
     """
 
     stamp_ns: NDArray[np.int64]
     position_m: NDArray[np.float64]
     orientation_xyzw: NDArray[np.float64]
     residual_m: NDArray[np.float64]
-    after: NDArray[np.int64]
+    measurements_before: NDArray[np.int64]
     kind: NDArray[np.str_]
-    newest_s: NDArray[np.float64]
+    newest_age_s: NDArray[np.float64]
     covariance: NDArray[np.float64]
 
     def select(self, rows: NDArray[np.bool_]) -> ValidPoses:
-        """Return some of them."""
+        """Return the poses of these rows."""
         return ValidPoses(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
-class Session:
-    """What one run of the master sent out, from its start to its end. Its method :meth:`take` is the master's observer.
-
-    Hours of poses are kept as numbers, and what the lines were as a hash.
+class MasterLog:
+    """What one process of the master published, from start to end. Poses are kept as numbers, lines as hashes.
 
     Parameters
     ----------
     folder
-        Where the master keeps its recording, the only file there.
+        Contains the recording and nothing else.
     now_ns
-        Tells the true time, in ns from the start of the run.
-    zero_ns
-        What the master's Unix clock showed at the start of the run, in ns, as it stands now: somebody may have set it.
+        Returns the true time in ns from the start.
+    unix_at_zero_ns
+        The master's Unix clock at true time zero, in ns, as set when the master started.
 
     Attributes
     ----------
     measurements, clocks, statuses
-        The records of these types.
+        Published records.
     arrived_ns
-        When each of the measurements was handed out, true time in ns from the start.
-    poses
-        How many poses, valid or not, by kind.
-    frames, framed_ns
-        How many frames there have been from the first beacon to the last, and how long they took.
-    lines
-        Hash of each line.
+        True time of each measurement's publication, in ns from the start.
+    pose_counts
+        Number of poses, valid or not, by kind.
+    frame_count, frames_duration_ns
+        Number of frames from the first to the last beacon, and their total duration.
     crashed
         Whether it was killed.
-    number
-        Of the session in its last beacon; None: there was none.
+    session_number
+        Session number of its last beacon.
     """
 
-    def __init__(self, folder: Path, now_ns: Callable[[], int], zero_ns: int) -> None:
+    def __init__(self, folder: Path, now_ns: Callable[[], int], unix_at_zero_ns: int) -> None:
         self._folder = folder
         self._now_ns = now_ns
-        self.zero_ns = zero_ns
+        self.unix_at_zero_ns = unix_at_zero_ns
         self.crashed = False
-        self.number: int | None = None
+        self.session_number: int | None = None
         self.measurements: list[PolarMeasurement] = []
         self.arrived_ns: list[int] = []
         self.clocks: list[ClockRecord] = []
         self.statuses: list[StatusRecord] = []
-        self.poses: Counter[Kind] = Counter()
-        self.frames = 0
-        self.framed_ns = 0
+        self.pose_counts: Counter[Kind] = Counter()
+        self.frame_count = 0
+        self.frames_duration_ns = 0
         self._first_beacon: BeaconRecord | None = None
-        self.lines = array("q")
+        self.line_hashes = array("q")
         self._pose_stamps = array("q")
-        self._pose_after = array("q")
+        self._pose_measurements_before = array("q")
         self._pose_kinds = array("b")
         self._pose_numbers = array("d")
 
-    def take(self, record: object, line: bytes) -> None:
-        """Take a record that goes out, and its line."""
-        self.lines.append(hash(line))
+    def observe(self, record: object, line: bytes) -> None:
+        """Log a published record and its line."""
+        self.line_hashes.append(hash(line))
         if isinstance(record, PolarMeasurement):
             self.measurements.append(record)
             self.arrived_ns.append(self._now_ns())
@@ -145,17 +143,20 @@ class Session:
         elif isinstance(record, StatusRecord):
             self.statuses.append(record)
         elif isinstance(record, PoseRecord):
-            self.poses[record.kind] += 1
+            self.pose_counts[record.kind] += 1
             if record.valid:
-                self._take_pose(record)
+                self._observe_pose(record)
         elif isinstance(record, BeaconRecord):
             first = self._first_beacon = self._first_beacon or record
-            self.number = record.session
-            self.frames, self.framed_ns = record.counter - first.counter, record.stamp_ns - first.stamp_ns
+            self.session_number = record.session
+            self.frame_count, self.frames_duration_ns = (
+                record.counter - first.counter,
+                record.stamp_ns - first.stamp_ns,
+            )
 
-    def _take_pose(self, pose: PoseRecord) -> None:
+    def _observe_pose(self, pose: PoseRecord) -> None:
         self._pose_stamps.append(pose.stamp_ns)
-        self._pose_after.append(len(self.measurements))
+        self._pose_measurements_before.append(len(self.measurements))
         self._pose_numbers.extend(pose.position_m or ())
         self._pose_numbers.extend(pose.orientation_xyzw or ())
         self._pose_numbers.append(np.nan if pose.residual_m is None else pose.residual_m)
@@ -165,253 +166,190 @@ class Session:
         self._pose_kinds.append(_KINDS.index(pose.kind))
 
     def valid_poses(self) -> ValidPoses:
-        """Return the valid poses so far."""
+        """Return the valid poses published so far."""
         numbers = np.array(self._pose_numbers).reshape(-1, 45)
         return ValidPoses(
             stamp_ns=np.array(self._pose_stamps, dtype=np.int64),
             position_m=numbers[:, :3],
             orientation_xyzw=numbers[:, 3:7],
             residual_m=numbers[:, 7],
-            after=np.array(self._pose_after, dtype=np.int64),
+            measurements_before=np.array(self._pose_measurements_before, dtype=np.int64),
             kind=np.array(_KINDS)[np.array(self._pose_kinds, dtype=np.intp)],
-            newest_s=numbers[:, 8],
+            newest_age_s=numbers[:, 8],
             covariance=numbers[:, 9:].reshape(-1, 6, 6),
         )
 
     def recording(self) -> Path | None:
-        """Return the recording; None when the master did not get as far as that."""
+        """Return the recording; None: the master ended before it had one."""
         return next(iter(sorted(self._folder.glob("*.jsonl"))), None)
 
 
 @dataclass(slots=True)
-class StationWitness:
-    """What a station's client read from its instrument, whether it went any further or not.
+class StationLog:
+    """What a station's client read from its instrument, delivered or not.
 
     Attributes
     ----------
-    station
-        Its number.
     folder
-        Of its journals; None: it keeps none.
-    offered
-        Every distance that its instrument has answered with.
-    stamps_ns
-        By the host time of each reading in ns: the true time of that instant, in ns from the start.
-    read_ns
-        By the same: the true time at which the client had it.
-    crashed_ns
-        True times between which a client has read what it may not have written, as it was killed at the later one.
+        Folder of its journals; None: it keeps none.
+    reported_distances
+        Every distance that its instrument reported.
+    true_times_ns
+        True time of each reading's timestamp, by its host time; both in ns.
+    read_times_ns
+        True time at which the client got each reading, by its host time; both in ns.
+    crash_windows_ns
+        Start and end of the true times in which readings may be unjournalled; the client was killed at the end.
     statuses
-        What it said of itself each time before it ended.
+        Status of the client before each end.
     """
 
     station: int
     folder: Path | None
-    offered: Sequence[Offered] = ()
-    stamps_ns: dict[int, int] = field(default_factory=dict)
-    read_ns: dict[int, int] = field(default_factory=dict)
-    crashed_ns: list[tuple[int, int]] = field(default_factory=list)
+    reported_distances: Sequence[ReportedDistance] = ()
+    true_times_ns: dict[int, int] = field(default_factory=dict)
+    read_times_ns: dict[int, int] = field(default_factory=dict)
+    crash_windows_ns: list[tuple[int, int]] = field(default_factory=list)
     statuses: list[ClientStatus] = field(default_factory=list)
 
-    def may_be_unwritten(self, true_ns: int, before_ns: int = 0, *, refused: bool = False) -> bool:
-        """Whether a client was killed after that time, in ns from the start, before it can have written what it had read.
+    def may_be_unwritten(self, true_ns: int, before_ns: int = 0, *, write_errors_only: bool = False) -> bool:
+        """Whether a client was killed before it must have journalled what it read at a true time in ns from the start.
 
         Parameters
         ----------
-        true_ns
-            When it was read, in ns from the start; or at most ``before_ns`` before that.
-        refused
-            Only a disk that refused to be written to is an excuse.
+        before_ns
+            Uncertainty of ``true_ns``: the reading may be this much later.
+        write_errors_only
+            Only accept kills during a write error of the disk.
         """
         return any(
-            from_ns - before_ns <= true_ns <= to_ns + _LAST_NS
-            and not (refused and to_ns - from_ns == UNWRITTEN_NS)
-            for from_ns, to_ns in self.crashed_ns
+            from_ns - before_ns <= true_ns <= to_ns + _SHUTDOWN_NS
+            and not (write_errors_only and to_ns - from_ns == UNWRITTEN_WINDOW_NS)
+            for from_ns, to_ns in self.crash_windows_ns
         )
 
     @property
     def journals(self) -> list[Path]:
-        """Its journals, one for each time that it was started."""
+        """Its journals, one per start."""
         return [] if self.folder is None else sorted(self.folder.glob("*.jsonl"))
 
 
-class Measured:
-    """Finds for what the master has delivered when it was measured, and what the journals say of it.
+class JournalIndex:
+    """Finds the journal entry and the true time of delivered measurements of a station.
 
-    Over the protocol ``classic`` a measurement keeps its station's time; over ``superframe`` it is found by its number.
-
-    Parameters
-    ----------
-    witness
-        Of the station.
+    Over protocol ``classic`` a measurement is identified by its host time, over ``superframe`` by its sequence number.
 
     Attributes
     ----------
     journalled
-        What stands in the station's journals, in their order.
+        All measurements in the journals, in order.
     """
 
-    def __init__(self, witness: StationWitness) -> None:
-        self.witness = witness
-        self._true_ns = witness.stamps_ns
-        journals = [load_journal(path) for path in witness.journals if _begun(path)]
+    def __init__(self, station_log: StationLog) -> None:
+        self.station_log = station_log
+        self._true_ns = station_log.true_times_ns
+        journals = [load_journal(path) for path in station_log.journals if _has_header(path)]
         self.journalled = [m for journal in journals for m in journal.measurements]
         self._heads = {m.sequence: journal.head for journal in journals for m in journal.measurements}
         self._offsets_us: dict[tuple[str, int], list[int]] = {}
         for journal in journals:
-            for told in journal.receptions:
-                offsets_us = self._offsets_us.setdefault((journal.head.boot, told.session), [])
-                offsets_us.append(told.sent_us - told.stamp_ns // 1000)
-        # Their names tell the order as well as the stations' Unix clocks do.
-        last = max(witness.journals, key=lambda path: path.stat().st_mtime_ns, default=None)
-        self._last_journal = last if last is not None and _begun(last) else None
+            for reception in journal.receptions:
+                offsets_us = self._offsets_us.setdefault((journal.head.boot, reception.session), [])
+                offsets_us.append(reception.sent_us - reception.stamp_ns // 1000)
+        # By modification time, because Unix clock steps may reorder the names.
+        last = max(station_log.journals, key=lambda path: path.stat().st_mtime_ns, default=None)
+        self._last_journal = last if last is not None and _has_header(last) else None
         self._last = load_journal(self._last_journal).head if self._last_journal is not None else None
         self._by_sequence = {m.sequence: m for m in self.journalled}
         self._by_host_time = {m.host_time_ns: m for m in self.journalled}
 
-    def in_journal(self, measurement: PolarMeasurement) -> PolarMeasurement | None:
-        """Return the measurement as the journal has it; None where it has not."""
+    def find(self, measurement: PolarMeasurement) -> PolarMeasurement | None:
+        """Return the journal entry of a measurement; None: there is none."""
         if measurement.host_time_ns is None:
             return self._by_sequence.get(measurement.sequence)
         return self._by_host_time.get(measurement.host_time_ns)
 
     def true_ns(self, measurement: PolarMeasurement) -> int | None:
-        """Return the true time of the client's stamp in ns from the start; None: nobody has read it."""
+        """Return the true time of the client's timestamp in ns from the start; None: the client never read it."""
         host_time_ns = measurement.host_time_ns
-        if host_time_ns is None and (journalled := self.in_journal(measurement)) is not None:
+        if host_time_ns is None and (journalled := self.find(measurement)) is not None:
             host_time_ns = journalled.host_time_ns
         return None if host_time_ns is None else self._true_ns.get(host_time_ns)
 
     def oldest_queued(self) -> int | None:
-        """Return the lowest number that waits for an acknowledgement, as its last journal says; None: it does not say.
-
-        A client says so every 5 s at most, if it is another one.
-        """
+        """Return the lowest unacknowledged sequence number of the last journal, which records it at most every 5 s; None: not recorded."""
         if (path := self._last_journal) is None:
             return None
-        told = [line for line in read_lines(path) if line.type == "acknowledged"]
-        return decode_line(AcknowledgedRecord, told[-1], path).oldest if told else None
+        reception = [line for line in read_lines(path) if line.type == "acknowledged"]
+        return decode_line(AcknowledgedRecord, reception[-1], path).oldest if reception else None
 
-    def timeless(self, sequence: int, session: int | None) -> bool:
-        """Whether no time of a master's session can be told of a measurement.
+    def has_no_timestamp(self, sequence: int, session: int | None) -> bool:
+        """Whether a measurement cannot be converted to the time of a master's session.
 
-        Its computer has been started again since, without having learnt the time of that session before; or its program was,
-        on a disk that took nothing, and has begun to number anew.
-
-        Parameters
-        ----------
-        sequence
-            Number of a measurement that is in the journals.
-        session
-            Number of the master's session; None: of none.
+        Its computer was rebooted before it had synchronised in that session, or its client was restarted on a failing disk and
+        has a new stream id.
         """
         head = self._heads[sequence]
-        if self._last is None or head.lineage != self._last.lineage:
+        if self._last is None or head.stream_id != self._last.stream_id:
             return True
         if head.boot == self._last.boot:
             return False
         offsets_us = self._offsets_us.get((head.boot, session), []) if session is not None else []
-        # The first ones may have been held back; of so many that is known.
-        told = len(offsets_us) >= _TELL
-        return not told or all(abs(b - a) > _APART_US for a, b in combinations(offsets_us, 2))
+        # The first beacons may have been delayed; with enough of them the station detects that.
+        reception = len(offsets_us) >= _MIN_RECEPTIONS
+        return not reception or all(abs(b - a) > _MAX_DISAGREEMENT_US for a, b in combinations(offsets_us, 2))
 
 
-def _begun(path: Path) -> bool:
-    """Whether there is more in a journal than what a client that is killed at once leaves."""
+def _has_header(path: Path) -> bool:
+    """Whether a journal has its header lines; a client that is killed at once leaves less."""
     with path.open("rb") as file:
         return [file.readline()[-1:] for _ in range(_HEAD_LINES)] == [b"\n"] * _HEAD_LINES
 
 
-class WatchedInstrument:
-    """An instrument that tells somebody else, too, what is read from it.
+class ObservedInstrument(LeicaInstrument):
+    """A Leica instrument that passes each reading of the tracked prism to a callback as well."""
 
-    Parameters
-    ----------
-    instrument
-        The one that is watched.
-    watch
-        Gets each reading of the tracked prism.
-    """
-
-    def __init__(self, instrument: Instrument, watch: Callable[[Reading], None]) -> None:
-        self._instrument = instrument
-        self._watch = watch
-
-    async def connect(self) -> str:
-        """Find and identify the instrument."""
-        return await self._instrument.connect()
-
-    async def track(self, prism: int, towards: Direction | None = None) -> None:
-        """Track a prism."""
-        await self._instrument.track(prism, towards)
+    def __init__(
+        self,
+        config: LeicaInstrumentConfig,
+        open_port: OpenPort,
+        clock: Clock,
+        on_reading: Callable[[Reading], None],
+    ) -> None:
+        super().__init__(config, open_port, clock)
+        self._on_reading = on_reading
 
     async def read(self) -> Reading:
-        """Return the next measurement, and tell."""
-        reading = await self._instrument.read()
-        self._watch(reading)
+        """Return the next measurement."""
+        reading = await super().read()
+        self._on_reading(reading)
         return reading
-
-    async def direct(self) -> None:
-        """Get ready for single measurements."""
-        await self._instrument.direct()
-
-    async def measure(self) -> Reading:
-        """Measure the target once."""
-        return await self._instrument.measure()
-
-    async def check(self) -> None:
-        """See whether it is still there."""
-        await self._instrument.check()
-
-    async def set_atmosphere(self, atmosphere: Atmosphere) -> None:
-        """Let the instrument correct for this air."""
-        await self._instrument.set_atmosphere(atmosphere)
-
-    @property
-    def condition(self) -> Condition:
-        """How it does."""
-        return self._instrument.condition
-
-    @property
-    def record(self) -> InstrumentRecord | None:
-        """What is known of it and of its settings."""
-        return self._instrument.record
-
-    async def close(self) -> None:
-        """Let go of the instrument."""
-        await self._instrument.close()
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
-    """A mission that is over.
+class MissionResult:
+    """A completed mission.
 
     Attributes
     ----------
     parameters
-        What the master knew of the set-up: the exact truth.
+        Setup as known to the master: the exact truth.
     world
-        The truth; its instants count from the start of the run.
+        Ground truth; times count from the start of the mission.
     duration_s
-        How long it measured, without the drain.
-    sessions
-        What the master sent out, one entry for each time that it was started.
-    witnesses
-        What was read from the instruments, by station number.
+        Duration of the measurements, drain excluded.
+    master_logs
+        One per start of the master.
     airtime_s
-        How long there was a packet on the air, of whomever.
-    superframe
-        Whether that protocol was spoken.
-    outages
-        When who did not hear whom.
+        Total airtime of all radios.
     faults
-        How many of each kind there were.
-    calm_s
-        When they were over, in s from the start; None: there were none.
+        Number of faults by kind.
+    faults_end_s
+        End of the faults in s from the start; None: no faults.
     rate_hz
-        How often each instrument measures, by station number.
-    overgrown
-        What was longer in memory than it should be.
+        Measurement rate by station number.
+    oversized_collections
+        Collections of the daemons that exceeded their bounds.
     start_ns
         Unix time of the start on the master's clock, in ns.
     """
@@ -419,18 +357,18 @@ class Run:
     parameters: Parameters
     world: World
     duration_s: float
-    sessions: list[Session]
-    witnesses: dict[int, StationWitness]
+    master_logs: list[MasterLog]
+    station_logs: dict[int, StationLog]
     airtime_s: float
     superframe: bool
     outages: tuple[Outage, ...] = ()
     faults: Counter[FaultKind] = field(default_factory=Counter)
-    calm_s: float | None = None
+    faults_end_s: float | None = None
     rate_hz: dict[int, float] = field(default_factory=dict)
-    overgrown: tuple[str, ...] = ()
+    oversized_collections: tuple[str, ...] = ()
     start_ns: int = START_UNIX_NS
 
     @property
     def end_ns(self) -> int:
-        """Unix time of the end on the master's clock, in ns; the drain comes after it."""
+        """Unix time of the end on the master's clock, in ns; the drain follows."""
         return self.start_ns + round(self.duration_s * 1e9)

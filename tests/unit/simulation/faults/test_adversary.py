@@ -10,7 +10,7 @@ import numpy as np
 from harness.plain_radio import PlainRadio
 
 from tsgt.simulation.kernel import VirtualClock
-from tsgt.simulation.lora.adversary import LONGEST_NOISE_BYTES, ForeignRadio
+from tsgt.simulation.lora.adversary import MAX_NOISE_BYTES, ReplayAttacker
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
@@ -31,7 +31,7 @@ async def _sent(per_s: float, heard: list[bytes], seconds: float) -> list[bytes]
     async def open_radio() -> AsyncGenerator[Radio]:
         yield radio
 
-    foreign = ForeignRadio(clock, np.random.default_rng(1), per_s)
+    foreign = ReplayAttacker(clock, np.random.default_rng(1), per_s)
     running = asyncio.create_task(foreign.run(open_radio))
     await clock.sleep_until(round(seconds * 1e9))
     running.cancel()
@@ -49,7 +49,7 @@ async def test_it_sends_as_often_as_it_is_told() -> None:
 async def test_without_anything_heard_it_is_noise() -> None:
     """Random bytes of all lengths."""
     packets = await _sent(5.0, [], 200.0)
-    assert {len(packet) for packet in packets} == set(range(1, LONGEST_NOISE_BYTES + 1))
+    assert {len(packet) for packet in packets} == set(range(1, MAX_NOISE_BYTES + 1))
 
 
 def _bits_off(packet: bytes, payload: bytes) -> int:

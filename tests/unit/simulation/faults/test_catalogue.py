@@ -11,8 +11,8 @@ from harness.missions import QUICK, SUPERFRAME, mission
 
 from tsgt.config import ScenarioConfig
 from tsgt.errors import ConfigError
-from tsgt.simulation.checks import violations
-from tsgt.simulation.faults import CALM_S, SETTLE_S, FaultKind, draw_faults, parse_faults
+from tsgt.simulation.checks import check_invariants
+from tsgt.simulation.faults import FAULT_FREE_START_S, FAULT_FREE_TAIL_S, FaultKind, draw_faults, parse_faults
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -36,8 +36,8 @@ def test_a_seed_gives_the_same_faults() -> None:
 def test_all_are_over_before_the_end() -> None:
     """What they break has to work again by then."""
     faults = draw_faults(FaultKind, np.random.default_rng(0), duration_s=3600.0, stations=[1, 2, 3])
-    assert min(fault.at_s for fault in faults) >= SETTLE_S
-    assert max(fault.at_s + fault.seconds for fault in faults) <= 3600.0 - CALM_S + 1e-9
+    assert min(fault.at_s for fault in faults) >= FAULT_FREE_START_S
+    assert max(fault.at_s + fault.duration_s for fault in faults) <= 3600.0 - FAULT_FREE_TAIL_S + 1e-9
 
 
 def test_each_kind_comes_alone() -> None:
@@ -60,9 +60,9 @@ def test_a_program_that_is_killed_while_it_ends_has_ended(tmp_path: Path) -> Non
     """What it writes last tears, alone or in a task of its own; a program that fails while it ends is told of."""
 
     async def write_last(computer: Computer, fails: type[Exception] | None) -> None:
-        write = computer.new_program()
-        assert computer.writes is not None
-        computer.writes.tear(0.0, lambda: None)
+        write = computer.new_writer()
+        assert computer.disk_writer is not None
+        computer.disk_writer.tear_next_write(0.0, lambda: None)
         try:
             await asyncio.Event().wait()
         finally:
@@ -75,16 +75,16 @@ def test_a_program_that_is_killed_while_it_ends_has_ended(tmp_path: Path) -> Non
             group.create_task(write_last(computer, None))
 
     async def end_programs(run: Mission) -> None:
-        await run.kill("station1")
+        await run.stop("station1")
         computer = run.computers["station1"]
         for program in (write_last(computer, None), write_in_task(computer)):
             computer.start(program)
             await run.sleep_until(run.now_s + 0.1)
-            await computer.end()
+            await computer.stop()
         computer.start(write_last(computer, OSError))
         await run.sleep_until(run.now_s + 0.1)
         with pytest.raises(OSError):  # noqa: PT011 (it has no text)
-            await computer.end()
+            await computer.stop()
 
     mission(tmp_path, duration_s=1.0, script=end_programs)
 
@@ -98,10 +98,12 @@ def test_a_crash_is_when_it_happens(tmp_path: Path) -> None:
         run.instruments[1].blocked = True  # while it searches, it answers late
         await run.sleep_until(13.2)
         killed_s.append(run.now_s)
-        await run.crash("station1", away_s=1.0)
+        await run.crash("station1", down_s=1.0)
 
-    ((_, crashed_ns),) = mission(tmp_path, duration_s=15.0, script=crash).witnesses[1].crashed_ns
-    assert crashed_ns / 1e9 == pytest.approx(killed_s[0], abs=1e-6)
+    ((_, crash_windows_ns),) = (
+        mission(tmp_path, duration_s=15.0, script=crash).station_logs[1].crash_windows_ns
+    )
+    assert crash_windows_ns / 1e9 == pytest.approx(killed_s[0], abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -126,4 +128,4 @@ def test_nothing_that_must_never_be(tmp_path: Path, protocol: Any, estimator: st
         faults=frozenset(FaultKind),
     )
     assert sum(run.faults.values()) > 3
-    assert violations(run) == []
+    assert check_invariants(run) == []

@@ -9,7 +9,7 @@ import pytest
 
 from tsgt.geometry import polar_to_cartesian
 from tsgt.model import ARCSECOND_RAD, InstrumentNoise
-from tsgt.simulation.instrument.edm import with_noise
+from tsgt.simulation.instrument.edm import measure_polar
 
 POINT = np.array([60.0, 45.0, 60.0])
 DISTANCE_M = float(np.linalg.norm(POINT))
@@ -32,7 +32,7 @@ def test_noise_is_as_large_as_stated(part: str, sigma: float, direction: str, ex
     """Angles and ppm grow with the distance; a steep sight has no more noise across than a level one."""
     points = np.tile(POINT, (20_000, 1))
     noise = InstrumentNoise(**SILENT | {part: sigma})
-    error = polar_to_cartesian(*with_noise(points, noise, np.random.default_rng(1))) - points
+    error = polar_to_cartesian(*measure_polar(points, noise, np.random.default_rng(1))) - points
     sight = POINT / DISTANCE_M
     across = np.cross(sight, [0.0, 0.0, 1.0])
     across /= np.linalg.norm(across)
@@ -43,5 +43,5 @@ def test_noise_is_as_large_as_stated(part: str, sigma: float, direction: str, ex
 
 def test_without_noise_it_is_the_truth() -> None:
     """Angles and distance of the point itself."""
-    seen = with_noise(POINT[None], InstrumentNoise(**SILENT), np.random.default_rng(1))
+    seen = measure_polar(POINT[None], InstrumentNoise(**SILENT), np.random.default_rng(1))
     np.testing.assert_allclose(polar_to_cartesian(*seen)[0], POINT, atol=1e-12)

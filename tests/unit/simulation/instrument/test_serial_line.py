@@ -59,7 +59,7 @@ async def test_one_program_at_a_time() -> None:
     """A second one is refused until the first has closed the port."""
     bench = Bench()
     port = await bench.line.open(115_200)
-    with pytest.raises(InstrumentError, match="taken"):
+    with pytest.raises(InstrumentError, match="already open"):
         await bench.line.open(115_200)
     await port.close()
     await (await bench.line.open(115_200)).close()
@@ -96,11 +96,11 @@ WHOLE = b"%R1P,0,1:0\r\n"
 @pytest.mark.parametrize(
     ("fault", "expected"),
     [
-        (LineFault.CUT, WHOLE[:6]),
+        (LineFault.TRUNCATED, WHOLE[:6]),
         (LineFault.DUPLICATED, WHOLE + WHOLE),
-        (LineFault.TORN, WHOLE),
-        (LineFault.LATE, WHOLE),
-        (LineFault.SILENCE, b""),
+        (LineFault.SPLIT, WHOLE),
+        (LineFault.DELAYED, WHOLE),
+        (LineFault.DROPPED, b""),
         (LineFault.NONE, WHOLE),
     ],
 )
@@ -115,7 +115,7 @@ async def test_faults_of_one_answer(fault: LineFault, expected: bytes) -> None:
     await bench.do((0,))
 
 
-@pytest.mark.parametrize("fault", [LineFault.GARBAGE, LineFault.SPOILT])
+@pytest.mark.parametrize("fault", [LineFault.GARBAGE, LineFault.CORRUPTED])
 async def test_garbage_on_the_line(fault: LineFault) -> None:
     """There are bytes that nobody sent."""
     bench = Bench()
@@ -129,11 +129,11 @@ async def test_garbage_on_the_line(fault: LineFault) -> None:
 async def test_deaf_and_mute() -> None:
     """Nothing gets through in one direction: the instrument acts on what it hears all the same."""
     bench = Bench()
-    bench.line.faults.mute = True
+    bench.line.faults.drop_responses = True
     await bench.send(b"%R1Q,1004,1:1\r\n")
     assert await bench.quiet(1.0)
     assert bench.instrument.settings.laser
-    bench.line.faults.mute, bench.line.faults.deaf = False, True
+    bench.line.faults.drop_responses, bench.line.faults.drop_requests = False, True
     await bench.send(b"%R1Q,1004,1:0\r\n")
     assert await bench.quiet(1.0)
     assert bench.instrument.settings.laser

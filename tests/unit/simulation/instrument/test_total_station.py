@@ -42,7 +42,7 @@ async def test_without_noise_it_measures_the_truth(station: int) -> None:
     bench = Bench(with_station(ScenarioConfig(), noise=SILENT), station=station)
     await bench.do(*SETUP)
     answers = await full(bench, 40)
-    offered = {str(o.instrument_ms): o for o in bench.instrument.offered}
+    offered = {str(o.instrument_ms): o for o in bench.instrument.reported_distances}
     parameters = scenario_parameters(bench.scenario).stations[station - 1]
     for answer in answers:
         horizontal, zenith, *_, distance_m, _ = numbers(answer)
@@ -73,7 +73,7 @@ async def test_ticks_are_even_but_for_their_jitter_and_the_drift() -> None:
     steps_ms = np.diff(stamps)
     assert steps_ms.mean() == pytest.approx(400 * (1 + 500e-6), abs=0.05)
     assert steps_ms.std() == pytest.approx(3.0 * math.sqrt(2), rel=0.15)
-    assert len(bench.instrument.offered) == 200
+    assert len(bench.instrument.reported_distances) == 200
 
 
 async def test_each_station_measures_at_instants_of_its_own() -> None:
@@ -83,7 +83,7 @@ async def test_each_station_measures_at_instants_of_its_own() -> None:
         bench = Bench(with_station(instrument={"tick_jitter_ms": 0.0}), seed=seed)
         await bench.do(*SETUP)
         await full(bench, 1)
-        phases.add(bench.instrument.offered[0].true_ns % 400_000_000)
+        phases.add(bench.instrument.reported_distances[0].true_ns % 400_000_000)
     assert len(phases) == 3
 
 
@@ -111,11 +111,11 @@ async def test_a_stored_distance_is_given_again() -> None:
     bench = Bench(with_station(rate_hz=1.0))
     await bench.do(*SETUP)
     await bench.ask(2167, 2000, 1)
-    before = bench.instrument.offered[-1]
+    before = bench.instrument.reported_distances[-1]
     first, second = [await bench.ask(2167, 2000, 1) for _ in range(2)]
     assert first.values[6:] == second.values[6:]
     assert float(first.values[6]) == before.distance_m
-    assert len(bench.instrument.offered) == 1
+    assert len(bench.instrument.reported_distances) == 1
 
 
 async def test_answers_take_the_time_of_the_model() -> None:
@@ -156,11 +156,13 @@ async def test_angles_are_newer_than_the_distance() -> None:
     for bench in (early, late):
         await bench.do(*SETUP)
         await full(bench, 30)
-    for one, other in zip(early.instrument.offered, late.instrument.offered, strict=False):
+    for one, other in zip(
+        early.instrument.reported_distances, late.instrument.reported_distances, strict=False
+    ):
         assert one.true_ns % 400_000_000 == other.true_ns % 400_000_000
     apart = [
         o.horizontal_angle_rad - _horizontal(late, (o.true_ns + 50_000_000) / 1e9)
-        for o in late.instrument.offered
+        for o in late.instrument.reported_distances
     ]
     assert max(map(abs, apart)) < 1e-9
 
@@ -223,7 +225,7 @@ async def test_faults_of_the_scenario(status: str, code: int) -> None:
     assert set(seen) - {1285} == {0, code} - {1285}
     assert code in seen
     assert all(not answer.values or float(answer.values[6]) == 0 for answer in seen[code])
-    true_s = [offered.true_ns / 1e9 for offered in bench.instrument.offered]
+    true_s = [offered.true_ns / 1e9 for offered in bench.instrument.reported_distances]
     assert not [at_s for at_s in true_s if 3.0 <= at_s < 4.0]
     assert true_s[-1] > 7
 
@@ -237,7 +239,7 @@ async def test_it_follows_from_the_start() -> None:
     assert (await bench.ask(6021)).values == ["1"]
     await bench.do(*SETUP)
     await bench.ask(2167, 1000, 1)
-    assert bench.instrument.offered[0].prism == 2
+    assert bench.instrument.reported_distances[0].prism == 2
 
 
 async def test_a_hidden_prism_is_predicted_and_then_lost() -> None:
@@ -263,7 +265,7 @@ async def test_what_the_world_hides_is_lost() -> None:
     bench = Bench(scenario, world=World(scenario.motion, prisms, 60.0, np.random.default_rng(1), spans_s))
     await bench.do(*SETUP)
     await full(bench, 20)
-    true_s = [offered.true_ns / 1e9 for offered in bench.instrument.offered]
+    true_s = [offered.true_ns / 1e9 for offered in bench.instrument.reported_distances]
     assert min(true_s) < 4.0
     assert not [at_s for at_s in true_s if 4.0 <= at_s < 5.0]
 
@@ -319,7 +321,7 @@ async def test_fine_adjustment_of_a_moving_prism_needs_point_tolerance() -> None
         await bench.do((18007, 0), (9031, 0))
         codes.add(await bench.code(9037, 0.1, 0.1, 0))
         await bench.do((9031, 1))
-        bench.instrument.lock_by_hand(1)
+        bench.instrument.lock_manually(1)
     assert INACCURATE in codes
 
 
@@ -382,7 +384,7 @@ async def test_a_foil_target() -> None:
     """Aimed at, it is measured in the mode for tape, with the tape's constant; not in the mode for prisms."""
     bench = Bench(ScenarioConfig(motion=STANDING, targets_m=((20.0, 5.0, 0.5),)))
     await bench.do((18007, 0), (2008, 3, 1), (17008, 2), (2020, 1))
-    bench.instrument.aim(1)
+    bench.instrument.aim_at_target(1)
     began_ns = bench.timeline.now_ns()
     await bench.do((2008, 1, 1))
     shot = await bench.ask(2167, 5000, 1)
@@ -396,7 +398,7 @@ async def test_two_faces() -> None:
     """In the second face the zenith angle is above pi, and the circle is turned by pi."""
     bench = Bench(ScenarioConfig(motion=STANDING, targets_m=((20.0, 5.0, 0.5),)))
     await bench.do((18007, 0), (2008, 3, 1), (17008, 2), (2020, 1))
-    bench.instrument.aim(1)
+    bench.instrument.aim_at_target(1)
     shots = []
     for _ in range(2):
         await bench.do((2008, 1, 1))
@@ -410,7 +412,7 @@ async def test_two_faces() -> None:
 async def test_there_is_no_such_target() -> None:
     """A person cannot aim at what the scenario does not have."""
     with pytest.raises(InstrumentError, match="no target 1"):
-        Bench().instrument.aim(1)
+        Bench().instrument.aim_at_target(1)
 
 
 async def test_another_prism_by_hand() -> None:
@@ -421,10 +423,10 @@ async def test_another_prism_by_hand() -> None:
     assert (await bench.ask(6021)).values == ["0"]
     await asyncio.sleep(1.0)
     await bench.ask(2167, 1000, 1)
-    assert bench.instrument.offered[-1].prism == 3
+    assert bench.instrument.reported_distances[-1].prism == 3
     await bench.do((9037, 0.05, 0.05, 0), (9013,))
     await full(bench, 3)
-    assert bench.instrument.offered[-1].prism == 3
+    assert bench.instrument.reported_distances[-1].prism == 3
 
 
 async def test_switched_off_and_on() -> None:

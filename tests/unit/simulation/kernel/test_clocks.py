@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tsgt.simulation.kernel import DriftingClock, VirtualClock, ramped
+from tsgt.simulation.kernel import DriftingClock, VirtualClock, drift_ramp
 
 START_NS = 1_700_000_000_123_456_789
 HOUR_NS = 3_600_000_000_000
@@ -74,7 +74,7 @@ async def test_a_step_moves_the_unix_clock_alone() -> None:
 def test_a_drift_that_changes() -> None:
     """Each stretch runs at its own rate from where the one before has ended."""
     warming = [(2 * HOUR_NS, -10.0), (HOUR_NS, 20.0)]
-    clock = DriftingClock(VirtualClock(START_NS), drift_ppm=0.0, drift_steps=warming)
+    clock = DriftingClock(VirtualClock(START_NS), drift_ppm=0.0, drift_changes=warming)
     gained_ms = [(clock.local_ns(n * HOUR_NS) - n * HOUR_NS) / 1e6 for n in range(4)]
     assert gained_ms == [0.0, 0.0, 72.0, 36.0]
 
@@ -82,7 +82,7 @@ def test_a_drift_that_changes() -> None:
 def test_a_drift_that_ramps() -> None:
     """From 5 ppm on by 6 ppm a minute, for ten minutes up and for ten down: the gain is the area below the ramp."""
     minute_ns = 60_000_000_000
-    clock = DriftingClock(VirtualClock(START_NS), drift_steps=ramped(5.0, 6.0, 20 * minute_ns))
+    clock = DriftingClock(VirtualClock(START_NS), drift_changes=drift_ramp(5.0, 6.0, 20 * minute_ns))
     gained_us = [(clock.local_ns(n * minute_ns) - n * minute_ns) / 1e3 for n in (1, 10, 20)]
     assert gained_us == pytest.approx([60 * 8, 600 * 35, 1200 * 35], abs=0.01)
 
@@ -90,7 +90,7 @@ def test_a_drift_that_ramps() -> None:
 @given(instants_ns, drifts_ppm, st.lists(st.tuples(instants_ns, drifts_ppm), max_size=3))
 def test_there_and_back(true_ns: int, drift_ppm: float, steps: list[tuple[int, float]]) -> None:
     """What a clock shows at an instant leads back to the first instant at which it shows that."""
-    clock = DriftingClock(VirtualClock(START_NS), drift_ppm=drift_ppm, drift_steps=steps)
+    clock = DriftingClock(VirtualClock(START_NS), drift_ppm=drift_ppm, drift_changes=steps)
     local_ns = clock.local_ns(true_ns)
     found_ns = clock.true_ns(local_ns)
     assert clock.local_ns(found_ns) == local_ns

@@ -254,7 +254,7 @@ def test_alone_work_is_done_at_once() -> None:
             await asyncio.to_thread(lambda: 1 // 0)
         return own, asyncio.get_running_loop().time()
 
-    assert run_virtual(main, alone=True) == (True, 0.0)
+    assert run_virtual(main, isolated=True) == (True, 0.0)
 
 
 def test_alone_a_cancelled_caller_hears_nothing() -> None:
@@ -268,7 +268,7 @@ def test_alone_a_cancelled_caller_hears_nothing() -> None:
         with pytest.raises(asyncio.CancelledError):
             await task
 
-    run_virtual(main, alone=True)
+    run_virtual(main, isolated=True)
     assert done == ["work"]
 
 
@@ -287,12 +287,12 @@ def test_a_stranger_is_let_in_while_time_passes(tmp_path: Path) -> None:
 
     async def main() -> None:
         async with await asyncio.start_unix_server(greet, tmp_path / "socket"):
-            stranger = threading.Thread(target=ask)
-            stranger.start()
-            while stranger.is_alive():  # noqa: ASYNC110 (it is the passing of time that must not keep him out)
+            interferer_radio = threading.Thread(target=ask)
+            interferer_radio.start()
+            while interferer_radio.is_alive():  # noqa: ASYNC110 (it is the passing of time that must not keep him out)
                 await asyncio.sleep(1)
 
-    run_virtual(main, alone=True)
+    run_virtual(main, isolated=True)
     assert answers == [b"hello"]
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from harness.air import (
     SYMBOL_NS,
-    RecordingAntenna,
+    RecordingListener,
     Scene,
     frame,
     link_with_snr,
@@ -107,7 +107,7 @@ def test_listening_anew_begins_anew() -> None:
 def test_antenna_may_stop_listening_when_told() -> None:
     """A chip in single reception leaves it from within what the air tells it."""
 
-    class Single(RecordingAntenna):
+    class Single(RecordingListener):
         def frame_ended(self, at_ns: int, reception: Reception | None) -> None:
             super().frame_ended(at_ns, reception)
             port.listen(None)
@@ -300,13 +300,13 @@ def test_leaving_cuts_the_frame_and_frees_the_name() -> None:
     scene.air.leave("tx")
     scene.air.leave("nobody")
     assert scene.finish() == ["damaged"]
-    scene.air.join(RecordingAntenna(), "tx")
+    scene.air.join(RecordingListener(), "tx")
 
 
 def test_names_are_unique() -> None:
     """Two radios of one name would be one in the link model, which is refused."""
-    with pytest.raises(ValueError, match="there is a radio 'rx' on the air already"):
-        Scene().air.join(RecordingAntenna(), "rx")
+    with pytest.raises(ValueError, match="radio 'rx' has joined already"):
+        Scene().air.join(RecordingListener(), "rx")
 
 
 def test_attenuation_during_a_run() -> None:
@@ -314,9 +314,9 @@ def test_attenuation_during_a_run() -> None:
     scene = Scene()
     scene.rx.listen(listening())
     scene.send(frame())
-    scene.link.attenuate("tx", "rx", 80.0)
+    scene.link.set_attenuation("tx", "rx", 80.0)
     scene.send(frame(100.0))
-    scene.link.attenuate("tx", "rx", 0.0)
+    scene.link.set_attenuation("tx", "rx", 0.0)
     scene.send(frame(200.0))
     scene.finish()
     assert [at_ns for at_ns, what in scene.antenna.events if what == "received"] == [

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from harness.air import RecordingAntenna, Scene, frame, link_with_snr, listening
+from harness.air import RecordingListener, Scene, frame, link_with_snr, listening
 
 from tsgt.simulation.lora import LinkModel
 from tsgt.simulation.lora.link import detection_probability, header_probability, payload_probability
@@ -78,7 +78,7 @@ def test_further_radios_change_nothing_for_others() -> None:
     def fates(bystanders: int) -> list[tuple[int, str]]:
         scene = Scene(link_with_snr(-15.0))
         for number in range(bystanders):
-            scene.air.join(RecordingAntenna(), f"bystander {number}").listen(listening())
+            scene.air.join(RecordingListener(), f"bystander {number}").listen(listening())
         scene.rx.listen(listening())
         for number in range(50):
             scene.send(frame(number * 70.0))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import pytest
-from harness.air import SYMBOL_NS, RecordingAntenna, frame, listening, modulation
+from harness.air import SYMBOL_NS, RecordingListener, frame, listening, modulation
 from harness.radios import running_timeline
 from structlog.testing import capture_logs
 
@@ -18,7 +18,7 @@ from tsgt.errors import StreamError
 from tsgt.recording import encode_line
 from tsgt.simulation.lora import AirClient, AirServer, LinkModel, LogDistanceLoss, air_server
 from tsgt.simulation.lora.air_client import WELCOME_TIMEOUT_S
-from tsgt.simulation.lora.air_messages import MAX_LINE_BYTES, FrameLine, Transmit
+from tsgt.simulation.lora.air_messages import MAX_LINE_BYTES, FrameMessage, Transmit
 from tsgt.simulation.lora.link import FixedLoss
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ class Radio:
 
     def __init__(self, client: AirClient) -> None:
         self.client = client
-        self.antenna = RecordingAntenna()
+        self.antenna = RecordingListener()
         self.port = client.join(self.antenna)
 
 
@@ -138,7 +138,7 @@ async def test_link_may_change_at_run_time(path: Path) -> None:
         tx, rx = await field.radio("tx"), await field.radio("rx")
         rx.port.listen(listening())
         for number, (attenuation_db, loss_probability) in enumerate([(0, 0), (80, 0), (0, 1), (0, 0)]):
-            field.link.attenuate("rx", "tx", attenuation_db)
+            field.link.set_attenuation("rx", "tx", attenuation_db)
             field.link.loss_probability = loss_probability
             tx.port.transmit(frame(number * 100.0))
             await field.at(number * 100.0 + 100.0)
@@ -154,10 +154,10 @@ async def test_client_that_vanishes_cuts_its_frame(path: Path) -> None:
         rx = await field.radio("rx")
         rx.port.listen(listening())
         async with AirClient(path, "tx", field.timeline) as client:
-            client.join(RecordingAntenna()).transmit(frame())
+            client.join(RecordingListener()).transmit(frame())
             await field.at(30.0)
         await field.at(100.0)
-        assert field.server.names == {"rx"}
+        assert field.server.radio_names == {"rx"}
         again = await field.radio("tx", crystal_ppm=20.0)
         again.port.transmit(frame(100.0))
         await field.at(200.0)
@@ -169,14 +169,14 @@ async def test_names_are_unique(path: Path) -> None:
     """A second radio of a name is refused with the reason, the first stays."""
     async with Field(path) as field:
         await field.radio("tx")
-        with pytest.raises(StreamError, match=rf"^{path}: .*there is a radio 'tx' on the air already[^\n]*$"):
+        with pytest.raises(StreamError, match=rf"^{path}: .*radio 'tx' has joined already[^\n]*$"):
             await field.radio("tx")
-        assert field.server.names == {"tx"}
+        assert field.server.radio_names == {"tx"}
 
 
 async def test_nobody_serves(path: Path) -> None:
     """Without a server the error names the socket and says what to do."""
-    with pytest.raises(StreamError, match=rf"^{path}: no air server answers \([^\n]+\); start one$"):
+    with pytest.raises(StreamError, match=rf"^{path}: no air server \([^\n]+\); start one$"):
         await AirClient(path, "tx", running_timeline()).__aenter__()
 
 
@@ -185,7 +185,7 @@ async def test_silent_server_is_given_up(path: Path) -> None:
     connected: list[asyncio.StreamWriter] = []
     server = await asyncio.start_unix_server(lambda _, writer: connected.append(writer), path)
     began_s = asyncio.get_running_loop().time()
-    with pytest.raises(StreamError, match="does not answer"):
+    with pytest.raises(StreamError, match="does not respond"):
         await AirClient(path, "tx", running_timeline()).__aenter__()
     assert asyncio.get_running_loop().time() - began_s == pytest.approx(WELCOME_TIMEOUT_S)
     connected[0].close()
@@ -202,7 +202,7 @@ async def test_garbage_from_a_server(path: Path, answer: bytes) -> None:
         writer.close()
 
     server = await asyncio.start_unix_server(talk, path)
-    with pytest.raises(StreamError, match="the server says what no air server says"):
+    with pytest.raises(StreamError, match="invalid message from the server"):
         await AirClient(path, "tx", running_timeline()).__aenter__()
     server.close()
     await settle()
@@ -221,8 +221,11 @@ async def test_server_that_stops_leaves_clients_deaf(path: Path) -> None:
             await field.at(30.0)
             with capture_logs() as logs:
                 await field.server.__aexit__()
-                with pytest.raises(StreamError, match=rf"^{path}: .*lost.*'rx'.*closed the connection$"):
-                    await client.wait_lost()
+                with pytest.raises(
+                    StreamError,
+                    match=rf"^{path}: radio 'rx' is disconnected .*: the server has closed the connection$",
+                ):
+                    await client.wait_disconnected()
         assert {entry["name"] for entry in logs if entry["event"] == "air_lost"} == {"rx", "tx"}
         rx.port.listen(listening(30.0))
         rx.port.transmit(frame(31.0))
@@ -241,7 +244,7 @@ async def test_leaving_is_no_error(path: Path) -> None:
 
 def transmit_line(**changes: Any) -> bytes:
     """Make a line that sends a frame, with changes in the frame."""
-    line = json.loads(encode_line(Transmit(frame=FrameLine.of(frame()))))
+    line = json.loads(encode_line(Transmit(frame=FrameMessage.of(frame()))))
     line["frame"] |= changes
     return json.dumps(line).encode() + b"\n"
 
@@ -252,9 +255,9 @@ def transmit_line(**changes: Any) -> bytes:
         (b"hello\n", "JSON"),
         (b"\xff\xfe\x00\n", "JSON"),
         (b"[1, 2]\n", ""),
-        (b'{"type":"measurement"}\n', "no line of type 'measurement'"),
+        (b'{"type":"measurement"}\n', "unknown message type 'measurement'"),
         (b'{"type":"join","name":""}\n', "name"),
-        (transmit_line(), "first line must be of type 'join'"),
+        (transmit_line(), "first message must be of type 'join'"),
         (JOIN + JOIN, "has joined as 'raw' already"),
         (JOIN + b'{"type":"stop","at_ns":1e99}\n', "at_ns"),
         (JOIN + transmit_line(start_ns=10**15), "start is not now"),
@@ -279,12 +282,12 @@ async def test_client_that_talks_garbage_is_dropped(path: Path, lines: bytes, re
             *_, refusal = (await reader.read()).splitlines()
             writer.close()
             await settle()
-        assert json.loads(refusal)["type"] == "refused"
+        assert json.loads(refusal)["type"] == "rejected"
         dropped = [entry for entry in logs if entry["event"] == "air_client_dropped"]
         assert len(dropped) == 1
         assert reason in dropped[0]["reason"]
         assert "\n" not in dropped[0]["reason"]
-        assert field.server.names == {"tx", "rx"}
+        assert field.server.radio_names == {"tx", "rx"}
         await field.at(100.0)
     assert rx.antenna.outcomes == ["received"]
 
@@ -297,7 +300,7 @@ async def test_lines_may_come_in_pieces(path: Path) -> None:
             writer.write(bytes([byte]))
             await asyncio.sleep(0)
         assert json.loads(await reader.readline())["type"] == "welcome"
-        assert field.server.names == {"raw"}
+        assert field.server.radio_names == {"raw"}
         writer.close()
         await settle()
 
@@ -311,11 +314,11 @@ async def test_client_that_does_not_read_is_dropped(path: Path, monkeypatch: pyt
             sleepy.connect(str(path))
             sleepy.sendall(JOIN)
             await settle()
-            assert field.server.names == {"tx", "raw"}
+            assert field.server.radio_names == {"tx", "raw"}
             for _ in range(1000):
                 tx.port.transmit(frame())
                 await settle()
-        assert field.server.names == {"tx"}
+        assert field.server.radio_names == {"tx"}
         reasons = [entry["reason"] for entry in logs if entry["event"] == "air_client_dropped"]
         assert reasons == ["it does not read"]
 
@@ -329,7 +332,7 @@ async def test_radio_without_position_is_told(path: Path) -> None:
             await field.radio("rx")
         tx.port.transmit(frame())
         await settle()
-        assert field.server.names == {"tx"}
+        assert field.server.radio_names == {"tx"}
 
 
 async def test_socket_is_the_users_own(path: Path) -> None:

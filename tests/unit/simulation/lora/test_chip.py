@@ -260,13 +260,13 @@ def test_fsk_mode_sends_nothing() -> None:
 @pytest.mark.parametrize(("level", "answer"), [(False, 0x00), (True, 0xFF)])
 def test_a_dead_bus(bench: Bench, level: bool, answer: int) -> None:  # noqa: FBT001
     """Without a bus MISO stays at one level and nothing is written, also after a reset."""
-    bench.chip.lose_bus(level)
+    bench.chip.disconnect_bus(level)
     assert bench.read(0x42) == answer
     bench.write(0x39, 0x34)
     bench.chip.set_reset(True)
     bench.chip.set_reset(False)
     assert bench.read(0x42) == answer
-    bench.chip.restore_bus()
+    bench.chip.reconnect_bus()
     assert bench.read(0x42) == 0x12
 
 
@@ -276,7 +276,7 @@ def test_a_spontaneous_reset(bench: Bench) -> None:
     bench.receive(b"abcd")
     levels: list[bool] = []
     bench.chip.on_dio(0, lambda _, level: levels.append(level))
-    bench.chip.reset_itself()
+    bench.chip.power_on_reset()
     assert bench.read(0x01) == 0x09
     assert bench.port.listening is None
     assert levels == [False]
@@ -303,7 +303,7 @@ def test_a_chip_that_hangs(bench: Bench) -> None:
 
 def test_a_lost_tx_done(bench: Bench) -> None:
     """The frame is sent, the chip stays in TX without a flag, and the next one is as usual."""
-    bench.chip.lose_tx_done()
+    bench.chip.drop_tx_done()
     frame = bench.transmit(b"abcd")
     bench.timeline.advance(1_000_000_000)
     assert frame.payload == b"abcd"

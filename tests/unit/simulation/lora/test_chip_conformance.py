@@ -265,7 +265,7 @@ def test_conformance_20_nothing_to_complain_of(bench: Bench) -> None:
         (((0x1E, 0xB4),), "LowDataRateOptimize off at SF11"),
         (((0x26, 0x08),), "LowDataRateOptimize on at SF7"),
         (((0x24, 5),), "hopping"),
-        (((0x1D, 0xF2),), "no meaning"),
+        (((0x1D, 0xF2),), "undefined bandwidth"),
     ],
 )
 def test_conformance_20_illegal_settings_are_flagged(

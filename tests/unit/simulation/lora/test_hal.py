@@ -61,7 +61,7 @@ def test_lost_edges_are_counted_by_the_next() -> None:
     """Edges that the host has lost are told with the one after them, where the host counts."""
     bench = Bench()
     hal = SimulatedHal(bench.chip)
-    hal.lose_edges(2)
+    hal.drop_edges(2)
     assert [edge.lost for edge in packets(bench, hal, 4)] == [2, 0]
 
 
@@ -69,7 +69,7 @@ def test_edges_may_get_lost_without_a_trace() -> None:
     """Where the host does not count, nothing tells of a lost edge but the level."""
     bench = Bench()
     hal = SimulatedHal(bench.chip)
-    hal.lose_edges(1, counted=False)
+    hal.drop_edges(1, counted=False)
     assert [edge.lost for edge in packets(bench, hal, 3)] == [0, 0]
 
 

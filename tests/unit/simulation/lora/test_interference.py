@@ -3,13 +3,13 @@ from __future__ import annotations
 import pytest
 from harness.air import modulation
 
-from tsgt.simulation.lora.air import needed_ratio_db, survives
+from tsgt.simulation.lora.interference import is_above_interference, required_sir_db
 
 
 def test_same_kind_needs_the_capture_ratio() -> None:
     """Against a signal of its own kind, 6 dB are needed, also a little beside its frequency."""
-    assert needed_ratio_db(modulation(), modulation()) == 6.0
-    assert needed_ratio_db(modulation(), modulation(frequency_hz=905.06e6)) == 6.0
+    assert required_sir_db(modulation(), modulation()) == 6.0
+    assert required_sir_db(modulation(), modulation(frequency_hz=905.06e6)) == 6.0
 
 
 @pytest.mark.parametrize(
@@ -18,7 +18,7 @@ def test_same_kind_needs_the_capture_ratio() -> None:
 def test_spreading_factors_are_nearly_orthogonal(wanted: int, interferer: int, ratio_db: float) -> None:
     """Between spreading factors the table of Croce et al. holds: wanted by row, interferer by column."""
     pair = (modulation(spreading_factor=wanted), modulation(spreading_factor=interferer))
-    assert needed_ratio_db(*pair) == ratio_db
+    assert required_sir_db(*pair) == ratio_db
 
 
 @pytest.mark.parametrize(
@@ -28,20 +28,20 @@ def test_spreading_factors_are_nearly_orthogonal(wanted: int, interferer: int, r
 )
 def test_other_chirps_are_noise(changes: dict[str, float]) -> None:
     """What is no copy of the wanted chirps is as bad as noise of that power: -12.5 dB at SF9."""
-    assert needed_ratio_db(modulation(), modulation(**changes)) == -12.5
+    assert required_sir_db(modulation(), modulation(**changes)) == -12.5
 
 
 def test_other_channels_do_not_matter() -> None:
     """Signals whose bands do not overlap do not meet."""
-    assert needed_ratio_db(modulation(), modulation(frequency_hz=905.25e6)) is None
+    assert required_sir_db(modulation(), modulation(frequency_hz=905.25e6)) is None
 
 
 def test_interferers_add_up_only_while_they_overlap() -> None:
     """Two interferers that are bearable one after the other are too much together."""
-    assert survives(1.0, [(0.6, 0, 10), (0.6, 10, 20)], from_ns=5)
-    assert not survives(1.0, [(0.6, 0, 11), (0.6, 10, 20)], from_ns=5)
+    assert is_above_interference(1.0, [(0.6, 0, 10), (0.6, 10, 20)], from_ns=5)
+    assert not is_above_interference(1.0, [(0.6, 0, 11), (0.6, 10, 20)], from_ns=5)
 
 
 def test_exactly_enough_is_enough() -> None:
     """A signal that has exactly the ratio that it needs survives, whatever the rounding."""
-    assert survives(10 ** (-80 / 10), [(10 ** (-86 / 10) * 10 ** (6 / 10), 0, 10)], from_ns=0)
+    assert is_above_interference(10 ** (-80 / 10), [(10 ** (-86 / 10) * 10 ** (6 / 10), 0, 10)], from_ns=0)

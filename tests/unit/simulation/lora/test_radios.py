@@ -7,7 +7,7 @@ import pytest
 from harness.radios import MS, PAPER, running_timeline
 
 from tsgt.simulation.kernel import VirtualClock
-from tsgt.simulation.lora import Air, HostDelay, LinkModel, StampJitter, opener
+from tsgt.simulation.lora import Air, HostDelay, LinkModel, TimestampJitter, radio_opener
 
 PACKETS = 400
 
@@ -16,7 +16,7 @@ async def _starts_ms(delay: HostDelay, *, lead_ns: int) -> list[float]:
     """Ask for a packet each second, so long before it; return how late each began."""
     clock, late_ms = VirtualClock(0), []
     air = Air(running_timeline(), np.random.default_rng(0), LinkModel())
-    async with opener(air, "here", clock, np.random.default_rng(1), PAPER, delay)() as radio:
+    async with radio_opener(air, "here", clock, np.random.default_rng(1), PAPER, delay)() as radio:
         for second in range(1, PACKETS + 1):
             at_ns = second * 1000 * MS
             await clock.sleep_until(at_ns - lead_ns)
@@ -42,9 +42,9 @@ async def test_stamps_scatter() -> None:
     """Stamps of both ends of the air are off by what is asked for, and the radio claims no less."""
     clock = VirtualClock(0)
     air = Air(running_timeline(), np.random.default_rng(0), LinkModel())
-    jitter = [StampJitter(20_000, np.random.default_rng(seed)) for seed in (1, 2)]
+    jitter = [TimestampJitter(20_000, np.random.default_rng(seed)) for seed in (1, 2)]
     one, other = (
-        opener(air, name, clock, np.random.default_rng(3), PAPER, jitter=each)
+        radio_opener(air, name, clock, np.random.default_rng(3), PAPER, jitter=each)
         for name, each in zip(("here", "there"), jitter, strict=True)
     )
     sent_ns, received_ns = [], []

@@ -12,7 +12,7 @@ from harness.missions import QUICK, SUPERFRAME, mission
 from tsgt.cli.simulate.figures import figures, frame_ms, outage_figures, station_figures
 from tsgt.cli.simulate.poses import estimator_figures
 from tsgt.config import ClassicMasterConfig
-from tsgt.simulation.checks import violations
+from tsgt.simulation.checks import check_invariants
 from tsgt.simulation.mission.authors_node import AuthorsTiming
 from tsgt.simulation.options import Outage, Restart
 from tsgt.simulation.scenario_files import find_scenario, with_stations
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 
     from tsgt.config import ScenarioConfig
     from tsgt.simulation.mission import Mission
-    from tsgt.simulation.options import Node
+    from tsgt.simulation.options import StationSoftware
 
 
 def test_a_mission_of_a_minute(tmp_path: Path) -> None:
     """Three stations deliver above 1.3 Hz each, stamped to 0.3 ms (their drift is not known at once), and the poses are good to centimetres."""
     run = mission(tmp_path, duration_s=60.0)
-    assert violations(run) == []
+    assert check_invariants(run) == []
     for figure in station_figures(run).values():
         assert figure.measured == pytest.approx(144, abs=2)  # 2.5 Hz, but for the time that connecting takes
         assert figure.rate_hz > 1.3
@@ -47,11 +47,17 @@ def with_lines(scenario: ScenarioConfig) -> ScenarioConfig:
 
 
 @pytest.mark.parametrize(("node", "least_hz", "most_hz"), [("ours", 1.5, 1.72), ("authors", 1.3, 1.6)])
-def test_rates_at_the_papers_settings(tmp_path: Path, node: Node, least_hz: float, most_hz: float) -> None:
+def test_rates_at_the_papers_settings(
+    tmp_path: Path, station_software: StationSoftware, least_hz: float, most_hz: float
+) -> None:
     """Airtime bounds three stations at 1.72 Hz each; the paper measured about 1.4 Hz with its nodes."""
     scenario = with_lines(find_scenario("dynamic"))
     run = mission(
-        tmp_path, scenario, duration_s=120.0, node=node, protocol=ClassicMasterConfig(kind="classic")
+        tmp_path,
+        scenario,
+        duration_s=120.0,
+        station_software=station_software,
+        protocol=ClassicMasterConfig(kind="classic"),
     )
     for figure in station_figures(run).values():
         assert least_hz <= figure.rate_hz <= most_hz
@@ -64,15 +70,15 @@ def test_one_seed_is_one_run(tmp_path: Path) -> None:
         for name, seed in (("one", 3), ("same", 3), ("other", 4))
     )
     assert json.dumps(figures(one)) == json.dumps(figures(same))
-    assert one.sessions[0].lines == same.sessions[0].lines
-    assert one.sessions[0].lines != other.sessions[0].lines
+    assert one.master_logs[0].line_hashes == same.master_logs[0].line_hashes
+    assert one.master_logs[0].line_hashes != other.master_logs[0].line_hashes
 
 
 def test_clocks_that_drift_either_way(tmp_path: Path) -> None:
     """Stations drift by plus and minus what is asked for, are years behind, and the master knows both."""
     run = mission(tmp_path, duration_s=40.0, drift_ppm=50.0)
-    assert violations(run) == []
-    last = {clock.station: clock for clock in run.sessions[0].clocks}
+    assert check_invariants(run) == []
+    last = {clock.station: clock for clock in run.master_logs[0].clocks}
     drifts = [last[station].frequency_ppm for station in (1, 2, 3)]
     assert drifts == pytest.approx([50.0, -50.0, 50.0], abs=10.0)
     assert all(clock.offset_ns < -(10**15) for clock in last.values())
@@ -83,12 +89,12 @@ def test_the_authors_node_is_polled(tmp_path: Path) -> None:
 
     The master takes off how late they stamp a ping on average: half a look, and seven transfers from the chip.
     """
-    run = mission(tmp_path, with_lines(find_scenario("dynamic")), duration_s=40.0, node="authors")
-    assert violations(run) == []
-    samples = [sample for clock in run.sessions[0].clocks for sample in clock.samples]
+    run = mission(tmp_path, with_lines(find_scenario("dynamic")), duration_s=40.0, station_software="authors")
+    assert check_invariants(run) == []
+    samples = [sample for clock in run.master_logs[0].clocks for sample in clock.samples]
     timing = AuthorsTiming()
     (delay_ns,) = {sample.forward_ns - sample.back_ns for sample in samples}
-    assert delay_ns == pytest.approx(timing.look_ns / 2 + 7 * timing.transfer_ns, abs=50_000)
+    assert delay_ns == pytest.approx(timing.poll_interval_ns / 2 + 7 * timing.transfer_ns, abs=50_000)
     for figure in station_figures(run).values():
         assert 1.2 < figure.rate_hz < 1.65
         assert figure.time_error_us[2] < 3000
@@ -100,7 +106,7 @@ def test_lost_packets_cost_measurements_and_nothing_else(tmp_path: Path) -> None
     scenario = find_scenario("dynamic")
     lossy = scenario.model_copy(update={"radio": scenario.radio.model_copy(update={"loss_probability": 0.1})})
     run = mission(tmp_path, lossy, duration_s=40.0)
-    assert violations(run) == []
+    assert check_invariants(run) == []
     for figure in station_figures(run).values():
         assert 15 < figure.delivered < 50
 
@@ -111,8 +117,8 @@ def test_hidden_prisms_never_enter_a_pose(tmp_path: Path) -> None:
     Until an instrument has noticed that it has lost it, it says that it has angles only.
     """
     run = mission(tmp_path, find_scenario("snowmobile"), duration_s=60.0, seed=1)
-    assert violations(run) == []
-    statuses = {measurement.status for measurement in run.sessions[0].measurements}
+    assert check_invariants(run) == []
+    statuses = {measurement.status for measurement in run.master_logs[0].measurements}
     assert {"ok", "no_target"} <= statuses <= {"ok", "no_target", "angle_only"}
 
 
@@ -120,7 +126,7 @@ def test_hidden_prisms_never_enter_a_pose(tmp_path: Path) -> None:
 def test_fewer_or_more_stations_than_prisms(tmp_path: Path, count: int) -> None:
     """Two stations measure but make no pose; five share three prisms."""
     run = mission(tmp_path, with_stations(find_scenario("dynamic"), count), duration_s=20.0)
-    assert violations(run) == []
+    assert check_invariants(run) == []
     assert list(station_figures(run)) == list(range(1, count + 1))
     assert all(figure.delivered > 5 for figure in station_figures(run).values())
     assert (estimator_figures(run)["linear"].valid_poses > 0) == (count >= 3)
@@ -131,24 +137,28 @@ def test_a_client_that_crashes_and_comes_back(tmp_path: Path) -> None:
 
     async def crash(mission: Mission) -> None:
         await mission.sleep_until(15.0)
-        await mission.kill("station2")
+        await mission.stop("station2")
         await mission.sleep_until(20.0)
         mission.start_station(2)
 
     run = mission(tmp_path, duration_s=45.0, script=crash)
-    assert violations(run) == []
+    assert check_invariants(run) == []
     stamps = {
         station: np.array(
-            [(m.stamp_ns - run.start_ns) / 1e9 for m in run.sessions[0].measurements if m.station == station]
+            [
+                (m.stamp_ns - run.start_ns) / 1e9
+                for m in run.master_logs[0].measurements
+                if m.station == station
+            ]
         )
         for station in (1, 2, 3)
     }
     assert not np.any((stamps[2] > 15.5) & (stamps[2] < 20.0))
     assert np.sum(stamps[2] > 30.0) > 15
     assert np.sum((stamps[1] > 15.0) & (stamps[1] < 20.0)) > 3
-    poses_s = (run.sessions[0].valid_poses().stamp_ns - run.start_ns) / 1e9
+    poses_s = (run.master_logs[0].valid_poses().stamp_ns - run.start_ns) / 1e9
     assert np.sum(poses_s > 30.0) > 150
-    assert len(run.witnesses[2].journals) == 2
+    assert len(run.station_logs[2].journals) == 2
 
 
 @pytest.mark.parametrize("down_s", [2.2, 8.0, 15.0])
@@ -160,14 +170,16 @@ def test_a_computer_whose_clock_stands_still_while_it_is_off(
 
     async def reboot(mission: Mission) -> None:
         await mission.sleep_until(at_s)
-        await mission.kill("station1")
+        await mission.stop("station1")
         mission.computers["station1"].clock.step(-round(down_s * 1e9))
         await mission.sleep_until(at_s + down_s)
         mission.start_station(1)
 
     run = mission(tmp_path, duration_s=35.0, script=reboot)
-    assert violations(run) == []
-    late = [m for m in run.sessions[0].measurements if m.station == 1 and m.stamp_ns > run.end_ns - 5 * 10**9]
+    assert check_invariants(run) == []
+    late = [
+        m for m in run.master_logs[0].measurements if m.station == 1 and m.stamp_ns > run.end_ns - 5 * 10**9
+    ]
     assert len(late) > 4
 
 
@@ -176,13 +188,13 @@ def test_a_master_that_crashes_and_comes_back(tmp_path: Path) -> None:
 
     async def crash(mission: Mission) -> None:
         await mission.sleep_until(15.0)
-        await mission.kill("master")
+        await mission.stop("master")
         await mission.sleep_until(17.0)
         mission.start_master()
 
     run = mission(tmp_path, duration_s=45.0, script=crash)
-    assert violations(run) == []
-    first, second = run.sessions
+    assert check_invariants(run) == []
+    first, second = run.master_logs
     assert first.recording() != second.recording()
     assert {clock.station for clock in second.clocks} == {1, 2, 3}
     assert len(second.valid_poses().stamp_ns) > 150
@@ -191,12 +203,12 @@ def test_a_master_that_crashes_and_comes_back(tmp_path: Path) -> None:
 def test_an_outage(tmp_path: Path) -> None:
     """While the robot is behind a hill for one station nothing arrives from it, and from the others more."""
     run = mission(tmp_path, duration_s=40.0, outages=(Outage((2,), 15.0, 10.0),))
-    assert violations(run) == []
+    assert check_invariants(run) == []
     received_s = {
         station: np.array(
             [
                 (m.received_ns - run.start_ns) / 1e9
-                for m in run.sessions[0].measurements
+                for m in run.master_logs[0].measurements
                 if m.station == station
             ]
         )
@@ -216,7 +228,7 @@ def test_an_outage_ends_between_two_nanoseconds(tmp_path: Path) -> None:
     assert round(outage.end_s * 1e9) / 1e9 < outage.end_s
     run = mission(tmp_path, duration_s=20.0, outages=(outage,))
     received_s = [
-        (m.received_ns - run.start_ns) / 1e9 for m in run.sessions[0].measurements if m.station == 2
+        (m.received_ns - run.start_ns) / 1e9 for m in run.master_logs[0].measurements if m.station == 2
     ]
     assert max(received_s) > 15.0
 
@@ -224,11 +236,11 @@ def test_an_outage_ends_between_two_nanoseconds(tmp_path: Path) -> None:
 def test_restarts_that_are_asked_for(tmp_path: Path) -> None:
     """A client and the master end when they are told to, and are back two seconds later."""
     run = mission(tmp_path, duration_s=40.0, restarts=(Restart(1, 15.0), Restart(None, 20.0)))
-    assert violations(run) == []
-    assert [len(witness.journals) for witness in run.witnesses.values()] == [2, 1, 1]
-    assert [len(witness.statuses) for witness in run.witnesses.values()] == [2, 1, 1]
-    assert len(run.sessions) == 2
-    made_s = np.array(sorted(run.witnesses[1].stamps_ns.values())) / 1e9
+    assert check_invariants(run) == []
+    assert [len(station_log.journals) for station_log in run.station_logs.values()] == [2, 1, 1]
+    assert [len(station_log.statuses) for station_log in run.station_logs.values()] == [2, 1, 1]
+    assert len(run.master_logs) == 2
+    made_s = np.array(sorted(run.station_logs[1].true_times_ns.values())) / 1e9
     assert not np.any((made_s > 15.0) & (made_s < 17.0))
     assert np.sum(made_s > 17.0) > 50
 
@@ -239,7 +251,7 @@ def test_somebody_else_on_the_channel(tmp_path: Path) -> None:
         mission(tmp_path / name, duration_s=40.0, interference_rate_hz=per_s)
         for name, per_s in (("alone", 0.0), ("disturbed", 0.5))
     )
-    assert violations(disturbed) == []
+    assert check_invariants(disturbed) == []
     for one, other in zip(station_figures(alone).values(), station_figures(disturbed).values(), strict=True):
         assert one.measured == other.measured
         assert 0.5 * one.delivered < other.delivered < one.delivered
@@ -251,7 +263,7 @@ def test_stamps_that_scatter_and_drifts_that_change(tmp_path: Path) -> None:
     The first synchronisation takes a second, so that 20 us of scatter make the frequency a guess until the second one.
     """
     run = mission(tmp_path, duration_s=60.0, stamp_jitter_us=20.0, drift_ramp_ppm_per_min=1.0)
-    assert violations(run) == []
+    assert check_invariants(run) == []
     for figure in station_figures(run).values():
         assert 5 < figure.time_error_us[0] < 1500
 
@@ -264,8 +276,8 @@ def test_a_clock_that_is_set_while_the_client_runs(tmp_path: Path) -> None:
         mission.computers["station1"].clock.step(3_600_000_000_000)
 
     run = mission(tmp_path, duration_s=30.0, script=step)
-    assert violations(run) == []
-    assert not any(clock.restarted for clock in run.sessions[0].clocks[3:])
+    assert check_invariants(run) == []
+    assert not any(clock.restarted for clock in run.master_logs[0].clocks[3:])
 
 
 def test_the_paper_filter_lags_behind(tmp_path: Path) -> None:
@@ -274,7 +286,7 @@ def test_the_paper_filter_lags_behind(tmp_path: Path) -> None:
     run = mission(
         tmp_path, with_lines(find_scenario("dynamic")), duration_s=120.0, drift_ppm=50.0, protocol=paper
     )
-    assert violations(run) == []
+    assert check_invariants(run) == []
     for figure in station_figures(run).values():
         assert figure.time_error_us[2] > 2000
 
@@ -290,7 +302,7 @@ def _lossy(loss: float) -> ScenarioConfig:
 def test_the_superframe_delivers_everything(tmp_path: Path) -> None:
     """Three stations deliver all that they measure, at once and once, and the poses are better for it."""
     run = mission(tmp_path, duration_s=60.0, protocol=SUPERFRAME)
-    assert violations(run) == []
+    assert check_invariants(run) == []
     for figure in station_figures(run).values():
         assert figure.delivered == figure.measured == pytest.approx(144, abs=2)
         assert figure.rate_hz == pytest.approx(2.5, abs=0.06)
@@ -312,8 +324,8 @@ def test_one_seed_is_one_run_of_the_superframe(tmp_path: Path) -> None:
         for name, seed in (("one", 3), ("same", 3), ("other", 4))
     )
     assert json.dumps(figures(one)) == json.dumps(figures(same))
-    assert one.sessions[0].lines == same.sessions[0].lines
-    assert one.sessions[0].lines != other.sessions[0].lines
+    assert one.master_logs[0].line_hashes == same.master_logs[0].line_hashes
+    assert one.master_logs[0].line_hashes != other.master_logs[0].line_hashes
 
 
 @pytest.mark.parametrize("authenticated", [True, False])
@@ -327,7 +339,7 @@ def test_an_outage_over_the_superframe(tmp_path: Path, *, authenticated: bool) -
         outages=(Outage((1, 2, 3), 20.0, 20.0),),
         authenticated=authenticated,
     )
-    assert violations(run) == []
+    assert check_invariants(run) == []
     for figure in station_figures(run).values():
         assert figure.delivered == figure.measured
     (outage,) = outage_figures(run)
@@ -348,8 +360,8 @@ def test_restarts_over_the_superframe(tmp_path: Path) -> None:
         restarts=(Restart(1, 15.0), Restart(2, 15.2), Restart(None, 30.0), Restart(1, 30.5)),
         outages=(Outage((3,), 25.0, 10.0),),
     )
-    assert violations(run) == []
-    assert [len(witness.journals) for witness in run.witnesses.values()] == [3, 2, 1]
+    assert check_invariants(run) == []
+    assert [len(station_log.journals) for station_log in run.station_logs.values()] == [3, 2, 1]
     for figure in station_figures(run).values():
         assert figure.delivered == figure.measured
 
@@ -368,7 +380,7 @@ def test_a_computer_that_was_off(tmp_path: Path) -> None:
         script=reboot,
         outages=(Outage((1,), 22.0, 10.0),),
     )
-    assert violations(run) == []
+    assert check_invariants(run) == []
     station = station_figures(run)[1]
     # Twice two seconds go into connecting.
     assert station.delivered == station.measured == pytest.approx(2.5 * (60 - 4), abs=2)
@@ -377,7 +389,7 @@ def test_a_computer_that_was_off(tmp_path: Path) -> None:
 def test_forged_packets_over_the_superframe(tmp_path: Path) -> None:
     """Somebody sends noise and what he has heard, changed and unchanged: it costs some packets and bends nothing."""
     run = mission(tmp_path, duration_s=60.0, protocol=SUPERFRAME, interference_rate_hz=1.0)
-    assert violations(run) == []
+    assert check_invariants(run) == []
     for figure in station_figures(run).values():
         assert figure.delivered >= figure.measured - 1
         assert figure.duplicates == 0
@@ -386,6 +398,6 @@ def test_forged_packets_over_the_superframe(tmp_path: Path) -> None:
 def test_many_stations(tmp_path: Path) -> None:
     """Twelve stations share the channel, and each delivers what it measures."""
     run = mission(tmp_path, with_stations(find_scenario("dynamic"), 12), duration_s=30.0, protocol=SUPERFRAME)
-    assert violations(run) == []
+    assert check_invariants(run) == []
     for figure in station_figures(run).values():
         assert figure.delivered >= figure.measured - 2  # frames last 2.5 s, and the drain 5 s

@@ -1,7 +1,4 @@
-"""The instrument's side of GeoCOM in ASCII: lines to procedures, answers to lines, one after the other.
-
-Written from the manual apart from the client's side, so that each checks the other.
-"""
+"""The instrument's side of GeoCOM in ASCII: parses requests, executes commands one at a time, formats responses."""
 
 from __future__ import annotations
 
@@ -10,10 +7,10 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from tsgt.simulation.instrument.geocom.answers import Answer
-from tsgt.simulation.instrument.geocom.measuring import MEASURING
-from tsgt.simulation.instrument.geocom.pointing import LICENSED, SEARCHING
-from tsgt.simulation.instrument.geocom.setting import SETTING
+from tsgt.simulation.instrument.geocom.commands import Response
+from tsgt.simulation.instrument.geocom.measuring_commands import MEASURING_COMMANDS
+from tsgt.simulation.instrument.geocom.pointing_commands import LICENSED_RPCS, POINTING_COMMANDS
+from tsgt.simulation.instrument.geocom.setting_commands import SETTING_COMMANDS
 from tsgt.station.geocom import ReturnCode
 
 if TYPE_CHECKING:
@@ -22,11 +19,11 @@ if TYPE_CHECKING:
     import numpy as np
 
     from tsgt.config import InstrumentModelConfig
-    from tsgt.simulation.instrument.geocom.answers import Job, Procedures, Value
-    from tsgt.simulation.instrument.total_station import SimulatedTotalStation
+    from tsgt.simulation.instrument.geocom.commands import Commands, Job, Value
+    from tsgt.simulation.instrument.model import TotalStationModel
     from tsgt.simulation.kernel import Handle, Timeline
 
-PROCEDURES: Procedures = {**SETTING, **MEASURING, **SEARCHING}
+COMMANDS: Commands = {**SETTING_COMMANDS, **MEASURING_COMMANDS, **POINTING_COMMANDS}
 
 STALL_S: Final = (0.3, 0.7)
 
@@ -37,19 +34,17 @@ _MAX_LINE: Final = 1024
 
 
 @dataclass(slots=True)
-class Forced:
-    """A code that is answered instead of doing anything.
+class ForcedResponse:
+    """Return code to send instead of executing a command.
 
     Attributes
     ----------
-    code
-        Of the procedure.
     com_code
-        Of the transport.
+        Return code of the transport.
     rpc
-        To this procedure; None: to whatever comes.
+        The command it applies to; None: any.
     times
-        How often.
+        Number of uses.
     """
 
     code: int = 0
@@ -66,30 +61,19 @@ class _Request:
 
 
 class GeoComServer:
-    """Answers requests one after the other; those that come meanwhile wait, and too many are lost.
-
-    Parameters
-    ----------
-    station
-        What it speaks for.
-    timeline
-        The true time.
-    model
-        How long it thinks.
-    generator
-        Source of all randomness.
+    """Executes requests one at a time; further requests wait in a short queue that drops the oldest.
 
     Attributes
     ----------
     on_send
-        Called with each answer.
+        Called with each response when its first byte leaves.
     forced
-        Codes to answer with.
+        Responses to force.
     """
 
     def __init__(
         self,
-        station: SimulatedTotalStation,
+        station: TotalStationModel,
         timeline: Timeline,
         model: InstrumentModelConfig,
         generator: np.random.Generator,
@@ -97,7 +81,7 @@ class GeoComServer:
         self._station = station
         self._timeline = timeline
         self._rng = generator
-        self._thinks_ms = model.processing_min_ms, model.processing_max_ms
+        self._processing_ms = model.processing_min_ms, model.processing_max_ms
         self._stalls_per_min = model.stalls_per_min
         self._next_stall_ns = self._draw_stall()
         self._buffer = b""
@@ -106,22 +90,22 @@ class GeoComServer:
         self._job: Job | None = None
         self._event: Handle | None = None
         self.on_send: Callable[[bytes], None] = lambda _: None
-        self.forced: deque[Forced] = deque()
+        self.forced: deque[ForcedResponse] = deque()
 
     def receive(self, data: bytes) -> None:
-        """Take bytes. A line ends with CR or LF; an empty one means nothing."""
+        """Process bytes. CR or LF ends a line; empty lines are ignored."""
         *lines, rest = (self._buffer + data).replace(b"\n", b"\r").split(b"\r")
         self._buffer = rest[-_MAX_LINE:]
         for line in lines:
             if line == b"c":
                 self._abort()
             elif line and self._request is None:
-                self._begin(line)
+                self._handle_line(line)
             elif line:
                 self._waiting.append(line)
 
-    def forget(self) -> None:
-        """Forget what has come, and what is under way: it is switched off."""
+    def reset(self) -> None:
+        """Drop all input and the running command: power-off."""
         if self._event is not None:
             self._event.cancel()
         if self._job is not None:
@@ -130,98 +114,100 @@ class GeoComServer:
         self._waiting.clear()
 
     def interrupt_movement(self) -> None:
-        """End what moves the telescope, because a person has taken it over; its answer says that it was ended."""
-        if self._request is not None and self._request.rpc in LICENSED:
-            self._end_job()
+        """Abort a movement or search because the operator takes over."""
+        if self._request is not None and self._request.rpc in LICENSED_RPCS:
+            self._abort_job()
 
     def _abort(self) -> None:
         self.on_send(b"?\r\n")
-        self._end_job()
+        self._abort_job()
 
-    def _end_job(self) -> None:
+    def _abort_job(self) -> None:
         if self._job is not None and self._event is not None:
             self._event.cancel()
             self._job.close()
-            self._finish(Answer(ReturnCode.ABORT))
+            self._finish(Response(ReturnCode.ABORT))
 
-    def _begin(self, line: bytes) -> None:
+    def _handle_line(self, line: bytes) -> None:
         parts = _REQUEST.fullmatch(line)
         if parts is None:
             if line.startswith(b"%R1Q"):
-                self._refuse(_Request(0, 0, checksum=False), ReturnCode.COM_WRONG_FORMAT)
+                self._reject(_Request(0, 0, checksum=False), ReturnCode.COM_WRONG_FORMAT)
             return
         rpc, transaction, checksum, text = parts.groups()
         request = _Request(int(rpc), int(transaction or 0), checksum is not None)
         if checksum is not None:
             bare = b"%%R1Q,%b,%b:%b" % (rpc, transaction, text)
             if crc_16(bare) != int(checksum):
-                self._refuse(request, ReturnCode.COM_SRVR_RX_CHECKSUM_ERROR)
+                self._reject(request, ReturnCode.COM_SRVR_RX_CHECKSUM_ERROR)
                 return
         forced = self._take_forced(request.rpc)
         if forced is not None:
             self._request = request
-            self._finish(Answer(forced.code, com_code=forced.com_code))
+            self._finish(Response(forced.code, com_code=forced.com_code))
             return
-        procedure = PROCEDURES.get(request.rpc)
-        if procedure is None:
-            self._refuse(request, ReturnCode.COM_PROC_UNAVAIL)
+        command = COMMANDS.get(request.rpc)
+        if command is None:
+            self._reject(request, ReturnCode.COM_PROC_UNAVAIL)
             return
-        signature, run = procedure
+        signature, execute = command
         try:
             values = _decode(signature, text.decode("ascii"))
         except ValueError:
-            self._refuse(request, ReturnCode.COM_CANT_DECODE_REQ)
+            self._reject(request, ReturnCode.COM_CANT_DECODE_REQ)
             return
         self._request = request
-        if request.rpc in LICENSED and not self._station.robotic_licence:
-            self._finish(Answer(ReturnCode.NA))
+        if request.rpc in LICENSED_RPCS and not self._station.robotic_licence:
+            self._finish(Response(ReturnCode.NA))
             return
-        answer = run(self._station, *values)
-        if isinstance(answer, Answer):
-            self._finish(answer)
+        response = execute(self._station, *values)
+        if isinstance(response, Response):
+            self._finish(response)
         else:
-            self._job = answer
-            self._go_on()
+            self._job = response
+            self._resume_job()
 
-    def _go_on(self) -> None:
-        assert self._job is not None  # noqa: S101 (it has been scheduled)
+    def _resume_job(self) -> None:
+        assert self._job is not None  # noqa: S101 (only called with a job)
         try:
             at_ns = next(self._job)
         except StopIteration as done:
             self._finish(done.value)
         else:
-            self._event = self._timeline.call_at(at_ns, self._go_on)
+            self._event = self._timeline.call_at(at_ns, self._resume_job)
 
-    def _refuse(self, request: _Request, com_code: int) -> None:
+    def _reject(self, request: _Request, com_code: int) -> None:
         self._request = request
-        self._finish(Answer(com_code=com_code))
+        self._finish(Response(com_code=com_code))
 
-    def _finish(self, answer: Answer) -> None:
-        """Answer after having thought."""
+    def _finish(self, response: Response) -> None:
+        """Send a response after the processing time."""
         self._job = None
         now_ns = self._timeline.now_ns()
-        thinks_ms = self._rng.uniform(*self._thinks_ms)
+        processing_ms = self._rng.uniform(*self._processing_ms)
         if now_ns >= self._next_stall_ns:
-            thinks_ms = self._rng.uniform(*STALL_S) * 1e3
+            processing_ms = self._rng.uniform(*STALL_S) * 1e3
             self._next_stall_ns = self._draw_stall()
-        self._event = self._timeline.call_at(now_ns + round(thinks_ms * 1e6), lambda: self._send(answer))
+        self._event = self._timeline.call_at(
+            now_ns + round(processing_ms * 1e6), lambda: self._send(response)
+        )
 
-    def _send(self, answer: Answer) -> None:
+    def _send(self, response: Response) -> None:
         request = self._request
-        assert request is not None  # noqa: S101 (the answer is to it)
+        assert request is not None  # noqa: S101 (set before the job)
         self._request = self._event = None
-        if answer.offered is not None:
-            self._station.offer(answer.offered)
-        body = ":" + ",".join([str(answer.code), *(self._text(value) for value in answer.values)])
-        head = f"%R1P,{answer.com_code},{request.transaction}"
+        if response.distance is not None:
+            self._station.report(response.distance)
+        body = ":" + ",".join([str(response.code), *(self._text(value) for value in response.values)])
+        head = f"%R1P,{response.com_code},{request.transaction}"
         if request.checksum:
             head += f",{crc_16((head + body).encode('ascii'))}"
         self.on_send(f"{head}{body}\r\n".encode("ascii"))
         while self._waiting and self._request is None:
-            self._begin(self._waiting.popleft())
+            self._handle_line(self._waiting.popleft())
 
     def _text(self, value: Value) -> str:
-        """Write a value as the manual has it: zeros at the end of a number are not sent."""
+        """Format a value as in the manual: doubles without trailing zeros."""
         if isinstance(value, float):
             text = f"{value:.{self._station.settings.decimals}f}"
             if "." in text:
@@ -233,7 +219,7 @@ class GeoComServer:
             return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
         return str(int(value))
 
-    def _take_forced(self, rpc: int) -> Forced | None:
+    def _take_forced(self, rpc: int) -> ForcedResponse | None:
         for forced in self.forced:
             if forced.rpc in (None, rpc):
                 forced.times -= 1
@@ -249,19 +235,12 @@ class GeoComServer:
 
 
 def _decode(signature: str, text: str) -> list[float | int | str]:
-    """Read parameters.
-
-    Parameters
-    ----------
-    signature
-        A letter for each: d a real number, i a whole one, s a string, b a byte in quotes.
-    text
-        What stands after the colon.
+    """Decode parameters by a signature, see :class:`Command`.
 
     Raises
     ------
     ValueError
-        Too many, too few, or something else.
+        Wrong number or type of parameters.
     """
     parts = _PARAMETER.findall(text)
     if len(parts) != len(signature):
@@ -283,7 +262,7 @@ def _decode(signature: str, text: str) -> list[float | int | str]:
 
 
 def crc_16(data: bytes) -> int:
-    """Return the checksum of a line: CRC-16/ARC, bit by bit."""
+    """Return the checksum of a line, CRC-16/ARC (polynomial 0x8005, reflected), bit by bit."""
     crc = 0
     for byte in data:
         crc ^= byte

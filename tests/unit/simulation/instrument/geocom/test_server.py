@@ -9,7 +9,7 @@ from harness.total_stations import SETUP, Bench
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tsgt.simulation.instrument.geocom.server import PROCEDURES, Forced, crc_16
+from tsgt.simulation.instrument.geocom.server import COMMANDS, ForcedResponse, crc_16
 from tsgt.simulation.kernel import run_virtual
 from tsgt.station.geocom import Rpc
 
@@ -127,15 +127,15 @@ async def test_forced_codes() -> None:
     """A test can make it answer what it likes, to whom it likes, as often as it likes."""
     bench = Bench()
     server = bench.instrument.server
-    server.forced.append(Forced(code=1293, rpc=2008, times=2))
-    server.forced.append(Forced(com_code=3108))
+    server.forced.append(ForcedResponse(code=1293, rpc=2008, times=2))
+    server.forced.append(ForcedResponse(com_code=3108))
     assert (await bench.ask(0)).com_code == 3108
     assert [await bench.code(2008, 1, 1) for _ in range(3)] == [1293, 1293, 0]
 
 
 async def test_every_procedure_answers() -> None:
     """Whatever the procedure and however silly the numbers, there is one answer and it is well formed."""
-    for rpc, (signature, _) in PROCEDURES.items():
+    for rpc, (signature, _) in COMMANDS.items():
         bench = Bench()
         bench.instrument.settings.power_mode = 0
         parameters = ['"x"' if kind == "s" else "1" for kind in signature]

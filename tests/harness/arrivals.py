@@ -9,7 +9,7 @@ import numpy as np
 from tsgt.config import scenario_parameters
 from tsgt.geometry import invert, raw_distance, transform_points
 from tsgt.model import PolarMeasurement
-from tsgt.simulation.instrument.edm import with_noise
+from tsgt.simulation.instrument.edm import measure_polar
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -66,7 +66,7 @@ def _measured(
     """One station's measurements of a prism that is at the given points, (N, 3) in ``station1``."""
     delays_s = generator.uniform(*DELAY_S, len(times_s))
     seen = transform_points(invert(np.array(station.T_station1_station)), points)
-    horizontal, zenith, distance = with_noise(seen, station.noise, generator)
+    horizontal, zenith, distance = measure_polar(seen, station.noise, generator)
     slope = raw_distance(distance, constant_m=station.prism_constant_m, ppm=station.atmospheric_ppm)
     stamps = start_ns + np.rint(times_s * 1e9).astype(np.int64)
     received = stamps + np.rint(delays_s * 1e9).astype(np.int64)

@@ -15,14 +15,14 @@ WAY_NS = 55_314_560
 
 
 def exchange(
-    sent_ns: int, offset_ns: Callable[[int], float], *, late_ns: int = 0, turn_round_ns: int = 1_000_000
+    sent_ns: int, offset_ns: Callable[[int], float], *, late_ns: int = 0, turnaround_ns: int = 1_000_000
 ) -> ClockSample:
     """Exchange packets with a clock that is ahead by the given function of the true time since the start."""
     stamped_ns = sent_ns + WAY_NS + late_ns
     return ClockSample(
         sent_ns=START_NS + sent_ns,
         station_ns=START_NS + stamped_ns + round(offset_ns(stamped_ns)),
-        received_ns=START_NS + stamped_ns + turn_round_ns + WAY_NS,
+        received_ns=START_NS + stamped_ns + turnaround_ns + WAY_NS,
         forward_ns=WAY_NS,
         back_ns=WAY_NS,
     )
@@ -34,13 +34,13 @@ def synchronisation(
     *,
     cycles: int = 5,
     late_ns: Sequence[int] = (),
-    turn_round_ns: int = 1_000_000,
+    turnaround_ns: int = 1_000_000,
 ) -> list[ClockSample]:
     """Exchange packets a few times; ``late_ns`` is the lateness of the first stamps."""
     late = [*late_ns, *[0] * (cycles - len(late_ns))]
     return [
         exchange(
-            round((start_s + 0.24 * n) * SECOND), offset_ns, late_ns=late[n], turn_round_ns=turn_round_ns
+            round((start_s + 0.24 * n) * SECOND), offset_ns, late_ns=late[n], turnaround_ns=turnaround_ns
         )
         for n in range(cycles)
     ]

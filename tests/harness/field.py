@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NoReturn, TypeVar
 
 import numpy as np
 from harness.radios import PAPER, running_timeline
-from harness.scene import START, standing_scene
+from harness.scene import START, stationary_scene
 
 from tsgt.clock import UnixTimeline
 from tsgt.config import (
@@ -23,16 +23,15 @@ from tsgt.config import (
     SuperframeMasterConfig,
 )
 from tsgt.errors import InstrumentError
-from tsgt.master import run_master
+from tsgt.master.daemon import MasterDependencies, run_master
 from tsgt.model import Status
-from tsgt.radio import DirectOrder, SearchOrder, TrackOrder
-from tsgt.radio.classic import MeasurementMessage, raw_status
-from tsgt.radio.classic.transactions import ClassicStation
-from tsgt.radio.superframe import Outbox, Queued, Situation, SuperframeStation
+from tsgt.radio import DirectCommand, SearchCommand, TrackCommand
+from tsgt.radio.classic import ClassicStation, MeasurementMessage, raw_status
+from tsgt.radio.superframe import InstrumentState, QueuedMeasurement, SendQueue, SuperframeStation
 from tsgt.radio.superframe.wire import RESTART_SKIP, Authenticator, angle_code
 from tsgt.simulation.kernel import DriftingClock, VirtualClock
-from tsgt.simulation.lora import Air, LinkModel, opener
-from tsgt.simulation.mission.authors_node import AUTHORS_STAMP_DELAY_MS, AuthorsNode
+from tsgt.simulation.lora import Air, LinkModel, radio_opener
+from tsgt.simulation.mission.authors_node import AUTHORS_TIMESTAMP_DELAY_MS, AuthorsNode
 from tsgt.station import Condition, Reading
 
 if TYPE_CHECKING:
@@ -43,8 +42,8 @@ if TYPE_CHECKING:
     from harness.scene import Scene
 
     from tsgt.clock import Clock
-    from tsgt.radio import Direction, OpenRadio, Packet, Radio
-    from tsgt.radio.superframe import Reception
+    from tsgt.radio import Direction, Packet, Radio, RadioOpener
+    from tsgt.radio.superframe import BeaconReception
     from tsgt.recording.journal import InstrumentRecord
     from tsgt.station import Atmosphere
 
@@ -163,16 +162,16 @@ async def classic_client(station: int, radio: Radio, clock: DriftingClock, tool:
         answer = session.received(packet.payload, timeline.unix_ns(packet.received_at_ns))
         if answer is None or isinstance(answer, bytes):
             return answer
-        if isinstance(answer, TrackOrder):
+        if isinstance(answer, TrackCommand):
             try:
                 await tool.track(answer.prism or station)
             except InstrumentError:
                 return session.executed(answer, ok=False)
             return session.executed(answer, ok=True)
-        if isinstance(answer, DirectOrder):
+        if isinstance(answer, DirectCommand):
             await tool.direct()
             return session.executed(answer, ok=True)
-        return session.shot(message(await tool.measure()))
+        return session.single_measured(message(await tool.measure()))
 
     async with asyncio.TaskGroup() as group:
         group.create_task(read())
@@ -194,15 +193,15 @@ class Notebook:
     """
 
     def __init__(self) -> None:
-        self.outbox = Outbox(0)
+        self.send_queue = SendQueue(0)
         self.made_ns: dict[int, int] = {}
-        self.receptions: list[Reception] = []
+        self.receptions: list[BeaconReception] = []
 
     def start(self) -> None:
         """Leave out the numbers that a torn journal may have lost."""
         if self.made_ns:
-            run_start = max(self.made_ns) + 1 + RESTART_SKIP
-            self.outbox = Outbox(run_start, reversed(list(self.outbox.newest_first())))
+            first_sequence = max(self.made_ns) + 1 + RESTART_SKIP
+            self.send_queue = SendQueue(first_sequence, reversed(list(self.send_queue.newest_first())))
 
 
 async def superframe_client(
@@ -215,25 +214,25 @@ async def superframe_client(
 ) -> NoReturn:
     """Answer beacons as a station's client does."""
     notes.start()
-    outbox = notes.outbox
-    situation = Situation(prism=number, direct=tool.direct_mode, connected=True)
+    send_queue = notes.send_queue
+    instrument_state = InstrumentState(prism=number, direct=tool.direct_mode, connected=True)
     station = SuperframeStation(
         number,
         PAPER,
         Authenticator(KEY),
-        outbox,
-        lineage=number,
+        send_queue,
+        stream_id=number,
         boot="boot",
         receptions=notes.receptions,
         random_bits=lambda bits: int(rng.integers(1 << bits)),
     )
 
     async def read() -> NoReturn:
-        sequence = outbox.run_start
+        sequence = send_queue.first_sequence
         while True:
             reading = await tool.read()
-            outbox.add(
-                Queued(
+            send_queue.add(
+                QueuedMeasurement(
                     sequence=sequence,
                     at_ns=reading.at_ns,
                     boot="boot",
@@ -248,20 +247,20 @@ async def superframe_client(
             sequence += 1
 
     async def obey() -> None:
-        nonlocal situation
-        order = station.next_order()
-        if isinstance(order, TrackOrder | SearchOrder):
-            prism = (order.prism if isinstance(order, TrackOrder) else None) or situation.prism
+        nonlocal instrument_state
+        order = station.next_command()
+        if isinstance(order, TrackCommand | SearchCommand):
+            prism = (order.prism if isinstance(order, TrackCommand) else None) or instrument_state.prism
             try:
-                await tool.track(prism, order.towards if isinstance(order, SearchOrder) else None)
+                await tool.track(prism, order.towards if isinstance(order, SearchCommand) else None)
             except InstrumentError:
                 station.executed(ok=False)
             else:
-                situation = situation._replace(prism=prism, direct=False)
+                instrument_state = instrument_state._replace(prism=prism, direct=False)
                 station.executed(ok=True)
-        elif isinstance(order, DirectOrder):
+        elif isinstance(order, DirectCommand):
             await tool.direct()
-            situation = situation._replace(direct=True)
+            instrument_state = instrument_state._replace(direct=True)
             station.executed(ok=True)
 
     async with asyncio.TaskGroup() as group:
@@ -274,7 +273,7 @@ async def superframe_client(
             if heard is None or heard.slot_ns is None:
                 continue
             await clock.sleep_until(heard.slot_ns - 6_000_000)
-            reply = station.compose(situation, clock.monotonic_ns())
+            reply = station.compose(instrument_state, clock.monotonic_ns())
             if reply is not None:
                 station.sent(await radio.transmit(reply, at_ns=heard.slot_ns))
 
@@ -319,7 +318,7 @@ class Station:
 
     async def _run(self) -> None:
         rng = np.random.default_rng((self.number, self._starts))
-        async with opener(self.air, f"station-{self.number}", self.clock, rng, PAPER)() as radio:
+        async with radio_opener(self.air, f"station-{self.number}", self.clock, rng, PAPER)() as radio:
             if self.authors:
                 await AuthorsNode(self.number, radio, self.clock, self.instrument, self.number, rng).run()
             if self.superframe:
@@ -346,7 +345,7 @@ class Field:
             protocol = SuperframeMasterConfig(kind="superframe", **{"phase_lock": False} | changed)
         else:
             protocol = ClassicMasterConfig(kind="classic", **{"initial_cycles": 5} | changed)
-        delay_ms = AUTHORS_STAMP_DELAY_MS if self.stations[1].authors else 0.0
+        delay_ms = AUTHORS_TIMESTAMP_DELAY_MS if self.stations[1].authors else 0.0
         return MasterConfig(
             kind="master",
             setup=SetupConfig(station_frames=self.folder / "frames", prism_layout=self.folder / "prisms"),
@@ -367,15 +366,15 @@ class Field:
             **changes,
         )
 
-    def open_radio(self) -> OpenRadio:
+    def open_radio(self) -> RadioOpener:
         """Return what opens the master's radio."""
-        return opener(self.air, "master", TRUE, np.random.default_rng(100), PAPER)
+        return radio_opener(self.air, "master", TRUE, np.random.default_rng(100), PAPER)
 
     async def master(
         self,
         config: MasterConfig | None = None,
         *,
-        open_radio: OpenRadio | None = None,
+        open_radio: RadioOpener | None = None,
         clock: Clock = TRUE,
         key: bytes | None = KEY,
     ) -> None:
@@ -384,11 +383,13 @@ class Field:
             config or self.config(),
             self.scene.parameters,
             PAPER,
-            open_radio=open_radio or self.open_radio(),
-            clock=clock,
-            key=key,
-            random_bits=lambda bits: int(self.rng.integers(1 << bits)),
-            observe=lambda record, _line: self.records.append(record),
+            MasterDependencies(
+                open_radio=open_radio or self.open_radio(),
+                clock=clock,
+                key=key,
+                random_bits=lambda bits: int(self.rng.integers(1 << bits)),
+                observe=lambda record, _line: self.records.append(record),
+            ),
         )
 
     def of(self, cls: type[T]) -> list[T]:
@@ -411,7 +412,7 @@ async def field_of(
 ) -> AsyncGenerator[Field]:
     """Start three stations, and stop what is left of them at the end."""
     air = Air(running_timeline(), np.random.default_rng(7), link or LinkModel())
-    scene = scene or standing_scene()
+    scene = scene or stationary_scene()
     offsets_s = {1: 0.3, 2: -7200.0, 3: 86_400.0}
     stations = {
         n: Station(

@@ -4,32 +4,28 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 from harness.radios import MS, PAPER
 
 from tsgt.clock import UnixTimeline
 from tsgt.config import ClassicMasterConfig, StationConfig
 from tsgt.master.classic import ClassicLink
-from tsgt.master.publisher import Reports
-from tsgt.master.station_events import Alerts
-from tsgt.master.statistics import Monitor
-from tsgt.radio import Packet, TrackOrder, Transmitted
-from tsgt.radio.classic import MeasurementMessage
-from tsgt.radio.classic.transactions import ClassicStation, Timing
-from tsgt.recording import ClockRecord
+from tsgt.master.link_events import ClockUpdate, MeasurementReceived
+from tsgt.radio import TX_DONE_NS, Packet, TrackCommand, Transmission
+from tsgt.radio.classic import ClassicStation, LinkTiming, MeasurementMessage
 from tsgt.simulation.kernel import VirtualClock
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable
 
-    from tsgt.master.publisher import Outlet
-    from tsgt.model import PolarMeasurement
+    from tsgt.master.link_events import LinkEvent
     from tsgt.radio import LoRaSettings
+    from tsgt.recording import ClockRecord
 
 SECOND = 1000 * MS
 START = 1_600_000_000 * SECOND
-TURN_ROUND_NS = 3 * MS
+TURNAROUND_NS = 3 * MS
 AGE_NS = 50 * MS
 """The instrument's newest measurement is so old when the master asks for it."""
 
@@ -64,7 +60,7 @@ class LoneStation:
         self.lost: Callable[[bytes], bool] = lambda _: False
         self.stamp_errors_ns: list[tuple[int, int]] = []
         self.clocks: list[ClockRecord] = []
-        self._timing = Timing.of(PAPER, 250 * MS)
+        self._timing = LinkTiming(PAPER, 250 * MS)
         self._made_ns: dict[int, int] = {}
         self._arriving: asyncio.Queue[Packet] = asyncio.Queue()
 
@@ -87,19 +83,19 @@ class LoneStation:
         """Return the station's next answer."""
         return await self._arriving.get()
 
-    async def transmit(self, payload: bytes, *, at_ns: int | None = None) -> Transmitted:
+    async def transmit(self, payload: bytes, *, at_ns: int | None = None) -> Transmission:
         """Send a request; what the station answers arrives when it would."""
         del at_ns  # the paper's protocol sends at once
         await asyncio.sleep(self.before(payload) / 1e9)
         started_ns = self.clock.monotonic_ns()
         end_ns = started_ns + self._timing.airtime_ns(len(payload))
         heard_ns = end_ns + self._timing.rx_done_ns
-        await self.clock.sleep_until(end_ns + self._timing.tx_done_ns)
+        await self.clock.sleep_until(end_ns + TX_DONE_NS)
         self.asked.append((payload, end_ns))
         answer = self._answer(payload, heard_ns)
         if answer is not None and not self.lost(payload):
             arrives_ns = (
-                heard_ns + TURN_ROUND_NS + self._timing.airtime_ns(len(answer)) + self._timing.rx_done_ns
+                heard_ns + TURNAROUND_NS + self._timing.airtime_ns(len(answer)) + self._timing.rx_done_ns
             )
             packet = Packet(
                 payload=answer,
@@ -110,9 +106,7 @@ class LoneStation:
             )
             delay_s = (arrives_ns - self.clock.monotonic_ns()) / 1e9
             asyncio.get_running_loop().call_later(delay_s, self._arriving.put_nowait, packet)
-        return Transmitted(
-            started_at_ns=started_ns, done_at_ns=end_ns + self._timing.tx_done_ns, stamp_sigma_ns=1
-        )
+        return Transmission(started_at_ns=started_ns, done_at_ns=end_ns + TX_DONE_NS, stamp_sigma_ns=1)
 
     def _answer(self, payload: bytes, heard_ns: int) -> bytes | None:
         if self.station is None:
@@ -130,32 +124,30 @@ class LoneStation:
             )
         )
         answer = self.station.received(payload, START + heard_ns + self.ahead_ns)
-        if isinstance(answer, TrackOrder):
+        if isinstance(answer, TrackCommand):
             return self.station.executed(answer, ok=True)
         return answer if isinstance(answer, bytes) else None
 
-    def measurement(self, measurement: PolarMeasurement) -> None:
-        """Take what comes out of the master, as its outlet does."""
-        assert measurement.host_time_ns is not None
-        assert measurement.stamp_bound_ns is not None
-        error_ns = measurement.stamp_ns - self._made_ns[measurement.host_time_ns]
-        self.stamp_errors_ns.append((error_ns, measurement.stamp_bound_ns))
-
-    def put(self, record: object) -> None:
-        """Take all other lines of the master, as its outlet does."""
-        if isinstance(record, ClockRecord):
-            self.clocks.append(record)
+    def report(self, event: LinkEvent) -> None:
+        """Take what the link reports."""
+        if isinstance(event, ClockUpdate):
+            self.clocks.append(event.record)
+        elif isinstance(event, MeasurementReceived):
+            measurement = event.measurement
+            assert measurement.host_time_ns is not None
+            assert measurement.stamp_bound_ns is not None
+            error_ns = measurement.stamp_ns - self._made_ns[measurement.host_time_ns]
+            self.stamp_errors_ns.append((error_ns, measurement.stamp_bound_ns))
 
 
 @asynccontextmanager
 async def lone_station() -> AsyncGenerator[LoneStation]:
     """Run a master's link with its one station."""
     field = LoneStation()
-    reports = Reports(
-        field.clock, UnixTimeline(START), cast("Outlet", field), Monitor([1]), Alerts([1], START)
-    )
     stations = [StationConfig(station=1, prism=1, prism_constant_mm=0.0)]
-    link = ClassicLink(stations, ClassicMasterConfig(kind="classic"), PAPER, reports)
+    link = ClassicLink(
+        stations, ClassicMasterConfig(kind="classic"), PAPER, field.clock, UnixTimeline(START), field.report
+    )
     async with asyncio.TaskGroup() as group:
         running = group.create_task(link.run(field))
         yield field

@@ -10,15 +10,15 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tsgt.model import PolarMeasurement
-    from tsgt.simulation.mission import Run
+    from tsgt.simulation.mission import MissionResult
 
 
-def journals(run: Run) -> list[Path]:
+def journals(run: MissionResult) -> list[Path]:
     """Return the journals of all stations."""
-    return [path for witness in run.witnesses.values() for path in witness.journals]
+    return [path for station_log in run.station_logs.values() for path in station_log.journals]
 
 
-def recording(run: Run, path: Path, *, without: int = 0) -> Path:
+def recording(run: MissionResult, path: Path, *, without: int = 0) -> Path:
     """Put the recordings of all sessions of the master into one file.
 
     Parameters
@@ -31,7 +31,7 @@ def recording(run: Run, path: Path, *, without: int = 0) -> Path:
         Leave out each so manieth measurement, as if the radio had not carried it; 0: none.
     """
     kept, measurements = [], 0
-    for session in run.sessions:
+    for session in run.master_logs:
         recorded = session.recording()
         assert recorded is not None
         for line in recorded.read_bytes().splitlines(keepends=True):
@@ -51,10 +51,10 @@ def merged_in(path: Path) -> list[PolarMeasurement]:
     ]
 
 
-def assert_true(run: Run, measurements: list[PolarMeasurement]) -> None:
+def assert_true(run: MissionResult, measurements: list[PolarMeasurement]) -> None:
     """Compare the times of merged measurements with the truth, each with the bound that it states."""
     for measurement in measurements:
         assert measurement.host_time_ns is not None
         assert measurement.stamp_bound_ns is not None
-        true_ns = run.witnesses[measurement.station].stamps_ns[measurement.host_time_ns]
+        true_ns = run.station_logs[measurement.station].true_times_ns[measurement.host_time_ns]
         assert abs(measurement.stamp_ns - run.start_ns - true_ns) <= measurement.stamp_bound_ns

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-from tsgt.radio import Packet, Transmitted
+from tsgt.radio import Packet, Transmission
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -60,13 +60,13 @@ class PlainRadio:
     async def configure(self, settings: LoRaSettings) -> None:
         """Take any settings."""
 
-    async def transmit(self, payload: bytes, *, at_ns: int | None = None) -> Transmitted:
+    async def transmit(self, payload: bytes, *, at_ns: int | None = None) -> Transmission:
         """Send for 50 ms."""
         await self._clock.sleep_until(at_ns or self._clock.monotonic_ns() + self._latency_ns)
         started_at_ns = self._clock.monotonic_ns()
         await self._clock.sleep_until(started_at_ns + AIRTIME_NS)
         self.on_sent(payload)
-        return Transmitted(
+        return Transmission(
             started_at_ns=started_at_ns, done_at_ns=self._clock.monotonic_ns(), stamp_sigma_ns=0
         )
 

@@ -36,7 +36,7 @@ FRAMES = np.array(
 Motion = tuple["NDArray[np.float64]", "NDArray[np.float64]"]
 
 
-def standing(time_s: float) -> Motion:  # noqa: ARG001 (a motion is a function of time)
+def at_rest(time_s: float) -> Motion:  # noqa: ARG001 (a motion is a function of time)
     """Rotation and position of a stationary robot."""
     return exp_so3(np.array([0.02, -0.01, 0.6])), np.array([30.0, 20.0, -1.0])
 
@@ -52,7 +52,7 @@ class Scene:
     """Exact measurements of a moving layout of prisms."""
 
     parameters: Parameters
-    motion: Callable[[float], Motion] = standing
+    motion: Callable[[float], Motion] = at_rest
 
     def measure(
         self, station: int, time_s: float, *, delay_s: float = 0.1, status: Status = Status.OK, prism: int = 0

@@ -29,27 +29,14 @@ ROUNDING = 1e-12
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """The rigid transform that brings source points closest to target points.
+    """The rigid transform that brings source points closest to target points."""
 
-    Attributes
-    ----------
-    rotation
-        R, (3, 3), proper: ``target = R source + t``.
-    translation_m
-        t, (3,).
-    residuals_m
-        (n, 3) target minus transformed source.
-    rms_m
-        Root mean square of the residuals' lengths, unweighted.
-    covariance
-        6x6 of (translation x, y, z in m; rotation about the target frame's fixed axes x, y, z in rad): the true
-        transform is ``[exp(dtheta) R | t + dt]``.
-    """
-
-    rotation: FloatArray
-    translation_m: FloatArray
-    residuals_m: FloatArray
-    rms_m: float
+    rotation: FloatArray  # R, (3, 3), proper: ``target = R source + t``
+    translation_m: FloatArray  # t, (3,)
+    residuals_m: FloatArray  # (n, 3) target minus transformed source
+    rms_m: float  # Root mean square of the residuals' lengths, unweighted
+    # 6x6 of (translation x, y, z in m; rotation about the target frame's fixed axes x, y, z in rad): the true
+    # transform is ``[exp(dtheta) R | t + dt]``
     covariance: FloatArray
 
     @property
@@ -60,24 +47,13 @@ class Alignment:
 
 @dataclass(frozen=True, slots=True)
 class BatchAlignment:
-    """The rigid transforms that bring one layout closest to each of N measured sets of its P points.
+    """The rigid transforms that bring one layout closest to each of N measured sets of its P points."""
 
-    Attributes
-    ----------
-    rotation
-        (N, 3, 3): ``point = R layout + t``. The identity where degenerate.
-    translation_m
-        (N, 3).
-    residuals_m
-        (N, P, 3) measured minus transformed layout.
-    degenerate
-        (N,) the measured points coincide or are collinear (relative to the layout, to :data:`COLLINEAR_RATIO`): the
-        rotation is undefined.
-    """
-
-    rotation: FloatArray
-    translation_m: FloatArray
-    residuals_m: FloatArray
+    rotation: FloatArray  # (N, 3, 3): ``point = R layout + t``. The identity where degenerate.
+    translation_m: FloatArray  # (N, 3)
+    residuals_m: FloatArray  # (N, P, 3) measured minus transformed layout
+    # (N,) the measured points coincide or are collinear (relative to the layout, to :data:`COLLINEAR_RATIO`): the
+    # rotation is undefined
     degenerate: NDArray[np.bool_]
 
 
@@ -90,6 +66,10 @@ def align(
 ) -> Alignment:
     """Weighted least-squares rigid alignment of two point sets (Arun et al. 1987; Umeyama 1991 for the sign).
 
+    Raises DegenerateGeometryError: fewer than three points, coincident or collinear points, or a mirror image that fits
+    equally well in more than one way.
+    Raises GeometryError: shapes that do not match, numbers that are not finite, weights that are not positive.
+
     Parameters
     ----------
     source, target
@@ -101,18 +81,7 @@ def align(
         noise is taken as isotropic with variances inverse to the weights, its size estimated from the residuals with
         3n - 6 degrees of freedom.
 
-    Returns
-    -------
-    Alignment
-        With a covariance of first order in the noise.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        Fewer than three points, coincident or collinear points, or a mirror image that fits equally well in more than one
-        way.
-    GeometryError
-        Shapes that do not match, numbers that are not finite, weights that are not positive.
+    Returns with a covariance of first order in the noise.
     """
     source, target = _points(source, "source"), _points(target, "target")
     n = len(source)
@@ -166,11 +135,8 @@ def fit_gain(points: FloatArray, weights: FloatArray) -> FloatArray:
     weights
         (n,) in the fit.
 
-    Returns
-    -------
-    FloatArray
-        (n, 6, 3). Summed over the points, gain times displacement is (translation of the moved frame's origin, small
-        rotation) in the axes of ``points``: the weighted pseudo-inverse of ``[I, -skew(point)]``, in blocks.
+    Returns (n, 6, 3). Summed over the points, gain times displacement is (translation of the moved frame's origin, small
+    rotation) in the axes of ``points``: the weighted pseudo-inverse of ``[I, -skew(point)]``, in blocks.
     """
     w = weights / weights.sum()
     mean = w @ points
@@ -186,6 +152,10 @@ def fit_gain(points: FloatArray, weights: FloatArray) -> FloatArray:
 def align_triplets(layout: ArrayLike, points: ArrayLike) -> BatchAlignment:
     """Closed-form alignment of three layout points with N measured triplets.
 
+    Raises DegenerateGeometryError: the layout's points coincide or are collinear. A degenerate measured triplet is marked
+    instead.
+    Raises GeometryError: wrong shapes or numbers that are not finite.
+
     Parameters
     ----------
     layout
@@ -193,17 +163,7 @@ def align_triplets(layout: ArrayLike, points: ArrayLike) -> BatchAlignment:
     points
         (N, 3, 3) measured triplets in the world frame in m: item, point, coordinate.
 
-    Returns
-    -------
-    BatchAlignment
-        The same optimum as :func:`align_many`, to rounding.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        The layout's points coincide or are collinear. A degenerate measured triplet is marked instead.
-    GeometryError
-        Wrong shapes or numbers that are not finite.
+    Returns the same optimum as :func:`align_many`, to rounding.
 
     Notes
     -----
@@ -268,17 +228,14 @@ def _triangle(points: bytes) -> tuple[FloatArray, float, FloatArray, FloatArray,
 def align_many(layout: ArrayLike, points: ArrayLike) -> BatchAlignment:
     """Alignment of a layout of any size with N measured sets, by one SVD each (Arun et al. 1987), equal weights.
 
+    Raises DegenerateGeometryError, GeometryError: as :func:`align_triplets`.
+
     Parameters
     ----------
     layout
         (P, 3) points in the body frame in m, P >= 3.
     points
         (N, P, 3) measured sets in the world frame in m.
-
-    Raises
-    ------
-    DegenerateGeometryError, GeometryError
-        As :func:`align_triplets`.
     """
     layout = _points(layout, "layout")
     batch = _batch(points, len(layout))
@@ -307,10 +264,8 @@ def spread_m(points: FloatArray) -> FloatArray:
 def check_spread(points: FloatArray, what: str) -> None:
     """Check that (n, 3) points in m, n >= 3, span a triangle; ``what`` names them in the plural in the message.
 
-    Raises
-    ------
-    DegenerateGeometryError
-        They coincide or are collinear; the message has the spread along and across their best line.
+    Raises DegenerateGeometryError: they coincide or are collinear; the message has the spread along and across their best
+    line.
     """
     along_m, across_m, _ = spread_m(points)
     rounding_m = ROUNDING * float(np.abs(points).max())

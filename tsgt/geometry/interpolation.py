@@ -23,37 +23,25 @@ NO_GAP_NS = -1
 
 @dataclass(frozen=True, slots=True)
 class Interpolated:
-    """One prism at N epochs, or several.
+    """One prism at N epochs, or several."""
 
-    Attributes
-    ----------
-    points
-        (N, 3) positions in m; 0 where invalid.
-    velocities_mps
-        (N, 3) slopes of the interpolation; 0 where invalid.
-    after
-        (N,) index of the first sample at or after the epoch; the number of samples where there is none. The other sample of
-        the interval is the one before it.
-    fraction
-        (N,) position of the epoch in the interval, 0 exclusive to 1 inclusive; 0 where a sample is missing.
-    gap_ns
-        (N,) length of the interval; :data:`NO_GAP_NS` where a sample is missing.
-    valid
-        (N,) both samples exist, not further apart than the outage limit.
-    """
-
-    points: FloatArray
-    velocities_mps: FloatArray
+    points: FloatArray  # (N, 3) positions in m; 0 where invalid
+    velocities_mps: FloatArray  # (N, 3) slopes of the interpolation; 0 where invalid
+    # (N,) index of the first sample at or after the epoch; the number of samples where there is none. The other
+    # sample of the interval is the one before it.
     after: NDArray[np.int64]
+    # (N,) position of the epoch in the interval, 0 exclusive to 1 inclusive; 0 where a sample is missing
     fraction: FloatArray
-    gap_ns: NDArray[np.int64]
-    valid: NDArray[np.bool_]
+    gap_ns: NDArray[np.int64]  # (N,) length of the interval; :data:`NO_GAP_NS` where a sample is missing
+    valid: NDArray[np.bool_]  # (N,) both samples exist, not further apart than the outage limit
 
 
 def interpolate(
     times_ns: NDArray[np.int64], points: ArrayLike, epochs_ns: NDArray[np.int64], outage_limit_ns: int
 ) -> Interpolated:
     """Interpolate a prism's samples linearly to epochs.
+
+    Raises GeometryError: shapes that do not match, times that do not increase, positions that are not finite.
 
     Parameters
     ----------
@@ -66,16 +54,8 @@ def interpolate(
     outage_limit_ns
         Longest valid interval between two samples, inclusive.
 
-    Returns
-    -------
-    Interpolated
-        One row per epoch. An epoch on a sample belongs to the interval that ends there, so that it is decided as soon as
-        that sample is known.
-
-    Raises
-    ------
-    GeometryError
-        Shapes that do not match, times that do not increase, positions that are not finite.
+    Returns one row per epoch. An epoch on a sample belongs to the interval that ends there, so that it is decided as soon
+    as that sample is known.
     """
     times_ns, epochs_ns = np.asarray(times_ns, dtype=np.int64), np.asarray(epochs_ns, dtype=np.int64)
     points = np.asarray(points, dtype=np.float64)
@@ -113,10 +93,7 @@ def interpolate_prisms(
     epochs_ns
         (N,) in any order.
 
-    Returns
-    -------
-    Interpolated
-        Shapes (N, P, ...). ``after`` indexes the samples of all prisms.
+    Returns shapes (N, P, ...). ``after`` indexes the samples of all prisms.
     """
     after = np.empty((len(epochs_ns), len(counts)), dtype=np.int64)
     bounds = list(accumulate(counts, initial=0))

@@ -80,10 +80,7 @@ def polar_jacobian(
 ) -> FloatArray:
     """Jacobian of :func:`polar_to_cartesian`.
 
-    Returns
-    -------
-    FloatArray
-        (..., 3, 3): rows x, y, z; columns horizontal angle, zenith angle, distance (m/rad, m/rad, 1).
+    Returns (..., 3, 3): rows x, y, z; columns horizontal angle, zenith angle, distance (m/rad, m/rad, 1).
     """
     h, z, d = np.broadcast_arrays(
         *(np.asarray(a, dtype=np.float64) for a in (horizontal_angle_rad, zenith_angle_rad, distance_m))
@@ -102,15 +99,9 @@ def polar_jacobian(
 def cartesian_jacobian(points: ArrayLike) -> FloatArray:
     """Jacobian of :func:`cartesian_to_polar` at points, (..., 3) in m: the inverse of :func:`polar_jacobian`.
 
-    Returns
-    -------
-    FloatArray
-        (..., 3, 3): rows horizontal angle, zenith angle, distance; columns x, y, z (rad/m, rad/m, 1).
+    Raises GeometryError: a point lies on the station's vertical axis: its horizontal angle has no derivative.
 
-    Raises
-    ------
-    GeometryError
-        A point lies on the station's vertical axis: its horizontal angle has no derivative.
+    Returns (..., 3, 3): rows horizontal angle, zenith angle, distance; columns x, y, z (rad/m, rad/m, 1).
     """
     x, y, z = np.moveaxis(np.asarray(points, dtype=np.float64), -1, 0)
     horizontal_m = np.hypot(x, y)

@@ -33,31 +33,20 @@ MIN_LAYOUT_RATIO = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Poses:
-    """N poses of the robot in the world.
+    """N poses of the robot in the world."""
 
-    Attributes
-    ----------
-    rotation
-        (N, 3, 3) ``R_world_robot``. The identity where degenerate.
-    translation_m
-        (N, 3) the robot's origin in the world.
-    residuals_m
-        (N, P) distance of each measured prism from its fitted position.
-    rms_m
-        (N,) root mean square of the residuals over the prisms.
-    degenerate
-        (N,) the prisms coincide or are collinear: the rotation is undefined.
-    """
-
-    rotation: FloatArray
-    translation_m: FloatArray
-    residuals_m: FloatArray
-    rms_m: FloatArray
-    degenerate: NDArray[np.bool_]
+    rotation: FloatArray  # (N, 3, 3) ``R_world_robot``. The identity where degenerate.
+    translation_m: FloatArray  # (N, 3) the robot's origin in the world
+    residuals_m: FloatArray  # (N, P) distance of each measured prism from its fitted position
+    rms_m: FloatArray  # (N,) root mean square of the residuals over the prisms
+    degenerate: NDArray[np.bool_]  # (N,) the prisms coincide or are collinear: the rotation is undefined
 
 
 def poses_from_prisms(layout: ArrayLike, points: ArrayLike) -> Poses:
     """Fit the prism layout to measured prisms (paper section III-D), unweighted.
+
+    Raises DegenerateGeometryError: fewer than three prisms in the layout, or they coincide or are collinear.
+    Raises GeometryError: wrong shapes or numbers that are not finite.
 
     Parameters
     ----------
@@ -65,13 +54,6 @@ def poses_from_prisms(layout: ArrayLike, points: ArrayLike) -> Poses:
         (P, 3) the P >= 3 prisms in the robot frame in m.
     points
         (N, P, 3) the prisms in the world in m, in the same order.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        Fewer than three prisms in the layout, or they coincide or are collinear.
-    GeometryError
-        Wrong shapes or numbers that are not finite.
     """
     fit = (align_triplets if np.shape(layout)[:1] == (3,) else align_many)(layout, points)
     squares = dot(fit.residuals_m, fit.residuals_m)
@@ -98,10 +80,7 @@ def pose_covariance(layout: FloatArray, rotation: FloatArray, prism_covariances:
     prism_covariances
         (N, P, 3, 3) of the measured prisms in the world in m^2.
 
-    Returns
-    -------
-    FloatArray
-        (N, 6, 6), symmetric: x, y, z of the robot's origin in m, rotation about the world's axes in rad.
+    Returns (N, 6, 6), symmetric: x, y, z of the robot's origin in m, rotation about the world's axes in rad.
     """
     from_robot = rotation[:, None, None]
     gain = _gains(layout)[0].reshape(-1, 2, 3, 3)
@@ -137,10 +116,7 @@ def interpolation_error_covariance(
     angular_acceleration_sigma_radps2
         One sigma, per axis, of the robot's angular acceleration.
 
-    Returns
-    -------
-    FloatArray
-        (N, 6, 6), in the order and axes of :func:`pose_covariance`, to be added to it.
+    Returns (N, 6, 6), in the order and axes of :func:`pose_covariance`, to be added to it.
     """
     effects = _over_prisms(error_s2[:, :, None, None, None] * _gains(layout)[1])
     # From the robot frame, where the gains are constant, to the world; translation and rotation separately.
@@ -182,20 +158,16 @@ def twists(
 def check_layout(layout: ArrayLike, names: Sequence[object] | None = None) -> None:
     """Check that a prism layout determines poses well.
 
+    Raises DegenerateGeometryError: fewer than three prisms, two of them closer than :data:`MIN_PRISM_DISTANCE_M`, or all of
+    them nearly collinear (:data:`MIN_LAYOUT_RATIO`).
+    Raises GeometryError: wrong shape or numbers that are not finite.
+
     Parameters
     ----------
     layout
         (P, 3) the prisms in the robot frame in m.
     names
         Names of the prisms in messages; 1, 2, ... when not given.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        Fewer than three prisms, two of them closer than :data:`MIN_PRISM_DISTANCE_M`, or all of them nearly collinear
-        (:data:`MIN_LAYOUT_RATIO`).
-    GeometryError
-        Wrong shape or numbers that are not finite.
     """
     array = np.asarray(layout, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != 3:

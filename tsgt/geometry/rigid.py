@@ -103,10 +103,7 @@ def quaternion_from_rotation(R: FloatArray) -> FloatArray:
 def rotation_from_quaternion(q: FloatArray) -> FloatArray:
     """Rotation matrices, (..., 3, 3), of Hamilton quaternions x, y, z, w of any length, (..., 4).
 
-    Raises
-    ------
-    GeometryError
-        A quaternion is zero or not finite.
+    Raises GeometryError: a quaternion is zero or not finite.
     """
     q = np.asarray(q, dtype=np.float64)
     x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
@@ -156,11 +153,8 @@ def transform_points(T: FloatArray, points: FloatArray) -> FloatArray:
 def check_transform(T: ArrayLike) -> None:
     """Check that a matrix is one rigid transform.
 
-    Raises
-    ------
-    GeometryError
-        Shape other than (4, 4), not finite, last row other than 0 0 0 1, not orthonormal to :data:`RIGID_TOLERANCE`,
-        or a reflection.
+    Raises GeometryError: shape other than (4, 4), not finite, last row other than 0 0 0 1, not orthonormal to
+    :data:`RIGID_TOLERANCE`, or a reflection.
     """
     matrix = np.asarray(T, dtype=np.float64)
     if matrix.shape != (4, 4):

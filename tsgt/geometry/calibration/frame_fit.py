@@ -28,21 +28,11 @@ STEP_TOLERANCE = 1e-10  # in m and rad: far below any instrument's noise, well a
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointSet:
-    """Named points in one frame, with their noise.
+    """Named points in one frame, with their noise."""
 
-    Attributes
-    ----------
-    names
-        n different target numbers or names of body points.
-    points_m
-        (n, 3).
-    covariances_m2
-        (n, 3, 3) in the same frame; may be zero.
-    """
-
-    names: tuple[PointName, ...]
-    points_m: FloatArray
-    covariances_m2: FloatArray
+    names: tuple[PointName, ...]  # n different target numbers or names of body points
+    points_m: FloatArray  # (n, 3)
+    covariances_m2: FloatArray  # (n, 3, 3) in the same frame; may be zero
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -143,6 +133,8 @@ class FrameFit:
 def fit_frame(pairs: PointPairs, *, weighted: bool) -> FrameFit:
     """Fit a rigid transform by Gauss-Newton, initialised with Arun's solution.
 
+    Raises DegenerateGeometryError: too few points, or they coincide or are collinear (levelled: above one another).
+
     Parameters
     ----------
     pairs
@@ -150,15 +142,7 @@ def fit_frame(pairs: PointPairs, *, weighted: bool) -> FrameFit:
     weighted
         Weight each residual with its inverse covariance; False is Arun's unweighted least squares.
 
-    Returns
-    -------
-    FrameFit
-        With a covariance of first order in the noise.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        Too few points, or they coincide or are collinear (levelled: above one another).
+    Returns with a covariance of first order in the noise.
 
     Notes
     -----

@@ -58,34 +58,19 @@ COARSE_NOISE_SCALES = (20.0, 4.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionCalibration:
-    """A set-up found from motion.
+    """A set-up found from motion."""
 
-    Attributes
-    ----------
-    initial
-        The given set-up.
-    parameters
-        Parameters about the set-up that the search began with: with levelled stations the given one without tilts.
-    covariance
-        (G, G) of the parameters, scaled by ``birge_ratio`` squared.
-    birge_ratio
-        How much more the segments of the recording disagree than noise and timestamp drift explain, at least 1: a sinking tripod.
-    wander_s
-        One sigma of each station's latency from segment to segment; included in the covariance.
-    prior
-        Motion prior.
-    noise_scale
-        Factor on the stated noise.
-    """
-
-    initial: Setup
+    initial: Setup  # The given set-up
     setup: Setup
+    # Parameters about the set-up that the search began with: with levelled stations the given one without tilts
     parameters: SetupParameters
-    covariance: FloatArray
+    covariance: FloatArray  # (G, G) of the parameters, scaled by ``birge_ratio`` squared
+    # How much more the segments of the recording disagree than noise and timestamp drift explain, at least 1: a
+    # sinking tripod
     birge_ratio: float
-    wander_s: float
-    prior: MotionPrior
-    noise_scale: float
+    wander_s: float  # One sigma of each station's latency from segment to segment; included in the covariance
+    prior: MotionPrior  # Motion prior
+    noise_scale: float  # Factor on the stated noise
     measurements: int
     outliers: int
 
@@ -134,6 +119,8 @@ def calibrate_motion(
 ) -> MotionCalibration:
     """Find a set-up from motion.
 
+    Raises GeometryError: nothing to estimate, or the measurements do not determine a trajectory.
+
     Parameters
     ----------
     observations
@@ -146,11 +133,6 @@ def calibrate_motion(
         Tuned on the measurements when not given.
     on_progress
         Called with the name of each stage.
-
-    Raises
-    ------
-    GeometryError
-        Nothing to estimate, or the measurements do not determine a trajectory.
     """
     initial = setup = Setup.of(observations) if start is None else start
     parameters = SetupParameters.of(setup.applied(observations), setup, prior_sigmas)

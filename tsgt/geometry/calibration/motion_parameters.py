@@ -24,46 +24,22 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetupPrior:
-    """What to estimate, and its prior: one sigma each, 0 for what is fixed.
+    """What to estimate, and its prior: one sigma each, 0 for what is fixed."""
 
-    Attributes
-    ----------
-    translation_sigma_m
-        Of each coordinate of the robot as seen by the stations 2, 3, ...
-    rotation_sigma_rad
-        Of a station's rotation about each axis.
-    levelled
-        Stations rotate about the vertical only: 4 instead of 6 degrees of freedom.
-    latency_sigma_s
-        Of a station's latency relative to that of station 1.
-    prism_sigma_m
-        Of each coordinate of a prism on the robot.
-    """
-
-    translation_sigma_m: float = 0.0
-    rotation_sigma_rad: float = 0.0
-    levelled: bool = False
-    latency_sigma_s: float = 0.0
-    prism_sigma_m: float = 0.0
+    translation_sigma_m: float = 0.0  # Of each coordinate of the robot as seen by the stations 2, 3,
+    rotation_sigma_rad: float = 0.0  # Of a station's rotation about each axis
+    levelled: bool = False  # Stations rotate about the vertical only: 4 instead of 6 degrees of freedom
+    latency_sigma_s: float = 0.0  # Of a station's latency relative to that of station 1
+    prism_sigma_m: float = 0.0  # Of each coordinate of a prism on the robot
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setup:
-    """What is common to all measurements.
+    """What is common to all measurements."""
 
-    Attributes
-    ----------
-    frames
-        (S, 4, 4) ``T_station1_station``.
-    latencies_s
-        (S,) delay of the timestamps, beyond the correction already applied.
-    layout
-        (P, 3) prisms in the robot frame in m.
-    """
-
-    frames: FloatArray
-    latencies_s: FloatArray
-    layout: FloatArray
+    frames: FloatArray  # (S, 4, 4) ``T_station1_station``
+    latencies_s: FloatArray  # (S,) delay of the timestamps, beyond the correction already applied
+    layout: FloatArray  # (P, 3) prisms in the robot frame in m
 
     @classmethod
     def of(cls, observations: Observations) -> Setup:
@@ -134,10 +110,7 @@ class SetupParameters:
     def of(cls, observations: Observations, setup: Setup, prior: SetupPrior) -> SetupParameters:
         """Lay out the parameters of a set-up that observations have.
 
-        Raises
-        ------
-        GeometryError
-            Nothing to estimate, station 1 has measured nothing, or a measurement is not polar.
+        Raises GeometryError: nothing to estimate, station 1 has measured nothing, or a measurement is not polar.
         """
         if not observations.polar.all():
             raise GeometryError(

@@ -26,18 +26,10 @@ MIN_COMPONENT_SHARE = 0.2
 
 @dataclass(frozen=True, slots=True)
 class UnobservableDirection:
-    """A direction of the set-up that the motion left uncertain.
+    """A direction of the set-up that the motion left uncertain."""
 
-    Attributes
-    ----------
-    description
-        All components of the direction, which change together, by one sigma each, in words.
-    excess
-        Ratio of its uncertainty to the limit.
-    """
-
-    description: str
-    excess: float
+    description: str  # All components of the direction, which change together, by one sigma each, in words
+    excess: float  # Ratio of its uncertainty to the limit
 
 
 def unobservable_directions(calibration: MotionCalibration) -> list[UnobservableDirection]:
@@ -68,44 +60,31 @@ def _describe(calibration: MotionCalibration, vector: FloatArray, sigma: FloatAr
     sigma = sigma * (1.0 if vector[np.argmax(np.abs(vector))] >= 0 else -1.0)
     components: list[tuple[float, str]] = []
     for i, station in enumerate(parameters.stations):
+        name = f"station {station + 1}"
         if len(parameters.translations):
-            translation, rotation = sigma[parameters.translations[i]], sigma[parameters.rotations[i]]
+            at = parameters.translations[i]
+            size_mm, towards = 1e3 * np.linalg.norm(sigma[at]), _direction(sigma[at])
             components.append(
-                (
-                    float(np.linalg.norm(vector[parameters.translations[i]])),
-                    f"station {station + 1} shifts by {1e3 * np.linalg.norm(translation):.2g} mm {_direction(translation)}",
-                )
+                (float(np.linalg.norm(vector[at])), f"{name} shifts by {size_mm:.2g} mm {towards}")
             )
-            components.append(
-                (
-                    float(np.linalg.norm(vector[parameters.rotations[i]])),
-                    f"station {station + 1} turns by {1e3 * np.linalg.norm(rotation):.2g} mrad about {_direction(about_axes(rotation))}",
-                )
-            )
+            at = parameters.rotations[i]
+            size_mrad, axis = 1e3 * np.linalg.norm(sigma[at]), _direction(about_axes(sigma[at]))
+            text = f"{name} turns by {size_mrad:.2g} mrad about {axis}"
+            components.append((float(np.linalg.norm(vector[at])), text))
         if len(parameters.latencies):
-            latency = parameters.latencies[i]
-            components.append(
-                (abs(vector[latency]), f"station {station + 1} is late by {1e3 * sigma[latency]:.2g} ms")
-            )
+            at = parameters.latencies[i]
+            components.append((abs(vector[at]), f"{name} is late by {1e3 * sigma[at]:.2g} ms"))
     if len(parameters.prisms):
-        displacements = (deformation_modes(calibration.setup.layout) @ sigma[parameters.prisms]).reshape(
-            -1, 3
-        )
+        modes = deformation_modes(calibration.setup.layout)
+        displacements = (modes @ sigma[parameters.prisms]).reshape(-1, 3)
         weight = float(np.linalg.norm(vector[parameters.prisms]))
         lengths = np.linalg.norm(displacements, axis=1)
         for prism, length in enumerate(lengths):
             x, y, z = 1e3 * displacements[prism]
-            components.append(
-                (
-                    weight * float(length / lengths.max()),
-                    f"prism {prism + 1} moves on the robot by ({x:.2g}, {y:.2g}, {z:.2g}) mm",
-                )
-            )
-    largest = max(weight for weight, _ in components)
-    described = sorted(
-        (component for component in components if component[0] >= MIN_COMPONENT_SHARE * largest),
-        key=lambda component: -component[0],
-    )
+            text = f"prism {prism + 1} moves on the robot by ({x:.2g}, {y:.2g}, {z:.2g}) mm"
+            components.append((weight * float(length / lengths.max()), text))
+    smallest = MIN_COMPONENT_SHARE * max(weight for weight, _ in components)
+    described = sorted((part for part in components if part[0] >= smallest), key=lambda part: -part[0])
     return ", ".join(text for _, text in described)
 
 

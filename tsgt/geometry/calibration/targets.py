@@ -41,17 +41,11 @@ MIN_POINTS = 3
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Limits that depend on what the frame is for.
+    """Limits that depend on what the frame is for."""
 
-    Attributes
-    ----------
-    weak_rad
-        One-sigma rotation above which an axis is weak.
-    blunder_m
-        Smallest prediction error that is rejected as a blunder: a wrong prism constant, common to all points, may cause less.
-    """
-
-    weak_rad: float
+    weak_rad: float  # One-sigma rotation above which an axis is weak
+    # Smallest prediction error that is rejected as a blunder: a wrong prism constant, common to all points, may cause
+    # less
     blunder_m: float
 
 
@@ -69,68 +63,38 @@ hardly distorts them.
 
 @dataclass(frozen=True, slots=True)
 class RejectedPoint:
-    """A point that is inconsistent with the others.
-
-    Attributes
-    ----------
-    prediction_error_m
-        Distance from its prediction by the points that were kept.
-    """
+    """A point that is inconsistent with the others."""
 
     name: PointName
-    prediction_error_m: float
+    prediction_error_m: float  # Distance from its prediction by the points that were kept
 
 
 @dataclass(frozen=True, slots=True)
 class WeakAxis:
-    """An axis about which the points hold the frame weakly.
+    """An axis about which the points hold the frame weakly."""
 
-    Attributes
-    ----------
-    axis
-        Unit vector in the target frame, pointing towards the points.
-    sigma_rad
-        One sigma of the rotation about it.
-    """
-
-    axis: tuple[float, float, float]
-    sigma_rad: float
+    axis: tuple[float, float, float]  # Unit vector in the target frame, pointing towards the points
+    sigma_rad: float  # One sigma of the rotation about it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameCalibration:
-    """A frame found from points.
+    """A frame found from points."""
 
-    Attributes
-    ----------
-    T
-        (4, 4) rigid transform from the source to the target frame, in m.
-    covariance
-        (6, 6) covariance of (x, y, z, rotation about the target frame's fixed axes x, y, z) in m and rad,
-        T_true = [exp(dtheta) R | t + dt]; rows and columns of roll and pitch are zero for levelled instruments.
-    used
-        Names of the n points that the frame was computed from.
-    residuals_m
-        (n,) distance of each used point from its transformed counterpart.
-    leave_one_out_m
-        (n,) the same when the frame is computed without that point; NaN where the others do not determine it.
-    consistent
-        False where the points are inconsistent and the outliers cannot be identified; nothing is rejected then, and the frame
-        must not be used.
-    weak
-        Weakly held axes, worst first.
-    tilt_rad
-        Angle between the z axes where the frames were taken as levelled and the points contradict that significantly.
-    """
-
-    T: FloatArray
+    T: FloatArray  # (4, 4) rigid transform from the source to the target frame, in m
+    # (6, 6) covariance of (x, y, z, rotation about the target frame's fixed axes x, y, z) in m and rad, T_true =
+    # [exp(dtheta) R | t + dt]; rows and columns of roll and pitch are zero for levelled instruments
     covariance: FloatArray
-    used: tuple[PointName, ...]
-    residuals_m: FloatArray
+    used: tuple[PointName, ...]  # Names of the n points that the frame was computed from
+    residuals_m: FloatArray  # (n,) distance of each used point from its transformed counterpart
+    # (n,) the same when the frame is computed without that point; NaN where the others do not determine it
     leave_one_out_m: FloatArray
     rejected: tuple[RejectedPoint, ...]
+    # False where the points are inconsistent and the outliers cannot be identified; nothing is rejected then, and the
+    # frame must not be used
     consistent: bool
-    weak: tuple[WeakAxis, ...]
+    weak: tuple[WeakAxis, ...]  # Weakly held axes, worst first
+    # Angle between the z axes where the frames were taken as levelled and the points contradict that significantly
     tilt_rad: float | None
 
     @property
@@ -146,17 +110,11 @@ class FrameCalibration:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PrismCalibration:
-    """Prisms in the robot frame.
+    """Prisms in the robot frame."""
 
-    Attributes
-    ----------
-    body
-        The fit to the body points; ``body.T`` takes station to robot coordinates.
-    prisms
-        Positions and covariances in the robot frame; each covariance contains the error of the body fit, which is common to all.
-    """
-
-    body: FrameCalibration
+    body: FrameCalibration  # The fit to the body points; ``body.T`` takes station to robot coordinates
+    # Positions and covariances in the robot frame; each covariance contains the error of the body fit, which is
+    # common to all
     prisms: PointSet
 
 
@@ -170,6 +128,10 @@ def calibrate_frame(
 ) -> FrameCalibration:
     """Find the frame ``source`` in the frame ``target`` from the points that both have.
 
+    Raises DegenerateGeometryError: fewer than three common points, or they coincide or are collinear (levelled: above one
+    another).
+    Raises GeometryError: a covariance of the source is singular.
+
     Parameters
     ----------
     source, target
@@ -179,13 +141,6 @@ def calibrate_frame(
         tests follow the noise model either way.
     levelled
         Both z axes are vertical: only heading and position are solved.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        Fewer than three common points, or they coincide or are collinear (levelled: above one another).
-    GeometryError
-        A covariance of the source is singular.
     """
     common = [name for name in target.names if name in source.names]
     if len(common) < MIN_POINTS:
@@ -223,17 +178,14 @@ def calibrate_frame(
 def calibrate_prisms(body: PointSet, body_cad: PointSet, prisms: PointSet) -> PrismCalibration:
     """Find the prisms in the robot frame from one station's measurements of them and of body points.
 
+    Raises DegenerateGeometryError: fewer than three body points, or they coincide or are collinear.
+
     Parameters
     ----------
     body, prisms
         Body points and prisms as measured from the same place, in the station's frame.
     body_cad
         The body points in the robot frame, from CAD, with the build tolerance as covariance.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        Fewer than three body points, or they coincide or are collinear.
     """
     frame = calibrate_frame(body, body_cad, limits=BODY_LIMITS)
     rotation = frame.T[:3, :3]
@@ -243,8 +195,7 @@ def calibrate_prisms(body: PointSet, body_cad: PointSet, prisms: PointSet) -> Pr
         + jacobian @ frame.covariance @ jacobian.transpose(0, 2, 1)
     )
     return PrismCalibration(
-        body=frame,
-        prisms=PointSet(prisms.names, transform_points(frame.T, prisms.points_m), covariances),
+        body=frame, prisms=PointSet(prisms.names, transform_points(frame.T, prisms.points_m), covariances)
     )
 
 

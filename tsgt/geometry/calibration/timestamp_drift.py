@@ -26,34 +26,18 @@ MAX_WANDER_S = 0.1
 
 
 class SegmentInformation(NamedTuple):
-    """Information of one segment of a recording on G parameters, its trajectory eliminated.
+    """Information of one segment of a recording on G parameters, its trajectory eliminated."""
 
-    Attributes
-    ----------
-    information
-        (G, G).
-    gradient
-        (G,) of half the cost.
-    """
-
-    information: FloatArray
-    gradient: FloatArray
+    information: FloatArray  # (G, G)
+    gradient: FloatArray  # (G,) of half the cost
 
 
 class WanderElimination(NamedTuple):
-    """A segment with its random latencies eliminated.
-
-    Attributes
-    ----------
-    cost_reduction
-        By which half the segment's cost falls.
-    log_determinant
-        Log ratio of the prior to the posterior information on the random latencies.
-    """
+    """A segment with its random latencies eliminated."""
 
     segment: SegmentInformation
-    cost_reduction: float
-    log_determinant: float
+    cost_reduction: float  # By which half the segment's cost falls
+    log_determinant: float  # Log ratio of the prior to the posterior information on the random latencies
 
 
 def eliminate_wander(

@@ -42,28 +42,15 @@ OVERLAP_KNOTS = 128
 
 @dataclass(frozen=True, slots=True)
 class TrajectoryFit:
-    """A trajectory fitted to measurements.
-
-    Attributes
-    ----------
-    observations
-        The M measurements, their noise scaled by ``noise_scale``.
-    noise_scale
-        Factor on the stated noise of the instruments.
-    residuals_m
-        (M, 3) trajectory minus measurement: along the line of sight, horizontally and vertically across it.
-    squared_distances
-        (M,) squared Mahalanobis distances of the residuals.
-    weights
-        (M,) of the robust loss: 1, or less for an outlier.
-    """
+    """A trajectory fitted to measurements."""
 
     trajectory: Trajectory
-    observations: Observations
-    noise_scale: float
+    observations: Observations  # The M measurements, their noise scaled by ``noise_scale``
+    noise_scale: float  # Factor on the stated noise of the instruments
+    # (M, 3) trajectory minus measurement: along the line of sight, horizontally and vertically across it
     residuals_m: FloatArray
-    squared_distances: FloatArray
-    weights: FloatArray
+    squared_distances: FloatArray  # (M,) squared Mahalanobis distances of the residuals
+    weights: FloatArray  # (M,) of the robust loss: 1, or less for an outlier
 
     @property
     def prior(self) -> MotionPrior:
@@ -88,6 +75,8 @@ def fit_trajectory(
 ) -> TrajectoryFit:
     """Fit a trajectory.
 
+    Raises GeometryError: fewer than three prisms were measured, or too few measurements to tune what is not given.
+
     Parameters
     ----------
     observations
@@ -100,11 +89,6 @@ def fit_trajectory(
         Factor on the stated noise; tuned on the measurements when not given.
     on_progress
         Called with the completed share of the work, 0 to 1.
-
-    Raises
-    ------
-    GeometryError
-        Fewer than three prisms were measured, or too few measurements to tune what is not given.
     """
     report_progress = on_progress or (lambda _: None)
     if prior is None or noise_scale is None:
@@ -122,9 +106,7 @@ def fit_trajectory(
     knots, covariances, cross_covariances, residuals_m, squared_distances, weights = [], [], [], [], [], []
     for completed, segment in enumerate(segments):
         report_progress(completed / len(segments))
-        rows = slice(
-            *np.searchsorted(knot_index, (segment.solved.start, segment.solved.stop)),
-        )
+        rows = slice(*np.searchsorted(knot_index, (segment.solved.start, segment.solved.stop)))
         guess = tracks.guess(times_s[segment.solved])
         steps = slice(segment.solved.start, segment.solved.stop - 1)
         solution = solve(observations.select(rows), guess, prior, sigmas=sigmas[steps])

@@ -24,18 +24,10 @@ _BLOCKS_PER_CHUNK = 64
 
 @dataclass(frozen=True, slots=True)
 class BlockCholesky:
-    """Cholesky factor of a block-tridiagonal matrix.
+    """Cholesky factor of a block-tridiagonal matrix."""
 
-    Attributes
-    ----------
-    banded
-        (2 B, K B) the lower factor by its diagonals, LAPACK's band storage.
-    size
-        B, the order of one block.
-    """
-
-    banded: FloatArray
-    size: int
+    banded: FloatArray  # (2 B, K B) the lower factor by its diagonals, LAPACK's band storage
+    size: int  # B, the order of one block
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Solve for one right-hand side, (K, B), or several, (K, B, N); the result has the same shape."""
@@ -89,17 +81,14 @@ def _inverse_and_sub_diagonal(columns: FloatArray) -> tuple[FloatArray, FloatArr
 def factorise(diagonal: FloatArray, off_diagonal: FloatArray) -> BlockCholesky:
     """Factorise a block-tridiagonal matrix.
 
+    Raises GeometryError: the matrix is not positive definite.
+
     Parameters
     ----------
     diagonal
         (K, B, B) symmetric blocks on the diagonal; only the lower triangles are read.
     off_diagonal
         (K - 1, B, B) blocks right of the diagonal: row block k, column block k + 1.
-
-    Raises
-    ------
-    GeometryError
-        The matrix is not positive definite.
     """
     count, size, _ = diagonal.shape
     # LAPACK's band storage is column by column.

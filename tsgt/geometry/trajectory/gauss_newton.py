@@ -30,6 +30,8 @@ from tsgt.geometry.trajectory.states import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from tsgt.geometry.rigid import FloatArray
@@ -74,54 +76,28 @@ MIN_STEP_FRACTION = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class AnchorPrior:
-    """Gaussian prior on the first knot.
+    """Gaussian prior on the first knot."""
 
-    Attributes
-    ----------
-    linearisation_point
-        One knot about which the error is counted, close to the trajectory.
-    information
-        (18, 18) inverse covariance of the error.
-    mean
-        (18,) of the error. In a direction with next to no information it may be metres or radians: as an error it keeps that
-        direction, as a retracted linearisation point it would not.
-    """
-
-    linearisation_point: States
-    information: FloatArray
+    linearisation_point: States  # One knot about which the error is counted, close to the trajectory
+    information: FloatArray  # (18, 18) inverse covariance of the error
+    # (18,) of the error. In a direction with next to no information it may be metres or radians: as an error it keeps
+    # that direction, as a retracted linearisation point it would not.
     mean: FloatArray = field(default_factory=lambda: np.zeros(STATE_DIM))
 
 
 class Solution(NamedTuple):
-    """The maximum a posteriori trajectory.
-
-    Attributes
-    ----------
-    factor
-        Cholesky factor of the normal equations at the solution.
-    squared_distances
-        (M,) squared Mahalanobis distance of each measurement's residual; 3 on average for good ones.
-    weights
-        (M,) of the robust loss, 1 for inliers.
-    linearised
-        Measurements linearised at the solution.
-    knot_index
-        (M,) knot that each measurement is attached to.
-    cost
-        Minus twice the log posterior density, up to a constant.
-    process
-        Process factors between the knots.
-    """
+    """The maximum a posteriori trajectory."""
 
     knots: States
-    factor: BlockCholesky
+    factor: BlockCholesky  # Cholesky factor of the normal equations at the solution
+    # (M,) squared Mahalanobis distance of each measurement's residual; 3 on average for good ones
     squared_distances: FloatArray
-    weights: FloatArray
-    linearised: LinearisedMeasurements
-    knot_index: NDArray[np.intp]
-    cost: float
+    weights: FloatArray  # (M,) of the robust loss, 1 for inliers
+    linearised: LinearisedMeasurements  # Measurements linearised at the solution
+    knot_index: NDArray[np.intp]  # (M,) knot that each measurement is attached to
+    cost: float  # Minus twice the log posterior density, up to a constant
     iterations: int
-    process: ProcessFactors
+    process: ProcessFactors  # Process factors between the knots
 
 
 class NormalEquations(NamedTuple):
@@ -195,6 +171,8 @@ def solve(
 ) -> Solution:
     """Find the maximum a posteriori trajectory.
 
+    Raises GeometryError: the measurements do not determine the trajectory.
+
     Parameters
     ----------
     observations
@@ -208,11 +186,6 @@ def solve(
     reject_outliers
         Solve a second time without measurements beyond :data:`REJECTION_THRESHOLD`. Without, the solution is a smooth function
         of its inputs.
-
-    Raises
-    ------
-    GeometryError
-        The measurements do not determine the trajectory.
     """
     anchor = diffuse_prior(guess.select(slice(0, 1)), prior) if anchor is None else anchor
     knot_index = nearest_knots(guess.time_s, observations.time_s)
@@ -236,8 +209,12 @@ def _minimise(
     rejectable: NDArray[np.bool_] | None = None,
 ) -> Solution:
     """Run Gauss-Newton with backtracking until the cost or the predicted gain falls below its tolerance."""
+
+    def evaluate(knots: States) -> NormalEquations:
+        return assemble(observations, knot_index, knots, process, anchor, rejectable=rejectable)
+
     iterations = 0
-    system = assemble(observations, knot_index, knots, process, anchor, rejectable=rejectable)
+    system = evaluate(knots)
     factor = factorise(system.diagonal, system.off_diagonal)
     while iterations < max_iterations:
         iterations += 1
@@ -245,9 +222,7 @@ def _minimise(
         if -float(np.vdot(step, system.gradient)) < PREDICTED_GAIN_TOLERANCE:
             knots, system = knots.retract(step), apply_linear_step(system, knot_index, step)
             break
-        candidate, candidate_knots = _line_search(
-            observations, knot_index, knots, step, system, process, anchor, rejectable
-        )
+        candidate, candidate_knots = _line_search(evaluate, knots, step, system)
         if candidate is None:
             break
         decrease = system.cost - candidate.cost
@@ -255,28 +230,12 @@ def _minimise(
         factor = factorise(system.diagonal, system.off_diagonal)
         if decrease < COST_TOLERANCE:
             break
-    return Solution(
-        knots,
-        factor,
-        system.squared_distances,
-        system.weights,
-        system.linearised,
-        knot_index,
-        system.cost,
-        iterations,
-        process,
-    )
+    found = system.squared_distances, system.weights, system.linearised, knot_index, system.cost
+    return Solution(knots, factor, *found, iterations, process)
 
 
 def _line_search(
-    observations: Observations,
-    knot_index: NDArray[np.intp],
-    knots: States,
-    step: FloatArray,
-    system: NormalEquations,
-    process: ProcessFactors,
-    anchor: AnchorPrior,
-    rejectable: NDArray[np.bool_] | None,
+    evaluate: Callable[[States], NormalEquations], knots: States, step: FloatArray, system: NormalEquations
 ) -> tuple[NormalEquations | None, States]:
     """Backtrack along a step until the cost decreases sufficiently; None where rounding hides any decrease.
 
@@ -287,9 +246,7 @@ def _line_search(
     fraction = 1.0
     while fraction > MIN_STEP_FRACTION:
         candidate_knots = knots.retract(fraction * step)
-        candidate = assemble(
-            observations, knot_index, candidate_knots, process, anchor, rejectable=rejectable
-        )
+        candidate = evaluate(candidate_knots)
         if candidate.cost < system.cost - 0.1 * fraction * predicted_decrease:
             return candidate, candidate_knots
         fraction /= 2.0

@@ -63,19 +63,11 @@ _DIFFERENCE_STEP = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class Hyperparameters:
-    """Maximum-evidence hyperparameters.
-
-    Attributes
-    ----------
-    noise_scale
-        Factor on the stated noise of the instruments.
-    log_evidence
-        Up to a constant.
-    """
+    """Maximum-evidence hyperparameters."""
 
     prior: MotionPrior
-    noise_scale: float
-    log_evidence: float
+    noise_scale: float  # Factor on the stated noise of the instruments
+    log_evidence: float  # Up to a constant
 
 
 class _Segment:
@@ -102,6 +94,8 @@ def tune(
 ) -> Hyperparameters:
     """Find the maximum-evidence hyperparameters.
 
+    Raises GeometryError: no segment has enough measurements of three prisms.
+
     Parameters
     ----------
     observations
@@ -114,11 +108,6 @@ def tune(
         Keep the prior and estimate only the noise scale.
     on_progress
         Called with the number of evaluations.
-
-    Raises
-    ------
-    GeometryError
-        No segment has enough measurements of three prisms.
     """
     initial = log_parameters(
         MotionPrior() if start is None else start, 1.0 if noise_scale is None else noise_scale
@@ -141,17 +130,14 @@ def maximise_evidence(
 ) -> Hyperparameters:
     """Maximise the evidence within bounds by L-BFGS-B.
 
+    Raises GeometryError: no segment has enough measurements of three prisms.
+
     Parameters
     ----------
     observations, on_progress
         As for :func:`tune`.
     start, lower, upper
         (7,) log parameters as from :func:`log_parameters`.
-
-    Raises
-    ------
-    GeometryError
-        No segment has enough measurements of three prisms.
     """
     segments = _segments(observations)
     evaluations = 0

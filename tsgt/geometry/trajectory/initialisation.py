@@ -27,25 +27,16 @@ def initial_guess(observations: Observations, time_s: FloatArray) -> States:
 
     Poses from linear interpolation between measurements, velocities from their differences.
 
-    Raises
-    ------
-    GeometryError
-        Fewer than three prisms were measured, or their tracks coincide or are collinear everywhere.
+    Raises GeometryError: fewer than three prisms were measured, or their tracks coincide or are collinear everywhere.
     """
     return PrismTracks.of(observations).guess(time_s)
 
 
 @dataclass(frozen=True, slots=True)
 class PrismTracks:
-    """Tracks of the measured prisms, prepared once for the initial guesses of many segments.
+    """Tracks of the measured prisms, prepared once for the initial guesses of many segments."""
 
-    Attributes
-    ----------
-    layout
-        (P, 3) positions of the measured prisms in the robot frame in m.
-    """
-
-    layout: FloatArray
+    layout: FloatArray  # (P, 3) positions of the measured prisms in the robot frame in m
     tracks: tuple[_Track, ...]
 
     @classmethod

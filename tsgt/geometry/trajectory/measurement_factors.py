@@ -7,7 +7,7 @@ of the zenith angle), so that neither the circle's zero nor the vertical is sing
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -59,17 +59,8 @@ class Observations:
 
     def select(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Observations:
         """Return the measurements of some rows."""
-        return Observations(
-            self.time_s[rows],
-            self.time_sigma_s[rows],
-            self.points_m[rows],
-            self.sigmas_m[rows],
-            self.polar[rows],
-            self.station[rows],
-            self.prism[rows],
-            self.frames,
-            self.layout,
-        )
+        names = (name for name in Observations.__slots__ if name not in ("frames", "layout"))
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def in_world(self) -> FloatArray:
         """(M, 3) measured points in frame ``station1`` in m."""
@@ -137,10 +128,10 @@ def linearise(
     half_delta_s2 = 0.5 * delta_s**2
     lever_arm = observations.layout[observations.prism]
     states = knots.select(knot_index)
-    delta_rotation, right_jacobian = exp_and_right_jacobian(
+    delta_R, J_r = exp_and_right_jacobian(
         states.angular_velocity * delta_s + states.angular_acceleration * half_delta_s2
     )
-    rotation = states.rotation @ delta_rotation
+    rotation = states.rotation @ delta_R
     point = (
         states.position
         + states.velocity * delta_s
@@ -154,9 +145,9 @@ def linearise(
     residuals, by_point = _residuals_by_point(observations, point)
     jacobian = np.empty((len(observations), 3, 18))
     by_rotation = -by_point @ rotation @ skew(lever_arm)
-    by_delta_rotation = by_rotation @ right_jacobian
+    by_delta_rotation = by_rotation @ J_r
     jacobian[:, :, 0:3] = by_point
-    jacobian[:, :, 3:6] = by_rotation @ np.swapaxes(delta_rotation, 1, 2)
+    jacobian[:, :, 3:6] = by_rotation @ np.swapaxes(delta_R, 1, 2)
     jacobian[:, :, 6:9] = by_point * delta_s[:, None]
     jacobian[:, :, 9:12] = by_delta_rotation * delta_s[:, None]
     jacobian[:, :, 12:15] = by_point * half_delta_s2[:, None]

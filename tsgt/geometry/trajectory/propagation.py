@@ -70,11 +70,11 @@ class Propagator:
         rotvec = _sum(
             _sum(_scaled(rate, dt_s), angular_acceleration, angular[0]), _cross(rate, rate_here), magnus_s2
         )
-        delta_rotation, right_jacobian = _exp_and_right_jacobian(rotvec)
+        delta_R, J_r = _exp_and_right_jacobian(rotvec)
         states = States(
             np.array([time_s]),
             start.position + start.velocity * dt_s + start.acceleration * linear[0],
-            start.rotation @ delta_rotation,
+            start.rotation @ delta_R,
             start.velocity + start.acceleration * linear[1],
             np.array([rate_here]),
             start.acceleration * linear[2],
@@ -88,13 +88,11 @@ class Propagator:
             (12, 12, linear[2], angular[2]),
         ):
             _set_diagonal(by_start, rows, columns, linear_value, angular_value)
-        magnus_by_rate = right_jacobian @ _skew(_scaled(rate, magnus_s2))
-        by_start[3:6, 3:6] = delta_rotation.T
-        by_start[3:6, 9:12] = (
-            right_jacobian * dt_s + magnus_by_rate - right_jacobian @ _skew(_scaled(rate_here, magnus_s2))
-        )
-        by_start[3:6, 15:18] = right_jacobian * angular[0] + magnus_by_rate * angular[1]
-        by_noise[3:6, 3:6] = right_jacobian
+        magnus_by_rate = J_r @ _skew(_scaled(rate, magnus_s2))
+        by_start[3:6, 3:6] = delta_R.T
+        by_start[3:6, 9:12] = J_r * dt_s + magnus_by_rate - J_r @ _skew(_scaled(rate_here, magnus_s2))
+        by_start[3:6, 15:18] = J_r * angular[0] + magnus_by_rate * angular[1]
+        by_noise[3:6, 3:6] = J_r
         by_noise[3:6, 9:12] = magnus_by_rate
         by_start, by_noise = by_start[:dim], by_noise[:dim]
         noise = np.zeros((STATE_DIM, STATE_DIM))

@@ -46,24 +46,13 @@ _IDENTITY_18 = np.eye(STATE_DIM)[None]
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:
-    """A continuous-time trajectory with its uncertainty.
+    """A continuous-time trajectory with its uncertainty."""
 
-    Attributes
-    ----------
-    knots
-        States at K times.
-    covariance
-        (K, 18, 18) of the knots' errors.
-    cross_covariance
-        (K - 1, 18, 18) of each knot's error (rows) with the next one's (columns).
-    sigmas
-        (K - 1, 6) acceleration sigmas of each step where they differ from those of ``prior``.
-    """
-
-    knots: States
+    knots: States  # States at K times
     prior: MotionPrior
-    covariance: FloatArray
-    cross_covariance: FloatArray
+    covariance: FloatArray  # (K, 18, 18) of the knots' errors
+    cross_covariance: FloatArray  # (K - 1, 18, 18) of each knot's error (rows) with the next one's (columns)
+    # (K - 1, 6) acceleration sigmas of each step where they differ from those of ``prior``
     sigmas: FloatArray | None = None
 
     def at(self, time_s: FloatArray, *, dim: int = STATE_DIM) -> tuple[States, FloatArray]:
@@ -111,19 +100,15 @@ class Trajectory:
         propagated = propagated[..., 0]
         magnus, rate, rate_here = (dt_s**2 / 12)[:, None], start.angular_velocity, propagated[:, 3:, 1]
         rotvec = propagated[:, 3:, 0] + magnus * cross(rate, rate_here)
-        delta_rotation, right_jacobian = exp_and_right_jacobian(rotvec)
-        states = _states(
-            time_s, start.position + propagated[:, :3, 0], start.rotation @ delta_rotation, propagated
-        )
-        linear_to_error = _linear_to_error(right_jacobian, magnus, rate)
-        by_start = linear_to_error @ axes_to_state(phi)
-        by_start[:, 3:6, 9:12] -= right_jacobian @ (magnus[..., None] * skew(rate_here))
-        by_start[:, 3:6, 3:6] = np.swapaxes(delta_rotation, 1, 2)
-        by_start, linear_to_error = by_start[:, :dim], linear_to_error[:, :dim]
+        delta_R, J_r = exp_and_right_jacobian(rotvec)
+        states = _states(time_s, start.position + propagated[:, :3, 0], start.rotation @ delta_R, propagated)
+        to_error = _linear_to_error(J_r, magnus, rate)
+        by_start = to_error @ axes_to_state(phi)
+        by_start[:, 3:6, 9:12] -= J_r @ (magnus[..., None] * skew(rate_here))
+        by_start[:, 3:6, 3:6] = np.swapaxes(delta_R, 1, 2)
+        by_start, to_error = by_start[:, :dim], to_error[:, :dim]
         covariance = by_start @ self.covariance[knot] @ np.swapaxes(by_start, 1, 2)
-        return states, _symmetric(
-            covariance + linear_to_error @ axes_to_state(noise) @ np.swapaxes(linear_to_error, 1, 2)
-        )
+        return states, _symmetric(covariance + to_error @ axes_to_state(noise) @ np.swapaxes(to_error, 1, 2))
 
     def _interpolate(self, time_s: FloatArray, later: np.ndarray, dim: int) -> tuple[States, FloatArray]:
         before, after = self.knots.select(later - 1), self.knots.select(later)
@@ -156,22 +141,22 @@ class Trajectory:
         axes = (from_earlier @ earlier_axes[..., None] + from_later @ later_axes[..., None])[..., 0]
         magnus_here, rate_here = (dt_s**2 / 12)[:, None], axes[:, 3:, 1]
         rotvec = axes[:, 3:, 0] + magnus_here * cross(earlier_rate, rate_here)
-        delta_rotation, right_jacobian = exp_and_right_jacobian(rotvec)
-        states = _states(time_s, axes[:, :3, 0], before.rotation @ delta_rotation, axes)
+        delta_R, J_r = exp_and_right_jacobian(rotvec)
+        states = _states(time_s, axes[:, :3, 0], before.rotation @ delta_R, axes)
         by_earlier, by_later = axes_to_state(from_earlier), axes_to_state(from_later)
         # The later rotation enters as the rotation vector from the earlier one minus its Magnus term.
-        by_rotation, inverse_jacobian = by_later[:, :, 3:6].copy(), inverse_right_jacobian(full_rotvec)
-        by_later[:, :, 3:6] = by_rotation @ inverse_jacobian
+        by_rotation, J_r_inv = by_later[:, :, 3:6].copy(), inverse_right_jacobian(full_rotvec)
+        by_later[:, :, 3:6] = by_rotation @ J_r_inv
         by_later[:, :, 9:12] -= by_rotation @ (magnus[..., None] * skew(earlier_rate))
         # The inverse Jacobian of the opposite rotation is the transpose.
-        by_earlier[:, :, 3:6] = -by_rotation @ np.swapaxes(inverse_jacobian, 1, 2)
+        by_earlier[:, :, 3:6] = -by_rotation @ np.swapaxes(J_r_inv, 1, 2)
         by_earlier[:, :, 9:12] += by_rotation @ (magnus[..., None] * skew(later_rate))
-        linear_to_error = _linear_to_error(right_jacobian, magnus_here, earlier_rate)[:, :dim]
-        by_earlier, by_later = linear_to_error @ by_earlier, linear_to_error @ by_later
-        by_earlier[:, 3:6, 9:12] -= right_jacobian @ (magnus_here[..., None] * skew(rate_here))
-        by_earlier[:, 3:6, 3:6] += np.swapaxes(delta_rotation, 1, 2)
+        to_error = _linear_to_error(J_r, magnus_here, earlier_rate)[:, :dim]
+        by_earlier, by_later = to_error @ by_earlier, to_error @ by_later
+        by_earlier[:, 3:6, 9:12] -= J_r @ (magnus_here[..., None] * skew(rate_here))
+        by_earlier[:, 3:6, 3:6] += np.swapaxes(delta_R, 1, 2)
         sigmas = axis_sigmas(self.prior)[None] if self.sigmas is None else self.sigmas[later - 1]
-        process = linear_to_error @ axes_to_state(conditional * (sigmas**2)[:, :, None, None])
+        process = to_error @ axes_to_state(conditional * (sigmas**2)[:, :, None, None])
         coupling = by_earlier @ self.cross_covariance[later - 1] @ np.swapaxes(by_later, 1, 2)
         covariance = (
             by_earlier @ self.covariance[later - 1] @ np.swapaxes(by_earlier, 1, 2)
@@ -179,7 +164,7 @@ class Trajectory:
             + coupling
             + np.swapaxes(coupling, 1, 2)
         )
-        return states, _symmetric(covariance + process @ np.swapaxes(linear_to_error, 1, 2))
+        return states, _symmetric(covariance + process @ np.swapaxes(to_error, 1, 2))
 
     def _times_s(self) -> FloatArray:
         """(2,) correlation times of the linear and the angular axes in s."""

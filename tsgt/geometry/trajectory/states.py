@@ -65,15 +65,7 @@ class States:
 
     def select(self, rows: slice | NDArray[np.intp]) -> States:
         """Return the states of some rows."""
-        return States(
-            self.time_s[rows],
-            self.position[rows],
-            self.rotation[rows],
-            self.velocity[rows],
-            self.angular_velocity[rows],
-            self.acceleration[rows],
-            self.angular_acceleration[rows],
-        )
+        return States(*(getattr(self, name)[rows] for name in States.__slots__))
 
     def retract(self, error: FloatArray) -> States:
         """Add errors, (K, 18), to the states."""
@@ -109,18 +101,10 @@ def concatenate_states(parts: list[States]) -> States:
 
 @dataclass(frozen=True, slots=True)
 class ProcessFactors:
-    """Process factors of the K - 1 steps between knots; they depend on the knots' times alone.
+    """Process factors of the K - 1 steps between knots; they depend on the knots' times alone."""
 
-    Attributes
-    ----------
-    phi
-        (K - 1, 6, 3, 3) transition matrix of each axis.
-    information
-        (K - 1, 6, 3, 3) inverse of the process noise covariance.
-    """
-
-    phi: FloatArray
-    information: FloatArray
+    phi: FloatArray  # (K - 1, 6, 3, 3) transition matrix of each axis
+    information: FloatArray  # (K - 1, 6, 3, 3) inverse of the process noise covariance
 
     @classmethod
     def of(cls, time_s: FloatArray, prior: MotionPrior, sigmas: FloatArray | None = None) -> ProcessFactors:
@@ -132,8 +116,7 @@ class ProcessFactors:
         two_phi, two_information = transition(dt_s, times_s), process_information(dt_s, times_s)
         weights = (axis_sigmas(prior)[None] if sigmas is None else sigmas) ** -2.0
         return cls(
-            np.repeat(two_phi, 3, axis=1),
-            np.repeat(two_information, 3, axis=1) * weights[:, :, None, None],
+            np.repeat(two_phi, 3, axis=1), np.repeat(two_information, 3, axis=1) * weights[:, :, None, None]
         )
 
     def select(self, rows: slice) -> ProcessFactors:
@@ -185,9 +168,9 @@ def linearise_process(knots: States, factors: ProcessFactors) -> LinearisedProce
     later[:, :3, 0] = knots.position[1:] - knots.position[:-1]
     later[:, 3:, 0] = rotvec - magnus * cross(before, after)
     by_earlier, by_later = np.empty((count, 3, 6)), np.empty((count, 3, 6))
-    inverse_jacobian = inverse_right_jacobian(rotvec)
+    J_r_inv = inverse_right_jacobian(rotvec)
     # The inverse Jacobian of the opposite rotation is the transpose.
-    by_earlier[:, :, :3], by_later[:, :, :3] = -np.swapaxes(inverse_jacobian, 1, 2), inverse_jacobian
+    by_earlier[:, :, :3], by_later[:, :, :3] = -np.swapaxes(J_r_inv, 1, 2), J_r_inv
     by_earlier[:, :, 3:] = skew(magnus * after)
     by_later[:, :, 3:] = skew(-magnus * before)
     residuals = np.swapaxes(later - matvec(factors.phi, earlier), 1, 2).reshape(count, STATE_DIM)
@@ -210,10 +193,7 @@ def add_process_factors(
     diagonal, off_diagonal, gradient
         (K, 18, 18), (K - 1, 18, 18), (K, 18).
 
-    Returns
-    -------
-    float
-        Sum of the squared Mahalanobis distances of the residuals.
+    Returns sum of the squared Mahalanobis distances of the residuals.
     """
     count = len(factors.phi)
     translation = slice(0, 3)

@@ -45,9 +45,7 @@ def covariance_without_nis_scale(window: FixedLagSmoother, at_s: float) -> Float
     return Propagator(state, covariance[0], PRIOR, process_noise_scale=PREDICTION_NOISE_SCALE).at(at_s)[1]
 
 
-def test_large_innovations_increase_predicted_covariance(
-    observations: Observations,
-) -> None:
+def test_large_innovations_increase_predicted_covariance(observations: Observations) -> None:
     """The robot doubles its speed between measurements."""
     hurried_s = np.where(
         observations.time_s < 6.0, observations.time_s, 6.0 + (observations.time_s - 6.0) / 2.0

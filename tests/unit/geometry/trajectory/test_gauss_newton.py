@@ -215,9 +215,7 @@ def test_the_order_of_measurements_is_irrelevant(observations: Observations) -> 
     assert shuffled.cost == pytest.approx(found.cost)
 
 
-def test_squared_distances_are_chi_square(
-    observations: Observations,
-) -> None:
+def test_squared_distances_are_chi_square(observations: Observations) -> None:
     """Mean squared distance of 3 minus the share that the trajectory absorbs."""
     found = solve(observations, guess_of(observations), PRIOR)
     # The trajectory takes what it takes up: six numbers a time, every 0.4 s, of nine that are measured.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from harness.radios import running_timeline
 
-from tsgt.doctor import Machine, examine
+from tsgt.doctor import Machine, run_checks
 from tsgt.doctor.machine import User
 from tsgt.errors import InstrumentError
 from tsgt.simulation.kernel import VirtualClock
@@ -115,7 +115,7 @@ ENABLED = {
 }
 
 
-class MadeUpMachine:
+class FakeMachine:
     """Everything that is outside of the checks, at first with nothing wrong; a test changes what it is about.
 
     Attributes
@@ -202,9 +202,9 @@ class MadeUpMachine:
             serves=lambda path: path in self.served,
         )
 
-    async def examine(self, name: str = "client.toml") -> dict[str, Finding]:
+    async def run_checks(self, name: str = "client.toml") -> dict[str, Finding]:
         """Make all checks; return the findings by name, of which none comes twice."""
-        found = [finding async for finding in examine(self.machine(), self.folder / name)]
+        found = [finding async for finding in run_checks(self.machine(), self.folder / name)]
         by_name = {finding.name: finding for finding in found}
         assert len(by_name) == len(found)
         return by_name

@@ -37,7 +37,7 @@ def test_bound_contains_the_truth(
     frame_s: float,
     duration_s: int,
 ) -> None:
-    """Any drift, ramps, changes by up to 20 ppm, an outage, stamps up to three times worse than stated, few pairs."""
+    """For any skew, ramp, changes by up to 20 ppm, outage, understated timestamps and few samples."""
     rng = np.random.default_rng(seed)
     levels_ppm = np.concatenate([[0.0], rng.uniform(-10, 10, changes)])
     times_s = np.sort(rng.uniform(0, duration_s + outage_s, changes)) // 15 * 15 + rng.uniform(0, 1)

@@ -71,20 +71,20 @@ packets = st.one_of(
 
 
 @given(commands)
-def test_commands_come_back(command: CommandMessage) -> None:
-    """What is sent is what is understood."""
+def test_commands_round_trip(command: CommandMessage) -> None:
+    """Decoding inverts encoding."""
     assert decode_command(command.to_bytes()) == command
 
 
 @given(replies)
-def test_replies_come_back(reply: PingReply | TimeReply | Acknowledgement | MeasurementMessage) -> None:
-    """What is sent is what is understood, to the last bit of a number."""
+def test_replies_round_trip(reply: PingReply | TimeReply | Acknowledgement | MeasurementMessage) -> None:
+    """Decoding inverts encoding, to the last bit of a number."""
     assert decode_reply(reply.to_bytes()) == reply
 
 
 @given(packets)
-def test_every_packet_is_understood_or_not(payload: bytes) -> None:
-    """A packet is a message that would be sent so, or none; no number that is none gets in."""
+def test_any_packet_decodes_or_is_rejected(payload: bytes) -> None:
+    """A decoded packet would be encoded the same; all its numbers are finite."""
     command, reply = decode_command(payload), decode_reply(payload)
     if command is not None:
         assert command.to_bytes() == payload
@@ -99,8 +99,8 @@ def test_every_packet_is_understood_or_not(payload: bytes) -> None:
 
 
 @given(st.lists(st.tuples(packets, st.integers(0, 3)), max_size=40))
-def test_a_station_survives_every_packet(events: list[tuple[bytes, int]]) -> None:
-    """Whatever it hears, each order is given once, and what it answers is a reply."""
+def test_station_survives_any_packet(events: list[tuple[bytes, int]]) -> None:
+    """For any packets, each command is issued once, and each reply is valid."""
     station = ClassicStation(1)
     under_way = None
     for payload, patience in events:
@@ -123,8 +123,8 @@ def test_a_station_survives_every_packet(events: list[tuple[bytes, int]]) -> Non
     turn=st.sampled_from(["poll", "shot", "order", "synchronisation"]),
     answers=st.lists(st.lists(st.tuples(packets, st.integers(54 * MS, 300 * MS)), max_size=3), max_size=60),
 )
-def test_every_turn_ends(turn: str, answers: list[list[tuple[bytes, int]]]) -> None:
-    """Whatever comes back, a turn asks a bounded number of times, and never for a station that is not its own."""
+def test_every_transaction_ends(turn: str, answers: list[list[tuple[bytes, int]]]) -> None:
+    """For any replies, a transaction sends a bounded number of requests, all to its own station."""
     turns: dict[str, Transaction] = {
         "poll": Poll(1, TIMING),
         "shot": SingleMeasurementPoll(1, TIMING),
@@ -150,7 +150,7 @@ def test_every_turn_ends(turn: str, answers: list[list[tuple[bytes, int]]]) -> N
 @examples(300)
 @given(data=st.data(), cycles=st.integers(1, 12))
 def test_late_and_lost_packets_never_make_a_wrong_sample(data: st.DataObject, cycles: int) -> None:
-    """A station that answers in order, however late, over a link that loses packets: each sample's bounds hold."""
+    """With a station that replies in order, however late, over a lossy link, each sample's bounds hold."""
     offset_ns = 10**18
     station = ClassicStation(1)
     turn = Synchronisation(1, cycles, TIMING)

@@ -10,7 +10,7 @@ from harness.clock_exchanges import SECOND, START_NS, exchange
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tsgt.timesync import clock_filter
+from tsgt.timesync.two_way import clock_filter
 
 MS = 1_000_000
 
@@ -37,7 +37,7 @@ def test_bound_contains_the_truth(
     cycles: int,
     loss: float,
 ) -> None:
-    """Random drift, temperature waves, late stamps and losses; asked every 20 s for two hours."""
+    """For random skew, temperature waves, late timestamps and losses; evaluated every 20 s for two hours."""
     rng = np.random.default_rng(seed)
     period_s, phase = rng.uniform(1200, 7200), rng.uniform(0, 2 * math.pi)
     # Frequency is a wave whose steepest slope is the wander.
@@ -58,7 +58,7 @@ def test_bound_contains_the_truth(
                 offset_ns,
                 late_ns=round(rng.normal(0, 5_000))
                 + (round(rng.exponential(late_ms * MS)) if rng.random() < late_share else 0),
-                turn_round_ns=round(rng.uniform(1, 8) * MS),
+                turnaround_ns=round(rng.uniform(1, 8) * MS),
             )
             for cycle in range(cycles if synchronisation == 0 else 5)
             if rng.random() >= loss

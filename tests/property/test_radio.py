@@ -49,7 +49,7 @@ bus_actions = st.one_of(
 @examples(200)
 @given(actions=st.lists(bus_actions, min_size=5, max_size=40))
 def test_arbitrary_bus_traffic_never_breaks_the_chip(actions: list[tuple[str, object]]) -> None:
-    """Whatever is done to bus and reset, every register still reads, and a reset brings a working chip back."""
+    """After any bus access and reset every register reads, and a reset restores a working chip."""
     timeline = VirtualTimeline()
     air = Air(timeline, np.random.default_rng(0), LinkModel())
     chip, peer = (
@@ -196,7 +196,7 @@ air_actions = st.one_of(
 @examples(150)
 @given(actions=st.lists(air_actions, min_size=3, max_size=25))
 def test_arbitrary_packets_never_break_the_driver(actions: list[Sent | OwnPacket]) -> None:
-    """After any packets, bursts and collisions the driver receives a good one; what it delivered was sent."""
+    """After any packets, bursts and collisions the driver receives a valid one; all delivered packets were sent."""
 
     async def run() -> None:
         timeline = running_timeline()

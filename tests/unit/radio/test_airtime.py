@@ -64,12 +64,12 @@ ROWS = [
 
 @pytest.mark.parametrize("row", ROWS)
 def test_airtime_of_worked_examples(row: Row) -> None:
-    """The time on air is the data sheet's, to the microsecond."""
+    """The airtime is the data sheet's, to the microsecond."""
     assert _computed(row) == row.airtime_us
 
 
-def test_airtime_of_every_table() -> None:
-    """Every value in the fact sheet's tables is met to the microsecond."""
+def test_airtime_matches_every_published_table() -> None:
+    """Every value of the fact sheet's tables is met to the microsecond."""
     if not FACTS.is_file():
         pytest.skip(f"the fact sheet is not at {FACTS}")
     rows = list(_published(FACTS.read_text(encoding="utf-8")))
@@ -89,15 +89,15 @@ def test_airtime_of_every_table() -> None:
         (8, 15_600, True),
     ],
 )
-def test_low_data_rate_follows_the_symbol(
+def test_low_data_rate_is_required_above_16_ms(
     spreading_factor: int, bandwidth_hz: int, *, expected: bool
 ) -> None:
-    """The low data rate optimisation is due where a symbol lasts longer than 16 ms."""
+    """The low data rate optimisation is required where a symbol lasts longer than 16 ms."""
     assert low_data_rate_required(spreading_factor, bandwidth_hz) is expected
 
 
 def test_low_data_rate_can_be_forced() -> None:
-    """A peer that breaks the rule (SF 11 at 250 kHz with optimisation) sends longer packets."""
+    """A sender with the optimisation against the rule (SF 11 at 250 kHz) sends longer packets."""
     assert airtime_us(34, spreading_factor=11, bandwidth_hz=250_000, coding_rate=6) == 509_952
     assert (
         airtime_us(34, spreading_factor=11, bandwidth_hz=250_000, coding_rate=6, low_data_rate=True)
@@ -106,7 +106,7 @@ def test_low_data_rate_can_be_forced() -> None:
 
 
 def test_spreading_factor_6_has_the_same_preamble() -> None:
-    """The 4.25 symbols of the SX127x hold at SF 6 too, unlike on later chips."""
+    """The preamble has 4.25 extra symbols at SF 6 too, unlike on later chips."""
     # ceil((80 - 24 + 28 + 16 - 20) / 24) = 4 blocks of 5 symbols, 8 + 20 + 12.25 symbols of 0.512 ms
     assert airtime_us(
         10, spreading_factor=6, bandwidth_hz=125_000, coding_rate=5, explicit_header=False
@@ -114,14 +114,14 @@ def test_spreading_factor_6_has_the_same_preamble() -> None:
 
 
 def test_symbols_without_header_and_crc() -> None:
-    """Leaving out header and CRC saves 36 bits."""
+    """Omitting header and CRC saves 36 bits."""
     with_both = payload_symbols(34, spreading_factor=9, coding_rate=6)
     without = payload_symbols(34, spreading_factor=9, coding_rate=6, explicit_header=False, crc=False)
     assert (with_both, without) == (56, 50)
 
 
 def test_the_shortest_packet_has_eight_symbols() -> None:
-    """A payload that fits into the first block adds nothing to it."""
+    """A payload that fits into the first block adds no symbols."""
     assert payload_symbols(1, spreading_factor=12, coding_rate=8, explicit_header=False, crc=False) == 8
 
 
@@ -136,16 +136,16 @@ def test_bit_rate_of_the_paper() -> None:
 
 
 @given(payload_bytes=st.integers(1, 254), modem=modems)
-def test_airtime_never_falls_with_the_payload(payload_bytes: int, modem: Modem) -> None:
-    """One byte more costs nothing or one block, as many symbols as the coding rate's denominator."""
+def test_airtime_increases_with_the_payload(payload_bytes: int, modem: Modem) -> None:
+    """One more byte costs nothing or one block of as many symbols as the coding rate's denominator."""
     step_us = airtime_us(payload_bytes + 1, **modem) - airtime_us(payload_bytes, **modem)
     block_ns = modem["coding_rate"] * symbol_time_ns(modem["spreading_factor"], modem["bandwidth_hz"])
     assert step_us * 1000 in (0, block_ns)
 
 
 @given(payload_bytes=st.integers(1, 255), preamble=st.integers(6, 60_000), modem=modems)
-def test_every_preamble_symbol_costs_a_symbol(payload_bytes: int, preamble: int, modem: Modem) -> None:
-    """Another symbol of preamble lasts a symbol."""
+def test_preamble_symbol_costs_one_symbol(payload_bytes: int, preamble: int, modem: Modem) -> None:
+    """Another symbol of preamble lasts one symbol."""
     more_us = airtime_us(payload_bytes, **modem, preamble_symbols=preamble + 1)
     less_us = airtime_us(payload_bytes, **modem, preamble_symbols=preamble)
     symbol_ns = symbol_time_ns(modem["spreading_factor"], modem["bandwidth_hz"])

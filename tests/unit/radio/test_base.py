@@ -28,12 +28,12 @@ from tsgt.radio import LoRaSettings
         ("power_dbm", 21),
     ],
 )
-def test_settings_out_of_range_are_refused_by_name(name: str, value: int) -> None:
-    """Each setting that the chip cannot take is refused where it is made, with its name and its value."""
+def test_setting_out_of_range_is_rejected(name: str, value: int) -> None:
+    """A setting that the chip does not support is rejected with its name and value."""
     with pytest.raises(RadioSettingsError, match=rf"{name} must be .*, got {value}"):
         LoRaSettings(**{**asdict(PAPER), name: value})
 
 
 def test_settings_error_is_a_value_error() -> None:
-    """Validation by pydantic or argparse, which look for ValueError, shows the message."""
+    """Pydantic and argparse, which catch ValueError, show the message."""
     assert issubclass(RadioSettingsError, ValueError)

@@ -18,16 +18,16 @@ if TYPE_CHECKING:
 TIMEOUT_NS = 200_000_000
 
 
-async def test_every_request_is_answered() -> None:
-    """Three requests, three replies, in order, each after the time that the reply is on the air."""
+async def test_every_request_has_a_reply() -> None:
+    """Three requests, three replies, in order, each after the airtime of the reply."""
     async with _pair() as (here, _):
         exchanges = await _ping(here, count=3)
     assert [exchange.number for exchange in exchanges] == [0, 1, 2]
     assert [exchange.round_trip_ns for exchange in exchanges] == [AIRTIME_NS] * 3
 
 
-async def test_a_reply_tells_how_the_request_was_heard() -> None:
-    """Strengths of both directions arrive, to a tenth of a dBm and a quarter of a dB."""
+async def test_reply_reports_the_signal_strength_of_the_request() -> None:
+    """The strengths of both directions arrive, to a tenth of a dBm and a quarter of a dB."""
     async with _pair() as (here, _):
         (exchange,) = await _ping(here, count=1)
     assert exchange.reply is not None
@@ -35,8 +35,8 @@ async def test_a_reply_tells_how_the_request_was_heard() -> None:
     assert exchange.reply.remote == SignalStrength(-101.3, -11.5)
 
 
-async def test_a_reply_tells_how_long_the_one_before_took() -> None:
-    """The turn-round comes with the next reply; the first has none to tell."""
+async def test_reply_reports_the_previous_turnaround() -> None:
+    """The turnaround arrives with the next reply; the first reply has none."""
     async with _pair(think_ns=3_000_000) as (here, _):
         exchanges = await _ping(here, count=3)
     turnarounds_ns = [exchange.reply and exchange.reply.previous_turnaround_ns for exchange in exchanges]
@@ -44,8 +44,8 @@ async def test_a_reply_tells_how_long_the_one_before_took() -> None:
     assert summarise(exchanges).turnaround_ns == (3_000_000, 3_000_000)
 
 
-async def test_a_new_run_starts_without_turn_round() -> None:
-    """What the last reply to somebody else took is not told to a new run."""
+async def test_new_session_starts_without_a_turnaround() -> None:
+    """The turnaround of the last reply to another session is not reported."""
     async with _pair() as (here, _):
         await _ping(here, count=2, session=1)
         (exchange,) = await _ping(here, count=1, session=2)
@@ -53,16 +53,16 @@ async def test_a_new_run_starts_without_turn_round() -> None:
     assert exchange.reply.previous_turnaround_ns is None
 
 
-async def test_request_and_reply_have_the_length_asked_for() -> None:
-    """The packets are filled up, so that their time on air is that of the payload to be tested."""
+async def test_packets_are_padded_to_the_requested_length() -> None:
+    """Request and reply have the airtime of the payload under test."""
     lengths = []
     async with _pair(on_air=lambda payload: lengths.append(len(payload))) as (here, _):
         await _ping(here, count=1, payload_bytes=40)
     assert lengths == [40, 40]
 
 
-async def test_a_lost_reply_is_given_up_in_time() -> None:
-    """Without a reply the next request leaves when the time-out has passed."""
+async def test_lost_reply_times_out() -> None:
+    """Without a reply the next request is sent after the timeout."""
     here = PlainRadio(VirtualClock(0))
     exchanges = await _ping(here, count=2)
     assert [exchange.reply for exchange in exchanges] == [None, None]
@@ -70,15 +70,15 @@ async def test_a_lost_reply_is_given_up_in_time() -> None:
     assert summarise(exchanges).loss == 1.0
 
 
-async def test_a_late_reply_does_not_pass_for_the_next() -> None:
-    """A reply to an earlier request is counted as late and answers nothing."""
+async def test_late_reply_is_counted_as_late() -> None:
+    """A reply to an earlier request does not count for the next one."""
     async with _pair(think_ns=TIMEOUT_NS) as (here, _):
         first, second = await _ping(here, count=2)
     assert first.reply is None
     assert second.late == 1
 
 
-async def test_a_second_reply_counts_once() -> None:
+async def test_repeated_reply_is_counted_as_late() -> None:
     """An echo of a reply is counted as late."""
     async with _pair() as (here, there):
         there.on_sent = here.hear_twice
@@ -87,8 +87,8 @@ async def test_a_second_reply_counts_once() -> None:
     assert [exchange.late for exchange in exchanges] == [0, 1]
 
 
-async def test_packets_of_others_are_ignored_and_counted() -> None:
-    """Short ones, long ones and the replies to another run do not disturb."""
+async def test_unknown_packets_are_ignored_and_counted() -> None:
+    """Short packets, long ones and replies to another session have no effect."""
     other = PlainRadio(VirtualClock(0))
     async with _pair() as (here, there):
         there.on_sent, to_here = other.hear, there.on_sent
@@ -101,8 +101,8 @@ async def test_packets_of_others_are_ignored_and_counted() -> None:
     assert exchange.unknown == 4
 
 
-async def test_packets_of_others_do_not_prolong_the_wait() -> None:
-    """A busy channel does not move the time-out."""
+async def test_unknown_packets_do_not_extend_the_timeout() -> None:
+    """A busy channel does not delay the next request."""
     here = PlainRadio(VirtualClock(0))
 
     async def chatter() -> None:
@@ -117,8 +117,8 @@ async def test_packets_of_others_do_not_prolong_the_wait() -> None:
     assert second.started_at_ns - first.sent_at_ns == TIMEOUT_NS
 
 
-async def test_a_request_is_answered_once() -> None:
-    """The same request again, as an echo brings it, gets no second reply."""
+async def test_repeated_request_has_one_reply() -> None:
+    """A repeated request, as from an echo, has no second reply."""
     sent: list[bytes] = []
     there, requests = PlainRadio(VirtualClock(0)), PlainRadio(VirtualClock(0))
     there.on_sent = sent.append
@@ -140,15 +140,15 @@ async def test_a_request_is_answered_once() -> None:
     assert (summary.answered, summary.repeated, summary.unknown) == (1, 1, 1)
 
 
-async def test_the_rate_counts_both_ways() -> None:
+async def test_packet_rate_counts_both_ways() -> None:
     """Ten exchanges of two packets of 50 ms each are twenty packets in a second."""
     async with _pair() as (here, _):
         exchanges = await _ping(here, count=10)
     assert summarise(exchanges).packets_per_s == pytest.approx(20.0)
 
 
-def test_nothing_sent_has_no_figures() -> None:
-    """A run that was stopped before its first request has an empty summary."""
+def test_empty_session_has_no_statistics() -> None:
+    """A session that was stopped before its first request has an empty summary."""
     summary = summarise([])
     assert (summary.sent, summary.received, summary.loss, summary.packets_per_s) == (0, 0, None, None)
     assert summarise_responses([]).turnaround_ns is None
@@ -177,7 +177,7 @@ async def _collect(radio: Radio, answers: list[Response]) -> None:
 async def _pair(
     *, think_ns: int = 0, on_air: Callable[[bytes], None] = lambda _: None
 ) -> AsyncIterator[tuple[PlainRadio, PlainRadio]]:
-    """Two radios that hear each other, the second answering after the time that it is to take."""
+    """Make two radios within range of each other, the second responding after ``think_ns``."""
     clock = VirtualClock(0)
     here, there = PlainRadio(clock), PlainRadio(clock, rssi_dbm=-101.3, snr_db=-11.5, latency_ns=think_ns)
 

@@ -54,8 +54,8 @@ async def run(attempts: Attempts, use_s: float, error: Exception | None, for_s: 
             await supervise_radio(attempts.open, use, CLOCK)
 
 
-async def test_a_radio_that_is_missing_is_looked_for_ever_more_slowly() -> None:
-    """The pauses double from 0.1 s to 5 s; the log says it once."""
+async def test_retry_delay_doubles_while_the_radio_is_missing() -> None:
+    """The delay doubles from 0.1 s to 5 s; the error is logged once."""
     attempts = Attempts(*[RadioError("no chip")] * 10)
     with capture_logs() as logs:
         await run(attempts, 1e6, None, 60.0)
@@ -65,30 +65,30 @@ async def test_a_radio_that_is_missing_is_looked_for_ever_more_slowly() -> None:
 
 
 @pytest.mark.parametrize("error", [RadioError("hung"), StreamError("no air")])
-async def test_a_radio_that_fails_in_use_is_closed_and_opened_again(error: TsgtError) -> None:
-    """After it has worked for a while the first pause is short again."""
+async def test_radio_that_fails_in_use_is_reopened(error: TsgtError) -> None:
+    """After a working period the first delay is short again."""
     attempts = Attempts()
     await run(attempts, 10.0, error, 35.0)
     assert [round(at_s, 3) for at_s in attempts.opened_s] == [0.0, 10.1, 20.2, 30.3]
     assert attempts.closed == 4
 
 
-async def test_another_reason_is_logged_again() -> None:
-    """Who mends one thing and finds the next one broken reads both."""
+async def test_changed_error_is_logged() -> None:
+    """The second of two different errors in a row is logged too."""
     attempts = Attempts(RadioError("no chip"), RadioError("no chip"), RadioError("pin taken"))
     with capture_logs() as logs:
         await run(attempts, 1e6, None, 10.0)
     assert [entry["error"] for entry in logs if entry["event"] == "radio_lost"] == ["no chip", "pin taken"]
 
 
-async def test_what_it_can_never_do_ends_it() -> None:
-    """Trying again does not make 20 dBm allowed."""
+async def test_settings_error_ends_the_supervision() -> None:
+    """A retry cannot make 20 dBm allowed."""
     with pytest.raises(RadioSettingsError):
         await supervise_radio(Attempts(RadioSettingsError("20 dBm")).open, _never, CLOCK)
 
 
-async def test_a_radio_that_fails_while_it_is_told_to_stop_stops() -> None:
-    """The error takes the place of the cancellation, which must not be lost: nobody cancels twice."""
+async def test_failure_during_cancellation_cancels() -> None:
+    """The radio's error replaces the cancellation, which must not be lost."""
 
     async def use(_radio: Radio) -> None:
         try:

@@ -15,8 +15,8 @@ PRIOR = ClockLine(1.0, 5.0, 100.0, 3.0, 50.0)
 UNKNOWN = ClockLine(0.0, 0.0, 1e9, 0.0, 1e9)
 
 
-def forwards(until_s: float) -> ClockLine:
-    """Filter the comparisons up to an instant, and carry the result there."""
+def forward(until_s: float) -> ClockLine:
+    """Filter the samples up to an instant, and propagate to it."""
     estimate, at_s = PRIOR, 0.0
     for time_s, offset_us, variance in zip(TIMES_S, OFFSETS_US, VARIANCES, strict=True):
         if time_s > until_s:
@@ -27,8 +27,8 @@ def forwards(until_s: float) -> ClockLine:
     return estimate.propagate(until_s - at_s, WALK_PPM2_PER_S * (until_s - at_s))
 
 
-def backwards(until_s: float) -> ClockLine:
-    """Filter the comparisons after an instant, newest first, and carry the result there."""
+def backward(until_s: float) -> ClockLine:
+    """Filter the samples after an instant, newest first, and propagate to it."""
     estimate, at_s = UNKNOWN, float(TIMES_S[-1])
     for time_s, offset_us, variance in zip(TIMES_S[::-1], OFFSETS_US[::-1], VARIANCES[::-1], strict=True):
         if time_s <= until_s:
@@ -39,8 +39,8 @@ def backwards(until_s: float) -> ClockLine:
     return estimate.propagate(until_s - at_s, WALK_PPM2_PER_S * (at_s - until_s))
 
 
-def at_once(time_s: float) -> ClockLine:
-    """Solve for offset and rate at all times together, from first principles, and return one of them."""
+def batch(time_s: float) -> ClockLine:
+    """Solve for offset and skew at all times together by least squares, and return one of them."""
     times_s = np.unique([*TIMES_S, time_s])
     size = 2 * len(times_s)
     information, vector = np.zeros((size, size)), np.zeros(size)
@@ -69,18 +69,18 @@ def at_once(time_s: float) -> ClockLine:
     )
 
 
-def test_forwards_is_the_least_squares_solution_at_the_end() -> None:
-    """Beyond the last comparison, the filter knows all that there is to know."""
-    assert tuple(forwards(9.6)) == pytest.approx(tuple(at_once(9.6)), rel=1e-6)
+def test_forward_filter_is_the_batch_solution_at_the_end() -> None:
+    """Beyond the last sample the filter equals the batch least-squares solution."""
+    assert tuple(forward(9.6)) == pytest.approx(tuple(batch(9.6)), rel=1e-6)
 
 
 @pytest.mark.parametrize("time_s", [0.2, 1.1, 4.0, 8.2, 9.0])
-def test_both_ways_merged_are_the_least_squares_solution(time_s: float) -> None:
-    """Between comparisons, those before and those after together are all that there is to know."""
-    assert tuple(forwards(time_s).fuse(backwards(time_s))) == pytest.approx(tuple(at_once(time_s)), rel=1e-5)
+def test_fused_filters_are_the_batch_solution(time_s: float) -> None:
+    """Between samples the fused forward and backward filters equal the batch least-squares solution."""
+    assert tuple(forward(time_s).fuse(backward(time_s))) == pytest.approx(tuple(batch(time_s)), rel=1e-5)
 
 
-def test_carrying_back_undoes_carrying() -> None:
-    """Without a walk nothing is lost on the way."""
+def test_backward_propagation_inverts_forward_propagation() -> None:
+    """Without a random walk propagation is reversible."""
     there = PRIOR.propagate(7.0, 0.0)
     assert tuple(there.propagate(-7.0, 0.0)) == pytest.approx(tuple(PRIOR), rel=1e-9)

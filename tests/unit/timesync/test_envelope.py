@@ -11,8 +11,8 @@ SPREAD = 40.0
 
 
 @pytest.mark.parametrize("count", [12, 100, 1000])
-def test_how_far_the_lowest_answer_is_from_the_line(count: int) -> None:
-    """Mean and scatter are those of many trials, whether what is cut off matters or not."""
+def test_minimum_delay_matches_trials(count: int) -> None:
+    """Mean and sigma are those of many trials, with small and large truncation."""
     random = np.random.default_rng(1)
     heights = random.uniform(0, SPREAD, (4000, count)) + random.uniform(0, 1, (4000, count))
     found = minimum_delay(SPREAD / (count + 1))
@@ -20,8 +20,8 @@ def test_how_far_the_lowest_answer_is_from_the_line(count: int) -> None:
     assert found.sigma == pytest.approx(heights.min(axis=1).std(), rel=0.25)
 
 
-def test_errors_of_the_line_are_as_stated() -> None:
-    """At the end of the answers, over many trials: no bias to speak of, and a scatter like the stated one."""
+def test_stated_sigma_matches_the_errors() -> None:
+    """Over many trials the extrapolated line has hardly any bias, and errors of the stated sigma."""
     random = np.random.default_rng(2)
     errors = []
     for _ in range(200):
@@ -44,8 +44,8 @@ def test_errors_of_the_line_are_as_stated() -> None:
     assert 0.6 < np.sqrt(np.mean(np.square(errors))) < 1.4
 
 
-def test_one_answer_tells_nothing_of_the_slope() -> None:
-    """What was known of it before remains."""
+def test_single_response_keeps_the_prior_slope() -> None:
+    """The prior slope and its sigma remain."""
     line = fit_lower_envelope([(3.0, 5.0)], centre=3.0, scale=1.0, prior=(1e-3, 1e-3), max_slope=1e-2)
     assert line.slope == pytest.approx(1e-3, rel=1e-2)
     assert line.slope_sigma == pytest.approx(1e-3, rel=5e-2)

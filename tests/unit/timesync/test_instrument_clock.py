@@ -19,12 +19,12 @@ FASTEST_MS = 20
 
 
 def arrived_ns(instrument_ms: float, late_ms: float = 0.0, rate: float = 0.0) -> int:
-    """Return when an answer with that time arrives."""
+    """Return the arrival of a response with that instrument time."""
     return OFFSET_NS + round((instrument_ms * (1 + rate) + FASTEST_MS + late_ms) * MS)
 
 
-def standing(samples: int = 200, rate: float = 0.0, start_ms: int = 5_000_000) -> InstrumentClock:
-    """Return a clock with samples every 400 ms, every fourth one as fast as can be."""
+def initialised_clock(samples: int = 200, rate: float = 0.0, start_ms: int = 5_000_000) -> InstrumentClock:
+    """Return a clock with samples every 400 ms, every fourth one with the minimum delay."""
     clock = InstrumentClock()
     for number in range(samples):
         ms = start_ms + 400 * number
@@ -32,8 +32,8 @@ def standing(samples: int = 200, rate: float = 0.0, start_ms: int = 5_000_000) -
     return clock
 
 
-def test_nothing_is_told_before_there_are_enough_samples() -> None:
-    """A few answers may all have been late."""
+def test_no_time_before_initialisation() -> None:
+    """A few responses may all be late."""
     clock = InstrumentClock()
     for number in range(MIN_SAMPLES):
         assert clock.at(1000) is None
@@ -44,18 +44,18 @@ def test_nothing_is_told_before_there_are_enough_samples() -> None:
     assert 0 <= time.host_ns - arrived_ns(1000) < MS  # it was taken within the ms that it is told in
 
 
-def test_the_fastest_answers_decide() -> None:
-    """Late ones change nothing: they are late on one side only."""
-    time = standing().at(5_079_600)
+def test_fastest_responses_define_the_envelope() -> None:
+    """Late responses do not change the envelope."""
+    time = initialised_clock().at(5_079_600)
     assert time is not None
     assert abs(time.host_ns - arrived_ns(5_079_600)) < MS / 2
     assert time.bound_ns < 5 * MS
 
 
 @pytest.mark.parametrize("rate", [-200e-6, -20e-6, 20e-6, 200e-6])
-def test_the_rate_is_found(rate: float) -> None:
-    """After some minutes it is known to a few parts in a million, and times follow it."""
-    clock = standing(1000, rate)
+def test_skew_is_estimated(rate: float) -> None:
+    """After some minutes the skew is known to a few ppm, and times follow it."""
+    clock = initialised_clock(1000, rate)
     assert clock.skew_ppm == pytest.approx(rate * 1e6, abs=5)
     time = clock.at(5_399_600)
     assert time is not None
@@ -63,9 +63,9 @@ def test_the_rate_is_found(rate: float) -> None:
 
 
 @pytest.mark.parametrize("start_ms", [300, 4_000_000, 2_000_000_000])
-def test_a_power_cycle_begins_anew(start_ms: int) -> None:
-    """The count begins near 0, or anywhere: three answers that agree say so, and old times are not told any more."""
-    clock = standing()
+def test_power_cycle_resets_the_clock(start_ms: int) -> None:
+    """Three samples that agree with a new count reset the fit; old times are void."""
+    clock = initialised_clock()
     results = [
         clock.add(start_ms + 100 * n, arrived_ns(5_200_000 + 100 * n, late_ms=7 * (n % 8)))
         for n in range(8 * MIN_SAMPLES)
@@ -77,8 +77,8 @@ def test_a_power_cycle_begins_anew(start_ms: int) -> None:
     assert abs(time.host_ns - arrived_ns(5_200_000)) < MS
 
 
-def test_the_wrap_of_the_count_begins_anew() -> None:
-    """After 24.8 days a count of 32 bits goes negative."""
+def test_wrap_of_the_count_resets_the_clock() -> None:
+    """After 24.8 days a 32-bit count becomes negative."""
     start_ms = 2**31 - 400 * 100
     clock = InstrumentClock()
     told, outside = [], 0
@@ -95,9 +95,9 @@ def test_the_wrap_of_the_count_begins_anew() -> None:
     assert max(told[-150:]) < MS
 
 
-def test_one_damaged_time_is_doubted() -> None:
-    """A digit that the line has changed gets no time, and bends no other one."""
-    clock = standing()
+def test_corrupted_time_is_inconsistent() -> None:
+    """A time with a wrong digit gets no timestamp and does not change the fit."""
+    clock = initialised_clock()
     before = clock.at(5_080_000)
     for wrong_ms in (-30_000, 90, 700, 5_000, 40_000_000):
         assert clock.timestamp(5_080_000 + wrong_ms, arrived_ns(5_080_000, 5.0)) is None
@@ -111,8 +111,8 @@ def test_one_damaged_time_is_doubted() -> None:
 
 @pytest.mark.parametrize("wrong_ms", [-5000, 60, 400, 70_000])
 @pytest.mark.parametrize("which", [0, 3, 7])
-def test_a_damaged_time_among_the_first_is_left_out(wrong_ms: int, which: int) -> None:
-    """There is no envelope yet that contradicts it, but the others do."""
+def test_corrupted_time_during_initialisation_is_rejected(wrong_ms: int, which: int) -> None:
+    """Before there is an envelope, the other samples reject an outlier."""
     clock = InstrumentClock()
     for number in range(MIN_SAMPLES + 2):
         ms = 60_000 + 50 * number
@@ -123,8 +123,8 @@ def test_a_damaged_time_among_the_first_is_left_out(wrong_ms: int, which: int) -
 
 
 @pytest.mark.parametrize("before", range(1, MIN_SAMPLES))
-def test_a_power_cycle_among_the_first_is_survived(before: int) -> None:
-    """However many samples there were before it, those after it are believed in the end."""
+def test_power_cycle_during_initialisation(before: int) -> None:
+    """The samples after the power cycle define the fit, however many came before."""
     clock = InstrumentClock()
     for number in range(before):
         clock.add(50_000_000 + 50 * number, arrived_ns(0, 50.0 * number))
@@ -136,9 +136,9 @@ def test_a_power_cycle_among_the_first_is_survived(before: int) -> None:
     assert abs(time.host_ns - arrived_ns(5000)) < 10 * MS
 
 
-def test_answers_that_become_faster_lower_the_envelope() -> None:
-    """Another baud or a better cable: what some of them agree on is believed, and nothing is forgotten."""
-    clock = standing()
+def test_faster_responses_lower_the_envelope() -> None:
+    """A smaller minimum delay, as from another baud rate, lowers the envelope without a reset."""
+    clock = initialised_clock()
     for number in range(200):
         ms = 5_080_000 + 400 * number
         assert clock.add(ms, arrived_ns(ms, -12.0 + number % 3))
@@ -147,9 +147,9 @@ def test_answers_that_become_faster_lower_the_envelope() -> None:
     assert abs(time.host_ns - arrived_ns(5_160_000, -12.0)) < MS
 
 
-def test_a_gap_is_bridged() -> None:
-    """After ten minutes without an answer the first one is put where the rate says, with a wider bound."""
-    clock = standing(1000, 20e-6)
+def test_gap_is_extrapolated() -> None:
+    """After ten minutes without a response the skew extrapolates, with a larger bound."""
+    clock = initialised_clock(1000, 20e-6)
     ms = 5_400_000 + 600_000
     time = clock.timestamp(ms, arrived_ns(ms, 35.0, 20e-6))
     before = clock.at(5_399_600)
@@ -159,9 +159,9 @@ def test_a_gap_is_bridged() -> None:
     assert before.bound_ns < time.bound_ns < 40 * MS
 
 
-def test_a_stale_answer_has_no_time() -> None:
-    """More than two seconds on the way: rather none than a doubtful one."""
-    clock = standing()
+def test_stale_response_has_no_time() -> None:
+    """A delay above two seconds is no delay."""
+    clock = initialised_clock()
     assert clock.timestamp(5_080_000, arrived_ns(5_080_000, 1_900.0)) is not None
     assert clock.timestamp(5_080_400, arrived_ns(5_080_400, 2_100.0)) is None
 
@@ -199,18 +199,18 @@ def of_answers(random: np.random.Generator, rate_ppm: float, spread_ms: float, p
     spread_ms=st.floats(0.1, 100),
     period_ms=st.sampled_from([50, 400, 1000]),
 )
-def test_times_are_in_order_and_never_after_the_answer(
+def test_times_are_in_order_and_never_after_the_arrival(
     seed: int, rate_ppm: float, spread_ms: float, period_ms: int
 ) -> None:
-    """And nearly every answer has one."""
+    """Nearly every response has a time."""
     told = of_answers(np.random.default_rng(seed), rate_ppm, spread_ms, period_ms)
     assert len(told.times_ns) >= 280
     assert all(before < after for before, after in pairwise(told.times_ns))
     assert all(time <= arrived for time, arrived in zip(told.times_ns, told.arrived_ns, strict=True))
 
 
-def test_of_a_hundred_times_hardly_one_is_outside_of_its_bound() -> None:
-    """Not in each run: where no early answer was a fast one, dozens in a row may be."""
+def test_bound_contains_nearly_all_times() -> None:
+    """Over many runs at most 1 % exceed it; in a single run without early fast responses dozens may."""
     random = np.random.default_rng(5)
     outside = sum(
         of_answers(random, random.uniform(-100, 100), random.uniform(0.1, 100), period_ms).outside

@@ -14,7 +14,7 @@ SYMBOL_NS = 2_048_000
 def measured(
     link_ns: int, exchanges: int, *, jitter_us: float = 20.0, seed: int = 0
 ) -> tuple[LinkDelayEstimator, int]:
-    """Return what so many exchanges tell, with jitter on each of four stamps, and how many alarms there were."""
+    """Return the estimator after some exchanges with jitter on each of four timestamps, and the number of rejections."""
     trip, rng, alarms = LinkDelayEstimator(NOMINAL_NS, SYMBOL_NS), np.random.default_rng(seed), 0
     for _ in range(exchanges):
         jitter_ns = rng.normal(0.0, 1000 * jitter_us, 4).sum() + rng.normal(0.0, 3_000, 2).sum()
@@ -22,16 +22,16 @@ def measured(
     return trip, alarms
 
 
-def test_before_any_exchange_it_is_nominal() -> None:
-    """What is known beforehand is a fifth of a symbol."""
+def test_initial_estimate_is_nominal() -> None:
+    """The prior bound is a fifth of a symbol."""
     trip = LinkDelayEstimator(NOMINAL_NS, SYMBOL_NS)
     assert (trip.link_delay_ns, trip.exchanges) == (NOMINAL_NS, 0)
     assert trip.bound_ns == pytest.approx(0.2 * SYMBOL_NS, rel=0.01)
 
 
 @pytest.mark.parametrize(("exchanges", "p99_us", "bound_us"), [(8, 22, 100), (64, 8, 25), (256, 5, 15)])
-def test_it_gets_better_with_each_exchange(exchanges: int, p99_us: float, bound_us: float) -> None:
-    """20 us of jitter on each stamp: 20 us after 8 exchanges, 7 us after 64."""
+def test_error_falls_with_the_number_of_exchanges(exchanges: int, p99_us: float, bound_us: float) -> None:
+    """With 20 us of jitter on each timestamp: 20 us after 8 exchanges, 7 us after 64."""
     trips = [measured(NOMINAL_NS + 150_000, exchanges, seed=seed)[0] for seed in range(100)]
     errors_us = [abs(trip.link_delay_ns - NOMINAL_NS - 150_000) / 1000 for trip in trips]
     assert np.quantile(errors_us, 0.99) < p99_us
@@ -39,8 +39,8 @@ def test_it_gets_better_with_each_exchange(exchanges: int, p99_us: float, bound_
 
 
 @pytest.mark.parametrize("jitter_us", [3.0, 20.0, 200.0, 1000.0])
-def test_the_bound_holds(jitter_us: float) -> None:
-    """At any time, for any constant that is possible, whatever the stamps."""
+def test_bound_contains_the_truth(jitter_us: float) -> None:
+    """For any possible link delay, number of exchanges and jitter."""
     for seed in range(30):
         link_ns = NOMINAL_NS + round(np.random.default_rng(seed).uniform(-0.2, 0.2) * SYMBOL_NS)
         for exchanges in (1, 2, 4, 7, 8, 10, 20, 60):
@@ -48,13 +48,13 @@ def test_the_bound_holds(jitter_us: float) -> None:
             assert abs(trip.link_delay_ns - link_ns) <= trip.bound_ns
 
 
-def test_usual_jitter_is_no_reason_for_an_alarm() -> None:
-    """Fewer than one exchange in a thousand."""
+def test_usual_jitter_is_not_rejected() -> None:
+    """Fewer than one exchange in a thousand is rejected."""
     assert sum(measured(NOMINAL_NS, 200, seed=seed)[1] for seed in range(20)) <= 4
 
 
-def test_a_packet_that_was_held_up_is_noticed_and_does_not_count() -> None:
-    """A beacon 0.3 ms late makes the round trip 0.3 ms longer."""
+def test_delayed_packet_is_rejected() -> None:
+    """A beacon 0.3 ms late makes the round trip 0.3 ms longer; the estimate does not change."""
     trip, _ = measured(NOMINAL_NS, 64)
     before_ns = trip.link_delay_ns
     for _ in range(50):
@@ -62,8 +62,8 @@ def test_a_packet_that_was_held_up_is_noticed_and_does_not_count() -> None:
     assert trip.link_delay_ns == before_ns
 
 
-def test_what_somebody_adds_is_known_until_it_is_over() -> None:
-    """The whole of it, which may be on one of the two ways; 0 after the next exchange that is as usual."""
+def test_anomaly_is_reported_until_it_ends() -> None:
+    """The whole extra delay is reported, as it may be on one of the two ways; 0 after the next consistent exchange."""
     trip, _ = measured(NOMINAL_NS, 64)
     assert trip.anomaly_ns == 0
     trip.add(2 * NOMINAL_NS + 3_000_000)
@@ -72,15 +72,15 @@ def test_what_somebody_adds_is_known_until_it_is_over() -> None:
     assert trip.anomaly_ns == 0
 
 
-def test_what_no_chip_does_is_refused_at_once() -> None:
-    """The first exchange already is compared with what is known beforehand."""
+def test_impossible_first_exchange_is_rejected() -> None:
+    """The first exchange is compared with the nominal delay."""
     trip = LinkDelayEstimator(NOMINAL_NS, SYMBOL_NS)
     assert not trip.add(2 * NOMINAL_NS + 2 * SYMBOL_NS)
     assert (trip.link_delay_ns, trip.exchanges) == (NOMINAL_NS, 0)
 
 
-def test_a_bad_exchange_at_the_start_is_outvoted() -> None:
-    """The first exchange is 0.4 ms off; with eight the constant is right."""
+def test_outlier_at_the_start_is_outvoted() -> None:
+    """The first exchange is 0.4 ms off; after eight the estimate is right."""
     trip = LinkDelayEstimator(NOMINAL_NS, SYMBOL_NS)
     trip.add(2 * NOMINAL_NS + 800_000)
     for k in range(7):
@@ -89,7 +89,7 @@ def test_a_bad_exchange_at_the_start_is_outvoted() -> None:
     assert abs(trip.link_delay_ns - NOMINAL_NS) <= trip.bound_ns
 
 
-def test_coarse_stamps_widen_the_limits() -> None:
-    """With stamps to 1 ms there are alarms at first only."""
+def test_coarse_timestamps_widen_the_gate() -> None:
+    """With timestamps of 1 ms sigma exchanges are rejected only at first."""
     alarms = [measured(NOMINAL_NS, 100, jitter_us=1000, seed=seed)[1] for seed in range(10)]
     assert max(alarms) < 10

@@ -14,22 +14,22 @@ NAMES = ("regression", "paper")
 
 
 def error_ns(found: ClockFilter, true_s: float, offset_ns: float) -> float:
-    """Return by how much the filter's offset is too high, asked with the station's time as the master would."""
+    """Return the error of the filter's offset, evaluated at the station's time as the master does."""
     true_ns = round(true_s * SECOND)
     return found.at(START_NS + true_ns + round(offset_ns)).offset_ns - offset_ns
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_offset_is_positive_when_the_station_is_ahead(name: str) -> None:
-    """A station whose clock shows two seconds more has an offset of plus two seconds."""
+    """A station whose clock is two seconds ahead has an offset of plus two seconds."""
     found = clock_filter(name)  # type: ignore[arg-type]
     found.update(synchronisation(0, drifting(2 * SECOND, 0)))
     assert found.at(START_NS).offset_ns == pytest.approx(2 * SECOND, abs=MS)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_nothing_is_known_before_the_first_synchronisation(name: str) -> None:
-    """Asking for an offset that nobody has measured is an error, also after everything was forgotten."""
+def test_no_offset_before_the_first_synchronisation(name: str) -> None:
+    """An offset before the first synchronisation, or after a reset, is an error."""
     found = clock_filter(name)  # type: ignore[arg-type]
     with pytest.raises(LookupError):
         found.at(START_NS)
@@ -40,8 +40,8 @@ def test_nothing_is_known_before_the_first_synchronisation(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_first_synchronisation_is_a_start(name: str) -> None:
-    """The first update says that it started anew, the second does not, the first after forgetting does."""
+def test_first_synchronisation_is_a_restart(name: str) -> None:
+    """The first update reports a restart, the second does not, the first after a reset does."""
     found = clock_filter(name)  # type: ignore[arg-type]
     clock = drifting(0, 5)
     assert [found.update(synchronisation(start_s, clock)).restarted for start_s in (0, 300)] == [True, False]
@@ -50,7 +50,7 @@ def test_the_first_synchronisation_is_a_start(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_single_exchange_will_do(name: str) -> None:
+def test_single_exchange_suffices(name: str) -> None:
     """One exchange gives an offset, with a bound that covers its round trip and grows with time."""
     found = clock_filter(name)  # type: ignore[arg-type]
     found.update([exchange(0, drifting(7 * SECOND, 20), turnaround_ns=4 * MS)])
@@ -62,8 +62,8 @@ def test_a_single_exchange_will_do(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_clock_that_is_decades_off_loses_no_nanosecond(name: str) -> None:
-    """Offsets beyond what a float resolves come out as exactly as small ones."""
+def test_large_offset_is_exact(name: str) -> None:
+    """Offsets beyond the resolution of a float are as exact as small ones."""
     found = clock_filter(name)  # type: ignore[arg-type]
     years_ns = -1_600_000_000 * SECOND - 1
     found.update(synchronisation(0, lambda _: 0.0))
@@ -98,8 +98,8 @@ def test_paper_takes_the_midpoint_and_then_a_tenth() -> None:
     assert found.at(START_NS).offset_ns == pytest.approx(-0.5 * MS, abs=1)
 
 
-def test_paper_knows_no_frequency() -> None:
-    """Its offset is the same at any time, and its bound grows by 100 ppm."""
+def test_paper_has_no_skew() -> None:
+    """Its offset is constant, and its bound grows by 100 ppm."""
     found = clock_filter("paper")
     found.update(synchronisation(0, drifting(0, 10)))
     early, late = found.at(START_NS + 2 * SECOND), found.at(START_NS + 102 * SECOND)
@@ -112,8 +112,8 @@ def test_paper_knows_no_frequency() -> None:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_line_is_that_of_an_independent_least_squares(seed: int) -> None:
-    """With equal round trips and next to no prior, offset and frequency are those of numpy.polyfit."""
+def test_line_equals_polyfit(seed: int) -> None:
+    """With equal round trips and a diffuse prior, offset and skew are those of numpy.polyfit."""
     rng = np.random.default_rng(seed)
     ppm = rng.uniform(-80, 80)
     samples = [
@@ -144,8 +144,8 @@ def test_line_is_that_of_an_independent_least_squares(seed: int) -> None:
     assert line.line.covariance == pytest.approx(covariance[0, 1], rel=0.2)
 
 
-def test_weights_are_those_of_the_normal_equations() -> None:
-    """Slow round trips count less, by the stated rule; checked with numpy's lstsq on scaled rows."""
+def test_line_equals_lstsq_with_weights() -> None:
+    """Slow round trips have less weight; checked with numpy's lstsq on scaled rows."""
     rng = np.random.default_rng(1)
     samples = [
         exchange(
@@ -167,7 +167,7 @@ def test_weights_are_those_of_the_normal_equations() -> None:
     assert [line.line.offset, line.line.skew] == pytest.approx(expected.tolist(), rel=1e-6)
 
 
-def test_regression_follows_drift_to_the_next_synchronisation() -> None:
+def test_skew_is_extrapolated_to_the_next_synchronisation() -> None:
     """After two synchronisations 300 s apart, 50 ppm are known well enough for the next 300 s."""
     found = clock_filter("regression")
     clock = drifting(0, 50)
@@ -177,15 +177,15 @@ def test_regression_follows_drift_to_the_next_synchronisation() -> None:
     assert abs(error_ns(found, 600, 50e3 * 600)) < 0.05 * MS
 
 
-def test_a_short_first_synchronisation_does_not_run_wild() -> None:
-    """Two stamps that scatter by 40 us within a quarter of a second are 160 ppm; crystals are not."""
+def test_short_first_synchronisation_keeps_the_prior_skew() -> None:
+    """Two timestamps that scatter by 40 us within a quarter of a second are 160 ppm; crystals are not."""
     found = clock_filter("regression")
     found.update(synchronisation(0, drifting(0, 0), cycles=2, late_ns=[0, 40_000]))
     assert abs(found.at(START_NS).skew_ppm) < 30
 
 
-def test_late_stamps_are_left_out() -> None:
-    """Three of five stamps are late by milliseconds: they are rejected and do no harm."""
+def test_late_timestamps_are_rejected() -> None:
+    """Three of five timestamps, late by milliseconds, do not change the offset."""
     found = clock_filter("regression")
     clock = drifting(0, 10)
     found.update(synchronisation(0, clock, cycles=50))
@@ -198,8 +198,8 @@ LATE_NS = [n * MS for n in (5, 1, 3, 2, 4)]
 """Five stamps, all late, none of which another one confirms."""
 
 
-def test_a_stamp_that_no_other_confirms_hardly_counts() -> None:
-    """It may be late by as much as its round trip took too long, so it does not bend a line of those that agree."""
+def test_unconfirmed_timestamp_has_little_weight() -> None:
+    """It may be late by its whole excess, so it does not bend a line of those that agree."""
     found = clock_filter("regression")
     clock = drifting(0, 10)
     for start_s in (0, 300, 600):
@@ -208,8 +208,8 @@ def test_a_stamp_that_no_other_confirms_hardly_counts() -> None:
     assert abs(error_ns(found, 901, 10e3 * 901)) < 0.05 * MS
 
 
-def test_stamps_that_never_agree_are_better_than_none() -> None:
-    """A station whose stamps are always late by something is followed, as well as they allow."""
+def test_timestamps_that_never_agree_are_used() -> None:
+    """A station whose timestamps are always late is followed as well as they allow."""
     found = clock_filter("regression")
     clock = drifting(0, 40)
     for start_s in range(0, 3901, 300):
@@ -218,8 +218,8 @@ def test_stamps_that_never_agree_are_better_than_none() -> None:
     assert 3 * MS < found.at(START_NS + 3910 * SECOND).bound_ns < 10 * MS
 
 
-def test_impossible_exchanges_are_left_out() -> None:
-    """A reply that came before it could have come has a wrong stamp on it."""
+def test_impossible_exchange_is_rejected() -> None:
+    """A reply earlier than possible has a wrong timestamp."""
     found = clock_filter("regression")
     samples = synchronisation(0, drifting(0, 0))
     samples[2] = exchange(samples[2].sent_ns - START_NS, drifting(3 * MS, 0), turnaround_ns=-6 * MS)
@@ -227,8 +227,8 @@ def test_impossible_exchanges_are_left_out() -> None:
     assert abs(error_ns(found, 1, 0)) < 0.02 * MS
 
 
-def test_a_line_that_bends_lets_go_of_the_past() -> None:
-    """A clock that changes its frequency by 3 ppm is followed from the second synchronisation after that."""
+def test_skew_change_drops_old_synchronisations() -> None:
+    """A skew that changes by 3 ppm is followed from the second synchronisation after that."""
     found = clock_filter("regression")
 
     def clock(true_ns: int) -> float:
@@ -241,8 +241,8 @@ def test_a_line_that_bends_lets_go_of_the_past() -> None:
 
 
 @pytest.mark.parametrize("step_ms", [20, -20, 200, -200, 10_000_000])
-def test_a_step_between_synchronisations_starts_anew(step_ms: int) -> None:
-    """A clock that was set by more than the bound is noticed; the frequency is kept, the offset is not."""
+def test_step_between_synchronisations_resets_the_offset(step_ms: int) -> None:
+    """A step above the bound is detected; the skew is kept, the offset is not."""
     found = clock_filter("regression")
 
     def clock(true_ns: int) -> float:
@@ -257,8 +257,8 @@ def test_a_step_between_synchronisations_starts_anew(step_ms: int) -> None:
 
 @pytest.mark.parametrize("step_ms", [50, -50])
 @pytest.mark.parametrize("after", [1, 3, 4])
-def test_a_step_within_a_synchronisation(step_ms: int, after: int) -> None:
-    """Exchanges from before a step are left out: the newest clock is the one that counts."""
+def test_step_within_a_synchronisation_rejects_earlier_exchanges(step_ms: int, after: int) -> None:
+    """Only exchanges after the step count."""
     found = clock_filter("regression")
     old = synchronisation(0, drifting(0, 0))
     new = synchronisation(0, drifting(step_ms * MS, 0))
@@ -267,8 +267,8 @@ def test_a_step_within_a_synchronisation(step_ms: int, after: int) -> None:
     assert abs(error_ns(found, 2, step_ms * MS)) < 0.02 * MS
 
 
-def test_frequency_is_remembered_when_the_offset_is_forgotten() -> None:
-    """After a restart five exchanges do, because the crystal is the same."""
+def test_skew_survives_a_reset() -> None:
+    """After a restart five exchanges suffice, because the crystal is the same."""
     found = clock_filter("regression")
     clock = drifting(0, 40)
     for start_s in (0, 300, 600):
@@ -279,8 +279,8 @@ def test_frequency_is_remembered_when_the_offset_is_forgotten() -> None:
 
 
 @pytest.mark.parametrize("step_ms", [1.4, -1.4, 0.3])
-def test_a_frequency_that_may_be_a_small_step_is_not_remembered(step_ms: float) -> None:
-    """A clock that was set by less than its bound seems to run at another frequency, which its next restart may end."""
+def test_skew_that_may_be_a_small_step_does_not_survive_a_reset(step_ms: float) -> None:
+    """A step below the bound looks like another skew, which the next restart may end."""
     found = clock_filter("regression")
     found.update(synchronisation(0, drifting(0, -20), cycles=8, turnaround_ns=3 * MS))
     found.update(synchronisation(14, drifting(step_ms * MS, -20), turnaround_ns=3 * MS))
@@ -293,8 +293,8 @@ def test_a_frequency_that_may_be_a_small_step_is_not_remembered(step_ms: float) 
         assert abs(error_ns(found, true_s, clock(true_s * SECOND))) < found.at(stamped_ns).bound_ns - ways_ns
 
 
-def test_another_crystal_is_believed_after_a_long_synchronisation() -> None:
-    """A station computer that was exchanged is not held to the frequency of the old one."""
+def test_long_synchronisation_overrides_the_prior_skew() -> None:
+    """An exchanged station computer has another crystal."""
     found = clock_filter("regression")
     for start_s in (0, 300, 600):
         found.update(synchronisation(start_s, drifting(0, 40)))
@@ -303,16 +303,16 @@ def test_another_crystal_is_believed_after_a_long_synchronisation() -> None:
     assert found.at(START_NS).skew_ppm == pytest.approx(-10, abs=1.5)
 
 
-def test_bound_covers_what_all_stamps_share() -> None:
-    """Stamps that are all late by 3 ms cannot be told from punctual ones, but the round trip bounds it."""
+def test_bound_covers_a_common_delay() -> None:
+    """Timestamps that are all 3 ms late look punctual, but the round trip bounds the delay."""
     found = clock_filter("regression")
     found.update(synchronisation(0, drifting(0, 0), late_ns=[3 * MS] * 5))
     assert error_ns(found, 1, 0) == pytest.approx(3 * MS, abs=1000)
     assert 3 * MS < found.at(START_NS + SECOND).bound_ns < 6 * MS
 
 
-def test_bound_grows_with_age_and_sigma_stays_below() -> None:
-    """The longer nothing is heard of a clock, the less is known of it."""
+def test_bound_grows_with_age() -> None:
+    """The bound grows with the time since the last synchronisation, and sigma stays below it."""
     found = clock_filter("regression")
     for start_s in (0, 300, 600):
         found.update(synchronisation(start_s, drifting(0, 1)))
@@ -346,13 +346,13 @@ def polls(
     return found
 
 
-def test_arrivals_no_false_alarm_in_hours() -> None:
-    """Four hours of polls without a step raise no alarm."""
+def test_check_passes_hours_without_a_step() -> None:
+    """Four hours of polls without a step are all plausible."""
     assert all(polls(TimestampCheck(), count=25_000))
 
 
-def test_arrivals_no_false_alarm_after_lost_replies_and_lost_lock() -> None:
-    """Minutes without a measurement, and then one again, are nothing to worry about."""
+def test_check_passes_gaps() -> None:
+    """Measurements after minutes without one are plausible."""
     check = TimestampCheck()
     assert all(polls(check, count=10))
     assert all(polls(check, count=10, first_s=7.5))
@@ -361,13 +361,13 @@ def test_arrivals_no_false_alarm_after_lost_replies_and_lost_lock() -> None:
     assert all(polls(check, count=10, first_s=300.0))
 
 
-def test_arrivals_the_first_measurement_may_be_as_old_as_it_likes() -> None:
-    """A station that lost its target an hour ago answers the first request with what it last saw."""
+def test_check_passes_an_old_first_measurement() -> None:
+    """A station that lost its target an hour ago replies to the first request with its last measurement."""
     assert polls(TimestampCheck(), count=1, step_s=-3600) == [True]
 
 
 @pytest.mark.parametrize("step_s", [1.0, 3600.0, -1.0, -3600.0])
-def test_arrivals_a_step_is_noticed_at_once(step_s: float) -> None:
+def test_check_detects_a_step_at_once(step_s: float) -> None:
     """Measurements from the future, or from before the previous one, come from another clock."""
     check = TimestampCheck()
     polls(check, count=5)
@@ -375,22 +375,22 @@ def test_arrivals_a_step_is_noticed_at_once(step_s: float) -> None:
 
 
 @pytest.mark.parametrize("step_s", [0.3, -0.4])
-def test_arrivals_a_step_of_some_tenths_is_noticed_soon(step_s: float) -> None:
-    """Steps just beyond the reply time-out show within a minute of polls."""
+def test_check_detects_a_small_step_within_a_minute(step_s: float) -> None:
+    """Steps just beyond the reply timeout show within a minute of polls."""
     check = TimestampCheck()
     polls(check, count=5)
     assert not all(polls(check, count=100, first_s=5 * 0.58, step_s=step_s))
 
 
-def test_arrivals_a_station_that_restarted_while_it_had_nothing_new() -> None:
-    """A station that answered without news is known to have had nothing older than that."""
+def test_check_detects_a_restart_without_new_measurements() -> None:
+    """After a reply without a new measurement the next one cannot be older than that reply."""
     check = TimestampCheck()
     polls(check, count=5)
     check.no_new_measurement(START_NS + 100 * SECOND)
     assert polls(check, count=1, first_s=100.58, step_s=-30.0) == [False]
 
 
-def test_arrivals_a_wide_bound_makes_the_check_lenient() -> None:
+def test_check_tolerates_the_bound() -> None:
     """After a long outage the offset itself may be off by its bound, which is no step."""
     check = TimestampCheck()
     assert check.check(START_NS, requested_ns=START_NS, received_ns=START_NS, bound_ns=0)

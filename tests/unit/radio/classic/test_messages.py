@@ -50,17 +50,17 @@ REPLIES = [
 
 
 @pytest.mark.parametrize(("command", "golden"), COMMANDS)
-def test_every_command_has_its_bytes(command: CommandMessage, golden: str) -> None:
-    """Commands are the bytes of the authors' nodes, and these bytes are the commands."""
+def test_commands_match_the_golden_bytes(command: CommandMessage, golden: str) -> None:
+    """Commands encode to the bytes of the authors' nodes, and decode from them."""
     assert command.to_bytes() == bytes.fromhex(golden)
     assert decode_command(bytes.fromhex(golden)) == command
 
 
 @pytest.mark.parametrize(("reply", "golden"), REPLIES)
-def test_every_reply_has_its_bytes(
+def test_replies_match_the_golden_bytes(
     reply: PingReply | TimeReply | Acknowledgement | MeasurementMessage, golden: str
 ) -> None:
-    """Replies are the bytes of the authors' nodes, and these bytes are the replies."""
+    """Replies encode to the bytes of the authors' nodes, and decode from them."""
     assert reply.to_bytes() == bytes.fromhex(golden)
     assert decode_reply(bytes.fromhex(golden)) == reply
 
@@ -70,7 +70,7 @@ def test_every_reply_has_its_bytes(
     [b"", b"t", b"t0", b"ta", b"x1", b"T1", b"t1 ", b"t13", b"n10", b"n1a", b"n133", b"\xb2\xb9", b"t\xb2"],
 )
 def test_other_packets_are_no_commands(payload: bytes) -> None:
-    """Station 0, unknown letters, prisms where none belong and bytes beyond ASCII are not understood."""
+    """Station 0, unknown letters, misplaced prisms and bytes beyond ASCII are rejected."""
     assert decode_command(payload) is None
 
 
@@ -82,7 +82,7 @@ def test_other_packets_are_no_commands(payload: bytes) -> None:
     ],
 )
 def test_other_packets_are_no_replies(payload: bytes) -> None:
-    """Wrong letters and lengths, and more nanoseconds than a second has, are not understood."""
+    """Wrong letters and lengths, and nanoseconds beyond a second, are rejected."""
     assert decode_reply(payload) is None
 
 
@@ -106,8 +106,8 @@ def _packed(**changes: Any) -> bytes:
         {"ns": 1_000_000_000},
     ],
 )
-def test_impossible_numbers_are_no_measurement(changes: dict[str, float]) -> None:
-    """A packet of 34 bytes with a number that no station sends is somebody else's."""
+def test_impossible_values_are_no_measurement(changes: dict[str, float]) -> None:
+    """A packet of 34 bytes with a value that no station sends is rejected."""
     assert isinstance(decode_reply(_packed()), MeasurementMessage)
     assert decode_reply(_packed(**changes)) is None
 
@@ -116,8 +116,8 @@ def test_impossible_numbers_are_no_measurement(changes: dict[str, float]) -> Non
 @pytest.mark.parametrize(
     ("seconds", "nanoseconds"), [(0, 0), (2**32 - 1, 2**32 - 1), (0, 2**32 - 1), (7, 10**9)]
 )
-def test_garbage_times_of_errors_are_no_times(status: int, seconds: int, nanoseconds: int) -> None:
-    """The authors' nodes have no time with an error; what they send for it is read as none."""
+def test_invalid_times_of_errors_are_ignored(status: int, seconds: int, nanoseconds: int) -> None:
+    """The authors' nodes have no time for an error; what they send is decoded as none."""
     reply = decode_reply(
         _packed(status=status, zenith=-1.0, horizontal=-1.0, distance=-1.0, s=seconds, ns=nanoseconds)
     )
@@ -125,8 +125,8 @@ def test_garbage_times_of_errors_are_no_times(status: int, seconds: int, nanosec
     assert (reply.status, reply.time_ns, reply.slope_distance_m) == (status, 0, -1.0)
 
 
-def test_the_time_of_our_own_errors_arrives() -> None:
-    """A tsgt client stamps the attempts that failed, too."""
+def test_time_of_our_own_errors_is_decoded() -> None:
+    """A tsgt client timestamps failed attempts too."""
     reply = decode_reply(_packed(status=3, zenith=0.0, horizontal=0.0, distance=0.0))
     assert isinstance(reply, MeasurementMessage)
     assert reply.time_ns == 7_000_000_008
@@ -142,29 +142,29 @@ def test_the_time_of_our_own_errors_arrives() -> None:
         (4, Status.ANGLE_ONLY),
     ],
 )
-def test_status_numbers_have_a_verdict(status: int, expected: Status) -> None:
-    """Only 0 may enter a pose."""
+def test_status_numbers_are_mapped(status: int, expected: Status) -> None:
+    """Only 0 is usable for a pose."""
     reply = decode_reply(_packed(status=status))
     assert isinstance(reply, MeasurementMessage)
     assert status_of(reply) is expected
     assert expected.usable == (status == 0)
 
 
-def test_every_verdict_has_a_number() -> None:
-    """Exactly the usable verdicts go out as good, and none becomes usable on its way."""
+def test_every_status_has_a_number() -> None:
+    """Exactly the usable statuses are sent as good."""
     assert {status for status in Status if raw_status(status) == 0} == {s for s in Status if s.usable}
     assert raw_status(Status.ERROR) == raw_status(Status.NO_TARGET) == 3
 
 
 def test_zeros_are_no_good_measurement() -> None:
-    """An authors' node before its first measurement sends zeros as good; nobody believes them."""
+    """An authors' node sends zeros with a good status before its first measurement; they are rejected."""
     reply = decode_reply(b"\x02" + bytes(33))
     assert isinstance(reply, MeasurementMessage)
     assert status_of(reply) is Status.NO_TARGET
     assert status_of(no_measurement_yet(2)) is Status.NO_TARGET
 
 
-def test_a_good_measurement_without_distance_is_not_good() -> None:
+def test_good_status_without_distance_is_angle_only() -> None:
     """A distance of 0 would put the prism into the station."""
     reply = decode_reply(_packed(distance=0.0))
     assert isinstance(reply, MeasurementMessage)
@@ -174,8 +174,8 @@ def test_a_good_measurement_without_distance_is_not_good() -> None:
 @pytest.mark.parametrize(
     "arguments", [("x", 1), ("t", 0), ("t", 10), ("t", 1, 3), ("n", 1, 0), ("n", 1, 10), ("n", -1)]
 )
-def test_there_is_no_such_command(arguments: Any) -> None:
-    """What does not fit into a command is refused where it is made."""
+def test_invalid_command_is_rejected(arguments: Any) -> None:
+    """Values that do not fit into a command raise an error."""
     with pytest.raises(ValueError, match=r"expected 1 to 9|only 1 to 9|there is no command"):
         CommandMessage(*arguments)
 
@@ -191,8 +191,8 @@ def test_there_is_no_such_command(arguments: Any) -> None:
         {"time_ns": 2**32 * 10**9},
     ],
 )
-def test_no_impossible_number_is_sent(changes: dict[str, Any]) -> None:
-    """What does not fit into a measurement is refused where it is made."""
+def test_invalid_measurement_is_rejected(changes: dict[str, Any]) -> None:
+    """Values that do not fit into a measurement raise an error."""
     fields = {name: getattr(MEASUREMENT, name) for name in MeasurementMessage.__slots__}
     with pytest.raises(ValueError, match=r"expected|finite|does not fit"):
         MeasurementMessage(**(fields | changes))

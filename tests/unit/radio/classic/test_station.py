@@ -23,43 +23,43 @@ def station() -> ClassicStation:
     return ClassicStation(1)
 
 
-def test_a_request_before_the_first_measurement_is_answered(station: ClassicStation) -> None:
-    """Silence would cost the master its time-out; what it gets is no good measurement."""
+def test_poll_before_the_first_measurement_has_a_reply(station: ClassicStation) -> None:
+    """Silence would cost the master its timeout; the reply is no good measurement."""
     assert station.received(b"t1", 5) == NONE_YET
     assert NONE_YET[:2] == b"\x01\x03"
 
 
-def test_the_newest_measurement_is_sent_again_and_again(station: ClassicStation) -> None:
-    """A measurement answers every request until there is a newer one."""
+def test_newest_measurement_is_repeated(station: ClassicStation) -> None:
+    """A measurement answers every poll until there is a newer one."""
     station.received(b"e1", 4)
     station.measured(SOME)
     assert [station.received(b"t1", 5) for _ in range(2)] == [SOME.to_bytes()] * 2
 
 
-def test_a_station_that_begins_says_so_until_it_is_synchronised(station: ClassicStation) -> None:
-    """A master that knew it before its restart has to learn that its clock may be another one."""
+def test_restarted_station_has_no_measurement_until_it_is_synchronised(station: ClassicStation) -> None:
+    """A master that knew it before its restart must learn that its clock may be another one."""
     station.measured(SOME)
     assert [station.received(b"t1", 5) for _ in range(2)] == [NONE_YET] * 2
     station.received(b"e1", 6)
     assert station.received(b"t1", 7) == SOME.to_bytes()
 
 
-def test_a_station_that_nobody_synchronises_gives_its_measurements_in_the_end(
+def test_unsynchronised_station_sends_measurements_after_eight_polls(
     station: ClassicStation,
 ) -> None:
-    """The authors' master synchronises when it is time, and does not wait for that."""
+    """The authors' master synchronises on its own schedule."""
     station.measured(SOME)
     assert [station.received(b"t1", 5) for _ in range(9)] == [NONE_YET] * 8 + [SOME.to_bytes()]
 
 
 @pytest.mark.parametrize("payload", [b"", b"t2", b"e2", b"x1", b"e1 ", bytes(34), SOME.to_bytes(), b"dOk"])
-def test_packets_of_others_are_passed_over(station: ClassicStation, payload: bytes) -> None:
-    """Commands for other stations, their replies, and foreign packets are not answered."""
+def test_other_packets_are_ignored(station: ClassicStation, payload: bytes) -> None:
+    """Commands for other stations, replies, and unknown packets have no reply."""
     assert station.received(payload, 5) is None
 
 
-def test_a_ping_is_answered_and_its_stamp_kept(station: ClassicStation) -> None:
-    """The stamp is the reception of the last ping, however often it is asked for."""
+def test_ping_is_timestamped(station: ClassicStation) -> None:
+    """The timestamp is the reception of the last ping, however often it is requested."""
     assert [station.received(payload, at) for payload, at in ((b"p1", 1), (b"e1", 2), (b"e2", 3))] == [
         None,
         b"e1",
@@ -73,13 +73,13 @@ def test_a_ping_is_answered_and_its_stamp_kept(station: ClassicStation) -> None:
     ]
 
 
-def test_without_a_ping_there_is_no_stamp(station: ClassicStation) -> None:
-    """A stamp of zero says so."""
+def test_timestamp_without_a_ping_is_zero(station: ClassicStation) -> None:
+    """A timestamp of zero means none."""
     assert station.received(b"s1", 5) == b"s" + bytes(8)
 
 
-def test_an_order_is_carried_out_and_then_answered(station: ClassicStation) -> None:
-    """The way to direct mode and back, each order once, each confirmed again when it is repeated."""
+def test_command_is_executed_once(station: ClassicStation) -> None:
+    """Each command to direct mode and back is executed once, and acknowledged again when repeated."""
     assert station.received(b"d1", 5) == DirectCommand()
     assert station.executed(DirectCommand(), ok=True) == b"dOk"
     assert station.received(b"d1", 6) == b"dOk"
@@ -88,8 +88,8 @@ def test_an_order_is_carried_out_and_then_answered(station: ClassicStation) -> N
     assert station.received(b"n1", 8) == b"nOk"
 
 
-def test_a_failed_order_changes_nothing(station: ClassicStation) -> None:
-    """After ``dNo`` the station tracks on, after ``nNo`` it stays in direct mode."""
+def test_failed_command_changes_nothing(station: ClassicStation) -> None:
+    """After ``dNo`` the station continues to track, after ``nNo`` it stays in direct mode."""
     station.received(b"e1", 4)
     station.measured(SOME)
     station.received(b"d1", 5)
@@ -102,24 +102,24 @@ def test_a_failed_order_changes_nothing(station: ClassicStation) -> None:
     assert station.received(b"t1", 9) == MeasureCommand()
 
 
-def test_another_prism_is_an_order_also_while_tracking(station: ClassicStation) -> None:
-    """The first order for a prism is carried out, its repetition confirmed, the next prism ordered again."""
+def test_another_prism_is_a_new_command(station: ClassicStation) -> None:
+    """The first command for a prism is executed, its repetition acknowledged, the next prism is a new command."""
     assert station.received(b"n13", 5) == TrackCommand(3)
     assert station.executed(TrackCommand(3), ok=True) == b"nOk"
     assert station.received(b"n13", 6) == b"nOk"
     assert station.received(b"n14", 7) == TrackCommand(4)
 
 
-def test_a_measurement_from_before_a_change_of_prism_is_not_sent(station: ClassicStation) -> None:
-    """The message does not say which prism it is of, so the old one must not pass for the new one."""
+def test_measurement_of_the_previous_prism_is_not_sent(station: ClassicStation) -> None:
+    """The message does not name its prism, so the old measurement must not pass for one of the new prism."""
     station.measured(SOME)
     station.received(b"n14", 5)
     station.executed(TrackCommand(4), ok=True)
     assert station.received(b"t1", 6) == NONE_YET
 
 
-def test_requests_in_direct_mode_are_single_measurements(station: ClassicStation) -> None:
-    """Each request is one measurement, and its answer the one that was made for it."""
+def test_polls_in_direct_mode_are_single_measurements(station: ClassicStation) -> None:
+    """Each poll commands one measurement, which is its reply."""
     station.measured(SOME)
     station.received(b"d1", 5)
     station.executed(DirectCommand(), ok=True)
@@ -128,8 +128,8 @@ def test_requests_in_direct_mode_are_single_measurements(station: ClassicStation
         assert station.single_measured(SOME) == SOME.to_bytes()
 
 
-def test_one_order_at_a_time(station: ClassicStation) -> None:
-    """While one is under way others are passed over, requests for data and pings are answered."""
+def test_one_command_at_a_time(station: ClassicStation) -> None:
+    """During a command others are ignored; polls and pings have replies."""
     station.received(b"e1", 4)
     station.measured(SOME)
     station.received(b"d1", 5)

@@ -1,401 +1,116 @@
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
-
 import pytest
 from harness.radios import MS, PAPER
 
-from tsgt.radio.classic import ClassicStation, LinkTiming, Synchronisation
-from tsgt.radio.classic.messages import TimeReply
+from tsgt.radio import TX_DONE_NS, LoRaSettings
+from tsgt.radio.classic import (
+    CommandMessage,
+    CommandTransaction,
+    LinkTiming,
+    MeasurementMessage,
+    Poll,
+    Request,
+    SingleMeasurementPoll,
+    Transaction,
+)
 
 TIMING = LinkTiming(PAPER, 250 * MS)
-PING_NS = TIMING.airtime_ns(2)
-FORWARD_NS = PING_NS + TIMING.rx_done_ns
-TURNAROUND_NS = 3 * MS
-OFFSET_NS = 1_600_000_000_000_000_000
-
-Meddle = Callable[["Exchange"], None]
-
-
-@dataclass
-class Exchange:
-    """A request on its way and what comes back; a test may change both.
-
-    Attributes
-    ----------
-    number, payload, sent_ns
-        The request: which, what, when it began on the air.
-    heard
-        Whether the station hears it.
-    replies
-        What comes back, with the time from the start of the request to RxDone.
-    exact
-        Whether the radio saw its edges.
-    """
-
-    number: int
-    payload: bytes
-    sent_ns: int
-    heard: bool = True
-    replies: list[tuple[bytes, int]] = field(default_factory=list)
-    exact: bool = True
-
-
-class Link:
-    """A station on a clock that is ahead, and the way there and back."""
-
-    def __init__(self, meddle: Meddle = lambda _: None, after: Meddle = lambda _: None) -> None:
-        self.station = ClassicStation(1)
-        self.offset_ns = OFFSET_NS
-        self.late_ns = 0
-        self.sent: list[bytes] = []
-        self._meddle = meddle
-        self._after = after
-        self._now_ns = 0
-
-    def run(self, turn: Synchronisation) -> None:
-        """Run a turn to its end."""
-        while (request := turn.request()) is not None:
-            self.sent.append(request.payload)
-            exchange = Exchange(len(self.sent) - 1, request.payload, self._now_ns)
-            self._meddle(exchange)
-            if exchange.heard:
-                stamp_ns = exchange.sent_ns + FORWARD_NS + self.late_ns + self.offset_ns
-                reply = self.station.received(request.payload, stamp_ns)
-                if isinstance(reply, bytes):
-                    back_ns = self.late_ns + TURNAROUND_NS + TIMING.airtime_ns(len(reply)) + TIMING.rx_done_ns
-                    exchange.replies.append((reply, FORWARD_NS + back_ns))
-            self._after(exchange)
-            self._now_ns += PING_NS
-            if not request.reply_timeout_ns:
-                continue
-            for payload, after_ns in sorted(exchange.replies, key=lambda reply: reply[1]):
-                received_ns = exchange.sent_ns + after_ns
-                if turn.accept_reply(
-                    payload, sent_ns=exchange.sent_ns, received_ns=received_ns, exact=exchange.exact
-                ):
-                    self._now_ns = received_ns + MS
-                    break
-            else:
-                self._now_ns += request.reply_timeout_ns
-                turn.timed_out()
-            assert len(self.sent) < 1000, "the turn does not end"
-
-
-def _offsets_ns(turn: Synchronisation) -> list[int]:
-    return [sample.station_ns - sample.sent_ns - sample.forward_ns for sample in turn.samples]
-
-
-def test_four_messages_a_cycle() -> None:
-    """Enter, ping and stamp as often as there are cycles, leave."""
-    link, turn = Link(), Synchronisation(1, 2, TIMING)
-    link.run(turn)
-    assert link.sent == [b"p1", b"e1", b"s1", b"e1", b"s1", b"c1", b"c1"]
-    assert (turn.has_reply, turn.missed_replies) == (True, 0)
-
-
-def test_a_sample_has_what_is_known() -> None:
-    """The way out gives the offset exactly; what the round trip takes beyond what is known is the turn-round."""
-    link, turn = Link(), Synchronisation(1, 3, TIMING)
-    link.run(turn)
-    assert _offsets_ns(turn) == [OFFSET_NS] * 3
-    assert [sample.excess_ns for sample in turn.samples] == [TURNAROUND_NS] * 3
-
-
-def test_a_known_delay_of_the_stamp_is_taken_off() -> None:
-    """A station that polls stamps late, and the master is told by how much."""
-    link, turn = Link(), Synchronisation(1, 1, TIMING, timestamp_delay_ns=2 * MS)
-    link.late_ns = 2 * MS
-    link.run(turn)
-    assert _offsets_ns(turn) == [OFFSET_NS]
-
-
-def test_a_silent_station_is_given_up() -> None:
-    """Three requests without a reply, and the node is told to leave in case that it hears."""
-
-    def deaf(exchange: Exchange) -> None:
-        exchange.heard = False
-
-    link, turn = Link(deaf), Synchronisation(1, 50, TIMING)
-    link.run(turn)
-    assert link.sent == [b"p1", b"e1", b"p1", b"s1", b"p1", b"s1", b"c1", b"c1"]
-    assert (turn.has_reply, turn.missed_replies, turn.samples) == (False, 3, [])
-
-
-def test_a_lost_ping_is_made_up_for() -> None:
-    """After it the station is asked for anything else, then pinged again; one cycle in five may be missing."""
-
-    def lossy(exchange: Exchange) -> None:
-        exchange.heard = exchange.number != 3
-
-    link, turn = Link(lossy), Synchronisation(1, 5, TIMING)
-    link.run(turn)
-    assert link.sent[3:8] == [b"e1", b"p1", b"s1", b"e1", b"s1"]
-    assert _offsets_ns(turn) == [OFFSET_NS] * 4
-
-
-def test_a_lost_stamp_is_asked_for_again() -> None:
-    """The station still has it, so the cycle is not lost."""
-
-    def lossy(exchange: Exchange) -> None:
-        if exchange.number == 2:
-            exchange.replies.clear()
-
-    link, turn = Link(after=lossy), Synchronisation(1, 1, TIMING)
-    link.run(turn)
-    assert link.sent == [b"p1", b"e1", b"s1", b"s1", b"c1", b"c1"]
-    assert turn.missed_replies == 1
-    assert _offsets_ns(turn) == [OFFSET_NS]
-
-
-def test_every_other_packet_lost_still_ends() -> None:
-    """Cycles that bring nothing are repeated, but at most as many again."""
-
-    def lossy(exchange: Exchange) -> None:
-        exchange.heard = exchange.payload != b"e1" or exchange.number % 2 == 1
-
-    link, turn = Link(lossy), Synchronisation(1, 10, TIMING)
-    link.run(turn)
-    assert link.sent.count(b"e1") <= 20
-    assert set(_offsets_ns(turn)) == {OFFSET_NS}
-
-
-def test_a_reply_of_an_earlier_ping_makes_no_sample() -> None:
-    """A station answers a ping only after the time-out: its stamp, of that ping, goes with no later one."""
-    late: list[tuple[bytes, int]] = []
-
-    def stalled(exchange: Exchange) -> None:
-        if exchange.number == 3:
-            late.extend(exchange.replies)
-            exchange.replies.clear()
-        elif exchange.number == 5:
-            exchange.replies += [(payload, after_ns + 10 * MS) for payload, after_ns in late]
-
-    link, turn = Link(after=stalled), Synchronisation(1, 5, TIMING)
-    link.run(turn)
-    assert link.sent[3:7] == [b"e1", b"p1", b"s1", b"e1"]
-    assert _offsets_ns(turn) == [OFFSET_NS] * 4
-
-
-def test_a_reply_before_its_time_is_none() -> None:
-    """What arrives before the ping can have been answered is somebody's old reply."""
-
-    def echo(exchange: Exchange) -> None:
-        if exchange.payload == b"e1":
-            exchange.heard = exchange.number != 3
-            exchange.replies.append((b"e1", PING_NS + 20 * MS))
-
-    link, turn = Link(echo), Synchronisation(1, 5, TIMING)
-    link.run(turn)
-    assert _offsets_ns(turn) == [OFFSET_NS] * 4
-    assert all(sample.excess_ns == TURNAROUND_NS for sample in turn.samples)
-
-
-def test_a_stamp_does_not_count_twice() -> None:
-    """The reply of an earlier cycle, heard again while the ping and its stamp are lost, brings no sample."""
-    old: list[tuple[bytes, int]] = []
-
-    def replayed(exchange: Exchange) -> None:
-        if exchange.number == 1:
-            old.extend(exchange.replies)
-        elif exchange.number == 3:
-            exchange.replies = [(b"e1", after_ns) for _, after_ns in old]
-
-    def deaf(exchange: Exchange) -> None:
-        exchange.heard = exchange.number != 3
-
-    link, turn = Link(deaf, replayed), Synchronisation(1, 5, TIMING)
-    link.run(turn)
-    assert _offsets_ns(turn) == [OFFSET_NS] * 4
-    assert link.sent[5:7] == [b"p1", b"s1"]
-
-
-def test_a_station_without_stamp_brings_no_sample() -> None:
-    """It restarted between the ping and the question."""
-
-    def restart(exchange: Exchange) -> None:
-        if exchange.number == 2:
-            link.station = ClassicStation(1)
-
-    link = Link(restart)
-    turn = Synchronisation(1, 1, TIMING)
-    link.run(turn)
-    assert _offsets_ns(turn) == [OFFSET_NS]
-    assert link.sent.count(b"e1") == 2
-
-
-@pytest.mark.parametrize("payload", [b"e2", b"s" + bytes(8), b"t1", b"dOk", bytes(34), b"\xff\xff"])
-def test_packets_of_others_do_not_disturb_a_ping(payload: bytes) -> None:
-    """Other stations' replies and foreign packets are passed over while a ping's reply is waited for."""
-
-    def busy(exchange: Exchange) -> None:
-        if exchange.payload == b"e1":
-            exchange.replies.append((payload, FORWARD_NS + PING_NS))
-
-    link, turn = Link(busy), Synchronisation(1, 3, TIMING)
-    link.run(turn)
-    assert _offsets_ns(turn) == [OFFSET_NS] * 3
-
-
-def test_the_stamp_of_another_station_spoils_nothing() -> None:
-    """A time reply does not say whose it is; one that the other cycles exclude is dropped."""
-    foreign = TimeReply(OFFSET_NS + 12_345_000 * MS).to_bytes()
-
-    def disturbed(exchange: Exchange) -> None:
-        if exchange.number == 6:
-            exchange.replies.append((foreign, FORWARD_NS + TIMING.airtime_ns(9)))
-
-    link, turn = Link(disturbed), Synchronisation(1, 5, TIMING)
-    link.run(turn)
-    assert set(_offsets_ns(turn)) == {OFFSET_NS}
-    assert len(turn.samples) >= 3
-
-
-def test_the_last_cycle_cannot_outvote_the_others() -> None:
-    """A foreign stamp in the last cycle asks for more cycles, and is dropped by these."""
-    foreign = TimeReply(OFFSET_NS + 12_345_000 * MS).to_bytes()
-
-    def disturbed(exchange: Exchange) -> None:
-        if exchange.number == 10:
-            exchange.replies.append((foreign, FORWARD_NS + TIMING.airtime_ns(9)))
-
-    link, turn = Link(disturbed), Synchronisation(1, 5, TIMING)
-    link.run(turn)
-    assert _offsets_ns(turn) == [OFFSET_NS] * 3
-
-
-def test_a_clock_that_is_set_meanwhile_counts_from_then() -> None:
-    """Samples from before the step are dropped."""
-
-    def step(exchange: Exchange) -> None:
-        if exchange.number == 7:
-            link.offset_ns += 3_600_000 * MS
-
-    link = Link(step)
-    turn = Synchronisation(1, 10, TIMING)
-    link.run(turn)
-    assert set(_offsets_ns(turn)) == {OFFSET_NS + 3_600_000 * MS}
-    assert len(turn.samples) >= 5
-
-
-def test_a_clock_that_is_set_all_the_time_has_no_offset() -> None:
-    """Samples that exclude each other to the end are none."""
-
-    def step(exchange: Exchange) -> None:
-        if exchange.payload == b"e1":
-            link.offset_ns += 1000 * MS
-
-    link = Link(step)
-    turn = Synchronisation(1, 5, TIMING)
-    link.run(turn)
-    assert turn.samples == []
-    assert turn.has_reply
-
-
-def test_late_stamps_agree_with_early_ones() -> None:
-    """A busy station stamps late and answers late: its bounds are wider, and all cycles count."""
-
-    def busy(exchange: Exchange) -> None:
-        link.late_ns = 40 * MS if exchange.number % 4 == 1 else 0
-
-    link = Link(busy)
-    turn = Synchronisation(1, 6, TIMING)
-    link.run(turn)
-    assert sorted(_offsets_ns(turn)) == [OFFSET_NS] * 3 + [OFFSET_NS + 40 * MS] * 3
-
-
-def test_drift_is_no_contradiction() -> None:
-    """A bad crystal, 100 ppm off, brings a sample with each ping that is heard, also with time-outs between."""
-    lost: list[bytes] = []
-
-    def drift(exchange: Exchange) -> None:
-        link.offset_ns = OFFSET_NS + exchange.sent_ns // 10_000
-        exchange.heard = exchange.number % 9 != 5
-        if not exchange.heard:
-            lost.append(exchange.payload)
-
-    link = Link(drift)
-    turn = Synchronisation(1, 50, TIMING)
-    link.run(turn)
-    assert len(turn.samples) == 50 - lost.count(b"e1") == 38
-
-
-def test_guessed_instants_make_no_sample() -> None:
-    """A cycle whose edges were lost is passed over without asking for the stamp."""
-
-    def lost_edge(exchange: Exchange) -> None:
-        exchange.exact = exchange.number != 3
-
-    link, turn = Link(lost_edge), Synchronisation(1, 5, TIMING)
-    link.run(turn)
-    assert link.sent[3:6] == [b"e1", b"e1", b"s1"]
-    assert len(turn.samples) == 4
+SOME = MeasurementMessage(
+    station=1,
+    status=0,
+    zenith_angle_rad=1.5,
+    horizontal_angle_rad=2.0,
+    slope_distance_m=50.0,
+    time_ns=1_000_000_007,
+)
+
+
+def test_timing_of_the_paper() -> None:
+    """At SF 9 the airtimes are those of the paper, and 250 ms suffice for every reply."""
+    assert [TIMING.airtime_ns(size) for size in (2, 9, 34)] == [53_760_000, 78_336_000, 139_776_000]
+    assert [TIMING.timeout_ns(size) for size in (2, 9, 34)] == [250 * MS] * 3
+    assert TX_DONE_NS == 67_000
+    assert TIMING.rx_done_ns == pytest.approx(0.76 * 2.048e6, abs=1)
+
+
+@pytest.mark.parametrize("spreading_factor", [10, 11, 12])
+def test_timeout_follows_the_airtime(spreading_factor: int) -> None:
+    """Where a measurement lasts 250 ms and more, the timeout exceeds it."""
+    settings = LoRaSettings(
+        frequency_hz=905_000_000, spreading_factor=spreading_factor, bandwidth_hz=250_000, coding_rate=6
+    )
+    timing = LinkTiming(settings, 250 * MS)
+    assert timing.timeout_ns(34) >= timing.airtime_ns(34) + timing.rx_done_ns + 100 * MS
+
+
+def test_poll_sends_one_request() -> None:
+    """After one request and its reply the poll is over."""
+    poll = Poll(1, TIMING)
+    assert poll.request() == Request(b"t1", 250 * MS)
+    assert not poll.has_reply
+    assert _reply(poll, SOME.to_bytes())
+    assert (poll.has_reply, poll.message, poll.request()) == (True, SOME, None)
+
+
+def test_poll_without_a_reply_is_over() -> None:
+    """The scheduler repeats it."""
+    poll = Poll(1, TIMING)
+    poll.request()
+    poll.timed_out()
+    assert (poll.has_reply, poll.request()) == (False, None)
 
 
 @pytest.mark.parametrize(
-    ("unheard", "lost", "samples", "silence_ms"),
-    [({7, 9}, {12}, 3, 840), ({7, 9}, set[int](), 4, 0), (set(range(7, 30)), set[int](), 3, 0)],
-    ids=["before its last answers", "before its last sample", "at the end"],
+    "payload", [b"e1", b"dOk", bytes(34), b"\x02" + SOME.to_bytes()[1:], SOME.to_bytes()[:-1]]
 )
-def test_a_silence_that_no_sample_has_followed_is_told(
-    unheard: set[int], lost: set[int], samples: int, silence_ms: int
-) -> None:
-    """The station may have been started anew in it and pinged after it; at the end nobody has pinged it any more."""
-
-    def unheard_there(exchange: Exchange) -> None:
-        exchange.heard = exchange.number not in unheard
-
-    def lost_here(exchange: Exchange) -> None:
-        if exchange.number in lost:
-            exchange.replies.clear()
-
-    link, turn = Link(unheard_there, lost_here), Synchronisation(1, 5, TIMING)
-    link.run(turn)
-    assert len(turn.samples) == samples
-    assert turn.longest_silence_ns / MS == pytest.approx(silence_ms, abs=40)
+def test_poll_accepts_only_its_own_station(payload: bytes) -> None:
+    """Other replies, unknown packets and the measurement of another station are not its reply."""
+    poll = Poll(1, TIMING)
+    poll.request()
+    assert not _reply(poll, payload)
+    assert not poll.has_reply
 
 
-def test_a_sample_that_is_alone_does_not_count() -> None:
-    """Somebody plays back a stamp, and nothing else arrives that could contradict it."""
-
-    def played_back(exchange: Exchange) -> None:
-        if exchange.number > 1:
-            exchange.heard = False
-        if exchange.number == 2:
-            exchange.replies.append((TimeReply(OFFSET_NS - 10**15).to_bytes(), FORWARD_NS + 100 * MS))
-
-    link, turn = Link(played_back), Synchronisation(1, 5, TIMING)
-    link.run(turn)
-    assert turn.samples == []
-    assert turn.has_reply
+def test_single_measurement_has_its_own_timeout() -> None:
+    """The instrument takes seconds; the timeout is longer than that."""
+    shot = SingleMeasurementPoll(1, TIMING, 20_000 * MS)
+    request = shot.request()
+    assert request is not None
+    assert (request.payload, request.reply_timeout_ns) == (b"t1", 20_250 * MS)
+    assert _reply(shot, SOME.to_bytes())
+    assert shot.message == SOME
 
 
-@pytest.mark.parametrize("asked", [b"s1", b"e1"])
-def test_what_was_sampled_before_a_restart_is_dropped(asked: bytes) -> None:
-    """A station that has answered pings and knows of none is another program, whatever else its clock shows."""
+@pytest.mark.parametrize(
+    ("order", "payload", "ok"),
+    [
+        (CommandMessage("d", 1), b"dOk", True),
+        (CommandMessage("d", 1), b"dNo", False),
+        (CommandMessage("n", 1, 3), b"nOk", True),
+        (CommandMessage("n", 1), b"nNo", False),
+    ],
+)
+def test_command_is_acknowledged(order: CommandMessage, payload: bytes, *, ok: bool) -> None:
+    """A command ends any synchronisation first, and takes its acknowledgement."""
+    turn = CommandTransaction(1, order, 2_000 * MS)
+    assert turn.request() == Request(b"c1", 0)
+    assert turn.request() == Request(order.to_bytes(), 2_000 * MS)
+    assert _reply(turn, payload)
+    assert turn.request() is None
+    assert turn.ok is ok
 
-    def meddle(exchange: Exchange) -> None:
-        if link.sent.count(b"e1") == 3 and exchange.payload == asked and link.station is before:
-            exchange.heard = False
-            link.station = ClassicStation(1)
-            link.offset_ns += MS
 
-    link, turn = Link(meddle), Synchronisation(1, 5, TIMING)
-    before = link.station
-    link.run(turn)
-    assert turn.restarted
-    assert len(turn.samples) >= 3
-    assert set(_offsets_ns(turn)) == {OFFSET_NS + MS}
+@pytest.mark.parametrize("payload", [b"nOk", b"nNo", b"d1", SOME.to_bytes()])
+def test_command_accepts_only_its_own_acknowledgement(payload: bytes) -> None:
+    """The late acknowledgement of the other command is not accepted."""
+    turn = CommandTransaction(1, CommandMessage("d", 1), 2_000 * MS)
+    turn.request()
+    turn.request()
+    assert not _reply(turn, payload)
+    turn.timed_out()
+    assert (turn.ok, turn.request()) == (None, None)
 
 
-def test_a_station_that_has_heard_no_ping_yet_was_not_restarted() -> None:
-    """The first ping was lost; of pings before this synchronisation it need not know."""
-
-    def meddle(exchange: Exchange) -> None:
-        exchange.heard = exchange.number != 1
-
-    link, turn = Link(meddle), Synchronisation(1, 3, TIMING)
-    link.run(turn)
-    assert not turn.restarted
-    assert len(turn.samples) == 2
+def _reply(turn: Transaction, payload: bytes) -> bool:
+    return turn.accept_reply(payload, sent_ns=0, received_ns=200 * MS, exact=True)

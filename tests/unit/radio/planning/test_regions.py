@@ -19,8 +19,8 @@ from tsgt.radio.planning.regulations import MAX_PRESET_DBM
         ("CA915", 905_000_000, 250_000, MIN_POWER_DBM),
     ],
 )
-def test_a_channel_has_its_power(region: str, frequency_hz: int, bandwidth_hz: int, power_dbm: int) -> None:
-    """The band decides, and in North America whether a fixed channel is wide enough."""
+def test_preset_power_of_a_channel(region: str, frequency_hz: int, bandwidth_hz: int, power_dbm: int) -> None:
+    """The band decides, and in North America the bandwidth of a fixed channel."""
     assert preset_power_dbm(region, frequency_hz=frequency_hz, bandwidth_hz=bandwidth_hz) == power_dbm
 
 
@@ -28,13 +28,13 @@ def test_a_channel_has_its_power(region: str, frequency_hz: int, bandwidth_hz: i
     ("region", "frequency_hz", "bandwidth_hz"),
     [("EU868", 905_000_000, 250_000), ("EU868", 868_650_000, 125_000), ("EU868", 869_525_000, 500_000)],
 )
-def test_a_channel_outside_is_refused(region: str, frequency_hz: int, bandwidth_hz: int) -> None:
+def test_channel_outside_the_bands_is_rejected(region: str, frequency_hz: int, bandwidth_hz: int) -> None:
     """Wrong region, a gap between bands, or too wide for the band: the message names the bands."""
     with pytest.raises(RadioSettingsError, match="not within a band of EU868"):
         preset_power_dbm(region, frequency_hz=frequency_hz, bandwidth_hz=bandwidth_hz)
 
 
-def test_no_preset_is_beyond_the_chip() -> None:
-    """Presets stay within what the chip may do all the time."""
+def test_presets_stay_within_the_chip_limit() -> None:
+    """No preset exceeds what the chip allows at any duty cycle."""
     for bands in REGIONS.values():
         assert all(MIN_POWER_DBM <= band.power_dbm <= MAX_PRESET_DBM for band in bands)

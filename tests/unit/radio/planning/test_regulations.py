@@ -25,21 +25,21 @@ def use(
     return ChannelUse(LoRaSettings(**{**usual, **settings}), gain_dbi, master_duty, duty)
 
 
-def test_without_a_region_only_the_chip_counts() -> None:
-    """Where nothing is said of the place, nothing can be said of its law."""
+def test_without_a_region_only_the_chip_limit_applies() -> None:
+    """Without a region no legal limit is known."""
     assert violations(use(duty=1.0), None, []) == []
 
 
 @pytest.mark.parametrize(("duty", "master_duty"), [(0.02, 0.001), (0.001, 0.02)])
-def test_20_dbm_for_more_than_a_hundredth_of_the_time_is_too_much(duty: float, master_duty: float) -> None:
-    """It is the chip's limit, whoever transmits that much, and 17 dBm comply."""
+def test_20_dbm_above_one_percent_duty_cycle_is_reported(duty: float, master_duty: float) -> None:
+    """The chip's limit applies to master and station; 17 dBm would comply."""
     (text,) = violations(use(power_dbm=20, duty=duty, master_duty=master_duty), None, [])
     assert "the chip allows 20 dBm for 1 % of the time" in text
     assert text.endswith("Would comply: 17 dBm")
 
 
-def test_20_dbm_for_less_is_allowed() -> None:
-    """The data sheet's exception."""
+def test_20_dbm_below_one_percent_duty_cycle_is_allowed() -> None:
+    """The data sheet allows 20 dBm at 1 % duty cycle."""
     assert violations(use(power_dbm=20), None, []) == []
 
 
@@ -48,7 +48,7 @@ def test_20_dbm_for_less_is_allowed() -> None:
     [(864_000_000, 0.001), (866_000_000, 0.01), (868_900_000, 0.001), (869_525_000, 0.1), (433_900_000, 0.1)],
 )
 def test_europe_limits_the_duty_cycle(frequency_hz: int, allowed: float) -> None:
-    """Each band has its own limit, up to which nothing is said and beyond which it is named."""
+    """Each band has its own limit."""
     region = "EU433" if frequency_hz < 500_000_000 else "EU868"
     power_dbm = 10 if region == "EU433" else 14
     settings = {"frequency_hz": frequency_hz, "power_dbm": power_dbm}
@@ -57,14 +57,14 @@ def test_europe_limits_the_duty_cycle(frequency_hz: int, allowed: float) -> None
     assert f"may transmit for {100 * allowed:g} % of any hour" in text
 
 
-def test_a_channel_in_two_bands_keeps_to_the_stricter() -> None:
-    """Across 865 MHz both limits count; only that of 0.1 % is exceeded."""
+def test_channel_in_two_bands_has_the_stricter_limit() -> None:
+    """Across 865 MHz both limits apply; only that of 0.1 % is violated."""
     (text,) = violations(use(frequency_hz=865_000_000), "EU868", [])
     assert "863 to 865 MHz" in text
 
 
-def test_settings_that_comply_are_named() -> None:
-    """The first of the others that keeps to the limit is told, and the band without a limit."""
+def test_complying_settings_are_named() -> None:
+    """The first alternative within the limit is named, and the band without a limit."""
     others = [use(duty=0.5), use(duty=0.09, spreading_factor=8), use(duty=0.05, spreading_factor=7)]
     (text,) = violations(use(duty=0.24), "EU868", others)
     assert (
@@ -72,21 +72,21 @@ def test_settings_that_comply_are_named() -> None:
     )
 
 
-def test_little_power_has_no_duty_limit_in_one_band() -> None:
-    """5 mW between 869.7 and 870 MHz are allowed all the time, more is not."""
+def test_low_power_has_no_duty_limit_in_one_band() -> None:
+    """5 mW between 869.7 and 870 MHz are unlimited, more is not."""
     settings = {"frequency_hz": 869_850_000, "duty": 0.5}
     assert violations(use(power_dbm=7, **settings), "EU868", []) == []
     assert len(violations(use(power_dbm=8, **settings), "EU868", [])) == 1
 
 
-def test_europe_limits_the_power_with_the_antenna() -> None:
-    """What an antenna gains over a dipole comes off the power."""
+def test_antenna_gain_reduces_the_allowed_power() -> None:
+    """Gain above a dipole counts against the e.r.p. limit."""
     (text,) = violations(use(frequency_hz=868_100_000, gain_dbi=8.15), "EU868", [])
     assert "14 dBm into 8.15 dBi are 20.0. Would comply: 6.0 dB less power or gain" in text
 
 
 @pytest.mark.parametrize(("region", "law"), [("US915", "47 CFR 15.249"), ("CA915", "RSS-210")])
-def test_north_america_allows_little_on_a_fixed_narrow_channel(region: str, law: str) -> None:
+def test_narrow_fixed_channel_in_north_america_has_a_low_limit(region: str, law: str) -> None:
     """The paper's 250 kHz may radiate -1.25 dBm; each region names its own rule, and 500 kHz comply."""
     channel = {"frequency_hz": 905_000_000, "bandwidth_hz": 250_000, "duty": 0.3}
     (text,) = violations(use(**channel, power_dbm=17), region, [])
@@ -98,15 +98,15 @@ def test_north_america_allows_little_on_a_fixed_narrow_channel(region: str, law:
     assert "8.2 dB less power" in text
 
 
-def test_north_america_allows_much_on_a_wide_channel() -> None:
-    """500 kHz may have 30 dBm into 6 dBi, and so much less into more."""
+def test_wide_channel_in_north_america_has_a_high_limit() -> None:
+    """500 kHz may have 30 dBm into 6 dBi, and less into more gain."""
     channel = {"frequency_hz": 905_000_000, "bandwidth_hz": 500_000, "duty": 0.3}
     assert violations(use(**channel, power_dbm=17, gain_dbi=6), "US915", []) == []
     (text,) = violations(use(**channel, power_dbm=17, gain_dbi=21), "US915", [])
     assert "at most 15 dBm; it is 17 dBm. Would comply: 2.0 dB less power or gain" in text
 
 
-def test_a_channel_outside_the_bands_is_refused() -> None:
-    """There is no limit to hold it against."""
+def test_channel_outside_the_bands_is_rejected() -> None:
+    """It has no limits to compare with."""
     with pytest.raises(RadioSettingsError, match="not within a band"):
         violations(use(frequency_hz=905_000_000), "EU868", [])

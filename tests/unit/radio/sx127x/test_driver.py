@@ -45,7 +45,7 @@ class Stranger:
 
 @pytest.mark.parametrize("size", [1, 2, 34, 255])
 async def test_packets_arrive_in_both_directions(size: int) -> None:
-    """What one radio sends the other receives, whatever its length, and the other way round."""
+    """Each radio receives what the other sends, at any length."""
     payload = bytes(i * 7 & 0xFF for i in range(size))
     async with bench() as b:
         await b.here.radio.transmit(payload)
@@ -55,8 +55,8 @@ async def test_packets_arrive_in_both_directions(size: int) -> None:
         assert b.here.chip.warnings == b.there.chip.warnings == []
 
 
-async def test_packet_carries_its_strength() -> None:
-    """RSSI and SNR are those of the air: 14 dBm less 80 dB, and an SNR that the chip cannot tell above 14 dB."""
+async def test_packet_has_its_signal_strength() -> None:
+    """RSSI and SNR are those of the channel: 14 dBm less 80 dB, and an SNR that saturates above 14 dB."""
     async with bench() as b:
         await b.here.radio.transmit(b"hello")
         packet = await b.there.radio.receive()
@@ -64,8 +64,8 @@ async def test_packet_carries_its_strength() -> None:
     assert packet.snr_db == 14
 
 
-async def test_weak_packet_carries_its_strength() -> None:
-    """Below the noise the RSSI is corrected by the SNR."""
+async def test_weak_packet_has_its_signal_strength() -> None:
+    """Below the noise the SNR corrects the RSSI."""
     async with bench() as b:
         b.air.link.set_attenuation("here", "there", 14 - 80 + 119.5)
         await b.here.radio.transmit(b"hello")
@@ -74,8 +74,8 @@ async def test_weak_packet_carries_its_strength() -> None:
     assert packet.rssi_dbm == pytest.approx(-119.5, abs=0.6)
 
 
-async def test_stamps_are_those_of_the_edges() -> None:
-    """TxDone comes an airtime after the start plus start-up and 67 us, RxDone 0.76 symbol after the packet's end."""
+async def test_timestamps_are_those_of_the_edges() -> None:
+    """TxDone is an airtime after the start plus start-up and 67 us, RxDone 0.76 symbols after the packet's end."""
     async with bench() as b:
         sent = await b.here.radio.transmit(bytes(34))
         packet = await b.there.radio.receive()
@@ -90,7 +90,7 @@ async def test_stamps_are_those_of_the_edges() -> None:
 @pytest.mark.parametrize("bandwidth_hz", BANDWIDTHS_HZ)
 @pytest.mark.parametrize("frequency_hz", [434_000_000, 869_525_000])
 async def test_every_bandwidth_works_on_both_ports(bandwidth_hz: int, frequency_hz: int) -> None:
-    """At each bandwidth, on either port, a packet arrives: narrow receivers are tuned off and senders are not."""
+    """At each bandwidth, on either port, a packet arrives: narrow receivers are tuned with an offset, senders are not."""
     settings = replace(PAPER, bandwidth_hz=bandwidth_hz, frequency_hz=frequency_hz, spreading_factor=7)
     async with bench(settings) as b:
         await b.here.radio.transmit(b"hello")
@@ -115,7 +115,7 @@ async def test_every_bandwidth_works_on_both_ports(bandwidth_hz: int, frequency_
     ],
 )
 async def test_every_setting_works(settings: LoRaSettings) -> None:
-    """Two radios with the same settings hear each other, and one with the paper's hears neither of them."""
+    """Two radios with the same settings receive each other, and one with the paper's receives neither."""
     async with bench(settings) as b:
         await b.here.radio.transmit(b"hello")
         assert (await b.there.radio.receive()).payload == b"hello"
@@ -131,16 +131,16 @@ async def test_every_setting_works(settings: LoRaSettings) -> None:
         replace(PAPER, frequency_hz=906_000_000),
     ],
 )
-async def test_radios_with_other_settings_are_not_heard(other: LoRaSettings) -> None:
-    """A radio hears nothing of one that differs in spreading factor, bandwidth, sync word, IQ or frequency."""
+async def test_packets_with_other_settings_are_not_received(other: LoRaSettings) -> None:
+    """A sender that differs in spreading factor, bandwidth, sync word, IQ or frequency is not received."""
     async with bench(PAPER, other) as b:
         await b.here.radio.transmit(b"hello")
         await b.clock.sleep_until(b.clock.monotonic_ns() + 1000 * MS)
         assert b.there.radio.statistics.received == 0
 
 
-async def test_every_combination_is_taken() -> None:
-    """The chip takes all combinations of the modem's settings, finds nothing against the data sheet, and receives."""
+async def test_every_combination_is_accepted() -> None:
+    """The chip accepts all combinations of the modem's settings without a data sheet violation, and receives."""
     combinations = itertools.product(BANDWIDTHS_HZ, range(7, 13), range(5, 9), (False, True))
     async with bench() as b:
         for bandwidth_hz, spreading_factor, coding_rate, flag in combinations:
@@ -163,7 +163,7 @@ async def test_every_combination_is_taken() -> None:
 
 
 async def test_configure_changes_the_settings_of_a_running_radio() -> None:
-    """After a change of settings on both sides packets arrive again, also from 500 kHz, which leaves traces."""
+    """After a change of settings on both sides packets arrive again, also from 500 kHz, which changes other registers."""
     async with bench(replace(PAPER, bandwidth_hz=500_000)) as b:
         await b.here.radio.configure(PAPER)
         await b.there.radio.configure(PAPER)
@@ -173,7 +173,7 @@ async def test_configure_changes_the_settings_of_a_running_radio() -> None:
 
 
 async def test_back_to_back_packets_wrap_in_the_fifo() -> None:
-    """Thirty packets of 34 bytes, one after the other, all arrive whole: 1020 bytes through a FIFO of 256."""
+    """Thirty consecutive packets of 34 bytes arrive intact: 1020 bytes through a FIFO of 256."""
     async with bench() as b:
         payloads = [bytes([number]) * 34 for number in range(30)]
         for payload in payloads:
@@ -185,7 +185,7 @@ async def test_back_to_back_packets_wrap_in_the_fifo() -> None:
 
 
 async def test_transmission_starts_at_its_instant() -> None:
-    """A packet with an instant is sent exactly then, and its sender receives until shortly before."""
+    """A scheduled packet starts exactly at its instant, and its sender receives until shortly before."""
     async with bench() as b:
         at_ns = b.clock.monotonic_ns() + 500 * MS
         sending = asyncio.create_task(b.here.radio.transmit(b"hello", at_ns=at_ns))
@@ -195,8 +195,8 @@ async def test_transmission_starts_at_its_instant() -> None:
     assert sent.started_at_ns == at_ns
 
 
-async def test_instant_that_has_passed_means_now() -> None:
-    """A packet whose instant has passed goes out at once, and says when it did."""
+async def test_past_instant_means_now() -> None:
+    """A packet whose instant has passed starts at once, with the actual start in its record."""
     async with bench() as b:
         now_ns = b.clock.monotonic_ns()
         sent = await b.here.radio.transmit(b"hello", at_ns=now_ns - 10 * MS)
@@ -204,7 +204,7 @@ async def test_instant_that_has_passed_means_now() -> None:
 
 
 async def test_transmissions_of_several_tasks_queue_up() -> None:
-    """Packets that tasks send at the same time go out one after the other and all arrive."""
+    """Packets of concurrent tasks are sent one after the other, and all arrive."""
     async with bench() as b:
         await asyncio.gather(*(b.here.radio.transmit(bytes([number])) for number in range(5)))
         received = [(await b.there.radio.receive()).payload[0] for _ in range(5)]
@@ -229,7 +229,7 @@ async def test_packet_that_ends_just_before_a_transmission_is_kept(edge_is_lost:
 
 
 async def test_cancelled_transmission_leaves_the_radio_receiving() -> None:
-    """A transmission that is cancelled on the air is cut off, not heard, and its sender receives again."""
+    """A transmission cancelled on the air is aborted, not received, and its sender receives again."""
     async with bench() as b:
         sending = asyncio.create_task(b.here.radio.transmit(bytes(34)))
         await b.clock.sleep_until(b.clock.monotonic_ns() + 50 * MS)
@@ -243,8 +243,8 @@ async def test_cancelled_transmission_leaves_the_radio_receiving() -> None:
 
 
 @pytest.mark.parametrize("delay_ms", [1, 496, 499])
-async def test_cancelled_before_its_instant_it_leaves_the_radio_receiving(delay_ms: int) -> None:
-    """A transmission that is cancelled before its instant, prepared or not, never starts."""
+async def test_transmission_cancelled_before_its_instant_leaves_the_radio_receiving(delay_ms: int) -> None:
+    """A transmission cancelled before its instant, loaded or not, never starts."""
     async with bench() as b:
         now_ns = b.clock.monotonic_ns()
         sending = asyncio.create_task(b.here.radio.transmit(b"never", at_ns=now_ns + 500 * MS))
@@ -256,8 +256,8 @@ async def test_cancelled_before_its_instant_it_leaves_the_radio_receiving(delay_
         assert b.there.radio.statistics.received == 0
 
 
-async def test_cancelled_reception_loses_nothing() -> None:
-    """A packet that arrives after a cancelled receive() waits for the next one."""
+async def test_cancelled_reception_loses_no_packet() -> None:
+    """A packet that arrives after a cancelled receive() is queued for the next one."""
     async with bench() as b:
         waiting = asyncio.create_task(b.there.radio.receive())
         await asyncio.sleep(0.1)
@@ -268,7 +268,7 @@ async def test_cancelled_reception_loses_nothing() -> None:
 
 
 async def test_full_queue_drops_the_oldest() -> None:
-    """When nobody receives, the newest packets are kept and the others counted and announced."""
+    """Without a receiver the newest packets are kept; the others are counted and logged."""
     async with bench(replace(PAPER, spreading_factor=7)) as b:
         with capture_logs() as logs:
             for number in range(QUEUE_CAPACITY + 2):
@@ -279,8 +279,8 @@ async def test_full_queue_drops_the_oldest() -> None:
         assert [entry["event"] for entry in logs] == ["radio_queue_overflow"] * 2
 
 
-async def test_damaged_packet_is_dropped_and_counted() -> None:
-    """A packet whose CRC is wrong, here for a collision in its payload, is not handed out."""
+async def test_packet_with_a_crc_error_is_dropped_and_counted() -> None:
+    """A packet whose CRC is wrong, here from a collision in its payload, is not delivered."""
     async with bench() as b:
         stranger = b.air.join(Stranger(), "stranger")
         start_ns = b.clock.monotonic_ns()
@@ -295,8 +295,8 @@ async def test_damaged_packet_is_dropped_and_counted() -> None:
         assert (await b.there.radio.receive()).payload == b"hello"
 
 
-async def test_packet_without_crc_is_dropped_where_one_is_asked_for() -> None:
-    """A receiver that relies on CRCs hands out no packet that has none, and counts it."""
+async def test_packet_without_crc_is_dropped_where_one_is_required() -> None:
+    """A receiver that requires CRCs drops and counts packets without one."""
     async with bench(replace(PAPER, crc=False), PAPER) as b:
         await b.here.radio.transmit(b"hello")
         await b.clock.sleep_until(b.clock.monotonic_ns() + 100 * MS)
@@ -304,16 +304,16 @@ async def test_packet_without_crc_is_dropped_where_one_is_asked_for() -> None:
         assert b.there.radio.statistics.received == 0
 
 
-async def test_packet_with_crc_is_taken_where_none_is_asked_for() -> None:
-    """A receiver without CRC takes packets of a sender with it: the header says so."""
+async def test_packet_with_crc_is_received_where_none_is_required() -> None:
+    """The header states whether a packet has a CRC."""
     async with bench(PAPER, replace(PAPER, crc=False)) as b:
         await b.here.radio.transmit(b"hello")
         assert (await b.there.radio.receive()).payload == b"hello"
 
 
 @pytest.mark.parametrize("size", [0, 256])
-async def test_payload_that_cannot_be_sent_is_refused(size: int) -> None:
-    """An empty payload and one of 256 bytes are refused before anything is touched."""
+async def test_payload_of_invalid_length_is_rejected(size: int) -> None:
+    """An empty payload and one of 256 bytes are rejected before any register access."""
     async with bench() as b:
         with pytest.raises(RadioSettingsError, match=f"1 to 255 bytes, got {size}"):
             await b.here.radio.transmit(bytes(size))
@@ -321,14 +321,14 @@ async def test_payload_that_cannot_be_sent_is_refused(size: int) -> None:
 
 
 async def test_twenty_dbm_must_be_allowed() -> None:
-    """20 dBm are refused unless the driver was made to allow them."""
+    """20 dBm are rejected unless the driver allows them."""
     with pytest.raises(RadioSettingsError, match="1 % duty"):
         async with bench(replace(PAPER, power_dbm=20)):
             pass
 
 
-async def test_twenty_dbm_arrive_as_such() -> None:
-    """With 20 dBm allowed a packet arrives 6 dB stronger than with 14, and going back restores the amplifier."""
+async def test_twenty_dbm_arrive_6_db_stronger() -> None:
+    """With 20 dBm a packet arrives 6 dB stronger than with 14, and going back restores the amplifier."""
     async with bench(replace(PAPER, power_dbm=20), allow_20_dbm=True) as b:
         await b.here.radio.transmit(b"hello")
         assert (await b.there.radio.receive()).rssi_dbm == pytest.approx(20 - 80, abs=0.6)
@@ -336,8 +336,8 @@ async def test_twenty_dbm_arrive_as_such() -> None:
         assert b.here.register(Register.PA_DAC) == 0x84
 
 
-async def test_radio_that_was_not_started_sends_nothing() -> None:
-    """Sending before the start fails and says why."""
+async def test_transmission_before_the_start_fails() -> None:
+    """The error states the reason."""
     async with bench() as b:
         side = make_side(b.air, "third")
         with pytest.raises(RadioError, match="down: not started"):
@@ -357,8 +357,8 @@ async def test_closed_radio_is_asleep() -> None:
             await b.here.radio.transmit(b"hello")
 
 
-async def test_frame_helper_has_our_airtime() -> None:
-    """The strangers of these tests send what our driver would."""
+async def test_frame_helper_has_the_drivers_airtime() -> None:
+    """The foreign senders of these tests send what the driver would."""
     assert frame(bytes(34), 0).end_ns == 1000 * airtime_us(
         34, spreading_factor=9, bandwidth_hz=250_000, coding_rate=6
     )

@@ -25,7 +25,7 @@ def new_air() -> Air:
 
 
 async def wait_ms(b: Bench, duration_ms: float) -> None:
-    """Let so much time pass."""
+    """Wait in virtual time."""
     await b.clock.sleep_until(b.clock.monotonic_ns() + round(duration_ms * MS))
 
 
@@ -67,8 +67,8 @@ class FixedRegisters:
 
 
 @pytest.mark.parametrize("level", [False, True])
-async def test_missing_chip_is_named_at_the_start(level: bool) -> None:  # noqa: FBT001 (a parameter)
-    """A bus on which nothing answers, 0x00 or 0xFF, ends the start with what to check."""
+async def test_missing_chip_fails_the_start(level: bool) -> None:  # noqa: FBT001 (a parameter)
+    """A bus without a response, 0x00 or 0xFF, ends the start with what to check."""
     side = make_side(new_air(), "here")
     side.chip.disconnect_bus(level)
     with pytest.raises(RadioNotFoundError, match=r"wiring, the NSS pin .* overlay"):
@@ -76,31 +76,31 @@ async def test_missing_chip_is_named_at_the_start(level: bool) -> None:  # noqa:
     await side.radio.close()
 
 
-async def test_sx1272_is_refused_by_name() -> None:
-    """The chip's predecessor, whose registers differ, is recognised and named."""
+async def test_sx1272_is_rejected_by_name() -> None:
+    """The predecessor, whose registers differ, is recognised and named."""
     radio = SX127x(FixedRegisters(VERSION=0x22), VirtualClock(0))
     with pytest.raises(RadioNotFoundError, match="SX1272"):
         await radio.start(PAPER)
 
 
-async def test_unknown_version_is_refused() -> None:
-    """Any other version is reported as it reads."""
+async def test_unknown_version_is_rejected() -> None:
+    """Any other version is reported as read."""
     radio = SX127x(FixedRegisters(VERSION=0x40), VirtualClock(0))
     with pytest.raises(RadioNotFoundError, match="0x40"):
         await radio.start(PAPER)
 
 
 @pytest.mark.parametrize("version", [0x11, 0x13])
-async def test_odd_versions_are_accepted_and_logged(version: int) -> None:
-    """Versions that some RFM9x modules have pass, with an entry in the log."""
+async def test_undocumented_versions_are_accepted_and_logged(version: int) -> None:
+    """Versions of some RFM9x modules are accepted with a log event."""
     radio = SX127x(FixedRegisters(VERSION=version), VirtualClock(0))
     with capture_logs() as logs, pytest.raises(RadioError, match="OP_MODE"):
         await radio.start(PAPER)
     assert logs == [{"event": "radio_version_unusual", "log_level": "info", "version": version}]
 
 
-async def test_register_that_does_not_keep_its_value_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A mismatch on reading back says which register, what it should hold and what it holds."""
+async def test_register_mismatch_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The error names the register, the written and the read value."""
     side = make_side(new_air(), "here")
     transfer = side.chip.transfer
 
@@ -119,8 +119,8 @@ async def test_register_that_does_not_keep_its_value_is_named(monkeypatch: pytes
 
 
 @pytest.mark.parametrize("counted", [False, True])
-async def test_packet_without_edge_is_found(counted: bool) -> None:  # noqa: FBT001 (a parameter)
-    """A packet whose edge is lost is found within 100 ms, and its stamp covers what really happened."""
+async def test_packet_without_edge_is_found_by_polling(counted: bool) -> None:  # noqa: FBT001 (a parameter)
+    """A packet whose edge is lost is found within 100 ms, and its sigma covers the true time."""
     async with bench() as b:
         await wait_ms(b, 1000)
         b.there.hal.drop_edges(1, counted=counted)
@@ -134,8 +134,8 @@ async def test_packet_without_edge_is_found(counted: bool) -> None:  # noqa: FBT
         await assert_both_ways(b)
 
 
-async def test_dio0_that_is_not_connected_costs_only_time_stamps() -> None:
-    """Without any edges packets still pass, each is counted, and no stamp is worse than the polling."""
+async def test_disconnected_dio0_degrades_timestamps_only() -> None:
+    """Without any edges packets still arrive, each is counted, and no sigma exceeds the polling interval."""
     async with bench() as b:
         b.here.hal.drop_edges(1000, counted=False)
         b.there.hal.drop_edges(1000, counted=False)
@@ -146,7 +146,7 @@ async def test_dio0_that_is_not_connected_costs_only_time_stamps() -> None:
         assert b.here.radio.statistics.tx_timeouts == 0
 
 
-async def test_edge_that_is_on_its_way_is_not_taken_as_lost() -> None:
+async def test_pending_edge_is_not_lost() -> None:
     """A check of the chip between an interrupt and its handling waits for the edge."""
     async with bench() as b:
         await b.there.radio.transmit(b"hello")
@@ -156,8 +156,8 @@ async def test_edge_that_is_on_its_way_is_not_taken_as_lost() -> None:
         assert b.here.radio.statistics.lost_edges == 0
 
 
-async def test_lost_edge_of_a_transmission_is_noticed() -> None:
-    """A TxDone without edge is found a few ms later; its stamp is computed and says that it is less certain."""
+async def test_transmission_without_edge_is_found_by_polling() -> None:
+    """A TxDone without edge is found a few ms later; its timestamp is computed, with a larger sigma."""
     async with bench() as b:
         b.here.hal.drop_edges(1, counted=False)
         sent = await b.here.radio.transmit(bytes(34))
@@ -169,7 +169,7 @@ async def test_lost_edge_of_a_transmission_is_noticed() -> None:
 
 
 async def test_edges_that_the_kernel_dropped_are_counted() -> None:
-    """What the HAL reports as lost shows in the statistics and in the log."""
+    """Edges that the HAL reports as lost appear in the statistics and in the log."""
     async with bench() as b:
         with capture_logs() as logs:
             b.here.radio._on_edge(Edge(0, lost=3))
@@ -178,7 +178,7 @@ async def test_edges_that_the_kernel_dropped_are_counted() -> None:
 
 
 async def test_stale_edge_is_ignored() -> None:
-    """An edge without its flag, in whatever state, changes nothing."""
+    """An edge without its flag changes nothing in any state."""
     async with bench() as b:
         b.here.radio._on_edge(Edge(b.clock.monotonic_ns()))
         sending = asyncio.create_task(b.here.radio.transmit(bytes(34)))
@@ -189,8 +189,8 @@ async def test_stale_edge_is_ignored() -> None:
         assert b.here.radio.statistics.received == 0
 
 
-async def test_stale_edge_does_not_stamp_the_end_of_a_transmission() -> None:
-    """An edge from before a transmission, handed over after its end, is not taken for its TxDone."""
+async def test_stale_edge_does_not_timestamp_a_transmission() -> None:
+    """An edge from before a transmission, delivered after its end, is not taken for its TxDone."""
     async with bench() as b:
         b.here.hal.drop_edges(1, counted=False)
         start_ns = b.clock.monotonic_ns()
@@ -201,7 +201,7 @@ async def test_stale_edge_does_not_stamp_the_end_of_a_transmission() -> None:
         assert (await sending).done_at_ns > start_ns
 
 
-async def test_edge_that_is_handled_too_late_gives_a_wide_stamp() -> None:
+async def test_late_edge_gives_a_large_sigma() -> None:
     """When a host was away for longer than a packet, a second one may stand in the place of the first.
 
     Its stamp must then not claim the first one's edge.
@@ -223,8 +223,8 @@ async def test_edge_that_is_handled_too_late_gives_a_wide_stamp() -> None:
 # --- Faults of the chip -------------------------------------------------------------------------------------------
 
 
-async def test_transmission_that_does_not_end_resets_the_chip() -> None:
-    """Without TxDone the call fails 50 ms after the packet's end; the radio is reset and works again at once."""
+async def test_transmission_without_tx_done_resets_the_chip() -> None:
+    """The call fails 50 ms after the packet's end; the radio is reset and works again at once."""
     async with bench() as b:
         b.here.chip.drop_tx_done()
         start_ns = b.clock.monotonic_ns()
@@ -239,12 +239,12 @@ async def test_transmission_that_does_not_end_resets_the_chip() -> None:
 
 
 async def test_radio_timeout_is_a_timeout_error() -> None:
-    """Callers that know nothing of radios can catch the built-in TimeoutError."""
+    """Callers can catch the built-in TimeoutError."""
     assert issubclass(RadioTimeoutError, TimeoutError)
 
 
 async def test_chip_that_resets_itself_is_set_up_again() -> None:
-    """After a dip of the supply the radio works again within 100 ms and the time of a reset."""
+    """After a supply dip the radio works again within 100 ms and the time of a reset."""
     async with bench() as b:
         b.here.chip.power_on_reset()
         await wait_ms(b, 120)
@@ -253,7 +253,7 @@ async def test_chip_that_resets_itself_is_set_up_again() -> None:
 
 
 async def test_chip_that_resets_itself_while_sending_is_set_up_again() -> None:
-    """A reset in the middle of a transmission fails that call and none after it."""
+    """A reset during a transmission fails that call and none after it."""
     async with bench() as b:
         sending = asyncio.create_task(b.here.radio.transmit(bytes(34)))
         await wait_ms(b, 50)
@@ -264,7 +264,7 @@ async def test_chip_that_resets_itself_while_sending_is_set_up_again() -> None:
 
 
 async def test_chip_that_hangs_while_receiving_is_reset() -> None:
-    """A chip whose registers are frozen looks well to a reader; it is found out and reset all the same."""
+    """A chip with frozen registers reads correctly; the write check detects it."""
     async with bench() as b:
         b.here.chip.hang()
         await wait_ms(b, 120)
@@ -284,7 +284,7 @@ async def test_chip_that_hangs_while_sending_is_reset() -> None:
 
 
 async def test_chip_that_hangs_with_a_packet_is_reset() -> None:
-    """A packet that cannot be taken off the chip is a fault, not a stream of packets."""
+    """A packet that cannot be removed from the chip is a fault, not a stream of packets."""
     async with bench() as b:
         b.there.hal.drop_edges(1, counted=False)
         await b.here.radio.transmit(b"hello")
@@ -297,8 +297,8 @@ async def test_chip_that_hangs_with_a_packet_is_reset() -> None:
         await assert_both_ways(b)
 
 
-async def test_changed_sync_word_is_noticed() -> None:
-    """A chip that has kept its mode but not its settings is set up again."""
+async def test_changed_sync_word_is_detected() -> None:
+    """A chip that kept its mode but not its settings is set up again."""
     async with bench() as b:
         b.here.chip.transfer(bytes([0x80 | Register.SYNC_WORD, 0x12]))
         await wait_ms(b, 120)
@@ -307,7 +307,7 @@ async def test_changed_sync_word_is_noticed() -> None:
 
 
 async def test_missing_chip_delivers_no_packets() -> None:
-    """All flags set is what an open line reads as, not a packet with a wrong CRC."""
+    """An open line reads as all flags set, which is no packet with a CRC error."""
     async with bench() as b:
         b.here.chip.disconnect_bus(level=True)
         b.here.radio._on_edge(Edge(b.clock.monotonic_ns()))
@@ -317,8 +317,8 @@ async def test_missing_chip_delivers_no_packets() -> None:
 
 
 @pytest.mark.parametrize("level", [False, True])
-async def test_lost_bus_is_survived(level: bool) -> None:  # noqa: FBT001 (a parameter)
-    """While nothing answers, sending fails with the reason; when the bus is back, so is the radio."""
+async def test_radio_recovers_with_the_bus(level: bool) -> None:  # noqa: FBT001 (a parameter)
+    """While the bus is lost, sending fails with the reason; the radio recovers with the bus."""
     async with bench() as b:
         with capture_logs() as logs:
             b.here.chip.disconnect_bus(level)
@@ -334,8 +334,8 @@ async def test_lost_bus_is_survived(level: bool) -> None:  # noqa: FBT001 (a par
 
 
 @pytest.mark.parametrize("level", [False, True])
-async def test_bus_lost_while_sending_is_survived(level: bool) -> None:  # noqa: FBT001 (a parameter)
-    """A bus that goes in the middle of a transmission fails that call; the radio comes back with the bus."""
+async def test_radio_recovers_from_a_bus_lost_while_sending(level: bool) -> None:  # noqa: FBT001 (a parameter)
+    """A bus lost during a transmission fails that call; the radio recovers with the bus."""
     async with bench() as b:
         sending = asyncio.create_task(b.here.radio.transmit(bytes(34)))
         await wait_ms(b, 50)
@@ -349,8 +349,8 @@ async def test_bus_lost_while_sending_is_survived(level: bool) -> None:  # noqa:
         await assert_both_ways(b)
 
 
-async def test_bus_that_fails_is_survived() -> None:
-    """An error of the operating system on the bus, in an interrupt as in the watch, ends nothing."""
+async def test_radio_recovers_from_bus_errors() -> None:
+    """An operating system error of the bus, in an interrupt or in the supervision, ends neither."""
     async with bench() as b:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(b.there.chip, "transfer", failing_transfer)
@@ -367,8 +367,8 @@ def failing_transfer(_data: bytes) -> bytes:
     raise RadioError("/dev/spidev0.0: transfer failed")
 
 
-async def test_failed_change_of_settings_is_tried_again() -> None:
-    """Settings that a chip does not take when asked come into force when it answers again."""
+async def test_failed_change_of_settings_is_retried() -> None:
+    """Settings that the chip does not accept become effective when it responds again."""
     async with bench() as b:
         b.here.chip.disconnect_bus(level=True)
         faster = replace(PAPER, spreading_factor=7)
@@ -380,8 +380,8 @@ async def test_failed_change_of_settings_is_tried_again() -> None:
         await assert_both_ways(b)
 
 
-async def test_cancelled_recovery_is_taken_up_by_the_watch() -> None:
-    """A call that is cancelled while it resets the chip leaves the rest to the background."""
+async def test_cancelled_recovery_is_continued_by_the_supervision() -> None:
+    """A call that is cancelled during a reset leaves the recovery to the background."""
     async with bench() as b:
         b.here.chip.drop_tx_done()
         sending = asyncio.create_task(b.here.radio.transmit(bytes(34)))

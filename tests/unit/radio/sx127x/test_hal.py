@@ -41,19 +41,19 @@ def hat(backend: Backend = "gpiod", *, nss_pin: int | None = 25, spi_hz: int = 5
 
 
 def rpi_gpio() -> FakeRpiGpio:
-    """Return the stand-in that is installed."""
+    """Return the installed fake."""
     gpio = sys.modules["RPi"].GPIO
     assert isinstance(gpio, FakeRpiGpio)
     return gpio
 
 
 def test_dragino_preset_is_the_hat() -> None:
-    """The preset has the pins of the HAT's manual, chip select driven by hand, and kernel time stamps."""
+    """The preset has the pins of the HAT's manual, chip select as GPIO, and kernel timestamps."""
     assert hat() == DRAGINO_HAT
 
 
-def test_spi_clock_above_the_data_sheet_is_refused() -> None:
-    """The chip takes up to 10 MHz."""
+def test_spi_clock_above_the_data_sheet_is_rejected() -> None:
+    """The chip supports up to 10 MHz."""
     with pytest.raises(RadioSettingsError, match="10000000, got 10000001"):
         hat(spi_hz=10_000_001)
 
@@ -62,7 +62,7 @@ def test_spi_clock_above_the_data_sheet_is_refused() -> None:
 
 
 @BACKENDS
-def test_bus_is_opened_as_the_chip_needs_it(pi: FakePi, backend: Backend) -> None:
+def test_bus_is_opened_in_the_mode_of_the_chip(pi: FakePi, backend: Backend) -> None:
     """SPI mode 0 with the wiring's clock, the controller's own chip select off where a pin does it."""
     opened = open_hal(hat(backend, spi_hz=500_000))
     (bus,) = pi.buses
@@ -71,8 +71,8 @@ def test_bus_is_opened_as_the_chip_needs_it(pi: FakePi, backend: Backend) -> Non
 
 
 @BACKENDS
-def test_controller_that_cannot_leave_its_chip_select_alone_will_do(pi: FakePi, backend: Backend) -> None:
-    """Where no_cs is not supported, CE0 toggles beside the pin, which does no harm."""
+def test_controller_without_no_cs_is_accepted(pi: FakePi, backend: Backend) -> None:
+    """Where no_cs is not supported, CE0 toggles together with the pin, without effect."""
     pi.no_cs_error = OSError(errno.EINVAL, "Invalid argument")
     opened = open_hal(hat(backend))
     assert opened.transfer(b"\x42\x00") == b"\x42\x00"
@@ -81,7 +81,7 @@ def test_controller_that_cannot_leave_its_chip_select_alone_will_do(pi: FakePi, 
 
 @BACKENDS
 def test_chip_select_is_low_during_each_transfer_only(pi: FakePi, backend: Backend) -> None:
-    """NSS idles high from the beginning, is low while bytes pass, and high again after a failure."""
+    """NSS is high at first, low during a transfer, and high again after a failure."""
     opened = open_hal(hat(backend))
     assert pi.levels[25]
     opened.transfer(b"\x42\x00")
@@ -96,7 +96,7 @@ def test_chip_select_is_low_during_each_transfer_only(pi: FakePi, backend: Backe
 
 @BACKENDS
 def test_kernel_chip_select_needs_no_pin(pi: FakePi, backend: Backend) -> None:
-    """Without an NSS pin none is asked for, and the SPI driver keeps its chip select."""
+    """Without an NSS pin none is requested, and the SPI driver keeps its chip select."""
     pi.nss_pin = None
     opened = open_hal(hat(backend, nss_pin=None))
     opened.transfer(b"\x42\x00")
@@ -106,8 +106,8 @@ def test_kernel_chip_select_needs_no_pin(pi: FakePi, backend: Backend) -> None:
 
 
 @BACKENDS
-def test_reset_is_released_at_first_and_follows(pi: FakePi, backend: Backend) -> None:
-    """NRESET starts released, and goes low and high as told."""
+def test_reset_starts_released(pi: FakePi, backend: Backend) -> None:
+    """NRESET starts released and follows set_reset()."""
     levels: list[bool] = []
     opened = open_hal(hat(backend))
     levels.append(pi.levels[17])
@@ -129,8 +129,8 @@ def test_level_of_dio0_is_read(pi: FakePi, backend: Backend) -> None:
 
 
 @BACKENDS
-async def test_everything_is_let_go(pi: FakePi, backend: Backend) -> None:
-    """close() lets go of the bus and of every pin, also while edges are waited for, and may be called twice."""
+async def test_close_releases_bus_and_pins(pi: FakePi, backend: Backend) -> None:
+    """close() also works while edges are awaited, and may be called twice."""
     opened = open_hal(hat(backend))
     opened.on_dio0(lambda _edge: None)
     opened.close()
@@ -148,7 +148,7 @@ async def test_everything_is_let_go(pi: FakePi, backend: Backend) -> None:
     ],
 )
 def test_busy_pin_is_named_with_the_usual_cause(pi: FakePi, backend: Backend, pin: int, hint: str) -> None:
-    """A pin that another has is named with its role and who usually has it; what was opened is let go."""
+    """A pin in use is named with its role and its usual owner; everything opened is released."""
     # rpi-lgpio has an exception of its own, with this text.
     busy = OSError(errno.EBUSY, "Device or resource busy") if backend == "gpiod" else Exception("'GPIO busy'")
     pi.request_errors[pin] = busy
@@ -166,15 +166,15 @@ def test_busy_pin_is_named_with_the_usual_cause(pi: FakePi, backend: Backend, pi
     ],
 )
 def test_missing_permission_for_pins_names_the_group(pi: FakePi, backend: Backend, error: Exception) -> None:
-    """A user who may not touch the pins is told which group to join."""
+    """The error names the group that the user must join."""
     pi.request_errors[17] = error
     with pytest.raises(RadioError, match="usermod -aG gpio"):
         open_hal(hat(backend))
 
 
 @BACKENDS
-def test_other_failures_of_a_pin_are_told_as_they_are(pi: FakePi, backend: Backend) -> None:
-    """What we do not know is passed on with pin and role."""
+def test_other_failures_of_a_pin_are_passed_on(pi: FakePi, backend: Backend) -> None:
+    """An unknown failure is passed on with pin and role."""
     pi.request_errors[17] = OSError(errno.EINVAL, "Invalid argument")
     with pytest.raises(RadioError, match=r"BCM 17 \(reset\) is not available: .*Invalid argument"):
         open_hal(hat(backend))
@@ -182,7 +182,7 @@ def test_other_failures_of_a_pin_are_told_as_they_are(pi: FakePi, backend: Backe
 
 @BACKENDS
 async def test_driver_works_through_the_pins_of_a_pi(pi: FakePi, backend: Backend) -> None:
-    """The whole way, driver, back end, package, chip: packets pass in both directions."""
+    """Packets pass in both directions through driver, backend, package and chip."""
     timeline = running_timeline()
     air = Air(timeline, np.random.default_rng(0), LinkModel())
     there = make_side(air, "there")
@@ -222,18 +222,18 @@ async def test_driver_works_through_the_pins_of_a_pi(pi: FakePi, backend: Backen
         (OSError(errno.ENXIO, "No such device or address"), RadioError, "No such device or address"),
     ],
 )
-def test_bus_that_cannot_be_opened_says_what_to_do(
+def test_failure_to_open_the_bus_names_the_remedy(
     pi: FakePi, error: OSError, expected: type[RadioError], hint: str
 ) -> None:
-    """SPI that is switched off, a missing group, and anything else name the device and the remedy."""
+    """SPI switched off, a missing group, and other errors name the device and the remedy."""
     pi.open_error = error
     with pytest.raises(expected, match=f"/dev/spidev0.0.*{hint}"):
         open_hal(hat())
 
 
 @pytest.mark.usefixtures("pi")
-def test_second_program_on_the_bus_is_refused() -> None:
-    """Two owners of one radio would each see half of it; the second is told so."""
+def test_second_program_on_the_bus_is_rejected() -> None:
+    """Two programs cannot share one radio."""
     first = open_hal(hat())
     with pytest.raises(RadioError, match=r"/dev/spidev0\.0 is in use: tsgt runs twice"):
         open_hal(hat())
@@ -245,10 +245,10 @@ def test_second_program_on_the_bus_is_refused() -> None:
 @pytest.mark.parametrize(
     ("package", "backend"), [("spidev", "gpiod"), ("gpiod", "gpiod"), ("RPi", "rpi-gpio")]
 )
-def test_missing_package_says_what_to_install(
+def test_missing_package_names_the_extra(
     monkeypatch: pytest.MonkeyPatch, package: str, backend: Backend
 ) -> None:
-    """A package that is not installed is named with the extras that bring it."""
+    """The error names the extra that installs the package."""
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(RadioError, match=rf"package {package}.* is missing: pip install 'tsgt\[pi\]'"):
         open_hal(hat(backend))
@@ -258,21 +258,21 @@ def test_missing_package_says_what_to_install(
 
 
 def test_gpio_chip_is_found_by_its_label(pi: FakePi) -> None:
-    """The chip behind the pin header is found whatever its number, which differs between kernels."""
+    """The chip of the pin header is found whatever its number, which differs between kernels."""
     opened = open_hal(hat())
     assert {request.path.rpartition("/")[2] for request in pi.requests} == {"gpiochip4"}
     opened.close()
 
 
 def test_named_gpio_chip_is_used(pi: FakePi) -> None:
-    """A chip that the wiring names is taken without looking."""
+    """A configured chip is used without a search."""
     opened = open_hal(Wiring(reset_pin=17, dio0_pin=4, nss_pin=25, gpio_chip="/dev/gpiochip7"))
     assert {request.path for request in pi.requests} == {"/dev/gpiochip7"}
     opened.close()
 
 
-def test_board_without_pin_header_says_so(pi: FakePi) -> None:
-    """Where no chip has a known label, the message names them and the way out."""
+def test_board_without_a_known_chip_is_reported(pi: FakePi) -> None:
+    """The error lists the known labels and the remedy."""
     pi.labels["gpiochip4"] = "INT34C6:00"
     with pytest.raises(RadioNotFoundError, match=r"pinctrl-bcm2835, .* name it as gpio_chip"):
         open_hal(hat())
@@ -280,29 +280,29 @@ def test_board_without_pin_header_says_so(pi: FakePi) -> None:
 
 
 def test_missing_permission_for_gpio_chips_names_the_group(pi: FakePi) -> None:
-    """A user who may not even look at the chips is told which group to join."""
+    """The error names the group that the user must join to open the chips."""
     pi.chip_error = PermissionError(errno.EACCES, "Permission denied")
     with pytest.raises(RadioError, match="usermod -aG gpio"):
         open_hal(hat())
 
 
 def test_missing_gpio_chip_is_named(pi: FakePi) -> None:
-    """A chip that the wiring names and that does not exist is named."""
+    """A configured chip that does not exist is named."""
     pi.request_errors[25] = FileNotFoundError(errno.ENOENT, "No such file")
     with pytest.raises(RadioNotFoundError, match="no GPIO chip /dev/gpiochip7"):
         open_hal(Wiring(reset_pin=17, dio0_pin=4, nss_pin=25, gpio_chip="/dev/gpiochip7"))
 
 
-def test_gpiod_of_the_first_generation_is_refused(pi: FakePi, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Version 1, which old systems bring along, is told from version 2."""
+def test_gpiod_version_1_is_rejected(pi: FakePi, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Version 1 of old systems is distinguished from version 2."""
     del pi
     monkeypatch.delattr(sys.modules["gpiod"], "request_lines")
     with pytest.raises(RadioError, match=r"gpiod is older than 2\.0"):
         open_hal(hat())
 
 
-async def test_gpiod_edges_carry_the_stamp_of_the_kernel(pi: FakePi) -> None:
-    """Each edge arrives in the loop with the kernel's CLOCK_MONOTONIC stamp; gaps in its numbers are lost edges."""
+async def test_gpiod_edges_have_the_kernel_timestamp(pi: FakePi) -> None:
+    """Each edge arrives with the kernel's CLOCK_MONOTONIC timestamp; gaps in the sequence numbers are lost edges."""
     opened = open_hal(hat())
     dio0 = pi.requests[-1]
     assert dio0.settings.event_clock is LINE.Clock.MONOTONIC
@@ -323,8 +323,8 @@ async def test_gpiod_edges_carry_the_stamp_of_the_kernel(pi: FakePi) -> None:
 
 
 @pytest.mark.usefixtures("pi")
-async def test_rpi_edges_are_stamped_in_the_thread() -> None:
-    """An edge is stamped where the callback is called and handed to the loop's thread, with a sigma of 1 ms."""
+async def test_rpi_edges_are_timestamped_in_the_thread() -> None:
+    """The callback timestamps an edge and passes it to the loop's thread, with a sigma of 1 ms."""
     opened = open_hal(hat("rpi-gpio"))
     edges: asyncio.Queue[Edge] = asyncio.Queue()
     opened.on_dio0(edges.put_nowait)
@@ -340,8 +340,8 @@ async def test_rpi_edges_are_stamped_in_the_thread() -> None:
 
 
 @pytest.mark.usefixtures("pi")
-async def test_rpi_gpio_without_interrupts_says_what_to_do() -> None:
-    """Kernels since 6.6 give RPi.GPIO no interrupts; the way out is named."""
+async def test_rpi_gpio_without_interrupts_names_the_remedy() -> None:
+    """Kernels since 6.6 give RPi.GPIO no interrupts."""
     rpi_gpio().detect_error = RuntimeError("Failed to add edge detection")
     opened = open_hal(hat("rpi-gpio"))
     with pytest.raises(RadioError, match=r"6\.6: use gpiod or rpi-lgpio"):
@@ -351,7 +351,7 @@ async def test_rpi_gpio_without_interrupts_says_what_to_do() -> None:
 
 @pytest.mark.usefixtures("pi")
 async def test_edge_after_the_end_of_the_loop_is_dropped() -> None:
-    """A callback that comes when the loop is closed raises nothing in RPi.GPIO's thread."""
+    """A callback after the loop is closed raises nothing in RPi.GPIO's thread."""
     opened = open_hal(hat("rpi-gpio"))
     other = asyncio.new_event_loop()
     other.close()
@@ -362,7 +362,7 @@ async def test_edge_after_the_end_of_the_loop_is_dropped() -> None:
     opened.close()
 
 
-def test_rpi_gpio_on_another_board_says_what_to_do(pi: FakePi, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rpi_gpio_on_another_board_names_the_remedy(pi: FakePi, monkeypatch: pytest.MonkeyPatch) -> None:
     """On a Pi 5 the import of RPi.GPIO itself fails."""
     del pi
 

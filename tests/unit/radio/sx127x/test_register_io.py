@@ -11,7 +11,7 @@ from tsgt.radio.sx127x.register_io import frf, op_mode, packet_strength, receive
 
 
 def values(settings: LoRaSettings) -> dict[Register, int]:
-    """Return what is written, by address; each register once."""
+    """Return the written values by address; each register once."""
     written = register_values(settings)
     assert len({register.address for register in written}) == len(written)
     return {register.address: register.value for register in written}
@@ -29,7 +29,7 @@ def values(settings: LoRaSettings) -> dict[Register, int]:
     ],
 )
 def test_frequency_is_rounded_to_the_nearest_step(frequency_hz: int, expected: str) -> None:
-    """RegFrf is that of the fact sheet; 869.525 MHz tells rounding from truncation."""
+    """RegFrf is that of the fact sheet; 869.525 MHz distinguishes rounding from truncation."""
     assert frf(frequency_hz).hex() == expected
 
 
@@ -89,7 +89,7 @@ def test_low_data_rate_can_be_set_against_the_rule(on: bool) -> None:  # noqa: F
     ("inverted_iq", "invert_iq", "invert_iq_2"), [(False, 0x27, 0x1D), (True, 0x66, 0x19)]
 )
 def test_iq_is_inverted_both_ways(inverted_iq: bool, invert_iq: int, invert_iq_2: int) -> None:  # noqa: FBT001
-    """Inverted IQ holds for sending and receiving, with the second register that goes with it."""
+    """Inverted IQ applies to sending and receiving, with its second register."""
     written = values(replace(PAPER, inverted_iq=inverted_iq))
     assert written[Register.INVERT_IQ] == invert_iq
     assert written[Register.INVERT_IQ_2] == invert_iq_2
@@ -107,7 +107,7 @@ def test_iq_is_inverted_both_ways(inverted_iq: bool, invert_iq: int, invert_iq_2
 def test_errata_2_1_sensitivity_at_500_khz(
     frequency_hz: int, bandwidth_hz: int, expected: tuple[int, int | None]
 ) -> None:
-    """The two registers for 500 kHz have the value of their band, and are left to the chip elsewhere."""
+    """The two registers for 500 kHz have the value of their band, and keep their reset value elsewhere."""
     written = values(replace(PAPER, frequency_hz=frequency_hz, bandwidth_hz=bandwidth_hz))
     assert (written[Register.HIGH_BW_OPTIMIZE_1], written.get(Register.HIGH_BW_OPTIMIZE_2)) == expected
 
@@ -136,8 +136,8 @@ def test_errata_2_3_spurious_reception(bandwidth_hz: int, reg_2f: int, offset_hz
     assert bytes(written[Register(Register.FRF_MSB + i)] for i in range(3)) == frf(PAPER.frequency_hz)
 
 
-def test_errata_2_3_leaves_500_khz_alone() -> None:
-    """At 500 kHz the automatic IF stays on and its registers at their reset values."""
+def test_errata_2_3_does_not_apply_at_500_khz() -> None:
+    """The automatic IF stays on and its registers at their reset values."""
     settings = replace(PAPER, bandwidth_hz=500_000)
     written = values(settings)
     assert written[Register.DETECT_OPTIMIZE] == 0xC3
@@ -146,7 +146,7 @@ def test_errata_2_3_leaves_500_khz_alone() -> None:
 
 
 def test_bandwidth_codes_count_up() -> None:
-    """The ten bandwidths are the codes 0 to 9."""
+    """The ten bandwidths have the codes 0 to 9."""
     codes = [
         values(replace(PAPER, bandwidth_hz=bandwidth_hz))[Register.MODEM_CONFIG_1] >> 4
         for bandwidth_hz in BANDWIDTHS_HZ
@@ -155,7 +155,7 @@ def test_bandwidth_codes_count_up() -> None:
 
 
 @pytest.mark.parametrize(("frequency_hz", "expected"), [(434_000_000, 0x8D), (905_000_000, 0x85)])
-def test_op_mode_knows_the_port(frequency_hz: int, expected: int) -> None:
+def test_op_mode_depends_on_the_port(frequency_hz: int, expected: int) -> None:
     """The low-frequency bit is set on the LF port only."""
     assert op_mode(replace(PAPER, frequency_hz=frequency_hz), Mode.RXCONTINUOUS) == expected
 

@@ -86,6 +86,10 @@ OLD_NAMES = {
     "standing": "stationary",
     "undetermined": "unobservable",
     "again": "replay_command",
+    "lineage": "stream_id",
+    "run_start": "first_sequence",
+    "left_out_m": "leave_one_out_m",
+    "angular_acceleration_time_s": "angular_acceleration_correlation_time_s",
 }
 """Keys and event names that were renamed, old to new."""
 

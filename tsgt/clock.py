@@ -1,8 +1,8 @@
-"""Time, handed in: what the program asks the machine about time stands behind one protocol.
+"""Clocks, passed to every part that needs the time.
 
-Inside, time is CLOCK_MONOTONIC, which no operator and no NTP daemon can set. On the stream and on disk it is
-the master's Unix clock. The two are tied by one mapping, fixed at the start of a program
-(:class:`UnixTimeline`), so that a step of the Unix clock never bends a trajectory.
+Internally, time is CLOCK_MONOTONIC, which no operator and no NTP daemon can set. The stream and recordings have the master's
+Unix clock. A mapping that is fixed at the start of a program (:class:`UnixTimeline`) relates them, so that a step of the
+Unix clock never distorts a trajectory.
 """
 
 from __future__ import annotations
@@ -15,39 +15,39 @@ from typing import Protocol
 
 
 class Clock(Protocol):
-    """What a program may ask about time. Implemented by the machine and by the simulation."""
+    """A clock of the machine or of the simulation."""
 
     def monotonic_ns(self) -> int:
-        """Nanoseconds of a clock that nobody sets; only differences mean anything."""
+        """Return the time in nanoseconds of a clock that is never set; only differences are meaningful."""
         ...
 
     def realtime_ns(self) -> int:
-        """Nanoseconds since the Unix epoch, as the machine believes at this moment."""
+        """Return the machine's Unix time in nanoseconds."""
         ...
 
     async def sleep_until(self, monotonic_ns: int) -> None:
-        """Return when :meth:`monotonic_ns` has reached the given value, at once if it has."""
+        """Return when :meth:`monotonic_ns` has reached a value."""
         ...
 
 
 class SystemClock:
-    """The machine's own clocks and the event loop's timer."""
+    """The machine's clocks and the event loop's timer."""
 
     def monotonic_ns(self) -> int:
-        """CLOCK_MONOTONIC in nanoseconds."""
+        """Return CLOCK_MONOTONIC in nanoseconds."""
         return time.monotonic_ns()
 
     def realtime_ns(self) -> int:
-        """CLOCK_REALTIME in nanoseconds."""
+        """Return CLOCK_REALTIME in nanoseconds."""
         return time.time_ns()
 
     async def sleep_until(self, monotonic_ns: int) -> None:
-        """Sleep on the event loop; an instant that has passed still lets other tasks run once."""
+        """Sleep on the event loop; other tasks run once even if the instant has passed."""
         await asyncio.sleep(max(0, monotonic_ns - self.monotonic_ns()) / 1e9)
 
 
 def boot_id() -> str:
-    """Return what names the present start of this machine, from which CLOCK_MONOTONIC counts; empty where unknown."""
+    """Return the kernel's boot id, which identifies the origin of CLOCK_MONOTONIC; empty where unknown."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     except (OSError, UnicodeDecodeError):
@@ -56,25 +56,20 @@ def boot_id() -> str:
 
 @dataclass(frozen=True, slots=True)
 class UnixTimeline:
-    """The one mapping from CLOCK_MONOTONIC to Unix time that a program keeps from start to end.
-
-    Attributes
-    ----------
-    unix_at_zero_ns
-        Unix time in nanoseconds at monotonic zero.
-    """
+    """The mapping from CLOCK_MONOTONIC to Unix time, fixed from the start of a program to its end."""
 
     unix_at_zero_ns: int
+    """Unix time in nanoseconds at monotonic zero."""
 
     @classmethod
     def fixed_now(cls, clock: Clock) -> UnixTimeline:
-        """Read both clocks once and keep their difference."""
+        """Read both clocks once."""
         return cls(clock.realtime_ns() - clock.monotonic_ns())
 
     def unix_ns(self, monotonic_ns: int) -> int:
-        """Unix time of a monotonic instant, in nanoseconds."""
+        """Convert a monotonic instant to Unix time, in nanoseconds."""
         return self.unix_at_zero_ns + monotonic_ns
 
     def monotonic_ns(self, unix_ns: int) -> int:
-        """Monotonic instant of a Unix time on this timeline, in nanoseconds."""
+        """Convert a Unix time on this timeline to a monotonic instant, in nanoseconds."""
         return unix_ns - self.unix_at_zero_ns

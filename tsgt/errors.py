@@ -1,27 +1,27 @@
-"""Every error that tsgt raises on purpose.
+"""The exceptions of tsgt.
 
 ::
 
     TsgtError
-    ├── ConfigError            a configuration or set-up file cannot be used
-    ├── InputFileError         a data file from outside cannot be used
+    ├── ConfigError            invalid configuration or set-up file
+    ├── InputFileError         invalid data file from another program
     ├── OutputFileError        a result cannot be written
-    ├── MissingExtraError      a library that an extra of tsgt brings is not installed
+    ├── MissingExtraError      a library of an extra of tsgt is not installed
     ├── RecordingError         a recording or journal cannot be read or written
     │   ├── CorruptLineError   one of its lines cannot be read
-    │   └── RecordingVersionError  it was written in another version of the format
-    ├── GeometryError          numbers that no geometry can be computed from
-    │   └── DegenerateGeometryError  points that coincide or lie in a line
-    ├── StreamError            a socket of ours cannot be opened or reached
-    ├── MessageError           bytes or numbers that make no packet of ours
-    ├── InstrumentError        the total station does not do what it was told, or is gone
-    │   └── InstrumentRefusedError  it answers, and will not do this: a licence or a target is missing
-    └── RadioError             the radio does not do what it was told
-        ├── RadioSettingsError     it was told something that it cannot do
-        ├── RadioNotFoundError     there is none: wiring, pins, SPI
+    │   └── RecordingVersionError  its format has another version
+    ├── GeometryError          invalid numbers for a geometric computation
+    │   └── DegenerateGeometryError  coincident or collinear points
+    ├── StreamError            a socket cannot be opened or reached
+    ├── MessageError           invalid message of a radio protocol
+    ├── InstrumentError        the total station failed to execute a command, or is not reachable
+    │   └── InstrumentRefusedError  it cannot execute this command: no licence or no target
+    └── RadioError             the radio failed
+        ├── RadioSettingsError     unsupported settings or payload
+        ├── RadioNotFoundError     no radio: wiring, pins, SPI
         └── RadioTimeoutError      a transmission did not end
 
-A message says what happened, where, and what to do; the same data is kept in attributes.
+A message states what happened, where, and what to do; attributes hold the same data.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ _QUOTED_CHARACTERS = 60
 
 
 def quoted(text: str) -> str:
-    """Quote what an input says, as far as there is room for it in one line of an error."""
+    """Quote text from an input, shortened to fit into one line of an error."""
     shown = repr(text)
     return shown if len(shown) <= _QUOTED_CHARACTERS else f"{shown[: _QUOTED_CHARACTERS - 3]}..."
 
 
 class TsgtError(Exception):
-    """Base of all errors that tsgt raises on purpose; its text is one line for the user."""
+    """Base of the exceptions of tsgt; the message is one line for the user."""
 
 
 class ConfigError(TsgtError):
-    """A configuration or set-up file cannot be used: unknown key, bad value, missing file."""
+    """Invalid configuration or set-up file: unknown key, bad value, missing file."""
 
     def __init__(self, message: str, *, path: Path | None = None, key: str | None = None) -> None:
         super().__init__(message)
@@ -54,7 +54,7 @@ class ConfigError(TsgtError):
 
 
 class InputFileError(TsgtError):
-    """A data file from outside cannot be used: empty, wrong columns, NaN, time running backwards."""
+    """Invalid data file from another program: empty, wrong columns, NaN, time running backwards."""
 
     def __init__(self, message: str, *, path: Path, line: int | None = None) -> None:
         where = str(path) if line is None else f"{path}, line {line}"
@@ -64,7 +64,7 @@ class InputFileError(TsgtError):
 
 
 class OutputFileError(TsgtError):
-    """A result cannot be written: no room on the disk, no such folder, no permission."""
+    """A result cannot be written: disk full, no such folder, no permission."""
 
     def __init__(self, message: str, *, path: Path) -> None:
         super().__init__(f"{path}: {message}")
@@ -72,7 +72,7 @@ class OutputFileError(TsgtError):
 
 
 class MissingExtraError(TsgtError, ImportError):
-    """A library that only some commands need is not installed: matplotlib, mcap."""
+    """An optional library is not installed: matplotlib, mcap."""
 
     def __init__(self, purpose: str, *, library: str, extra: str) -> None:
         super().__init__(f"{purpose} need {library}, which is not installed: pip install 'tsgt[{extra}]'")
@@ -81,7 +81,7 @@ class MissingExtraError(TsgtError, ImportError):
 
 
 class RecordingError(TsgtError):
-    """A recording cannot be read or written: no header, no room on the disk, no such station."""
+    """A recording cannot be read or written: no header, disk full, no such station."""
 
     def __init__(self, message: str, *, path: Path, line: int | None = None) -> None:
         where = str(path) if line is None else f"{path}, line {line}"
@@ -91,48 +91,48 @@ class RecordingError(TsgtError):
 
 
 class CorruptLineError(RecordingError):
-    """A line in the middle of a recording is not what its writer can have written."""
+    """A line in the middle of a recording cannot have been written by its writer."""
 
 
 class RecordingVersionError(RecordingError):
-    """The recording was written in a version of the format that this program does not read."""
+    """The version of a recording's format is not supported."""
 
 
 class GeometryError(TsgtError, ValueError):
-    """Numbers that no geometry can be computed from: wrong shape, NaN, a distance below zero."""
+    """Invalid numbers for a geometric computation: wrong shape, NaN, negative distance."""
 
 
 class DegenerateGeometryError(GeometryError):
-    """Points that coincide or lie in a line where a plane or a volume is needed."""
+    """Coincident or collinear points where a plane or a volume is needed."""
 
 
 class StreamError(TsgtError, OSError):
-    """A socket (poses, simulated air) cannot be opened or reached: it is in use, or nobody serves it."""
+    """A socket (poses, simulated radio channel) cannot be opened or reached: in use, or no server."""
 
 
 class MessageError(TsgtError, ValueError):
-    """Bytes that are no message of ours, or a message that does not go into its fields: foreign, cut off, damaged."""
+    """Bytes that do not form a valid message, or a message with values that do not fit its fields."""
 
 
 class InstrumentError(TsgtError):
-    """The total station does not do what it was told: unplugged, switched off, no target, garbage on the line."""
+    """The total station failed to execute a command: unplugged, switched off, no target, garbage on the line."""
 
 
 class InstrumentRefusedError(InstrumentError):
-    """The total station answers, but cannot or will not do this: no licence, no target. Trying again changes nothing."""
+    """The total station responds but cannot execute this command: no licence, no target. Retrying is useless."""
 
 
 class RadioError(TsgtError):
-    """The radio does not do what it was told: a register does not keep its value, a pin is taken, SPI fails."""
+    """The radio failed: a register does not keep its value, a pin is in use, SPI fails."""
 
 
 class RadioSettingsError(RadioError, ValueError):
-    """Settings or a payload that the radio cannot take: SF 6, 20 dBm not asked for, 256 bytes."""
+    """Unsupported settings or payload: SF 6, 20 dBm without permission, 256 bytes."""
 
 
 class RadioNotFoundError(RadioError):
-    """No radio answers: SPI is switched off, a wire or the chip-select pin is wrong, the chip is another one."""
+    """No radio responds: SPI disabled, wrong wiring or chip-select pin, another chip."""
 
 
 class RadioTimeoutError(RadioError, TimeoutError):
-    """A transmission did not end when it had to; the radio has been reset."""
+    """A transmission did not end in time; the radio was reset."""

@@ -1,7 +1,6 @@
-"""Logs on stderr: coloured lines for a person at a terminal, JSON lines for everything else.
+"""Logging to stderr: coloured lines on a terminal, JSON lines otherwise.
 
-A log entry is a stable event name with keys (units in the names), never a sentence with numbers in it; the
-names are listed in docs/reference/log-events.md.
+A log entry is a stable event name with keys (units in the names); docs/reference/log-events.md lists them.
 """
 
 from __future__ import annotations
@@ -17,13 +16,7 @@ Level = Literal["debug", "info", "warning", "error", "critical"]
 
 
 def configure_logging(level: Level = "info") -> None:
-    """Set up structlog for the whole process.
-
-    Parameters
-    ----------
-    level
-        Entries below this are dropped.
-    """
+    """Set up structlog for the whole process; entries below ``level`` are dropped."""
     shared: list[structlog.typing.Processor] = [
         structlog.contextvars.merge_contextvars,
         structlog.processors.add_log_level,
@@ -42,13 +35,13 @@ def configure_logging(level: Level = "info") -> None:
 
 
 class _StderrLogger:
-    """Writes entries to stderr, and goes on without where that fails.
+    """Writes entries to stderr and ignores failures.
 
-    A daemon must not end because its log is on a full disk, or behind a terminal or a pipe that is gone.
+    A daemon must not end because its log is on a full disk, or its terminal or pipe was closed.
     """
 
     def msg(self, message: str) -> None:
-        """Write one entry. Stderr is looked up each time: whoever redirects it later (a test) is followed."""
+        """Write one entry to the present ``sys.stderr``, which may have been redirected."""
         if sys.stderr is not None:
             with suppress(OSError):
                 sys.stderr.write(message + "\n")

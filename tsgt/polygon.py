@@ -1,7 +1,4 @@
-"""Polygons seen from above: which side of the boundary a point lies on, how far from each edge, and which are sound.
-
-Plain Python, as both the configuration, which refuses unsound polygons, and the geo-fence stand on it.
-"""
+"""Plane polygons: point in polygon, distance to an edge, validity. Used by the configuration and by geofences."""
 
 from __future__ import annotations
 
@@ -14,20 +11,20 @@ if TYPE_CHECKING:
 
 Point = tuple[float, float]
 
-APART_M = 0.001
-"""Corners and edges closer than this count as touching: nobody stakes out an area finer."""
+MIN_SEPARATION_M = 0.001
+"""Corners and edges closer than this touch; areas are not staked out more finely."""
 
 
 def edges(corners: Sequence[Point]) -> list[tuple[Point, Point]]:
-    """Return the edges in order; the last corner is joined to the first."""
+    """Return the edges in order, including the one from the last corner to the first."""
     return list(itertools.pairwise([*corners, corners[0]]))
 
 
 def contains(corners: Sequence[Point], point: Point) -> bool:
-    """Tell whether a point lies inside; for a point on the boundary either answer may come.
+    """Return whether a point lies inside; for a point on the boundary either is possible.
 
-    It does when a ray to the east crosses the boundary an odd number of times. Each edge holds its southern end
-    and not its northern one, so that a ray through a corner counts once.
+    Even-odd rule with a ray to the east. Each edge includes its southern end and excludes its northern one, so that a
+    ray through a corner counts once.
     """
     x, y = point
     inside = False
@@ -38,9 +35,9 @@ def contains(corners: Sequence[Point], point: Point) -> bool:
 
 
 def distance_to_edge(point: Point, edge: tuple[Point, Point]) -> tuple[float, Point]:
-    """Return the distance from a point to an edge, and the unit vector along the shortest way.
+    """Return the distance from a point to an edge, and the unit vector along the shortest path, of either sign.
 
-    Its sense is either of the two. For a point on the edge it is the edge's normal.
+    For a point on the edge the vector is the edge's normal.
     """
     (ax, ay), (bx, by) = edge
     along_x, along_y = bx - ax, by - ay
@@ -49,42 +46,36 @@ def distance_to_edge(point: Point, edge: tuple[Point, Point]) -> tuple[float, Po
     part = min(max(part, 0.0), 1.0)
     off_x, off_y = point[0] - ax - part * along_x, point[1] - ay - part * along_y
     distance = math.hypot(off_x, off_y)
-    # Rounding spoils the direction of a way that is much shorter than the edge.
+    # Rounding makes the direction of a much shorter path than the edge unreliable.
     if distance <= 1e-9 * length:
         return distance, (-along_y / length, along_x / length)
     return distance, (off_x / distance, off_y / distance)
 
 
 def check_simple(corners: Sequence[Point]) -> None:
-    """Refuse what does not bound one area: corners that coincide, edges that cross, touch or fold back.
-
-    Raises
-    ------
-    ValueError
-        With the numbers of the corners, from 1, and their coordinates.
-    """
+    """Raise ValueError for a polygon that is not simple: corners coincide, edges cross, touch or fold back."""
     sides = edges(corners)
     n = len(sides)
     for i, (a, b) in enumerate(sides):
-        if math.dist(a, b) < APART_M:
-            hint = "; leave the last out, it is joined to the first by itself" if i == n - 1 else ""
+        if math.dist(a, b) < MIN_SEPARATION_M:
+            hint = "; omit the last, the polygon is closed automatically" if i == n - 1 else ""
             raise ValueError(
-                f"corner {i + 1} and corner {(i + 1) % n + 1} are the same point, {_at(a)}{hint}"
+                f"corner {i + 1} and corner {(i + 1) % n + 1} are the same point, {_format(a)}{hint}"
             )
     for i, j in itertools.combinations(range(n), 2):
         if _touch(sides[i], sides[j], adjacent=j - i in (1, n - 1)):
-            first, second = (f"{k + 1}-{(k + 1) % n + 1} from {_at(sides[k][0])}" for k in (i, j))
+            first, second = (f"{k + 1}-{(k + 1) % n + 1} from {_format(sides[k][0])}" for k in (i, j))
             raise ValueError(
                 f"edges {first} and {second} cross, touch or fold back; give the corners in order around one area"
             )
 
 
 def _touch(first: tuple[Point, Point], second: tuple[Point, Point], *, adjacent: bool) -> bool:
-    """Tell whether two edges come closer than they may; adjacent ones share a corner, which does not count."""
+    """Return whether two edges touch, apart from the common corner of adjacent ones."""
     if not adjacent and _cross(first, second):
         return True
     return any(
-        distance_to_edge(end, other)[0] < APART_M
+        distance_to_edge(end, other)[0] < MIN_SEPARATION_M
         for end, other in _ends(first, second)
         if not (adjacent and end in other)
     )
@@ -93,13 +84,13 @@ def _touch(first: tuple[Point, Point], second: tuple[Point, Point], *, adjacent:
 def _ends(
     first: tuple[Point, Point], second: tuple[Point, Point]
 ) -> Iterator[tuple[Point, tuple[Point, Point]]]:
-    """Each end of either edge, with the other edge."""
+    """Yield each end of either edge with the other edge."""
     yield from ((end, second) for end in first)
     yield from ((end, first) for end in second)
 
 
 def _cross(first: tuple[Point, Point], second: tuple[Point, Point]) -> bool:
-    """Tell whether each edge has the ends of the other on different sides."""
+    """Return whether each edge has the ends of the other on different sides."""
     return all(
         (_side(one, other[0]) > 0) != (_side(one, other[1]) > 0)
         for one, other in ((first, second), (second, first))
@@ -111,5 +102,5 @@ def _side(edge: tuple[Point, Point], point: Point) -> float:
     return (bx - ax) * (point[1] - ay) - (by - ay) * (point[0] - ax)
 
 
-def _at(point: Point) -> str:
+def _format(point: Point) -> str:
     return f"[{point[0]:g}, {point[1]:g}]"

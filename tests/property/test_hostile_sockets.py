@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.air import RecordingAntenna, frame
+from harness.air import RecordingListener, frame
 from harness.cli import called
 from harness.client import client_config
 from harness.damage import Damage, damages, examples
@@ -26,13 +26,13 @@ from hypothesis import strategies as st
 from structlog.testing import capture_logs
 
 from tsgt.errors import RadioError, StreamError
-from tsgt.master import StreamServer
+from tsgt.master.stream_server import StreamServer
 from tsgt.recording import MAX_LINE_BYTES, encode_line
 from tsgt.recording.journal import InstrumentRecord
 from tsgt.simulation.kernel import VirtualClock, run_virtual
 from tsgt.simulation.lora import AirClient, AirServer, LinkModel
 from tsgt.simulation.lora.air_messages import (
-    FrameLine,
+    FrameMessage,
     Incoming,
     Join,
     Left,
@@ -42,7 +42,7 @@ from tsgt.simulation.lora.air_messages import (
     Welcome,
 )
 from tsgt.simulation.lora.link import FixedLoss
-from tsgt.station import Answer, AtmosphereRequest, run_client
+from tsgt.station import AtmosphereRequest, AtmosphereResponse, ClientDependencies, run_client
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
     from tsgt.radio import Radio
 
-FRAME = FrameLine.of(frame())
+FRAME = FrameMessage.of(frame())
 SETTINGS = InstrumentRecord(make="Leica", prism_type="round", prism_constant_m=0.0, atmospheric_ppm=8.1)
 
 
@@ -133,7 +133,9 @@ def test_the_clients_socket(strangers: list[tuple[Damage, str]]) -> None:
         config = client_config(folder)
         path = folder / "client.sock"
         running = asyncio.create_task(
-            run_client(config, PAPER, instrument=instrument, open_radio=_no_radio, clock=clock)
+            run_client(
+                config, PAPER, ClientDependencies(instrument=instrument, open_radio=_no_radio, clock=clock)
+            )
         )
         await asyncio.sleep(2.0)
         with ExitStack() as stack:
@@ -146,7 +148,7 @@ def test_the_clients_socket(strangers: list[tuple[Damage, str]]) -> None:
             status, answer = (await reader.read()).splitlines()
             writer.close()
         assert json.loads(status)["type"] == "client_status"
-        assert json.loads(answer)["problem"] in ("", "another request came after this one")
+        assert json.loads(answer)["problem"] in ("", "superseded by a later request")
         running.cancel()
         await asyncio.wait([running])
         assert running.cancelled() or running.exception() is None
@@ -169,16 +171,16 @@ def test_strangers_at_the_air_server(strangers: list[tuple[Damage, str]]) -> Non
             AirClient(path, "tx", timeline) as sender,
             AirClient(path, "rx", timeline) as receiver,
         ):
-            port = sender.join(RecordingAntenna())
-            receiver.join(RecordingAntenna())
+            port = sender.join(RecordingListener())
+            receiver.join(RecordingListener())
             with ExitStack() as stack:
                 for damage, closing in strangers:
                     stack.enter_context(connected(path, damage.to(TO_AIR), closing))
                     await settle()
-                assert {"tx", "rx"} <= server.names
+                assert {"tx", "rx"} <= server.radio_names
                 port.transmit(frame(start_ns=timeline.now_ns()))
                 await settle()
-                assert {"tx", "rx"} <= server.names
+                assert {"tx", "rx"} <= server.radio_names
 
     _in_folder(run)
 
@@ -202,9 +204,9 @@ def test_a_client_of_a_hostile_air_server(damage: Damage) -> None:
         timeline = running_timeline()
         with suppress(StreamError):
             async with AirClient(path, "rx", timeline) as client:
-                client.join(RecordingAntenna())
+                client.join(RecordingListener())
                 await asyncio.sleep(0.5)
-                await client.wait_lost()
+                await client.wait_disconnected()
         server.close()
         await settle()
 
@@ -251,7 +253,7 @@ COMMANDS = {
     "status": (("status",), [STATUS_STREAM, STREAM]),
     "atmosphere": (
         ("atmosphere", "20", "1000"),
-        [b'{"type":"client_status"}\n' + _lines(Answer(settings=SETTINGS))],
+        [b'{"type":"client_status"}\n' + _lines(AtmosphereResponse(settings=SETTINGS))],
     ),
 }
 

@@ -10,15 +10,16 @@ from typing import TYPE_CHECKING
 
 import hypothesis.strategies as st
 from harness.records import CLOCK, EVENT, HEADER, STATUS
-from harness.scene import START, driving, standing_scene
+from harness.scene import START, driving, stationary_scene
 from hypothesis import given, settings
 
 from tsgt.config import GeofenceConfig
-from tsgt.estimation import Feed, Pipeline
-from tsgt.master import replayed
+from tsgt.estimation import LinearEstimator, LiveEstimator
 from tsgt.master.geofence import Geofence
-from tsgt.master.publisher import Outlet
-from tsgt.master.statistics import Monitor
+from tsgt.master.publisher import Publisher
+from tsgt.master.replay import replayed
+from tsgt.master.station_events import StationEventDetector
+from tsgt.master.statistics import Statistics
 from tsgt.model import Status
 from tsgt.recording import encode_line
 
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     from tsgt.recording import ClockRecord, EventRecord, PoseRecord, StatusRecord
 
 TRANSPORT_NS = 2_000_000_000
-SCENE = standing_scene().moving(driving)
+SCENE = stationary_scene().moving(driving)
 CONTINUOUS = SCENE.with_limits(estimator="continuous")
 
 # A fourth station helps the first on its prism.
@@ -72,7 +73,7 @@ def live(
     measurements: list[PolarMeasurement], ticks_ns: list[int], end_ns: int, scene: Scene = SCENE
 ) -> list[bytes]:
     """Lines of a live run whose timer also fires at the instants given."""
-    feed = Feed(scene.parameters)
+    feed = LiveEstimator(scene.parameters)
     calls = [(m.received_ns, m) for m in measurements] + [(tick, None) for tick in ticks_ns if tick < end_ns]
     records: list[Measurement | PoseRecord] = []
     for now_ns, measurement in sorted(calls, key=lambda call: call[0]):
@@ -92,7 +93,7 @@ def test_the_desk_gives_what_the_stream_gave(
 ) -> None:
     """All measurements at once in the order of time give the poses that arrived one by one."""
     end_ns = max((m.received_ns for m in measurements), default=START) + round(wait_s * 1e9)
-    pipeline = Pipeline(SCENE.parameters)
+    pipeline = LinearEstimator(SCENE.parameters)
     for measurement in sorted(measurements, key=lambda m: m.stamp_ns):
         pipeline.add(measurement)
     desk = [encode_line(pose) for pose in pipeline.advance(end_ns).records()]
@@ -106,7 +107,7 @@ def test_the_same_with_two_stations_on_one_prism(
 ) -> None:
     """Each of the stations on a prism is waited for, so the order in which they arrive does not matter."""
     end_ns = max((m.received_ns for m in measurements), default=START)
-    pipeline = Pipeline(FOUR.parameters)
+    pipeline = LinearEstimator(FOUR.parameters)
     for measurement in sorted(measurements, key=lambda m: m.stamp_ns):
         pipeline.add(measurement)
     desk = [encode_line(pose) for pose in pipeline.advance(end_ns).records()]
@@ -136,7 +137,7 @@ def test_nor_does_it_with_predictions(measurements: list[PolarMeasurement], tick
 @given(arrivals())
 def test_stamps_of_poses_increase_by_one_period(measurements: list[PolarMeasurement]) -> None:
     """No epoch is left out and none is given twice."""
-    pipeline = Pipeline(SCENE.parameters)
+    pipeline = LinearEstimator(SCENE.parameters)
     stamps: list[int] = []
     for measurement in measurements:
         pipeline.add(measurement)
@@ -149,7 +150,9 @@ def test_stamps_of_poses_increase_by_one_period(measurements: list[PolarMeasurem
 @given(st.one_of(arrivals(), arrivals(FOUR)))
 def test_the_announced_deadline_is_when_the_next_pose_is_due(measurements: list[PolarMeasurement]) -> None:
     """At the deadline there is a pose, one nanosecond before there is none."""
-    pipeline = Pipeline(FOUR.parameters if any(m.station == 4 for m in measurements) else SCENE.parameters)
+    pipeline = LinearEstimator(
+        FOUR.parameters if any(m.station == 4 for m in measurements) else SCENE.parameters
+    )
     for measurement in measurements:
         pipeline.add(measurement)
         pipeline.advance(measurement.received_ns)
@@ -202,14 +205,20 @@ def _replayed_again(
     others: list[tuple[int, ClockRecord | EventRecord | StatusRecord]],
     ticks_ns: list[int],
 ) -> None:
-    fence = Geofence(GeofenceConfig(name="yard", polygon_m=((29, 0), (30, 0), (30, 40), (29, 40))))
+    geofence = Geofence(GeofenceConfig(name="yard", polygon_m=((29, 0), (30, 0), (30, 40), (29, 40))))
     lines: list[bytes] = []
-    monitor = Monitor([1, 2, 3])
-    outlet = Outlet(scene.parameters, monitor, [fence], lambda _record, line: lines.append(line))
+    publisher = Publisher(
+        scene.parameters,
+        Statistics([1, 2, 3]),
+        StationEventDetector([1, 2, 3], START),
+        [geofence],
+        lambda _record, line: lines.append(line),
+        lambda: START,
+    )
     calls: list[tuple[int, Callable[[], None]]] = [
-        *((m.received_ns, partial(outlet.measurement, m)) for m in measurements),
-        *((at_ns, partial(outlet.put, replace(record, stamp_ns=at_ns))) for at_ns, record in others),
-        *((at_ns, partial(outlet.advance, at_ns)) for at_ns in ticks_ns),
+        *((m.received_ns, partial(publisher.measurement, m)) for m in measurements),
+        *((at_ns, partial(publisher.put, replace(record, stamp_ns=at_ns))) for at_ns, record in others),
+        *((at_ns, partial(publisher.advance, at_ns)) for at_ns in ticks_ns),
     ]
     for _, call in sorted(calls, key=lambda each: each[0]):
         call()

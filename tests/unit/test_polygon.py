@@ -103,7 +103,7 @@ def min_gap(corners: tuple[tuple[float, float], ...]) -> float:
     [
         pytest.param([(0, 0), (10, 10), (10, 0), (0, 10)], "edges 1-2 .* and 3-4 .* cross", id="bow tie"),
         pytest.param(
-            [*SQUARE, (0, 0)], "corner 5 and corner 1 are the same point.*leave the last out", id="closed"
+            [*SQUARE, (0, 0)], "corner 5 and corner 1 are the same point.*omit the last", id="closed"
         ),
         pytest.param([(0, 0), (0, 0), (1, 1)], "corner 1 and corner 2 are the same", id="repeated corner"),
         pytest.param([(0, 0), (5, 0), (10, 0)], "edges 1-2 .* fold back", id="no area"),

@@ -1,25 +1,37 @@
-"""TODO face."""
+"""Measurements to poses, live and from a recording. Sans-I/O; knows neither radio nor files.
 
-from tsgt.estimation.linear import Pipeline
-from tsgt.estimation.live import Feed
+In: raw measurements and the parameters in force. Out: poses with covariance, validity and reason, as records or arrays.
+`linear` and `continuous` are the estimators, `live` puts measurements and poses in the order of the stream; `tracks` and
+`observations` apply latency, constants, frames and noise; `pose_batch` and `pose_output` hold and validate poses.
+"""
+
+from tsgt.estimation.linear import LinearEstimator
+from tsgt.estimation.live import LiveEstimator
 from tsgt.estimation.observations import build_observations, instrument_time_sigma_s
 from tsgt.estimation.pose_batch import Kind, PoseBatch, Reason
-from tsgt.estimation.pose_output import ContinuousPoses, Seen
-from tsgt.estimation.tracks import FARTHEST_M, Track, believable, build_tracks, measured_at_ns, usable
+from tsgt.estimation.pose_output import ContinuousPoseOutput, MeasurementHistory
+from tsgt.estimation.tracks import (
+    MAX_DISTANCE_M,
+    Track,
+    build_tracks,
+    has_plausible_time,
+    measured_at_ns,
+    usable,
+)
 
 __all__ = [
-    "FARTHEST_M",
-    "ContinuousPoses",
-    "Feed",
+    "MAX_DISTANCE_M",
+    "ContinuousPoseOutput",
     "Kind",
-    "Pipeline",
+    "LinearEstimator",
+    "LiveEstimator",
+    "MeasurementHistory",
     "PoseBatch",
     "Reason",
-    "Seen",
     "Track",
-    "believable",
     "build_observations",
     "build_tracks",
+    "has_plausible_time",
     "instrument_time_sigma_s",
     "measured_at_ns",
     "usable",

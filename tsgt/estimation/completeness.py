@@ -1,7 +1,7 @@
-"""Up to when a station's measurements have all arrived, though a radio that repeats what was lost mixes up their order.
+"""Tracks up to when a station's measurements have all arrived, although retransmissions change their order. Sans-I/O.
 
-Pure. A measurement that is missing is noticed by its number, and waited for until the transport limit has passed: a
-pose that did not wait would lie on a straight line over the gap, and stay so.
+A missing sequence number is waited for until the transport limit: a pose computed without it would permanently lie on a
+straight line over the gap.
 """
 
 from __future__ import annotations
@@ -9,10 +9,8 @@ from __future__ import annotations
 import heapq
 
 
-class Arrivals:
-    """Follows the numbers of one station's measurements.
-
-    Numbers rise by one from measurement to measurement. Lower ones with younger times are a new count.
+class CompletenessTracker:
+    """Tracks the sequence numbers of one station, which rise by one. Lower numbers with later times are a restart.
 
     Parameters
     ----------
@@ -24,39 +22,31 @@ class Arrivals:
         self._limit_ns = transport_limit_ns
         self._next: int | None = None
         self._complete_ns = 0
-        self._beyond: list[tuple[int, int]] = []  # heap of numbers and times behind a gap
+        self._after_gap: list[tuple[int, int]] = []  # heap of sequence numbers and times
 
     def add(self, sequence: int, time_ns: int) -> None:
-        """Take note of a measurement.
-
-        Parameters
-        ----------
-        sequence
-            Its number.
-        time_ns
-            When it was made; like all instants here on the master's Unix clock in ns.
-        """
+        """Record a measurement and the time when it was made, on the master's Unix clock like all instants here."""
         if self._next is not None and sequence > self._next:
-            heapq.heappush(self._beyond, (sequence, time_ns))
+            heapq.heappush(self._after_gap, (sequence, time_ns))
             return
         if self._next is not None and sequence < self._next:
-            if time_ns <= max(self._complete_ns, max((at_ns for _, at_ns in self._beyond), default=0)):
+            if time_ns <= max(self._complete_ns, max((at_ns for _, at_ns in self._after_gap), default=0)):
                 return
-            self._beyond.clear()
+            self._after_gap.clear()
         self._take(sequence, time_ns)
         self._close()
 
     def complete_ns(self, now_ns: int) -> int:
-        """Return the time of the last measurement before which none is waited for any more; 0 before the first one."""
-        while self._beyond and self._beyond[0][1] < now_ns - self._limit_ns:
-            self._take(*heapq.heappop(self._beyond))
+        """Return the time of the last measurement before which none is waited for; 0 before the first one."""
+        while self._after_gap and self._after_gap[0][1] < now_ns - self._limit_ns:
+            self._take(*heapq.heappop(self._after_gap))
             self._close()
         return self._complete_ns
 
-    def given_up_after_ns(self, time_ns: int) -> int | None:
-        """Return the time of the measurement at whose limit the gaps before a time are given up; None without any."""
+    def last_gap_end_ns(self, time_ns: int) -> int | None:
+        """Return the time of the measurement at whose transport limit the gaps before a time end; None without gaps."""
         following, complete_ns, last_ns = self._next, self._complete_ns, 0
-        for sequence, at_ns in sorted(self._beyond):
+        for sequence, at_ns in sorted(self._after_gap):
             if complete_ns >= time_ns:
                 break
             if following is not None and sequence > following:
@@ -65,8 +55,8 @@ class Arrivals:
         return last_ns if last_ns and complete_ns >= time_ns else None
 
     def _close(self) -> None:
-        while self._beyond and self._next is not None and self._beyond[0][0] <= self._next:
-            self._take(*heapq.heappop(self._beyond))
+        while self._after_gap and self._next is not None and self._after_gap[0][0] <= self._next:
+            self._take(*heapq.heappop(self._after_gap))
 
     def _take(self, sequence: int, time_ns: int) -> None:
         self._next = sequence + 1

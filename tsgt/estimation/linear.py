@@ -1,12 +1,12 @@
-"""Measurements in, poses with reasons out: the estimator ``linear``, the same for the live stream and the desk.
+"""The estimator ``linear``, live and for post-processing. Sans-I/O.
 
-Pure: no clock, no sockets. Poses are computed at epochs, the whole multiples of a period in Unix time. An epoch is
-*decided* as soon as each prism either has a measurement at or after it, or cannot get one any more that would help:
-everything that was made up to now less the transport limit has arrived, and the prism's last measurement is further
-back than the outage limit. A measurement behind a gap in its station's numbers does not count until the gap is closed,
-or the transport limit has passed. Where several stations are on one prism, each of them has its say. A decided epoch gets its pose at once, so live poses wait for what they need and no
-longer; and what is decided does not depend on when the pipeline is asked, so that a replay gives the same poses.
-A measurement that arrives later than the transport limit may come too late for the stream; :mod:`tsgt.analysis` hands all measurements over in the order of time and loses none.
+Epochs are the whole multiples of a period in Unix time. An epoch is *decided* as soon as each prism either has a
+measurement at or after it, or can no longer get a useful one: everything made before now minus the transport limit has
+arrived, and the prism's last measurement is older than the outage limit. A measurement after a gap in its station's
+sequence numbers counts when the gap is closed or the transport limit has passed. All stations that track a prism
+contribute. A decided epoch gets its pose at once; what is decided does not depend on when the estimator is asked, so a replay
+gives the same poses. Live, a measurement that arrives after the transport limit may come too late;
+:mod:`tsgt.analysis` adds all measurements in the order of time and loses none.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.estimation.completeness import Arrivals
+from tsgt.estimation.completeness import CompletenessTracker
 from tsgt.estimation.pose_batch import PoseBatch, Reason
-from tsgt.estimation.tracks import Track, believable, build_tracks, measured_at_ns, usable
+from tsgt.estimation.tracks import Track, build_tracks, has_plausible_time, measured_at_ns, usable
 from tsgt.geometry import (
     check_layout,
     interpolate_prisms,
     interpolated_covariance,
+    interpolation_error_covariance,
+    interpolation_error_s2,
     pose_covariance,
     poses_from_prisms,
     quaternion_from_rotation,
     twists,
-    interpolation_error_covariance,
-    interpolation_error_s2,
 )
 
 if TYPE_CHECKING:
@@ -40,22 +40,19 @@ if TYPE_CHECKING:
     from tsgt.geometry import Interpolated
     from tsgt.model import Measurement, Parameters
 
-# Bounds the memory of a long recording's intermediate arrays; results do not depend on it.
-_EPOCHS_AT_ONCE = 8192
+# Limits the memory of intermediate arrays; results do not depend on it.
+_MAX_BATCH_EPOCHS = 8192
 
 
-class Pipeline:
-    """The estimator ``linear``: the paper's method (section III-D), with reasons, covariance and velocity.
+class LinearEstimator:
+    """The paper's estimator (Vaidis et al. 2021, section III-D), with reasons, covariance and velocity.
 
-    Parameters
-    ----------
-    parameters
-        Stations, prisms and limits in force. A prism whose stations never measure keeps every pose invalid.
+    A prism that is never measured keeps every pose invalid.
 
     Raises
     ------
     DegenerateGeometryError
-        The prisms of the layout are fewer than three, coincide, or lie in a line.
+        The prisms of the layout are fewer than three, coincident or collinear.
     """
 
     def __init__(self, parameters: Parameters) -> None:
@@ -69,11 +66,12 @@ class Pipeline:
         self._tracks = {prism: Track.empty() for prism in self._prisms}
         self._unusable_ns: dict[int, list[int]] = {prism: [] for prism in self._prisms}
         self._pending: list[Measurement] = []
-        # Who can measure a prism, and up to when each station's measurements are here.
         self._trackers = {
             prism: {s.station for s in parameters.stations if s.prism == prism} for prism in self._prisms
         }
-        self._arrivals = {s.station: Arrivals(self._limits.transport_limit_ns) for s in parameters.stations}
+        self._completeness = {
+            s.station: CompletenessTracker(self._limits.transport_limit_ns) for s in parameters.stations
+        }
         self._now_ns = 0
         self._not_before_ns = 0
         self._next_epoch_ns: int | None = None
@@ -81,41 +79,38 @@ class Pipeline:
         self._none = PoseBatch.blank(np.empty(0, np.int64), self._prisms)
 
     def begin_at(self, now_ns: int) -> None:
-        """Make no poses for what lies before an instant less the transport limit.
+        """Compute no poses before an instant minus the transport limit.
 
-        A live run calls this when it begins: a first measurement stamped by a clock that is years behind, or one
-        from a long backlog, must not make the stream begin there.
+        For live use: a first measurement from a backlog, or with the time of a clock that is years behind, must not
+        start the stream there.
         """
         self._not_before_ns = now_ns - self._limits.transport_limit_ns
 
     def add(self, measurement: Measurement) -> None:
-        """Take a measurement.
-
-        Passed over are those of a station or prism that the parameters do not name, and those that cannot have
-        been made when their stamp says.
-        """
+        """Add a measurement; implausible ones and those of unknown stations or prisms are ignored."""
         station = self._stations.get(measurement.station)
-        if station is None or measurement.prism not in self._tracks or not believable(measurement, station):
+        if (
+            station is None
+            or measurement.prism not in self._tracks
+            or not has_plausible_time(measurement, station)
+        ):
             return
         time_ns = measured_at_ns(measurement, station)
         first_epoch = -(-max(time_ns, self._not_before_ns) // self._limits.period_ns) * self._limits.period_ns
         if self._next_epoch_ns is None or (not self._started and first_epoch < self._next_epoch_ns):
             self._next_epoch_ns = first_epoch
         self._trackers[measurement.prism].add(station.station)
-        self._arrivals[station.station].add(measurement.sequence, time_ns)
+        self._completeness[station.station].add(measurement.sequence, time_ns)
         if usable(measurement):
             self._pending.append(measurement)
         else:
             self._unusable_ns[measurement.prism].append(time_ns)
 
     def advance(self, now_ns: int) -> PoseBatch:
-        """Return the poses of all epochs that are decided by now and were not returned before.
+        """Return the poses of all epochs that were decided since the last call.
 
-        Parameters
-        ----------
-        now_ns
-            The present on the master's Unix clock; measurements made more than the transport limit before it
-            are taken to have been added.
+        ``now_ns`` is the present on the master's Unix clock; measurements made more than the transport limit before it
+        are assumed to have arrived.
         """
         self._now_ns = now_ns
         self._take_pending()
@@ -125,23 +120,21 @@ class Pipeline:
         if start is None or decided < start:
             return self._none
         epochs = np.arange(start, decided + 1, period, dtype=np.int64)
-        chunks = [epochs[at : at + _EPOCHS_AT_ONCE] for at in range(0, len(epochs), _EPOCHS_AT_ONCE)]
+        chunks = [epochs[at : at + _MAX_BATCH_EPOCHS] for at in range(0, len(epochs), _MAX_BATCH_EPOCHS)]
         poses = PoseBatch.concatenated([self._poses(chunk) for chunk in chunks])
         self._started = True
         self._next_epoch_ns = int(epochs[-1]) + period
-        self._forget_before(self._next_epoch_ns)
+        self._discard_before(self._next_epoch_ns)
         return poses
 
     def next_deadline_ns(self) -> int | None:
-        """Return when the next epoch will be decided even if nothing more arrives; None before the first one."""
+        """Return when the next epoch is decided if nothing more arrives; None before the first one."""
         self._take_pending()
         epoch = self._next_epoch_ns
         if epoch is None:
             return None
-        waits_ns = [self._waits_until_ns(prism, epoch) for prism in self._prisms]
-        return max(
-            [epoch, *(wait_ns + self._limits.transport_limit_ns + 1 for wait_ns in waits_ns if wait_ns)]
-        )
+        complete_ns = [self._complete_at_ns(prism, epoch) for prism in self._prisms]
+        return max([epoch, *(at_ns + self._limits.transport_limit_ns + 1 for at_ns in complete_ns if at_ns)])
 
     def _take_pending(self) -> None:
         if self._pending:
@@ -152,7 +145,7 @@ class Pipeline:
 
     def _decided_until_ns(self, prism: int, now_ns: int) -> int:
         arrived_ns = now_ns - self._limits.transport_limit_ns - 1
-        complete_ns = (self._arrivals[station].complete_ns(now_ns) for station in self._trackers[prism])
+        complete_ns = (self._completeness[station].complete_ns(now_ns) for station in self._trackers[prism])
         known_ns = max(arrived_ns, min(complete_ns, default=0))
         times = self._tracks[prism].times_ns
         before = int(times.searchsorted(known_ns, side="right"))
@@ -161,8 +154,8 @@ class Pipeline:
         last_ns = int(times[before - 1])
         return arrived_ns if arrived_ns >= last_ns + self._limits.outage_limit_ns else last_ns
 
-    def _waits_until_ns(self, prism: int, epoch_ns: int) -> int | None:
-        """Up to when everything must have arrived for an epoch to be decided; None if nothing is waited for."""
+    def _complete_at_ns(self, prism: int, epoch_ns: int) -> int | None:
+        """Return up to when everything must have arrived to decide an epoch; None if nothing is waited for."""
         times = self._tracks[prism].times_ns
         after = int(np.searchsorted(times, epoch_ns))
         lost_ns = epoch_ns
@@ -171,19 +164,19 @@ class Pipeline:
         if after == len(times):
             return lost_ns
         bracket_ns = int(times[after])
-        arrivals = [self._arrivals[station] for station in self._trackers[prism]]
-        incomplete = [each for each in arrivals if each.complete_ns(self._now_ns) < bracket_ns]
+        trackers = [self._completeness[station] for station in self._trackers[prism]]
+        incomplete = [each for each in trackers if each.complete_ns(self._now_ns) < bracket_ns]
         if not incomplete:
             return None
-        # The gaps may be given up before the bracket itself is old enough.
-        gaps_ns = max(each.given_up_after_ns(bracket_ns) or bracket_ns for each in incomplete)
+        # The gaps may end before the bracket itself is old enough.
+        gaps_ns = max(each.last_gap_end_ns(bracket_ns) or bracket_ns for each in incomplete)
         return min(bracket_ns, lost_ns, gaps_ns)
 
-    def _forget_before(self, epoch_ns: int) -> None:
+    def _discard_before(self, epoch_ns: int) -> None:
         for prism, track in self._tracks.items():
             self._tracks[prism] = track.since(epoch_ns)
             times = self._unusable_ns[prism] = sorted(self._unusable_ns[prism])
-            # The newest one before the epoch is the only one of the past that can still be a reason.
+            # Of the past, only the newest one before the epoch can still be a reason.
             del times[: max(0, bisect.bisect_right(times, epoch_ns) - 1)]
 
     def _poses(self, epochs_ns: NDArray[np.int64]) -> PoseBatch:
@@ -206,28 +199,28 @@ class Pipeline:
         return batch
 
     def _describe(self, batch: PoseBatch, tracks: Sequence[Track], between: Interpolated) -> None:
-        """Fill in what each prism's track says: its reason, its station, the age of its last measurement."""
+        """Fill in each prism's reason, and station and age of its last measurement."""
         epochs_ns = batch.stamp_ns
         batch.prism_reason[~between.valid] = Reason.OUTAGE
         for column, (prism, track) in enumerate(zip(self._prisms, tracks, strict=True)):
             latest = track.times_ns.searchsorted(epochs_ns, side="right") - 1
-            seen = latest >= 0
+            known = latest >= 0
             batch.station[:, column] = self._home_station.get(prism, 0)
-            batch.station[seen, column] = track.stations[latest[seen]]
-            batch.age_s[seen, column] = (epochs_ns[seen] - track.times_ns[latest[seen]]) / 1e9
+            batch.station[known, column] = track.stations[latest[known]]
+            batch.age_s[known, column] = (epochs_ns[known] - track.times_ns[latest[known]]) / 1e9
             lost = ~between.valid[:, column]
             if self._unusable_ns[prism] and lost.any():
                 unusable_ns = np.sort(np.array(self._unusable_ns[prism], dtype=np.int64))
                 newest = np.searchsorted(unusable_ns, epochs_ns, side="right") - 1
-                since_ns = np.where(seen, track.times_ns[latest] if len(track) else 0, -(2**63))
-                spoilt = lost & (newest >= 0) & (unusable_ns[newest] > since_ns)
-                batch.prism_reason[spoilt, column] = Reason.STATION_STATUS
+                since_ns = np.where(known, track.times_ns[latest] if len(track) else 0, -(2**63))
+                unusable = lost & (newest >= 0) & (unusable_ns[newest] > since_ns)
+                batch.prism_reason[unusable, column] = Reason.STATION_STATUS
 
     def _fit(self, batch: PoseBatch, rows: NDArray[np.intp], samples: Track, between: Interpolated) -> None:
-        """Fit the layout to the prisms at the rows where all of them are known."""
+        """Fit the layout to the prisms in the rows where all of them are known."""
         points, velocities = between.points[rows], between.velocities_mps[rows]
         covariances = _interpolated_covariances(samples, between, rows)
-        unseen = interpolation_error_s2(between.fraction[rows], between.gap_ns[rows])
+        error_s2 = interpolation_error_s2(between.fraction[rows], between.gap_ns[rows])
         poses = poses_from_prisms(self._layout, points)
         batch.reason[rows[poses.degenerate]] = Reason.DEGENERATE_GEOMETRY
         fitted = ~poses.degenerate
@@ -240,7 +233,7 @@ class Pipeline:
         ) + interpolation_error_covariance(
             self._layout,
             rotation,
-            unseen[fitted],
+            error_s2[fitted],
             acceleration_sigma_mps2=self._limits.acceleration_sigma_mps2,
             angular_acceleration_sigma_radps2=self._limits.angular_acceleration_sigma_radps2,
         )
@@ -255,7 +248,7 @@ class Pipeline:
 def _interpolated_covariances(
     samples: Track, between: Interpolated, rows: NDArray[np.intp]
 ) -> NDArray[np.float64]:
-    """(R, P, 3, 3) covariances of interpolated positions: noise of the instruments and uncertain instants."""
+    """Return covariances (R, P, 3, 3) of interpolated positions, from instrument noise and uncertain times."""
     after, fraction = between.after[rows], between.fraction[rows]
     before = after - 1
     covariance = interpolated_covariance(

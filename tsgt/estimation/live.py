@@ -1,7 +1,7 @@
-"""The live side of the pipeline: what arrives goes in; out comes what belongs on stream and recording, in order.
+"""Live estimation: measurements in; measurements and poses out, in the order of stream and recording. Sans-I/O.
 
-Pure. The order of calls and the instants handed in decide everything, and all of them stand in the recording; so a
-replay, which makes the same calls, gives the same lines bit for bit.
+The output depends only on the order of the calls and their instants, which are recorded. So a replay, which makes the same
+calls, gives the same lines bit for bit.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING
 
-from tsgt.estimation.continuous import ContinuousPipeline
-from tsgt.estimation.linear import Pipeline
+from tsgt.estimation.continuous import ContinuousEstimator
+from tsgt.estimation.linear import LinearEstimator
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -19,45 +19,41 @@ if TYPE_CHECKING:
     from tsgt.recording import PoseRecord
 
 
-class Feed:
-    """Turns arrivals into records: each measurement, followed by the poses that it completed.
-
-    Parameters
-    ----------
-    parameters
-        Stations, prisms and limits in force.
-    """
+class LiveEstimator:
+    """Turns arriving measurements into records: each measurement, followed by the poses that it completes."""
 
     def __init__(self, parameters: Parameters) -> None:
         continuous = parameters.pipeline.estimator == "continuous"
-        self._pipeline = ContinuousPipeline(parameters) if continuous else Pipeline(parameters)
+        self._estimator = ContinuousEstimator(parameters) if continuous else LinearEstimator(parameters)
         self._now_ns = -(2**63)
         self._begun = False
 
     def measurement(self, measurement: Measurement) -> list[Measurement | PoseRecord]:
-        """Take a measurement at its ``received_ns``; return it between the poses due before and those due with it.
+        """Take a measurement at its ``received_ns``; return it after the poses due before it, before those it completes.
 
-        An instant before that of an earlier call is moved up to it, in the record as well: the recording states
-        when the pipeline had the measurement, because a replay must hand it over at the same point.
+        A ``received_ns`` before an earlier call's instant is set to the latter, in the record too: a replay must pass on
+        the measurement at the same point.
         """
         if measurement.received_ns < self._now_ns:
             measurement = dataclasses.replace(measurement, received_ns=self._now_ns)
         if not self._begun:
-            self._pipeline.begin_at(measurement.received_ns)
+            self._estimator.begin_at(measurement.received_ns)
             self._begun = True
         due = self.advance(measurement.received_ns)
-        self._pipeline.add(measurement)
+        self._estimator.add(measurement)
         return [*due, measurement, *self.advance(measurement.received_ns)]
 
     def advance(self, now_ns: int) -> list[PoseRecord]:
-        """Return the poses that are due by now. To be called before any other record is put in its place."""
+        """Return the poses that are due by now; call it before another record is published."""
         self._now_ns = max(self._now_ns, now_ns)
-        return list(self._pipeline.advance(self._now_ns).records())
+        return list(self._estimator.advance(self._now_ns).records())
 
     def outside_lag_window(self) -> Mapping[int, int] | None:
-        """Return how many measurements of which station came too late for ``continuous``; None with ``linear``."""
-        return self._pipeline.outside_lag_window if isinstance(self._pipeline, ContinuousPipeline) else None
+        """Return by station how many measurements arrived outside the lag window; None with ``linear``."""
+        return (
+            self._estimator.outside_lag_window if isinstance(self._estimator, ContinuousEstimator) else None
+        )
 
     def next_deadline_ns(self) -> int | None:
-        """Return when :meth:`advance` should be called if nothing arrives before; None while nothing waits."""
-        return self._pipeline.next_deadline_ns()
+        """Return when :meth:`advance` has to be called if nothing arrives before; None while nothing is due."""
+        return self._estimator.next_deadline_ns()

@@ -1,8 +1,8 @@
-"""From raw measurements to what the estimator ``continuous`` computes with.
+"""Raw measurements to the observations of the estimator ``continuous``.
 
-Latency, prism constant, atmospheric scale and noise are applied here; the raw measurement stays as it is. Prisms are counted
-from their middle, so that it is the middle that moves as the motion prior says: what a layout counts from is anybody's choice,
-and a robot that tilts swings a far origin about, which the prior would take for driving.
+Applies latency, prism constant, atmospheric scale and noise; the raw measurement stays unchanged. Prism positions are
+relative to their centroid, whose motion the motion prior describes: the origin of a layout is arbitrary, and a tilting
+robot swings a distant origin about, which the prior would interpret as driving.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.estimation.tracks import believable, measured_at_ns, usable
+from tsgt.estimation.tracks import has_plausible_time, measured_at_ns, usable
 from tsgt.geometry import Observations, corrected_distance, polar_to_cartesian
 from tsgt.model import PointMeasurement, PolarMeasurement
 
@@ -25,42 +25,34 @@ if TYPE_CHECKING:
 INSTRUMENT_TIME_SIGMA_S = 6e-4
 FIRST_TIME_SIGMA_S = 3e-3
 FIRST_TIMES = 5
-"""One sigma of an instrument's time on its station's clock, which no stamp states: of one told in whole ms; and of a
-station's first measurements, from when it falls with the root of their number. It is found from answers that come late
-(docs/explanation/instrument-time.md), and is off the same way for many measurements, so this is on the cautious side."""
+"""Sigma of the conversion from an instrument's clock to its station's, which no stamp includes: steady state, with
+timestamps in whole ms, and first measurements, from where it falls with the square root of their number. The conversion
+uses responses with random delays (docs/explanation/instrument-time.md), and its error is correlated over many measurements,
+so the values are conservative."""
 
-LEAST_SIGMA_M = 1e-5
-"""A tenth of the last digit that instruments give. A configuration may state no noise at all, but nothing can be weighed by it."""
+MIN_SIGMA_M = 1e-5
+"""A tenth of the instruments' last digit. A configuration may state no noise, which cannot be used as a weight."""
 
 
-def middle_m(parameters: Parameters) -> FloatArray:
-    """(3,) middle (centroid) of the prisms in the robot frame, whose motion is what observations tell of; in m."""
-    middle: FloatArray = _layout(parameters).mean(axis=0)
-    return middle
+def centroid_m(parameters: Parameters) -> FloatArray:
+    """Return the centroid (3,) of the prisms in the robot frame, in m."""
+    centroid: FloatArray = _layout(parameters).mean(axis=0)
+    return centroid
 
 
 def build_observations(
     parameters: Parameters, measurements: Iterable[Measurement], *, origin_ns: int
 ) -> tuple[Observations, list[Measurement]]:
-    """Observations of all usable measurements of the stations and prisms in the parameters.
+    """Return the observations of all usable measurements in the order of time, and the measurement of each.
 
     Parameters
     ----------
-    parameters
-        Station frames, constants, latencies, noise; and the prisms.
     measurements
-        In any order. Unusable and unbelievable ones, and those of stations or prisms that the parameters do not name,
-        are passed over. Of those of one station with the same instant the first stays: a station that has nothing
-        new may send its last measurement again.
+        In any order. Unusable and implausible ones, and those of unknown stations or prisms, are ignored. Of a
+        station's measurements with the same instant the first is used: a station without a new measurement may repeat
+        its last one.
     origin_ns
-        What the observations' times count from, on the master's Unix clock.
-
-    Returns
-    -------
-    observations : Observations
-        In the order of time, with a layout that counts from :func:`middle_m`.
-    sources : list of Measurement
-        The measurement of each.
+        Origin of the observations' times, on the master's Unix clock.
     """
     stations = {station.station: row for row, station in enumerate(parameters.stations)}
     prisms = {prism.prism: row for row, prism in enumerate(parameters.prisms)}
@@ -70,7 +62,7 @@ def build_observations(
         if row is None or measurement.prism not in prisms:
             continue
         station = parameters.stations[row]
-        if usable(measurement) and believable(measurement, station):
+        if usable(measurement) and has_plausible_time(measurement, station):
             timed.setdefault((measured_at_ns(measurement, station), row), measurement)
     ordered = sorted(timed.items(), key=lambda item: item[0])
     points, sigmas = np.empty((len(ordered), 3)), np.empty((len(ordered), 3))
@@ -91,11 +83,11 @@ def build_observations(
             sigmas[i] = _sigmas_m(station.noise, distance_m)
         else:
             points[i] = measurement.position_m
-            # Without the direction of the line of sight the range's noise has to stand for all three axes.
+            # The direction of the line of sight is unknown, so the range noise applies to all three axes.
             sigmas[i] = np.hypot(station.noise.range_sigma_m, station.noise.pointing_sigma_m)
     sources = [measurement for _, measurement in ordered]
     is_point = np.array([isinstance(m, PointMeasurement) for m in sources], dtype=bool)
-    # Cartesian points are in frame 1 already, whichever station they came from: the row after the stations' frames.
+    # Cartesian points are already in frame 1, whatever their station: the row after the stations' frames.
     layout = _layout(parameters)
     frames = np.array([*(s.T_station1_station for s in parameters.stations), np.eye(4)])
     station_rows = np.array([row for (_, row), _ in ordered], dtype=np.intp)
@@ -104,7 +96,7 @@ def build_observations(
             time_s=np.array([time_ns - origin_ns for (time_ns, _), _ in ordered], dtype=np.int64) / 1e9,
             time_sigma_s=np.array([_time_sigma_s(m) for m in sources], dtype=np.float64),
             points_m=points,
-            sigmas_m=np.maximum(sigmas, LEAST_SIGMA_M),
+            sigmas_m=np.maximum(sigmas, MIN_SIGMA_M),
             polar=~is_point,
             station=np.where(is_point, len(parameters.stations), station_rows),
             prism=np.array([prisms[m.prism] for m in sources], dtype=np.intp),
@@ -116,16 +108,16 @@ def build_observations(
 
 
 def _time_sigma_s(measurement: Measurement) -> float:
-    """One sigma of when it was made: of its stamp, and of the instrument's time that the stamp rests on."""
+    """Return one sigma of a measurement's time: of its stamp, and of the instrument's time that the stamp is based on."""
     stamp_sigma_s = getattr(measurement, "stamp_sigma_ns", 0) / 1e9
-    if not stamp_sigma_s:  # imported: its time is taken at its word
+    if not stamp_sigma_s:  # imported: taken as exact
         return 0.0
     return math.hypot(stamp_sigma_s, instrument_time_sigma_s(measurement.sequence))
 
 
 def instrument_time_sigma_s(sequence: int) -> float:
-    """Return one sigma in s of an instrument's time on its station's clock, by the measurement's running number."""
-    number = min(max(sequence, 0), 1_000_000)  # a damaged file may say anything
+    """Return one sigma in s of an instrument's time on its station's clock, by the measurement's sequence number."""
+    number = min(max(sequence, 0), 1_000_000)  # a damaged file may contain any number
     return math.hypot(INSTRUMENT_TIME_SIGMA_S, FIRST_TIME_SIGMA_S / math.sqrt(1 + number / FIRST_TIMES))
 
 
@@ -134,7 +126,7 @@ def _layout(parameters: Parameters) -> FloatArray:
 
 
 def _sigmas_m(noise: InstrumentNoise, distance_m: float) -> tuple[float, float, float]:
-    """One sigma along the line of sight and in both directions across it."""
+    """Return one sigma in m along the line of sight and in both directions across it."""
     along = np.sqrt(
         noise.range_sigma_m**2 + (noise.range_sigma_ppm * 1e-6 * distance_m) ** 2 + noise.pointing_sigma_m**2
     )

@@ -1,11 +1,11 @@
-"""Poses at many epochs as arrays, and why some of them are not valid."""
+"""Poses at many epochs as arrays, with the reasons of invalid ones."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
 from enum import IntEnum
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Reason(IntEnum):
-    """Why a pose is not valid; the worst comes last."""
+    """Why a pose is invalid, in rising order of severity."""
 
     VALID = 0
     TILT = 1
@@ -31,23 +31,12 @@ class Reason(IntEnum):
 
     @property
     def word(self) -> stream_records.Reason:
-        """The word on the stream, empty for a valid pose."""
-        return _WORD[self]
-
-
-_WORD: tuple[stream_records.Reason, ...] = (
-    "",
-    "tilt",
-    "residual",
-    "degenerate_geometry",
-    "uncertain",
-    "outage",
-    "station_status",
-)
+        """The word on the stream; empty for a valid pose."""
+        return cast("stream_records.Reason", self.name.lower() if self else "")
 
 
 class Kind(IntEnum):
-    """How a pose came about, and so which estimator made it."""
+    """How a pose was computed."""
 
     INTERPOLATED = 0
     PREDICTED = 1
@@ -56,69 +45,50 @@ class Kind(IntEnum):
     @property
     def word(self) -> stream_records.Kind:
         """The word on the stream."""
-        return _KIND_WORD[self]
+        return cast("stream_records.Kind", self.name.lower())
 
     @property
     def estimator(self) -> Literal["linear", "continuous"]:
-        """Name of the estimator that makes such poses."""
+        """The estimator of such poses."""
         return "linear" if self == Kind.INTERPOLATED else "continuous"
-
-
-_KIND_WORD: tuple[stream_records.Kind, ...] = ("interpolated", "predicted", "smoothed")
 
 
 @dataclass(frozen=True, slots=True)
 class PoseBatch:
-    """Poses at N epochs from P prisms, as arrays; NaN where a pose could not be computed.
-
-    Attributes
-    ----------
-    stamp_ns
-        (N,) epochs on the master's Unix clock.
-    kind
-        (N,) values of :class:`Kind`.
-    reason
-        (N,) values of :class:`Reason`.
-    position_m, orientation_xyzw
-        (N, 3) and (N, 4): the robot's frame in the frame ``station1``.
-    covariance
-        (N, 6, 6): x, y, z, rotations about the fixed axes x, y, z, in the frame ``station1``, in m and rad.
-    velocity_mps, angular_velocity_radps
-        (N, 3) each: of the robot's origin in ``station1``, and in the robot's frame.
-    residual_m
-        (N,) root mean square, over the prisms, of what they miss the layout by.
-    station
-        (N, P) the station that last measured each prism.
-    age_s
-        (N, P) how old that measurement was at the epoch; NaN where there was none.
-    prism_residual_m
-        (N, P) what each prism misses the layout by.
-    prism_reason
-        (N, P) values of :class:`Reason` for each prism alone.
-    prisms
-        Numbers of the prisms, the order of the columns.
-    """
+    """Poses at N epochs from P prisms, as arrays; NaN where a pose was not computed."""
 
     stamp_ns: NDArray[np.int64]
+    """(N,) epochs on the master's Unix clock."""
     kind: NDArray[np.int8]
+    """(N,) values of :class:`Kind`."""
     reason: NDArray[np.int8]
+    """(N,) values of :class:`Reason`."""
     position_m: NDArray[np.float64]
     orientation_xyzw: NDArray[np.float64]
+    """(N, 3) and (N, 4): the robot frame in the frame ``station1``."""
     covariance: NDArray[np.float64]
+    """(N, 6, 6): x, y, z, rotations about the fixed axes x, y, z, in the frame ``station1``, in m and rad."""
     velocity_mps: NDArray[np.float64]
     angular_velocity_radps: NDArray[np.float64]
+    """(N, 3) each: of the robot's origin in ``station1``, and in the robot frame."""
     residual_m: NDArray[np.float64]
+    """(N,) root mean square of the prisms' distances from the fitted layout."""
     station: NDArray[np.int64]
+    """(N, P) the station that last measured each prism."""
     age_s: NDArray[np.float64]
+    """(N, P) age of that measurement at the epoch; NaN where there was none."""
     prism_residual_m: NDArray[np.float64]
+    """(N, P) distance of each prism from the fitted layout."""
     prism_reason: NDArray[np.int8]
+    """(N, P) values of :class:`Reason` per prism."""
     prisms: tuple[int, ...]
+    """Numbers of the prisms, the order of the columns."""
 
     @classmethod
     def blank(
         cls, stamp_ns: NDArray[np.int64], prisms: tuple[int, ...], kind: Kind = Kind.INTERPOLATED
     ) -> PoseBatch:
-        """Make a batch in which nothing is computed and nothing is invalid yet."""
+        """Return a batch in which nothing is computed and nothing is invalid."""
         n, p = len(stamp_ns), len(prisms)
         return cls(
             stamp_ns=stamp_ns,
@@ -139,7 +109,7 @@ class PoseBatch:
 
     @classmethod
     def concatenated(cls, batches: Sequence[PoseBatch]) -> PoseBatch:
-        """Join batches in the order given; at least one."""
+        """Concatenate at least one batch in the given order."""
         some = [batch for batch in batches if len(batch)]
         if len(some) <= 1:
             return (some or batches)[0]
@@ -147,7 +117,7 @@ class PoseBatch:
         return cls(**arrays, prisms=batches[0].prisms)
 
     def select(self, rows: NDArray[np.bool_]) -> PoseBatch:
-        """Return some of them."""
+        """Return the poses of a mask."""
         return PoseBatch(
             **{f.name: getattr(self, f.name)[rows] for f in fields(self)[:-1]}, prisms=self.prisms
         )
@@ -161,15 +131,16 @@ class PoseBatch:
         return np.equal(self.reason, int(Reason.VALID))
 
     def invalid_counts(self) -> dict[str, int]:
-        """Count the poses that are not valid, by the word of their reason, the commonest first."""
+        """Return the number of invalid poses by reason, the most frequent first."""
         counts = {reason.word: int(np.count_nonzero(self.reason == reason)) for reason in Reason if reason}
         return {word: n for word, n in sorted(counts.items(), key=lambda item: -item[1]) if n}
 
     def records(self) -> Iterable[stream_records.PoseRecord]:
-        """Yield each pose as it leaves the program; numbers that were not computed are None."""
+        """Yield each pose as a record; numbers that were not computed are None."""
         if not len(self):
             return
         computed = np.isfinite(self.position_m[:, 0])
+        reasons, kinds = [reason.word for reason in Reason], [kind.word for kind in Kind]
         # One conversion to Python numbers per array, not per element.
         rows = zip(
             self.stamp_ns.tolist(),
@@ -185,37 +156,29 @@ class PoseBatch:
             self._shares(),
             strict=True,
         )
-        for (
-            stamp,
-            kind,
-            reason,
-            known,
-            position,
-            orientation,
-            covariance,
-            velocity,
-            turning,
-            residual,
-            shares,
-        ) in rows:
+        for stamp, kind, reason, known, *arrays, residual, shares in rows:
+            position, orientation, covariance, velocity, angular_velocity = (
+                tuple(array) if known else None for array in arrays
+            )
             yield stream_records.PoseRecord(
                 stamp_ns=stamp,
                 frame=WORLD_FRAME,
                 child_frame=ROBOT_FRAME,
-                position_m=tuple(position) if known else None,
-                orientation_xyzw=tuple(orientation) if known else None,
-                covariance=tuple(covariance) if known else None,
-                velocity_mps=tuple(velocity) if known else None,
-                angular_velocity_radps=tuple(turning) if known else None,
+                position_m=position,
+                orientation_xyzw=orientation,
+                covariance=covariance,
+                velocity_mps=velocity,
+                angular_velocity_radps=angular_velocity,
                 estimator=Kind(kind).estimator,
-                kind=_KIND_WORD[kind],
+                kind=kinds[kind],
                 valid=reason == Reason.VALID,
-                reason=_WORD[reason],
+                reason=reasons[reason],
                 residual_m=None if math.isnan(residual) else residual,
                 stations=shares,
             )
 
     def _shares(self) -> Iterable[tuple[stream_records.StationShare, ...]]:
+        words = [reason.word for reason in Reason]
         columns = (self.station, self.age_s, self.prism_residual_m, self.prism_reason)
         for stations, ages, residuals, reasons in zip(*(c.tolist() for c in columns), strict=True):
             yield tuple(
@@ -224,7 +187,7 @@ class PoseBatch:
                     prism=prism,
                     age_s=None if math.isnan(age) else age,
                     residual_m=None if math.isnan(residual) else residual,
-                    reason=_WORD[reason],
+                    reason=words[reason],
                 )
                 for station, prism, age, residual, reason in zip(
                     stations, self.prisms, ages, residuals, reasons, strict=True

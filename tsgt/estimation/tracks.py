@@ -1,13 +1,12 @@
-"""From raw measurements to each prism's track in the frame ``station1``.
+"""Raw measurements to each prism's track in the frame ``station1``.
 
-Latency, prism constant, atmospheric scale and the station's frame are applied here and nowhere else; the raw
-measurement stays as it is.
+Applies latency, prism constant, atmospheric scale and the station's frame; the raw measurement stays unchanged.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,53 +29,38 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """Positions of one prism in the order of time.
-
-    Attributes
-    ----------
-    times_ns
-        (M,) instants of measurement on the master's Unix clock, strictly increasing.
-    points_m
-        (M, 3) positions in the frame ``station1``.
-    covariances_m2
-        (M, 3, 3) their covariances in the same frame, from the instrument's noise.
-    time_sigmas_ns
-        (M,) one sigma of the instants.
-    stations
-        (M,) number of the station that measured.
-    """
+    """Positions of one prism in the order of time."""
 
     times_ns: NDArray[np.int64]
+    """(M,) instants of measurement on the master's Unix clock, strictly increasing."""
     points_m: NDArray[np.float64]
+    """(M, 3) positions in the frame ``station1``."""
     covariances_m2: NDArray[np.float64]
+    """(M, 3, 3) their covariances in the same frame, from the instrument's noise."""
     time_sigmas_ns: NDArray[np.int64]
+    """(M,) one sigma of the instants."""
     stations: NDArray[np.int64]
+    """(M,) number of the station that measured."""
 
     @classmethod
     def empty(cls) -> Track:
-        """Make a track without positions."""
+        """Return a track without positions."""
         none = np.empty(0, dtype=np.int64)
         return cls(none, np.empty((0, 3)), np.empty((0, 3, 3)), none, none)
 
     @classmethod
     def joined(cls, tracks: Sequence[Track]) -> Track:
-        """Put tracks one after the other, at least one; only in the order given."""
-        return cls(
-            np.concatenate([track.times_ns for track in tracks]),
-            np.concatenate([track.points_m for track in tracks]),
-            np.concatenate([track.covariances_m2 for track in tracks]),
-            np.concatenate([track.time_sigmas_ns for track in tracks]),
-            np.concatenate([track.stations for track in tracks]),
-        )
+        """Concatenate at least one track in the given order."""
+        return cls(*(np.concatenate([getattr(track, f.name) for track in tracks]) for f in fields(cls)))
 
     def __len__(self) -> int:
         return len(self.times_ns)
 
     def merged(self, other: Track) -> Track:
-        """Return both in the order of time; of two positions at one instant that of the lower station stays.
+        """Return both in the order of time; of two positions at one instant that of the lower station is kept.
 
-        A station that has nothing new may send its last measurement again, with the same instant. Which of two
-        stations wins must not depend on which came first, or a replay and the desk would differ.
+        A station without a new measurement may repeat its last one, with the same instant. Which of two stations wins
+        must not depend on the order of arrival, or live and post-processed poses would differ.
         """
         if not len(self) and len(other) <= 1:
             return other
@@ -87,67 +71,48 @@ class Track:
         return ordered.select(np.unique(ordered.times_ns, return_index=True)[1])
 
     def since(self, time_ns: int) -> Track:
-        """Return the part that later epochs need: from the last position before an instant on."""
+        """Return the part from the last position before an instant, which later epochs need."""
         return self.select(slice(max(0, int(self.times_ns.searchsorted(time_ns)) - 1), None))
 
     def select(self, rows: slice | NDArray[np.intp]) -> Track:
-        """Return the given positions, by a slice or by their indices."""
-        return Track(
-            self.times_ns[rows],
-            self.points_m[rows],
-            self.covariances_m2[rows],
-            self.time_sigmas_ns[rows],
-            self.stations[rows],
-        )
+        """Return the positions at a slice or at indices."""
+        return Track(*(getattr(self, f.name)[rows] for f in fields(self)))
 
 
 _EMPTY = Track.empty()
 
-FARTHEST_M = 100_000.0
-"""No total station measures so far, and no robot drives there: numbers beyond are garbage."""
+MAX_DISTANCE_M = 100_000.0
+"""Longer than the range of any total station."""
 
-AHEAD_AT_MOST_NS = 1_000_000_000
-"""A measurement cannot have been made after it arrived; a clock offset that is a little off may make it seem so."""
+MAX_FUTURE_NS = 1_000_000_000
+"""A small error of the clock offset may date a measurement after its arrival by this much."""
 
 
 def usable(measurement: Measurement) -> bool:
-    """Tell whether a measurement holds a position: a status that allows it and a possible distance."""
+    """Return whether a measurement has a usable status and a possible distance or position."""
     if not measurement.status.usable:
         return False
     if isinstance(measurement, PointMeasurement):
-        return all(abs(coordinate) < FARTHEST_M for coordinate in measurement.position_m)
+        return all(abs(coordinate) < MAX_DISTANCE_M for coordinate in measurement.position_m)
     distance_m = measurement.slope_distance_m
-    return distance_m is not None and 0.0 < distance_m < FARTHEST_M
+    return distance_m is not None and 0.0 < distance_m < MAX_DISTANCE_M
 
 
 def measured_at_ns(measurement: Measurement, station: StationParameters) -> int:
-    """Return the instant of a measurement: its stamp less the station's latency."""
+    """Return the instant of a measurement: its stamp minus the station's latency."""
     return measurement.stamp_ns - station.latency_ns
 
 
-def believable(measurement: Measurement, station: StationParameters) -> bool:
-    """Tell whether a measurement can have been made when its stamp says.
-
-    One from the future cannot, and believing it would stop the stream until then.
-    """
-    return measured_at_ns(measurement, station) <= measurement.received_ns + AHEAD_AT_MOST_NS
+def has_plausible_time(measurement: Measurement, station: StationParameters) -> bool:
+    """Return whether a measurement is not from the future, which would stop the stream until then."""
+    return measured_at_ns(measurement, station) <= measurement.received_ns + MAX_FUTURE_NS
 
 
 def build_tracks(parameters: Parameters, measurements: Iterable[Measurement]) -> dict[int, Track]:
-    """Tracks of all prisms of the layout from the usable measurements of the stations in the parameters.
+    """Return the track of every prism of the layout, possibly empty.
 
-    Parameters
-    ----------
-    parameters
-        Station frames, constants, latencies, noise; and the prisms.
-    measurements
-        In any order. Unusable and unbelievable ones, and those of stations or prisms that the parameters do not
-        name, are passed over.
-
-    Returns
-    -------
-    dict[int, Track]
-        One track per prism of the layout, an empty one where nothing was measured.
+    Unusable and implausible measurements, and those of unknown stations or prisms, are ignored; the others may be in any
+    order.
     """
     stations = {station.station: station for station in parameters.stations}
     tracks = dict.fromkeys((prism.prism for prism in parameters.prisms), _EMPTY)
@@ -156,7 +121,7 @@ def build_tracks(parameters: Parameters, measurements: Iterable[Measurement]) ->
         station = stations.get(measurement.station)
         if station is None or measurement.prism not in tracks:
             continue
-        if usable(measurement) and believable(measurement, station):
+        if usable(measurement) and has_plausible_time(measurement, station):
             groups[measurement.station, measurement.prism, type(measurement)].append(measurement)
     for (number, prism, _), group in groups.items():
         tracks[prism] = tracks[prism].merged(_track_of(stations[number], group))
@@ -164,8 +129,8 @@ def build_tracks(parameters: Parameters, measurements: Iterable[Measurement]) ->
 
 
 def _track_of(station: StationParameters, measurements: Sequence[Measurement]) -> Track:
-    """Turn usable measurements of one station and one kind into a track, in the order given."""
-    # The sequence is of one kind, but only its elements can tell mypy which.
+    """Return the track of usable measurements of one station and one type."""
+    # All have the same type; mypy needs the elements' types.
     polar = [m for m in measurements if isinstance(m, PolarMeasurement)]
     points, covariances = _from_polar(station, polar) if polar else _from_points(station, measurements)
     track = Track(
@@ -198,7 +163,7 @@ def _from_points(
     station: StationParameters, measurements: Sequence[Measurement]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     points = np.array([m.position_m for m in measurements if isinstance(m, PointMeasurement)])
-    # Without the direction of the line of sight the range's noise has to stand for all three axes.
+    # The direction of the line of sight is unknown, so the range noise applies to all three axes.
     noise = station.noise
     variance = noise.range_sigma_m**2 + noise.pointing_sigma_m**2
     return points, np.broadcast_to(variance * np.eye(3), (len(points), 3, 3)).copy()

@@ -1,1 +1,6 @@
-"""The master on the robot: measurements to poses, and the stream of both."""
+"""The master on the robot: daemon, publisher, stream server, geofences, layout monitor, replay.
+
+In: link events of the sub-rooms `classic` (the paper's polling protocol) and `superframe` (TDMA), which use the radio.
+Out: records, in one order, to the stream's socket and to the recording. `daemon` puts the parts together.
+Nothing is exported: the command line imports `daemon`, `replay` and `stream_server` themselves.
+"""

@@ -1,9 +1,7 @@
-"""The master's daemon: radio in, poses out.
+"""The master's daemon: receives measurements over the radio, publishes and records poses.
 
-One task group holds everything: the radio with its link to the stations, the timer of the poses, the status of each
-second, the disk. What is spoken over the radio is a matter of the link (:mod:`tsgt.master.classic.link`,
-:mod:`tsgt.master.superframe.link`), what leaves the program one of :mod:`tsgt.master.publisher`; here they are connected
-with radio, socket, disk and time.
+One task group owns every task: the radio with its link to the stations, the deadlines of the poses, the status of each
+second, the recording.
 """
 
 from __future__ import annotations
@@ -11,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import secrets
 from contextlib import asynccontextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NoReturn, Protocol
 
 import structlog
@@ -21,15 +19,16 @@ from tsgt import service
 from tsgt.clock import UnixTimeline
 from tsgt.config import ClassicMasterConfig
 from tsgt.errors import RadioError, StreamError
-from tsgt.estimation import Feed
+from tsgt.estimation import LiveEstimator
 from tsgt.master.classic import ClassicLink
-from tsgt.master.geofence import Geofence, run_fence_command
-from tsgt.master.layout_monitor import FrameWatch
-from tsgt.master.publisher import Outlet, Reports
-from tsgt.master.reacquisition_hints import Searches
-from tsgt.master.recording_thread import Disk
-from tsgt.master.station_events import Alerts
-from tsgt.master.statistics import Monitor
+from tsgt.master.geofence import Geofence, run_geofence_command
+from tsgt.master.layout_monitor import LayoutMonitor
+from tsgt.master.link_events import MasterEvent
+from tsgt.master.publisher import Publisher
+from tsgt.master.reacquisition_hints import ReacquisitionHints
+from tsgt.master.recording_thread import RecordingThread
+from tsgt.master.station_events import StationEventDetector
+from tsgt.master.statistics import Statistics
 from tsgt.master.stream_server import StreamServer
 from tsgt.master.superframe import SuperframeLink
 from tsgt.radio.supervisor import supervise_radio
@@ -49,53 +48,46 @@ if TYPE_CHECKING:
 
     from tsgt.clock import Clock
     from tsgt.config import FrameWatchConfig, GeofenceConfig, MasterConfig
-    from tsgt.master.publisher import Watcher
+    from tsgt.master.link_events import LinkStatus
     from tsgt.model import Measurement, Parameters
-    from tsgt.radio import LoRaSettings, RadioOpener, Radio
-    from tsgt.recording import StatusRecord
+    from tsgt.radio import LoRaSettings, Radio, RadioOpener
 
 STATUS_PERIOD_NS = 1_000_000_000
 
-STUCK_NS = 60_000_000_000
-"""No turn takes so long, not even a first synchronisation over a bad link; systemd then starts the master anew."""
+STALL_TIMEOUT_NS = 60_000_000_000
+"""A transaction or frame that lasts longer has stalled; not even a first synchronisation over a bad link does. systemd then
+restarts the master."""
 
 log = structlog.get_logger()
 
 
+@dataclass(frozen=True, kw_only=True)
+class MasterDependencies:
+    """What the master needs besides its configuration."""
+
+    open_radio: RadioOpener
+    """Opens the radio; called again after each failure."""
+    clock: Clock
+    """The radio's."""
+    key: bytes | None = None
+    """Content of ``protocol.key_file``; None: the radio is not authenticated."""
+    random_bits: Callable[[int], int] = secrets.randbits
+    """Returns a random number of this many bits, for nonces."""
+    observe: Callable[[object, bytes], None] = lambda _record, _line: None
+    """Called with each published record and its line."""
+    write: Callable[[int, memoryview], int] | None = None
+    """See :class:`~tsgt.recording.RecordingWriter`."""
+
+
 async def run_master(
-    config: MasterConfig,
-    parameters: Parameters,
-    settings: LoRaSettings,
-    *,
-    open_radio: RadioOpener,
-    clock: Clock,
-    key: bytes | None = None,
-    random_bits: Callable[[int], int] = secrets.randbits,
-    observe: Callable[[object, bytes], None] = lambda _record, _line: None,
-    write: Callable[[int, memoryview], int] | None = None,
+    config: MasterConfig, parameters: Parameters, settings: LoRaSettings, dependencies: MasterDependencies
 ) -> None:
-    """Collect, compute, stream and record until cancelled.
+    """Receive, compute, stream and record until cancelled.
 
     Parameters
     ----------
-    config
-        Of the master.
     parameters
-        What the set-up files and the configuration come to.
-    settings
-        Of the modem.
-    open_radio
-        Opens the radio, as often as it takes.
-    clock
-        Time; the radio's.
-    key
-        That of ``protocol.key_file``; None: there is none, and anybody can take part.
-    random_bits
-        Returns so many random bits: for nonces.
-    observe
-        Sees every record that goes out with its line, in their order: for simulations and tests.
-    write
-        See :class:`~tsgt.recording.RecordingWriter`.
+        Of the set-up files and the configuration.
 
     Raises
     ------
@@ -104,44 +96,60 @@ async def run_master(
     StreamError
         The socket cannot be opened.
     """
+    clock = dependencies.clock
     timeline = UnixTimeline.fixed_now(clock)
     start_ns = timeline.unix_ns(clock.monotonic_ns())
     path = new_recording_path(config.recording.directory, "master", start_ns)
-    with RecordingWriter(path, write=write) as writer:
+    server = StreamServer(
+        config.stream.socket,
+        encode_line(HelloRecord()),
+        mode=int(config.stream.mode, 8),
+        queue_lines=config.stream.queue_lines,
+        unix_now_ns=lambda: timeline.unix_ns(clock.monotonic_ns()),
+    )
+    with RecordingWriter(path, write=dependencies.write) as writer:
         recorder = Recorder(writer)
-        disk = Disk(recorder)
-
-        def hand_out(record: object, line: bytes) -> None:
-            disk.put(line)
-            server.publish(line)
-            observe(record, line)
-
+        recording = RecordingThread(recorder)
         header = RecordingHeader(
             software=f"tsgt {tsgt.__version__}", created_ns=start_ns, source="tsgt-master"
         )
         recorder.put(encode_line(header))
         recorder.put(encode_line(parameters))
-        server = StreamServer(
-            config.stream.socket,
-            encode_line(HelloRecord()),
-            mode=int(config.stream.mode, 8),
-            queue_lines=config.stream.queue_lines,
-            unix_now_ns=lambda: timeline.unix_ns(clock.monotonic_ns()),
-        )
+
+        def emit(record: object, line: bytes) -> None:
+            if isinstance(record, EventRecord):
+                log.info("stream_event", name=record.event, message=record.message)
+            recording.put(line)
+            server.publish(line)
+            dependencies.observe(record, line)
+
         try:
             async with server, asyncio.TaskGroup() as group:
-                master = _Master(config, parameters, clock, timeline, hand_out, group)
-                link = _link(
-                    config, parameters, settings, disk, master.reports, key=key, random_bits=random_bits
+                stations = [station.station for station in config.stations]
+                publisher = Publisher(
+                    parameters,
+                    Statistics(stations),
+                    StationEventDetector(stations, start_ns),
+                    [
+                        _LayoutObserver(config.frame_watch, parameters),
+                        *(_GeofenceObserver(geofence, group) for geofence in config.geofences),
+                    ],
+                    emit,
+                    lambda: timeline.unix_ns(clock.monotonic_ns()),
                 )
+                link = _link(config, parameters, settings, timeline, recording, publisher, dependencies)
+                master = _Master(clock, timeline, publisher, link)
                 log.info("master_started", recording=str(path), stations=len(config.stations))
                 service.sd_notify("READY=1")
-                group.create_task(disk.run())
-                group.create_task(service.sync_periodically(writer.sync, clock, config.recording.fsync_interval_s))
-                group.create_task(master.keep_time())
-                group.create_task(master.report(link))
-                group.create_task(master.watchdog(link))
-                group.create_task(supervise_radio(master.watched(open_radio), link.run, clock))
+                group.create_task(recording.run())
+                group.create_task(
+                    service.sync_periodically(writer.sync, clock, config.recording.fsync_interval_s)
+                )
+                group.create_task(master.publish_due_poses())
+                group.create_task(master.publish_status())
+                group.create_task(master.notify_watchdog())
+                radio_opener = master.with_radio_events(dependencies.open_radio)
+                group.create_task(supervise_radio(radio_opener, link.run, clock))
         finally:
             service.sd_notify("STOPPING=1")
             recorder.close()
@@ -149,19 +157,19 @@ async def run_master(
 
 
 class Link(Protocol):
-    """A protocol as the master runs it: reports what the stations send."""
+    """A protocol on the master's side; reports link events to the publisher."""
 
     @property
-    def turn_ns(self) -> int | None:
-        """Since when the present turn with a station, or frame with all, lasts; None without a radio."""
+    def exchange_start_ns(self) -> int | None:
+        """When the present transaction or frame began, on the master's Unix clock; None without a radio."""
         ...
 
-    def status(self, now_ns: int) -> StatusRecord:
-        """Report how the link and its stations do at an instant on the master's Unix clock."""
+    def status(self) -> LinkStatus:
+        """Return what the status record states about the link."""
         ...
 
     async def run(self, radio: Radio) -> None:
-        """Use a radio for as long as it works."""
+        """Use a radio until it fails."""
         ...
 
 
@@ -169,95 +177,80 @@ def _link(
     config: MasterConfig,
     parameters: Parameters,
     settings: LoRaSettings,
-    disk: Disk,
-    reports: Reports,
-    *,
-    key: bytes | None,
-    random_bits: Callable[[int], int],
+    timeline: UnixTimeline,
+    recording: RecordingThread,
+    publisher: Publisher,
+    dependencies: MasterDependencies,
 ) -> Link:
-    protocol = config.protocol
+    protocol, clock = config.protocol, dependencies.clock
     if isinstance(protocol, ClassicMasterConfig):
-        return ClassicLink(config.stations, protocol, settings, reports)
+        return ClassicLink(config.stations, protocol, settings, clock, timeline, publisher.report)
     return SuperframeLink(
         config.stations,
         protocol,
         settings,
-        disk,
-        reports,
-        Searches(parameters),
-        key=key,
-        random_bits=random_bits,
+        clock,
+        timeline,
+        publisher.report,
+        recording,
+        ReacquisitionHints(parameters),
+        key=dependencies.key,
+        random_bits=dependencies.random_bits,
     )
 
 
 class _Master:
-    """The connected parts, and the tasks that move them."""
+    """The tasks of the master."""
 
-    def __init__(
-        self,
-        config: MasterConfig,
-        parameters: Parameters,
-        clock: Clock,
-        timeline: UnixTimeline,
-        hand_out: Callable[[object, bytes], None],
-        group: asyncio.TaskGroup,
-    ) -> None:
+    def __init__(self, clock: Clock, timeline: UnixTimeline, publisher: Publisher, link: Link) -> None:
         self._clock = clock
-        stations = [station.station for station in config.stations]
-        monitor = Monitor(stations)
-        alerts = Alerts(stations, timeline.unix_ns(clock.monotonic_ns()))
-        watchers: list[Watcher] = [
-            _FrameWatcher(config.frame_watch, parameters),
-            *(_Fence(fence, group) for fence in config.geofences),
-        ]
-        self._outlet = Outlet(parameters, monitor, watchers, self._logged(hand_out))
-        self.reports = Reports(clock, timeline, self._outlet, monitor, alerts)
+        self._timeline = timeline
+        self._publisher = publisher
+        self._link = link
         self._radio_failed = False
 
-    # --- Time ---------------------------------------------------------------------------------------------------
+    def _now_ns(self) -> int:
+        return self._timeline.unix_ns(self._clock.monotonic_ns())
 
-    async def keep_time(self) -> NoReturn:
-        """Send poses when they are due and no measurement brings them."""
+    async def publish_due_poses(self) -> NoReturn:
+        """Publish poses when they are due and no measurement completes them."""
         while True:
-            deadline_ns = self._outlet.next_deadline_ns()
-            wait_s = None if deadline_ns is None else max(0, deadline_ns - self.reports.now_ns()) / 1e9
+            deadline_ns = self._publisher.next_deadline_ns()
+            wait_s = None if deadline_ns is None else max(0, deadline_ns - self._now_ns()) / 1e9
             try:
                 async with asyncio.timeout(wait_s):
-                    await self._outlet.changed()
+                    await self._publisher.changed()
             except TimeoutError:
-                self._outlet.advance(self.reports.now_ns())
+                self._publisher.advance(self._now_ns())
 
-    async def report(self, link: Link) -> NoReturn:
-        """Send a status each second, and what time has brought."""
+    async def publish_status(self) -> NoReturn:
+        """Publish a status record each second."""
         next_ns = self._clock.monotonic_ns()
         while True:
             next_ns = max(next_ns + STATUS_PERIOD_NS, self._clock.monotonic_ns())
             await self._clock.sleep_until(next_ns)
-            now_ns = self.reports.now_ns()
-            self.reports.events(self.reports.alerts.tick(now_ns, unix_ns=self._clock.realtime_ns()))
-            status = link.status(now_ns)
-            self._outlet.put(status)
-            heard = sum(s.last_heard_s is not None and s.last_heard_s < 5 for s in status.stations)
+            status = self._publisher.publish_status(
+                self._link.status(), realtime_ns=self._clock.realtime_ns()
+            )
+            received = sum(s.last_heard_s is not None and s.last_heard_s < 5 for s in status.stations)
             service.sd_notify(
-                f"STATUS={heard} of {len(status.stations)} stations heard, "
+                f"STATUS={received} of {len(status.stations)} stations received, "
                 f"{status.valid_poses} of {status.poses} poses valid"
             )
 
-    async def watchdog(self, link: Link) -> None:
-        """Tell systemd that this program lives, as often as it wants, unless its turns have come to a standstill."""
+    async def notify_watchdog(self) -> None:
+        """Notify systemd's watchdog at its interval, unless the link has stalled."""
         interval_s = service.watchdog_interval_s()
         while interval_s is not None:
-            turn_ns, now_ns = link.turn_ns, self.reports.now_ns()
-            if turn_ns is not None and now_ns - turn_ns > STUCK_NS:
-                log.error("scheduler_stalled", for_s=(now_ns - turn_ns) / 1e9)
+            start_ns, now_ns = self._link.exchange_start_ns, self._now_ns()
+            if start_ns is not None and now_ns - start_ns > STALL_TIMEOUT_NS:
+                log.error("scheduler_stalled", for_s=(now_ns - start_ns) / 1e9)
             else:
                 service.sd_notify("WATCHDOG=1")
             await self._clock.sleep_until(self._clock.monotonic_ns() + round(interval_s * 1e9))
 
-    # --- Radio --------------------------------------------------------------------------------------------------
-
-    def watched(self, open_radio: RadioOpener) -> RadioOpener:
-        """Tell the stream when the radio fails, and when it is back."""
+    def with_radio_events(self, open_radio: RadioOpener) -> RadioOpener:
+        """Publish an event when the radio fails, and when it has recovered."""
 
         @asynccontextmanager
         async def opened() -> AsyncGenerator[Radio]:
@@ -265,80 +258,74 @@ class _Master:
                 async with open_radio() as radio:
                     if self._radio_failed:
                         self._radio_failed = False
-                        self.reports.event("radio_recovered", "the radio of the master works again")
+                        self._publisher.report(
+                            MasterEvent("radio_recovered", "the radio of the master works again")
+                        )
                     yield radio
             except (RadioError, StreamError) as error:
                 if not self._radio_failed:
                     self._radio_failed = True
-                    self.reports.event("radio_failed", f"no station can be asked: {error}")
+                    message = f"the radio of the master failed, no station can be reached: {error}"
+                    self._publisher.report(MasterEvent("radio_failed", message))
                 raise
 
         return opened
 
-    @staticmethod
-    def _logged(hand_out: Callable[[object, bytes], None]) -> Callable[[object, bytes], None]:
-        """Put events into the log as well: there they are found without a reader of the stream."""
 
-        def logged(record: object, line: bytes) -> None:
-            if isinstance(record, EventRecord):
-                log.info("stream_event", name=record.event, message=record.message)
-            hand_out(record, line)
-
-        return logged
-
-
-class _FrameWatcher:
-    """The watch over the frames, as one that knows no time; it has the poses of the estimator ``linear`` in any case."""
+class _LayoutObserver:
+    """Feeds the layout monitor with poses of the estimator ``linear``, whichever estimator is published."""
 
     def __init__(self, config: FrameWatchConfig, parameters: Parameters) -> None:
-        self._watch = FrameWatch(config, parameters.pipeline.period_ns)
-        self._linear: Feed | None = None  # of its own, unless those that go out are the same
+        self._monitor = LayoutMonitor(config, parameters.pipeline.period_ns)
+        self._linear: LiveEstimator | None = None  # None: the published poses are linear
         if parameters.pipeline.estimator != "linear":
             pipeline = replace(parameters.pipeline, estimator="linear")
-            self._linear = Feed(replace(parameters, pipeline=pipeline))
+            self._linear = LiveEstimator(replace(parameters, pipeline=pipeline))
 
     def pose(self, record: PoseRecord, now_ns: int) -> Sequence[EventRecord]:
-        return self._watch.pose(record, now_ns) if self._linear is None else ()
+        return self._monitor.pose(record, now_ns) if self._linear is None else ()
 
     def measurement(self, record: Measurement) -> Sequence[EventRecord]:
         if self._linear is None:
             return ()
         poses = (found for found in self._linear.measurement(record) if isinstance(found, PoseRecord))
-        return [event for pose in poses for event in self._watch.pose(pose, record.received_ns)]
+        return [event for pose in poses for event in self._monitor.pose(pose, record.received_ns)]
 
-    def tick(self, now_ns: int) -> Sequence[EventRecord]:  # noqa: ARG002 (nothing runs out)
+    def tick(self, now_ns: int) -> Sequence[EventRecord]:  # noqa: ARG002 (has no time-outs)
         return ()
 
     def next_deadline_ns(self) -> None:
         return None
 
 
-class _Fence:
-    """A geo-fence with the command that is run at its crossings."""
+class _GeofenceObserver:
+    """A geofence and the command that runs when it is crossed."""
 
     def __init__(self, config: GeofenceConfig, group: asyncio.TaskGroup) -> None:
-        self._fence = Geofence(config)
+        self._geofence = Geofence(config)
         self._config = config
         self._group = group
 
     def pose(self, record: PoseRecord, now_ns: int) -> Sequence[EventRecord]:
-        return self._acted_on(self._fence.pose(record, now_ns))
+        return self._run_command(self._geofence.pose(record, now_ns))
 
     def measurement(self, record: Measurement) -> Sequence[EventRecord]:
-        return self._fence.measurement(record)
+        return self._geofence.measurement(record)
 
     def tick(self, now_ns: int) -> Sequence[EventRecord]:
-        return self._acted_on(self._fence.tick(now_ns))
+        return self._run_command(self._geofence.tick(now_ns))
 
     def next_deadline_ns(self) -> int | None:
-        return self._fence.next_deadline_ns()
+        return self._geofence.next_deadline_ns()
 
-    def _acted_on(self, events: Sequence[EventRecord]) -> Sequence[EventRecord]:
+    def _run_command(self, events: Sequence[EventRecord]) -> Sequence[EventRecord]:
         if self._config.command:
             for event in events:
-                command = run_fence_command(self._config.command, event=event.event, fence=self._config.name)
+                command = run_geofence_command(
+                    self._config.command, event=event.event, fence=self._config.name
+                )
                 try:
                     self._group.create_task(command)
-                except RuntimeError:  # the master is ending, and starts nothing any more
+                except RuntimeError:  # the task group is shutting down
                     command.close()
         return events

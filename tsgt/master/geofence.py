@@ -1,10 +1,8 @@
-"""The geo-fence: tells when the robot leaves an area, or may have left it, and when it is back.
+"""Geofences: detects when the robot exits or enters an area, and runs the configured command.
 
-Pure: poses and instants come in, events go out. A fence is armed by the first valid pose. From then on the robot
-counts as gone in two cases, each of which is enough: its position, at as many standard deviations as configured,
-lies on the wrong side of the boundary; or nobody has known for a while where it is.
-
-Runs the command that a geo-fence is configured with.
+A geofence is armed by the first valid pose. From then on the robot is outside its allowed side when its position, at the
+configured number of standard deviations, is beyond the boundary, or when there was no valid pose for a while.
+:class:`Geofence` is sans-I/O.
 """
 
 from __future__ import annotations
@@ -29,16 +27,16 @@ if TYPE_CHECKING:
     from tsgt.recording import PoseRecord
 
 
-class FenceSettings(Protocol):
-    """What a fence needs to know: ``tsgt.config.GeofenceConfig`` in its units, which this core may not import."""
+class GeofenceSettings(Protocol):
+    """Settings of a geofence: ``tsgt.config.GeofenceConfig``, which this sans-I/O part may not import."""
 
     @property
     def name(self) -> str:
-        """Its name in events."""
+        """Name in events."""
 
     @property
-    def keep(self) -> str:
-        """``inside`` or ``outside``: where the robot belongs."""
+    def allowed_side(self) -> str:
+        """``inside`` or ``outside``: the side on which the robot may be."""
 
     @property
     def polygon_m(self) -> Sequence[Point]:
@@ -46,31 +44,25 @@ class FenceSettings(Protocol):
 
     @property
     def margin_m(self) -> float:
-        """The robot has to stay this far on the right side."""
+        """Required distance to the boundary."""
 
     @property
     def sigmas(self) -> float:
-        """How many standard deviations of the position count."""
+        """Standard deviations of the position that count as uncertainty."""
 
     @property
     def hysteresis_m(self) -> float:
-        """It is back only this much further on the right side."""
+        """Additional distance to the boundary to enter again."""
 
     @property
     def lost_after_s(self) -> float:
-        """No valid pose for this long counts as leaving."""
+        """Time without a valid pose that counts as an exit."""
 
 
 class Geofence:
-    """Watches one area.
+    """Monitors one area."""
 
-    Parameters
-    ----------
-    settings
-        The area and its limits.
-    """
-
-    def __init__(self, settings: FenceSettings) -> None:
+    def __init__(self, settings: GeofenceSettings) -> None:
         self.name = settings.name
         self._settings = settings
         self._edges = edges(settings.polygon_m)
@@ -80,9 +72,9 @@ class Geofence:
         self._lost = False
 
     def pose(self, record: PoseRecord, now_ns: int) -> list[EventRecord]:
-        """Take a pose, valid or not, that came out at ``now_ns``; return what it changed.
+        """Take a pose that was published at ``now_ns``; return the events that follow from it.
 
-        Smoothed poses are passed over: they tell where the robot was.
+        Smoothed poses are ignored: they show where the robot was.
         """
         events = self.tick(now_ns)
         if (
@@ -93,86 +85,83 @@ class Geofence:
         ):
             return events
         self._last_valid_ns = now_ns
-        gone_before = self._beyond or self._lost
+        was_outside = self._beyond or self._lost
         x, y, _ = record.position_m
-        spare_m = self._spare_m((x, y), record.covariance)
-        self._beyond = spare_m < (self._settings.hysteresis_m if self._beyond else 0.0)
+        clearance_m = self._clearance_m((x, y), record.covariance)
+        self._beyond = clearance_m < (self._settings.hysteresis_m if self._beyond else 0.0)
         self._lost = False
-        if self._beyond == gone_before:
+        if self._beyond == was_outside:
             return events
-        what = f"{abs(spare_m):.2f} m {'beyond' if spare_m < 0 else 'within'} its limit at x {x:.2f}, y {y:.2f} m"
-        if self._beyond:
-            return [
-                *events,
-                self._event(now_ns, "geofence_exited", f"fence {self.name} left: the robot is {what}"),
-            ]
-        return [
-            *events,
-            self._event(now_ns, "geofence_entered", f"fence {self.name} entered: the robot is {what}"),
-        ]
+        side = "beyond" if clearance_m < 0 else "within"
+        change = "exited" if self._beyond else "entered"
+        message = (
+            f"geofence {self.name} {change}: the robot is {abs(clearance_m):.2f} m {side} its limit "
+            f"at x {x:.2f}, y {y:.2f} m"
+        )
+        return [*events, EventRecord(stamp_ns=now_ns, event=f"geofence_{change}", message=message)]
 
-    def measurement(self, record: Measurement) -> list[EventRecord]:  # noqa: ARG002 (poses tell where the robot is)
-        """Take a measurement, which says nothing here."""
+    def measurement(self, record: Measurement) -> list[EventRecord]:  # noqa: ARG002 (a geofence uses poses)
+        """Ignore a measurement."""
         return []
 
     def tick(self, now_ns: int) -> list[EventRecord]:
-        """Notice that no valid pose has come for too long."""
+        """Return the event of a robot without a valid pose for too long."""
         deadline_ns = self.next_deadline_ns()
         if deadline_ns is None or now_ns < deadline_ns:
             return []
         self._lost = True
         if self._beyond:
             return []
-        message = f"fence {self.name} left: no valid pose for {self._settings.lost_after_s:g} s"
-        return [self._event(now_ns, "geofence_exited", message)]
+        # Stamped when it is detected, not with the pose: a replay puts it after the poses that were due by then.
+        message = f"geofence {self.name} exited: no valid pose for {self._settings.lost_after_s:g} s"
+        return [EventRecord(stamp_ns=now_ns, event="geofence_exited", message=message)]
 
     def next_deadline_ns(self) -> int | None:
-        """Return when :meth:`tick` is to be called if no valid pose comes before; None while nothing runs out."""
+        """Return when :meth:`tick` has to be called without a valid pose before; None while no time-out is running."""
         if self._last_valid_ns is None or self._lost:
             return None
         return self._last_valid_ns + self._lost_after_ns
 
-    def _spare_m(self, point: Point, covariance: Sequence[float]) -> float:
-        """Return how far the robot may still go, at the stated number of standard deviations; negative: beyond.
+    def _clearance_m(self, point: Point, covariance: Sequence[float]) -> float:
+        """Return the distance to the boundary less margin and uncertainty; negative: beyond.
 
-        Every edge counts with the uncertainty in its own direction: one further off is the nearer one if the
-        position is poor that way.
+        Every edge counts with the uncertainty in its own direction: where that is large, a distant edge may be the
+        critical one.
         """
         xx, xy, _, _, _, _, _, yy, *_ = covariance
-        ways = [
+        distances = [
             (distance, self._settings.sigmas * math.sqrt(max(u * u * xx + 2 * u * v * xy + v * v * yy, 0.0)))
             for distance, (u, v) in (distance_to_edge(point, edge) for edge in self._edges)
         ]
-        on_right_side = contains(self._settings.polygon_m, point) == (self._settings.keep == "inside")
-        spare_m = (
-            min(d - unsure for d, unsure in ways) if on_right_side else -min(d + unsure for d, unsure in ways)
+        on_allowed_side = contains(self._settings.polygon_m, point) == (
+            self._settings.allowed_side == "inside"
         )
-        return spare_m - self._settings.margin_m
+        clearance_m = (
+            min(d - uncertainty for d, uncertainty in distances)
+            if on_allowed_side
+            else -min(d + uncertainty for d, uncertainty in distances)
+        )
+        return clearance_m - self._settings.margin_m
 
-    @staticmethod
-    def _event(now_ns: int, event: str, message: str) -> EventRecord:
-        # Stamped when it is noticed, not with the pose: a replay puts it after the poses that were due by then.
-        return EventRecord(stamp_ns=now_ns, event=event, message=message)
 
-
-TIMEOUT_S = 10.0
-"""How long it may take before it is killed, with what it has started."""
+COMMAND_TIMEOUT_S = 10.0
+"""After this a command is killed, with its child processes."""
 
 KILL_TIMEOUT_S = 0.5
-"""How long is waited for it to be gone then: one that may not be killed must not keep the master from ending."""
+"""How long to wait for the end of a killed command: one that may not be killed must not block the master."""
 
 log = structlog.get_logger()
 
 
-async def run_fence_command(command: Sequence[str], *, event: str, fence: str) -> None:
-    """Run a command at a crossing; what becomes of it is told in the log, and nowhere else.
+async def run_geofence_command(command: Sequence[str], *, event: str, fence: str) -> None:
+    """Run a command at a crossing and log its outcome.
 
     Parameters
     ----------
     command
         Program and arguments.
     event, fence
-        Put into its environment as ``TSGT_EVENT`` and ``TSGT_FENCE``.
+        Its environment variables ``TSGT_EVENT`` and ``TSGT_FENCE``.
     """
     problem = await _problem(command, os.environ | {"TSGT_EVENT": event, "TSGT_FENCE": fence})
     if problem:
@@ -182,8 +171,8 @@ async def run_fence_command(command: Sequence[str], *, event: str, fence: str) -
 
 
 async def _problem(command: Sequence[str], environment: dict[str, str]) -> str:
-    """Run it; say what went wrong, or nothing."""
-    environment.pop("NOTIFY_SOCKET", None)  # it is not a part of the service, and must not speak for it
+    """Run a command; return what went wrong, or an empty string."""
+    environment.pop("NOTIFY_SOCKET", None)  # only the service itself may notify systemd
     try:
         process = await asyncio.create_subprocess_exec(
             *command,
@@ -192,18 +181,18 @@ async def _problem(command: Sequence[str], environment: dict[str, str]) -> str:
             stdout=asyncio.subprocess.DEVNULL,
             start_new_session=True,
         )
-    except (OSError, ValueError) as error:  # ValueError: a zero byte among the arguments
+    except (OSError, ValueError) as error:  # ValueError: a zero byte in an argument
         return f"cannot be started ({error})"
     try:
-        async with asyncio.timeout(TIMEOUT_S):
+        async with asyncio.timeout(COMMAND_TIMEOUT_S):
             status = await process.wait()
     except TimeoutError:
-        return f"killed after {TIMEOUT_S:g} s"
+        return f"killed after {COMMAND_TIMEOUT_S:g} s"
     else:
         return f"exit status {status}" if status else ""
     finally:
         if process.returncode is None:
-            with suppress(ProcessLookupError, PermissionError):  # it may have become another user's
+            with suppress(ProcessLookupError, PermissionError):  # it may run as another user
                 os.killpg(process.pid, signal.SIGKILL)
             with suppress(TimeoutError):
                 async with asyncio.timeout(KILL_TIMEOUT_S):

@@ -1,161 +1,191 @@
-"""Everything that leaves the master, in one order: to the readers of the stream, into the recording, to the watchers.
+"""Publishes everything that leaves the master, in one order: to the stream, to the recording and to the observers.
 
-What a line says of an instant stands behind all poses that were due by then. A replay makes the same calls with the
-same instants, so it gives the same lines bit for bit.
-
-Where the protocols of the radio report to: one place for what goes out, what is counted, and what is worth an event.
+A record with a stamp follows all poses that were due by that stamp. A replay makes the same calls with the same
+instants and gives the same lines bit for bit.
 """
 
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from tsgt.estimation import Feed
+from tsgt.estimation import LiveEstimator
+from tsgt.master.link_events import (
+    BeaconSent,
+    BeaconTimeRejected,
+    ClockStepped,
+    ClockUpdate,
+    LinkDelayAnomaly,
+    LinkStatus,
+    MasterEvent,
+    MeasurementReceived,
+    NoResponse,
+    ReplyReceived,
+    StationResponded,
+    SuperframeState,
+    TrackedPrism,
+    TrackingResult,
+)
 from tsgt.model import PolarMeasurement
 from tsgt.recording import EventRecord, PoseRecord, encode_line
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Sequence
 
-    from tsgt.clock import Clock, UnixTimeline
-    from tsgt.master.station_events import Alerts
-    from tsgt.master.statistics import Monitor
+    from tsgt.master.link_events import LinkEvent
+    from tsgt.master.station_events import StationEventDetector
+    from tsgt.master.statistics import Statistics
     from tsgt.model import Measurement, Parameters
     from tsgt.recording import BeaconRecord, ClockRecord, StatusRecord
 
 
-class Watcher(Protocol):
-    """Looks at what goes out, and may have an event to add."""
+class Observer(Protocol):
+    """Sees poses and measurements, and may add events."""
 
     def pose(self, record: PoseRecord, now_ns: int) -> Sequence[EventRecord]:
-        """Take a pose that came out at an instant."""
+        """Take a pose that was published at an instant."""
         ...
 
     def measurement(self, record: Measurement) -> Sequence[EventRecord]:
-        """Take a measurement that has come."""
+        """Take a measurement that was published."""
         ...
 
     def tick(self, now_ns: int) -> Sequence[EventRecord]:
-        """Notice what time alone has brought."""
+        """Return the events of time-outs that have expired."""
         ...
 
     def next_deadline_ns(self) -> int | None:
-        """Return when :meth:`tick` has to be called; None while nothing runs out."""
+        """Return when :meth:`tick` has to be called; None while no time-out is running."""
         ...
 
 
-class Outlet:
-    """Turns what happens into lines, puts them in order and hands them out.
+class Publisher:
+    """Turns link events into records, puts them in order and emits them.
 
     Parameters
     ----------
-    parameters
-        Stations, prisms and limits in force.
-    monitor
-        Counts what goes out.
-    watchers
-        Asked about each pose.
-    hand_out
-        Takes each record with its line.
+    statistics
+        Counts what the status records state.
+    detector
+        Turns changes of a station into events.
+    observers
+        See each pose and measurement.
+    emit
+        Takes each record with its encoded line.
+    now_ns
+        Returns the present on the master's Unix clock.
     """
 
     def __init__(
         self,
         parameters: Parameters,
-        monitor: Monitor,
-        watchers: Sequence[Watcher],
-        hand_out: Callable[[object, bytes], None],
+        statistics: Statistics,
+        detector: StationEventDetector,
+        observers: Sequence[Observer],
+        emit: Callable[[object, bytes], None],
+        now_ns: Callable[[], int],
     ) -> None:
-        self._feed = Feed(parameters)
-        self._monitor = monitor
-        self._watchers = watchers
-        self._hand_out = hand_out
+        self._estimator = LiveEstimator(parameters)
+        self._statistics = statistics
+        self._detector = detector
+        self._observers = observers
+        self._emit = emit
+        self._now_ns = now_ns
         self._changed = asyncio.Event()
 
+    def report(self, event: LinkEvent) -> None:
+        """Count and publish what a link reports, with the events that follow from it."""
+        statistics, detector, now_ns = self._statistics, self._detector, self._now_ns()
+        match event:
+            case MeasurementReceived(measurement):
+                self.measurement(measurement)
+                self._put_all(detector.measurement(measurement, now_ns))
+            case StationResponded(station, rssi_dbm, snr_db):
+                statistics.exchange(station, responded=True)
+                self._put_all(detector.exchange(station, now_ns, responded=True))
+                statistics.packet(station, now_ns, rssi_dbm=rssi_dbm, snr_db=snr_db)
+            case NoResponse(station):
+                statistics.exchange(station, responded=False)
+                self._put_all(detector.exchange(station, now_ns, responded=False))
+            case ReplyReceived(station):
+                self._put_all(detector.reply(station, now_ns))
+            case BeaconSent(record) | ClockUpdate(record):
+                self.put(record)
+            case SuperframeState():
+                statistics.superframe_state(event)
+            case TrackedPrism(station, prism):
+                statistics.tracked_prism(station, prism)
+            case TrackingResult(station, prism, tracks):
+                self._put_all(detector.tracking_result(station, prism, now_ns, tracks=tracks))
+            case ClockStepped(station):
+                self.put(detector.clock_stepped(station, now_ns))
+            case BeaconTimeRejected(station, count):
+                self.put(detector.beacon_time_rejected(station, now_ns, count))
+            case LinkDelayAnomaly(station):
+                self.put(detector.link_delay_anomaly(station, now_ns))
+            case MasterEvent(name, message):
+                self.put(EventRecord(stamp_ns=now_ns, event=name, message=message))
+
+    def publish_status(self, link: LinkStatus, *, realtime_ns: int) -> StatusRecord:
+        """Publish the events that time alone brings, and a status record; return the latter.
+
+        Parameters
+        ----------
+        realtime_ns
+            The present on the machine's Unix clock, which may be set.
+        """
+        now_ns = self._now_ns()
+        self._put_all(self._detector.tick(now_ns, realtime_ns=realtime_ns))
+        status = self._statistics.status(now_ns, link)
+        self.put(status)
+        return status
+
     def measurement(self, measurement: Measurement) -> None:
-        """Send a measurement, and the poses that it completes."""
-        self._send(self._feed.measurement(measurement), measurement.received_ns)
+        """Publish a measurement and the poses that it completes."""
+        self._send(self._estimator.measurement(measurement), measurement.received_ns)
 
     def put(self, record: StatusRecord | EventRecord | ClockRecord | BeaconRecord) -> None:
-        """Send a record in its place, after the poses that are due by its stamp."""
-        self._send([*self._feed.advance(record.stamp_ns), record], record.stamp_ns)
+        """Publish a record after the poses that are due by its stamp."""
+        self._send([*self._estimator.advance(record.stamp_ns), record], record.stamp_ns)
 
     def advance(self, now_ns: int) -> None:
-        """Send the poses that are due by now, and what the watchers make of the time."""
-        self._send(self._feed.advance(now_ns), now_ns)
-        for watcher in self._watchers:
-            for event in watcher.tick(now_ns):
-                self.put(event)
+        """Publish the poses that are due by now, and the observers' events."""
+        self._send(self._estimator.advance(now_ns), now_ns)
+        for observer in self._observers:
+            self._put_all(observer.tick(now_ns))
 
     def next_deadline_ns(self) -> int | None:
         """Return when :meth:`advance` has to be called if nothing happens before."""
-        deadlines_ns = [self._feed.next_deadline_ns(), *(w.next_deadline_ns() for w in self._watchers)]
+        deadlines_ns = [
+            self._estimator.next_deadline_ns(),
+            *(observer.next_deadline_ns() for observer in self._observers),
+        ]
         return min((deadline_ns for deadline_ns in deadlines_ns if deadline_ns is not None), default=None)
 
     async def changed(self) -> None:
-        """Return when something has been sent since the last call, so that the next deadline may be another."""
+        """Return when something was published since the last call: the next deadline may have changed."""
         await self._changed.wait()
         self._changed.clear()
+
+    def _put_all(self, events: Sequence[EventRecord]) -> None:
+        for event in events:
+            self.put(event)
 
     def _send(self, records: Sequence[object], now_ns: int) -> None:
         events: list[EventRecord] = []
         for record in records:
-            self._hand_out(record, encode_line(record))
+            self._emit(record, encode_line(record))
             if isinstance(record, PoseRecord):
-                if record.kind != "smoothed":  # each of them has been there before, predicted
-                    self._monitor.pose(valid=record.valid)
-                for watcher in self._watchers:
-                    events += watcher.pose(record, now_ns)
+                if record.kind != "smoothed":  # already counted when it was predicted
+                    self._statistics.pose(valid=record.valid)
+                for observer in self._observers:
+                    events += observer.pose(record, now_ns)
             elif isinstance(record, PolarMeasurement):
-                self._monitor.measurement(record)
-                for watcher in self._watchers:
-                    events += watcher.measurement(record)
-        outside_lag_window = self._feed.outside_lag_window()
+                self._statistics.measurement(record)
+                for observer in self._observers:
+                    events += observer.measurement(record)
+        outside_lag_window = self._estimator.outside_lag_window()
         if outside_lag_window is not None:
-            self._monitor.outside_lag_window(outside_lag_window)
-        for event in events:
-            self.put(event)
+            self._statistics.outside_lag_window(outside_lag_window)
+        self._put_all(events)
         self._changed.set()
-
-
-@dataclass(frozen=True, slots=True)
-class Reports:
-    """What a link reports to.
-
-    Attributes
-    ----------
-    clock, timeline
-        The master's time, and where it lies in Unix time.
-    outlet
-        Takes all that leaves the master.
-    monitor
-        Counts for the status lines.
-    alerts
-        Turns findings into events.
-    """
-
-    clock: Clock
-    timeline: UnixTimeline
-    outlet: Outlet
-    monitor: Monitor
-    alerts: Alerts
-
-    def now_ns(self) -> int:
-        """Return the present on the master's Unix clock, as its stream has it."""
-        return self.timeline.unix_ns(self.clock.monotonic_ns())
-
-    def measured(self, measurement: PolarMeasurement) -> None:
-        """Hand on a measurement that is new."""
-        self.outlet.measurement(measurement)
-        self.events(self.alerts.measurement(measurement, self.now_ns()))
-
-    def events(self, events: Iterable[EventRecord]) -> None:
-        """Hand on events."""
-        for event in events:
-            self.outlet.put(event)
-
-    def event(self, name: str, message: str, station: int | None = None) -> None:
-        """Hand on an event that happens now."""
-        self.events([EventRecord(stamp_ns=self.now_ns(), event=name, message=message, station=station)])

@@ -1,8 +1,8 @@
-"""Where stations that have lost their prism are to look for it: where the others see the robot. Pure.
+"""Search directions for stations that have lost their prism, from where the others see the robot. Sans-I/O.
 
-A prism is as far from the middle of others as the layout says, however the robot stands. So the points that other
-stations have measured within the last second give a direction, and the layout how far around it the prism can be; how
-fast the robot drives adds to that. Nothing is assumed of how it is turned.
+The distance of a prism from the centroid of others follows from the layout, however the robot is oriented. So points
+that other stations measured within the last second give a direction, and the layout the spread of the prism about it; the
+robot's speed adds to the spread. Nothing is assumed about the robot's orientation.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.estimation import believable, build_tracks, measured_at_ns
+from tsgt.estimation import build_tracks, has_plausible_time, measured_at_ns
 from tsgt.geometry import cartesian_to_polar, invert, transform_points
 from tsgt.model import PolarMeasurement, Status
 from tsgt.radio import Direction
@@ -27,63 +27,57 @@ if TYPE_CHECKING:
     from tsgt.estimation import Track
     from tsgt.model import Parameters
 
-LOST_FOR_NS = 2_000_000_000
-"""An instrument that finds its prism by itself, in prediction or by looking nearby, has done so by then."""
+HINT_DELAY_NS = 2_000_000_000
+"""By then an instrument has found a prism that it finds by itself, by prediction or a local search."""
 
-AGAIN_NS = 5_000_000_000
-"""A direction is good for so long, and the next one is given then."""
+HINT_INTERVAL_NS = 5_000_000_000
+"""A direction is valid for this long; then the next one is given."""
 
-TRIES = 6
-SELDOM_NS = 30_000_000_000
-"""After so many directions without success the prism is hidden, or the station's frame is wrong. Between two directions the
-instrument then has time to look all around."""
+MAX_FREQUENT_HINTS = 6
+SLOW_HINT_INTERVAL_NS = 30_000_000_000
+"""After this many directions without success the prism is hidden, or the station's frame is wrong. The longer interval
+leaves the instrument time for a full search."""
 
-FRESH_NS = 1_000_000_000
-"""A point that is older says nothing of where the robot is."""
+MAX_POINT_AGE_NS = 1_000_000_000
+"""An older point does not show where the robot is."""
 
-BASE_NS = 200_000_000
-"""Velocity is taken over so long at least; noise would be velocity otherwise."""
+MIN_VELOCITY_BASELINE_NS = 200_000_000
+"""Velocity is the difference of two points at least this far apart; noise would dominate over less."""
 
-KEPT_NS = 2_000_000_000
-MOST_POINTS = 64
-"""Points are kept for so long: a fresh one, and another one to take the velocity from. At 20 Hz that is 40."""
+POINT_HISTORY_NS = 2_000_000_000
+POINT_HISTORY_CAPACITY = 64
+"""History for a recent point and one to take the velocity from; 40 points at 20 Hz."""
 
-AHEAD_S = 1.0
-"""What passes before the telescope points where it is told: a frame, and turning. The direction is that of then, and the
-robot may have stopped or turned off before, or go on for as long again."""
+PREDICTION_S = 1.0
+"""From the decision to the telescope's arrival: a frame, and turning. The direction is predicted by this, and the spread
+allows the robot to have stopped or turned, or to continue for as long again."""
 
-STARTS_M = 0.5
-"""A robot that stands may start: 1 m/s^2 within this second."""
+START_ALLOWANCE_M = 0.5
+"""A stationary robot may start: 1 m/s^2 within a second."""
 
-WIDEST_RAD = math.radians(45.0)
-"""A robot that is so near may be anywhere."""
+MAX_SPREAD_RAD = math.radians(45.0)
+"""A direction with a larger spread is useless: the robot is too near."""
 
 _LOST = (Status.NO_TARGET, Status.ANGLE_ONLY)
 
 
 @dataclass(slots=True)
 class _Station:
-    """What is known of one station; instants on the master's Unix clock in ns."""
+    """State of one station; instants on the master's Unix clock in ns."""
 
     prism: int
     newest_ns: int = 0
     lost_ns: int | None = None
-    """Since when its instrument has said nothing else than that it has no prism; None while it has."""
+    """When its instrument lost the prism; None while it has it."""
     second_face: bool = False
-    points: deque[PolarMeasurement] = field(default_factory=lambda: deque(maxlen=MOST_POINTS))
-    told: Direction | None = None
-    told_ns: int | None = None
-    tries: int = 0
+    points: deque[PolarMeasurement] = field(default_factory=lambda: deque(maxlen=POINT_HISTORY_CAPACITY))
+    hint: Direction | None = None
+    hint_ns: int | None = None
+    hints: int = 0
 
 
-class Searches:
-    """Decides when a station is told where to look for its prism, and which direction that is.
-
-    Parameters
-    ----------
-    parameters
-        Frames of the stations, and the layout of the prisms.
-    """
+class ReacquisitionHints:
+    """Decides when a station gets a search direction, and which one."""
 
     def __init__(self, parameters: Parameters) -> None:
         self._parameters = parameters
@@ -92,13 +86,13 @@ class Searches:
         self._stations = {station.station: _Station(station.prism) for station in parameters.stations}
 
     def measured(self, measurement: PolarMeasurement) -> None:
-        """Take a measurement; those of a station come in any order."""
+        """Take a measurement; those of a station arrive in any order."""
         station = self._stations.get(measurement.station)
-        if station is None or not believable(measurement, self._frames[measurement.station]):
+        if station is None or not has_plausible_time(measurement, self._frames[measurement.station]):
             return
         at_ns = measured_at_ns(measurement, self._frames[measurement.station])
         usable = measurement.status.usable
-        if usable and at_ns > station.newest_ns - KEPT_NS:
+        if usable and at_ns > station.newest_ns - POINT_HISTORY_NS:
             station.points.append(measurement)
         if at_ns > station.newest_ns:
             station.newest_ns = at_ns
@@ -108,67 +102,68 @@ class Searches:
                 station.lost_ns = at_ns
             if usable:
                 station.second_face = measurement.zenith_angle_rad > math.pi
-                station.told, station.told_ns, station.tries = None, None, 0
-        elif usable and station.lost_ns is not None:  # it was lost and found in between, which has come late
+                station.hint, station.hint_ns, station.hints = None, None, 0
+        elif usable and station.lost_ns is not None:  # a late one: the prism was found and lost again
             station.lost_ns = max(station.lost_ns, at_ns)
 
-    def towards(self, number: int, now_ns: int) -> Direction | None:
-        """Return where a station is to look for its prism at present; None: wherever it likes.
+    def direction(self, number: int, now_ns: int) -> Direction | None:
+        """Return where a station should search for its prism now; None: no hint.
 
-        The same direction is returned for 5 s; another one is a new order.
-
-        Parameters
-        ----------
-        number
-            Of the station.
-        now_ns
-            The present on the master's Unix clock.
+        The same object is returned for 5 s; another one is a new command. ``now_ns`` is on the master's Unix clock.
         """
         station = self._stations[number]
-        if station.lost_ns is None or now_ns - station.lost_ns <= LOST_FOR_NS:
+        if station.lost_ns is None or now_ns - station.lost_ns <= HINT_DELAY_NS:
             return None
-        if station.told_ns is not None:
-            since_ns = now_ns - station.told_ns
-            if since_ns < AGAIN_NS:
-                return station.told
-            if since_ns < SELDOM_NS and station.tries >= TRIES:
+        if station.hint_ns is not None:
+            since_ns = now_ns - station.hint_ns
+            if since_ns < HINT_INTERVAL_NS:
+                return station.hint
+            if since_ns < SLOW_HINT_INTERVAL_NS and station.hints >= MAX_FREQUENT_HINTS:
                 return None
-        station.told = self._direction(number, station, now_ns)
-        if station.told is not None:
-            station.told_ns = now_ns
-            station.tries += 1
-        return station.told
+        station.hint = self._compute(number, station, now_ns)
+        if station.hint is not None:
+            station.hint_ns = now_ns
+            station.hints += 1
+        return station.hint
 
-    def _direction(self, number: int, station: _Station, now_ns: int) -> Direction | None:
+    def _compute(self, number: int, station: _Station, now_ns: int) -> Direction | None:
         tracks = build_tracks(self._parameters, self._recent(now_ns))
-        moving = {prism: found for prism, track in tracks.items() if (found := _moving(track, now_ns))}
-        if station.prism in moving:  # another station tracks it as well
-            moving = {station.prism: moving[station.prism]}
-        if not moving:
+        known = {
+            prism: found
+            for prism, track in tracks.items()
+            if (found := _position_and_velocity(track, now_ns))
+        }
+        if station.prism in known:  # another station tracks it as well
+            known = {station.prism: known[station.prism]}
+        if not known:
             return None
-        middle_m, velocity_mps = np.mean(list(moving.values()), axis=0)
-        in_layout_m = np.mean([self._layout[prism] for prism in moving], axis=0)
-        within_m = float(np.linalg.norm(self._layout[station.prism] - in_layout_m)) + STARTS_M
-        within_m += AHEAD_S * float(np.linalg.norm(velocity_mps))
+        centroid_m, velocity_mps = np.mean(list(known.values()), axis=0)
+        layout_centroid_m = np.mean([self._layout[prism] for prism in known], axis=0)
+        spread_m = float(np.linalg.norm(self._layout[station.prism] - layout_centroid_m)) + START_ALLOWANCE_M
+        spread_m += PREDICTION_S * float(np.linalg.norm(velocity_mps))
         T_station_station1 = invert(np.array(self._frames[number].T_station1_station))
-        seen_m = transform_points(T_station_station1, middle_m + AHEAD_S * velocity_mps)
-        horizontal_rad, zenith_rad, distance_m = map(float, cartesian_to_polar(seen_m))
-        if within_m > distance_m * math.sin(WIDEST_RAD):
+        point_m = transform_points(T_station_station1, centroid_m + PREDICTION_S * velocity_mps)
+        horizontal_rad, zenith_rad, distance_m = map(float, cartesian_to_polar(point_m))
+        if spread_m > distance_m * math.sin(MAX_SPREAD_RAD):
             return None
         if station.second_face:
             horizontal_rad, zenith_rad = (horizontal_rad + math.pi) % math.tau, math.tau - zenith_rad
-        return Direction(horizontal_rad, zenith_rad, math.asin(within_m / distance_m))
+        return Direction(horizontal_rad, zenith_rad, math.asin(spread_m / distance_m))
 
     def _recent(self, now_ns: int) -> Iterable[PolarMeasurement]:
         for station in self._stations.values():
-            yield from (point for point in station.points if point.stamp_ns > now_ns - KEPT_NS)
+            yield from (point for point in station.points if point.stamp_ns > now_ns - POINT_HISTORY_NS)
 
 
-def _moving(track: Track, now_ns: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Return where a prism is now, in m, and its velocity in m/s; None where that is not known."""
-    if not len(track) or track.times_ns[-1] < now_ns - FRESH_NS:
+def _position_and_velocity(
+    track: Track, now_ns: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Return a prism's present position in m and velocity in m/s; None where they are not known."""
+    if not len(track) or track.times_ns[-1] < now_ns - MAX_POINT_AGE_NS:
         return None
-    before = int(np.searchsorted(track.times_ns, track.times_ns[-1] - BASE_NS, side="right")) - 1
+    before = (
+        int(np.searchsorted(track.times_ns, track.times_ns[-1] - MIN_VELOCITY_BASELINE_NS, side="right")) - 1
+    )
     if before < 0:
         return None
     elapsed_s = float(track.times_ns[-1] - track.times_ns[before]) / 1e9

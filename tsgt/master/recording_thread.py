@@ -1,4 +1,4 @@
-"""The master's recording behind a thread: a disk that takes its time must not keep the radio waiting."""
+"""Writes the master's recording in a thread, so that a slow disk does not delay the radio."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ if TYPE_CHECKING:
     from tsgt.recording.recorder import Recorder
 
 
-class Disk:
-    """Takes lines at once and writes them in a thread; tells what has become of them.
+class RecordingThread:
+    """Takes lines without waiting, writes them in a thread and reports which were written.
 
     Parameters
     ----------
@@ -21,25 +21,25 @@ class Disk:
 
     def __init__(self, recorder: Recorder) -> None:
         self._recorder = recorder
-        self._unwritten = asyncio.Event()
+        self._pending = asyncio.Event()
         self._flushed = asyncio.Event()
 
     @property
-    def taken(self) -> int:
-        """How many lines have been put; the number of the next one."""
-        return self._recorder.taken
+    def line_count(self) -> int:
+        """Lines put so far; the number of the next one."""
+        return self._recorder.line_count
 
     def put(self, line: bytes) -> None:
-        """Take a line."""
+        """Queue a line."""
         self._recorder.put(line)
-        self._unwritten.set()
+        self._pending.set()
 
     def written(self, numbers: range) -> bool | None:
-        """Tell whether lines are in the file; False: one is lost, None: one still waits."""
+        """Return whether lines are in the file; False: one is lost, None: one is pending."""
         return self._recorder.written(numbers)
 
     async def flushed(self, timeout_s: float) -> bool:
-        """Wait until the disk has taken what waited, all or some; return False when nothing happens for so long."""
+        """Wait until some of the pending lines are written; return False after the timeout."""
         self._flushed.clear()
         with suppress(TimeoutError):
             async with asyncio.timeout(timeout_s):
@@ -47,9 +47,9 @@ class Disk:
         return False
 
     async def run(self) -> NoReturn:
-        """Write for ever."""
+        """Write until cancelled."""
         while True:
-            await self._unwritten.wait()
-            self._unwritten.clear()
+            await self._pending.wait()
+            self._pending.clear()
             await asyncio.to_thread(self._recorder.flush)
             self._flushed.set()

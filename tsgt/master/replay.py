@@ -1,4 +1,4 @@
-"""A recording through the live pipeline again: the same lines, bit for bit, at any speed."""
+"""Replays a recording through the live estimator: the same lines, bit for bit, at any speed."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from tsgt.errors import CorruptLineError, RecordingError
-from tsgt.estimation import Feed
+from tsgt.estimation import LiveEstimator
 from tsgt.model import Measurement, Parameters, PointMeasurement, PolarMeasurement
 from tsgt.recording import (
     BeaconRecord,
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from tsgt.master.stream_server import StreamServer
     from tsgt.recording import Line
 
-# What came from outside; headers and parameters are not on the stream.
+# Records that arrived at the master; headers and parameters are not on the stream.
 _ARRIVALS: dict[str, type[Measurement | StatusRecord | EventRecord | ClockRecord | BeaconRecord]] = {
     "measurement": PolarMeasurement,
     "point": PointMeasurement,
@@ -43,49 +43,47 @@ def replayed(
     keep_going: bool = False,
     on_problem: Callable[[RecordingError], None] | None = None,
 ) -> Iterator[tuple[int, list[bytes]]]:
-    """Make the calls that the live master made, in the same order with the same instants.
+    """Repeat the calls of the live master, in the same order with the same instants.
 
     Parameters
     ----------
-    path
-        The recording.
     keep_going
         Skip lines that cannot be read instead of raising.
     on_problem
-        Told of each line that is skipped.
+        Called for each skipped line.
 
     Yields
     ------
     tuple[int, list[bytes]]
-        The instant of an arrival on the master's Unix clock in ns, and the lines that it brought to the stream.
+        The instant of an arrival on the master's Unix clock in ns, and the stream's lines that follow from it.
 
     Raises
     ------
     RecordingError
-        The recording cannot be read, or measurements stand in it before any parameters.
+        The recording cannot be read, or measurements precede all parameters.
     """
-    feed: Feed | None = None
+    estimator: LiveEstimator | None = None
     missing_poses = 0
     for line in read_lines(path, keep_going=keep_going, on_problem=on_problem):
         try:
             if line.type == "parameters":
-                feed, missing_poses = Feed(decode_line(Parameters, line, path)), 0
-            elif line.type == "pose" and feed is not None:
-                # One that was not made yet was due by the timer, with nothing arriving any more.
+                estimator, missing_poses = LiveEstimator(decode_line(Parameters, line, path)), 0
+            elif line.type == "pose" and estimator is not None:
+                # A pose that was not replayed yet was due by the timer.
                 missing_poses += 1
-                if missing_poses > 0 and (due_ns := feed.next_deadline_ns()) is not None:
-                    poses = [encode_line(pose) for pose in feed.advance(due_ns)]
+                if missing_poses > 0 and (due_ns := estimator.next_deadline_ns()) is not None:
+                    poses = [encode_line(pose) for pose in estimator.advance(due_ns)]
                     missing_poses -= len(poses)
                     yield due_ns, poses
             elif line.type in _ARRIVALS:
-                if feed is None:
+                if estimator is None:
                     raise RecordingError(
-                        f"a line of type {line.type} stands before any parameters; this is not a whole recording",
+                        f"a line of type {line.type} precedes all parameters; this is not a complete recording",
                         path=path,
                         line=line.number,
                     )
                 now_ns, lines, poses_made = _arrival(
-                    feed, decode_line(_ARRIVALS[line.type], line, path), line
+                    estimator, decode_line(_ARRIVALS[line.type], line, path), line
                 )
                 missing_poses -= poses_made
                 yield now_ns, lines
@@ -97,16 +95,18 @@ def replayed(
 
 
 def _arrival(
-    feed: Feed, record: Measurement | StatusRecord | EventRecord | ClockRecord | BeaconRecord, line: Line
+    estimator: LiveEstimator,
+    record: Measurement | StatusRecord | EventRecord | ClockRecord | BeaconRecord,
+    line: Line,
 ) -> tuple[int, list[bytes], int]:
-    """Hand over what arrived: the instant, the lines that it brought, and how many of them are poses."""
+    """Pass on an arrival; return its instant, the lines that follow from it, and the number of poses among them."""
     if isinstance(record, StatusRecord | EventRecord | ClockRecord | BeaconRecord):
         now_ns = record.stamp_ns
-        records: list[object] = [*feed.advance(now_ns), record]
+        records: list[object] = [*estimator.advance(now_ns), record]
     else:
         now_ns = record.received_ns
-        records = [*feed.measurement(record)]
-    # What stood in the file goes out as it stood there, with keys that only a newer program knows.
+        records = [*estimator.measurement(record)]
+    # Lines of the file are passed on unchanged, with unknown keys of a newer program.
     lines = [line.data if each is record else encode_line(each) for each in records]
     return now_ns, lines, len(records) - 1
 
@@ -114,32 +114,28 @@ def _arrival(
 async def replay(
     arrivals: Iterator[tuple[int, list[bytes]]], server: StreamServer, clock: Clock, *, speed: float
 ) -> int:
-    """Publish replayed arrivals at their own pace times a speed, waiting for readers rather than losing lines.
+    """Publish replayed arrivals at a speed, waiting for slow readers.
 
     Parameters
     ----------
     arrivals
         From :func:`replayed`.
-    server
-        The open stream.
-    clock
-        Sets the pace.
     speed
-        1 is the pace of the recording, infinity as fast as the readers can take.
+        1 is real time, infinity as fast as the readers can take.
 
     Returns
     -------
     int
-        How many lines were published.
+        Number of published lines.
     """
     lines_published = 0
     start_ns: int | None = None
-    began_ns = clock.monotonic_ns()
+    replay_start_ns = clock.monotonic_ns()
     for now_ns, lines in arrivals:
         start_ns = now_ns if start_ns is None else start_ns
         if math.isfinite(speed):
-            await clock.sleep_until(began_ns + round((now_ns - start_ns) / speed))
+            await clock.sleep_until(replay_start_ns + round((now_ns - start_ns) / speed))
         for line in lines:
-            await server.publish_patiently(line)
+            await server.publish_when_ready(line)
         lines_published += len(lines)
     return lines_published

@@ -1,4 +1,4 @@
-"""What happens to stations, and is worth an event on the stream. Pure: instants and findings in, events out."""
+"""Detects changes of a station's state that are worth an event on the stream. Sans-I/O."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ if TYPE_CHECKING:
 
     from tsgt.model import Measurement
 
-LOST_AFTER_NS = 5_000_000_000
-"""A station that has been asked for this long without an answer is lost. Nobody asks it while others are synchronised."""
+LOSS_TIMEOUT_NS = 5_000_000_000
+"""A station that has not responded to requests for this long is lost. While others are synchronised none are sent."""
 
-IDLE_AFTER_NS = 10_000_000_000
-"""A station that answers without anything new for this long has lost its instrument; no instrument pauses so long."""
+IDLE_TIMEOUT_NS = 10_000_000_000
+"""A station that sends no new measurement for this long is idle; no instrument pauses for longer."""
 
-CLOCK_STEP_NS = 100_000_000
-"""The machine's Unix clock has been stepped when it has left the master's timeline by this much more than before."""
+CLOCK_STEP_THRESHOLD_NS = 100_000_000
+"""A change of the offset between the machine's Unix clock and the master's timeline that counts as a step."""
 
 _MEANING = {
     Status.OK: "measures",
@@ -35,114 +35,110 @@ _MEANING = {
 
 @dataclass(slots=True)
 class _Station:
-    """What is known of one station."""
+    """State of one station."""
 
-    heard_ns: int
-    missed_ns: int | None = None
-    """Since when it has been asked without an answer; None while it answers."""
-    misses: int = 0
+    received_ns: int
+    unanswered_since_ns: int | None = None
+    """First request without a response; None while the station responds."""
+    unanswered: int = 0
     lost: bool = False
     refused: bool = False
-    nothing_new_ns: int | None = None
-    """Since when its answers hold no new measurement; None while they do."""
+    nothing_new_since_ns: int | None = None
+    """First reply without a new measurement; None while there are new ones."""
     idle: bool = False
     meaning: str = _MEANING[Status.OK]
     newest: tuple[int, int] = (-1, 0)
     """Sequence number and stamp of the newest measurement."""
 
 
-class Alerts:
-    """Turns findings into events, once per change.
+class StationEventDetector:
+    """Turns changes of the stations' states into events, one per change.
 
     Parameters
     ----------
-    stations
-        Numbers of the stations.
     now_ns
         The present on the master's Unix clock in ns, like all instants here.
     """
 
     def __init__(self, stations: Iterable[int], now_ns: int) -> None:
         self._stations = {station: _Station(now_ns) for station in stations}
-        self._unix_ahead_ns = 0
+        self._clock_difference_ns = 0
 
-    def asked(self, station: int, now_ns: int, *, answered: bool) -> list[EventRecord]:
-        """Take note of a turn of a station; tell when it is back."""
+    def exchange(self, station: int, now_ns: int, *, responded: bool) -> list[EventRecord]:
+        """Take the outcome of a request or slot; return the event of a station that recovered."""
         found = self._stations[station]
-        if not answered:
-            found.missed_ns = now_ns if found.missed_ns is None else found.missed_ns
-            found.misses += 1
+        if not responded:
+            if found.unanswered_since_ns is None:
+                found.unanswered_since_ns = now_ns
+            found.unanswered += 1
             return []
-        found.missed_ns, found.misses = None, 0
-        silent_s = (now_ns - found.heard_ns) / 1e9
-        found.heard_ns = now_ns
+        found.unanswered_since_ns, found.unanswered = None, 0
+        silent_s = (now_ns - found.received_ns) / 1e9
+        found.received_ns = now_ns
         if not found.lost:
             return []
         found.lost = False
-        return [_event(now_ns, "station_recovered", f"answers again after {silent_s:.0f} s", station)]
+        return [_event(now_ns, "station_recovered", f"responds again after {silent_s:.0f} s", station)]
 
-    def ordered(self, station: int, prism: int, now_ns: int, *, tracks: bool) -> list[EventRecord]:
-        """Take note of whether a station says that it tracks its prism."""
+    def tracking_result(self, station: int, prism: int, now_ns: int, *, tracks: bool) -> list[EventRecord]:
+        """Take whether a station tracks its prism; return the event of a change."""
         found = self._stations[station]
         if tracks != found.refused:
             return []
         found.refused = not tracks
         if tracks:
             return [_event(now_ns, "station_tracking", f"now tracks prism {prism}", station)]
-        text = f"does not track prism {prism}; look at its instrument. It is told again"
+        text = f"does not track prism {prism}; check its instrument. The command is repeated"
         return [_event(now_ns, "station_not_tracking", text, station)]
 
-    def stepped(self, station: int, now_ns: int) -> list[EventRecord]:
-        """Tell that a station's clock was found to be another one."""
-        text = "has another clock than before: restarted, or set; its measurements are put on the new one"
-        return [_event(now_ns, "station_clock_stepped", text, station)]
+    def clock_stepped(self, station: int, now_ns: int) -> EventRecord:
+        """Return the event of a station's clock that was stepped or reset."""
+        text = "has a new clock: restarted, or set; its measurements are converted with the new offset"
+        return _event(now_ns, "station_clock_stepped", text, station)
 
-    def beacon_time_rejected(self, station: int, now_ns: int, count: int) -> list[EventRecord]:
-        """Tell that a station received beacons at a time at which they cannot have been sent."""
+    def beacon_time_rejected(self, station: int, now_ns: int, count: int) -> EventRecord:
+        """Return the event of beacons that a station received at impossible times."""
         text = (
-            f"station {station} received {count} beacons at a time at which they cannot have been sent; somebody may be "
-            "holding back packets and sending them later. They are not used"
+            f"rejected {count} beacons received at impossible times; "
+            "someone may be delaying and replaying packets"
         )
-        return [
-            EventRecord(
-                stamp_ns=now_ns, event="beacon_time_rejected", message=text, station=station, count=count
-            )
-        ]
+        return _event(now_ns, "beacon_time_rejected", text, station, count)
 
-    def link_delay_anomaly(self, station: int, now_ns: int) -> list[EventRecord]:
-        """Tell that the time between a station and the master came out as it cannot be."""
+    def link_delay_anomaly(self, station: int, now_ns: int) -> EventRecord:
+        """Return the event of an impossible link delay."""
         text = (
-            "and the master disagree on how long a packet takes; somebody may be holding back packets and sending them "
-            "later, or a radio stamps badly. This exchange is not used"
+            "measured an impossible link delay; someone may be delaying and replaying packets, or a radio has bad "
+            "timestamps. The exchange is not used"
         )
-        return [_event(now_ns, "link_delay_anomaly", text, station)]
+        return _event(now_ns, "link_delay_anomaly", text, station)
 
-    def polled(self, station: int, now_ns: int) -> list[EventRecord]:
-        """Take note of an answer, before the measurement that it may hold; tell when none comes any more.
+    def reply(self, station: int, now_ns: int) -> list[EventRecord]:
+        """Take a reply, before the measurements that it may carry; return the event of a station that went idle.
 
-        A node that repeats an error without a time has been told of already.
+        A station that repeats an error without a time does not become idle: the error has its own event.
         """
         found = self._stations[station]
-        found.nothing_new_ns = now_ns if found.nothing_new_ns is None else found.nothing_new_ns
-        idle_ns = now_ns - found.nothing_new_ns
-        if found.idle or idle_ns <= IDLE_AFTER_NS or found.meaning != _MEANING[Status.OK]:
+        if found.nothing_new_since_ns is None:
+            found.nothing_new_since_ns = now_ns
+        idle_ns = now_ns - found.nothing_new_since_ns
+        if found.idle or idle_ns <= IDLE_TIMEOUT_NS or found.meaning != _MEANING[Status.OK]:
             return []
         found.idle = True
-        text = f"answers, but has measured nothing for {idle_ns / 1e9:.0f} s; look at its instrument"
+        text = f"responds, but has measured nothing for {idle_ns / 1e9:.0f} s; check its instrument"
         return [_event(now_ns, "station_idle", text, station)]
 
     def measurement(self, measurement: Measurement, now_ns: int) -> list[EventRecord]:
-        """Tell when an instrument measures again, and when it reports an error, another one, or none any more."""
+        """Take a measurement; return the events of an instrument that measures again or has a new status."""
         found = self._stations.get(measurement.station)
         if found is None:
             return []
         events = []
         late = measurement.sequence < found.newest[0] and measurement.stamp_ns < found.newest[1]
-        found.nothing_new_ns = None
+        found.nothing_new_since_ns = None
         if found.idle:
             found.idle = False
             events.append(_event(now_ns, "station_measuring", "measures again", measurement.station))
-        if late:  # it tells how the instrument did, not how it does
+        if late:  # its status is out of date
             return events
         found.newest = (measurement.sequence, measurement.stamp_ns)
         meaning = _MEANING[measurement.status]
@@ -152,37 +148,39 @@ class Alerts:
             events.append(_event(now_ns, "instrument_status", f"{meaning}{again}", measurement.station))
         return events
 
-    def tick(self, now_ns: int, *, unix_ns: int) -> list[EventRecord]:
-        """Tell what time alone brings.
+    def tick(self, now_ns: int, *, realtime_ns: int) -> list[EventRecord]:
+        """Return the events that time alone brings.
 
         Parameters
         ----------
         now_ns
             The present on the timeline that was fixed at the start.
-        unix_ns
-            The present as the machine's Unix clock shows it.
+        realtime_ns
+            The present on the machine's Unix clock.
         """
         events = []
         for number, station in self._stations.items():
-            missed_ns = station.missed_ns
-            late = missed_ns is not None and now_ns - missed_ns > LOST_AFTER_NS
-            if late and station.misses > 1 and not station.lost:
+            since_ns = station.unanswered_since_ns
+            timed_out = since_ns is not None and now_ns - since_ns > LOSS_TIMEOUT_NS
+            if timed_out and station.unanswered > 1 and not station.lost:
                 station.lost = True
                 text = (
-                    f"not heard for {(now_ns - station.heard_ns) / 1e9:.0f} s; `tsgt status` on its computer tells "
-                    "whether it hears this master"
+                    f"has not responded for {(now_ns - station.received_ns) / 1e9:.0f} s; run `tsgt status` on its "
+                    "computer to see whether it receives this master"
                 )
                 events.append(_event(now_ns, "station_lost", text, number))
-        ahead_ns = unix_ns - now_ns
-        if abs(ahead_ns - self._unix_ahead_ns) > CLOCK_STEP_NS:
+        difference_ns = realtime_ns - now_ns
+        step_ns = difference_ns - self._clock_difference_ns
+        if abs(step_ns) > CLOCK_STEP_THRESHOLD_NS:
             text = (
-                f"the Unix clock of this computer was set by {(ahead_ns - self._unix_ahead_ns) / 1e9:+.3f} s and is "
-                f"now {ahead_ns / 1e9:+.3f} s from the time of this stream, which goes on as it was"
+                f"the Unix clock of this computer was set by {step_ns / 1e9:+.3f} s and is now "
+                f"{difference_ns / 1e9:+.3f} s from the time of this stream, which is not affected"
             )
             events.append(EventRecord(stamp_ns=now_ns, event="unix_clock_stepped", message=text))
-            self._unix_ahead_ns = ahead_ns
+            self._clock_difference_ns = difference_ns
         return events
 
 
-def _event(now_ns: int, event: str, text: str, station: int) -> EventRecord:
-    return EventRecord(stamp_ns=now_ns, event=event, message=f"station {station} {text}", station=station)
+def _event(now_ns: int, event: str, text: str, station: int, count: int | None = None) -> EventRecord:
+    message = f"station {station} {text}"
+    return EventRecord(stamp_ns=now_ns, event=event, message=message, station=station, count=count)

@@ -1,12 +1,11 @@
-"""The stream: JSON lines on a UNIX socket, to any number of readers.
+"""Stream server: JSON lines on a UNIX socket, to any number of readers.
 
-Problem: a reader that sleeps must cost the others and the master nothing, and must know that it has missed
-something. Idea: the kernel and the transport take what they can; behind them each reader has a queue of its own,
-and when that is full its oldest line goes. The reader finds an event ``lines_lost`` with their number where they
-are missing, and then the newest lines. The lines are described in docs/reference/stream.md.
+Problem: a reader that stalls must not cost the others or the master anything, and must know that it has lost lines. Idea:
+the kernel and the transport buffer what they can; behind them each reader has a queue, which drops its oldest line when it
+is full. The reader then gets an event ``lines_lost`` with their number in their place. The lines are described in
+docs/reference/stream.md.
 
-There is no task in here: lines go out from within :meth:`StreamServer.publish` and from the event loop's
-callbacks.
+There are no tasks: lines are sent from :meth:`StreamServer.publish` and from the event loop's callbacks.
 """
 
 from __future__ import annotations
@@ -28,14 +27,14 @@ if TYPE_CHECKING:
 
 QUEUE_LINES = 2000
 
-MOST_READERS = 64
-"""More at a time are let go at once: each costs memory, and a file descriptor that the radio may need."""
+MAX_READERS = 64
+"""Further readers are disconnected: each needs memory, and a file descriptor that the radio may need."""
 
 CLOSE_TIMEOUT_S = 0.5
-"""How long readers have, at the end, to take what is waiting for them."""
+"""How long readers have at the end to take their queues."""
 
-_TURNS_TO_SET_UP = 5
-"""Turns of the event loop from accepting a connection to its protocol, with some in hand."""
+_SETUP_ITERATIONS = 5
+"""Iterations of the event loop from accepting a connection to its protocol, with reserve."""
 
 log = structlog.get_logger()
 
@@ -43,26 +42,26 @@ log = structlog.get_logger()
 class StreamServer:
     """Serves lines to every reader of a UNIX socket; an async context manager.
 
-    A reader gets the greeting and then whatever is published from then on. What readers send is read and
-    thrown away. On leaving, readers have :data:`CLOSE_TIMEOUT_S` to take what is waiting for them.
+    A reader gets the greeting and then what is published. What readers send is ignored. On exit, readers have
+    :data:`CLOSE_TIMEOUT_S` to take their queues.
 
     Parameters
     ----------
     path
-        The socket. A stale one of an earlier run is replaced; its folder is created if need be.
+        The socket. A stale one is replaced; the folder is created.
     hello
         The greeting, without line end.
     mode
         Permissions of the socket.
     queue_lines
-        How many lines wait for a reader, beyond what kernel and transport hold, before it loses the oldest.
+        Capacity of a reader's queue.
     unix_now_ns
         The master's Unix clock, for the event ``lines_lost``.
 
     Raises
     ------
     StreamError
-        On entering: another program serves the socket, or it cannot be made.
+        On entering: another program serves the socket, or it cannot be created.
     """
 
     def __init__(
@@ -88,7 +87,7 @@ class StreamServer:
         loop = asyncio.get_running_loop()
         try:
             self._server = await loop.create_unix_server(self._new_reader, sock=self._listener.socket)
-        except BaseException:  # cancelled: nobody will call __aexit__
+        except BaseException:  # also when cancelled: __aexit__ is not called
             self._listener.remove()
             self._listener.socket.close()
             raise
@@ -98,9 +97,9 @@ class StreamServer:
     async def __aexit__(self, *_: object) -> None:
         self._closing = True
         self._listener.remove()
-        # No new connections; those that asyncio is just setting up come to their end while there is a server.
+        # Accept no more connections, and let asyncio finish those that it is setting up while the server exists.
         asyncio.get_running_loop().remove_reader(self._listener.socket)
-        for _turn in range(_TURNS_TO_SET_UP):
+        for _iteration in range(_SETUP_ITERATIONS):
             await asyncio.sleep(0)
         self._server.close()
         try:
@@ -118,24 +117,24 @@ class StreamServer:
 
     @property
     def readers(self) -> int:
-        """How many readers are connected."""
+        """Number of connected readers."""
         return len(self._readers)
 
     def publish(self, line: bytes) -> None:
-        """Send a line, given without line end, to all readers; never waits, slow readers lose lines."""
+        """Send a line, without line end, to all readers; never waits, slow readers lose lines."""
         data = line + b"\n"
         for reader in self._readers:
             reader.send(data)
 
-    async def publish_patiently(self, line: bytes) -> None:
-        """Send a line as soon as every reader has room for it, so that nobody loses any."""
-        # Always one turn of the event loop, so that a long run of lines does not keep readers from connecting.
+    async def publish_when_ready(self, line: bytes) -> None:
+        """Send a line when every reader has room for it; no reader loses lines."""
+        # Always yield to the event loop, so that readers can connect during many lines.
         await asyncio.sleep(0)
         await self._until(lambda: not any(reader.full for reader in self._readers))
         self.publish(line)
 
     async def finish(self) -> None:
-        """Return when every reader has taken everything and is let go, however long it takes; for a replay."""
+        """Return when every reader has taken everything and is disconnected; for a replay."""
         await self._until(lambda: not any(reader.waiting for reader in self._readers))
         for reader in self._readers:
             reader.close()  # which sends what the transport still holds
@@ -152,19 +151,19 @@ class StreamServer:
 
     def _new_reader(self) -> asyncio.Protocol:
         if self._closing:
-            return _TooLate()
+            return _RejectedConnection()
         return _Reader(self._readers, self._changed, self._hello, self._queue_lines, self._unix_now_ns)
 
 
-class _TooLate(asyncio.Protocol):
-    """A connection that was made while the server closed."""
+class _RejectedConnection(asyncio.Protocol):
+    """A connection that was accepted while the server was closing."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         transport.close()
 
 
 class _Reader(asyncio.Protocol):
-    """One connection, from its greeting on: the transport while it takes lines, the queue while it does not."""
+    """One connection: lines go to the transport, or to the queue while it is full."""
 
     def __init__(
         self,
@@ -207,9 +206,9 @@ class _Reader(asyncio.Protocol):
         self._transport.abort()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.WriteTransport)  # noqa: S101 (asyncio's promise for a stream socket)
+        assert isinstance(transport, asyncio.WriteTransport)  # noqa: S101 (a stream socket has one)
         self._transport = transport
-        if len(self._readers) >= MOST_READERS:
+        if len(self._readers) >= MAX_READERS:
             log.warning("reader_refused", readers=len(self._readers))
             self.abort()
             return
@@ -219,10 +218,10 @@ class _Reader(asyncio.Protocol):
         log.info("reader_connected", readers=len(self._readers))
 
     def data_received(self, data: bytes) -> None:
-        """Readers have nothing to say yet."""
+        """Ignore what readers send."""
 
     def eof_received(self) -> bool:
-        """Keep the connection of a reader that only has nothing to say: a shell pipe through socat."""
+        """Keep the connection of a reader that only closed its sending side, as a shell pipe through socat."""
         poller = select.poll()
         poller.register(self._transport.get_extra_info("socket").fileno(), select.POLLOUT)
         return not any(events & select.POLLHUP for _, events in poller.poll(0))
@@ -240,9 +239,9 @@ class _Reader(asyncio.Protocol):
             self._transport.write(self._queue.popleft())
         self._changed.set()
 
-    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 (a reader may go as it likes)
+    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 (the reason does not matter)
         if self not in self._readers:
-            return  # one too many
+            return  # beyond MAX_READERS
         self._readers.discard(self)
         self._changed.set()
         log.info("reader_disconnected", readers=len(self._readers))

@@ -1,13 +1,9 @@
-"""Recordings: JSON lines on disk, appended in the order of arrival, with every parameter in force.
+"""Recordings: JSON lines on disk in the order of arrival, with every parameter in force. What is recorded is what is streamed.
 
-Problem: a robot loses power, a disk fills up, a program is killed, and what was measured until then has to be
-there. Idea: one record is one line is one write to the kernel, at the end of a file that nobody else may write.
-A killed program leaves at most one torn line, which the reader skips and the next writer cuts off. Only a power
-cut can take more: what was written since the last :meth:`RecordingWriter.sync`. The format is described in
-docs/reference/recording.md.
-
-Nothing that can be imported from here waits, asks for the time or logs, so the pure parts of the program may use it;
-:mod:`tsgt.recording.recorder` does log.
+In: records and encoded lines. Out: files (`writer`, `recorder`), and their content again (`reader`, `journal`). One record
+is one line is one write to the kernel, at the end of a locked file. A killed program leaves at most one torn line, which
+readers skip and the next writer cuts off; only a power cut can lose more: the lines since the last sync. The format is
+described in docs/reference/recording.md. Nothing exported here waits, reads a clock or logs; `recorder` does.
 """
 
 from tsgt.recording.files import new_recording_path, sync_folder, write_atomically

@@ -1,4 +1,4 @@
-"""Files that are there as a whole or not at all, and names for new ones."""
+"""Atomic output files, and names of new recordings."""
 
 from __future__ import annotations
 
@@ -18,24 +18,14 @@ if TYPE_CHECKING:
 
 @contextmanager
 def write_atomically(path: Path) -> Iterator[BinaryIO]:
-    """Write a result so that it is there as a whole or not at all; an existing file is replaced on success.
+    """Yield a file that becomes ``path`` when the block ends without an exception; an existing file is replaced.
 
-    A pipe, a terminal or ``/dev/null`` is written directly, there is nothing to replace.
-
-    Parameters
-    ----------
-    path
-        The result; the folder must exist.
-
-    Yields
-    ------
-    BinaryIO
-        Takes the bytes. It becomes ``path`` when the block ends without an exception.
+    A pipe, a terminal or ``/dev/null`` is written directly. The folder must exist.
 
     Raises
     ------
     OutputFileError
-        No room on the disk, no such folder, no permission.
+        Disk full, no such folder, no permission.
     """
     target = path.resolve()
     part = target.with_name(f".{secrets.token_hex(8)}.part")
@@ -56,34 +46,25 @@ def write_atomically(path: Path) -> Iterator[BinaryIO]:
     except BrokenPipeError:
         raise
     except OSError as error:
-        # A failed write names no file; one that names another is not about this result.
+        # A failed write has no file name; an error with another name does not concern this file.
         if error.filename not in (None, str(path), str(part)) or isinstance(error, TsgtError):
             raise
         raise OutputFileError(f"cannot be written ({error.strerror})", path=path) from error
 
 
 def new_recording_path(directory: Path, name: str, unix_ns: int) -> Path:
-    """Make an empty file for a new recording, with a name that no file there has.
+    """Create an empty file with a new name in a directory, which is created if needed.
 
     Parameters
     ----------
-    directory
-        Where; it is made if need be.
-    name
-        What the name begins with.
     unix_ns
-        The time that it is named after, in ns. A computer without a battery clock may see the same time at each
-        start; the name then gets a number.
-
-    Returns
-    -------
-    Path
-        For example ``name-20261121T055100Z.jsonl``, or ``name-20261121T055100Z-2.jsonl``.
+        Unix time in ns that follows ``name`` in the file name: ``name-20261121T055100Z.jsonl``. A computer without a
+        battery clock may have the same time at each start; then a number follows: ``name-20261121T055100Z-2.jsonl``.
 
     Raises
     ------
     RecordingError
-        The folder or the file cannot be made.
+        The directory or the file cannot be created.
     """
     stem = f"{name}-{datetime.fromtimestamp(unix_ns // 1_000_000_000, UTC):%Y%m%dT%H%M%SZ}"
     try:
@@ -95,15 +76,15 @@ def new_recording_path(directory: Path, name: str, unix_ns: int) -> Path:
                 break
     except OSError as error:
         raise RecordingError(
-            f"no file can be made there ({error.strerror}); check the folder and its permissions",
+            f"no file can be created there ({error.strerror}); check the folder and its permissions",
             path=directory,
         ) from error
     return path
 
 
 def sync_folder(path: Path) -> None:
-    """Make the name of a new file survive a power cut."""
-    with suppress(OSError):  # some file systems refuse; the file itself is unharmed
+    """Bring the directory entry of a new file to the disk."""
+    with suppress(OSError):  # not supported by some file systems
         folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
         try:
             os.fsync(folder)

@@ -1,4 +1,4 @@
-"""The form of a line in a recording: what each begins with, to bytes and back."""
+"""Encoding and decoding of the lines of a recording."""
 
 from __future__ import annotations
 
@@ -18,58 +18,41 @@ if TYPE_CHECKING:
 FORMAT_VERSION = 1
 
 MAX_LINE_BYTES = 1 << 20
-"""Longest line that a reader takes; it keeps a file without line ends from filling the memory."""
+"""Longest line that a reader accepts; a file without line ends must not fill the memory."""
 
 HEADER_START = b'{"type":"recording",'
-"""How every header begins; what is left of a torn one is known by it."""
+"""Start of every header, by which a torn one is recognised."""
 
 NO_HEADER = "does not begin with the header of a recording; give a file that tsgt recorded or imported"
-"""What is wrong with a file whose first line is no header, and what to do."""
+"""Error message for a file whose first line is not a header."""
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingHeader:
-    """The first line of a recording, and of each further session in the same file.
-
-    Attributes
-    ----------
-    type
-        Always ``recording``.
-    version
-        Version of the format. Readers refuse others; new types of lines and new keys do not change it.
-    software
-        Name and version of the program that wrote it.
-    created_ns
-        When the session began, on the Unix clock of the computer that wrote it, in ns.
-    source
-        Where the lines come from: a program, or the files that were imported.
-    """
+    """The first line of a recording, and of each further session in the same file."""
 
     type: Literal["recording"] = "recording"
     version: int = FORMAT_VERSION
+    """Version of the format. Readers reject others; new types of lines and new keys do not change it."""
     software: str
+    """Name and version of the program that wrote it."""
     created_ns: int
+    """Start of the session, on the Unix clock of the computer that wrote it, in ns."""
     source: str
+    """Origin of the lines: a program, or the imported files."""
 
 
 class Line(NamedTuple):
-    """One line of a recording that is whole and is a JSON object with a type.
-
-    Attributes
-    ----------
-    number
-        Number of the line in the file, from 1.
-    type
-        Its ``type``, of which the reader need not know anything.
-    data
-        The JSON object as it stands in the file, without the line end.
-    """
+    """One complete line of a recording: a JSON object with a type."""
 
     number: int
+    """Number of the line in the file, from 1."""
     type: str
+    """Its ``type``, which may be unknown."""
     data: bytes
+    """The JSON object without the line end."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +76,7 @@ def _validator_of(cls: Any) -> SchemaValidator:
 
 
 def _bounded(schema: Any) -> Any:
-    """Refuse whole numbers beyond 64 bits: no program of ours writes one, and not all arithmetic takes it."""
+    """Reject integers beyond 64 bits, which tsgt never writes."""
     if isinstance(schema, dict):
         bounds = {"ge": -(2**63), "lt": 2**64} if schema.get("type") == "int" else {}
         return bounds | {key: _bounded(value) for key, value in schema.items()}
@@ -107,7 +90,7 @@ _validator: Callable[[object], SchemaValidator] = functools.cache(_validator_of)
 
 def encode_line(record: object) -> bytes:
     """Turn a record into one JSON object, without a line end."""
-    # Not the adapter's own dump_json, whose passing on of a dozen options takes as long as a line does.
+    # Not dump_json: passing its dozen options takes as long as encoding a line.
     return _adapter(type(record)).serializer.to_json(record)
 
 
@@ -117,7 +100,7 @@ def decode(cls: type[T], data: bytes) -> T:
     Raises
     ------
     ValueError
-        In one line: what is not JSON, or the first field that is missing or wrong.
+        Not JSON, or the first field that is missing or wrong; one line.
     """
     try:
         record: T = _validator(cls).validate_json(data, strict=True)
@@ -145,12 +128,12 @@ def decode_line(cls: type[T], line: Line, path: Path) -> T:
 
 
 def check_header(data: bytes, path: Path, line: int) -> None:
-    """Make sure that a line is the header of a recording that this program can read.
+    """Check that a line is the header of a recording in the supported format.
 
     Raises
     ------
     ValueError
-        It is no header, or a field is missing or wrong.
+        It is not a header, or a field is missing or wrong.
     RecordingVersionError
         It is the header of another version of the format.
     """

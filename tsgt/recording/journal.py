@@ -1,4 +1,4 @@
-"""What a station's journal holds besides measurements, and reading it."""
+"""Records of a station's journal besides measurements, and reading a journal."""
 
 from __future__ import annotations
 
@@ -17,201 +17,126 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JournalRecord:
-    """The second line of a journal: whose it is.
-
-    Attributes
-    ----------
-    type
-        Always ``journal``.
-    station
-        Number of the station, from 1.
-    unix_at_zero_ns
-        What was added to CLOCK_MONOTONIC of the station's computer to get the times in this file, in ns; the same
-        from the start of the client to its end.
-    boot
-        Which start of the computer its CLOCK_MONOTONIC counts from: the kernel's boot id; empty where unknown.
-    lineage
-        The same, 0 to 65535, in all journals whose sequence numbers go on from one to the next; null where each
-        begins at 0, as over the protocol classic.
-    run_start
-        Sequence number of the first measurement.
-    """
+    """The second line of a journal: its station and the origin of its times and sequence numbers."""
 
     type: Literal["journal"] = "journal"
     station: int
+    """Number of the station, from 1."""
     unix_at_zero_ns: int
+    """Offset from CLOCK_MONOTONIC of the station's computer to the times in this file, in ns; constant from the start
+    of the client to its end."""
     boot: str = ""
-    lineage: int | None = None
-    run_start: int = 0
+    """The kernel's boot id, which identifies the origin of CLOCK_MONOTONIC; empty where unknown."""
+    stream_id: int | None = None
+    """The same, 0 to 65535, in all journals whose sequence numbers continue from one to the next; null where each
+    begins at 0, as with the protocol classic."""
+    first_sequence: int = 0
+    """Sequence number of the first measurement."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InstrumentRecord:
-    """What measured, and how it was set: written after each connection and each change, as read back from it.
-
-    Attributes
-    ----------
-    type
-        Always ``instrument``.
-    stamp_ns
-        From when on, on the station computer's clock, in ns.
-    make
-        Maker of the instrument.
-    model
-        Model, as the instrument says; empty where unknown.
-    serial_number
-        Its number; empty where unknown.
-    firmware
-        Version of its firmware; empty where unknown.
-    prism_type
-        Reflector that it is set to, in the words of the configuration; empty where unknown.
-    prism_constant_m
-        What the instrument itself adds to a distance for it, in m, in its maker's convention; null where unknown. The
-        distances in this file have it, so the master must add only what is still missing.
-    atmospheric_ppm
-        Scale correction of the distance that the instrument itself applies, in 1e-6; null where unknown.
-    temperature_c
-        Of the air that this stands for, in degrees Celsius; null where unknown.
-    pressure_hpa
-        Of the same air, in hPa; null where unknown.
-    distance_mode
-        How it measures distances, in the words of the driver; empty where unknown.
-    latency_ns
-        What has been taken off the stamps for the time from the measurement to the fastest answer, in ns.
-    angle_delay_ns
-        By how much the angles are newer than the distance, in ns; positive: newer. Not corrected in this file.
-    """
+    """The instrument and its settings as read back from it, after each connection and each change."""
 
     __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
     type: Literal["instrument"] = "instrument"
     stamp_ns: int = 0
+    """Start of validity, on the station computer's clock, in ns."""
     make: str
+    """Maker of the instrument."""
     model: str = ""
+    """Model, as the instrument reports it; empty where unknown."""
     serial_number: str = ""
+    """Serial number; empty where unknown."""
     firmware: str = ""
+    """Firmware version; empty where unknown."""
     prism_type: str = ""
+    """Reflector that it is set to, in the words of the configuration; empty where unknown."""
     prism_constant_m: float | None = None
+    """What the instrument itself adds to a distance, in m, in its maker's convention; null where unknown. The distances
+    in this file include it, so the master must add only the remainder."""
     atmospheric_ppm: float | None = None
+    """Scale correction of the distance that the instrument itself applies, in 1e-6; null where unknown."""
     temperature_c: float | None = None
+    """Air temperature of this correction, in degrees Celsius; null where unknown."""
     pressure_hpa: float | None = None
+    """Air pressure of this correction, in hPa; null where unknown."""
     distance_mode: str = ""
+    """EDM mode, in the words of the driver; empty where unknown."""
     latency_ns: int = 0
+    """Already subtracted from the stamps: from the measurement to the fastest response, in ns."""
     angle_delay_ns: int = 0
+    """By how much the angles are newer than the distance, in ns; positive: newer. Not corrected in this file."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReceptionRecord:
-    """When the station received one of the master's beacons, and when the master had sent it.
-
-    Attributes
-    ----------
-    type
-        Always ``reception``.
-    stamp_ns
-        The end of its reception (RxDone) in ns, on the station computer's clock.
-    stamp_sigma_ns
-        One sigma of that.
-    session
-        Number of the master's session, 48 bits.
-    counter
-        Number of the frame in it.
-    sent_us
-        When it had left (TxDone), in us from the start of the session by the master's clock.
-    """
+    """The reception of one of the master's beacons, with its transmission time."""
 
     type: Literal["reception"] = "reception"
     stamp_ns: int
+    """End of its reception (RxDone) in ns, on the station computer's clock."""
     stamp_sigma_ns: int
+    """One sigma of that."""
     session: int
+    """Number of the master's session, 48 bits."""
     counter: int
+    """Number of the frame in the session."""
     sent_us: int
+    """End of its transmission (TxDone), in us from the start of the session by the master's clock."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AcknowledgedRecord:
-    """How far the master's recording has got; written now and then.
-
-    Attributes
-    ----------
-    type
-        Always ``acknowledged``.
-    stamp_ns
-        When, on the station computer's clock, in ns.
-    oldest
-        Every measurement with a lower sequence number has been acknowledged, or was given up.
-    """
+    """How far the master has acknowledged; written now and then."""
 
     type: Literal["acknowledged"] = "acknowledged"
     stamp_ns: int
+    """When, on the station computer's clock, in ns."""
     oldest: int
+    """Every measurement with a lower sequence number has been acknowledged or discarded."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TargetRecord:
-    """A single measurement of a target that a person had aimed at.
-
-    Attributes
-    ----------
-    type
-        Always ``target``.
-    station
-        Number of the station that measured, from 1.
-    stamp_ns
-        The station computer's stamp in ns, on its own clock.
-    horizontal_angle_rad
-        Horizontal circle, clockwise from the circle's zero, in rad; 0 where the instrument gave none.
-    zenith_angle_rad
-        Angle from straight up in rad; 0 where the instrument gave none.
-    slope_distance_m
-        Slope distance in m as the instrument gave it; null where it gave none.
-    status
-        The instrument's verdict, as in ``measurement``.
-    raw_status
-        The number that the instrument itself gave for it.
-    instrument_time_ns
-        The instrument's own stamp in ns, on the instrument's clock; null where it has none.
-    """
+    """A single measurement of a target that the operator had aimed at."""
 
     __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
     type: Literal["target"] = "target"
     station: int
+    """Number of the station that measured, from 1."""
     stamp_ns: int
+    """The station computer's stamp in ns, on its own clock."""
     horizontal_angle_rad: float
+    """Horizontal circle, clockwise from the circle's zero, in rad; 0 where the instrument gave none."""
     zenith_angle_rad: float
+    """Angle from the zenith in rad; 0 where the instrument gave none."""
     slope_distance_m: float | None
+    """Slope distance in m as the instrument gave it; null where it gave none."""
     status: Status
+    """The instrument's status, as in ``measurement``."""
     raw_status: int
+    """The instrument's own status number."""
     instrument_time_ns: int | None
+    """The instrument's own stamp in ns, on the instrument's clock; null where it has none."""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be a measurement."""
+        """Reject impossible times and numbers."""
         check_instants(self.stamp_ns)
         check_finite(self.horizontal_angle_rad, self.zenith_angle_rad, self.slope_distance_m or 0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Journal:
-    """What a station measured in one run of its client.
-
-    Attributes
-    ----------
-    head
-        Whose it is.
-    created_ns
-        When it was begun, on the station's own clock.
-    measurements
-        All of them, in the order in which they were read; times are on the station's own clock.
-    targets
-        Single measurements of targets, likewise.
-    receptions
-        Of the master's beacons, likewise.
-    """
+    """The measurements of one run of a station's client; times are on the station's own clock."""
 
     head: JournalRecord
     created_ns: int
+    """Start of the client."""
     measurements: list[PolarMeasurement]
+    """In the order in which they were read."""
     targets: list[TargetRecord]
     receptions: list[ReceptionRecord]
 
@@ -221,8 +146,8 @@ class Journal:
         return self.head.station
 
 
-def is_only_begun(path: Path) -> bool:
-    """Tell whether a program has ended between making a journal and its first lines: it is empty, or ends in its head.
+def is_unfinished_journal(path: Path) -> bool:
+    """Return whether the client ended before the first lines were complete: the file is empty or ends in its head.
 
     Raises
     ------
@@ -248,18 +173,18 @@ def load_journal(
     Parameters
     ----------
     path
-        The journal; its last line may be torn.
+        Its last line may be torn.
     keep_going
         Skip lines that cannot be read instead of raising.
     on_problem
-        Told of every line that is skipped: a torn last line always, others with ``keep_going``.
+        Called for each skipped line: a torn last line always, others with ``keep_going``.
 
     Raises
     ------
     RecordingError
-        The file cannot be read, or is no journal.
+        The file cannot be read, or is not a journal.
     CorruptLineError
-        A line is not what a client can have written.
+        A line cannot have been written by a client.
     """
     head: JournalRecord | None = None
     created_ns = 0
@@ -288,7 +213,7 @@ def load_journal(
             if on_problem is not None:
                 on_problem(problem)
     if head is None:
-        raise RecordingError("is no journal of a station; give a file that tsgt-client wrote", path=path)
+        raise RecordingError("is not a station's journal; give a file that tsgt-client wrote", path=path)
     return Journal(
         head=head,
         created_ns=created_ns,

@@ -1,30 +1,23 @@
-"""What a station had measured and the radio had not carried, put into the recording from its journal afterwards."""
+"""Measurements that were merged into a recording from a station's journal."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Literal
 
-from tsgt.model import PolarMeasurement  # noqa: TC001 (pydantic looks it up when the program runs)
+from tsgt.model import PolarMeasurement  # noqa: TC001 (pydantic evaluates annotations at run time)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MergedRecord:
-    """A measurement that came from a station's journal, after the recording had ended.
+    """A measurement from a station's journal, added after the recording had ended.
 
-    It was not on the stream, so a replay passes over it; whoever processes the recording uses it like any other.
-
-    Attributes
-    ----------
-    type
-        Always ``merged``.
-    journal
-        Name of the file that it came from.
-    measurement
-        As the journal has it, with its number in the journal, but for its times: ``stamp_ns`` is on the master's Unix
-        clock, and ``received_ns`` is the same, for the master never had it.
+    It was not on the stream, so a replay ignores it; post-processing uses it like any other.
     """
 
     type: Literal["merged"] = "merged"
     journal: str
+    """Name of the file that it came from."""
     measurement: PolarMeasurement
+    """As in the journal, with its number there, except for its times: ``stamp_ns`` is on the master's Unix clock, and
+    ``received_ns`` is the same, as the master never received it."""

@@ -1,4 +1,4 @@
-"""Reading a recording: torn ends are skipped, corrupt lines are errors, unknown types are passed over."""
+"""Reads recordings: torn ends are skipped, corrupt lines are errors, unknown types are ignored."""
 
 from __future__ import annotations
 
@@ -30,25 +30,16 @@ _MEASUREMENTS: dict[str, type[Measurement]] = {"measurement": PolarMeasurement, 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recording:
-    """What a recording holds for processing it again.
-
-    Attributes
-    ----------
-    header
-        The header of the first session.
-    parameters
-        The parameters in force at the end: the last ones in the file.
-    measurements
-        All measurements in the order of arrival, and where they stand in the file those that were merged into it.
-    end_ns
-        Latest time on the master's Unix clock that the file knows of, in ns: of an arrival, a status or an event.
-        None when it has none of these.
-    """
+    """The content of a recording that post-processing needs."""
 
     header: RecordingHeader
+    """Of the first session."""
     parameters: Parameters
+    """The last ones in the file."""
     measurements: list[Measurement]
+    """In the order of arrival, with merged ones at their place in the file."""
     end_ns: int | None
+    """Latest arrival, status or event in the file, on the master's Unix clock in ns; None without any."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,26 +53,19 @@ def read_lines(
     keep_going: bool = False,
     on_problem: Callable[[RecordingError], None] | None = None,
 ) -> Iterator[Line]:
-    """Read a recording line by line. Every line is checked to be JSON with a type, also of unknown types.
+    """Yield the lines of a recording, headers included; each is checked to be JSON with a type.
 
     Parameters
     ----------
-    path
-        The recording.
     keep_going
         Skip lines that cannot be read instead of raising.
     on_problem
-        Told of every line that is skipped: a torn last line always, others with ``keep_going``.
-
-    Yields
-    ------
-    Line
-        The lines in the order of the file, headers included.
+        Called for each skipped line: a torn last line always, others with ``keep_going``.
 
     Raises
     ------
     RecordingError
-        The file cannot be read or does not begin with the header of a recording.
+        The file cannot be read, or does not begin with the header of a recording.
     RecordingVersionError
         It was written in another version of the format.
     CorruptLineError
@@ -116,17 +100,17 @@ def load_recording(
     keep_going: bool = False,
     on_problem: Callable[[RecordingError], None] | None = None,
 ) -> Recording:
-    """Read what is needed to process a recording again. Poses in it are checked to be whole, but not kept.
+    """Read measurements and parameters for post-processing.
 
     Parameters
     ----------
-    path, keep_going, on_problem
-        As for :func:`read_lines`; a line whose fields are missing or wrong counts as one that cannot be read.
+    keep_going, on_problem
+        As for :func:`read_lines`; a line with missing or wrong fields counts as one that cannot be read.
 
     Raises
     ------
     RecordingError
-        As :func:`read_lines`; also when there are no parameters in the file.
+        As :func:`read_lines`; also without parameters in the file.
     """
     header: RecordingHeader | None = None
     parameters: Parameters | None = None
@@ -156,8 +140,8 @@ def load_recording(
                 on_problem(problem)
         if known_ns is not None:
             end_ns = known_ns if end_ns is None else max(end_ns, known_ns)
-    if header is None or parameters is None:  # read_lines has made sure of the header
-        raise RecordingError("holds no parameters; the program that wrote it ended too early", path=path)
+    if header is None or parameters is None:  # read_lines has checked the header
+        raise RecordingError("contains no parameters; the program that wrote it ended too early", path=path)
     return Recording(header=header, parameters=parameters, measurements=measurements, end_ns=end_ns)
 
 
@@ -172,7 +156,7 @@ def _unreadable(raw: bytes, why: str, path: Path, line: int) -> RecordingError:
 
 
 def _raw_lines(path: Path) -> Iterator[bytes]:
-    """Lines with their ends; of one that is too long only the beginning."""
+    """Yield lines with their ends; of a line that is too long only its start."""
     try:
         with path.open("rb") as file:
             read_line = functools.partial(file.readline, MAX_LINE_BYTES)
@@ -180,7 +164,7 @@ def _raw_lines(path: Path) -> Iterator[bytes]:
                 piece = raw
                 while len(piece) == MAX_LINE_BYTES and not piece.endswith(b"\n"):
                     piece = read_line()
-                # Whether a line that is too long ever ends tells a corrupt one from a torn tail.
+                # A line that is too long is corrupt if it ends, and a torn tail if not.
                 yield raw if piece is raw or not piece.endswith(b"\n") else raw + b"\n"
     except OSError as error:
         raise RecordingError(f"cannot be read ({error.strerror})", path=path) from error

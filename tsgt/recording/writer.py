@@ -1,4 +1,4 @@
-"""Appending to a recording so that a killed program, a full disk or a power cut take as little as can be."""
+"""Appends to a recording so that a killed program, a full disk or a power cut lose as little as possible."""
 
 from __future__ import annotations
 
@@ -27,29 +27,27 @@ if TYPE_CHECKING:
 
 
 class RecordingWriter:
-    """Appends lines to a recording, each as a whole or not at all.
+    """Appends lines to a recording, each completely or not at all.
 
-    A line is in the hands of the kernel when :meth:`write` returns; it is on the disk after the next
-    :meth:`sync`. The file is locked: there is one writer at a time.
+    A line is in the kernel when :meth:`write` returns, and on the disk after the next :meth:`sync`. The file is locked: it
+    has one writer at a time. The caller writes the header and the parameters that begin every session.
 
     Parameters
     ----------
     path
-        A new file, or a recording that is to be continued. Every session begins with a header line and a
-        parameters line, which the caller writes.
+        A new file, or a recording to continue.
     write
-        Hands bytes to the kernel, None: :func:`os.write`; another one for simulations, whose disks fill up and whose programs are
-        killed in the middle of a line.
+        Passes bytes to the kernel, default :func:`os.write`; simulations use one that fails.
 
     Attributes
     ----------
     cut_bytes
-        Length of the torn line that was cut off the end of the file, 0 when it was whole.
+        Length of the torn line that was cut off the end of the file; 0 when it was complete.
 
     Raises
     ------
     RecordingError
-        The file cannot be opened, is no recording, or another program is writing it.
+        The file cannot be opened, is not a recording, or another program is writing it.
     RecordingVersionError
         It is a recording of another version.
     """
@@ -57,7 +55,7 @@ class RecordingWriter:
     def __init__(self, path: Path, *, write: Callable[[int, memoryview], int] | None = None) -> None:
         self._path = path
         self._write_bytes = write
-        self._sync_lock = threading.Lock()  # a sync may be under way in a thread when the owner closes
+        self._sync_lock = threading.Lock()  # a sync may be running in a thread when the owner closes
         self._unsynced = True
         try:
             self._fd = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o644)
@@ -86,7 +84,7 @@ class RecordingWriter:
             ) from error
 
     def _repair(self) -> int:
-        """Bring the file to the end of a line; return how many bytes of a torn one had to go."""
+        """Cut the file off at the end of a line; return the length of a torn one."""
         with open(self._fd, "rb", closefd=False) as file:
             whole_bytes, size = _whole_lines(file)
             file.seek(0)
@@ -115,18 +113,18 @@ class RecordingWriter:
         Raises
         ------
         RecordingError
-            The line could not be written as a whole, and nothing of it was. Later lines may succeed.
+            The line could not be written, and no part of it was. Later lines may succeed.
         """
         self.write_line(encode_line(record))
 
     def write_line(self, line: bytes) -> None:
-        """Append a line that is encoded already, without its line end; raises as :meth:`write`."""
+        """Append an encoded line without its line end; raises as :meth:`write`."""
         try:
             self._append(line + b"\n")
         except OSError as error:
             raise RecordingError(
-                f"a line was left out ({error.strerror}); make room on the disk or check it, "
-                "writing goes on as soon as it can",
+                f"a line was not written ({error.strerror}); free or check the disk, "
+                "writing continues when it works again",
                 path=self._path,
             ) from error
 
@@ -135,16 +133,16 @@ class RecordingWriter:
         size = os.fstat(self._fd).st_size
         rest = memoryview(data)
         try:
-            # Once round, unless the disk fills up within the line: then the second round says so.
+            # One iteration, unless the disk fills up within the line: then the second one raises.
             write = self._write_bytes or os.write
             while rest:
                 rest = rest[write(self._fd, rest) :]
         except OSError:
             self._torn_at = size
-            with suppress(OSError):  # a failing disk may refuse that too; the next line tries again
+            with suppress(OSError):  # may fail too; the next line tries again
                 self._cut_torn_line()
             raise
-        self._unsynced = True  # after the write, so that a sync under way cannot take it for done
+        self._unsynced = True  # after the write, so that a concurrent sync does not count it as synced
 
     def _cut_torn_line(self) -> None:
         if self._torn_at is not None:
@@ -152,12 +150,12 @@ class RecordingWriter:
             self._torn_at = None
 
     def sync(self) -> None:
-        """Return when all lines written so far are on the disk; may be called from another thread.
+        """Bring all lines written so far to the disk; may run in another thread.
 
         Raises
         ------
         RecordingError
-            The disk reports an error; lines since the last good sync may be lost.
+            The disk failed; lines since the last successful sync may be lost.
         """
         with self._sync_lock:
             if not self._unsynced:
@@ -199,7 +197,7 @@ def _is_record(data: bytes) -> bool:
 
 
 def _whole_lines(file: BinaryIO) -> tuple[int, int]:
-    """How many bytes up to the last line end, and in all."""
+    """Return the number of bytes up to the last line end, and in all."""
     size = file.seek(0, os.SEEK_END)
     end = size
     while end > 0:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 from harness.cli import called
 from harness.harmless import Files, check
-from harness.published import write_prisms, write_targets, write_tracks
+from harness.published import CONSTANTS, write_prisms, write_targets, write_tracks
 
 if TYPE_CHECKING:
     from harness.cli import Tsgt
@@ -38,7 +38,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     tracks = write_tracks(folder, duration_s=6.0)
     prisms, targets = write_prisms(folder), write_targets(folder)
     imported = ("import", "rts", "--tracks", *tracks, "--prisms", prisms)
-    assert called(*imported, "--targets", targets, "--output", folder / "r.jsonl").code == 0
+    assert called(*imported, "--targets", targets, *CONSTANTS, "--output", folder / "r.jsonl").code == 0
     assert called(*imported, "--output", folder / "p.jsonl").code == 0
     assert called("process", folder / "r.jsonl", "--output", folder / "r.tum").code == 0
     return {path.name: path.read_text() for path in folder.iterdir()} | SETUP | {"prisms.csv": PRISM_LINES}
@@ -103,7 +103,7 @@ def test_what_is_no_rotation_in_the_parameters_of_a_recording(good: dict[str, st
     changed = json.loads(parameters)
     changed["stations"][1]["T_station1_station"][0][0] *= 0.9
     content = "".join([head, json.dumps(changed) + "\n", *others])
-    refused(good, ("process", "@r.jsonl"), "r.jsonl", content, "which is no rotation")
+    refused(good, ("process", "@r.jsonl"), "r.jsonl", content, "which is not a rotation")
 
 
 @pytest.mark.parametrize("number", ["1e300", "-1e300", "1e9"])
@@ -180,7 +180,7 @@ def test_a_scenario(scenario: str, key: str, number: str) -> None:
     assert re.findall(r"\w+_\w+", key)[0] in outcome.err
 
 
-@pytest.mark.parametrize("key", ["acceleration_correlation_time_s", "angular_acceleration_time_s"])
+@pytest.mark.parametrize("key", ["acceleration_correlation_time_s", "angular_acceleration_correlation_time_s"])
 def test_how_a_robot_moves(good: dict[str, str], key: str) -> None:
     """What no estimator can compute with is an error of the configuration, and names its key."""
     content = with_number(MASTER, key, "1e-300")

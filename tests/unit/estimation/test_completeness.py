@@ -1,6 +1,6 @@
 """Up to when a station's measurements are all here."""
 
-from tsgt.estimation.completeness import Arrivals
+from tsgt.estimation.completeness import CompletenessTracker
 
 SECOND = 1_000_000_000
 LIMIT = 2 * SECOND
@@ -8,7 +8,7 @@ LIMIT = 2 * SECOND
 
 def test_measurements_in_order_are_complete_at_once() -> None:
     """Without a gap the last measurement is the answer."""
-    arrivals = Arrivals(LIMIT)
+    arrivals = CompletenessTracker(LIMIT)
     for sequence in range(3):
         arrivals.add(7 + sequence, sequence * SECOND)
     assert arrivals.complete_ns(2 * SECOND) == 2 * SECOND
@@ -16,7 +16,7 @@ def test_measurements_in_order_are_complete_at_once() -> None:
 
 def test_what_lies_behind_a_gap_does_not_count() -> None:
     """A number that is missing may still come."""
-    arrivals = Arrivals(LIMIT)
+    arrivals = CompletenessTracker(LIMIT)
     arrivals.add(0, SECOND)
     arrivals.add(2, 3 * SECOND)
     assert arrivals.complete_ns(3 * SECOND) == SECOND
@@ -24,7 +24,7 @@ def test_what_lies_behind_a_gap_does_not_count() -> None:
 
 def test_closing_a_gap_completes_what_was_behind_it() -> None:
     """Late measurements may come in any order."""
-    arrivals = Arrivals(LIMIT)
+    arrivals = CompletenessTracker(LIMIT)
     for sequence in (0, 4, 2, 3, 1):
         arrivals.add(sequence, (sequence + 1) * SECOND)
     assert arrivals.complete_ns(5 * SECOND) == 5 * SECOND
@@ -32,7 +32,7 @@ def test_closing_a_gap_completes_what_was_behind_it() -> None:
 
 def test_a_gap_is_not_waited_for_for_ever() -> None:
     """What has not come within the transport limit of the measurement behind it is given up."""
-    arrivals = Arrivals(LIMIT)
+    arrivals = CompletenessTracker(LIMIT)
     arrivals.add(0, SECOND)
     arrivals.add(2, 3 * SECOND)
     arrivals.add(3, 4 * SECOND)
@@ -42,7 +42,7 @@ def test_a_gap_is_not_waited_for_for_ever() -> None:
 
 def test_a_backlog_from_before_the_first_measurement_changes_nothing() -> None:
     """Newest first: what comes after an outage is older than what is known."""
-    arrivals = Arrivals(LIMIT)
+    arrivals = CompletenessTracker(LIMIT)
     arrivals.add(100, 100 * SECOND)
     arrivals.add(99, 99 * SECOND)
     arrivals.add(101, 101 * SECOND)
@@ -51,7 +51,7 @@ def test_a_backlog_from_before_the_first_measurement_changes_nothing() -> None:
 
 def test_a_new_count_is_followed() -> None:
     """A station that has lost its journal counts from the beginning again."""
-    arrivals = Arrivals(LIMIT)
+    arrivals = CompletenessTracker(LIMIT)
     arrivals.add(500, 10 * SECOND)
     arrivals.add(0, 11 * SECOND)
     arrivals.add(1, 12 * SECOND)
@@ -60,9 +60,9 @@ def test_a_new_count_is_followed() -> None:
 
 def test_when_gaps_are_given_up() -> None:
     """Everything up to a time is complete when the measurement behind the last gap before it is too old to wait."""
-    arrivals = Arrivals(LIMIT)
+    arrivals = CompletenessTracker(LIMIT)
     for sequence, second in ((0, 1), (2, 3), (3, 4), (5, 6)):
         arrivals.add(sequence, second * SECOND)
-    given_up_s = [arrivals.given_up_after_ns(second * SECOND) for second in (1, 2, 3, 4, 5, 6, 7)]
+    given_up_s = [arrivals.last_gap_end_ns(second * SECOND) for second in (1, 2, 3, 4, 5, 6, 7)]
     assert given_up_s == [None, 3 * SECOND, 3 * SECOND, 3 * SECOND, 6 * SECOND, 6 * SECOND, None]
     assert arrivals.complete_ns(3 * SECOND + LIMIT + 1) == 4 * SECOND

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from harness.scene import SECOND, START, Scene, with_origin, driving, standing, stationary_scene
+from harness.scene import SECOND, START, Scene, with_origin, driving, at_rest, stationary_scene
 
 from tsgt.errors import DegenerateGeometryError
 from tsgt.estimation import Kind, PoseBatch, Reason
-from tsgt.estimation.continuous import ContinuousPipeline
+from tsgt.estimation.continuous import ContinuousEstimator
 from tsgt.geometry import exp_so3, log_so3, rotation_from_quaternion
 from tsgt.model import PolarMeasurement, PrismPosition, Status
 
@@ -42,7 +42,7 @@ def every(
 
 def stream(scene: Scene, measurements: list[PolarMeasurement], until_s: float) -> tuple[PoseBatch, PoseBatch]:
     """Predicted and smoothed poses of a live run."""
-    pipeline = ContinuousPipeline(scene.parameters)
+    pipeline = ContinuousEstimator(scene.parameters)
     batches = []
     for measurement in sorted(measurements, key=lambda m: m.received_ns):
         batches.append(pipeline.advance(measurement.received_ns))
@@ -130,7 +130,7 @@ def test_a_late_measurement_within_the_lag_changes_smoothed_poses(scene: Scene) 
 
 def test_what_comes_too_late_is_counted(scene: Scene) -> None:
     """Measurements from before the window change nothing any more, and are counted by station."""
-    pipeline = ContinuousPipeline(scene.parameters)
+    pipeline = ContinuousEstimator(scene.parameters)
     for measurement in every(scene, 8.0):
         pipeline.advance(measurement.received_ns)
         pipeline.add(measurement)
@@ -146,7 +146,7 @@ def test_what_was_measured_long_before_the_beginning_is_too_late(scene: Scene) -
         replace(m, stamp_ns=m.stamp_ns - 3600 * SECOND, sequence=m.sequence + 10_000)
         for m in measurements[:6]
     ]
-    pipeline = ContinuousPipeline(scene.parameters)
+    pipeline = ContinuousEstimator(scene.parameters)
     for measurement in (*old, *measurements):
         pipeline.add(measurement)
         pipeline.advance(measurement.received_ns)
@@ -161,7 +161,7 @@ def test_one_from_just_before_the_first_may_come_late(scene: Scene, before_ns: i
     measurements = every(scene, 4.0)
     first_s = (measurements[0].stamp_ns - START - before_ns) / SECOND
     late = scene.measure(2, first_s, delay_s=1.9)
-    pipeline = ContinuousPipeline(scene.parameters)
+    pipeline = ContinuousEstimator(scene.parameters)
     pipeline.begin_at(START - round(begun_s * SECOND))
     for measurement in sorted([*measurements, late], key=lambda m: m.received_ns):
         pipeline.advance(measurement.received_ns)
@@ -250,7 +250,7 @@ def test_prisms_that_miss_their_layout_are_the_reason(scene: Scene) -> None:
 
 def test_a_robot_upside_down_is_refused() -> None:
     """It leans further than the limit: a mirrored layout, or swapped prisms."""
-    _, position = standing(0.0)
+    _, position = at_rest(0.0)
     scene = stationary_scene().with_limits(estimator="continuous")
     scene = scene.moving(lambda _: (exp_so3(np.array([3.0, 0.0, 0.0])), position))
     _, smoothed = stream(scene, every(scene, 8.0), 8.0)
@@ -267,7 +267,7 @@ def test_no_noise_of_the_instruments_without_its_scale(scene: Scene) -> None:
 
 def test_the_deadline_is_the_next_epoch(scene: Scene) -> None:
     """Before the first measurement nothing waits; then a pose is due at each epoch."""
-    pipeline = ContinuousPipeline(scene.parameters)
+    pipeline = ContinuousEstimator(scene.parameters)
     assert pipeline.next_deadline_ns() is None
     pipeline.begin_at(START + 1)
     pipeline.add(scene.measure(1, 0.0))
@@ -280,17 +280,17 @@ def test_a_layout_in_a_line_is_refused(scene: Scene) -> None:
     """No pose can come of it."""
     line = tuple(PrismPosition(prism=p, position_m=(float(p), 0.0, 0.0)) for p in (1, 2, 3))
     with pytest.raises(DegenerateGeometryError):
-        ContinuousPipeline(replace(scene.parameters, prisms=line))
+        ContinuousEstimator(replace(scene.parameters, prisms=line))
 
 
 def test_memory_is_bounded(scene: Scene) -> None:
     """After a minute it keeps no more than after ten seconds."""
-    pipeline = ContinuousPipeline(scene.parameters)
+    pipeline = ContinuousEstimator(scene.parameters)
     sizes = []
     for measurement in [*every(scene, 30.0), *(scene.measure(3, 30.0, status=Status.TILT),)]:
         pipeline.advance(measurement.received_ns)
         pipeline.add(measurement)
-        sizes.append(len(pipeline._seen.times_ns))
+        sizes.append(len(pipeline._history.times_ns))
     assert max(sizes[75:]) <= max(sizes[:75])
 
 

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.scene import LAYOUT, SECOND, START, driving, standing, stationary_scene
+from harness.scene import LAYOUT, SECOND, START, driving, at_rest, stationary_scene
 
 from tsgt.errors import DegenerateGeometryError
-from tsgt.estimation import Pipeline, PoseBatch, Reason
+from tsgt.estimation import LinearEstimator, PoseBatch, Reason
 from tsgt.geometry import exp_so3, log_so3, rotation_from_quaternion
 from tsgt.model import TRACKING_NOISE, PrismPosition, Status
 
@@ -33,7 +33,7 @@ def scene() -> Scene:
 
 def poses_of(scene: Scene, measurements: Sequence[PolarMeasurement], until_s: float) -> PoseBatch:
     """All poses that are decided at so many seconds after the start, everything added at once."""
-    pipeline = Pipeline(scene.parameters)
+    pipeline = LinearEstimator(scene.parameters)
     for measurement in measurements:
         pipeline.add(measurement)
     return pipeline.advance(START + round(until_s * SECOND))
@@ -49,7 +49,7 @@ def every(
 def test_a_standing_robot_is_where_it_stands(scene: Scene) -> None:
     """Exact measurements give the exact pose, at every epoch between the first and the last of them."""
     poses = poses_of(scene, every(scene, [0.0, 0.4]), until_s=0.4)
-    rotation, position = standing(0.0)
+    rotation, position = at_rest(0.0)
     assert poses.valid.tolist() == [False] + [True] * 8  # nothing brackets the very first instant
     np.testing.assert_allclose(poses.position_m[1:], np.broadcast_to(position, (8, 3)), atol=1e-9)
     quaternion = poses.orientation_xyzw[1]
@@ -76,7 +76,7 @@ def test_epochs_are_whole_multiples_of_the_period(scene: Scene) -> None:
 
 def test_a_pose_waits_for_the_last_station_and_no_longer(scene: Scene) -> None:
     """Nothing is due while one station may still measure; everything is due with its measurement."""
-    pipeline = Pipeline(scene.parameters)
+    pipeline = LinearEstimator(scene.parameters)
     for measurement in [*every(scene, [0.0]), *every(scene, [0.4], stations=(1, 2))]:
         pipeline.add(measurement)
     assert len(pipeline.advance(START + SECOND // 2)) == 1  # the first epoch, which nothing precedes
@@ -88,7 +88,7 @@ def test_a_pose_waits_for_the_last_station_and_no_longer(scene: Scene) -> None:
 
 def test_a_pose_waits_for_a_measurement_that_is_sent_again(scene: Scene) -> None:
     """A gap in a station's numbers is not bridged by a straight line while what is missing may still come."""
-    pipeline = Pipeline(scene.parameters)
+    pipeline = LinearEstimator(scene.parameters)
     for measurement in every(scene, [0.0, 0.4, 0.8], stations=(1, 2)):
         pipeline.add(replace(measurement, sequence=round((measurement.stamp_ns - START) / (0.4 * SECOND))))
     pipeline.add(scene.measure(3, 0.0))
@@ -113,7 +113,7 @@ def test_an_interval_longer_than_the_outage_limit_is_invalid(scene: Scene, gap_s
 
 def test_a_silent_station_is_given_up_at_the_deadline(scene: Scene) -> None:
     """An epoch is called an outage when its last chance has passed, at the instant announced."""
-    pipeline = Pipeline(scene.parameters)
+    pipeline = LinearEstimator(scene.parameters)
     for measurement in [*every(scene, [0.0]), *every(scene, [0.5, 1.0, 1.5, 2.0], stations=(1, 2))]:
         pipeline.add(measurement)
     pipeline.advance(START + 2 * SECOND)
@@ -192,7 +192,7 @@ def test_a_degenerate_layout_is_refused_at_the_start(scene: Scene) -> None:
     """No pipeline is made for prisms that cannot give a pose."""
     together = tuple(PrismPosition(prism=i, position_m=(0.0, 0.0, float(i // 3))) for i in (1, 2, 3))
     with pytest.raises(DegenerateGeometryError, match="prisms 1 and 2"):
-        Pipeline(replace(scene.parameters, prisms=together))
+        LinearEstimator(replace(scene.parameters, prisms=together))
 
 
 def test_latency_is_taken_off_the_stamp(scene: Scene) -> None:
@@ -312,7 +312,7 @@ def test_a_stamp_from_the_future_stops_nothing(scene: Scene) -> None:
 
 def test_a_live_run_begins_when_it_begins(scene: Scene) -> None:
     """A station that begins in another year does not make the live stream begin there."""
-    pipeline = Pipeline(scene.parameters)
+    pipeline = LinearEstimator(scene.parameters)
     pipeline.begin_at(START)
     for measurement in [scene.measure(2, -40_000_000.0, delay_s=40_000_000.0), *every(scene, [0.0, 0.4])]:
         pipeline.add(measurement)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from harness.scene import START, stationary_scene
 
-from tsgt.estimation import Feed
+from tsgt.estimation import LiveEstimator
 from tsgt.model import PolarMeasurement
 from tsgt.recording import PoseRecord
 
@@ -12,7 +12,7 @@ from tsgt.recording import PoseRecord
 def test_a_measurement_is_followed_by_the_poses_that_it_completes() -> None:
     """A reader has every measurement that a pose is made of before the pose."""
     scene = stationary_scene()
-    feed = Feed(scene.parameters)
+    feed = LiveEstimator(scene.parameters)
     records = [
         r
         for time_s in (0.0, 0.1)
@@ -28,7 +28,7 @@ def test_a_measurement_is_followed_by_the_poses_that_it_completes() -> None:
 def test_what_was_due_before_comes_before() -> None:
     """A pose whose deadline passed before a measurement arrived stands before that measurement."""
     scene = stationary_scene()
-    feed = Feed(scene.parameters)
+    feed = LiveEstimator(scene.parameters)
     feed.measurement(scene.measure(1, 0.0))
     late = feed.measurement(scene.measure(1, 10.0))
     assert isinstance(late[0], PoseRecord)
@@ -38,7 +38,7 @@ def test_what_was_due_before_comes_before() -> None:
 def test_the_record_says_when_the_pipeline_had_it() -> None:
     """A measurement handed over after a later instant is recorded with that instant, for the replay's sake."""
     scene = stationary_scene()
-    feed = Feed(scene.parameters)
+    feed = LiveEstimator(scene.parameters)
     feed.advance(START + 5_000_000_000)
     records = feed.measurement(scene.measure(1, 0.0))
     assert isinstance(records[0], PolarMeasurement)
@@ -49,7 +49,7 @@ def test_the_record_says_when_the_pipeline_had_it() -> None:
 def test_the_deadline_is_that_of_the_pipeline() -> None:
     """Before the first measurement nothing waits; after it something does."""
     scene = stationary_scene()
-    feed = Feed(scene.parameters)
+    feed = LiveEstimator(scene.parameters)
     assert feed.next_deadline_ns() is None
     feed.measurement(scene.measure(1, 0.0))
     assert feed.next_deadline_ns() == START + 2_000_000_001

@@ -7,7 +7,7 @@ import pytest
 from harness.scene import START, Motion, stationary_scene
 
 from tsgt.estimation import build_observations
-from tsgt.estimation.observations import INSTRUMENT_TIME_SIGMA_S, LEAST_SIGMA_M, middle_m
+from tsgt.estimation.observations import INSTRUMENT_TIME_SIGMA_S, MIN_SIGMA_M, centroid_m
 from tsgt.geometry import exp_so3, log_so3
 from tsgt.geometry.trajectory import fit_trajectory
 from tsgt.model import InstrumentNoise, MotionPrior, PointMeasurement
@@ -46,7 +46,7 @@ def test_no_measurement_is_without_noise() -> None:
         position_m=(1.0, 2.0, 3.0),
     )
     observations, _ = build_observations(parameters, [polar, point], origin_ns=START)
-    assert observations.sigmas_m.tolist() == [[LEAST_SIGMA_M] * 3] * 2
+    assert observations.sigmas_m.tolist() == [[MIN_SIGMA_M] * 3] * 2
 
 
 def test_a_time_that_is_imported_is_taken_at_its_word() -> None:
@@ -75,7 +75,7 @@ def test_times_that_are_off_as_in_an_instruments_first_minute_make_no_pose_over_
     states, covariance = fit_trajectory(observations, prior=MotionPrior(), noise_scale=1.0).trajectory.at(times_s)
     rotation, position = (np.array(part) for part in zip(*map(fast, times_s.tolist()), strict=True))
     turned = log_so3(np.swapaxes(states.rotation, 1, 2) @ rotation)
-    middle = position + rotation @ middle_m(SCENE.parameters)
+    middle = position + rotation @ centroid_m(SCENE.parameters)
     errors = np.concatenate([middle - states.position, turned], axis=1)
     nees = np.einsum("ni,ni->n", errors, np.linalg.solve(covariance[:, :6, :6], errors[..., None])[..., 0])
     assert nees.max() < 20.0

@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 import numpy as np
-from harness.scene import SECOND, START, standing, stationary_scene
+from harness.scene import SECOND, START, at_rest, stationary_scene
 
-from tsgt.estimation import ContinuousPoses, Reason, Seen
+from tsgt.estimation import ContinuousPoseOutput, Reason, MeasurementHistory
 from tsgt.geometry.trajectory import States
 
 NONE = np.empty(0, np.int64)
-SEEN = Seen(NONE, NONE, NONE.astype(np.intp), np.empty(0), [NONE] * 3)
+SEEN = MeasurementHistory(NONE, NONE, NONE.astype(np.intp), np.empty(0), [NONE] * 3)
 
 
 def test_a_covariance_that_rounding_has_spoilt_is_not_valid() -> None:
     """A variance below zero says nothing of the position, however well the rotation is known."""
     parameters = stationary_scene().with_limits(estimator="continuous").parameters
-    rotation, position = standing(0.0)
+    rotation, position = at_rest(0.0)
     still = np.zeros((2, 3))
     states = States(
         np.array([0.0, 1.0]), np.array([position] * 2), np.array([rotation] * 2), still, still, still, still
     )
     covariance = np.array([np.diag([1e-6] * 3 + [1e-4] * 3), np.diag([-1e-3] * 3 + [1e-4] * 3)])
     stamp_ns = np.array([START, START + SECOND])
-    poses = ContinuousPoses(parameters).smoothed(stamp_ns, SEEN, states, covariance)
+    poses = ContinuousPoseOutput(parameters).smoothed(stamp_ns, SEEN, states, covariance)
     assert poses.valid.tolist() == [True, False]
     assert poses.reason[1] == Reason.OUTAGE

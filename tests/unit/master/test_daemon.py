@@ -18,7 +18,7 @@ from harness.scene import START, driving, stationary_scene
 from tsgt.config import GeofenceConfig
 from tsgt.errors import RadioError
 from tsgt.geometry import rotation_from_quaternion
-from tsgt.master.geofence import run_fence_command
+from tsgt.master.geofence import run_geofence_command
 from tsgt.master.replay import replayed
 from tsgt.model import PolarMeasurement, Status
 from tsgt.recording import ClockRecord, EventRecord, PoseRecord, StatusRecord, encode_line, read_lines
@@ -308,9 +308,9 @@ def test_a_fence_runs_its_command(tmp_path: Path) -> None:
 
     async def commands() -> None:
         script = f'echo "$TSGT_EVENT $TSGT_FENCE" > {tmp_path}/said'
-        await run_fence_command(("sh", "-c", script), event="geofence_exited", fence="yard")
-        await run_fence_command(("/nonexistent",), event="geofence_exited", fence="yard")
-        await run_fence_command(("false",), event="geofence_exited", fence="yard")
+        await run_geofence_command(("sh", "-c", script), event="geofence_exited", fence="yard")
+        await run_geofence_command(("/nonexistent",), event="geofence_exited", fence="yard")
+        await run_geofence_command(("false",), event="geofence_exited", fence="yard")
 
     run(commands)
     assert (tmp_path / "said").read_text() == "geofence_exited yard\n"
@@ -322,8 +322,8 @@ def test_no_name_of_a_fence_is_a_command(tmp_path: Path) -> None:
 
     async def commands() -> None:
         script = f'printf %s "$TSGT_FENCE" > {tmp_path}/said'
-        await run_fence_command(("sh", "-c", script), event="geofence_exited", fence=name)
-        await run_fence_command(("touch", f"{tmp_path}/$TSGT_FENCE"), event="geofence_exited", fence=name)
+        await run_geofence_command(("sh", "-c", script), event="geofence_exited", fence=name)
+        await run_geofence_command(("touch", f"{tmp_path}/$TSGT_FENCE"), event="geofence_exited", fence=name)
 
     run(commands)
     assert (tmp_path / "said").read_text() == name

@@ -54,7 +54,7 @@ def test_the_first_pose_beyond_the_boundary_gives_the_event() -> None:
     assert watched.pose(at(9.9, 5.0), START) == []
     (event,) = watched.pose(at(10.25, 5.0), START + 7)
     assert (event.event, event.stamp_ns) == ("geofence_exited", START + 7)
-    assert event.message == "fence yard left: the robot is 0.25 m beyond its limit at x 10.25, y 5.00 m"
+    assert event.message == "geofence yard exited: the robot is 0.25 m beyond its limit at x 10.25, y 5.00 m"
 
 
 def test_a_robot_that_starts_beyond_is_told_of_at_once() -> None:
@@ -69,16 +69,19 @@ def test_it_is_back_only_beyond_the_hysteresis() -> None:
     assert run(fence(), poses) == ["", "geofence_exited", "", "", "", "geofence_entered", ""]
 
 
-def test_keep_outside_turns_it_round() -> None:
+def test_allowed_side_outside_turns_it_round() -> None:
     """An area that is forbidden is left by driving into it."""
     poses = [at(x, 5) for x in (12.0, 10.1, 9.9, 10.4, 10.6)]
-    assert run(fence(keep="outside"), poses) == ["", "", "geofence_exited", "", "geofence_entered"]
+    assert run(fence(allowed_side="outside"), poses) == ["", "", "geofence_exited", "", "geofence_entered"]
 
 
 def test_the_margin_keeps_the_origin_away() -> None:
     """A robot whose front is a metre ahead of its origin has to turn a metre earlier."""
     assert run(fence(margin_m=1.0), [at(8.9, 5), at(9.1, 5)]) == ["", "geofence_exited"]
-    assert run(fence(margin_m=1.0, keep="outside"), [at(11.1, 5), at(10.9, 5)]) == ["", "geofence_exited"]
+    assert run(fence(margin_m=1.0, allowed_side="outside"), [at(11.1, 5), at(10.9, 5)]) == [
+        "",
+        "geofence_exited",
+    ]
 
 
 def test_the_uncertainty_counts_across_the_edge_only() -> None:
@@ -108,10 +111,10 @@ def test_on_the_boundary_the_uncertainty_counts_as_well() -> None:
 
 @given(
     x=st.floats(-2, 11), y=st.floats(-2, 11), sx=st.floats(0, 1), sy=st.floats(0, 1), rho=st.floats(-0.99, 0.99),
-    keep=st.sampled_from(["inside", "outside"]), margin=st.floats(0, 1),
+    allowed_side=st.sampled_from(["inside", "outside"]), margin=st.floats(0, 1),
 )  # fmt: skip
 def test_it_agrees_with_brute_force(
-    x: float, y: float, sx: float, sy: float, rho: float, keep: str, margin: float
+    x: float, y: float, sx: float, sy: float, rho: float, allowed_side: str, margin: float
 ) -> None:
     """Oracle: every point of the boundary in steps of 5 mm; left if any of them is too near in sigmas, or beyond."""
     corners = np.array(BAY)
@@ -120,7 +123,7 @@ def test_it_agrees_with_brute_force(
         [a * (1 - steps) + b * steps for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
     ) - [x, y]
     inside = 0 < x < 9 and 0 < y < 9 and not (3 < x < 6 and y > 3)
-    left_at_all = inside != (keep == "inside")
+    left_at_all = inside != (allowed_side == "inside")
     # Per edge the nearest point counts, in its own direction.
     per_edge = offsets.reshape(len(BAY), -1, 2)
     lengths = np.linalg.norm(per_edge, axis=2)
@@ -136,7 +139,9 @@ def test_it_agrees_with_brute_force(
         return
     expected = "geofence_exited" if left_at_all or spare < 0 else ""
     pose = at(x, y, sigma_x_m=sx, sigma_y_m=sy, rho=rho)
-    assert run(fence(polygon_m=BAY, sigmas=2.0, keep=keep, margin_m=margin), [pose]) == [expected]
+    assert run(fence(polygon_m=BAY, sigmas=2.0, allowed_side=allowed_side, margin_m=margin), [pose]) == [
+        expected
+    ]
 
 
 @given(st.lists(st.tuples(st.floats(-2, 12), st.floats(-2, 12), st.integers(0, 3 * SECOND)), max_size=30))
@@ -161,7 +166,7 @@ def test_no_valid_pose_for_a_while_counts_as_leaving() -> None:
     assert watched.tick(START + 2 * SECOND - 1) == []
     (event,) = watched.tick(START + 2 * SECOND)
     assert event.event == "geofence_exited"
-    assert event.message == "fence yard left: no valid pose for 2 s"
+    assert event.message == "geofence yard exited: no valid pose for 2 s"
     assert watched.next_deadline_ns() is None
     assert watched.tick(START + 9 * SECOND) == []
     # Within the hysteresis: it was loss that made it leave, not the boundary.

@@ -13,8 +13,8 @@ from harness.records import NO_POSE, POSE, SECOND, START
 from tsgt.analysis.formats import read_prisms, read_tracks
 from tsgt.analysis.rts_import import point_measurements
 from tsgt.config import FrameWatchConfig, ScenarioConfig, scenario_parameters
-from tsgt.estimation import Feed
-from tsgt.master.layout_monitor import FrameWatch
+from tsgt.estimation import LiveEstimator
+from tsgt.master.layout_monitor import LayoutMonitor
 from tsgt.model import Parameters, StationParameters
 from tsgt.recording import PoseRecord, StationShare
 from tsgt.simulation.world import World
@@ -48,7 +48,7 @@ def pose(number: int, residual_mm: float, *, speed_mps: float = 0.0, reason: Rea
 
 def events(poses: Iterable[PoseRecord], **settings: float) -> list[EventRecord]:
     """Watch poses; all events."""
-    watch = FrameWatch(FrameWatchConfig.model_validate(settings), PERIOD_NS)
+    watch = LayoutMonitor(FrameWatchConfig.model_validate(settings), PERIOD_NS)
     return [event for each in poses for event in watch.pose(each, each.stamp_ns + 7)]
 
 
@@ -57,9 +57,9 @@ def test_the_alarm_names_station_and_figures() -> None:
     (event,) = events([pose(n, 4.0) for n in range(200)] + [pose(200 + n, 9.0) for n in range(300)])
     assert (event.event, event.station) == ("layout_residual_high", 2)
     assert event.message == (
-        "the prisms miss their layout by 9.0 mm, allowed are 6.0 mm (medians over 10 s): a tripod or a prism has moved, "
-        "likeliest that of station 2; check with tsgt calibrate check; a movement across the plane of three prisms "
-        "would not show"
+        "the prisms miss their layout by 9.0 mm, limit 6.0 mm (medians over 10 s): a tripod or a prism has moved, "
+        "most likely of station 2; check with tsgt calibrate check; a movement across the plane of three prisms "
+        "is not observable"
     )
     # Three quarters of a window after the step, and stamped when it was noticed.
     assert event.stamp_ns == START + 349 * PERIOD_NS + 7
@@ -107,7 +107,7 @@ def test_poses_with_too_large_a_residual_count_and_others_without_validity_do_no
 def live(parameters: Parameters, measurements: Iterable[Measurement]) -> list[PoseRecord]:
     """Make the poses that the master would have sent."""
     pipeline = dataclasses.replace(parameters.pipeline, estimator="linear")
-    feed = Feed(dataclasses.replace(parameters, pipeline=pipeline))
+    feed = LiveEstimator(dataclasses.replace(parameters, pipeline=pipeline))
     return [r for m in measurements for r in feed.measurement(m) if isinstance(r, PoseRecord)]
 
 

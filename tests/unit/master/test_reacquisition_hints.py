@@ -13,7 +13,12 @@ from hypothesis import strategies as st
 
 from tsgt.config import ScenarioConfig
 from tsgt.geometry import exp_so3, polar_to_cartesian
-from tsgt.master.reacquisition_hints import AGAIN_NS, SELDOM_NS, TRIES, Searches
+from tsgt.master.reacquisition_hints import (
+    HINT_INTERVAL_NS,
+    MAX_FREQUENT_HINTS,
+    SLOW_HINT_INTERVAL_NS,
+    ReacquisitionHints,
+)
 from tsgt.model import Status
 from tsgt.simulation.world import scenario_world
 
@@ -35,7 +40,7 @@ def ns(time_s: float) -> int:
 
 
 def watch(
-    searches: Searches,
+    hints: ReacquisitionHints,
     scene: Scene,
     *,
     since_s: float = 0.0,
@@ -50,7 +55,7 @@ def watch(
             time_s = STEP_S * step + 0.01 * station
             status = sees(station, time_s)
             if status is not None:
-                searches.measured(scene.measure(station, time_s, status=status))
+                hints.measured(scene.measure(station, time_s, status=status))
 
 
 def beside_rad(scene: Scene, towards: Direction, time_s: float, *, station: int = 2, prism: int = 0) -> float:
@@ -64,30 +69,30 @@ def beside_rad(scene: Scene, towards: Direction, time_s: float, *, station: int 
 def test_a_station_without_its_prism_is_told_where_it_is() -> None:
     """After two seconds, to within what the layout leaves open: 0.8 m in 38 m, and half a metre more."""
     scene = stationary_scene()
-    searches = Searches(scene.parameters)
-    watch(searches, scene)
-    assert searches.towards(2, ns(12.0)) is None
-    towards = searches.towards(2, ns(12.5))
+    hints = ReacquisitionHints(scene.parameters)
+    watch(hints, scene)
+    assert hints.direction(2, ns(12.0)) is None
+    towards = hints.direction(2, ns(12.5))
     assert towards is not None
     assert beside_rad(scene, towards, 12.5) < towards.spread_rad < math.radians(2.5)
-    assert searches.towards(1, ns(12.5)) is None
+    assert hints.direction(1, ns(12.5)) is None
 
 
 def test_angles_alone_are_no_prism() -> None:
     """An instrument that has lost it may still tell its angles."""
     scene = stationary_scene()
-    searches = Searches(scene.parameters)
-    watch(searches, scene, sees=lambda s, t: Status.ANGLE_ONLY if s == 2 and t > LOST_S else Status.OK)
-    assert searches.towards(2, ns(12.5)) is not None
+    hints = ReacquisitionHints(scene.parameters)
+    watch(hints, scene, sees=lambda s, t: Status.ANGLE_ONLY if s == 2 and t > LOST_S else Status.OK)
+    assert hints.direction(2, ns(12.5)) is not None
 
 
 @pytest.mark.parametrize("status", [Status.TILT, Status.ERROR, Status.WRONG_DISTANCE, Status.LOW_ACCURACY])
 def test_who_has_another_trouble_is_left_alone(status: Status) -> None:
     """Looking for a prism does not level an instrument."""
     scene = stationary_scene()
-    searches = Searches(scene.parameters)
-    watch(searches, scene, sees=lambda s, t: status if s == 2 and t > LOST_S else Status.OK)
-    assert searches.towards(2, ns(12.5)) is None
+    hints = ReacquisitionHints(scene.parameters)
+    watch(hints, scene, sees=lambda s, t: status if s == 2 and t > LOST_S else Status.OK)
+    assert hints.direction(2, ns(12.5)) is None
 
 
 def motion(
@@ -122,9 +127,9 @@ def test_the_prism_is_within_the_spread(
 ) -> None:
     """However the robot drives and leans, by one other prism as by two, for a second and a half from now on."""
     scene = stationary_scene().moving(motion(speed_mps, yaw_rate_radps, heading_rad, tilt_rad))
-    searches = Searches(scene.parameters)
-    watch(searches, scene, sees=lambda s, t: Status.NO_TARGET if s in lost and t > LOST_S else Status.OK)
-    towards = searches.towards(2, ns(12.6))
+    hints = ReacquisitionHints(scene.parameters)
+    watch(hints, scene, sees=lambda s, t: Status.NO_TARGET if s in lost and t > LOST_S else Status.OK)
+    towards = hints.direction(2, ns(12.6))
     assert towards is not None
     for ahead_s in (0.0, 0.5, 1.0, 1.5):
         assert beside_rad(scene, towards, 12.6 + ahead_s) <= towards.spread_rad
@@ -142,11 +147,11 @@ def test_the_prism_is_found_in_the_reference_scenario() -> None:
     scene = stationary_scene().moving(motion)
     inside = []
     for begin_s in range(0, 590, 5):
-        searches = Searches(scene.parameters)
+        hints = ReacquisitionHints(scene.parameters)
         lost = partial(_loses, from_s=begin_s + 0.5)
-        watch(searches, scene, since_s=begin_s, until_s=begin_s + 3.0, sees=lost)
+        watch(hints, scene, since_s=begin_s, until_s=begin_s + 3.0, sees=lost)
         now_s = begin_s + 3.1
-        towards = searches.towards(2, ns(now_s))
+        towards = hints.direction(2, ns(now_s))
         assert towards is not None
         inside.append(
             [beside_rad(scene, towards, now_s + ahead_s) <= towards.spread_rad for ahead_s in (0.0, 1.0, 2.0)]
@@ -165,43 +170,41 @@ def _loses(station: int, time_s: float, *, from_s: float) -> Status:
 def test_nobody_sees_the_robot() -> None:
     """Then nobody knows where it is: all have lost it, or what came of it is too old."""
     scene = stationary_scene()
-    searches = Searches(scene.parameters)
-    watch(searches, scene, sees=lambda _, t: Status.NO_TARGET if t > LOST_S else Status.OK)
-    assert searches.towards(2, ns(12.5)) is None
-    searches = Searches(scene.parameters)
-    watch(searches, scene, until_s=12.0)
-    assert searches.towards(2, ns(12.5)) is not None
-    searches = Searches(scene.parameters)
-    watch(searches, scene, until_s=12.0)
-    assert searches.towards(2, ns(13.3)) is None
+    hints = ReacquisitionHints(scene.parameters)
+    watch(hints, scene, sees=lambda _, t: Status.NO_TARGET if t > LOST_S else Status.OK)
+    assert hints.direction(2, ns(12.5)) is None
+    hints = ReacquisitionHints(scene.parameters)
+    watch(hints, scene, until_s=12.0)
+    assert hints.direction(2, ns(12.5)) is not None
+    hints = ReacquisitionHints(scene.parameters)
+    watch(hints, scene, until_s=12.0)
+    assert hints.direction(2, ns(13.3)) is None
 
 
 def test_one_point_is_not_enough() -> None:
     """It does not tell how fast the robot is."""
     scene = stationary_scene()
-    searches = Searches(scene.parameters)
-    watch(
-        searches, scene, sees=lambda s, t: Status.NO_TARGET if s == 2 else (Status.OK if t > 12.3 else None)
-    )
-    assert searches.towards(2, ns(12.5)) is None
+    hints = ReacquisitionHints(scene.parameters)
+    watch(hints, scene, sees=lambda s, t: Status.NO_TARGET if s == 2 else (Status.OK if t > 12.3 else None))
+    assert hints.direction(2, ns(12.5)) is None
 
 
 def test_a_robot_that_is_very_near_may_be_anywhere() -> None:
     """No direction says anything where the robot is about as large as its distance."""
     near = stationary_scene().moving(lambda _: (np.eye(3), np.array([2.5, -2.0, -1.0])))
-    searches = Searches(near.parameters)
-    watch(searches, near)
-    assert searches.towards(2, ns(12.5)) is None
+    hints = ReacquisitionHints(near.parameters)
+    watch(hints, near)
+    assert hints.direction(2, ns(12.5)) is None
 
 
 def test_another_station_on_the_same_prism_knows_best() -> None:
     """Where stations outnumber prisms; only its start is left open."""
     scene = stationary_scene()
-    searches = Searches(scene.parameters)
-    watch(searches, scene)
+    hints = ReacquisitionHints(scene.parameters)
+    watch(hints, scene)
     for step in range(25, 32):
-        searches.measured(scene.measure(1, STEP_S * step + 0.05, prism=2))
-    towards = searches.towards(2, ns(12.5))
+        hints.measured(scene.measure(1, STEP_S * step + 0.05, prism=2))
+    towards = hints.direction(2, ns(12.5))
     assert towards is not None
     assert beside_rad(scene, towards, 12.5) < 1e-4
     assert towards.spread_rad == pytest.approx(0.5 / 38, rel=0.1)
@@ -210,8 +213,8 @@ def test_another_station_on_the_same_prism_knows_best() -> None:
 def test_the_direction_is_in_the_face_of_the_telescope() -> None:
     """Who measures in the second face would have to turn over otherwise."""
     scene = stationary_scene()
-    searches, turned = Searches(scene.parameters), Searches(scene.parameters)
-    watch(searches, scene)
+    hints, turned = ReacquisitionHints(scene.parameters), ReacquisitionHints(scene.parameters)
+    watch(hints, scene)
     for step in range(32):
         for station in (1, 2, 3):
             time_s = STEP_S * step + 0.01 * station
@@ -224,7 +227,7 @@ def test_the_direction_is_in_the_face_of_the_telescope() -> None:
                     zenith_angle_rad=math.tau - first.zenith_angle_rad,
                 )
             )
-    one, two = searches.towards(2, ns(12.5)), turned.towards(2, ns(12.5))
+    one, two = hints.direction(2, ns(12.5)), turned.direction(2, ns(12.5))
     assert one is not None
     assert two is not None
     assert two.zenith_angle_rad == pytest.approx(math.tau - one.zenith_angle_rad)
@@ -235,26 +238,31 @@ def test_the_direction_is_in_the_face_of_the_telescope() -> None:
 def test_a_direction_holds_for_five_seconds_and_then_comes_anew() -> None:
     """From the points of then; after six of them only every half minute, and none in between."""
     scene = stationary_scene().moving(driving)
-    searches = Searches(scene.parameters)
+    hints = ReacquisitionHints(scene.parameters)
     told: list[tuple[float, Direction | None]] = [(0.0, None)]
     for tenth in range(1000):
         time_s = 0.1 * tenth
-        watch(searches, scene, since_s=time_s, until_s=time_s + 0.1)
-        towards = searches.towards(2, ns(time_s + 0.2))
+        watch(hints, scene, since_s=time_s, until_s=time_s + 0.1)
+        towards = hints.direction(2, ns(time_s + 0.2))
         if towards is not told[-1][1]:
             told.append((time_s + 0.2, towards))
     changes_s = [round(time_s - told[1][0], 6) for time_s, _ in told[1:]]
-    again_s, seldom_s = AGAIN_NS / SECOND, SELDOM_NS / SECOND
+    again_s, seldom_s = HINT_INTERVAL_NS / SECOND, SLOW_HINT_INTERVAL_NS / SECOND
     assert changes_s == pytest.approx(
         [
-            *(again_s * number for number in range(TRIES + 1)),
-            again_s * (TRIES - 1) + seldom_s,
-            again_s * TRIES + seldom_s,
-            again_s * (TRIES - 1) + 2 * seldom_s,
+            *(again_s * number for number in range(MAX_FREQUENT_HINTS + 1)),
+            again_s * (MAX_FREQUENT_HINTS - 1) + seldom_s,
+            again_s * MAX_FREQUENT_HINTS + seldom_s,
+            again_s * (MAX_FREQUENT_HINTS - 1) + 2 * seldom_s,
         ],
         abs=0.11,
     )
-    assert [towards is None for _, towards in told[1:]] == [False] * TRIES + [True, False, True, False]
+    assert [towards is None for _, towards in told[1:]] == [False] * MAX_FREQUENT_HINTS + [
+        True,
+        False,
+        True,
+        False,
+    ]
     for time_s, towards in told:
         assert towards is None or beside_rad(scene, towards, time_s) <= towards.spread_rad
 
@@ -262,16 +270,16 @@ def test_a_direction_holds_for_five_seconds_and_then_comes_anew() -> None:
 def test_who_has_its_prism_again_needs_no_direction() -> None:
     """At once; and when it loses it again, it is told again after two seconds."""
     scene = stationary_scene()
-    searches = Searches(scene.parameters)
-    watch(searches, scene)
-    first = searches.towards(2, ns(12.5))
+    hints = ReacquisitionHints(scene.parameters)
+    watch(hints, scene)
+    first = hints.direction(2, ns(12.5))
     assert first is not None
-    watch(searches, scene, since_s=12.5, until_s=14.0, sees=lambda _s, _t: Status.OK)
-    assert searches.towards(2, ns(14.0)) is None
-    watch(searches, scene, since_s=14.0, until_s=16.0)
-    assert searches.towards(2, ns(16.0)) is None
-    watch(searches, scene, since_s=16.0, until_s=16.5)
-    again = searches.towards(2, ns(16.5))
+    watch(hints, scene, since_s=12.5, until_s=14.0, sees=lambda _s, _t: Status.OK)
+    assert hints.direction(2, ns(14.0)) is None
+    watch(hints, scene, since_s=14.0, until_s=16.0)
+    assert hints.direction(2, ns(16.0)) is None
+    watch(hints, scene, since_s=16.0, until_s=16.5)
+    again = hints.direction(2, ns(16.5))
     assert again is not None
     assert again is not first
 
@@ -279,25 +287,25 @@ def test_who_has_its_prism_again_needs_no_direction() -> None:
 def test_measurements_that_come_late_count_where_they_belong() -> None:
     """One from before the loss changes nothing; one from within it shows that the prism was there."""
     scene = stationary_scene()
-    before, within = Searches(scene.parameters), Searches(scene.parameters)
-    for searches in (before, within):
-        watch(searches, scene)
+    before, within = ReacquisitionHints(scene.parameters), ReacquisitionHints(scene.parameters)
+    for hints in (before, within):
+        watch(hints, scene)
     before.measured(scene.measure(2, 9.0))
     within.measured(scene.measure(2, 11.5))
-    assert before.towards(2, ns(12.6)) is not None
-    assert within.towards(2, ns(12.6)) is None
-    for searches in (before, within):
-        watch(searches, scene, since_s=12.5, until_s=13.5)
-    assert within.towards(2, ns(13.6)) is not None
+    assert before.direction(2, ns(12.6)) is not None
+    assert within.direction(2, ns(12.6)) is None
+    for hints in (before, within):
+        watch(hints, scene, since_s=12.5, until_s=13.5)
+    assert within.direction(2, ns(13.6)) is not None
 
 
 def test_strangers_and_the_future_are_passed_over() -> None:
     """A station that nobody knows, and a measurement that says to be from tomorrow."""
     scene = stationary_scene()
-    searches = Searches(scene.parameters)
-    searches.measured(replace(scene.measure(1, 1.0), station=9))
+    hints = ReacquisitionHints(scene.parameters)
+    hints.measured(replace(scene.measure(1, 1.0), station=9))
     tomorrow = replace(scene.measure(2, 1.0), stamp_ns=ns(86_400.0))
-    searches.measured(tomorrow)
-    watch(searches, scene)
-    towards = searches.towards(2, ns(12.5))
+    hints.measured(tomorrow)
+    watch(hints, scene)
+    towards = hints.direction(2, ns(12.5))
     assert towards is not None

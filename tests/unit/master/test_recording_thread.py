@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from harness.field import running
 from harness.records import HEADER
 
-from tsgt.master.recording_thread import Disk
+from tsgt.master.recording_thread import RecordingThread
 from tsgt.recording import RecordingWriter
 from tsgt.recording.recorder import Recorder
 
@@ -20,13 +20,13 @@ async def test_lines_are_written_beside_everything_else(tmp_path: Path) -> None:
     """Who wants to know waits for the disk, but not for ever."""
     with RecordingWriter(tmp_path / "run.jsonl") as writer:
         writer.write(HEADER)
-        disk = Disk(Recorder(writer))
+        disk = RecordingThread(Recorder(writer))
         disk.put(b"{}")
         assert disk.written(range(1)) is None
         assert not await disk.flushed(0.015)  # nobody writes
         async with running(disk.run()):
             assert await disk.flushed(0.015)
-            assert disk.written(range(disk.taken)) is True
+            assert disk.written(range(disk.line_count)) is True
             assert not await disk.flushed(0.015)  # nothing to do
             disk.put(b"{}")
             await asyncio.sleep(0)

@@ -11,7 +11,7 @@ from harness.records import EVENT, HEADER
 from harness.scene import START, stationary_scene
 
 from tsgt.errors import CorruptLineError, RecordingError
-from tsgt.estimation import Feed
+from tsgt.estimation import LiveEstimator
 from tsgt.master.replay import replay, replayed
 from tsgt.master.stream_server import StreamServer
 from tsgt.recording import RecordingWriter, encode_line
@@ -25,7 +25,7 @@ SCENE = stationary_scene()
 
 def live_lines(path: Path, seconds: int = 3) -> list[bytes]:
     """Record a short live run, as a master does; return the lines that its readers got."""
-    feed = Feed(SCENE.parameters)
+    feed = LiveEstimator(SCENE.parameters)
     lines: list[bytes] = []
     for step in range(seconds * 10):
         for station in (1, 2, 3):
@@ -63,7 +63,7 @@ def test_recorded_poses_are_made_again_not_copied(tmp_path: Path) -> None:
 def test_poses_of_the_timer_are_replayed_after_a_crash(tmp_path: Path) -> None:
     """When the stations fell silent, poses went on until the master was killed; the replay goes as far."""
     path = tmp_path / "run.jsonl"
-    feed = Feed(SCENE.parameters)
+    feed = LiveEstimator(SCENE.parameters)
     records = [
         r for step in range(5) for s in (1, 2, 3) for r in feed.measurement(SCENE.measure(s, step / 10))
     ]
@@ -102,9 +102,7 @@ def test_a_measurement_without_parameters_is_an_error(tmp_path: Path) -> None:
     with RecordingWriter(path) as writer:
         writer.write(HEADER)
         writer.write(SCENE.measure(1, 0.0))
-    with pytest.raises(
-        RecordingError, match="line 2: a line of type measurement stands before any parameters"
-    ):
+    with pytest.raises(RecordingError, match="line 2: a line of type measurement precedes all parameters"):
         replayed_lines(path)
 
 

@@ -1,4 +1,4 @@
-"""The monitor: what it counts and what it says before anything came."""
+"""The statistics: what it counts and what it says before anything came."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from tsgt.master.statistics import Monitor
+from tsgt.master.link_events import LinkStatus, SuperframeState
+from tsgt.master.statistics import Statistics
 from tsgt.model import PolarMeasurement, Status
 from tsgt.timesync.two_way import ClockEstimate
 
@@ -27,7 +28,7 @@ MEASUREMENT = PolarMeasurement(
 
 def test_before_the_first_measurement() -> None:
     """A silent station is reported, with nulls instead of made-up numbers."""
-    status = Monitor([1, 2]).status(SECOND)
+    status = Statistics([1, 2]).status(SECOND)
     assert [(s.id, s.measurements, s.usable, s.age_s, s.status) for s in status.stations] == [
         (1, 0, 0, None, None),
         (2, 0, 0, None, None),
@@ -36,61 +37,61 @@ def test_before_the_first_measurement() -> None:
 
 def test_counts_what_came_and_what_was_usable() -> None:
     """Measurements without position count, but not as usable; the last status is reported."""
-    monitor = Monitor([1, 2])
-    monitor.measurement(MEASUREMENT)
-    monitor.measurement(replace(MEASUREMENT, sequence=1, stamp_ns=11 * SECOND, status=Status.NO_TARGET))
-    station = monitor.status(12 * SECOND).stations[1]
+    statistics = Statistics([1, 2])
+    statistics.measurement(MEASUREMENT)
+    statistics.measurement(replace(MEASUREMENT, sequence=1, stamp_ns=11 * SECOND, status=Status.NO_TARGET))
+    station = statistics.status(12 * SECOND).stations[1]
     assert (station.measurements, station.usable, station.status) == (2, 1, Status.NO_TARGET)
     assert station.age_s == 1.0
 
 
 def test_a_station_that_nobody_asked_about_is_passed_over() -> None:
     """A foreign station does not appear in the report."""
-    monitor = Monitor([1])
-    monitor.measurement(MEASUREMENT)
-    assert monitor.status(12 * SECOND) == Monitor([1]).status(12 * SECOND)
+    statistics = Statistics([1])
+    statistics.measurement(MEASUREMENT)
+    assert statistics.status(12 * SECOND) == Statistics([1]).status(12 * SECOND)
 
 
 def test_counts_poses() -> None:
     """Valid poses are counted within all poses."""
-    monitor = Monitor([1])
+    statistics = Statistics([1])
     for valid in (True, False, True):
-        monitor.pose(valid=valid)
-    status = monitor.status(SECOND)
+        statistics.pose(valid=valid)
+    status = statistics.status(SECOND)
     assert (status.stamp_ns, status.poses, status.valid_poses) == (SECOND, 3, 2)
 
 
 def test_the_rate_is_that_of_the_last_ten_seconds() -> None:
     """Measurements every 0.5 s are 2 Hz; when no more come the rate falls to nothing."""
-    monitor = Monitor([2])
+    statistics = Statistics([2])
     for n in range(60):
-        monitor.measurement(replace(MEASUREMENT, sequence=n, received_ns=n * SECOND // 2))
-    assert monitor.status(30 * SECOND - 1).stations[0].rate_hz == pytest.approx(2.0)
-    assert monitor.status(34 * SECOND + 1).stations[0].rate_hz == pytest.approx(1.1)
-    assert monitor.status(60 * SECOND).stations[0].rate_hz == 0
+        statistics.measurement(replace(MEASUREMENT, sequence=n, received_ns=n * SECOND // 2))
+    assert statistics.status(30 * SECOND - 1).stations[0].rate_hz == pytest.approx(2.0)
+    assert statistics.status(34 * SECOND + 1).stations[0].rate_hz == pytest.approx(1.1)
+    assert statistics.status(60 * SECOND).stations[0].rate_hz == 0
 
 
 def test_loss_is_the_share_of_the_last_fifty_requests() -> None:
     """Older ones are forgotten."""
-    monitor = Monitor([2])
+    statistics = Statistics([2])
     for n in range(150):
-        monitor.asked(2, answered=n >= 100 and n % 5 > 0)
-    assert monitor.status(SECOND).stations[0].loss == pytest.approx(0.2)
+        statistics.exchange(2, responded=n >= 100 and n % 5 > 0)
+    assert statistics.status(SECOND).stations[0].loss == pytest.approx(0.2)
 
 
 def test_the_last_radio_message_is_shown() -> None:
     """With its strength, and how long ago it was."""
-    monitor = Monitor([2])
-    monitor.heard(2, 3 * SECOND, rssi_dbm=-91.5, snr_db=7.25)
-    station = monitor.status(5 * SECOND).stations[0]
+    statistics = Statistics([2])
+    statistics.packet(2, 3 * SECOND, rssi_dbm=-91.5, snr_db=7.25)
+    station = statistics.status(5 * SECOND).stations[0]
     assert (station.last_heard_s, station.rssi_dbm, station.snr_db) == (2.0, -91.5, 7.25)
 
 
 def test_the_clock_is_asked_for_at_the_time_of_the_status() -> None:
     """Offset and bound are those of now."""
-    monitor = Monitor([2])
-    status = monitor.status(
-        5 * SECOND, clock=lambda station, now_ns: ClockEstimate(now_ns + station, 1, 7, 0.0)
+    statistics = Statistics([2])
+    status = statistics.status(
+        5 * SECOND, LinkStatus(clock=lambda station, now_ns: ClockEstimate(now_ns + station, 1, 7, 0.0))
     )
     station = status.stations[0]
     assert (station.clock_offset_ns, station.clock_bound_ns) == (5 * SECOND + 2, 7)
@@ -101,40 +102,42 @@ def test_the_clock_is_asked_for_at_the_time_of_the_status() -> None:
 )
 def test_a_station_is_locked_while_it_has_a_target(status: Status, locked: bool) -> None:  # noqa: FBT001 (a parameter)
     """By its last measurement; an angle without a distance has a target."""
-    monitor = Monitor([2])
-    monitor.measurement(replace(MEASUREMENT, status=status))
-    assert monitor.status(SECOND).stations[0].locked is locked
+    statistics = Statistics([2])
+    statistics.measurement(replace(MEASUREMENT, status=status))
+    assert statistics.status(SECOND).stations[0].locked is locked
 
 
 def test_a_measurement_that_comes_late_is_counted_but_is_not_the_newest() -> None:
     """After an outage old ones come in between; a new count begins with younger times."""
-    monitor = Monitor([2])
-    monitor.measurement(replace(MEASUREMENT, sequence=9, stamp_bound_ns=5))
+    statistics = Statistics([2])
+    statistics.measurement(replace(MEASUREMENT, sequence=9, stamp_bound_ns=5))
     late = replace(MEASUREMENT, sequence=3, stamp_ns=2 * SECOND, status=Status.TILT, stamp_bound_ns=7)
-    monitor.measurement(late)
-    station = monitor.status(12 * SECOND).stations[0]
+    statistics.measurement(late)
+    station = statistics.status(12 * SECOND).stations[0]
     assert (station.measurements, station.status, station.age_s, station.stamp_bound_ns) == (
         2,
         Status.OK,
         2.0,
         5,
     )
-    monitor.measurement(replace(late, sequence=0, stamp_ns=11 * SECOND))
-    assert monitor.status(12 * SECOND).stations[0].status is Status.TILT
+    statistics.measurement(replace(late, sequence=0, stamp_ns=11 * SECOND))
+    assert statistics.status(12 * SECOND).stations[0].status is Status.TILT
 
 
 def test_how_a_station_stands_on_the_superframe() -> None:
     """Nulls until something is known, as with the other protocol."""
-    monitor = Monitor([2])
-    station = monitor.status(SECOND).stations[0]
+    statistics = Statistics([2])
+    station = statistics.status(SECOND).stations[0]
     assert (station.joined, station.outstanding, station.missed_slots, station.rejected_beacons) == (
         None,
         None,
         None,
         None,
     )
-    monitor.stands(2, joined=True, outstanding=3, missed_slots=4, rejected_beacons=5)
-    status = monitor.status(SECOND, protocol="superframe", authenticated=True, frame_ms=378.5)
+    statistics.superframe_state(
+        SuperframeState(2, joined=True, outstanding=3, missed_slots=4, rejected_beacons=5)
+    )
+    status = statistics.status(SECOND, LinkStatus(protocol="superframe", authenticated=True, frame_ms=378.5))
     assert (status.protocol, status.authenticated, status.frame_ms) == ("superframe", True, 378.5)
     station = status.stations[0]
     assert (station.joined, station.outstanding, station.missed_slots, station.rejected_beacons) == (

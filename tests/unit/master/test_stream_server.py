@@ -14,7 +14,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from tsgt.errors import StreamError
-from tsgt.master.stream_server import CLOSE_TIMEOUT_S, MOST_READERS, StreamServer
+from tsgt.master.stream_server import CLOSE_TIMEOUT_S, MAX_READERS, StreamServer
 
 HELLO = b'{"type":"hello"}'
 BIG = 50_000
@@ -174,7 +174,7 @@ async def test_patient_publishing_loses_nothing(path: Path) -> None:
 
         async def publish() -> None:
             for number in range(100):
-                await server.publish_patiently(line(number, BIG))
+                await server.publish_when_ready(line(number, BIG))
 
         async with asyncio.TaskGroup() as group:
             publishing = group.create_task(publish())
@@ -195,7 +195,7 @@ async def test_patient_publishing_goes_on_when_the_slow_reader_leaves(path: Path
         for number in range(200):
             server.publish(line(number, BIG))
         async with asyncio.TaskGroup() as group:
-            publishing = group.create_task(server.publish_patiently(line(200)))
+            publishing = group.create_task(server.publish_when_ready(line(200)))
             await settle()
             assert not publishing.done()
             sleepy.socket.close()
@@ -204,7 +204,7 @@ async def test_patient_publishing_goes_on_when_the_slow_reader_leaves(path: Path
 async def test_patient_publishing_without_readers_does_not_wait(path: Path) -> None:
     """With nobody there, lines go nowhere at once."""
     async with StreamServer(path, HELLO) as server:
-        await server.publish_patiently(line(0))
+        await server.publish_when_ready(line(0))
 
 
 async def test_wait_for_reader_waits(path: Path) -> None:
@@ -244,12 +244,12 @@ async def test_half_closed_reader_gets_lines(path: Path) -> None:
 async def test_one_reader_too_many_is_let_go(path: Path) -> None:
     """Also of those that come at once; when one of the others leaves, there is room again."""
     async with StreamServer(path, HELLO) as server:
-        crowd = [socket.socket(socket.AF_UNIX) for _ in range(MOST_READERS + 20)]
+        crowd = [socket.socket(socket.AF_UNIX) for _ in range(MAX_READERS + 20)]
         with capture_logs() as logs:
             for connection in crowd:
                 connection.connect(str(path))
             await settle()
-        assert server.readers == MOST_READERS
+        assert server.readers == MAX_READERS
         assert [entry["event"] for entry in logs].count("reader_refused") == 20
         for connection in crowd:
             connection.close()
@@ -365,7 +365,7 @@ async def test_busy_live_socket_is_refused(path: Path) -> None:
 async def test_other_file_is_left_alone(path: Path) -> None:
     """What is not a socket is not touched."""
     path.write_bytes(b"notes")
-    with pytest.raises(StreamError, match=rf"^{path}: is not a socket and is left alone; [^\n]+$"):
+    with pytest.raises(StreamError, match=rf"^{path}: is not a socket; [^\n]+$"):
         await StreamServer(path, HELLO).__aenter__()
     assert path.read_bytes() == b"notes"
 
@@ -374,7 +374,7 @@ async def test_impossible_folder_is_one_line(tmp_path: Path) -> None:
     """A folder that cannot be made is one line with the path."""
     (tmp_path / "file").touch()
     path = tmp_path / "file" / "poses.sock"
-    with pytest.raises(StreamError, match=rf"^{path}: the socket cannot be made \([^\n]+$"):
+    with pytest.raises(StreamError, match=rf"^{path}: the socket cannot be created \([^\n]+$"):
         await StreamServer(path, HELLO).__aenter__()
 
 

@@ -93,5 +93,5 @@ def test_a_new_recording_never_has_the_name_of_another(tmp_path: Path) -> None:
 def test_a_new_recording_where_none_can_be(tmp_path: Path) -> None:
     """The error names the folder."""
     (tmp_path / "file").touch()
-    with pytest.raises(RecordingError, match="file: no file can be made there"):
+    with pytest.raises(RecordingError, match="file: no file can be created there"):
         new_recording_path(tmp_path / "file", "master", 0)

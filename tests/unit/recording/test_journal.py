@@ -50,7 +50,7 @@ def test_round_trip(tmp_path: Path) -> None:
 def test_a_recording_is_no_journal(tmp_path: Path) -> None:
     """Whoever names the wrong file is told so."""
     path = write(tmp_path / "r.jsonl", HEADER, PARAMETERS, measurement(0))
-    with pytest.raises(RecordingError, match="is no journal of a station"):
+    with pytest.raises(RecordingError, match="is not a station's journal"):
         load_journal(path)
 
 

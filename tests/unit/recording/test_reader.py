@@ -206,7 +206,7 @@ def test_other_version_is_refused(path: Path) -> None:
 def test_recording_without_parameters_is_refused(path: Path) -> None:
     """Without parameters nothing can be computed."""
     path.write_bytes(encode_line(HEADER) + b"\n" + encode_line(measurement(0)) + b"\n")
-    with pytest.raises(RecordingError, match="holds no parameters"):
+    with pytest.raises(RecordingError, match="contains no parameters"):
         load_recording(path)
 
 

@@ -55,7 +55,7 @@ def test_what_a_full_disk_refused_is_written_when_there_is_room(disk: FullDisk) 
 
 def test_memory_is_bounded_and_the_loss_is_counted(disk: FullDisk) -> None:
     """Beyond the limit the oldest lines go, and the log says how many."""
-    recorder = Recorder(disk, waiting_lines=4)
+    recorder = Recorder(disk, max_pending_lines=4)
     with capture_logs() as logs:
         for number in range(10):
             disk.full = number < 9
@@ -80,19 +80,19 @@ def test_what_still_waits_at_the_end_is_tried_once_more(disk: FullDisk) -> None:
 
 def test_a_write_that_hangs_for_hours_does_not_fill_the_memory(disk: FullDisk) -> None:
     """What waits for a disk that does not even answer is bounded; the newest lines go, and are counted."""
-    recorder = Recorder(disk, waiting_lines=10)
+    recorder = Recorder(disk, max_pending_lines=10)
     for _ in range(50):
         recorder.put(b"{}")
-    assert recorder.waiting == 20
+    assert recorder.pending == 20
 
 
 def test_the_caller_finds_out_what_became_of_a_line(disk: FullDisk) -> None:
     """Written, still waiting, or lost; by the number under which it was put."""
-    recorder = Recorder(disk, waiting_lines=2)
+    recorder = Recorder(disk, max_pending_lines=2)
     recorder.write_line(b"0")
     disk.full = True
     for number in range(1, 5):
-        assert recorder.taken == number
+        assert recorder.line_count == number
         recorder.put(b"%d" % number)
     assert [recorder.written(range(n, n + 1)) for n in range(5)] == [True, None, None, None, None]
     recorder.flush()
@@ -106,7 +106,7 @@ def test_the_caller_finds_out_what_became_of_a_line(disk: FullDisk) -> None:
 
 def test_a_line_that_could_not_even_wait_counts_as_lost(disk: FullDisk) -> None:
     """While a write hangs; those before and after it are written."""
-    recorder = Recorder(disk, waiting_lines=1)
+    recorder = Recorder(disk, max_pending_lines=1)
     for number in range(3):
         recorder.put(b"%d" % number)
     recorder.flush()

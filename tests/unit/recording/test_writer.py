@@ -187,14 +187,14 @@ def test_impossible_place_is_one_line(place: str, tmp_path: Path) -> None:
 def test_full_disk_leaves_no_half_line(path: Path, writer: RecordingWriter) -> None:
     """A line that does not fit is an error in one line, and nothing of it stays."""
     with pytest.raises(
-        RecordingError, match=r"^[^\n]*a line was left out \(No space left on device\)[^\n]*room[^\n]*$"
+        RecordingError, match=r"^[^\n]*a line was not written \(No space left on device\)[^\n]*free[^\n]*$"
     ):
         writer.write(measurement(0))
     assert path.read_bytes() == recording_bytes()
 
 
 def test_writing_goes_on_when_there_is_room_again(path: Path, writer: RecordingWriter, disk: Disk) -> None:
-    """After a line was left out the next one is written as soon as it fits."""
+    """After a failed write the next one is written as soon as it fits."""
     with pytest.raises(RecordingError):
         writer.write(measurement(0))
     disk.room_bytes = 10_000

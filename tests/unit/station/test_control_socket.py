@@ -69,8 +69,8 @@ def journalled(folder: Path, kind: str) -> list[dict[str, Any]]:
     return [json.loads(line.data) for line in read_lines(path) if line.type == kind]
 
 
-async def test_a_crowd_is_let_go(tmp_path: Path) -> None:
-    """So many are let in and the others not; a second later there is room again."""
+async def test_excess_connections_are_closed(tmp_path: Path) -> None:
+    """A second later there is room again."""
     async with client(tmp_path):
         crowd = [
             await asyncio.open_unix_connection(tmp_path / "client.sock") for _ in range(MAX_CONNECTIONS + 5)
@@ -84,8 +84,8 @@ async def test_a_crowd_is_let_go(tmp_path: Path) -> None:
             writer.close()
 
 
-async def test_who_says_nothing_gets_the_status_and_soon_the_end(tmp_path: Path) -> None:
-    """The line comes at once, the end after a second."""
+async def test_silent_connection_gets_status_and_is_closed(tmp_path: Path) -> None:
+    """The status comes at once, the end after a second."""
     async with client(tmp_path):
         reader, writer = await asyncio.open_unix_connection(tmp_path / "client.sock")
         async with asyncio.timeout(0.01):
@@ -95,8 +95,8 @@ async def test_who_says_nothing_gets_the_status_and_soon_the_end(tmp_path: Path)
         writer.close()
 
 
-async def test_the_air_is_set_and_journalled(tmp_path: Path) -> None:
-    """The answer has what was read back; status and journal have it, too."""
+async def test_atmosphere_is_set_and_journalled(tmp_path: Path) -> None:
+    """Response, status and journal have the settings as read back."""
     async with client(tmp_path) as instrument:
         instrument.give()
         first, answer = await talk(tmp_path, WARM + b"\n")
@@ -115,8 +115,8 @@ async def test_the_air_is_set_and_journalled(tmp_path: Path) -> None:
     assert before["stamp_ns"] <= first_ns < changed["stamp_ns"] <= second_ns
 
 
-async def test_what_is_refused_is_said(tmp_path: Path) -> None:
-    """In the instrument's own words."""
+async def test_refused_atmosphere_is_reported(tmp_path: Path) -> None:
+    """The response has the instrument's reason."""
     async with client(tmp_path) as instrument:
         instrument.air_refusal = InstrumentRefusedError("it has no such setting")
         _, answer = await talk(tmp_path, WARM + b"\n")
@@ -133,8 +133,8 @@ async def test_what_is_refused_is_said(tmp_path: Path) -> None:
         (b'{"type":"atmosphere","temperature_c":NaN,"pressure_hpa":1000.0}\n', "invalid request"),
     ],
 )
-async def test_nonsense_is_answered(tmp_path: Path, request_line: bytes, words: str) -> None:
-    """It says what is wrong with it, and sets nothing."""
+async def test_invalid_request_is_reported(tmp_path: Path, request_line: bytes, words: str) -> None:
+    """The response names the error, and nothing is set."""
     async with client(tmp_path) as instrument:
         before = instrument.record
         _, answer = await talk(tmp_path, request_line)
@@ -142,16 +142,16 @@ async def test_nonsense_is_answered(tmp_path: Path, request_line: bytes, words: 
         assert instrument.record == before
 
 
-async def test_who_talks_without_end_is_cut_off(tmp_path: Path) -> None:
-    """And the client goes on."""
+async def test_request_without_end_is_closed(tmp_path: Path) -> None:
+    """The client continues."""
     async with client(tmp_path):
         with suppress(ConnectionResetError):
             await talk(tmp_path, b"x" * 10_000)
         assert len(await talk(tmp_path)) == 1
 
 
-async def test_people_who_stay_hold_up_nobody(tmp_path: Path) -> None:
-    """Neither others who ask nor the end of the client."""
+async def test_open_connections_delay_neither_others_nor_shutdown(tmp_path: Path) -> None:
+    """Fifty connections stay open."""
     async with client(tmp_path):
         stays = [await asyncio.open_unix_connection(tmp_path / "client.sock") for _ in range(50)]
         async with asyncio.timeout(0.01):
@@ -161,8 +161,8 @@ async def test_people_who_stay_hold_up_nobody(tmp_path: Path) -> None:
         writer_.close()
 
 
-async def test_the_status_has_what_the_instrument_says_of_itself(tmp_path: Path) -> None:
-    """What it is doing, what a person should see to, how its battery is; without it, why."""
+async def test_status_has_condition_of_instrument(tmp_path: Path) -> None:
+    """While disconnected, the problem is the connection error."""
     async with client(tmp_path) as instrument:
         instrument.condition = Condition(
             activity="looking around", problem="point the telescope at prism 1", battery_percent=9
@@ -178,10 +178,10 @@ async def test_the_status_has_what_the_instrument_says_of_itself(tmp_path: Path)
     assert without["problem"] == "nobody answers; is the cable in?"
 
 
-async def test_a_full_disk_is_said_with_what_is_not_journalled(
+async def test_full_disk_is_reported_with_waiting_and_lost_lines(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """How many lines wait, and when no more can wait, how many are lost; measuring goes on."""
+    """Measuring continues."""
     full = False
     write_line = RecordingWriter.write_line
 

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from tsgt.radio import Radio
 
 
-async def test_every_measurement_is_journalled_and_the_newest_is_answered(tmp_path: Path) -> None:
-    """The journal holds what was read, on the station's clock, raw; a poll gets the last of it."""
+async def test_every_measurement_is_journalled_and_newest_is_polled(tmp_path: Path) -> None:
+    """The journal has raw values on the station's clock."""
     async with field_day(tmp_path) as day:
         await asyncio.sleep(10.0)
         message = await day.poll()
@@ -49,7 +49,7 @@ async def test_every_measurement_is_journalled_and_the_newest_is_answered(tmp_pa
     assert message.status == 0
 
 
-async def test_the_ping_is_stamped_with_the_end_of_its_reception(tmp_path: Path) -> None:
+async def test_ping_is_timestamped_at_rx_done(tmp_path: Path) -> None:
     """`s` returns the RxDone of `e` on the station's own Unix clock, whatever happened in between."""
     async with field_day(tmp_path) as day:
         sent = await day.master.radio.transmit(b"e1")
@@ -63,8 +63,8 @@ async def test_the_ping_is_stamped_with_the_end_of_its_reception(tmp_path: Path)
     assert 0.3 < symbols < 1.2  # RxDone of an SX127x comes 0.65 to 0.95 symbols after the end on the air
 
 
-async def test_before_the_first_measurement_there_is_an_answer_too(tmp_path: Path) -> None:
-    """Without an instrument the master gets a status instead of silence."""
+async def test_poll_before_first_measurement_gets_a_status(tmp_path: Path) -> None:
+    """Without an instrument the master is not left waiting."""
     async with field_day(tmp_path) as day:
         day.line.plugged = False
         await day.kill()
@@ -78,10 +78,10 @@ async def test_before_the_first_measurement_there_is_an_answer_too(tmp_path: Pat
     ("status", "sent", "raw_status"),
     [("tilt", 1, 1290), ("wrong_distance", 2, 1291), ("no_target", 3, None), ("angle_only", 4, 1285)],
 )
-async def test_a_bad_status_is_journalled_and_sent(
+async def test_error_status_is_journalled_and_sent(
     tmp_path: Path, status: str, sent: int, raw_status: int | None
 ) -> None:
-    """What the instrument complains of reaches the journal, with its own code, and the master."""
+    """The journal has the instrument's own code."""
     fault = StatusFaultConfig(station=1, status=status, start_s=4.0, end_s=60.0)  # type: ignore[arg-type]
     async with field_day(tmp_path, SCENARIO.model_copy(update={"faults": (fault,)})) as day:
         await asyncio.sleep(3.0)
@@ -95,8 +95,8 @@ async def test_a_bad_status_is_journalled_and_sent(
     assert journal[0].status is Status.OK
 
 
-async def test_an_instrument_that_is_unplugged_comes_back(tmp_path: Path) -> None:
-    """The radio goes on with the last measurement; new ones come a few seconds after the cable is in."""
+async def test_unplugged_instrument_recovers(tmp_path: Path) -> None:
+    """Meanwhile polls get the last measurement; new ones follow a few seconds after the cable is back."""
     async with field_day(tmp_path) as day:
         with capture_logs() as logs:
             await asyncio.sleep(5.0)
@@ -113,8 +113,8 @@ async def test_an_instrument_that_is_unplugged_comes_back(tmp_path: Path) -> Non
     assert events.count("instrument_connected") == 1
 
 
-async def test_a_radio_that_fails_leaves_the_journal_whole(tmp_path: Path) -> None:
-    """Measurements go on while there is no radio, which the status says, and are offered when it is back."""
+async def test_failing_radio_does_not_affect_journal(tmp_path: Path) -> None:
+    """The status reports it; measurements are offered again when it recovers."""
     async with field_day(tmp_path) as day:
         await day.kill()
         broken, opened = True, day.open_radio
@@ -139,8 +139,8 @@ async def test_a_radio_that_fails_leaves_the_journal_whole(tmp_path: Path) -> No
         assert len(day.journals()[-1]) == len(day.read) >= 60
 
 
-async def test_orders_change_what_is_measured(tmp_path: Path) -> None:
-    """`d` stops the tracking, `t` then measures a target, `n` with a prism tracks that one, once a person has locked in on it."""
+async def test_commands_change_mode_and_prism(tmp_path: Path) -> None:
+    """`d` stops tracking, `t` then measures a target, `n` with a prism tracks that one once the operator has locked on."""
     async with field_day(tmp_path) as day:
         await asyncio.sleep(1.0)
         assert await day.ask(b"d1", timeout_s=2.0) == Acknowledgement("d", ok=True)
@@ -169,8 +169,8 @@ async def test_orders_change_what_is_measured(tmp_path: Path) -> None:
     assert [target.status for target in journal.targets] == [Status.OK, Status.NO_TARGET]
 
 
-async def test_an_order_that_fails_is_refused_and_changes_nothing(tmp_path: Path) -> None:
-    """Without an instrument another prism gives `nNo`, and the old one is tracked on when it is back."""
+async def test_failed_command_changes_nothing(tmp_path: Path) -> None:
+    """Without an instrument `n` and `d` are refused, and the old prism is tracked after recovery."""
     async with field_day(tmp_path) as day:
         day.line.plugged = False
         await asyncio.sleep(1.0)
@@ -183,8 +183,8 @@ async def test_an_order_that_fails_is_refused_and_changes_nothing(tmp_path: Path
         assert {m.prism for m in day.journals()[0]} == {1}
 
 
-async def test_a_shot_that_fails_is_answered(tmp_path: Path) -> None:
-    """In direct mode without an instrument the master gets a status; the mode stays when the instrument is back."""
+async def test_failed_single_measurement_gets_a_status(tmp_path: Path) -> None:
+    """Direct mode persists when the instrument recovers."""
     async with field_day(tmp_path) as day:
         await asyncio.sleep(1.0)
         assert await day.ask(b"d1", timeout_s=2.0) == Acknowledgement("d", ok=True)
@@ -200,10 +200,10 @@ async def test_a_shot_that_fails_is_answered(tmp_path: Path) -> None:
     assert shot.status == 0
 
 
-async def test_a_full_disk_stops_neither_instrument_nor_radio(
+async def test_full_disk_stops_neither_instrument_nor_radio(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Lines wait in memory and stand in the journal when there is room; the status says so meanwhile."""
+    """Lines wait in memory and are journalled when there is room; the status reports it meanwhile."""
     full = False
     write_line = RecordingWriter.write_line
 
@@ -228,8 +228,8 @@ async def test_a_full_disk_stops_neither_instrument_nor_radio(
         assert [m.sequence for m in day.journals()[0]] == list(range(len(day.read)))
 
 
-async def test_a_slow_disk_holds_up_no_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """While a write hangs, pings and polls are answered, soon with the measurement that it holds up."""
+async def test_slow_disk_delays_no_reply(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """While a write hangs, pings and polls are answered, soon with the measurement that it delays."""
     released, writing = threading.Event(), threading.Event()
     write_line = RecordingWriter.write_line
 
@@ -264,8 +264,8 @@ async def test_a_slow_disk_holds_up_no_answer(tmp_path: Path, monkeypatch: pytes
         released.set()
 
 
-async def test_a_client_that_is_killed_anywhere_has_journalled_what_it_read(tmp_path: Path) -> None:
-    """Cancelled after any number of steps of the event loop and started again: nothing that was read is missing."""
+async def test_killed_client_has_journalled_all_readings(tmp_path: Path) -> None:
+    """Cancelled after any number of steps of the event loop, and restarted."""
     async with field_day(tmp_path) as day:
         for run in range(60):
             await day.kill()
@@ -284,8 +284,8 @@ async def test_a_client_that_is_killed_anywhere_has_journalled_what_it_read(tmp_
             assert stamps <= journalled
 
 
-async def test_the_journal_begins_with_what_a_merge_needs(tmp_path: Path) -> None:
-    """Header, then whose journal it is and how its times came about."""
+async def test_journal_starts_with_header_and_station(tmp_path: Path) -> None:
+    """A merge needs the station and the origin of its times."""
     async with field_day(tmp_path):
         pass
     (path,) = (tmp_path / "journals").iterdir()
@@ -302,8 +302,8 @@ async def test_the_journal_begins_with_what_a_merge_needs(tmp_path: Path) -> Non
     }
 
 
-async def test_the_status_says_how_it_goes(tmp_path: Path) -> None:
-    """One line, then the end; it knows instrument, master and journal."""
+async def test_status_reports_instrument_master_and_journal(tmp_path: Path) -> None:
+    """One line, then the connection is closed."""
     async with field_day(tmp_path) as day:
         await day.kill()
         day.start()
@@ -325,8 +325,8 @@ async def test_the_status_says_how_it_goes(tmp_path: Path) -> None:
     assert status["radio_ok"]
 
 
-async def test_a_second_client_does_not_take_the_socket(tmp_path: Path) -> None:
-    """Two clients with one configuration are a mistake; the second one ends with a line that says so."""
+async def test_second_client_does_not_take_socket(tmp_path: Path) -> None:
+    """Two clients with one configuration are a mistake; the error says so."""
     async with field_day(tmp_path) as day:
         with pytest.raises(StreamError, match="another program serves this socket"):
             await run_client(

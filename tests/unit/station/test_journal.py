@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-async def test_what_waits_for_the_disk_is_written_without_another_line(tmp_path: Path) -> None:
+async def test_waiting_lines_are_written_without_another_line(tmp_path: Path) -> None:
     """The instrument may be unplugged by then, and the program killed."""
     full = True
 

@@ -81,8 +81,8 @@ def journalled(folder: Path) -> list[PolarMeasurement]:
     return sorted(measurements, key=lambda measurement: measurement.sequence)
 
 
-async def test_every_measurement_is_delivered_in_time(tmp_path: Path) -> None:
-    """With the master's time, which the station's clock, an hour and 10 ppm off, is brought to."""
+async def test_every_measurement_is_delivered_with_its_time(tmp_path: Path) -> None:
+    """The station's clock is an hour and 10 ppm off the master's."""
     async with superframe_day(tmp_path) as (day, air):
         await air.frames(60.0)
         await day.kill()
@@ -97,8 +97,8 @@ async def test_every_measurement_is_delivered_in_time(tmp_path: Path) -> None:
             assert abs(error_ns) < 100_000
 
 
-async def test_a_client_that_is_killed_anywhere_loses_nothing(tmp_path: Path) -> None:
-    """Started again after any number of steps of the event loop: what was read is delivered, once it is there."""
+async def test_killed_client_loses_no_measurement(tmp_path: Path) -> None:
+    """Restarted after any number of steps of the event loop, it delivers all readings."""
     async with superframe_day(tmp_path) as (day, air):
         air.master.session_every = 1
         for run in range(25):
@@ -115,8 +115,8 @@ async def test_a_client_that_is_killed_anywhere_loses_nothing(tmp_path: Path) ->
         assert set(air.master.received) <= set(sequences)
 
 
-async def test_a_restarted_computer_delivers_what_it_had(tmp_path: Path) -> None:
-    """Measured while the master was away; timed by the clock of before, whose beacons the journal has."""
+async def test_restarted_computer_delivers_backlog(tmp_path: Path) -> None:
+    """Measured while the master was away; timed on the clock before the restart by journalled beacons."""
     async with superframe_day(tmp_path) as (day, air):
         await air.frames(20.0)
         await asyncio.sleep(10.0)
@@ -130,8 +130,8 @@ async def test_a_restarted_computer_delivers_what_it_had(tmp_path: Path) -> None
         assert before <= set(air.master.received)
 
 
-async def test_what_is_of_an_unknown_clock_stays_in_the_journal(tmp_path: Path) -> None:
-    """The master was restarted too, so that nobody can say when it was measured."""
+async def test_measurements_on_unknown_clock_are_discarded(tmp_path: Path) -> None:
+    """The master was restarted too, so that their time cannot be determined."""
     async with superframe_day(tmp_path) as (day, air):
         await air.frames(5.0)
         await asyncio.sleep(5.0)
@@ -148,7 +148,7 @@ async def test_what_is_of_an_unknown_clock_stays_in_the_journal(tmp_path: Path) 
         assert min(new.master.received) > 1000
 
 
-async def test_orders_are_carried_out_and_answered(tmp_path: Path) -> None:
+async def test_commands_are_executed_and_responded_to(tmp_path: Path) -> None:
     """Another prism, single measurements, back again, and a search."""
     async with superframe_day(tmp_path) as (day, air):
         await air.frames(3.0)
@@ -180,10 +180,10 @@ async def test_orders_are_carried_out_and_answered(tmp_path: Path) -> None:
         assert {measurement.prism for measurement in usable} == {1, 2}
 
 
-async def test_a_run_whose_disk_takes_nothing_at_its_start_has_numbers_of_its_own(
+async def test_run_with_failing_disk_starts_its_own_stream(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Were it killed, the next run would not know which ones it had given away."""
+    """The next run could not know which sequence numbers it has used."""
 
     def refuse(_: RecordingWriter, __: bytes) -> None:
         raise RecordingError("no room", path=tmp_path)
@@ -203,10 +203,10 @@ async def test_a_run_whose_disk_takes_nothing_at_its_start_has_numbers_of_its_ow
     assert after.first_sequence > before.first_sequence + 2 * RESTART_SKIP
 
 
-async def test_what_the_disk_holds_up_is_not_delivered(
+async def test_measurement_is_delivered_after_the_disk_accepts_or_refuses_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A full disk lets it through, for then nothing would be; a line that is still to be written does not."""
+    """A full disk does not stop delivery."""
     full = False
     write_line = RecordingWriter.write_line
 
@@ -225,8 +225,8 @@ async def test_what_the_disk_holds_up_is_not_delivered(
         await air.frames(1.0)
 
 
-async def test_the_journal_tells_of_beacons_and_acknowledgement(tmp_path: Path) -> None:
-    """What a restart needs."""
+async def test_journal_has_receptions_and_acknowledgements(tmp_path: Path) -> None:
+    """A restart needs them."""
     async with superframe_day(tmp_path) as (day, air):
         await air.frames(20.0)
         await day.kill()
@@ -237,7 +237,7 @@ async def test_the_journal_tells_of_beacons_and_acknowledgement(tmp_path: Path) 
     assert 3 <= types.count("acknowledged") <= 6
 
 
-async def test_the_status_says_how_delivery_goes(tmp_path: Path) -> None:
+async def test_status_reports_delivery(tmp_path: Path) -> None:
     """Before and after a master is there."""
     async with superframe_day(tmp_path) as (day, air):
         await asyncio.sleep(5.0)
@@ -253,8 +253,8 @@ async def test_the_status_says_how_delivery_goes(tmp_path: Path) -> None:
     assert after["master_heard_s"] < 0.5
 
 
-async def test_a_station_without_a_key_says_so(tmp_path: Path) -> None:
-    """In the log and in the status; a master with a key does not know it, nor it the master."""
+async def test_station_without_key_is_reported(tmp_path: Path) -> None:
+    """In log and status; a master with a key does not accept it, nor it the master."""
     with capture_logs() as logs:
         async with field_day(tmp_path, protocol=SUPERFRAME) as day:
             air = OnAir(day)
@@ -266,8 +266,8 @@ async def test_a_station_without_a_key_says_so(tmp_path: Path) -> None:
     assert not air.master.received
 
 
-async def test_replies_begin_on_time(tmp_path: Path) -> None:
-    """At the slot, to the radio's own precision: the guard is for others."""
+async def test_reply_starts_at_slot(tmp_path: Path) -> None:
+    """Within the radio's own precision: the guard time is for others."""
     async with superframe_day(tmp_path) as (day, air):
         await air.frames(10.0)
         payload = air.master.beacon()
@@ -279,10 +279,10 @@ async def test_replies_begin_on_time(tmp_path: Path) -> None:
         air.master.take(packet.payload)
 
 
-async def test_the_numbers_of_a_run_are_on_the_disk_before_the_first_is_used(
+async def test_first_sequence_is_synced_before_its_use(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A run of which nothing was left after a power cut would be followed by one with the same numbers."""
+    """After a power cut the next run would otherwise use the same numbers."""
     synced: list[bytes] = []
     sync = RecordingWriter.sync
 

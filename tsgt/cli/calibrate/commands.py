@@ -1,4 +1,4 @@
-"""How orders for single measurements get to the stations, in either protocol, while no master runs."""
+"""Commands for single measurements to the stations, in either protocol, while no master runs."""
 
 from __future__ import annotations
 
@@ -9,12 +9,17 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
 from tsgt.clock import UnixTimeline
-from tsgt.master.classic import Collector
+from tsgt.master.classic import Transport
 from tsgt.master.superframe import FrameLoop, superframe_timing
 from tsgt.model import Status
-from tsgt.radio import DirectOrder, MeasureOrder, TrackOrder
-from tsgt.radio.classic import Command, Ordered, Shot, status_of
-from tsgt.radio.classic.transactions import Timing
+from tsgt.radio import DirectCommand, MeasureCommand, TrackCommand
+from tsgt.radio.classic import (
+    CommandMessage,
+    CommandTransaction,
+    LinkTiming,
+    SingleMeasurementPoll,
+    status_of,
+)
 from tsgt.radio.superframe import SuperframeMaster
 from tsgt.radio.superframe.wire import Authenticator, angle_rad, distance_m
 
@@ -23,27 +28,19 @@ if TYPE_CHECKING:
 
     from tsgt.clock import Clock
     from tsgt.config import ClassicMasterConfig, SuperframeMasterConfig
-    from tsgt.radio import LoRaSettings, Order, Packet, Radio, Transmitted
-    from tsgt.radio.superframe.reception import Heard
+    from tsgt.radio import Command, LoRaSettings, Packet, Radio, Transmission
+    from tsgt.radio.superframe import ReceivedReply
 
-ORDER_TIMEOUT_S = 10.0
-"""How long a change of mode may take; some instruments need seconds."""
+COMMAND_TIMEOUT_S = 10.0
+"""A change of mode takes some instruments seconds."""
 
 ATTEMPTS = 3
-"""How often an order is given to a station that does not answer; in frames, how many times as long it is waited for."""
+"""Attempts with a station that does not respond; with the superframe, factor on the timeout."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Answer:
-    """What a station says to an order.
-
-    Attributes
-    ----------
-    ok
-        It has been carried out.
-    status, horizontal_angle_rad, zenith_angle_rad, slope_distance_m
-        Of the single measurement, raw; a distance of 0 is none.
-    """
+class CommandResponse:
+    """Response of a station; the raw single measurement if the command was to measure, with a distance of 0 for none."""
 
     ok: bool
     status: Status = Status.ERROR
@@ -52,100 +49,76 @@ class Answer:
     slope_distance_m: float = 0.0
 
 
-class Orders(Protocol):
-    """Gives orders to stations, one after the other."""
+class CommandSender(Protocol):
+    """Sends commands to stations, one after the other."""
 
-    async def give(self, station: int, order: Order) -> Answer | None:
-        """Give an order to track, to leave that, or to measure; return the answer, None where there is none.
-
-        Raises
-        ------
-        RadioError
-            The master's radio failed.
-        """
+    async def send(self, station: int, command: Command) -> CommandResponse | None:
+        """Send a command; return the response, None without one. Raises RadioError if the master's radio fails."""
         ...
 
 
-class ClassicOrders:
-    """Gives orders in the protocol classic.
-
-    Parameters
-    ----------
-    radio
-        Nobody else uses it.
-    clock
-        The radio's.
-    protocol
-        How long a station may take to answer.
-    settings
-        Of the modem.
-    """
+class ClassicCommandSender:
+    """Sends commands in the protocol classic; the only user of the radio."""
 
     def __init__(
         self, radio: Radio, clock: Clock, protocol: ClassicMasterConfig, settings: LoRaSettings
     ) -> None:
-        self._timing = Timing.of(settings, round(protocol.reply_timeout_ms * 1e6))
-        self._collector = Collector(radio, clock, UnixTimeline.fixed_now(clock), self._timing)
+        self._timing = LinkTiming(settings, round(protocol.reply_timeout_ms * 1e6))
+        self._transport = Transport(radio, clock, UnixTimeline.fixed_now(clock), self._timing)
 
-    async def give(self, station: int, order: Order) -> Answer | None:
-        """See :class:`Orders`."""
-        match order:
-            case TrackOrder(prism):
-                return await self._ordered(Command("n", station, prism))
-            case DirectOrder():
-                return await self._ordered(Command("d", station))
-            case MeasureOrder():
-                return await self._shot(station)
+    async def send(self, station: int, command: Command) -> CommandResponse | None:
+        """See :meth:`CommandSender.send`."""
+        match command:
+            case TrackCommand(prism):
+                return await self._command(CommandMessage("n", station, prism))
+            case DirectCommand():
+                return await self._command(CommandMessage("d", station))
+            case MeasureCommand():
+                return await self._measure(station)
             case _:
-                raise ValueError(f"the protocol classic has no {order}")
+                raise ValueError(f"the protocol classic has no {command}")
 
-    async def _ordered(self, command: Command) -> Answer | None:
+    async def _command(self, message: CommandMessage) -> CommandResponse | None:
         for _ in range(ATTEMPTS):
-            turn = Ordered(command.station, command, round(1e9 * ORDER_TIMEOUT_S))
-            await self._collector.take(turn)
-            if turn.ok is not None:
-                return Answer(ok=turn.ok)
+            transaction = CommandTransaction(message.station, message, round(1e9 * COMMAND_TIMEOUT_S))
+            await self._transport.run(transaction)
+            if transaction.ok is not None:
+                return CommandResponse(ok=transaction.ok)
         return None
 
-    async def _shot(self, station: int) -> Answer | None:
-        turn = Shot(station, self._timing)
-        await self._collector.take(turn)
-        if turn.message is None:
+    async def _measure(self, station: int) -> CommandResponse | None:
+        transaction = SingleMeasurementPoll(station, self._timing)
+        await self._transport.run(transaction)
+        if transaction.message is None:
             return None
-        return Answer(
+        return CommandResponse(
             ok=True,
-            status=status_of(turn.message),
-            horizontal_angle_rad=turn.message.horizontal_angle_rad,
-            zenith_angle_rad=turn.message.zenith_angle_rad,
-            slope_distance_m=turn.message.slope_distance_m,
+            status=status_of(transaction.message),
+            horizontal_angle_rad=transaction.message.horizontal_angle_rad,
+            zenith_angle_rad=transaction.message.zenith_angle_rad,
+            slope_distance_m=transaction.message.slope_distance_m,
         )
 
 
 @asynccontextmanager
-async def superframe_orders(
+async def superframe_command_sender(
     radio: Radio,
     clock: Clock,
     prisms: Mapping[int, int],
     protocol: SuperframeMasterConfig,
     settings: LoRaSettings,
     key: bytes | None,
-) -> AsyncGenerator[Orders]:
-    """Run frames, in which orders can be given.
+) -> AsyncGenerator[CommandSender]:
+    """Run TDMA frames that carry commands.
 
-    Measurements that stations send in them are not acknowledged: a master will want them.
+    Measurements in the frames are not acknowledged: they are for a master.
 
     Parameters
     ----------
-    radio
-        Nobody else uses it.
-    clock
-        The radio's.
     prisms
         By station: the prism that it tracks.
-    protocol, settings
-        As the configuration of the master says.
     key
-        Of the mission; None: anybody can take part.
+        Key of the mission; None: unauthenticated.
     """
     master = SuperframeMaster(
         prisms,
@@ -155,26 +128,26 @@ async def superframe_orders(
         clock.monotonic_ns(),
         records=False,
     )
-    listener = _Listener()
-    frames = asyncio.create_task(FrameLoop(radio, clock, master, listener).run())
+    observer = _ResponseObserver()
+    frames = asyncio.create_task(FrameLoop(radio, clock, master, observer).run())
     try:
-        yield _SuperframeOrders(master, listener, frames)
+        yield _SuperframeCommandSender(master, observer, frames)
     finally:
         frames.cancel()
         await asyncio.wait([frames])
 
 
-class _Listener:
-    """Waits for one answer at a time; the rest of what happens in frames is of no interest here."""
+class _ResponseObserver:
+    """Waits for one response at a time and ignores all other link events."""
 
     def __init__(self) -> None:
         self._station = 0
-        self._answer: asyncio.Future[Answer] | None = None
+        self._response: asyncio.Future[CommandResponse] | None = None
 
-    def expect(self, station: int) -> asyncio.Future[Answer]:
+    def expect(self, station: int) -> asyncio.Future[CommandResponse]:
         self._station = station
-        self._answer = asyncio.get_running_loop().create_future()
-        return self._answer
+        self._response = asyncio.get_running_loop().create_future()
+        return self._response
 
     async def ready(self) -> None:
         pass
@@ -182,39 +155,41 @@ class _Listener:
     def composing(self) -> None:
         pass
 
-    def beacon(self, sent: Transmitted) -> None:
+    def beacon_sent(self, sent: Transmission) -> None:
         pass
 
-    def heard(self, heard: Heard, packet: Packet) -> None:  # noqa: ARG002 (the interface)
-        if self._answer is None or self._answer.done() or heard.station != self._station:
+    def received(self, reply: ReceivedReply, packet: Packet) -> None:  # noqa: ARG002 (the interface)
+        if self._response is None or self._response.done() or reply.station != self._station:
             return
-        if (shot := heard.shot) is not None:
-            answer = Answer(
+        if (measured := reply.single_measurement) is not None:
+            response = CommandResponse(
                 ok=True,
-                status=shot.status,
-                horizontal_angle_rad=angle_rad(shot.horizontal),
-                zenith_angle_rad=angle_rad(shot.zenith),
-                slope_distance_m=distance_m(shot.distance, far=False) or 0.0,
+                status=measured.status,
+                horizontal_angle_rad=angle_rad(measured.horizontal),
+                zenith_angle_rad=angle_rad(measured.zenith),
+                slope_distance_m=distance_m(measured.distance, far=False) or 0.0,
             )
-            self._answer.set_result(answer)
-        elif heard.answer is not None:
-            self._answer.set_result(Answer(ok=heard.answer.ok))
+            self._response.set_result(response)
+        elif reply.response is not None:
+            self._response.set_result(CommandResponse(ok=reply.response.ok))
 
-    def silent(self, stations: Sequence[int]) -> None:
+    def not_received(self, stations: Sequence[int]) -> None:
         pass
 
 
-class _SuperframeOrders:
-    def __init__(self, master: SuperframeMaster, listener: _Listener, frames: asyncio.Task[None]) -> None:
+class _SuperframeCommandSender:
+    def __init__(
+        self, master: SuperframeMaster, observer: _ResponseObserver, frames: asyncio.Task[None]
+    ) -> None:
         self._master = master
-        self._listener = listener
+        self._observer = observer
         self._frames = frames
 
-    async def give(self, station: int, order: Order) -> Answer | None:
-        self._master.order(station, order)
-        answer = self._listener.expect(station)
-        either: list[asyncio.Future[Any]] = [answer, self._frames]
-        await asyncio.wait(either, timeout=ATTEMPTS * ORDER_TIMEOUT_S, return_when=asyncio.FIRST_COMPLETED)
+    async def send(self, station: int, command: Command) -> CommandResponse | None:
+        self._master.station(station).submit(command)
+        response = self._observer.expect(station)
+        either: list[asyncio.Future[Any]] = [response, self._frames]
+        await asyncio.wait(either, timeout=ATTEMPTS * COMMAND_TIMEOUT_S, return_when=asyncio.FIRST_COMPLETED)
         if self._frames.done():
             self._frames.result()
-        return answer.result() if answer.done() else None
+        return response.result() if response.done() else None

@@ -1,8 +1,8 @@
-"""From the stations' messages to measurements on the master's clock. Pure.
+"""Converts the stations' replies to measurements on the master's clock. Sans-I/O.
 
-A station answers every poll, so most of what comes it has said before; and its clock may have been anything.
-Each new message is put on the master's clock, unless its time shows that the station's clock is no longer the one
-that was synchronised: then it waits, with all that follow, for the next synchronisation.
+A station answers every poll, so most replies repeat an earlier one, and its clock may have changed meanwhile. Each new
+measurement is converted to the master's clock, unless the station's clock may no longer be the synchronised one: then
+it is held, with all that follow, until the next synchronisation.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, replace
+from enum import Enum, auto
 from typing import TYPE_CHECKING, NamedTuple
 
 from tsgt.model import PolarMeasurement, Status
 from tsgt.radio.classic import OK, status_of
 from tsgt.recording import ClockRecord
-from tsgt.timesync.offset_regression import highest_offset_ns
 from tsgt.timesync.two_way import TimestampCheck
 
 if TYPE_CHECKING:
@@ -28,36 +28,83 @@ if TYPE_CHECKING:
 UNTIMED_SIGMA_NS = 1_000_000_000
 """One sigma of a stamp that is only the time of arrival: an error message of the authors' nodes has no other."""
 
-SILENCE_NS = 5_000_000_000
-"""A station that was silent for longer may have been switched off and on, and have another clock; no computer that
-a station client runs on starts faster."""
+SILENCE_TIMEOUT_NS = 5_000_000_000
+"""A station that was silent for longer may have been power-cycled and have another clock; no computer that runs a
+station client boots faster."""
 
-RESTART_NS = 500_000_000
-"""No client is started again within this. It may have another clock then: that of its computer was set meanwhile."""
+MIN_RESTART_NS = 500_000_000
+"""No client restarts faster than this. After a restart it may have another clock: that of its computer may have been set."""
 
-STALE_NS = 1_000_000_000
-"""Instruments that track measure more often than this. A new measurement that looks older may be one of a clock that
-stood still, or was set back, while nobody asked the station."""
+STALE_THRESHOLD_NS = 1_000_000_000
+"""Tracking instruments measure more often than this. A new measurement that appears older may be of a clock that was
+stopped or set back while the station was not polled."""
 
-HELD_MEASUREMENTS = 100
-"""How many wait for a synchronisation at most; the oldest goes first."""
+HELD_CAPACITY = 100
+"""Measurements that are held until a synchronisation; beyond that the oldest are dropped."""
 
-KNOWN_MEASUREMENTS = 1000
-"""So many of the last ones are known when they come again, played back by somebody or out of a radio's buffer."""
+DUPLICATE_WINDOW = 1000
+"""The last measurements among which a repeated or replayed one is recognised."""
 
 
-class Intake:
-    """Judges and stamps what the stations answer.
+class ClockState(Enum):
+    """What is known of a station's clock."""
+
+    UNSYNCHRONISED = auto()
+    """No offset is known; measurements are held."""
+    SYNCHRONISED = auto()
+    """Measurements are converted with the known offset."""
+    AWAITING_MEASUREMENT = auto()
+    """Synchronised, but the station has reported that it has not measured yet. It may have restarted before its first
+    measurement, so that one needs a synchronisation."""
+    SUSPENDED = auto()
+    """The station may have another clock than the synchronised one; measurements are held."""
+
+    @property
+    def holds(self) -> bool:
+        """Whether measurements are held until the next synchronisation."""
+        return self in (ClockState.UNSYNCHRONISED, ClockState.SUSPENDED)
+
+
+class ClockEvent(Enum):
+    """What changes the state of a station's clock."""
+
+    SYNCHRONISATION = auto()
+    NO_MEASUREMENT_YET = auto()
+    POSSIBLE_RESTART = auto()
+    IMPOSSIBLE_TIMESTAMP = auto()
+
+
+_TRANSITIONS = {
+    ClockEvent.SYNCHRONISATION: dict.fromkeys(ClockState, ClockState.SYNCHRONISED),
+    ClockEvent.NO_MEASUREMENT_YET: {ClockState.SYNCHRONISED: ClockState.AWAITING_MEASUREMENT},
+    ClockEvent.POSSIBLE_RESTART: {
+        ClockState.SYNCHRONISED: ClockState.SUSPENDED,
+        ClockState.AWAITING_MEASUREMENT: ClockState.SUSPENDED,
+    },
+    ClockEvent.IMPOSSIBLE_TIMESTAMP: {
+        ClockState.SYNCHRONISED: ClockState.UNSYNCHRONISED,
+        ClockState.AWAITING_MEASUREMENT: ClockState.UNSYNCHRONISED,
+    },
+}
+
+
+def next_clock_state(state: ClockState, event: ClockEvent) -> ClockState:
+    """Return the state after an event; a transition that the table does not list leaves it unchanged."""
+    return _TRANSITIONS[event].get(state, state)
+
+
+class Ingest:
+    """Validates and stamps the stations' replies.
 
     Parameters
     ----------
     prisms
         Number of the prism by number of the station that tracks it.
     new_filter
-        Makes the filter of one station's clock.
+        Makes the clock filter of one station.
     stamp_delays_ns
-        By station, where there is one: how late its computer stamps receptions on average, in ns; as much as that
-        one stamp may be off by.
+        By station: by how much its computer's reception stamps are late on average, in ns. A single stamp may be off
+        by as much.
     """
 
     def __init__(
@@ -72,200 +119,193 @@ class Intake:
             for station, prism in prisms.items()
         }
 
-    def answered(self, message: MeasurementMessage, *, requested_ns: int, received_ns: int) -> Arrival:
-        """Take the answer to a poll.
+    def reply(self, message: MeasurementMessage, *, requested_ns: int, received_ns: int) -> PollResult:
+        """Take the reply to a poll.
 
         Parameters
         ----------
-        message
-            The answer, of a station that is known.
         requested_ns
-            When the request for it began, on the master's Unix clock in ns.
+            When the transmission of the request began, on the master's Unix clock in ns.
         received_ns
-            When it had been received, on the same clock.
+            End of the reply's reception, on the same clock.
         """
-        return self._stations[message.station].answered(message, requested_ns, received_ns)
+        return self._stations[message.station].reply(message, requested_ns, received_ns)
 
-    def unanswered(self, station: int) -> None:
-        """Take note that a station did not answer."""
-        self._stations[station].unanswered()
+    def no_response(self, station: int) -> None:
+        """Record that a station did not respond to a request."""
+        self._stations[station].no_response()
 
-    def doubt(self, station: int) -> None:
-        """Hold a station's measurements until it is synchronised: it may have been restarted, with another clock."""
-        self._stations[station].doubt()
+    def suspend(self, station: int) -> None:
+        """Hold a station's measurements until it is synchronised: it may have restarted with another clock."""
+        self._stations[station].handle(ClockEvent.POSSIBLE_RESTART)
 
-    def synchronised(self, station: int, samples: Sequence[ClockSample], now_ns: int) -> Synchronised:
-        """Take the exchanges of a synchronisation, at least one; what was held is stamped and let go."""
+    def synchronised(
+        self, station: int, samples: Sequence[ClockSample], now_ns: int
+    ) -> SynchronisationResult:
+        """Take the samples of a synchronisation, at least one; held measurements are stamped and released."""
         return self._stations[station].synchronised(samples, now_ns)
 
     def clock(self, station: int, now_ns: int) -> ClockEstimate | None:
-        """Return what a station's clock shows against the master's at an instant; None while nobody knows."""
+        """Return the estimate of a station's clock at an instant; None while unsynchronised."""
         return self._stations[station].clock(now_ns)
 
+    def clock_state(self, station: int) -> ClockState:
+        """Return what is known of a station's clock."""
+        return self._stations[station].state
 
-class Arrival(NamedTuple):
-    """What came of an answer.
 
-    Attributes
-    ----------
-    measurement
-        For pipeline and stream; None where there is nothing new, or it has to wait.
-    stepped
-        The station's clock has just been found to be another one.
-    doubtful
-        The station has to be synchronised before its measurements can be used: it stepped, was silent, begins anew,
-        or sends what looks old.
-    """
+class PollResult(NamedTuple):
+    """The result of a poll."""
 
     measurement: PolarMeasurement | None = None
+    """None where there is nothing new, or it is held."""
     stepped: bool = False
-    doubtful: bool = False
+    """The station's clock was just found to have been stepped or reset."""
+    needs_synchronisation: bool = False
+    """The station has to be synchronised before its measurements can be used: its clock stepped, it was silent, it may
+    have restarted, or a measurement appears old."""
 
 
-class Synchronised(NamedTuple):
-    """What came of a synchronisation.
-
-    Attributes
-    ----------
-    record
-        For the stream.
-    measurements
-        Those that waited for it and are of this clock, in the order of their arrival.
-    stepped
-        It has just been found that the station's clock is another one than before.
-    """
+class SynchronisationResult(NamedTuple):
+    """The result of a synchronisation."""
 
     record: ClockRecord
     measurements: list[PolarMeasurement]
+    """Those that were held and belong to this clock, in the order of their arrival."""
     stepped: bool
+    """The station's clock was just found to have been stepped or reset."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Untimed:
-    """What an error message without a time is known by."""
+    """Identifies an error message without a time."""
 
     raw_status: int
 
 
 class _Station:
-    """One station's clock and what was last heard from it."""
+    """Clock and last replies of one station."""
 
     def __init__(self, station: int, prism: int, clock: ClockFilter, stamp_delay_ns: int) -> None:
+        self.state = ClockState.UNSYNCHRONISED
         self._station = station
         self._prism = prism
         self._clock = clock
         self._stamp_delay_ns = stamp_delay_ns
         self._check = TimestampCheck()
-        self._offset_ns: int | None = None
+        self._offset_ns = 0
+        """Rough offset, to read the filter at the present; meaningless while unsynchronised."""
         self._last: int | _Untimed | None = None
-        self._known: deque[int] = deque(maxlen=KNOWN_MEASUREMENTS)
-        self._held: deque[tuple[MeasurementMessage, int]] = deque(maxlen=HELD_MEASUREMENTS)
+        self._known: deque[int] = deque(maxlen=DUPLICATE_WINDOW)
+        self._held: deque[tuple[MeasurementMessage, int]] = deque(maxlen=HELD_CAPACITY)
+        self._held_before_restart = False
+        """The station may have restarted, with another clock, after a held measurement."""
         self._sequence = 0
-        self._heard_ns: int | None = None
-        self._doubtful = False
-        self._had_nothing = False
-        self._missed = False
-        self._held_of_before = False
-        """Its program may have been started again since what is held was measured, with another clock."""
+        self._received_ns: int | None = None
+        self._unanswered = False
+        """A request after the last reply was not answered."""
 
-    def unanswered(self) -> None:
-        self._missed = True
-        self._held_of_before = bool(self._held)
+    def handle(self, event: ClockEvent) -> None:
+        self.state = next_clock_state(self.state, event)
 
-    def doubt(self) -> None:
-        self._doubtful = True
+    def no_response(self) -> None:
+        self._unanswered = True
+        self._held_before_restart = bool(self._held)
 
-    def answered(self, message: MeasurementMessage, requested_ns: int, received_ns: int) -> Arrival:
-        unasked = self._heard_ns is not None and received_ns - self._heard_ns > SILENCE_NS
-        missed = self._missed or unasked
-        back = self._is_back(received_ns)
+    def reply(self, message: MeasurementMessage, requested_ns: int, received_ns: int) -> PollResult:
+        not_polled = self._received_ns is not None and received_ns - self._received_ns > SILENCE_TIMEOUT_NS
+        unnoticed_restart = self._unanswered or not_polled
+        was_silent = self._end_silence(received_ns)
         if message.time_ns == 0:
             self._check.no_new_measurement(requested_ns)
             if message.status == OK or not (message.zenith_angle_rad or message.horizontal_angle_rad):
-                # It has not measured anything yet.
-                self._had_nothing = True
-                return Arrival(doubtful=self._begins_anew(missed=missed) or back)
-            return Arrival(self._untimed(message, received_ns), doubtful=back)
+                self.handle(ClockEvent.NO_MEASUREMENT_YET)
+                restarted = self._no_measurement_yet(unnoticed_restart=unnoticed_restart)
+                return PollResult(needs_synchronisation=restarted or was_silent)
+            return PollResult(self._untimed(message, received_ns), needs_synchronisation=was_silent)
         if message.time_ns in self._known:
-            if message.time_ns == self._last:  # and not an older one that somebody plays back
+            if message.time_ns == self._last:  # not an older one that was replayed
                 self._check.no_new_measurement(requested_ns)
-            return Arrival(doubtful=back)
+            return PollResult(needs_synchronisation=was_silent)
         present = self.clock(received_ns)
-        if present is None or self._doubtful:
+        if present is None or self.state.holds:
             self._hold(message, received_ns)
-            return Arrival(doubtful=back)
-        # By the clock as it is now: carried back to a time of years ago its bound would excuse anything.
+            return PollResult(needs_synchronisation=was_silent)
+        # The bound of the present: extrapolated to a time years ago it would accept anything.
         stamp_ns, timed = message.time_ns - present.offset_ns, _timed(message)
         possible = self._check.check(
             stamp_ns, requested_ns=requested_ns, received_ns=received_ns, bound_ns=present.bound_ns
         )
-        stale = stamp_ns < requested_ns - present.bound_ns - STALE_NS
+        stale = stamp_ns < requested_ns - present.bound_ns - STALE_THRESHOLD_NS
         if not timed and (stale or not possible):  # an authors' node has no time for its errors
-            told = self._untimed(message, received_ns)
-            if told is not None and not _has_no_values(message):
-                # It has a time of its own, by which it would be told again after the next synchronisation.
+            error = self._untimed(message, received_ns)
+            if error is not None and not _has_no_values(message):
+                # It has a valid time, by which the next synchronisation would release it a second time.
                 self._known.append(message.time_ns)
-            return Arrival(told)
+            return PollResult(error)
         if not possible:
-            self._offset_ns = None
-            self._clock.forget()
+            self.handle(ClockEvent.IMPOSSIBLE_TIMESTAMP)
+            self._clock.reset()
             self._check = TimestampCheck()
             self._hold(message, received_ns)
-            return Arrival(stepped=True, doubtful=True)
-        if stale or self._had_nothing:  # between the nothing and this its program may have been started again
-            self._doubtful = True
+            return PollResult(stepped=True, needs_synchronisation=True)
+        if stale or self.state is ClockState.AWAITING_MEASUREMENT:
+            self.handle(ClockEvent.POSSIBLE_RESTART)
             self._hold(message, received_ns)
-            return Arrival(doubtful=True)
-        self._take(message)
-        return Arrival(self._measurement(message, received_ns))
+            return PollResult(needs_synchronisation=True)
+        self._remember(message)
+        return PollResult(self._measurement(message, received_ns))
 
-    def _take(self, message: MeasurementMessage) -> None:
+    def _remember(self, message: MeasurementMessage) -> None:
         self._last = message.time_ns
         self._known.append(message.time_ns)
 
     def _hold(self, message: MeasurementMessage, received_ns: int) -> None:
-        self._take(message)
+        self._remember(message)
         self._held.append((message, received_ns))
 
-    def _begins_anew(self, *, missed: bool) -> bool:
-        """Tell whether the program of a station without a measurement was started again.
+    def _no_measurement_yet(self, *, unnoticed_restart: bool) -> bool:
+        """Return whether a station without a measurement has restarted.
 
-        It was if there was a measurement before, and may have been if a request was lost, or if it was not asked for so
-        long that it can have come back unnoticed.
+        It has if there was a measurement before, and may have if a request was lost, or if it was not polled for long.
         """
-        anew, self._last = missed or self._last is not None, None
-        self._doubtful = self._doubtful or anew
-        self._held_of_before = self._held_of_before or (anew and bool(self._held))
-        return anew
+        restarted, self._last = unnoticed_restart or self._last is not None, None
+        if restarted:
+            self.handle(ClockEvent.POSSIBLE_RESTART)
+            self._held_before_restart = bool(self._held)
+        return restarted
 
-    def _is_back(self, received_ns: int) -> bool:
-        """Tell whether this is the first answer after a silence in which the station may have got another clock.
+    def _end_silence(self, received_ns: int) -> bool:
+        """Return whether this is the first reply after a silence in which the station may have got another clock.
 
-        What it says then cannot be judged by its time alone: a clock that has stood still meanwhile makes a new
-        measurement look like one from before.
+        Its time alone then proves nothing: a clock that was stopped meanwhile makes a new measurement look old.
         """
-        silent = self._missed and self._heard_ns is not None and received_ns - self._heard_ns > SILENCE_NS
-        self._heard_ns, self._missed = received_ns, False
-        self._doubtful = self._doubtful or silent
+        silent = (
+            self._unanswered
+            and self._received_ns is not None
+            and received_ns - self._received_ns > SILENCE_TIMEOUT_NS
+        )
+        self._received_ns, self._unanswered = received_ns, False
+        if silent:
+            self.handle(ClockEvent.POSSIBLE_RESTART)
         return silent
 
-    def synchronised(self, samples: Sequence[ClockSample], now_ns: int) -> Synchronised:
+    def synchronised(self, samples: Sequence[ClockSample], now_ns: int) -> SynchronisationResult:
         newest = samples[-1]
-        if self._heard_ns is None or samples[0].sent_ns - self._heard_ns > RESTART_NS:
-            self._held_of_before = bool(self._held)
-        known = self._offset_ns is not None
-        doubtful = self._doubtful
-        forgotten = known and doubtful and not self._agrees(newest)
+        if self._received_ns is None or samples[0].sent_ns - self._received_ns > MIN_RESTART_NS:
+            self._held_before_restart = bool(self._held)
+        known = self.state is not ClockState.UNSYNCHRONISED
+        suspended = self.state is ClockState.SUSPENDED
+        forgotten = suspended and not self._agrees(newest)
         if forgotten:
-            self._clock.forget()  # the paper's filter would go there a tenth of the way
-        self._missed = False
-        self._heard_ns, self._doubtful, self._had_nothing = now_ns, False, False
-        before = self._by_the_clock_before() if known and not forgotten else {}
-        updated = self._clock.update(samples, anew=doubtful)
-        another = self._held_of_before and (updated.restarted or not known)
-        stepped = updated.restarted and known
+            self._clock.reset()  # the paper's filter would only take a tenth of the step
+        earlier_ns = self._earlier_offsets_ns() if known and not forgotten else {}
+        updated = self._clock.update(samples, may_have_restarted=suspended)
+        self.handle(ClockEvent.SYNCHRONISATION)
+        self._received_ns, self._unanswered = now_ns, False
+        other_clock = self._held_before_restart and (updated.restarted or not known)
         self._offset_ns = newest.station_ns - newest.sent_ns - newest.forward_ns
-        # The first, rough offset says when "now" is over there.
+        # The first, rough offset gives the present on the station's clock.
         self._offset_ns = self._clock.at(now_ns + self._offset_ns).offset_ns
         estimate = self._at(now_ns + self._offset_ns)
         record = ClockRecord(
@@ -273,7 +313,7 @@ class _Station:
             station=self._station,
             filter=self._clock.name,
             offset_ns=estimate.offset_ns,
-            frequency_ppm=estimate.frequency_ppm,
+            frequency_ppm=estimate.skew_ppm,
             sigma_ns=estimate.sigma_ns,
             bound_ns=estimate.bound_ns,
             restarted=updated.restarted,
@@ -281,38 +321,39 @@ class _Station:
             rejected=updated.rejected,
         )
         released = [
-            self._released(*held, None if another else estimate, before.get(held[0].time_ns))
+            self._released(*held, None if other_clock else estimate, earlier_ns.get(held[0].time_ns))
             for held in self._held
         ]
         self._held.clear()
-        self._held_of_before = False
-        return Synchronised(record, [m for m in released if m is not None], stepped)
+        self._held_before_restart = False
+        return SynchronisationResult(
+            record, [m for m in released if m is not None], updated.restarted and known
+        )
 
-    def _by_the_clock_before(self) -> dict[int, int]:
-        """Return the offset in ns of each that is held, if it may be of the clock that was known so far."""
-        held = self._held if self._held_of_before else ()
+    def _earlier_offsets_ns(self) -> dict[int, int]:
+        """Return the offset in ns of each held measurement that may be of the clock before this synchronisation."""
+        held = self._held if self._held_before_restart else ()
         return {message.time_ns: self._clock.at(message.time_ns).offset_ns for message, _ in held}
 
     def _agrees(self, sample: ClockSample) -> bool:
-        """Whether an exchange is possible with the clock as it is known."""
+        """Whether a sample is consistent with the known clock."""
         estimate = self._at(sample.station_ns)
-        highest_ns = highest_offset_ns(sample) + estimate.bound_ns
-        lowest_ns = highest_offset_ns(sample) - max(sample.excess_ns, 0) - estimate.bound_ns
-        return lowest_ns <= estimate.offset_ns <= highest_ns
+        lowest_ns = sample.min_offset_ns - estimate.bound_ns
+        return lowest_ns <= estimate.offset_ns <= sample.max_offset_ns + estimate.bound_ns
 
     def clock(self, now_ns: int) -> ClockEstimate | None:
-        return None if self._offset_ns is None else self._at(now_ns + self._offset_ns)
+        return None if self.state is ClockState.UNSYNCHRONISED else self._at(now_ns + self._offset_ns)
 
     def _at(self, station_ns: int) -> ClockEstimate:
         estimate = self._clock.at(station_ns)
         return replace(estimate, bound_ns=estimate.bound_ns + self._stamp_delay_ns)
 
     def _untimed(self, message: MeasurementMessage, received_ns: int) -> PolarMeasurement | None:
-        """Take an error without a time, or with one that cannot be, once until something else comes."""
-        known_by = _Untimed(message.status)
-        if known_by == self._last:
+        """Return an error without a valid time, once until something else arrives."""
+        key = _Untimed(message.status)
+        if key == self._last:
             return None
-        self._last = known_by
+        self._last = key
         return self._record(message, received_ns, received_ns, UNTIMED_SIGMA_NS)
 
     def _released(
@@ -320,26 +361,26 @@ class _Station:
         message: MeasurementMessage,
         received_ns: int,
         present: ClockEstimate | None,
-        before_ns: int | None,
+        earlier_ns: int | None,
     ) -> PolarMeasurement | None:
-        """Stamp what was held, if it can be of the clock that has been found and not of one before that.
+        """Stamp a held measurement, if it can be of the synchronised clock.
 
-        ``before_ns`` is the offset by the clock that was known so far, where it may be of that one: it may have stepped by
-        less than exchanges tell.
+        ``earlier_ns`` is the offset before the synchronisation, where the measurement may be of that clock: a step may
+        be too small to show in the samples.
         """
         if present is not None:
             stamp_ns = message.time_ns - present.offset_ns
-            if received_ns - 2 * STALE_NS <= stamp_ns <= received_ns + present.bound_ns:
-                return self._measurement(message, received_ns, before_ns)
+            if received_ns - 2 * STALE_THRESHOLD_NS <= stamp_ns <= received_ns + present.bound_ns:
+                return self._measurement(message, received_ns, earlier_ns)
         if _timed(message):
-            return None  # nobody knows when it was; the station's journal has it
+            return None  # its time is unknown; the station's journal has it
         return self._record(message, received_ns, received_ns, UNTIMED_SIGMA_NS)
 
     def _measurement(
-        self, message: MeasurementMessage, received_ns: int, before_ns: int | None = None
+        self, message: MeasurementMessage, received_ns: int, earlier_ns: int | None = None
     ) -> PolarMeasurement:
         estimate = self._clock.at(message.time_ns)
-        stepped_ns = 0 if before_ns is None else abs(estimate.offset_ns - before_ns)
+        stepped_ns = 0 if earlier_ns is None else abs(estimate.offset_ns - earlier_ns)
         return self._record(
             message,
             received_ns,
@@ -375,10 +416,10 @@ class _Station:
 
 
 def _has_no_values(message: MeasurementMessage) -> bool:
-    """Whether this is an error of an authors' node: -1 for all values, and a time that means nothing."""
+    """Whether this is an error of an authors' node: -1 for all values, and a meaningless time."""
     return message.zenith_angle_rad < 0
 
 
 def _timed(message: MeasurementMessage) -> bool:
-    """Whether every node has a time for it: an authors' node has none for its errors."""
+    """Whether every node stamps it: an authors' node has no time for its errors."""
     return status_of(message) in (Status.OK, Status.ANGLE_ONLY)

@@ -12,14 +12,14 @@ from hypothesis import given
 from hypothesis import settings as limits
 
 from tsgt.master.classic import UNTIMED_SIGMA_NS
-from tsgt.master.classic.ingest import Intake
+from tsgt.master.classic.ingest import Ingest
 from tsgt.model import ClockSample, Status
 from tsgt.radio.classic import MeasurementMessage
 from tsgt.radio.classic.messages import decode_reply, no_measurement_yet
 from tsgt.timesync.two_way import clock_filter
 
 if TYPE_CHECKING:
-    from tsgt.master.classic.ingest import Arrival, Synchronised
+    from tsgt.master.classic.ingest import PollResult, SynchronisationResult
 
 MS = 1_000_000
 SECOND = 1000 * MS
@@ -64,26 +64,26 @@ class Master:
     """One station's intake, polled at instants that count from the start, in ms."""
 
     def __init__(self, *, synchronised: bool = True) -> None:
-        self.intake = Intake({1: 4}, lambda: clock_filter("regression"))
+        self.ingest = Ingest({1: 4}, lambda: clock_filter("regression"))
         if synchronised:
             self.synchronise(0)
 
-    def synchronise(self, at_ms: int, ahead_ns: int = AHEAD_NS, *, late_ns: int = 0) -> Synchronised:
+    def synchronise(self, at_ms: int, ahead_ns: int = AHEAD_NS, *, late_ns: int = 0) -> SynchronisationResult:
         """Take a synchronisation whose last exchange ends at an instant."""
         at_ns = START + at_ms * MS
-        return self.intake.synchronised(1, samples(at_ns, ahead_ns, late_ns=late_ns), at_ns)
+        return self.ingest.synchronised(1, samples(at_ns, ahead_ns, late_ns=late_ns), at_ns)
 
-    def poll(self, at_ms: int, answer: MeasurementMessage) -> Arrival:
+    def poll(self, at_ms: int, answer: MeasurementMessage) -> PollResult:
         """Take an answer that has been received at an instant, 194 ms after the request for it began."""
         received_ns = START + at_ms * MS
-        return self.intake.answered(answer, requested_ns=received_ns - 194 * MS, received_ns=received_ns)
+        return self.ingest.reply(answer, requested_ns=received_ns - 194 * MS, received_ns=received_ns)
 
 
 def test_a_measurement_is_put_on_the_masters_clock() -> None:
     """Its stamp is the host's less what the station is ahead; everything raw is kept."""
-    arrival = Master().poll(1000, message(START + 750 * MS + AHEAD_NS))
-    assert not arrival.stepped
-    measurement = arrival.measurement
+    result = Master().poll(1000, message(START + 750 * MS + AHEAD_NS))
+    assert not result.stepped
+    measurement = result.measurement
     assert measurement is not None
     assert measurement.stamp_ns == pytest.approx(START + 750 * MS, abs=20_000)
     assert measurement.host_time_ns == START + 750 * MS + AHEAD_NS
@@ -109,40 +109,38 @@ def test_a_repeat_is_no_measurement() -> None:
 )
 def test_before_its_first_measurement_a_station_says_nothing(answer: MeasurementMessage) -> None:
     """Time 0 is no time, whatever the status."""
-    arrival = Master().poll(1000, answer)
-    assert arrival == (None, False, False)
+    result = Master().poll(1000, answer)
+    assert result == (None, False, False)
 
 
 def test_an_error_without_a_time_is_told_once_until_it_changes() -> None:
-    """It is stamped with its arrival, very uncertain, and never taken for a sign of another clock."""
+    """It is stamped with its result, very uncertain, and never taken for a sign of another clock."""
     master = Master()
-    arrivals = [
-        master.poll(1000 * n, failure(status)) for n, status in enumerate((1, 1, 2, 2, 2, 1), start=1)
-    ]
-    told = [arrival.measurement for arrival in arrivals if arrival.measurement is not None]
+    results = [master.poll(1000 * n, failure(status)) for n, status in enumerate((1, 1, 2, 2, 2, 1), start=1)]
+    told = [result.measurement for result in results if result.measurement is not None]
     assert [m.status for m in told] == [Status.TILT, Status.WRONG_DISTANCE, Status.TILT]
     assert [m.stamp_ns - START for m in told] == [1000 * MS, 3000 * MS, 6000 * MS]
     assert {m.stamp_sigma_ns for m in told} == {UNTIMED_SIGMA_NS}
     assert {m.slope_distance_m for m in told} == {None}
-    assert not any(arrival.stepped for arrival in arrivals)
+    assert not any(result.stepped for result in results)
 
 
 def test_an_error_with_a_wild_time_is_one_without() -> None:
     """The time field of an authors' node that reports an error means nothing."""
     master = Master()
     master.poll(500, message(START + 250 * MS + AHEAD_NS))
-    arrival = master.poll(1000, replace(failure(3), time_ns=12_345 * SECOND))
-    assert arrival.measurement is not None
-    assert arrival.measurement.stamp_ns == START + 1000 * MS
-    assert not arrival.stepped
+    result = master.poll(1000, replace(failure(3), time_ns=12_345 * SECOND))
+    assert result.measurement is not None
+    assert result.measurement.stamp_ns == START + 1000 * MS
+    assert not result.stepped
 
 
 def test_an_error_with_a_good_time_is_stamped_with_it() -> None:
     """Our clients stamp errors as they stamp everything."""
-    arrival = Master().poll(1000, message(START + 800 * MS + AHEAD_NS, status=1))
-    assert arrival.measurement is not None
-    assert arrival.measurement.status is Status.TILT
-    assert arrival.measurement.stamp_ns == pytest.approx(START + 800 * MS, abs=20_000)
+    result = Master().poll(1000, message(START + 800 * MS + AHEAD_NS, status=1))
+    assert result.measurement is not None
+    assert result.measurement.status is Status.TILT
+    assert result.measurement.stamp_ns == pytest.approx(START + 800 * MS, abs=20_000)
 
 
 @pytest.mark.parametrize("step_s", [3600, 0.4, -3.0, -1e6, -1.6e9])
@@ -152,13 +150,13 @@ def test_after_a_step_measurements_wait_for_the_new_clock(step_s: float) -> None
     step_ns = round(step_s * 1e9)
     master.poll(1000, message(START + 750 * MS + AHEAD_NS))
     made_ms = (2000, 2400, 2800)
-    arrivals = [master.poll(ms + 200, message(START + ms * MS + AHEAD_NS + step_ns)) for ms in made_ms]
-    assert [(a.measurement, a.stepped, a.doubtful) for a in arrivals] == [
+    results = [master.poll(ms + 200, message(START + ms * MS + AHEAD_NS + step_ns)) for ms in made_ms]
+    assert [(a.measurement, a.stepped, a.needs_synchronisation) for a in results] == [
         (None, True, True),
         (None, False, False),
         (None, False, False),
     ]
-    assert master.intake.clock(1, START + 3000 * MS) is None
+    assert master.ingest.clock(1, START + 3000 * MS) is None
     found = master.synchronise(4500, AHEAD_NS + step_ns)
     assert found.record.restarted
     assert not found.stepped  # it has been told
@@ -195,10 +193,10 @@ def test_before_the_first_synchronisation_measurements_wait() -> None:
 
 def test_a_measurement_without_distance_has_none() -> None:
     """Distance 0 stands for none."""
-    arrival = Master().poll(1000, message(START + 750 * MS + AHEAD_NS, status=4, distance_m=0.0))
-    assert arrival.measurement is not None
-    assert arrival.measurement.status is Status.ANGLE_ONLY
-    assert arrival.measurement.slope_distance_m is None
+    result = Master().poll(1000, message(START + 750 * MS + AHEAD_NS, status=4, distance_m=0.0))
+    assert result.measurement is not None
+    assert result.measurement.status is Status.ANGLE_ONLY
+    assert result.measurement.slope_distance_m is None
 
 
 @limits(max_examples=200)
@@ -235,11 +233,11 @@ def test_a_station_that_was_silent_is_synchronised_before_it_is_believed() -> No
     """A clock that stood still while the station was off makes new measurements look old: they wait."""
     master = Master()
     assert master.poll(1000, message(START + 700 * MS + AHEAD_NS)).measurement is not None
-    master.intake.unanswered(1)
+    master.ingest.no_response(1)
     off_ns = 20 * SECOND  # its clock went on from where it was when the power went
     back = master.poll(21_200, message(START + 21_000 * MS - off_ns + AHEAD_NS))
     assert back.measurement is None
-    assert back.doubtful
+    assert back.needs_synchronisation
     assert not back.stepped
     found = master.synchronise(22_500, AHEAD_NS - off_ns)
     assert found.stepped
@@ -253,15 +251,15 @@ def test_a_station_that_was_only_not_asked_is_believed_at_once() -> None:
     master.poll(1000, message(START + 700 * MS + AHEAD_NS))
     later = master.poll(30_000, message(START + 29_800 * MS + AHEAD_NS))
     assert later.measurement is not None
-    assert not later.doubtful
+    assert not later.needs_synchronisation
 
 
 def test_after_a_silence_the_same_clock_is_not_called_another_one() -> None:
     """The synchronisation agrees with what was known, so what waited is let go and nothing is announced."""
     master = Master()
     master.poll(1000, message(START + 700 * MS + AHEAD_NS))
-    master.intake.unanswered(1)
-    assert master.poll(21_200, message(START + 21_000 * MS + AHEAD_NS)).doubtful
+    master.ingest.no_response(1)
+    assert master.poll(21_200, message(START + 21_000 * MS + AHEAD_NS)).needs_synchronisation
     found = master.synchronise(23_000)
     assert not found.stepped
     assert [m.stamp_ns for m in found.measurements] == [pytest.approx(START + 21_000 * MS, abs=MS)]
@@ -291,8 +289,8 @@ def test_what_was_held_before_a_restart_gets_no_time_of_the_clock_after_it(step_
     """Nobody knows when it was; the station's journal has it."""
     master = Master()
     master.poll(1000, message(START + 700 * MS + AHEAD_NS))
-    master.intake.unanswered(1)
-    assert master.poll(8000, message(START + 7800 * MS + AHEAD_NS)).doubtful
+    master.ingest.no_response(1)
+    assert master.poll(8000, message(START + 7800 * MS + AHEAD_NS)).needs_synchronisation
     found = master.synchronise(20_000, AHEAD_NS + round(step_s * 1e9) if step_s < 1e9 else AHEAD_NS - START)
     assert found.stepped
     assert found.measurements == []
@@ -302,9 +300,9 @@ def test_what_was_held_before_a_restart_gets_no_time_of_the_clock_after_it(step_
 def test_what_was_held_while_the_station_may_have_got_another_clock_is_let_go(known: bool) -> None:  # noqa: FBT001
     """Half a second apart, both clocks explain it; only without a lost request it is certain which one it is of."""
     master = Master(synchronised=known)
-    master.intake.unanswered(1)
+    master.ingest.no_response(1)
     master.poll(8000, message(START + 7800 * MS + AHEAD_NS))
-    master.intake.unanswered(1)
+    master.ingest.no_response(1)
     assert master.synchronise(20_000, AHEAD_NS + 500 * MS).measurements == []
 
 
@@ -321,11 +319,11 @@ def test_what_was_held_before_a_pause_that_is_long_enough_for_a_restart_is_let_g
 
 
 def test_an_error_that_was_held_while_the_station_may_have_got_another_clock_has_no_time() -> None:
-    """It is told, but with the time of its arrival: 11 ms apart, the clock that was found explains it just as well."""
+    """It is told, but with the time of its result: 11 ms apart, the clock that was found explains it just as well."""
     master = Master()
-    master.intake.unanswered(1)
+    master.ingest.no_response(1)
     master.poll(8000, message(START + 7800 * MS + AHEAD_NS, status=3, distance_m=-1.0))
-    master.intake.unanswered(1)
+    master.ingest.no_response(1)
     (measurement,) = master.synchronise(9000, AHEAD_NS + 11 * MS).measurements
     assert measurement.stamp_ns == START + 8000 * MS
     assert measurement.stamp_sigma_ns == UNTIMED_SIGMA_NS
@@ -334,9 +332,9 @@ def test_an_error_that_was_held_while_the_station_may_have_got_another_clock_has
 def test_what_was_held_is_used_if_the_clock_is_the_same_after_lost_requests() -> None:
     """The clock that was known goes on: there is but one that it can be of."""
     master = Master()
-    master.intake.unanswered(1)
+    master.ingest.no_response(1)
     master.poll(8000, message(START + 7800 * MS + AHEAD_NS))
-    master.intake.unanswered(1)
+    master.ingest.no_response(1)
     assert len(master.synchronise(20_000).measurements) == 1
 
 
@@ -344,10 +342,10 @@ def test_what_was_held_may_be_of_the_clock_before_or_of_the_one_after_a_small_st
     """A station that answers late may have stepped by as much, unnoticed: the bound contains both."""
     master, step_ns = Master(synchronised=False), 5 * MS
     master.synchronise(0, late_ns=5 * MS)
-    master.intake.unanswered(1)
+    master.ingest.no_response(1)
     held = message(START + 23_000 * MS + AHEAD_NS)
-    assert master.poll(23_200, held).doubtful
-    master.intake.unanswered(1)
+    assert master.poll(23_200, held).needs_synchronisation
+    master.ingest.no_response(1)
     found = master.synchronise(25_000, AHEAD_NS + step_ns, late_ns=5 * MS)
     assert not found.record.restarted
     (measurement,) = found.measurements
@@ -384,7 +382,7 @@ def test_a_station_that_begins_anew_once_more_is_doubted_once_more() -> None:
     """There was no measurement in between, but a request was lost; without that, one that has none is left alone."""
     master = Master()
     assert master.poll(1000, no_measurement_yet(1)) == (None, False, False)
-    master.intake.unanswered(1)
+    master.ingest.no_response(1)
     assert master.poll(1600, no_measurement_yet(1)) == (None, False, True)
     master.synchronise(3000)
     assert master.poll(3600, no_measurement_yet(1)) == (None, False, False)
@@ -393,11 +391,11 @@ def test_a_station_that_begins_anew_once_more_is_doubted_once_more() -> None:
 def test_the_papers_filter_begins_anew_after_a_restart() -> None:
     """A tenth of the way each time, it would need an hour to get there."""
     master = Master()
-    master.intake = Intake({1: 4}, lambda: clock_filter("paper"))
+    master.ingest = Ingest({1: 4}, lambda: clock_filter("paper"))
     master.synchronise(0)
     master.poll(1000, message(START + 700 * MS + AHEAD_NS))
-    master.intake.unanswered(1)
-    assert master.poll(21_200, message(START + 1200 * MS + AHEAD_NS)).doubtful
+    master.ingest.no_response(1)
+    assert master.poll(21_200, message(START + 1200 * MS + AHEAD_NS)).needs_synchronisation
     found = master.synchronise(23_000, AHEAD_NS - 20 * SECOND)
     assert found.stepped
     assert found.record.offset_ns == pytest.approx(AHEAD_NS - 20 * SECOND, abs=MS)
@@ -406,7 +404,7 @@ def test_the_papers_filter_begins_anew_after_a_restart() -> None:
 def test_the_papers_filter_begins_anew_after_a_step_that_a_measurement_has_shown() -> None:
     """The next mean is taken whole."""
     master = Master()
-    master.intake = Intake({1: 4}, lambda: clock_filter("paper"))
+    master.ingest = Ingest({1: 4}, lambda: clock_filter("paper"))
     master.synchronise(0)
     ahead_ns = AHEAD_NS + 3600 * SECOND
     assert master.poll(1000, message(START + 800 * MS + ahead_ns)).stepped
@@ -418,7 +416,7 @@ def test_the_papers_filter_begins_anew_after_a_step_that_a_measurement_has_shown
 def test_a_stamp_that_is_late_by_an_average_may_be_off_by_as_much() -> None:
     """The bound says so."""
     plain, late = Master(synchronised=False), Master(synchronised=False)
-    late.intake = Intake({1: 4}, lambda: clock_filter("regression"), {1: 700_000})
+    late.ingest = Ingest({1: 4}, lambda: clock_filter("regression"), {1: 700_000})
     bounds = [master.synchronise(0).record.bound_ns for master in (plain, late)]
     assert bounds[1] - bounds[0] == 700_000
 
@@ -429,7 +427,7 @@ def test_the_first_measurement_after_nothing_waits_for_a_synchronisation() -> No
     master.poll(1000, no_measurement_yet(1))
     first = master.poll(1600, message(START + 1300 * MS + AHEAD_NS + 30 * MS))
     assert first.measurement is None
-    assert first.doubtful
+    assert first.needs_synchronisation
     (measurement,) = master.synchronise(3000, AHEAD_NS + 30 * MS).measurements
     assert measurement.stamp_ns == pytest.approx(START + 1300 * MS, abs=MS)
     assert master.poll(3600, message(START + 3300 * MS + AHEAD_NS + 30 * MS)).measurement is not None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from harness.clock_exchanges import SECOND, START_NS, synchronisation
 
-from tsgt.master.classic.ingest import Intake
+from tsgt.master.classic.ingest import Ingest
 from tsgt.radio.classic import MeasurementMessage
 from tsgt.radio.classic.messages import no_measurement_yet
 from tsgt.timesync.two_way import RegressionFilter, clock_filter
@@ -18,22 +18,24 @@ class Master:
     """One station's intake, at instants that count from the start in s."""
 
     def __init__(self, filter_name: str = "regression") -> None:
-        self.intake = Intake({1: 4}, lambda: clock_filter(filter_name))  # type: ignore[arg-type]
+        self.ingest = Ingest({1: 4}, lambda: clock_filter(filter_name))  # type: ignore[arg-type]
         self.ahead_ns = 0
 
     def synchronise(self, at_s: float, *, cycles: int = 5) -> list[tuple[int, int | None]]:
         """Exchange packets from an instant on; return stamp and bound of what was held until then, in ns."""
         samples = synchronisation(at_s, lambda _: self.ahead_ns, cycles=cycles, turnaround_ns=TURNAROUND_NS)
-        found = self.intake.synchronised(1, samples, samples[-1].received_ns)
+        found = self.ingest.synchronised(1, samples, samples[-1].received_ns)
         return [(m.stamp_ns, m.stamp_bound_ns) for m in found.measurements]
 
     def restart(self, at_s: float, step_ns: int) -> None:
         """Start the station's program again, with a clock that is ahead by so much more; it says so."""
         self.ahead_ns += step_ns
         now_ns = START_NS + round(at_s * SECOND)
-        self.intake.unanswered(1)
+        self.ingest.no_response(1)
         answer = no_measurement_yet(1)
-        assert self.intake.answered(answer, requested_ns=now_ns - 194 * MS, received_ns=now_ns).doubtful
+        assert self.ingest.reply(
+            answer, requested_ns=now_ns - 194 * MS, received_ns=now_ns
+        ).needs_synchronisation
 
     def poll(
         self, at_s: float, *, made_s: float | None = None, status: int = 0
@@ -49,8 +51,8 @@ class Master:
             slope_distance_m=30.0 if status == 0 else 0.0,
             time_ns=made_ns + self.ahead_ns,
         )
-        arrival = self.intake.answered(message, requested_ns=received_ns - 194 * MS, received_ns=received_ns)
-        measurement = arrival.measurement
+        result = self.ingest.reply(message, requested_ns=received_ns - 194 * MS, received_ns=received_ns)
+        measurement = result.measurement
         return None if measurement is None else (measurement.stamp_ns, measurement.stamp_bound_ns)
 
 
@@ -83,10 +85,10 @@ def test_no_line_reaches_over_what_may_have_been_a_restart() -> None:
         clock.update(synchronisation(0, lambda _: 0.0, cycles=50, turnaround_ns=TURNAROUND_NS))
     stepped = synchronisation(30, lambda _: 1.0 * MS, turnaround_ns=TURNAROUND_NS)
     through.update(stepped)
-    assert not anew.update(stepped, anew=True).restarted  # as far as exchanges tell
+    assert not anew.update(stepped, may_have_restarted=True).restarted  # as far as exchanges tell
     at_ns = stepped[-1].station_ns
-    assert abs(through.at(at_ns).frequency_ppm) > 20
-    assert abs(anew.at(at_ns).frequency_ppm) < 2
+    assert abs(through.at(at_ns).skew_ppm) > 20
+    assert abs(anew.at(at_ns).skew_ppm) < 2
 
 
 @pytest.mark.parametrize("apart_s", [28, 60])
@@ -97,7 +99,9 @@ def test_a_station_that_had_nothing_yet_was_restarted_while_nobody_asked_it(apar
     master.ahead_ns += 1_800_000
     now_ns = START_NS + apart_s * SECOND
     answer = no_measurement_yet(1)
-    assert master.intake.answered(answer, requested_ns=now_ns - 194 * MS, received_ns=now_ns).doubtful
+    assert master.ingest.reply(
+        answer, requested_ns=now_ns - 194 * MS, received_ns=now_ns
+    ).needs_synchronisation
     master.synchronise(apart_s + 0.5)
     for number in range(170):
         at_s = apart_s + 3 + number / 2
@@ -115,7 +119,7 @@ def test_the_papers_filter_takes_a_tenth_all_the_same() -> None:
         clock.update(synchronisation(0, lambda _: 0.0))
     stepped = synchronisation(30, lambda _: 1.0 * MS)
     plain.update(stepped)
-    anew.update(stepped, anew=True)
+    anew.update(stepped, may_have_restarted=True)
     assert plain.at(stepped[-1].station_ns) == anew.at(stepped[-1].station_ns)
 
 
@@ -124,7 +128,7 @@ def test_what_comes_while_the_clock_is_doubted_waits_for_a_synchronisation() -> 
     master = Master()
     master.synchronise(0)
     assert master.poll(2.0) is not None
-    master.intake.doubt(1)
+    master.ingest.suspend(1)
     master.ahead_ns += 30 * MS
     assert master.poll(3.0) is None
     ((stamp_ns, _),) = master.synchronise(3.5)
@@ -133,13 +137,13 @@ def test_what_comes_while_the_clock_is_doubted_waits_for_a_synchronisation() -> 
 
 
 def test_an_error_that_came_late_is_told_once() -> None:
-    """With the time of its arrival, as it looked old; after a silence it comes again, and its clock is known by then."""
+    """With the time of its result, as it looked old; after a silence it comes again, and its clock is known by then."""
     master = Master()
     master.synchronise(0)
     assert master.poll(2.0) is not None
-    master.intake.unanswered(1)
+    master.ingest.no_response(1)
     assert master.poll(5.0, made_s=2.5, status=3) is not None
-    master.intake.unanswered(1)
+    master.ingest.no_response(1)
     assert master.poll(11.0, made_s=2.5, status=3) is None
     assert master.synchronise(12.0) == []
 
@@ -159,8 +163,6 @@ def test_errors_of_an_authors_node_are_told_although_their_time_is_always_the_sa
             slope_distance_m=-1.0,
             time_ns=12_345 * SECOND,
         )
-        arrival = master.intake.answered(
-            message, requested_ns=received_ns - 194 * MS, received_ns=received_ns
-        )
-        told.append(None if arrival.measurement is None else arrival.measurement.raw_status)
+        result = master.ingest.reply(message, requested_ns=received_ns - 194 * MS, received_ns=received_ns)
+        told.append(None if result.measurement is None else result.measurement.raw_status)
     assert told == [1, 2, None, 1]

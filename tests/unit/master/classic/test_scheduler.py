@@ -10,41 +10,45 @@ from typing import Any
 import pytest
 from harness.radios import PAPER
 
-from tsgt.master.classic.scheduler import Cadence, Scheduler, StationPlan, Task
+from tsgt.master.classic.scheduler import (
+    ScheduledTransaction,
+    Scheduler,
+    StationPlan,
+    SynchronisationSchedule,
+)
 from tsgt.model import ClockSample
-from tsgt.radio.classic import CommandTransaction, Poll, Synchronisation
+from tsgt.radio.classic import CommandTransaction, LinkTiming, Poll, Synchronisation
 from tsgt.radio.classic.messages import no_measurement_yet
-from tsgt.radio.classic.transactions import LinkTiming
 
 MS = 1_000_000
 SECOND = 1000 * MS
-TIMING = LinkTiming.of(PAPER, 250 * MS)
+TIMING = LinkTiming(PAPER, 250 * MS)
 SAMPLE = ClockSample(sent_ns=0, station_ns=1, received_ns=2, forward_ns=0, back_ns=0)
 
 # Durations at the paper's settings: a poll that is answered and one that is not, a cycle, what is around the cycles.
 POLL_NS, TIMEOUT_NS, CYCLE_NS, FRAME_NS = 195 * MS, 304 * MS, 245 * MS, 162 * MS
 
-PAPERS = Cadence(initial_cycles=50, resync_cycles=5, interval_ns=300 * SECOND)
+PAPERS = SynchronisationSchedule(initial_cycles=50, resync_cycles=5, interval_ns=300 * SECOND)
 
 
 @dataclass
 class Channel:
     """Carries turns out: stations answer, are dead, refuse orders, give no stamps, or leave their clock open."""
 
-    cadence: Cadence = PAPERS
+    schedule: SynchronisationSchedule = PAPERS
     stations: int = 3
     now_ns: int = 0
     dead: set[int] = field(default_factory=set)
     refusing: set[int] = field(default_factory=set)
     stampless: set[int] = field(default_factory=set)
-    doubted: set[int] = field(default_factory=set)
-    turns: list[tuple[int, Task]] = field(default_factory=list)
+    inconclusive: set[int] = field(default_factory=set)
+    turns: list[tuple[int, ScheduledTransaction]] = field(default_factory=list)
     spent_ns: Counter[int] = field(default_factory=Counter)
 
     def __post_init__(self) -> None:
         self.scheduler = Scheduler(
             [StationPlan(station=n, prism=n + 3) for n in range(1, self.stations + 1)],
-            self.cadence,
+            self.schedule,
             TIMING,
             self.now_ns,
         )
@@ -62,10 +66,10 @@ class Channel:
             self.spent_ns[turn.station] += took_ns
             self.now_ns += took_ns
             self.scheduler.finished(turn, self.now_ns)
-            if isinstance(turn, Synchronisation) and turn.station in self.doubted:
-                self.scheduler.doubted(turn.station, self.now_ns)
+            if isinstance(turn, Synchronisation) and turn.station in self.inconclusive:
+                self.scheduler.synchronisation_inconclusive(turn.station, self.now_ns)
 
-    def _carry_out(self, turn: Task) -> int:
+    def _carry_out(self, turn: ScheduledTransaction) -> int:
         dead = turn.station in self.dead
         if isinstance(turn, CommandTransaction):
             turn.ok = None if dead else turn.station not in self.refusing
@@ -73,7 +77,7 @@ class Channel:
         if isinstance(turn, Poll):
             turn.message = None if dead else no_measurement_yet(turn.station)
             return TIMEOUT_NS if dead else POLL_NS
-        turn.answered = not dead
+        turn.has_reply = not dead
         if dead:
             return FRAME_NS + 3 * TIMEOUT_NS
         if turn.station in self.stampless:
@@ -88,7 +92,7 @@ class Channel:
     def rate_hz(self, station: int, since_s: float) -> float:
         """How often a station was polled with success."""
         polls = [
-            turn for _, turn in self.of(Poll, since_s=since_s) if turn.station == station and turn.answered
+            turn for _, turn in self.of(Poll, since_s=since_s) if turn.station == station and turn.has_reply
         ]
         return len(polls) / (self.now_ns / SECOND - since_s)
 
@@ -99,7 +103,7 @@ def test_each_station_is_told_to_track_then_synchronised_then_polled() -> None:
     channel.run(60)
     kinds = [(type(turn), turn.station) for _, turn in channel.turns[:9]]
     assert kinds == [(kind, n) for kind in (CommandTransaction, Synchronisation, Poll) for n in (1, 2, 3)]
-    assert channel.of(CommandTransaction)[0][1]._order.to_bytes() == b"n14"
+    assert channel.of(CommandTransaction)[0][1]._command.to_bytes() == b"n14"
     assert [turn._cycles for _, turn in channel.of(Synchronisation)[:3]] == [50, 50, 50]
 
 
@@ -127,7 +131,7 @@ def test_synchronisations_are_staggered_evenly() -> None:
 
 def test_early_synchronisations_leave_time_for_polls_between_them() -> None:
     """Stations that were first synchronised one after the other do not take the channel together again."""
-    channel = Channel(Cadence(initial_cycles=5, resync_cycles=5, interval_ns=300 * SECOND))
+    channel = Channel(SynchronisationSchedule(initial_cycles=5, resync_cycles=5, interval_ns=300 * SECOND))
     channel.run(300)
     starts_ns = [at for at, _ in channel.of(Synchronisation, since_s=10)]
     assert min(b - a for a, b in pairwise(starts_ns)) > 5 * SECOND
@@ -200,7 +204,7 @@ def test_a_poll_without_an_answer_is_repeated_at_once_but_only_once() -> None:
     channel.dead.add(2)
     channel.run(62)
     stations = [turn.station for _, turn in channel.of(Poll)]
-    unanswered = next(place for place, (_, turn) in enumerate(channel.of(Poll)) if not turn.answered)
+    unanswered = next(place for place, (_, turn) in enumerate(channel.of(Poll)) if not turn.has_reply)
     assert stations[unanswered : unanswered + 4] == [2, 2, 3, 1]
 
 
@@ -245,9 +249,9 @@ def test_a_station_with_another_clock_is_synchronised_before_anything_else() -> 
 
 def test_a_station_whose_synchronisation_leaves_doubt_is_synchronised_again_at_once() -> None:
     """As one whose clock was found to be another one; its measurements wait meanwhile."""
-    channel = Channel(doubted={2})
+    channel = Channel(inconclusive={2})
     channel.run(44)
-    channel.doubted.clear()
+    channel.inconclusive.clear()
     kinds = [type(turn) for _, turn in channel.turns if turn.station == 2]
     assert kinds[:4] == [CommandTransaction, Synchronisation] * 2
     channel.run(100)
@@ -269,12 +273,12 @@ def test_a_station_whose_synchronisations_always_leave_doubt_gets_no_more_than_i
     """Each leads to the next, but others have their turns in between."""
     channel = Channel()
     channel.run(60)
-    channel.doubted.add(2)
+    channel.inconclusive.add(2)
     if not samples:
         channel.stampless.add(2)
-    channel.scheduler.doubted(2, channel.now_ns)
+    channel.scheduler.synchronisation_inconclusive(2, channel.now_ns)
     assert share_of_2(channel) < 0.34
-    channel.doubted.clear()
+    channel.inconclusive.clear()
     channel.stampless.clear()
     channel.run(1200)
     assert channel.rate_hz(2, 1150) == pytest.approx(channel.rate_hz(1, 1150), rel=0.1)
@@ -286,7 +290,7 @@ def test_doubts_that_are_far_apart_cost_no_pause() -> None:
     channel.run(60)
     for until_s in range(70, 130, 10):
         before_ns = channel.now_ns
-        channel.scheduler.doubted(2, before_ns)
+        channel.scheduler.synchronisation_inconclusive(2, before_ns)
         channel.run(until_s)
         at_once = [turn for at, turn in channel.turns if at >= before_ns][:2]
         assert [(type(turn), turn.station) for turn in at_once] == [

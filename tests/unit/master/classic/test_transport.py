@@ -1,4 +1,4 @@
-"""The collector: what a turn asks for goes out, what comes back is handed to it with its instants."""
+"""The collector: what a transaction asks for goes out, what comes back is handed to it with its instants."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from harness.radios import MS, PAPER, Bench, bench
 
 from tsgt.clock import UnixTimeline
 from tsgt.errors import RadioError
-from tsgt.master.classic import Collector
-from tsgt.radio.classic.transactions import Request, LinkTiming
+from tsgt.master.classic import Transport
+from tsgt.radio.classic import LinkTiming, Request, Transaction
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-TIMING = LinkTiming.of(PAPER, 250 * MS)
+TIMING = LinkTiming(PAPER, 250 * MS)
 TIMELINE = UnixTimeline(1000)
 
 
 @dataclass
-class Questions:
-    """A turn that sends requests and accepts replies that begin with one letter."""
+class ScriptedTransaction(Transaction):
+    """A transaction that sends requests and accepts replies that begin with one letter."""
 
     requests: list[Request]
     station: int = 1
@@ -36,7 +36,7 @@ class Questions:
         """Send the next one."""
         return self.requests.pop(0) if self.requests else None
 
-    def replied(self, payload: bytes, *, sent_ns: int, received_ns: int, exact: bool) -> bool:
+    def accept_reply(self, payload: bytes, *, sent_ns: int, received_ns: int, exact: bool) -> bool:
         """Take what begins with e."""
         if payload[:1] != b"e":
             self.refused.append(payload)
@@ -49,9 +49,9 @@ class Questions:
         self.timeouts += 1
 
 
-def collector(both: Bench) -> Collector:
+def transport_on(both: Bench) -> Transport:
     """Make one on the bench's first radio."""
-    return Collector(both.here.radio, both.clock, TIMELINE, TIMING)
+    return Transport(both.here.radio, both.clock, TIMELINE, TIMING)
 
 
 async def answer(both: Bench, replies: Sequence[tuple[int, bytes]]) -> None:
@@ -65,69 +65,69 @@ async def test_instants_are_those_on_the_air() -> None:
     """The request's begin is its TxDone less lag and airtime; the reply's is its RxDone; both are edges."""
     async with bench() as both:
         task = asyncio.create_task(answer(both, [(1, b"e1")]))
-        turn, taker = Questions([Request(b"e1", 250 * MS)]), collector(both)
+        transaction, transport = ScriptedTransaction([Request(b"e1", 250 * MS)]), transport_on(both)
         began_ns = both.clock.monotonic_ns()
-        await taker.take(turn)
+        await transport.run(transaction)
         await task
-    ((payload, sent_ns, received_ns, exact),) = turn.accepted
+    ((payload, sent_ns, received_ns, exact),) = transaction.accepted
     assert payload == b"e1"
     assert exact
     assert sent_ns - 1000 - began_ns == pytest.approx(0, abs=MS)
     both_ways_ns = 2 * (TIMING.airtime_ns(2) + TIMING.rx_done_ns) + MS
     assert received_ns - sent_ns == pytest.approx(both_ways_ns, abs=200_000)
-    assert taker.last is not None
-    assert taker.last.payload == b"e1"
-    assert taker.requested_ns == sent_ns
+    assert transport.last is not None
+    assert transport.last.payload == b"e1"
+    assert transport.requested_ns == sent_ns
 
 
 async def test_without_a_reply_the_turn_learns_of_it_when_the_time_is_over() -> None:
     """The time-out counts from the end of the transmission."""
     async with bench() as both:
-        turn = Questions([Request(b"e1", 250 * MS)])
+        transaction = ScriptedTransaction([Request(b"e1", 250 * MS)])
         began_ns = both.clock.monotonic_ns()
-        await collector(both).take(turn)
+        await transport_on(both).run(transaction)
         took_ns = both.clock.monotonic_ns() - began_ns
-    assert turn.timeouts == 1
+    assert transaction.timeouts == 1
     assert took_ns == pytest.approx(TIMING.airtime_ns(2) + 250 * MS, abs=MS)
 
 
 async def test_a_request_without_reply_is_not_waited_for() -> None:
     """The next one follows at once."""
     async with bench() as both:
-        turn = Questions([Request(b"p1", 0), Request(b"c1", 0)])
+        transaction = ScriptedTransaction([Request(b"p1", 0), Request(b"c1", 0)])
         began_ns = both.clock.monotonic_ns()
-        await collector(both).take(turn)
+        await transport_on(both).run(transaction)
         took_ns = both.clock.monotonic_ns() - began_ns
-    assert turn.timeouts == 0
+    assert transaction.timeouts == 0
     assert took_ns == pytest.approx(2 * TIMING.airtime_ns(2), abs=2 * MS)
 
 
 async def test_foreign_packets_are_counted_and_the_wait_goes_on() -> None:
-    """What the turn does not accept changes nothing else."""
+    """What the transaction does not accept changes nothing else."""
     async with bench() as both:
         task = asyncio.create_task(answer(both, [(1, b"x"), (80, b"e1")]))
-        turn, taker = Questions([Request(b"e1", 250 * MS)]), collector(both)
-        await taker.take(turn)
+        transaction, transport = ScriptedTransaction([Request(b"e1", 250 * MS)]), transport_on(both)
+        await transport.run(transaction)
         await task
-    assert turn.refused == [b"x"]
-    assert len(turn.accepted) == 1
-    assert taker.foreign == 1
+    assert transaction.refused == [b"x"]
+    assert len(transaction.accepted) == 1
+    assert transport.unrelated_packets == 1
 
 
 async def test_what_came_before_the_request_is_no_answer_to_it() -> None:
-    """A reply that was late for one turn is not taken by the next."""
+    """A reply that was late for one transaction is not taken by the next."""
     async with bench() as both:
         await both.there.radio.transmit(b"e1")
         await asyncio.sleep(0.1)
-        turn, taker = Questions([Request(b"e1", 250 * MS)]), collector(both)
-        await taker.take(turn)
-    assert turn.accepted == []
-    assert turn.timeouts == 1
-    assert taker.foreign == 1
+        transaction, transport = ScriptedTransaction([Request(b"e1", 250 * MS)]), transport_on(both)
+        await transport.run(transaction)
+    assert transaction.accepted == []
+    assert transaction.timeouts == 1
+    assert transport.unrelated_packets == 1
 
 
 async def test_a_lost_edge_makes_an_inexact_stamp() -> None:
-    """The reply was found by polling; the turn is told not to trust its instant."""
+    """The reply was found by polling; the transaction is told not to trust its instant."""
     async with bench() as both:
 
         async def answer_without_edge() -> None:
@@ -136,23 +136,23 @@ async def test_a_lost_edge_makes_an_inexact_stamp() -> None:
             await both.there.radio.transmit(b"e1", at_ns=packet.received_at_ns + MS)
 
         task = asyncio.create_task(answer_without_edge())
-        turn = Questions([Request(b"e1", 250 * MS)])
-        await collector(both).take(turn)
+        transaction = ScriptedTransaction([Request(b"e1", 250 * MS)])
+        await transport_on(both).run(transaction)
         await task
-    assert [exact for *_, exact in turn.accepted] == [False]
+    assert [exact for *_, exact in transaction.accepted] == [False]
 
 
 async def test_a_packet_that_was_there_in_time_counts_even_if_the_program_was_late() -> None:
     """The loop was held up beyond the time-out while the packet came."""
     async with bench() as both:
         task = asyncio.create_task(answer(both, [(1, b"e1")]))
-        turn = Questions([Request(b"e1", 250 * MS)])
+        transaction = ScriptedTransaction([Request(b"e1", 250 * MS)])
         loop = asyncio.get_running_loop()
         loop.call_later(0.15, both.timeline.advance, 600 * MS)
-        await collector(both).take(turn)
+        await transport_on(both).run(transaction)
         await task
-    assert len(turn.accepted) == 1
-    assert turn.timeouts == 0
+    assert len(transaction.accepted) == 1
+    assert transaction.timeouts == 0
 
 
 async def test_errors_of_the_radio_reach_the_caller() -> None:
@@ -160,5 +160,5 @@ async def test_errors_of_the_radio_reach_the_caller() -> None:
     async with bench() as both:
         await both.here.radio.close()
         with pytest.raises(RadioError):
-            await collector(both).take(Questions([Request(b"e1", 250 * MS)]))
+            await transport_on(both).run(ScriptedTransaction([Request(b"e1", 250 * MS)]))
     assert TRUE.monotonic_ns() < 1000 * MS

@@ -13,8 +13,7 @@ from harness.frames import KEY, TIMING, counted
 from harness.radios import MS, Bench, bench
 
 from tsgt.master.superframe import FrameLoop
-from tsgt.radio.superframe import SuperframeMaster
-from tsgt.radio.superframe.phase_lock import FramePlan
+from tsgt.radio.superframe import FramePlan, SuperframeMaster
 from tsgt.radio.superframe.wire import (
     CODE_BYTES,
     Authenticator,
@@ -29,14 +28,14 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from tsgt.radio import Packet, Transmission
-    from tsgt.radio.superframe.reception import ReceivedReply
+    from tsgt.radio.superframe import ReceivedReply
 
 
 @dataclass
-class Notes:
+class CallLog:
     """A listener that writes down what it is told."""
 
-    told: list[str] = field(default_factory=list)
+    calls: list[str] = field(default_factory=list)
     sent_ns: list[int] = field(default_factory=list)
     ready_after_s: float = 0.0
 
@@ -46,21 +45,21 @@ class Notes:
 
     def composing(self) -> None:
         """Note it."""
-        self.told.append("composing")
+        self.calls.append("composing")
 
-    def beacon(self, sent: Transmission) -> None:
+    def beacon_sent(self, sent: Transmission) -> None:
         """Note it."""
-        self.told.append("beacon")
+        self.calls.append("beacon")
         self.sent_ns.append(sent.done_at_ns)
 
-    def heard(self, heard: ReceivedReply, packet: Packet) -> None:
+    def received(self, reply: ReceivedReply, packet: Packet) -> None:
         """Note who."""
         assert packet.payload
-        self.told.append(f"heard {heard.station}")
+        self.calls.append(f"received {reply.station}")
 
-    def silent(self, stations: Sequence[int]) -> None:
+    def not_received(self, stations: Sequence[int]) -> None:
         """Note who."""
-        self.told.append(f"silent {list(stations)}")
+        self.calls.append(f"not received {list(stations)}")
 
 
 class LateLock:
@@ -87,7 +86,7 @@ def master_on(both: Bench, *, late: bool = False) -> SuperframeMaster:
         Authenticator(KEY),
         counted(),
         both.clock.monotonic_ns(),
-        lock=lock,  # type: ignore[arg-type]
+        phase_lock=lock,  # type: ignore[arg-type]
     )
 
 
@@ -117,47 +116,47 @@ async def answer(both: Bench, master: SuperframeMaster, *, early_ns: int = 0) ->
 async def test_frames_go_round() -> None:
     """Composed, out, heard, silent; the next one follows when the last slot is over."""
     async with bench() as both:
-        master, notes = master_on(both), Notes()
+        master, call_log = master_on(both), CallLog()
         async with (
             running(answer(both, master)),
-            running(FrameLoop(both.here.radio, both.clock, master, notes).run()),
+            running(FrameLoop(both.here.radio, both.clock, master, call_log).run()),
         ):
             await asyncio.sleep(3)
-    assert notes.told[:8] == ["composing", "beacon", "heard 2", "silent [1]"] * 2
-    for before_ns, after_ns in pairwise(notes.sent_ns):
+    assert call_log.calls[:8] == ["composing", "beacon", "received 2", "not received [1]"] * 2
+    for before_ns, after_ns in pairwise(call_log.sent_ns):
         assert (after_ns - before_ns) / MS < 500
 
 
 async def test_a_frame_ends_when_nobody_is_waited_for_any_more() -> None:
     """Without an answer it lasts until the last slot is over."""
     async with bench() as both:
-        master, notes = master_on(both), Notes()
-        async with running(FrameLoop(both.here.radio, both.clock, master, notes).run()):
+        master, call_log = master_on(both), CallLog()
+        async with running(FrameLoop(both.here.radio, both.clock, master, call_log).run()):
             await asyncio.sleep(2)
-    assert notes.told[:6] == ["composing", "beacon", "silent [1, 2]"] * 2
+    assert call_log.calls[:6] == ["composing", "beacon", "not received [1, 2]"] * 2
     slots_ns = 2 * (TIMING.airtime_ns(44) + TIMING.guard_ns) + TIMING.turnaround_ns
     session_bytes = 25  # of a beacon that tells two stations how to join
-    first_ns = notes.sent_ns[1] - notes.sent_ns[0] - TIMING.airtime_ns(session_bytes)
+    first_ns = call_log.sent_ns[1] - call_log.sent_ns[0] - TIMING.airtime_ns(session_bytes)
     assert first_ns == pytest.approx(slots_ns, abs=8 * MS)
 
 
 async def test_a_frame_that_is_to_begin_later_is_composed_later() -> None:
     """So that it acknowledges what is written until then."""
     async with bench() as both:
-        master, notes = master_on(both, late=True), Notes()
-        async with running(FrameLoop(both.here.radio, both.clock, master, notes).run()):
+        master, call_log = master_on(both, late=True), CallLog()
+        async with running(FrameLoop(both.here.radio, both.clock, master, call_log).run()):
             await asyncio.sleep(0.9)
-            assert notes.told == []
+            assert call_log.calls == []
             await asyncio.sleep(0.1)
-            assert notes.told == ["composing"]
+            assert call_log.calls == ["composing"]
 
 
 async def test_nothing_is_sent_before_all_is_put_away() -> None:
     """The listener says when."""
     async with bench() as both:
-        master, notes = master_on(both), Notes(ready_after_s=1.0)
-        async with running(FrameLoop(both.here.radio, both.clock, master, notes).run()):
+        master, call_log = master_on(both), CallLog(ready_after_s=1.0)
+        async with running(FrameLoop(both.here.radio, both.clock, master, call_log).run()):
             await asyncio.sleep(0.99)
-            assert notes.told == []
+            assert call_log.calls == []
             await asyncio.sleep(0.1)
-            assert notes.told == ["composing"]
+            assert call_log.calls == ["composing"]

@@ -370,7 +370,7 @@ async def test_a_station_without_its_prism_is_told_where_the_robot_is(tmp_path: 
             )
             assert aside_rad < towards.spread_rad
     assert events(field) == ["instrument_status 2", "instrument_status 2"]
-    ordered = [log for log in logs if log["event"] == "search_ordered"]
+    ordered = [log for log in logs if log["event"] == "search_commanded"]
     assert [log["station"] for log in ordered] == [2, 2, 2]
     assert undelivered(field, until_s=53) == NOTHING
     assert station_status(field, 1).rate_hz == pytest.approx(2.5, abs=0.11)
@@ -438,7 +438,7 @@ async def test_a_direction_that_has_grown_old_is_not_given_any_more(tmp_path: Pa
         link.set_attenuation("master", "station-3", 200)
         with capture_logs() as logs:
             await asyncio.sleep(20)
-        assert [log["event"] for log in logs].count("search_ordered") == 1
+        assert [log["event"] for log in logs].count("search_commanded") == 1
         assert tool.sought == []
         link.set_attenuation("master", "station-3", 0)
         await asyncio.sleep(5)

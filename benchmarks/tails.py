@@ -13,7 +13,7 @@ import sys
 from dataclasses import replace
 
 import numpy as np
-from instrument_time import Case, errors  # type: ignore[import-not-found]  # the script beside this one
+from instrument_time import Case, errors  # type: ignore[import-not-found]  # a script in this folder
 from scipy.stats import chi2
 
 from tsgt.config import ScenarioConfig

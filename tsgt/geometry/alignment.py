@@ -126,17 +126,10 @@ def align(
 
 
 def fit_gain(points: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return the derivative of the fitted rigid transform by the displacement of each point.
+    """Return the derivative of the fitted rigid transform by the displacement of each of n points, as blocks of shape (n, 6, 3).
 
-    Parameters
-    ----------
-    points
-        (n, 3) from the origin of the moved frame in m.
-    weights
-        (n,) in the fit.
-
-    Returns (n, 6, 3). Summed over the points, gain times displacement is (translation of the moved frame's origin, small
-    rotation) in the axes of ``points``: the weighted pseudo-inverse of ``[I, -skew(point)]``, in blocks.
+    Summed over the points, gain times displacement is (translation of the moved frame's origin, small rotation) in the axes of
+    ``points``, (n, 3) in m from that origin: the pseudo-inverse of ``[I, -skew(point)]`` with the fit's weights, (n,).
     """
     w = weights / weights.sum()
     mean = w @ points
@@ -150,20 +143,12 @@ def fit_gain(points: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 def align_triplets(layout: ArrayLike, points: ArrayLike) -> BatchAlignment:
-    """Closed-form alignment of three layout points with N measured triplets.
+    """Closed-form alignment of three layout points, (3, 3), with N measured triplets, (N, 3, 3): item, point, coordinate.
 
-    Raises DegenerateGeometryError: the layout's points coincide or are collinear. A degenerate measured triplet is marked
-    instead.
+    In m, in the body and in the world frame. The optimum is that of :func:`align_many` to rounding.
+
+    Raises DegenerateGeometryError: the layout's points coincide or are collinear; a degenerate measured triplet is marked instead.
     Raises GeometryError: wrong shapes or numbers that are not finite.
-
-    Parameters
-    ----------
-    layout
-        (3, 3) the three points in the body frame in m.
-    points
-        (N, 3, 3) measured triplets in the world frame in m: item, point, coordinate.
-
-    Returns the same optimum as :func:`align_many`, to rounding.
 
     Notes
     -----
@@ -226,16 +211,9 @@ def _triangle(points: bytes) -> tuple[FloatArray, float, FloatArray, FloatArray,
 
 
 def align_many(layout: ArrayLike, points: ArrayLike) -> BatchAlignment:
-    """Alignment of a layout of any size with N measured sets, by one SVD each (Arun et al. 1987), equal weights.
+    """Alignment of a layout, (P, 3) in the body frame in m, with N measured sets, (N, P, 3) in the world frame in m.
 
-    Raises DegenerateGeometryError, GeometryError: as :func:`align_triplets`.
-
-    Parameters
-    ----------
-    layout
-        (P, 3) points in the body frame in m, P >= 3.
-    points
-        (N, P, 3) measured sets in the world frame in m.
+    By one SVD each (Arun et al. 1987), equal weights; P >= 3. Raises as :func:`align_triplets`.
     """
     layout = _points(layout, "layout")
     batch = _batch(points, len(layout))

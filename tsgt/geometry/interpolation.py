@@ -82,18 +82,8 @@ def interpolate_prisms(
 ) -> Interpolated:
     """Interpolate the samples of P prisms as :func:`interpolate` does for one, without its checks.
 
-    Parameters
-    ----------
-    times_ns
-        (M,) sample times of all prisms, prism after prism, strictly increasing within each.
-    points
-        (M, 3) sample positions in m.
-    counts
-        Samples of each of the P prisms.
-    epochs_ns
-        (N,) in any order.
-
-    Returns shapes (N, P, ...). ``after`` indexes the samples of all prisms.
+    ``times_ns``, (M,), and ``points``, (M, 3) in m, are prism after prism, strictly increasing within each; ``counts`` are the
+    samples of each prism. The result has shapes (N, P, ...); its ``after`` indexes the samples of all prisms.
     """
     after = np.empty((len(epochs_ns), len(counts)), dtype=np.int64)
     bounds = list(accumulate(counts, initial=0))
@@ -141,12 +131,7 @@ def interpolated_covariance(
 def interpolation_error_s2(fraction: FloatArray, gap_ns: NDArray[np.int64]) -> FloatArray:
     """Error of linear interpolation per unit of constant acceleration, in m per m/s^2: t_before t_after / 2.
 
-    Parameters
-    ----------
-    fraction
-        Position of the epoch in the interval, 0 to 1.
-    gap_ns
-        Length of the interval, of the same shape.
+    ``fraction`` is the position of the epoch in the interval, 0 to 1, ``gap_ns`` the interval's length; of the same shape.
     """
     gap_s = np.asarray(gap_ns) * 1e-9
     error_s2: FloatArray = (fraction * gap_s) * ((1 - fraction) * gap_s) / 2

@@ -23,16 +23,9 @@ if TYPE_CHECKING:
 def polar_to_cartesian(
     horizontal_angle_rad: ArrayLike, zenith_angle_rad: ArrayLike, distance_m: ArrayLike
 ) -> FloatArray:
-    """Points in the station frame, (..., 3) in m, of polar measurements.
+    """Points in the station frame, (..., 3) in m, of polar measurements with corrected slope distances.
 
-    Parameters
-    ----------
-    horizontal_angle_rad
-        Clockwise.
-    zenith_angle_rad
-        Above pi in the second face, where the horizontal angle is turned by pi: both faces give the same point.
-    distance_m
-        Corrected slope distance.
+    Zenith angles above pi are of the second face, where the horizontal angle is turned by pi: both faces give the same point.
     """
     return np.asarray(distance_m)[..., None] * _direction(horizontal_angle_rad, zenith_angle_rad)
 
@@ -40,11 +33,8 @@ def polar_to_cartesian(
 def cartesian_to_polar(points: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
     """First-face polar coordinates of points in the station frame, (..., 3) in m; inverse of :func:`polar_to_cartesian`.
 
-    Returns
-    -------
-    tuple of FloatArray
-        Horizontal angle in rad in [0, 2 pi), zenith angle in rad in [0, pi], distance in m, each of shape (...). An
-        undefined angle is 0: the horizontal angle on the vertical axis, both angles at the station itself.
+    Returns horizontal angle in rad in [0, 2 pi), zenith angle in rad in [0, pi], distance in m. An undefined angle is 0: the
+    horizontal angle on the vertical axis, both angles at the station itself.
     """
     x, y, z = np.moveaxis(np.asarray(points, dtype=np.float64), -1, 0)
     horizontal_m = np.hypot(x, y)
@@ -56,16 +46,9 @@ def cartesian_to_polar(points: ArrayLike) -> tuple[FloatArray, FloatArray, Float
 
 
 def corrected_distance(slope_distance_m: ArrayLike, *, constant_m: float, ppm: float) -> FloatArray:
-    """Corrected slope distance in m: atmospheric scale and prism constant applied.
+    """Corrected slope distance in m: atmospheric correction in ppm of the raw distance, prism constant in m added.
 
-    Parameters
-    ----------
-    slope_distance_m
-        As measured.
-    constant_m
-        Prism constant, added. It is not scaled: it is a length of glass, not of air.
-    ppm
-        Atmospheric correction in 1e-6 of the raw distance.
+    The constant is not scaled: it is a length of glass, not of air.
     """
     return np.asarray(slope_distance_m, dtype=np.float64) * (1 + ppm * 1e-6) + constant_m
 
@@ -132,18 +115,9 @@ def measurement_covariance(
 ) -> FloatArray:
     """Covariance of measured points in the station frame, (..., 3, 3) in m^2.
 
-    Parameters
-    ----------
-    horizontal_angle_rad, zenith_angle_rad, distance_m
-        As for :func:`polar_to_cartesian`.
-    noise
-        Instrument sigmas. The range's constant and ppm parts are independent and add as variances.
-
-    Notes
-    -----
-    The horizontal angle's sigma is the angle sigma over sin(zenith angle), and the point moves by distance x sin(zenith
-    angle) per rad of it. The sines cancel: across the line of sight the noise is distance x angle sigma in all directions,
-    straight up as well.
+    The range's constant and ppm parts are independent and add as variances. The horizontal angle's sigma is the angle sigma over
+    sin(zenith angle), and the point moves by distance x sin(zenith angle) per rad of it. The sines cancel: across the line of sight
+    the noise is distance x angle sigma in all directions, straight up as well.
     """
     distance_m = np.asarray(distance_m, dtype=np.float64)
     direction = _direction(horizontal_angle_rad, zenith_angle_rad)

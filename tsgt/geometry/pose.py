@@ -45,15 +45,10 @@ class Poses:
 def poses_from_prisms(layout: ArrayLike, points: ArrayLike) -> Poses:
     """Fit the prism layout to measured prisms (paper section III-D), unweighted.
 
+    ``layout`` is (P, 3) in the robot frame, P >= 3, ``points`` are (N, P, 3) in the world, both in m and in the same order.
+
     Raises DegenerateGeometryError: fewer than three prisms in the layout, or they coincide or are collinear.
     Raises GeometryError: wrong shapes or numbers that are not finite.
-
-    Parameters
-    ----------
-    layout
-        (P, 3) the P >= 3 prisms in the robot frame in m.
-    points
-        (N, P, 3) the prisms in the world in m, in the same order.
     """
     fit = (align_triplets if np.shape(layout)[:1] == (3,) else align_many)(layout, points)
     squares = dot(fit.residuals_m, fit.residuals_m)
@@ -71,16 +66,9 @@ def poses_from_prisms(layout: ArrayLike, points: ArrayLike) -> Poses:
 def pose_covariance(layout: FloatArray, rotation: FloatArray, prism_covariances: FloatArray) -> FloatArray:
     """Propagate prism noise through the unweighted fit, to first order.
 
-    Parameters
-    ----------
-    layout
-        (P, 3) the prisms in the robot frame in m.
-    rotation
-        (N, 3, 3) ``R_world_robot``.
-    prism_covariances
-        (N, P, 3, 3) of the measured prisms in the world in m^2.
-
-    Returns (N, 6, 6), symmetric: x, y, z of the robot's origin in m, rotation about the world's axes in rad.
+    From the layout, (P, 3) in the robot frame in m, ``R_world_robot``, (N, 3, 3), and the covariances of the measured prisms,
+    (N, P, 3, 3) in the world in m^2, to (N, 6, 6), symmetric: x, y, z of the robot's origin in m, rotation about the world's axes
+    in rad.
     """
     from_robot = rotation[:, None, None]
     gain = _gains(layout)[0].reshape(-1, 2, 3, 3)
@@ -105,18 +93,14 @@ def interpolation_error_covariance(
 
     Parameters
     ----------
-    layout
-        (P, 3) the prisms in the robot frame in m.
-    rotation
-        (N, 3, 3) ``R_world_robot``.
     error_s2
-        (N, P) interpolation error per unit of acceleration in s^2: see :func:`tsgt.geometry.interpolation_error_s2`.
+        (N, P) interpolation error per unit of acceleration: see :func:`tsgt.geometry.interpolation_error_s2`.
     acceleration_sigma_mps2
         One sigma, per axis, of the acceleration of the prisms' centroid.
     angular_acceleration_sigma_radps2
         One sigma, per axis, of the robot's angular acceleration.
 
-    Returns (N, 6, 6), in the order and axes of :func:`pose_covariance`, to be added to it.
+    Returns (N, 6, 6), to be added to :func:`pose_covariance`, with the same arguments and axes.
     """
     effects = _over_prisms(error_s2[:, :, None, None, None] * _gains(layout)[1])
     # From the robot frame, where the gains are constant, to the world; translation and rotation separately.
@@ -132,23 +116,10 @@ def interpolation_error_covariance(
 def twists(
     layout: FloatArray, rotation: FloatArray, prism_velocities_mps: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Unweighted least-squares twist of the rigid robot from its prisms' velocities.
+    """Unweighted least-squares twist of the rigid robot from its prisms' velocities, (N, P, 3) in the world.
 
-    Parameters
-    ----------
-    layout
-        (P, 3) the prisms in the robot frame in m.
-    rotation
-        (N, 3, 3) ``R_world_robot``.
-    prism_velocities_mps
-        (N, P, 3) in the world.
-
-    Returns
-    -------
-    velocity_mps : FloatArray
-        (N, 3) of the robot's origin in the world.
-    angular_velocity_radps : FloatArray
-        (N, 3) in the robot frame.
+    Other arguments as for :func:`pose_covariance`. Returns the velocity of the robot's origin in the world in m/s and the angular
+    velocity in the robot frame in rad/s, (N, 3) each.
     """
     in_robot = rotate(np.swapaxes(rotation, 1, 2)[:, None], prism_velocities_mps)
     twist = _over_prisms(rotate(_gains(layout)[0], in_robot))
@@ -156,18 +127,11 @@ def twists(
 
 
 def check_layout(layout: ArrayLike, names: Sequence[object] | None = None) -> None:
-    """Check that a prism layout determines poses well.
+    """Check that a prism layout, (P, 3) in the robot frame in m, determines poses well; ``names`` are for messages.
 
-    Raises DegenerateGeometryError: fewer than three prisms, two of them closer than :data:`MIN_PRISM_DISTANCE_M`, or all of
-    them nearly collinear (:data:`MIN_LAYOUT_RATIO`).
+    Raises DegenerateGeometryError: fewer than three prisms, two of them closer than :data:`MIN_PRISM_DISTANCE_M`, or all of them
+    nearly collinear (:data:`MIN_LAYOUT_RATIO`).
     Raises GeometryError: wrong shape or numbers that are not finite.
-
-    Parameters
-    ----------
-    layout
-        (P, 3) the prisms in the robot frame in m.
-    names
-        Names of the prisms in messages; 1, 2, ... when not given.
     """
     array = np.asarray(layout, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != 3:

@@ -56,19 +56,11 @@ class PointSet:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointPairs:
-    """The same points in two frames, in the same order.
-
-    Attributes
-    ----------
-    source, target
-        The points in either frame, with the same names.
-    levelled
-        Both z axes are vertical: only heading and position are solved.
-    """
+    """The same points in two frames, in the same order and with the same names."""
 
     source: PointSet
     target: PointSet
-    levelled: bool
+    levelled: bool  # both z axes are vertical: only heading and position are solved
 
     @property
     def names(self) -> tuple[PointName, ...]:
@@ -96,26 +88,19 @@ class PointPairs:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameFit:
-    """A rigid transform from source to target.
-
-    Attributes
-    ----------
-    rotation, translation_m
-        (3, 3) and (3,): ``target = rotation source + translation_m``.
-    covariance
-        (6, 6) of (x, y, z, rotation about the target frame's fixed axes x, y, z) in m and rad, from the noise of the points;
-        zero for components that are not solved.
-    """
+    """A rigid transform: ``target = rotation source + translation_m``."""
 
     rotation: FloatArray
     translation_m: FloatArray
+    # (6, 6) of (x, y, z, rotation about the target frame's fixed axes x, y, z) in m and rad, from the noise of the points;
+    # zero for components that are not solved
     covariance: FloatArray
 
     def residuals_m(self, pairs: PointPairs) -> FloatArray:
         """(n, 3) target minus transformed source."""
         moved = pairs.source.points_m @ self.rotation.T + self.translation_m
-        misses: FloatArray = pairs.target.points_m - moved
-        return misses
+        residuals: FloatArray = pairs.target.points_m - moved
+        return residuals
 
     def residual_covariances_m2(self, pairs: PointPairs) -> FloatArray:
         """(n, 3, 3) covariance of the residuals from the noise of both points."""
@@ -196,7 +181,7 @@ def _initial_fit(pairs: PointPairs) -> FrameFit:
     if across <= 1e-6 * along or np.hypot(cosine, sine) == 0:
         raise DegenerateGeometryError(
             f"expected points apart from each other in plan, got a horizontal spread of {1e3 * across:.3f} mm; "
-            "add points beside them"
+            "add points away from them"
         )
     rotation = exp_so3(np.array([0.0, 0.0, np.arctan2(sine, cosine)]))
     return FrameFit(rotation, target.mean(axis=0) - rotation @ source.mean(axis=0), no_covariance)

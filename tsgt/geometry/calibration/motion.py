@@ -60,16 +60,16 @@ COARSE_NOISE_SCALES = (20.0, 4.0)
 class MotionCalibration:
     """A set-up found from motion."""
 
-    initial: Setup  # The given set-up
+    initial: Setup  # as given
     setup: Setup
-    # Parameters about the set-up that the search began with: with levelled stations the given one without tilts
+    # Parameters about the initial set-up, without its tilts if stations are levelled
     parameters: SetupParameters
     covariance: FloatArray  # (G, G) of the parameters, scaled by ``birge_ratio`` squared
     # How much more the segments of the recording disagree than noise and timestamp drift explain, at least 1: a
     # sinking tripod
     birge_ratio: float
     wander_s: float  # One sigma of each station's latency from segment to segment; included in the covariance
-    prior: MotionPrior  # Motion prior
+    prior: MotionPrior
     noise_scale: float  # Factor on the stated noise
     measurements: int
     outliers: int

@@ -44,12 +44,9 @@ class _Track(NamedTuple):
 def frames_from_motion(observations: Observations) -> FloatArray:
     """Return initial frames, (S, 4, 4), of stations that are approximately level.
 
-    Raises GeometryError: two stations have too few epochs in common, or the robot hardly moved.
+    From polar measurements in the order of time; of their frames only that of station 1 (row 0) is used.
 
-    Parameters
-    ----------
-    observations
-        Polar measurements in the order of time; of their frames only that of station 1 (row 0) is used.
+    Raises GeometryError: two stations have too few epochs in common, or the robot hardly moved.
     """
     stations = np.unique(observations.station)
     if 0 not in stations:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 class SetupPrior:
     """What to estimate, and its prior: one sigma each, 0 for what is fixed."""
 
-    translation_sigma_m: float = 0.0  # Of each coordinate of the robot as seen by the stations 2, 3,
+    translation_sigma_m: float = 0.0  # Of each coordinate of the robot as seen by each station but the first
     rotation_sigma_rad: float = 0.0  # Of a station's rotation about each axis
     levelled: bool = False  # Stations rotate about the vertical only: 4 instead of 6 degrees of freedom
     latency_sigma_s: float = 0.0  # Of a station's latency relative to that of station 1
@@ -76,35 +76,16 @@ class Setup:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SetupParameters:
-    """Layout of the G parameters in one vector.
+    """Layout of the G parameters in one vector: indices of each kind, empty where it is fixed."""
 
-    Attributes
-    ----------
-    reference
-        The set-up about which the prior holds.
-    pivot
-        (3,) centroid of all measurements in frame ``station1``, about which stations rotate.
-    stations
-        (n,) rows of the stations whose frame or latency is estimated.
-    translations, rotations
-        (n, 3) and (n, 3 or 1) indices of each station's frame correction; rotation about z only if there is one. n is 0 where
-        frames are fixed.
-    latencies
-        (n,) indices; empty where latencies are fixed.
-    prisms
-        (3 P - 6,) indices of the deformation modes; empty where prisms are fixed.
-    sigmas
-        (G,) of the prior.
-    """
-
-    reference: Setup
-    pivot: FloatArray
-    stations: NDArray[np.intp]
-    translations: NDArray[np.intp]
-    rotations: NDArray[np.intp]
-    latencies: NDArray[np.intp]
-    prisms: NDArray[np.intp]
-    sigmas: FloatArray
+    reference: Setup  # the set-up about which the prior holds
+    pivot: FloatArray  # (3,) centroid of all measurements in frame ``station1``, about which stations rotate
+    stations: NDArray[np.intp]  # (n,) rows of the stations whose frame or latency is estimated
+    translations: NDArray[np.intp]  # (n, 3)
+    rotations: NDArray[np.intp]  # (n, 3), or (n, 1) about z
+    latencies: NDArray[np.intp]  # (n,)
+    prisms: NDArray[np.intp]  # (3 P - 6,) of the deformation modes
+    sigmas: FloatArray  # (G,) of the prior
 
     @classmethod
     def of(cls, observations: Observations, setup: Setup, prior: SetupPrior) -> SetupParameters:

@@ -178,14 +178,10 @@ def calibrate_frame(
 def calibrate_prisms(body: PointSet, body_cad: PointSet, prisms: PointSet) -> PrismCalibration:
     """Find the prisms in the robot frame from one station's measurements of them and of body points.
 
-    Raises DegenerateGeometryError: fewer than three body points, or they coincide or are collinear.
+    ``body`` and ``prisms`` are measured from the same place, in the station's frame; ``body_cad`` has the body points in the robot
+    frame, from CAD, with the build tolerance as covariance.
 
-    Parameters
-    ----------
-    body, prisms
-        Body points and prisms as measured from the same place, in the station's frame.
-    body_cad
-        The body points in the robot frame, from CAD, with the build tolerance as covariance.
+    Raises DegenerateGeometryError: fewer than three body points, or they coincide or are collinear.
     """
     frame = calibrate_frame(body, body_cad, limits=BODY_LIMITS)
     rotation = frame.T[:3, :3]
@@ -299,7 +295,7 @@ def _tilt_rad(pairs: PointPairs) -> float | None:
     try:
         tilted = fit_frame(free, weighted=True)
     except DegenerateGeometryError:
-        return None  # a line of points cannot tell
+        return None  # collinear points
     tilted_chi_squared = tilted.chi_squared(free)
     drop = fit_frame(pairs, weighted=True).chi_squared(pairs) - tilted_chi_squared
     if drop <= chdtri(2, FALSE_ALARM_RATE) * _noise_scale(tilted_chi_squared / free.redundancy):

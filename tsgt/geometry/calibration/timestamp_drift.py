@@ -43,14 +43,9 @@ class WanderElimination(NamedTuple):
 def eliminate_wander(
     segment: SegmentInformation, latencies: NDArray[np.intp], wander_s: float
 ) -> WanderElimination:
-    """Marginalise an additional latency of each station in a segment.
+    """Marginalise an additional latency of each station in a segment, with one sigma of ``wander_s``.
 
-    Parameters
-    ----------
-    latencies
-        (n,) rows of the latencies in the parameters, of all stations but the first.
-    wander_s
-        One sigma of the additional latency of each station.
+    ``latencies``, (n,), are the rows of the latencies in the parameters, of all stations but the first.
     """
     information, gradient = segment
     # Relative to station 1, whose own wander shifts all others alike.
@@ -73,16 +68,9 @@ def eliminate_wander(
 def estimate_wander_s(
     segments: Sequence[SegmentInformation], prior: SegmentInformation, latencies: NDArray[np.intp]
 ) -> float:
-    """One sigma of the wander of latencies between segments; 0 without evidence for it.
+    """Return one sigma of the wander of latencies between segments; 0 without evidence for it.
 
-    Parameters
-    ----------
-    segments
-        The segments of a recording, linearised at one set-up.
-    prior
-        Prior information on the parameters at the same set-up.
-    latencies
-        (n,) rows of the latencies in the parameters.
+    ``segments`` and the ``prior`` are linearised at one set-up; ``latencies``, (n,), are the rows of the latencies.
     """
     if not len(latencies) or len(segments) < 2:
         return 0.0

@@ -62,7 +62,7 @@ some measurements rejected, another pose metres away may fit the rest.
 """
 
 COST_TOLERANCE = 0.01
-"""Predicted gain, in squared sigmas of the whole window, below which a step is the last one. Beside an outlier, whose weight
+"""Predicted gain, in squared sigmas of the whole window, below which a step is the last one. With an outlier, whose weight
 changes with each step, a tolerance of 1 left predictions up to 0.6 sigmas from those of a full search.
 """
 
@@ -94,7 +94,7 @@ MAX_STEPS = 5
 
 _DIFFUSE_SIGMAS = np.repeat([1.0, 1.0, 10.0, 10.0, 10.0, 10.0], 3)
 """Sigmas of the first state's error (m, rad, and their first and second time derivatives) once measurements determine it to
-millimetres. Larger ones would be lost to rounding beside the stiff process factors when it is eliminated.
+millimetres. Larger ones would be lost to rounding against the stiff process factors when it is eliminated.
 """
 
 

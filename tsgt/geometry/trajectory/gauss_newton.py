@@ -89,38 +89,28 @@ class Solution(NamedTuple):
     """The maximum a posteriori trajectory."""
 
     knots: States
-    factor: BlockCholesky  # Cholesky factor of the normal equations at the solution
+    factor: BlockCholesky  # of the normal equations at the solution
     # (M,) squared Mahalanobis distance of each measurement's residual; 3 on average for good ones
     squared_distances: FloatArray
     weights: FloatArray  # (M,) of the robust loss, 1 for inliers
-    linearised: LinearisedMeasurements  # Measurements linearised at the solution
+    linearised: LinearisedMeasurements  # at the solution
     knot_index: NDArray[np.intp]  # (M,) knot that each measurement is attached to
     cost: float  # Minus twice the log posterior density, up to a constant
     iterations: int
-    process: ProcessFactors  # Process factors between the knots
+    process: ProcessFactors
 
 
 class NormalEquations(NamedTuple):
-    """Normal equations at a trajectory.
+    """Normal equations at a trajectory; fields not explained here are those of :class:`Solution`."""
 
-    Attributes
-    ----------
-    diagonal, off_diagonal, gradient
-        (K, 18, 18), (K - 1, 18, 18) and (K, 18).
-    cost, squared_distances, weights, linearised
-        As in :class:`Solution`.
-    whitened
-        (M, 3, 19) whitened Jacobians and residuals, without the robust weights.
-    """
-
-    diagonal: FloatArray
-    off_diagonal: FloatArray
-    gradient: FloatArray
+    diagonal: FloatArray  # (K, 18, 18)
+    off_diagonal: FloatArray  # (K - 1, 18, 18)
+    gradient: FloatArray  # (K, 18)
     cost: float
     squared_distances: FloatArray
     weights: FloatArray
     linearised: LinearisedMeasurements
-    whitened: FloatArray
+    whitened: FloatArray  # (M, 3, 19) whitened Jacobians and residuals, without the robust weights
 
 
 def knot_times(time_s: FloatArray, *, min_spacing_s: float = MIN_KNOT_SPACING_S) -> FloatArray:
@@ -265,15 +255,9 @@ def assemble(
 ) -> NormalEquations:
     """Assemble the normal equations at a trajectory.
 
-    Parameters
-    ----------
-    knot_index
-        (M,) knot that each measurement is attached to.
-    active
-        (M,) False: the measurement gets no weight and no cost. All are active when not given.
-    rejectable
-        (M,) True: the measurement is rejected beyond :data:`REJECTION_THRESHOLD`, unless half of all are outliers. None is
-        rejected when not given; reject only at a converged trajectory.
+    Each of the M measurements is attached to the knot ``knot_index``. One that is not ``active`` gets no weight and no cost; one that
+    is ``rejectable`` none beyond :data:`REJECTION_THRESHOLD`, unless half of all are outliers. By default all are active and none
+    is rejectable; reject only at a converged trajectory.
     """
     linearised = linearise(observations, knots, knot_index)
     whitened = linearised.whitened(observations)

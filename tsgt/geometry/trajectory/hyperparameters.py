@@ -130,14 +130,7 @@ def maximise_evidence(
 ) -> Hyperparameters:
     """Maximise the evidence within bounds by L-BFGS-B.
 
-    Raises GeometryError: no segment has enough measurements of three prisms.
-
-    Parameters
-    ----------
-    observations, on_progress
-        As for :func:`tune`.
-    start, lower, upper
-        (7,) log parameters as from :func:`log_parameters`.
+    ``start``, ``lower`` and ``upper``, (7,), are log parameters as from :func:`log_parameters`; the rest is as for :func:`tune`.
     """
     segments = _segments(observations)
     evaluations = 0
@@ -188,7 +181,7 @@ def _segments(observations: Observations) -> list[_Segment]:
                 continue
     if not found:
         raise GeometryError(
-            f"too few measurements to tell how the robot moves: no {length_s:.0f} s of them have "
+            f"too few measurements to tune the motion prior: no {length_s:.0f} s of them have "
             f"{MIN_MEASUREMENTS}, of at least 3 prisms"
         )
     return found
@@ -334,20 +327,11 @@ _MANOEUVRE_RADPS = 1.0
 
 
 def with_noise_floor(prior: MotionPrior, floor: MotionPrior, share: float = 1.0) -> MotionPrior:
-    """Raise the process noise of a prior to a share of another one's, axis by axis.
+    """Raise the process noise of a prior to that of ``share`` times the sigmas of ``floor``, axis by axis.
 
     Priors are compared by the power spectral density of the acceleration at the frequency of manoeuvres, ``sigma^2 time /
     (1 + (frequency time)^2)``: a sigma means little if the acceleration is too short or too long for a manoeuvre. Correlation
     times are kept.
-
-    Parameters
-    ----------
-    prior
-        Raised where it is below the floor.
-    floor
-        Reference for the floor.
-    share
-        Of the floor's acceleration sigma.
     """
     times_s = axis_correlation_times_s(prior)
     min_sigmas = (
@@ -366,12 +350,8 @@ def _relative_power(time_s: FloatArray) -> FloatArray:
 def partially_occluded(time_s: FloatArray, prism: NDArray[np.intp], at_s: FloatArray) -> NDArray[np.bool_]:
     """Whether fewer than three prisms are observed at times ``at_s``, (N,).
 
-    A prism is observed while its measurements before and after are at most :data:`OUTAGE_S` apart.
-
-    Parameters
-    ----------
-    time_s, prism
-        (M,) measurements in the order of time.
+    A prism is observed while its measurements (M times in increasing order, M prisms) before and after are at most
+    :data:`OUTAGE_S` apart.
     """
     observed = np.zeros(len(at_s), np.intp)
     for each in np.unique(prism):

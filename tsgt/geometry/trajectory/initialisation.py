@@ -46,7 +46,7 @@ class PrismTracks:
         measured = [prism for prism in range(len(observations.layout)) if np.any(observations.prism == prism)]
         if len(measured) < 3:
             raise GeometryError(
-                f"a trajectory needs measurements of 3 prisms to begin with, {len(measured)} have been measured"
+                f"a trajectory needs measurements of 3 prisms, {len(measured)} have been measured"
             )
         each = (observations.prism == prism for prism in measured)
         return cls(
@@ -65,7 +65,7 @@ class PrismTracks:
             valid = np.flatnonzero(~poses.degenerate)
         if not len(valid):
             raise GeometryError(
-                "the measured prisms lie in a line or at one place: which station tracks which prism?"
+                "the measured prisms lie in a line or at one place: check which station tracks which prism"
             )
         rotation = _interpolate_rotation(time_s, time_s[valid], poses.rotation[valid])
         # The tracked prisms, if any, determine the position.

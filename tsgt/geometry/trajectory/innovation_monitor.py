@@ -77,16 +77,8 @@ class InnovationMonitor:
     ) -> None:
         """Process new measurements.
 
-        Parameters
-        ----------
-        observations
-            M measurements of the window, old and new.
-        is_new
-            (M,).
-        inconsistent
-            (N,) the new measurements whose innovation failed the gate.
-        outliers
-            (M,) outliers of the updated trajectory.
+        Of the window's M measurements ``is_new`` marks the N new ones and ``outliers`` those of the updated trajectory;
+        ``inconsistent``, (N,), are the new ones whose innovation failed the gate.
         """
         flagged = np.zeros(len(observations), np.bool_)
         flagged[~is_new] = self._flagged

@@ -22,37 +22,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Observations:
-    """M prism measurements, in the order of time.
+    """M prism measurements, in the order of time."""
 
-    Attributes
-    ----------
-    time_s
-        (M,) from the trajectory's time origin, corrected for the station's latency.
-    time_sigma_s
-        (M,).
-    points_m
-        (M, 3) measured prism in the station frame, prism constant and atmospheric correction applied.
-    sigmas_m
-        (M, 3) along the line of sight, horizontally across it, and across it in the plane of the zenith angle.
-    polar
-        (M,) whether range and angles were measured; otherwise Cartesian coordinates.
-    station, prism
-        (M,) rows of ``frames`` and ``layout``.
-    frames
-        (S, 4, 4) ``T_station1_station``.
-    layout
-        (P, 3) prisms in m, in the axes of the robot, from the reference point of the states.
-    """
-
-    time_s: FloatArray
-    time_sigma_s: FloatArray
+    time_s: FloatArray  # (M,) from the trajectory's time origin, corrected for the station's latency
+    time_sigma_s: FloatArray  # (M,)
+    # (M, 3) measured prism in the station frame, prism constant and atmospheric correction applied
     points_m: FloatArray
+    # (M, 3) along the line of sight, horizontally across it, and across it in the plane of the zenith angle
     sigmas_m: FloatArray
-    polar: NDArray[np.bool_]
-    station: NDArray[np.intp]
-    prism: NDArray[np.intp]
-    frames: FloatArray
-    layout: FloatArray
+    polar: NDArray[np.bool_]  # (M,) range and angles were measured; otherwise Cartesian coordinates
+    station: NDArray[np.intp]  # (M,) row of ``frames``
+    prism: NDArray[np.intp]  # (M,) row of ``layout``
+    frames: FloatArray  # (S, 4, 4) ``T_station1_station``
+    layout: FloatArray  # (P, 3) prisms in m, in the axes of the robot, from the reference point of the states
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -70,28 +52,15 @@ class Observations:
 
 @dataclass(frozen=True, slots=True)
 class LinearisedMeasurements:
-    """Residuals and Jacobians of M measurements.
+    """Residuals and Jacobians of M measurements."""
 
-    Attributes
-    ----------
-    residuals_m
-        (M, 3) predicted minus measured: along the line of sight, horizontally and vertically across it.
-    jacobian
-        (M, 3, 18) by the error of the knot's state.
-    by_point
-        (M, 3, 3) by the prism's position in frame ``station1``.
-    point_m, velocity_mps
-        (M, 3) predicted position and velocity of the prism at the time of the measurement.
-    rotation
-        (M, 3, 3) of the robot at that time.
-    """
-
+    # (M, 3) predicted minus measured: along the line of sight, horizontally and vertically across it
     residuals_m: FloatArray
-    jacobian: FloatArray
-    by_point: FloatArray
-    point_m: FloatArray
-    velocity_mps: FloatArray
-    rotation: FloatArray
+    jacobian: FloatArray  # (M, 3, 18) by the error of the knot's state
+    by_point: FloatArray  # (M, 3, 3) by the prism's position in frame ``station1``
+    point_m: FloatArray  # (M, 3) predicted position of the prism at the time of the measurement
+    velocity_mps: FloatArray  # (M, 3)
+    rotation: FloatArray  # (M, 3, 3) of the robot at that time
 
     def covariance(self, observations: Observations) -> FloatArray:
         """(M, 3, 3) covariance of the residuals in m^2: instrument noise plus time noise times the prism's velocity."""
@@ -180,14 +149,9 @@ def _residuals_by_point(observations: Observations, point: FloatArray) -> tuple[
 
 
 def line_of_sight_axes(points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return unit vectors along and across the lines of sight to points, (M, 3), in the station frame.
+    """Return unit vectors along and across the lines of sight to points, (M, 3), in the station frame, and the distances, (M,).
 
-    Returns
-    -------
-    axes : FloatArray
-        (M, 3, 3) rows: along, across in the direction of growing horizontal angle, across in that of growing zenith angle.
-    distance_m : FloatArray
-        (M,).
+    The rows of (M, 3, 3) are: along, across in the direction of growing horizontal angle, across in that of growing zenith angle.
     """
     distance_m = np.sqrt(dot(points_m, points_m))
     # A corrected distance of zero has no direction: any unit vector avoids NaN.

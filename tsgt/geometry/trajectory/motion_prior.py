@@ -61,12 +61,7 @@ def prior_from_axes(sigmas: Iterable[float], times_s: Iterable[float]) -> Motion
 def transition(dt_s: ArrayLike, time_s: ArrayLike) -> FloatArray:
     """Transition matrices ``Phi(dt)`` of one axis, (..., 3, 3), for (position, velocity, acceleration).
 
-    Parameters
-    ----------
-    dt_s
-        Step, not negative.
-    time_s
-        Correlation time of the acceleration; broadcast with ``dt_s``.
+    Steps, not negative, and correlation times of the acceleration, in s, are broadcast.
     """
     dt_s = np.asarray(dt_s, np.float64)
     s = dt_s / np.asarray(time_s, np.float64)
@@ -95,20 +90,9 @@ def interpolation_weights(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Interpolation of one axis between two known states (Barfoot, section 3.4, for this prior).
 
-    The mean is ``from_earlier @ x_earlier + from_later @ x_later``; ``conditional`` is the covariance given both states, for
-    unit acceleration sigma.
-
-    Parameters
-    ----------
-    before_s, after_s
-        From the earlier state to the query time and from there to the later state, not negative, their sum above zero.
-    time_s
-        Correlation time of the acceleration.
-
-    Returns
-    -------
-    from_earlier, from_later, conditional : FloatArray
-        (..., 3, 3) each.
+    The query is ``before_s`` after the earlier and ``after_s`` before the later state, not negative, their sum above zero.
+    Returns (..., 3, 3) each: the mean is ``from_earlier @ x_earlier + from_later @ x_later``, and ``conditional`` is the covariance
+    given both states, for unit acceleration sigma.
     """
     dts_s = np.stack([before_s, after_s, before_s + after_s])
     q = process_noise(before_s, time_s)

@@ -200,12 +200,7 @@ def _symmetric(matrix: FloatArray) -> FloatArray:
 def ros_covariance(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
     """Pose covariances in ROS order, (N, 6, 6): x, y, z, rotation about the fixed axes x, y, z of ``station1``.
 
-    Parameters
-    ----------
-    rotation
-        (N, 3, 3) ``R_station1_robot``.
-    covariance
-        (N, d, d) of states' errors, d >= 6.
+    From ``R_station1_robot``, (N, 3, 3), and the covariance of states' errors, (N, d, d), d >= 6.
     """
     to_fixed_axes = np.zeros((len(rotation), 6, 6))
     to_fixed_axes[:, :3, :3] = IDENTITY
@@ -216,21 +211,10 @@ def ros_covariance(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
 def state_at_point(
     states: States, covariance: FloatArray, lever_arm: FloatArray
 ) -> tuple[States, FloatArray]:
-    """Motion of another point of the rigid robot.
+    """Motion of another point of the rigid robot, and the (N, 6, 6) covariance of its position's and rotation's errors.
 
-    Parameters
-    ----------
-    covariance
-        (N, d, d) of the states' errors, d >= 6.
-    lever_arm
-        (3,) from the states' reference point to the other point, in the robot frame, in m.
-
-    Returns
-    -------
-    states : States
-        Of the other point.
-    covariance : FloatArray
-        (N, 6, 6) of the errors of its position and of the rotation.
+    ``covariance`` is that of the states' errors, (N, d, d), d >= 6; ``lever_arm``, (3,) in the robot frame in m, points from the
+    states' reference point to the other point.
     """
     rotation, rate = states.rotation, states.angular_velocity
     lever_velocity = cross(rate, lever_arm)
@@ -254,19 +238,8 @@ def with_second_order_terms(rotation: FloatArray, covariance: FloatArray) -> tup
     mean square of the latter is 3 σ⁴ r² / 4, with σ² the variance of θ. One prism alone leaves rotations about three axes, each
     of which moves the point closer; the mean product of two of them is σ₁² σ₂² / 4.
 
-    Parameters
-    ----------
-    rotation
-        (N, 3, 3).
-    covariance
-        (N, 6, 6) of the errors of position and rotation, as from :func:`state_at_point`.
-
-    Returns
-    -------
-    covariance : FloatArray
-        (N, 6, 6).
-    sigma_rad : FloatArray
-        (N,) one sigma of the least certain rotation; NaN where rounding made its variance negative.
+    ``rotation`` is (N, 3, 3), ``covariance`` (N, 6, 6) as from :func:`state_at_point`. Returns the covariance with these terms and
+    one sigma of θ in rad, (N,), the least certain rotation; NaN where rounding made its variance negative.
     """
     variance, axes = np.linalg.eigh(covariance[:, 3:, 3:])
     # The displacement per rad is the covariance with the rotation over its variance; the variance cancels in the square.

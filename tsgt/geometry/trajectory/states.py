@@ -38,27 +38,15 @@ _MIN_WRAP_RAD = 0.3
 
 @dataclass(frozen=True, slots=True)
 class States:
-    """States at K times.
+    """States at K times: the motion of the layout's reference point and of the robot's rotation."""
 
-    Attributes
-    ----------
-    time_s
-        (K,) strictly increasing, from the trajectory's time origin.
-    position, velocity, acceleration
-        (K, 3) of the layout's reference point, in frame ``station1``: m, m/s, m/s^2.
-    rotation
-        (K, 3, 3) ``R_station1_robot``.
-    angular_velocity, angular_acceleration
-        (K, 3) in the robot frame: rad/s, rad/s^2.
-    """
-
-    time_s: FloatArray
-    position: FloatArray
-    rotation: FloatArray
-    velocity: FloatArray
-    angular_velocity: FloatArray
-    acceleration: FloatArray
-    angular_acceleration: FloatArray
+    time_s: FloatArray  # (K,) strictly increasing, from the trajectory's time origin
+    position: FloatArray  # (K, 3) in frame ``station1``, m
+    rotation: FloatArray  # (K, 3, 3) ``R_station1_robot``
+    velocity: FloatArray  # (K, 3) in frame ``station1``, m/s
+    angular_velocity: FloatArray  # (K, 3) in the robot frame, rad/s
+    acceleration: FloatArray  # (K, 3) in frame ``station1``, m/s^2
+    angular_acceleration: FloatArray  # (K, 3) in the robot frame, rad/s^2
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -130,23 +118,14 @@ class LinearisedProcess:
 
     The residual of an axis is ``later - Phi earlier``. It is linear in the states except for the rotation, whose Jacobians
     depend on them.
-
-    Attributes
-    ----------
-    earlier, later
-        (K - 1, 6, 3) per axis, relative to the earlier knot's pose: the earlier knot's (0, velocity, acceleration), and the
-        later knot's (displacement or rotation vector, velocity, acceleration).
-    residuals
-        (K - 1, 18).
-    rotation_by_earlier, rotation_by_later
-        (K - 1, 3, 6) derivatives of the rotation between the knots by the errors of rotation and angular velocity of either.
     """
 
-    earlier: FloatArray
+    earlier: FloatArray  # (K - 1, 6, 3) per axis: zero, velocity and acceleration of the earlier knot
+    # (K - 1, 6, 3) displacement or rotation vector from the earlier knot, velocity and acceleration of the later knot
     later: FloatArray
-    residuals: FloatArray
-    rotation_by_earlier: FloatArray
-    rotation_by_later: FloatArray
+    residuals: FloatArray  # (K - 1, 18)
+    rotation_by_earlier: FloatArray  # (K - 1, 3, 6) by the errors of rotation and angular velocity
+    rotation_by_later: FloatArray  # (K - 1, 3, 6)
 
 
 def linearise_process(knots: States, factors: ProcessFactors) -> LinearisedProcess:
@@ -184,16 +163,10 @@ def add_process_factors(
     off_diagonal: FloatArray,
     gradient: FloatArray,
 ) -> float:
-    """Add the process factors to the normal equations, in place; only the rotation's Jacobians are not constant.
+    """Add the K - 1 process factors to the normal equations, in place; only the rotation's Jacobians are not constant.
 
-    Parameters
-    ----------
-    linearised, factors
-        The K - 1 steps.
-    diagonal, off_diagonal, gradient
-        (K, 18, 18), (K - 1, 18, 18), (K, 18).
-
-    Returns sum of the squared Mahalanobis distances of the residuals.
+    Shapes of ``diagonal``, ``off_diagonal`` and ``gradient``: (K, 18, 18), (K - 1, 18, 18), (K, 18). Returns the sum of the squared
+    Mahalanobis distances of the residuals.
     """
     count = len(factors.phi)
     translation = slice(0, 3)

@@ -145,9 +145,9 @@ def test_no_wander_in_white_noise() -> None:
 def test_gap_of_all_stations() -> None:
     """Half a minute without measurements splits the segments; both sides agree."""
     observations = with_errors(drive())
-    heard = observations.select((observations.time_s < 20.0) | (observations.time_s > 52.0))
-    found = calibrate_motion(heard, REFINE, prior=PRIOR, noise_scale=1.0)
-    assert found.measurements == len(heard)
+    observations_with_gap = observations.select((observations.time_s < 20.0) | (observations.time_s > 52.0))
+    found = calibrate_motion(observations_with_gap, REFINE, prior=PRIOR, noise_scale=1.0)
+    assert found.measurements == len(observations_with_gap)
     assert found.outliers < 5
     assert found.birge_ratio < 1.5
 

@@ -214,7 +214,7 @@ def test_nearly_collinear_points_are_weak_about_their_line(aside_m: float) -> No
 
 
 def test_unpredictable_point_is_not_suspected() -> None:
-    """Of four points, the one beside a line of three cannot be predicted."""
+    """Of four points, the one off a line of three cannot be predicted."""
     points = IN_LINE + np.outer([0, 2.0, 0, 0], [0.6, 0.8, 0.0])
     solved = [calibrate_frame(*field(points, seed=seed).measure()) for seed in range(20)]
     assert all(frame.consistent for frame in solved)

@@ -86,7 +86,7 @@ def test_noise_scale_is_tuned(observations: Observations) -> None:
 
 def test_no_trajectory_without_three_prisms(observations: Observations) -> None:
     """The error says how many prisms were measured."""
-    with pytest.raises(GeometryError, match="3 prisms to begin with, 2 have been measured"):
+    with pytest.raises(GeometryError, match="3 prisms, 2 have been measured"):
         fit_trajectory(observations.select(observations.prism < 2), prior=PRIOR, noise_scale=1.0)
 
 

@@ -256,11 +256,11 @@ def test_accepted_reflection_marks_an_ambiguous_interval(seed: int) -> None:
         window.update(wrong.select(slice(each, each + 1)))
         window.marginalise_before(wrong.time_s[each] - LAG_S)
     at_s = time_grid(float(wrong.time_s[row]) - 0.4, float(wrong.time_s[row]) + 0.4)
-    believed = at_s[~window.ambiguous_at(at_s) & (at_s < window.ambiguous_from_s)]
-    states, covariance = window.trajectory().at(believed, dim=6)
-    errors = states.local_coordinates_about(motion.select(rows_at(believed)))[:, :6]
+    unambiguous = at_s[~window.ambiguous_at(at_s) & (at_s < window.ambiguous_from_s)]
+    states, covariance = window.trajectory().at(unambiguous, dim=6)
+    errors = states.local_coordinates_about(motion.select(rows_at(unambiguous)))[:, :6]
     assert (
-        max([_nees(errors[i : i + 1], covariance[i : i + 1]) for i in range(len(believed))], default=0.0)
+        max([_nees(errors[i : i + 1], covariance[i : i + 1]) for i in range(len(unambiguous))], default=0.0)
         < 60.0
     )
 

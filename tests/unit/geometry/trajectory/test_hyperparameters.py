@@ -210,7 +210,7 @@ def test_stationary_robot() -> None:
 
 def test_too_few_measurements_are_rejected(observations: Observations) -> None:
     """Some seconds, or two prisms, raise an error that says what is missing."""
-    with pytest.raises(GeometryError, match="too few measurements to tell how the robot moves"):
+    with pytest.raises(GeometryError, match="too few measurements to tune the motion prior"):
         tune(observations.select(slice(0, MIN_MEASUREMENTS - 1)))
     with pytest.raises(GeometryError, match="of at least 3 prisms"):
         tune(observations.select(observations.prism < 2))

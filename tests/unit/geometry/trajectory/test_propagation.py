@@ -48,9 +48,9 @@ def test_process_noise_scale_acts_on_the_variance() -> None:
     state, covariance = rotating(0.3)
     sigma_mps2, sigma_radps2 = PRIOR.acceleration_sigma_mps2, PRIOR.angular_acceleration_sigma_radps2
     x, y, z, roll, pitch, yaw = (float(np.sqrt(2.0)) * each for each in (*sigma_mps2, *sigma_radps2))
-    lively = replace(
+    doubled_prior = replace(
         PRIOR, acceleration_sigma_mps2=(x, y, z), angular_acceleration_sigma_radps2=(roll, pitch, yaw)
     )
     _, found = Propagator(state, covariance, PRIOR, process_noise_scale=2.0).at(7.6)
-    _, expected = Propagator(state, covariance, lively).at(7.6)
+    _, expected = Propagator(state, covariance, doubled_prior).at(7.6)
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-15)

@@ -212,7 +212,7 @@ def test_ros_covariance_is_that_of_drawn_errors() -> None:
     np.testing.assert_allclose(found, expected, atol=0.02 * np.abs(expected).max())
 
 
-# What follows is about one hundred robots that move as the prior says, each measured for so long:
+# Duration of the measurements of one hundred robots drawn from the prior:
 UNTIL_S = 8.0
 AHEAD_S = np.array([0.1, 0.3, 1.0])
 INSIDE_S = np.array([2.0, 3.3, 4.7, 6.0])

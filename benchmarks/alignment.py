@@ -94,7 +94,3 @@ def main() -> None:
     print(f"largest difference in rotation or translation (m): {difference:.1e}")
     print(f"closed form against batched SVD: {batched_s / closed_s:.1f}x faster")
     print(f"closed form against plain loop: {loop_s / closed_s:.1f}x faster")
-
-
-if __name__ == "__main__":
-    main()

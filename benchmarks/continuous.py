@@ -4,7 +4,7 @@ A simulated robot drives curves on rough ground; each station measures 2.5 times
 process with one thread. The batch is what `tsgt process` does, without input and output: tuning of the prior, the trajectory
 with all covariances, and poses 20 times a second.
 
-    python benchmarks/continuous.py [HOURS]
+    python benchmarks/run.py continuous [HOURS]
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.geometry import Observations, exp_so3, invert, transform_from, transform_points
-from tsgt.geometry.trajectory import FixedLagSmoother, fit_trajectory
+from tsgt.geometry import exp_so3, invert, transform_from, transform_points
+from tsgt.geometry.trajectory import FixedLagSmoother, Observations, fit_trajectory
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:
@@ -119,7 +119,3 @@ def main() -> None:
         took_ms = updates(stations)
         p50, p99 = np.percentile(took_ms, [50, 99])
         print(f"  {stations:3} {took_ms.mean():8.2f} {p50:8.2f} {p99:8.2f} {took_ms.max():8.2f}", flush=True)
-
-
-if __name__ == "__main__":
-    main()

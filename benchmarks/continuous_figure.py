@@ -1,7 +1,7 @@
 """Draw the errors of both estimators over a minute of a simulated recording, with the 95 % bound of `continuous`.
 
 tsgt simulate --protocol superframe --seed 0 --faults none --output dynamic.jsonl --truth dynamic.tum
-python benchmarks/continuous_figure.py dynamic.jsonl dynamic.tum docs/explanation/figures/continuous-errors.svg
+python benchmarks/run.py continuous_figure dynamic.jsonl dynamic.tum docs/explanation/figures/continuous-errors.svg
 """
 
 from __future__ import annotations
@@ -120,7 +120,3 @@ def main() -> None:
         # The renderer leaves blanks at ends of lines.
         lines = output.read_text(encoding="utf-8").splitlines()
         output.write_text("\n".join(line.rstrip() for line in lines) + "\n", encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()

@@ -5,7 +5,7 @@ measurements arrive together, 0.4 s apart and 0.15 to 0.3 s old. Poses are predi
 alone, once by the live estimator; those less certain than its default limits (0.1 m, 5 degrees) or more than 1.2 s from the
 manoeuvre are omitted.
 
-    python benchmarks/hard_manoeuvres.py [ROBOTS]
+    python benchmarks/run.py hard_manoeuvres [ROBOTS]
 """
 
 from __future__ import annotations
@@ -17,10 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
-from tsgt.geometry import FixedLagSmoother
+from tsgt.geometry.trajectory import FixedLagSmoother
 from tsgt.model import MotionPrior
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from harness.manoeuvre import speeding_up_and_turning_back
 from harness.prior_motion import measure, rows_at, sorted_by_time
 
@@ -89,7 +88,3 @@ def main() -> None:
                 sure = nees[~np.isnan(nees)]
                 above = ", ".join(f"{1e6 * np.mean(sure > limit):.0f}" for limit in ABOVE)
                 print(f"{name}, {way}: {len(sure) / len(nees):.0%}, {sure.max():.0f}, {above}", flush=True)
-
-
-if __name__ == "__main__":
-    main()

@@ -3,7 +3,7 @@
 For each drive: NEES of valid poses, their errors, and the share of valid poses; once with the maximum-evidence prior, once as
 `tsgt process` does it, once with the configured prior.
 
-    python benchmarks/hidden_bends.py [NAME:SEED]...
+    python benchmarks/run.py hidden_bends [NAME:SEED]...
 """
 
 from __future__ import annotations
@@ -116,7 +116,3 @@ def main() -> None:
     for each in sys.argv[1:] or DRIVES:
         name, _, seed = each.partition(":")
         drive(name, int(seed))
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,7 @@
 """Accuracy of `tsgt calibrate motion`: errors planted into simulated drives, and what remains of them.
 
     tsgt simulate dynamic --seed 3 --output r3.jsonl
-    python benchmarks/motion_calibration.py r3.jsonl ... [--length 300]
+    python benchmarks/run.py motion_calibration r3.jsonl ... [--length 300]
 
 Takes recordings with true frames and latencies, cuts them into drives of a length in seconds, displaces station 2 by 5 mm,
 0.5 mrad (each in a random direction) and 30 ms, and calibrates. Prints, per drive, the largest error of translations (mm),
@@ -103,7 +103,3 @@ def main() -> None:
         f"errors over 2 sigmas {100 * np.mean(np.abs(sigmas) > 2):.1f} %, over 3 {100 * np.mean(np.abs(sigmas) > 3):.1f} %, "
         f"largest {np.abs(sigmas).max():.1f}"
     )
-
-
-if __name__ == "__main__":
-    main()

@@ -3,7 +3,7 @@
 For each recording and prior, sigmas and noise scale are tuned on the same segments. The table has the log evidence relative to
 white noise on acceleration, and held-out prediction errors (folds as in `tsgt evaluate`; the prior is tuned without them).
 
-    python benchmarks/motion_prior.py RECORDING...
+    python benchmarks/run.py motion_prior RECORDING...
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ from tsgt.recording import load_recording
 
 if TYPE_CHECKING:
     from tsgt.analysis.evaluation import Fold
-    from tsgt.geometry import FloatArray, Observations
+    from tsgt.geometry import FloatArray
+    from tsgt.geometry.trajectory import Observations
     from tsgt.geometry.trajectory.hyperparameters import Hyperparameters
 
 # An acceleration that lasts a millisecond is white at any rate of measuring; one of a minute, over the steps between
@@ -115,7 +116,3 @@ def main() -> None:
             print(row(name, evidence, missed_m(observations, time_s), more), flush=True)
         lines = cross_validate(folds(observations), lambda fold: interpolation_errors(observations, fold))  # noqa: B023
         print(row("linear", "", lines.error_m[~lines.at_gap]), flush=True)
-
-
-if __name__ == "__main__":
-    main()

@@ -3,7 +3,7 @@
 For each kind of pose: the mean NEES over all robots with its 95 % band, and the share beyond the 95 % limit. Successive times
 are not independent, so that each has its own band.
 
-    python benchmarks/nees.py [ROBOTS]
+    python benchmarks/run.py nees [ROBOTS]
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from scipy.stats import chi2
 from tsgt.geometry.trajectory import Trajectory, initial_guess, knot_times, solve
 from tsgt.model import MotionPrior
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from harness.prior_motion import STEP_S, draw_motions, measure, rows_at, sorted_by_time
 
 ROBOTS = 400
@@ -78,7 +77,3 @@ def main() -> None:
             cells = " ".join(f"{m:6.2f} ({b:4.1%})".rjust(13) for m, b in zip(means, beyond, strict=True))
             print(f"  {part:>18} {low:6.2f}-{high:5.2f} {cells}")
     print(f"{outside} of {total} means outside their 95 % band; {time.process_time() - start_s:.0f} s of CPU")
-
-
-if __name__ == "__main__":
-    main()

@@ -3,7 +3,7 @@
 In the reference scenario the prism of station 1 is hidden repeatedly. Unless the telescope reacquires it, a fine adjustment in a
 window of 5 degrees and a lock-in follow at once, where the telescope rests.
 
-    python benchmarks/other_prism.py [--narrow]
+    python benchmarks/run.py other_prism [--narrow]
 """
 
 from __future__ import annotations
@@ -75,7 +75,3 @@ def main() -> None:
             f"hidden {hidden_s} s: "
             + ", ".join(f"{what} {found[what]}" for what in ("right", "another", "none"))
         )
-
-
-if __name__ == "__main__":
-    main()

@@ -4,7 +4,7 @@ Batch poses of the robot of the scenario `dynamic`, whose motion is not Gaussian
 errors of the client's fit of the instrument's clock (benchmarks/instrument_time.py); clients and instruments restart every
 ten minutes. Once with the stated time noise alone, once with that of the estimator.
 
-    python benchmarks/tails.py [HOURS] [FIRST_SEED]
+    python benchmarks/run.py tails [HOURS] [FIRST_SEED]
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from scipy.stats import chi2
 from tsgt.config import ScenarioConfig
 from tsgt.estimation.observations import FIRST_TIME_SIGMA_S, FIRST_TIMES, INSTRUMENT_TIME_SIGMA_S
 from tsgt.geometry import (
-    Observations,
     cartesian_to_polar,
     exp_so3,
     invert,
@@ -28,7 +27,7 @@ from tsgt.geometry import (
     transform_from,
     transform_points,
 )
-from tsgt.geometry.trajectory import fit_trajectory
+from tsgt.geometry.trajectory import Observations, fit_trajectory
 from tsgt.simulation.world import World, scenario_world
 
 HOUR_S = 3600.0
@@ -122,7 +121,3 @@ def main() -> None:
                 f"  {name}: {rms_mm:.2f} mm rms, mean {nees.mean():.2f}, {shares}, largest {nees.max():.0f}",
                 flush=True,
             )
-
-
-if __name__ == "__main__":
-    main()

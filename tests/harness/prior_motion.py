@@ -9,15 +9,8 @@ import numpy as np
 from harness.scene import FRAMES, LAYOUT
 from scipy.signal import lfilter
 
-from tsgt.geometry import (
-    Observations,
-    cartesian_to_polar,
-    exp_so3,
-    invert,
-    polar_to_cartesian,
-    transform_points,
-)
-from tsgt.geometry.trajectory import States
+from tsgt.geometry import cartesian_to_polar, exp_so3, invert, polar_to_cartesian, transform_points
+from tsgt.geometry.trajectory import Observations, States
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from tsgt.geometry import exp_so3, skew, state_at_point, with_second_order_terms
-from tsgt.geometry.trajectory import States
+from tsgt.geometry import exp_so3, skew
+from tsgt.geometry.trajectory import States, state_at_point, with_second_order_terms
 
 deterministic = settings(derandomize=True, max_examples=50)
 STEP = 1e-4

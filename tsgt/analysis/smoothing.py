@@ -29,8 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from tsgt.geometry import Observations
-    from tsgt.geometry.trajectory import TrajectoryFit
+    from tsgt.geometry.trajectory import Observations, TrajectoryFit
     from tsgt.model import Measurement, MotionPrior, Parameters, PipelineParameters
     from tsgt.recording import Recording
 

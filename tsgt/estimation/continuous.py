@@ -19,12 +19,13 @@ from tsgt.estimation.observations import build_observations
 from tsgt.estimation.pose_batch import Kind, PoseBatch
 from tsgt.estimation.pose_output import ContinuousPoseOutput, MeasurementHistory
 from tsgt.estimation.tracks import has_plausible_time, measured_at_ns, usable
-from tsgt.geometry import FixedLagSmoother, check_layout, concatenate_states
+from tsgt.geometry import check_layout
+from tsgt.geometry.trajectory import FixedLagSmoother, concatenate_states
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from tsgt.geometry import States
+    from tsgt.geometry.trajectory import States
     from tsgt.model import Measurement, Parameters
 
 SMOOTHING_INTERVAL_NS = 500_000_000

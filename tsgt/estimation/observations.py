@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.estimation.tracks import has_plausible_time, measured_at_ns, usable
-from tsgt.geometry import Observations, corrected_distance, polar_to_cartesian
+from tsgt.geometry import corrected_distance, polar_to_cartesian
+from tsgt.geometry.trajectory import Observations
 from tsgt.model import PointMeasurement, PolarMeasurement
 
 if TYPE_CHECKING:

@@ -12,14 +12,15 @@ import numpy as np
 
 from tsgt.estimation.observations import centroid_m
 from tsgt.estimation.pose_batch import Kind, PoseBatch, Reason
-from tsgt.geometry import quaternion_from_rotation, ros_covariance, state_at_point, with_second_order_terms
+from tsgt.geometry import quaternion_from_rotation
+from tsgt.geometry.trajectory import ros_covariance, state_at_point, with_second_order_terms
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from tsgt.geometry import States
+    from tsgt.geometry.trajectory import States
     from tsgt.model import Parameters
 
 MAX_ROTATION_SIGMA_RAD = 0.5

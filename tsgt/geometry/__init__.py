@@ -50,22 +50,14 @@ from tsgt.geometry.rigid import (
     transform_from,
     transform_points,
 )
-from tsgt.geometry.trajectory.fixed_lag import FixedLagSmoother
-from tsgt.geometry.trajectory.measurement_factors import Observations
-from tsgt.geometry.trajectory.query import Trajectory, ros_covariance, state_at_point, with_second_order_terms
-from tsgt.geometry.trajectory.states import States, concatenate_states
 
 __all__ = [
     "NO_GAP_NS",
     "Alignment",
     "BatchAlignment",
-    "FixedLagSmoother",
     "FloatArray",
     "Interpolated",
-    "Observations",
     "Poses",
-    "States",
-    "Trajectory",
     "align",
     "align_many",
     "align_triplets",
@@ -73,7 +65,6 @@ __all__ = [
     "cartesian_to_polar",
     "check_layout",
     "check_transform",
-    "concatenate_states",
     "corrected_distance",
     "exp_so3",
     "interpolate",
@@ -90,13 +81,10 @@ __all__ = [
     "poses_from_prisms",
     "quaternion_from_rotation",
     "raw_distance",
-    "ros_covariance",
     "rotate",
     "rotation_from_quaternion",
     "skew",
-    "state_at_point",
     "transform_from",
     "transform_points",
     "twists",
-    "with_second_order_terms",
 ]

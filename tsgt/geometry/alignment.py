@@ -126,10 +126,11 @@ def align(
 
 
 def fit_gain(points: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return the derivative of the fitted rigid transform by the displacement of each of n points, as blocks of shape (n, 6, 3).
+    """Return the derivative of the fitted rigid transform by the displacement of each of n points, (n, 6, 3).
 
-    Summed over the points, gain times displacement is (translation of the moved frame's origin, small rotation) in the axes of
-    ``points``, (n, 3) in m from that origin: the pseudo-inverse of ``[I, -skew(point)]`` with the fit's weights, (n,).
+    Summed over the points, gain times displacement is (translation of the moved frame's origin, small rotation) in the
+    axes of ``points``, (n, 3) in m from that origin: the pseudo-inverse of ``[I, -skew(point)]`` with the fit's weights,
+    (n,), in blocks.
     """
     w = weights / weights.sum()
     mean = w @ points
@@ -147,7 +148,8 @@ def align_triplets(layout: ArrayLike, points: ArrayLike) -> BatchAlignment:
 
     In m, in the body and in the world frame. The optimum is that of :func:`align_many` to rounding.
 
-    Raises DegenerateGeometryError: the layout's points coincide or are collinear; a degenerate measured triplet is marked instead.
+    Raises DegenerateGeometryError: the layout's points coincide or are collinear; a degenerate measured triplet is
+    marked instead.
     Raises GeometryError: wrong shapes or numbers that are not finite.
 
     Notes

@@ -82,8 +82,8 @@ def interpolate_prisms(
 ) -> Interpolated:
     """Interpolate the samples of P prisms as :func:`interpolate` does for one, without its checks.
 
-    ``times_ns``, (M,), and ``points``, (M, 3) in m, are prism after prism, strictly increasing within each; ``counts`` are the
-    samples of each prism. The result has shapes (N, P, ...); its ``after`` indexes the samples of all prisms.
+    ``times_ns``, (M,), and ``points``, (M, 3) in m, are prism after prism, strictly increasing within each; ``counts``
+    are the samples of each prism. The result has shapes (N, P, ...); its ``after`` indexes the samples of all prisms.
     """
     after = np.empty((len(epochs_ns), len(counts)), dtype=np.int64)
     bounds = list(accumulate(counts, initial=0))
@@ -122,7 +122,7 @@ def _on_lines(
 def interpolated_covariance(
     cov_before: FloatArray, cov_after: FloatArray, fraction: FloatArray
 ) -> FloatArray:
-    """Propagate the noise of two samples, (..., 3, 3) in m^2, to an epoch at a fraction, (...), of the interval between them."""
+    """Propagate the noise of two samples, (..., 3, 3) in m^2, to an epoch at a fraction, (...), of their interval."""
     f = fraction[..., None, None]
     covariance: FloatArray = (1 - f) ** 2 * cov_before + f**2 * cov_after
     return covariance

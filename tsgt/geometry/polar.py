@@ -25,7 +25,8 @@ def polar_to_cartesian(
 ) -> FloatArray:
     """Points in the station frame, (..., 3) in m, of polar measurements with corrected slope distances.
 
-    Zenith angles above pi are of the second face, where the horizontal angle is turned by pi: both faces give the same point.
+    Zenith angles above pi are of the second face, where the horizontal angle is turned by pi: both faces give the same
+    point.
     """
     return np.asarray(distance_m)[..., None] * _direction(horizontal_angle_rad, zenith_angle_rad)
 
@@ -115,9 +116,9 @@ def measurement_covariance(
 ) -> FloatArray:
     """Covariance of measured points in the station frame, (..., 3, 3) in m^2.
 
-    The range's constant and ppm parts are independent and add as variances. The horizontal angle's sigma is the angle sigma over
-    sin(zenith angle), and the point moves by distance x sin(zenith angle) per rad of it. The sines cancel: across the line of sight
-    the noise is distance x angle sigma in all directions, straight up as well.
+    The range's constant and ppm parts are independent and add as variances. The horizontal angle's sigma is the angle
+    sigma over sin(zenith angle), and the point moves by distance x sin(zenith angle) per rad of it. The sines cancel:
+    across the line of sight the noise is distance x angle sigma in all directions, straight up as well.
     """
     distance_m = np.asarray(distance_m, dtype=np.float64)
     direction = _direction(horizontal_angle_rad, zenith_angle_rad)

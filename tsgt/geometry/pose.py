@@ -66,9 +66,9 @@ def poses_from_prisms(layout: ArrayLike, points: ArrayLike) -> Poses:
 def pose_covariance(layout: FloatArray, rotation: FloatArray, prism_covariances: FloatArray) -> FloatArray:
     """Propagate prism noise through the unweighted fit, to first order.
 
-    From the layout, (P, 3) in the robot frame in m, ``R_world_robot``, (N, 3, 3), and the covariances of the measured prisms,
-    (N, P, 3, 3) in the world in m^2, to (N, 6, 6), symmetric: x, y, z of the robot's origin in m, rotation about the world's axes
-    in rad.
+    From the layout, (P, 3) in the robot frame in m, ``R_world_robot``, (N, 3, 3), and the covariances of the measured
+    prisms, (N, P, 3, 3) in the world in m^2, to (N, 6, 6), symmetric: x, y, z of the robot's origin in m, rotation
+    about the world's axes in rad.
     """
     from_robot = rotation[:, None, None]
     gain = _gains(layout)[0].reshape(-1, 2, 3, 3)
@@ -118,8 +118,8 @@ def twists(
 ) -> tuple[FloatArray, FloatArray]:
     """Unweighted least-squares twist of the rigid robot from its prisms' velocities, (N, P, 3) in the world.
 
-    Other arguments as for :func:`pose_covariance`. Returns the velocity of the robot's origin in the world in m/s and the angular
-    velocity in the robot frame in rad/s, (N, 3) each.
+    Other arguments as for :func:`pose_covariance`. Returns the velocity of the robot's origin in the world in m/s and
+    the angular velocity in the robot frame in rad/s, (N, 3) each.
     """
     in_robot = rotate(np.swapaxes(rotation, 1, 2)[:, None], prism_velocities_mps)
     twist = _over_prisms(rotate(_gains(layout)[0], in_robot))
@@ -129,8 +129,8 @@ def twists(
 def check_layout(layout: ArrayLike, names: Sequence[object] | None = None) -> None:
     """Check that a prism layout, (P, 3) in the robot frame in m, determines poses well; ``names`` are for messages.
 
-    Raises DegenerateGeometryError: fewer than three prisms, two of them closer than :data:`MIN_PRISM_DISTANCE_M`, or all of them
-    nearly collinear (:data:`MIN_LAYOUT_RATIO`).
+    Raises DegenerateGeometryError: fewer than three prisms, two of them closer than :data:`MIN_PRISM_DISTANCE_M`, or
+    all of them nearly collinear (:data:`MIN_LAYOUT_RATIO`).
     Raises GeometryError: wrong shape or numbers that are not finite.
     """
     array = np.asarray(layout, dtype=np.float64)

@@ -234,7 +234,10 @@ def exp_and_right_jacobian(w: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def inverse_right_jacobian(w: FloatArray) -> FloatArray:
-    """Inverse right Jacobian, (..., 3, 3): ``Log(R Exp(d)) = Log(R) + J_r^-1(Log R) d`` to first order, below pi (Barfoot 7.1)."""
+    """Inverse right Jacobian, (..., 3, 3), of rotation vectors below pi (Barfoot 7.1).
+
+    ``Log(R Exp(d)) = Log(R) + J_r^-1(Log R) d`` to first order in d.
+    """
     square = dot(w, w)[..., None, None] + TINY
     half = 0.5 * np.sqrt(square)
     skew_w = skew(w)

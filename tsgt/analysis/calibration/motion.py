@@ -22,8 +22,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from tsgt.analysis.evaluation import Fold
-    from tsgt.geometry import FloatArray, Observations
+    from tsgt.geometry import FloatArray
     from tsgt.geometry.calibration import SetupPrior
+    from tsgt.geometry.trajectory import Observations
     from tsgt.model import Matrix4, MotionPrior, Parameters, Vector3
     from tsgt.recording import Recording
 

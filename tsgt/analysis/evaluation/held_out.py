@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.analysis.processing import Estimator
-    from tsgt.geometry import FloatArray, Observations
-    from tsgt.geometry.trajectory import Trajectory
+    from tsgt.geometry import FloatArray
+    from tsgt.geometry.trajectory import Observations, Trajectory
     from tsgt.model import PipelineParameters
 
 FOLDS = 5

@@ -131,8 +131,8 @@ def fit_frame(pairs: PointPairs, *, weighted: bool) -> FrameFit:
 
     Notes
     -----
-    The weights are computed once, at Arun's rotation. The steps fail to converge only where the points are collinear up to their
-    noise; Arun's solution is returned then, with a covariance that shows it.
+    The weights are computed once, at Arun's rotation. The steps fail to converge only where the points are collinear up
+    to their noise; Arun's solution is returned then, with a covariance that shows it.
     """
     initial = _initial_fit(pairs)
     noise = initial.residual_covariances_m2(pairs)

@@ -1,10 +1,10 @@
 """Calibration of station frames, latencies and prism positions from the motion of a robot that all stations track. Sans-I/O.
 
 A wrong frame or latency distorts the rigid robot as it moves, so that the measurement factors of the trajectory
-(:mod:`tsgt.geometry.trajectory`) also determine the set-up. Each step solves the trajectory for a fixed set-up, then eliminates
-it from the joint normal equations (Schur complement through its banded factor); the small remaining system is solved for the
-set-up, and its inverse is the covariance with the trajectory marginalised. docs/how-to/calibrate-from-motion.md says what the
-result is good for.
+(:mod:`tsgt.geometry.trajectory`) also determine the set-up. Each step solves the trajectory for a fixed set-up, then
+eliminates it from the joint normal equations (Schur complement through its banded factor); the small remaining system
+is solved for the set-up, and its inverse is the covariance with the trajectory marginalised.
+docs/how-to/calibrate-from-motion.md says what the result is good for.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ if TYPE_CHECKING:
     from tsgt.geometry.trajectory import Observations, Solution, States
 
 SEGMENT_S = 40.0
-"""A recording is split into trajectories of this length: memory stays bounded, and inconsistent segments show. Little information
-is lost at their ends.
+"""A recording is split into trajectories of this length: memory stays bounded, and inconsistent segments show. Little
+information is lost at their ends.
 """
 
 MAX_GAP_S = 5.0
-"""A longer gap of all stations ends a segment: the motion is uncorrelated beyond, and a trajectory without measurements may not
-converge.
+"""A longer gap of all stations ends a segment: the motion is uncorrelated beyond, and a trajectory without measurements
+may not converge.
 """
 
 MIN_MEASUREMENTS = 30

@@ -1,8 +1,8 @@
 """Parameters of a calibration from motion: station frames, latencies and prism positions as one vector. Sans-I/O.
 
 Station 1 (row 0) defines frame and time. A frame is corrected by a translation and by a rotation about a pivot at the
-centroid of all measurements, both in the axes of frame ``station1``: the translation is the displacement at the robot. Prisms
-move only relative to each other, since the motion does not determine the robot's origin.
+centroid of all measurements, both in the axes of frame ``station1``: the translation is the displacement at the robot.
+Prisms move only relative to each other, since the motion does not determine the robot's origin.
 """
 
 from __future__ import annotations
@@ -53,7 +53,10 @@ class Setup:
         return updated.select(np.argsort(time_s, kind="stable"))
 
     def corrections(self, reference: Setup, pivot: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Corrections of each station's frame from a reference: (S, 3) translation at the pivot in m, (S, 3) rotation in rad."""
+        """Corrections of each station's frame from a reference.
+
+        Returns the translation at the pivot in m and the rotation in rad, (S, 3) each.
+        """
         station_from_reference = np.swapaxes(reference.frames[:, :3, :3], 1, 2)
         pivot_in_station = rotate(station_from_reference, pivot - reference.frames[:, :3, 3])
         translation = rotate(self.frames[:, :3, :3], pivot_in_station) + self.frames[:, :3, 3] - pivot

@@ -1,8 +1,9 @@
 """Frames from points measured in two of them: stations from targets, prisms from body points. Sans-I/O.
 
-The frame follows from the alignment of the points (paper section III-C, "Calibration procedure": Arun et al. 1987), by default
-weighted by the noise of both measurements. Each point is predicted from all others: data snooping (Baarda 1968, here with
-three coordinates at a time) rejects outliers. The covariance shows about which axes the points hold the frame weakly.
+The frame follows from the alignment of the points (paper section III-C, "Calibration procedure": Arun et al. 1987), by
+default weighted by the noise of both measurements. Each point is predicted from all others: data snooping (Baarda 1968,
+here with three coordinates at a time) rejects outliers. The covariance shows about which axes the points hold the frame
+weakly.
 """
 
 from __future__ import annotations
@@ -137,8 +138,8 @@ def calibrate_frame(
     source, target
         Paired by name; unpaired points are ignored. No covariance of the source may be singular.
     weighted
-        Weight each residual with its inverse covariance (maximum likelihood); False is Arun's unweighted least squares. Outlier
-        tests follow the noise model either way.
+        Weight each residual with its inverse covariance (maximum likelihood); False is Arun's unweighted least squares.
+        Outlier tests follow the noise model either way.
     levelled
         Both z axes are vertical: only heading and position are solved.
     """
@@ -178,8 +179,8 @@ def calibrate_frame(
 def calibrate_prisms(body: PointSet, body_cad: PointSet, prisms: PointSet) -> PrismCalibration:
     """Find the prisms in the robot frame from one station's measurements of them and of body points.
 
-    ``body`` and ``prisms`` are measured from the same place, in the station's frame; ``body_cad`` has the body points in the robot
-    frame, from CAD, with the build tolerance as covariance.
+    ``body`` and ``prisms`` are measured from the same place, in the station's frame; ``body_cad`` has the body points
+    in the robot frame, from CAD, with the build tolerance as covariance.
 
     Raises DegenerateGeometryError: fewer than three body points, or they coincide or are collinear.
     """
@@ -236,7 +237,7 @@ class _Prediction:
 
 
 def _noise_scale(variance_ratio: float) -> float:
-    """Factor on the noise model's variances, between 1 and ``MAX_NOISE_SCALE`` squared, from the variance ratio of the residuals."""
+    """Factor on the noise model's variances from the variance ratio of the residuals: 1 to ``MAX_NOISE_SCALE`` squared."""
     return min(max(variance_ratio, 1.0), MAX_NOISE_SCALE**2)
 
 
@@ -256,8 +257,9 @@ def _worst_outlier(pairs: PointPairs, blunder_m: float) -> PointName | None:
 def _outliers(pairs: PointPairs, blunder_m: float) -> tuple[PointName, ...] | None:
     """Outliers, found one at a time; None where they cannot be identified.
 
-    That is the case if rejecting another point instead would make the rest plausible as well, if fewer than four points would
-    remain, if the outliers come near to half of all, or if the rest are inconsistent with their noise although none stands out.
+    That is the case if rejecting another point instead would make the rest plausible as well, if fewer than four points
+    would remain, if the outliers come near to half of all, or if the rest are inconsistent with their noise although
+    none stands out.
     """
     outliers: list[PointName] = []
     kept = pairs

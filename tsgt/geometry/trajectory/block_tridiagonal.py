@@ -81,8 +81,8 @@ def _inverse_and_sub_diagonal(columns: FloatArray) -> tuple[FloatArray, FloatArr
 def factorise(diagonal: FloatArray, off_diagonal: FloatArray) -> BlockCholesky:
     """Factorise a block-tridiagonal matrix.
 
-    ``diagonal``, (K, B, B), are the symmetric blocks on the diagonal, of which only the lower triangles are read; ``off_diagonal``,
-    (K - 1, B, B), those right of it: row block k, column block k + 1.
+    ``diagonal``, (K, B, B), are the symmetric blocks on the diagonal, of which only the lower triangles are read;
+    ``off_diagonal``, (K - 1, B, B), those right of it: row block k, column block k + 1.
 
     Raises GeometryError: the matrix is not positive definite.
     """

@@ -57,8 +57,8 @@ axis for each attitude: tracking beyond the range of the linearisation would cre
 
 MIN_INLIER_SHARE = 0.5
 MIN_INITIAL_INLIER_SHARE = 0.9
-"""Share of inliers. A tracked trajectory tolerates a station on a wrong prism; an initialisation tolerates next to none: with
-some measurements rejected, another pose metres away may fit the rest.
+"""Share of inliers. A tracked trajectory tolerates a station on a wrong prism, an initialisation next to none: with some
+measurements rejected, another pose metres away may fit the rest.
 """
 
 COST_TOLERANCE = 0.01
@@ -68,9 +68,9 @@ changes with each step, a tolerance of 1 left predictions up to 0.6 sigmas from 
 
 STEP_TOLERANCE_M = 0.05
 STEP_TOLERANCE_RAD = 0.005
-"""Steps below both need no relinearisation: at 20 m the line of sight changes by 0.06 mm over the one, and a prism at 1.5 m is
-0.02 mm off the tangent of the other. The next measurement relinearises. With twice as much, predictions of a robot rotating
-at 1 rad/s were up to 0.4 sigmas from those of a full search.
+"""Steps below both need no relinearisation: at 20 m the line of sight changes by 0.06 mm over the one, and a prism at
+1.5 m is 0.02 mm off the tangent of the other. The next measurement relinearises. With twice as much, predictions of a
+robot rotating at 1 rad/s were up to 0.4 sigmas from those of a full search.
 """
 
 MAX_INITIAL_ITERATIONS = 10
@@ -145,9 +145,10 @@ class FixedLagSmoother:
     def reliable_from_s(self) -> float:
         """Time from which the trajectory since the last initialisation is reliable, infinite before the first one.
 
-        It is the time at which each of three prisms has been measured a second time. After one or two measurements of each, the
-        robot may lie the other way about the line through two prisms; later measurements resolve that for later times, not for times
-        before a gap. And the first measurement of a prism, with nothing before it to contradict it, may be of a wrong prism.
+        It is the time at which each of three prisms has been measured a second time. After one or two measurements of
+        each, the robot may lie the other way about the line through two prisms; later measurements resolve that for
+        later times, not for times before a gap. And the first measurement of a prism, with nothing before it to
+        contradict it, may be of a wrong prism.
         """
         return self._reliable_from_s
 
@@ -226,8 +227,8 @@ class FixedLagSmoother:
     def predict(self, time_s: float, *, dim: int = STATE_DIM) -> tuple[States, FloatArray]:
         """Return the state at a time, given all measurements so far, with its covariance as :meth:`Trajectory.at` does.
 
-        Beyond the last measurement the process noise is scaled by :data:`PREDICTION_NOISE_SCALE`, and the covariance by the newest
-        NIS.
+        Beyond the last measurement the process noise is scaled by :data:`PREDICTION_NOISE_SCALE`, and the covariance by
+        the newest NIS.
         """
         assert self._propagator is not None  # noqa: S101 (only called while initialised)
         if time_s >= self._propagator.time_s:

@@ -42,8 +42,8 @@ MIN_KNOT_SPACING_S = 0.02
 """Within half of this the motion is described by velocity and acceleration."""
 
 OUTLIER_THRESHOLD = 4.0
-"""Mahalanobis distance (3 degrees of freedom) beyond which a measurement is an outlier and its weight falls with the distance;
-0.11 % of good measurements exceed it (chi-square of 16).
+"""Mahalanobis distance (3 degrees of freedom) beyond which a measurement is an outlier: its weight falls with the
+distance. 0.11 % of good measurements exceed it (chi-square of 16).
 """
 
 REJECTION_THRESHOLD = 30.0
@@ -174,8 +174,8 @@ def solve(
     sigmas
         (K - 1, 6) acceleration sigmas of each step; those of ``prior`` when not given.
     reject_outliers
-        Solve a second time without measurements beyond :data:`REJECTION_THRESHOLD`. Without, the solution is a smooth function
-        of its inputs.
+        Solve a second time without measurements beyond :data:`REJECTION_THRESHOLD`. Without, the solution is a smooth
+        function of its inputs.
     """
     anchor = diffuse_prior(guess.select(slice(0, 1)), prior) if anchor is None else anchor
     knot_index = nearest_knots(guess.time_s, observations.time_s)
@@ -229,8 +229,8 @@ def _line_search(
 ) -> tuple[NormalEquations | None, States]:
     """Backtrack along a step until the cost decreases sufficiently; None where rounding hides any decrease.
 
-    Backtracking suits the stiff chain of knots better than Levenberg-Marquardt damping: that would hold back all knots for the
-    sake of one that rotated too far.
+    Backtracking suits the stiff chain of knots better than Levenberg-Marquardt damping: that would hold back all knots
+    for the sake of one that rotated too far.
     """
     predicted_decrease = -float(np.vdot(step, system.gradient))
     fraction = 1.0
@@ -255,9 +255,9 @@ def assemble(
 ) -> NormalEquations:
     """Assemble the normal equations at a trajectory.
 
-    Each of the M measurements is attached to the knot ``knot_index``. One that is not ``active`` gets no weight and no cost; one that
-    is ``rejectable`` none beyond :data:`REJECTION_THRESHOLD`, unless half of all are outliers. By default all are active and none
-    is rejectable; reject only at a converged trajectory.
+    Each of the M measurements is attached to the knot ``knot_index``. One that is not ``active`` gets no weight and no
+    cost; one that is ``rejectable`` none beyond :data:`REJECTION_THRESHOLD`, unless half of all are outliers. By
+    default all are active and none is rejectable; reject only at a converged trajectory.
     """
     linearised = linearise(observations, knots, knot_index)
     whitened = linearised.whitened(observations)

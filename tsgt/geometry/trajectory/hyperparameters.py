@@ -1,12 +1,12 @@
-"""Hyperparameters: the motion prior and the noise scale that maximise the evidence, and a floor for the process noise. Sans-I/O.
+"""Hyperparameters of the estimator: motion prior, noise scale, and a floor for the process noise. Sans-I/O.
 
 :func:`tune` maximises the evidence (type-II maximum likelihood), the density of the measurements with the trajectory
 integrated out. The gradient is that of the expected complete-data log likelihood (Fisher's identity), from the marginal
 covariances that the solution has anyway; exact for the linearised problem.
 
-:func:`with_noise_floor` bounds the process noise of a tuned prior from below. Driving is not Gaussian: a prior tuned to minutes
-of straight driving makes the next bend impossible. While all prisms are measured the data overrule it, during an outage they
-do not.
+:func:`with_noise_floor` bounds the process noise of a tuned prior from below. Driving is not Gaussian: a prior tuned to
+minutes of straight driving makes the next bend impossible. While all prisms are measured the data overrule it, during an
+outage they do not.
 
 docs/explanation/continuous-trajectory.md has the formulas and the measured effects.
 """
@@ -130,7 +130,8 @@ def maximise_evidence(
 ) -> Hyperparameters:
     """Maximise the evidence within bounds by L-BFGS-B.
 
-    ``start``, ``lower`` and ``upper``, (7,), are log parameters as from :func:`log_parameters`; the rest is as for :func:`tune`.
+    ``start``, ``lower`` and ``upper``, (7,), are log parameters as from :func:`log_parameters`; the rest is as for
+    :func:`tune`.
     """
     segments = _segments(observations)
     evaluations = 0
@@ -258,7 +259,10 @@ _Moments = tuple["FloatArray", "FloatArray", "FloatArray"]
 
 
 def _expected_moments(solution: Solution, covariance: FloatArray, cross_covariance: FloatArray) -> _Moments:
-    """Second moments of the process factors' (later, earlier) states by axis, (K - 1, 6, 3, 3): later-later, later-earlier, earlier-earlier."""
+    """Second moments of the states that each process factor connects, by axis, (K - 1, 6, 3, 3).
+
+    Of the later state, of later with earlier, and of the earlier state.
+    """
     linearised = linearise_process(solution.knots, solution.process)
     count = len(cross_covariance)
     earlier, later = linearised.earlier, linearised.later
@@ -298,7 +302,7 @@ def _axis_blocks(matrix: FloatArray) -> FloatArray:
 def _expected_squared_distances(
     process_moments: _Moments, phi: FloatArray, information: FloatArray
 ) -> FloatArray:
-    """(K - 1, A) expected squared Mahalanobis distances of the process residuals; phi and information are (K - 1, A or 1, 3, 3)."""
+    """(K - 1, A) expected squared Mahalanobis distances of the process residuals of A axes."""
     moments, cross, earlier = process_moments
     coupling = phi @ np.swapaxes(cross, -1, -2)
     residual = moments - coupling - np.swapaxes(coupling, -1, -2) + phi @ earlier @ np.swapaxes(phi, -1, -2)
@@ -307,7 +311,7 @@ def _expected_squared_distances(
 
 
 def _expected_log_density(moments: _Moments, dt_s: FloatArray, time_s: float, sigmas: FloatArray) -> float:
-    """Return the expected log density of the process residuals of some axes, up to terms independent of the correlation time."""
+    """Return the expected log density of the process residuals, as far as it depends on the correlation time."""
     phi, information = transition(dt_s, time_s), process_information(dt_s, time_s)
     squared_distances = _expected_squared_distances(moments, phi[:, None], information[:, None]) / sigmas**2
     _, logdet = np.linalg.slogdet(information)
@@ -330,8 +334,8 @@ def with_noise_floor(prior: MotionPrior, floor: MotionPrior, share: float = 1.0)
     """Raise the process noise of a prior to that of ``share`` times the sigmas of ``floor``, axis by axis.
 
     Priors are compared by the power spectral density of the acceleration at the frequency of manoeuvres, ``sigma^2 time /
-    (1 + (frequency time)^2)``: a sigma means little if the acceleration is too short or too long for a manoeuvre. Correlation
-    times are kept.
+    (1 + (frequency time)^2)``: a sigma means little if the acceleration is too short or too long for a manoeuvre.
+    Correlation times are kept.
     """
     times_s = axis_correlation_times_s(prior)
     min_sigmas = (

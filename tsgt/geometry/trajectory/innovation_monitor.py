@@ -43,8 +43,8 @@ class InnovationMonitor:
     def ambiguous_at(self, time_s: FloatArray) -> NDArray[np.bool_]:
         """Whether the state stays ambiguous at times (N,), by the resolved ambiguities.
 
-        A resolved ambiguity leaves no interval if all flagged measurements are of one prism and still outliers: then these were
-        wrong. Otherwise the trajectory followed the wrong ones, or was bent towards all of them.
+        A resolved ambiguity leaves no interval if all flagged measurements are of one prism and still outliers: then
+        these were wrong. Otherwise the trajectory followed the wrong ones, or was bent towards all of them.
         """
         found = np.zeros(len(time_s), np.bool_)
         for from_s, until_s in self._ambiguous_intervals_s:

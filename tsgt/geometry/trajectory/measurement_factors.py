@@ -149,9 +149,10 @@ def _residuals_by_point(observations: Observations, point: FloatArray) -> tuple[
 
 
 def line_of_sight_axes(points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return unit vectors along and across the lines of sight to points, (M, 3), in the station frame, and the distances, (M,).
+    """Return unit vectors along and across the lines of sight to points, (M, 3), and the distances, (M,).
 
-    The rows of (M, 3, 3) are: along, across in the direction of growing horizontal angle, across in that of growing zenith angle.
+    The rows of (M, 3, 3), in the station frame, are: along, across in the direction of growing horizontal angle, across in
+    that of growing zenith angle.
     """
     distance_m = np.sqrt(dot(points_m, points_m))
     # A corrected distance of zero has no direction: any unit vector avoids NaN.

@@ -73,13 +73,13 @@ def transition(dt_s: ArrayLike, time_s: ArrayLike) -> FloatArray:
 
 
 def process_noise(dt_s: ArrayLike, time_s: ArrayLike) -> FloatArray:
-    """Process noise covariances ``Q(dt)`` of one axis with unit acceleration sigma, (..., 3, 3); arguments as :func:`transition`."""
+    """Process noise ``Q(dt)`` of one axis with unit acceleration sigma, (..., 3, 3); arguments as :func:`transition`."""
     dt_s = np.asarray(dt_s, np.float64)
     return _scale_by_dt(_unit_step_noise(dt_s / np.asarray(time_s, np.float64)), dt_s)
 
 
 def process_information(dt_s: ArrayLike, time_s: ArrayLike) -> FloatArray:
-    """Inverse of :func:`process_noise`, (..., 3, 3), inverted in units of dt for conditioning; ``dt_s`` must be above zero."""
+    """Inverse of :func:`process_noise`, (..., 3, 3), computed in units of dt, which must be above zero, for conditioning."""
     dt_s = np.asarray(dt_s, np.float64)
     information = np.linalg.inv(_unit_step_noise(dt_s / np.asarray(time_s, np.float64)))
     return _scale_by_dt(np.asarray(information, np.float64), 1.0 / dt_s)
@@ -91,8 +91,8 @@ def interpolation_weights(
     """Interpolation of one axis between two known states (Barfoot, section 3.4, for this prior).
 
     The query is ``before_s`` after the earlier and ``after_s`` before the later state, not negative, their sum above zero.
-    Returns (..., 3, 3) each: the mean is ``from_earlier @ x_earlier + from_later @ x_later``, and ``conditional`` is the covariance
-    given both states, for unit acceleration sigma.
+    Returns (..., 3, 3) each: the mean is ``from_earlier @ x_earlier + from_later @ x_later``, and ``conditional`` is
+    the covariance given both states, for unit acceleration sigma.
     """
     dts_s = np.stack([before_s, after_s, before_s + after_s])
     q = process_noise(before_s, time_s)

@@ -115,7 +115,7 @@ def acceleration_response(dt_s: float, time_s: float) -> _Vector:
 
 
 def _series() -> FloatArray:
-    """(32, 9) coefficients of the process noise as a power series in minus the step in correlation times, without the factor 2 s.
+    """(32, 9) power series of the process noise in minus the step in correlation times, without the factor 2 s.
 
     The response to an impulse is the exponential series from its second, first or zeroth term on; products of two responses
     are integrated term by term.

@@ -213,8 +213,8 @@ def state_at_point(
 ) -> tuple[States, FloatArray]:
     """Motion of another point of the rigid robot, and the (N, 6, 6) covariance of its position's and rotation's errors.
 
-    ``covariance`` is that of the states' errors, (N, d, d), d >= 6; ``lever_arm``, (3,) in the robot frame in m, points from the
-    states' reference point to the other point.
+    ``covariance`` is that of the states' errors, (N, d, d), d >= 6; ``lever_arm``, (3,) in the robot frame in m, points
+    from the states' reference point to the other point.
     """
     rotation, rate = states.rotation, states.angular_velocity
     lever_velocity = cross(rate, lever_arm)
@@ -235,11 +235,12 @@ def with_second_order_terms(rotation: FloatArray, covariance: FloatArray) -> tup
 
     Two prisms leave a rotation by an angle θ about the line through them unobserved: it displaces a point at the distance r
     from that line by rθ along its circle and by rθ²/2 towards the line, where the first-order sigma may be a millimetre. The
-    mean square of the latter is 3 σ⁴ r² / 4, with σ² the variance of θ. One prism alone leaves rotations about three axes, each
-    of which moves the point closer; the mean product of two of them is σ₁² σ₂² / 4.
+    mean square of the latter is 3 σ⁴ r² / 4, with σ² the variance of θ. One prism alone leaves rotations about three
+    axes, each of which moves the point closer; the mean product of two of them is σ₁² σ₂² / 4.
 
-    ``rotation`` is (N, 3, 3), ``covariance`` (N, 6, 6) as from :func:`state_at_point`. Returns the covariance with these terms and
-    one sigma of θ in rad, (N,), the least certain rotation; NaN where rounding made its variance negative.
+    ``rotation`` is (N, 3, 3), ``covariance`` (N, 6, 6) as from :func:`state_at_point`. Returns the covariance with
+    these terms and one sigma of θ in rad, (N,), the least certain rotation; NaN where rounding made its variance
+    negative.
     """
     variance, axes = np.linalg.eigh(covariance[:, 3:, 3:])
     # The displacement per rad is the covariance with the rotation over its variance; the variance cancels in the square.

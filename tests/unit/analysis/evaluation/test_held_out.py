@@ -13,15 +13,14 @@ from tsgt.analysis.evaluation import (
     trajectory_errors,
 )
 from tsgt.analysis.evaluation.held_out import PredictionErrorStatistics
-from tsgt.geometry import Observations
-from tsgt.geometry.trajectory import States, Trajectory
+from tsgt.geometry.trajectory import Observations, States, Trajectory
 from tsgt.model import MotionPrior
 
 LAYOUT = np.array([[-0.5, 0.0, 1.0], [0.5, 0.0, 1.0], [0.0, 0.5, 1.5]])
 
 
 def observations(count: int = 60, *, step_s: float = 0.1) -> Observations:
-    """Three prisms in turn, a robot that goes along x at 1 m/s without turning."""
+    """Return three prisms in turn on a robot that moves along x at 1 m/s without rotation."""
     prism = np.arange(count) % 3
     time_s = np.arange(count, dtype=np.float64) * step_s
     points = LAYOUT[prism] + np.stack([time_s, np.zeros(count), np.zeros(count)], axis=1)
@@ -38,55 +37,55 @@ def observations(count: int = 60, *, step_s: float = 0.1) -> Observations:
     )
 
 
-def test_each_measurement_but_the_outer_five_is_left_out_once() -> None:
-    """Five folds for each prism; what a fold leaves out and what it keeps make up all measurements."""
+def test_each_measurement_but_the_outer_five_is_held_out_once() -> None:
+    """Five folds per prism; test and training rows of a fold make up all measurements."""
     some = observations()
-    parts = folds(some)
-    assert [part.number for part in parts] == sorted([0, 1, 2, 3, 4] * 3)
-    left_out = np.sort(np.concatenate([part.test for part in parts]))
-    np.testing.assert_array_equal(left_out, np.arange(15, 45))
-    for part in parts:
+    splits = folds(some)
+    assert [part.number for part in splits] == sorted([0, 1, 2, 3, 4] * 3)
+    held_out = np.sort(np.concatenate([part.test for part in splits]))
+    np.testing.assert_array_equal(held_out, np.arange(15, 45))
+    for part in splits:
         assert len(set(some.prism[part.test])) == 1
         np.testing.assert_array_equal(np.sort(np.concatenate([part.test, part.training])), np.arange(60))
 
 
-def test_a_fold_leaves_every_fifth_out() -> None:
-    """So the neighbours of what is left out stay."""
+def test_fold_holds_out_every_fifth_measurement() -> None:
+    """So that their neighbours remain."""
     part = next(part for part in folds(observations(150)) if part.number == 2)
     assert np.diff(part.test).tolist() == [15] * (len(part.test) - 1)
 
 
-def test_prisms_with_few_measurements_are_never_left_out() -> None:
+def test_prisms_with_few_measurements_are_never_held_out() -> None:
     """Ten of a prism are all outer ones."""
     assert folds(observations(30)) == []
     assert cross_validate([], lambda part: np.empty(len(part.test))).statistics.n == 0
 
 
-def test_what_serves_all_folds_of_a_number_has_seen_none_of_them() -> None:
+def test_training_rows_are_disjoint_from_the_test_rows_of_their_number() -> None:
     """A prior may be tuned once for the three folds of a number."""
     some = observations()
     for part in folds(some):
         assert not set(training_rows(some, part.number)) & set(part.test)
 
 
-def test_gaps_count_apart() -> None:
-    """Where the remaining neighbours are more than a second apart, a straight line is not what is asked for."""
+def test_gaps_are_counted_separately() -> None:
+    """Measurements whose remaining neighbours are more than a second apart."""
     some = observations()
     late = some.time_s + np.where(np.arange(60) >= 30, 0.5, 0.0)
     gapped = replace(some, time_s=late)
-    parts = folds(gapped)
-    found = cross_validate(parts, lambda part: interpolation_errors(gapped, part))
+    splits = folds(gapped)
+    found = cross_validate(splits, lambda part: interpolation_errors(gapped, part))
     assert found.gaps.n == 6  # the last before and the first after, of each prism
     assert found.statistics.n == 24
     assert found.statistics.mean == pytest.approx(0.0, abs=1e-9)
-    # The robot did not move while nothing was measured, as a straight line has it do.
+    # The robot did not move during the gap, but the straight line does.
     assert found.gaps.mean > 100.0
-    standing = cross_validate(folds(some), lambda part: interpolation_errors(some, part))
-    assert standing.gaps.n == 0
+    regular = cross_validate(folds(some), lambda part: interpolation_errors(some, part))
+    assert regular.gaps.n == 0
 
 
-def test_lines_join_the_remaining_measurements() -> None:
-    """Oracle: the middle of the neighbours; a bend is cut off."""
+def test_interpolation_errors() -> None:
+    """Oracle: the mean of the neighbours; a curve is cut off."""
     some = observations()
     bent = some.points_m.copy()
     bent[:, 1] += some.time_s**2
@@ -99,8 +98,8 @@ def test_lines_join_the_remaining_measurements() -> None:
     np.testing.assert_allclose(interpolation_errors(curved, part), expected)
 
 
-def test_a_trajectory_is_asked_where_the_prism_is() -> None:
-    """One that is 3 mm and 4 mm off misses each measurement by 5 mm."""
+def test_trajectory_errors() -> None:
+    """A trajectory that is 3 mm and 4 mm off has an error of 5 mm at each measurement."""
     some = observations()
     time_s = np.array([0.0, 6.0])
     zero = np.zeros((2, 3))
@@ -115,7 +114,7 @@ def test_a_trajectory_is_asked_where_the_prism_is() -> None:
     np.testing.assert_allclose(trajectory_errors(trajectory, some), 0.005, rtol=1e-6)
 
 
-def test_figures_are_in_mm() -> None:
+def test_statistics_are_in_mm() -> None:
     """Mean, median and 95th percentile; NaN and a count of 0 without any."""
     found = PredictionErrorStatistics.of(np.array([0.001, 0.002, 0.006]))
     assert found.n == 3

@@ -12,26 +12,25 @@ from tsgt.geometry.trajectory import fit_trajectory
 from tsgt.model import MotionPrior, PolarMeasurement
 
 if TYPE_CHECKING:
-    from tsgt.geometry import Observations
-    from tsgt.geometry.trajectory import TrajectoryFit
+    from tsgt.geometry.trajectory import Observations, TrajectoryFit
 
 PRIOR = MotionPrior()
 
 
 @pytest.fixture(scope="module")
 def observations() -> Observations:
-    """Measure a robot that moves as the prior says for a minute, with the noise that is stated."""
+    """Measure a robot that moves according to the prior for a minute, with the stated noise."""
     (motion,) = draw_motions(PRIOR, count=1, duration_s=61.0, seed=4)
     return sorted_by_time(measure(motion, until_s=60.0, seed=5))
 
 
 def fitted(observations: Observations) -> TrajectoryFit:
-    """Fit it with what is true of it."""
+    """Fit with the true hyperparameters."""
     return fit_trajectory(observations, prior=PRIOR, noise_scale=1.0)
 
 
 def sources(observations: Observations) -> list[PolarMeasurement]:
-    """Give each observation a measurement of a station of its own for each prism."""
+    """Return a measurement for each observation, with one station per prism."""
     return [
         PolarMeasurement(
             station=10 + prism,
@@ -48,8 +47,8 @@ def sources(observations: Observations) -> list[PolarMeasurement]:
     ]
 
 
-def test_residuals_are_as_large_as_they_should_be(observations: Observations) -> None:
-    """Where motion and noise are as supposed, normalised residuals have a mean of 0 and a standard deviation of 1."""
+def test_normalised_residuals_are_standard_normal(observations: Observations) -> None:
+    """With correct prior and noise the mean is 0 and the standard deviation 1."""
     found = residual_statistics(fitted(observations), sources(observations))
     assert list(found) == [10, 11, 12]
     for axes in found.values():
@@ -61,8 +60,8 @@ def test_residuals_are_as_large_as_they_should_be(observations: Observations) ->
             assert figures.beyond_3_sigma < 0.03
 
 
-def test_a_noisy_axis_shows(observations: Observations) -> None:
-    """Ranges of one station that scatter by four times the stated noise have a standard deviation of about four."""
+def test_noisy_axis_is_detected(observations: Observations) -> None:
+    """Ranges of one station with four times the stated noise have a standard deviation of about four."""
     along = np.random.default_rng(6).normal(size=len(observations)) * 0.01
     worse = np.where(observations.prism == 1, along, 0.0)[:, None]
     distance_m = np.linalg.norm(observations.points_m, axis=1)[:, None]
@@ -74,20 +73,20 @@ def test_a_noisy_axis_shows(observations: Observations) -> None:
 
 
 def test_cartesian_points_have_their_own_axes(observations: Observations) -> None:
-    """Nobody knows along which line they were measured."""
+    """Their line of sight is unknown."""
     found = residual_statistics(fitted(as_cartesian(observations)), sources(observations))
     assert list(found[10]) == ["x", "y", "z"]
 
 
-def test_outliers_are_named(observations: Observations) -> None:
-    """A prism that was measured half a metre off is found, with by how much; good measurements are not."""
+def test_outliers_are_reported(observations: Observations) -> None:
+    """A measurement with an error of half a metre is found with its size; good measurements are not."""
     assert len(outliers(fitted(observations), sources(observations))) <= 2
     points = observations.points_m.copy()
     points[200] += (0.3, 0.0, 0.4)
-    strays = outliers(fitted(replace(observations, points_m=points)), sources(observations))
-    worst = strays[0]
+    rejected = outliers(fitted(replace(observations, points_m=points)), sources(observations))
+    worst = rejected[0]
     assert (worst.stamp_ns, worst.prism) == (200, int(observations.prism[200]) + 1)
     assert worst.station == worst.prism + 9
     assert worst.missed_mm == pytest.approx(500.0, abs=15.0)
     assert worst.sigmas > 100
-    assert all(stray.sigmas < 6 for stray in strays[1:])
+    assert all(outlier.sigmas < 6 for outlier in rejected[1:])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tsgt.errors import GeometryError
-from tsgt.geometry import Observations, exp_so3, rotate
+from tsgt.geometry import exp_so3, rotate
 from tsgt.geometry.calibration import (
     Setup,
     SetupPrior,
@@ -18,7 +18,7 @@ from tsgt.geometry.calibration import (
     unobservable_directions,
 )
 from tsgt.geometry.calibration.motion_parameters import SetupParameters
-from tsgt.geometry.trajectory import initial_guess, knot_times, linearise
+from tsgt.geometry.trajectory import Observations, initial_guess, knot_times, linearise
 from tsgt.geometry.trajectory.measurement_factors import line_of_sight_axes
 from tsgt.model import MotionPrior
 

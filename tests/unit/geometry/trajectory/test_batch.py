@@ -16,7 +16,7 @@ from tsgt.geometry.trajectory import fit_trajectory
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:
-    from tsgt.geometry import Observations
+    from tsgt.geometry.trajectory import Observations
 
 PRIOR = MotionPrior()
 

@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from harness.prior_motion import draw_motions, measure, rows_at, sorted_by_time
 
-from tsgt.geometry import FixedLagSmoother, FloatArray, Observations, Trajectory
-from tsgt.geometry.trajectory import initial_guess, knot_times, solve
+from tsgt.geometry.trajectory import (
+    FixedLagSmoother,
+    Observations,
+    Trajectory,
+    initial_guess,
+    knot_times,
+    solve,
+)
 from tsgt.geometry.trajectory.innovation_monitor import AMBIGUITY_MARGIN_S
 from tsgt.model import MotionPrior
+
+if TYPE_CHECKING:
+    from tsgt.geometry import FloatArray
 
 PRIOR = MotionPrior()
 LAG_S = 3.0

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from harness.manoeuvre import speeding_up_and_turning_back
 from harness.prior_motion import draw_motions, measure, rows_at, sorted_by_time
 
-from tsgt.geometry import FixedLagSmoother, FloatArray, Observations
+from tsgt.geometry.trajectory import FixedLagSmoother, Observations
 from tsgt.geometry.trajectory.fixed_lag import PREDICTION_NOISE_SCALE
 from tsgt.geometry.trajectory.propagation import Propagator
 from tsgt.model import MotionPrior
+
+if TYPE_CHECKING:
+    from tsgt.geometry import FloatArray
 
 PRIOR = MotionPrior()
 LAG_S = 3.0

@@ -22,11 +22,13 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
 from tsgt.errors import GeometryError
-from tsgt.geometry import Observations, Trajectory, cartesian_to_polar, exp_so3
+from tsgt.geometry import cartesian_to_polar, exp_so3
 from tsgt.geometry.trajectory import (
     MIN_KNOT_SPACING_S,
     STATE_DIM,
+    Observations,
     States,
+    Trajectory,
     initial_guess,
     knot_times,
     nearest_knots,

@@ -10,14 +10,21 @@ import pytest
 from harness.prior_motion import STEP_S, draw_motions, measure, rows_at, sorted_by_time
 
 from tsgt.errors import GeometryError
-from tsgt.geometry import States, exp_so3, log_so3
-from tsgt.geometry.trajectory import fit_trajectory, hyperparameters, scale_noise, tune, with_noise_floor
+from tsgt.geometry import exp_so3, log_so3
+from tsgt.geometry.trajectory import (
+    States,
+    fit_trajectory,
+    hyperparameters,
+    scale_noise,
+    tune,
+    with_noise_floor,
+)
 from tsgt.geometry.trajectory.hyperparameters import MIN_MEASUREMENTS, partially_occluded
 from tsgt.geometry.trajectory.motion_prior import axis_sigmas
 from tsgt.model import MotionPrior, PipelineParameters
 
 if TYPE_CHECKING:
-    from tsgt.geometry import Observations
+    from tsgt.geometry.trajectory import Observations
 
 PRIOR = MotionPrior()
 UNTIL_S = 80.0

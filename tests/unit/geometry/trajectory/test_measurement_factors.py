@@ -11,15 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from tsgt.geometry import (
-    Observations,
-    cartesian_to_polar,
-    invert,
-    polar_to_cartesian,
-    transform_from,
-    transform_points,
-)
-from tsgt.geometry.trajectory import STATE_DIM, States, linearise
+from tsgt.geometry import cartesian_to_polar, invert, polar_to_cartesian, transform_from, transform_points
+from tsgt.geometry.trajectory import STATE_DIM, Observations, States, linearise
 from tsgt.geometry.trajectory.measurement_factors import line_of_sight_axes
 
 if TYPE_CHECKING:

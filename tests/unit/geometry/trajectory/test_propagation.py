@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tsgt.geometry import FloatArray, Trajectory, exp_so3
-from tsgt.geometry.trajectory import STATE_DIM, States
+from tsgt.geometry import FloatArray, exp_so3
+from tsgt.geometry.trajectory import STATE_DIM, States, Trajectory
 from tsgt.geometry.trajectory.propagation import Propagator
 from tsgt.model import MotionPrior
 

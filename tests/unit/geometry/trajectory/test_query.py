@@ -25,7 +25,8 @@ from tsgt.geometry.trajectory.gauss_newton import AnchorPrior, diffuse_prior
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:
-    from tsgt.geometry import FloatArray, Observations
+    from tsgt.geometry import FloatArray
+    from tsgt.geometry.trajectory import Observations
 
 PRIOR = MotionPrior()
 SEEDS = 100

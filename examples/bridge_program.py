@@ -1,8 +1,8 @@
-"""A program for the client's bridge, with an invented instrument in the place where yours will be.
+"""A program for the client's bridge, with an invented instrument in place of yours.
 
 Usage, in the client's configuration: ``command = ["python3", "/path/bridge_program.py"]``; with the name of a CSV file
-after it the rows of that (horizontal angle and zenith angle in rad, slope distance in m) are given out one by one, again
-and again. It needs nothing but Python's standard library. What each line means stands in docs/reference/bridge.md.
+as argument its rows (horizontal angle and zenith angle in rad, slope distance in m) are printed one by one, repeatedly. It
+requires only Python's standard library. docs/reference/bridge.md specifies the lines.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Row = tuple[float, float, float]
 
 
 def circling() -> Iterator[Row]:
-    """Yield what a station sees of a prism that drives in a circle, 20 m away."""
+    """Yield measurements of a prism that moves in a circle, 20 m away."""
     for step in itertools.count():
         angle = 0.05 * step
         x, y = 20 + 3 * math.cos(angle), 3 * math.sin(angle)
@@ -34,26 +34,26 @@ def circling() -> Iterator[Row]:
 
 
 def rows_of(path: str) -> Iterable[Row]:
-    """Return the rows of a CSV file, over and over."""
+    """Return the rows of a CSV file, repeatedly."""
     with open(path, encoding="utf-8") as file:  # noqa: PTH123 (as anybody would write it)
         rows = [(float(row[0]), float(row[1]), float(row[2])) for row in csv.reader(file)]
     return itertools.cycle(rows)
 
 
 def say(record: dict[str, Any]) -> None:
-    """Print a line, and let it go at once: without flush it would wait in here for others."""
+    """Print a line and flush the output, which is buffered otherwise."""
     print(json.dumps(record), flush=True)
 
 
 def listen(commands: queue.Queue[dict[str, Any] | None]) -> None:
-    """Put the client's commands into a queue; None when the client is gone."""
+    """Queue the client's commands; None when the client is gone."""
     for line in sys.stdin:
         commands.put(json.loads(line))
     commands.put(None)
 
 
 def measured(row: Row) -> dict[str, Any]:
-    """Return a measurement that was made just now. Replace this by your instrument, and the time by that of its callback."""
+    """Return a measurement of this moment. Replace it by your instrument, and the time by that of its callback."""
     horizontal, zenith, distance = row
     return {
         "host_time_ns": time.monotonic_ns(),  # CLOCK_MONOTONIC
@@ -65,7 +65,7 @@ def measured(row: Row) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Measure, and do what the client wants, until it is gone."""
+    """Measure and execute commands until the client is gone."""
     rows = iter(rows_of(sys.argv[1]) if len(sys.argv) > 1 else circling())
     commands: queue.Queue[dict[str, Any] | None] = queue.Queue()
     threading.Thread(target=listen, args=(commands,), daemon=True).start()

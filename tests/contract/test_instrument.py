@@ -1,4 +1,4 @@
-"""What every instrument does, whatever is behind it: each test runs on all of them."""
+"""The contract of every instrument: each test runs on all of them."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ NAME = "Leica TCRP1201+ 230001"
 
 @dataclass(frozen=True)
 class Bench:
-    """The instrument under test, and the simulated one at its far end with its cable."""
+    """The instrument under test, and the simulated one behind it with its cable."""
 
     instrument: Instrument
     far: LeicaBench
@@ -39,7 +39,7 @@ class Bench:
 
 @asynccontextmanager
 async def bench(kind: str) -> AsyncGenerator[Bench]:
-    """Set up an instrument of one kind; it is not connected."""
+    """Set up a disconnected instrument of one kind."""
     async with leica_bench() as far:
         if kind == "leica":
             yield Bench(far.instrument, far)
@@ -60,16 +60,16 @@ def kind(request: pytest.FixtureRequest) -> str:
     return name
 
 
-async def test_it_says_who_it_is(kind: str) -> None:
-    """Connecting returns a name for people, also the second time."""
+async def test_connect_returns_identity(kind: str) -> None:
+    """Also the second time."""
     async with bench(kind) as day:
         assert (await day.instrument.connect()).startswith(NAME)
         await day.instrument.close()
         assert (await day.instrument.connect()).startswith(NAME)
 
 
-async def test_readings_come_one_after_the_other(kind: str) -> None:
-    """While tracking, no reading comes twice, and the stamps lie in the past."""
+async def test_readings_are_consecutive(kind: str) -> None:
+    """No reading is repeated, and the timestamps are in the past."""
     async with bench(kind) as day:
         await day.instrument.connect()
         await day.instrument.track(2)
@@ -81,8 +81,8 @@ async def test_readings_come_one_after_the_other(kind: str) -> None:
     assert {(reading.prism, reading.status.usable) for reading in readings} == {(2, True)}
 
 
-async def test_a_reading_that_is_cancelled_takes_nothing_away(kind: str) -> None:
-    """Whoever gives up waiting gets that reading with the next call."""
+async def test_cancelled_read_loses_no_reading(kind: str) -> None:
+    """The next call returns it."""
     async with bench(kind) as day:
         await day.instrument.connect()
         await day.instrument.track(1)
@@ -97,8 +97,8 @@ async def test_a_reading_that_is_cancelled_takes_nothing_away(kind: str) -> None
     assert np.diff(stamps) == pytest.approx([PERIOD_NS] * (len(stamps) - 1), rel=0, abs=UNEVEN_NS)
 
 
-async def test_another_prism_gives_readings_of_that_one(kind: str) -> None:
-    """After a change there is no reading of the old prism."""
+async def test_prism_change_drops_old_readings(kind: str) -> None:
+    """All later readings are of the new prism."""
     async with bench(kind) as day:
         await day.instrument.connect()
         await day.instrument.track(1)
@@ -110,7 +110,7 @@ async def test_another_prism_gives_readings_of_that_one(kind: str) -> None:
 
 
 async def test_single_measurements(kind: str) -> None:
-    """In direct mode it measures what it is aimed at, and takes its time; without a target it says so."""
+    """In direct mode, of the target in the line of sight; NO_TARGET without one."""
     async with bench(kind) as day:
         await day.instrument.connect()
         await day.instrument.track(1)
@@ -118,15 +118,15 @@ async def test_single_measurements(kind: str) -> None:
         before_ns = day.far.clock.monotonic_ns()
         nothing = await day.instrument.measure()
         day.far.station.aim_at_target(1)
-        shot = await day.instrument.measure()
+        measured = await day.instrument.measure()
     assert (nothing.prism, nothing.status, nothing.slope_distance_m) == (None, Status.NO_TARGET, None)
-    assert (shot.prism, shot.status) == (None, Status.OK)
-    assert shot.slope_distance_m == pytest.approx(20.6216, abs=0.01)
-    assert shot.at_ns - before_ns > 2_000_000_000
+    assert (measured.prism, measured.status) == (None, Status.OK)
+    assert measured.slope_distance_m == pytest.approx(20.6216, abs=0.01)
+    assert measured.at_ns - before_ns > 2_000_000_000
 
 
-async def test_it_refuses_what_it_cannot_do(kind: str) -> None:
-    """A single measurement while it tracks, a reading while it does not: an error, and it goes on."""
+async def test_calls_in_wrong_mode_raise(kind: str) -> None:
+    """A single measurement while tracking, a reading while not; the instrument continues."""
     async with bench(kind) as day:
         await day.instrument.connect()
         await day.instrument.track(1)
@@ -141,8 +141,8 @@ async def test_it_refuses_what_it_cannot_do(kind: str) -> None:
                 pass  # it has to find the prism again
 
 
-async def test_a_pulled_cable_ends_the_reading(kind: str) -> None:
-    """Whoever waits gets an error; with the cable in again it can be connected again."""
+async def test_unplugged_cable_ends_read(kind: str) -> None:
+    """After replugging it can be connected again."""
     async with bench(kind) as day:
         await day.instrument.connect()
         await day.instrument.track(1)

@@ -1,4 +1,4 @@
-"""Bridge programs in memory: one that says what a test wants, and one that serves any instrument."""
+"""Bridge programs in memory: a scripted one, and one that serves any instrument."""
 
 from __future__ import annotations
 
@@ -23,16 +23,14 @@ COMMANDS = ["track", "direct", "measure", "atmosphere"]
 
 
 class FakeProgram:
-    """A program that says what it is made to say, and answers ``done`` to every command unless told otherwise.
+    """A scripted program that responds ``done`` to every command by default.
 
     Attributes
     ----------
     commands
-        What it has been told.
+        All commands received.
     on_command
-        Answers a command.
-    ended
-        Whether it has been ended.
+        Responds to a command.
     """
 
     def __init__(self, listener: Listener, clock: Clock) -> None:
@@ -43,7 +41,7 @@ class FakeProgram:
         self.ended = False
 
     def say(self, *records: dict[str, Any] | bytes) -> None:
-        """Print lines, all at once."""
+        """Print lines in one piece."""
         self.print(b"".join(_line(record) + b"\n" for record in records))
 
     def print(self, data: bytes) -> None:
@@ -52,16 +50,16 @@ class FakeProgram:
             self._listener.output_received(data, self._clock.monotonic_ns())
 
     def measure(self, distance_m: float = 10.0, **more: Any) -> None:
-        """Print a measurement that was made just now."""
+        """Print a measurement of this moment."""
         self.say(self.measurement(distance_m, **more))
 
     def measurement(self, distance_m: float = 10.0, **more: Any) -> dict[str, Any]:
-        """Make the line of a measurement that was made just now."""
+        """Return the line of a measurement of this moment."""
         now_ns = self._clock.monotonic_ns()
         return measured(distance_m, host_time_ns=now_ns) | more
 
     def done(self, command: dict[str, Any], error: str = "") -> None:
-        """Say that a command was carried out, or not."""
+        """Respond to a command."""
         self.say({"type": "done", "id": command["id"], "error": error})
 
     def exit(self, how: str = "exit status 1") -> None:
@@ -72,7 +70,7 @@ class FakeProgram:
     # --- Program ----------------------------------------------------------------------------------------------
 
     def write(self, data: bytes) -> None:
-        """Take commands."""
+        """Receive commands."""
         for line in data.splitlines():
             command = json.loads(line)
             self.commands.append(command)
@@ -88,24 +86,11 @@ class FakeProgram:
 
 
 class FakeStart:
-    """Starts fake programs.
+    """Starts scripted programs, each of which prints ``first_lines`` at once; ``programs`` are all that were started."""
 
-    Parameters
-    ----------
-    clock
-        Theirs.
-    first_words
-        What each says at once.
-
-    Attributes
-    ----------
-    programs
-        Those that were started.
-    """
-
-    def __init__(self, clock: Clock, *first_words: dict[str, Any] | bytes) -> None:
+    def __init__(self, clock: Clock, *first_lines: dict[str, Any] | bytes) -> None:
         self._clock = clock
-        self._first_words = first_words
+        self._first_lines = first_lines
         self.programs: list[FakeProgram] = []
 
     async def __call__(self, command: Sequence[str], listener: Listener) -> FakeProgram:
@@ -113,31 +98,25 @@ class FakeStart:
         del command
         program = FakeProgram(listener, self._clock)
         self.programs.append(program)
-        program.say(*self._first_words)
+        program.say(*self._first_lines)
         return program
 
 
 class ServedInstrument:
-    """A program that serves an instrument, as a program with a maker's library would.
-
-    Parameters
-    ----------
-    instrument
-        What it serves.
-    """
+    """Starts a program that serves an instrument, as one with a manufacturer's library would."""
 
     def __init__(self, instrument: Instrument, clock: Clock) -> None:
         self._instrument = instrument
         self._clock = clock
 
     async def __call__(self, command: Sequence[str], listener: Listener) -> _Serving:
-        """Start it; a StartProgram."""
+        """Start it."""
         del command
         return _Serving(self._instrument, listener, self._clock)
 
 
 class _Serving:
-    """It runs."""
+    """The running program."""
 
     def __init__(self, instrument: Instrument, listener: Listener, clock: Clock) -> None:
         self._instrument = instrument
@@ -148,7 +127,7 @@ class _Serving:
         self._task = asyncio.create_task(self._run())
 
     def write(self, data: bytes) -> None:
-        """Take a command."""
+        """Queue a command."""
         self._commands.put_nowait(data)
 
     def kill(self) -> None:
@@ -188,8 +167,8 @@ class _Serving:
                 case {"type": "direct"}:
                     await instrument.direct()
                 case {"type": "measure", "id": number}:
-                    shot = _fields(await instrument.measure())
-                    self._say({"type": "shot", "id": number} | shot)
+                    measured = _fields(await instrument.measure())
+                    self._say({"type": "shot", "id": number} | measured)
                     return
                 case {"type": "atmosphere", "temperature_c": temperature_c, "pressure_hpa": pressure_hpa}:
                     await instrument.set_atmosphere(
@@ -222,7 +201,7 @@ class _Serving:
 
 
 def measured(distance_m: float = 10.0, **more: Any) -> dict[str, Any]:
-    """Make the line of a measurement."""
+    """Return the line of a measurement."""
     values = {"horizontal_angle_rad": 1.0, "zenith_angle_rad": 1.5, "slope_distance_m": distance_m}
     return {"type": "measurement", "status": "ok"} | values | more
 

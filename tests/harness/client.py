@@ -1,4 +1,4 @@
-"""A station's client between a simulated total station and a master that a test plays, on virtual time."""
+"""A station's client between a simulated total station and the radio of a test's master, on virtual time."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 START_NS = 1_700_000_000_000_000_000
 OFFSET_NS = -3_600_000_000_000
-"""The station's computer believes that it is an hour earlier."""
+"""The station's clock is an hour behind."""
 
 SCENARIO = ScenarioConfig(targets_m=((20.0, 5.0, 0.5), (0.5, 0.0, 0.0)))
 
@@ -51,7 +51,7 @@ SCENARIO = ScenarioConfig(targets_m=((20.0, 5.0, 0.5), (0.5, 0.0, 0.0)))
 def client_config(
     folder: Path, *, station: int = 1, prism: int = 1, protocol: ProtocolConfig | None = None
 ) -> ClientConfig:
-    """Make a configuration whose instrument and radio are not read; of the protocol classic."""
+    """Return a configuration, of the classic protocol by default; its instrument and radio sections are not used."""
     return ClientConfig(
         kind="client",
         station=station,
@@ -76,14 +76,12 @@ class Field:
 
     Attributes
     ----------
-    instrument, line
-        The total station, and the cable to it.
+    line
+        The cable to the instrument.
     read
-        What the clients have read from it.
+        All readings of the clients.
     protocol
-        What the client speaks; None: classic.
-    key, boot
-        As the client gets them.
+        None: classic.
     """
 
     folder: Path
@@ -118,20 +116,20 @@ class Field:
         )
 
     async def measuring(self) -> None:
-        """Return when a client that has just been started has read something, which takes two seconds."""
+        """Wait for the first reading of a client that has just been started; takes two seconds."""
         before = len(self.read)
         while len(self.read) == before:  # noqa: ASYNC110 (time has to pass meanwhile)
             await asyncio.sleep(0.01)
 
     async def kill(self) -> None:
-        """Cancel the client wherever it is."""
+        """Cancel the client."""
         if self.client is not None:
             self.client.cancel()
             await asyncio.wait([self.client])
             self.client = None
 
     async def ask(self, payload: bytes, timeout_s: float = 0.25) -> Reply | None:
-        """Send a request and return the reply; None when there is none in time after the request's end."""
+        """Send a request and return the reply; None if there is none within the timeout."""
         await self.master.radio.transmit(payload)
         with suppress(TimeoutError):
             async with asyncio.timeout(timeout_s):
@@ -139,14 +137,14 @@ class Field:
         return None
 
     async def poll(self) -> MeasurementMessage:
-        """Ask for data and insist; ping first, for the station has to have been synchronised once."""
+        """Poll a measurement, after the ping that the station requires first."""
         await self.ask(b"e1")
         reply = await self.ask(b"t1")
         assert isinstance(reply, MeasurementMessage), reply
         return reply
 
     def journals(self) -> list[list[PolarMeasurement]]:
-        """Return what stands in each journal, in the order of the client's starts."""
+        """Return the measurements of each journal, in the order of the client's starts."""
         paths = sorted((self.folder / "journals").iterdir(), key=lambda path: path.stat().st_mtime_ns)
         return [load_journal(path).measurements for path in paths]
 
@@ -159,7 +157,7 @@ async def field_day(
     protocol: ProtocolConfig | None = None,
     key: bytes | None = None,
 ) -> AsyncGenerator[Field]:
-    """Set up a station that measures and a master's radio; end both with the block."""
+    """Set up a measuring station and a master's radio for the duration of the block."""
     timeline = running_timeline()
     rng = np.random.default_rng(7)
     air = Air(timeline, np.random.default_rng(0), LinkModel())

@@ -1,7 +1,7 @@
-"""The authors' C++ node as facts/radio.md 10 describes what it does to the registers, written anew from that table.
+"""The register accesses of the authors' C++ node, reimplemented from the table in facts/radio.md 10.
 
-It does several things that no other driver does: it leaves the low-frequency bit set at 905 MHz, maps DIO0 to 11,
-polls that pin and not the flags, reads the FIFO byte by byte, and never leaves reception between packets.
+Unlike other drivers, it leaves the low-frequency bit set at 905 MHz, maps DIO0 to 11, polls that pin instead of the flags,
+reads the FIFO byte by byte, and never leaves reception between packets.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from tsgt.simulation.lora import SX1276Chip
 
 TRANSFER_S = 50e-6
-"""Two bytes at 500 kHz, and the system call."""
+"""Two bytes at 500 kHz plus the system call."""
 
 POLL_S = 1e-3
 
@@ -24,17 +24,7 @@ RX_DONE, CRC_ERROR = 0x40, 0x20
 
 
 class CppNode:
-    """A node's radio.
-
-    Parameters
-    ----------
-    program
-        Spends its time.
-    chip
-        Its chip.
-    spreading_factor
-        8 since February 2021, 9 before.
-    """
+    """A node's radio; the spreading factor is 8 since February 2021, 9 before."""
 
     def __init__(self, program: BlockingProgram, chip: SX1276Chip, *, spreading_factor: int) -> None:
         self._program = program
@@ -42,7 +32,7 @@ class CppNode:
         self._spreading_factor = spreading_factor
 
     def start(self) -> None:
-        """Reset the chip, find out which it is, and set it up."""
+        """Reset, identify and set up the chip."""
         assert self._version_after(reset_low=True) != 0x22, "an SX1272, whose reset works the other way round"
         assert self._version_after(reset_low=False) == 0x12
         self._mode(SLEEP)
@@ -67,7 +57,7 @@ class CppNode:
         self._write(0x0B, 0x3B)
 
     def send(self, payload: bytes, timeout_s: float = 1.0) -> bool:
-        """Send, and return whether DIO0 rose in time; TxDone is left set."""
+        """Send; return whether DIO0 rose in time. TxDone stays set."""
         self._mode(STDBY)
         self._write(0x40, ALL_DIO_11)
         self._write(0x12, 0xFF)
@@ -80,13 +70,13 @@ class CppNode:
         return self._wait_for_dio0(timeout_s)
 
     def listen(self) -> None:
-        """Enter reception, once."""
+        """Enter reception."""
         self._write(0x12, 0xFF)
         self._write(0x40, ALL_DIO_11)
         self._mode(RXCONTINUOUS)
 
     def receive(self, timeout_s: float = 1.0) -> bytes | None:
-        """Return the next packet; None when none came in time or its CRC is wrong."""
+        """Return the next packet; None after the timeout, or if its CRC is wrong."""
         if not self._wait_for_dio0(timeout_s):
             return None
         flags = self._read(0x12)
@@ -99,7 +89,7 @@ class CppNode:
         return bytes(self._read(0x00) for _ in range(length))
 
     def _version_after(self, *, reset_low: bool) -> int:
-        """Pulse NRESET, first to one level and then to the other, and read the version at the second."""
+        """Set NRESET to one level, then to the other, and read the version."""
         for low in (not reset_low, reset_low):
             self._chip.set_reset(low)
             self._program.sleep(0.1)

@@ -1,4 +1,4 @@
-"""A line with a GeoCOM instrument at its end that answers what it is asked, in memory, with all that can go wrong."""
+"""A GeoCOM instrument on a line in memory, with faults of the line."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
 
 REQUEST = re.compile(r"%R1Q,(?P<rpc>\d+),(?P<transaction>\d+)(?:,(?P<checksum>\d+))?:(?P<parameters>.*)")
 
-ANSWER_S = 0.02
-"""How long the instrument takes."""
+REPLY_S = 0.02
+"""Response time of the instrument."""
 
 Fault = Callable[[str], list[tuple[float, bytes]]]
-"""What becomes of an answer: bytes on the line, each lot so many seconds after the request."""
+"""Maps a reply to pieces of data, each with its delay in s after the request."""
 
 
 def checksum_of(text: str) -> int:
-    """CRC-16/ARC by long division, bit by bit: slow, and not as the program does it."""
+    """Return the CRC-16/ARC by long division, bit by bit: slow, and independent of the codec."""
     bits = [byte >> bit & 1 for byte in text.encode() for bit in range(8)] + [0] * 16
     generator = [1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0, 1]
     for start in range(len(bits) - 16):
@@ -37,73 +37,73 @@ def checksum_of(text: str) -> int:
 
 
 def answered(line: str) -> list[tuple[float, bytes]]:
-    """Say it."""
-    return [(ANSWER_S, line.encode() + b"\r\n")]
+    """Send the reply."""
+    return [(REPLY_S, line.encode() + b"\r\n")]
 
 
 def silent(_: str) -> list[tuple[float, bytes]]:
-    """Say nothing."""
+    """Send nothing."""
     return []
 
 
 def late(seconds: float) -> Fault:
-    """Take longer."""
+    """Delay the reply."""
     return lambda line: [(seconds, line.encode() + b"\r\n")]
 
 
 def doubled(line: str) -> list[tuple[float, bytes]]:
-    """Say it twice."""
-    return [*answered(line), (ANSWER_S + 0.001, line.encode() + b"\r\n")]
+    """Send the reply twice."""
+    return [*answered(line), (REPLY_S + 0.001, line.encode() + b"\r\n")]
 
 
 def torn(place: int, pause_s: float = 0.05) -> Fault:
-    """Say it in two pieces."""
+    """Send the reply in two pieces."""
 
     def fault(line: str) -> list[tuple[float, bytes]]:
         data = line.encode() + b"\r\n"
-        return [(ANSWER_S, data[:place]), (ANSWER_S + pause_s, data[place:])]
+        return [(REPLY_S, data[:place]), (REPLY_S + pause_s, data[place:])]
 
     return lambda line: [(at_s, data) for at_s, data in fault(line) if data]
 
 
 def cut(place: int) -> Fault:
-    """Leave its end out."""
-    return lambda line: [(ANSWER_S, line.encode()[:place])]
+    """Truncate the reply."""
+    return lambda line: [(REPLY_S, line.encode()[:place])]
 
 
 def damaged(line: str) -> list[tuple[float, bytes]]:
-    """Get a bit wrong, where it can be seen."""
+    """Flip a bit so that the damage is visible."""
     data = bytearray(line.encode())
     data[-1] ^= 0x80
-    return [(ANSWER_S, bytes(data) + b"\r\n")]
+    return [(REPLY_S, bytes(data) + b"\r\n")]
 
 
 def garbage_before(garbage: bytes) -> Fault:
-    """Say something else before it."""
-    return lambda line: [(ANSWER_S / 2, garbage), *answered(line)]
+    """Send garbage before the reply."""
+    return lambda line: [(REPLY_S / 2, garbage), *answered(line)]
 
 
 def not_taken(com_code: int) -> Fault:
-    """Carry nothing out: neither the request nor its number has been understood."""
+    """Execute nothing: the request and its transaction were not understood."""
     return lambda _: answered(f"%R1P,{com_code},0:0")
 
 
 @dataclass
 class FakeInstrument:
-    """It answers every request with code 0 and the parameters of the request.
+    """An instrument that replies to every request with code 0 and the request's parameters.
 
     Attributes
     ----------
     baud
-        At another one it hears and says nothing that makes sense.
+        At another rate it exchanges garbage only.
     checksums
-        Whether it puts checksums on its answers.
+        Whether its replies have checksums.
     faults
-        What becomes of the answers from now on, one after the other; then all is well.
+        Faults of the next replies, one each.
     busy
-        While it searches it answers nothing but an abortion.
-    heard
-        Every request, with everything that came between.
+        Whether a search is in progress, during which it responds to an abort only.
+    received
+        Every line.
     """
 
     baud: int = 115_200
@@ -111,30 +111,32 @@ class FakeInstrument:
     garbles: bool = True
     faults: deque[Fault] = field(default_factory=deque)
     busy: bool = False
-    heard: list[bytes] = field(default_factory=list)
+    received: list[bytes] = field(default_factory=list)
 
-    def answers(self, line: bytes) -> list[tuple[float, bytes]]:
-        """Hear a line; return what comes of it."""
-        self.heard.append(line)
+    def replies(self, line: bytes) -> list[tuple[float, bytes]]:
+        """Process a line; return the reply's pieces."""
+        self.received.append(line)
         if line == b"c":
             self.busy = False
-            return [(ANSWER_S, b"?\r\n")]
+            return [(REPLY_S, b"?\r\n")]
         found = REQUEST.fullmatch(line.decode("ascii"))
         if found is None or self.busy:
             return []
-        answer = f"%R1P,0,{found['transaction']}:0"
+        reply = f"%R1P,0,{found['transaction']}:0"
         if found["parameters"]:
-            answer += f",{found['parameters']}"
+            reply += f",{found['parameters']}"
         if self.checksums:
-            head, body = answer.split(":", 1)
-            answer = f"{head},{checksum_of(answer)}:{body}"
+            head, body = reply.split(":", 1)
+            reply = f"{head},{checksum_of(reply)}:{body}"
         fault = self.faults.popleft() if self.faults else answered
-        return fault(answer)
+        return fault(reply)
 
     @property
     def requests(self) -> list[bytes]:
-        """What it was asked for, without what only keeps the line in step."""
-        return [line for line in self.heard if line.startswith(b"%R1Q") and not line.startswith(b"%R1Q,0,")]
+        """All requests but probes."""
+        return [
+            line for line in self.received if line.startswith(b"%R1Q") and not line.startswith(b"%R1Q,0,")
+        ]
 
 
 class MemoryPort:
@@ -152,21 +154,21 @@ class MemoryPort:
         self._gone = False
 
     def write(self, data: bytes) -> None:
-        """Let the instrument hear it."""
+        """Send to the instrument."""
         self._check()
         if self.baud != self._instrument.baud:
             if self._instrument.garbles:
-                self.come(ANSWER_S, b"\xfe\x80\r\x7f\n\xff")
+                self.come(REPLY_S, b"\xfe\x80\r\x7f\n\xff")
             return
         self._sent += data
         while (end := min(filter(lambda at: at >= 0, map(self._sent.find, (b"\r", b"\n"))), default=-1)) >= 0:
             line, self._sent = self._sent[:end], self._sent[end + 1 :]
             if line:
-                for after_s, answer in self._instrument.answers(line):
-                    self.come(after_s, answer)
+                for after_s, reply in self._instrument.replies(line):
+                    self.come(after_s, reply)
 
     def come(self, after_s: float, data: bytes) -> None:
-        """Let bytes come from the line."""
+        """Let data arrive after a delay."""
         asyncio.get_running_loop().call_later(after_s, self._come, data)
 
     def _come(self, data: bytes) -> None:
@@ -182,19 +184,19 @@ class MemoryPort:
         return self._chunks.popleft()
 
     def drain(self) -> bytes:
-        """Forget what has come."""
+        """Discard unread data."""
         self._check()
         data = b"".join(chunk.data for chunk in self._chunks)
         self._chunks.clear()
         return data
 
     def unplug(self) -> None:
-        """Be gone."""
+        """Unplug the cable."""
         self._gone = True
         self._came.set()
 
     async def close(self) -> None:
-        """Be closed."""
+        """Close the port."""
         self.closed = True
         self.unplug()
 
@@ -205,14 +207,14 @@ class MemoryPort:
 
 @dataclass
 class Cable:
-    """What opens the line to an instrument, at any number of bits per second.
+    """Opens ports to an instrument.
 
     Attributes
     ----------
     ports
-        Every port that has been opened.
+        All ports that were opened.
     impossible
-        Speeds that the adapter does not have.
+        Baud rates that the adapter does not support.
     """
 
     instrument: FakeInstrument

@@ -1,4 +1,4 @@
-"""Our driver on its chip, a second chip for a driver by others, and one air."""
+"""Our driver on its simulated chip, a second chip for a third-party driver, and the air between them."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
     from tsgt.radio.sx127x import SX127x
 
 SIZES = (5, 17, 34, 251)
-"""Payloads for all drivers: Adafruit's takes 5 to 251 bytes."""
+"""Payload sizes that all drivers support: Adafruit's takes 5 to 251 bytes."""
 
 
 @dataclass(frozen=True)
 class Lab:
-    """What a test of interoperation needs: our radio, and the other chip with a program to drive it."""
+    """Our radio, and the other chip with a program to drive it."""
 
     radio: SX127x
     chip: SX1276Chip
@@ -33,18 +33,18 @@ class Lab:
 
 @asynccontextmanager
 async def lab(settings: LoRaSettings) -> AsyncGenerator[Lab]:
-    """Start our radio, and close it at the end."""
+    """Start our radio for the duration of the block."""
     timeline = running_timeline()
     air = Air(timeline, np.random.default_rng(0), LinkModel())
     ours = make_side(air, "ours")
-    peer = SX1276Chip(timeline, lambda antenna: air.join(antenna, "peer"), np.random.default_rng(2))
+    other = SX1276Chip(timeline, lambda antenna: air.join(antenna, "peer"), np.random.default_rng(2))
     await ours.radio.start(settings)
     try:
-        yield Lab(ours.radio, peer, BlockingProgram())
+        yield Lab(ours.radio, other, BlockingProgram())
     finally:
         await ours.radio.close()
 
 
 def payload(size: int) -> bytes:
-    """Return bytes that differ from place to place and from size to size."""
+    """Return bytes that depend on position and size."""
     return bytes((size + 7 * place) % 256 for place in range(size))

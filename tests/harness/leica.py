@@ -29,7 +29,7 @@ TARGETS_M = ((20.0, 5.0, 0.5),)
 
 @dataclass(frozen=True)
 class LeicaBench:
-    """The driver, its line, the instrument at the far end, and the host's clock, which is the true time here."""
+    """The driver, its line, the simulated instrument, and the host's clock, which shows true time."""
 
     instrument: LeicaInstrument
     station: SimulatedTotalStation
@@ -38,7 +38,7 @@ class LeicaBench:
 
     @property
     def now_s(self) -> float:
-        """The true time."""
+        """True time."""
         return self.clock.monotonic_ns() / 1e9
 
     async def begin(self, prism: int = 1) -> None:
@@ -47,7 +47,7 @@ class LeicaBench:
         await self.instrument.track(prism)
 
     async def read_for(self, seconds: float) -> list[Reading]:
-        """Return all readings of the next seconds."""
+        """Return all readings within a duration."""
         readings = []
         until_s = self.now_s + seconds
         while True:
@@ -67,7 +67,7 @@ class LeicaBench:
 
 
 def leica_config(**changes: Any) -> LeicaInstrumentConfig:
-    """Return a configuration whose instrument adds nothing of its own to a distance."""
+    """Return a configuration with the prism constant 0."""
     settings: dict[str, Any] = {"prism_type": "user", "prism_constant_mm": 0.0} | changes
     return LeicaInstrumentConfig(kind="leica", port=Path("/dev/ttyUSB0"), **settings)
 
@@ -82,7 +82,7 @@ async def leica_bench(
     seed: int = 2,
     duration_s: float = 300.0,
 ) -> AsyncGenerator[LeicaBench]:
-    """Set up a driver that is not connected; it is closed at the end."""
+    """Set up a disconnected driver for the duration of the block."""
     stations = tuple(
         SimulatedStation(
             station=number,

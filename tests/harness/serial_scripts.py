@@ -1,9 +1,9 @@
-"""Two hundred scripts of what goes wrong between a client and its instrument, and what has to hold in each.
+"""Two hundred fault injection scripts for the link between a client and its instrument, and their invariants.
 
-A script lets the real driver and its supervisor measure with a simulated Leica on virtual time, does something to line or
-instrument, and ends it at a known instant. Every distance that is given must be one that the instrument has answered with,
-once, with the time at which it was measured; and the first one after the end must come within the time stated for the
-kind of fault. ``python benchmarks/serial_faults.py`` runs all of them.
+A script runs the real driver and its supervisor with a simulated Leica in virtual time, injects a fault into line or
+instrument, and ends it at a known time. Every reported distance must be one that the instrument has offered, once, with the
+time of its measurement; and the first one after the fault must come within the limit of the kind of fault.
+``python benchmarks/run.py serial_faults`` runs all of them.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ if TYPE_CHECKING:
     from tsgt.station import Reading
 
 SETTLE_S: Final = 10.0
-"""Before the fault: connecting takes two seconds."""
+"""Duration before the fault: connecting takes two seconds."""
 
 AFTER_S: Final = 20.0
-"""Watched after the end of the fault."""
+"""Duration after the end of the fault."""
 
 STAMP_LIMIT_NS: Final = 25_000_000
-"""A stamp is less than this from the measurement: answers take 20 to 60 ms, of which 20 are taken off."""
+"""Bound on the error of a timestamp: replies take 20 to 60 ms, of which 20 are subtracted."""
 
 _DRIFT_PPM: Final = 15.0
 _LATENCY_MS: Final = 20.0
@@ -48,15 +48,7 @@ _ROUNDING: Final = 1e-9
 
 @dataclass(slots=True)
 class Bench:
-    """What a script has in its hands.
-
-    Attributes
-    ----------
-    station, line
-        The instrument, and its cable.
-    rng
-        Its own.
-    """
+    """The instrument, its cable, and a script's random numbers."""
 
     station: SimulatedTotalStation
     line: SimulatedLine
@@ -65,20 +57,14 @@ class Bench:
 
 @dataclass(frozen=True, slots=True)
 class Script:
-    """Something that goes wrong.
+    """A fault injection.
 
     Attributes
     ----------
-    kind
-        Which kind of fault.
-    seed
-        Of everything that is drawn.
     limit_s
-        From the end of the fault to the next distance it takes no longer than this.
+        Bound on the time from the end of the fault to the next distance.
     act
-        Does it, and returns at its end.
-    checksum
-        Whether the line has checksums.
+        Injects the fault, and returns at its end.
     """
 
     kind: str
@@ -89,32 +75,32 @@ class Script:
 
 
 @dataclass(slots=True)
-class Outcome:
-    """What came of a script.
+class ScriptResult:
+    """The result of a script.
 
     Attributes
     ----------
-    offered, given
-        How many distances the instrument has answered with, and how many of them the client was given.
-    wrong
-        What must not happen: values that were never offered, or twice, and times that lie.
+    offered, reported
+        Number of distances offered by the instrument, and reported by the client.
+    violations
+        Distances that were never offered, or reported twice, and wrong timestamps.
     recovery_s
-        From the end of the fault to the next distance; infinite if there was none.
+        Time from the end of the fault to the next distance; infinite if there was none.
     """
 
     offered: int = 0
-    given: int = 0
-    wrong: list[str] = field(default_factory=list)
+    reported: int = 0
+    violations: list[str] = field(default_factory=list)
     recovery_s: float = float("inf")
 
 
-def run_script(script: Script) -> Outcome:
-    """Run a script on virtual time."""
+def run_script(script: Script) -> ScriptResult:
+    """Run a script in virtual time."""
     timeline = VirtualTimeline()
     return run_virtual(partial(_run, script, timeline), timeline)
 
 
-async def _run(script: Script, timeline: VirtualTimeline) -> Outcome:
+async def _run(script: Script, timeline: VirtualTimeline) -> ScriptResult:
     world_rng, station_rng, script_rng = np.random.default_rng(script.seed).spawn(3)
     scenario = ScenarioConfig()
     world = scenario_world(scenario, 200.0, world_rng)
@@ -147,44 +133,44 @@ async def _run(script: Script, timeline: VirtualTimeline) -> Outcome:
     finally:
         running.cancel()
         await asyncio.wait([running])
-    outcome = Outcome(offered=len(station.reported_distances))
-    _judge(outcome, [reading for _, reading in readings if reading.status.usable], station, clock)
+    outcome = ScriptResult(offered=len(station.reported_distances))
+    _check(outcome, [reading for _, reading in readings if reading.status.usable], station, clock)
     usable_ns = [at_ns for at_ns, reading in readings if reading.status.usable and at_ns >= ended_ns]
     if usable_ns:
         outcome.recovery_s = (usable_ns[0] - ended_ns) / 1e9
     if outcome.recovery_s > script.limit_s:
-        outcome.wrong.append(f"no distance for {outcome.recovery_s:.1f} s after the end of the fault")
+        outcome.violations.append(f"no distance for {outcome.recovery_s:.1f} s after the end of the fault")
     return outcome
 
 
 def _ignore(_: object) -> None:
-    """Nobody wants to know."""
+    """Ignore a callback."""
 
 
-def _judge(
-    outcome: Outcome, usable: Iterable[Reading], station: SimulatedTotalStation, clock: DriftingClock
+def _check(
+    outcome: ScriptResult, usable: Iterable[Reading], station: SimulatedTotalStation, clock: DriftingClock
 ) -> None:
-    """Compare what was given with what was offered."""
+    """Compare reported with offered distances."""
     seen: set[ReportedDistance] = set()
     offered: dict[int, list[ReportedDistance]] = {}
     for each in station.reported_distances:
         offered.setdefault(each.instrument_ms, []).append(each)
     for reading in usable:
-        outcome.given += 1
+        outcome.reported += 1
         if reading.instrument_time_ns is None or reading.slope_distance_m is None:
-            outcome.wrong.append(f"usable, but without time or distance: {reading}")
+            outcome.violations.append(f"usable without time or distance: {reading}")
             continue
         candidates = offered.get(reading.instrument_time_ns // 1_000_000, [])
         truth = next((each for each in candidates if _same(each, reading)), None)
         if truth is None:
-            outcome.wrong.append(f"never offered: {reading}")
+            outcome.violations.append(f"never offered: {reading}")
             continue
         if truth in seen:
-            outcome.wrong.append(f"given twice: {reading}")
+            outcome.violations.append(f"reported twice: {reading}")
         seen.add(truth)
         late_ns = clock.true_ns(reading.at_ns) - truth.true_ns
         if abs(late_ns) > STAMP_LIMIT_NS:
-            outcome.wrong.append(f"stamped {late_ns / 1e6:.1f} ms after it was measured: {reading}")
+            outcome.violations.append(f"timestamped {late_ns / 1e6:.1f} ms after the measurement: {reading}")
 
 
 def _same(offered: ReportedDistance, reading: Reading) -> bool:
@@ -200,7 +186,7 @@ def _same(offered: ReportedDistance, reading: Reading) -> bool:
 
 
 def all_scripts() -> list[Script]:
-    """Return the two hundred scripts, those of one kind together; the same in every run."""
+    """Return the two hundred scripts, grouped by kind; the same in every run."""
     kinds: list[tuple[int, str, float, Callable[[Bench], Awaitable[None]], bool]] = [
         *((8, f"answers {fault}", 3.0, partial(_spoil, (fault,), 0.1), False) for fault in _LINE_FAULTS),
         (16, "all of these", 3.0, partial(_spoil, _LINE_FAULTS, 0.05), False),
@@ -248,7 +234,7 @@ def _families() -> dict[str, list[ReturnCode]]:
 
 
 async def _spoil(faults: tuple[LineFault, ...], share: float, bench: Bench) -> None:
-    """Let a share of all answers go wrong for 15 s."""
+    """Inject faults into a share of all replies for 15 s."""
     script = bench.line.faults.script
     for _ in range(15):
         for _ in range(60):
@@ -256,12 +242,12 @@ async def _spoil(faults: tuple[LineFault, ...], share: float, bench: Bench) -> N
             script.append(faults[bench.rng.integers(len(faults))] if hit else LineFault.NONE)
         await asyncio.sleep(1.0)
         script.clear()
-    # What is late is still on its way.
+    # Delayed replies are still on their way.
     await asyncio.sleep(bench.line.faults.delay_s)
 
 
 async def _change_digits(bench: Bench) -> None:
-    """Let one digit in ten answers be another one for 15 s."""
+    """Change a digit in one of ten replies for 15 s."""
     bench.line.faults.script.clear()
     for _ in range(15):
         bench.line.faults.script.extend(
@@ -272,7 +258,7 @@ async def _change_digits(bench: Bench) -> None:
 
 
 async def _force(codes: list[ReturnCode], bench: Bench) -> None:
-    """Answer with codes of a family now and then for 15 s, whatever was asked for."""
+    """Force return codes of a family now and then for 15 s."""
     for _ in range(15):
         code = codes[bench.rng.integers(len(codes))]
         com = code >> 8 == ReturnCode.COM_TIMEDOUT >> 8

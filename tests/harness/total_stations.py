@@ -1,4 +1,4 @@
-"""A simulated total station on the running loop's virtual time, and somebody who types GeoCOM at the end of its cable."""
+"""A simulated total station in virtual time, and a terminal that sends it GeoCOM requests."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ SILENT = NoiseConfig(range_sigma_mm=0.0, range_sigma_ppm=0.0, angle_sigma_arcsec
 STANDING = MotionConfig(speeds_mps=(0.0,), speed_weights=(1.0,))
 
 
-class Typed(NamedTuple):
-    """An answer: its codes and values as text, and the chunk that ended it."""
+class RawReply(NamedTuple):
+    """A reply with its values as text, and the chunk that ended it."""
 
     com_code: int
     transaction: int
@@ -34,19 +34,7 @@ class Typed(NamedTuple):
 
 
 class Bench:
-    """An instrument, its cable, and a terminal.
-
-    Parameters
-    ----------
-    scenario
-        The world.
-    seed
-        Of all randomness.
-    station
-        Which of its stations.
-    world
-        What is the case; without it that of the scenario, for ``duration_s``.
-    """
+    """An instrument, its cable, and a terminal; without a world, that of the scenario for ``duration_s``."""
 
     def __init__(
         self,
@@ -71,26 +59,26 @@ class Bench:
         self.port: Port | None = None
         self._asked = 0
 
-    async def ask(self, rpc: int, *parameters: object) -> Typed:
-        """Send a request and return the answer to it."""
+    async def ask(self, rpc: int, *parameters: object) -> RawReply:
+        """Send a request and return its reply."""
         self._asked += 1
         text = ",".join(str(parameter) for parameter in parameters)
         answer = await self.type(f"%R1Q,{rpc},{self._asked}:{text}\r\n".encode())
         assert answer.transaction == self._asked
         return answer
 
-    async def type(self, data: bytes) -> Typed:
-        """Send bytes and return the next line that comes."""
+    async def type(self, data: bytes) -> RawReply:
+        """Send data and return the next line."""
         await self.send(data)
         return await self.listen()
 
     async def send(self, data: bytes) -> None:
-        """Send bytes; the port is opened when need be."""
+        """Send data; open the port if necessary."""
         if self.port is None:
             self.port = await self.line.open(self.instrument.baud)
         self.port.write(data)
 
-    async def listen(self) -> Typed:
+    async def listen(self) -> RawReply:
         """Return the next line."""
         assert self.port is not None
         line = b""
@@ -101,7 +89,7 @@ class Bench:
         head, _, tail = line.decode().strip().partition(":")
         _, com_code, transaction = head.split(",")[:3]
         code, *values = tail.split(",")
-        return Typed(int(com_code), int(transaction), int(code), values, chunk)
+        return RawReply(int(com_code), int(transaction), int(code), values, chunk)
 
     async def code(self, rpc: int, *parameters: object) -> int:
         """Send a request and return its code."""
@@ -115,7 +103,7 @@ class Bench:
             assert (answer.com_code, answer.code) == (0, 0), (rpc, parameters, answer)
 
     async def quiet(self, seconds: float) -> bool:
-        """Tell whether nothing comes for so long."""
+        """Return whether nothing arrives for a duration."""
         assert self.port is not None
         try:
             async with asyncio.timeout(seconds):
@@ -145,4 +133,4 @@ def with_station(scenario: ScenarioConfig | None = None, **changes: object) -> S
 
 
 SETUP: tuple[tuple[object, ...], ...] = ((2008, 3, 1), (17008, 9), (2024, 0.0), (2020, 9), (2008, 1, 1))
-"""From any state to continuous measuring with the constant zero."""
+"""Requests for continuous measurements with the prism constant 0, from any state."""

@@ -1,4 +1,4 @@
-"""Whatever a bridge program prints, the client takes what can be, and nothing else."""
+"""Arbitrary output of a bridge program: only plausible measurements become readings."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ STAMPS = ("host", "instrument", "arrival")
 
 
 @given(st.binary(max_size=300), st.lists(st.integers(0, 300)), st.integers(1, 50))
-def test_pieces_do_not_matter(data: bytes, cuts: list[int], limit_bytes: int) -> None:
-    """However the output is cut into pieces, the lines are the same, and none is longer than its limit."""
+def test_splitting_is_independent_of_pieces(data: bytes, cuts: list[int], limit_bytes: int) -> None:
+    """The lines are the same, and none exceeds its limit."""
     cutter = LineSplitter(limit_bytes)
     lines = []
     for begin, end in pairwise(sorted({0, len(data), *(cut for cut in cuts if cut < len(data))})):
@@ -48,14 +48,14 @@ lines = st.tuples(
     st.integers(0, 10**9),
     ages_ns,
 )
-"""Type, fields that may be wrong, how long after the one before it comes, and its age then."""
+"""Type, possibly invalid fields, delay after the previous line, and age on arrival."""
 
 
 @given(st.sampled_from(STAMPS), st.lists(lines, max_size=20), st.binary(max_size=20))
-def test_readings_are_what_can_have_been_measured(
-    stamps: str, said: list[tuple[str, dict[str, Any], int, int | None]], rubbish: bytes
+def test_readings_are_plausible(
+    stamps: str, said: list[tuple[str, dict[str, Any], int, int | None]], garbage: bytes
 ) -> None:
-    """No line raises; every usable reading has angles, a distance and a time that can be, each time once."""
+    """No line raises; every usable reading has valid angles, distance and time, each time once."""
     readings: deque[Reading] = deque()
 
     async def main() -> None:
@@ -69,7 +69,7 @@ def test_readings_are_what_can_have_been_measured(
             now_ns += after_ns
             if age_ns is not None:
                 record |= {"host_time_ns": now_ns - age_ns, "instrument_time_ns": now_ns - age_ns + 77}
-            run.output_received(rubbish + b"\n" + json.dumps(record).encode() + b"\n", now_ns)
+            run.output_received(garbage + b"\n" + json.dumps(record).encode() + b"\n", now_ns)
 
     with capture_logs():
         run_virtual(main)
@@ -103,8 +103,8 @@ TRANSCRIPT = [
 
 @examples(60)
 @given(damage=damages, cuts=st.lists(st.integers(0, 2000), max_size=5))
-def test_damaged_output_does_no_harm(damage: Damage, cuts: list[int]) -> None:
-    """What a real program prints, damaged: nothing is raised, and a usable reading can be one."""
+def test_damaged_output_gives_plausible_readings(damage: Damage, cuts: list[int]) -> None:
+    """Nothing is raised."""
     readings: deque[Reading] = deque()
     output = damage.to(TRANSCRIPT)
 

@@ -1,4 +1,4 @@
-"""GeoCOM: what is sent is what was meant, and whatever comes on the line, no reply is taken for another."""
+"""GeoCOM: values survive encoding, and no reply is attributed to another request, whatever the line does."""
 
 from __future__ import annotations
 
@@ -50,20 +50,20 @@ transactions = st.integers(1, MAX_TRANSACTION)
 
 @given(data=st.binary(max_size=60).map(bytes.hex))
 @example(data="123456789")
-def test_the_checksum_is_that_of_a_division_bit_by_bit(data: str) -> None:
-    """Two ways to compute it agree; the published check value is the second's as well."""
+def test_checksum_equals_long_division(data: str) -> None:
+    """Two implementations agree, and the second has the published check value."""
     assert checksum_of("123456789") == 0xBB3D
     assert crc16_arc(data.encode()) == checksum_of(data)
 
 
 @given(rpc=st.sampled_from(Rpc), parameters=values, transaction=transactions, checksum=st.booleans())
-def test_a_request_comes_back_as_it_was_sent(
+def test_request_round_trip(
     rpc: Rpc,
     parameters: list[int | float | str],
     transaction: int,
     checksum: bool,  # noqa: FBT001 (a parameter of hypothesis)
 ) -> None:
-    """What stands in a request reads, as the values of a reply, as what was given; reals to the last decimal sent."""
+    """Encoded parameters decode to the same values; reals to the last decimal."""
     line = encode_request(rpc, parameters, transaction=transaction, checksum=checksum, decimals=12)
     assert line.endswith(b"\r\n")
     assert line.count(b"\r") == line.count(b"\n") == 1
@@ -88,8 +88,8 @@ def test_a_request_comes_back_as_it_was_sent(
 @example(data=b"9" * 5000, head=b"%R1P,0,1:0,")
 @example(data=b"1e999", head=b"%R1P,0,1:0,")
 @example(data=b"'2f'", head=b"%R1P,0,1:")
-def test_no_bytes_break_the_reading_of_a_reply(data: bytes, head: bytes) -> None:
-    """Whatever comes is a reply or refused with an error of ours."""
+def test_arbitrary_bytes_decode_or_raise(data: bytes, head: bytes) -> None:
+    """Only MessageError is raised."""
     try:
         reply = decode_reply(head + data)
     except MessageError:
@@ -98,8 +98,8 @@ def test_no_bytes_break_the_reading_of_a_reply(data: bytes, head: bytes) -> None
 
 
 @given(place=st.integers(0, 200), bit=st.integers(0, 7))
-def test_a_wrong_bit_never_passes_the_checksum(place: int, bit: int) -> None:
-    """With checksums a reply of which one bit is wrong is refused."""
+def test_checksum_detects_single_bit_errors(place: int, bit: int) -> None:
+    """Every such reply is rejected."""
     text = "%R1P,0,17:0,1.2345678901,1.5707963268,0.0000048481,42.1234,123456"
     head, body = text.split(":")
     line = bytearray(f"{head},{checksum_of(text)}:{body}".encode())
@@ -117,7 +117,7 @@ good_lines = st.builds(
     st.lists(st.integers(0, 10**9), min_size=1, max_size=8),
 )
 ends = st.sampled_from([b"\r\n", b"\r", b"\n", b"\r\n\r\n"])
-rubbish = st.one_of(
+garbage = st.one_of(
     st.just(b""),
     st.sampled_from([b"?\r\n", b"%R1P,0,3:0,1.2", b"%R1", b"%R1Q,0,1:\r\n", b"\r\n", b"x" * 5000]),
     st.binary(max_size=40).filter(lambda data: b"%R1P" not in data),
@@ -125,13 +125,13 @@ rubbish = st.one_of(
 
 
 @given(
-    pieces=st.lists(st.tuples(rubbish, good_lines, ends), max_size=6),
+    pieces=st.lists(st.tuples(garbage, good_lines, ends), max_size=6),
     cuts=st.lists(st.integers(0, 500), max_size=12),
 )
-def test_every_reply_is_found_and_stamped_however_it_comes(
+def test_every_reply_is_framed_and_timestamped(
     pieces: list[tuple[bytes, bytes, bytes]], cuts: list[int]
 ) -> None:
-    """Cut anywhere, with anything before it: each reply comes once, with the time at which its first byte was there."""
+    """However the data is split, and whatever precedes a reply."""
     stream = b"".join(before + line + end for before, line, end in pieces)
     byte_ns = 1_000_000
     lines = ReplyLines(baud=10_000)
@@ -145,8 +145,8 @@ def test_every_reply_is_found_and_stamped_however_it_comes(
         assert stream[line.first_byte_ns // byte_ns :].startswith(line.data)
 
 
-def test_a_line_without_end_does_not_fill_the_memory() -> None:
-    """Rubbish that never ends is dropped, and the reply after it found."""
+def test_line_without_end_is_bounded() -> None:
+    """It is dropped, and the reply after it found."""
     lines = ReplyLines(baud=115_200)
     for number in range(1000):
         assert not lines.push(Chunk(b"%R1P" * 256, number))
@@ -159,8 +159,8 @@ def test_a_line_without_end_does_not_fill_the_memory() -> None:
 
 
 @given(code=st.integers(-10, 70_000), has_values=st.booleans())
-def test_every_code_has_a_verdict_and_a_name(code: int, has_values: bool) -> None:  # noqa: FBT001
-    """No code is unknown to the program to the point of an error."""
+def test_every_code_has_an_outcome_and_a_name(code: int, has_values: bool) -> None:  # noqa: FBT001
+    """Known or not."""
     assert isinstance(outcome_of(code, has_values=has_values), Outcome)
     assert name_of(code).startswith(str(code))
 
@@ -173,10 +173,9 @@ faults = st.one_of(
     st.just(doubled),
     st.floats(0.001, 4.0).map(late),
     st.integers(0, 30).map(cut),
-    # Within the call's time: a rest that came later could make a whole of the next reply, if that is cut; and without a
-    # checksum nobody could tell.
+    # Within the timeout: a later piece could complete the next reply if that is truncated, undetectably without a checksum.
     st.builds(torn, st.integers(1, 30), st.floats(0.001, 0.9)),
-    rubbish.map(garbage_before),
+    garbage.map(garbage_before),
     st.sampled_from([3074, 3080, 3087, 3093, 3100, 3101, 3107, 3108, 3109]).map(not_taken),
 )
 steps = st.lists(
@@ -190,7 +189,7 @@ steps = st.lists(
 
 
 def text_of(values: tuple[int | float | str, ...]) -> str:
-    """Return values as a reply has them."""
+    """Return values as in a reply."""
     return ",".join(map(str, values))
 
 
@@ -208,11 +207,11 @@ def text_of(values: tuple[int | float | str, ...]) -> str:
     ],
     checksum=False,
 )
-def test_no_reply_is_taken_for_another(
+def test_reply_belongs_to_its_request(
     script: list[tuple[str, list[Fault], float]],
     checksum: bool,  # noqa: FBT001 (a parameter of hypothesis)
 ) -> None:
-    """Whatever happens to the line and to those who wait: a reply is that to its request, and it goes on afterwards."""
+    """Whatever happens to the line and the callers; calls succeed again afterwards."""
 
     async def run() -> None:
         loop = asyncio.get_running_loop()
@@ -225,7 +224,7 @@ def test_no_reply_is_taken_for_another(
             reply = await connection.call(Rpc.TMC_GET_FULL_MEAS, number, number + 0.5, timeout_s=1.0)
             if reply.code == 0:
                 right = (number, number + 0.5)
-                # Without a checksum a reply that was cut is a whole one if something else ends its line.
+                # Without a checksum a truncated reply is valid if other data ends its line.
                 assert reply.values == right or (
                     not checksum and text_of(right).startswith(text_of(reply.values))
                 )
@@ -255,7 +254,7 @@ def test_no_reply_is_taken_for_another(
     run_virtual(run)
 
 
-def test_the_names_of_the_procedures_are_different() -> None:
+def test_procedure_numbers_are_unique() -> None:
     """An alias would mean that two procedures have one number."""
     assert len(Rpc.__members__) == len(Rpc)
     assert all(re.fullmatch(r"[A-Z]{3}_[A-Z0-9_]+", rpc.name) for rpc in Rpc)

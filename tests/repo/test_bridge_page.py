@@ -1,4 +1,4 @@
-"""The page on the bridge says what the code does."""
+"""The page on the bridge agrees with the code."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ COMMANDS: dict[str, type[CommandLine]] = {
 
 
 def blocks(language: str) -> list[str]:
-    """Return the page's blocks in a language."""
+    """Return the page's code blocks in a language."""
     return re.findall(rf"^```{language}\n(.*?)^```", PAGE, flags=re.MULTILINE | re.DOTALL)
 
 
 @pytest.mark.parametrize("line", [HelloLine, MeasurementLine, DoneLine, StatusLine, SettingsLine])
-def test_every_field_is_in_its_table(line: type) -> None:
-    """The tables have the fields of the lines, and no others."""
+def test_tables_list_all_fields(line: type) -> None:
+    """And no others."""
     (name,) = (field.default for field in dataclasses.fields(line) if field.name == "type")
     table = PAGE.split(f"### `{name}`")[1].split("\n## ")[0].split("\n### ")[0]
     rows = re.findall(r"^\| (`.*?`) \|", table, flags=re.MULTILINE)
@@ -50,16 +50,17 @@ def test_every_field_is_in_its_table(line: type) -> None:
     assert documented == {field.name for field in dataclasses.fields(line)}
 
 
-def test_a_shot_has_the_fields_of_a_measurement() -> None:
-    """As the page says: all but the prism, and an id."""
+def test_shot_has_fields_of_measurement() -> None:
+    """All but the prism, and an id."""
     shot, measurement = (
-        {field.name for field in dataclasses.fields(line)} for line in (SingleMeasurementLine, MeasurementLine)
+        {field.name for field in dataclasses.fields(line)}
+        for line in (SingleMeasurementLine, MeasurementLine)
     )
     assert shot == measurement - {"prism"} | {"id"}
 
 
-def test_commands_have_the_fields_of_the_table() -> None:
-    """Type, and what the second column lists."""
+def test_command_table_lists_all_fields() -> None:
+    """Type, and the second column."""
     for name, command in COMMANDS.items():
         fields = re.search(rf"^\| `{name}` \| (.*?) \|", PAGE, flags=re.MULTILINE)
         assert fields is not None
@@ -67,14 +68,14 @@ def test_commands_have_the_fields_of_the_table() -> None:
         assert documented == {field.name for field in dataclasses.fields(command)}
 
 
-def test_the_lines_on_the_page_are_understood() -> None:
-    """Each that a program prints is one that the client takes."""
+def test_example_lines_decode() -> None:
+    """Each that a program prints."""
     printed = blocks("json")[1].splitlines()
     assert all(decode_program_line(line.encode()) is not None for line in printed)
 
 
-def test_the_script_on_the_page_works() -> None:
-    """A shell runs it, and the client understands what it prints."""
+def test_example_script_works() -> None:
+    """A shell runs it, and the client decodes its output."""
     (script,) = blocks("sh")
     run = subprocess.run(
         ["sh", "-c", script.replace("while sleep 0.4", "for _ in once")],  # noqa: S607
@@ -86,7 +87,7 @@ def test_the_script_on_the_page_works() -> None:
     assert isinstance(measurement, MeasurementLine)
 
 
-def test_the_configuration_on_the_page_is_valid() -> None:
+def test_example_configuration_is_valid() -> None:
     """Its keys are those of the configuration."""
     (block,) = blocks("toml")
     keys = set(re.findall(r"^(\w+) =", block, flags=re.MULTILINE))

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class StepClock:
-    """A clock whose sleepers go on when the test says so."""
+    """A clock whose sleepers wait for the test."""
 
     def __init__(self) -> None:
         self.wanted_ns: list[int] = []
@@ -34,11 +34,11 @@ class StepClock:
         self._step = asyncio.Event()
 
     def monotonic_ns(self) -> int:
-        """Stand still."""
+        """Return a constant."""
         return 5_000_000_000
 
     def realtime_ns(self) -> int:
-        """Stand still."""
+        """Return a constant."""
         return 0
 
     async def sleep_until(self, monotonic_ns: int) -> None:
@@ -49,14 +49,14 @@ class StepClock:
         self._step.clear()
 
     async def step(self) -> None:
-        """Let the sleeper go and wait until it sleeps again."""
+        """Release the sleeper and wait until it sleeps again."""
         self._asleep.clear()
         self._step.set()
         await self._asleep.wait()
 
 
 async def synced(sync: Callable[[], None], steps: int) -> StepClock:
-    """Keep something synced for so many intervals."""
+    """Sync for a number of intervals."""
     clock = StepClock()
     task = asyncio.create_task(sync_periodically(sync, clock, interval_s=1.0))
     await asyncio.sleep(0)
@@ -69,7 +69,7 @@ async def synced(sync: Callable[[], None], steps: int) -> StepClock:
 
 
 async def test_sync_is_called_every_interval() -> None:
-    """The recording is brought to the disk once per interval, an interval from now."""
+    """An interval after the end of the last one."""
     calls: list[str] = []
     clock = await synced(lambda: calls.append(threading.current_thread().name), steps=3)
     assert len(calls) == 3
@@ -77,14 +77,14 @@ async def test_sync_is_called_every_interval() -> None:
 
 
 async def test_sync_does_not_block_the_loop() -> None:
-    """A disk that takes its time is waited for in a thread."""
+    """It runs in a thread."""
     threads: list[threading.Thread] = []
     await synced(lambda: threads.append(threading.current_thread()), steps=1)
     assert threads[0] is not threading.main_thread()
 
 
 async def test_failing_disk_is_logged_once() -> None:
-    """Trouble and its end are logged when they begin, and keeping goes on in between."""
+    """And its recovery; syncing continues in between."""
     outcomes = iter([True, False, False, True])
 
     def sync() -> None:
@@ -101,7 +101,7 @@ async def test_failing_disk_is_logged_once() -> None:
 def test_notification_reaches_systemd(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, abstract: bool
 ) -> None:
-    """Assignments arrive in one datagram, one per line, on a socket with a path or an abstract one."""
+    """One datagram, one assignment per line, on a socket with a path or an abstract one."""
     name = f"@tsgt-test-{os.getpid()}" if abstract else str(tmp_path / "notify")
     monkeypatch.setenv("NOTIFY_SOCKET", name)
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
@@ -110,16 +110,16 @@ def test_notification_reaches_systemd(
         assert systemd.recv(1000) == b"READY=1\nSTATUS=3 stations"
 
 
-def test_notification_without_systemd_is_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Outside of systemd nothing happens."""
+def test_notification_without_systemd_has_no_effect(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is logged."""
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
     with capture_logs() as logs:
         sd_notify("READY=1")
     assert logs == []
 
 
-def test_notification_that_fails_is_logged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A socket that is not there does not end the service."""
+def test_failing_notification_is_logged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The service continues."""
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "nobody"))
     with capture_logs() as logs:
         sd_notify("READY=1")
@@ -139,7 +139,7 @@ def test_notification_that_fails_is_logged(tmp_path: Path, monkeypatch: pytest.M
 def test_watchdog_interval(
     monkeypatch: pytest.MonkeyPatch, usec: str | None, pid: str | None, interval_s: float | None
 ) -> None:
-    """The interval is half of what systemd allows, if it is meant for this process."""
+    """Half the timeout of systemd, if it is set for this process."""
     for name, value in (
         ("WATCHDOG_USEC", usec),
         ("WATCHDOG_PID", str(os.getpid()) if pid == "self" else pid),
@@ -151,27 +151,27 @@ def test_watchdog_interval(
     assert watchdog_interval_s() == interval_s
 
 
-async def test_systemd_hears_ready_alive_and_stopping(
+async def test_systemd_is_notified_of_ready_alive_and_stopping(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ready at once, alive as often as systemd asks, and at the end that it stops."""
+    """Alive as often as the watchdog requires."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(str(tmp_path / "notify"))
         monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
         monkeypatch.setenv("WATCHDOG_USEC", "1000000")
         clock = StepClock()
-        telling = asyncio.create_task(notify_systemd(lambda: "well", clock))
+        notifying = asyncio.create_task(notify_systemd(lambda: "well", clock))
         await asyncio.sleep(0)
         await clock.step()
-        telling.cancel()
-        await asyncio.wait([telling])
+        notifying.cancel()
+        await asyncio.wait([notifying])
         messages = [systemd.recv(100) for _ in range(3)]
     assert messages == [b"READY=1\nSTATUS=well", b"WATCHDOG=1\nSTATUS=well", b"STOPPING=1"]
     assert clock.wanted_ns == [5_500_000_000, 5_500_000_000]
 
 
-def test_a_known_error_comes_out_of_a_task_group_as_itself() -> None:
-    """The user gets the error's one line, not a tree of exceptions."""
+def test_known_error_is_unwrapped_from_task_group() -> None:
+    """The user gets its message, not a tree of exceptions."""
 
     async def fail() -> None:
         raise StreamError("nobody there")
@@ -184,8 +184,8 @@ def test_a_known_error_comes_out_of_a_task_group_as_itself() -> None:
         run(main)
 
 
-def test_an_unknown_error_keeps_its_tree() -> None:
-    """A bug is shown with everything that there is to know about it."""
+def test_unknown_error_keeps_its_group() -> None:
+    """A bug is shown with its full traceback."""
 
     async def fail() -> None:
         raise ZeroDivisionError
@@ -198,8 +198,8 @@ def test_an_unknown_error_keeps_its_tree() -> None:
         run(main)
 
 
-def test_programs_that_open_sockets_together_wait_for_each_other(tmp_path: Path) -> None:
-    """One that finds the folder locked for a moment opens its socket after that."""
+def test_locked_folder_is_awaited(tmp_path: Path) -> None:
+    """Programs that start together open their sockets one after the other."""
     descriptor = os.open(tmp_path, os.O_RDONLY)
     fcntl.flock(descriptor, fcntl.LOCK_EX)
     other = threading.Timer(0.05, os.close, (descriptor,))

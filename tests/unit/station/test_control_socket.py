@@ -1,4 +1,4 @@
-"""The client's status socket: the status, a request, and people who do neither."""
+"""The control socket of a client: status, requests, and connections without either."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from harness.client import client_config
 from harness.radios import PAPER
-from harness.shots import ScriptedInstrument
+from harness.scripted_instrument import ScriptedInstrument
 
 from tsgt.errors import InstrumentRefusedError, RadioError, RecordingError
 from tsgt.recording import RecordingWriter, encode_line, read_lines
@@ -31,13 +31,13 @@ WARM = encode_line(AtmosphereRequest(temperature_c=25.0, pressure_hpa=1000.0))
 
 
 def no_radio() -> AbstractAsyncContextManager[Radio]:
-    """Fail."""
+    """Raise an error."""
     raise RadioError("no chip")
 
 
 @asynccontextmanager
 async def client(folder: Path) -> AsyncGenerator[ScriptedInstrument]:
-    """Run a client without a radio; its instrument is connected."""
+    """Run a client without a radio and with a connected instrument."""
     clock = VirtualClock(START_NS)
     instrument = ScriptedInstrument(clock)
     config = client_config(folder)
@@ -48,14 +48,14 @@ async def client(folder: Path) -> AsyncGenerator[ScriptedInstrument]:
         await asyncio.sleep(2.0)
         yield instrument
     finally:
-        began_ns = clock.monotonic_ns()
+        start_ns = clock.monotonic_ns()
         running.cancel()
         await asyncio.wait([running])
-        assert clock.monotonic_ns() - began_ns < 500_000_000
+        assert clock.monotonic_ns() - start_ns < 500_000_000
 
 
 async def talk(folder: Path, request: bytes = b"") -> list[dict[str, Any]]:
-    """Say something to the client and return its lines."""
+    """Send a request and return the client's lines."""
     reader, writer = await asyncio.open_unix_connection(folder / "client.sock")
     writer.write(request)
     lines = (await reader.read()).splitlines()
@@ -64,7 +64,7 @@ async def talk(folder: Path, request: bytes = b"") -> list[dict[str, Any]]:
 
 
 def journalled(folder: Path, kind: str) -> list[dict[str, Any]]:
-    """Return the lines of a kind in the only journal."""
+    """Return the lines of a type in the only journal."""
     (path,) = (folder / "journals").iterdir()
     return [json.loads(line.data) for line in read_lines(path) if line.type == kind]
 
@@ -72,15 +72,15 @@ def journalled(folder: Path, kind: str) -> list[dict[str, Any]]:
 async def test_excess_connections_are_closed(tmp_path: Path) -> None:
     """A second later there is room again."""
     async with client(tmp_path):
-        crowd = [
+        connections = [
             await asyncio.open_unix_connection(tmp_path / "client.sock") for _ in range(MAX_CONNECTIONS + 5)
         ]
         async with asyncio.timeout(0.01):
-            lines = [await reader.readline() for reader, _ in crowd]
+            lines = [await reader.readline() for reader, _ in connections]
         assert [bool(line) for line in lines] == [True] * MAX_CONNECTIONS + [False] * 5
         await asyncio.sleep(1.1)
         assert len(await talk(tmp_path, b"?\n")) == 2
-        for _, writer in crowd:
+        for _, writer in connections:
             writer.close()
 
 
@@ -99,18 +99,18 @@ async def test_atmosphere_is_set_and_journalled(tmp_path: Path) -> None:
     """Response, status and journal have the settings as read back."""
     async with client(tmp_path) as instrument:
         instrument.give()
-        first, answer = await talk(tmp_path, WARM + b"\n")
+        first, response = await talk(tmp_path, WARM + b"\n")
         instrument.give()
         await asyncio.sleep(0.1)
         (after,) = await talk(tmp_path)
     assert first["settings"]["temperature_c"] is None
-    assert (answer["type"], answer["problem"]) == ("answer", "")
-    assert answer["settings"]["temperature_c"] == 25.0
-    assert answer["settings"]["atmospheric_ppm"] == 10.0
-    assert after["settings"] == answer["settings"]
+    assert (response["type"], response["problem"]) == ("answer", "")
+    assert response["settings"]["temperature_c"] == 25.0
+    assert response["settings"]["atmospheric_ppm"] == 10.0
+    assert after["settings"] == response["settings"]
     before, changed = journalled(tmp_path, "instrument")
     assert before["temperature_c"] is None
-    assert changed == answer["settings"]
+    assert changed == response["settings"]
     first_ns, second_ns = (line["stamp_ns"] for line in journalled(tmp_path, "measurement"))
     assert before["stamp_ns"] <= first_ns < changed["stamp_ns"] <= second_ns
 
@@ -119,8 +119,8 @@ async def test_refused_atmosphere_is_reported(tmp_path: Path) -> None:
     """The response has the instrument's reason."""
     async with client(tmp_path) as instrument:
         instrument.air_refusal = InstrumentRefusedError("it has no such setting")
-        _, answer = await talk(tmp_path, WARM + b"\n")
-    assert answer["problem"] == "it has no such setting"
+        _, response = await talk(tmp_path, WARM + b"\n")
+    assert response["problem"] == "it has no such setting"
 
 
 @pytest.mark.parametrize(
@@ -137,8 +137,8 @@ async def test_invalid_request_is_reported(tmp_path: Path, request_line: bytes, 
     """The response names the error, and nothing is set."""
     async with client(tmp_path) as instrument:
         before = instrument.record
-        _, answer = await talk(tmp_path, request_line)
-        assert words in answer["problem"]
+        _, response = await talk(tmp_path, request_line)
+        assert words in response["problem"]
         assert instrument.record == before
 
 
@@ -153,11 +153,11 @@ async def test_request_without_end_is_closed(tmp_path: Path) -> None:
 async def test_open_connections_delay_neither_others_nor_shutdown(tmp_path: Path) -> None:
     """Fifty connections stay open."""
     async with client(tmp_path):
-        stays = [await asyncio.open_unix_connection(tmp_path / "client.sock") for _ in range(50)]
+        others = [await asyncio.open_unix_connection(tmp_path / "client.sock") for _ in range(50)]
         async with asyncio.timeout(0.01):
             reader, writer = await asyncio.open_unix_connection(tmp_path / "client.sock")
             await reader.readline()
-    for _, writer_ in (*stays, (reader, writer)):
+    for _, writer_ in (*others, (reader, writer)):
         writer_.close()
 
 

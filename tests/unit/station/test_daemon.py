@@ -1,4 +1,4 @@
-"""The client's daemon between instrument, radio and disk, each of which fails."""
+"""The client daemon with failing instrument, radio and disk."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from harness.client import OFFSET_NS, SCENARIO, START_NS, client_config, field_day
 from harness.radios import PAPER
-from harness.shots import ScriptedInstrument
+from harness.scripted_instrument import ScriptedInstrument
 from structlog.testing import capture_logs
 
 from tsgt.config.scenario import StatusFaultConfig
@@ -130,7 +130,7 @@ async def test_failing_radio_does_not_affect_journal(tmp_path: Path) -> None:
         day.read.clear()
         day.start()
         await asyncio.sleep(20.0)
-        assert not (await asked(tmp_path / "client.sock"))["radio_ok"]
+        assert not (await client_status(tmp_path / "client.sock"))["radio_ok"]
         assert await day.ask(b"t1") is None
         broken = False
         await asyncio.sleep(6.0)
@@ -146,18 +146,18 @@ async def test_commands_change_mode_and_prism(tmp_path: Path) -> None:
         assert await day.ask(b"d1", timeout_s=2.0) == Acknowledgement("d", ok=True)
         before = len(day.read)
         day.instrument.aim_at_target(1)
-        shot = await day.ask(b"t1", timeout_s=5.0)
-        assert isinstance(shot, MeasurementMessage)
-        assert shot.slope_distance_m == pytest.approx(20.6216, abs=0.01)
+        single = await day.ask(b"t1", timeout_s=5.0)
+        assert isinstance(single, MeasurementMessage)
+        assert single.slope_distance_m == pytest.approx(20.6216, abs=0.01)
         assert len(day.read) == before
         day.instrument.aim_at_target(2)
         near = await day.ask(b"t1", timeout_s=20.0)
         assert isinstance(near, MeasurementMessage)
         assert (near.status, near.slope_distance_m) == (3, 0.0)  # too near to give a distance
-        ordered_ns = day.clock.realtime_ns()
+        command_ns = day.clock.realtime_ns()
         assert await day.ask(b"n12", timeout_s=2.0) == Acknowledgement("n", ok=True)
         next_ns = (await day.poll()).time_ns
-        assert next_ns == 0 or next_ns > ordered_ns  # not one of the other prism
+        assert next_ns == 0 or next_ns > command_ns  # not one of the other prism
         day.instrument.lock_manually(2)
         await asyncio.sleep(4.0)
         assert (await day.poll()).status == 0
@@ -195,9 +195,9 @@ async def test_failed_single_measurement_gets_a_status(tmp_path: Path) -> None:
         assert failed.status == 3
         day.line.plugged = True
         await asyncio.sleep(6.0)
-        shot = await day.ask(b"t1", timeout_s=5.0)
-    assert isinstance(shot, MeasurementMessage)
-    assert shot.status == 0
+        single = await day.ask(b"t1", timeout_s=5.0)
+    assert isinstance(single, MeasurementMessage)
+    assert single.status == 0
 
 
 async def test_full_disk_stops_neither_instrument_nor_radio(
@@ -218,12 +218,12 @@ async def test_full_disk_stops_neither_instrument_nor_radio(
         full = True
         await asyncio.sleep(10.0)
         assert (await day.poll()).time_ns > START_NS + OFFSET_NS + 11_000_000_000
-        status = await asked(tmp_path / "client.sock")
+        status = await client_status(tmp_path / "client.sock")
         assert not status["journal_ok"]
         assert 20 <= status["journal_waiting"] <= 28
         full = False
         await asyncio.sleep(1.0)
-        assert (await asked(tmp_path / "client.sock"))["journal_ok"]
+        assert (await client_status(tmp_path / "client.sock"))["journal_ok"]
         await day.kill()
         assert [m.sequence for m in day.journals()[0]] == list(range(len(day.read)))
 
@@ -241,7 +241,7 @@ async def test_slow_disk_delays_no_reply(tmp_path: Path, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(RecordingWriter, "write_line", write_slowly)
 
-    # In virtual time a thread stops the clock; so here the thread is not one of the loop's.
+    # In virtual time the loop's own threads stop the clock; this one does not.
     async def in_bare_thread(function: Callable[[], None]) -> None:
         done = asyncio.Event()
         loop = asyncio.get_running_loop()
@@ -308,11 +308,11 @@ async def test_status_reports_instrument_master_and_journal(tmp_path: Path) -> N
         await day.kill()
         day.start()
         await asyncio.sleep(0.1)
-        first = await asked(tmp_path / "client.sock")
+        first = await client_status(tmp_path / "client.sock")
         assert (first["last"], first["master_heard_s"], first["measurements"]) == (None, None, 0)
         await asyncio.sleep(20.0)
         await day.poll()
-        status = await asked(tmp_path / "client.sock")
+        status = await client_status(tmp_path / "client.sock")
     assert status["type"] == "client_status"
     assert status["instrument"] == "Leica TCRP1201+ 230001"
     assert (status["mode"], status["prism"], status["locked"]) == ("tracking", 1, True)
@@ -338,8 +338,8 @@ async def test_second_client_does_not_take_socket(tmp_path: Path) -> None:
             )
 
 
-async def asked(path: Path) -> dict[str, Any]:
-    """Ask the client how it does."""
+async def client_status(path: Path) -> dict[str, Any]:
+    """Return the client's status."""
     reader, writer = await asyncio.open_unix_connection(path)
     line = await reader.readline()
     writer.close()

@@ -1,4 +1,4 @@
-"""The supervisor of an instrument: connections, orders, air and settings, whatever the instrument is."""
+"""The instrument supervisor: connections, commands, atmosphere and settings, with any instrument."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.shots import RECORD, ScriptedInstrument
+from harness.scripted_instrument import RECORD, ScriptedInstrument
 from structlog.testing import capture_logs
 
 from tsgt.errors import InstrumentError, InstrumentRefusedError
@@ -35,7 +35,7 @@ GONE = "the instrument is gone"
 
 @dataclass
 class Bench:
-    """A supervisor, its instrument, and all that it has handed out, in that order."""
+    """A supervisor, its instrument, and the arguments of all callbacks, in order."""
 
     instrument: ScriptedInstrument
     session: ClientSession = field(default_factory=lambda: ClientSession(1, 1))
@@ -73,7 +73,7 @@ class Bench:
 async def bench(
     instrument: ScriptedInstrument | None = None, *, connected: bool = True
 ) -> AsyncGenerator[Bench]:
-    """Keep an instrument; it is connected and tracks, after the second that this takes."""
+    """Run a supervisor; its instrument connects and tracks within 1.5 s."""
     made = Bench(instrument or ScriptedInstrument(VirtualClock(0)))
     running = asyncio.create_task(made.supervisor.run())
     try:
@@ -88,8 +88,8 @@ async def bench(
     assert running.cancelled()
 
 
-async def test_an_order_that_is_refused_leaves_the_instrument_as_it_is() -> None:
-    """It is answered with no, there is no new connection, and the next reading comes."""
+async def test_refused_command_keeps_connection() -> None:
+    """The result is negative, and the next reading follows."""
     async with bench() as day:
         day.instrument.refusal = InstrumentRefusedError("there is no prism 9")
         with capture_logs() as logs:
@@ -101,8 +101,8 @@ async def test_an_order_that_is_refused_leaves_the_instrument_as_it_is() -> None
     assert [entry["event"] for entry in logs] == ["command_refused"]
 
 
-async def test_a_single_measurement_that_is_refused_is_answered() -> None:
-    """There is none, and the instrument stays ready for the next one."""
+async def test_refused_single_measurement_gets_a_result() -> None:
+    """The instrument stays ready for the next one."""
     async with bench() as day:
         assert (await day.execute(DirectCommand())).ok
         day.instrument.target = InstrumentRefusedError("no target there")
@@ -110,8 +110,8 @@ async def test_a_single_measurement_that_is_refused_is_answered() -> None:
         assert day.supervisor.description == "scripted"
 
 
-async def test_a_search_is_told_where_to_look() -> None:
-    """The direction in the order reaches the instrument; without one it looks where it last had the prism."""
+async def test_search_command_passes_direction() -> None:
+    """Without one the instrument searches at the prism's last direction."""
     towards = Direction(1.0, 1.5, 0.05)
     async with bench() as day:
         assert (await day.execute(SearchCommand(towards))).ok
@@ -120,8 +120,8 @@ async def test_a_search_is_told_where_to_look() -> None:
     assert day.instrument.towards == [None, towards, None]
 
 
-async def test_an_instrument_that_is_back_is_used_within_a_second() -> None:
-    """However long it was away: the pauses do not grow beyond that."""
+async def test_recovered_instrument_is_connected_within_a_second() -> None:
+    """The retry delay does not grow beyond that, however long the outage."""
     async with bench() as day:
         day.instrument.plugged = False
         day.instrument.fail()
@@ -132,8 +132,8 @@ async def test_an_instrument_that_is_back_is_used_within_a_second() -> None:
         assert day.supervisor.description == "scripted"
 
 
-async def test_without_a_connection_the_problem_is_why() -> None:
-    """Before it there is none, with it the instrument's own counts."""
+async def test_condition_has_connection_error_while_disconnected() -> None:
+    """While connected, the instrument's own condition counts."""
     instrument = ScriptedInstrument(VirtualClock(0))
     instrument.plugged = False
     async with bench(instrument, connected=False) as day:
@@ -144,7 +144,7 @@ async def test_without_a_connection_the_problem_is_why() -> None:
         assert day.supervisor.condition == instrument.condition
 
 
-async def test_settings_are_handed_out_before_what_was_measured_with_them() -> None:
+async def test_settings_precede_the_readings_they_apply_to() -> None:
     """Once after each connection and after each change."""
     async with bench() as day:
         first = day.instrument.give()
@@ -160,8 +160,8 @@ async def test_settings_are_handed_out_before_what_was_measured_with_them() -> N
         assert day.out == [RECORD]
 
 
-async def test_the_air_is_set_between_two_readings() -> None:
-    """No reading is lost, the settings are handed out, and whoever asked is told that it is done."""
+async def test_atmosphere_is_set_between_two_readings() -> None:
+    """No reading is lost, the settings are published, and the request gets its response."""
     async with bench() as day:
         assert await day.supervisor.set_atmosphere(WARM) == ""
         day.instrument.give()
@@ -171,16 +171,16 @@ async def test_the_air_is_set_between_two_readings() -> None:
     assert isinstance(reading, Reading)
 
 
-async def test_the_air_is_set_while_nothing_is_measured() -> None:
-    """In direct mode too, where nobody reads."""
+async def test_atmosphere_is_set_in_direct_mode() -> None:
+    """No reading is in progress there."""
     async with bench() as day:
         assert (await day.execute(DirectCommand())).ok
         assert await day.supervisor.set_atmosphere(WARM) == ""
         assert (await day.execute(MeasureCommand())).ok
 
 
-async def test_an_instrument_that_goes_while_nothing_is_measured_is_missed() -> None:
-    """In direct mode nobody reads: it is asked now and then, and connected again when it is back."""
+async def test_lost_instrument_is_detected_in_direct_mode() -> None:
+    """It is checked periodically, and reconnected when it is back."""
     async with bench() as day:
         assert (await day.execute(DirectCommand())).ok
         day.instrument.plugged = False
@@ -193,8 +193,8 @@ async def test_an_instrument_that_goes_while_nothing_is_measured_is_missed() -> 
         assert (await day.execute(MeasureCommand())).ok
 
 
-async def test_the_air_is_set_again_after_each_connection() -> None:
-    """Also when it was asked for while there was no instrument."""
+async def test_atmosphere_is_set_after_each_connection() -> None:
+    """Also when it was requested without an instrument."""
     instrument = ScriptedInstrument(VirtualClock(0))
     instrument.plugged = False
     async with bench(instrument, connected=False) as day:
@@ -207,8 +207,8 @@ async def test_the_air_is_set_again_after_each_connection() -> None:
             instrument.fail()
 
 
-async def test_an_air_that_is_refused_is_forgotten() -> None:
-    """Whoever asked is told why, and it is not tried again with the next connection."""
+async def test_refused_atmosphere_is_not_retried() -> None:
+    """The request gets the reason."""
     async with bench() as day:
         day.instrument.air_refusal = InstrumentRefusedError("it has no such setting")
         assert await day.supervisor.set_atmosphere(WARM) == "it has no such setting"
@@ -218,8 +218,8 @@ async def test_an_air_that_is_refused_is_forgotten() -> None:
         assert day.instrument.record == RECORD
 
 
-async def test_an_instrument_that_goes_while_the_air_is_set_gets_it_later() -> None:
-    """Whoever asked is not left waiting."""
+async def test_atmosphere_is_set_after_reconnection() -> None:
+    """A request interrupted by a lost instrument gets a response."""
     async with bench() as day:
         day.instrument.air_refusal = InstrumentError(GONE)
         assert await day.supervisor.set_atmosphere(WARM) == NOT_CONNECTED
@@ -230,8 +230,8 @@ async def test_an_instrument_that_goes_while_the_air_is_set_gets_it_later() -> N
 
 
 @pytest.mark.parametrize("after_s", [0.0, 0.05])
-async def test_of_two_requests_the_later_one_counts(after_s: float) -> None:
-    """Before or while the first one is carried out; both are answered."""
+async def test_later_atmosphere_request_supersedes_earlier(after_s: float) -> None:
+    """Before or during its execution; both get a response."""
     async with bench() as day, asyncio.TaskGroup() as group:
         first = group.create_task(day.supervisor.set_atmosphere(WARM))
         await asyncio.sleep(after_s)
@@ -243,8 +243,8 @@ async def test_of_two_requests_the_later_one_counts(after_s: float) -> None:
         assert day.instrument.record.temperature_c == -5.0
 
 
-async def test_an_order_and_the_air_together() -> None:
-    """Neither is lost when both come in the same moment."""
+async def test_simultaneous_command_and_atmosphere_are_executed() -> None:
+    """Neither is lost."""
     async with bench() as day, asyncio.TaskGroup() as group:
         setting = group.create_task(day.supervisor.set_atmosphere(WARM))
         assert (await day.execute(TrackCommand(2))).ok
@@ -253,17 +253,17 @@ async def test_an_order_and_the_air_together() -> None:
 
 
 class FailsWhenStopped(ScriptedInstrument):
-    """An instrument that is gone in the moment in which nobody wants it any more."""
+    """An instrument that fails when a read is cancelled."""
 
     async def read(self) -> Reading:
-        """Wait, and fail at the end."""
+        """Fail on cancellation."""
         try:
             return await super().read()
         except asyncio.CancelledError:
             raise InstrumentError(GONE) from None
 
 
-async def test_a_keeper_that_is_stopped_in_the_moment_of_a_failure_stops() -> None:
-    """The error does not take the place of the cancellation."""
+async def test_cancellation_during_failure_is_not_lost() -> None:
+    """The error does not replace the cancellation."""
     async with bench(FailsWhenStopped(VirtualClock(0))):
         pass

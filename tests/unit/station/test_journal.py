@@ -1,4 +1,4 @@
-"""The queue before a station's journal."""
+"""The queue of a station's journal."""
 
 from __future__ import annotations
 

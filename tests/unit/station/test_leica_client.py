@@ -1,4 +1,4 @@
-"""The client's daemon with a Leica on a serial line: what the instrument offers stands in the journal, whatever happens."""
+"""The client daemon with a Leica on a serial line: every offered distance is journalled, whatever happens."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @asynccontextmanager
 async def client(folder: Path, *, rate_hz: float = 2.5, seed: int = 2) -> AsyncGenerator[LeicaBench]:
-    """Run a client without a radio beside a simulated Leica."""
+    """Run a client with a simulated Leica and without a radio."""
     async with leica_bench(rate_hz=rate_hz, seed=seed) as bench:
         running = asyncio.create_task(
             run_client(
@@ -42,14 +42,14 @@ async def client(folder: Path, *, rate_hz: float = 2.5, seed: int = 2) -> AsyncG
 
 
 def measurements(folder: Path) -> list[PolarMeasurement]:
-    """Return what stands in the only journal."""
+    """Return the measurements of the only journal."""
     (path,) = (folder / "journals").iterdir()
     return load_journal(path).measurements
 
 
 @pytest.mark.parametrize("rate_hz", [2.5, 20.0])
-async def test_what_was_offered_is_journalled_once(tmp_path: Path, rate_hz: float) -> None:
-    """With the instrument's time, the arrival of the answer, and a stamp between measurement and arrival."""
+async def test_offered_distance_is_journalled_once(tmp_path: Path, rate_hz: float) -> None:
+    """With the instrument's time, the arrival of the reply, and a timestamp between measurement and arrival."""
     async with client(tmp_path, rate_hz=rate_hz) as bench:
         await asyncio.sleep(60.0)
         true_ns = {1_000_000 * each.instrument_ms: each.true_ns for each in bench.station.reported_distances}
@@ -67,10 +67,8 @@ async def test_what_was_offered_is_journalled_once(tmp_path: Path, rate_hz: floa
 
 
 @pytest.mark.parametrize("seed", range(5))
-async def test_a_cable_that_is_put_in_again_brings_measurements_within_three_seconds(
-    tmp_path: Path, seed: int
-) -> None:
-    """However long it was out, and in whatever the client was doing; said once in the log."""
+async def test_replugged_cable_brings_measurements_within_three_seconds(tmp_path: Path, seed: int) -> None:
+    """However long it was out, and whatever the client was doing; logged once."""
     async with client(tmp_path, seed=seed) as bench:
         await asyncio.sleep(10.0)
         with capture_logs() as logs:
@@ -86,8 +84,8 @@ async def test_a_cable_that_is_put_in_again_brings_measurements_within_three_sec
     assert [entry["event"] for entry in logs].count("instrument_lost") <= 2 * 3
 
 
-async def test_an_instrument_that_was_switched_off_comes_back(tmp_path: Path) -> None:
-    """Its time begins anew and a person locks it in again; the stamps go on."""
+async def test_power_cycled_instrument_recovers(tmp_path: Path) -> None:
+    """Its clock restarts and the operator locks on again; timestamps continue."""
     async with client(tmp_path) as bench:
         await asyncio.sleep(10.0)
         bench.station.switch_off()
@@ -107,13 +105,13 @@ async def test_an_instrument_that_was_switched_off_comes_back(tmp_path: Path) ->
     assert usable[-1].instrument_time_ns < 30_000_000_000
 
 
-async def test_the_air_that_was_told_outlives_the_cable(tmp_path: Path) -> None:
-    """What the journal says of the settings is what the instrument is set to."""
+async def test_atmosphere_survives_reconnection(tmp_path: Path) -> None:
+    """The journalled settings are the instrument's settings."""
     async with client(tmp_path) as bench:
         await asyncio.sleep(5.0)
-        _, answer = await talk(tmp_path, WARM + b"\n")
-        assert (answer["problem"], answer["settings"]["temperature_c"]) == ("", 25.0)
-        assert answer["settings"]["atmospheric_ppm"] == pytest.approx(16.0, abs=1.0)
+        _, response = await talk(tmp_path, WARM + b"\n")
+        assert (response["problem"], response["settings"]["temperature_c"]) == ("", 25.0)
+        assert response["settings"]["atmospheric_ppm"] == pytest.approx(16.0, abs=1.0)
         bench.line.plugged = False
         await asyncio.sleep(1.0)
         bench.line.plugged = True

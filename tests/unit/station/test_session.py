@@ -1,4 +1,4 @@
-"""The client's session: what it makes of readings and orders, without instrument, radio and time."""
+"""The client session: records and status from readings and commands, without instrument, radio and time."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SILENT = LinkStatus(protocol="classic", master_received_ns=None, rssi_dbm=None, 
 
 
 def reading(seconds: float, *, prism: int | None = 1, status: Status = Status.OK) -> Reading:
-    """Make a reading so many seconds after the start."""
+    """Return a reading this long after the start."""
     good = status in (Status.OK, Status.LOW_ACCURACY)
     return Reading(
         at_ns=77 + round(seconds * SECOND),
@@ -36,13 +36,13 @@ def reading(seconds: float, *, prism: int | None = 1, status: Status = Status.OK
 
 
 def measure(session: ClientSession, seconds: float, *, status: Status = Status.OK) -> PolarMeasurement:
-    """Let the session take a reading."""
+    """Return the record of a reading."""
     made = reading(seconds, status=status)
     return session.measurement(made, ZERO + made.at_ns)
 
 
 def status(session: ClientSession, seconds: float, link: LinkStatus = SILENT) -> ClientStatus:
-    """Ask how it goes."""
+    """Return the status."""
     return session.status(
         START + round(seconds * SECOND),
         link,
@@ -57,8 +57,8 @@ def status(session: ClientSession, seconds: float, link: LinkStatus = SILENT) ->
     )
 
 
-def test_the_journal_gets_what_the_instrument_said() -> None:
-    """Raw values, three times the one stamp, and running numbers."""
+def test_measurement_has_raw_values() -> None:
+    """One timestamp in three fields, and consecutive sequence numbers."""
     session = ClientSession(3, 1)
     first, second = measure(session, 0.0), measure(session, 0.4)
     assert first == PolarMeasurement(
@@ -78,29 +78,29 @@ def test_the_journal_gets_what_the_instrument_said() -> None:
     assert (second.sequence, second.host_time_ns) == (1, START + 400_000_000)
 
 
-def test_the_journal_gets_when_the_first_byte_came() -> None:
-    """Raw beside the stamp, so that the desk can make the stamp anew from the instrument's time."""
+def test_measurement_has_raw_arrival() -> None:
+    """Post-processing can recompute the timestamp from the instrument's time."""
     made = replace(reading(0.0), received_ns=77 + 95_000_000)
     measurement = ClientSession(3, 1).measurement(made, ZERO + made.at_ns)
     assert (measurement.stamp_ns, measurement.received_ns) == (START, START + 95_000_000)
 
 
-def test_the_numbers_go_on_from_those_of_earlier_runs() -> None:
+def test_sequence_numbers_start_at_the_given_one() -> None:
     """Where the protocol identifies measurements by them."""
     session = ClientSession(3, 1, 1501)
     assert [measure(session, at).sequence for at in (0.0, 0.4)] == [1501, 1502]
     assert status(session, 1.0).measurements == 2
 
 
-@pytest.mark.parametrize("verdict", Status)
-def test_the_journal_keeps_every_status(verdict: Status) -> None:
-    """In the common vocabulary and as the instrument's own number."""
-    measurement = measure(ClientSession(3, 1), 0.0, status=verdict)
-    assert (measurement.status, measurement.raw_status) == (verdict, 12)
+@pytest.mark.parametrize("value", Status)
+def test_every_status_is_journalled(value: Status) -> None:
+    """With the instrument's own code."""
+    measurement = measure(ClientSession(3, 1), 0.0, status=value)
+    assert (measurement.status, measurement.raw_status) == (value, 12)
 
 
-def test_orders_move_the_mode() -> None:
-    """Direct mode and back, to another prism or the same; the session knows what is done already."""
+def test_commands_change_mode() -> None:
+    """Direct mode and back, to another prism or the same; the session knows which commands are satisfied."""
     session = ClientSession(3, 1)
     assert not session.is_satisfied(DirectCommand())
     session.apply(DirectCommand())
@@ -119,16 +119,16 @@ def test_orders_move_the_mode() -> None:
     assert (status(session, 0.0).mode, session.prism) == ("tracking", 7)
 
 
-def test_a_shot_goes_to_the_journal() -> None:
-    """It belongs to no prism and has no running number."""
+def test_single_measurement_is_journalled() -> None:
+    """It has neither prism nor sequence number."""
     session = ClientSession(3, 1)
     target = session.single_measurement(reading(1.0, prism=None), START + SECOND)
     assert (target.station, target.stamp_ns, target.slope_distance_m) == (3, START + SECOND, 42.123456789)
     assert status(session, 1.0).measurements == 0
 
 
-def test_the_status_before_anything_has_happened() -> None:
-    """What is not known is null."""
+def test_initial_status() -> None:
+    """Unknown fields are null."""
     assert status(ClientSession(3, 1), 0.0) == ClientStatus(
         stamp_ns=START,
         station=3,
@@ -163,8 +163,8 @@ def test_the_status_before_anything_has_happened() -> None:
     )
 
 
-def test_the_status_knows_lock_rate_and_master() -> None:
-    """The rate is that of the last ten seconds, and sinks when nothing comes any more."""
+def test_status_has_lock_rate_and_master() -> None:
+    """The rate covers the last ten seconds, and falls to 0 without measurements."""
     session = ClientSession(3, 1)
     for number in range(100):
         measure(session, number * 0.4)

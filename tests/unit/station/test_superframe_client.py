@@ -1,4 +1,4 @@
-"""The client's daemon on the superframe, between a simulated total station and a master that the test plays."""
+"""The client daemon on the superframe, between a simulated total station and a scripted master."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 from harness.client import START_NS, field_day
-from harness.hand_master import KEY, TIMING, HandMaster
 from harness.radios import MS
+from harness.scripted_master import KEY, TIMING, ScriptedMaster
 from structlog.testing import capture_logs
-from unit.station.test_daemon import asked
+from unit.station.test_daemon import client_status
 
 from tsgt.clock import UnixTimeline
 from tsgt.config import SuperframeConfig
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from harness.client import Field
-    from harness.hand_master import Answered
+    from harness.scripted_master import ReceivedMessage
 
     from tsgt.model import PolarMeasurement
 
@@ -34,15 +34,15 @@ SUPERFRAME = SuperframeConfig(kind="superframe")
 
 
 class OnAir:
-    """The hand's master on a radio; the only station is number 1."""
+    """The scripted master on a radio, with station 1 only."""
 
     def __init__(self, day: Field) -> None:
         self._day = day
         self._clock = VirtualClock(START_NS)
-        self.master = HandMaster(stations=1, station=1, session_every=4)
+        self.master = ScriptedMaster(stations=1, station=1, session_every=4)
 
-    async def frame(self, commands: Sequence[EncodedCommand] = ()) -> Answered | None:
-        """Play one frame, from beacon to reply."""
+    async def frame(self, commands: Sequence[EncodedCommand] = ()) -> ReceivedMessage | None:
+        """Run one frame, from beacon to reply."""
         radio = self._day.master.radio
         payload = self.master.beacon(commands=commands)
         self.master.left(await radio.transmit(payload))
@@ -53,26 +53,26 @@ class OnAir:
         return None
 
     async def frames(self, seconds: float) -> None:
-        """Play frames one after the other."""
+        """Run frames for a duration."""
         end_ns = self._clock.monotonic_ns() + round(seconds * 1e9)
         while self._clock.monotonic_ns() < end_ns:
             await self.frame()
 
     async def drained(self, day: Field) -> None:
-        """Play frames until nothing is queued."""
+        """Run frames until nothing is queued."""
         await self.frames(5.0)
-        assert (await asked(day.folder / "client.sock"))["queued"] <= 3
+        assert (await client_status(day.folder / "client.sock"))["queued"] <= 3
 
 
 @asynccontextmanager
 async def superframe_day(folder: Path) -> AsyncGenerator[tuple[Field, OnAir]]:
-    """Set up a station that has the key, and its master."""
+    """Set up a station with the key, and its master."""
     async with field_day(folder, protocol=SUPERFRAME, key=KEY) as day:
         yield day, OnAir(day)
 
 
 def journalled(folder: Path) -> list[PolarMeasurement]:
-    """Return what stands in all journals."""
+    """Return the measurements of all journals."""
     measurements = [
         measurement
         for path in (folder / "journals").iterdir()
@@ -144,7 +144,7 @@ async def test_measurements_on_unknown_clock_are_discarded(tmp_path: Path) -> No
             new.master.session = 0x77
             await new.frames(5.0)
         assert [entry["event"] for entry in logs].count("measurements_discarded") == 1
-        assert (await asked(tmp_path / "client.sock"))["queued"] <= 2
+        assert (await client_status(tmp_path / "client.sock"))["queued"] <= 2
         assert min(new.master.received) > 1000
 
 
@@ -153,7 +153,7 @@ async def test_commands_are_executed_and_responded_to(tmp_path: Path) -> None:
     async with superframe_day(tmp_path) as (day, air):
         await air.frames(3.0)
 
-        async def order(command_id: int, kind: int, argument: int = 0) -> Answered:
+        async def order(command_id: int, kind: int, argument: int = 0) -> ReceivedMessage:
             for _ in range(20):
                 answered = await air.frame([EncodedCommand(1, command_id, kind, argument)])
                 if answered and (answered.reply.response or answered.reply.single_measurement):
@@ -162,13 +162,13 @@ async def test_commands_are_executed_and_responded_to(tmp_path: Path) -> None:
             raise AssertionError
 
         assert (await order(1, 2)).reply.response == CommandResponse(1, ok=True)
-        assert (await asked(tmp_path / "client.sock"))["mode"] == "direct"
+        assert (await client_status(tmp_path / "client.sock"))["mode"] == "direct"
         day.instrument.aim_at_target(1)
         shot = (await order(2, 3)).reply.single_measurement
         assert shot is not None
         assert shot.distance == pytest.approx(206_216, abs=100)
         assert (await order(3, 0, 1)).reply.response == CommandResponse(3, ok=True)
-        assert (await asked(tmp_path / "client.sock"))["prism"] == 2
+        assert (await client_status(tmp_path / "client.sock"))["prism"] == 2
         day.instrument.aim_at_prism(2)
         assert (await order(4, 1)).reply.response == CommandResponse(4, ok=True)
         assert (await order(5, 3)).reply.response == CommandResponse(5, ok=False)  # it is not in direct mode
@@ -241,11 +241,11 @@ async def test_status_reports_delivery(tmp_path: Path) -> None:
     """Before and after a master is there."""
     async with superframe_day(tmp_path) as (day, air):
         await asyncio.sleep(5.0)
-        before = await asked(day.folder / "client.sock")
+        before = await client_status(day.folder / "client.sock")
         assert (before["protocol"], before["authenticated"], before["joined"]) == ("superframe", True, False)
         assert (before["queued"], before["clock_bound_ns"]) == (13, None)
         await air.frames(20.0)
-        after = await asked(day.folder / "client.sock")
+        after = await client_status(day.folder / "client.sock")
     assert after["joined"]
     assert (after["missed_slots"], after["rejected_beacons"]) == (0, 0)
     assert after["queued"] <= 2
@@ -259,7 +259,7 @@ async def test_station_without_key_is_reported(tmp_path: Path) -> None:
         async with field_day(tmp_path, protocol=SUPERFRAME) as day:
             air = OnAir(day)
             await air.frames(10.0)
-            status = await asked(tmp_path / "client.sock")
+            status = await client_status(tmp_path / "client.sock")
     assert [entry["event"] for entry in logs if entry["event"] == "unauthenticated"] == ["unauthenticated"]
     assert [entry["event"] for entry in logs].count("beacon_authentication_failed") == 1
     assert (status["authenticated"], status["joined"], status["master_heard_s"]) == (False, False, None)

@@ -29,7 +29,7 @@ FULL = HELLO | {"commands": COMMANDS}
 async def tracking(
     hello: dict[str, Any] = FULL, config: BridgeInstrumentConfig = CONFIG
 ) -> tuple[BridgeInstrument, FakeProgram, FakeStart]:
-    """Connect to a program and have prism 1 tracked, a minute after the computer was switched on."""
+    """Connect to a program and track prism 1, a minute after the start of the clock."""
     await asyncio.sleep(max(0.0, 60.0 - CLOCK.monotonic_ns() / 1e9))
     start = FakeStart(CLOCK, hello)
     instrument = BridgeInstrument(config, CLOCK, start)
@@ -38,8 +38,8 @@ async def tracking(
     return instrument, start.programs[0], start
 
 
-async def waiting(instrument: BridgeInstrument) -> list[Reading]:
-    """Return the readings that are there."""
+async def queued(instrument: BridgeInstrument) -> list[Reading]:
+    """Return all queued readings."""
     readings = []
     try:
         while True:
@@ -49,8 +49,8 @@ async def waiting(instrument: BridgeInstrument) -> list[Reading]:
         return readings
 
 
-async def test_connecting_says_who_is_behind_the_program() -> None:
-    """The name comes from hello, and with it how measurements get their times."""
+async def test_connect_returns_identity_and_timestamp_source() -> None:
+    """Both come from hello."""
     hello = {"model": "S7", "serial_number": "12", "firmware": "1.2", "make": "Acme"}
     for stamps, how in (
         ({"stamps": "host"}, "timestamped by the bridge"),
@@ -61,8 +61,8 @@ async def test_connecting_says_who_is_behind_the_program() -> None:
         assert await instrument.connect() == f"Acme S7 12, {how}"
 
 
-async def test_a_measurement_is_read_as_it_was_said() -> None:
-    """Angles, distance, verdict and times are those of the line; the latency is taken off the stamp."""
+async def test_reading_has_values_of_line() -> None:
+    """The latency is subtracted from the timestamp."""
     config = CONFIG.model_copy(update={"latency_ms": 20.0})
     instrument, program, _ = await tracking(config=config)
     now_ns = CLOCK.monotonic_ns()
@@ -82,8 +82,8 @@ async def test_a_measurement_is_read_as_it_was_said() -> None:
     assert (reading.status, reading.raw_status, reading.instrument_time_ns) == (Status.LOW_ACCURACY, 1284, 7)
 
 
-async def test_commands_and_their_answers() -> None:
-    """The program is told what to do in its own format."""
+async def test_commands_are_sent_in_bridge_format() -> None:
+    """With consecutive ids."""
     instrument, program, _ = await tracking()
     await instrument.track(2, Direction(horizontal_angle_rad=1.0, zenith_angle_rad=1.5, spread_rad=0.1))
     await instrument.set_atmosphere(Atmosphere(temperature_c=12.0, pressure_hpa=950.0))
@@ -97,8 +97,8 @@ async def test_commands_and_their_answers() -> None:
     ]
 
 
-async def test_what_the_program_refuses_changes_nothing() -> None:
-    """It goes on tracking the prism that it tracked."""
+async def test_refused_command_changes_nothing() -> None:
+    """The program continues to track its prism."""
     instrument, program, _ = await tracking()
     program.on_command = lambda command: program.done(command, "there is no prism 9\x1b[31m")
     with pytest.raises(InstrumentRefusedError, match=r"bridge: track: there is no prism 9 \[31m"):
@@ -107,8 +107,8 @@ async def test_what_the_program_refuses_changes_nothing() -> None:
     assert (await instrument.read()).prism == 1
 
 
-async def test_a_program_that_takes_no_commands_can_be_tracked_with() -> None:
-    """It measures what a person has set up; everything else is refused, and nothing is sent."""
+async def test_program_without_commands_tracks() -> None:
+    """It measures what the operator has set up; everything else is refused, and nothing is sent."""
     instrument, program, _ = await tracking(HELLO)
     program.measure()
     assert (await instrument.read()).prism == 1
@@ -122,14 +122,14 @@ async def test_a_program_that_takes_no_commands_can_be_tracked_with() -> None:
     assert program.commands == []
 
 
-async def test_a_single_measurement() -> None:
-    """The shot answers the command; one without a target is an answer too, and so is an error."""
+async def test_single_measurement() -> None:
+    """The response to the command, with or without a target, or an error."""
     instrument, program, _ = await tracking()
     with pytest.raises(InstrumentRefusedError, match="call direct first"):
         await instrument.measure()
     await instrument.direct()
-    shot = measured(20.0) | {"type": "shot"}
-    program.on_command = lambda command: program.say(shot | {"id": command["id"]})
+    single = measured(20.0) | {"type": "shot"}
+    program.on_command = lambda command: program.say(single | {"id": command["id"]})
     reading = await instrument.measure()
     assert (reading.prism, reading.slope_distance_m, reading.at_ns) == (None, 20.0, CLOCK.monotonic_ns())
     program.on_command = lambda command: program.say(
@@ -137,14 +137,18 @@ async def test_a_single_measurement() -> None:
     )
     reading = await instrument.measure()
     assert (reading.status, reading.slope_distance_m) == (Status.NO_TARGET, None)
-    for answer in (shot | {"slope_distance_m": -1.0}, {"type": "done"}, {"type": "done", "error": "no foil"}):
+    for answer in (
+        single | {"slope_distance_m": -1.0},
+        {"type": "done"},
+        {"type": "done", "error": "no foil"},
+    ):
         program.on_command = lambda command, answer=answer: program.say(answer | {"id": command["id"]})  # type: ignore[misc]
         with pytest.raises(InstrumentRefusedError, match=r"expected metres|contains no measurement|no foil"):
             await instrument.measure()
 
 
-async def test_after_a_change_nothing_of_the_old_prism_is_read() -> None:
-    """What was measured before the answer is of the old prism; a line that names another one is not believed."""
+async def test_readings_of_old_prism_are_dropped_after_change() -> None:
+    """Lines before the response belong to the old prism; one that names another prism is rejected."""
     instrument, program, _ = await tracking()
     program.measure(1.0)
 
@@ -157,11 +161,11 @@ async def test_after_a_change_nothing_of_the_old_prism_is_read() -> None:
     await asyncio.sleep(0.4)
     program.measure(4.0, prism=1)
     program.measure(5.0, prism=3)
-    assert [(reading.prism, reading.slope_distance_m) for reading in await waiting(instrument)] == [(3, 5.0)]
+    assert [(reading.prism, reading.slope_distance_m) for reading in await queued(instrument)] == [(3, 5.0)]
 
 
-async def test_each_measurement_counts_once() -> None:
-    """A line with the time of the one before it is a repeat, also after the program was started anew."""
+async def test_repeated_measurement_is_dropped() -> None:
+    """By time and values, also after a restart of the program."""
     instrument, program, start = await tracking()
     line = program.measurement(instrument_time_ns=1000)
     program.say(line, line)
@@ -171,20 +175,20 @@ async def test_each_measurement_counts_once() -> None:
     await instrument.connect()
     await instrument.track(1)
     start.programs[1].say(line)
-    assert await waiting(instrument) == []
+    assert await queued(instrument) == []
 
 
-async def test_a_coarse_time_of_the_instrument_loses_nothing() -> None:
-    """Where it has whole seconds only, other numbers tell that it is another measurement."""
+async def test_coarse_instrument_time_loses_no_measurement() -> None:
+    """Different values identify a new measurement."""
     instrument, program, _ = await tracking()
     for number in range(10):
         await asyncio.sleep(0.4)
         program.measure(1.0 + number, instrument_time_ns=CLOCK.monotonic_ns() // 10**9 * 10**9)
-    assert len(await waiting(instrument)) == 10
+    assert len(await queued(instrument)) == 10
 
 
 async def instrument_readings(instrument: BridgeInstrument) -> list[Reading]:
-    """Read until the program is lost."""
+    """Read until the program has failed."""
     readings = []
     try:
         while True:
@@ -193,8 +197,8 @@ async def instrument_readings(instrument: BridgeInstrument) -> list[Reading]:
         return readings
 
 
-async def test_what_came_before_the_end_is_read_before_the_error() -> None:
-    """Nothing that was measured is lost with the program, even if somebody connects before it is read."""
+async def test_queued_readings_precede_error() -> None:
+    """They are kept even across a new connection."""
     instrument, program, _ = await tracking()
     program.measure(1.0)
     await asyncio.sleep(0.4)
@@ -206,8 +210,8 @@ async def test_what_came_before_the_end_is_read_before_the_error() -> None:
     assert (await instrument.read()).slope_distance_m == 2.0
 
 
-async def test_an_end_is_said_with_its_reason() -> None:
-    """The error has the program, how it ended, and what it complained of."""
+async def test_exit_is_reported_with_reason() -> None:
+    """The error names the program, how it ended, and its last error message."""
     instrument, program, _ = await tracking()
     program.exit("exit status 3: no license")
     with pytest.raises(InstrumentError, match=r"bridge: the program has ended \(exit status 3: no license\)"):
@@ -216,28 +220,28 @@ async def test_an_end_is_said_with_its_reason() -> None:
 
 
 async def test_silence_while_tracking_is_a_stall() -> None:
-    """After stall_timeout_s the program is killed; a sign of life gives it so long again, rubbish does not."""
+    """The program is killed after stall_timeout_s; usable lines restart the timeout, garbage does not."""
     instrument, program, _ = await tracking()
-    began_ns = CLOCK.monotonic_ns()
+    start_ns = CLOCK.monotonic_ns()
 
     async def talk() -> None:
         await asyncio.sleep(4.0)
         program.say({"type": "status", "activity": "looking around"})
         await asyncio.sleep(4.0)
-        program.say(b"rubbish")
+        program.say(b"garbage")
 
     talking = asyncio.create_task(talk())
     with pytest.raises(
         InstrumentError, match=r"has printed nothing usable for 5 s \(a line of the program was rejected"
     ):
         await instrument.read()
-    assert CLOCK.monotonic_ns() - began_ns == 9_000_000_000
+    assert CLOCK.monotonic_ns() - start_ns == 9_000_000_000
     assert program.ended
     await talking
 
 
-async def test_in_direct_mode_silence_is_no_stall() -> None:
-    """A program has nothing to say while a person aims."""
+async def test_silence_in_direct_mode_is_no_stall() -> None:
+    """The operator aims."""
     instrument, program, _ = await tracking()
     await instrument.direct()
     await asyncio.sleep(3600.0)
@@ -247,8 +251,8 @@ async def test_in_direct_mode_silence_is_no_stall() -> None:
     await instrument.read()
 
 
-async def test_in_direct_mode_the_end_of_the_program_is_missed() -> None:
-    """Nobody reads then, but the client asks."""
+async def test_exit_in_direct_mode_is_detected() -> None:
+    """By the periodic check."""
     instrument, program, _ = await tracking()
     await instrument.direct()
     program.exit("exit status 3")
@@ -256,19 +260,19 @@ async def test_in_direct_mode_the_end_of_the_program_is_missed() -> None:
         await instrument.check()
 
 
-async def test_a_command_without_an_answer_is_a_stall() -> None:
-    """It is waited for 30 s, whatever else the program says."""
+async def test_missing_response_is_a_stall() -> None:
+    """After 30 s, whatever else the program prints."""
     instrument, program, _ = await tracking()
     program.on_command = lambda _: program.say({"type": "done", "id": 77})
-    began_ns = CLOCK.monotonic_ns()
+    start_ns = CLOCK.monotonic_ns()
     with pytest.raises(InstrumentError, match="does not respond to direct"):
         await instrument.direct()
-    assert CLOCK.monotonic_ns() - began_ns == 30_000_000_000
+    assert CLOCK.monotonic_ns() - start_ns == 30_000_000_000
     assert program.ended
 
 
-async def test_a_program_may_take_its_time_to_find_the_instrument() -> None:
-    """With status lines it may wait for ever; without a word it has 30 s."""
+async def test_status_lines_extend_hello_timeout() -> None:
+    """A silent program has 30 s."""
     start = FakeStart(CLOCK)
     instrument = BridgeInstrument(CONFIG, CLOCK, start)
     connecting = asyncio.create_task(instrument.connect())
@@ -278,14 +282,14 @@ async def test_a_program_may_take_its_time_to_find_the_instrument() -> None:
         assert instrument.condition.problem == "switch the instrument on"
     start.programs[0].say(HELLO)
     await connecting
-    began_ns = CLOCK.monotonic_ns()
+    start_ns = CLOCK.monotonic_ns()
     with pytest.raises(InstrumentError, match="has not sent hello"):
         await instrument.connect()
-    assert CLOCK.monotonic_ns() - began_ns == 30_000_000_000
+    assert CLOCK.monotonic_ns() - start_ns == 30_000_000_000
 
 
-async def test_another_version_is_refused() -> None:
-    """The error names both, and the program is ended."""
+async def test_other_version_is_rejected() -> None:
+    """The error names both, and the program is killed."""
     start = FakeStart(CLOCK, {"type": "hello", "bridge": 2})
     instrument = BridgeInstrument(CONFIG, CLOCK, start)
     with pytest.raises(
@@ -295,8 +299,8 @@ async def test_another_version_is_refused() -> None:
     assert start.programs[0].ended
 
 
-async def test_a_second_hello_ends_the_run() -> None:
-    """A wrapper has started its program anew, which knows nothing of what it was told."""
+async def test_second_hello_ends_session() -> None:
+    """A wrapper has restarted its program, which knows no commands."""
     instrument, program, _ = await tracking()
     program.say(FULL)
     with pytest.raises(InstrumentError, match="second hello"):
@@ -332,34 +336,34 @@ async def test_a_second_hello_ends_the_run() -> None:
         {"prism": 2},
     ],
 )
-async def test_a_line_that_cannot_be_is_refused(wrong: bytes | dict[str, Any]) -> None:
-    """It is said in the log and in the condition, and the next good line is read as if nothing had been."""
+async def test_invalid_line_is_rejected(wrong: bytes | dict[str, Any]) -> None:
+    """Log and condition report it, and the next valid line is read."""
     with capture_logs() as logs:
         instrument, program, _ = await tracking()
         program.say(wrong if isinstance(wrong, bytes) else program.measurement() | wrong)
-        assert await waiting(instrument) == []
+        assert await queued(instrument) == []
         assert "was rejected" in instrument.condition.problem
         await asyncio.sleep(0.4)
         program.measure()
-        assert len(await waiting(instrument)) == 1
+        assert len(await queued(instrument)) == 1
     assert [entry["event"] for entry in logs] == ["bridge_line_rejected"]
     assert len(logs[0]["line"]) <= 200
     assert instrument.condition.problem == ""
 
 
-async def test_refusals_are_logged_once_a_minute() -> None:
+async def test_rejected_lines_are_logged_once_a_minute() -> None:
     """With their number."""
     with capture_logs() as logs:
         _, program, _ = await tracking()
         for _ in range(130):
             await asyncio.sleep(1.0)
-            program.say(b"rubbish")
+            program.say(b"garbage")
     assert [entry["rejected"] for entry in logs] == [1, 61, 121]
 
 
 @pytest.mark.parametrize("flood", [b"{}\n" * 2000, b"x" * 2_000_000, b"\n" * 3000])
-async def test_a_program_that_runs_wild_is_ended(flood: bytes) -> None:
-    """Neither many lines nor one without an end keep the client busy."""
+async def test_excessive_output_kills_program(flood: bytes) -> None:
+    """Many lines, or one without end."""
     instrument, program, _ = await tracking()
     program.print(flood)
     assert program.ended
@@ -367,8 +371,8 @@ async def test_a_program_that_runs_wild_is_ended(flood: bytes) -> None:
         await instrument.read()
 
 
-async def test_rubbish_in_pieces_does_no_harm() -> None:
-    """Random bytes between good lines, in random pieces: each good line is read once, and nothing else."""
+async def test_garbage_between_lines_is_ignored() -> None:
+    """Random bytes in random pieces: each valid line is read once."""
     generator = random.Random(1)  # noqa: S311 (no secrets)
     instrument, program, _ = await tracking()
     count = 200
@@ -380,39 +384,39 @@ async def test_rubbish_in_pieces_does_no_harm() -> None:
             cut = generator.randrange(1, 100)
             program.print(data[:cut])
             data = data[cut:]
-    readings = await waiting(instrument)
+    readings = await queued(instrument)
     assert [reading.slope_distance_m for reading in readings] == [1.0 + number for number in range(count)]
 
 
-async def test_a_missing_target_is_news_twice_a_second_at_most() -> None:
-    """Every change of the status is, and the first one after a measurement."""
+async def test_missing_target_is_reported_twice_a_second_at_most() -> None:
+    """Every change is reported, and the first one after a measurement."""
     instrument, program, _ = await tracking()
     for _ in range(100):
         await asyncio.sleep(0.05)
         program.say({"type": "measurement", "status": "no_target"})
-    assert len(await waiting(instrument)) == 10
+    assert len(await queued(instrument)) == 10
     for status in ("no_target", "angle_only", "no_target"):
         program.measure()
         await asyncio.sleep(0.01)
         program.say({"type": "measurement", "status": status})
-    assert len(await waiting(instrument)) == 6
+    assert len(await queued(instrument)) == 6
 
 
-async def test_without_times_the_arrival_is_the_stamp() -> None:
-    """It is exact only for lines that come alone: of several in one piece nobody knows when each was made."""
+async def test_arrival_is_timestamp_of_single_lines() -> None:
+    """Lines that arrive together are rejected."""
     instrument, program, _ = await tracking(HELLO | {"stamps": "arrival"})
     program.say(measured(1.0))
     at_ns = CLOCK.monotonic_ns()
     await asyncio.sleep(0.4)
     program.say(measured(2.0), measured(3.0))
-    assert [(reading.slope_distance_m, reading.at_ns) for reading in await waiting(instrument)] == [
+    assert [(reading.slope_distance_m, reading.at_ns) for reading in await queued(instrument)] == [
         (1.0, at_ns)
     ]
     assert "flush" in instrument.condition.problem
 
 
-async def test_the_instruments_own_time_is_put_on_the_hosts_clock() -> None:
-    """The jitter of the way does not matter, and the first lines wait until the clock is known."""
+async def test_instrument_time_is_mapped_to_host_clock() -> None:
+    """The jitter of the arrivals does not matter; the first lines wait for the clock fit."""
     generator = random.Random(2)  # noqa: S311 (no secrets)
     instrument, program, _ = await tracking(HELLO | {"stamps": "instrument", "clock": "power-on"})
     true_ns, readings = {}, []
@@ -423,7 +427,7 @@ async def test_the_instruments_own_time_is_put_on_the_hosts_clock() -> None:
         true_ns[time_ns] = made_ns
         await asyncio.sleep(generator.expovariate(1 / 0.005) if number != 100 else 1.0)
         program.say(measured(instrument_time_ns=time_ns))
-        readings += await waiting(instrument)
+        readings += await queued(instrument)
         if number == 3:
             assert readings == []
     assert [reading.instrument_time_ns for reading in readings] == list(true_ns)
@@ -432,8 +436,8 @@ async def test_the_instruments_own_time_is_put_on_the_hosts_clock() -> None:
     assert max(map(abs, errors_ms[20:])) < 1.5
 
 
-async def test_an_instrument_that_was_switched_off_and_on() -> None:
-    """Until its new time is known nothing is read, and then nothing with a wrong time."""
+async def test_power_cycle_resets_clock_fit() -> None:
+    """No reading has a wrong time."""
     instrument, program, _ = await tracking(HELLO | {"stamps": "instrument"})
     switched_on_ns, readings, true_ns = 0, [], {}
     for number in range(60):
@@ -443,13 +447,13 @@ async def test_an_instrument_that_was_switched_off_and_on() -> None:
         time_ns = CLOCK.monotonic_ns() - switched_on_ns
         true_ns[time_ns] = CLOCK.monotonic_ns()
         program.say(measured(instrument_time_ns=time_ns))
-        readings += await waiting(instrument)
+        readings += await queued(instrument)
     assert len(readings) > 55
     assert all(abs(reading.at_ns - true_ns[reading.instrument_time_ns or 0]) < 1e6 for reading in readings)
 
 
-async def test_condition_and_record_follow_what_the_program_says() -> None:
-    """Battery, problems and settings; the record changes with the settings only."""
+async def test_condition_and_record_follow_program() -> None:
+    """The record changes with the settings only."""
     assert BridgeInstrument(CONFIG, CLOCK).record is None
     config = CONFIG.model_copy(update={"latency_ms": 3.0})
     instrument, program, _ = await tracking(HELLO | {"model": "S7"}, config)
@@ -470,19 +474,19 @@ async def test_condition_and_record_follow_what_the_program_says() -> None:
     assert record.prism_constant_m == 0.002
 
 
-async def test_a_cancelled_reading_takes_nothing_away() -> None:
-    """Whoever gives up waiting gets that reading with the next call."""
+async def test_cancelled_read_loses_no_reading() -> None:
+    """The next call returns it."""
     instrument, program, _ = await tracking()
     readings: list[Reading] = []
     for number in range(40):
         program.measure(1.0 + number)
         await asyncio.sleep(0.1)
-        readings += await waiting(instrument)
+        readings += await queued(instrument)
     assert len(readings) == 40
 
 
-async def test_a_program_that_always_ends_is_started_with_pauses() -> None:
-    """The supervisor starts it about once a second, for ever, and says why once."""
+async def test_crashing_program_is_restarted_with_delay() -> None:
+    """About once a second, for ever; logged once."""
     start = FakeStart(CLOCK)
     instrument = BridgeInstrument(CONFIG, CLOCK, start)
     supervisor = InstrumentSupervisor(
@@ -512,8 +516,8 @@ async def test_a_program_that_always_ends_is_started_with_pauses() -> None:
     assert "no licence" in supervisor.condition.problem
 
 
-async def test_a_program_that_ends_at_random_loses_and_doubles_nothing() -> None:
-    """Each measurement that it has printed reaches the client once, though each run begins with the last one again."""
+async def test_random_exits_lose_and_repeat_no_measurement() -> None:
+    """Each run starts with the last measurement of the one before."""
     generator = random.Random(3)  # noqa: S311 (no secrets)
     start = FakeStart(CLOCK, FULL)
     instrument = BridgeInstrument(CONFIG, CLOCK, start)
@@ -527,7 +531,7 @@ async def test_a_program_that_ends_at_random_loses_and_doubles_nothing() -> None
         on_result=lambda _: None,
     )
     running = asyncio.create_task(supervisor.run())
-    said: list[float] = []
+    printed: list[float] = []
     last: dict[str, Any] | None = None
     with capture_logs():
         for number in range(5000):
@@ -540,11 +544,11 @@ async def test_a_program_that_ends_at_random_loses_and_doubles_nothing() -> None
                 program.say(last)
             last = program.measurement(1.0 + number)
             program.say(last)
-            said.append(1.0 + number)
+            printed.append(1.0 + number)
             if generator.random() < 0.05:
                 program.exit()
         await asyncio.sleep(3.0)
         running.cancel()
         await asyncio.wait([running])
     assert len(start.programs) > 50
-    assert [reading.slope_distance_m for reading in readings] == said
+    assert [reading.slope_distance_m for reading in readings] == printed

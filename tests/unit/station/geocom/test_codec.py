@@ -1,4 +1,4 @@
-"""GeoCOM in ASCII: lines as the manual prints them, and what the return codes mean."""
+"""The GeoCOM codec and the table of return codes."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from tsgt.station.geocom import Outcome, ReturnCode, Rpc, name_of, outcome_of
 from tsgt.station.geocom.codec import Byte, decode_reply, encode_request
 
 
-def test_requests_as_they_go_over_the_line() -> None:
-    """Without and with a transaction, without and with parameters, and with a checksum."""
+def test_request_encoding() -> None:
+    """Without and with a transaction, parameters and a checksum."""
     assert encode_request(Rpc.COM_NULL_PROC) == b"%R1Q,0:\r\n"
     assert encode_request(Rpc.TMC_GET_FULL_MEAS, (100, 1), transaction=7) == b"%R1Q,2167,7:100,1\r\n"
     assert (
@@ -39,33 +39,33 @@ def test_requests_as_they_go_over_the_line() -> None:
         ("Ä", 10, r'"\xc4"'),
     ],
 )
-def test_parameters_as_they_go_over_the_line(value: float | str, decimals: int, text: str) -> None:
-    """Never an exponent, no zeros at the end but one, nothing in a text that could end it or the line."""
+def test_parameter_encoding(value: float | str, decimals: int, text: str) -> None:
+    """No exponent, one trailing zero at most, no character that could end the string or the line."""
     assert encode_request(1, (value,), decimals=decimals) == f"%R1Q,1:{text}\r\n".encode()
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), Byte(256), Byte(-1), "€"])
-def test_what_cannot_be_sent_is_refused(value: float | str) -> None:
-    """A number that is none, a byte that is none, a character that GeoCOM has not."""
+def test_invalid_parameter_is_rejected(value: float | str) -> None:
+    """A number that is not finite, an invalid byte, a character that is not Latin-1."""
     with pytest.raises(MessageError):
         encode_request(1, (value,))
 
 
 @pytest.mark.parametrize("transaction", [0, -1, 32_768])
-def test_a_transaction_has_fifteen_bits(transaction: int) -> None:
-    """Beyond, an instrument would give it back with a sign; 0 means none."""
+def test_transaction_has_fifteen_bits(transaction: int) -> None:
+    """A larger one would come back negative; 0 means none."""
     with pytest.raises(MessageError, match="between 1 and 32767"):
         encode_request(1, transaction=transaction)
 
 
-def test_a_checksum_needs_a_transaction() -> None:
+def test_checksum_requires_transaction() -> None:
     """It is the third number of the header."""
     with pytest.raises(MessageError, match="needs a transaction"):
         encode_request(1, checksum=True)
 
 
-def test_replies_as_they_come() -> None:
-    """Numbers with and without exponent, texts with commas and escapes, bytes, and replies with no value at all."""
+def test_reply_decoding() -> None:
+    """Numbers with and without exponent, strings with commas and escapes, bytes, and replies without values."""
     reply = decode_reply(b'%R1P,0,12:1284,1.5,-0.1e-07,3,"TS16, 1\\"",\'2f\',0x1F,""\r\n')
     assert (reply.com_code, reply.transaction, reply.code) == (0, 12, 1284)
     assert reply.values == (1.5, -0.1e-7, 3, 'TS16, 1"', 0x2F, 31, "")
@@ -103,14 +103,14 @@ def test_replies_as_they_come() -> None:
         b"%R1P,0,1234567:0",
     ],
 )
-def test_damaged_replies_are_refused(line: bytes) -> None:
-    """Cut, mixed up, or with what no instrument sends."""
+def test_damaged_reply_is_rejected(line: bytes) -> None:
+    """Truncated, mixed up, or with characters that no instrument sends."""
     with pytest.raises(MessageError):
         decode_reply(line)
 
 
-def test_a_checksum_is_checked_where_there_is_one() -> None:
-    """Wrong, it is refused in any case; missing, only where it was agreed on and the request got through."""
+def test_checksum_is_verified() -> None:
+    """A wrong one is always rejected; a missing one only where it is required and the request was delivered."""
     line = encode_request(0, (0, 5), transaction=3, checksum=True).replace(b"%R1Q", b"%R1P")
     with pytest.raises(MessageError, match="checksum is"):
         decode_reply(line)
@@ -151,14 +151,14 @@ def test_a_checksum_is_checked_where_there_is_one() -> None:
         (4711, Outcome.ERROR, Outcome.ERROR),
     ],
 )
-def test_what_a_code_means(code: int, with_values: Outcome, without: Outcome) -> None:
-    """Which measurements may be used, which have angles only, and what else is to be told apart."""
+def test_outcome_of_return_code(code: int, with_values: Outcome, without: Outcome) -> None:
+    """With and without values."""
     assert outcome_of(code, has_values=True) is with_values
     assert outcome_of(code, has_values=False) is without
 
 
-def test_codes_have_names_and_families() -> None:
-    """A known code by its name, another one by the part of the instrument that it is from."""
+def test_name_of_return_code() -> None:
+    """An unknown code has the name of its component."""
     assert name_of(ReturnCode.NA) == "27 NA"
     assert name_of(1284) == "1284 TMC_ACCURACY_GUARANTEE"
     assert name_of(8799) == "8799 (unknown, of AUT)"

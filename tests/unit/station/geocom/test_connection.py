@@ -1,4 +1,4 @@
-"""The owner of a GeoCOM line: every reply is that to its own request, whatever the line does."""
+"""The GeoCOM connection: every reply belongs to its request, whatever the line does."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from harness.geocom_line import (
-    ANSWER_S,
+    REPLY_S,
     Cable,
     FakeInstrument,
     cut,
@@ -35,14 +35,14 @@ MS = 1_000_000
 async def connected(
     *, checksum: bool = False, baud: int = 115_200
 ) -> tuple[GeoComConnection, FakeInstrument]:
-    """Make a connection with an instrument that answers."""
+    """Return a connection to an instrument that responds."""
     instrument = FakeInstrument(checksums=checksum, baud=baud)
     port = await Cable(instrument).open(baud)
     return GeoComConnection(port, VirtualClock(0), checksum=checksum), instrument
 
 
-async def echoed(connection: GeoComConnection, number: int) -> None:
-    """Ask for something and check that the answer is the one to it."""
+async def check_echo(connection: GeoComConnection, number: int) -> None:
+    """Call a procedure and check that the reply belongs to it."""
     reply = await connection.call(Rpc.TMC_GET_FULL_MEAS, number, timeout_s=1.0)
     assert (reply.code, reply.values) == (0, (number,))
 
@@ -52,8 +52,8 @@ def now_s() -> float:
     return asyncio.get_running_loop().time()
 
 
-async def test_a_reply_has_code_and_values() -> None:
-    """What the instrument says comes back, numbers as numbers and texts as texts."""
+async def test_reply_has_code_and_values() -> None:
+    """Numbers as numbers and strings as strings."""
     connection, instrument = await connected()
     reply = await connection.call(Rpc.BAP_SET_PRISM_TYPE2, 9, 'a, "b"')
     assert reply.code == 0
@@ -61,8 +61,8 @@ async def test_a_reply_has_code_and_values() -> None:
     assert instrument.requests[0].startswith(b"%R1Q,17030,")
 
 
-async def test_a_reply_is_stamped_with_its_first_byte() -> None:
-    """The time of the last byte less the time that all of them take on the line, ten bits each."""
+async def test_reply_is_timestamped_at_first_byte() -> None:
+    """The time of the last byte minus the duration of all bytes, ten bits each."""
     connection, _ = await connected(baud=9600)
     reply = await connection.call(Rpc.TMC_GET_FULL_MEAS, 150)
     length = len("%R1P,0,1:0,150\r\n")
@@ -70,8 +70,8 @@ async def test_a_reply_is_stamped_with_its_first_byte() -> None:
     assert reply.first_byte_ns == 20 * MS - round(length * 10 / 9600 * 1e9)
 
 
-async def test_a_reply_in_pieces_is_stamped_with_its_first() -> None:
-    """What matters is when the first byte came, not when the line was whole."""
+async def test_reply_in_pieces_is_timestamped_at_first_byte() -> None:
+    """Not when the line was complete."""
     connection, instrument = await connected()
     instrument.faults.append(torn(5))
     reply = await connection.call(Rpc.TMC_GET_FULL_MEAS, 150)
@@ -107,59 +107,59 @@ async def test_a_reply_in_pieces_is_stamped_with_its_first() -> None:
         not_taken(3109),
     ],
 )
-async def test_one_fault_costs_no_reply(fault: Fault) -> None:
-    """One fault of the line is survived, and all replies after it are the right ones."""
+async def test_single_fault_loses_no_reply(fault: Fault) -> None:
+    """All later replies are correct."""
     connection, instrument = await connected()
-    await echoed(connection, 1)
+    await check_echo(connection, 1)
     instrument.faults.append(fault)
     for number in range(2, 6):
-        await echoed(connection, number)
+        await check_echo(connection, number)
 
 
-async def test_a_late_reply_is_not_taken_for_the_next() -> None:
-    """A reply that comes after its caller has been told of the silence is dropped; the line is in step again."""
+async def test_late_reply_is_dropped() -> None:
+    """It arrives after its call has failed; the line is resynchronised."""
     connection, instrument = await connected()
     instrument.faults.extend([late(4.5), silent, silent, silent])
     with pytest.raises(InstrumentError, match="does not respond"):
         await connection.call(Rpc.TMC_GET_FULL_MEAS, 1, timeout_s=1.0)
     assert now_s() == pytest.approx(4.0)
     await asyncio.sleep(0.495)
-    await echoed(connection, 2)
+    await check_echo(connection, 2)
 
 
-async def test_the_next_call_waits_for_the_reply_to_a_cancelled_one() -> None:
-    """An instrument takes one request at a time; cancelling a caller does not change that."""
+async def test_call_waits_for_reply_to_cancelled_call() -> None:
+    """An instrument takes one request at a time."""
     connection, instrument = await connected()
     instrument.faults.append(late(0.8))
     with pytest.raises(TimeoutError):
         async with asyncio.timeout(0.1):
             await connection.call(Rpc.TMC_GET_FULL_MEAS, 1)
-    await echoed(connection, 2)
-    assert now_s() == pytest.approx(0.8 + ANSWER_S)
+    await check_echo(connection, 2)
+    assert now_s() == pytest.approx(0.8 + REPLY_S)
     assert len(instrument.requests) == 2
 
 
-async def test_a_cancelled_call_whose_reply_never_comes_holds_nobody_up_for_ever() -> None:
-    """The next call waits as long as the cancelled one would have, then brings the line into step again."""
+async def test_wait_for_cancelled_call_ends_at_its_timeout() -> None:
+    """Then the line is resynchronised."""
     connection, instrument = await connected()
     instrument.faults.append(silent)
     with pytest.raises(TimeoutError):
         async with asyncio.timeout(0.1):
             await connection.call(Rpc.TMC_GET_FULL_MEAS, 1, timeout_s=2.0)
-    await echoed(connection, 2)
-    assert now_s() == pytest.approx(2.0 + 2 * ANSWER_S)
+    await check_echo(connection, 2)
+    assert now_s() == pytest.approx(2.0 + 2 * REPLY_S)
 
 
-async def test_two_callers_take_turns() -> None:
-    """The second request goes out when the first reply is there."""
+async def test_concurrent_calls_are_serialised() -> None:
+    """The second request is sent after the first reply."""
     connection, instrument = await connected()
-    await asyncio.gather(echoed(connection, 1), echoed(connection, 2))
-    assert now_s() == pytest.approx(2 * ANSWER_S)
+    await asyncio.gather(check_echo(connection, 1), check_echo(connection, 2))
+    assert now_s() == pytest.approx(2 * REPLY_S)
     assert len(instrument.requests) == 2
 
 
-async def test_silence_ends_in_an_error_that_says_what_to_do() -> None:
-    """Without an answer the call fails after its time and three attempts to get the instrument's attention."""
+async def test_silence_raises_with_advice() -> None:
+    """After the timeout and three attempts to resynchronise."""
     connection, instrument = await connected()
     instrument.faults.extend([silent] * 100)
     with pytest.raises(
@@ -169,8 +169,8 @@ async def test_silence_ends_in_an_error_that_says_what_to_do() -> None:
     assert now_s() == pytest.approx(4.0)
 
 
-async def test_a_procedure_that_stays_silent_is_asked_for_twice() -> None:
-    """The instrument answers other requests, but not this one: once more, then an error."""
+async def test_silent_procedure_is_repeated_once() -> None:
+    """The instrument replies to other requests."""
     connection, instrument = await connected()
     instrument.faults.extend([silent, garbage_before(b"x"), silent])
     with capture_logs() as logs, pytest.raises(InstrumentError, match=r"no reply .* to TMC_GET_FULL_MEAS"):
@@ -180,18 +180,18 @@ async def test_a_procedure_that_stays_silent_is_asked_for_twice() -> None:
 
 
 @pytest.mark.parametrize("fault", [silent, damaged])
-async def test_what_moves_the_telescope_is_not_asked_for_twice(fault: Fault) -> None:
-    """Whether it has been carried out is not known; a second change of face would undo the first."""
+async def test_moving_procedure_is_not_repeated(fault: Fault) -> None:
+    """It may have been executed; a second change of face would undo the first."""
     connection, instrument = await connected()
     instrument.faults.append(fault)
     with pytest.raises(InstrumentError, match="to AUT_CHANGE_FACE"):
         await connection.call(Rpc.AUT_CHANGE_FACE, 0, 0, 0)
     assert len(instrument.requests) == 1
-    await echoed(connection, 2)
+    await check_echo(connection, 2)
 
 
-async def test_what_moves_the_telescope_is_not_asked_for_again_after_an_error_without_a_number() -> None:
-    """The error may be that of an earlier request, and come late: the telescope may be moving already."""
+async def test_moving_procedure_is_not_repeated_after_error_without_transaction() -> None:
+    """The error may be the late one of an earlier request."""
     connection, instrument = await connected()
     instrument.faults.append(not_taken(3101))
     reply = await connection.call(Rpc.AUT_CHANGE_FACE, 0, 0, 0)
@@ -200,25 +200,25 @@ async def test_what_moves_the_telescope_is_not_asked_for_again_after_an_error_wi
 
 
 @pytest.mark.parametrize(("code", "times"), [(3081, 1), (3080, 3), (3109, 3)])
-async def test_why_a_request_was_not_taken_comes_back_as_its_code(code: int, times: int) -> None:
-    """An unknown procedure is told at once; what may go well next time is tried three times."""
+async def test_com_code_is_returned(code: int, times: int) -> None:
+    """An unknown procedure at once; a temporary error after three attempts."""
     connection, instrument = await connected()
     instrument.faults.extend([not_taken(code)] * times)
     assert (await connection.call(Rpc.TMC_SET_PRISM_CORR, 0.0)).code == code
     assert not instrument.faults
 
 
-async def test_damaged_answers_only_end_in_an_error() -> None:
-    """Three damaged replies in a row are a fault of the cable."""
+async def test_damaged_replies_raise() -> None:
+    """Three in a row are a fault of the cable."""
     connection, instrument = await connected()
     instrument.faults.extend([damaged] * 3)
     with pytest.raises(InstrumentError, match="only damaged replies"):
         await connection.call(Rpc.TMC_GET_FULL_MEAS, 1)
-    await echoed(connection, 2)
+    await check_echo(connection, 2)
 
 
-async def test_an_abortion_ends_a_search() -> None:
-    """A search whose caller was cancelled is ended, and the instrument answers again at once."""
+async def test_abort_ends_search() -> None:
+    """The instrument responds again at once."""
     connection, instrument = await connected()
     instrument.faults.append(late(20.0))
     task = asyncio.create_task(connection.call(Rpc.AUT_PS_SEARCH_WINDOW, timeout_s=60.0))
@@ -226,20 +226,20 @@ async def test_an_abortion_ends_a_search() -> None:
     task.cancel()
     with pytest.raises(asyncio.CancelledError):
         await task
-    abortion = asyncio.create_task(connection.abort())
+    abort = asyncio.create_task(connection.abort())
     await asyncio.sleep(0)
-    assert instrument.heard[-1] == b"c"
+    assert instrument.received[-1] == b"c"
     port: MemoryPort = connection.port  # type: ignore[assignment]
     transaction = instrument.requests[0].split(b",")[2].rstrip(b":").decode()
     port.come(0.5, f"%R1P,0,{transaction}:8\r\n".encode())
-    await abortion
+    await abort
     assert now_s() == pytest.approx(1.5)
-    await echoed(connection, 2)
-    assert now_s() == pytest.approx(1.5 + ANSWER_S)
+    await check_echo(connection, 2)
+    assert now_s() == pytest.approx(1.5 + REPLY_S)
 
 
-async def test_an_abortion_that_is_not_answered_brings_the_line_into_step() -> None:
-    """The reply of what was ended may be lost as well."""
+async def test_abort_without_reply_resynchronises() -> None:
+    """The reply of the aborted procedure may be lost as well."""
     connection, instrument = await connected()
     instrument.faults.append(silent)
     task = asyncio.create_task(connection.call(Rpc.AUT_PS_SEARCH_WINDOW, timeout_s=60.0))
@@ -248,45 +248,45 @@ async def test_an_abortion_that_is_not_answered_brings_the_line_into_step() -> N
     with pytest.raises(asyncio.CancelledError):
         await task
     await connection.abort()
-    await echoed(connection, 2)
-    assert now_s() == pytest.approx(4.0 + 2 * ANSWER_S)
+    await check_echo(connection, 2)
+    assert now_s() == pytest.approx(4.0 + 2 * REPLY_S)
 
 
-async def test_an_abortion_of_nothing_does_no_harm() -> None:
-    """The instrument's question mark is nobody's reply."""
+async def test_abort_without_procedure_is_harmless() -> None:
+    """The instrument's question mark is no reply."""
     connection, _ = await connected()
     await connection.abort()
-    await echoed(connection, 2)
+    await check_echo(connection, 2)
 
 
-async def test_a_search_whose_answer_was_lost_is_not_waited_for() -> None:
-    """The answer to what was asked behind it comes without the search's own: that will not come any more."""
+async def test_lost_reply_of_search_is_detected() -> None:
+    """A probe is answered without it, and replies come in order."""
     connection, instrument = await connected()
     instrument.faults.append(silent)
     with pytest.raises(InstrumentError, match="AUT_PS_SEARCH_WINDOW was lost"):
         await connection.call(Rpc.AUT_PS_SEARCH_WINDOW, timeout_s=90.0)
-    assert now_s() == pytest.approx(4.0 + ANSWER_S)
-    await echoed(connection, 2)
+    assert now_s() == pytest.approx(4.0 + REPLY_S)
+    await check_echo(connection, 2)
 
 
-async def test_a_search_that_takes_long_is_waited_for() -> None:
-    """While the instrument searches it answers nothing; what was asked behind it is answered afterwards."""
+async def test_long_search_is_awaited() -> None:
+    """The instrument does not respond during a search; probes are answered afterwards."""
     connection, instrument = await connected()
     port: MemoryPort = connection.port  # type: ignore[assignment]
     instrument.busy = True
     task = asyncio.create_task(connection.call(Rpc.AUT_PS_SEARCH_WINDOW, timeout_s=90.0))
     await asyncio.sleep(20.5)
     instrument.busy = False
-    asked = [line.split(b",")[2].rstrip(b":").decode() for line in instrument.heard]
+    asked = [line.split(b",")[2].rstrip(b":").decode() for line in instrument.received]
     assert len(asked) == 6
     for number, transaction in enumerate(asked):
-        port.come(number * ANSWER_S, f"%R1P,0,{transaction}:0\r\n".encode())
+        port.come(number * REPLY_S, f"%R1P,0,{transaction}:0\r\n".encode())
     assert (await task).code == 0
-    await echoed(connection, 2)
+    await check_echo(connection, 2)
 
 
-async def test_a_line_that_is_gone_is_told_at_once() -> None:
-    """Whoever waits for a reply is told, and everybody after."""
+async def test_lost_line_raises_at_once() -> None:
+    """The pending call, and every later one."""
     connection, _ = await connected()
     port: MemoryPort = connection.port  # type: ignore[assignment]
     asyncio.get_running_loop().call_later(0.01, port.unplug)
@@ -296,40 +296,40 @@ async def test_a_line_that_is_gone_is_told_at_once() -> None:
     assert now_s() == pytest.approx(0.01)
 
 
-async def test_checksums_go_both_ways() -> None:
-    """A reply whose checksum is wrong is asked for again."""
+async def test_wrong_checksum_repeats_request() -> None:
+    """Requests carry checksums too."""
     connection, instrument = await connected(checksum=True)
 
     def other_value(line: str) -> list[tuple[float, bytes]]:
-        return [(ANSWER_S, line.replace("7654321", "7654421").encode() + b"\r\n")]
+        return [(REPLY_S, line.replace("7654321", "7654421").encode() + b"\r\n")]
 
     instrument.faults.append(other_value)
-    await echoed(connection, 7654321)
+    await check_echo(connection, 7654321)
     assert len(instrument.requests) == 2
     assert instrument.requests[0].count(b",") == 3
 
 
-async def test_the_number_of_decimals_is_what_the_instrument_was_told() -> None:
-    """Real numbers are sent with so many."""
+async def test_decimals_are_as_set() -> None:
+    """Real numbers are sent with this many."""
     connection, instrument = await connected()
     connection.decimals = 4
     await connection.call(Rpc.AUT_FINE_ADJUST, 1 / 3, 0.5, False)
     assert instrument.requests[0].endswith(b":0.3333,0.5,0")
 
 
-async def test_connecting_takes_the_wanted_speed() -> None:
-    """An instrument that answers at once is taken as it is."""
+async def test_connect_at_configured_baud_rate() -> None:
+    """An instrument that responds at once."""
     cable = Cable(FakeInstrument())
     with capture_logs() as logs:
         connection = await connect(cable.open, 115_200, VirtualClock(0), checksum=False)
     assert connection.port is cable.ports[0]
-    assert now_s() == pytest.approx(ANSWER_S)
+    assert now_s() == pytest.approx(REPLY_S)
     assert not logs
 
 
 @pytest.mark.parametrize("garbles", [True, False])
-async def test_connecting_finds_another_speed(garbles: bool) -> None:  # noqa: FBT001 (a parameter of pytest)
-    """Whether it is silent or answers rubbish: the speed at which it answers is found, and said."""
+async def test_connect_finds_other_baud_rate(garbles: bool) -> None:  # noqa: FBT001 (a parameter of pytest)
+    """Whether it is silent or sends garbage; the rate is logged."""
     cable = Cable(FakeInstrument(baud=9600, garbles=garbles), impossible=frozenset({19_200}))
     with capture_logs() as logs:
         connection = await connect(cable.open, 115_200, VirtualClock(0), checksum=False)
@@ -344,11 +344,11 @@ async def test_connecting_finds_another_speed(garbles: bool) -> None:  # noqa: F
             "configured": 115_200,
         }
     ]
-    await echoed(connection, 2)
+    await check_echo(connection, 2)
 
 
-async def test_connecting_tries_the_wanted_speed_every_second() -> None:
-    """An instrument that is switched on while others are tried is found soon."""
+async def test_configured_baud_rate_is_tried_every_second() -> None:
+    """An instrument that is switched on meanwhile is found soon."""
     instrument = FakeInstrument(baud=57_600)
     cable = Cable(instrument)
     instrument.faults.extend([silent] * 4)
@@ -357,8 +357,8 @@ async def test_connecting_tries_the_wanted_speed_every_second() -> None:
     assert connection.port.baud == 57_600
 
 
-async def test_connecting_gives_up_when_nothing_answers_at_any_speed() -> None:
-    """Every speed has been tried; the message says what to look at, and no port stays open."""
+async def test_connect_fails_after_all_baud_rates() -> None:
+    """The message says what to check, and no port stays open."""
     cable = Cable(FakeInstrument(faults=deque([silent] * 100)))
     with pytest.raises(InstrumentError, match="line: no instrument responds at 115200 baud"):
         await connect(cable.open, 115_200, VirtualClock(0), checksum=False)
@@ -367,15 +367,15 @@ async def test_connecting_gives_up_when_nothing_answers_at_any_speed() -> None:
     assert now_s() < 11
 
 
-async def test_connecting_ends_the_search_of_a_client_before() -> None:
-    """An instrument that searches answers nothing; it is made to stop."""
+async def test_connect_aborts_search_of_earlier_client() -> None:
+    """An instrument does not respond during a search."""
     cable = Cable(FakeInstrument(busy=True))
     await connect(cable.open, 115_200, VirtualClock(0), checksum=False)
-    assert now_s() == pytest.approx(0.5 + ANSWER_S)
+    assert now_s() == pytest.approx(0.5 + REPLY_S)
 
 
-async def test_an_instrument_without_checksums_is_told_apart() -> None:
-    """It answers, but not with checksums: the message says which setting to change."""
+async def test_missing_checksum_support_is_reported() -> None:
+    """The message says which setting to change."""
     instrument = FakeInstrument()
     instrument.faults.append(not_taken(3110))
     cable = Cable(instrument)
@@ -384,17 +384,17 @@ async def test_an_instrument_without_checksums_is_told_apart() -> None:
     assert cable.ports[0].closed
 
 
-async def test_a_port_that_cannot_be_opened_ends_the_attempt() -> None:
-    """Nothing is probed on a device that is not there."""
+async def test_unopenable_port_ends_connect() -> None:
+    """No other baud rate is tried."""
     cable = Cable(FakeInstrument(), impossible=frozenset({115_200}))
     with pytest.raises(InstrumentError, match="cannot be opened at 115200"):
         await connect(cable.open, 115_200, VirtualClock(0), checksum=False)
     assert not cable.ports
 
 
-async def test_closing_closes_the_line() -> None:
-    """Nobody can use it afterwards."""
+async def test_close_closes_port() -> None:
+    """Later calls fail."""
     connection, _ = await connected()
     await connection.close()
     with pytest.raises(InstrumentError):
-        await echoed(connection, 1)
+        await check_echo(connection, 1)

@@ -1,4 +1,4 @@
-"""What goes wrong on the line, and codes from every family: no wrong value, no wrong time, no hang."""
+"""Faults of the line, and return codes of every family: no wrong value, no wrong time, no hang."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
     from tsgt.station import Reading
 
-# A digit that is another one takes a checksum to be seen: see simulation/serial_scripts.py.
+# A changed digit is detected by a checksum only: see harness/serial_scripts.py.
 FAULTS = [fault for fault in LineFault if fault not in (LineFault.NONE, LineFault.WRONG_DIGIT)]
 
 
-async def keep(day: LeicaBench, seconds: float) -> list[Reading]:
-    """Read, and connect again after each error, as the client does; return the readings."""
+async def read_through_errors(day: LeicaBench, seconds: float) -> list[Reading]:
+    """Read, and reconnect after each error, as the client does."""
     readings: list[Reading] = []
     until_s = day.now_s + seconds
     connected = False
@@ -47,7 +47,7 @@ async def keep(day: LeicaBench, seconds: float) -> list[Reading]:
 
 
 def check(day: LeicaBench, readings: list[Reading], *, latency_ms: float = 20.0) -> None:
-    """Every distance was offered, is given once, and has its time."""
+    """Check that every distance was offered, is reported once, and has its time."""
     offered = {offered.instrument_ms: offered for offered in day.station.reported_distances}
     usable = [reading for reading in readings if reading.status.usable]
     times = [reading.instrument_time_ns for reading in usable]
@@ -61,8 +61,8 @@ def check(day: LeicaBench, readings: list[Reading], *, latency_ms: float = 20.0)
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-async def test_a_fault_costs_some_seconds_at_most(fault: LineFault) -> None:
-    """One answer in ten goes wrong in this way: readings stay right, and most of them come."""
+async def test_line_fault_costs_few_readings(fault: LineFault) -> None:
+    """One reply in ten is affected: readings stay correct, and most of them arrive."""
     async with leica_bench() as day:
         await day.begin()
         random = np.random.default_rng(5)
@@ -70,32 +70,32 @@ async def test_a_fault_costs_some_seconds_at_most(fault: LineFault) -> None:
             day.line.faults.script.extend(
                 fault if random.random() < 0.1 else LineFault.NONE for _ in range(30)
             )
-        readings = await keep(day, 60.0)
+        readings = await read_through_errors(day, 60.0)
         check(day, readings)
         day.line.faults.script.clear()
-        after = await keep(day, 10.0)
+        after = await read_through_errors(day, 10.0)
     assert len([reading for reading in after if reading.status.usable]) >= 14
 
 
 @pytest.mark.parametrize("seed", range(12))
-async def test_scripts_of_faults(seed: int) -> None:
+async def test_mixed_line_faults_give_no_wrong_reading(seed: int) -> None:
     """Several of them at once, with checksums or without."""
     random = np.random.default_rng(seed)
     async with leica_bench(leica_config(checksum=bool(seed % 2)), seed=seed) as day:
         for _ in range(600):
             fault = FAULTS[random.integers(len(FAULTS))] if random.random() < 0.05 else LineFault.NONE
             day.line.faults.script.append(fault)
-        readings = await keep(day, 60.0)
+        readings = await read_through_errors(day, 60.0)
     check(day, readings)
     assert len(readings) > 40
 
 
 @pytest.mark.parametrize("code", sorted(set(ReturnCode)))
-async def test_any_code_is_survived(code: ReturnCode) -> None:
-    """Whatever a measurement and the lock are answered with, for a while: it goes on when the answers do."""
+async def test_any_return_code_is_survived(code: ReturnCode) -> None:
+    """Measurements and lock queries return it for a while; tracking continues afterwards."""
     async with leica_bench() as day:
         await day.begin()
-        readings = await keep(day, 3.0)
+        readings = await read_through_errors(day, 3.0)
         com = 3072 <= code < 3328
         for rpc in (Rpc.TMC_GET_FULL_MEAS, Rpc.MOT_READ_LOCK_STATUS):
             forced = (
@@ -104,22 +104,22 @@ async def test_any_code_is_survived(code: ReturnCode) -> None:
                 else ForcedResponse(code=code, rpc=rpc, times=8)
             )
             day.station.server.forced.append(forced)
-        readings += await keep(day, 30.0)
+        readings += await read_through_errors(day, 30.0)
         check(day, readings)
-        after = await keep(day, 20.0)
+        after = await read_through_errors(day, 20.0)
     assert len([reading for reading in after if reading.status.usable]) >= 20
 
 
-async def test_a_silent_line_raises() -> None:
-    """Nothing comes any more: an error within some seconds, and another one for each attempt to connect."""
+async def test_silent_line_raises() -> None:
+    """An error within some seconds, and for each attempt to connect."""
     async with leica_bench() as day:
         await day.begin()
         await day.read_for(5.0)
         day.line.faults.drop_responses = True
-        begun_s = day.now_s
+        start_s = day.now_s
         with pytest.raises(InstrumentError):
             await day.read_for(30.0)
-        assert day.now_s - begun_s < 12.0
+        assert day.now_s - start_s < 12.0
         await day.instrument.close()
         with pytest.raises(InstrumentError):
             await day.instrument.connect()
@@ -128,8 +128,8 @@ async def test_a_silent_line_raises() -> None:
         assert (await day.instrument.read()).status.usable
 
 
-async def test_a_search_that_was_switched_off_is_not_waited_for() -> None:
-    """Its answer never comes. The driver notices within 4 s of the instrument being there again, not after the search's 90."""
+async def test_power_cycle_during_search_is_detected() -> None:
+    """The search's reply never comes: an error within 4 s of the instrument's return, not after the search's timeout of 90 s."""
     async with leica_bench() as day:
         await day.begin()
         day.station.blocked = True
@@ -142,8 +142,8 @@ async def test_a_search_that_was_switched_off_is_not_waited_for() -> None:
             await day.read_for(BOOT_NS / 1e9 + 4.1)
 
 
-async def test_another_speed_is_found() -> None:
-    """The instrument has been set to 19200 by somebody."""
+async def test_other_baud_rate_is_found() -> None:
+    """The instrument has been set to 19200."""
     async with leica_bench() as day:
         day.station.baud = 19_200
         await day.begin()

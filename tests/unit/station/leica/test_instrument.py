@@ -1,4 +1,4 @@
-"""The driver for Leica instruments, on a simulated instrument at the end of a simulated line."""
+"""The Leica driver with a simulated instrument on a simulated line."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from tsgt.station.geocom import GeoComConnection
 
 
-def hidden(start_s: float, end_s: float) -> StatusFaultConfig:
-    """Return a time in which nothing can be seen."""
+def occlusion(start_s: float, end_s: float) -> StatusFaultConfig:
+    """Return an occlusion."""
     return StatusFaultConfig(station=1, status="no_target", start_s=start_s, end_s=end_s)
 
 
@@ -36,8 +36,8 @@ def hidden(start_s: float, end_s: float) -> StatusFaultConfig:
 
 
 @pytest.mark.parametrize("rate_hz", [2.5, 7.0, 20.0])
-async def test_every_distance_that_was_offered_is_read_once(rate_hz: float) -> None:
-    """Whatever the rate: no repeats, nothing left out, values as they were offered."""
+async def test_every_offered_distance_is_read_once(rate_hz: float) -> None:
+    """At any rate: no repeats, no gaps, unchanged values."""
     async with leica_bench(rate_hz=rate_hz) as day:
         await day.begin()
         readings = await day.read_for(60.0)
@@ -48,8 +48,8 @@ async def test_every_distance_that_was_offered_is_read_once(rate_hz: float) -> N
         assert reading.slope_distance_m == pytest.approx(source.distance_m, abs=1e-9)
 
 
-async def test_hardly_a_tick_of_a_fast_instrument_is_missed() -> None:
-    """At 20 Hz with short answers nearly every tick is there."""
+async def test_fast_instrument_is_polled_fast_enough() -> None:
+    """At 20 Hz with short replies nearly every distance is read."""
     model = InstrumentModelConfig(processing_min_ms=5.0, processing_max_ms=10.0)
     async with leica_bench(rate_hz=20.0, model=model) as day:
         await day.begin()
@@ -57,8 +57,8 @@ async def test_hardly_a_tick_of_a_fast_instrument_is_missed() -> None:
     assert len(readings) > 0.97 * 60 * 20
 
 
-async def test_times_are_those_of_the_distances() -> None:
-    """After half a minute a stamp without the fastest way of an answer, 20 ms here, is hardly off."""
+async def test_timestamps_match_distances() -> None:
+    """After half a minute, with the minimum latency of 20 ms subtracted."""
     async with leica_bench(leica_config(latency_ms=20.0)) as day:
         await day.begin()
         await day.read_for(30.0)
@@ -70,8 +70,8 @@ async def test_times_are_those_of_the_distances() -> None:
     assert all(r.received_ns is not None and r.received_ns > r.at_ns for r in readings)
 
 
-async def test_about_two_questions_are_asked_for_a_slow_distance() -> None:
-    """Where distances come every 400 ms, most questions in between would be for nothing."""
+async def test_slow_distances_are_polled_about_twice() -> None:
+    """At intervals of 400 ms most polls in between would be useless."""
     async with leica_bench() as day:
         await day.begin()
         await day.read_for(20.0)
@@ -89,8 +89,8 @@ async def test_about_two_questions_are_asked_for_a_slow_distance() -> None:
     assert asked < 2.6 * len(readings)
 
 
-async def test_a_cancelled_reading_costs_nothing() -> None:
-    """Whoever gives up waiting gets the same distances with the next calls."""
+async def test_cancelled_read_loses_no_reading() -> None:
+    """The next calls return the same distances."""
     async with leica_bench() as day:
         await day.begin()
         times = []
@@ -105,8 +105,8 @@ async def test_a_cancelled_reading_costs_nothing() -> None:
 # --- The lock -----------------------------------------------------------------------------------------------------
 
 
-async def test_a_lock_is_kept_over_a_connection() -> None:
-    """Neither connecting nor setting up lets the prism go, for which a person would be needed."""
+async def test_lock_is_kept_across_connections() -> None:
+    """Connecting and setting up do not release the prism, which would require the operator."""
     async with leica_bench() as day:
         await day.begin()
         await day.read_for(1.0)
@@ -117,9 +117,9 @@ async def test_a_lock_is_kept_over_a_connection() -> None:
         assert not day.station.beeps
 
 
-async def test_a_short_occlusion_is_bridged_by_the_instrument() -> None:
-    """While it predicts nothing is searched; readings say that there is no prism, once, and go on after it."""
-    async with leica_bench(faults=[hidden(20.0, 21.0)]) as day:
+async def test_short_occlusion_is_bridged_by_prediction() -> None:
+    """No search starts meanwhile; readings report NO_TARGET once, and continue."""
+    async with leica_bench(faults=[occlusion(20.0, 21.0)]) as day:
         await day.begin()
         await day.read_for(19.0 - day.now_s)
         during = await day.read_for(2.0)
@@ -128,9 +128,9 @@ async def test_a_short_occlusion_is_bridged_by_the_instrument() -> None:
     assert after.prism == 1
 
 
-async def test_a_lost_prism_is_found_again() -> None:
-    """After a long occlusion the telescope searches, and tracks on; readings say NO_TARGET at least every second."""
-    async with leica_bench(faults=[hidden(20.0, 40.0)]) as day:
+async def test_lost_target_is_reacquired() -> None:
+    """After a long occlusion the telescope searches; readings report NO_TARGET at least every second."""
+    async with leica_bench(faults=[occlusion(20.0, 40.0)]) as day:
         await day.begin()
         await day.read_for(22.0 - day.now_s)
         lost = await day.read_for(17.0)
@@ -142,8 +142,8 @@ async def test_a_lost_prism_is_found_again() -> None:
         assert len(await day.read_for(10.0)) >= 24
 
 
-async def test_the_master_says_where_to_look() -> None:
-    """A prism that has gone elsewhere is found at once where the order says it is."""
+async def test_target_is_reacquired_at_direction_from_master() -> None:
+    """A prism that has moved elsewhere is found at once."""
     async with leica_bench(leica_config(search_window_deg=10.0)) as day:
         await day.begin()
         reading = await day.instrument.read()
@@ -158,8 +158,8 @@ async def test_the_master_says_where_to_look() -> None:
     assert found.prism == 1
 
 
-async def test_an_order_leaves_a_search_alone_that_has_found_the_prism() -> None:
-    """One that comes while the instrument locks in does not send the telescope elsewhere."""
+async def test_command_does_not_interrupt_lock_on() -> None:
+    """One that arrives while the instrument locks on does not turn the telescope elsewhere."""
     async with leica_bench(leica_config(search_window_deg=10.0)) as day:
         await day.begin()
         reading = await day.instrument.read()
@@ -175,13 +175,13 @@ async def test_an_order_leaves_a_search_alone_that_has_found_the_prism() -> None
     assert found.prism == 1
 
 
-async def test_a_lock_by_hand_during_a_search_that_fails_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The next search would begin with letting go of it."""
+async def test_manual_lock_during_failing_search_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next search would release it."""
     windows = []
     async with leica_bench() as day:
 
-        async def fail(_: TargetSearch, look: SearchWindow) -> bool:
-            windows.append(look)
+        async def fail(_: TargetSearch, window: SearchWindow) -> bool:
+            windows.append(window)
             day.station.blocked = False
             day.station.lock_manually(1)
             return False
@@ -195,8 +195,8 @@ async def test_a_lock_by_hand_during_a_search_that_fails_is_kept(monkeypatch: py
     assert len(windows) == 1
 
 
-async def test_a_lock_by_hand_during_a_search_ends_that() -> None:
-    """The instrument's answer that it was ended is no reason to search on."""
+async def test_manual_lock_ends_search() -> None:
+    """The reply that it was aborted does not start another search."""
     async with leica_bench() as day:
         await day.begin()
         await day.read_for(3.0)
@@ -211,8 +211,8 @@ async def test_a_lock_by_hand_during_a_search_ends_that() -> None:
 
 
 @pytest.mark.parametrize(("misses", "called"), [(1, False), (3, True)])
-async def test_a_robot_that_drives_on_after_a_sweep_is_swept_for_again(misses: int, called: bool) -> None:  # noqa: FBT001
-    """It cannot be far, so that is done before a person is called; but not for ever."""
+async def test_sweep_is_repeated_for_moving_robot(misses: int, called: bool) -> None:  # noqa: FBT001
+    """The robot is near, so the operator is called only after some sweeps."""
     async with leica_bench() as day:
         await day.begin()
         await day.read_for(3.0)
@@ -228,32 +228,32 @@ async def test_a_robot_that_drives_on_after_a_sweep_is_swept_for_again(misses: i
 
 
 class LockedByHand:
-    """A line to an instrument that finds the prism; before it can point at it, a person ends that and locks in."""
+    """A line to an instrument whose sweep finds the prism, and whose fine adjustment the operator replaces by a manual lock."""
 
     def __init__(self) -> None:
-        self.asked: list[Rpc] = []
+        self.called: list[Rpc] = []
 
     async def call(self, rpc: Rpc, *_: object, **__: object) -> Reply:
-        """Answer as that instrument does."""
-        self.asked.append(rpc)
-        values = (int(Rpc.AUT_FINE_ADJUST in self.asked),) if rpc is Rpc.MOT_READ_LOCK_STATUS else ()
+        """Reply as that instrument does."""
+        self.called.append(rpc)
+        values = (int(Rpc.AUT_FINE_ADJUST in self.called),) if rpc is Rpc.MOT_READ_LOCK_STATUS else ()
         code = ReturnCode.ABORT if rpc is Rpc.AUT_FINE_ADJUST else ReturnCode.OK
         return Reply(code, values, 0, 1)
 
 
-async def test_a_lock_by_hand_after_a_sweep_is_kept() -> None:
-    """A prism that could not be pointed at is swept for again only while nobody has locked in on it."""
+async def test_manual_lock_after_sweep_is_kept() -> None:
+    """A sweep is repeated only while there is no lock."""
     line = LockedByHand()
     target_search = TargetSearch(cast("GeoComConnection", line), power_search=True)
     assert await target_search.search(
         SearchWindow("searching", sweep=True, centre=None, width_rad=0.1, height_rad=0.1)
     )
-    assert line.asked.count(Rpc.AUT_PS_SEARCH_WINDOW) == 1
+    assert line.called.count(Rpc.AUT_PS_SEARCH_WINDOW) == 1
 
 
-async def test_a_person_is_called_when_nothing_helps() -> None:
-    """After all searches it beeps and says what is to be done; locked in by hand, it goes on."""
-    async with leica_bench(faults=[hidden(5.0, 200.0)]) as day:
+async def test_operator_is_called_after_all_searches() -> None:
+    """It beeps and reports the required action; after a manual lock it continues."""
+    async with leica_bench(faults=[occlusion(5.0, 200.0)]) as day:
         await day.begin()
         await day.read_for(100.0)
         assert day.station.beeps
@@ -264,8 +264,8 @@ async def test_a_person_is_called_when_nothing_helps() -> None:
         assert day.instrument.condition.problem == ""
 
 
-async def test_another_prism_needs_a_person() -> None:
-    """Nothing tells prisms apart: until somebody has turned the telescope, and lets it rest, there is no target."""
+async def test_prism_change_requires_operator() -> None:
+    """Nothing tells prisms apart: there is no target until the operator has turned the telescope and lets it rest."""
     async with leica_bench() as day:
         await day.begin()
         await day.read_for(2.0)
@@ -284,8 +284,8 @@ async def test_another_prism_needs_a_person() -> None:
         assert day.instrument.condition.problem == ""
 
 
-async def test_without_the_licence_a_person_does_it_all() -> None:
-    """It is said once; distances of what a person points at and locks in on are measured."""
+async def test_operator_points_without_licence() -> None:
+    """It is reported once; the target that the operator locks on is measured."""
     async with leica_bench() as day:
         day.station.robotic_licence = False
         await day.begin()
@@ -294,8 +294,8 @@ async def test_without_the_licence_a_person_does_it_all() -> None:
         assert "GeoCOM Robotic" in day.instrument.condition.problem
 
 
-async def test_a_change_of_prism_survives_the_cable() -> None:
-    """Unplugged while it waits for a person: it still does afterwards, and takes no old prism for the new one."""
+async def test_prism_change_survives_reconnection() -> None:
+    """Unplugged while it waits for the operator, it still waits afterwards, and does not take the old prism for the new one."""
     async with leica_bench() as day:
         await day.begin()
         await day.read_for(2.0)
@@ -308,8 +308,8 @@ async def test_a_change_of_prism_survives_the_cable() -> None:
         assert {reading.status for reading in await day.read_for(8.0)} == {Status.NO_TARGET}
 
 
-async def test_another_prism_is_found_where_the_master_says() -> None:
-    """No person is needed then."""
+async def test_new_prism_is_found_at_direction_from_master() -> None:
+    """The operator is not required then."""
     async with leica_bench() as day:
         await day.begin()
         await day.read_for(2.0)
@@ -325,8 +325,8 @@ async def test_another_prism_is_found_where_the_master_says() -> None:
 # --- What the instrument says of itself ---------------------------------------------------------------------------
 
 
-async def test_faults_have_their_status() -> None:
-    """Not level, a wrong correction, too close: each is said, and tracking goes on afterwards."""
+async def test_faults_are_reported_as_status() -> None:
+    """Not level, a wrong correction, too close; tracking continues afterwards."""
     faults = [
         StatusFaultConfig(station=1, status="tilt", start_s=10.0, end_s=15.0),
         StatusFaultConfig(station=1, status="wrong_distance", start_s=20.0, end_s=25.0),
@@ -341,8 +341,8 @@ async def test_faults_have_their_status() -> None:
     assert all((reading.slope_distance_m is not None) == reading.status.usable for reading in readings)
 
 
-async def test_it_is_set_up_as_configured() -> None:
-    """Reflector, constant, mode, air and the rest are what is read back, and the record says so."""
+async def test_settings_are_as_configured() -> None:
+    """Reflector, constant, mode, atmosphere and the rest are read back into the record."""
     config = leica_config(
         prism_type="360",
         prism_constant_mm=None,
@@ -366,8 +366,8 @@ async def test_it_is_set_up_as_configured() -> None:
     assert record.angle_delay_ns == 3_000_000
 
 
-async def test_the_air_can_change_while_it_tracks() -> None:
-    """No lock is lost, the record follows; nonsense is refused and tracking goes on."""
+async def test_atmosphere_is_set_while_tracking() -> None:
+    """The lock is kept and the record updated; invalid values are refused and tracking continues."""
     async with leica_bench() as day:
         await day.begin()
         await day.instrument.read()
@@ -381,8 +381,8 @@ async def test_the_air_can_change_while_it_tracks() -> None:
         assert (await day.instrument.read()).status is Status.OK
 
 
-async def test_a_low_battery_is_said() -> None:
-    """With its charge, so that somebody can bring another one."""
+async def test_low_battery_is_reported() -> None:
+    """With its charge."""
     async with leica_bench() as day:
         day.station.battery_percent = 9.0
         await day.begin()
@@ -395,8 +395,8 @@ async def test_a_low_battery_is_said() -> None:
 
 
 @pytest.mark.parametrize("faces", [1, 2])
-async def test_single_measurements_of_a_foil(faces: int) -> None:
-    """True distance to the foil, in one face or two; without a target it says so; then it tracks again by itself."""
+async def test_single_measurement_of_reflective_tape(faces: int) -> None:
+    """The true distance in one face or two; NO_TARGET without a target; tracking resumes afterwards."""
     async with leica_bench(leica_config(target_faces=faces)) as day:
         await day.begin()
         await day.read_for(3.0)
@@ -404,19 +404,19 @@ async def test_single_measurements_of_a_foil(faces: int) -> None:
         day.station.aim_at_target(None)
         assert (await day.instrument.measure()).status is Status.NO_TARGET
         day.station.aim_at_target(1)
-        shot = await day.instrument.measure()
-        assert shot.status.usable
-        assert shot.slope_distance_m == pytest.approx(20.6216, abs=0.01)
-        assert shot.horizontal_angle_rad == pytest.approx(math.tau - math.atan2(5, 20), abs=5e-4)
-        assert shot.zenith_angle_rad < math.pi
+        measured = await day.instrument.measure()
+        assert measured.status.usable
+        assert measured.slope_distance_m == pytest.approx(20.6216, abs=0.01)
+        assert measured.horizontal_angle_rad == pytest.approx(math.tau - math.atan2(5, 20), abs=5e-4)
+        assert measured.zenith_angle_rad < math.pi
         await day.instrument.track(1)
         assert (await day.read_until(Status.OK, within_s=30.0)).prism == 1
         assert day.station.settings.prism_constant_m == 0.0
 
 
 @pytest.mark.parametrize("code", [ReturnCode.TMC_BUSY, ReturnCode.FATAL])
-async def test_the_distance_of_the_last_shot_is_not_given_again(code: ReturnCode) -> None:
-    """An instrument that will not forget it has it still, whatever it is pointed at by now."""
+async def test_stored_distance_is_not_reported_again(code: ReturnCode) -> None:
+    """An instrument that fails to clear it still has it, wherever it points."""
     async with leica_bench() as day:
         await day.begin()
         await day.instrument.direct()
@@ -430,8 +430,8 @@ async def test_the_distance_of_the_last_shot_is_not_given_again(code: ReturnCode
             await day.instrument.measure()
 
 
-async def test_a_shot_is_set_up_anew_after_a_power_cycle() -> None:
-    """The instrument has forgotten that the target is a foil; nobody had told that it was off."""
+async def test_single_measurement_is_set_up_after_power_cycle() -> None:
+    """The instrument has lost its target settings, and nothing reported the power cycle."""
     async with leica_bench() as day:
         await day.begin()
         await day.instrument.direct()
@@ -447,25 +447,25 @@ async def test_a_shot_is_set_up_anew_after_a_power_cycle() -> None:
     assert after.slope_distance_m == pytest.approx(before.slope_distance_m, abs=0.01)
 
 
-async def test_the_wrap_of_its_time_costs_some_seconds() -> None:
-    """After 24.8 days its milliseconds are negative: stamps are as good as before, and not as good as distances alone."""
+async def test_wrap_of_instrument_time_is_handled() -> None:
+    """After 24.8 days its milliseconds are negative: timestamps stay as good as before."""
     async with leica_bench() as day:
         day.station._on_since_ns = day.clock.monotonic_ns() - (2**31 - 15_000) * 1_000_000
         await day.begin()
         readings = [reading for reading in await day.read_for(40.0) if reading.status.usable]
         truths = {each.instrument_ms: each.true_ns for each in day.station.reported_distances}
-        late_ms = [
+        errors_ms = [
             (reading.at_ns - truths[reading.instrument_time_ns // 1_000_000]) / 1e6
             for reading in readings
             if reading.instrument_time_ns is not None
         ]
     assert any((reading.instrument_time_ns or 0) < 0 for reading in readings)
-    assert len(late_ms) > 85
-    assert all(15.0 < late < 30.0 for late in late_ms)
+    assert len(errors_ms) > 85
+    assert all(15.0 < error < 30.0 for error in errors_ms)
 
 
-async def test_calls_at_the_wrong_time_are_refused() -> None:
-    """A single measurement while tracking, a reading while not, anything without a connection."""
+async def test_calls_in_wrong_mode_are_refused() -> None:
+    """A single measurement while tracking, a reading while not, anything while disconnected."""
     async with leica_bench() as day:
         with pytest.raises(InstrumentError, match="not connected"):
             await day.instrument.read()
@@ -481,8 +481,8 @@ async def test_calls_at_the_wrong_time_are_refused() -> None:
 # --- Lines and power ----------------------------------------------------------------------------------------------
 
 
-async def test_the_first_reading_comes_soon_after_the_cable() -> None:
-    """Unplugged and plugged in again: with the lock kept, within 2 s of the first attempt, in the same time."""
+async def test_first_reading_follows_reconnection_within_two_seconds() -> None:
+    """With the lock kept, and with consistent timestamps."""
     async with leica_bench() as day:
         await day.begin()
         before = (await day.read_for(20.0))[-1]
@@ -492,20 +492,20 @@ async def test_the_first_reading_comes_soon_after_the_cable() -> None:
         await day.instrument.close()
         await asyncio.sleep(10.0)
         day.line.plugged = True
-        begun_s = day.now_s
+        start_s = day.now_s
         await day.begin()
         reading = await day.instrument.read()
-        took_s = day.now_s - begun_s
+        took_s = day.now_s - start_s
     assert reading.status.usable
     assert took_s < 2.0
     assert before.instrument_time_ns is not None
     assert reading.instrument_time_ns is not None
-    apart_ns = (reading.at_ns - before.at_ns) - (reading.instrument_time_ns - before.instrument_time_ns)
-    assert abs(apart_ns) < 5_000_000
+    drift_ns = (reading.at_ns - before.at_ns) - (reading.instrument_time_ns - before.instrument_time_ns)
+    assert abs(drift_ns) < 5_000_000
 
 
-async def test_a_power_cycle_begins_the_time_anew() -> None:
-    """Its count is near zero then: no stamp is wrong, and after a person has locked in it goes on."""
+async def test_power_cycle_resets_instrument_clock() -> None:
+    """Its count is near zero then: no timestamp is wrong, and readings continue after a manual lock."""
     async with leica_bench(leica_config(latency_ms=20.0)) as day:
         await day.begin()
         await day.read_for(20.0)
@@ -516,19 +516,19 @@ async def test_a_power_cycle_begins_the_time_anew() -> None:
         day.station.switch_on()
         await asyncio.sleep(6.0)
         day.station.lock_manually(1)
-        begun = len(day.station.reported_distances)
+        start = len(day.station.reported_distances)
         await day.begin()
         readings = [r for r in await day.read_for(20.0) if r.status.usable]
-    true_ns = {offered.instrument_ms: offered.true_ns for offered in day.station.reported_distances[begun:]}
+    true_ns = {offered.instrument_ms: offered.true_ns for offered in day.station.reported_distances[start:]}
     assert len(readings) > 40
     for reading in readings:
         assert reading.instrument_time_ns is not None
         assert abs(reading.at_ns - true_ns[reading.instrument_time_ns // 1_000_000]) < 20_000_000
 
 
-async def test_searches_end_with_the_connection() -> None:
-    """Closing in the middle of a search ends it at the instrument too, and leaves nothing running."""
-    async with leica_bench(faults=[hidden(3.0, 60.0)]) as day:
+async def test_close_aborts_search() -> None:
+    """At the instrument too, and no task is left."""
+    async with leica_bench(faults=[occlusion(3.0, 60.0)]) as day:
         await day.begin()
         while "searching" not in day.instrument.condition.activity:
             await day.instrument.read()
@@ -538,8 +538,8 @@ async def test_searches_end_with_the_connection() -> None:
 
 
 @pytest.mark.parametrize("away_s", [0.5, 7.3, 60.0])
-async def test_the_client_reads_again_within_three_seconds(away_s: float) -> None:
-    """From the device being back to the first reading, whenever in the client's pauses that happens."""
+async def test_client_reads_within_three_seconds_of_recovery(away_s: float) -> None:
+    """At any phase of the client's retry delay."""
     readings: list[tuple[float, Status]] = []
     async with leica_bench() as day:
         supervisor = InstrumentSupervisor(

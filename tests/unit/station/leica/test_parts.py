@@ -1,4 +1,4 @@
-"""The smaller parts of the driver for Leica instruments: replies, faces, scheduler, models, wet thermometers."""
+"""Parts of the Leica driver: replies, two faces, poll schedule, models, wet-bulb temperature."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ GOOD = (1.5, 1.6, 1e-6, 0.0, 0.0, 1e-6, 50.5, 12_345)
 
 
 def reply(code: int, *values: float | str) -> Reply:
-    """Return a reply that came at 1 s."""
+    """Return a reply that arrived at 1 s."""
     return Reply(code, values, 0, 1_000_000_000)
 
 
 @pytest.mark.parametrize("code", [0, 1283, 1284])
-def test_usable_codes_give_the_distance(code: int) -> None:
-    """In motion accuracy is not guaranteed, and the distance is as good as it gets."""
+def test_usable_codes_have_a_distance(code: int) -> None:
+    """In motion the accuracy is not guaranteed, and the distance is as good as it gets."""
     got = decode_full_measurement(reply(code, *GOOD))
     assert got.status.usable
     assert (got.distance_m, got.time_ms) == (50.5, 12_345)
@@ -46,8 +46,8 @@ def test_usable_codes_give_the_distance(code: int) -> None:
         (4711, Status.ERROR),
     ],
 )
-def test_other_codes_give_none(code: int, status: Status) -> None:
-    """Whatever stands in the place of the distance."""
+def test_other_codes_have_no_distance(code: int, status: Status) -> None:
+    """Whatever the value of the distance."""
     got = decode_full_measurement(reply(code, *GOOD))
     assert got.status is status
     assert (got.distance_m, got.time_ms) == (None, None)
@@ -69,15 +69,15 @@ def test_other_codes_give_none(code: int, status: Status) -> None:
         ("a", *GOOD[1:]),
     ],
 )
-def test_a_good_code_with_bad_values_gives_no_distance(values: tuple[float | str, ...]) -> None:
-    """A distance of zero is none, and a part of a reply is not filled up."""
+def test_invalid_values_give_no_distance(values: tuple[float | str, ...]) -> None:
+    """A distance of zero is none, and an incomplete reply is not completed."""
     got = decode_full_measurement(reply(0, *values))
     assert not got.status.usable
     assert got.distance_m is None
 
 
-def test_the_mean_of_two_faces_is_free_of_the_axes_errors() -> None:
-    """Collimation and index have opposite signs in the two; also across the zero of the circle."""
+def test_two_face_mean_cancels_axis_errors() -> None:
+    """Collimation and index errors have opposite signs in the two; also across the zero of the circle."""
     for horizontal_rad in (0.00001, 1.0, math.tau - 0.00001):
         collimation, index = 0.0001, 0.0002
         first = FullMeasurement(
@@ -93,15 +93,15 @@ def test_the_mean_of_two_faces_is_free_of_the_axes_errors() -> None:
             0,
         )
         mean = mean_of_two_faces(first, second)
-        apart = math.remainder(mean.horizontal_angle_rad - horizontal_rad, math.tau)
-        assert apart == pytest.approx(0.0, abs=1e-12)
+        difference = math.remainder(mean.horizontal_angle_rad - horizontal_rad, math.tau)
+        assert difference == pytest.approx(0.0, abs=1e-12)
         assert mean.zenith_angle_rad == pytest.approx(1.4)
         assert mean.distance_m == pytest.approx(20.001)
         assert mean.status is Status.LOW_ACCURACY
 
 
-def test_two_faces_of_different_things_are_no_mean() -> None:
-    """Somebody has turned the telescope, or walked through the line of sight."""
+def test_faces_of_different_targets_are_refused() -> None:
+    """The telescope was turned, or the line of sight was interrupted."""
     first = FullMeasurement(1.0, 1.4, 20.0, 1, Status.OK, 0, 0)
     second = FullMeasurement(1.0 + math.pi, math.tau - 1.4, 20.001, 2, Status.OK, 0, 0)
     check_same_target(first, second)
@@ -114,23 +114,23 @@ def test_two_faces_of_different_things_are_no_mean() -> None:
             check_same_target(first, other)
 
 
-def test_a_status_is_repeated_now_and_then() -> None:
-    """At once when it changes, else every half second: enough for people, little for journal and radio."""
+def test_unchanged_status_is_repeated_every_half_second() -> None:
+    """A changed one is reported at once."""
     readings = ReadingFactory(1, 0)
-    given = []
+    reported = []
     for number in range(100):
         status = Status.NO_TARGET if number < 50 else Status.TILT
         measured = FullMeasurement(0.0, 0.0, None, None, status, 0, number * 50 * MS)
         reading = readings.without_distance(measured)
         if reading is not None:
-            given.append((number, reading.status))
-    assert given[0] == (0, Status.NO_TARGET)
-    assert (50, Status.TILT) in given
-    assert len(given) == 10
+            reported.append((number, reading.status))
+    assert reported[0] == (0, Status.NO_TARGET)
+    assert (50, Status.TILT) in reported
+    assert len(reported) == 10
 
 
-def test_the_pace_follows_the_instrument() -> None:
-    """Nothing is waited for until it is known how often distances come, and shortly before the next is asked."""
+def test_polls_follow_the_interval_of_distances() -> None:
+    """At once until the interval is known, then shortly before the next distance is due."""
     scheduler = PollScheduler()
     for number in range(5):
         assert scheduler.next_ns(0, 0) == 0
@@ -141,8 +141,8 @@ def test_the_pace_follows_the_instrument() -> None:
     assert scheduler.interval_ns == 50 * MS
 
 
-def test_a_faster_instrument_is_noticed() -> None:
-    """Whoever sleeps until the next distance sees none between: once in a while nothing is waited for."""
+def test_higher_rate_is_detected() -> None:
+    """Once in a while an interval is polled throughout."""
     scheduler = PollScheduler()
     for number in range(30):
         scheduler.add_distance(400 * number)
@@ -153,8 +153,8 @@ def test_a_faster_instrument_is_noticed() -> None:
     assert 0 < waits.count(False) <= 3
 
 
-def test_models_are_known_by_the_beginning_of_their_names() -> None:
-    """As instruments give them; whoever is unknown has no delays."""
+def test_model_is_identified_by_prefix() -> None:
+    """An unknown model has no delays."""
     assert Identity(model='TS16 P 1" R500').properties.angle_delay_ns == 7_220_000
     assert Identity(model="Leica TS60 I").properties.angle_delay_ns == 4_980_000
     assert Identity(model="MS60").properties.angle_delay_ns == 0
@@ -163,13 +163,13 @@ def test_models_are_known_by_the_beginning_of_their_names() -> None:
 
 
 @pytest.mark.parametrize(("dry_c", "wet_c"), [(12.0, 8.2), (20.0, 15.1), (30.0, 23.9), (0.0, -2.3)])
-def test_a_wet_thermometer_shows_less(dry_c: float, wet_c: float) -> None:
-    """At 60 % relative humidity, by the psychrometric tables."""
+def test_wet_bulb_temperature(dry_c: float, wet_c: float) -> None:
+    """At 60 % relative humidity, against psychrometric tables."""
     assert wet_bulb_temperature_c(dry_c) == pytest.approx(wet_c, abs=0.8)
 
 
-def test_every_configured_word_is_known() -> None:
-    """What the configuration allows, the driver can set."""
+def test_driver_supports_every_configuration_value() -> None:
+    """Prism types and distance modes."""
     fields = LeicaInstrumentConfig.model_fields
     assert set(fields["prism_type"].annotation.__args__) == set(PRISM_TYPES)  # type: ignore[union-attr]
     assert set(fields["distance_mode"].annotation.__args__) == set(TRACKING_MODES)  # type: ignore[union-attr]

@@ -1,4 +1,4 @@
-"""What the client makes of the paper's protocol: which measurement is offered, and how orders are answered."""
+"""The classic link: which measurement is offered, and the responses to commands."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ START = 1_600_000_000_000_000_000
 
 
 class Air:
-    """A radio whose other end is the test."""
+    """A radio connected to the test."""
 
     def __init__(self) -> None:
         self.arriving: asyncio.Queue[Packet] = asyncio.Queue()
@@ -41,14 +41,14 @@ class Air:
         """Do nothing."""
 
     async def transmit(self, payload: bytes, *, at_ns: int | None = None) -> Transmission:
-        """Hand the packet to the test."""
+        """Queue the packet for the test."""
         if self.broken:
             raise RadioError("it is broken")
         self.sent.put_nowait(payload)
         return Transmission(started_at_ns=at_ns or 0, done_at_ns=at_ns or 0, stamp_sigma_ns=1)
 
     async def receive(self) -> Packet:
-        """Return what the test sends."""
+        """Return the test's next packet."""
         return await self.arriving.get()
 
     async def close(self) -> None:
@@ -56,7 +56,7 @@ class Air:
 
 
 class Client:
-    """A link with its session, and the orders that have come."""
+    """A link with its session, and the commands received."""
 
     def __init__(self, group: asyncio.TaskGroup) -> None:
         self.air = Air()
@@ -72,7 +72,7 @@ class Client:
         )
 
     def measure(self, stamp_ns: int, *, prism: int = 1, status: Status = Status.OK) -> PolarMeasurement:
-        """Make a measurement."""
+        """Return a measurement."""
         return PolarMeasurement(
             station=3,
             prism=prism,
@@ -86,7 +86,7 @@ class Client:
             host_time_ns=stamp_ns,
         )
 
-    async def say(self, payload: bytes) -> None:
+    async def send(self, payload: bytes) -> None:
         """Send a request."""
         packet = Packet(
             payload=payload,
@@ -100,16 +100,16 @@ class Client:
 
     async def ask(self, payload: bytes) -> Reply | None:
         """Send a request and return the reply."""
-        await self.say(payload)
-        return await self.answer()
+        await self.send(payload)
+        return await self.reply()
 
-    async def answer(self) -> Reply | None:
-        """Return what has been sent; None where nothing was."""
+    async def reply(self) -> Reply | None:
+        """Return the next reply; None without one."""
         await asyncio.sleep(0.001)
         return decode_reply(self.air.sent.get_nowait()) if self.air.sent.qsize() else None
 
     async def poll(self) -> MeasurementMessage:
-        """Ask for data, of a station that has been synchronised."""
+        """Ping and poll a measurement."""
         await self.ask(b"e3")
         reply = await self.ask(b"t3")
         assert isinstance(reply, MeasurementMessage)
@@ -126,8 +126,8 @@ async def client() -> AsyncGenerator[Client]:
         talking.cancel()
 
 
-async def test_the_master_gets_the_newest_again_and_again() -> None:
-    """Bit for bit the raw values, and the host's stamp."""
+async def test_newest_measurement_is_repeated() -> None:
+    """Raw values bit for bit, and the host's timestamp."""
     async with client() as made:
         made.link.offer(made.measure(START))
         made.link.offer(made.measure(START + 400 * MS))
@@ -143,7 +143,7 @@ async def test_the_master_gets_the_newest_again_and_again() -> None:
 
 
 @pytest.mark.parametrize(
-    ("verdict", "raw"),
+    ("status", "raw"),
     [
         (Status.OK, 0),
         (Status.LOW_ACCURACY, 0),
@@ -154,23 +154,23 @@ async def test_the_master_gets_the_newest_again_and_again() -> None:
         (Status.ANGLE_ONLY, 4),
     ],
 )
-async def test_every_status_reaches_the_master(verdict: Status, raw: int) -> None:
-    """Seven verdicts become five numbers on the air."""
+async def test_every_status_is_encoded(status: Status, raw: int) -> None:
+    """Seven statuses become five codes on the air."""
     async with client() as made:
-        made.link.offer(made.measure(START, status=verdict))
+        made.link.offer(made.measure(START, status=status))
         message = await made.poll()
     assert (message.status, message.time_ns) == (raw, START)
 
 
-async def test_what_the_disk_held_up_is_not_offered_as_another_prism() -> None:
-    """After a change of prism a late line of the old one is journalled, and that is all."""
+async def test_delayed_measurement_of_old_prism_is_not_offered() -> None:
+    """It is journalled only."""
     async with client() as made:
         late = made.measure(START)
-        await made.say(b"n32")
+        await made.send(b"n32")
         assert made.commands == [TrackCommand(2)]
         made.session.apply(TrackCommand(2))
         made.link.respond(TrackCommand(2), ok=True)
-        assert await made.answer() == Acknowledgement("n", ok=True)
+        assert await made.reply() == Acknowledgement("n", ok=True)
         made.link.offer(late)
         assert (await made.poll()).time_ns == 0
         made.link.offer(made.measure(START + MS, prism=2))
@@ -181,10 +181,8 @@ async def test_what_the_disk_held_up_is_not_offered_as_another_prism() -> None:
 
 
 @pytest.mark.parametrize(("sigma_ns", "stamp_ms"), [(MS, -40), (29 * MS, 0)])
-async def test_a_ping_that_was_found_without_its_interrupt_is_not_stamped_too_early(
-    sigma_ns: int, stamp_ms: int
-) -> None:
-    """The driver's guess may lie 50 ms before the packet's end; the master's bounds rest on stamps that are never early."""
+async def test_ping_without_interrupt_is_not_timestamped_early(sigma_ns: int, stamp_ms: int) -> None:
+    """The driver's estimate may precede the packet's end by 50 ms; the master's bounds require timestamps that are never early."""
     async with client() as made:
         found_ns = made.clock.monotonic_ns()
         made.air.arriving.put_nowait(
@@ -196,17 +194,17 @@ async def test_a_ping_that_was_found_without_its_interrupt_is_not_stamped_too_ea
                 stamp_sigma_ns=sigma_ns,
             )
         )
-        assert await made.answer() is not None
+        assert await made.reply() is not None
         assert await made.ask(b"s3") == TimeReply(START + found_ns + stamp_ms * MS)
 
 
-async def test_a_shot_is_answered_whatever_becomes_of_it() -> None:
-    """In direct mode `t` is an order for one single measurement; its answer carries it, or says that there is none."""
+async def test_single_measurement_always_gets_a_response() -> None:
+    """In direct mode `t` requests a single measurement; the response has it, or an error status."""
     async with client() as made:
-        await made.say(b"d3")
+        await made.send(b"d3")
         made.link.respond(DirectCommand(), ok=True)
-        assert await made.answer() == Acknowledgement("d", ok=True)
-        await made.say(b"t3")
+        assert await made.reply() == Acknowledgement("d", ok=True)
+        await made.send(b"t3")
         assert made.commands == [DirectCommand(), MeasureCommand()]
         made.link.respond_single(
             TargetRecord(
@@ -220,43 +218,43 @@ async def test_a_shot_is_answered_whatever_becomes_of_it() -> None:
                 instrument_time_ns=None,
             )
         )
-        message = await made.answer()
+        message = await made.reply()
         assert isinstance(message, MeasurementMessage)
         assert (message.status, message.time_ns, message.slope_distance_m) == (0, START + MS, 7.5)
-        await made.say(b"t3")
+        await made.send(b"t3")
         made.link.respond_single(None)
-        failed = await made.answer()
+        failed = await made.reply()
         assert isinstance(failed, MeasurementMessage)
         assert failed.status == 3
 
 
-async def test_what_the_master_cannot_order_is_not_answered() -> None:
+async def test_search_result_is_not_sent() -> None:
     """There is no search in this protocol."""
     async with client() as made:
         made.link.respond(SearchCommand(), ok=True)
-        assert await made.answer() is None
+        assert await made.reply() is None
 
 
-async def test_an_answer_that_nobody_waits_for_is_not_sent() -> None:
-    """After twenty seconds the master asks others; nor does a radio that fails stop the client."""
+async def test_expired_response_is_not_sent() -> None:
+    """After twenty seconds the master polls others. A failing radio does not stop the client either."""
     async with client() as made:
-        await made.say(b"d3")
+        await made.send(b"d3")
         await asyncio.sleep(21.0)
         made.link.respond(DirectCommand(), ok=True)
-        assert await made.answer() is None
-        await made.say(b"n3")
+        assert await made.reply() is None
+        await made.send(b"n3")
         made.air.broken = True
         made.link.respond(TrackCommand(None), ok=True)
-        assert await made.answer() is None
+        assert await made.reply() is None
 
 
-async def test_the_status_tells_of_the_master() -> None:
-    """Of packets for this station only; what the protocol does not have is null."""
+async def test_status_reports_packets_for_this_station() -> None:
+    """Fields that the protocol lacks are null."""
     async with client() as made:
         assert made.link.status().master_received_ns is None
-        await made.say(b"t2")
+        await made.send(b"t2")
         assert made.link.status().master_received_ns is None
-        await made.say(b"t3")
+        await made.send(b"t3")
         status = made.link.status()
         assert status.master_received_ns is not None
         assert abs(status.master_received_ns - START) < 10 * MS

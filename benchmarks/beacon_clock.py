@@ -10,20 +10,18 @@ import argparse
 import copy
 import json
 import statistics
-import time
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 from harness.beacon_scenarios import BEACON_SCENARIOS, run_beacon_scenario
+from measuring import best_s
 
 from tsgt.timesync import BeaconClock
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from harness.beacon_scenarios import BeaconScenario, Told
+    from harness.beacon_scenarios import BeaconScenario, ReportedTime
 
 SETTLED_S = 5.0
 """Live figures are of what is measured after this."""
@@ -75,7 +73,7 @@ def main() -> None:
 
 def row(scenario: BeaconScenario, seeds: int) -> Row:
     """Run a scenario with seeds 0 and up."""
-    told = [t for seed in range(seeds) for t in run_beacon_scenario(scenario, seed).told]
+    told = [t for seed in range(seeds) for t in run_beacon_scenario(scenario, seed).times]
     live = [t for t in told if t.live and t.measured_s >= SETTLED_S]
     late = [t for t in told if not t.live and t.measured_s >= SETTLED_S]
     ratios = [abs(t.error_us) / t.bound_us for t in told]
@@ -95,7 +93,7 @@ def row(scenario: BeaconScenario, seeds: int) -> Row:
     )
 
 
-def _error(told: list[Told], share: float) -> float:
+def _error(told: list[ReportedTime], share: float) -> float:
     return float(np.quantile([abs(t.rounded_us) for t in told], share))
 
 
@@ -108,23 +106,13 @@ def cost_us() -> dict[str, float]:
         clock.add(received_ns, sent_us, 20_000)
     adding, live = [], []
     for received_ns, sent_us in pairs[FULL:]:
-        adding.append(_seconds(partial(clock.add, received_ns, sent_us, 20_000)))
-        live.append(_seconds(partial(clock.at, received_ns - FRAME_NS // 2)))
-    firsts = [_seconds(partial(copy.deepcopy(clock).at, pairs[FULL][0])) for _ in range(5)]
-    past = [_seconds(partial(clock.at, received_ns + 1)) for received_ns, _ in reversed(pairs[:FULL])]
+        adding.append(best_s(partial(clock.add, received_ns, sent_us, 20_000), 1))
+        live.append(best_s(partial(clock.at, received_ns - FRAME_NS // 2), 1))
+    firsts = [best_s(partial(copy.deepcopy(clock).at, pairs[FULL][0]), 1) for _ in range(5)]
+    past = [best_s(partial(clock.at, received_ns + 1), 1) for received_ns, _ in reversed(pairs[:FULL])]
     return {
         "add": 1e6 * statistics.median(adding),
         "at, live": 1e6 * statistics.median(live),
         "at, one after the other of an outage": 1e6 * statistics.median(past),
         "at, the first of them": 1e6 * statistics.median(firsts),
     }
-
-
-def _seconds(call: Callable[[], object]) -> float:
-    start_s = time.perf_counter()
-    call()
-    return time.perf_counter() - start_s
-
-
-if __name__ == "__main__":
-    main()

@@ -1,8 +1,8 @@
-"""What the clock of a station's computer may do between beacons, and how :class:`BeaconClock` bears it.
+"""Scenarios of a station's clock between beacons, and the errors of :class:`BeaconClock` in each.
 
-Only the clock is simulated: stamps of beacons on both sides, measurements in between, and a station that tells their
-times in its slots as it does with the protocol ``superframe``: new ones at once, those of an outage when beacons are
-known from after it, newest first. All are compared with the truth, which is the master's clock without jitter.
+Only the clock is simulated: timestamps of beacons on both sides, measurements in between, and a station that reports their
+times in its slots as in the protocol ``superframe``: new ones at once, those of an outage when there are beacons from after
+it, newest first. The truth is the master's clock without jitter.
 """
 
 from __future__ import annotations
@@ -28,51 +28,47 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# At SF 9 and 250 kHz; the same for all packets but for the jitter of the chips.
+# At SF 9 and 250 kHz; constant but for the jitter of the chips.
 _LINK_S = 1.489e-3
 _LINK_SIGMA_S = 3e-6
 
 _SLOT_S = 0.1
 """From the end of a beacon to the slot of the station."""
 _BATCH = 8
-"""So many measurements of an outage ride along in a reply."""
+"""Measurements of an outage in a reply."""
 _LIVE_S = 1.0
 _DIRECT_EXTRA_US = 2000.0
-"""A time from a single beacon must be surer by this than one from the fit."""
+"""The bound of a time from a single beacon must be smaller by this than that of the fit."""
 
 _GRID_S = 0.05
-"""The rate of a clock is constant for so long."""
+"""Interval of constant skew."""
 
 _EARLIEST_NS = 3_600_000_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BeaconScenario:
-    """A station's clock and the beacons that it is compared with; times count from the start, in s.
+    """A station's clock and its beacons; times count from the start, in s.
 
     Attributes
     ----------
-    name, summary
-        What it is called, and what happens.
     drift_ppm, ramp_ppm_per_min, wander_ppm
-        By how much the station's clock gains on the master's, by how much more each minute, and one sigma of the random
-        walk on top, after a second.
+        Skew of the station's clock, positive: it runs fast; its change per minute; one sigma of its random walk after a
+        second.
     changes_ppm
-        From an instant on it gains so much more.
+        Times and sizes of steps of the skew.
     outages_s
-        No beacons are received from one instant to another.
+        Start and end of intervals without beacons.
     stamp_sigma_us, stated_sigma_us
-        Jitter of each stamp on either side, and what the station's radio says it is; None: what it is.
+        Jitter of each timestamp on either side, and the radio's claim of it; None: the same.
     late_share, late_us
-        So many of the station's stamps are late as well, by an exponentially distributed time of this mean.
-    held_up_s
-        A beacon of about that instant is recorded, kept from the station, and played to it 80 ms later.
+        Share of the station's timestamps that are late, and the mean of their exponentially distributed delay.
+    delayed_s
+        The beacons at about these times are delayed by 80 ms (delayed replay).
     loss
-        Share of beacons that are lost.
+        Share of lost beacons.
     frame_s, measuring_s
-        Between beacons, and between measurements.
-    duration_s
-        How long it takes.
+        Interval of beacons, and of measurements.
     """
 
     name: str
@@ -86,7 +82,7 @@ class BeaconScenario:
     stated_sigma_us: float | None = None
     late_share: float = 0.0
     late_us: float = 0.0
-    held_up_s: tuple[float, ...] = ()
+    delayed_s: tuple[float, ...] = ()
     loss: float = 0.0
     frame_s: float = 0.4
     measuring_s: float = 0.4007
@@ -124,9 +120,9 @@ BEACON_SCENARIOS: tuple[BeaconScenario, ...] = (
         name="late", summary="2 % of the stamps late, by 0.5 ms on average", late_share=0.02, late_us=500.0
     ),
     BeaconScenario(
-        name="held-up",
-        summary="a beacon held up for 80 ms, every 20 s",
-        held_up_s=tuple(np.arange(20.0, 590.0, 20.0)),
+        name="delayed",
+        summary="a beacon delayed by 80 ms, every 20 s",
+        delayed_s=tuple(np.arange(20.0, 590.0, 20.0)),
     ),
     BeaconScenario(
         name="slewed",
@@ -136,21 +132,17 @@ BEACON_SCENARIOS: tuple[BeaconScenario, ...] = (
 )
 
 
-class Told(NamedTuple):
-    """A measurement whose time was told.
+class ReportedTime(NamedTuple):
+    """The reported time of a measurement.
 
     Attributes
     ----------
     measured_s
-        When it was made.
-    error_us
-        Time told less the truth, without rounding.
-    rounded_us
-        The same, with the time rounded as it goes over the air.
-    bound_us
-        As stated.
+        Its true time.
+    error_us, rounded_us
+        Reported less true time, before and after rounding to the unit of the radio message.
     live
-        It was told within a second.
+        Reported within a second.
     """
 
     measured_s: float
@@ -162,61 +154,48 @@ class Told(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class BeaconRun:
-    """What came of a scenario.
+    """The outcome of a scenario: reported times in order, and the number of rejected samples."""
 
-    Attributes
-    ----------
-    told
-        All measurements whose time was told, in the order in which it was.
-    refused
-        How many pairs the clock refused.
-    """
-
-    told: list[Told]
-    refused: int
+    times: list[ReportedTime]
+    rejected: int
 
     def quantile_us(self, share: float, *, live: bool, since_s: float = 0.0) -> float:
         """Return a quantile of the absolute errors, rounding included, or NaN where there are none."""
-        errors = [abs(t.rounded_us) for t in self.told if t.live == live and t.measured_s >= since_s]
+        errors = [abs(t.rounded_us) for t in self.times if t.live == live and t.measured_s >= since_s]
         return float(np.quantile(errors, share)) if errors else float("nan")
 
 
 def run_beacon_scenario(scenario: BeaconScenario, seed: int = 0) -> BeaconRun:
-    """Follow a station's clock through a scenario.
-
-    Parameters
-    ----------
-    scenario
-        One of :data:`BEACON_SCENARIOS`, or another.
-    seed
-        Of the jitter, the losses and the wander.
-    """
+    """Run a scenario; the seed is that of jitter, losses and wander."""
     s, rng = scenario, np.random.default_rng(seed)
     local_ns = _local(s, rng)
     frames = int(s.duration_s / s.frame_s)
     true_s = s.frame_s * np.arange(frames) + rng.uniform(0.1, 0.12, frames)
     sent_us = np.rint(1e6 * true_s + rng.normal(0.0, s.stamp_sigma_us, frames)).astype(np.int64)
-    held_s = np.where(np.isin(np.arange(frames), np.searchsorted(true_s, s.held_up_s)), 0.08, 0.0)
-    received_ns = local_ns(true_s + held_s + rng.normal(_LINK_S, _LINK_SIGMA_S, frames))
+    delays_s = np.where(np.isin(np.arange(frames), np.searchsorted(true_s, s.delayed_s)), 0.08, 0.0)
+    received_ns = local_ns(true_s + delays_s + rng.normal(_LINK_S, _LINK_SIGMA_S, frames))
     late_us = np.where(rng.random(frames) < s.late_share, rng.exponential(s.late_us, frames), 0.0)
     received_ns += np.rint(1e3 * (late_us + rng.normal(0.0, s.stamp_sigma_us, frames))).astype(np.int64)
-    heard = rng.random(frames) >= s.loss
+    received = rng.random(frames) >= s.loss
     for from_s, until_s in s.outages_s:
-        heard &= (true_s < from_s) | (true_s >= until_s)
+        received &= (true_s < from_s) | (true_s >= until_s)
     measured_s = np.arange(rng.uniform(0.0, s.measuring_s), s.duration_s, s.measuring_s)
     station = _Station(s, measured_s, local_ns(measured_s))
-    for frame in np.flatnonzero(heard).tolist():
-        if frame and heard[frame - 1]:
-            station.learn(frame, int(received_ns[frame - 1]), int(sent_us[frame - 1]))
+    for frame in np.flatnonzero(received).tolist():
+        if frame and received[frame - 1]:
+            station.take_sample(frame, int(received_ns[frame - 1]), int(sent_us[frame - 1]))
         beacon = _Beacon(
-            true_s[frame], int(received_ns[frame]), int(sent_us[frame]), 1e6 * held_s[frame] + late_us[frame]
+            true_s[frame],
+            int(received_ns[frame]),
+            int(sent_us[frame]),
+            1e6 * delays_s[frame] + late_us[frame],
         )
-        station.tell(beacon)
-    return BeaconRun(station.told, station.refused)
+        station.report(beacon)
+    return BeaconRun(station.times, station.rejected)
 
 
 class _Beacon(NamedTuple):
-    """One that the station has received, ``late_us`` after it should have."""
+    """A received beacon, ``late_us`` too late."""
 
     true_s: float
     received_ns: int
@@ -225,7 +204,7 @@ class _Beacon(NamedTuple):
 
 
 class _Station:
-    """Learns from beacons, and tells times in its slots."""
+    """Synchronises to beacons, and reports times in its slots."""
 
     def __init__(self, scenario: BeaconScenario, measured_s: Floats, at_ns: Integers) -> None:
         stated_us = scenario.stamp_sigma_us if scenario.stated_sigma_us is None else scenario.stated_sigma_us
@@ -234,19 +213,21 @@ class _Station:
         self._measured_s, self._at_ns = measured_s.tolist(), at_ns.tolist()
         self._queue: list[int] = []
         self._next = 0
-        self.told: list[Told] = []
-        self.refused = 0
+        self.times: list[ReportedTime] = []
+        self.rejected = 0
 
-    def learn(self, frame: int, received_ns: int, sent_us: int) -> None:
-        """Take a pair, if the time is known in full."""
+    def take_sample(self, frame: int, received_ns: int, sent_us: int) -> None:
+        """Take a sample, if its session time is unambiguous."""
         every = SESSION_INTERVAL if self._clock.initialised else SESSION_INTERVAL_JOINING
         unambiguous = frame < FULL_TIME_FRAMES or frame % every == 0
         full_us = sent_us if unambiguous else self._clock.unwrap(received_ns, sent_us & 0xFFFF)
         if full_us is not None:
-            self.refused += not self._clock.add(received_ns, full_us, self._sigma_ns, unambiguous=unambiguous)
+            self.rejected += not self._clock.add(
+                received_ns, full_us, self._sigma_ns, unambiguous=unambiguous
+            )
 
-    def tell(self, beacon: _Beacon) -> None:
-        """Tell what can be told, newest first, in the slot after a beacon."""
+    def report(self, beacon: _Beacon) -> None:
+        """Report times, newest first, in the slot after a beacon."""
         while self._next < len(self._at_ns) and self._measured_s[self._next] <= beacon.true_s + _SLOT_S:
             self._queue.append(self._next)
             self._next += 1
@@ -260,7 +241,7 @@ class _Station:
             self._note(index, self._time(self._at_ns[index], beacon, live=live), live=live)
 
     def _time(self, at_ns: int, beacon: _Beacon, *, live: bool) -> TimeEstimate:
-        """Take it from the fit, or from this beacon alone where that is surer."""
+        """Return the time from the fit, or from this beacon alone where its bound is smaller."""
         fitted = self._clock.at(at_ns)
         if fitted is not None and not live:
             return fitted
@@ -268,7 +249,7 @@ class _Station:
         stamp_us = SIGMAS * self._sigma_ns / 1000
         if fitted is not None and fitted.bound_us <= since.bound_us + stamp_us + _DIRECT_EXTRA_US:
             return fitted
-        # The master adds the jitter of its own stamp, and by how much the reply comes late.
+        # The master adds the jitter of its own timestamp, and the delay of the reply.
         return since._replace(
             time_us=beacon.sent_us + since.time_us,
             bound_us=since.bound_us + stamp_us + SIGMAS * self._master_sigma_us + beacon.late_us,
@@ -277,19 +258,21 @@ class _Station:
     def _note(self, index: int, time: TimeEstimate, *, live: bool) -> None:
         truth_us = 1e6 * (self._measured_s[index] - _LINK_S)
         rounded_us = TIME_UNIT_US * round(time.time_us / TIME_UNIT_US)
-        self.told.append(
-            Told(self._measured_s[index], time.time_us - truth_us, rounded_us - truth_us, time.bound_us, live)
+        self.times.append(
+            ReportedTime(
+                self._measured_s[index], time.time_us - truth_us, rounded_us - truth_us, time.bound_us, live
+            )
         )
 
 
 def _local(s: BeaconScenario, rng: np.random.Generator) -> Callable[[Floats], Integers]:
-    """Return what turns true times in s into ns of the station's clock."""
+    """Return the conversion of true times in s to ns of the station's clock."""
     grid_s = _GRID_S * np.arange(int(s.duration_s / _GRID_S) + 20)
-    rate_ppm = s.drift_ppm + s.ramp_ppm_per_min * grid_s / 60
-    rate_ppm += np.cumsum(rng.normal(0.0, s.wander_ppm * _GRID_S**0.5, len(grid_s)))
+    skew_ppm = s.drift_ppm + s.ramp_ppm_per_min * grid_s / 60
+    skew_ppm += np.cumsum(rng.normal(0.0, s.wander_ppm * _GRID_S**0.5, len(grid_s)))
     for from_s, by_ppm in s.changes_ppm:
-        rate_ppm += np.where(grid_s >= from_s, by_ppm, 0.0)
-    gained_us = np.concatenate([[0.0], np.cumsum(rate_ppm[:-1] * _GRID_S)])
+        skew_ppm += np.where(grid_s >= from_s, by_ppm, 0.0)
+    gained_us = np.concatenate([[0.0], np.cumsum(skew_ppm[:-1] * _GRID_S)])
     start_ns = _EARLIEST_NS + int(rng.integers(10**12))
 
     def local_ns(true_s: Floats) -> Integers:

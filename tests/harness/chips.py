@@ -1,4 +1,4 @@
-"""A simulated chip on a bench: its bus by register, and an air that does exactly what the test says."""
+"""A simulated chip on a bench: register access, and a channel controlled by the test."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tsgt.simulation.lora.modem import ChipTiming
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from tsgt.simulation.lora.frames import FrameListener, ReceiverSettings, Modulation, AirPort
+    from tsgt.simulation.lora.frames import AirPort, FrameListener, Modulation, ReceiverSettings
 
 PREAMBLE_SYMBOLS_TO_LOCK = 5
 NO_JITTER = ChipTiming(jitter_sigma_ns=0)
@@ -25,10 +25,10 @@ SLEEP, STDBY, FSTX, TX, FSRX, RXCONTINUOUS, RXSINGLE, CAD = range(0x80, 0x88)
 
 
 class FakePort:
-    """Keeps what the chip sends, and lets it hear what the test sends."""
+    """Records what the chip sends, and delivers what the test sends."""
 
     def __init__(self, timeline: VirtualTimeline) -> None:
-        self.antenna: FrameListener
+        self.listener: FrameListener
         self.frames: list[Frame] = []
         self.stopped_ns: list[int] = []
         self.listening: ReceiverSettings | None = None
@@ -36,30 +36,30 @@ class FakePort:
         self.preamble = False
         self._timeline = timeline
 
-    def join(self, antenna: FrameListener) -> FakePort:
-        """Be the air that the chip joins."""
-        self.antenna = antenna
+    def join(self, listener: FrameListener) -> FakePort:
+        """Act as the air that the chip joins."""
+        self.listener = listener
         return self
 
     def transmit(self, frame: Frame) -> None:
-        """Keep the frame."""
+        """Record the frame."""
         self.frames.append(frame)
 
     def stop_transmitting(self, at_ns: int) -> None:
-        """Keep the time."""
+        """Record the time."""
         self.stopped_ns.append(at_ns)
 
     def listen(self, listening: ReceiverSettings | None) -> None:
-        """Keep what it listens to."""
+        """Record the receiver settings."""
         self.listening = listening
 
     def rssi_dbm(self, at_ns: int) -> float:
-        """Return what the test has set."""
+        """Return the test's value."""
         del at_ns
         return self.channel_dbm
 
     def preamble_present(self, modulation: Modulation, at_ns: int) -> bool:
-        """Return what the test has set."""
+        """Return the test's value."""
         del modulation, at_ns
         return self.preamble
 
@@ -75,7 +75,7 @@ class FakePort:
         rssi_dbm: float = -60.0,
         frequency_error_hz: float = 0.0,
     ) -> Frame:
-        """Send a frame, beginning now, that the chip hears if it listens at this moment until its end."""
+        """Send a frame now; the chip receives it if it listens until its end."""
         assert self.listening is not None
         listening = self.listening
         frame = Frame(
@@ -94,23 +94,23 @@ class FakePort:
             if self.listening is listening:
                 action()
 
-        antenna, explicit = self.antenna, listening.modulation.explicit_header
+        listener, explicit = self.listener, listening.modulation.explicit_header
         locked_ns = frame.start_ns + PREAMBLE_SYMBOLS_TO_LOCK * frame.symbol_ns
-        events = [(locked_ns, partial(antenna.preamble_detected, locked_ns))]
+        events = [(locked_ns, partial(listener.preamble_detected, locked_ns))]
         if not header_ok:
-            events.append((frame.header_end_ns, partial(antenna.frame_ended, frame.header_end_ns, None)))
+            events.append((frame.header_end_ns, partial(listener.frame_ended, frame.header_end_ns, None)))
         else:
             if explicit:
-                ended = partial(antenna.header_received, frame.header_end_ns, header)
+                ended = partial(listener.header_received, frame.header_end_ns, header)
                 events.append((frame.header_end_ns, ended))
-            events.append((frame.end_ns, partial(antenna.frame_ended, frame.end_ns, reception)))
+            events.append((frame.end_ns, partial(listener.frame_ended, frame.end_ns, reception)))
         for at_ns, action in events:
             self._timeline.call_at(at_ns, partial(still, action))
         return frame
 
 
 class Bench:
-    """A chip, fresh from power-on, whose timing has no jitter unless asked for."""
+    """A chip after power-on, by default without timing jitter."""
 
     def __init__(
         self,
@@ -142,7 +142,7 @@ class Bench:
         self.write(0x00, *data)
 
     def enter_lora(self, *, spreading_factor: int = 7, crc: bool = True) -> None:
-        """Go to STDBY in LoRa mode, 125 kHz, 4/5, explicit header."""
+        """Enter STDBY in LoRa mode, 125 kHz, 4/5, explicit header."""
         self.write(0x01, 0x00)
         self.write(0x01, SLEEP)
         self.write(0x01, STDBY)
@@ -150,18 +150,18 @@ class Bench:
         self.timeline.advance(1_000_000)
 
     def listen(self) -> None:
-        """Receive continuously, and wait until it does."""
+        """Enter continuous reception, and wait for it."""
         self.write(0x01, RXCONTINUOUS)
         self.timeline.advance(1_000_000)
 
     def receive(self, payload: bytes, *, crc: bool = True, crc_ok: bool = True, snr_db: float = 8.0) -> Frame:
-        """Let a frame arrive and pass, and wait until RxDone has been set."""
+        """Deliver a frame and wait for RxDone."""
         frame = self.port.send(payload, crc=crc, crc_ok=crc_ok, snr_db=snr_db)
         self.timeline.advance_to(frame.end_ns + frame.symbol_ns)
         return frame
 
     def transmit(self, payload: bytes, base: int = 0x80) -> Frame:
-        """Send, and wait until TxDone."""
+        """Send, and wait for TxDone."""
         self.write_fifo(base, payload)
         self.write(0x0E, base)
         self.write(0x22, len(payload))

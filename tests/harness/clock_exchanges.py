@@ -1,4 +1,4 @@
-"""Exchanges with a station's clock, for the tests of the clock filters."""
+"""Synchronisation exchanges for the tests of the clock filters."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ WAY_NS = 55_314_560
 def exchange(
     sent_ns: int, offset_ns: Callable[[int], float], *, late_ns: int = 0, turnaround_ns: int = 1_000_000
 ) -> ClockSample:
-    """Exchange packets with a clock that is ahead by the given function of the true time since the start."""
+    """Make an exchange with a clock that is ahead by a function of the true time since the start."""
     stamped_ns = sent_ns + WAY_NS + late_ns
     return ClockSample(
         sent_ns=START_NS + sent_ns,
@@ -36,7 +36,7 @@ def synchronisation(
     late_ns: Sequence[int] = (),
     turnaround_ns: int = 1_000_000,
 ) -> list[ClockSample]:
-    """Exchange packets a few times; ``late_ns`` is the lateness of the first stamps."""
+    """Make a synchronisation; ``late_ns`` are the delays of its first timestamps."""
     late = [*late_ns, *[0] * (cycles - len(late_ns))]
     return [
         exchange(
@@ -47,5 +47,5 @@ def synchronisation(
 
 
 def drifting(offset_ns: float, ppm: float) -> Callable[[int], float]:
-    """Return the offset of a clock that gains evenly."""
+    """Return the offset of a clock with constant skew."""
     return lambda true_ns: offset_ns + ppm * 1e-6 * true_ns

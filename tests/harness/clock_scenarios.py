@@ -1,9 +1,9 @@
-"""Ten named troubles of a station's clock, and how a clock filter of the master bears each of them.
+"""Ten scenarios of a station's clock, and the errors of the master's clock filters in each.
 
-Only the clock is simulated: exchanges of the protocol ``classic`` at the paper's modem settings and when the master's
-scheduler has them (50 cycles at the start, then 5 cycles each time: after 30, 90, 270 s, and from then on every 300 s;
-with the paper's filter every 300 s from the start), and in between a measurement at each poll, whose stamp is put on
-the master's clock by the filter and compared with the truth. The master's clock is the true time.
+Only the clock is simulated: synchronisations of the protocol ``classic`` at the paper's modem settings, on the master's
+schedule (50 cycles at the start, then 5 cycles after 30, 90, 270 s, and from then on every 300 s; with the paper's filter
+every 300 s from the start), and in between a measurement at each poll. The filter converts its timestamp to the master's
+clock, which is the true time.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from tsgt.master.classic.scheduler import SynchronisationSchedule
 from tsgt.model import ClockSample
 from tsgt.radio import airtime_us, symbol_time_ns
-from tsgt.timesync.two_way import TimestampCheck, ClockEstimate, clock_filter
+from tsgt.timesync.two_way import ClockEstimate, TimestampCheck, clock_filter
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -38,64 +38,56 @@ _MEASUREMENT_WAY_S = (
 )
 _CYCLE_S = 0.24
 _REPLY_TIMEOUT_S = 0.25
-_REGRESSION_CADENCE = SynchronisationSchedule(initial_cycles=50, resync_cycles=5, interval_ns=300_000_000_000)
-_CADENCES: dict[FilterName, SynchronisationSchedule] = {
-    "regression": _REGRESSION_CADENCE,
-    "paper": replace(_REGRESSION_CADENCE, first_interval_ns=_REGRESSION_CADENCE.interval_ns),
+_REGRESSION_SCHEDULE = SynchronisationSchedule(
+    initial_cycles=50, resync_cycles=5, interval_ns=300_000_000_000
+)
+_SCHEDULES: dict[FilterName, SynchronisationSchedule] = {
+    "regression": _REGRESSION_SCHEDULE,
+    "paper": replace(_REGRESSION_SCHEDULE, first_interval_ns=_REGRESSION_SCHEDULE.interval_ns),
 }
-_MOST_TIMEOUTS = 3
+_MAX_TIMEOUTS = 3
 
-# Three stations at 1.72 Hz. The instrument measures at its own pace of 2.2 Hz or so.
+# Three stations at 1.72 Hz. The instrument measures asynchronously at about 2.2 Hz.
 _POLL_S = 0.58
-_OLDEST_MEASUREMENT_S = 0.45
+_MAX_MEASUREMENT_AGE_S = 0.45
 
 _EDGE_SIGMA_S = 5e-6
-_TURN_ROUND_S = (0.001, 0.008)
+_TURNAROUND_S = (0.001, 0.008)
 
-# The station's clock is ahead by this at the start: its computer has no battery clock, so it is years behind.
+# Initial clock offset of a computer without a battery clock: years behind.
 _OFFSET_AT_START_S = -3.2e7
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """The station's clock is set."""
+    """A step of the station's clock."""
 
     at_s: float
     by_s: float
     """Positive: forward."""
     away_s: float = 0.0
-    """The station does not answer for so long before: it starts anew."""
+    """Silence before the step, as in a restart."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClockScenario:
-    """A clock with its troubles; times are counted from the start.
+    """A station's clock; times are counted from the start.
 
     Attributes
     ----------
-    name
-        What it is called.
-    summary
-        What happens, in a line.
     drift_ppm
-        By how much the station's clock gains on the master's, in 1e-6.
-    warming_ppm
-        By how much more it gains after ``warming_s`` than at the start.
-    warming_s
-        How long the temperature moves, evenly, from a quarter of the duration on.
+        Skew of the station's clock; positive: it runs fast.
+    warming_ppm, warming_s
+        Change of the skew, evenly over this time from a quarter of the duration on.
     late_share, late_mean_s
-        So many of the station's stamps are late, by an exponentially distributed time of this mean.
+        Share of the timestamps that are late, and the mean of their exponentially distributed delay.
     late_always_s
-        All of them are late by this.
+        Delay of all timestamps.
     loss
-        Share of cycles that get no answer, and of polls.
-    step
-        The clock is set, or the station starts anew.
-    stall_timeout_s
-        From when to when the station is out of reach. It goes on measuring; those measurements reach the master
-        with the station's journal and are judged like the others.
-    duration_s
-        How long it takes.
+        Share of cycles and polls without a reply.
+    outage_s
+        Start and end of an outage. The station continues to measure; those measurements reach the master with the
+        station's journal and are evaluated like the others.
     """
 
     name: str
@@ -108,7 +100,7 @@ class ClockScenario:
     late_always_s: float = 0.0
     loss: float = 0.0
     step: Step | None = None
-    stall_timeout_s: tuple[float, float] | None = None
+    outage_s: tuple[float, float] | None = None
     duration_s: float = 4 * HOUR_S
 
 
@@ -141,36 +133,33 @@ SCENARIOS: tuple[ClockScenario, ...] = (
         name="outage",
         summary="out of reach for 90 minutes, and 3 ppm more meanwhile",
         warming_ppm=3.0,
-        stall_timeout_s=(HOUR_S + 50, 2.5 * HOUR_S + 50),
+        outage_s=(HOUR_S + 50, 2.5 * HOUR_S + 50),
     ),
 )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClockOutcome:
-    """How a filter did in a scenario.
+    """Errors of a filter in a scenario.
 
     Attributes
     ----------
-    scenario, filter
-        Which.
     measurements
-        How many were stamped.
+        Number of timestamps.
     p50_ns, p99_ns, max_ns
-        Of the absolute error of their stamps.
+        Of their absolute error.
     final_ns
-        Mean error over the last half hour, in ns; negative: the stamps are early.
+        Mean error over the last half hour; negative: the timestamps are early.
     bound_held
-        Share of the stamps that were off by no more than the stated bound.
+        Share of the timestamps within the stated bound.
     bound_p50_ns
         Median of that bound.
     unobservable
-        How many measurements came between a step too small to notice and the next synchronisation. They are not
-        in the figures above.
+        Number of measurements between an undetectable step and the next synchronisation; not in the figures above.
     withheld
-        How many were held back because their stamps were not plausible.
+        Number of implausible timestamps.
     restarts
-        How many times the filter or the check of arrivals found that the clock had been set.
+        How often the filter or the timestamp check detected a restart.
     """
 
     scenario: str
@@ -188,17 +177,17 @@ class ClockOutcome:
 
 
 class _StationClock:
-    """What the station's clock shows."""
+    """The station's clock."""
 
     def __init__(self, scenario: ClockScenario) -> None:
         self._scenario = scenario
 
     def ns(self, true_ns: Sequence[int] | NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return what it shows at true times in ns from the start."""
+        """Return its time at true times in ns from the start."""
         s = self._scenario
         true_ns = np.asarray(true_ns, dtype=np.int64)
         t = true_ns / 1e9
-        # Frequency is even, then a ramp, then even again; the offset is its integral.
+        # The skew is constant, then a ramp, then constant; the offset is its integral.
         warm_s = np.clip(t - s.duration_s / 4, 0.0, s.warming_s)
         after_s = np.clip(t - s.duration_s / 4 - s.warming_s, 0.0, None)
         gained_s = 1e-6 * (s.drift_ppm * t + s.warming_ppm * (warm_s**2 / (2 * s.warming_s) + after_s))
@@ -207,7 +196,7 @@ class _StationClock:
         return true_ns + round(_OFFSET_AT_START_S * 1e9) + np.rint(gained_s * 1e9).astype(np.int64)
 
 
-# Nothing may be negative on the way, not even on a clock that is years behind.
+# Avoids negative times, even on a clock that is years behind.
 _START_NS = 1_700_000_000_000_000_000
 
 
@@ -218,7 +207,7 @@ class _Run:
         self._scenario = scenario
         self._clock = _StationClock(scenario)
         self._filter = clock_filter(name)
-        self._cadence = _CADENCES[name]
+        self._schedule = _SCHEDULES[name]
         self._check = TimestampCheck()
         self._rng = np.random.default_rng(seed)
         self._unknown = True
@@ -229,10 +218,10 @@ class _Run:
         self._bounds_ns: list[int] = []
         self._times_s: list[float] = []
         self._unobservable = self._withheld = 0
-        self._restarts = -1  # the first synchronisation is none
+        self._restarts = -1  # the first synchronisation is no restart
 
     def outcome(self) -> ClockOutcome:
-        """Run it."""
+        """Run the scenario."""
         s = self._scenario
         now_s = 0.0
         while now_s < s.duration_s:
@@ -259,7 +248,7 @@ class _Run:
 
     def _reachable(self, at_s: float) -> bool:
         s = self._scenario
-        silent = s.stall_timeout_s is not None and s.stall_timeout_s[0] <= at_s < s.stall_timeout_s[1]
+        silent = s.outage_s is not None and s.outage_s[0] <= at_s < s.outage_s[1]
         return not silent and not self._away(at_s)
 
     def _away(self, at_s: float) -> bool:
@@ -267,12 +256,12 @@ class _Run:
         return step is not None and step.at_s - step.away_s <= at_s < step.at_s
 
     def _synchronise(self, start_s: float) -> float:
-        """Exchange packets, update the filter, and return when that was done."""
-        cycles = self._cadence.resync_cycles if self._synchronisations else self._cadence.initial_cycles
+        """Synchronise, and return the time of its end."""
+        cycles = self._schedule.resync_cycles if self._synchronisations else self._schedule.initial_cycles
         samples = list[ClockSample]()
         now_s, timeouts = start_s, 0
         for _ in range(cycles):
-            if timeouts == _MOST_TIMEOUTS:
+            if timeouts == _MAX_TIMEOUTS:
                 break
             if not self._reachable(now_s) or self._rng.random() < self._scenario.loss:
                 timeouts += 1
@@ -285,8 +274,8 @@ class _Run:
             self._restarts += self._filter.update(samples).restarted
             self._synchronised_s = start_s
             self._unknown = False
-        following_ns = self._cadence.next_interval_ns(self._synchronisations)
-        interval_ns = following_ns if samples else self._cadence.first_interval_ns
+        following_ns = self._schedule.next_interval_ns(self._synchronisations)
+        interval_ns = following_ns if samples else self._schedule.first_interval_ns
         self._due_s = now_s + interval_ns / 1e9
         self._synchronisations += bool(samples)
         return now_s
@@ -299,7 +288,7 @@ class _Run:
         edges_s = self._rng.normal(0.0, _EDGE_SIGMA_S, 2)
         sent_ns = round(at_s * 1e9)
         stamped_ns = sent_ns + _WAY_NS + round((late_s + edges_s[0]) * 1e9)
-        back_s = late_s + self._rng.uniform(*_TURN_ROUND_S) + edges_s[1]
+        back_s = late_s + self._rng.uniform(*_TURNAROUND_S) + edges_s[1]
         return ClockSample(
             sent_ns=_START_NS + sent_ns,
             station_ns=_START_NS + int(self._clock.ns([stamped_ns])[0]),
@@ -309,15 +298,15 @@ class _Run:
         )
 
     def _poll(self, start_s: float, until_s: float) -> float:
-        """Poll until then, or until a measurement is not plausible; return when that was."""
+        """Poll until ``until_s`` or an implausible measurement; return the time of the end."""
         s = self._scenario
         polls_s = np.arange(start_s, until_s, _POLL_S)
-        sending_s = polls_s + _WAY_NS / 1e9 + self._rng.uniform(*_TURN_ROUND_S, len(polls_s))
-        true_s = sending_s - self._rng.uniform(0.0, _OLDEST_MEASUREMENT_S, len(polls_s))
+        sending_s = polls_s + _WAY_NS / 1e9 + self._rng.uniform(*_TURNAROUND_S, len(polls_s))
+        true_s = sending_s - self._rng.uniform(0.0, _MAX_MEASUREMENT_AGE_S, len(polls_s))
         lost = self._rng.random(len(polls_s)) < s.loss
         true_ns = np.rint(true_s * 1e9).astype(np.int64)
         stamps_ns = self._clock.ns(true_ns)
-        for poll_s, sent_s, taken_ns, stamp_ns, no_answer in zip(
+        for poll_s, sent_s, taken_ns, stamp_ns, lost_reply in zip(
             polls_s.tolist(),
             sending_s.tolist(),
             true_ns.tolist(),
@@ -325,7 +314,7 @@ class _Run:
             lost.tolist(),
             strict=True,
         ):
-            if no_answer or taken_ns < 0:
+            if lost_reply or taken_ns < 0:
                 continue
             if self._away(poll_s) or self._away(taken_ns / 1e9):
                 continue
@@ -361,15 +350,8 @@ class _Run:
 
 
 def run_clock_scenario(scenario: ClockScenario, name: FilterName, *, seed: int = 0) -> ClockOutcome:
-    """Follow the station's clock through a scenario with a filter, and compare every stamp with the truth.
+    """Run a scenario with a filter, and compare every timestamp with the truth.
 
-    Parameters
-    ----------
-    scenario
-        One of :data:`SCENARIOS`, or another.
-    name
-        Name of the filter.
-    seed
-        The same one gives the same exchanges to both filters, as long as they ask for the same.
+    Both filters get the same exchanges from the same seed, as long as they synchronise at the same times.
     """
     return _Run(scenario, name, seed).outcome()

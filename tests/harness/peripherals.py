@@ -1,4 +1,4 @@
-"""Stand-ins for the hardware modules that drivers by others import, with a simulated chip behind them."""
+"""Fakes of the hardware modules that third-party drivers import, with a simulated chip."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from tsgt.simulation.lora import SX1276Chip
 
 
-def import_driver(name: str, stand_ins: dict[str, ModuleType]) -> ModuleType:
-    """Import a fresh copy of a driver, the only one to see these stand-ins; skip where it is not installed."""
+def import_driver(name: str, fakes: dict[str, ModuleType]) -> ModuleType:
+    """Import a fresh copy of a driver with these fakes; skip where it is not installed."""
     package = name.partition(".")[0]
-    with mock.patch.dict(sys.modules, stand_ins):
+    with mock.patch.dict(sys.modules, fakes):
         for loaded in [module for module in sys.modules if module.partition(".")[0] == package]:
             del sys.modules[loaded]
         try:
@@ -32,24 +32,24 @@ def import_driver(name: str, stand_ins: dict[str, ModuleType]) -> ModuleType:
 
 
 def module(name: str, **attributes: Any) -> ModuleType:
-    """Make a module that has nothing but the given attributes."""
+    """Make a module with the given attributes only."""
     made = ModuleType(name)
     vars(made).update(attributes)
     return made
 
 
 class CircuitPythonSpi:
-    """``busio.SPI``: bytes go out and come in separately, between edges of a chip-select pin."""
+    """``busio.SPI``: separate writes and reads between edges of a chip-select pin."""
 
     def __init__(self, chip: SX1276Chip) -> None:
         self._chip = chip
 
     def try_lock(self) -> bool:
-        """Take the bus, which is free."""
+        """Lock the bus."""
         return True
 
     def unlock(self) -> None:
-        """Let go of the bus."""
+        """Unlock the bus."""
 
     def configure(self, baudrate: int, polarity: int, phase: int) -> None:
         """Set clock and mode."""
@@ -77,7 +77,7 @@ class CircuitPythonPin:
         self._level = False
 
     def switch_to_output(self, *, value: bool = False) -> None:
-        """Become an output of that level."""
+        """Configure as an output with that level."""
         self.value = value
 
     @property
@@ -92,7 +92,7 @@ class CircuitPythonPin:
 
 
 def circuit_python_modules() -> dict[str, ModuleType]:
-    """Return what Adafruit's driver needs in order to be imported: names for its type annotations, mostly."""
+    """Return the modules that Adafruit's driver imports, mostly names for type annotations."""
     return {
         "micropython": module("micropython", const=lambda value: value),
         "busio": module("busio", SPI=CircuitPythonSpi),
@@ -179,7 +179,7 @@ class RaspberryPi:
 
 
 class SpiDev:
-    """``spidev.SpiDev`` with a chip select that the kernel drives: each transfer is one window."""
+    """``spidev.SpiDev`` with the kernel's chip select: each transfer is one window."""
 
     def __init__(self, program: BlockingProgram, chip: SX1276Chip) -> None:
         self._program = program
@@ -189,7 +189,7 @@ class SpiDev:
 
     @property
     def max_speed_hz(self) -> int:
-        """Clock of the bus; it can only be set here."""
+        """Clock of the bus; write-only."""
         raise NotImplementedError
 
     @max_speed_hz.setter

@@ -1,4 +1,4 @@
-"""A Raspberry Pi without hardware: stand-ins for spidev, gpiod 2 and RPi.GPIO with pins and a bus behind them."""
+"""A Raspberry Pi without hardware: fakes of spidev, gpiod 2 and RPi.GPIO with pins and a bus."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ LINE = SimpleNamespace(
 
 
 class FakePi:
-    """Pins, bus, and what is wrong with them.
+    """Pins, bus, and their faults.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class FakePi:
     nss_pin
         The pin whose level ``nss_during_transfer`` keeps for each transfer.
     answer, on_drive
-        What the bus answers, and who is told of every output that is set.
+        Response of the bus, and observer of every output.
     open_error, transfer_error, request_errors, import_errors
         What spidev raises on opening and on transferring, what asking for a pin raises, what an import raises.
     """
@@ -67,17 +67,17 @@ class FakePi:
             (dev / name).touch()
 
     def drive(self, pin: int, *, level: bool) -> None:
-        """Let a program set an output."""
+        """Set an output, as a program does."""
         self.levels[pin] = level
         self.on_drive(pin, level)
 
     @property
     def open_things(self) -> int:
-        """How many buses and pins have not been let go."""
+        """Number of buses and pins that are not released."""
         return len([bus for bus in self.buses if bus.is_open]) + len(self.levels)
 
     def spidev(self) -> ModuleType:
-        """Make a stand-in for spidev 3."""
+        """Make a fake of spidev 3."""
         pi = self
 
         class SpiDev:
@@ -122,7 +122,7 @@ class FakePi:
         return _module("spidev", SpiDev=SpiDev)
 
     def gpiod(self) -> ModuleType:
-        """Make a stand-in for gpiod 2."""
+        """Make a fake of gpiod 2."""
         pi = self
 
         class Chip:
@@ -154,7 +154,7 @@ class FakePi:
         return _module("gpiod", Chip=Chip, LineSettings=LineSettings, line=LINE, request_lines=request_lines)
 
     def rpi(self) -> ModuleType:
-        """Make a stand-in for the package RPi with its GPIO."""
+        """Make a fake of the package RPi with its GPIO."""
         return _module("RPi", GPIO=FakeRpiGpio(self))
 
 
@@ -191,20 +191,20 @@ class FakeRequest:
         return Value.ACTIVE if self._pi.levels[pin] else Value.INACTIVE
 
     def rise(self, timestamp_ns: int, *, lost: int = 0) -> None:
-        """Let an edge come, after some that the kernel's buffer had no room for."""
+        """Raise an edge, after ``lost`` ones that overflowed the kernel's buffer."""
         self._seqno += 1 + lost
         self._events.append(SimpleNamespace(timestamp_ns=timestamp_ns, line_seqno=self._seqno))
         os.write(self._writer, b".")
 
     def read_edge_events(self) -> list[SimpleNamespace]:
-        """Return all edges that wait; would block if there were none."""
+        """Return all pending edges; would block without any."""
         assert self._events, "read_edge_events() blocks when there are none"
         os.read(self.fd, 100)
         events, self._events = self._events, []
         return events
 
     def release(self) -> None:
-        """Let go of the line."""
+        """Release the line."""
         del self._pi.levels[self.pin]
         os.close(self.fd)
         os.close(self._writer)
@@ -212,7 +212,7 @@ class FakeRequest:
 
 @dataclass
 class FakeRpiGpio:
-    """RPi.GPIO; its interrupts are called by the test, from a thread."""
+    """RPi.GPIO; the test calls its interrupts from a thread."""
 
     pi: FakePi
     BCM: int = 11
@@ -228,10 +228,10 @@ class FakeRpiGpio:
     mode: int = 0
 
     def setwarnings(self, flag: bool) -> None:  # noqa: FBT001 (as there)
-        """Take it."""
+        """Accept it."""
 
     def setmode(self, mode: int) -> None:
-        """Choose how pins are numbered."""
+        """Accept the numbering of the pins."""
         self.mode = mode
 
     def setup(self, pin: int, direction: int, *, initial: int = 0, pull_up_down: int = 20) -> None:
@@ -251,18 +251,18 @@ class FakeRpiGpio:
         return int(self.pi.levels[pin])
 
     def add_event_detect(self, pin: int, edge: int, callback: Callable[[int], None]) -> None:
-        """Ask for interrupts."""
+        """Enable interrupts."""
         assert edge == self.RISING
         if self.detect_error is not None:
             raise self.detect_error
         self.callbacks[pin] = callback
 
     def remove_event_detect(self, pin: int) -> None:
-        """End them."""
+        """Disable interrupts."""
         del self.callbacks[pin]
 
     def cleanup(self, pin: int) -> None:
-        """Let go of a pin."""
+        """Release a pin."""
         del self.pi.levels[pin]
 
 

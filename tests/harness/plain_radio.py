@@ -1,4 +1,4 @@
-"""A radio without a modem: a test lets packets arrive, and is told of those that are sent."""
+"""A radio without a modem: a test delivers packets, and is notified of sent ones."""
 
 from __future__ import annotations
 
@@ -17,17 +17,7 @@ AIRTIME_NS = 50_000_000
 
 
 class PlainRadio:
-    """A :class:`~tsgt.radio.base.Radio` whose packets all last 50 ms.
-
-    Parameters
-    ----------
-    clock
-        Its time.
-    rssi_dbm, snr_db
-        How it hears everything.
-    latency_ns
-        How long it takes to start sending.
-    """
+    """A :class:`~tsgt.radio.base.Radio` whose packets all last 50 ms, and start after ``latency_ns``."""
 
     def __init__(
         self, clock: Clock, *, rssi_dbm: float = -80.0, snr_db: float = 7.25, latency_ns: int = 0
@@ -40,8 +30,8 @@ class PlainRadio:
         self.on_sent: Callable[[bytes], None] = lambda _: None
         """Called with each payload at the end of its transmission."""
 
-    def hear(self, payload: bytes) -> None:
-        """Let a packet arrive now."""
+    def deliver(self, payload: bytes) -> None:
+        """Deliver a packet now."""
         self._packets.put_nowait(
             Packet(
                 payload=payload,
@@ -52,13 +42,13 @@ class PlainRadio:
             )
         )
 
-    def hear_twice(self, payload: bytes) -> None:
-        """Let a packet arrive now, and its echo."""
-        self.hear(payload)
-        self.hear(payload)
+    def deliver_twice(self, payload: bytes) -> None:
+        """Deliver a packet and its echo now."""
+        self.deliver(payload)
+        self.deliver(payload)
 
     async def configure(self, settings: LoRaSettings) -> None:
-        """Take any settings."""
+        """Accept any settings."""
 
     async def transmit(self, payload: bytes, *, at_ns: int | None = None) -> Transmission:
         """Send for 50 ms."""

@@ -1,4 +1,4 @@
-"""Two radios, driver and all, on simulated chips that share one air."""
+"""Two radios with the real driver on simulated chips that share one air."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ PAPER = LoRaSettings(frequency_hz=905_000_000, spreading_factor=9, bandwidth_hz=
 """The modem settings of the paper."""
 
 MS = 1_000_000
-"""One millisecond in ns."""
+"""In ns."""
 
 
 def running_timeline() -> VirtualTimeline:
-    """Timeline of the running test's event loop."""
+    """Return the timeline of the running test's event loop."""
     loop = asyncio.get_running_loop()
     assert isinstance(loop, VirtualEventLoop)
     return loop._timeline
@@ -36,20 +36,20 @@ def running_timeline() -> VirtualTimeline:
 
 @dataclass(frozen=True)
 class Side:
-    """One radio from the driver down to the chip."""
+    """One radio from driver to chip."""
 
     radio: SX127x
     chip: SX1276Chip
     hal: SimulatedHal
 
     def register(self, address: int) -> int:
-        """Read a register behind the driver's back."""
+        """Read a register, bypassing the driver."""
         return self.chip.transfer(bytes([address, 0]))[1]
 
 
 @dataclass(frozen=True)
 class Bench:
-    """Two radios that hear each other well, and what they share."""
+    """Two radios with a good link, and what they share."""
 
     here: Side
     there: Side
@@ -59,7 +59,7 @@ class Bench:
 
 
 def make_side(air: Air, name: str, *, allow_20_dbm: bool = False) -> Side:
-    """Make a radio that is still to be started."""
+    """Make a radio that is not started."""
     chip = SX1276Chip(air.timeline, lambda antenna: air.join(antenna, name), np.random.default_rng(1))
     hal = SimulatedHal(chip)
     return Side(SX127x(hal, VirtualClock(0), allow_20_dbm=allow_20_dbm), chip, hal)

@@ -1,4 +1,4 @@
-"""Whatever a station's clock does within the stated model: the truth lies within the stated bound."""
+"""The beacon clock's bound contains the truth for any clock within the stated model."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_bound_contains_the_truth(
     rng = np.random.default_rng(seed)
     levels_ppm = np.concatenate([[0.0], rng.uniform(-10, 10, changes)])
     times_s = np.sort(rng.uniform(0, duration_s + outage_s, changes)) // 15 * 15 + rng.uniform(0, 1)
-    begun_s = float(rng.uniform(0, duration_s))
+    start_s = float(rng.uniform(0, duration_s))
     run = run_beacon_scenario(
         BeaconScenario(
             name="any",
@@ -49,7 +49,7 @@ def test_bound_contains_the_truth(
             ramp_ppm_per_min=ramp_ppm_per_min,
             wander_ppm=wander_ppm,
             changes_ppm=tuple(zip(times_s.tolist(), np.diff(levels_ppm).tolist(), strict=True)),
-            outages_s=((begun_s, begun_s + outage_s),),
+            outages_s=((start_s, start_s + outage_s),),
             stamp_sigma_us=stamp_sigma_us,
             stated_sigma_us=max(stamp_sigma_us * understated, 1.0),
             loss=loss,
@@ -58,4 +58,4 @@ def test_bound_contains_the_truth(
         ),
         seed=math.floor(rng.integers(2**32)),
     )
-    assert all(abs(told.error_us) <= told.bound_us for told in run.told)
+    assert all(abs(time.error_us) <= time.bound_us for time in run.times)

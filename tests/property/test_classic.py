@@ -1,4 +1,4 @@
-"""Nothing that comes over the air breaks the classic protocol, and everything it sends comes back as it was."""
+"""The classic protocol survives any packet, and its messages round-trip."""
 
 from __future__ import annotations
 
@@ -155,17 +155,17 @@ def test_late_and_lost_packets_never_make_a_wrong_sample(data: st.DataObject, cy
     station = ClassicStation(1)
     turn = Synchronisation(1, cycles, TIMING)
     flying: list[tuple[int, bytes]] = []  # replies and their RxDone, in order
-    sending_ns: list[tuple[int, int]] = []  # when the station sends and hears nothing
+    sending_ns: list[tuple[int, int]] = []  # when the station sends and cannot receive
     now_ns = 0
     free_at_ns = 0  # the station's program; what comes before waits in its radio
     while (request := turn.request()) is not None:
         sent_ns, now_ns = now_ns, now_ns + TIMING.airtime_ns(2)
-        heard_ns = now_ns + TIMING.rx_done_ns
-        deaf = any(start_ns < heard_ns and sent_ns < end_ns for start_ns, end_ns in sending_ns)
-        if not deaf and data.draw(st.sampled_from([True] * 6 + [False])):
-            reply = station.received(request.payload, heard_ns + offset_ns)
+        received_ns = now_ns + TIMING.rx_done_ns
+        busy = any(start_ns < received_ns and sent_ns < end_ns for start_ns, end_ns in sending_ns)
+        if not busy and data.draw(st.sampled_from([True] * 6 + [False])):
+            reply = station.received(request.payload, received_ns + offset_ns)
             think_ms = data.draw(st.sampled_from([1, 1, 1, 50, 200, 300, 600]))
-            free_at_ns = max(free_at_ns, heard_ns) + think_ms * MS
+            free_at_ns = max(free_at_ns, received_ns) + think_ms * MS
             if isinstance(reply, bytes):
                 start_ns, free_at_ns = free_at_ns, free_at_ns + TIMING.airtime_ns(len(reply))
                 sending_ns.append((start_ns, free_at_ns))
@@ -174,7 +174,7 @@ def test_late_and_lost_packets_never_make_a_wrong_sample(data: st.DataObject, cy
         if not request.reply_timeout_ns:
             continue
         deadline_ns = now_ns + request.reply_timeout_ns
-        # What ended while the master was sending, it has not heard.
+        # The master cannot receive while it sends.
         flying = [(at_ns, reply) for at_ns, reply in flying if at_ns > now_ns]
         accepted = False
         while flying and flying[0][0] <= deadline_ns and not accepted:

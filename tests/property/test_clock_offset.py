@@ -1,4 +1,4 @@
-"""Whatever a clock within the stated model does: the truth lies within the stated bound."""
+"""The clock filters' bound contains the truth for any clock within the stated model."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ _DELAY_CAP = 4.0
 _CANDIDATES = 3
 _CANDIDATE_SPREAD_NS = 100e6
 _CANDIDATE_WINDOW = 32
-"""This many inconsistent samples within this spread, among so many samples, replace the envelope."""
+"""This many inconsistent samples within this spread, in a window of this many samples, replace the envelope."""
 
 
 class HostTime(NamedTuple):

@@ -1,4 +1,4 @@
-"""The file with the key of a mission."""
+"""The key file of a mission."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tsgt.radio.superframe.wire import KEY_BYTES
 
 @pytest.fixture
 def key(tmp_path: Path) -> Path:
-    """Return a key as it is made."""
+    """Return a new key."""
     path = tmp_path / "radio.key"
     write_key(path)
     return path

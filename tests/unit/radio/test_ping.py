@@ -81,7 +81,7 @@ async def test_late_reply_is_counted_as_late() -> None:
 async def test_repeated_reply_is_counted_as_late() -> None:
     """An echo of a reply is counted as late."""
     async with _pair() as (here, there):
-        there.on_sent = here.hear_twice
+        there.on_sent = here.deliver_twice
         exchanges = await _ping(here, count=2)
     assert [exchange.reply is not None for exchange in exchanges] == [True, True]
     assert [exchange.late for exchange in exchanges] == [0, 1]
@@ -91,11 +91,11 @@ async def test_unknown_packets_are_ignored_and_counted() -> None:
     """Short packets, long ones and replies to another session have no effect."""
     other = PlainRadio(VirtualClock(0))
     async with _pair() as (here, there):
-        there.on_sent, to_here = other.hear, there.on_sent
+        there.on_sent, to_here = other.deliver, there.on_sent
         await _ping(here, count=1, session=8)
         there.on_sent = to_here
         for payload in (b"t1", bytes(34), (await other.receive()).payload, b"\xa5!"):
-            here.hear(payload)
+            here.deliver(payload)
         (exchange,) = await _ping(here, count=1, session=7)
     assert exchange.reply is not None
     assert exchange.unknown == 4
@@ -108,7 +108,7 @@ async def test_unknown_packets_do_not_extend_the_timeout() -> None:
     async def chatter() -> None:
         while True:
             await asyncio.sleep(0.15)
-            here.hear(b"chatter")
+            here.deliver(b"chatter")
 
     busy = asyncio.create_task(chatter())
     first, second = await _ping(here, count=2)
@@ -122,11 +122,11 @@ async def test_repeated_request_has_one_reply() -> None:
     sent: list[bytes] = []
     there, requests = PlainRadio(VirtualClock(0)), PlainRadio(VirtualClock(0))
     there.on_sent = sent.append
-    requests.on_sent = there.hear_twice
+    requests.on_sent = there.deliver_twice
     answers: list[Response] = []
     answering = asyncio.create_task(_collect(there, answers))
     await _ping(requests, count=1)
-    there.hear(b"t1")
+    there.deliver(b"t1")
     await asyncio.sleep(1)
     answering.cancel()
     await asyncio.wait([answering])
@@ -183,7 +183,7 @@ async def _pair(
 
     def carry(radio: PlainRadio, payload: bytes) -> None:
         on_air(payload)
-        radio.hear(payload)
+        radio.deliver(payload)
 
     here.on_sent = lambda payload: carry(there, payload)
     there.on_sent = lambda payload: carry(here, payload)

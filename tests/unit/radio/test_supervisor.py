@@ -1,4 +1,4 @@
-"""A radio that is opened again and again."""
+"""Supervision of the radio."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CLOCK = VirtualClock(0)
 
 
 class Attempts:
-    """Opens nothing, and fails as it is told; keeps the instants."""
+    """Opens a fake radio or raises the next error; records the times."""
 
     def __init__(self, *errors: TsgtError | None) -> None:
         self.errors = list(errors)
@@ -31,7 +31,7 @@ class Attempts:
 
     @asynccontextmanager
     async def open(self) -> AsyncGenerator[Radio]:
-        """Open, or fail with the next error."""
+        """Open, or raise the next error."""
         self.opened_s.append(CLOCK.monotonic_ns() / 1e9)
         if self.errors and (error := self.errors.pop(0)) is not None:
             raise error
@@ -42,7 +42,7 @@ class Attempts:
 
 
 async def run(attempts: Attempts, use_s: float, error: Exception | None, for_s: float) -> None:
-    """Keep the radio for a while; each use ends with the error after its time."""
+    """Supervise the radio for a while; each use ends with the error after its time."""
 
     async def use(_radio: Radio) -> None:
         await asyncio.sleep(use_s)

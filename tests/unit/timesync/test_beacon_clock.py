@@ -1,4 +1,4 @@
-"""The master's time on a station's clock."""
+"""The master's session time on a station's clock."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ def test_delayed_beacon_is_rejected() -> None:
 def test_single_beacon_in_a_long_outage_waits_for_confirmation(
     away_s: int, again_s: int, late_us: int
 ) -> None:
-    """After so long any delay is consistent, so the sample does not count together with later ones."""
+    """After a long outage any delay is consistent, so the sample does not count together with later ones."""
     clock, alone = clock_with(150), 150 + round(2.5 * away_s)
     back = alone + round(2.5 * again_s)
     clock.add(received_ns(sent_us(alone)) + 1000 * late_us, sent_us(alone), SIGMA_NS)

@@ -1,4 +1,4 @@
-"""The filter of offset and rate, against weighted least squares over everything at once."""
+"""The clock line's Kalman filter against batch least squares."""
 
 from __future__ import annotations
 

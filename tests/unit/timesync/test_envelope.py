@@ -1,4 +1,4 @@
-"""The line below answers that are late by chance."""
+"""The lower envelope of randomly delayed responses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The fit of the instrument's time to the host's clock, sample by sample."""
+"""The instrument's time on the host's clock."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_no_time_before_initialisation() -> None:
     assert clock.initialised
     time = clock.at(1000)
     assert time is not None
-    assert 0 <= time.host_ns - arrived_ns(1000) < MS  # it was taken within the ms that it is told in
+    assert 0 <= time.host_ns - arrived_ns(1000) < MS  # it was taken within the stated ms
 
 
 def test_fastest_responses_define_the_envelope() -> None:
@@ -81,18 +81,18 @@ def test_wrap_of_the_count_resets_the_clock() -> None:
     """After 24.8 days a 32-bit count becomes negative."""
     start_ms = 2**31 - 400 * 100
     clock = InstrumentClock()
-    told, outside = [], 0
+    errors_ns, outside = [], 0
     for number in range(300):
         ms = start_ms + 400 * number
         wrapped = ms - 2**32 if ms >= 2**31 else ms
         clock.add(wrapped, arrived_ns(ms, 10.0 * (number % 4)))
         time = clock.timestamp(wrapped, arrived_ns(ms, 50.0))
         if time is not None:
-            told.append(abs(time.host_ns - arrived_ns(ms)))
-            outside += told[-1] > time.bound_ns
-    assert len(told) > 300 - 2 * MIN_SAMPLES - 2
+            errors_ns.append(abs(time.host_ns - arrived_ns(ms)))
+            outside += errors_ns[-1] > time.bound_ns
+    assert len(errors_ns) > 300 - 2 * MIN_SAMPLES - 2
     assert outside == 0
-    assert max(told[-150:]) < MS
+    assert max(errors_ns[-150:]) < MS
 
 
 def test_corrupted_time_is_inconsistent() -> None:
@@ -166,18 +166,18 @@ def test_stale_response_has_no_time() -> None:
     assert clock.timestamp(5_080_400, arrived_ns(5_080_400, 2_100.0)) is None
 
 
-class Told(NamedTuple):
-    """What became of 300 answers: times, and how many of those are off by more than their bound."""
+class Results(NamedTuple):
+    """Times and arrivals of 300 responses, and the number of times outside their bound."""
 
     times_ns: list[int]
     arrived_ns: list[int]
     outside: int
 
 
-def of_answers(random: np.random.Generator, rate_ppm: float, spread_ms: float, period_ms: int) -> Told:
-    """Give a clock answers that take anything up to ``spread_ms``."""
+def run_responses(random: np.random.Generator, rate_ppm: float, spread_ms: float, period_ms: int) -> Results:
+    """Run a clock on responses with delays uniform up to ``spread_ms``."""
     clock = InstrumentClock()
-    told = Told([], [], 0)
+    results = Results([], [], 0)
     for number in range(300):
         true_ms = 1_000_000 + number * period_ms + random.normal(0, 4)
         arrived = arrived_ns(true_ms, random.uniform(0, spread_ms), rate_ppm * 1e-6)
@@ -185,11 +185,11 @@ def of_answers(random: np.random.Generator, rate_ppm: float, spread_ms: float, p
         time = None if clock.inconsistent else clock.timestamp(int(true_ms), arrived)
         if time is None:
             continue
-        told.times_ns.append(time.host_ns)
-        told.arrived_ns.append(arrived)
+        results.times_ns.append(time.host_ns)
+        results.arrived_ns.append(arrived)
         beyond = abs(time.host_ns - arrived_ns(true_ms, rate=rate_ppm * 1e-6)) > time.bound_ns
-        told = told._replace(outside=told.outside + beyond)
-    return told
+        results = results._replace(outside=results.outside + beyond)
+    return results
 
 
 @settings(max_examples=30)
@@ -203,17 +203,17 @@ def test_times_are_in_order_and_never_after_the_arrival(
     seed: int, rate_ppm: float, spread_ms: float, period_ms: int
 ) -> None:
     """Nearly every response has a time."""
-    told = of_answers(np.random.default_rng(seed), rate_ppm, spread_ms, period_ms)
-    assert len(told.times_ns) >= 280
-    assert all(before < after for before, after in pairwise(told.times_ns))
-    assert all(time <= arrived for time, arrived in zip(told.times_ns, told.arrived_ns, strict=True))
+    results = run_responses(np.random.default_rng(seed), rate_ppm, spread_ms, period_ms)
+    assert len(results.times_ns) >= 280
+    assert all(before < after for before, after in pairwise(results.times_ns))
+    assert all(time <= arrived for time, arrived in zip(results.times_ns, results.arrived_ns, strict=True))
 
 
 def test_bound_contains_nearly_all_times() -> None:
     """Over many runs at most 1 % exceed it; in a single run without early fast responses dozens may."""
     random = np.random.default_rng(5)
     outside = sum(
-        of_answers(random, random.uniform(-100, 100), random.uniform(0.1, 100), period_ms).outside
+        run_responses(random, random.uniform(-100, 100), random.uniform(0.1, 100), period_ms).outside
         for period_ms in 20 * [50, 400, 1000]
     )
     assert outside <= 60 * 300 // 100

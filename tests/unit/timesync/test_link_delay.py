@@ -1,4 +1,4 @@
-"""The link constant from four stamps."""
+"""The link delay from two-way exchanges."""
 
 from __future__ import annotations
 

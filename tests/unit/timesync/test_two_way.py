@@ -1,4 +1,4 @@
-"""The clock filters: signs, fits, late stamps, steps, and what they say they do not know."""
+"""The clock filters: signs, fits, late timestamps, steps, bounds."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ The master sends a request, and one station replies (:class:`~tsgt.radio.classic
 is a sequence of requests: a poll, a command, a synchronisation. It returns the next request and takes each packet that
 the radio receives until it accepts one as the reply, or the reply timeout has passed.
 
-The protocol has no sequence numbers that tell a late reply from the expected one, and two of its replies do not even
+The protocol has no sequence numbers to distinguish a late reply from the expected one, and two of its replies do not even
 name their station. :class:`Synchronisation` lists the guards against a wrong clock sample.
 """
 

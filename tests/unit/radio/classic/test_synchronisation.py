@@ -15,52 +15,50 @@ FORWARD_NS = PING_NS + TIMING.rx_done_ns
 TURNAROUND_NS = 3 * MS
 OFFSET_NS = 1_600_000_000_000_000_000
 
-Meddle = Callable[["Exchange"], None]
+Modify = Callable[["Exchange"], None]
 
 
 @dataclass
 class Exchange:
-    """A request on its way and what comes back; a test may change both.
+    """A request and its replies, which a test may change.
 
     Attributes
     ----------
-    number, payload, sent_ns
-        The request: which, what, when it began on the air.
-    heard
-        Whether the station hears it.
+    received
+        Whether the station receives the request.
     replies
-        What comes back, with the time from the start of the request to RxDone.
+        Payloads, with the time from the start of the request to RxDone.
     exact
-        Whether the radio saw its edges.
+        Whether the timestamps are edges.
     """
 
     number: int
     payload: bytes
     sent_ns: int
-    heard: bool = True
+    received: bool = True
     replies: list[tuple[bytes, int]] = field(default_factory=list)
     exact: bool = True
 
 
 class Link:
-    """A station on a clock that is ahead, and the way there and back."""
+    """A station on a clock that is ahead, and the link to it."""
 
-    def __init__(self, meddle: Meddle = lambda _: None, after: Meddle = lambda _: None) -> None:
+    def __init__(self, modify: Modify = lambda _: None, after: Modify = lambda _: None) -> None:
         self.station = ClassicStation(1)
         self.offset_ns = OFFSET_NS
         self.late_ns = 0
         self.sent: list[bytes] = []
-        self._meddle = meddle
+        self._modify = modify
         self._after = after
         self._now_ns = 0
 
     def run(self, turn: Synchronisation) -> None:
-        """Run a turn to its end."""
+        """Run a transaction to its end."""
         while (request := turn.request()) is not None:
             self.sent.append(request.payload)
             exchange = Exchange(len(self.sent) - 1, request.payload, self._now_ns)
-            self._meddle(exchange)
-            if exchange.heard:
+            self._modify(exchange)
+            if exchange.received:
                 stamp_ns = exchange.sent_ns + FORWARD_NS + self.late_ns + self.offset_ns
                 reply = self.station.received(request.payload, stamp_ns)
                 if isinstance(reply, bytes):
@@ -80,7 +78,7 @@ class Link:
             else:
                 self._now_ns += request.reply_timeout_ns
                 turn.timed_out()
-            assert len(self.sent) < 1000, "the turn does not end"
+            assert len(self.sent) < 1000, "the transaction does not end"
 
 
 def _offsets_ns(turn: Synchronisation) -> list[int]:
@@ -114,10 +112,10 @@ def test_known_timestamp_delay_is_subtracted() -> None:
 def test_silent_station_ends_the_synchronisation() -> None:
     """After three requests without a reply the node is commanded to leave."""
 
-    def deaf(exchange: Exchange) -> None:
-        exchange.heard = False
+    def lose_requests(exchange: Exchange) -> None:
+        exchange.received = False
 
-    link, turn = Link(deaf), Synchronisation(1, 50, TIMING)
+    link, turn = Link(lose_requests), Synchronisation(1, 50, TIMING)
     link.run(turn)
     assert link.sent == [b"p1", b"e1", b"p1", b"s1", b"p1", b"s1", b"c1", b"c1"]
     assert (turn.has_reply, turn.missed_replies, turn.samples) == (False, 3, [])
@@ -126,10 +124,10 @@ def test_silent_station_ends_the_synchronisation() -> None:
 def test_lost_ping_is_repeated_after_a_flush() -> None:
     """The station first replies to another request; one cycle in five may be missing."""
 
-    def lossy(exchange: Exchange) -> None:
-        exchange.heard = exchange.number != 3
+    def lose_packets(exchange: Exchange) -> None:
+        exchange.received = exchange.number != 3
 
-    link, turn = Link(lossy), Synchronisation(1, 5, TIMING)
+    link, turn = Link(lose_packets), Synchronisation(1, 5, TIMING)
     link.run(turn)
     assert link.sent[3:8] == [b"e1", b"p1", b"s1", b"e1", b"s1"]
     assert _offsets_ns(turn) == [OFFSET_NS] * 4
@@ -138,11 +136,11 @@ def test_lost_ping_is_repeated_after_a_flush() -> None:
 def test_lost_timestamp_is_requested_again() -> None:
     """The station still has it, so the cycle is not lost."""
 
-    def lossy(exchange: Exchange) -> None:
+    def lose_packets(exchange: Exchange) -> None:
         if exchange.number == 2:
             exchange.replies.clear()
 
-    link, turn = Link(after=lossy), Synchronisation(1, 1, TIMING)
+    link, turn = Link(after=lose_packets), Synchronisation(1, 1, TIMING)
     link.run(turn)
     assert link.sent == [b"p1", b"e1", b"s1", b"s1", b"c1", b"c1"]
     assert turn.missed_replies == 1
@@ -152,10 +150,10 @@ def test_lost_timestamp_is_requested_again() -> None:
 def test_synchronisation_with_heavy_loss_ends() -> None:
     """Cycles without a sample are repeated, but at most as many again."""
 
-    def lossy(exchange: Exchange) -> None:
-        exchange.heard = exchange.payload != b"e1" or exchange.number % 2 == 1
+    def lose_packets(exchange: Exchange) -> None:
+        exchange.received = exchange.payload != b"e1" or exchange.number % 2 == 1
 
-    link, turn = Link(lossy), Synchronisation(1, 10, TIMING)
+    link, turn = Link(lose_packets), Synchronisation(1, 10, TIMING)
     link.run(turn)
     assert link.sent.count(b"e1") <= 20
     assert set(_offsets_ns(turn)) == {OFFSET_NS}
@@ -183,7 +181,7 @@ def test_early_reply_is_rejected() -> None:
 
     def echo(exchange: Exchange) -> None:
         if exchange.payload == b"e1":
-            exchange.heard = exchange.number != 3
+            exchange.received = exchange.number != 3
             exchange.replies.append((b"e1", PING_NS + 20 * MS))
 
     link, turn = Link(echo), Synchronisation(1, 5, TIMING)
@@ -202,10 +200,10 @@ def test_repeated_timestamp_makes_no_sample() -> None:
         elif exchange.number == 3:
             exchange.replies = [(b"e1", after_ns) for _, after_ns in old]
 
-    def deaf(exchange: Exchange) -> None:
-        exchange.heard = exchange.number != 3
+    def lose_requests(exchange: Exchange) -> None:
+        exchange.received = exchange.number != 3
 
-    link, turn = Link(deaf, replayed), Synchronisation(1, 5, TIMING)
+    link, turn = Link(lose_requests, replayed), Synchronisation(1, 5, TIMING)
     link.run(turn)
     assert _offsets_ns(turn) == [OFFSET_NS] * 4
     assert link.sent[5:7] == [b"p1", b"s1"]
@@ -240,11 +238,11 @@ def test_other_packets_do_not_disturb_a_ping(payload: bytes) -> None:
 
 def test_timestamp_of_another_station_is_dropped() -> None:
     """A time reply does not name its station; the other cycles exclude a wrong one."""
-    foreign = TimeReply(OFFSET_NS + 12_345_000 * MS).to_bytes()
+    other_reply = TimeReply(OFFSET_NS + 12_345_000 * MS).to_bytes()
 
     def disturbed(exchange: Exchange) -> None:
         if exchange.number == 6:
-            exchange.replies.append((foreign, FORWARD_NS + TIMING.airtime_ns(9)))
+            exchange.replies.append((other_reply, FORWARD_NS + TIMING.airtime_ns(9)))
 
     link, turn = Link(disturbed), Synchronisation(1, 5, TIMING)
     link.run(turn)
@@ -254,11 +252,11 @@ def test_timestamp_of_another_station_is_dropped() -> None:
 
 def test_the_last_cycle_cannot_outvote_the_others() -> None:
     """A wrong timestamp in the last cycle causes more cycles, which exclude it."""
-    foreign = TimeReply(OFFSET_NS + 12_345_000 * MS).to_bytes()
+    other_reply = TimeReply(OFFSET_NS + 12_345_000 * MS).to_bytes()
 
     def disturbed(exchange: Exchange) -> None:
         if exchange.number == 10:
-            exchange.replies.append((foreign, FORWARD_NS + TIMING.airtime_ns(9)))
+            exchange.replies.append((other_reply, FORWARD_NS + TIMING.airtime_ns(9)))
 
     link, turn = Link(disturbed), Synchronisation(1, 5, TIMING)
     link.run(turn)
@@ -311,8 +309,8 @@ def test_skew_is_no_inconsistency() -> None:
 
     def drift(exchange: Exchange) -> None:
         link.offset_ns = OFFSET_NS + exchange.sent_ns // 10_000
-        exchange.heard = exchange.number % 9 != 5
-        if not exchange.heard:
+        exchange.received = exchange.number % 9 != 5
+        if not exchange.received:
             lost.append(exchange.payload)
 
     link = Link(drift)
@@ -334,23 +332,23 @@ def test_inexact_timestamps_make_no_sample() -> None:
 
 
 @pytest.mark.parametrize(
-    ("unheard", "lost", "samples", "silence_ms"),
+    ("lost_requests_of", "lost", "samples", "silence_ms"),
     [({7, 9}, {12}, 3, 840), ({7, 9}, set[int](), 4, 0), (set(range(7, 30)), set[int](), 3, 0)],
     ids=["before its last answers", "before its last sample", "at the end"],
 )
 def test_silence_without_a_later_sample_is_reported(
-    unheard: set[int], lost: set[int], samples: int, silence_ms: int
+    lost_requests_of: set[int], lost: set[int], samples: int, silence_ms: int
 ) -> None:
     """The station may have restarted in it and been pinged afterwards; at the end no ping follows."""
 
-    def unheard_there(exchange: Exchange) -> None:
-        exchange.heard = exchange.number not in unheard
+    def lost_requests(exchange: Exchange) -> None:
+        exchange.received = exchange.number not in lost_requests_of
 
-    def lost_here(exchange: Exchange) -> None:
+    def lost_replies(exchange: Exchange) -> None:
         if exchange.number in lost:
             exchange.replies.clear()
 
-    link, turn = Link(unheard_there, lost_here), Synchronisation(1, 5, TIMING)
+    link, turn = Link(lost_requests, lost_replies), Synchronisation(1, 5, TIMING)
     link.run(turn)
     assert len(turn.samples) == samples
     assert turn.longest_silence_ns / MS == pytest.approx(silence_ms, abs=40)
@@ -361,7 +359,7 @@ def test_single_sample_is_dropped() -> None:
 
     def played_back(exchange: Exchange) -> None:
         if exchange.number > 1:
-            exchange.heard = False
+            exchange.received = False
         if exchange.number == 2:
             exchange.replies.append((TimeReply(OFFSET_NS - 10**15).to_bytes(), FORWARD_NS + 100 * MS))
 
@@ -375,13 +373,13 @@ def test_single_sample_is_dropped() -> None:
 def test_restart_drops_earlier_samples(asked: bytes) -> None:
     """A station that has replied to pings and has no timestamp is a restarted program, whatever its clock shows."""
 
-    def meddle(exchange: Exchange) -> None:
+    def modify(exchange: Exchange) -> None:
         if link.sent.count(b"e1") == 3 and exchange.payload == asked and link.station is before:
-            exchange.heard = False
+            exchange.received = False
             link.station = ClassicStation(1)
             link.offset_ns += MS
 
-    link, turn = Link(meddle), Synchronisation(1, 5, TIMING)
+    link, turn = Link(modify), Synchronisation(1, 5, TIMING)
     before = link.station
     link.run(turn)
     assert turn.restarted
@@ -392,10 +390,10 @@ def test_restart_drops_earlier_samples(asked: bytes) -> None:
 def test_missing_timestamp_before_the_first_ping_is_no_restart() -> None:
     """The first ping was lost; pings before this synchronisation do not count."""
 
-    def meddle(exchange: Exchange) -> None:
-        exchange.heard = exchange.number != 1
+    def modify(exchange: Exchange) -> None:
+        exchange.received = exchange.number != 1
 
-    link, turn = Link(meddle), Synchronisation(1, 3, TIMING)
+    link, turn = Link(modify), Synchronisation(1, 3, TIMING)
     link.run(turn)
     assert not turn.restarted
     assert len(turn.samples) == 2

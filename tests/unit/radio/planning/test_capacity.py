@@ -1,4 +1,4 @@
-"""What the planner says that a channel carries."""
+"""The predicted capacity of a channel."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def superframe(
     start_jitter_ns: int = 5_000_000,
     **settings: Any,
 ) -> CycleEstimate:
-    """Plan the superframe likewise."""
+    """Plan the superframe with a master's defaults."""
     timing = FrameTiming.from_tolerances(
         modem(**settings), start_jitter_ns=start_jitter_ns, turnaround_ns=8_000_000, clock_error_ppm=100
     )

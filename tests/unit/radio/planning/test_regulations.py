@@ -1,4 +1,4 @@
-"""Limits of law and chip."""
+"""Power presets, and limits of regions and chip."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ import pytest
 
 from tsgt.errors import RadioSettingsError
 from tsgt.radio import LoRaSettings
-from tsgt.radio.planning import DIPOLE_DBI, ChannelUse, violations
+from tsgt.radio.planning import DIPOLE_DBI, MIN_POWER_DBM, REGIONS, ChannelUse, preset_power_dbm, violations
+from tsgt.radio.planning.regulations import MAX_PRESET_DBM
 
 
 def use(
     *, duty: float = 0.005, master_duty: float = 0.001, gain_dbi: float = DIPOLE_DBI, **settings: Any
 ) -> ChannelUse:
-    """Return a use that keeps to most limits in Europe, or another."""
+    """Return a use within most European limits, with changes."""
     usual = {
         "frequency_hz": 869_525_000,
         "spreading_factor": 9,
@@ -110,3 +111,36 @@ def test_channel_outside_the_bands_is_rejected() -> None:
     """It has no limits to compare with."""
     with pytest.raises(RadioSettingsError, match="not within a band"):
         violations(use(frequency_hz=905_000_000), "EU868", [])
+
+
+@pytest.mark.parametrize(
+    ("region", "frequency_hz", "bandwidth_hz", "power_dbm"),
+    [
+        ("EU868", 868_100_000, 125_000, 14),
+        ("EU868", 869_525_000, 250_000, 17),
+        ("EU433", 433_900_000, 250_000, 10),
+        ("US915", 905_000_000, 500_000, 17),
+        ("CA915", 905_000_000, 250_000, MIN_POWER_DBM),
+    ],
+)
+def test_preset_power_of_a_channel(region: str, frequency_hz: int, bandwidth_hz: int, power_dbm: int) -> None:
+    """The band decides, and in North America the bandwidth of a fixed channel."""
+    assert preset_power_dbm(region, frequency_hz=frequency_hz, bandwidth_hz=bandwidth_hz) == power_dbm
+
+
+@pytest.mark.parametrize(
+    ("region", "frequency_hz", "bandwidth_hz"),
+    [("EU868", 905_000_000, 250_000), ("EU868", 868_650_000, 125_000), ("EU868", 869_525_000, 500_000)],
+)
+def test_preset_of_a_channel_outside_the_bands_is_rejected(
+    region: str, frequency_hz: int, bandwidth_hz: int
+) -> None:
+    """Wrong region, a gap between bands, or too wide for the band: the message names the bands."""
+    with pytest.raises(RadioSettingsError, match="not within a band of EU868"):
+        preset_power_dbm(region, frequency_hz=frequency_hz, bandwidth_hz=bandwidth_hz)
+
+
+def test_presets_stay_within_the_chip_limit() -> None:
+    """No preset exceeds what the chip allows at any duty cycle."""
+    for bands in REGIONS.values():
+        assert all(MIN_POWER_DBM <= band.power_dbm <= MAX_PRESET_DBM for band in bands)

@@ -30,8 +30,8 @@ def frame(payload: bytes, start_ns: int, *, crc: bool = True, power_dbm: float =
     return Frame(modulation, PAPER.coding_rate, crc, PAPER.preamble_symbols, payload, power_dbm, start_ns)
 
 
-class Stranger:
-    """An antenna that hears nothing: a sender of frames that no driver of ours would send."""
+class Sender:
+    """An antenna that receives nothing, for frames that the driver would not send."""
 
     def preamble_detected(self, at_ns: int) -> None:
         """Ignore it."""
@@ -282,11 +282,11 @@ async def test_full_queue_drops_the_oldest() -> None:
 async def test_packet_with_a_crc_error_is_dropped_and_counted() -> None:
     """A packet whose CRC is wrong, here from a collision in its payload, is not delivered."""
     async with bench() as b:
-        stranger = b.air.join(Stranger(), "stranger")
+        sender = b.air.join(Sender(), "sender")
         start_ns = b.clock.monotonic_ns()
         sending = asyncio.create_task(b.here.radio.transmit(bytes(34)))
         await b.clock.sleep_until(start_ns + 90 * MS)
-        stranger.transmit(frame(b"noise", start_ns + 90 * MS))
+        sender.transmit(frame(b"noise", start_ns + 90 * MS))
         await sending
         await b.clock.sleep_until(start_ns + 500 * MS)
         assert b.there.radio.statistics.crc_errors == 1
@@ -358,7 +358,7 @@ async def test_closed_radio_is_asleep() -> None:
 
 
 async def test_frame_helper_has_the_drivers_airtime() -> None:
-    """The foreign senders of these tests send what the driver would."""
+    """The frames of these tests have the driver's airtime."""
     assert frame(bytes(34), 0).end_ns == 1000 * airtime_us(
         34, spreading_factor=9, bandwidth_hz=250_000, coding_rate=6
     )

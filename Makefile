@@ -41,7 +41,7 @@ all-tests: $(VENV)/.test
 	$(BIN)/pytest tests/process tests/interop
 
 docs: $(VENV)/.test
-	$(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 # Forty times the examples of `make test`, on two cores; what is not done after 15 minutes is given up.
 # A failing example is kept in .hypothesis: `pytest` with the name of its test shrinks and shows it.
@@ -50,19 +50,13 @@ fuzz: $(VENV)/.test
 
 # Simulated missions with faults of all kinds for a quarter of an hour; prints each violated invariant.
 soak: $(VENV)/.test
-	$(BIN)/python benchmarks/soak.py --minutes 15
+	$(BIN)/python benchmarks/run.py soak --minutes 15
 
+BENCHMARKS := alignment process air simulation_speed clock_scenarios beacon_clock instrument_time instrument nees continuous
+
+# Speed and memory, as ratios within one run; `python benchmarks/run.py` lists all benchmarks.
 bench: $(VENV)/.test
-	$(BIN)/python benchmarks/alignment.py
-	$(BIN)/python benchmarks/process.py
-	$(BIN)/python benchmarks/air.py
-	$(BIN)/python benchmarks/simulation_speed.py
-	$(BIN)/python benchmarks/clock_scenarios.py
-	$(BIN)/python benchmarks/beacon_clock.py
-	$(BIN)/python benchmarks/instrument_time.py
-	$(BIN)/python benchmarks/instrument.py
-	$(BIN)/python benchmarks/nees.py
-	$(BIN)/python benchmarks/continuous.py
+	for name in $(BENCHMARKS); do $(BIN)/python benchmarks/run.py $$name || exit 1; done
 
 # Schemas, field tables and the command reference are generated from the code; a test fails when they are stale.
 generated: $(VENV)/.test

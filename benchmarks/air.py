@@ -8,10 +8,10 @@ the ones that run on hardware, the chips are simulated register by register, the
 from __future__ import annotations
 
 import asyncio
-import time
 from dataclasses import dataclass
 
 import numpy as np
+from measuring import Stopwatch
 
 from tsgt.radio import LoRaSettings, airtime_us
 from tsgt.simulation.kernel import VirtualClock, VirtualTimeline, run_virtual
@@ -94,10 +94,10 @@ def simulate(traffic: Traffic) -> Result:
                 if packet.payload[0] == (own - 1) % RADIOS:
                     await radios[own].transmit(bytes([own]) * traffic.payload_bytes)
 
-        before_s = time.process_time()
-        tasks = [asyncio.create_task(take_part(own)) for own in range(RADIOS)]
-        await clock.sleep_until(clock.monotonic_ns() + DURATION_S * 1_000_000_000)
-        cpu_s = time.process_time() - before_s
+        with Stopwatch() as stopwatch:
+            tasks = [asyncio.create_task(take_part(own)) for own in range(RADIOS)]
+            await clock.sleep_until(clock.monotonic_ns() + DURATION_S * 1_000_000_000)
+        cpu_s = stopwatch.cpu_s
         for task in tasks:
             task.cancel()
         await asyncio.wait(tasks)
@@ -110,7 +110,3 @@ def simulate(traffic: Traffic) -> Result:
         )
 
     return run_virtual(run, timeline)
-
-
-if __name__ == "__main__":
-    main()

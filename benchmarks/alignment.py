@@ -5,17 +5,15 @@ All three align the same 200,000 noisy triplets and must agree. The loop sees a 
 
 from __future__ import annotations
 
-import time
 from typing import TYPE_CHECKING
 
 import numpy as np
+from measuring import best_s
 from scipy.spatial.transform import Rotation
 
 from tsgt.geometry import align_many, align_triplets
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from tsgt.geometry import FloatArray
 
 TRIPLETS = 200_000
@@ -48,16 +46,6 @@ def loop(layout: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray
         rotations[i] = vt.T @ u.T
         translations[i] = mean - rotations[i] @ layout_mean
     return rotations, translations
-
-
-def best_s(work: Callable[[], object], rounds: int) -> float:
-    """Return the shortest wall time in s of several rounds."""
-    times_s = []
-    for _ in range(rounds):
-        start_s = time.perf_counter()
-        work()
-        times_s.append(time.perf_counter() - start_s)
-    return min(times_s)
 
 
 def main() -> None:

@@ -2,9 +2,9 @@
 
 A refactoring must not change behaviour: the same seeds give the same recordings, truth and figures.
 
-    python benchmarks/byte_identity.py collect --tree OLD_TREE --output OLD --old-names
-    python benchmarks/byte_identity.py collect --tree . --output NEW
-    python benchmarks/byte_identity.py compare OLD NEW
+    python benchmarks/run.py byte_identity collect --tree OLD_TREE --output OLD --old-names
+    python benchmarks/run.py byte_identity collect --tree . --output NEW
+    python benchmarks/run.py byte_identity compare OLD NEW
 
 `collect` runs fourteen missions (both protocols, both estimators, faults on and off) and processes and evaluates both
 segments of published field data, if they are there. `compare` translates the old names and compares the rest exactly.
@@ -231,7 +231,3 @@ def main() -> None:
         )
     else:
         sys.exit(1 if compare(arguments.old, arguments.new) else 0)
-
-
-if __name__ == "__main__":
-    main()

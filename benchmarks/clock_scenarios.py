@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import time
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from harness.clock_scenarios import SCENARIOS, run_clock_scenario
+from measuring import Stopwatch
 
 if TYPE_CHECKING:
     from harness.clock_scenarios import ClockOutcome
@@ -24,13 +24,12 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="figures in ns, for a machine")
     parser.add_argument("--seed", type=int, default=0, help="of the exchanges (default 0)")
     arguments = parser.parse_args()
-    before_s = time.process_time()
-    outcomes = [
-        run_clock_scenario(scenario, name, seed=arguments.seed)
-        for scenario in SCENARIOS
-        for name in ("paper", "regression")
-    ]
-    cpu_s = time.process_time() - before_s
+    with Stopwatch() as stopwatch:
+        outcomes = [
+            run_clock_scenario(scenario, name, seed=arguments.seed)
+            for scenario in SCENARIOS
+            for name in ("paper", "regression")
+        ]
     if arguments.json:
         print(json.dumps([asdict(outcome) for outcome in outcomes], indent=1))
         return
@@ -39,7 +38,7 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|")
     for outcome in outcomes:
         print(_row(outcome))
-    print(f"{len(outcomes)} runs, {cpu_s:.1f} s of CPU")
+    print(f"{len(outcomes)} runs, {stopwatch.cpu_s:.1f} s of CPU")
 
 
 def _row(outcome: ClockOutcome) -> str:
@@ -47,7 +46,3 @@ def _row(outcome: ClockOutcome) -> str:
     errors = " | ".join(f"{figure / 1e6:.3f}" for figure in figures)
     held = f"{outcome.bound_held:.2%} | {outcome.bound_p50_ns / 1e6:.1f}"
     return f"| {outcome.scenario} | {outcome.filter} | {errors} | {held} |"
-
-
-if __name__ == "__main__":
-    main()

@@ -14,12 +14,11 @@ import os
 # More threads than one help with none of the small matrices, and their CPU time would count.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import resource
 import sys
-import time
 from typing import TYPE_CHECKING
 
 import numpy as np
+from measuring import Stopwatch, peak_memory_mb
 
 from tsgt.geometry import exp_so3, invert, transform_from, transform_points
 from tsgt.geometry.trajectory import FixedLagSmoother, Observations, fit_trajectory
@@ -76,12 +75,12 @@ def batch(hours: float, stations: int) -> tuple[float, float]:
     """Return CPU seconds of the fit, and of the poses after it."""
     observations = synthetic_observations(hours, stations)
     epochs_s = np.arange(observations.time_s[0], observations.time_s[-1], 1 / POSES_HZ)
-    start_s = time.process_time()
-    found = fit_trajectory(observations)
-    fitted_s = time.process_time()
-    for first in range(0, len(epochs_s), 1024):
-        found.trajectory.at(epochs_s[first : first + 1024], dim=6)
-    return fitted_s - start_s, time.process_time() - fitted_s
+    with Stopwatch() as fit:
+        found = fit_trajectory(observations)
+    with Stopwatch() as query:
+        for first in range(0, len(epochs_s), 1024):
+            found.trajectory.at(epochs_s[first : first + 1024], dim=6)
+    return fit.cpu_s, query.cpu_s
 
 
 def updates(stations: int) -> FloatArray:
@@ -90,12 +89,12 @@ def updates(stations: int) -> FloatArray:
     filtered = FixedLagSmoother(MotionPrior())
     took_ms: list[float] = []
     for row, time_s in enumerate(observations.time_s):
-        start_s = time.process_time()
-        filtered.update(observations.select(slice(row, row + 1)))
-        filtered.marginalise_before(time_s - LAG_S)
-        if filtered.initialised:
-            filtered.predict(time_s + AHEAD_S)
-        took_ms.append(1e3 * (time.process_time() - start_s))
+        with Stopwatch() as stopwatch:
+            filtered.update(observations.select(slice(row, row + 1)))
+            filtered.marginalise_before(time_s - LAG_S)
+            if filtered.initialised:
+                filtered.predict(time_s + AHEAD_S)
+        took_ms.append(1e3 * stopwatch.cpu_s)
     return np.array(took_ms)
 
 
@@ -106,7 +105,7 @@ def main() -> None:
     hours = 1
     while hours <= hours_max:
         fitted_s, asked_s = batch(hours, 3)
-        memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        memory_mb = peak_memory_mb()
         per_hour_s = (fitted_s + asked_s) / hours
         print(f"  {hours:3} {fitted_s:8.2f} {asked_s:8.2f} {per_hour_s:8.2f} {memory_mb:8.0f}", flush=True)
         hours *= 2

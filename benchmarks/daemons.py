@@ -1,6 +1,6 @@
 """What the daemons cost: CPU and memory of three clients and a master while the demonstration runs in real time.
 
-Run it with ``python benchmarks/daemons.py [SECONDS]``; ten minutes unless told otherwise. The figures are read from
+Run it with ``python benchmarks/run.py daemons [SECONDS]``; ten minutes unless told otherwise. The figures are read from
 /proc of each process, so they hold its start as well; the shares are of one core of this machine.
 """
 
@@ -62,7 +62,3 @@ def _usage(pid: int) -> tuple[float, float]:
     ticks = int(fields[11]) + int(fields[12])  # utime and stime, proc(5)
     peak = re.search(r"VmHWM:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())
     return ticks / os.sysconf("SC_CLK_TCK"), int(peak[1]) / 1024 if peak else 0.0
-
-
-if __name__ == "__main__":
-    main()

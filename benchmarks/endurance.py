@@ -1,6 +1,6 @@
 """Real-time endurance: the daemons of the demonstration for half an hour, with loss and restarts, and what they grow by.
 
-Run it with ``python benchmarks/endurance.py --minutes 30 --loss 0.05``. Air server, three clients and a master are
+Run it with ``python benchmarks/run.py endurance --minutes 30 --loss 0.05``. Air server, three clients and a master are
 processes of their own, as are sockets, serial lines (pseudo-terminals), files and time real; radios and instruments are
 simulated, as in ``tsgt demo``. The master is ended after one minute and killed after two, and then left alone; client 1
 is killed and ended in turn every two minutes; the other clients and the air server run through. A reader follows the
@@ -246,7 +246,7 @@ class Endurance:
         found = aftermath(
             recordings,
             {number: self._files.journals(number) for number in self._files.stations},
-            {number: instrument.offered for number, instrument in self._instruments.items()},
+            {number: instrument.reported_distances for number, instrument in self._instruments.items()},
             queued,
         )
         found.violations += self._wrong_ends(queued)
@@ -287,7 +287,8 @@ class Endurance:
     def _wrong_ends(self, queued: dict[int, int]) -> list[Violation]:
         wrong = [
             Violation(
-                "stuck", f"station {number}: {left} not delivered within {DRAIN_LIMIT_S:g} s (-1: no status)"
+                "liveness",
+                f"station {number}: {left} not delivered within {DRAIN_LIMIT_S:g} s (-1: no status)",
             )
             for number, left in queued.items()
             if left
@@ -383,7 +384,3 @@ def _print(result: dict[str, Any]) -> None:
     print(f"{len(result['violations'])} violations")
     for each in result["violations"]:
         print(f"{each['check']}: {each['detail']}")
-
-
-if __name__ == "__main__":
-    main()

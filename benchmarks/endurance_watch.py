@@ -18,8 +18,7 @@ import numpy as np
 
 from tsgt.config import ScenarioConfig
 from tsgt.log import configure_logging
-from tsgt.simulation.lora import AirServer
-from tsgt.simulation.mission import scenario_link
+from tsgt.simulation.lora import AirServer, scenario_link
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -24,7 +24,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of what is sent (default 0)")
     arguments = parser.parse_args()
     settings = LoRaSettings(frequency_hz=905_000_000, spreading_factor=9, bandwidth_hz=250_000, coding_rate=6)
-    timing = FrameTiming.stated(settings, start_jitter_ns=5 * MS, turn_round_ns=8 * MS, clock_error_ppm=100.0)
+    timing = FrameTiming.from_tolerances(
+        settings, start_jitter_ns=5 * MS, turnaround_ns=8 * MS, clock_error_ppm=100.0
+    )
     rng, begun_s = np.random.default_rng(arguments.seed), time.perf_counter()
     result = forge(timing, rng.bytes(32), arguments.packets, rng, per_step=200)
     print("| kind | to stations | accepted | to the master | accepted |")
@@ -43,7 +45,3 @@ def main() -> None:
     )
     if result.accepted.total() or result.diverged or not result.same_state:
         raise SystemExit(1)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """How old measurements are when frames begin on the instruments' beat, and when they follow each other at once.
 
-    python benchmarks/frame_lock.py
+    python benchmarks/run.py frame_lock
 
 Frames only, without radios and daemons: exact times on the air at SF 9, 250 kHz, rate 4/6; a master that needs 6 ms
 from the last reply to the next beacon; instruments with even intervals at random phases, 20 ppm apart; whole replies
@@ -171,7 +171,3 @@ def main() -> None:
             f"{np.quantile(medians, 0.9):.0f} in 8 of 10 seeds, {np.mean(medians <= 150):.0%} within 150 ms",
             flush=True,
         )
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """How small a movement of a tripod the live alarm finds, and whether it cries without one.
 
-    python benchmarks/frame_watch.py
+    python benchmarks/run.py frame_watch
 
 The figures stand in docs/how-to/calibrate.md, section "The live alarm".
 """
@@ -11,20 +11,18 @@ import dataclasses
 import logging
 import math
 import statistics
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import numpy as np
 import structlog
+from measuring import simulated
 
 from tsgt.config import ClassicMasterConfig, FrameWatchConfig, ScenarioConfig
-from tsgt.estimation import Feed
+from tsgt.estimation import LiveEstimator
 from tsgt.geometry import exp_so3, transform_from
-from tsgt.master.layout_monitor import FrameWatch
+from tsgt.master.layout_monitor import LayoutMonitor
 from tsgt.recording import PoseRecord, load_recording
-from tsgt.simulation.options import Options
-from tsgt.simulation.runner import simulate
+from tsgt.simulation.options import SimulationOptions
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -32,7 +30,7 @@ if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
     from tsgt.model import Measurement, Parameters
     from tsgt.recording import EventRecord
-    from tsgt.simulation.options import Node
+    from tsgt.simulation.options import StationSoftware
 
     Drive = tuple[Parameters, Sequence[Measurement]]
 
@@ -40,14 +38,14 @@ DURATION_S = 600.0
 SEEDS = (1, 2, 3)
 
 
-def drive(seed: int, node: Node) -> Drive:
+def drive(seed: int, node: StationSoftware) -> Drive:
     """Run the reference scenario with the paper's protocol at its modem settings; what the master received."""
-    with TemporaryDirectory() as name:
-        classic = ClassicMasterConfig(kind="classic")
-        options = Options(duration_s=DURATION_S, seed=seed, node=node, protocol=classic)
-        run = simulate(ScenarioConfig(), options, folder=Path(name))
-        (path,) = Path(name).glob("master*/*.jsonl")
-        return run.parameters, load_recording(path).measurements
+    classic = ClassicMasterConfig(kind="classic")
+    options = SimulationOptions(duration_s=DURATION_S, seed=seed, station_software=node, protocol=classic)
+    with simulated(ScenarioConfig(), options) as result:
+        path = result.master_logs[-1].recording()
+        assert path is not None  # noqa: S101 (the master has recorded)
+        return result.parameters, load_recording(path).measurements
 
 
 def with_moved(parameters: Parameters, station: int, movement: FloatArray) -> Parameters:
@@ -67,7 +65,7 @@ def with_moved(parameters: Parameters, station: int, movement: FloatArray) -> Pa
 
 def alarms(parameters: Parameters, measurements: Sequence[Measurement]) -> list[EventRecord]:
     """Run the live pipeline and its watch."""
-    feed, watch = Feed(parameters), FrameWatch(FrameWatchConfig(), parameters.pipeline.period_ns)
+    feed, watch = LiveEstimator(parameters), LayoutMonitor(FrameWatchConfig(), parameters.pipeline.period_ns)
     records = (record for measurement in measurements for record in feed.measurement(measurement))
     return [
         event
@@ -96,7 +94,7 @@ def report(what: str, drives: list[Drive], moves: list[FloatArray]) -> None:
 def main() -> None:
     """Print all figures."""
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
-    node: Node
+    node: StationSoftware
     for node in ("ours", "authors"):
         drives = [drive(seed, node) for seed in SEEDS]
         counts = [len(measurements) / 3 / DURATION_S for _, measurements in drives]
@@ -113,7 +111,3 @@ def main() -> None:
                 drives,
                 [transform_from(exp_so3(turn), np.zeros(3)) for turn in turns],
             )
-
-
-if __name__ == "__main__":
-    main()

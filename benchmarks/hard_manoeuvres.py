@@ -13,15 +13,13 @@ from __future__ import annotations
 import os
 import sys
 from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
 
 import numpy as np
+from harness.manoeuvre import speeding_up_and_turning_back
+from harness.prior_motion import measure, rows_at, sorted_by_time
 
 from tsgt.geometry.trajectory import FixedLagSmoother
 from tsgt.model import MotionPrior
-
-from harness.manoeuvre import speeding_up_and_turning_back
-from harness.prior_motion import measure, rows_at, sorted_by_time
 
 MANOEUVRES = {
     "turns back and speeds up": ((0.5, 1.5), (-0.5, 0.5)),

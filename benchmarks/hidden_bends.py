@@ -9,11 +9,10 @@ For each drive: NEES of valid poses, their errors, and the share of valid poses;
 from __future__ import annotations
 
 import sys
-import tempfile
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from measuring import normalised_squared, simulated
 
 from tsgt.analysis.evaluation import interior_mask
 from tsgt.analysis.smoothing import estimate_motion_model
@@ -27,7 +26,6 @@ from tsgt.log import configure_logging
 from tsgt.model import PipelineParameters
 from tsgt.recording import load_recording
 from tsgt.simulation.options import SimulationOptions
-from tsgt.simulation.runner import simulate
 from tsgt.simulation.scenario_files import find_scenario
 
 if TYPE_CHECKING:
@@ -59,8 +57,7 @@ def drive(name: str, seed: int) -> None:
         station_software="ours",
         protocol=SuperframeMasterConfig(kind="superframe"),
     )
-    with tempfile.TemporaryDirectory(prefix="tsgt-hidden-") as folder:
-        run = simulate(scenario, options, folder=Path(folder))
+    with simulated(scenario, options) as run:
         path = run.master_logs[-1].recording()
         if path is None:
             raise RuntimeError(f"{name}: the master made no recording")
@@ -95,7 +92,7 @@ def evaluate(name: str, recording: Recording, world: World, start_ns: int, end_n
         off_m = place_m - states.position
         turned = log_so3(np.swapaxes(states.rotation, 1, 2) @ truth[:, :3, :3])
         error = np.concatenate([off_m, turned], axis=1)
-        nees = np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[..., None])[..., 0])
+        nees = normalised_squared(error, covariance)
         valid = (np.linalg.eigvalsh(covariance[:, :3, :3])[:, -1] < ACCEPTED.position_sigma_limit_m**2) & (
             np.linalg.eigvalsh(covariance[:, 3:, 3:])[:, -1] < ACCEPTED.rotation_sigma_limit_rad**2
         )

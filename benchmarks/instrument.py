@@ -1,6 +1,6 @@
 """How fast the driver for Leica instruments reads a simulated one, and what that costs.
 
-    python benchmarks/instrument.py
+    python benchmarks/run.py instrument
 
 Ten minutes of virtual time for each row, over a line that has the pace of a real one. Ticks are the instants at which the
 instrument takes a distance; "offered" are those that an answer has carried. CPU is that of driver, line and simulated
@@ -76,14 +76,14 @@ async def run(case: Case, timeline: VirtualTimeline) -> Result:
     await driver.connect()
     await driver.track(1)
     await driver.read()
-    begun_ns, begun_cpu_s, before = clock.monotonic_ns(), time.process_time(), len(far_end.offered)
+    begun_ns, begun_cpu_s, before = clock.monotonic_ns(), time.process_time(), len(far_end.reported_distances)
     readings, ages_ms = [], []
     while clock.monotonic_ns() < begun_ns + DURATION_S * 1e9:
         reading = await driver.read()
         readings.append(reading.instrument_time_ns)
-        ages_ms.append((clock.monotonic_ns() - far_end.offered[-1].true_ns) / 1e6)
+        ages_ms.append((clock.monotonic_ns() - far_end.reported_distances[-1].true_ns) / 1e6)
     cpu_s = time.process_time() - begun_cpu_s
-    offered = len(far_end.offered) - before
+    offered = len(far_end.reported_distances) - before
     await driver.close()
     return Result(
         ticks=DURATION_S * case.rate_hz,
@@ -114,7 +114,3 @@ def main() -> None:
             f" | {100 * result.read / result.offered:.2f} % | {result.repeated}"
             f" | {result.age_ms[0]:.0f} / {result.age_ms[1]:.0f} ms | {result.cpu_s / DURATION_S * 60:.3f} s |"
         )
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """How well the instrument's time is put on the host's clock, as measurements come.
 
-    python benchmarks/instrument_time.py
+    python benchmarks/run.py instrument_time
 
 The first table is of the whole driver with a simulated instrument (20 ppm) and line, by the number of the distance since
 it was connected. The second is of the clock fit only, without lines and drivers: instrument times in whole ms, a crystal that is off and wanders, answers
@@ -137,7 +137,7 @@ async def driven(case: Driven, seed: int, timeline: VirtualTimeline) -> list[flo
     while len(found) < last:
         reading = await driver.read()
         if reading.slope_distance_m is not None:
-            found.append((reading.at_ns - far_end.offered[-1].true_ns) / 1e6)
+            found.append((reading.at_ns - far_end.reported_distances[-1].true_ns) / 1e6)
     await driver.close()
     return found
 
@@ -182,7 +182,3 @@ def main() -> None:
             cells.append(f"{np.median(part):.2f} / {part.max():.1f}")
         outside = np.mean(np.abs(table[:, 1]) > table[:, 2])
         print(f"| {case.name} | {' | '.join(cells)} | {np.median(table[:, 2]):.1f} | {100 * outside:.3f} % |")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """Kill -9 again and again: three clients and a master as processes, and what they have left behind at the end.
 
-Run it with ``python benchmarks/kill_loop.py --kills 200``. Daemons, sockets, serial lines (pseudo-terminals), files and
+Run it with ``python benchmarks/run.py kill_loop --kills 200``. Daemons, sockets, serial lines (pseudo-terminals), files and
 time are real, radios and instruments simulated, as in ``tsgt demo``. Each daemon is killed at a random age, half of the
 time within its first five seconds, one time in ten all at once, and started again a second later. A kill hardly ever
 tears a line, so every third time half a line is put behind the last one of the newest file, as a write that did not
@@ -33,8 +33,7 @@ from tsgt.simulation.checks import Violation
 from tsgt.simulation.demo import Demo, write_demo_files
 from tsgt.simulation.instrument import PtyLine, SimulatedTotalStation
 from tsgt.simulation.kernel import LoopTimeline
-from tsgt.simulation.lora import AirServer
-from tsgt.simulation.mission import scenario_link
+from tsgt.simulation.lora import AirServer, scenario_link
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -136,7 +135,7 @@ class KillLoop:
         found = aftermath(
             sorted(self._files.recordings.glob("*.jsonl")),
             {number: self._files.journals(number) for number in self._files.stations},
-            {number: instrument.offered for number, instrument in instruments.items()},
+            {number: instrument.reported_distances for number, instrument in instruments.items()},
             queued,
         )
         found.violations[:0] = self._problems
@@ -201,7 +200,7 @@ class KillLoop:
         for number, left in queued.items():
             if left:
                 detail = f"station {number}: {left} measurements not delivered within {DRAIN_LIMIT_S:g} s (-1: no status)"
-                self._problems.append(Violation("stuck", detail))
+                self._problems.append(Violation("liveness", detail))
         return queued
 
     async def _status(self, station: int, key: str) -> int:
@@ -238,7 +237,3 @@ async def _until(condition: Callable[[], bool]) -> None:
 def _holds(path: Path, key: bytes) -> bool:
     content = path.read_bytes()
     return key in content.lower() or bytes.fromhex(key.decode()) in content
-
-
-if __name__ == "__main__":
-    main()

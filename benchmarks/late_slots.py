@@ -1,6 +1,6 @@
 """How often a station misses its slot while both cores are busy with something else, and what that costs.
 
-Run it with ``python benchmarks/late_slots.py [SECONDS]``; two minutes unless told otherwise. The demonstration runs in
+Run it with ``python benchmarks/run.py late_slots [SECONDS]``; two minutes unless told otherwise. The demonstration runs in
 real time, three clients and a master as processes of their own, beside one process per core that does nothing but
 count. Late slots are what the clients say of themselves, slots the beacons in the master's recording, and nothing may
 be missing in it that a client has in its journal, but for what was under way when everything ended.
@@ -99,7 +99,3 @@ def beacons(recording: Path) -> tuple[int, int]:
             if line.startswith(b'{"type":"beacon"'):
                 count, last_ns = count + 1, json.loads(line)["stamp_ns"]
     return count, last_ns
-
-
-if __name__ == "__main__":
-    main()

@@ -10,17 +10,17 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measuring import Stopwatch
 
 from tsgt.analysis.merge import merge
 from tsgt.config import ClassicMasterConfig, ScenarioConfig, SuperframeMasterConfig
 from tsgt.log import configure_logging
 from tsgt.recording import MergedRecord, decode_line, read_lines
-from tsgt.simulation.options import Options, Outage
+from tsgt.simulation.options import Outage, SimulationOptions
 from tsgt.simulation.runner import simulate
 
 AROUND_S = 300.0
@@ -60,7 +60,7 @@ def figures(protocol: str, outage_min: float, seed: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name:
         run = simulate(
             ScenarioConfig(),
-            Options(
+            SimulationOptions(
                 duration_s=AROUND_S + outage_s + after_s,
                 drift_ppm=20.0,
                 drift_ramp_ppm_per_min=0.5,
@@ -73,19 +73,21 @@ def figures(protocol: str, outage_min: float, seed: int) -> dict[str, Any]:
             ),
             folder=Path(name),
         )
-        path = run.sessions[0].recording()
+        path = run.master_logs[0].recording()
         assert path is not None  # noqa: S101 (the master has recorded)
-        journals = [journal for witness in run.witnesses.values() for journal in witness.journals]
-        began_s = time.perf_counter()
-        merged = merge(path, journals)
-        seconds = time.perf_counter() - began_s
+        journals = [journal for station_log in run.station_logs.values() for journal in station_log.journals]
+        with Stopwatch() as stopwatch:
+            merged = merge(path, journals)
         added = [
             decode_line(MergedRecord, line, path).measurement
             for line in read_lines(path)
             if line.type == "merged"
         ]
     errors_ns = np.abs(
-        [m.stamp_ns - run.start_ns - run.witnesses[m.station].stamps_ns[m.host_time_ns or 0] for m in added]
+        [
+            m.stamp_ns - run.start_ns - run.station_logs[m.station].true_times_ns[m.host_time_ns or 0]
+            for m in added
+        ]
     )
     bounds_ns = np.array([m.stamp_bound_ns or 0 for m in added])
     return {
@@ -95,9 +97,5 @@ def figures(protocol: str, outage_min: float, seed: int) -> dict[str, Any]:
         "error_ms": {"p50": float(np.median(errors_ns)) / 1e6, "max": float(errors_ns.max()) / 1e6},
         "bound_ms": {"p50": float(np.median(bounds_ns)) / 1e6, "max": float(bounds_ns.max()) / 1e6},
         "broken": int(np.count_nonzero(errors_ns > bounds_ns)),
-        "seconds": seconds,
+        "seconds": stopwatch.wall_s,
     }
-
-
-if __name__ == "__main__":
-    main()

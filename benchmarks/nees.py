@@ -10,15 +10,14 @@ from __future__ import annotations
 
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
+from harness.prior_motion import STEP_S, draw_motions, measure, rows_at, sorted_by_time
+from measuring import normalised_squared
 from scipy.stats import chi2
 
 from tsgt.geometry.trajectory import Trajectory, initial_guess, knot_times, solve
 from tsgt.model import MotionPrior
-
-from harness.prior_motion import STEP_S, draw_motions, measure, rows_at, sorted_by_time
 
 ROBOTS = 400
 UNTIL_S = 20.0
@@ -60,8 +59,9 @@ def main() -> None:
             states, covariance = trajectory.at(asked_s)
             error = motion.select(rows_at(asked_s)).local_coordinates_about(states)
             for part, rows in PARTS.items():
-                solved = np.linalg.solve(covariance[:, rows, rows], error[:, rows, None])[..., 0]
-                found.setdefault((name, part), []).append(np.einsum("ni,ni->n", error[:, rows], solved))
+                found.setdefault((name, part), []).append(
+                    normalised_squared(error[:, rows], covariance[:, rows, rows])
+                )
     outside = total = 0
     for name, (unit, instants_s) in tables.items():
         print(f"{name}, {robots} robots: mean NEES, (share beyond the 95 % limit)")

@@ -7,7 +7,7 @@ prisms, standing and driving, and poses against the truth, three times over:
 - ``letter``: the same with nodes as the authors deployed them and the paper's clock filter, at 10 ppm of drift;
 - ``ours``: protocol superframe, estimator continuous.
 
-    python benchmarks/paper_experiments.py [--experiment NAME]... [--json]
+    python benchmarks/run.py paper_experiments [--experiment NAME]... [--json]
 
 What the figures mean stands in docs/explanation/paper-experiments.md.
 """
@@ -16,22 +16,21 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
+from measuring import simulated
 
 from tsgt.analysis.evaluation import (
     PairDistances,
     PoseErrors,
     Reference,
     distances_at_epochs,
-    interior_mask,
     inter_prism,
+    interior_mask,
     pose_errors,
     stationary_errors,
 )
@@ -44,7 +43,6 @@ from tsgt.geometry import quaternion_from_rotation, rotation_from_quaternion, tr
 from tsgt.log import configure_logging
 from tsgt.recording import load_recording
 from tsgt.simulation.options import SimulationOptions
-from tsgt.simulation.runner import simulate
 from tsgt.simulation.scenario_files import find_scenario
 
 if TYPE_CHECKING:
@@ -98,8 +96,7 @@ def drive(experiment: str, system: str, seed: int) -> Drive:
             kind="classic", clock_filter="paper" if system == "letter" else "regression"
         ),
     )
-    with tempfile.TemporaryDirectory(prefix="tsgt-paper-") as folder:
-        run = simulate(scenario, options, folder=Path(folder))
+    with simulated(scenario, options) as run:
         path = run.master_logs[-1].recording()
         if path is None:
             raise RuntimeError(f"{experiment}, {system}: the master made no recording")
@@ -262,7 +259,3 @@ def main(experiments: tuple[str, ...], systems: tuple[str, ...], jobs: int, *, a
     for experiment, by_system in result.items():
         for system, found in by_system.items():
             click.echo(row(experiment, system, found))
-
-
-if __name__ == "__main__":
-    main()

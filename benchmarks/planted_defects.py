@@ -1,6 +1,6 @@
 """Would the checkers see a defect? Defects planted in the program one by one, and which check or test finds each.
 
-    python benchmarks/planted_defects.py [NAMES ...] [--seeds N]
+    python benchmarks/run.py planted_defects [NAMES ...] [--seeds N]
 
 A defect is a wrong function in the place of a right one, for as long as its missions run and are checked: nothing is
 edited, and the checkers run with the defect, as they would if it were in the program. Each runs short simulated
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import errno
 import logging
 import os
 import subprocess
@@ -25,21 +26,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
 import pytest
-
-from tsgt.config import ClassicMasterConfig, ScenarioConfig, SuperframeMasterConfig
-from tsgt.log import configure_logging
-from tsgt.simulation.checks import violations
-from tsgt.simulation.faults import QUICK_CYCLES, FaultKind
-from tsgt.simulation.mission import FULL, MASTER
-from tsgt.simulation.options import Options
-from tsgt.simulation.runner import simulate
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from harness import defects
 from harness.defects import Planting
 
+from tsgt.config import ClassicMasterConfig, ScenarioConfig, SuperframeMasterConfig
+from tsgt.log import configure_logging
+from tsgt.simulation.checks import check_invariants
+from tsgt.simulation.faults import FAST_SYNC_CYCLES, FaultKind
+from tsgt.simulation.mission import MASTER
+from tsgt.simulation.options import SimulationOptions
+from tsgt.simulation.runner import simulate
+
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Sequence
+    from collections.abc import Callable, Coroutine
 
     from tsgt.simulation.mission import Mission
 
@@ -103,10 +102,10 @@ async def killed_with_a_full_disk(mission: Mission) -> None:
     """Kill the master while its disk takes nothing."""
     disk = mission.computers[MASTER].disk
     await mission.sleep_until(20.0)
-    disk.refuse(FULL, 20 * 10**9, 27 * 10**9)
+    disk.fail_writes(errno.ENOSPC, 20 * 10**9, 27 * 10**9)
     await mission.sleep_until(25.0)
-    await mission.crash(MASTER, away_s=2.0)
-    disk.refuses = None
+    await mission.crash(MASTER, down_s=2.0)
+    disk.write_error = None
 
 
 async def sleeping_reader(mission: Mission) -> None:
@@ -208,11 +207,11 @@ def hunt(defect: Defect, seeds: int = SEEDS) -> Found:
     protocol = (
         SuperframeMasterConfig(kind="superframe")
         if defect.protocol == "superframe"
-        else ClassicMasterConfig(kind="classic", initial_cycles=QUICK_CYCLES)
+        else ClassicMasterConfig(kind="classic", initial_cycles=FAST_SYNC_CYCLES)
     )
     planting = Planting()
     for seed in range(seeds):
-        options = Options(
+        options = SimulationOptions(
             duration_s=defect.duration_s,
             drift_ppm=defect.drift_ppm,
             seed=seed,
@@ -224,7 +223,7 @@ def hunt(defect: Defect, seeds: int = SEEDS) -> Found:
             try:
                 defect.plant(planting)
                 run = simulate(scenario, options, folder=Path(folder), script=defect.script)
-                seen = violations(run)
+                seen = check_invariants(run)
             except Exception as error:  # (a daemon or a checker that falls over is seen as well)
                 if _is_ours(error):
                     raise
@@ -252,7 +251,7 @@ def fails(key: str) -> bool:
     """Whether a defect's test passes without it and fails with it, each time in a process of its own."""
     planted = f"import planted_defects as p; p.DEFECTS[{key!r}].plant(p.Planting())"
     run = f"import sys, pytest; sys.exit(pytest.main(['-q', '-p', 'no:cacheprovider', {str(TESTS / DEFECTS[key].test)!r}]))"
-    path = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
+    path = os.pathsep.join([str(Path(__file__).parent), str(TESTS), os.environ.get("PYTHONPATH", "")])
     ends = [
         subprocess.run(
             [sys.executable, "-c", f"{first}\n{run}"],
@@ -266,33 +265,8 @@ def fails(key: str) -> bool:
     return ends == [pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED]
 
 
-def main(names: Sequence[str] = (), seeds: int = SEEDS, *, verbose: bool = False) -> int:
-    """Print the table; return 3 if something was not found."""
-    configure_logging("critical")
-    logging.disable(logging.CRITICAL)  # asyncio's, of daemons that are killed
-    print("| defect | protocol, estimator | faults | seen by | after, s |\n|---|---|---|---|---|")
-    missed = 0
-    for key in names or DEFECTS:
-        defect = DEFECTS[key]
-        if defect.test:
-            seen = f"`{defect.test}`" if fails(key) else ""
-            print(f"| {defect.name} | | | {seen or '**nothing**'} | |", flush=True)
-        else:
-            found = hunt(defect, seeds)
-            seen = ", ".join(sorted(found.checks))
-            print(
-                f"| {defect.name} | {defect.protocol}, {defect.estimator} | {', '.join(defect.faults)} | "
-                f"{seen or '**nothing**'} | {found.simulated_s:g} |",
-                flush=True,
-            )
-            if verbose:
-                print(f"    {dict(found.checks)} {found.example[:300]}", flush=True)
-        missed += not seen
-    return 3 if missed else 0
-
-
-if __name__ == "__main__":
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+def main() -> int:
+    """Read the command line, print the table; return 3 if a defect was not detected."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -302,4 +276,24 @@ if __name__ == "__main__":
     )
     parser.add_argument("-v", "--verbose", action="store_true", help="also the first violation of each")
     arguments = parser.parse_args()
-    sys.exit(main(arguments.names, arguments.seeds, verbose=arguments.verbose))
+    configure_logging("critical")
+    logging.disable(logging.CRITICAL)  # asyncio's, of daemons that are killed
+    print("| defect | protocol, estimator | faults | seen by | after, s |\n|---|---|---|---|---|")
+    missed = 0
+    for key in arguments.names or DEFECTS:
+        defect = DEFECTS[key]
+        if defect.test:
+            seen = f"`{defect.test}`" if fails(key) else ""
+            print(f"| {defect.name} | | | {seen or '**nothing**'} | |", flush=True)
+        else:
+            found = hunt(defect, arguments.seeds)
+            seen = ", ".join(sorted(found.checks))
+            print(
+                f"| {defect.name} | {defect.protocol}, {defect.estimator} | {', '.join(defect.faults)} | "
+                f"{seen or '**nothing**'} | {found.simulated_s:g} |",
+                flush=True,
+            )
+            if arguments.verbose:
+                print(f"    {dict(found.checks)} {found.example[:300]}", flush=True)
+        missed += not seen
+    return 3 if missed else 0

@@ -13,23 +13,23 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
 from concurrent.futures import ProcessPoolExecutor
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from measuring import Stopwatch
 
 from tsgt.config import ScenarioConfig, scenario_parameters
-from tsgt.estimation import Pipeline
+from tsgt.estimation import LinearEstimator
 from tsgt.recording import RecordingHeader, RecordingWriter
 from tsgt.simulation.instrument import SimulatedLine, SimulatedTotalStation
 from tsgt.simulation.kernel import VirtualClock, VirtualTimeline, run_virtual
 from tsgt.simulation.mission import instrument_config
 from tsgt.simulation.world import scenario_world
 from tsgt.station.leica import LeicaInstrument
-from tsgt.station.session import Session
+from tsgt.station.session import ClientSession
 
 if TYPE_CHECKING:
     from tsgt.config import SimulatedStation
@@ -71,7 +71,7 @@ def write_recording(path: Path) -> int:
     timeline = VirtualTimeline()
     unsorted = run_virtual(lambda: measured(scenario, timeline), timeline)
     measurements = sorted(unsorted, key=lambda m: m.stamp_ns)
-    pipeline = Pipeline(parameters)
+    pipeline = LinearEstimator(parameters)
     with RecordingWriter(path) as writer:
         writer.write(RecordingHeader(software="benchmark", created_ns=START_NS, source="simulation"))
         writer.write(parameters)
@@ -94,7 +94,7 @@ async def measured(scenario: ScenarioConfig, timeline: VirtualTimeline) -> list[
         instrument = LeicaInstrument(instrument_config(station, Path()), line.open, clock)
         await instrument.connect()
         await instrument.track(station.prism)
-        session = Session(station.station, station.prism)
+        session = ClientSession(station.station, station.prism)
         readings = []
         while clock.monotonic_ns() < DURATION_S * 1_000_000_000:
             reading = await instrument.read()
@@ -121,12 +121,7 @@ def best(*arguments: str) -> tuple[float, float]:
 
 def read_with_json(path: Path) -> float:
     """CPU time in s of parsing every line."""
-    before = time.process_time()
-    with path.open("rb") as file:
+    with Stopwatch() as stopwatch, path.open("rb") as file:
         for line in file:
             json.loads(line)
-    return time.process_time() - before
-
-
-if __name__ == "__main__":
-    main()
+    return stopwatch.cpu_s

@@ -5,22 +5,20 @@ that speak GeoCOM, and afterwards every checker. CPU time is that of the whole p
 machine that is busy with other things it grows, so compare figures of one sitting only. The five seconds of the drain
 at the end of a run are simulated and not counted.
 
-Run ``python benchmarks/simulation_speed.py [SECONDS] [RUNS]``.
+Run ``python benchmarks/run.py simulation_speed [SECONDS] [RUNS]``.
 """
 
 from __future__ import annotations
 
 import sys
-import time
-from pathlib import Path
-from tempfile import TemporaryDirectory
+from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
+from measuring import Stopwatch, simulated
+
 from tsgt.config import ClassicMasterConfig, SuperframeMasterConfig
-from tsgt.log import configure_logging
-from tsgt.simulation.checks import violations
-from tsgt.simulation.options import Options
-from tsgt.simulation.runner import simulate
+from tsgt.simulation.checks import check_invariants
+from tsgt.simulation.options import SimulationOptions
 from tsgt.simulation.scenario_files import find_scenario
 
 if TYPE_CHECKING:
@@ -33,9 +31,10 @@ PROTOCOLS = (ClassicMasterConfig(kind="classic"), SuperframeMasterConfig(kind="s
 ESTIMATORS = ("linear", "continuous")
 
 
-def main(duration_s: float = DURATION_S, runs: int = RUNS) -> None:
+def main() -> None:
     """Print a row for each protocol and estimator."""
-    configure_logging("error")
+    duration_s = float(sys.argv[1]) if len(sys.argv) > 1 else DURATION_S
+    runs = int(sys.argv[2]) if len(sys.argv) > 2 else RUNS
     scenario = find_scenario("dynamic")
     print(f"dynamic, {duration_s:g} simulated seconds, seed {SEED}; CPU time is the least of {runs} runs")
     print(f"{'':24}{'simulation CPU s':>18}{'checkers CPU s':>16}{'simulated s per CPU s':>23}")
@@ -43,7 +42,7 @@ def main(duration_s: float = DURATION_S, runs: int = RUNS) -> None:
         for estimator in ESTIMATORS:
             settings = scenario.pipeline.model_copy(update={"estimator": estimator})
             chosen = scenario.model_copy(update={"pipeline": settings})
-            options = Options(duration_s=duration_s, protocol=protocol, seed=SEED)
+            options = SimulationOptions(duration_s=duration_s, protocol=protocol, seed=SEED)
             simulation_s, checkers_s = min((timed(chosen, options) for _ in range(runs)), key=sum)
             rate = duration_s / (simulation_s + checkers_s)
             print(
@@ -52,7 +51,7 @@ def main(duration_s: float = DURATION_S, runs: int = RUNS) -> None:
             )
 
 
-def timed(scenario: ScenarioConfig, options: Options) -> tuple[float, float]:
+def timed(scenario: ScenarioConfig, options: SimulationOptions) -> tuple[float, float]:
     """Return the CPU time of a run and of its checkers, in s.
 
     Raises
@@ -60,19 +59,11 @@ def timed(scenario: ScenarioConfig, options: Options) -> tuple[float, float]:
     SystemExit
         A checker has found something: a run that is wrong has no speed.
     """
-    with TemporaryDirectory() as folder:
-        began_s = time.process_time()
-        run = simulate(scenario, options, folder=Path(folder))
-        simulated_s = time.process_time()
-        found = violations(run)
-        if found:
-            sys.exit(f"{found[0].check}: {found[0].detail}")
-        return simulated_s - began_s, time.process_time() - simulated_s
-
-
-if __name__ == "__main__":
-    arguments = [float(argument) for argument in sys.argv[1:]]
-    main(
-        arguments[0] if arguments else DURATION_S,
-        int(arguments[1]) if len(arguments) > 1 else RUNS,
-    )
+    with ExitStack() as stack:
+        with Stopwatch() as simulation:
+            result = stack.enter_context(simulated(scenario, options))
+        with Stopwatch() as checkers:
+            found = check_invariants(result)
+    if found:
+        sys.exit(f"{found[0].check}: {found[0].detail}")
+    return simulation.cpu_s, checkers.cpu_s

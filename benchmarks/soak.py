@@ -1,6 +1,6 @@
 """Many simulated missions with faults of all kinds, each from one seed, and what must never happen counted in all of them.
 
-    python benchmarks/soak.py [--minutes M] [--first SEED] [--seeds N] [--jobs J] [--json FILE]
+    python benchmarks/run.py soak [--minutes M] [--first SEED] [--seeds N] [--jobs J] [--json FILE]
 
 Protocol, estimator, losses and drifts change from seed to seed, and with them how often which faults come
 (`tsgt/simulation/faults/catalogue.py`). A line for each violation says how to get the same run again. `make soak` runs it for a
@@ -26,18 +26,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from measuring import normalised_squared
 
 from tsgt.config import ClassicMasterConfig, SuperframeMasterConfig
 from tsgt.geometry import log_so3, rotation_from_quaternion
 from tsgt.log import configure_logging
-from tsgt.simulation.checks import violations
-from tsgt.simulation.faults import QUICK_CYCLES, FaultKind
-from tsgt.simulation.options import Options
+from tsgt.simulation.checks import check_invariants
+from tsgt.simulation.faults import FAST_SYNC_CYCLES, FaultKind
+from tsgt.simulation.options import SimulationOptions
 from tsgt.simulation.runner import simulate
 from tsgt.simulation.scenario_files import find_scenario
 
 if TYPE_CHECKING:
-    from tsgt.simulation.mission import Run
+    from tsgt.simulation.mission import MissionResult
 
 DURATION_S = 220.0
 LIMITS = (22.46, 38.26, 60.0)
@@ -130,20 +131,20 @@ def run(seed: int) -> Sums:
     pipeline = scenario.pipeline.model_copy(update={"estimator": mission.estimator})
     radio = scenario.radio.model_copy(update={"loss_probability": mission.loss})
     scenario = scenario.model_copy(update={"pipeline": pipeline, "radio": radio})
-    options = Options(
+    options = SimulationOptions(
         duration_s=DURATION_S,
         drift_ppm=mission.drift_ppm,
         seed=seed,
         protocol=SuperframeMasterConfig(kind="superframe")
         if mission.protocol == "superframe"
-        else ClassicMasterConfig(kind="classic", initial_cycles=QUICK_CYCLES),
+        else ClassicMasterConfig(kind="classic", initial_cycles=FAST_SYNC_CYCLES),
         faults=frozenset(FaultKind),
     )
     began_s = time.process_time()
     with tempfile.TemporaryDirectory(prefix="tsgt-soak-") as folder:
         try:
             done = simulate(scenario, options, folder=Path(folder))
-            found = [f"{each.check}: {each.detail}" for each in violations(done)]
+            found = [f"{each.check}: {each.detail}" for each in check_invariants(done)]
             _count(done, sums)
         except (KeyboardInterrupt, SystemExit):
             raise
@@ -155,9 +156,9 @@ def run(seed: int) -> Sums:
     return sums
 
 
-def _count(done: Run, sums: Sums) -> None:
+def _count(done: MissionResult, sums: Sums) -> None:
     sums.faults.update({str(kind): count for kind, count in done.faults.items()})
-    for session in done.sessions:
+    for session in done.master_logs:
         poses = session.valid_poses()
         sums.measurements += len(session.measurements)
         sums.poses += len(poses.stamp_ns)
@@ -165,10 +166,10 @@ def _count(done: Run, sums: Sums) -> None:
             some = poses.select(poses.kind == kind)
             if not len(some.stamp_ns):
                 continue
-            truth = done.world.pose_at((some.stamp_ns - session.zero_ns) / 1e9)
+            truth = done.world.pose_at((some.stamp_ns - session.unix_at_zero_ns) / 1e9)
             turned = rotation_from_quaternion(some.orientation_xyzw) @ np.swapaxes(truth[:, :3, :3], 1, 2)
             errors = np.concatenate([some.position_m - truth[:, :3, 3], log_so3(turned)], axis=1)
-            nees = np.einsum("ni,ni->n", errors, np.linalg.solve(some.covariance, errors[..., None])[..., 0])
+            nees = normalised_squared(errors, some.covariance)
             sums.above[f"{kind}, all"] += len(nees)
             sums.above[f"{kind}, sum"] += round(float(nees.sum()))
             for limit in LIMITS:
@@ -240,8 +241,3 @@ def main() -> int:
                 )
     report(sums)
     return 3 if sums.violations else 0
-
-
-if __name__ == "__main__":
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    sys.exit(main())

@@ -1,6 +1,6 @@
 """What the superframe carries, how old it is and how well it is timed, beside the paper's protocol.
 
-Run it with ``python benchmarks/superframe.py``; about five minutes on two cores. Each row is one ``tsgt simulate``, whose
+Run it with ``python benchmarks/run.py superframe``; about five minutes on two cores. Each row is one ``tsgt simulate``, whose
 options stand in it, so that any row can be had alone.
 """
 
@@ -75,7 +75,3 @@ def row(case: str, result: dict[str, Any]) -> str:
             f"time error of what was measured within {within['p50']:.0f} / {within['p99']:.0f} / {within['max']:.0f})"
         )
     return f"| {' | '.join(cells)} |"
-
-
-if __name__ == "__main__":
-    main()

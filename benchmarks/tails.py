@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 from instrument_time import Case, errors  # type: ignore[import-not-found]  # a script in this folder
+from measuring import normalised_squared
 from scipy.stats import chi2
 
 from tsgt.config import ScenarioConfig
@@ -93,8 +94,7 @@ def figures(observations: Observations, world: World) -> tuple[np.ndarray, np.nd
     truth = world.pose_at(times_s)
     off_m = truth[:, :3, 3] - states.position
     error = np.concatenate([off_m, log_so3(np.swapaxes(states.rotation, 1, 2) @ truth[:, :3, :3])], axis=1)
-    solved = np.linalg.solve(covariance[:, :6, :6], error[..., None])[..., 0]
-    return np.einsum("ni,ni->n", error, solved), np.einsum("ni,ni->n", off_m, off_m)
+    return normalised_squared(error, covariance[:, :6, :6]), np.einsum("ni,ni->n", off_m, off_m)
 
 
 def main() -> None:

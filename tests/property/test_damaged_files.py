@@ -1,4 +1,4 @@
-"""Damaged files of all other kinds at the desk: a result, or one line that says what is wrong; never half a file."""
+"""Damaged files of post-processing: a result, or one line with the error; never a partial output file."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from harness.cli import called
 from harness.damage import UNHARMED, Damage, Samples, damages, examples
 from harness.harmless import Files, check
 from harness.pos_files import SECOND, write_pos
-from harness.published import write_prisms, write_targets, write_tracks
+from harness.published import CONSTANTS, write_prisms, write_targets, write_tracks
 from hypothesis import example, given
 from hypothesis import strategies as st
 
@@ -36,7 +36,7 @@ START_S = 1_700_000_000
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Samples:
-    """One good file of each kind."""
+    """Return one valid file of each kind."""
     folder = tmp_path_factory.mktemp("good")
     tracks = write_tracks(folder, duration_s=6.0)
     write_prisms(folder)
@@ -44,7 +44,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Samples:
     assert (
         called(
             *("import", "rts", "--tracks", *tracks, "--prisms", folder / "sensor_positions.csv"),
-            *("--targets", folder / "GCP.txt", "--output", folder / "r.jsonl"),
+            *("--targets", folder / "GCP.txt", *CONSTANTS, "--output", folder / "r.jsonl"),
         ).code
         == 0
     )
@@ -69,19 +69,19 @@ COMMANDS: dict[str, tuple[tuple[str, ...], str, str]] = {
     "tracks": ((*IMPORT, "--prisms", "@sensor_positions.csv"), "trimble2.csv", "o.jsonl"),
     "published prisms": ((*IMPORT, "--prisms", "@sensor_positions.csv"), "sensor_positions.csv", "o.jsonl"),
     "published targets": (
-        (*IMPORT, "--prisms", "@sensor_positions.csv", "--targets", "@GCP.txt"),
+        (*IMPORT, "--prisms", "@sensor_positions.csv", "--targets", "@GCP.txt", *CONSTANTS),
         "GCP.txt",
         "o.jsonl",
     ),
     "raw measurements": (
         (
             *("import", "polar", "--tracks", "@polar.csv", "--prisms", "@sensor_positions.csv"),
-            *("--frames", "@frames.toml"),
+            *("--frames", "@frames.toml", "--prism-constant-mm", "10"),
         ),
         "polar.csv",
         "o.jsonl",
     ),
-    "marker file": (("calibrate", "targets", "@GCP.txt"), "GCP.txt", "o.toml"),
+    "marker file": (("calibrate", "targets", "@GCP.txt", *CONSTANTS[:2]), "GCP.txt", "o.toml"),
     "receivers": (("analyse", "gnss", "@1.pos", "@2.pos", "--recording", "@r.jsonl"), "2.pos", ""),
     "reference": ((*EVALUATE, "--reference", "@r.tum"), "r.tum", ""),
     "reference exported": (
@@ -98,8 +98,8 @@ COMMANDS: dict[str, tuple[tuple[str, ...], str, str]] = {
 @examples(3)
 @given(damage=damages)
 @example(damage=UNHARMED)
-def test_data_files(good: Samples, command: str, damage: Damage) -> None:
-    """What others have written, and set-up files: each command works on a damaged one or refuses it."""
+def test_damaged_data_files(good: Samples, command: str, damage: Damage) -> None:
+    """Data and set-up files: each command succeeds with a damaged one or rejects it."""
     arguments, name, output = COMMANDS[command]
     name = name or arguments[-1].removeprefix("@")
     with Files({**good.of, name: damage.to([good.of[name]])}) as files:
@@ -109,7 +109,7 @@ def test_data_files(good: Samples, command: str, damage: Damage) -> None:
 
 @examples(15)
 @given(damage=damages, command=st.sampled_from(["targets", "prisms"]), levelled=st.booleans())
-def test_target_files(damage: Damage, command: str, levelled: bool) -> None:  # noqa: FBT001 (given by hypothesis)
+def test_damaged_target_files(damage: Damage, command: str, levelled: bool) -> None:  # noqa: FBT001 (given by hypothesis)
     """Our CSV and the authors' marker file, in all forms of the reference page."""
     with Files({"measured.csv": damage.to(DOCUMENTED)}) as files:
         extra = ("--levelled",) * (levelled and command == "targets")
@@ -118,24 +118,24 @@ def test_target_files(damage: Damage, command: str, levelled: bool) -> None:  # 
 
 @examples(40)
 @given(damage=damages)
-def test_configurations(damage: Damage) -> None:
-    """Every example file of a configuration, damaged, is a configuration or one line of error."""
+def test_damaged_configurations(damage: Damage) -> None:
+    """Every example configuration, damaged, is valid or one line of error."""
     with Files({**SETUP, "c.toml": damage.to(EXAMPLES)}) as files:
         check(files, ("config", "check", "@c.toml"))
 
 
 @examples(15)
 @given(damage=damages, master=st.sampled_from(MASTERS), name=st.sampled_from(sorted(SETUP)))
-def test_what_a_configuration_names(damage: Damage, master: bytes, name: str) -> None:
-    """A good configuration that names a damaged set-up file is checked together with that."""
+def test_damaged_files_named_by_a_configuration(damage: Damage, master: bytes, name: str) -> None:
+    """A valid configuration with a damaged set-up file."""
     with Files({**SETUP, name: damage.to([SETUP[name]]), "c.toml": master}) as files:
         check(files, ("config", "check", "@c.toml"))
 
 
 @examples(1)
 @given(damage=damages)
-def test_studies(damage: Damage) -> None:
-    """A damaged layout or scenario is studied or refused."""
+def test_damaged_studies(damage: Damage) -> None:
+    """A damaged layout or scenario is evaluated or rejected."""
     content = damage.to([LAYOUT, *SCENARIOS])
     with Files({"f.toml": content}) as files:
         if b'kind = "scenario"' in content:

@@ -1,4 +1,4 @@
-"""The reader of RTKLIB's files: what was written is read back, and whatever else comes is refused in one line."""
+"""The reader of RTKLIB files: valid files are read exactly, all others are rejected in one line."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ rows = st.lists(
 
 
 @given(variants, rows)
-def test_what_was_written_is_read(
+def test_written_files_are_read_exactly(
     variant: Variant, written: list[tuple[int, tuple[float, ...], int, int]]
 ) -> None:
-    """Times exactly, places to the last digit of each format, in any order of time."""
+    """Times exactly, positions to the last digit of each format, in any order of time."""
     with tempfile.TemporaryDirectory() as folder:
         path = write_pos(
             Path(folder) / "rover.pos",
@@ -68,8 +68,8 @@ def test_what_was_written_is_read(
     st.integers(0, 30),
     st.text(st.sampled_from("0123456789.-/:, %\n\teE+abQ'\"é\u0660"), max_size=30),
 )
-def test_damage_is_refused_or_read(variant: Variant, start: int, length: int, put_in: str) -> None:
-    """A file in which something was overwritten is read, or refused with its name; nothing else happens."""
+def test_damaged_file_is_read_or_rejected(variant: Variant, start: int, length: int, put_in: str) -> None:
+    """A file with overwritten characters; the error names the file."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "rover.pos"
         times = [FIRST * SECOND + k * SECOND for k in range(3)]
@@ -80,8 +80,8 @@ def test_damage_is_refused_or_read(variant: Variant, start: int, length: int, pu
 
 
 @given(st.binary(max_size=200), st.booleans())
-def test_garbage_is_refused(content: bytes, header: bool) -> None:  # noqa: FBT001 (given by hypothesis)
-    """Bytes of any kind, also after a good header."""
+def test_random_bytes_are_rejected(content: bytes, header: bool) -> None:  # noqa: FBT001 (given by hypothesis)
+    """Also after a valid header."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "rover.pos"
         before = "\n".join([*Variant().header(), ""]).encode() if header else b""
@@ -90,15 +90,15 @@ def test_garbage_is_refused(content: bytes, header: bool) -> None:  # noqa: FBT0
 
 
 def check(path: Path) -> None:
-    """Read a file; where that works, the numbers are such as can be computed with."""
-    said = ""
+    """Read a file; without an error, the numbers are finite and times increase."""
+    message = ""
     try:
         (found,) = receivers([read_pos(path)])
     except InputFileError as error:
-        said = str(error)
-    if said:
-        assert said.startswith(str(path))
-        assert "\n" not in said
+        message = str(error)
+    if message:
+        assert message.startswith(str(path))
+        assert "\n" not in message
         return
     assert np.isfinite(found.points_m).all()
     assert (np.diff(found.times_ns) > 0).all()

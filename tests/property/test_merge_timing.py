@@ -1,4 +1,4 @@
-"""Whatever a clock within the stated model does between synchronisations: merged times are within the stated bound."""
+"""Times of merged measurements are within their bound for any clock within the stated model."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_bound_contains_the_truth(
     loss: float,
     gaps_s: list[float],
 ) -> None:
-    """Random drift, temperature waves, late stamps, losses and outages; before, between and after synchronisations."""
+    """Random drift, temperature waves, delays, losses and outages; before, between and after synchronisations."""
     rng = np.random.default_rng(seed)
     period_s, phase = rng.uniform(1200, 7200), rng.uniform(0, 2 * math.pi)
     # Frequency is a wave whose steepest slope is the wander.

@@ -25,7 +25,7 @@ SCENE = replace(
 
 
 def recording_of(measurements: list[Measurement], parameters: Parameters = SCENE.parameters) -> Recording:
-    """Make a recording of measurements, in the order given."""
+    """Return a recording of measurements, in the order given."""
     return Recording(
         header=RecordingHeader(software="test", created_ns=0, source="test"),
         parameters=parameters,
@@ -35,7 +35,7 @@ def recording_of(measurements: list[Measurement], parameters: Parameters = SCENE
 
 
 def drive(*, delay_s: float = 0.1) -> list[Measurement]:
-    """Four seconds of three stations."""
+    """Return four seconds of measurements by three stations."""
     return [
         SCENE.measure(station, 0.4 * step + 0.11 * station, delay_s=delay_s)
         for step in range(10)
@@ -43,15 +43,15 @@ def drive(*, delay_s: float = 0.1) -> list[Measurement]:
     ]
 
 
-def test_the_poses_are_those_of_the_robot() -> None:
-    """Straight lines between exact measurements stay near the driven bend."""
+def test_poses_equal_those_of_the_robot() -> None:
+    """Linear interpolation between exact measurements stays near the true curve."""
     poses = process(recording_of(drive()), path=PATH)
     truth = [driving((stamp - START) / 1e9)[1] for stamp in poses.stamp_ns[poses.valid].tolist()]
     np.testing.assert_allclose(poses.position_m[poses.valid], truth, atol=0.01)
 
 
-def test_late_measurements_count_where_they_belong() -> None:
-    """The order of arrival changes no pose, however late a measurement came."""
+def test_order_of_arrival_does_not_matter() -> None:
+    """However late a measurement arrived."""
     measurements = drive()
     late = recording_of([*measurements[:5], *measurements[6:], measurements[5]])
     a, b = process(recording_of(measurements), path=PATH), process(late, path=PATH)
@@ -60,29 +60,29 @@ def test_late_measurements_count_where_they_belong() -> None:
 
 
 def test_invalid_poses_are_counted_by_reason() -> None:
-    """The counts and the valid poses make up all poses; reasons that do not occur are not listed."""
+    """Counts and valid poses make up all poses; reasons that do not occur are not listed."""
     poses = process(recording_of(drive()), path=PATH)
     counts = poses.invalid_counts()
     assert set(counts) == {"outage"}
     assert counts["outage"] + np.count_nonzero(poses.valid) == len(poses)
 
 
-def test_a_station_beside_the_three_may_be_silent() -> None:
-    """A fourth station without measurements is no reason to refuse: its prism is measured by another."""
+def test_redundant_station_without_measurements_is_accepted() -> None:
+    """Its prism is measured by another station."""
     fourth = replace(SCENE.parameters.stations[2], station=4)
     parameters = replace(SCENE.parameters, stations=(*SCENE.parameters.stations, fourth))
     assert process(recording_of(drive(), parameters), path=PATH).valid.any()
 
 
 def test_measurements_of_an_unknown_station_are_named() -> None:
-    """A station without parameters cannot be used, and that is said rather than that it is missing."""
+    """The message says that the station has no parameters, not that it is missing."""
     parameters = replace(SCENE.parameters, stations=SCENE.parameters.stations[:2])
     with pytest.raises(RecordingError, match="station 3 measured it, but is not among the parameters"):
         process(recording_of(drive(), parameters), path=PATH)
 
 
-def test_a_station_that_only_reports_errors_is_named_with_them() -> None:
-    """The commonest status comes first."""
+def test_station_with_errors_only_is_named_with_them() -> None:
+    """The most frequent status comes first."""
     spoilt = [
         replace(m, status=Status.NO_TARGET if i % 4 else Status.TILT) if m.station == 1 else m
         for i, m in enumerate(drive())
@@ -93,8 +93,8 @@ def test_a_station_that_only_reports_errors_is_named_with_them() -> None:
         process(recording_of(spoilt), path=PATH)
 
 
-def test_a_computed_pose_explains_more_than_a_gap() -> None:
-    """Where most epochs are gaps and all computed poses are upside down, the layout is what is wrong."""
+def test_reason_of_computed_poses_precedes_outages() -> None:
+    """If most epochs are outages and all computed poses are upside down, the layout is named."""
     mirrored = tuple(
         replace(p, position_m=(p.position_m[0], -p.position_m[1], p.position_m[2]))
         for p in SCENE.parameters.prisms
@@ -106,7 +106,7 @@ def test_a_computed_pose_explains_more_than_a_gap() -> None:
 
 
 def test_frames_are_replaced_by_station() -> None:
-    """Every station of the recording gets its new frame, everything else stays."""
+    """Every station of the recording gets its new frame, everything else is unchanged."""
     frames = dict.fromkeys((1, 2, 3, 4), SCENE.parameters.stations[0].T_station1_station)
     replaced = with_frames(SCENE.parameters, frames, path=Path("frames.toml"))
     assert [s.T_station1_station for s in replaced.stations] == [frames[1]] * 3
@@ -115,7 +115,7 @@ def test_frames_are_replaced_by_station() -> None:
         with_frames(SCENE.parameters, {1: frames[1], 2: frames[2]}, path=Path("frames.toml"))
 
 
-def test_the_layout_is_replaced_by_prism() -> None:
+def test_layout_is_replaced_by_prism() -> None:
     """Every prism of the recording gets its new position."""
     layout = {k: (float(k), float(k * k), 0.0) for k in (1, 2, 3, 4)}
     replaced = with_layout(SCENE.parameters, layout, path=Path("prisms.toml"))
@@ -131,8 +131,8 @@ def test_frames_matter_to_raw_angles_only() -> None:
     assert has_raw_angles([point, SCENE.measure(1, 0.0)])
 
 
-def test_stations_at_different_times_give_no_pose() -> None:
-    """The advice is to look at the times."""
+def test_stations_without_common_time_give_no_pose() -> None:
+    """The advice is to check the times."""
     apart = [
         SCENE.measure(station, 20.0 * station + 0.4 * step) for step in range(5) for station in (1, 2, 3)
     ]
@@ -140,22 +140,22 @@ def test_stations_at_different_times_give_no_pose() -> None:
         process(recording_of(sorted(apart, key=lambda m: m.stamp_ns)), path=PATH)
 
 
-def test_a_stamp_from_the_future_is_passed_over() -> None:
-    """One wrong stamp, months ahead of its arrival, does not make a recording unusable."""
+def test_timestamp_in_the_future_is_ignored() -> None:
+    """One wrong timestamp, months after its arrival, does not make a recording unusable."""
     wrong = replace(drive()[0], stamp_ns=drive()[0].stamp_ns + 10_000_000 * 10**9)
     poses, same = (process(recording_of(m), path=PATH) for m in (drive(), [*drive(), wrong]))
     np.testing.assert_array_equal(poses.position_m, same.position_m)
 
 
-def test_a_master_left_running_is_no_reason_to_refuse(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Status lines for long after the last measurement end the poses at some point, not the program."""
-    monkeypatch.setattr("tsgt.analysis.processing.EPOCHS_MAX", 200)
+def test_long_time_after_the_last_measurement_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Status lines for months after the last measurement limit the poses, not the program."""
+    monkeypatch.setattr("tsgt.analysis.processing.MAX_EPOCHS", 200)
     recording = replace(recording_of(drive()), end_ns=START + 10_000_000 * 10**9)
     assert 150 < len(process(recording, path=PATH)) <= 200
 
 
-def test_a_layout_that_no_pose_can_come_of_is_refused() -> None:
-    """The file that holds the layout is named."""
+def test_degenerate_layout_is_rejected() -> None:
+    """The message names the file of the layout."""
     layout = {1: (0.0, 0.0, 0.0), 2: (0.0, 0.0, 0.0), 3: (1.0, 0.0, 0.0)}
     with pytest.raises(ConfigError, match=r"^prisms.toml: prisms 1 and 2 are 0.0 mm apart"):
         with_layout(SCENE.parameters, layout, path=Path("prisms.toml"))

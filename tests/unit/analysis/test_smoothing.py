@@ -27,7 +27,7 @@ PATH = Path("field.jsonl")
 
 
 def wandering(time_s: float) -> Motion:
-    """Rotation and position of a robot that speeds up, slows down and turns all the time."""
+    """Return rotation and position of a robot that accelerates, brakes and rotates all the time."""
     position = (
         30 + 1.5 * np.sin(0.8 * time_s),
         20 - 1.2 * np.cos(1.1 * time_s),
@@ -40,7 +40,7 @@ SCENE = stationary_scene().moving(wandering)
 
 
 def recording_of(measurements: Sequence[Measurement], parameters: Parameters = SCENE.parameters) -> Recording:
-    """Make a recording of measurements, in the order given."""
+    """Return a recording of measurements, in the order given."""
     return with_estimator(
         Recording(
             header=RecordingHeader(software="test", created_ns=0, source="test"),
@@ -53,7 +53,7 @@ def recording_of(measurements: Sequence[Measurement], parameters: Parameters = S
 
 
 def drive(seconds: float = 14.0, *, noise_m: float = 0.002) -> list[PolarMeasurement]:
-    """Three stations at 2.5 Hz, ranges with some noise."""
+    """Return measurements of three stations at 2.5 Hz, ranges with noise."""
     rng = np.random.default_rng(2)
     return [
         replace(m, slope_distance_m=m.slope_distance_m + rng.normal(scale=noise_m))  # type: ignore[operator]
@@ -62,8 +62,8 @@ def drive(seconds: float = 14.0, *, noise_m: float = 0.002) -> list[PolarMeasure
     ]
 
 
-def test_the_poses_are_those_of_the_robot() -> None:
-    """Smoothed ones, all the way from the first to the last measurement, better than straight lines make them."""
+def test_poses_equal_those_of_the_robot() -> None:
+    """Smoothed ones, from the first to the last measurement, more accurate than linear interpolation."""
     measurements = drive()
     found = smooth_recording(recording_of(measurements), path=PATH)
     poses = found.poses
@@ -75,12 +75,12 @@ def test_the_poses_are_those_of_the_robot() -> None:
     truth = np.array([wandering((stamp - START) / 1e9)[1] for stamp in poses.stamp_ns.tolist()])
     centroid = LAYOUT.mean(axis=0)
     turned = np.array([wandering((stamp - START) / 1e9)[0] for stamp in poses.stamp_ns.tolist()])
-    missed_m = np.linalg.norm(
+    error_m = np.linalg.norm(
         poses.position_m + _rotations(poses.orientation_xyzw) @ centroid - truth - turned @ centroid, axis=1
     )
     inner = slice(40, -40)
     assert poses.valid[inner].all()
-    assert np.sqrt(np.mean(missed_m[inner] ** 2)) < 0.002
+    assert np.sqrt(np.mean(error_m[inner] ** 2)) < 0.002
     lines = process(with_estimator(recording_of(measurements), "linear"), path=PATH)
     assert lines.kind.max() == Kind.INTERPOLATED
 
@@ -96,31 +96,31 @@ def _rotations(orientation_xyzw: np.ndarray) -> np.ndarray:
     ).transpose(2, 0, 1)
 
 
-def test_process_takes_the_estimator_of_the_recording() -> None:
-    """And gives the same poses."""
+def test_process_uses_the_estimator_of_the_recording() -> None:
+    """The same poses."""
     recording = recording_of(drive())
     np.testing.assert_array_equal(
         process(recording, path=PATH).position_m, smooth_recording(recording, path=PATH).poses.position_m
     )
 
 
-def test_late_measurements_count_where_they_belong() -> None:
-    """The order of arrival changes no pose, however late a measurement came."""
+def test_order_of_arrival_does_not_matter() -> None:
+    """However late a measurement arrived."""
     measurements = drive()
     late = [*measurements[:5], *measurements[6:], measurements[5]]
     a, b = (smooth_recording(recording_of(some), path=PATH).poses for some in (measurements, late))
     np.testing.assert_array_equal(a.position_m, b.position_m)
 
 
-def test_too_few_measurements_take_the_recorded_motion() -> None:
-    """Nobody can tell from two seconds how a robot moves."""
+def test_too_few_measurements_keep_the_recorded_prior() -> None:
+    """Two seconds do not determine the hyperparameters."""
     found = smooth_recording(recording_of(drive(2.0)), path=PATH)
     assert not found.motion.tuned
     assert found.motion.prior == SCENE.parameters.pipeline.motion
 
 
-def test_a_prism_out_of_sight_is_named_and_bridged_while_that_is_honest() -> None:
-    """Two prisms and the robot's inertia carry on for a while; the pose stays valid, the prism's share says outage."""
+def test_occluded_prism_is_bridged_with_growing_sigma() -> None:
+    """Two prisms and the motion prior suffice for a while; the pose remains valid, the prism's reason is outage."""
     measurements = [m for m in drive() if m.station != 2 or not 6.0 < (m.stamp_ns - START) / SECOND < 8.0]
     poses = smooth_recording(recording_of(measurements), path=PATH).poses
     out = poses.prism_reason[:, 1] == Reason.OUTAGE
@@ -131,8 +131,8 @@ def test_a_prism_out_of_sight_is_named_and_bridged_while_that_is_honest() -> Non
     assert sigma[inside].max() > 1.15 * np.median(sigma)
 
 
-def test_nothing_is_valid_where_nothing_was_measured() -> None:
-    """A gap of six seconds in all stations is not bridged."""
+def test_gap_of_all_stations_has_no_valid_poses() -> None:
+    """A gap of six seconds is not bridged."""
     measurements = [m for m in drive() if not 5.0 < (m.stamp_ns - START) / SECOND < 11.0]
     poses = smooth_recording(recording_of(measurements), path=PATH).poses
     middle = np.abs(poses.stamp_ns - (START + 8 * SECOND)) < SECOND
@@ -140,8 +140,8 @@ def test_nothing_is_valid_where_nothing_was_measured() -> None:
     assert poses.valid[~middle].any()
 
 
-def test_one_wrong_measurement_spoils_no_pose() -> None:
-    """It is passed over as an outlier."""
+def test_outlier_does_not_affect_validity() -> None:
+    """It is rejected."""
     measurements = drive()
     wrong = measurements[60]
     measurements[60] = replace(wrong, slope_distance_m=wrong.slope_distance_m + 1.0)  # type: ignore[operator]
@@ -150,8 +150,8 @@ def test_one_wrong_measurement_spoils_no_pose() -> None:
     assert poses.valid[near].all()
 
 
-def test_a_mirrored_layout_is_said_to_be_one() -> None:
-    """The robot would lie upside down."""
+def test_mirrored_layout_is_named() -> None:
+    """The robot would be upside down."""
     mirrored = tuple(
         replace(p, position_m=(p.position_m[0], -p.position_m[1], p.position_m[2]))
         for p in SCENE.parameters.prisms
@@ -160,8 +160,8 @@ def test_a_mirrored_layout_is_said_to_be_one() -> None:
         smooth_recording(recording_of(drive(), replace(SCENE.parameters, prisms=mirrored)), path=PATH)
 
 
-def test_another_robots_layout_makes_no_poses() -> None:
-    """The prisms miss it by decimetres."""
+def test_layout_of_another_robot_gives_no_poses() -> None:
+    """The layout residual is decimetres."""
     other = tuple(
         replace(p, position_m=(1.5 * p.position_m[0], 1.5 * p.position_m[1], p.position_m[2]))
         for p in SCENE.parameters.prisms
@@ -171,8 +171,8 @@ def test_another_robots_layout_makes_no_poses() -> None:
     assert poses.invalid_counts()["residual"] > 0.95 * len(poses)
 
 
-def test_no_measurements_are_refused() -> None:
-    """So is a prism that was never seen."""
+def test_missing_measurements_are_rejected() -> None:
+    """Of all prisms, or of one."""
     with pytest.raises(RecordingError, match="holds no measurements"):
         smooth_recording(recording_of([]), path=PATH)
     blind = [replace(m, status=Status.NO_TARGET) if m.station == 1 else m for m in drive()]
@@ -180,28 +180,28 @@ def test_no_measurements_are_refused() -> None:
         smooth_recording(recording_of(blind), path=PATH)
 
 
-def test_where_a_layout_counts_from_does_not_matter() -> None:
-    """With the origin metres off the prisms the poses are the same ones of another point, and so is how sure they are."""
+def test_origin_of_the_layout_does_not_matter() -> None:
+    """With the origin metres away the poses and covariances are the same ones of another point."""
     arm = np.array([-3.0, 1.0, -1.5])
     near = smooth_recording(recording_of(drive()), path=PATH)
     far = smooth_recording(recording_of(drive(), with_origin(SCENE.parameters, arm)), path=PATH)
     assert far.motion.noise_scale == pytest.approx(near.motion.noise_scale, rel=1e-4)
     rotation = rotation_from_quaternion(near.poses.orientation_xyzw)
-    spoke = rotation @ arm
+    lever_arm = rotation @ arm
     np.testing.assert_allclose(far.poses.orientation_xyzw, near.poses.orientation_xyzw, atol=1e-6)
-    np.testing.assert_allclose(far.poses.position_m, near.poses.position_m + spoke, atol=1e-6)
-    turning = np.cross(rotate(rotation, near.poses.angular_velocity_radps), spoke)
+    np.testing.assert_allclose(far.poses.position_m, near.poses.position_m + lever_arm, atol=1e-6)
+    turning = np.cross(rotate(rotation, near.poses.angular_velocity_radps), lever_arm)
     np.testing.assert_allclose(far.poses.velocity_mps, near.poses.velocity_mps + turning, atol=1e-5)
     # About fixed axes an error of rotation moves the other point by its cross product with the way there.
-    by_error = np.tile(np.eye(6), (len(spoke), 1, 1))
-    by_error[:, :3, 3:] = -skew(spoke)
+    by_error = np.tile(np.eye(6), (len(lever_arm), 1, 1))
+    by_error[:, :3, 3:] = -skew(lever_arm)
     expected = by_error @ near.poses.covariance @ np.swapaxes(by_error, 1, 2)
     np.testing.assert_allclose(far.poses.covariance, expected, atol=1e-4 * np.abs(expected).max())
     np.testing.assert_array_equal(far.poses.reason, near.poses.reason)
 
 
-def test_what_is_held_out_was_not_seen() -> None:
-    """Moving a left-out measurement moves no prediction, neither its own nor another one of its fold."""
+def test_predictions_do_not_depend_on_the_held_out_measurements() -> None:
+    """Shifting a held-out measurement changes no prediction of its fold, including its own."""
     origin_ns = START
     observations, _ = build_observations(SCENE.parameters, drive(), origin_ns=origin_ns)
     found = held_out_errors(observations, SCENE.parameters.pipeline)

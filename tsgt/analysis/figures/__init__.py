@@ -1,4 +1,8 @@
-"""TODO face."""
+"""matplotlib figures: common style, time axis and curves, and the figures of ``tsgt analyse``.
+
+Comes in: arrays and statistics of other rooms. Goes out: PNG, PDF or SVG files. The figures of a report are in the room
+``report``. matplotlib is an extra and imported when a figure is made.
+"""
 
 from tsgt.analysis.figures.axes import (
     TimeAxis,

@@ -1,4 +1,4 @@
-"""What a report's figures share: an axis of time that people read, and curves of as many points as paper shows. Pure."""
+"""Elements of figures: time axis, thinned curves, bands, dots, logarithmic axes, shaded intervals, legends."""
 
 from __future__ import annotations
 
@@ -24,27 +24,25 @@ if TYPE_CHECKING:
 PANEL_HEIGHT_MM = 26.0
 
 BUCKETS = 1500
-"""A page's width at 200 dpi has about as many dots."""
+"""About the number of dots across a page at 200 dpi."""
 
-STRETCHES = 150
-"""In so many parts a band is drawn."""
+MAX_SEGMENTS = 150
+"""Number of segments of a band."""
 
 HATCHES = ("", "///", "...", "xxx", "\\\\\\", "+++")
-"""Areas differ by these too, so that they can be told apart in grey."""
+"""Areas differ by hatching too, so that they are distinguishable in greyscale."""
 
 
 @dataclass(frozen=True, slots=True)
 class TimeAxis:
-    """The axis of time: from the first measurement, in a unit that keeps the numbers small.
+    """Time axis from the first measurement, in a unit that keeps the numbers small.
 
     Attributes
     ----------
     origin_ns
-        What counts as 0, on the master's Unix clock.
+        Unix time at 0.
     unit_s
         Seconds in one unit.
-    label
-        Of the axis.
     """
 
     origin_ns: int
@@ -59,36 +57,30 @@ class TimeAxis:
         return cls(start_ns, unit_s, f"time from the first measurement ({name})")
 
     def of(self, stamp_ns: NDArray[np.int64] | int) -> FloatArray:
-        """Where instants stand on the axis."""
+        """Convert Unix times to positions on the axis."""
         return np.asarray((np.asarray(stamp_ns, dtype=np.int64) - self.origin_ns) / (1e9 * self.unit_s))
 
 
 def stroke(row: int) -> Stroke:
-    """How the curve of that number is drawn."""
+    """Return the style of the curve with this number."""
     return STROKES[row % len(STROKES)]
 
 
 def hatch(row: int) -> str:
-    """How the area of that number is hatched."""
+    """Return the hatching of the area with this number."""
     return HATCHES[row % len(HATCHES)]
 
 
 def thinned(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Keep of each stretch of a long curve its lowest and its highest point, and its gaps.
-
-    Parameters
-    ----------
-    x, y
-        (N,); NaN in ``y`` leaves a gap.
-    """
+    """Reduce a long curve, (N,), to minimum and maximum of each segment; NaN in ``y`` leaves a gap."""
     size = len(x) // BUCKETS
     if size < 4:
         return x, y
     n = len(x) // size
-    stretches = y[: n * size].reshape(n, size)
-    blank = np.isnan(stretches).all(axis=1)
-    low = np.where(blank, 0, np.argmin(np.where(np.isnan(stretches), np.inf, stretches), axis=1))
-    high = np.where(blank, 0, np.argmax(np.where(np.isnan(stretches), -np.inf, stretches), axis=1))
+    segments = y[: n * size].reshape(n, size)
+    blank = np.isnan(segments).all(axis=1)
+    low = np.where(blank, 0, np.argmin(np.where(np.isnan(segments), np.inf, segments), axis=1))
+    high = np.where(blank, 0, np.argmax(np.where(np.isnan(segments), -np.inf, segments), axis=1))
     ends = np.sort(np.stack([low, high], axis=1), axis=1) + size * np.arange(n)[:, None]
     rows = np.concatenate([ends.ravel(), np.arange(n * size, len(x))])
     return x[rows], y[rows]
@@ -97,7 +89,7 @@ def thinned(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 def curve(
     panel: Axes, x: FloatArray, y: FloatArray, row: int, *, label: str | None, dashes: bool = True
 ) -> None:
-    """Draw a long curve as the one of that number; ``dashes`` off where it is too ragged to show any."""
+    """Draw a long curve in the style of this number; without dashes if it is too ragged to show them."""
     look = stroke(row)
     panel.plot(
         *thinned(x, y),
@@ -109,19 +101,19 @@ def curve(
 
 
 def banded(panel: Axes, x: FloatArray, y: FloatArray, row: int, *, label: str | None) -> None:
-    """Draw what swings too fast for a curve, as the one of that number: its median, and where nine tenths of it lie."""
-    size = max(1, len(x) // STRETCHES)
+    """Draw a rapidly varying quantity as its median and 5th to 95th percentile."""
+    size = max(1, len(x) // MAX_SEGMENTS)
     n = -(-len(x) // size)
     filled = np.full(n * size, np.nan)
     filled[: len(y)] = y
-    stretches = filled.reshape(n, size)
-    told = np.isfinite(stretches).any(axis=1)
-    figures = np.full((3, n), np.nan)
-    figures[:, told] = np.nanpercentile(stretches[told], (5, 50, 95), axis=1)
+    segments = filled.reshape(n, size)
+    known = np.isfinite(segments).any(axis=1)
+    percentiles = np.full((3, n), np.nan)
+    percentiles[:, known] = np.nanpercentile(segments[known], (5, 50, 95), axis=1)
     middle = x[np.minimum(np.arange(n) * size + size // 2, len(x) - 1)]
     look = stroke(row)
-    panel.fill_between(middle, figures[0], figures[2], color=look.color, alpha=0.25, linewidth=0)
-    panel.plot(middle, figures[1], color=look.color, linestyle=look.linestyle, label=label)
+    panel.fill_between(middle, percentiles[0], percentiles[2], color=look.color, alpha=0.25, linewidth=0)
+    panel.plot(middle, percentiles[1], color=look.color, linestyle=look.linestyle, label=label)
 
 
 def plain_log(axis: Axis) -> None:
@@ -136,9 +128,9 @@ def plain_log(axis: Axis) -> None:
 
 
 def shade(panel: Axes, spans: Sequence[tuple[float, float]], label: str) -> None:
-    """Shade stretches of the axis of time."""
+    """Shade intervals of the time axis."""
     if spans:
-        # As one object: an hour has hundreds of stretches.
+        # One object: an hour has hundreds of intervals.
         panel.broken_barh(
             [(start, end - start) for start, end in spans],
             (0.0, 1.0),
@@ -151,7 +143,7 @@ def shade(panel: Axes, spans: Sequence[tuple[float, float]], label: str) -> None
 
 
 def dots(panel: Axes, x: FloatArray, y: FloatArray, row: int, *, label: str | None = None) -> None:
-    """Draw many points as the ones of that number: as a picture, so that a PDF stays small."""
+    """Draw many points in the style of this number, rasterised so that a PDF stays small."""
     look = stroke(row)
     panel.plot(
         x,

@@ -1,4 +1,4 @@
-"""The comparison with satellite receivers as a figure: errors over time and how often, satellites, quality."""
+"""Figure of ``tsgt analyse gnss``: errors over time and their distribution, satellites, quality."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ if TYPE_CHECKING:
     from tsgt.analysis.gnss import DistanceSeries, Receiver
 
 _SMALLEST_MM = 0.1
-"""Errors below are drawn here: a logarithmic axis has no zero, and nothing measures better."""
+"""Lower limit of the logarithmic axis; smaller errors are drawn here."""
 _LARGEST_AT_LEAST_MM = 10.0
 _BINS_PER_DECADE = 12
 _POINTS_PER_BIN = 10
-_MOST_BINS = 200
+_MAX_BINS = 200
 
 
 class _Series(NamedTuple):
-    """Errors of one kind over time."""
+    """Errors of one pair over time."""
 
     label: str
     times_ns: NDArray[np.int64]
@@ -44,16 +44,14 @@ def draw_gnss(
 ) -> None:
     """Draw errors of distances between receivers, and between prisms if there are any.
 
-    Curves are medians, bands hold 90 % of what they are from.
+    Curves are medians, bands hold 90 % of the values.
 
     Parameters
     ----------
     receivers
-        All of them; what is drawn of them is their time in ``gnss``.
+        Drawn in the time interval of ``gnss``.
     gnss, prisms
-        Distances between receivers, one of them at least; and between prisms, which are drawn together.
-    path
-        File to write.
+        Distances between receivers, at least one; and between prisms, which are drawn together.
 
     Raises
     ------
@@ -76,7 +74,7 @@ def draw_gnss(
         shares = figure.add_subplot(grid[0, 1], sharey=errors)
         satellites = figure.add_subplot(grid[1, 0], sharex=errors)
         quality = figure.add_subplot(grid[2, 0], sharex=errors)
-        # The prisms' stroke is none of those that stand for a receiver below.
+        # The prisms' stroke differs from those of the receivers below.
         strokes = _strokes(max(len(series), len(receivers) + 1))
         chosen = [*strokes[: len(series) - 1], strokes[-1] if prisms else strokes[len(series) - 1]]
         for each, stroke in zip(series, chosen, strict=True):
@@ -143,27 +141,27 @@ def _curve(
     *,
     label: str | None = None,
 ) -> None:
-    """Draw the median and where 90 % are, in pieces of time; thousands of points would hide each other."""
-    pieces = int(np.clip(len(values) // _POINTS_PER_BIN, 1, _MOST_BINS))
+    """Draw median and 90 % band per time bin; thousands of points would hide each other."""
+    pieces = int(np.clip(len(values) // _POINTS_PER_BIN, 1, _MAX_BINS))
     edges_s = np.linspace(0, (end_ns - start_ns) / 1e9, pieces + 1)
     piece = np.clip(np.searchsorted(edges_s, (times_ns - start_ns) / 1e9, side="right") - 1, 0, pieces - 1)
     low, middle, high = (np.full(pieces, np.nan) for _ in range(3))
     for i in np.unique(piece):
         low[i], middle[i], high[i] = np.percentile(values[piece == i], [5, 50, 95])
-    # A piece without values is a gap. A curve through one that stands between two gaps would not show: hence steps.
+    # A bin without values is a gap. Steps show a single bin between two gaps, a curve would not.
     axes.stairs(middle, edges_s, baseline=None, color=stroke.color, linestyle=stroke.linestyle, label=label)
     axes.stairs(high, edges_s, baseline=low, fill=True, color=stroke.color, alpha=0.25, linewidth=0)
 
 
 def _seen(receivers: Sequence[Receiver]) -> list[int]:
-    """Return the qualities that there are, worst first."""
+    """Return the qualities that occur, worst first."""
     return [
         q for q in reversed(QUALITY_ORDER) if any(np.any(receiver.quality == q) for receiver in receivers)
     ]
 
 
 def _rows(receivers: Sequence[Receiver]) -> NDArray[np.float64]:
-    """Return the height at which each quality is drawn, by its number."""
+    """Return the height of each quality, by its number."""
     rows = np.full(len(QUALITIES), np.nan)
     for height, q in enumerate(_seen(receivers)):
         rows[q] = height

@@ -1,4 +1,4 @@
-"""The figure of the layout study: how well poses are known, over the robot's heading and the stations' distance."""
+"""Figure of ``tsgt analyse layout``: accuracy over the robot's heading and the stations' distance."""
 
 from __future__ import annotations
 
@@ -31,12 +31,10 @@ def draw_layouts(
     Parameters
     ----------
     covariances
-        By the name of a layout, in the order of the ranking: covariances (N, 6, 6) of stances with
+        By name of the layout, in the order of the ranking: (N, 6, 6) of robot poses with
         :data:`tsgt.analysis.design.layout_study.HEADING_COUNT` headings at each place.
     distances
         By the stations' distance in m and the name of their arrangement.
-    path
-        The file: PNG, PDF or SVG.
 
     Raises
     ------
@@ -67,7 +65,7 @@ def draw_layouts(
         axes[1, 1].minorticks_off()
         axes[1, 1].set_xlabel("distance of the stations (m)")
         first = next(iter(covariances))
-        for column, title in enumerate(("layout", f"where the stations stand, with {first}")):
+        for column, title in enumerate(("layout", f"arrangement of the stations, with {first}")):
             # Above the panel, where no curve can run.
             axes[0, column].legend(title=title, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
         save(figure, path)

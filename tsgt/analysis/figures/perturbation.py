@@ -1,4 +1,4 @@
-"""The figure of the perturbation study: errors of the pose over noise on the prisms."""
+"""Figure of the perturbation study: pose errors over noise on the prisms."""
 
 from __future__ import annotations
 
@@ -25,16 +25,14 @@ _UNITS = ("position error (mm)", "rotation error (rad)")
 def draw_perturbation(
     study: Sequence[Perturbation], first_order_per_mm: tuple[FloatArray, FloatArray], paths: Sequence[Path]
 ) -> None:
-    """Draw mean and spread of the pose's errors over the noise, axis by axis, and of their lengths.
+    """Draw mean and standard deviation of the pose errors over the noise, per axis and of the norm.
 
     Parameters
     ----------
     study
-        What the noises did, in their order.
+        In the order of the noise.
     first_order_per_mm
-        Sigmas of position (m) and rotation (rad) for 1 mm of noise, shape (3,) each.
-    paths
-        The files: PNG, PDF or SVG.
+        Sigmas of position (m) and rotation (rad) for 1 mm of noise, (3,) each.
 
     Raises
     ------
@@ -65,7 +63,7 @@ def draw_perturbation(
                     _first_order(panel, noise_mm, expected[row][:, column])
                 panel.set_title(name)
             axes[row, 0].set_ylabel(_UNITS[row])
-            # The band says how far the draws go; a first order that runs away must not shrink it.
+            # Scale to the samples: a diverging first-order line must not compress them.
             low, high = (mean - std).min(), (mean + std).max()
             room = 0.08 * (high - low) or 1.0
             axes[row, 0].set_ylim(low - room, high + room)

@@ -1,7 +1,7 @@
-"""The look that all figures share: legible in a paper's column, for the colour-blind, and in grey.
+"""Common style of all figures: legible in a paper's column, by the colour-blind, and in greyscale.
 
-Lines differ in colour, in lightness and in dashes, so that two of the three may be lost. matplotlib is an extra: it
-is imported when a figure is made, and never opens a window.
+Lines differ in colour, lightness and dashes, so that any one of them suffices. matplotlib is an extra: it is imported when
+a figure is made, and never opens a window.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ FORMATS = (".png", ".pdf", ".svg")
 
 
 class Stroke(NamedTuple):
-    """How one of several curves is drawn."""
+    """Style of one of several curves."""
 
     color: str
     linestyle: str | tuple[int, tuple[float, ...]]
     marker: str
 
 
-# Okabe and Ito's palette (2008), of which those colours are taken that differ in lightness too, darkest first.
+# Those colours of the palette of Okabe and Ito (2008) that differ in lightness too, darkest first.
 STROKES = (
     Stroke("#000000", "-", "o"),
     Stroke("#0072B2", (0, (5, 1.5)), "s"),
@@ -61,18 +61,13 @@ _STYLE: dict[Any, Any] = {
     "legend.frameon": False,
     "savefig.dpi": _DPI,
     "svg.hashsalt": "tsgt",
-    "pdf.fonttype": 42,  # letters stay letters: searchable, and what publishers ask for
+    "pdf.fonttype": 42,  # TrueType fonts: searchable text, as publishers require
 }
 
 
 @contextmanager
 def drawing(*, width_mm: float, height_mm: float) -> Iterator[Figure]:
-    """Give an empty figure in the shared style; it is to be saved before the block ends.
-
-    Parameters
-    ----------
-    width_mm, height_mm
-        Size on paper.
+    """Yield an empty figure of this size on paper in the common style, to be saved before the block ends.
 
     Raises
     ------
@@ -89,12 +84,12 @@ def drawing(*, width_mm: float, height_mm: float) -> Iterator[Figure]:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure in the format that its name ends in: one of :data:`FORMATS`.
+    """Write a figure in the format of the path's suffix, one of :data:`FORMATS`.
 
     Raises
     ------
     OutputFileError
-        Another ending, or a file that cannot be written.
+        Another suffix, or the file cannot be written.
     """
     if path.suffix not in FORMATS:
         raise OutputFileError(f"figures end in {', '.join(FORMATS)}", path=path)
@@ -102,8 +97,7 @@ def save(figure: Figure, path: Path) -> None:
     metadata = {".png": None, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}[path.suffix]
     layout = figure.get_layout_engine()
     if layout is not None:
-        # All formats have the same layout, and finding it takes as long as drawing; with one left in place,
-        # each file would be drawn twice.
+        # All formats have the same layout, and computing it takes as long as drawing: compute it once.
         layout.execute(figure)
         figure.set_layout_engine(None)
     try:

@@ -108,7 +108,7 @@ def measurement_csv(measurements: Iterable[Measurement]) -> Iterator[str]:
 
 def _line_writer() -> Callable[[Iterable[object]], str]:
     """Return a function that formats a row as one line of CSV: ``writerow`` returns what ``write`` returns."""
-    return csv.writer(_Echo(), lineterminator="\n").writerow  # type: ignore[return-value]
+    return csv.writer(_Echo(), lineterminator="\n").writerow
 
 
 class _Echo:

@@ -1,11 +1,15 @@
-"""TODO face."""
+"""Report of a recording: one HTML page with verdicts, tables and figures, and the same numbers as JSON.
+
+Comes in: a recording, perhaps a reference trajectory and stationary intervals. Goes out: ``Findings``, and from them
+verdicts, sections, page and numbers. matplotlib and jinja2 are imported when a figure or page is made.
+"""
 
 from tsgt.analysis.report.findings import Difference, Findings, collect_findings
 from tsgt.analysis.report.log import ClockSeries, RadioSeries
 from tsgt.analysis.report.motion import Bins, DistanceErrorSeries, Grid
 from tsgt.analysis.report.numbers import report_numbers
 from tsgt.analysis.report.page import render_page
-from tsgt.analysis.report.sections import facts, sections
+from tsgt.analysis.report.sections import sections, summary_table
 from tsgt.analysis.report.stations import StationRecord
 from tsgt.analysis.report.verdicts import verdicts
 
@@ -19,9 +23,9 @@ __all__ = [
     "RadioSeries",
     "StationRecord",
     "collect_findings",
-    "facts",
     "render_page",
     "report_numbers",
     "sections",
+    "summary_table",
     "verdicts",
 ]

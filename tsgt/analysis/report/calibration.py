@@ -1,4 +1,4 @@
-"""The section of a report on the calibration: how well the targets fit the frames that were solved from them. Pure."""
+"""Report section on the calibration: residuals of the targets from which the station frames were solved. Sans-I/O."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tsgt.analysis.figures import hatch, stroke
-from tsgt.analysis.report.elements import number, wide
+from tsgt.analysis.report.elements import format_number, page_figure
 from tsgt.analysis.report.page import Section, Table
 from tsgt.model import PolarMeasurement
 
@@ -23,19 +23,19 @@ if TYPE_CHECKING:
 TITLE = "Calibration residuals"
 
 
-def calibration(recording: Recording) -> Section:
-    """Tell how well each target fits, or why that is not known."""
+def calibration_section(recording: Recording) -> Section:
+    """Return the target residuals, or why they are unknown."""
     found = _targets(recording)
     if not found:
         if not any(isinstance(m, PolarMeasurement) for m in recording.measurements):
             return Section(
                 TITLE, ("The measurements are points in frame station1: no station frame is used.",)
             )
-        why = (
-            "The recording does not say how well the targets fitted from which the station frames were solved. It does if "
-            "the frames are a file that tsgt calibrate targets --output has written."
+        reason = (
+            "The recording contains no residuals of the targets from which the station frames were solved. It does if "
+            "the frames are a file written by `tsgt calibrate targets --output`."
         )
-        return Section(TITLE, (why,))
+        return Section(TITLE, (reason,))
     rows = [
         (
             str(station),
@@ -57,26 +57,25 @@ def calibration(recording: Recording) -> Section:
         if s.station not in found and not _is_world(s.T_station1_station)
     ]
     if others:
-        text.append(f"Of station {' and '.join(others)} nothing is known of targets.")
+        text.append(f"The targets of station {' and '.join(others)} are unknown.")
     table = Table(
-        "Distance of each target, as the station sees it, from where station 1 does",
-        ("station", "target", "residual (mm)", "predicted by the others (mm)"),
+        "Distance of each target, measured by the station, from its position measured by station 1",
+        ("station", "target", "residual (mm)", "leave-one-out (mm)"),
         tuple(rows),
     )
-    plot = wide(
+    plot = page_figure(
         "calibration",
-        "How far each target is from where station 1 sees it: in the solved frame, and (white) predicted by the frame solved from "
-        "the other targets alone. A target that stands out was disturbed or aimed at badly; all of them large is a wrong "
-        "target constant. Crosses: rejected targets, "
-        "whose bars may go beyond the axis.",
+        "Distance of each target from its position measured by station 1: residual in the solved frame, and (white) "
+        "leave-one-out, in the frame solved from the other targets. A single large bar indicates a disturbed or badly aimed "
+        "target, large bars of all targets a wrong target constant. Crosses: rejected targets, whose bars may exceed the axis.",
         24.0 + 30.0 * len(found),
         lambda figure: draw_targets(figure, found),
     )
     return Section(TITLE, tuple(text), (table,), (plot,))
 
 
-def calibration_keys(recording: Recording) -> dict[int, Any]:
-    """Put the same figures under their names, for ``--json``, by station number."""
+def calibration_numbers(recording: Recording) -> dict[int, Any]:
+    """Return the same numbers for ``--json``, by station number."""
     return {
         station: {
             "rms_mm": 1e3 * _rms(_used(targets)),
@@ -110,7 +109,7 @@ def draw_targets(figure: Figure, found: Mapping[int, Sequence[TargetResidual]]) 
             color="white",
             edgecolor="black",
             hatch=hatch(1),
-            label="predicted by the others",
+            label="leave-one-out",
         )
         rejected = [place for place, target in zip(places, targets, strict=True) if target.residual_m is None]
         if rejected:
@@ -127,7 +126,7 @@ def draw_targets(figure: Figure, found: Mapping[int, Sequence[TargetResidual]]) 
         panel.grid(visible=False, axis="x")
         panel.set_title(f"station {station}", loc="left")
         panel.set_ylabel("mm")
-    # A rejected target may be off by a hundred times as much, which would leave nothing to see of the others.
+    # A rejected target may have a hundred times the residual, which would hide the others.
     used = [t for targets in found.values() for t in targets if t.residual_m is not None]
     most_m = max((value or 0.0 for t in used for value in (t.residual_m, t.leave_one_out_m)), default=0.0)
     panels[0].set_ylim(0.0, 1.4e3 * max(most_m, 1e-4))
@@ -148,7 +147,7 @@ def _rms(residuals_m: Sequence[float]) -> float:
 
 
 def _mm(length_m: float | None) -> str:
-    return number(math.nan if length_m is None else 1e3 * length_m, 2)
+    return format_number(math.nan if length_m is None else 1e3 * length_m, 2)
 
 
 def _is_world(frame: Sequence[Sequence[float]]) -> bool:

@@ -1,4 +1,4 @@
-"""What the sections of a report are made with: figures on paper, numbers and times as people read them."""
+"""Elements of report sections: figures of page width, formatted numbers and times."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 
     from tsgt.geometry import FloatArray
 
-LISTED = 20
-"""So many rows of a list that may be long."""
+MAX_LISTED = 20
+"""Rows of a table that may be long."""
 
 
-def wide(name: str, caption: str, height_mm: float, fill: Callable[[Figure], None]) -> ReportFigure:
-    """Make a figure as wide as a page, which draws itself when it is written."""
+def page_figure(name: str, caption: str, height_mm: float, fill: Callable[[Figure], None]) -> ReportFigure:
+    """Return a figure of page width that ``fill`` draws when it is written."""
 
     def write(paths: Sequence[Path]) -> None:
         with drawing(width_mm=PAGE_WIDTH_MM, height_mm=height_mm) as figure:
@@ -35,18 +35,18 @@ def wide(name: str, caption: str, height_mm: float, fill: Callable[[Figure], Non
     return ReportFigure(name, caption, write)
 
 
-def number(value: float, digits: int = 1) -> str:
-    """Write a number; a dash where there is none."""
+def format_number(value: float, digits: int = 1) -> str:
+    """Format a number; a dash for NaN."""
     return f"{value:.{digits}f}" if math.isfinite(value) else "-"
 
 
-def median(values: FloatArray | None) -> float:
-    """Take the median of the numbers that are known; NaN without any."""
+def nan_median(values: FloatArray | None) -> float:
+    """Return the median of the finite values; NaN without any."""
     if values is None or not np.isfinite(values).any():
         return math.nan
     return float(np.nanmedian(values))
 
 
-def utc(stamp_ns: int) -> str:
-    """Write an instant to the millisecond, in UTC."""
+def format_utc(stamp_ns: int) -> str:
+    """Format a Unix time to the millisecond, in UTC."""
     return datetime.fromtimestamp(stamp_ns / 1e9, UTC).isoformat(sep=" ", timespec="milliseconds")[:-6]

@@ -1,4 +1,4 @@
-"""Everything that a report tells of a recording, found once; what cannot be found says why."""
+"""Content of a report, computed once; what cannot be computed has a reason in ``problems``."""
 
 from __future__ import annotations
 
@@ -56,22 +56,20 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 _NOISES_M = tuple(0.02 * level for level in range(21))
-_DRAWS = 1000
-_EQUIVALENT_DRAWS = 20_000
+_SAMPLES = 1000
+_EQUIVALENT_SAMPLES = 20_000
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """The two estimators' poses beside each other, where both are valid: (N,) each.
+    """Poses of the two estimators compared at N epochs at which both are valid.
 
     Attributes
     ----------
-    stamp_ns
-        Epochs.
     position_m
-        Distance between the positions of the prisms' centroid.
+        (N,) distance between the positions of the prisms' centroid.
     rotation_rad
-        Angle between the rotations.
+        (N,) angle between the rotations.
     """
 
     stamp_ns: np.ndarray[Any, np.dtype[np.int64]]
@@ -81,16 +79,16 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class PoseNoise:
-    """What noise on the prisms of this layout does to a pose.
+    """Effect of prism noise on a pose, for the layout of the recording.
 
     Attributes
     ----------
     study
-        For noise of several sizes.
+        For noise of several sigmas.
     first_order_per_mm
         Sigmas of position (m) and rotation (rad) for 1 mm of noise, (3,) each.
     as_measured
-        For the noise that explains the mean error of the distances between prisms; None where there are none.
+        For the noise that explains the mean inter-prism error; None without distances.
     """
 
     study: list[Perturbation]
@@ -100,42 +98,28 @@ class PoseNoise:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Findings:
-    """What was found of a recording.
+    """Content of a report; None and empty where something could not be computed.
 
     Attributes
     ----------
-    recording, path
-        What it is of.
     start_ns, end_ns
         First and last measurement.
     log
         Radio, clocks, events.
-    stations, station_figures
-        What each station measured, and in figures by its number.
-    inter_prism, ride
-        Distances between prisms; None where a prism is missing.
-    odometry_ns
-        When the robot stood still by its odometry, within the recording or not; None without odometry.
-    continuous, linear
-        Poses of both estimators; None where one has none.
+    inter_prism, distance_errors
+        Inter-prism distances; None if a prism was not measured.
+    odometry_stationary_ns
+        Stationary intervals of the odometry, within the recording or not; None without odometry.
     difference
-        Between the two; None where one is missing.
+        Between the estimators.
     held_out
-        Misses of left-out measurements; None where none were left out.
+        Prediction errors, if requested.
     residuals, outliers, normalised
-        Of the continuous trajectory; empty without it.
-    compared
-        Against the reference, by estimator; empty without one.
-    aligned
-        The same after an alignment, where one was asked for and could be found.
-    stops
-        The mean pose of each stop against the reference, by estimator.
-    reference
-        The reference.
-    pose_noise
-        What the layout makes of noise; None where no pose can come of it.
+        Of the continuous trajectory.
+    reference_errors, aligned_errors, stationary_errors
+        Against the reference by estimator: unaligned, after an alignment, and mean poses of stationary intervals.
     problems
-        Why something is missing, in sentences, by its name.
+        Reasons for missing content, as sentences, by its name.
     """
 
     recording: Recording
@@ -143,11 +127,11 @@ class Findings:
     start_ns: int
     end_ns: int
     log: Log
-    stations: list[StationRecord]
+    station_records: list[StationRecord]
     station_statistics: dict[int, StationStatistics]
     inter_prism: InterPrismDistances | None
     distance_errors: DistanceErrorSeries | None
-    odometry_ns: tuple[tuple[int, int], ...] | None
+    odometry_stationary_ns: tuple[tuple[int, int], ...] | None
     continuous: SmoothedRecording | None
     linear: PoseBatch | None
     difference: Difference | None
@@ -155,29 +139,29 @@ class Findings:
     residuals: dict[int, dict[str, ResidualStatistics]]
     outliers: list[Outlier]
     normalised: FloatArray
-    compared: dict[Estimator, PoseErrorStatistics]
-    aligned: dict[Estimator, AlignedErrorStatistics]
-    stops: dict[Estimator, StationaryStatistics]
+    reference_errors: dict[Estimator, PoseErrorStatistics]
+    aligned_errors: dict[Estimator, AlignedErrorStatistics]
+    stationary_errors: dict[Estimator, StationaryStatistics]
     reference: Reference | None
     pose_noise: PoseNoise | None
     problems: dict[str, str]
 
     @property
     def poses(self) -> PoseBatch | None:
-        """The poses that the report shows: those of the estimator of the recording, else of the other one."""
-        both = self.both
+        """The poses that the report shows: of the recording's estimator, otherwise of the other one."""
+        both = self.poses_by_estimator
         return both.get(self.recording.parameters.pipeline.estimator) or next(iter(both.values()), None)
 
     @property
-    def both(self) -> dict[Estimator, PoseBatch]:
-        """The poses of each estimator that has some."""
+    def poses_by_estimator(self) -> dict[Estimator, PoseBatch]:
+        """The poses of each estimator that has any."""
         continuous = None if self.continuous is None else self.continuous.poses
         found: dict[Estimator, PoseBatch | None] = {"linear": self.linear, "continuous": continuous}
         return {name: poses for name, poses in found.items() if poses is not None}
 
     @property
     def duration_s(self) -> float:
-        """From the first measurement to the last, in s."""
+        """From the first measurement to the last."""
         return (self.end_ns - self.start_ns) / 1e9
 
 
@@ -191,24 +175,22 @@ def collect_findings(
     stationary_ns: Sequence[tuple[int, int]] | None = None,
     on_progress: Callable[[float], None] | None = None,
 ) -> Findings:
-    """Find everything that a report tells.
+    """Compute the content of a report.
 
     Parameters
     ----------
-    recording
-        Measurements and the parameters in force.
     path
-        Its file.
+        The recording's file.
     reference
-        What to compare poses with, if anything.
+        Trajectory to compare poses with.
     with_held_out
-        Whether to leave measurements out and predict them.
+        Cross-validate both estimators.
     align
-        How poses are aligned with the reference besides, if at all.
-    still_ns
-        When the robot stood still, if something else than the measurements tells it.
+        Compare with the reference after this alignment as well.
+    stationary_ns
+        Stationary intervals from another source than the measurements.
     on_progress
-        Called now and then with the share of the work that is done, 0 to 1.
+        Called with the completed fraction, 0 to 1.
 
     Raises
     ------
@@ -222,7 +204,7 @@ def collect_findings(
         raise RecordingError("holds no measurements, so there is nothing to report", path=path)
     problems: dict[str, str] = {}
     start_ns, end_ns = min(m.stamp_ns for m in measurements), max(m.stamp_ns for m in measurements)
-    stations = station_records(measurements, [s.station for s in parameters.stations])
+    records = station_records(measurements, [s.station for s in parameters.stations])
     limit_ns = parameters.pipeline.outage_limit_ns
     fitted = 0.5 if with_held_out else 0.8
 
@@ -240,18 +222,17 @@ def collect_findings(
     report(fitted)
     linear = attempt("linear", lambda: process(with_estimator(recording, "linear"), path=path))
     tracks = build_tracks(parameters, measurements)
-    unseen = [prism for prism, track in tracks.items() if not len(track)]
-    if unseen:
-        names = " and ".join(f"prism {prism}" for prism in unseen)
-        problems["inter_prism"] = f"nothing usable was measured of {names}"
-    epochs = None if unseen else distances_at_epochs(parameters, tracks)
+    unmeasured = [prism for prism, track in tracks.items() if not len(track)]
+    if unmeasured:
+        names = " and ".join(f"prism {prism}" for prism in unmeasured)
+        problems["inter_prism"] = f"no usable measurement of {names}"
+    epochs = None if unmeasured else distances_at_epochs(parameters, tracks)
     distances = None if epochs is None else inter_prism(parameters, tracks, stationary_ns, epochs)
-    moved = continuous.poses if continuous is not None else linear
-    left_out = None
+    held_out = None
     if with_held_out and continuous is not None:
         report(fitted + 0.1)
         observations, _ = build_observations(parameters, continuous.sources, origin_ns=continuous.origin_ns)
-        left_out = attempt(
+        held_out = attempt(
             "held_out",
             lambda: held_out_errors(
                 observations, parameters.pipeline, on_progress=lambda s: report(fitted + 0.1 + 0.3 * s)
@@ -259,49 +240,46 @@ def collect_findings(
         )
     report(0.9)
     centroid_m = np.mean([prism.position_m for prism in parameters.prisms], axis=0)
-    both: tuple[tuple[Estimator, PoseBatch | None], ...] = (
-        ("linear", linear),
-        ("continuous", None if continuous is None else continuous.poses),
-    )
-    compared: dict[Estimator, PoseErrorStatistics] = {}
+    smoothed = None if continuous is None else continuous.poses
+    both: dict[Estimator, PoseBatch | None] = {"linear": linear, "continuous": smoothed}
+    poses_of = {name: poses for name, poses in both.items() if poses is not None}
+    errors: dict[Estimator, PoseErrorStatistics] = {}
     aligned: dict[Estimator, AlignedErrorStatistics] = {}
-    stops: dict[Estimator, StationaryStatistics] = {}
+    stationary: dict[Estimator, StationaryStatistics] = {}
     if reference is not None:
-        compared = {name: compare(poses, reference, centroid_m) for name, poses in both if poses is not None}
-        stood_ns = () if distances is None else distances.stationary_ns
-        for name, poses in both:
-            if poses is None:
-                continue
-            stops[name] = stationary_errors(poses, reference, stood_ns, centroid_m).statistics()
-            if align is not None and compared[name].compared:
-                left = attempt("aligned", partial(compare_aligned, poses, reference, centroid_m, align))
-                aligned |= {} if left is None else {name: left}
+        intervals_ns = () if distances is None else distances.stationary_ns
+        for name, poses in poses_of.items():
+            errors[name] = compare(poses, reference, centroid_m)
+            stationary[name] = stationary_errors(poses, reference, intervals_ns, centroid_m).statistics()
+            if align is not None and errors[name].compared:
+                result = attempt("aligned", partial(compare_aligned, poses, reference, centroid_m, align))
+                aligned |= {} if result is None else {name: result}
     return Findings(
         recording=recording,
         path=path,
         start_ns=start_ns,
         end_ns=end_ns,
         log=read_log(path),
-        stations=stations,
+        station_records=records,
         station_statistics={
             each.station: station_statistics(each, start_ns=start_ns, end_ns=end_ns, outage_limit_ns=limit_ns)
-            for each in stations
+            for each in records
         },
         inter_prism=distances,
-        distance_errors=None if epochs is None else distance_error_series(parameters, epochs, moved),
-        odometry_ns=None if stationary_ns is None else tuple(stationary_ns),
+        distance_errors=None
+        if epochs is None
+        else distance_error_series(parameters, epochs, linear if smoothed is None else smoothed),
+        odometry_stationary_ns=None if stationary_ns is None else tuple(stationary_ns),
         continuous=continuous,
         linear=linear,
-        difference=None
-        if continuous is None or linear is None
-        else difference(linear, continuous.poses, centroid_m),
-        held_out=left_out,
+        difference=None if smoothed is None or linear is None else difference(linear, smoothed, centroid_m),
+        held_out=held_out,
         residuals={} if continuous is None else residual_statistics(continuous.fit, continuous.sources),
         outliers=[] if continuous is None else outliers(continuous.fit, continuous.sources),
         normalised=np.empty((0, 3)) if continuous is None else normalised_residuals(continuous.fit),
-        compared=compared,
-        aligned=aligned,
-        stops=stops,
+        reference_errors=errors,
+        aligned_errors=aligned,
+        stationary_errors=stationary,
         reference=reference,
         pose_noise=attempt("pose_noise", lambda: _pose_noise(recording, distances)),
         problems=problems,
@@ -309,25 +287,17 @@ def collect_findings(
 
 
 def difference(a: PoseBatch, b: PoseBatch, point_m: FloatArray) -> Difference:
-    """Compare poses at the epochs at which both are valid.
-
-    Parameters
-    ----------
-    a, b
-        Poses at epochs that increase.
-    point_m
-        Point of the robot whose position is compared, (3,).
-    """
+    """Compare poses at the epochs, which increase, at which both are valid; positions at ``point_m`` of the robot, (3,)."""
     stamps, rows_a, rows_b = np.intersect1d(
         a.stamp_ns[a.valid], b.stamp_ns[b.valid], assume_unique=True, return_indices=True
     )
     rows = np.flatnonzero(a.valid)[rows_a], np.flatnonzero(b.valid)[rows_b]
-    turns = [rotation_from_quaternion(p.orientation_xyzw[r]) for p, r in zip((a, b), rows, strict=True)]
-    points = [p.position_m[r] + R @ point_m for p, r, R in zip((a, b), rows, turns, strict=True)]
+    rotations = [rotation_from_quaternion(p.orientation_xyzw[r]) for p, r in zip((a, b), rows, strict=True)]
+    points = [p.position_m[r] + R @ point_m for p, r, R in zip((a, b), rows, rotations, strict=True)]
     return Difference(
         stamps,
         np.linalg.norm(points[0] - points[1], axis=1),
-        np.linalg.norm(log_so3(np.swapaxes(turns[0], 1, 2) @ turns[1]), axis=1),
+        np.linalg.norm(log_so3(np.swapaxes(rotations[0], 1, 2) @ rotations[1]), axis=1),
     )
 
 
@@ -336,24 +306,24 @@ def _pose_noise(recording: Recording, distances: InterPrismDistances | None) -> 
     layout = np.array([prism.position_m for prism in prisms])
     check_layout(layout, names=[prism.prism for prism in prisms])
     centroid_m = layout.mean(axis=0)
-    # The same recording has to give the same report.
+    # A fixed seed: the same recording gives the same report.
     random = np.random.default_rng(0)
     errors = [
         np.abs(pair.distances_m - pair.reference_m)
         for pair in (distances.dynamic if distances is not None else ())
     ]
-    found = np.concatenate(errors) if errors else np.empty(0)
-    mean_m = float(found.mean()) if len(found) else 0.0
+    all_errors = np.concatenate(errors) if errors else np.empty(0)
+    mean_m = float(all_errors.mean()) if len(all_errors) else 0.0
     return PoseNoise(
-        perturbation_study(layout, _NOISES_M, samples=_DRAWS, point_m=centroid_m, random=random),
+        perturbation_study(layout, _NOISES_M, samples=_SAMPLES, point_m=centroid_m, random=random),
         first_order_sigmas(layout, 1e-3, point_m=centroid_m),
-        equivalent_noise(layout, mean_m, samples=_EQUIVALENT_DRAWS, point_m=centroid_m, random=random)
+        equivalent_noise(layout, mean_m, samples=_EQUIVALENT_SAMPLES, point_m=centroid_m, random=random)
         if mean_m > 0.0
         else None,
     )
 
 
 def position_sigma_mm(poses: PoseBatch) -> FloatArray:
-    """Give the sigma of the position per axis (root mean square of the three) that each valid pose states, in mm."""
+    """Return the stated position sigma per axis (root mean square of the three) of each valid pose."""
     covariance = poses.covariance[poses.valid, :3, :3]
     return np.asarray(1e3 * np.sqrt(np.einsum("nii->n", covariance) / 3))

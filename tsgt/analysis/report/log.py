@@ -1,4 +1,4 @@
-"""What a recording tells beside its measurements, for a report: the radio, the stations' clocks, events."""
+"""Radio quality, station clocks and events of a recording, for its report."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ if TYPE_CHECKING:
 
 _TYPES = (b'"status"', b'"clock"', b'"event"')
 
-_PASSED_OVER = (b'{"type":"pose"', b'{"type":"measurement"', b'{"type":"point"', b'{"type":"beacon"')
-"""How most lines begin: known by this, they need not be looked through."""
+_SKIPPED_PREFIXES = (b'{"type":"pose"', b'{"type":"measurement"', b'{"type":"point"', b'{"type":"beacon"')
+"""Prefixes of most lines: skipped without parsing."""
 
 
 @dataclass(frozen=True, slots=True)
 class RadioSeries:
-    """How a station was heard over time, (N,) each; NaN where nothing was recorded.
+    """Radio quality of a station at N status records; NaN where nothing was recorded.
 
     Attributes
     ----------
     stamp_ns
-        Times of the status records on the master's Unix clock.
+        (N,) on the master's Unix clock.
     rssi_dbm, snr_db
-        Of its last radio message.
+        (N,) of its last radio message.
     loss
-        Share of its last requests that it did not answer, 0 to 1.
+        (N,) share of its last requests without a response, 0 to 1.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -46,18 +46,18 @@ class RadioSeries:
 
 @dataclass(frozen=True, slots=True)
 class ClockSeries:
-    """A station's clock against the master's over time, (N,) each.
+    """A station's clock relative to the master's at N synchronisations.
 
     Attributes
     ----------
     stamp_ns
-        Times of the synchronisations on the master's Unix clock.
+        (N,) on the master's Unix clock.
     offset_ns
-        Positive: the station is ahead.
+        (N,) positive: station ahead.
     bound_ns
-        The offset is within this of the truth.
+        (N,) of the error of the offset.
     restarted
-        Whether all that was known before was thrown away then.
+        (N,) whether the clock filter was reset.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -68,7 +68,7 @@ class ClockSeries:
 
 @dataclass(frozen=True, slots=True)
 class Log:
-    """What stands in a recording beside measurements and poses.
+    """Records of a recording other than measurements and poses.
 
     Attributes
     ----------
@@ -76,10 +76,8 @@ class Log:
         By station; empty without records.
     events
         (stamp_ns, message) in the order of the file.
-    protocol
-        That of the last status; None without a radio.
-    authenticated
-        Whether a key kept others from taking part; None without a radio.
+    protocol, authenticated
+        Of the last status; None without a radio.
     """
 
     radio: dict[int, RadioSeries]
@@ -90,9 +88,9 @@ class Log:
 
 
 def read_log(path: Path) -> Log:
-    """Read the lines of a recording that are neither measurements nor poses; lines that cannot be read are passed over.
+    """Read status, clock and event records; unreadable lines are skipped.
 
-    They only illustrate: what is computed comes from :func:`tsgt.recording.load_recording`, which checks each line.
+    They only illustrate: results come from :func:`tsgt.recording.load_recording`, which checks each line.
 
     Raises
     ------
@@ -105,8 +103,8 @@ def read_log(path: Path) -> Log:
     try:
         with path.open("rb") as file:
             for raw in file:
-                # Poses are most of a file: to parse them for nothing would take longer than all the rest.
-                if raw.startswith(_PASSED_OVER) or not any(kind in raw for kind in _TYPES):
+                # Poses are most of a file: parsing them would take longer than everything else.
+                if raw.startswith(_SKIPPED_PREFIXES) or not any(kind in raw for kind in _TYPES):
                     continue
                 record = _parsed(raw)
                 match record.get("type"):

@@ -1,4 +1,4 @@
-"""Errors of the distances between prisms beside how the robot moved at that time. Pure."""
+"""Inter-prism errors by the motion of the robot. Sans-I/O."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ if TYPE_CHECKING:
 
 BINS = 8
 MIN_BIN_COUNT = 20
-"""One second of epochs: fewer say nothing about a bin."""
+"""One second of epochs: bins with fewer have no statistics."""
 
 
 @dataclass(frozen=True, slots=True)
 class RobotMotion:
-    """How a robot moved at N epochs; NaN where no pose is valid.
+    """Motion of a robot at N epochs; NaN where no pose is valid.
 
     Attributes
     ----------
     speed_mps
         (N,) of the prisms' centroid.
     acceleration_mps2
-        (N,) by which that speed grows; negative while the robot slows down.
-    turning_radps
-        (N,) length of the angular velocity.
+        (N,) derivative of the speed; negative while braking.
+    angular_rate_radps
+        (N,) norm of the angular velocity.
     """
 
     speed_mps: FloatArray
@@ -42,22 +42,22 @@ class RobotMotion:
 
     @classmethod
     def unknown(cls, n: int) -> RobotMotion:
-        """Make one of which nothing is known."""
+        """Return N unknown values."""
         return cls(*(np.full(n, np.nan) for _ in range(3)))
 
 
 @dataclass(frozen=True, slots=True)
 class DistanceErrorSeries:
-    """Distance errors over time.
+    """Inter-prism errors over time.
 
     Attributes
     ----------
     stamp_ns
         (N,) 20 Hz epochs in the time that all tracks cover.
     error_m
-        By pair's name, (N,) measured distance less that of the layout; NaN where one of the tracks has a gap.
+        By name of the pair, (N,) measured distance minus that of the layout; NaN where a track has a gap.
     motion
-        How the robot moved then.
+        Of the robot at these epochs.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -67,16 +67,16 @@ class DistanceErrorSeries:
 
 @dataclass(frozen=True, slots=True)
 class Bins:
-    """Errors sorted by one quantity into bins of equal width.
+    """Statistics of |error| in B bins of equal width.
 
     Attributes
     ----------
     edges
         (B + 1,) of the bins.
     counts
-        (B,) errors in each.
+        (B,).
     median, mean, p95
-        (B,) of |error| in m; NaN where there are too few.
+        (B,) of |error| in m; NaN with too few errors.
     """
 
     edges: FloatArray
@@ -95,7 +95,7 @@ class Grid:
     x_edges, y_edges
         (X + 1,) and (Y + 1,).
     mean
-        (Y, X) in m; NaN where there are too few.
+        (Y, X) in m; NaN with too few errors.
     counts
         (Y, X).
     """
@@ -109,17 +109,7 @@ class Grid:
 def distance_error_series(
     parameters: Parameters, found: EpochDistances, poses: PoseBatch | None
 ) -> DistanceErrorSeries:
-    """Put the errors of the distances beside the robot's motion.
-
-    Parameters
-    ----------
-    parameters
-        The prism layout.
-    found
-        Distances over time.
-    poses
-        What tells how the robot moved; None where there are none.
-    """
+    """Relate inter-prism errors to the motion of the robot, which follows from ``poses`` (None: unknown)."""
     centroid_m = np.mean([prism.position_m for prism in parameters.prisms], axis=0)
     error_m = {f"{a}-{b}": m - found.references_m[a, b] for (a, b), m in found.distances_m.items()}
     unknown = RobotMotion.unknown(len(found.stamp_ns))
@@ -133,49 +123,50 @@ def _motion(poses: PoseBatch, centroid_m: FloatArray, epochs: NDArray[np.int64])
         return RobotMotion.unknown(len(epochs))
     rows = poses.valid
     velocity = np.full((len(poses), 3), np.nan)
-    arms = np.cross(poses.angular_velocity_radps[rows], centroid_m)
-    turned = rotate(rotation_from_quaternion(poses.orientation_xyzw[rows]), arms)
-    velocity[rows] = poses.velocity_mps[rows] + turned
+    tangential = np.cross(poses.angular_velocity_radps[rows], centroid_m)
+    velocity[rows] = poses.velocity_mps[rows] + rotate(
+        rotation_from_quaternion(poses.orientation_xyzw[rows]), tangential
+    )
     time_s = (poses.stamp_ns - poses.stamp_ns[0]) / 1e9
     speed = np.linalg.norm(velocity, axis=1)
-    turning = np.where(rows, np.linalg.norm(poses.angular_velocity_radps, axis=1), np.nan)
+    angular_rate = np.where(rows, np.linalg.norm(poses.angular_velocity_radps, axis=1), np.nan)
     at_s = (epochs - poses.stamp_ns[0]) / 1e9
-    columns = (speed, np.gradient(speed, time_s), turning)
+    columns = (speed, np.gradient(speed, time_s), angular_rate)
     return RobotMotion(*(np.interp(at_s, time_s, column, left=np.nan, right=np.nan) for column in columns))
 
 
 def binned(error_m: FloatArray, quantity: FloatArray) -> Bins | None:
-    """Sort errors by a quantity; None where there is too little to sort.
+    """Sort |error| by a quantity; None with too few values.
 
     Parameters
     ----------
     error_m
-        (P, N) of P pairs at N epochs; NaN where unknown.
+        (P, N) of P pairs at N epochs; NaN if unknown.
     quantity
-        (N,); NaN where unknown.
+        (N,); NaN if unknown.
     """
     edges = _edges(quantity)
     if edges is None:
         return None
-    place = _places(quantity, edges)
+    place = _bin_indices(quantity, edges)
     size = np.abs(error_m)
     found = []
     for i in range(len(edges) - 1):
         some = size[:, place == i]
         some = some[np.isfinite(some)]
-        told = len(some) >= MIN_BIN_COUNT
-        figures = (np.median(some), np.mean(some), np.percentile(some, 95)) if told else (np.nan,) * 3
+        enough = len(some) >= MIN_BIN_COUNT
+        figures = (np.median(some), np.mean(some), np.percentile(some, 95)) if enough else (np.nan,) * 3
         found.append((len(some), *map(float, figures)))
     counts, median, mean, p95 = (np.array(column) for column in zip(*found, strict=True))
     return Bins(edges, counts, median, mean, p95)
 
 
 def gridded(error_m: FloatArray, x: FloatArray, y: FloatArray) -> Grid | None:
-    """Sort errors by two quantities; arguments as for :func:`binned`."""
+    """Sort |error| by two quantities; arguments as for :func:`binned`."""
     x_edges, y_edges = _edges(x), _edges(y)
     if x_edges is None or y_edges is None:
         return None
-    columns, rows = _places(x, x_edges), _places(y, y_edges)
+    columns, rows = _bin_indices(x, x_edges), _bin_indices(y, y_edges)
     shape = (len(y_edges) - 1, len(x_edges) - 1)
     mean, counts = np.full(shape, np.nan), np.zeros(shape, np.int64)
     size = np.abs(error_m)
@@ -193,13 +184,13 @@ def _edges(quantity: FloatArray) -> FloatArray | None:
     known = quantity[np.isfinite(quantity)]
     if len(known) < MIN_BIN_COUNT:
         return None
-    # The few largest would leave most bins empty; they are counted in the outermost ones.
+    # Extreme values would leave most bins empty; they count in the outermost bins.
     top = float(np.percentile(np.abs(known), 99))
     low = -top if (known < 0.0).any() else 0.0
     return np.linspace(low, top, BINS + 1) if top > 0.0 else None
 
 
-def _places(quantity: FloatArray, edges: FloatArray) -> NDArray[np.int64]:
-    """Bin of each, -1 where it is not known."""
+def _bin_indices(quantity: FloatArray, edges: FloatArray) -> NDArray[np.int64]:
+    """Return the bin of each value, -1 for NaN."""
     found = np.clip(np.searchsorted(edges, quantity, side="right") - 1, 0, len(edges) - 2)
     return np.where(np.isfinite(quantity), found, -1)

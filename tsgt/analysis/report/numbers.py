@@ -1,4 +1,4 @@
-"""All numbers of a report, as ``--json`` prints them. Pure."""
+"""All numbers of a report, as ``--json`` prints them. Sans-I/O."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tsgt.analysis.report.calibration import calibration_keys
-from tsgt.analysis.report.elements import median
+from tsgt.analysis.report.calibration import calibration_numbers
+from tsgt.analysis.report.elements import nan_median
 from tsgt.analysis.report.findings import position_sigma_mm
 from tsgt.analysis.report.motion import binned, gridded
 from tsgt.analysis.report.verdicts import bound_and_speed, verdicts
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 def report_numbers(findings: Findings) -> dict[str, Any]:
-    """Collect all numbers; those of ``tsgt evaluate`` without a report have the same names."""
+    """Return all numbers; those of ``tsgt evaluate`` without a report have the same names."""
     f = findings
     poses = f.poses
     bound_ms, fast_mps = bound_and_speed(f)
@@ -39,7 +39,7 @@ def report_numbers(findings: Findings) -> dict[str, Any]:
         "poses": 0 if poses is None else len(poses),
         "valid_poses": 0 if poses is None else int(np.count_nonzero(poses.valid)),
         "invalid": {} if poses is None else poses.invalid_counts(),
-        "by_estimator": {name: of_poses(each) for name, each in f.both.items()},
+        "by_estimator": {name: pose_numbers(each) for name, each in f.poses_by_estimator.items()},
         "protocol": f.log.protocol,
         "authenticated": f.log.authenticated,
         "events": [{"stamp_ns": stamp_ns, "message": message} for stamp_ns, message in f.log.events],
@@ -47,7 +47,7 @@ def report_numbers(findings: Findings) -> dict[str, Any]:
         "bound_median_ms": bound_ms,
         "speed_p95_mps": fast_mps,
         "problems": f.problems,
-        "calibration": calibration_keys(f.recording),
+        "calibration": calibration_numbers(f.recording),
     }
     if f.inter_prism is not None:
         found |= _distances(f.inter_prism)
@@ -59,7 +59,7 @@ def report_numbers(findings: Findings) -> dict[str, Any]:
             for name, each in f.held_out.items()
         }
     if f.difference is not None and len(f.difference.stamp_ns):
-        found["estimators_apart"] = apart(f.difference)
+        found["estimators_apart"] = difference_numbers(f.difference)
     if f.continuous is not None:
         motion = f.continuous.motion
         found |= {
@@ -72,8 +72,8 @@ def report_numbers(findings: Findings) -> dict[str, Any]:
             },
             "outliers": [dataclasses.asdict(stray) for stray in f.outliers],
         }
-    if f.compared:
-        found["estimators"] = {name: _compared(f, name) for name in f.compared}
+    if f.reference_errors:
+        found["estimators"] = {name: _compared(f, name) for name in f.reference_errors}
         found |= found["estimators"].get(f.recording.parameters.pipeline.estimator, {})
     if f.pose_noise is not None and f.pose_noise.as_measured is not None:
         found["perturbation"] = _as_measured(f.pose_noise.as_measured)
@@ -81,36 +81,39 @@ def report_numbers(findings: Findings) -> dict[str, Any]:
 
 
 def _compared(f: Findings, name: Estimator) -> dict[str, Any]:
-    """Tell how far one estimator's poses are from the reference."""
-    found = {**dataclasses.asdict(f.compared[name]), "stationary": dataclasses.asdict(f.stops[name])}
-    aligned = f.aligned.get(name)
+    """Return the errors of one estimator against the reference."""
+    found = {
+        **dataclasses.asdict(f.reference_errors[name]),
+        "stationary": dataclasses.asdict(f.stationary_errors[name]),
+    }
+    aligned = f.aligned_errors.get(name)
     return found if aligned is None else {**found, "aligned": dataclasses.asdict(aligned)}
 
 
-def spread(values: FloatArray) -> dict[str, float]:
-    """Sum up what is not NaN, by its median and the 95th percentile; NaN where there is nothing."""
+def median_and_p95(values: FloatArray) -> dict[str, float]:
+    """Return median and 95th percentile of the finite values; NaN without any."""
     known = values[np.isfinite(values)]
     if not len(known):
         return {"median": math.nan, "p95": math.nan}
     return {"median": float(np.median(known)), "p95": float(np.percentile(known, 95))}
 
 
-def apart(difference: Difference) -> dict[str, Any]:
-    """Tell how far both estimators' poses are apart."""
+def difference_numbers(difference: Difference) -> dict[str, Any]:
+    """Summarise the difference of the two estimators' poses."""
     return {
         "epochs": len(difference.stamp_ns),
-        "position_mm": spread(1e3 * difference.position_m),
-        "rotation_deg": spread(np.degrees(difference.rotation_rad)),
+        "position_mm": median_and_p95(1e3 * difference.position_m),
+        "rotation_deg": median_and_p95(np.degrees(difference.rotation_rad)),
     }
 
 
-def of_poses(poses: PoseBatch) -> dict[str, Any]:
-    """Count an estimator's poses, and sum up the sigmas that the valid ones state."""
+def pose_numbers(poses: PoseBatch) -> dict[str, Any]:
+    """Count an estimator's poses, and summarise the stated sigmas of the valid ones."""
     return {
         "poses": len(poses),
         "valid_poses": int(np.count_nonzero(poses.valid)),
         "invalid": poses.invalid_counts(),
-        "position_sigma_mm": spread(position_sigma_mm(poses)),
+        "position_sigma_mm": median_and_p95(position_sigma_mm(poses)),
     }
 
 
@@ -119,7 +122,7 @@ def _station(f: Findings, station: int) -> dict[str, Any]:
     heard = (None, None, None) if series is None else (series.rssi_dbm, series.snr_db, series.loss)
     names = ("rssi_median_dbm", "snr_median_db", "loss_median")
     found = dataclasses.asdict(f.station_statistics[station])
-    return {**found, **{name: median(values) for name, values in zip(names, heard, strict=True)}}
+    return {**found, **{name: nan_median(values) for name, values in zip(names, heard, strict=True)}}
 
 
 def _distances(found: InterPrismDistances) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Figures of a report: where the robot went, both estimators, residuals. From data to matplotlib, nothing else."""
+"""Report figures: path of the robot, both estimators, residuals."""
 
 from __future__ import annotations
 
@@ -26,17 +26,7 @@ _SIGHT = ("along the line of sight", "horizontally across", "vertically across")
 
 
 def draw_map(figure: Figure, poses: PoseBatch, stations: Mapping[int, FloatArray]) -> None:
-    """Draw the way from above, with the stations; where no pose is valid the line is broken.
-
-    Parameters
-    ----------
-    figure
-        An empty one.
-    poses
-        As computed.
-    stations
-        Positions in frame ``station1``, (3,) each, by number.
-    """
+    """Draw the path from above with the stations, by number (3,) in frame ``station1``; interrupted where no pose is valid."""
     panel = figure.subplots()
     xy = np.where(poses.valid[:, None], poses.position_m, np.nan)[:, :2]
     step = max(1, len(xy) // 20_000)
@@ -69,10 +59,10 @@ def draw_map(figure: Figure, poses: PoseBatch, stations: Mapping[int, FloatArray
     figure.legend(loc="outside upper center", ncols=4)
 
 
-def draw_coordinates(figure: Figure, poses: PoseBatch, clock: TimeAxis) -> None:
-    """Draw the position over time, and below it the sigmas of position and rotation that the poses state."""
+def draw_coordinates(figure: Figure, poses: PoseBatch, axis: TimeAxis) -> None:
+    """Draw the position over time, and the stated sigmas of position and rotation below."""
     axes = figure.subplots(5, 1, sharex=True)
-    time, valid = clock.of(poses.stamp_ns), poses.valid
+    time, valid = axis.of(poses.stamp_ns), poses.valid
     sigma = np.sqrt(np.einsum("nii->ni", poses.covariance))
     sigma[~valid] = np.nan
     position = np.where(valid[:, None], poses.position_m, np.nan)
@@ -89,25 +79,25 @@ def draw_coordinates(figure: Figure, poses: PoseBatch, clock: TimeAxis) -> None:
     axes[4].set_ylabel("rotation\nsigma (deg)")
     for panel in axes[3:]:
         plain_log(panel.yaxis)
-    axes[4].set_xlabel(clock.label)
+    axes[4].set_xlabel(axis.label)
     figure.align_ylabels(axes)
     handles, labels = axes[3].get_legend_handles_labels()
     figure.legend(handles, [f"sigma {x}" for x in labels], loc="outside upper center", ncols=2)
 
 
-def draw_held_out(figure: Figure, misses: Mapping[Estimator, HeldOutErrors]) -> None:
-    """Draw how many of the left-out measurements each estimator missed by how much."""
+def draw_held_out(figure: Figure, held_out: Mapping[Estimator, HeldOutErrors]) -> None:
+    """Draw the cumulative distribution of the held-out prediction errors of each estimator."""
     axes = figure.subplots(1, 2, sharey=True)
     for panel, gap, title in zip(
         axes, (False, True), ("neighbours at most 1 s apart", "at gaps over 1 s"), strict=True
     ):
         reach_mm = 0.0
-        for row, (name, each) in enumerate(misses.items()):
+        for row, (name, each) in enumerate(held_out.items()):
             chosen = np.sort(1e3 * each.error_m[each.at_gap == gap])
             share = 100 * np.arange(1, len(chosen) + 1) / max(1, len(chosen))
             look = stroke(row)
             panel.plot(chosen, share, color=look.color, linestyle=look.linestyle, label=name)
-            # The farthest misses would squeeze all others.
+            # The largest errors would compress all others.
             reach_mm = max(reach_mm, 1.2 * np.percentile(chosen, 97) if len(chosen) else 0.0)
         if reach_mm:
             panel.set_xlim(0.0, reach_mm)
@@ -115,23 +105,23 @@ def draw_held_out(figure: Figure, misses: Mapping[Estimator, HeldOutErrors]) -> 
             panel.text(0.5, 0.5, "none", transform=panel.transAxes, ha="center", va="center")
             panel.set_xticks([])
         panel.set_title(title, loc="left")
-        panel.set_xlabel("missed by (mm)")
-    axes[0].set_ylabel("share missed by less (%)")
-    axes[0].set_ylim(0, 101)  # a curve at 100 % is seen
+        panel.set_xlabel("prediction error (mm)")
+    axes[0].set_ylabel("share with a smaller error (%)")
+    axes[0].set_ylim(0, 101)  # a curve at 100 % is visible
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
 
 
-def draw_difference(figure: Figure, difference: Difference, clock: TimeAxis) -> None:
-    """Draw how far the poses of the two estimators are apart."""
+def draw_difference(figure: Figure, difference: Difference, axis: TimeAxis) -> None:
+    """Draw the difference between the poses of the two estimators."""
     axes = figure.subplots(2, 1, sharex=True)
     time, position, rotation = _with_gaps(difference)
-    curve(axes[0], clock.of(time), 1e3 * position, 1, label=None, dashes=False)
-    curve(axes[1], clock.of(time), np.degrees(rotation), 1, label=None, dashes=False)
+    curve(axes[0], axis.of(time), 1e3 * position, 1, label=None, dashes=False)
+    curve(axes[1], axis.of(time), np.degrees(rotation), 1, label=None, dashes=False)
     axes[0].set_ylabel("position (mm)")
     axes[1].set_ylabel("rotation (deg)")
     for panel in axes:
         panel.set_ylim(bottom=0.0)
-    axes[1].set_xlabel(clock.label)
+    axes[1].set_xlabel(axis.label)
     figure.align_ylabels(axes)
 
 
@@ -140,20 +130,16 @@ def draw_residuals(
     normalised: FloatArray,
     stamp_ns: NDArray[np.int64],
     station: NDArray[np.int64],
-    clock: TimeAxis,
+    axis: TimeAxis,
 ) -> None:
     """Draw the normalised residuals of each station over time.
 
     Parameters
     ----------
-    figure
-        An empty one.
     normalised
         (M, 3) in sigmas, along the line of sight, horizontally and vertically across it.
     stamp_ns, station
-        (M,) when, and who measured.
-    clock
-        The axis of time.
+        (M,) of the measurements.
     """
     numbers = np.unique(station).tolist()
     axes = figure.subplots(len(numbers), 3, sharex=True, sharey=True, squeeze=False)
@@ -161,8 +147,8 @@ def draw_residuals(
         rows = station == number
         for column, name in enumerate(_SIGHT):
             panel = axes[row, column]
-            # What is further out is drawn at the edge: it is named in the table of outliers.
-            dots(panel, clock.of(stamp_ns[rows]), np.clip(normalised[rows, column], -5.8, 5.8), 1)
+            # Values further out are drawn at the edge: the table of outliers lists them.
+            dots(panel, axis.of(stamp_ns[rows]), np.clip(normalised[rows, column], -5.8, 5.8), 1)
             for limit in (-3.0, 3.0):
                 panel.axhline(limit, color="black", linestyle="--", linewidth=0.8)
             panel.axhline(0.0, color="black", linewidth=0.6)
@@ -170,11 +156,11 @@ def draw_residuals(
                 panel.set_title(name)
         axes[row, 0].set_ylabel(f"station {number}\n(sigmas)")
     axes[0, 0].set_ylim(-6, 6)
-    figure.supxlabel(clock.label, fontsize=8)
+    figure.supxlabel(axis.label, fontsize=8)
 
 
 def _with_gaps(difference: Difference) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
-    """Put a NaN where epochs are missing, so that no line is drawn across."""
+    """Insert NaN where epochs are missing, so that the line is interrupted."""
     steps = np.diff(difference.stamp_ns)
     if not len(steps):
         return difference.stamp_ns, difference.position_m, difference.rotation_rad

@@ -1,4 +1,4 @@
-"""Figures of a report: stations, clocks, distances between prisms. From data to matplotlib, nothing else."""
+"""Report figures: stations, clocks, inter-prism distances."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ if TYPE_CHECKING:
 
 
 def draw_gaps(
-    figure: Figure, stations: Sequence[StationRecord], clock: TimeAxis, outage_limit_s: float, end_ns: int
+    figure: Figure, stations: Sequence[StationRecord], axis: TimeAxis, outage_limit_s: float, end_ns: int
 ) -> None:
-    """Draw for each station how long before each measurement the last usable one was, and which are not usable.
+    """Draw for each station the time between usable measurements, and unusable measurements.
 
-    A station that begins late or ends early has a gap there too: from the first measurement of any to its own first one,
-    and from its last one to ``end_ns``, the last measurement of any.
+    The gaps before the first measurement of a station (from the first of any) and after its last (until ``end_ns``, the last
+    of any) are drawn too.
     """
     axes = figure.subplots(len(stations), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
     for panel, station in zip(axes, stations, strict=True):
         times = station.stamp_ns[station.usable]
         if len(times) > 1:
-            dots(panel, clock.of(times[1:]), np.diff(times) / 1e9, 1, label="usable measurement")
+            dots(panel, axis.of(times[1:]), np.diff(times) / 1e9, 1, label="usable measurement")
         if len(times):
             edges_ns = np.array([times[0], end_ns])
-            waits_s = np.array([times[0] - clock.origin_ns, end_ns - times[-1]]) / 1e9
+            waits_s = np.array([times[0] - axis.origin_ns, end_ns - times[-1]]) / 1e9
             long = waits_s > outage_limit_s
             if long.any():
                 panel.plot(
-                    clock.of(edges_ns[long]),
+                    axis.of(edges_ns[long]),
                     waits_s[long],
                     linestyle="none",
                     marker="D",
@@ -50,15 +50,15 @@ def draw_gaps(
                 )
         bad = station.stamp_ns[~station.usable]
         if len(bad):
-            # At the foot of the panel, whatever the scale.
+            # At the bottom of the panel, whatever the scale.
             panel.plot(
-                clock.of(bad),
+                axis.of(bad),
                 np.full(len(bad), 0.06),
                 transform=panel.get_xaxis_transform(),
                 linestyle="none",
                 marker="x",
                 color=stroke(2).color,
-                label="not usable",
+                label="unusable",
             )
         panel.axhline(outage_limit_s, color="black", linewidth=0.8, linestyle=":", label="outage limit")
         plain_log(panel.yaxis)
@@ -66,44 +66,44 @@ def draw_gaps(
         if not len(station.stamp_ns):
             panel.text(0.5, 0.5, "no measurements", transform=panel.transAxes, ha="center", va="center")
     low, high = axes[0].get_ylim()
-    # The highest mark is a gap, the one to be seen best: it stands clear of the edge.
+    # The highest mark, a gap, must be clear of the edge.
     axes[0].set_ylim(min(low, 0.15), max(1.4 * high, 3.0))
-    figure.supylabel("time since the usable measurement before (s)", fontsize=8)
-    axes[-1].set_xlabel(clock.label)
+    figure.supylabel("time since the previous usable measurement (s)", fontsize=8)
+    axes[-1].set_xlabel(axis.label)
     legend_above(figure, list(axes))
 
 
-def draw_radio(figure: Figure, radio: Mapping[int, RadioSeries], clock: TimeAxis) -> None:
-    """Draw strength, ratio to the noise and loss of each station's radio over time."""
+def draw_radio(figure: Figure, radio: Mapping[int, RadioSeries], axis: TimeAxis) -> None:
+    """Draw RSSI, SNR and loss of each station over time."""
     axes = figure.subplots(3, 1, sharex=True)
     for row, (station, series) in enumerate(radio.items()):
-        time = clock.of(series.stamp_ns)
+        time = axis.of(series.stamp_ns)
         for panel, values in zip(axes, (series.rssi_dbm, series.snr_db, 100 * series.loss), strict=True):
             curve(panel, time, values, row, label=f"station {station}")
     for panel, label in zip(axes, ("RSSI (dBm)", "SNR (dB)", "loss (%)"), strict=True):
         panel.set_ylabel(label)
-    # A loss of nothing is a line that can be seen.
+    # A loss of 0 must be visible as a line.
     top = max(5.0, axes[2].get_ylim()[1])
     axes[2].set_ylim(-0.05 * top, top)
-    axes[2].set_xlabel(clock.label)
+    axes[2].set_xlabel(axis.label)
     legend_above(figure, [axes[0]])
 
 
 def draw_clocks(
-    figure: Figure, clocks: Mapping[int, ClockSeries], stations: Sequence[StationRecord], clock: TimeAxis
+    figure: Figure, clocks: Mapping[int, ClockSeries], stations: Sequence[StationRecord], axis: TimeAxis
 ) -> None:
-    """Draw how the stations' clocks wander, where synchronisations were recorded, and the bounds of all stamps."""
+    """Draw the clock offsets, if synchronisations were recorded, and the timestamp bounds of all stations."""
     bounded = [s for s in stations if np.isfinite(s.bound_ns).any()]
     panels = figure.subplots(bool(clocks) + len(bounded), 1, sharex=True, squeeze=False)[:, 0]
     places = iter(panels)
     if clocks:
         panel = next(places)
         for row, (station, series) in enumerate(clocks.items()):
-            time, look = clock.of(series.stamp_ns), stroke(row)
-            # A clock that was set anew starts anew: its step would hide the drift.
-            runs = np.cumsum(series.restarted)
-            for run in np.unique(runs):
-                rows = runs == run
+            time, look = axis.of(series.stamp_ns), stroke(row)
+            # Each restart begins a new curve: a step of the clock would hide the drift.
+            segments = np.cumsum(series.restarted)
+            for segment in np.unique(segments):
+                rows = segments == segment
                 panel.errorbar(
                     time[rows],
                     (series.offset_ns[rows] - series.offset_ns[rows][0]) / 1e6,
@@ -113,31 +113,31 @@ def draw_clocks(
                     marker=look.marker,
                     capsize=2,
                     linewidth=0.9,
-                    label=f"station {station}" if run == runs[0] else None,
+                    label=f"station {station}" if segment == segments[0] else None,
                 )
-        panel.set_ylabel("offset less\nthe first (ms)")
+        panel.set_ylabel("offset minus\nthe first (ms)")
     for panel, record in zip(places, bounded, strict=True):
-        # Each in a panel of its own, and as points: bounds jump to and fro between the same few values.
+        # As points in separate panels: bounds alternate between the same few values.
         known = np.isfinite(record.bound_ns)
-        dots(panel, clock.of(record.stamp_ns[known]), record.bound_ns[known] / 1e6, 1)
+        dots(panel, axis.of(record.stamp_ns[known]), record.bound_ns[known] / 1e6, 1)
         panel.set_ylabel(f"station {record.station}\nbound (ms)")
     if bounded:
         below = panels[bool(clocks) :]
         known = np.concatenate([s.bound_ns[np.isfinite(s.bound_ns)] for s in bounded]) / 1e6
         least, most = float(known.min()), float(known.max())
-        # The first ones, before a clock is known well, may be larger by a hundred times.
+        # The first bounds, before a clock filter converges, may be a hundred times larger.
         wide = least > 0.0 and most > 5 * least
         for panel in below:
             if wide:
                 plain_log(panel.yaxis)
             panel.set_ylim(least / 1.2 if wide else 0.0, max(1.2 * most, 1e-3))
-    panels[-1].set_xlabel(clock.label)
+    panels[-1].set_xlabel(axis.label)
     figure.align_ylabels(panels)
     legend_above(figure, list(panels))
 
 
 def draw_histograms(figure: Figure, found: InterPrismDistances) -> None:
-    """Draw the distances of each pair, standing above moving, about that of the layout."""
+    """Draw the distances of each pair minus those of the layout, stationary above moving."""
     axes = figure.subplots(2, len(found.dynamic), squeeze=False, sharex=True)
     spread = [
         np.percentile(np.abs(pair.distances_m - pair.reference_m), 98)
@@ -146,12 +146,12 @@ def draw_histograms(figure: Figure, found: InterPrismDistances) -> None:
     ]
     reach_mm = 1.1 * 1e3 * max([*spread, 1e-3])
     for column, (static, dynamic) in enumerate(zip(found.static, found.dynamic, strict=True)):
-        for row, (pair, name) in enumerate(((static, "standing"), (dynamic, "moving and standing"))):
+        for row, (pair, name) in enumerate(((static, "stationary"), (dynamic, "all epochs"))):
             _histogram(axes[row, column], pair, reach_mm, row)
             if column == 0:
                 axes[row, column].set_ylabel(f"{name}\nshare (%)")
         axes[0, column].set_title(f"prisms {static.name}, layout {1e3 * static.reference_m:.1f} mm")
-    figure.supxlabel("measured distance less that of the layout (mm)", fontsize=8)
+    figure.supxlabel("measured distance minus that of the layout (mm)", fontsize=8)
     legend_above(figure, list(axes.ravel()))
 
 
@@ -184,13 +184,13 @@ def _histogram(panel: Axes, pair: PairDistances, reach_mm: float, row: int) -> N
 
 
 def draw_distance_errors(
-    figure: Figure, ride: DistanceErrorSeries, stationary_ns: Sequence[tuple[int, int]], clock: TimeAxis
+    figure: Figure, errors: DistanceErrorSeries, stationary_ns: Sequence[tuple[int, int]], axis: TimeAxis
 ) -> None:
-    """Draw the error of each distance over time, and below it how the robot moved; shade where it stood."""
-    pairs = list(ride.error_m.items())
+    """Draw the error of each distance over time, and speed and angular rate below; shade stationary intervals."""
+    pairs = list(errors.error_m.items())
     axes = figure.subplots(len(pairs) + 2, 1, sharex=True)
-    time = clock.of(ride.stamp_ns)
-    still = [(float(clock.of(a)), float(clock.of(b))) for a, b in stationary_ns]
+    time = axis.of(errors.stamp_ns)
+    stationary = [(float(axis.of(a)), float(axis.of(b))) for a, b in stationary_ns]
     known = [1e3 * e[np.isfinite(e)] for _, e in pairs]
     reach = max((float(np.percentile(np.abs(e), 99.8)) for e in known if len(e)), default=1.0)
     for panel, (name, error_m) in zip(axes, pairs, strict=False):
@@ -199,29 +199,29 @@ def draw_distance_errors(
         panel.set_ylim(-1.1 * reach, 1.1 * reach)
         panel.set_ylabel(f"{name}\nerror (mm)")
     for panel, values, label in (
-        (axes[-2], ride.motion.speed_mps, "speed\n(m/s)"),
-        (axes[-1], ride.motion.angular_rate_radps, "angular rate\n(rad/s)"),
+        (axes[-2], errors.motion.speed_mps, "speed\n(m/s)"),
+        (axes[-1], errors.motion.angular_rate_radps, "angular rate\n(rad/s)"),
     ):
         curve(panel, time, values, 0, label=None, dashes=False)
         panel.set_ylabel(label)
         panel.set_ylim(bottom=0.0)
     for panel in axes:
-        shade(panel, still, "standing still")
-    axes[-1].set_xlabel(clock.label)
+        shade(panel, stationary, "stationary")
+    axes[-1].set_xlabel(axis.label)
     figure.align_ylabels(axes)
     legend_above(figure, axes[:1])
 
 
 def draw_bins(figure: Figure, bins: Sequence[tuple[str, Bins | None]]) -> None:
-    """Draw the size of the errors over one quantity after the other, and how many there are."""
+    """Draw |error| over each quantity, and the number of errors."""
     axes = figure.subplots(
         2, len(bins), squeeze=False, sharex="col", sharey="row", gridspec_kw={"height_ratios": (3, 1)}
     )
     for column, (label, found) in enumerate(bins):
         above, below = axes[:, column]
         below.set_xlabel(label)
-        if found is None or not found.counts.any():  # the logarithmic axis below cannot show nothing
-            above.text(0.5, 0.5, "not known", transform=above.transAxes, ha="center", va="center")
+        if found is None or not found.counts.any():  # a logarithmic axis cannot be empty
+            above.text(0.5, 0.5, "unknown", transform=above.transAxes, ha="center", va="center")
             continue
         middle = (found.edges[1:] + found.edges[:-1]) / 2
         for row, (name, values) in enumerate(
@@ -247,7 +247,7 @@ def draw_bins(figure: Figure, bins: Sequence[tuple[str, Bins | None]]) -> None:
         below.set_yscale("log")
         below.locator_params(axis="x", nbins=5)
     axes[0, 0].set_ylim(bottom=0.0)
-    # From one on, so that the heights of bars can be compared; last, since it fixes the top of all.
+    # From 1, so that the heights of bars can be compared; last, since it fixes the upper limit.
     axes[1, 0].set_ylim(bottom=1.0)
     axes[0, 0].set_ylabel("|distance error| (mm)")
     axes[1, 0].set_ylabel("distances")
@@ -255,7 +255,7 @@ def draw_bins(figure: Figure, bins: Sequence[tuple[str, Bins | None]]) -> None:
 
 
 def draw_grids(figure: Figure, grids: Sequence[tuple[str, str, Grid]]) -> None:
-    """Draw the mean size of the errors over two quantities at a time, as numbers on grey-safe colours."""
+    """Draw the mean |error| over two quantities, as numbers on greyscale-safe colours."""
     axes = figure.subplots(1, len(grids), squeeze=False, sharey=True)[0]
     top = max((1e3 * float(np.nanmax(g.mean)) for _, _, g in grids if np.isfinite(g.mean).any()), default=1.0)
     mesh = None
@@ -282,7 +282,7 @@ def draw_grids(figure: Figure, grids: Sequence[tuple[str, str, Grid]]) -> None:
 
 
 def draw_statuses(figure: Figure, stations: Sequence[StationRecord]) -> None:
-    """Draw what share of each station's measurements had which status."""
+    """Draw the share of each status among a station's measurements."""
     panel = figure.subplots()
     names = list(dict.fromkeys(name for s in stations for name in s.statuses))
     left = np.zeros(len(stations))

@@ -1,4 +1,4 @@
-"""How regularly stations measured: rates, gaps, statuses. Pure."""
+"""Regularity of the stations' measurements: rates, gaps, statuses. Sans-I/O."""
 
 from __future__ import annotations
 
@@ -22,26 +22,24 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class StationRecord:
-    """What one station measured, in the order of time; repeats of a measurement count once.
+    """N measurements of one station, in the order of time; repeated ones count once.
 
     Attributes
     ----------
-    station
-        Its number.
     prisms
-        Those that it measured.
+        Numbers of the measured prisms.
     stamp_ns
-        (N,) as recorded, on the master's Unix clock.
+        (N,) on the master's Unix clock.
     usable
-        (N,) whether status and distance allow it to enter a pose.
+        (N,) whether status and distance allow its use in a pose.
     bound_ns
-        (N,) by how much the stamp may be wrong; NaN where nobody can say.
+        (N,) of the timestamp error; NaN if unknown.
     delay_s
         (N,) from the measurement to its arrival at the master.
     statuses
-        How often the instrument said what.
+        Number of measurements by status.
     distance_m
-        Nearest and farthest; NaN where it gave none.
+        Minimum and maximum; NaN without distances.
     """
 
     station: int
@@ -56,26 +54,24 @@ class StationRecord:
 
 @dataclass(frozen=True, slots=True)
 class StationStatistics:
-    """A station in figures, as they stand in a report.
+    """Statistics of a station.
 
     Attributes
     ----------
-    measurements, usable
-        How many there are, and how many of them can enter a pose.
     rate_hz
-        Usable ones per second, from the first to the last; NaN with fewer than two.
+        Usable measurements per second, from the first to the last; NaN with fewer than two.
     longest_gap_s
-        Longest time without a usable one, the recording's start and end included.
+        Longest time without a usable measurement, including start and end of the recording.
     gaps, in_gaps
-        How many gaps are longer than the outage limit, and what share of the recording they take.
+        Number of gaps longer than the outage limit, and their share of the recording.
     statuses
-        How often the instrument said what.
+        Number of measurements by status.
     delay_median_s, delay_p95_s
         From the measurement to its arrival at the master.
     bound_max_ms
-        Largest bound of a stamp; NaN where none was recorded.
+        Largest timestamp bound; NaN if none was recorded.
     distance_min_m, distance_max_m
-        Slope distances; NaN where it gave none.
+        Slope distances; NaN without distances.
     """
 
     measurements: int
@@ -93,19 +89,11 @@ class StationStatistics:
 
 
 def station_records(measurements: Sequence[Measurement], stations: Sequence[int]) -> list[StationRecord]:
-    """Sort measurements by station; a station that sent none has an empty record.
-
-    Parameters
-    ----------
-    measurements
-        In any order.
-    stations
-        Numbers of those that should have measured; others that did come after them.
-    """
-    found: dict[int, dict[int, Measurement]] = {station: {} for station in stations}
+    """Group measurements by station; the expected ``stations`` come first, with empty records if they have no measurements."""
+    by_station: dict[int, dict[int, Measurement]] = {station: {} for station in stations}
     for m in measurements:
-        found.setdefault(m.station, {}).setdefault(m.stamp_ns, m)
-    return [_record(station, [each[t] for t in sorted(each)]) for station, each in found.items()]
+        by_station.setdefault(m.station, {}).setdefault(m.stamp_ns, m)
+    return [_record(station, [each[t] for t in sorted(each)]) for station, each in by_station.items()]
 
 
 def _record(station: int, measurements: Sequence[Measurement]) -> StationRecord:
@@ -127,7 +115,7 @@ def _record(station: int, measurements: Sequence[Measurement]) -> StationRecord:
 def station_statistics(
     record: StationRecord, *, start_ns: int, end_ns: int, outage_limit_ns: int
 ) -> StationStatistics:
-    """Sum a station up over a recording from ``start_ns`` to ``end_ns``."""
+    """Summarise the measurements of a station over a recording from ``start_ns`` to ``end_ns``."""
     times_ns = record.stamp_ns[record.usable]
     steps_s = np.diff(np.concatenate([[start_ns], times_ns, [end_ns]])) / 1e9
     long = steps_s > outage_limit_ns / 1e9

@@ -1,6 +1,6 @@
-"""What of a recording can be trusted, and what to look at. Pure.
+"""Verdicts: which results of a recording can be trusted, and what to check. Sans-I/O.
 
-The limits are for guidance: they are what a set-up in order keeps to, with room.
+The limits are guidelines that a correct set-up meets with a margin.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ _RESIDUAL_MEAN = 0.5
 _RESIDUAL_STD = 1.5
 _NOISE_SCALE = (0.5, 2.0)
 _OUTLIERS = 0.01
-_LEAST_RESIDUALS = 30
+_MIN_RESIDUALS = 30
 _NEES = (3.0, 12.0)
 
 
 class Level(StrEnum):
-    """How good it is."""
+    """Severity of a verdict."""
 
     GOOD = "good"
     CARE = "take care"
@@ -45,14 +45,14 @@ class Level(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """One thing to know, in a sentence that says what to do."""
+    """A statement about a result, with advice."""
 
     level: Level
     text: str
 
 
 def verdicts(findings: Findings) -> list[Verdict]:
-    """Judge what was found, the worst first."""
+    """Return the verdicts, the worst first."""
     found = [
         *_poses(findings),
         *_stations(findings),
@@ -79,16 +79,16 @@ def _poses(f: Findings) -> Iterator[Verdict]:
     why = ", ".join(f"{reason} {n}" for reason, n in poses.invalid_counts().items())
     yield Verdict(
         level,
-        # Rounded down: 100.0 % is all of them.
+        # Rounded down, so that 100.0 % means all poses.
         f"{math.floor(1e3 * share) / 10:.1f}% of the poses of {estimator} are valid"
-        f"{f' (not valid: {why})' if why else ''}. Use no other.",
+        f"{f' (not valid: {why})' if why else ''}. Use valid poses only.",
     )
     sigma_mm = position_sigma_mm(poses)
     yield Verdict(
         Level.GOOD if np.median(sigma_mm) <= _SIGMA_MM else Level.CARE,
-        f"The valid poses state {np.median(sigma_mm):.1f} mm (median) and "
-        f"{np.percentile(sigma_mm, 95):.1f} mm (95 %) as the sigma of their position per axis; an error that all "
-        "prisms share, as of a station's frame, is not in it.",
+        f"The stated position sigma of the valid poses per axis is {np.median(sigma_mm):.1f} mm (median) and "
+        f"{np.percentile(sigma_mm, 95):.1f} mm (95 %); it does not include errors common to all prisms, such as "
+        "those of a station frame.",
     )
 
 
@@ -105,13 +105,13 @@ def _stations(f: Findings) -> Iterator[Verdict]:
             )
     if f.log.authenticated is False:
         yield Verdict(
-            Level.CARE, "The radio was not authenticated: nobody can say whether somebody else has sent."
+            Level.CARE, "The radio was not authenticated: data of other senders cannot be excluded."
         )
 
 
 def bound_and_speed(f: Findings) -> tuple[float, float]:
-    """Median bound of the stamps in ms, and the speed in m/s below which the robot is 95 % of the time; NaN: not known."""
-    bounds = [s.bound_ns[np.isfinite(s.bound_ns)] for s in f.stations]
+    """Return the median timestamp bound in ms and the 95th percentile of the speed in m/s; NaN if unknown."""
+    bounds = [s.bound_ns[np.isfinite(s.bound_ns)] for s in f.station_records]
     known = np.concatenate(bounds) if bounds else np.empty(0)
     speed_mps = np.empty(0) if f.distance_errors is None else f.distance_errors.motion.speed_mps
     speed_mps = speed_mps[np.isfinite(speed_mps)]
@@ -125,35 +125,36 @@ def _times(f: Findings) -> Iterator[Verdict]:
     bound_ms, fast_mps = bound_and_speed(f)
     if math.isnan(bound_ms):
         yield Verdict(
-            Level.CARE, "No bound of the time stamps was recorded; how well the clocks agreed is not known."
+            Level.CARE,
+            "No timestamp bound was recorded; the accuracy of the clock synchronisation is unknown.",
         )
     elif not math.isnan(fast_mps):
-        reach_mm = bound_ms * fast_mps
+        bound_mm = bound_ms * fast_mps
         yield Verdict(
-            Level.GOOD if reach_mm <= _BOUND_MM else Level.CARE,
-            f"Stamps are within {bound_ms:.2f} ms (median bound): {reach_mm:.1f} mm at {fast_mps:.1f} m/s (95 % of the "
-            "speed).",
+            Level.GOOD if bound_mm <= _BOUND_MM else Level.CARE,
+            f"The median timestamp bound is {bound_ms:.2f} ms, which is {bound_mm:.1f} mm at {fast_mps:.1f} m/s (95th "
+            "percentile of the speed).",
         )
 
 
 def _distances(f: Findings) -> Iterator[Verdict]:
     if f.inter_prism is None:
-        yield Verdict(Level.BAD, f"Distances between prisms: {f.problems['inter_prism']}.")
+        yield Verdict(Level.BAD, f"No inter-prism distances: {f.problems['inter_prism']}.")
         return
-    standing = [pair.statistics() for pair in f.inter_prism.static if len(pair.distances_m)]
+    static = [pair.statistics() for pair in f.inter_prism.static if len(pair.distances_m)]
     moving = [pair.statistics() for pair in f.inter_prism.dynamic if len(pair.distances_m)]
     if not moving:
         yield Verdict(Level.BAD, "At no time were all prisms measured without a gap.")
         return
-    if not standing:
-        why = "The robot never stood still for 3 s"
-        if f.odometry_ns:
-            why = "By the odometry, the robot stood still before or after this recording only"
-        elif f.odometry_ns is not None:
-            why = "By the odometry, the robot never stood still for 3 s"
+    if not static:
+        why = "The robot was never stationary for 3 s"
+        if f.odometry_stationary_ns:
+            why = "According to the odometry, the robot was stationary before or after this recording only"
+        elif f.odometry_stationary_ns is not None:
+            why = "According to the odometry, the robot was never stationary for 3 s"
         yield Verdict(
             Level.CARE,
-            f"{why}: errors of layout, frames and prism constants cannot be told from those of time.",
+            f"{why}: errors of layout, frames and prism constants cannot be separated from timing errors.",
         )
     for pair in f.inter_prism.static:
         figures = pair.statistics()
@@ -161,22 +162,23 @@ def _distances(f: Findings) -> Iterator[Verdict]:
         if abs(bias_mm) > _STATIC_BIAS_MM:
             yield Verdict(
                 Level.CARE,
-                f"Standing still, the distance {pair.name} is {bias_mm:+.1f} mm off the layout: look at the prism "
-                "layout, the prism constants, the stations' frames.",
+                f"Stationary, the mean distance {pair.name} deviates by {bias_mm:+.1f} mm from the layout: check the prism "
+                "layout, the prism constants and the station frames.",
             )
     moving_mm = float(np.mean([figures.mean_abs_error for figures in moving]))
     yield Verdict(
         Level.GOOD if moving_mm <= _MOVING_MM else Level.CARE,
-        f"On average, distances between prisms are {moving_mm:.1f} mm off over the whole way.",
+        f"The mean inter-prism error over the whole recording is {moving_mm:.1f} mm.",
     )
-    if standing:
-        standing_mm = float(np.mean([figures.std for figures in standing]))
-        spread_mm = float(np.mean([figures.std for figures in moving]))
-        if spread_mm > _TIMING_SHARE * standing_mm:
+    if static:
+        static_std_mm = float(np.mean([figures.std for figures in static]))
+        std_mm = float(np.mean([figures.std for figures in moving]))
+        if std_mm > _TIMING_SHARE * static_std_mm:
             yield Verdict(
                 Level.CARE,
-                f"Distances between prisms spread {spread_mm:.1f} mm over the whole way, and {standing_mm:.1f} mm standing still: the "
-                "rest comes from straight lines between measurements, from stamps and latencies (`tsgt calibrate motion`).",
+                f"The standard deviation of the inter-prism distances is {std_mm:.1f} mm over the whole recording, but "
+                f"{static_std_mm:.1f} mm stationary: the difference is due to linear interpolation between measurements, "
+                "timestamps and latencies (`tsgt calibrate motion`).",
             )
 
 
@@ -187,48 +189,50 @@ def _residuals(f: Findings) -> Iterator[Verdict]:
     if not f.continuous.motion.tuned:
         yield Verdict(
             Level.CARE,
-            "The measurements are too few to tell how the robot moves and how much they scatter: both are as recorded.",
+            "There are too few measurements to estimate motion prior and noise scale: both are those of the recording.",
         )
     elif not _NOISE_SCALE[0] <= scale <= _NOISE_SCALE[1]:
         yield Verdict(
-            Level.CARE, f"The measurements scatter by {scale:.2g} times what the instruments' noise says."
+            Level.CARE,
+            f"The noise of the measurements is {scale:.2g} times the stated noise of the instruments.",
         )
-    judged = [each for axes in f.residuals.values() for each in axes.values() if each.n >= _LEAST_RESIDUALS]
-    strange = [
+    sufficient = [each for axes in f.residuals.values() for each in axes.values() if each.n >= _MIN_RESIDUALS]
+    abnormal = [
         f"station {station} {axis.replace('_', ' ')} (mean {each.mean:+.1f}, std {each.std:.1f})"
         for station, axes in f.residuals.items()
         for axis, each in axes.items()
-        if each.n >= _LEAST_RESIDUALS and (abs(each.mean) > _RESIDUAL_MEAN or each.std > _RESIDUAL_STD)
+        if each.n >= _MIN_RESIDUALS and (abs(each.mean) > _RESIDUAL_MEAN or each.std > _RESIDUAL_STD)
     ]
-    if strange:
+    if abnormal:
         yield Verdict(
             Level.CARE,
-            f"Residuals are not what noise makes: {', '.join(strange)}. A mean is a frame or a latency.",
+            f"Residuals exceed the noise: {', '.join(abnormal)}. A mean other than 0 indicates an error of a frame or a latency.",
         )
-    elif judged:
-        yield Verdict(Level.GOOD, "The residuals of all stations are what their noise makes.")
+    elif sufficient:
+        yield Verdict(Level.GOOD, "The residuals of all stations are consistent with their noise.")
     n = len(f.continuous.sources)
     if len(f.outliers) > _OUTLIERS * n:
         yield Verdict(
-            Level.CARE, f"{len(f.outliers)} of {n} measurements stray too far to be noise; see the residuals."
+            Level.CARE, f"{len(f.outliers)} of {n} measurements were rejected as outliers; see the residuals."
         )
 
 
 def _reference(f: Findings) -> Iterator[Verdict]:
-    for name, each in f.compared.items():
+    for name, each in f.reference_errors.items():
         if not each.compared:
             yield Verdict(
-                Level.BAD, f"No valid pose of {name} lies in the time of the reference; nothing was compared."
+                Level.BAD,
+                f"No valid pose of {name} is within the time of the reference; nothing was compared.",
             )
             continue
-        honest = math.isfinite(each.nees.mean) and _NEES[0] <= each.nees.mean <= _NEES[1]
+        consistent = math.isfinite(each.nees.mean) and _NEES[0] <= each.nees.mean <= _NEES[1]
         yield Verdict(
-            Level.GOOD if honest else Level.CARE,
-            f"Against the reference, {name} is off by {each.position_rms_mm:.1f} mm and "
+            Level.GOOD if consistent else Level.CARE,
+            f"The error of {name} against the reference is {each.position_rms_mm:.1f} mm and "
             f"{each.orientation_rms_deg:.2f} degrees (rms, unaligned)"
             + (
-                "; its covariances fit that."
-                if honest
-                else f"; its covariances do not fit that (NEES {each.nees.mean:.1f} instead of 6)."
+                "; its covariances are consistent with that."
+                if consistent
+                else f"; its covariances are inconsistent with that (NEES {each.nees.mean:.1f}, expected 6)."
             ),
         )

@@ -1,4 +1,4 @@
-"""Has a station moved? Against simulated movements, an independent optimiser and the stated false alarms."""
+"""Movement of a station: simulated movements, an independent optimiser, the stated false-alarm probability."""
 
 from __future__ import annotations
 
@@ -24,12 +24,14 @@ from tsgt.model import TARGET_NOISE
 if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
 
-AROUND = np.array([[18, 3, 0.4], [6, -21, -0.6], [-15, 9, 1.1], [-10, -16, 0.2], [30, 25, 2.0]], dtype=float)
-STILL = np.eye(4)
+TARGETS_M = np.array(
+    [[18, 3, 0.4], [6, -21, -0.6], [-15, 9, 1.1], [-10, -16, 0.2], [30, 25, 2.0]], dtype=float
+)
+UNMOVED = np.eye(4)
 
 
 def seen(points_m: FloatArray, T: FloatArray, rng: np.random.Generator | None) -> PointSet:
-    """Measure targets from where the station stands; without a generator exactly."""
+    """Measure targets from a station's frame; without a generator exactly."""
     points = transform_points(invert(T), points_m)
     covariances = measurement_covariance(*cartesian_to_polar(points), TARGET_NOISE)
     if rng is not None:
@@ -39,27 +41,34 @@ def seen(points_m: FloatArray, T: FloatArray, rng: np.random.Generator | None) -
 
 
 def checked(
-    T: FloatArray, count: int, seed: int | None = None, *, limit_m: float = 0.0, points_m: FloatArray = AROUND
+    T: FloatArray,
+    count: int,
+    seed: int | None = None,
+    *,
+    limit_m: float = 0.0,
+    points_m: FloatArray = TARGETS_M,
 ) -> StationCheck:
-    """Measure so many targets before and after a movement."""
+    """Measure targets before and after a movement."""
     rng = None if seed is None else np.random.default_rng(seed)
-    return check_station(seen(points_m[:count], STILL, rng), seen(points_m[:count], T, rng), limit_m=limit_m)
+    return check_station(
+        seen(points_m[:count], UNMOVED, rng), seen(points_m[:count], T, rng), limit_m=limit_m
+    )
 
 
 def moved(x: float = 0.0, y: float = 0.0, z: float = 0.0, *turns: float) -> FloatArray:
-    """Movement of a station in m and rad, in its frame of before."""
+    """Return a movement of a station in m and rad, in its previous frame."""
     return transform_from(exp_so3(np.array(turns or (0.0, 0.0, 0.0))), np.array([x, y, z]))
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5])
-def test_a_station_that_stands_is_sound(count: int) -> None:
-    """In 300 campaigns each: with a false alarm in ten thousand, none."""
-    results = [checked(STILL, count, seed) for seed in range(300)]
+def test_stationary_station_passes(count: int) -> None:
+    """In 300 simulations each: with a false-alarm probability of 1e-4, no alarm."""
+    results = [checked(UNMOVED, count, seed) for seed in range(300)]
     assert all(result.ok and result.consistent for result in results)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5])
-def test_a_movement_of_20_mm_is_found(count: int) -> None:
+def test_movement_of_20_mm_is_detected(count: int) -> None:
     """Always, and its length within four sigma."""
     for seed in range(100):
         result = checked(moved(0.012, -0.016), count, seed)
@@ -69,7 +78,7 @@ def test_a_movement_of_20_mm_is_found(count: int) -> None:
 
 
 @pytest.mark.parametrize(("count", "levelled"), [(2, True), (5, False)])
-def test_a_turn_is_found_without_a_movement(count: int, *, levelled: bool) -> None:
+def test_rotation_is_detected_without_translation(count: int, *, levelled: bool) -> None:
     """0.5 mrad about the plumb line shifts targets 20 m away by 10 mm; the station itself has not moved."""
     result = checked(moved(0, 0, 0, 0, 0, 0.5e-3), count)
     assert (result.ok, result.levelled) == (False, levelled)
@@ -78,56 +87,56 @@ def test_a_turn_is_found_without_a_movement(count: int, *, levelled: bool) -> No
     assert result.shifts_m[2] == pytest.approx(0.5e-3 * np.hypot(6, 21), rel=1e-3)
 
 
-def test_one_target_gives_its_shift_and_no_more() -> None:
-    """It cannot tell a turn from a movement."""
+def test_one_target_gives_its_shift_only() -> None:
+    """It cannot separate rotation and translation."""
     result = checked(moved(0, 0, 0, 0, 0, 1e-3), 1)
     assert result.turned_rad is None
     assert result.moved_m == pytest.approx(result.shifts_m[1])
     assert result.moved_m == pytest.approx(1e-3 * np.hypot(18, 3), rel=1e-3)
 
 
-def test_two_targets_side_by_side_give_no_turn() -> None:
-    """Ten centimetres apart they hold a heading to some ten milliradians: worth nothing."""
+def test_two_close_targets_determine_no_rotation() -> None:
+    """Ten centimetres apart they determine the heading to some ten milliradians only."""
     points = np.array([[20.0, 0.0, 0.0], [20.0, 0.1, 0.0]])
     assert checked(moved(0.02), 2, points_m=points).turned_rad is None
 
 
 @pytest.mark.parametrize("count", [2, 4])
-def test_it_agrees_with_an_independent_optimiser(count: int) -> None:
-    """Translation and rotation, found by a general least-squares program with its own rotation parameters."""
+def test_agrees_with_an_independent_optimiser(count: int) -> None:
+    """Translation and rotation, from a general least-squares solver with its own rotation parameters."""
     T = moved(0.03, 0.01, -0.005, *((0, 0, 2e-3) if count == 2 else (1e-3, -0.5e-3, 2e-3)))
     rng = np.random.default_rng(5)
-    then, now = seen(AROUND[:count], STILL, rng), seen(AROUND[:count], T, rng)
-    whitening = np.linalg.cholesky(np.linalg.inv(then.covariances_m2 + now.covariances_m2))
+    reference, current = seen(TARGETS_M[:count], UNMOVED, rng), seen(TARGETS_M[:count], T, rng)
+    whitening = np.linalg.cholesky(np.linalg.inv(reference.covariances_m2 + current.covariances_m2))
 
-    def misses(x: FloatArray) -> FloatArray:
+    def residuals(x: FloatArray) -> FloatArray:
         rotation = Rotation.from_rotvec([0, 0, x[3]] if count == 2 else x[3:]).as_matrix()
-        residuals = then.points_m - now.points_m @ np.asarray(rotation).T - x[:3]
+        residuals = reference.points_m - current.points_m @ np.asarray(rotation).T - x[:3]
         return np.ravel(residuals[:, None, :] @ whitening)
 
-    oracle = least_squares(misses, np.zeros(4 if count == 2 else 6), xtol=1e-15, ftol=1e-15, gtol=1e-15).x
-    result = check_station(then, now)
+    oracle = least_squares(residuals, np.zeros(4 if count == 2 else 6), xtol=1e-15, ftol=1e-15, gtol=1e-15).x
+    result = check_station(reference, current)
     assert result.moved_m == pytest.approx(float(np.linalg.norm(oracle[:3])), abs=1e-5)
     assert result.turned_rad == pytest.approx(float(np.linalg.norm(oracle[3:])), abs=1e-6)
 
 
-def test_the_limit_tolerates_what_is_no_noise() -> None:
+def test_limit_accepts_shifts_beyond_noise() -> None:
     """Up to the largest shift of a target."""
     assert not checked(moved(0.015), 3).ok
     assert not checked(moved(0.015), 3, limit_m=0.014).ok
     assert checked(moved(0.015), 3, limit_m=0.016).ok
 
 
-def test_a_target_that_moved_itself_is_no_movement_of_the_station() -> None:
+def test_moved_target_is_inconsistent() -> None:
     """No single movement explains the shifts."""
-    then, now = seen(AROUND, STILL, None), seen(AROUND, STILL, None)
-    now.points_m[3] += [0.0, 0.0, 0.05]
-    result = check_station(then, now)
+    reference, current = seen(TARGETS_M, UNMOVED, None), seen(TARGETS_M, UNMOVED, None)
+    current.points_m[3] += [0.0, 0.0, 0.05]
+    result = check_station(reference, current)
     assert (result.ok, result.consistent) == (False, False)
 
 
-def test_only_targets_of_now_count() -> None:
-    """What was measured then and not now is left out."""
-    result = check_station(seen(AROUND, STILL, None), seen(AROUND, moved(0.02), None).select((2, 5)))
+def test_only_current_targets_count() -> None:
+    """Reference targets that were not measured again are ignored."""
+    result = check_station(seen(TARGETS_M, UNMOVED, None), seen(TARGETS_M, moved(0.02), None).select((2, 5)))
     assert set(result.shifts_m) == {2, 5}
     assert result.moved_m == pytest.approx(0.02, abs=1e-6)

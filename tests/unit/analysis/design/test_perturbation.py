@@ -64,8 +64,8 @@ def test_position_of_the_centroid_is_unbiased() -> None:
     assert at_origin.position_mean_m[2] > 0.3
 
 
-def test_ten_millimetres_between_prisms() -> None:
-    """The noise that gives them is found, and what it does to the pose is what first order expects of it."""
+def test_equivalent_noise_of_ten_millimetres() -> None:
+    """The noise that causes them is found, and its first-order effect on the pose."""
     found = equivalent_noise(LAYOUT, 0.010, samples=50_000, point_m=CENTROID, random=_random())
     assert found.inter_prism_mean_m == pytest.approx(0.010, rel=1e-6)
     # |difference of two prisms| along their line: sqrt(2) sigma sqrt(2 / pi) in the mean.
@@ -77,7 +77,7 @@ def test_ten_millimetres_between_prisms() -> None:
     np.testing.assert_allclose(found.euler_abs_mean_rad, rotation_rad * math.sqrt(2 / math.pi), rtol=0.015)
 
 
-def test_the_same_seed_gives_the_same_study() -> None:
+def test_same_seed_gives_the_same_study() -> None:
     """Randomness comes from the generator alone."""
     one, two = (
         perturbation_study(LAYOUT, [0.01, 0.1], samples=50, point_m=CENTROID, random=_random(7)) for _ in "ab"
@@ -85,41 +85,41 @@ def test_the_same_seed_gives_the_same_study() -> None:
     np.testing.assert_array_equal(one[1].euler_mean_rad, two[1].euler_mean_rad)
 
 
-def test_the_whole_study_takes_less_than_five_seconds() -> None:
-    """101 sizes of noise, 1000 draws each; it takes a tenth of a second on a desk computer."""
-    began_s = time.perf_counter()
+def test_study_takes_less_than_five_seconds() -> None:
+    """101 sigmas, 1000 samples each; it takes a tenth of a second on a desktop computer."""
+    start_s = time.perf_counter()
     study = perturbation_study(
         LAYOUT, list(0.004 * np.arange(101)), samples=1000, point_m=CENTROID, random=_random()
     )
     assert len(study) == 101
-    assert time.perf_counter() - began_s < 5
+    assert time.perf_counter() - start_s < 5
 
 
-def test_progress_is_told() -> None:
-    """From the first noise to the last."""
-    told: list[float] = []
+def test_progress_is_reported() -> None:
+    """From the first sigma to the last."""
+    progress: list[float] = []
     perturbation_study(
-        LAYOUT, [0.0, 0.1], samples=2, point_m=CENTROID, random=_random(), on_progress=told.append
+        LAYOUT, [0.0, 0.1], samples=2, point_m=CENTROID, random=_random(), on_progress=progress.append
     )
-    assert told == [0.5, 1.0]
+    assert progress == [0.5, 1.0]
 
 
-def test_prisms_in_a_line_are_refused() -> None:
-    """No rotation follows from them."""
+def test_prisms_in_a_line_are_rejected() -> None:
+    """They determine no rotation."""
     line = np.array([[0.0, 0, 1], [0.5, 0, 1], [1.0, 0, 1]])
     with pytest.raises(DegenerateGeometryError, match="nearly in a line"):
         perturbation_study(line, [0.01], samples=10, point_m=np.zeros(3), random=_random())
 
 
-def test_errors_beyond_the_layout_have_their_noise_too() -> None:
-    """Five metres between prisms that are one apart: absurd, and answered."""
+def test_equivalent_noise_of_errors_larger_than_the_layout() -> None:
+    """Five metres between prisms that are one metre apart."""
     found = equivalent_noise(LAYOUT, 5.0, samples=2000, point_m=CENTROID, random=_random())
     assert found.inter_prism_mean_m == pytest.approx(5.0, rel=1e-6)
 
 
 @pytest.mark.parametrize("angles_rad", [(0.1, -0.2, 0.3), (3.0, 1.5, -3.1), (-1.0, -1.57, 0.5)])
-def test_euler_angles_are_those_about_fixed_axes_x_y_z(angles_rad: tuple[float, float, float]) -> None:
-    """R = Rz Ry Rx, the other way round."""
+def test_euler_angles_are_about_fixed_axes_x_y_z(angles_rad: tuple[float, float, float]) -> None:
+    """The inverse of R = Rz Ry Rx."""
     x, y, z = (exp_so3(angle * axis) for angle, axis in zip(angles_rad, np.eye(3), strict=True))
     np.testing.assert_allclose(euler_angles_rad(z @ y @ x), angles_rad, atol=1e-9)
 

@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from harness.scene import LAYOUT, SECOND, START, Scene, driving, standing, stationary_scene
+from harness.scene import LAYOUT, SECOND, START, Scene, at_rest, driving, stationary_scene
 
 from tsgt.analysis.evaluation import InterPrismDistances, inter_prism
 from tsgt.analysis.evaluation.inter_prism import stationary_intervals
@@ -16,7 +16,7 @@ REFERENCES_MM = [987.0, 681.0, 815.0]
 
 
 def track(times_s: list[float], x_m: list[float]) -> Track:
-    """Make a track along the x axis."""
+    """Return a track along the x axis."""
     n = len(times_s)
     points = np.column_stack([x_m, np.zeros(n), np.zeros(n)])
     times_ns = np.array([START + round(time_s * SECOND) for time_s in times_s])
@@ -25,12 +25,12 @@ def track(times_s: list[float], x_m: list[float]) -> Track:
 
 
 def stop_and_go(time_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Stand for 10 s, drive along x at 1 m/s for 10 s, stand for 10 s."""
+    """Return a robot that is stationary for 10 s, moves along x at 1 m/s for 10 s, and is stationary for 10 s."""
     return exp_so3(np.zeros(3)), np.array([30.0 + np.clip(time_s - 10.0, 0.0, 10.0), 20.0, 0.0])
 
 
 def found_in(scene: Scene, *, duration_s: float, without: tuple[int, ...] = ()) -> InterPrismDistances:
-    """Measure at 2.5 Hz with phases, leaving out some steps of station 2, and compare the prisms."""
+    """Measure at 2.5 Hz with phases, without some steps of station 2, and compute the inter-prism distances."""
     measurements = [
         scene.measure(station, 0.4 * step + 0.11 * station)
         for step in range(int(duration_s / 0.4))
@@ -40,7 +40,7 @@ def found_in(scene: Scene, *, duration_s: float, without: tuple[int, ...] = ()) 
     return inter_prism(scene.parameters, build_tracks(scene.parameters, measurements))
 
 
-def test_a_standing_robot_has_the_distances_of_its_layout() -> None:
+def test_stationary_robot_has_the_distances_of_its_layout() -> None:
     """Exact measurements give exact distances, interpolated and raw."""
     found = found_in(stationary_scene(), duration_s=8.0)
     for pairs in (found.dynamic, found.static):
@@ -53,8 +53,8 @@ def test_a_standing_robot_has_the_distances_of_its_layout() -> None:
     assert found.stationary_s == pytest.approx(7.6 - 0.22)
 
 
-def test_a_gap_is_counted_apart() -> None:
-    """Epochs without all three tracks are invalid; they enter no mean."""
+def test_gap_is_counted_as_invalid() -> None:
+    """Epochs without all three tracks enter no mean."""
     # Station 2 measures at 0.22 + 0.4 step: without steps 5 to 7 there is a gap from 1.82 to 3.42 s.
     found = found_in(stationary_scene(), duration_s=8.0, without=(5, 6, 7))
     assert found.invalid_epochs == len(range(1850, 3420, 50))
@@ -62,14 +62,14 @@ def test_a_gap_is_counted_apart() -> None:
     assert all(len(pair.distances_m) == found.epochs - found.invalid_epochs for pair in found.dynamic)
 
 
-def test_the_epochs_span_what_all_tracks_cover() -> None:
+def test_epochs_span_the_time_of_all_tracks() -> None:
     """From the first whole 50 ms that all tracks have reached to the last before one of them ends."""
     found = found_in(stationary_scene(), duration_s=8.0)
     assert found.epochs == len(range(350, 7600 + 110 + 1, 50))  # the last station starts at 0.33 s
 
 
-def test_figures_are_those_of_the_distances() -> None:
-    """Mean and deviation of the distance, mean and 95th percentile of its error, against plain numpy."""
+def test_statistics_equal_plain_numpy() -> None:
+    """Mean and deviation of the distance, mean and 95th percentile of its error."""
     pair = found_in(stationary_scene().moving(driving), duration_s=8.0).dynamic[1]
     figures = pair.statistics()
     mm = pair.distances_m * 1e3
@@ -80,8 +80,8 @@ def test_figures_are_those_of_the_distances() -> None:
     assert error[int(0.94 * len(mm))] <= figures.p95 <= error[int(0.96 * len(mm))]
 
 
-def test_no_distance_has_no_figures() -> None:
-    """A robot that never stands has no static distances, and no mean of nothing."""
+def test_no_distances_give_nan() -> None:
+    """A robot that is never stationary has no static distances."""
     found = found_in(stationary_scene().moving(stop_and_go), duration_s=40.0)
     assert len(found.static[0].distances_m) > 0
     moving = found_in(stationary_scene().moving(lambda t: stop_and_go(t % 5 + 11)), duration_s=4.0)
@@ -91,8 +91,8 @@ def test_no_distance_has_no_figures() -> None:
     assert figures.valid == 0
 
 
-def test_static_pairs_come_from_the_stationary_intervals_only() -> None:
-    """Moving prisms measured at different instants would bend the distance; raw pairs do not contain them."""
+def test_static_pairs_are_from_stationary_intervals_only() -> None:
+    """Prisms measured at different instants while moving would distort the distance."""
     found = found_in(stationary_scene().moving(stop_and_go), duration_s=30.0)
     assert 18.0 < found.stationary_s < 20.0
     for pair in found.static:
@@ -100,23 +100,23 @@ def test_static_pairs_come_from_the_stationary_intervals_only() -> None:
         assert np.median(np.abs(pair.distances_m - pair.reference_m)) < 1e-9
 
 
-def test_a_slow_drive_is_motion() -> None:
-    """0.06 m/s is motion, 0.04 m/s is not."""
+def test_speed_threshold() -> None:
+    """0.06 m/s is moving, 0.04 m/s is stationary."""
     times = [0.4 * step for step in range(20)]
     for speed, still in ((0.06, []), (0.04, [(START, START + round(7.6 * SECOND))])):
         assert stationary_intervals([track(times, [speed * t for t in times])], LIMIT_NS) == still
 
 
-def test_a_short_stop_is_no_stationary_interval() -> None:
-    """It takes 3 s of standing."""
+def test_short_stop_is_not_a_stationary_interval() -> None:
+    """It takes 3 s."""
     times = [0.4 * step for step in range(20)]
     for stop_s, count in ((2.8, 0), (3.6, 1)):
         x = [max(0.0, 2.0 - t) - max(0.0, t - 2.0 - stop_s) for t in times]
         assert len(stationary_intervals([track(times, x)], LIMIT_NS)) == count
 
 
-def test_an_outage_is_not_standing() -> None:
-    """Nobody knows what the robot did while a prism was lost."""
+def test_outage_is_not_stationary() -> None:
+    """The motion during an outage is unknown."""
     times = [0.4 * step for step in range(11)] + [9.0 + 0.4 * step for step in range(11)]
     intervals = stationary_intervals([track(times, [5.0] * 22)], LIMIT_NS)
     assert intervals == [(START, START + 4 * SECOND), (START + 9 * SECOND, START + 13 * SECOND)]
@@ -131,16 +131,16 @@ def test_noise_of_a_fast_instrument_is_not_motion() -> None:
     assert stationary_intervals([track(times, x)], LIMIT_NS) == [(START, START + round(9.95 * SECOND))]
 
 
-def test_all_tracks_must_stand() -> None:
-    """One prism that moves is motion of the robot."""
+def test_all_tracks_must_be_stationary() -> None:
+    """One moving prism is motion of the robot."""
     times = [0.4 * step for step in range(20)]
-    standing_track = track(times, [0.0] * 20)
-    assert stationary_intervals([standing_track, track(times, [0.5 * t for t in times])], LIMIT_NS) == []
+    stationary_track = track(times, [0.0] * 20)
+    assert stationary_intervals([stationary_track, track(times, [0.5 * t for t in times])], LIMIT_NS) == []
 
 
-def test_the_reference_is_the_layout() -> None:
+def test_reference_is_the_layout() -> None:
     """The reference distances are those of the prism layout in the parameters."""
-    found = found_in(stationary_scene().moving(standing), duration_s=4.0)
+    found = found_in(stationary_scene().moving(at_rest), duration_s=4.0)
     for pair in found.dynamic:
         a, b = pair.prisms
         assert pair.reference_m == pytest.approx(float(np.linalg.norm(LAYOUT[a - 1] - LAYOUT[b - 1])))

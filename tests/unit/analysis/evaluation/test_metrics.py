@@ -14,16 +14,16 @@ from tsgt.geometry import transform_from, transform_points
 POINT_M = np.array([0.1, 0.2, 1.0])
 
 
-def way(count: int = 50) -> np.ndarray:
-    """Poses along a bend that climbs."""
+def path(count: int = 50) -> np.ndarray:
+    """Return poses along a climbing curve."""
     t = np.linspace(0.0, 3.0, count)
     turns = Rotation.from_euler("ZYX", np.stack([t, 0.1 * np.sin(t), 0.05 * t], axis=1)).as_matrix()
     return transform_from(turns, np.stack([10 * np.cos(t), 10 * np.sin(t), 0.3 * t**2], axis=1))
 
 
-def test_a_rigid_error_is_hidden_altogether() -> None:
-    """A frame that is off by 2 degrees and 50 mm in the middle of the way: that is removed, and told."""
-    true = way()
+def test_rigid_alignment_hides_a_rigid_error() -> None:
+    """A frame error of 2 degrees and 50 mm at the centroid is removed, and reported as hidden."""
+    true = path()
     middle = transform_points(true, POINT_M).mean(axis=0)
     turn = Rotation.from_rotvec(np.radians(2.0) * np.array([0.0, 0.6, 0.8])).as_matrix()
     shift = np.array([0.03, 0.0, 0.04])
@@ -37,9 +37,9 @@ def test_a_rigid_error_is_hidden_altogether() -> None:
     assert found.hidden_orientation_deg == pytest.approx(2.0, abs=1e-5)
 
 
-def test_a_shift_leaves_rotations_alone() -> None:
-    """Only what all positions have in common goes; errors about it stay, to the third side of a right triangle."""
-    true = way()
+def test_translation_alignment_keeps_rotations() -> None:
+    """Only the common translation is removed; the other errors remain, to the third side of a right triangle."""
+    true = path()
     found = true.copy()
     found[:, :3, 3] += (0.003, 0.0, 0.0)
     found[::2, 2, 3] += 0.004
@@ -52,8 +52,8 @@ def test_a_shift_leaves_rotations_alone() -> None:
     assert figures.hidden_orientation_deg == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_straight_way_does_not_say_how_to_turn() -> None:
-    """About the way itself any rotation fits as well."""
+def test_straight_path_does_not_determine_the_rotation() -> None:
+    """Any rotation about the path fits equally well."""
     straight = transform_from(
         np.broadcast_to(np.eye(3), (9, 3, 3)), np.arange(9.0)[:, None] * (1.0, 0.0, 0.0)
     )
@@ -62,8 +62,8 @@ def test_a_straight_way_does_not_say_how_to_turn() -> None:
     assert aligned_statistics(straight, straight, POINT_M, "translation").translation_mm == 0.0
 
 
-def test_without_poses_there_are_no_figures() -> None:
-    """Nothing was compared, so nothing is told."""
+def test_alignment_without_poses_is_nan() -> None:
+    """Nothing was compared."""
     nothing = aligned_statistics(np.empty((0, 4, 4)), np.empty((0, 4, 4)), POINT_M, "rigid")
     assert math.isnan(nothing.translation_mm)
 
@@ -71,7 +71,7 @@ def test_without_poses_there_are_no_figures() -> None:
 PRISM_POINT_M = np.array([0.0, 0.1, 1.2])
 
 
-def test_no_error_for_the_truth_itself() -> None:
+def test_truth_has_no_error() -> None:
     """A pose that is the truth has no error."""
     rotations = Rotation.random(20, random_state=1).as_matrix()
     true = transform_from(rotations, np.random.default_rng(1).normal(size=(20, 3)))
@@ -90,7 +90,7 @@ def test_position_error_is_that_of_the_point() -> None:
     assert math.degrees(errors.rotation_rad[0]) == pytest.approx(10.0)
 
 
-def test_figures_are_root_mean_squares() -> None:
+def test_errors_are_root_mean_squares() -> None:
     """Errors of 3 and 4 mm make sqrt(12.5) mm; the unit is millimetres."""
     true = np.tile(np.eye(4), (2, 1, 1))
     estimated = true.copy()
@@ -99,15 +99,15 @@ def test_figures_are_root_mean_squares() -> None:
     assert errors.position_rms_mm == pytest.approx(math.sqrt(12.5))
 
 
-def test_no_poses_have_no_figure() -> None:
-    """Without a pose the figures are not a number, rather than perfect."""
+def test_no_poses_give_nan() -> None:
+    """Rather than zero."""
     errors = pose_errors(np.empty((0, 4, 4)), np.empty((0, 4, 4)), PRISM_POINT_M)
     assert math.isnan(errors.position_rms_mm)
     assert math.isnan(errors.orientation_rms_deg)
 
 
-def test_two_seconds_at_each_end_do_not_count() -> None:
-    """Figures start 2 s after the start and end 2 s before the end, both included."""
+def test_two_seconds_at_each_end_are_excluded() -> None:
+    """The limits themselves are included."""
     second = 1_000_000_000
     stamps = np.array([1.9, 2.0, 5.0, 8.0, 8.1]) * second
     inner = interior_mask(100 * second + stamps.astype(np.int64), 100 * second, 110 * second)

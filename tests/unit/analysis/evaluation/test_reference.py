@@ -21,7 +21,7 @@ ROW = "{} {} 0 0 0 0 {} {}"
 
 
 def written(path: Path, *, count: int = 201, step_ns: int = 50_000_000) -> Path:
-    """Write a robot that goes along x at 1 m/s and turns left at 0.1 rad/s."""
+    """Write a robot that moves along x at 1 m/s and rotates left at 0.1 rad/s."""
     rows = []
     for i in range(count):
         t = i * step_ns / 1e9
@@ -32,7 +32,7 @@ def written(path: Path, *, count: int = 201, step_ns: int = 50_000_000) -> Path:
 
 
 def poses(stamp_ns: np.ndarray, *, offset_m: float = 0.0) -> PoseBatch:
-    """Poses of that robot, off sideways, with a sigma of 1 mm and 1 mrad."""
+    """Return poses of that robot with a lateral offset, with a sigma of 1 mm and 1 mrad."""
     batch = PoseBatch.blank(stamp_ns, (1, 2, 3), Kind.SMOOTHED)
     t = (stamp_ns - START_NS) / 1e9
     batch.position_m[:] = np.stack([t, np.full(len(t), offset_m), np.zeros(len(t))], axis=1)
@@ -41,8 +41,8 @@ def poses(stamp_ns: np.ndarray, *, offset_m: float = 0.0) -> PoseBatch:
     return batch
 
 
-def test_stamps_are_read_to_the_nanosecond(tmp_path: Path) -> None:
-    """A float would not hold them."""
+def test_timestamps_are_read_to_the_nanosecond(tmp_path: Path) -> None:
+    """A float would lose them."""
     path = tmp_path / "r.tum"
     path.write_text("1700000000.000000001 0 0 0 0 0 0 1\n1700000000.050000003 0 0 0 0 0 0 2\n")
     found = read_tum(path)
@@ -50,8 +50,8 @@ def test_stamps_are_read_to_the_nanosecond(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.orientation_xyzw[1], (0, 0, 0, 1))
 
 
-def test_poses_between_those_of_the_reference(tmp_path: Path) -> None:
-    """Lines and the shortest turn between neighbours at most 0.1 s apart; nothing beyond its ends or across a gap."""
+def test_reference_is_interpolated(tmp_path: Path) -> None:
+    """Linear and slerp between neighbours at most 0.1 s apart; nothing beyond its ends or across a gap."""
     reference = read_tum(written(tmp_path / "r.tum"))
     asked = START_NS + np.array([-1, 0, 12_345_678, 10_000_000_000, 10_000_000_001])
     found, known = reference.at(asked)
@@ -65,8 +65,8 @@ def test_poses_between_those_of_the_reference(tmp_path: Path) -> None:
     assert known.tolist() == [True, False, False, True]
 
 
-def test_only_valid_poses_in_the_inner_part_count(tmp_path: Path) -> None:
-    """Two seconds at either end are left out; 3 mm off at a sigma of 1 mm is a NEES of 9."""
+def test_only_valid_poses_in_the_interior_count(tmp_path: Path) -> None:
+    """Two seconds at either end are excluded; 3 mm at a sigma of 1 mm is a NEES of 9."""
     reference = read_tum(written(tmp_path / "r.tum"))
     batch = poses(START_NS + np.arange(201) * 50_000_000, offset_m=0.003)
     batch.reason[100] = Reason.OUTAGE
@@ -79,7 +79,7 @@ def test_only_valid_poses_in_the_inner_part_count(tmp_path: Path) -> None:
     assert found.nees.above_95 == 0.0
 
 
-def test_nees_of_right_covariances_is_six() -> None:
+def test_nees_of_consistent_covariances_is_six() -> None:
     """Oracle: errors drawn from covariances; 5 % of them are above the 95th percentile."""
     rng = np.random.default_rng(3)
     root = rng.normal(size=(6, 6))
@@ -89,7 +89,7 @@ def test_nees_of_right_covariances_is_six() -> None:
     assert found.above_95 == pytest.approx(0.05, abs=0.006)
 
 
-def test_no_poses_have_no_figures(tmp_path: Path) -> None:
+def test_no_valid_poses_give_nan(tmp_path: Path) -> None:
     """An estimator without valid poses cannot be compared."""
     batch = poses(START_NS + np.arange(201) * 50_000_000)
     none = replace(batch, reason=np.full(201, Reason.OUTAGE, np.int8))
@@ -113,7 +113,7 @@ def test_no_poses_have_no_figures(tmp_path: Path) -> None:
         ("-1.0 0 0 0 0 0 0 1\n1.0 0 0 0 0 0 0 1\n", "line 1: is not a pose"),
     ],
 )
-def test_what_is_no_trajectory_is_refused(tmp_path: Path, text: str, problem: str) -> None:
+def test_invalid_trajectory_is_rejected(tmp_path: Path, text: str, problem: str) -> None:
     """With the line."""
     path = tmp_path / "r.tum"
     path.write_text(text)
@@ -121,7 +121,7 @@ def test_what_is_no_trajectory_is_refused(tmp_path: Path, text: str, problem: st
         read_tum(path)
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    """As any other problem with it."""
+def test_missing_file_is_named(tmp_path: Path) -> None:
+    """As with any other problem."""
     with pytest.raises(InputFileError, match=r"r\.tum: cannot be read"):
         read_tum(tmp_path / "r.tum")

@@ -14,8 +14,8 @@ SECOND_NS = 1_000_000_000
 POINT_M = np.array([0.0, 0.0, 1.0])
 
 
-def stood(count: int = 401) -> tuple[PoseBatch, Reference]:
-    """Twenty seconds at 20 Hz in one place, without an error."""
+def stationary_robot(count: int = 401) -> tuple[PoseBatch, Reference]:
+    """Return twenty seconds at 20 Hz at one place, without errors."""
     stamps = START_NS + np.arange(count, dtype=np.int64) * 50_000_000
     batch = PoseBatch.blank(stamps, (1, 2, 3), Kind.SMOOTHED)
     batch.position_m[:] = (5.0, -3.0, 0.5)
@@ -23,9 +23,9 @@ def stood(count: int = 401) -> tuple[PoseBatch, Reference]:
     return batch, Reference(stamps, batch.position_m.copy(), batch.orientation_xyzw.copy())
 
 
-def test_noise_averages_out_and_an_offset_stays() -> None:
-    """Each stop counts for itself: 10 mm to and fro in the first are nothing, 3 mm and 1 degree in the second are that."""
-    poses, truth = stood()
+def test_noise_averages_out_and_offsets_remain() -> None:
+    """Per interval: alternating 10 mm in the first give 0, a constant 3 mm and 1 degree in the second remain."""
+    poses, truth = stationary_robot()
     poses.position_m[:100:2, 0] += 0.010
     poses.position_m[1:100:2, 0] -= 0.010
     poses.position_m[200:, 1] += 0.003
@@ -41,9 +41,9 @@ def test_noise_averages_out_and_an_offset_stays() -> None:
     assert figures.rotation_mean_deg == pytest.approx(0.5)
 
 
-def test_a_robot_that_creeps_is_compared_with_where_it_was() -> None:
-    """Half of the stop without valid poses: the truth of that half does not count either."""
-    poses, truth = stood()
+def test_only_instants_with_valid_poses_are_compared() -> None:
+    """Of a slowly moving robot: where poses are invalid, the truth does not count either."""
+    poses, truth = stationary_robot()
     drift = np.linspace(0.0, 0.02, 401)
     poses.position_m[:, 0] += drift
     truth.position_m[:, 0] += drift
@@ -52,9 +52,9 @@ def test_a_robot_that_creeps_is_compared_with_where_it_was() -> None:
     np.testing.assert_allclose(found.position_m, [0.0], atol=1e-9)
 
 
-def test_a_stop_of_less_than_a_second_is_none() -> None:
-    """Nor is one without valid poses; without any stop there are no figures."""
-    poses, truth = stood()
+def test_intervals_with_less_than_a_second_of_poses_are_ignored() -> None:
+    """Without any interval the statistics are NaN."""
+    poses, truth = stationary_robot()
     poses.reason[200:] = Reason.OUTAGE
     stops = [(START_NS, START_NS + 900_000_000), (START_NS + 12 * SECOND_NS, START_NS + 20 * SECOND_NS)]
     found = stationary_errors(poses, truth, stops, POINT_M).statistics()

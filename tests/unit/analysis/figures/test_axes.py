@@ -8,8 +8,8 @@ from tsgt.analysis.figures import TimeAxis
 from tsgt.analysis.figures.axes import BUCKETS, thinned
 
 
-def test_a_long_curve_keeps_its_peaks_and_its_gaps() -> None:
-    """Thinned, it looks the same on paper."""
+def test_thinned_curve_keeps_peaks_and_gaps() -> None:
+    """It looks the same on paper."""
     x = np.arange(100_000.0)
     y = np.sin(x / 5000)
     y[12_345], y[50_000:60_000] = 7.0, np.nan
@@ -21,8 +21,8 @@ def test_a_long_curve_keeps_its_peaks_and_its_gaps() -> None:
 
 
 @pytest.mark.parametrize(("span_s", "unit"), [(100, "(s)"), (3600, "(min)"), (40_000, "(h)")])
-def test_the_axis_of_time_has_small_numbers(span_s: int, unit: str) -> None:
-    """Its unit follows from how long the recording is."""
-    clock = TimeAxis.over(START, START + span_s * SECOND)
-    assert clock.label.endswith(unit)
-    assert float(clock.of(START + span_s * SECOND)) <= 300
+def test_time_axis_has_small_numbers(span_s: int, unit: str) -> None:
+    """Its unit depends on the duration of the recording."""
+    axis = TimeAxis.over(START, START + span_s * SECOND)
+    assert axis.label.endswith(unit)
+    assert float(axis.of(START + span_s * SECOND)) <= 300

@@ -253,7 +253,7 @@ def synthetic_pose(stamp_ns: int = GOLDEN_NS + 2) -> PoseRecord:
     return PoseRecord(
         stamp_ns=stamp_ns,
         valid=True,
-        reason=None,
+        reason="",
         position_m=(30.5, 20.25, -1.0),
         orientation_xyzw=(0.0, 0.0, 0.6, 0.8),
         covariance=tuple(k / 8 for k in range(36)),

@@ -1,4 +1,4 @@
-"""Merging the journals of simulated missions: everything is there once, at its true time, and nothing else."""
+"""Merging the journals of simulated missions: every measurement is present once, at its true time."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ S = 1_000_000_000
 
 @pytest.fixture(scope="module")
 def outage(tmp_path_factory: pytest.TempPathFactory) -> MissionResult:
-    """Over classic, two minutes in which no station hears the master."""
+    """Over classic, two minutes without reception between the stations and the master."""
     return mission(
         tmp_path_factory.mktemp("outage"),
         duration_s=240.0,
@@ -54,7 +54,7 @@ def short(tmp_path_factory: pytest.TempPathFactory) -> MissionResult:
 
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory: pytest.TempPathFactory) -> MissionResult:
-    """Over superframe; from half a minute before the end on nobody hears anybody."""
+    """Over superframe; without any reception in the last half minute."""
     return mission(
         tmp_path_factory.mktemp("frames"),
         protocol=SUPERFRAME,
@@ -65,7 +65,7 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> MissionResult:
 
 
 def measured(path: Path) -> Counter[object]:
-    """Count what a recording holds, each measurement by what no two share."""
+    """Count the measurements of a recording by identity."""
     return Counter(
         identity(measurement)
         for measurement in load_recording(path).measurements
@@ -74,14 +74,14 @@ def measured(path: Path) -> Counter[object]:
 
 
 def journalled(run: MissionResult) -> Counter[object]:
-    """Count what the journals hold, likewise."""
+    """Count the measurements of the journals by identity."""
     return Counter(
         identity(measurement) for path in journals(run) for measurement in load_journal(path).measurements
     )
 
 
 def added_to(run: MissionResult, path: Path, *, without: int = 0) -> list[PolarMeasurement]:
-    """Merge all journals of a mission into its recording, and return what was added, which must be true."""
+    """Merge all journals of a mission into its recording; return the added measurements after checking their times."""
     recording(run, path, without=without)
     merged = merge(path, journals(run))
     added = merged_in(path)
@@ -93,8 +93,8 @@ def added_to(run: MissionResult, path: Path, *, without: int = 0) -> list[PolarM
 # --- Classic ----------------------------------------------------------------------------------------------------------
 
 
-def test_an_outage_is_closed(outage: MissionResult, tmp_path: Path) -> None:
-    """Poses that the recording alone cannot have are there after a merge, and are where the robot was."""
+def test_outage_is_filled(outage: MissionResult, tmp_path: Path) -> None:
+    """A merge yields poses during the outage, close to the true ones."""
     path = recording(outage, tmp_path / "r.jsonl")
     before = process(load_recording(path), path=path)
     added_to(outage, path)
@@ -111,8 +111,8 @@ def test_an_outage_is_closed(outage: MissionResult, tmp_path: Path) -> None:
     assert np.sqrt(np.mean(error_m**2)) < 0.05
 
 
-def test_everything_is_there_once(outage: MissionResult, tmp_path: Path) -> None:
-    """Over classic the radio carries the newest measurements only; afterwards all of them are in the recording."""
+def test_every_measurement_is_present_once(outage: MissionResult, tmp_path: Path) -> None:
+    """Classic transmits the newest measurements only; after the merge the recording has all of them."""
     path = recording(outage, tmp_path / "r.jsonl")
     merged = merge(path, journals(outage))
     assert measured(path) == journalled(outage)
@@ -121,8 +121,8 @@ def test_everything_is_there_once(outage: MissionResult, tmp_path: Path) -> None
     assert merged.bounds_ns[-1] < 5_000_000
 
 
-def test_a_second_merge_adds_nothing(outage: MissionResult, tmp_path: Path) -> None:
-    """Neither the same journals nor copies of them bring anything that is there."""
+def test_second_merge_adds_nothing(outage: MissionResult, tmp_path: Path) -> None:
+    """Neither the same journals nor copies of them."""
     path = recording(outage, tmp_path / "r.jsonl")
     first = merge(path, journals(outage))
     content = path.read_bytes()
@@ -136,8 +136,8 @@ def test_a_second_merge_adds_nothing(outage: MissionResult, tmp_path: Path) -> N
     )
 
 
-def test_a_copy_of_a_journal_adds_nothing(short: MissionResult, tmp_path: Path) -> None:
-    """Also when it is given along with the journal the first time."""
+def test_copy_of_a_journal_adds_nothing(short: MissionResult, tmp_path: Path) -> None:
+    """Also together with the journal in the first merge."""
     path = recording(short, tmp_path / "r.jsonl")
     copy = tmp_path / "copy.jsonl"
     copy.write_bytes(journals(short)[0].read_bytes())
@@ -145,16 +145,16 @@ def test_a_copy_of_a_journal_adds_nothing(short: MissionResult, tmp_path: Path) 
     assert measured(path) == journalled(short)
 
 
-def test_a_replay_is_the_stream_as_it_was(outage: MissionResult, tmp_path: Path) -> None:
-    """What was merged was not on the stream."""
+def test_replay_ignores_merged_measurements(outage: MissionResult, tmp_path: Path) -> None:
+    """They were not in the stream."""
     path = recording(outage, tmp_path / "r.jsonl")
     before = list(replayed(path))
     merge(path, journals(outage))
     assert list(replayed(path)) == before
 
 
-def test_an_output_of_its_own(short: MissionResult, tmp_path: Path) -> None:
-    """It is the recording with what would have been appended, and the recording stays as it was."""
+def test_output_file(short: MissionResult, tmp_path: Path) -> None:
+    """It equals the recording with the additions, and the recording is unchanged."""
     path, output = recording(short, tmp_path / "r.jsonl"), tmp_path / "o.jsonl"
     content = path.read_bytes()
     merge(path, journals(short), output=output)
@@ -163,8 +163,8 @@ def test_an_output_of_its_own(short: MissionResult, tmp_path: Path) -> None:
     assert output.read_bytes() == path.read_bytes()
 
 
-def test_killed_at_any_byte(short: MissionResult, tmp_path: Path) -> None:
-    """Once more, and everything is there once, whatever the kill has left of the last line."""
+def test_merge_after_a_kill_at_any_byte(short: MissionResult, tmp_path: Path) -> None:
+    """Repeating the merge completes it, whatever remains of the last line."""
     path = recording(short, tmp_path / "r.jsonl")
     size = path.stat().st_size
     merge(path, journals(short))
@@ -178,8 +178,8 @@ def test_killed_at_any_byte(short: MissionResult, tmp_path: Path) -> None:
         assert measured(path) == journalled(short)
 
 
-def test_sessions_and_runs(tmp_path: Path) -> None:
-    """The master is started again; a station too, in an outage, and meanwhile somebody has set its Unix clock."""
+def test_restarts_of_master_and_station(tmp_path: Path) -> None:
+    """A station restarts during an outage, and its Unix clock is set meanwhile."""
 
     async def set_clock(mission: Mission) -> None:
         await mission.sleep_until(50.0)
@@ -203,8 +203,8 @@ def test_sessions_and_runs(tmp_path: Path) -> None:
     assert measured(path) == journalled(run)
 
 
-def test_a_computer_that_wakes_up_in_the_same_hour(tmp_path: Path) -> None:
-    """Without a battery clock, times of two journals overlap; what the radio carried tells which is which."""
+def test_repeated_unix_time_after_a_reboot(tmp_path: Path) -> None:
+    """Without a battery-backed clock, times of two journals overlap; delivered measurements resolve the ambiguity."""
 
     async def reboot(mission: Mission) -> None:
         await mission.sleep_until(39.0)
@@ -219,8 +219,8 @@ def test_a_computer_that_wakes_up_in_the_same_hour(tmp_path: Path) -> None:
     assert measured(path) == journalled(run)
 
 
-def test_errors_are_merged_too(tmp_path: Path) -> None:
-    """A tilted instrument is the reason why ``linear`` has no poses; with its journal the desk knows."""
+def test_error_statuses_are_merged(tmp_path: Path) -> None:
+    """A tilted instrument explains why ``linear`` has no poses."""
     scenario = ScenarioConfig(faults=(StatusFaultConfig(station=2, status="tilt", start_s=15.0, end_s=25.0),))
     run = mission(tmp_path / "m", scenario, duration_s=40.0, outages=(Outage((1, 2, 3), 10.0, 20.0),))
     path = tmp_path / "r.jsonl"
@@ -235,8 +235,8 @@ def test_errors_are_merged_too(tmp_path: Path) -> None:
     assert merge(path, journals(run)).added == 0
 
 
-def test_what_was_long_before_is_left_out(tmp_path: Path) -> None:
-    """A station that measured before the master came is merged from two minutes before on."""
+def test_measurements_long_before_the_master_are_excluded(tmp_path: Path) -> None:
+    """Those from two minutes before its start on are merged."""
 
     async def late_master(mission: Mission) -> None:
         await mission.sleep_until(1.0)
@@ -260,8 +260,8 @@ def test_what_was_long_before_is_left_out(tmp_path: Path) -> None:
 # --- Superframe -------------------------------------------------------------------------------------------------------
 
 
-def test_what_was_never_delivered(frames: MissionResult, tmp_path: Path) -> None:
-    """The mission ends out of reach: what waited in the stations' queues is merged, for a while beyond the last beacon."""
+def test_undelivered_measurements_are_merged(frames: MissionResult, tmp_path: Path) -> None:
+    """The mission ends without reception: the send queues are merged, for a while beyond the last beacon."""
     path = tmp_path / "r.jsonl"
     added = added_to(frames, path)
     assert sum(m.stamp_ns > frames.start_ns + 31 * S for m in added) > 3 * 60
@@ -269,8 +269,8 @@ def test_what_was_never_delivered(frames: MissionResult, tmp_path: Path) -> None
     assert merge(path, journals(frames)).added == 0
 
 
-def test_what_the_disk_of_the_master_lost(frames: MissionResult, tmp_path: Path) -> None:
-    """Delivered, but not in the file: found missing by number and content, and timed by the beacons around it."""
+def test_lost_lines_of_the_recording_are_restored(frames: MissionResult, tmp_path: Path) -> None:
+    """Identified by sequence number and content, and timed by the beacons around them."""
     path = tmp_path / "r.jsonl"
     kept = len(load_recording(recording(frames, path)).measurements)
     added = added_to(frames, path, without=2)
@@ -280,8 +280,8 @@ def test_what_the_disk_of_the_master_lost(frames: MissionResult, tmp_path: Path)
     assert len(load_recording(path).measurements) == sum(journalled(frames).values())
 
 
-def test_the_instruments_time_counts_once(frames: MissionResult, tmp_path: Path) -> None:
-    """A time that was merged is as sure as one that was delivered, or as its journal says if that is less."""
+def test_instrument_time_sigma_is_not_added_twice(frames: MissionResult, tmp_path: Path) -> None:
+    """The time sigma of a merged measurement equals that of a delivered one, or the journal's if larger."""
     path = tmp_path / "r.jsonl"
     added = added_to(frames, path)
     parameters = load_recording(path).parameters
@@ -296,8 +296,8 @@ def test_the_instruments_time_counts_once(frames: MissionResult, tmp_path: Path)
         assert known_s - 1e-9 <= sigma_s < 1.2 * known_s
 
 
-def test_runs_and_boots_over_superframe(tmp_path: Path) -> None:
-    """Numbers go on over restarts of the client; a restarted computer has another clock, and is timed by itself."""
+def test_restarts_and_reboots_over_superframe(tmp_path: Path) -> None:
+    """Sequence numbers continue over restarts of the client; each boot has its own clock."""
 
     async def reboot(mission: Mission) -> None:
         await mission.reboot(3, 30.0, 10.0)
@@ -319,8 +319,8 @@ def test_runs_and_boots_over_superframe(tmp_path: Path) -> None:
     }
 
 
-def test_numbers_that_begin_again(tmp_path: Path) -> None:
-    """Somebody empties the folder of journals: the same numbers come again, and mean other measurements."""
+def test_reused_sequence_numbers(tmp_path: Path) -> None:
+    """After the journals were deleted, the same numbers denote other measurements."""
     kept = tmp_path / "kept.jsonl"
 
     async def emptied(mission: Mission) -> None:
@@ -339,62 +339,64 @@ def test_numbers_that_begin_again(tmp_path: Path) -> None:
     assert before + merged.added == sum(journal.measurements for journal in merged.journals)
 
 
-def test_beacons_of_another_master(frames: MissionResult, tmp_path: Path) -> None:
-    """A journal that heard none of this recording's is not taken for one that belongs to it."""
+def test_journal_of_another_master_is_skipped(frames: MissionResult, tmp_path: Path) -> None:
+    """It has no beacon of this recording."""
     path = recording(frames, tmp_path / "r.jsonl")
     other = tmp_path / "other.jsonl"
     content = journals(frames)[0].read_bytes().replace(b'"session":', b'"session":7')
     other.write_bytes(content.replace(b'"boot":"station1-1"', b'"boot":"x"'))
     merged = merge(path, [*journals(frames), other])
-    assert "knows no beacon" in merged.journals[3].skipped
+    assert "has no beacon of this recording" in merged.journals[3].skipped
     other.write_bytes(
         b"".join(line for line in content.splitlines(keepends=True) if b"reception" not in line)
     )
-    with pytest.raises(RecordingError, match="does not say when beacons came"):
+    with pytest.raises(RecordingError, match="has no beacon times"):
         merge(path, [other])
 
 
 # --- What does not belong together ------------------------------------------------------------------------------------
 
 
-def test_journals_of_another_mission(short: MissionResult, tmp_path: Path) -> None:
-    """They are skipped and the reason is told; if there is nothing else, nothing is done."""
+def test_journals_of_another_mission_are_skipped(short: MissionResult, tmp_path: Path) -> None:
+    """With a reason; if no other journals are given, the merge fails and writes nothing."""
     other = mission(tmp_path / "other", duration_s=5.0, seed=9)
     path = recording(short, tmp_path / "r.jsonl")
     content = path.read_bytes()
     with pytest.raises(RecordingError, match=r"none of the journals can be merged; .* of another mission"):
         merge(path, journals(other))
     assert path.read_bytes() == content
-    foreign = tmp_path / "foreign.jsonl"
-    foreign.write_bytes(journals(other)[1].read_bytes().replace(b'"boot":"station2-1"', b'"boot":"else"'))
-    merged = merge(path, [*journals(short), foreign])
+    unrelated = tmp_path / "unrelated.jsonl"
+    unrelated.write_bytes(journals(other)[1].read_bytes().replace(b'"boot":"station2-1"', b'"boot":"else"'))
+    merged = merge(path, [*journals(short), unrelated])
     assert [bool(journal.skipped) for journal in merged.journals] == [False, False, False, True]
     assert "another mission" in merged.journals[3].skipped
     assert measured(path) == journalled(short)
 
 
-def test_another_protocol(short: MissionResult, frames: MissionResult, tmp_path: Path) -> None:
-    """Classic journals have nothing to do with beacons, nor superframe journals with synchronisations."""
+def test_journals_of_the_other_protocol_are_rejected(
+    short: MissionResult, frames: MissionResult, tmp_path: Path
+) -> None:
+    """Classic journals have no beacons, superframe journals no synchronisations."""
     classic, superframe = recording(short, tmp_path / "c.jsonl"), recording(frames, tmp_path / "s.jsonl")
     with pytest.raises(
-        RecordingError, match="is of the protocol superframe, and the recording has no beacons"
+        RecordingError, match="is of the protocol superframe, but the recording has no beacons"
     ):
         merge(classic, journals(frames))
-    with pytest.raises(RecordingError, match="is of the protocol classic, and the recording has no synchron"):
+    with pytest.raises(RecordingError, match="is of the protocol classic, but the recording has no synchron"):
         merge(superframe, journals(short))
 
 
-def test_another_station(short: MissionResult, tmp_path: Path) -> None:
-    """A station that the recording does not know is told by its number."""
+def test_unknown_station_is_named(short: MissionResult, tmp_path: Path) -> None:
+    """By its number."""
     path = recording(short, tmp_path / "r.jsonl")
     seventh = tmp_path / "station7.jsonl"
     seventh.write_bytes(journals(short)[0].read_bytes().replace(b'"station":1', b'"station":7'))
-    with pytest.raises(RecordingError, match="is of station 7, and the recording has only 1, 2, 3"):
+    with pytest.raises(RecordingError, match="is of station 7, but the recording has only 1, 2, 3"):
         merge(path, [seventh])
 
 
-def test_files_in_the_wrong_place(short: MissionResult, tmp_path: Path) -> None:
-    """A journal as recording, a recording as journal, neither: named, and nothing is touched or made."""
+def test_wrong_file_types_are_rejected(short: MissionResult, tmp_path: Path) -> None:
+    """A journal as recording, a recording as journal, neither: nothing is changed or created."""
     path, journal = recording(short, tmp_path / "r.jsonl"), journals(short)[0]
     with pytest.raises(RecordingError, match="is a station's journal; give the master's recording first"):
         merge(journal, [journal])
@@ -411,8 +413,8 @@ def test_files_in_the_wrong_place(short: MissionResult, tmp_path: Path) -> None:
         merge(path, [journal])
 
 
-def test_a_recording_that_is_being_written(short: MissionResult, tmp_path: Path) -> None:
-    """The master has to end first; a copy can be made meanwhile."""
+def test_locked_recording_is_rejected(short: MissionResult, tmp_path: Path) -> None:
+    """While the master writes it, merging to another output is possible."""
     path = recording(short, tmp_path / "r.jsonl")
     with RecordingWriter(path):
         with pytest.raises(RecordingError, match="another program is writing it"):
@@ -421,7 +423,7 @@ def test_a_recording_that_is_being_written(short: MissionResult, tmp_path: Path)
 
 
 def test_damaged_lines(short: MissionResult, tmp_path: Path) -> None:
-    """They are errors, or skipped and told of when that is asked for; the other lines are merged."""
+    """An error, or skipped and reported with keep_going; the other lines are merged."""
     path, journal = recording(short, tmp_path / "r.jsonl"), tmp_path / "j.jsonl"
     lines = journals(short)[0].read_bytes().splitlines(keepends=True)
     journal.write_bytes(

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from harness.records import PARAMETERS, measurement
 
-from tsgt.analysis.report.calibration import calibration, calibration_keys
+from tsgt.analysis.report.calibration import calibration_numbers, calibration_section
 from tsgt.model import Matrix4, Parameters, PointMeasurement, TargetResidual
 from tsgt.recording import Recording, RecordingHeader
 
@@ -18,7 +18,7 @@ TARGETS = (
 
 
 def recording(*targets: tuple[TargetResidual, ...]) -> Recording:
-    """Three stations, of which 1 is the world, with these targets."""
+    """Return a recording of three stations, of which 1 is the world, with these targets."""
     frames = (PARAMETERS.stations[0].T_station1_station, AWAY, AWAY)
     stations = tuple(
         replace(station, targets=fits, T_station1_station=frame)
@@ -32,9 +32,9 @@ def recording(*targets: tuple[TargetResidual, ...]) -> Recording:
     )
 
 
-def test_each_target_has_its_row() -> None:
-    """With its residual, what the others predict, or that it was rejected; rejected ones do not count in the mean."""
-    section = calibration(recording((), TARGETS, ()))
+def test_each_target_has_a_row() -> None:
+    """With residual and leave-one-out error, or as rejected; rejected targets do not count in the root mean square."""
+    section = calibration_section(recording((), TARGETS, ()))
     (table,) = section.tables
     assert table.rows == (
         ("2", "4", "3.00", "5.00"),
@@ -43,27 +43,27 @@ def test_each_target_has_its_row() -> None:
     )
     assert section.text == (
         "Station 2: 2 targets used, root mean square 3.54 mm.",
-        "Of station 3 nothing is known of targets.",
+        "The targets of station 3 are unknown.",
     )
     assert [plot.name for plot in section.plots] == ["calibration"]
-    keys = calibration_keys(recording((), TARGETS, ()))[2]
+    keys = calibration_numbers(recording((), TARGETS, ()))[2]
     assert round(keys["rms_mm"], 2) == 3.54
     assert keys["targets"][2] == {"target": 9, "residual_mm": None, "leave_one_out_mm": 60.0}
 
 
-def test_a_recording_without_targets_says_so() -> None:
-    """In a line, and there is no figure."""
-    section = calibration(recording((), (), ()))
+def test_recording_without_targets_has_a_reason() -> None:
+    """One line, and no figure."""
+    section = calibration_section(recording((), (), ()))
     assert len(section.text) == 1
-    assert "does not say how well the targets fitted" in section.text[0]
+    assert "contains no residuals of the targets" in section.text[0]
     assert not section.plots
-    assert calibration_keys(recording((), (), ())) == {}
+    assert calibration_numbers(recording((), (), ())) == {}
 
 
 def test_points_have_no_station_frames() -> None:
-    """They came in frame station1, whoever made that."""
+    """They are in frame station1 already."""
     point = PointMeasurement(
         station=1, prism=1, sequence=0, stamp_ns=START_NS, received_ns=START_NS, position_m=(1.0, 2.0, 3.0)
     )
-    section = calibration(replace(recording((), (), ()), measurements=[point]))
+    section = calibration_section(replace(recording((), (), ()), measurements=[point]))
     assert "no station frame is used" in section.text[0]

@@ -10,7 +10,7 @@ from tsgt.estimation import Track, build_tracks
 
 
 def tracks_of(scene: Scene, *, duration_s: float = 8.0) -> dict[int, Track]:
-    """Exact measurements at 2.5 Hz, each station with its own phase."""
+    """Return tracks of exact measurements at 2.5 Hz, each station with its own phase."""
     return build_tracks(
         scene.parameters,
         [
@@ -21,7 +21,7 @@ def tracks_of(scene: Scene, *, duration_s: float = 8.0) -> dict[int, Track]:
     )
 
 
-def test_a_standing_robot_has_no_errors_and_one_interval() -> None:
+def test_stationary_robot_has_no_errors_and_one_interval() -> None:
     """Exact measurements give the distances of the layout at each epoch."""
     scene = stationary_scene()
     tracks = tracks_of(scene)
@@ -33,8 +33,8 @@ def test_a_standing_robot_has_no_errors_and_one_interval() -> None:
     assert np.isnan(found.motion.speed_mps).all()
 
 
-def test_straight_lines_cut_a_bend() -> None:
-    """A driving robot's distances are off where tracks are interpolated, and no interval is still."""
+def test_interpolation_causes_errors_in_curves() -> None:
+    """A moving robot has no stationary interval."""
     scene = stationary_scene().moving(driving)
     tracks = tracks_of(scene)
     found = distance_error_series(scene.parameters, distances_at_epochs(scene.parameters, tracks), None)
@@ -42,8 +42,8 @@ def test_straight_lines_cut_a_bend() -> None:
     assert inter_prism(scene.parameters, tracks).stationary_ns == ()
 
 
-def test_distances_are_taken_in_the_given_intervals() -> None:
-    """Somebody else may know better when the robot stood; outside nothing counts."""
+def test_static_distances_are_from_the_given_intervals() -> None:
+    """Stationary intervals from another source; measurements outside do not count."""
     scene = stationary_scene()
     found = inter_prism(scene.parameters, tracks_of(scene), [(START + SECOND, START + 3 * SECOND)])
     assert found.stationary_s == 2.0
@@ -53,8 +53,8 @@ def test_distances_are_taken_in_the_given_intervals() -> None:
         np.testing.assert_allclose(pair.distances_m, pair.reference_m, atol=1e-9)
 
 
-def test_standing_before_and_after_the_recording_does_not_count() -> None:
-    """Odometry runs longer than stations measure; of another day nothing is left."""
+def test_given_intervals_are_clipped_to_the_recording() -> None:
+    """Odometry may cover more time than the measurements; of another day nothing remains."""
     scene = stationary_scene()
     tracks = tracks_of(scene)
     hour = 3600 * SECOND
@@ -66,8 +66,8 @@ def test_standing_before_and_after_the_recording_does_not_count() -> None:
     assert all(not len(pair.distances_m) for pair in other_day.static)
 
 
-def test_errors_are_sorted_by_size_into_their_bins() -> None:
-    """Each bin has the figures of its own errors; too few are told by nothing."""
+def test_binned_errors() -> None:
+    """Each bin has the statistics of its own errors; with too few errors they are NaN."""
     quantity = np.repeat(np.linspace(0.05, 0.75, BINS), 100)
     error_m = np.where(np.arange(len(quantity)) % 2, 1.0, -1.0) * quantity
     error_m[:90] = np.nan
@@ -79,8 +79,8 @@ def test_errors_are_sorted_by_size_into_their_bins() -> None:
     np.testing.assert_allclose(found.p95[1:], found.mean[1:])
 
 
-def test_a_quantity_of_both_signs_has_bins_on_both_sides() -> None:
-    """Slowing down is not gaining speed."""
+def test_signed_quantity_has_symmetric_bins() -> None:
+    """Braking differs from accelerating."""
     quantity = np.linspace(-2.0, 1.0, 500)
     found = binned(np.ones((1, 500)), quantity)
     assert found is not None
@@ -88,14 +88,14 @@ def test_a_quantity_of_both_signs_has_bins_on_both_sides() -> None:
 
 
 @pytest.mark.parametrize("quantity", [np.full(100, np.nan), np.zeros(100), np.ones(5)])
-def test_nothing_is_sorted_by_what_is_not_known_or_does_not_differ(quantity: np.ndarray) -> None:
-    """There are no bins then, in one dimension or in two."""
+def test_unknown_or_constant_quantity_has_no_bins(quantity: np.ndarray) -> None:
+    """In one dimension or in two."""
     errors = np.ones((1, len(quantity)))
     assert binned(errors, quantity) is None
     assert gridded(errors, quantity, quantity) is None
 
 
-def test_a_grid_holds_the_mean_of_each_cell() -> None:
+def test_grid_contains_the_mean_of_each_cell() -> None:
     """Rows are the second quantity, columns the first."""
     x, y = np.repeat([0.1, 0.9], 200), np.tile([0.1, 0.9], 200)
     found = gridded((x + 10 * y)[None], x, y)

@@ -1,4 +1,4 @@
-"""The report's render_page, whatever stands in a recording."""
+"""The report's page with untrusted text."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from tsgt.analysis.report.page import Section, Table
 from tsgt.analysis.report.verdicts import Level, Verdict
 
 
-def test_text_from_outside_is_no_markup() -> None:
-    """Names of files, sources and events are shown as they are; none becomes a tag or ends an attribute."""
+def test_text_is_escaped() -> None:
+    """Names of files, sources and events are shown literally; none becomes a tag or ends an attribute."""
     evil = "<script>alert(1)</script>\"'><img src=x onerror=alert(1)>`<b>`"
     table = Table(caption=evil, header=(evil, evil), rows=((evil, evil),))
     text = render_page(

@@ -1,4 +1,4 @@
-"""Figures of a report: that what they are to show lies within their axes."""
+"""Report figures contain their data within the axes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SECOND = 1_000_000_000
 
 
 def record(station: int, first_s: float, last_s: float, bound_ms: float) -> StationRecord:
-    """Measured twice a second, each stamp within the same bound."""
+    """Return measurements twice a second, each timestamp with the same bound."""
     stamps = np.round(np.arange(first_s, last_s + 0.1, 0.5) * SECOND).astype(np.int64)
     return StationRecord(
         station=station,
@@ -29,7 +29,7 @@ def record(station: int, first_s: float, last_s: float, bound_ms: float) -> Stat
     )
 
 
-def test_the_bounds_of_all_stations_are_on_one_scale_that_holds_them() -> None:
+def test_common_scale_contains_the_bounds_of_all_stations() -> None:
     """Each station has its panel; a scale that fits the first alone would cut the others off."""
     stations = [record(1, 0.0, 9.0, 1.0), record(2, 0.0, 9.0, 0.02), record(3, 0.0, 9.0, 40.0)]
     with drawing(width_mm=100, height_mm=100) as figure:
@@ -42,8 +42,8 @@ def test_the_bounds_of_all_stations_are_on_one_scale_that_holds_them() -> None:
         assert high > 40.0
 
 
-def test_a_station_that_ends_early_has_its_gap_in_the_figure() -> None:
-    """It is the longest one in the table, so it must be seen: from the last measurement to the end of all."""
+def test_gap_at_the_end_is_drawn() -> None:
+    """From the last measurement of a station to the end of all; it is the longest gap in the table."""
     stations = [record(1, 0.0, 20.0, 1.0), record(2, 0.0, 8.0, 1.0)]
     with drawing(width_mm=100, height_mm=100) as figure:
         draw_gaps(figure, stations, TimeAxis.over(0, 20 * SECOND), 1.0, 20 * SECOND)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-def test_a_station_is_summed_up() -> None:
+def test_station_statistics() -> None:
     """Rate, gaps, statuses and delays are those of its measurements; one sent twice counts once."""
     scene = stationary_scene()
     times_s = [0.0, 0.5, 1.0, 1.5, 4.0, 4.5, 5.0]
@@ -34,8 +34,8 @@ def test_a_station_is_summed_up() -> None:
     assert np.isnan(found.bound_max_ms)
 
 
-def test_a_station_that_sent_nothing_is_one_gap() -> None:
-    """It has an entry all the same."""
+def test_station_without_measurements_is_one_gap() -> None:
+    """It has an entry nevertheless."""
     (record,) = station_records([], [3])
     found = station_statistics(record, start_ns=START, end_ns=START + 5 * SECOND, outage_limit_ns=SECOND)
     assert found.usable == 0
@@ -44,7 +44,7 @@ def test_a_station_that_sent_nothing_is_one_gap() -> None:
 
 
 def test_radio_clocks_and_events_are_read(tmp_path: Path) -> None:
-    """What was not known at the time is NaN; lines that cannot be read are passed over."""
+    """Unknown values are NaN; unreadable lines are skipped."""
     path = tmp_path / "recording.jsonl"
     station = {"id": 2, "rssi_dbm": -60.5, "snr_db": None, "loss": 0.25}
     clock = {"type": "clock", "stamp_ns": 5, "station": 2, "offset_ns": -7, "bound_ns": 9, "restarted": True}

@@ -1,4 +1,4 @@
-"""What tests of merging look at: recordings, journals and merged lines of simulated missions."""
+"""Recordings, journals and merged records of simulated missions, for tests of merging."""
 
 from __future__ import annotations
 
@@ -19,17 +19,7 @@ def journals(run: MissionResult) -> list[Path]:
 
 
 def recording(run: MissionResult, path: Path, *, without: int = 0) -> Path:
-    """Put the recordings of all sessions of the master into one file.
-
-    Parameters
-    ----------
-    run
-        The mission.
-    path
-        The file.
-    without
-        Leave out each so manieth measurement, as if the radio had not carried it; 0: none.
-    """
+    """Concatenate the recordings of all master sessions; drop every ``without``-th measurement (0: none), as if lost by radio."""
     kept, measurements = [], 0
     for session in run.master_logs:
         recorded = session.recording()
@@ -43,7 +33,7 @@ def recording(run: MissionResult, path: Path, *, without: int = 0) -> Path:
 
 
 def merged_in(path: Path) -> list[PolarMeasurement]:
-    """Return what has been merged into a recording."""
+    """Return the measurements merged into a recording."""
     return [
         decode_line(MergedRecord, line, path).measurement
         for line in read_lines(path)
@@ -52,7 +42,7 @@ def merged_in(path: Path) -> list[PolarMeasurement]:
 
 
 def assert_true(run: MissionResult, measurements: list[PolarMeasurement]) -> None:
-    """Compare the times of merged measurements with the truth, each with the bound that it states."""
+    """Check that the time errors of merged measurements are within their stated bounds."""
     for measurement in measurements:
         assert measurement.host_time_ns is not None
         assert measurement.stamp_bound_ns is not None

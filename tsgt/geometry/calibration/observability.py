@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from tsgt.geometry.calibration.motion import MotionCalibration
     from tsgt.geometry.rigid import FloatArray
 
-SHIFT_LIMIT_M = 0.005
-TURN_LIMIT_RAD = 0.0005
+TRANSLATION_LIMIT_M = 0.005
+ROTATION_LIMIT_RAD = 0.0005
 LATENCY_LIMIT_S = 0.005
 PRISM_LIMIT_M = 0.005
 """One-sigma limits beyond which a parameter counts as unobservable; the limit is half the prior's sigma if that is smaller."""
@@ -36,8 +36,8 @@ def unobservable_directions(calibration: MotionCalibration) -> list[Unobservable
     """Directions whose uncertainty exceeds the limits, largest first: eigenvectors of the scaled covariance."""
     parameters = calibration.parameters
     limits = np.empty(len(parameters.sigmas))
-    limits[parameters.translations] = SHIFT_LIMIT_M
-    limits[parameters.rotations] = TURN_LIMIT_RAD
+    limits[parameters.translations] = TRANSLATION_LIMIT_M
+    limits[parameters.rotations] = ROTATION_LIMIT_RAD
     limits[parameters.latencies] = LATENCY_LIMIT_S
     limits[parameters.prisms] = PRISM_LIMIT_M
     limits = np.minimum(limits, 0.5 * parameters.sigmas)

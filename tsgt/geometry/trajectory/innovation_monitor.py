@@ -52,12 +52,12 @@ class InnovationMonitor:
         return found
 
     def reset(self, observations: Observations) -> None:
-        """Flag no single measurement of a window, but the state as a whole: the trajectory is being initialised."""
+        """Mark the state as ambiguous while the trajectory of a window is being initialised."""
         self.inconsistent_prisms = frozenset(observations.prism.tolist())
         self._flagged = np.zeros(len(observations), np.bool_)
 
     def set_start(self, time_s: float) -> None:
-        """Limit the ambiguity to times after the measurements of the initialised trajectory."""
+        """Start the ambiguity after the measurements of the initialised trajectory."""
         self._inconsistent_from_s = time_s
 
     def select(self, rows: NDArray[np.bool_]) -> None:

@@ -1,4 +1,4 @@
-"""Whatever is sent and heard: the air does not break, and every lock has an end."""
+"""Arbitrary traffic: the channel does not fail, and every lock has an end."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from tsgt.simulation.kernel import VirtualTimeline
 from tsgt.simulation.lora import Air, LinkModel
-from tsgt.simulation.lora.frames import Frame, ReceiverSettings, Modulation
+from tsgt.simulation.lora.frames import Frame, Modulation, ReceiverSettings
 from tsgt.simulation.lora.link import FixedLoss
 
 NAMES = ("a", "b", "c")
@@ -32,8 +32,8 @@ PLAIN = modulation(spreading_factor=7, bandwidth_hz=500_000)
 
 
 @dataclass(frozen=True)
-class Deed:
-    """What a radio does, and when."""
+class RadioAction:
+    """An action of a radio at a time."""
 
     radio: str
     what: str
@@ -41,8 +41,8 @@ class Deed:
     settings: dict[str, Any]
 
 
-def deeds(modulations: st.SearchStrategy[Modulation]) -> st.SearchStrategy[list[Deed]]:
-    """Make sequences of what radios may do."""
+def radio_actions(modulations: st.SearchStrategy[Modulation]) -> st.SearchStrategy[list[RadioAction]]:
+    """Generate sequences of actions."""
     sending = st.fixed_dictionaries(
         {
             "modulation": modulations,
@@ -53,7 +53,7 @@ def deeds(modulations: st.SearchStrategy[Modulation]) -> st.SearchStrategy[list[
             "power_dbm": st.sampled_from([-90.0, -20.0, 8.0, 14.0, 20.0]),
         }
     )
-    hearing = st.fixed_dictionaries(
+    receiving = st.fixed_dictionaries(
         {
             "modulation": modulations,
             "preamble_symbols": st.sampled_from([0, 8, 30]),
@@ -67,23 +67,25 @@ def deeds(modulations: st.SearchStrategy[Modulation]) -> st.SearchStrategy[list[
     gaps_ns = st.integers(0, 20_000_000)
     return st.lists(
         st.one_of(
-            st.builds(Deed, radios, st.just("transmit"), gaps_ns, sending),
-            st.builds(Deed, radios, st.just("listen"), gaps_ns, hearing),
-            st.builds(Deed, radios, st.sampled_from(["deaf", "stop", "leave", "ask"]), gaps_ns, st.just({})),
+            st.builds(RadioAction, radios, st.just("transmit"), gaps_ns, sending),
+            st.builds(RadioAction, radios, st.just("listen"), gaps_ns, receiving),
+            st.builds(
+                RadioAction, radios, st.sampled_from(["deaf", "stop", "leave", "ask"]), gaps_ns, st.just({})
+            ),
         ),
         max_size=40,
     )
 
 
 class StrictListener(RecordingListener):
-    """Checks that what it is told makes sense: a lock, perhaps a header, an end, in the order of time."""
+    """Checks the order of events: a lock, possibly a header, an end, with increasing times."""
 
     def __init__(self) -> None:
         super().__init__()
         self.locked = False
 
     def preamble_detected(self, at_ns: int) -> None:
-        """Check that nobody locks twice."""
+        """Check that a receiver does not lock twice."""
         assert not self.locked
         self.locked = True
         super().preamble_detected(at_ns)
@@ -94,7 +96,7 @@ class StrictListener(RecordingListener):
         super().header_received(at_ns, header)
 
     def frame_ended(self, at_ns: int, reception: Any) -> None:
-        """Check that an end does so, too."""
+        """Check that an end belongs to a lock."""
         assert self.locked
         self.locked = False
         if reception is not None:
@@ -103,36 +105,40 @@ class StrictListener(RecordingListener):
 
 
 @given(
-    st.one_of(deeds(MODULATIONS), deeds(st.just(PLAIN))), st.integers(0, 2**32), st.sampled_from([60, 120])
+    st.one_of(radio_actions(MODULATIONS), radio_actions(st.just(PLAIN))),
+    st.integers(0, 2**32),
+    st.sampled_from([60, 120]),
 )
-def test_arbitrary_traffic(sequence: list[Deed], seed: int, loss_db: float) -> None:
+def test_arbitrary_traffic(sequence: list[RadioAction], seed: int, loss_db: float) -> None:
     """Arbitrary frames, receivers, cuts and departures raise nothing; every lock ends; nothing is left behind."""
     timeline = VirtualTimeline()
     link = LinkModel(path_loss=FixedLoss(default_db=loss_db), fading_sigma_db=3.0, rayleigh_fading=True)
     air = Air(timeline, np.random.default_rng(seed), link)
-    antennas = {name: StrictListener() for name in NAMES}
-    ports = {name: air.join(antennas[name], name) for name in NAMES}
-    for deed in sequence:
-        timeline.advance(deed.after_ns)
-        now_ns, port, antenna = timeline.now_ns(), ports[deed.radio], antennas[deed.radio]
-        if deed.what == "transmit":
-            port.transmit(Frame(start_ns=now_ns, **deed.settings))
-        elif deed.what == "stop":
+    listeners = {name: StrictListener() for name in NAMES}
+    ports = {name: air.join(listeners[name], name) for name in NAMES}
+    for action in sequence:
+        timeline.advance(action.after_ns)
+        now_ns, port, listener = timeline.now_ns(), ports[action.radio], listeners[action.radio]
+        if action.what == "transmit":
+            port.transmit(Frame(start_ns=now_ns, **action.settings))
+        elif action.what == "stop":
             port.stop_transmitting(now_ns)
-        elif deed.what == "ask":
+        elif action.what == "ask":
             assert np.isfinite(port.rssi_dbm(now_ns))
             port.preamble_present(PLAIN, now_ns)
         else:
-            antenna.locked = False
-            port.listen(ReceiverSettings(since_ns=now_ns, **deed.settings) if deed.what == "listen" else None)
-            if deed.what == "leave":
-                air.leave(deed.radio)
-                ports[deed.radio] = air.join(antenna, deed.radio)
+            listener.locked = False
+            port.listen(
+                ReceiverSettings(since_ns=now_ns, **action.settings) if action.what == "listen" else None
+            )
+            if action.what == "leave":
+                air.leave(action.radio)
+                ports[action.radio] = air.join(listener, action.radio)
     while (next_ns := timeline.next_ns()) is not None:
         timeline.advance_to(next_ns)
-    for antenna in antennas.values():
-        assert not antenna.locked
-        assert antenna.events == sorted(antenna.events, key=lambda event: event[0])
+    for listener in listeners.values():
+        assert not listener.locked
+        assert listener.events == sorted(listener.events, key=lambda event: event[0])
     timeline.advance(10**15)
     ports["a"].transmit(frame(start_ns=timeline.now_ns()))
     assert len(air.frames) == 1

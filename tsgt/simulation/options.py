@@ -55,15 +55,9 @@ class Outage:
 
 @dataclass(frozen=True, slots=True)
 class Restart:
-    """A stop and restart of a daemon.
+    """A stop and restart of a daemon."""
 
-    Attributes
-    ----------
-    station
-        None: the master.
-    """
-
-    station: int | None
+    station: int | None  # None: the master
     at_s: float
 
     @classmethod

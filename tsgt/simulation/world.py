@@ -255,14 +255,9 @@ def _rotation(
     yaw: NDArray[np.float64], pitch: NDArray[np.float64], roll: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Rotation about z by yaw, then about the new y by pitch, then about the new x by roll: (N, 3, 3)."""
-    cy, sy, cp, sp, cr, sr = (
-        np.cos(yaw),
-        np.sin(yaw),
-        np.cos(pitch),
-        np.sin(pitch),
-        np.cos(roll),
-        np.sin(roll),
-    )
+    cy, sy = np.cos(yaw), np.sin(yaw)
+    cp, sp = np.cos(pitch), np.sin(pitch)
+    cr, sr = np.cos(roll), np.sin(roll)
     rotation = np.empty((*yaw.shape, 3, 3))
     rows = (
         (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),

@@ -1,4 +1,4 @@
-"""The defects of `benchmarks/planted_defects.py` can be planted, seen, and taken out again."""
+"""The defects of `benchmarks/planted_defects.py` can be planted, detected and removed."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def script() -> ModuleType:
 
 
 @pytest.mark.parametrize(("key", "check"), [("angle", "journal"), ("offset", "time"), ("order", "replay")])
-def test_a_defect_is_seen_and_gone_again(script: ModuleType, key: str, check: str) -> None:
-    """Eight seconds are enough for the quickest; the program is whole afterwards."""
+def test_planted_defect_is_detected_and_removed(script: ModuleType, key: str, check: str) -> None:
+    """Eight seconds suffice for these; the program is restored afterwards."""
     defect: Any = dataclasses.replace(script.DEFECTS[key], duration_s=8.0)
     planting = Planting()
     defect.plant(planting)
@@ -41,8 +41,8 @@ def test_a_defect_is_seen_and_gone_again(script: ModuleType, key: str, check: st
     assert all(owner.__dict__[name] is right for owner, name, right in places)
 
 
-def test_every_defect_has_its_place(script: ModuleType) -> None:
-    """What is replaced is there, and there again afterwards; what has a test names one that exists."""
+def test_every_defect_replaces_existing_code(script: ModuleType) -> None:
+    """The replaced attributes exist and are restored; the named tests exist."""
     for defect in script.DEFECTS.values():
         planting = Planting()
         defect.plant(planting)

@@ -1,4 +1,4 @@
-"""The simulated robot: what the reference scenario says of its motion, and that the truth is smooth."""
+"""Ground truth: motion statistics of the reference scenario, smoothness, routes, occlusions."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def _times(duration_s: float, step_s: float = 0.05) -> NDArray[np.float64]:
 
 @pytest.fixture(scope="module")
 def hour() -> NDArray[np.float64]:
-    """Poses of an hour of driving at 20 Hz, (N, 4, 4)."""
+    """Poses of an hour at 20 Hz, (N, 4, 4)."""
     return _world(duration_s=3600.0).pose_at(_times(3600.0))
 
 
@@ -39,7 +39,7 @@ def _speeds(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.hypot(velocity[:, 0], velocity[:, 1])
 
 
-def test_speeds_come_as_often_as_the_scenario_says(hour: NDArray[np.float64]) -> None:
+def test_speed_distribution_matches_the_scenario(hour: NDArray[np.float64]) -> None:
     """Speeds 0, 0.5, 1.0 and 1.5 m/s take shares of 3, 2, 3 and 2 tenths of the time."""
     speeds = _speeds(hour)
     shares = np.array([np.mean(np.abs(speeds - speed) < 0.05) for speed in MOTION.speeds_mps])
@@ -48,7 +48,7 @@ def test_speeds_come_as_often_as_the_scenario_says(hour: NDArray[np.float64]) ->
     assert shares.sum() > 0.8
 
 
-def test_shaking_while_moving(hour: NDArray[np.float64]) -> None:
+def test_vibration_while_moving(hour: NDArray[np.float64]) -> None:
     """While moving, roll and pitch are 1.5 degrees rms each and heave is 20 mm rms."""
     moving = hour[_speeds(hour) > 0.45]
     roll, pitch = np.arctan2(moving[:, 2, 1], moving[:, 2, 2]), -np.arcsin(moving[:, 2, 0])
@@ -58,16 +58,16 @@ def test_shaking_while_moving(hour: NDArray[np.float64]) -> None:
     assert math.sqrt(np.mean(heave**2)) == pytest.approx(0.020, rel=0.07)
 
 
-def test_a_standing_robot_does_not_move(hour: NDArray[np.float64]) -> None:
-    """A second and a half into a stop the robot stands still and level."""
+def test_stationary_robot_is_still_and_level(hour: NDArray[np.float64]) -> None:
+    """From 1.5 s after a stop the robot is still and level."""
     still = np.convolve(_speeds(hour) < 1e-3, np.ones(61), mode="same") == 61
     assert still.sum() > 1000
     np.testing.assert_allclose(hour[still, 2, 2], 1.0, atol=1e-6)
     np.testing.assert_allclose(hour[still, 2, 3], MOTION.area_centre_m[2], atol=1e-3)
 
 
-def test_yaw_rates_are_those_of_the_scenario(hour: NDArray[np.float64]) -> None:
-    """Turns are at 0.3 or 0.5 rad/s to either side; faster ones do not happen."""
+def test_yaw_rates_match_the_scenario(hour: NDArray[np.float64]) -> None:
+    """Turns are at 0.3 or 0.5 rad/s to either side, never faster."""
     yaw = np.unwrap(np.arctan2(hour[:, 1, 0], hour[:, 0, 0]))
     rates = np.gradient(yaw, 0.05)
     assert np.abs(rates).max() < 0.5 + 0.1  # pitch and roll add a little to what is seen from above
@@ -75,14 +75,14 @@ def test_yaw_rates_are_those_of_the_scenario(hour: NDArray[np.float64]) -> None:
         assert np.mean(np.abs(rates - rate) < 0.01) > 0.02
 
 
-def test_the_robot_stays_around_its_area(hour: NDArray[np.float64]) -> None:
-    """The robot leaves the 40 m circle by no more than it takes to turn round, and uses most of it."""
+def test_robot_stays_near_its_area(hour: NDArray[np.float64]) -> None:
+    """The robot leaves the 40 m circle by no more than its turn takes, and uses most of it."""
     distance = np.hypot(*(hour[:, :2, 3] - MOTION.area_centre_m[:2]).T)
     assert distance.max() < MOTION.area_radius_m + 8.0
     assert distance.max() > MOTION.area_radius_m - 5.0
 
 
-def test_it_drives_where_it_looks(hour: NDArray[np.float64]) -> None:
+def test_velocity_is_along_the_x_axis(hour: NDArray[np.float64]) -> None:
     """The velocity points along the robot's x axis."""
     velocity = np.gradient(hour[:, :3, 3], 0.05, axis=0)
     fast = _speeds(hour) > 0.4
@@ -96,8 +96,8 @@ def test_poses_are_rigid(hour: NDArray[np.float64]) -> None:
         check_transform(pose)
 
 
-def test_the_truth_is_smooth_between_its_grid_points() -> None:
-    """Over a millisecond, anywhere, a prism moves as its velocity and acceleration say, to a micrometre."""
+def test_truth_is_smooth_between_grid_points() -> None:
+    """Over a millisecond a prism moves according to velocity and acceleration, to a micrometre."""
     start = np.arange(1.0, 59.0, STEP_S / 3)
     world = _world(3, 60.0)
     before, here, after = (world.prism_at(start + shift, 1) for shift in (-1e-3, 0.0, 1e-3))
@@ -106,23 +106,23 @@ def test_the_truth_is_smooth_between_its_grid_points() -> None:
     assert np.linalg.norm(np.diff(bend, axis=0), axis=1).max() < 1e-6
 
 
-def test_the_same_generator_gives_the_same_world() -> None:
-    """One seed is one world, and another seed another."""
+def test_same_seed_gives_the_same_world() -> None:
+    """Another seed gives another world."""
     times = _times(60.0)
     poses = _world(5, 60.0).pose_at(times)
     np.testing.assert_array_equal(poses, _world(5, 60.0).pose_at(times))
     assert np.abs(poses - _world(6, 60.0).pose_at(times)).max() > 0.1
 
 
-def test_an_instant_does_not_depend_on_its_company() -> None:
-    """Asked alone or among others, an instant has the same pose."""
+def test_pose_does_not_depend_on_other_queried_instants() -> None:
+    """An instant has the same pose whether queried alone or among others."""
     world, times = _world(duration_s=20.0), _times(20.0, 0.013)
     together = world.pose_at(times)
     np.testing.assert_array_equal(together[777], world.pose_at(times[777:778])[0])
 
 
-def test_prisms_ride_on_the_robot() -> None:
-    """A prism is where the pose puts its place in the robot frame."""
+def test_prism_positions_follow_the_pose() -> None:
+    """A prism is at its robot-frame position transformed by the pose."""
     world, times = _world(duration_s=20.0), _times(20.0)
     np.testing.assert_allclose(
         world.prism_at(times, 2), transform_points(world.pose_at(times), PRISMS[2]), atol=1e-12
@@ -130,20 +130,20 @@ def test_prisms_ride_on_the_robot() -> None:
 
 
 @pytest.mark.parametrize("time_s", [-0.001, 20.001, math.nan])
-def test_outside_its_time_there_is_no_truth(time_s: float) -> None:
-    """Asking before the start, after the end or at no time at all is an error, not an extrapolation."""
+def test_instant_outside_the_covered_time_is_rejected(time_s: float) -> None:
+    """There is no extrapolation; NaN is rejected too."""
     with pytest.raises(ValueError, match="the ground truth covers 0 to 20"):
         _world(duration_s=20.0).pose_at(np.array([1.0, time_s]))
 
 
-def test_the_truth_reaches_both_ends() -> None:
-    """The first and the last instant belong to the truth, also of a run that is no whole number of steps."""
+def test_first_and_last_instant_are_covered() -> None:
+    """Also for a duration that is no whole number of steps."""
     world = _world(duration_s=7.013)
     assert np.isfinite(world.pose_at(np.array([0.0, 7.013]))).all()
 
 
-def test_a_robot_that_only_stands() -> None:
-    """With the one speed 0 the robot stays where it starts, level."""
+def test_robot_with_zero_speed_stays_level() -> None:
+    """With the only speed 0 the robot stays at its start."""
     world = _world(duration_s=30.0, motion=MotionConfig(speeds_mps=(0.0,), speed_weights=(1.0,)))
     poses = world.pose_at(_times(30.0))
     np.testing.assert_allclose(poses[:, :3, 3], np.tile(MOTION.area_centre_m, (len(poses), 1)), atol=1e-12)
@@ -156,16 +156,16 @@ ROUTE = MotionConfig(route_m=((0.0, 0.0, 0.0), (30.0, 0.0, 3.0), (30.0, 40.0, 3.
 
 
 @pytest.mark.parametrize("route", [(), ((5.0, 5.0, 0.0), (300.0, 5.0, 0.0))])
-def test_it_may_stand_before_it_drives(route: tuple[tuple[float, float, float], ...]) -> None:
-    """With a route and without one: it stands still, and has driven off soon after."""
+def test_start_delay_is_respected(route: tuple[tuple[float, float, float], ...]) -> None:
+    """With and without a route the robot is still before ``start_after_s`` and moves soon after."""
     motion = MotionConfig(start_after_s=30.0, speeds_mps=(1.0,), speed_weights=(1.0,), route_m=route)
     position = _world(duration_s=60.0, motion=motion).pose_at(np.array([0.0, 28.0, 33.0]))[:, :3, 3]
     assert np.linalg.norm(position[1] - position[0]) < 1e-6
     assert np.linalg.norm(position[2] - position[0]) > 1.0
 
 
-def test_a_route_is_driven_to_its_end() -> None:
-    """The robot starts at the first way point, ends at the last one and stands there."""
+def test_route_is_driven_to_its_end() -> None:
+    """The robot starts at the first waypoint, and stops at the last one."""
     poses = _world(duration_s=300.0, motion=ROUTE).pose_at(np.array([0.0, 299.0, 300.0]))
     # The smoothing of corners and of speeds takes a little off both ends.
     np.testing.assert_allclose(poses[0, :2, 3], (0.0, 0.0), atol=2.0)
@@ -173,8 +173,8 @@ def test_a_route_is_driven_to_its_end() -> None:
     np.testing.assert_allclose(poses[1], poses[2], atol=1e-6)
 
 
-def test_a_route_is_kept_to() -> None:
-    """The robot never leaves the route by more than its rounded corners do, and never turns back."""
+def test_robot_stays_on_its_route() -> None:
+    """The robot leaves the route only at its rounded corners and never reverses."""
     position = _world(duration_s=300.0, motion=ROUTE).pose_at(_times(300.0))[:, :3, 3]
     to_first_leg = np.abs(position[:, 1])
     to_second_leg = np.abs(position[:, 0] - 30.0)
@@ -182,8 +182,8 @@ def test_a_route_is_kept_to() -> None:
     assert np.diff(position[:, 0] + position[:, 1]).min() > -1e-3
 
 
-def test_on_a_route_the_robot_looks_ahead_and_uphill() -> None:
-    """The robot's x axis points along the route, its nose up where the route climbs."""
+def test_heading_and_pitch_follow_the_route() -> None:
+    """The robot's x axis is tangential to the route, upward where it climbs."""
     poses = _world(duration_s=300.0, motion=ROUTE.model_copy(update={"tilt_rms_deg": 0.0})).pose_at(
         _times(300.0)
     )
@@ -192,8 +192,8 @@ def test_on_a_route_the_robot_looks_ahead_and_uphill() -> None:
     np.testing.assert_allclose(poses[climbing, :3, 0], np.tile(along, (climbing.sum(), 1)), atol=1e-3)
 
 
-def test_speeds_on_a_route_are_those_drawn() -> None:
-    """On a straight route the robot drives at the speeds of its configuration."""
+def test_route_speeds_match_the_scenario() -> None:
+    """On a straight route the robot drives at the configured speeds."""
     motion = MotionConfig(route_m=((0.0, 0.0, 0.0), (1000.0, 0.0, 0.0)), heave_rms_mm=0.0)
     speeds = _speeds(_world(duration_s=600.0, motion=motion).pose_at(_times(600.0)))
     shares = [np.mean(np.abs(speeds - speed) < 0.02) for speed in motion.speeds_mps]
@@ -207,8 +207,8 @@ TREES = OcclusionConfig(rate_per_min=3.0, duration_min_s=1.0, duration_max_s=2.0
 BENDS = OcclusionConfig(rate_per_min=1.0, duration_min_s=5.0, duration_max_s=10.0, common=True)
 
 
-def test_occlusions_come_as_often_and_last_as_long_as_the_scenario_says() -> None:
-    """In ten hours there are 1800 of three per minute, each within its limits."""
+def test_occlusion_rate_and_durations_match_the_scenario() -> None:
+    """Three per minute give 1800 in ten hours, each within the limits."""
     spans = draw_occlusions([TREES], [1], 36_000.0, np.random.default_rng(0))[1]
     assert len(spans) == pytest.approx(1800, abs=150)
     lengths = spans[:, 1] - spans[:, 0]
@@ -216,8 +216,8 @@ def test_occlusions_come_as_often_and_last_as_long_as_the_scenario_says() -> Non
     assert lengths.max() <= 2.0
 
 
-def test_common_occlusions_hide_the_robot_from_all_stations() -> None:
-    """What is common comes to all stations at once, the rest to each in its own time."""
+def test_common_occlusions_affect_all_stations() -> None:
+    """Common occlusions coincide at all stations, the others are independent."""
     spans = draw_occlusions([TREES, BENDS], [1, 2], 3600.0, np.random.default_rng(0))
     one, other = ({tuple(span) for span in spans[station].tolist()} for station in (1, 2))
     common = one & other
@@ -226,8 +226,8 @@ def test_common_occlusions_hide_the_robot_from_all_stations() -> None:
     assert all(to - since <= 2.0 for since, to in (one | other) - common)
 
 
-def test_occlusions_do_not_change_the_drive() -> None:
-    """The same seed drives the same way with and without trees."""
+def test_occlusions_do_not_change_the_motion() -> None:
+    """The same seed gives the same motion with and without occlusions."""
     scenario = ScenarioConfig()
     times = _times(30.0)
     open_world = scenario_world(scenario, 30.0, np.random.default_rng(4))

@@ -43,18 +43,10 @@ _MAX_MEDIAN_ERROR_NS = 5_000_000
 
 
 class Violation(NamedTuple):
-    """A violated invariant.
+    """A violated invariant."""
 
-    Attributes
-    ----------
-    check
-        Name of the invariant.
-    detail
-        Subject, measured value and limit, in one line.
-    """
-
-    check: str
-    detail: str
+    check: str  # name of the invariant
+    detail: str  # subject, measured value and limit, in one line
 
 
 def check_invariants(result: MissionResult) -> list[Violation]:

@@ -34,18 +34,10 @@ kind = "classic"        # the paper's protocol
 
 @dataclass(frozen=True, slots=True)
 class DemoFiles:
-    """Paths in the folder of a demonstration.
+    """Paths in the folder of a demonstration."""
 
-    Attributes
-    ----------
-    folder
-        Configuration, sockets, logs, journals and recordings.
-    socket
-        UNIX socket of the pose stream.
-    """
-
-    folder: Path
-    socket: Path
+    folder: Path  # configuration, sockets, logs, journals and recordings
+    socket: Path  # UNIX socket of the pose stream
     stations: tuple[int, ...]
 
     @property

@@ -51,8 +51,6 @@ class Demo:
     ----------
     world
         Ground truth; its zero is ``start_ns``.
-    start_ns
-        CLOCK_MONOTONIC at the start of the world, in ns.
     processes
         The clients in the order of the stations, then the master.
     """
@@ -68,7 +66,7 @@ class Demo:
             2 + len(scenario.stations)
         )
         self.world = scenario_world(scenario, duration_s + STARTUP_TIMEOUT_S + 10, world_rng)
-        self.start_ns = clock.monotonic_ns()
+        self.start_ns = clock.monotonic_ns()  # CLOCK_MONOTONIC at the start of the world, in ns
         self.processes = [
             Process(
                 f"client {station}",

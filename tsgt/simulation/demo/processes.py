@@ -31,26 +31,14 @@ main()
 
 @dataclass(slots=True)
 class Process:
-    """A daemon process that is kept running.
-
-    Attributes
-    ----------
-    entry_point
-        Function of :mod:`tsgt.cli.daemons` that the process runs.
-    log_path
-        File for its stderr and stdout.
-    pid
-        None: not running.
-    starts
-        Number of starts.
-    """
+    """A daemon process that is kept running."""
 
     name: str
-    entry_point: str
+    entry_point: str  # function of :mod:`tsgt.cli.daemons` that the process runs
     arguments: tuple[str, ...]
-    log_path: Path
-    pid: int | None = field(default=None, init=False)
-    starts: int = field(default=0, init=False)
+    log_path: Path  # file for its stderr and stdout
+    pid: int | None = field(default=None, init=False)  # None: not running
+    starts: int = field(default=0, init=False)  # number of starts
 
     async def keep_running(self) -> NoReturn:
         """Start the process whenever it is not running; stop it when cancelled."""

@@ -129,25 +129,13 @@ _RATE_SPREAD = 8.0
 
 
 class Fault(NamedTuple):
-    """A fault.
+    """A fault."""
 
-    Attributes
-    ----------
-    at_s
-        Start in s from the start of the mission.
-    station
-        None: the master, or the channel.
-    duration_s
-        0: instantaneous.
-    seed
-        Seed of further draws.
-    """
-
-    at_s: float
+    at_s: float  # start in s from the start of the mission
     kind: FaultKind
-    station: int | None
-    duration_s: float
-    seed: int
+    station: int | None  # None: the master, or the channel
+    duration_s: float  # 0: instantaneous
+    seed: int  # seed of further draws
 
 
 def parse_faults(text: str) -> frozenset[FaultKind]:

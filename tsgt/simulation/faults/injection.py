@@ -130,14 +130,12 @@ async def _use_interferer(
 # --- Radios ----------------------------------------------------------------------------------------------------
 
 
-async def _chip_reset(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
-    del rng
+async def _chip_reset(mission: Mission, fault: Fault, _rng: np.random.Generator) -> None:
     if (hardware := mission.computers[_computer_name(fault)].hardware) is not None:
         hardware.chip.power_on_reset()
 
 
-async def _chip_hang(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
-    del rng
+async def _chip_hang(mission: Mission, fault: Fault, _rng: np.random.Generator) -> None:
     if (hardware := mission.computers[_computer_name(fault)].hardware) is not None:
         hardware.chip.hang()
 
@@ -208,8 +206,7 @@ async def _power(mission: Mission, fault: Fault, rng: np.random.Generator) -> No
     _lock_manually(mission, _station(fault))
 
 
-async def _prism_loss(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
-    del rng
+async def _prism_loss(mission: Mission, fault: Fault, _rng: np.random.Generator) -> None:
     instrument = mission.instruments[_station(fault)]
     instrument.blocked = True
     await asyncio.sleep(fault.duration_s)
@@ -246,8 +243,7 @@ async def _clock_step(mission: Mission, fault: Fault, rng: np.random.Generator) 
     mission.computers[_computer_name(fault)].clock.step(_step_ns(rng, _STEP_S))
 
 
-async def _master_clock_step(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
-    del fault
+async def _master_clock_step(mission: Mission, _fault: Fault, rng: np.random.Generator) -> None:
     mission.clock.step(_step_ns(rng, _MASTER_STEP_S))
 
 
@@ -256,8 +252,7 @@ def _step_ns(rng: np.random.Generator, span_s: tuple[float, float]) -> int:
     return round(rng.uniform(*span_s) * 1e9 * 10 ** rng.uniform(-6, 0))
 
 
-async def _reboot(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
-    del rng
+async def _reboot(mission: Mission, fault: Fault, _rng: np.random.Generator) -> None:
     await mission.reboot(_station(fault), fault.at_s, fault.duration_s)
 
 
@@ -287,8 +282,7 @@ async def _torn_write(mission: Mission, fault: Fault, rng: np.random.Generator) 
     await mission.crash(_computer_name(fault), down_s=fault.duration_s)
 
 
-async def _disk(error: int, mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
-    del rng
+async def _disk(error: int, mission: Mission, fault: Fault, _rng: np.random.Generator) -> None:
     disk = mission.computers[_computer_name(fault)].disk
     disk.fail_writes(error, round(fault.at_s * 1e9), round((fault.at_s + fault.duration_s) * 1e9))
     await asyncio.sleep(fault.duration_s)

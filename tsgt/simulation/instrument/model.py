@@ -48,27 +48,15 @@ REFLECTORLESS: Final = 5
 
 
 class ReportedDistance(NamedTuple):
-    """A distance measurement that a response has reported.
+    """A distance measurement that a response has reported."""
 
-    Attributes
-    ----------
-    instrument_ms
-        Timestamp in ms since the instrument was switched on.
-    true_ns
-        When it was measured, on the timeline.
-    prism
-        None: a foil target.
-    code
-        GeoCOM return code.
-    """
-
-    instrument_ms: int
-    true_ns: int
+    instrument_ms: int  # timestamp in ms since the instrument was switched on
+    true_ns: int  # when it was measured, on the timeline
     horizontal_angle_rad: float
     zenith_angle_rad: float
     distance_m: float
-    prism: int | None
-    code: int
+    prism: int | None  # None: a foil target
+    code: int  # GeoCOM return code
 
 
 class TotalStationModel:
@@ -87,18 +75,10 @@ class TotalStationModel:
 
     Attributes
     ----------
-    face
-        0: first face; 1: second face.
-    robotic_licence
-        Whether the option GeoCOM Robotic is installed.
     tilt_rad
         Tilt across and along the line of sight, as the compensator shows it.
     air
         Actual temperature in degrees Celsius and pressure in hPa along the line of sight.
-    reported_distances
-        Each reported distance once.
-    beeps
-        True times of beeps in ns.
     """
 
     def __init__(
@@ -131,17 +111,17 @@ class TotalStationModel:
         self._observed_ns: int | None = None
         self._result: ReportedDistance | ReturnCode | None = None
         self._on_since_ns: int | None = now_ns - int(generator.uniform(60e9, 3600e9))
-        self.face = 0
+        self.face = 0  # 0: first face; 1: second face
         self.settings = Settings()
-        self.robotic_licence = True
+        self.robotic_licence = True  # whether the option GeoCOM Robotic is installed
         self.battery_percent = 85.0
         self.external_power = False
         self.tilt_rad = (3.0 * ARCSECOND_RAD, -2.0 * ARCSECOND_RAD)
         self.air = (12.0, 1013.25)
         self.name = "TCRP1201+"
         self.serial_number = 230_000 + station.station
-        self.reported_distances: list[ReportedDistance] = []
-        self.beeps: list[int] = []
+        self.reported_distances: list[ReportedDistance] = []  # each reported distance once
+        self.beeps: list[int] = []  # True times of beeps in ns
 
     def now_ns(self) -> int:
         """Return the true time in ns."""

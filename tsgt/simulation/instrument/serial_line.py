@@ -57,17 +57,13 @@ class LineFaults:
     ----------
     script
         Faults of the next responses, in order; later responses have none.
-    drop_requests
-        Whether requests are lost.
-    drop_responses
-        Whether responses are lost.
     """
 
     script: deque[LineFault] = field(default_factory=deque)
     delay_s: float = 4.0
     split_delay_s: float = 0.3
-    drop_requests: bool = False
-    drop_responses: bool = False
+    drop_requests: bool = False  # whether requests are lost
+    drop_responses: bool = False  # whether responses are lost
 
     def apply(self, data: bytes) -> list[tuple[int, bytes]]:
         """Return the parts of a response that arrive, each with its delay in ns."""

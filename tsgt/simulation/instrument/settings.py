@@ -45,8 +45,6 @@ class Settings:
 
     Attributes
     ----------
-    decimals
-        Decimal places of doubles in requests and responses.
     atr, lock
         User switches: automatic target recognition, tracking.
     edm_mode, program, target_type
@@ -55,23 +53,17 @@ class Settings:
         Constant that is added; constant of the user-defined prism type.
     search_area
         PowerSearch window: centre and range of both angles in rad, and whether it is enabled.
-    spiral_rad
-        ATR search window, full width and height.
-    search_range_m
-        Nearest and farthest prism that PowerSearch accepts.
     atmosphere
         Wavelength in m, pressure in hPa, dry and wet temperature in degrees Celsius (TMC_SetAtmCorr).
     geometric_ppm, atmospheric_ppm
         Scale corrections in 1e-6; the latter follows from ``atmosphere`` unless set directly.
     incline, angle_switches
         Compensator; corrections of tilt, standing axis, collimation and tilting axis.
-    orientation_rad
-        Horizontal circle reading of the true direction zero.
     power_mode, power_timeout_ms
         Action after this idle time: 0 none, 2 off.
     """
 
-    decimals: int = 15
+    decimals: int = 15  # decimal places of doubles in requests and responses
     atr: bool = True
     lock: bool = True
     fine_adjust_mode: int = 0
@@ -85,8 +77,8 @@ class Settings:
     user_constant_m: float = 0.0
     user_prism: str = ""
     search_area: tuple[float, float, float, float, int] = (0.0, 0.0, 0.0, 0.0, 0)
-    spiral_rad: tuple[float, float] = (0.07, 0.07)
-    search_range_m: tuple[int, int] = (0, 400)
+    spiral_rad: tuple[float, float] = (0.07, 0.07)  # ATR search window, full width and height
+    search_range_m: tuple[int, int] = (0, 400)  # nearest and farthest prism that PowerSearch accepts
     search_range_on: bool = False
     atr_setting: int = 0
     reduced_field_of_view: bool = False
@@ -97,7 +89,7 @@ class Settings:
     refraction_method: int = 1
     incline: bool = True
     angle_switches: tuple[int, int, int, int] = (1, 1, 1, 1)
-    orientation_rad: float = 0.0
+    orientation_rad: float = 0.0  # horizontal circle reading of the true direction zero
     station_m: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     reflector_height_m: float = 0.0
     guide_light: int = 0

@@ -40,21 +40,13 @@ class TargetObservation(NamedTuple):
     ----------
     point
         Position of the target in the frame of the station, (3,) in m; None: no target.
-    prism
-        None: a foil target.
-    followed
-        Whether the telescope is locked on it.
-    direction
-        Direction of the telescope.
-    code
-        GeoCOM return code; of the failure if there is no target.
     """
 
     point: NDArray[np.float64] | None
-    prism: int | None
-    followed: bool
-    direction: PolarDirection
-    code: ReturnCode
+    prism: int | None  # None: a foil target
+    followed: bool  # whether the telescope is locked on it
+    direction: PolarDirection  # direction of the telescope
+    code: ReturnCode  # GeoCOM return code; of the failure if there is no target
 
 
 class TargetsInView:

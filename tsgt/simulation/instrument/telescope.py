@@ -39,19 +39,6 @@ class Telescope:
         Visibility by prism number.
     prediction_s
         How long it continues with constant angular speed after losing a prism.
-
-    Attributes
-    ----------
-    prism
-        The prism it follows, or followed last.
-    target_id
-        Number of the only prism that it accepts; None: any.
-    blocked
-        Whether the line of sight is blocked; advance before changing it.
-    moving
-        Whether it is turning to another direction, and cannot measure.
-    field_rad
-        Half the field of view.
     """
 
     def __init__(self, prisms: Mapping[int, PrismVisibility], *, prediction_s: float, now_s: float) -> None:
@@ -62,11 +49,11 @@ class Telescope:
         self._direction: PolarDirection = (0.0, math.pi / 2)
         self._speed_radps: PolarDirection = (0.0, 0.0)
         self.lock = Lock.OUT
-        self.prism: int | None = None
-        self.target_id: int | None = None
-        self.blocked = False
-        self.moving = False
-        self.field_rad = HALF_FIELD_OF_VIEW_RAD
+        self.prism: int | None = None  # the prism it follows, or followed last
+        self.target_id: int | None = None  # number of the only prism that it accepts; None: any
+        self.blocked = False  # whether the line of sight is blocked; advance before changing it
+        self.moving = False  # whether it is turning to another direction, and cannot measure
+        self.field_rad = HALF_FIELD_OF_VIEW_RAD  # half the field of view
 
     def advance(self, to_s: float) -> None:
         """Advance to a later time; earlier times have no effect."""

@@ -31,8 +31,6 @@ class SimulatedTotalStation(TotalStationModel):
     ----------
     server
         GeoCOM server; tests force return codes through it.
-    baud
-        Bit rate of its serial port in bits per second.
     """
 
     def __init__(
@@ -47,7 +45,7 @@ class SimulatedTotalStation(TotalStationModel):
     ) -> None:
         super().__init__(station, scenario, world, timeline, generator, start_ns=start_ns)
         self._ready_ns = self._last_received_ns = timeline.now_ns()
-        self.baud = station.instrument.baud
+        self.baud = station.instrument.baud  # bit rate of its serial port in bits per second
         self.server = GeoComServer(self, timeline, station.instrument, generator)
 
     def receive(self, data: bytes) -> None:

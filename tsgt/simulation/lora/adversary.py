@@ -23,11 +23,6 @@ class ReplayAttacker:
     ----------
     rate_hz
         Average packet rate.
-
-    Attributes
-    ----------
-    sent
-        Number of packets sent.
     """
 
     def __init__(self, clock: Clock, rng: np.random.Generator, rate_hz: float) -> None:
@@ -35,7 +30,7 @@ class ReplayAttacker:
         self._rng = rng
         self._rate_hz = rate_hz
         self._captured: deque[bytes] = deque(maxlen=_CAPTURE_CAPACITY)
-        self.sent = 0
+        self.sent = 0  # number of packets sent
 
     async def run(self, open_radio: RadioOpener) -> None:
         """Open the radio, receive and send until cancelled."""

@@ -317,21 +317,13 @@ class Arrival(NamedTuple):
 
 
 class FrameOnAir:
-    """A frame that is or was transmitted.
-
-    Attributes
-    ----------
-    number
-        Count of the sender's frames, this one included.
-    end_ns
-        Actual end; earlier than the frame's if it was cut.
-    """
+    """A frame that is or was transmitted."""
 
     def __init__(self, frame: Frame, sender: Transceiver, number: int) -> None:
         self.frame = frame
         self.sender = sender
-        self.number = number
-        self.end_ns = frame.end_ns
+        self.number = number  # count of the sender's frames, this one included
+        self.end_ns = frame.end_ns  # actual end; earlier than the frame's if it was cut
         self.arrivals: dict[Transceiver, Arrival] = {}
 
 
@@ -349,15 +341,13 @@ class Air:
     ----------
     frames
         Frames on the air, and those that overlap a frame whose reception is undecided.
-    airtime_ns
-        Total airtime of all frames.
     """
 
     def __init__(self, timeline: Timeline, rng: np.random.Generator, link: LinkModel) -> None:
         self.timeline = timeline
         self.link = link
         self.frames: list[FrameOnAir] = []
-        self.airtime_ns = 0
+        self.airtime_ns = 0  # total airtime of all frames
         self._seed = int(rng.integers(2**63))
         self._sent: Counter[str] = Counter()
         self._radios: dict[str, Transceiver] = {}

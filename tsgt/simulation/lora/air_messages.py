@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Annotated, Literal, Self, TypeVar
 
 from pydantic import Field
@@ -41,42 +41,15 @@ class FrameMessage:
     @classmethod
     def of(cls, frame: Frame) -> Self:
         """Convert a frame to its message."""
-        modulation = frame.modulation
-        return cls(
-            frequency_hz=modulation.frequency_hz,
-            spreading_factor=modulation.spreading_factor,
-            bandwidth_hz=modulation.bandwidth_hz,
-            inverted_iq=modulation.inverted_iq,
-            sync_word=modulation.sync_word,
-            explicit_header=modulation.explicit_header,
-            low_data_rate=modulation.low_data_rate,
-            coding_rate=frame.coding_rate,
-            crc=frame.crc,
-            preamble_symbols=frame.preamble_symbols,
-            payload_hex=frame.payload.hex(),
-            power_dbm=frame.power_dbm,
-            start_ns=frame.start_ns,
-        )
+        flat = {**vars(frame.modulation), **{each.name: getattr(frame, each.name) for each in fields(frame)}}
+        del flat["modulation"]
+        return cls(payload_hex=flat.pop("payload").hex(), **flat)
 
     def frame(self) -> Frame:
         """Convert the message to a frame."""
-        return Frame(
-            modulation=Modulation(
-                frequency_hz=self.frequency_hz,
-                spreading_factor=self.spreading_factor,
-                bandwidth_hz=self.bandwidth_hz,
-                inverted_iq=self.inverted_iq,
-                sync_word=self.sync_word,
-                explicit_header=self.explicit_header,
-                low_data_rate=self.low_data_rate,
-            ),
-            coding_rate=self.coding_rate,
-            crc=self.crc,
-            preamble_symbols=self.preamble_symbols,
-            payload=bytes.fromhex(self.payload_hex),
-            power_dbm=self.power_dbm,
-            start_ns=self.start_ns,
-        )
+        flat = asdict(self)
+        modulation = Modulation(**{each.name: flat.pop(each.name) for each in fields(Modulation)})
+        return Frame(modulation=modulation, payload=bytes.fromhex(flat.pop("payload_hex")), **flat)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -123,23 +96,13 @@ class Rejected:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Incoming:
-    """Another radio transmits a frame.
-
-    Attributes
-    ----------
-    crystal_ppm
-        Offset of the sender's carrier in 1e-6.
-    loss_db
-        Path loss to this radio, fading included.
-    loss_probability
-        Probability that the frame is lost in addition.
-    """
+    """Another radio transmits a frame."""
 
     type: Literal["incoming"] = "incoming"
     sender: Name
-    crystal_ppm: Finite
-    loss_db: Finite
-    loss_probability: Finite
+    crystal_ppm: Finite  # offset of the sender's carrier in 1e-6
+    loss_db: Finite  # path loss to this radio, fading included
+    loss_probability: Finite  # probability that the frame is lost in addition
     frame: FrameMessage
 
 

@@ -74,11 +74,6 @@ class SX1276Chip:
         Connects it to a channel; called once.
     rng
         Interrupt jitter.
-
-    Attributes
-    ----------
-    warnings
-        Violations of the data sheet by the driver, each kind once.
     """
 
     def __init__(
@@ -89,7 +84,7 @@ class SX1276Chip:
         *,
         timing: ChipTiming | None = None,
     ) -> None:
-        self.warnings: list[str] = []
+        self.warnings: list[str] = []  # violations of the data sheet by the driver, each kind once
         self._timeline = timeline
         self._timing = timing or ChipTiming()
         self._memory = ChipMemory()

@@ -74,17 +74,13 @@ class ChipMemory:
 
     Attributes
     ----------
-    lora
-        Common registers and the LoRa page, by address.
-    fsk
-        By address; only the FSK page is used.
     frf
         Carrier frequency in effect, in synthesizer steps: RegFrf when its last byte was written.
     """
 
     def __init__(self) -> None:
-        self.lora = bytearray(REGISTERS)
-        self.fsk = bytearray(REGISTERS)
+        self.lora = bytearray(REGISTERS)  # common registers and the LoRa page, by address
+        self.fsk = bytearray(REGISTERS)  # by address; only the FSK page is used
         self.fifo = bytearray(FIFO_BYTES)
         self.frf = 0
         self.reset()

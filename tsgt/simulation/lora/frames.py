@@ -11,58 +11,28 @@ from tsgt.radio import HEADER_SYMBOLS, payload_symbols, symbol_time_ns
 
 @dataclass(frozen=True)
 class Modulation:
-    """What sender and receiver must share (facts/radio.md 3.3).
+    """What sender and receiver must share (facts/radio.md 3.3)."""
 
-    Attributes
-    ----------
-    frequency_hz
-        Nominal carrier frequency.
-    spreading_factor
-        6 to 12.
-    inverted_iq
-        Whether up-chirps and down-chirps are swapped.
-    sync_word
-        One byte, in two symbols at the end of the preamble.
-    explicit_header
-        Whether the frame carries its length and coding.
-    low_data_rate
-        Low-data-rate optimisation.
-    """
-
-    frequency_hz: float
-    spreading_factor: int
+    frequency_hz: float  # nominal carrier frequency
+    spreading_factor: int  # 6 to 12
     bandwidth_hz: float
-    inverted_iq: bool
-    sync_word: int
-    explicit_header: bool
-    low_data_rate: bool
+    inverted_iq: bool  # whether up-chirps and down-chirps are swapped
+    sync_word: int  # one byte, in two symbols at the end of the preamble
+    explicit_header: bool  # whether the frame carries its length and coding
+    low_data_rate: bool  # low-data-rate optimisation
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A packet on the air, from the first symbol of its preamble.
-
-    Attributes
-    ----------
-    coding_rate
-        Denominator of the payload's code rate, 5 to 8 for 4/5 to 4/8.
-    preamble_symbols
-        As programmed; 4.25 symbols more are on the air.
-    payload
-        1 to 255 bytes.
-    power_dbm
-        At the sender's antenna connector.
-    start_ns
-        Start, on the channel's timeline.
-    """
+    """A packet on the air, from the first symbol of its preamble."""
 
     modulation: Modulation
-    coding_rate: int
+    coding_rate: int  # denominator of the payload's code rate, 5 to 8 for 4/5 to 4/8
     crc: bool
-    preamble_symbols: int
-    payload: bytes
-    power_dbm: float
-    start_ns: int
+    preamble_symbols: int  # as programmed; 4.25 symbols more are on the air
+    payload: bytes  # 1 to 255 bytes
+    power_dbm: float  # at the sender's antenna connector
+    start_ns: int  # start, on the channel's timeline
 
     @cached_property
     def symbol_ns(self) -> int:
@@ -113,20 +83,14 @@ class ReceiverSettings:
 
     Attributes
     ----------
-    since_ns
-        When it started to listen.
-    preamble_symbols
-        As programmed; a longer preamble is not recognised.
-    max_payload_bytes
-        Frames whose header announces more are dropped.
     payload_bytes, coding_rate, crc
         Assumed for frames without a header.
     """
 
     modulation: Modulation
-    since_ns: int
-    preamble_symbols: int
-    max_payload_bytes: int
+    since_ns: int  # when it started to listen
+    preamble_symbols: int  # as programmed; a longer preamble is not recognised
+    max_payload_bytes: int  # frames whose header announces more are dropped
     payload_bytes: int
     coding_rate: int
     crc: bool
@@ -147,24 +111,16 @@ class Reception:
 
     Attributes
     ----------
-    payload
-        As received, possibly damaged.
-    crc_ok
-        Whether the checksum matches; True for a frame without one.
-    header
-        As received, or as assumed.
     snr_db, rssi_dbm
         Of the frame itself at the receiver.
-    frequency_error_hz
-        Positive: the sender's carrier is above the receiver's.
     """
 
-    payload: bytes
-    crc_ok: bool
-    header: Header
+    payload: bytes  # as received, possibly damaged
+    crc_ok: bool  # whether the checksum matches; True for a frame without one
+    header: Header  # as received, or as assumed
     snr_db: float
     rssi_dbm: float
-    frequency_error_hz: float
+    frequency_error_hz: float  # positive: the sender's carrier is above the receiver's
 
 
 class FrameListener(Protocol):

@@ -118,18 +118,12 @@ class LogDistanceLoss:
     ----------
     positions_m
         Positions by name, in one frame; may be replaced at any time.
-    exponent
-        2 in free space, 2.7 to 3.5 over ground and through trees.
-    shadowing_sigma_db
-        One sigma, constant per pair and the same in both directions.
-    antenna_gain_db
-        Of each antenna, cable loss deducted.
     """
 
     positions_m: Mapping[str, tuple[float, float, float]]
-    exponent: float = 2.0
-    shadowing_sigma_db: float = 0.0
-    antenna_gain_db: float = 0.0
+    exponent: float = 2.0  # 2 in free space, 2.7 to 3.5 over ground and through trees
+    shadowing_sigma_db: float = 0.0  # one sigma, constant per pair and the same in both directions
+    antenna_gain_db: float = 0.0  # of each antenna, cable loss deducted
     seed: int = 0
 
     def loss_db(self, sender: str, receiver: str, frequency_hz: float) -> float:
@@ -161,21 +155,15 @@ class LinkModel:
 
     Attributes
     ----------
-    noise_figure_db
-        Of every receiver.
     fading_sigma_db
         One sigma of each frame's power at each receiver: 1 to 3 for stationary radios.
-    rayleigh_fading
-        Whether the power has Rayleigh fading, for moving radios.
-    loss_probability
-        Probability that a receiver misses a frame regardless of its power.
     """
 
     path_loss: PathLoss = field(default_factory=FixedLoss)
-    noise_figure_db: float = NOISE_FIGURE_DB
+    noise_figure_db: float = NOISE_FIGURE_DB  # of every receiver
     fading_sigma_db: float = 0.0
-    rayleigh_fading: bool = False
-    loss_probability: float = 0.0
+    rayleigh_fading: bool = False  # whether the power has Rayleigh fading, for moving radios
+    loss_probability: float = 0.0  # probability that a receiver misses a frame regardless of its power
     _attenuations_db: dict[frozenset[str], float] = field(default_factory=dict, init=False, repr=False)
 
     def set_attenuation(self, one: str, other: str, attenuation_db: float) -> None:

@@ -53,29 +53,21 @@ class ChipTiming:
         From SLEEP to a running oscillator; from there to a locked synthesizer.
     tx_start_ns, rx_start_ns
         From there to the start of the frame on the air; to a listening receiver.
-    tx_done_ns
-        From the end of the frame to TxDone.
     rx_done_symbols
         From the end of the frame to RxDone in symbols, by spreading factor.
-    rx_timeout_ns
-        From the programmed number of symbols to RxTimeout.
-    cad_processing_symbols
-        Processing time of channel activity detection after listening.
-    jitter_sigma_ns
-        One sigma of TxDone and RxDone.
     """
 
     oscillator_ns: int = 250_000
     pll_ns: int = 60_000
     tx_start_ns: int = 120_000
     rx_start_ns: int = 41_000
-    tx_done_ns: int = 67_000
+    tx_done_ns: int = 67_000  # from the end of the frame to TxDone
     rx_done_symbols: dict[int, float] = field(
         default_factory=lambda: {6: 0.74, 7: 0.74, 8: 0.74, 9: 0.76, 10: 0.80, 11: 0.81, 12: 0.90}
     )
-    rx_timeout_ns: int = 305_000
-    cad_processing_symbols: float = 0.85
-    jitter_sigma_ns: int = 3_000
+    rx_timeout_ns: int = 305_000  # from the programmed number of symbols to RxTimeout
+    cad_processing_symbols: float = 0.85  # processing time of channel activity detection after listening
+    jitter_sigma_ns: int = 3_000  # one sigma of TxDone and RxDone
 
 
 class Report(Protocol):

@@ -33,17 +33,13 @@ class HostDelay(NamedTuple):
 
     Attributes
     ----------
-    sigma
-        Of the natural logarithm.
-    work_ms
-        Duration of the preparation.
     wake_median_ms, wake_sigma
         Distribution of the wake-up delay.
     """
 
     median_ms: float = 3.0
-    sigma: float = 0.5
-    work_ms: float = 1.0
+    sigma: float = 0.5  # of the natural logarithm
+    work_ms: float = 1.0  # duration of the preparation
     wake_median_ms: float = 0.3
     wake_sigma: float = 1.0
 

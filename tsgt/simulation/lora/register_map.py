@@ -45,30 +45,20 @@ class ModemSettings:
     ----------
     sending, receiving
         Modulations of transmitter and receiver; they differ in IQ and, at narrow bandwidths, in frequency.
-    coding_rate
-        Denominator, 5 to 8.
-    crc
-        RxPayloadCrcOn, which applies to transmission as well.
-    preamble_symbols
-        As programmed.
     payload_bytes, max_payload_bytes
         RegPayloadLength and RegMaxPayloadLength.
-    timeout_symbols
-        Preamble timeout of RXSINGLE.
-    continuous
-        TxContinuousMode.
     """
 
     sending: Modulation
     receiving: Modulation
     symbol_ns: int
-    coding_rate: int
-    crc: bool
-    preamble_symbols: int
+    coding_rate: int  # denominator, 5 to 8
+    crc: bool  # rxPayloadCrcOn, which applies to transmission as well
+    preamble_symbols: int  # as programmed
     payload_bytes: int
     max_payload_bytes: int
-    timeout_symbols: int
-    continuous: bool
+    timeout_symbols: int  # preamble timeout of RXSINGLE
+    continuous: bool  # txContinuousMode
 
 
 def modem_settings(memory: ChipMemory) -> tuple[ModemSettings | None, tuple[str, ...]]:

@@ -49,20 +49,14 @@ class AuthorsTiming:
 
     Attributes
     ----------
-    poll_interval_ns
-        Polling interval of the radio.
     transfer_ns
         One transfer from the radio chip (two bytes at 500 kHz); a packet takes five, plus one per byte.
-    pause_ns
-        Before a station sends a measurement, and between two polls of the master.
-    timeout_ns
-        Of the master, for a reply.
     """
 
-    poll_interval_ns: int = 1_000_000
+    poll_interval_ns: int = 1_000_000  # polling interval of the radio
     transfer_ns: int = 33_000
-    pause_ns: int = 10_000_000
-    timeout_ns: int = 250_000_000
+    pause_ns: int = 10_000_000  # before a station sends a measurement, and between two polls of the master
+    timeout_ns: int = 250_000_000  # of the master, for a reply
 
 
 AUTHORS_TIMESTAMP_DELAY_MS = 0.7

@@ -30,17 +30,6 @@ class Computer:
         Name of its radio and daemon: ``master``, ``station1``, ...
     rng
         Draws of its radio and of its host delays.
-
-    Attributes
-    ----------
-    task
-        The running daemon; None: there is none.
-    is_down
-        Whether the daemon was ended by the simulation and will be restarted.
-    hardware
-        Radio hardware, since it was last opened.
-    disk_writer
-        Disk access of the current or last daemon.
     """
 
     def __init__(
@@ -56,10 +45,10 @@ class Computer:
         self.clock = clock
         self.rng = rng
         self.disk = SimulatedDisk()
-        self.task: asyncio.Task[None] | None = None
-        self.is_down = False
-        self.hardware: RadioHardware | None = None
-        self.disk_writer: DiskWriter | None = None
+        self.task: asyncio.Task[None] | None = None  # the running daemon; None: there is none
+        self.is_down = False  # whether the daemon was ended by the simulation and will be restarted
+        self.hardware: RadioHardware | None = None  # radio hardware, since it was last opened
+        self.disk_writer: DiskWriter | None = None  # disk access of the current or last daemon
         self._air = air
         self._settings = settings
         self._jitter = jitter

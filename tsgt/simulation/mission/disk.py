@@ -19,15 +19,9 @@ WRITE_RECOVERY_NS = 2_000_000_000
 
 @dataclass(slots=True)
 class SimulatedDisk:
-    """State of a disk, shared by all daemons that run on a computer.
+    """State of a disk, shared by all daemons that run on a computer."""
 
-    Attributes
-    ----------
-    write_error
-        Error number of all writes, ENOSPC or EROFS; None: writes succeed.
-    """
-
-    write_error: int | None = None
+    write_error: int | None = None  # error number of all writes, ENOSPC or EROFS; None: writes succeed
     _failure_ns: tuple[int, int] | None = None
 
     def fail_writes(self, error: int, since_ns: int, until_ns: int) -> None:

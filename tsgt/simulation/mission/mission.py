@@ -73,18 +73,10 @@ class Mission:
 
     Attributes
     ----------
-    world
-        Ground truth on true time.
-    clock
-        The master's clock.
     computers
         By name.
     instruments, lines, prisms
         Total stations, their serial lines, and the prisms they track, by station number.
-    drifting
-        Stations whose clock drift is changing.
-    master_logs
-        One per start of the master.
     """
 
     def __init__(
@@ -98,7 +90,7 @@ class Mission:
         self._options = options
         self._folder = folder
         self._true = VirtualClock(START_UNIX_NS)
-        self.clock = VirtualClock(START_UNIX_NS)
+        self.clock = VirtualClock(START_UNIX_NS)  # the master's clock
         self._settings = lora_settings(
             radio_config(scenario, MASTER, folder), Path(f"scenario {scenario.name}")
         )
@@ -109,7 +101,7 @@ class Mission:
         self._key = key_rng.bytes(_KEY_BYTES) if authenticated else None
         self.parameters = scenario_parameters(scenario)
         until_s = options.duration_s + 2 * DRAIN_S
-        self.world: World = scenario_world(scenario, until_s, world_rng)
+        self.world: World = scenario_world(scenario, until_s, world_rng)  # ground truth on true time
         self._positions_m = {station_name(s.station): s.position_m for s in scenario.stations}
         self._positions_m[INTERFERER] = _INTERFERER_POSITION_M
         self.air = Air(timeline, air_rng, scenario_link(scenario.radio, self._positions_m, air_rng))
@@ -124,9 +116,9 @@ class Mission:
         self.instruments = {s.station: self._instrument(s) for s in scenario.stations}
         self.lines = {number: self._line(number) for number in numbers}
         self._boots = dict.fromkeys(numbers, 1)
-        self.master_logs: list[MasterLog] = []
+        self.master_logs: list[MasterLog] = []  # one per start of the master
         self.prisms = {s.station: s.prism for s in scenario.stations}
-        self.drifting: set[int] = set()
+        self.drifting: set[int] = set()  # stations whose clock drift is changing
         self.superframe = isinstance(options.protocol, SuperframeMasterConfig)
         self.station_logs = {
             number: StationLog(

@@ -48,36 +48,16 @@ _KINDS: tuple[Kind, ...] = get_args(Kind)
 
 @dataclass(frozen=True, slots=True)
 class ValidPoses:
-    """The valid poses of a stream, in its order.
+    """The valid poses of a stream, in its order."""
 
-    Attributes
-    ----------
-    stamp_ns
-        (N,) on the master's Unix clock.
-    position_m
-        (N, 3) in frame ``station1``.
-    orientation_xyzw
-        (N, 4).
-    residual_m
-        (N,) as published.
-    measurements_before
-        (N,) number of measurements published before each pose.
-    kind
-        (N,) kind of pose, as published.
-    newest_age_s
-        (N,) age of the newest measurement.
-    covariance
-        (N, 6, 6) as published.
-    """
-
-    stamp_ns: NDArray[np.int64]
-    position_m: NDArray[np.float64]
-    orientation_xyzw: NDArray[np.float64]
-    residual_m: NDArray[np.float64]
-    measurements_before: NDArray[np.int64]
-    kind: NDArray[np.str_]
-    newest_age_s: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    stamp_ns: NDArray[np.int64]  # (N,) on the master's Unix clock
+    position_m: NDArray[np.float64]  # (N, 3) in frame ``station1``
+    orientation_xyzw: NDArray[np.float64]  # (N, 4)
+    residual_m: NDArray[np.float64]  # (N,) as published
+    measurements_before: NDArray[np.int64]  # (N,) number of measurements published before each pose
+    kind: NDArray[np.str_]  # (N,) kind of pose, as published
+    newest_age_s: NDArray[np.float64]  # (N,) age of the newest measurement
+    covariance: NDArray[np.float64]  # (N, 6, 6) as published
 
     def select(self, rows: NDArray[np.bool_]) -> ValidPoses:
         """Return the poses of these rows."""
@@ -100,29 +80,21 @@ class MasterLog:
     ----------
     measurements, clocks, statuses
         Published records.
-    arrived_ns
-        True time of each measurement's publication, in ns from the start.
-    pose_counts
-        Number of poses, valid or not, by kind.
     frame_count, frames_duration_ns
         Number of frames from the first to the last beacon, and their total duration.
-    crashed
-        Whether it was killed.
-    session_number
-        Session number of its last beacon.
     """
 
     def __init__(self, folder: Path, now_ns: Callable[[], int], unix_at_zero_ns: int) -> None:
         self._folder = folder
         self._now_ns = now_ns
         self.unix_at_zero_ns = unix_at_zero_ns
-        self.crashed = False
-        self.session_number: int | None = None
+        self.crashed = False  # whether it was killed
+        self.session_number: int | None = None  # session number of its last beacon
         self.measurements: list[PolarMeasurement] = []
-        self.arrived_ns: list[int] = []
+        self.arrived_ns: list[int] = []  # True time of each measurement's publication, in ns from the start
         self.clocks: list[ClockRecord] = []
         self.statuses: list[StatusRecord] = []
-        self.pose_counts: Counter[Kind] = Counter()
+        self.pose_counts: Counter[Kind] = Counter()  # number of poses, valid or not, by kind
         self.frame_count = 0
         self.frames_duration_ns = 0
         self._first_beacon: BeaconRecord | None = None
@@ -190,27 +162,21 @@ class StationLog:
 
     Attributes
     ----------
-    folder
-        Folder of its journals; None: it keeps none.
-    reported_distances
-        Every distance that its instrument reported.
     true_times_ns
         True time of each reading's timestamp, by its host time; both in ns.
     read_times_ns
         True time at which the client got each reading, by its host time; both in ns.
     crash_windows_ns
         Start and end of the true times in which readings may be unjournalled; the client was killed at the end.
-    statuses
-        Status of the client before each end.
     """
 
     station: int
-    folder: Path | None
-    reported_distances: Sequence[ReportedDistance] = ()
+    folder: Path | None  # folder of its journals; None: it keeps none
+    reported_distances: Sequence[ReportedDistance] = ()  # every distance that its instrument reported
     true_times_ns: dict[int, int] = field(default_factory=dict)
     read_times_ns: dict[int, int] = field(default_factory=dict)
     crash_windows_ns: list[tuple[int, int]] = field(default_factory=list)
-    statuses: list[ClientStatus] = field(default_factory=list)
+    statuses: list[ClientStatus] = field(default_factory=list)  # status of the client before each end
 
     def may_be_unwritten(self, true_ns: int, before_ns: int = 0, *, write_errors_only: bool = False) -> bool:
         """Whether a client was killed before it must have journalled what it read at a true time in ns from the start.
@@ -328,45 +294,21 @@ class ObservedInstrument(LeicaInstrument):
 
 @dataclass(frozen=True, slots=True)
 class MissionResult:
-    """A completed mission.
+    """A completed mission."""
 
-    Attributes
-    ----------
-    parameters
-        Setup as known to the master: the exact truth.
-    world
-        Ground truth; times count from the start of the mission.
-    duration_s
-        Duration of the measurements, drain excluded.
-    master_logs
-        One per start of the master.
-    airtime_s
-        Total airtime of all radios.
-    faults
-        Number of faults by kind.
-    faults_end_s
-        End of the faults in s from the start; None: no faults.
-    rate_hz
-        Measurement rate by station number.
-    oversized_collections
-        Collections of the daemons that exceeded their bounds.
-    start_ns
-        Unix time of the start on the master's clock, in ns.
-    """
-
-    parameters: Parameters
-    world: World
-    duration_s: float
-    master_logs: list[MasterLog]
+    parameters: Parameters  # setup as known to the master: the exact truth
+    world: World  # ground truth; times count from the start of the mission
+    duration_s: float  # duration of the measurements, drain excluded
+    master_logs: list[MasterLog]  # one per start of the master
     station_logs: dict[int, StationLog]
-    airtime_s: float
+    airtime_s: float  # total airtime of all radios
     superframe: bool
     outages: tuple[Outage, ...] = ()
-    faults: Counter[FaultKind] = field(default_factory=Counter)
-    faults_end_s: float | None = None
-    rate_hz: dict[int, float] = field(default_factory=dict)
-    oversized_collections: tuple[str, ...] = ()
-    start_ns: int = START_UNIX_NS
+    faults: Counter[FaultKind] = field(default_factory=Counter)  # number of faults by kind
+    faults_end_s: float | None = None  # end of the faults in s from the start; None: no faults
+    rate_hz: dict[int, float] = field(default_factory=dict)  # measurement rate by station number
+    oversized_collections: tuple[str, ...] = ()  # collections of the daemons that exceeded their bounds
+    start_ns: int = START_UNIX_NS  # unix time of the start on the master's clock, in ns
 
     @property
     def end_ns(self) -> int:

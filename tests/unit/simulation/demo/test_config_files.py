@@ -1,4 +1,4 @@
-"""The configuration files of a demo are whole, and say what the scenario says."""
+"""The configuration files of a demo are complete and match the scenario."""
 
 from __future__ import annotations
 
@@ -24,18 +24,16 @@ if TYPE_CHECKING:
     from tsgt.simulation.demo.config_files import Protocol
 
 
-def test_the_master_knows_exactly_the_set_up_of_the_scenario(tmp_path: Path) -> None:
-    """What the master's files come to is what the scenario's parameters are."""
+def test_master_setup_equals_the_scenario(tmp_path: Path) -> None:
+    """The parameters read from the files are those of the scenario."""
     files = write_demo_files(tmp_path, ScenarioConfig(), tmp_path / "poses.sock")
     assert parameters(load(files.master_config, MasterConfig)) == scenario_parameters(ScenarioConfig())
 
 
 @pytest.mark.parametrize("protocol", ["superframe", "classic"])
 @pytest.mark.parametrize("station", [1, 2, 3])
-def test_each_client_finds_its_instrument_and_the_master_s_air(
-    tmp_path: Path, station: int, protocol: Protocol
-) -> None:
-    """A client's file names its own instrument and journal, and the modem settings and protocol of the master."""
+def test_clients_match_the_master(tmp_path: Path, station: int, protocol: Protocol) -> None:
+    """Each client has its own instrument and journal, and the master's modem settings and protocol."""
     files = write_demo_files(tmp_path, ScenarioConfig(), tmp_path / "poses.sock", protocol)
     client = load(files.client_config(station), ClientConfig)
     master = load(files.master_config, MasterConfig)

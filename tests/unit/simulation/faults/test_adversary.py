@@ -1,4 +1,4 @@
-"""Somebody else on the channel: what is sent, and how often."""
+"""The replay attacker: what it sends, and how often."""
 
 from __future__ import annotations
 
@@ -17,36 +17,36 @@ if TYPE_CHECKING:
 
     from tsgt.radio import Radio
 
-HEARD = [bytes([number]) * 10 for number in range(1, 5)]
+CAPTURED = [bytes([number]) * 10 for number in range(1, 5)]
 
 
-async def _sent(per_s: float, heard: list[bytes], seconds: float) -> list[bytes]:
+async def _sent(per_s: float, captured: list[bytes], seconds: float) -> list[bytes]:
     clock = VirtualClock(0)
     radio, packets = PlainRadio(clock), list[bytes]()
     radio.on_sent = packets.append
-    for payload in heard:
-        radio.hear(payload)
+    for payload in captured:
+        radio.deliver(payload)
 
     @asynccontextmanager
     async def open_radio() -> AsyncGenerator[Radio]:
         yield radio
 
-    foreign = ReplayAttacker(clock, np.random.default_rng(1), per_s)
-    running = asyncio.create_task(foreign.run(open_radio))
+    attacker = ReplayAttacker(clock, np.random.default_rng(1), per_s)
+    running = asyncio.create_task(attacker.run(open_radio))
     await clock.sleep_until(round(seconds * 1e9))
     running.cancel()
     await asyncio.wait([running])
-    assert foreign.sent == len(packets)
+    assert attacker.sent == len(packets)
     return packets
 
 
-async def test_it_sends_as_often_as_it_is_told() -> None:
-    """So many packets per second at random times, each after the end of the one before."""
+async def test_packet_rate() -> None:
+    """Packets come at the given average rate, each after the end of the previous one."""
     packets = await _sent(2.0, [], 1000.0)
     assert 1000 / (0.5 + 0.05) * 0.93 < len(packets) < 1000 / (0.5 + 0.05) * 1.07
 
 
-async def test_without_anything_heard_it_is_noise() -> None:
+async def test_noise_without_captured_packets() -> None:
     """Random bytes of all lengths."""
     packets = await _sent(5.0, [], 200.0)
     assert {len(packet) for packet in packets} == set(range(1, MAX_NOISE_BYTES + 1))
@@ -56,16 +56,16 @@ def _bits_off(packet: bytes, payload: bytes) -> int:
     return sum((a ^ b).bit_count() for a, b in zip(packet, payload, strict=True))
 
 
-async def test_what_it_has_heard_comes_back() -> None:
-    """A quarter each: noise, packets as they were, the beginnings of packets, packets with one bit turned over."""
-    packets = await _sent(5.0, HEARD, 400.0)
-    whole = [packet for packet in packets if packet in HEARD]
-    cut = [packet for packet in packets if len(packet) < 10 and any(p.startswith(packet) for p in HEARD)]
+async def test_captured_packets_are_replayed() -> None:
+    """A quarter each: noise, unchanged packets, truncated packets, packets with one flipped bit."""
+    packets = await _sent(5.0, CAPTURED, 400.0)
+    whole = [packet for packet in packets if packet in CAPTURED]
+    cut = [packet for packet in packets if len(packet) < 10 and any(p.startswith(packet) for p in CAPTURED)]
     flipped = [
-        packet for packet in packets if len(packet) == 10 and 1 in {_bits_off(packet, p) for p in HEARD}
+        packet for packet in packets if len(packet) == 10 and 1 in {_bits_off(packet, p) for p in CAPTURED}
     ]
     assert len(packets) > 1200
     for kind in (whole, cut, flipped):
         assert 0.2 < len(kind) / len(packets) < 0.3
-    assert set(whole) == set(HEARD)
-    assert whole.count(HEARD[-1]) > len(whole) / 2
+    assert set(whole) == set(CAPTURED)
+    assert whole.count(CAPTURED[-1]) > len(whole) / 2

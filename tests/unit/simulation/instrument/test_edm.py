@@ -1,4 +1,4 @@
-"""The noise of simulated measurements: each part acts in its direction, as large as stated."""
+"""Measurement noise: each component acts in its direction with its stated size."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ SILENT = {"range_sigma_m": 0.0, "range_sigma_ppm": 0.0, "angle_sigma_rad": 0.0, 
         ("pointing_sigma_m", 0.001, "up", 0.001),
     ],
 )
-def test_noise_is_as_large_as_stated(part: str, sigma: float, direction: str, expected_m: float) -> None:
-    """Angles and ppm grow with the distance; a steep sight has no more noise across than a level one."""
+def test_noise_matches_its_sigma(part: str, sigma: float, direction: str, expected_m: float) -> None:
+    """Angle and ppm noise grow with the distance; a steep line of sight has no more noise across than a level one."""
     points = np.tile(POINT, (20_000, 1))
     noise = InstrumentNoise(**SILENT | {part: sigma})
     error = polar_to_cartesian(*measure_polar(points, noise, np.random.default_rng(1))) - points
@@ -41,7 +41,7 @@ def test_noise_is_as_large_as_stated(part: str, sigma: float, direction: str, ex
     assert abs(seen_m.mean()) < 4 * expected_m / math.sqrt(len(seen_m))
 
 
-def test_without_noise_it_is_the_truth() -> None:
+def test_zero_noise_gives_the_truth() -> None:
     """Angles and distance of the point itself."""
     seen = measure_polar(POINT[None], InstrumentNoise(**SILENT), np.random.default_rng(1))
     np.testing.assert_allclose(polar_to_cartesian(*seen)[0], POINT, atol=1e-12)

@@ -1,4 +1,4 @@
-"""A simulated cable: pace, speeds, plug, and what goes wrong on it."""
+"""The simulated serial line: transfer times, bit rates, unplugging, faults."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from tsgt.simulation.instrument import LineFault
 from tsgt.simulation.instrument.serial_line import line_ns
 
 
-async def test_bytes_take_their_time() -> None:
-    """At 9600 bits per second question and answer take a millisecond a byte, besides the thinking."""
+async def test_transfer_times() -> None:
+    """At 9600 bits per second request and response take a millisecond per byte, plus the processing time."""
     bench = Bench()
     bench.instrument.baud = 9600
-    answer = await bench.ask(5004)
-    line_time_ns = line_ns(len("%R1Q,5004,1:\r\n") + len(answer.chunk.data), 9600)
+    response = await bench.ask(5004)
+    line_time_ns = line_ns(len("%R1Q,5004,1:\r\n") + len(response.chunk.data), 9600)
     assert line_time_ns == 38 * 10_000_000_000 // 9600
-    assert 20e6 <= answer.chunk.at_ns - line_time_ns <= 60e6
+    assert 20e6 <= response.chunk.at_ns - line_time_ns <= 60e6
 
 
-async def test_another_speed_gives_garbage() -> None:
-    """Nothing that comes is a line, though something comes; at the right speed and after a line feed it answers."""
+async def test_wrong_bit_rate_gives_garbage() -> None:
+    """At the right bit rate and after a line feed it responds again."""
     bench = Bench()
     port = await bench.line.open(9600)
     port.write(b"%R1Q,0,1:\r\n")
@@ -33,8 +33,8 @@ async def test_another_speed_gives_garbage() -> None:
     await bench.do((0,))
 
 
-async def test_a_pulled_cable() -> None:
-    """Whoever waits gets an error, and so does everything else, until it is opened anew with the cable in."""
+async def test_unplugged_cable() -> None:
+    """A waiting read and all other calls fail until the port is reopened with the cable plugged in."""
     bench = Bench()
     await bench.do((0,))
     port = bench.port
@@ -55,8 +55,8 @@ async def test_a_pulled_cable() -> None:
     await bench.do((0,))
 
 
-async def test_one_program_at_a_time() -> None:
-    """A second one is refused until the first has closed the port."""
+async def test_port_is_exclusive() -> None:
+    """A second open fails until the first is closed."""
     bench = Bench()
     port = await bench.line.open(115_200)
     with pytest.raises(InstrumentError, match="already open"):
@@ -65,8 +65,8 @@ async def test_one_program_at_a_time() -> None:
     await (await bench.line.open(115_200)).close()
 
 
-async def test_reading_may_be_cancelled() -> None:
-    """No byte is lost by it."""
+async def test_cancelled_read_loses_no_bytes() -> None:
+    """A later read returns them."""
     bench = Bench()
     await bench.send(b"%R1Q,0,1:\r\n")
     assert bench.port is not None
@@ -80,8 +80,8 @@ async def test_reading_may_be_cancelled() -> None:
     assert chunk.data == b"%R1P,0,1:0\r\n"
 
 
-async def test_what_was_not_read_can_be_thrown_away() -> None:
-    """drain() returns it once."""
+async def test_drain_discards_unread_bytes() -> None:
+    """drain() returns them once."""
     bench = Bench()
     await bench.send(b"%R1Q,0,1:\r\n")
     await asyncio.sleep(1.0)
@@ -104,8 +104,8 @@ WHOLE = b"%R1P,0,1:0\r\n"
         (LineFault.NONE, WHOLE),
     ],
 )
-async def test_faults_of_one_answer(fault: LineFault, expected: bytes) -> None:
-    """Each does what it says to the next answer, and only to that one."""
+async def test_fault_applies_to_one_response(fault: LineFault, expected: bytes) -> None:
+    """Later responses are intact."""
     bench = Bench()
     bench.line.faults.script.append(fault)
     await bench.send(b"%R1Q,0,1:\r\n")
@@ -116,8 +116,8 @@ async def test_faults_of_one_answer(fault: LineFault, expected: bytes) -> None:
 
 
 @pytest.mark.parametrize("fault", [LineFault.GARBAGE, LineFault.CORRUPTED])
-async def test_garbage_on_the_line(fault: LineFault) -> None:
-    """There are bytes that nobody sent."""
+async def test_fault_with_garbage(fault: LineFault) -> None:
+    """The response contains bytes that the instrument did not send."""
     bench = Bench()
     bench.line.faults.script.append(fault)
     await bench.send(b"%R1Q,0,1:\r\n")
@@ -126,8 +126,8 @@ async def test_garbage_on_the_line(fault: LineFault) -> None:
     assert bench.port.drain() not in (b"", WHOLE)
 
 
-async def test_deaf_and_mute() -> None:
-    """Nothing gets through in one direction: the instrument acts on what it hears all the same."""
+async def test_dropped_requests_and_responses() -> None:
+    """A request whose response is dropped is still executed."""
     bench = Bench()
     bench.line.faults.drop_responses = True
     await bench.send(b"%R1Q,1004,1:1\r\n")

@@ -1,4 +1,4 @@
-"""The virtual clock and clocks that drift against it: their time, and sleeps that reach their instant."""
+"""Virtual and drifting clocks: their time, and sleeps that end at the right instant."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ instants_ns = st.integers(0, 1000 * HOUR_NS)
 drifts_ppm = st.floats(-1000, 1000)
 
 
-async def test_an_hour_passes_at_once() -> None:
-    """Sleeping an hour moves both clocks by an hour and costs no real time."""
+async def test_sleep_takes_no_real_time() -> None:
+    """Sleeping an hour advances both clocks by an hour."""
     clock = VirtualClock(START_NS)
-    began_s = time.monotonic()
+    start_s = time.monotonic()
     await clock.sleep_until(3_600_000_000_000)
     assert clock.monotonic_ns() >= 3_600_000_000_000
     assert clock.realtime_ns() - clock.monotonic_ns() == START_NS
-    assert time.monotonic() - began_s < 1.0
+    assert time.monotonic() - start_s < 1.0
 
 
-async def test_a_sleep_is_never_too_short() -> None:
-    """The instant asked for has been reached on return, odd nanoseconds included, and not long ago."""
+async def test_sleep_is_never_too_short() -> None:
+    """The instant has been reached on return, odd nanoseconds included, and not long ago."""
     clock = VirtualClock(START_NS)
     for instant_ns in (1, 1_000_001, 1_234_567_891, 77_777_777_777):
         await clock.sleep_until(instant_ns)
         assert 0 <= clock.monotonic_ns() - instant_ns < 10_000
 
 
-async def test_the_past_is_reached_already() -> None:
+async def test_sleep_until_the_past_returns_at_once() -> None:
     """Waiting for an instant that has passed takes no time."""
     clock = VirtualClock(START_NS)
     await clock.sleep_until(5_000_000_000)
@@ -44,8 +44,8 @@ async def test_the_past_is_reached_already() -> None:
     assert clock.monotonic_ns() == now_ns
 
 
-async def test_a_drifting_clock_gains() -> None:
-    """After an hour a clock that runs fast by 10 ppm is 36 ms further ahead, on both of its faces."""
+async def test_drifting_clock_gains() -> None:
+    """After an hour a clock with 10 ppm is 36 ms further ahead, monotonic and Unix time alike."""
     true = VirtualClock(START_NS)
     clock = DriftingClock(true, offset_ns=-5_000_000_000, drift_ppm=10.0)
     await true.sleep_until(HOUR_NS)
@@ -53,8 +53,8 @@ async def test_a_drifting_clock_gains() -> None:
     assert clock.realtime_ns() - true.realtime_ns() == -5_000_000_000 + 36_000_000
 
 
-async def test_a_sleep_ends_by_the_drifting_clock() -> None:
-    """A sleep ends when the sleeper's own clock shows the instant, not before and not long after."""
+async def test_sleep_follows_the_drifting_clock() -> None:
+    """A sleep ends when the clock itself reaches the instant."""
     for drift_ppm in (-200.0, 0.0, 200.0):
         clock = DriftingClock(VirtualClock(START_NS), drift_ppm=drift_ppm)
         instant_ns = clock.monotonic_ns() + HOUR_NS
@@ -62,8 +62,8 @@ async def test_a_sleep_ends_by_the_drifting_clock() -> None:
         assert 0 <= clock.monotonic_ns() - instant_ns < 10_000
 
 
-async def test_a_step_moves_the_unix_clock_alone() -> None:
-    """Whoever sets the clock forward by a minute moves CLOCK_REALTIME and nothing else."""
+async def test_step_changes_the_unix_clock_only() -> None:
+    """CLOCK_MONOTONIC is unaffected."""
     clock = DriftingClock(VirtualClock(START_NS))
     before_ns = clock.monotonic_ns()
     clock.step(60_000_000_000)
@@ -71,16 +71,16 @@ async def test_a_step_moves_the_unix_clock_alone() -> None:
     assert clock.realtime_ns() == START_NS + before_ns + 60_000_000_000
 
 
-def test_a_drift_that_changes() -> None:
-    """Each stretch runs at its own rate from where the one before has ended."""
+def test_drift_changes() -> None:
+    """Each segment runs at its own rate from the end of the previous one."""
     warming = [(2 * HOUR_NS, -10.0), (HOUR_NS, 20.0)]
     clock = DriftingClock(VirtualClock(START_NS), drift_ppm=0.0, drift_changes=warming)
     gained_ms = [(clock.local_ns(n * HOUR_NS) - n * HOUR_NS) / 1e6 for n in range(4)]
     assert gained_ms == [0.0, 0.0, 72.0, 36.0]
 
 
-def test_a_drift_that_ramps() -> None:
-    """From 5 ppm on by 6 ppm a minute, for ten minutes up and for ten down: the gain is the area below the ramp."""
+def test_drift_ramp() -> None:
+    """From 5 ppm by 6 ppm a minute, ten minutes up and ten down: the gain is the area below the ramp."""
     minute_ns = 60_000_000_000
     clock = DriftingClock(VirtualClock(START_NS), drift_changes=drift_ramp(5.0, 6.0, 20 * minute_ns))
     gained_us = [(clock.local_ns(n * minute_ns) - n * minute_ns) / 1e3 for n in (1, 10, 20)]
@@ -88,8 +88,8 @@ def test_a_drift_that_ramps() -> None:
 
 
 @given(instants_ns, drifts_ppm, st.lists(st.tuples(instants_ns, drifts_ppm), max_size=3))
-def test_there_and_back(true_ns: int, drift_ppm: float, steps: list[tuple[int, float]]) -> None:
-    """What a clock shows at an instant leads back to the first instant at which it shows that."""
+def test_conversion_round_trip(true_ns: int, drift_ppm: float, steps: list[tuple[int, float]]) -> None:
+    """The reading at an instant converts back to the first instant with that reading."""
     clock = DriftingClock(VirtualClock(START_NS), drift_ppm=drift_ppm, drift_changes=steps)
     local_ns = clock.local_ns(true_ns)
     found_ns = clock.true_ns(local_ns)

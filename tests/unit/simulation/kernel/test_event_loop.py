@@ -1,4 +1,4 @@
-"""asyncio on virtual time: what takes no time, what takes its exact time, and what still is real."""
+"""asyncio on virtual time: what takes no time, what takes exact time, and what stays real."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ if TYPE_CHECKING:
 HOUR_NS = 3_600_000_000_000
 
 
-def test_an_hour_takes_no_time_and_is_exact() -> None:
-    """A sleep of an hour ends exactly an hour later and at once for the caller."""
+def test_sleep_is_exact_and_takes_no_real_time() -> None:
+    """A sleep of an hour ends exactly an hour later."""
     timeline = VirtualTimeline()
-    began_s = time.monotonic()
+    start_s = time.monotonic()
     run_virtual(lambda: asyncio.sleep(3600), timeline)
     assert timeline.now_ns() == HOUR_NS
-    assert time.monotonic() - began_s < 1.0
+    assert time.monotonic() - start_s < 1.0
 
 
-def test_a_million_odd_sleeps_do_not_drift() -> None:
+def test_many_odd_sleeps_do_not_drift() -> None:
     """Sleeps of an odd number of nanoseconds add up exactly, also a week after the start."""
     timeline = VirtualTimeline()
     week_ns = 7 * 24 * HOUR_NS
@@ -44,8 +44,8 @@ def test_a_million_odd_sleeps_do_not_drift() -> None:
     assert timeline.now_ns() == week_ns + 10_000 * 1_234_567
 
 
-def test_the_clock_reaches_every_nanosecond() -> None:
-    """VirtualClock.sleep_until ends exactly at the instant asked for."""
+def test_clock_reaches_every_nanosecond() -> None:
+    """VirtualClock.sleep_until ends exactly at the instant."""
 
     async def main() -> None:
         clock = VirtualClock(0)
@@ -56,8 +56,8 @@ def test_the_clock_reaches_every_nanosecond() -> None:
     run_virtual(main)
 
 
-def test_tasks_and_hardware_share_one_order() -> None:
-    """Timers of tasks and events of the timeline come by time, and by scheduling when the time is the same."""
+def test_tasks_and_timeline_events_share_one_order() -> None:
+    """Timers and timeline events are ordered by time, then by scheduling."""
     timeline = VirtualTimeline()
     seen: list[str] = []
 
@@ -74,8 +74,8 @@ def test_tasks_and_hardware_share_one_order() -> None:
     assert seen == ["task 1", "chip 1.5", "chip 2", "task 2", "task 3"]
 
 
-def test_ready_tasks_run_before_time_moves() -> None:
-    """As long as a task can run, no timer fires."""
+def test_ready_tasks_run_before_time_advances() -> None:
+    """No timer fires while a task can run."""
     seen: list[str] = []
 
     async def busy() -> None:
@@ -92,8 +92,8 @@ def test_ready_tasks_run_before_time_moves() -> None:
     assert seen == ["busy", "timer"]
 
 
-def test_a_timer_due_now_is_not_starved() -> None:
-    """A timer of no delay fires although another task is always ready to run."""
+def test_timer_due_now_is_not_starved() -> None:
+    """A timer of no delay fires although another task is always ready."""
 
     async def main() -> None:
         fired = asyncio.Event()
@@ -105,8 +105,8 @@ def test_a_timer_due_now_is_not_starved() -> None:
     run_virtual(main)
 
 
-def test_a_hardware_event_wakes_a_task() -> None:
-    """A callback of the timeline can set what a task waits for, without any timer of the loop."""
+def test_timeline_event_wakes_a_task() -> None:
+    """A timeline callback can set what a task waits for, without any timer of the loop."""
     timeline = VirtualTimeline()
 
     async def main() -> float:
@@ -119,7 +119,7 @@ def test_a_hardware_event_wakes_a_task() -> None:
 
 
 def test_blocking_code_may_advance_the_time() -> None:
-    """A blocking call that advances the timeline lets timers fall due, which run in order after it."""
+    """Timers that become due during a blocking call run in order after it."""
     timeline = VirtualTimeline()
     seen: list[tuple[str, int]] = []
 
@@ -140,7 +140,7 @@ def test_blocking_code_may_advance_the_time() -> None:
 
 
 def test_timeouts_expire_on_time() -> None:
-    """asyncio.timeout cuts a wait at its virtual limit."""
+    """asyncio.timeout ends a wait at its virtual limit."""
 
     async def main() -> float:
         with pytest.raises(TimeoutError):
@@ -151,8 +151,8 @@ def test_timeouts_expire_on_time() -> None:
     assert run_virtual(main) == 10.0
 
 
-def test_a_cancelled_timer_does_not_move_time() -> None:
-    """A time-out that was not needed leaves nothing that time would jump to."""
+def test_cancelled_timer_does_not_advance_time() -> None:
+    """An unneeded timeout leaves nothing to jump to."""
     timeline = VirtualTimeline()
 
     async def main() -> None:
@@ -164,8 +164,8 @@ def test_a_cancelled_timer_does_not_move_time() -> None:
     assert timeline.now_ns() == 1_000_000_000
 
 
-def test_equal_timers_are_cancelled_one_by_one() -> None:
-    """Two timers alike in time, callback and arguments are two timers."""
+def test_equal_timers_are_cancelled_individually() -> None:
+    """Two timers with equal time, callback and arguments are two timers."""
     seen: list[int] = []
 
     async def main() -> None:
@@ -179,8 +179,8 @@ def test_equal_timers_are_cancelled_one_by_one() -> None:
     assert seen == [1]
 
 
-def test_a_timer_cancelled_in_the_instant_it_is_due_does_not_run() -> None:
-    """Of two timers due together, the first may still cancel the second."""
+def test_timer_cancelled_when_due_does_not_run() -> None:
+    """Of two timers due together, the first may cancel the second."""
     seen: list[str] = []
 
     async def main() -> None:
@@ -197,7 +197,7 @@ def test_a_timer_cancelled_in_the_instant_it_is_due_does_not_run() -> None:
     assert not seen
 
 
-def test_a_cancelled_task_ends_at_once() -> None:
+def test_cancelled_task_ends_at_once() -> None:
     """Cancelling a sleeping task takes no virtual time."""
 
     async def main() -> float:
@@ -212,7 +212,7 @@ def test_a_cancelled_task_ends_at_once() -> None:
 
 
 def test_unix_sockets_work_between_tasks(tmp_path: Path) -> None:
-    """A thousand exchanges over a real UNIX socket take no virtual time while timers are pending."""
+    """A thousand exchanges over a UNIX socket take no virtual time while timers are pending."""
 
     async def echo(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         while line := await reader.readline():
@@ -234,8 +234,8 @@ def test_unix_sockets_work_between_tasks(tmp_path: Path) -> None:
     assert run_virtual(main) == 0.0
 
 
-def test_time_stands_still_for_threads() -> None:
-    """Work in a thread takes no virtual time, however long it takes, so that no time-out of its caller expires."""
+def test_time_is_frozen_during_executor_work() -> None:
+    """Work in a thread takes no virtual time, so that no timeout of its caller expires."""
 
     async def main() -> float:
         async with asyncio.timeout(0.001):
@@ -245,8 +245,8 @@ def test_time_stands_still_for_threads() -> None:
     assert run_virtual(main) == 0.0
 
 
-def test_alone_work_is_done_at_once() -> None:
-    """A loop that is alone does the executor's work in its own, and hands over result and error alike."""
+def test_isolated_loop_runs_executor_work_inline() -> None:
+    """Results and errors are passed on alike."""
 
     async def main() -> tuple[bool, float]:
         own = await asyncio.to_thread(threading.current_thread) is threading.current_thread()
@@ -257,8 +257,8 @@ def test_alone_work_is_done_at_once() -> None:
     assert run_virtual(main, isolated=True) == (True, 0.0)
 
 
-def test_alone_a_cancelled_caller_hears_nothing() -> None:
-    """The executor's work is done, but whoever was cancelled while it waited for it ends as cancelled."""
+def test_cancelled_caller_of_inline_work_stays_cancelled() -> None:
+    """The work is done, but its result is dropped."""
     done: list[str] = []
 
     async def main() -> None:
@@ -272,8 +272,8 @@ def test_alone_a_cancelled_caller_hears_nothing() -> None:
     assert done == ["work"]
 
 
-def test_a_stranger_is_let_in_while_time_passes(tmp_path: Path) -> None:
-    """A listening socket, which not every round asks, is still answered while timers keep the loop from waiting."""
+def test_isolated_loop_accepts_connections(tmp_path: Path) -> None:
+    """A listening socket is served although it is polled rarely."""
     answers: list[bytes] = []
 
     def ask() -> None:
@@ -287,17 +287,17 @@ def test_a_stranger_is_let_in_while_time_passes(tmp_path: Path) -> None:
 
     async def main() -> None:
         async with await asyncio.start_unix_server(greet, tmp_path / "socket"):
-            interferer_radio = threading.Thread(target=ask)
-            interferer_radio.start()
-            while interferer_radio.is_alive():  # noqa: ASYNC110 (it is the passing of time that must not keep him out)
+            client_thread = threading.Thread(target=ask)
+            client_thread.start()
+            while client_thread.is_alive():  # noqa: ASYNC110 (it is the passing of time that must not keep him out)
                 await asyncio.sleep(1)
 
     run_virtual(main, isolated=True)
     assert answers == [b"hello"]
 
 
-def test_nothing_scheduled_waits_for_a_socket_for_real() -> None:
-    """With no timer anywhere the loop sleeps until the socket has something to read, without spinning."""
+def test_loop_without_timers_blocks_on_sockets() -> None:
+    """It waits in real time without spinning."""
 
     async def main() -> float:
         receiving, sending = os.pipe()
@@ -318,7 +318,7 @@ def test_nothing_scheduled_waits_for_a_socket_for_real() -> None:
 
 
 def test_signals_are_handled() -> None:
-    """add_signal_handler works while the loop waits for real."""
+    """add_signal_handler works while the loop waits in real time."""
 
     async def main() -> bool:
         asked = asyncio.Event()
@@ -331,16 +331,16 @@ def test_signals_are_handled() -> None:
     assert run_virtual(main)
 
 
-def test_an_error_in_the_hardware_ends_the_run() -> None:
-    """An exception in an event of the timeline is not swallowed."""
+def test_exception_in_a_timeline_event_is_raised() -> None:
+    """It is not swallowed."""
     timeline = VirtualTimeline()
     timeline.call_at(5, lambda: 1 // 0)
     with pytest.raises(ZeroDivisionError):
         run_virtual(lambda: asyncio.sleep(1), timeline)
 
 
-def test_timers_of_a_closed_loop_are_forgotten() -> None:
-    """A timeline outlives its loop: what the loop had scheduled passes without harm."""
+def test_timers_of_a_closed_loop_have_no_effect() -> None:
+    """A timeline outlives its loop; the loop's timers pass without a call."""
     timeline = VirtualTimeline()
     loop = VirtualEventLoop(timeline)
     loop.call_later(1, pytest.fail, "called after closing")

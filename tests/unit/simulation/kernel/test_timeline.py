@@ -1,4 +1,4 @@
-"""Virtual time: order, jumps, cancellation; and the same events in real time."""
+"""Timelines: order, jumps and cancellation, in virtual and in real time."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from functools import partial
 from tsgt.simulation.kernel import LoopTimeline, VirtualTimeline
 
 
-def test_time_stands_still_by_itself() -> None:
-    """Scheduling moves nothing; only advancing does."""
+def test_scheduling_does_not_advance_time() -> None:
+    """Only advancing does."""
     timeline = VirtualTimeline()
     timeline.call_at(5, lambda: None)
     assert timeline.now_ns() == 0
     assert timeline.next_ns() == 5
 
 
-def test_events_come_in_order_of_time_then_of_scheduling() -> None:
-    """The earlier event comes first, and of two at one instant the one scheduled first."""
+def test_events_are_ordered_by_time_then_by_scheduling() -> None:
+    """Of two events at one instant, the first scheduled is called first."""
     timeline = VirtualTimeline()
     seen: list[str] = []
     for at_ns, name in ((20, "c"), (10, "a"), (20, "d"), (10, "b")):
@@ -27,8 +27,8 @@ def test_events_come_in_order_of_time_then_of_scheduling() -> None:
     assert seen == ["a", "b", "c", "d"]
 
 
-def test_an_event_sees_its_own_time() -> None:
-    """A callback is called at its instant, and afterwards time is where it was told to be."""
+def test_callback_runs_at_its_time() -> None:
+    """Afterwards time is at the end of the advance."""
     timeline = VirtualTimeline()
     seen: list[int] = []
     for at_ns in (3, 7):
@@ -38,8 +38,8 @@ def test_an_event_sees_its_own_time() -> None:
     assert timeline.now_ns() == 10
 
 
-def test_what_is_not_due_stays() -> None:
-    """An event after the end of the advance waits for the next one."""
+def test_event_after_the_advance_waits() -> None:
+    """It is called by a later advance."""
     timeline = VirtualTimeline()
     seen: list[int] = []
     timeline.call_at(11, lambda: seen.append(timeline.now_ns()))
@@ -49,8 +49,8 @@ def test_what_is_not_due_stays() -> None:
     assert seen == [11]
 
 
-def test_an_event_schedules_another_within_the_same_advance() -> None:
-    """A chain of events runs through in one advance, each at its own time."""
+def test_event_may_schedule_another_within_the_same_advance() -> None:
+    """A chain of events is called in one advance, each at its own time."""
     timeline = VirtualTimeline()
     seen: list[int] = []
 
@@ -63,8 +63,8 @@ def test_an_event_schedules_another_within_the_same_advance() -> None:
     assert seen == [10, 20, 30, 40]
 
 
-def test_the_past_counts_as_now() -> None:
-    """An event for an instant that has passed comes with the next advance, and time does not run back."""
+def test_event_in_the_past_is_due_now() -> None:
+    """It is called by the next advance, and time does not run backwards."""
     timeline = VirtualTimeline()
     timeline.advance_to(100)
     seen: list[int] = []
@@ -75,8 +75,8 @@ def test_the_past_counts_as_now() -> None:
     assert timeline.now_ns() == 100
 
 
-def test_a_cancelled_event_does_not_come() -> None:
-    """Cancelling works before the event, and afterwards does nothing."""
+def test_cancelled_event_is_not_called() -> None:
+    """Cancelling after the call has no effect."""
     timeline = VirtualTimeline()
     seen: list[str] = []
     cancelled = timeline.call_at(5, partial(seen.append, "cancelled"))
@@ -90,8 +90,8 @@ def test_a_cancelled_event_does_not_come() -> None:
     assert timeline.next_ns() is None
 
 
-def test_a_callback_may_advance_the_time_itself() -> None:
-    """What a blocking callback jumps over is called on the way, and the outer advance goes on from there."""
+def test_callback_may_advance_the_time() -> None:
+    """Events skipped by a blocking callback are called, and the outer advance continues from there."""
     timeline = VirtualTimeline()
     seen: list[tuple[str, int]] = []
 
@@ -106,8 +106,8 @@ def test_a_callback_may_advance_the_time_itself() -> None:
     assert timeline.now_ns() == 110
 
 
-def test_cancelled_events_do_not_pile_up() -> None:
-    """A million time-outs that never expire leave the heap small and the rest in order."""
+def test_cancelled_events_are_purged() -> None:
+    """Many unexpired timeouts leave the heap small and the order intact."""
     timeline = VirtualTimeline()
     seen: list[int] = []
     timeline.call_at(7, lambda: seen.append(7))
@@ -119,16 +119,16 @@ def test_cancelled_events_do_not_pile_up() -> None:
     assert seen == [5, 7]
 
 
-def test_real_time_on_a_loop() -> None:
-    """The same calls work on CLOCK_MONOTONIC: not before their time, and cancelled ones never."""
+def test_loop_timeline_in_real_time() -> None:
+    """Callbacks are never early, and cancelled ones are not called."""
 
     async def main() -> None:
         timeline = LoopTimeline(asyncio.get_running_loop())
-        began_ns = timeline.now_ns()
-        assert abs(began_ns - time.monotonic_ns()) < 1_000_000_000
+        start_ns = timeline.now_ns()
+        assert abs(start_ns - time.monotonic_ns()) < 1_000_000_000
         reached: asyncio.Future[int] = asyncio.get_running_loop().create_future()
-        timeline.call_at(began_ns, reached.cancel).cancel()
-        timeline.call_at(began_ns + 5_000_000, lambda: reached.set_result(timeline.now_ns()))
-        assert await reached >= began_ns + 5_000_000 - 1_000
+        timeline.call_at(start_ns, reached.cancel).cancel()
+        timeline.call_at(start_ns + 5_000_000, lambda: reached.set_result(timeline.now_ns()))
+        assert await reached >= start_ns + 5_000_000 - 1_000
 
     asyncio.run(main())

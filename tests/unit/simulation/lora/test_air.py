@@ -21,38 +21,38 @@ from tsgt.simulation.lora.link import FixedLoss
 IMPLICIT = modulation(explicit_header=False)
 
 
-def receive(sent: dict[str, Any], heard: dict[str, Any]) -> Reception:
-    """Send one frame and return what arrives."""
+def receive(sent: dict[str, Any], receiver: dict[str, Any]) -> Reception:
+    """Send one frame and return its reception."""
     scene = Scene()
-    scene.rx.listen(listening(**heard))
+    scene.rx.listen(listening(**receiver))
     scene.send(frame(**sent))
     scene.finish()
-    (reception,) = scene.antenna.receptions
+    (reception,) = scene.listener.receptions
     return reception
 
 
-def test_receiver_is_told_in_time() -> None:
-    """The lock comes with the fifth symbol, the header 8 symbols after the preamble, the end after the airtime."""
+def test_reception_events_have_exact_times() -> None:
+    """Lock at the fifth symbol, header 8 symbols after the preamble, end after the airtime."""
     scene = Scene()
     scene.rx.listen(listening())
     sent = scene.send(frame(10.0))
     scene.finish()
     airtime_ns = 1000 * airtime_us(34, spreading_factor=9, bandwidth_hz=250_000, coding_rate=6)
-    assert scene.antenna.events == [
+    assert scene.listener.events == [
         (sent.start_ns + 5 * SYMBOL_NS, "preamble"),
         (sent.start_ns + round(20.25 * SYMBOL_NS), "header"),
         (sent.start_ns + airtime_ns, "received"),
     ]
 
 
-def test_reception_says_what_the_link_budget_says() -> None:
-    """Payload, header, power, SNR and the error of the carrier are those of the frame at the receiver."""
+def test_reception_matches_the_link_budget() -> None:
+    """Payload, header, power, SNR and frequency error are those of the frame at the receiver."""
     scene = Scene(LinkModel(path_loss=FixedLoss(default_db=100.0)))
     scene.rx.listen(listening(modulation=modulation(frequency_hz=905e6 - 10_000)))
     scene.sender("tx", crystal_ppm=10.0)
     sent = scene.send(frame(crc=False))
     scene.finish()
-    (reception,) = scene.antenna.receptions
+    (reception,) = scene.listener.receptions
     assert reception.payload == sent.payload
     assert reception.crc_ok
     assert reception.header == Header(34, 6, crc=False)
@@ -61,8 +61,8 @@ def test_reception_says_what_the_link_budget_says() -> None:
     assert reception.frequency_error_hz == pytest.approx(10_000 + 9_050)
 
 
-def test_crystals_far_apart_do_not_meet() -> None:
-    """Crystals that put the carriers more than a quarter of the bandwidth apart keep radios from meeting."""
+def test_large_crystal_offset_prevents_reception() -> None:
+    """Carriers more than a quarter of the bandwidth apart are not received."""
     scene = Scene()
     scene.rx.listen(listening())
     scene.sender("tx", crystal_ppm=70.0)
@@ -71,7 +71,7 @@ def test_crystals_far_apart_do_not_meet() -> None:
 
 
 def test_back_to_back_frames_are_all_received() -> None:
-    """A receiver that stays in reception gets one frame after the other."""
+    """A receiver in continuous mode receives consecutive frames."""
     scene = Scene()
     scene.rx.listen(listening())
     sent = scene.send(frame())
@@ -80,19 +80,19 @@ def test_back_to_back_frames_are_all_received() -> None:
     assert scene.finish() == ["received"] * 6
 
 
-def test_becoming_deaf_ends_a_reception_silently() -> None:
-    """A receiver that leaves reception is told nothing of the frame that it was locked to."""
+def test_stopping_the_receiver_ends_a_reception_without_event() -> None:
+    """The frame that it was locked to is not reported."""
     scene = Scene()
     scene.rx.listen(listening())
     scene.send(frame())
     scene.at(30.0)
     scene.rx.listen(None)
     scene.finish()
-    assert [what for _, what in scene.antenna.events] == ["preamble", "header"]
+    assert [what for _, what in scene.listener.events] == ["preamble", "header"]
 
 
-def test_listening_anew_begins_anew() -> None:
-    """A new reception in the middle of a frame loses it and finds the next one."""
+def test_restarting_the_receiver_loses_the_current_frame() -> None:
+    """The next frame is received."""
     scene = Scene()
     scene.rx.listen(listening())
     sent = scene.send(frame(payload=b"first"))
@@ -100,12 +100,12 @@ def test_listening_anew_begins_anew() -> None:
     scene.rx.listen(listening(15.0))
     scene.send(frame(start_ns=sent.end_ns, payload=b"second"))
     scene.finish()
-    assert [what for _, what in scene.antenna.events] == ["preamble", "preamble", "header", "received"]
-    assert scene.antenna.receptions[0].payload == b"second"
+    assert [what for _, what in scene.listener.events] == ["preamble", "preamble", "header", "received"]
+    assert scene.listener.receptions[0].payload == b"second"
 
 
-def test_antenna_may_stop_listening_when_told() -> None:
-    """A chip in single reception leaves it from within what the air tells it."""
+def test_listener_may_stop_the_receiver_in_a_callback() -> None:
+    """A chip in single reception does so."""
 
     class Single(RecordingListener):
         def frame_ended(self, at_ns: int, reception: Reception | None) -> None:
@@ -113,70 +113,72 @@ def test_antenna_may_stop_listening_when_told() -> None:
             port.listen(None)
 
     scene = Scene()
-    antenna = Single()
-    port = scene.air.join(antenna, "single")
+    listener = Single()
+    port = scene.air.join(listener, "single")
     port.listen(listening())
     sent = scene.send(frame())
     scene.send(frame(start_ns=sent.end_ns))
     scene.finish()
-    assert antenna.outcomes == ["received"]
+    assert listener.outcomes == ["received"]
 
 
 def test_locked_receiver_ignores_later_frames() -> None:
-    """While it follows a frame on one channel, a receiver misses what begins there, and is free afterwards."""
+    """A locked receiver misses frames that start on the channel, and is free afterwards."""
     scene = Scene(LinkModel(path_loss=FixedLoss(pairs_db={("far", "rx"): 100.0})))
     scene.rx.listen(listening())
     scene.send(frame(payload=b"near" * 8))
     scene.send(frame(30.0, payload=b"far" * 8), "far")
     scene.send(frame(120.0, payload=b"later"), "far")
     scene.finish()
-    assert [reception.payload for reception in scene.antenna.receptions] == [b"near" * 8, b"later"]
+    assert [reception.payload for reception in scene.listener.receptions] == [b"near" * 8, b"later"]
 
 
-def test_weaker_frame_beside_the_channel_does_not_take_over() -> None:
-    """Two senders at opposite ends of what a receiver tolerates bear each other; the one that was first is kept."""
+def test_weaker_frame_with_frequency_offset_does_not_take_over() -> None:
+    """Two senders at opposite ends of the frequency tolerance; the first one is received."""
     scene = Scene()
     scene.rx.listen(listening())
     scene.send(frame(modulation=modulation(frequency_hz=905.05e6), payload=b"first"), "one")
     scene.send(frame(6.0, modulation=modulation(frequency_hz=904.95e6), power_dbm=10.0), "other")
     scene.finish()
-    assert [reception.payload for reception in scene.antenna.receptions] == [b"first"]
+    assert [reception.payload for reception in scene.listener.receptions] == [b"first"]
 
 
-def test_search_goes_on_after_a_header_that_is_lost() -> None:
-    """A receiver that lost a header finds the preamble of a frame that began before that, if enough is left."""
+def test_search_resumes_after_a_lost_header() -> None:
+    """The preamble of a frame that started before is still detected, if enough of it is left."""
     scene = Scene()
     scene.rx.listen(listening(max_payload_bytes=20))
     scene.send(frame(payload=bytes(34), power_dbm=0.0), "long")
     sent = scene.send(frame(17.5, payload=bytes(10), power_dbm=14.0), "short")
     assert scene.finish() == ["lost", "received"]
-    assert scene.antenna.events[0] == (5 * SYMBOL_NS, "preamble")
-    assert scene.antenna.events[-1][0] == sent.end_ns
+    assert scene.listener.events[0] == (5 * SYMBOL_NS, "preamble")
+    assert scene.listener.events[-1][0] == sent.end_ns
 
 
-def test_longer_payload_than_allowed_is_dropped_at_the_header() -> None:
-    """A header that announces more than the receiver takes leads to nothing."""
+def test_payload_above_the_limit_is_dropped_at_the_header() -> None:
+    """A header that announces more than the receiver accepts ends the reception."""
     scene = Scene()
     scene.rx.listen(listening(max_payload_bytes=33))
     sent = scene.send(frame())
     scene.finish()
-    assert scene.antenna.events[1:] == [(sent.header_end_ns, "lost")]
+    assert scene.listener.events[1:] == [(sent.header_end_ns, "lost")]
 
 
 @pytest.mark.parametrize(
-    ("sent", "heard", "outcomes"),
+    ("sent", "receiver", "outcomes"),
     [(8, 6, ["received"]), (12, 8, ["received"]), (13, 8, []), (8, 20, ["received"])],
 )
-def test_preamble_may_be_a_little_longer_than_set(sent: int, heard: int, outcomes: list[str]) -> None:
-    """A preamble of up to four symbols more than the receiver's setting is recognised, a shorter one always."""
+def test_preamble_may_exceed_the_setting_by_four_symbols(
+    sent: int, receiver: int, outcomes: list[str]
+) -> None:
+    """A preamble of up to four symbols more than the setting is recognised, a shorter one always."""
     scene = Scene()
-    scene.rx.listen(listening(preamble_symbols=heard))
+    scene.rx.listen(listening(preamble_symbols=receiver))
     scene.send(frame(preamble_symbols=sent))
     assert scene.finish() == outcomes
 
 
-def test_late_receiver_hears_the_rest_of_a_long_preamble() -> None:
-    """What counts is how much of the preamble a receiver hears."""
+def test_late_receiver_detects_the_rest_of_a_long_preamble() -> None:
+    """The part of the preamble that is received counts."""
     scene = Scene()
     scene.send(frame(preamble_symbols=30))
     scene.at(20.0)
@@ -184,24 +186,24 @@ def test_late_receiver_hears_the_rest_of_a_long_preamble() -> None:
     assert scene.finish() == ["received"]
 
 
-def test_sender_decides_where_there_is_a_header() -> None:
-    """Coding rate, length and checksum of the receiver do not matter with an explicit header."""
+def test_explicit_header_overrides_the_receiver_settings() -> None:
+    """The receiver's coding rate, length and checksum setting do not matter."""
     reception = receive({"crc": False, "coding_rate": 8}, {"crc": True, "coding_rate": 5, "payload_bytes": 1})
     assert reception.header == Header(34, 8, crc=False)
     assert len(reception.payload) == 34
 
 
-def test_implicit_header_needs_no_header_event() -> None:
-    """Without a header nothing is reported between lock and end."""
+def test_implicit_header_gives_no_header_event() -> None:
+    """Nothing is reported between lock and end."""
     scene = Scene()
     scene.rx.listen(listening(modulation=IMPLICIT))
     scene.send(frame(modulation=IMPLICIT))
     scene.finish()
-    assert [what for _, what in scene.antenna.events] == ["preamble", "received"]
+    assert [what for _, what in scene.listener.events] == ["preamble", "received"]
 
 
 @pytest.mark.parametrize(
-    ("sent", "heard", "crc_ok", "whole"),
+    ("sent", "receiver", "crc_ok", "whole"),
     [
         ({"crc": False}, {"crc": True}, False, True),
         ({"crc": True}, {"crc": False}, True, True),
@@ -212,30 +214,30 @@ def test_implicit_header_needs_no_header_event() -> None:
     ],
     ids=str,
 )
-def test_implicit_header_takes_the_receivers_word(
+def test_implicit_header_uses_the_receiver_settings(
     sent: dict[str, Any],
-    heard: dict[str, Any],
+    receiver: dict[str, Any],
     *,
     crc_ok: bool,
     whole: bool,
 ) -> None:
-    """Without a header, the receiver's length, coding rate and checksum must be the sender's."""
+    """The receiver's length, coding rate and checksum must match the sender's."""
     settings = {"modulation": IMPLICIT}
-    reception = receive(settings | sent, settings | heard)
+    reception = receive(settings | sent, settings | receiver)
     assert reception.crc_ok == crc_ok
-    assert len(reception.payload) == heard.get("payload_bytes", 34)
+    assert len(reception.payload) == receiver.get("payload_bytes", 34)
     assert (frame().payload.startswith(reception.payload)) == whole
 
 
 def test_damaged_payload_differs() -> None:
-    """A payload whose checksum is wrong has its length and wrong bytes."""
+    """A payload with a wrong checksum has its length and wrong bytes."""
     scene = Scene(link_with_snr(-15.5))
     scene.rx.listen(listening())
     sent = scene.send(frame())
     for _ in range(50):
         sent = scene.send(frame(start_ns=sent.end_ns))
     scene.finish()
-    damaged = [reception for reception in scene.antenna.receptions if not reception.crc_ok]
+    damaged = [reception for reception in scene.listener.receptions if not reception.crc_ok]
     assert damaged
     assert all(len(reception.payload) == 34 for reception in damaged)
     assert all(reception.payload != sent.payload for reception in damaged)
@@ -245,21 +247,21 @@ def test_damaged_payload_differs() -> None:
     ("cut_symbols", "events"),
     [(3.0, []), (10.0, ["preamble", "lost"]), (30.0, ["preamble", "header", "damaged"])],
 )
-def test_frame_that_is_cut_short(cut_symbols: float, events: list[str]) -> None:
-    """A sender that stops leaves a receiver that waits for header or payload in vain, and reports that in time."""
+def test_cut_frame_is_reported_at_its_expected_end(cut_symbols: float, events: list[str]) -> None:
+    """A receiver waits for the header or payload of a frame that was cut, and then reports it."""
     scene = Scene()
     scene.rx.listen(listening())
     sent = scene.send(frame())
     scene.at(cut_symbols)
     scene.sender("tx").stop_transmitting(round(cut_symbols * SYMBOL_NS))
     scene.finish()
-    assert [what for _, what in scene.antenna.events] == events
+    assert [what for _, what in scene.listener.events] == events
     if events[-1:] == ["damaged"]:
-        assert scene.antenna.events[-1][0] == sent.end_ns
+        assert scene.listener.events[-1][0] == sent.end_ns
 
 
-def test_cut_frame_disturbs_no_longer() -> None:
-    """What is cut off the air does not interfere."""
+def test_cut_frame_does_not_interfere() -> None:
+    """After it was cut."""
     scene = Scene()
     scene.rx.listen(listening())
     scene.send(frame(-40.0), "other")
@@ -270,18 +272,18 @@ def test_cut_frame_disturbs_no_longer() -> None:
     assert scene.finish() == ["received"]
 
 
-def test_preamble_that_is_drowned_at_first_is_found_later() -> None:
-    """A receiver finds a long preamble once a frame that drowned its beginning has ended."""
+def test_preamble_is_detected_after_interference_ends() -> None:
+    """A long preamble is detected once the interfering frame has ended."""
     scene = Scene()
     scene.send(frame(-60.0), "other")
     scene.at(-10.0)
     scene.rx.listen(listening(-10.0, preamble_symbols=20))
     scene.send(frame(preamble_symbols=20))
     assert scene.finish() == ["received"]
-    assert 8.25 * SYMBOL_NS < scene.antenna.events[0][0] <= 20 * SYMBOL_NS
+    assert 8.25 * SYMBOL_NS < scene.listener.events[0][0] <= 20 * SYMBOL_NS
 
 
-def test_new_frame_ends_the_one_before() -> None:
+def test_new_frame_cuts_the_previous_one() -> None:
     """A radio has one transmitter."""
     scene = Scene()
     scene.rx.listen(listening())
@@ -292,7 +294,7 @@ def test_new_frame_ends_the_one_before() -> None:
 
 
 def test_leaving_cuts_the_frame_and_frees_the_name() -> None:
-    """A radio that leaves takes its frame with it; the name can be used again."""
+    """The name can be used again."""
     scene = Scene()
     scene.rx.listen(listening())
     scene.send(frame())
@@ -304,13 +306,13 @@ def test_leaving_cuts_the_frame_and_frees_the_name() -> None:
 
 
 def test_names_are_unique() -> None:
-    """Two radios of one name would be one in the link model, which is refused."""
+    """A second radio with the same name is rejected."""
     with pytest.raises(ValueError, match="radio 'rx' has joined already"):
         Scene().air.join(RecordingListener(), "rx")
 
 
-def test_attenuation_during_a_run() -> None:
-    """A radio that something shadows from now on is not heard any more, until it is gone."""
+def test_attenuation_during_a_mission() -> None:
+    """A radio behind an attenuation is not received until it is removed."""
     scene = Scene()
     scene.rx.listen(listening())
     scene.send(frame())
@@ -319,14 +321,14 @@ def test_attenuation_during_a_run() -> None:
     scene.link.set_attenuation("tx", "rx", 0.0)
     scene.send(frame(200.0))
     scene.finish()
-    assert [at_ns for at_ns, what in scene.antenna.events if what == "received"] == [
+    assert [at_ns for at_ns, what in scene.listener.events if what == "received"] == [
         frame().end_ns,
         frame(200.0).end_ns,
     ]
 
 
 def test_rssi_adds_noise_and_signals() -> None:
-    """RSSI is the noise floor on a quiet channel, and with it the sum of what is sent in its band."""
+    """RSSI is the noise floor on a quiet channel, otherwise the sum with the signals in the band."""
     scene = Scene(LinkModel(path_loss=FixedLoss(default_db=80.0)))
     assert scene.rx.rssi_dbm(0) == pytest.approx(-116.5, abs=0.05)
     scene.rx.listen(listening())
@@ -343,8 +345,8 @@ def test_rssi_adds_noise_and_signals() -> None:
 @pytest.mark.parametrize(
     ("at_symbols", "present"), [(0.5, False), (1.0, True), (12.25, True), (13.0, False), (60.0, False)]
 )
-def test_activity_is_found_in_preambles_only(at_symbols: float, *, present: bool) -> None:
-    """Activity detection finds a preamble that filled the last symbol, and no payload."""
+def test_activity_detection_finds_preambles_only(at_symbols: float, *, present: bool) -> None:
+    """It finds a preamble that filled the last symbol, and no payload."""
     scene = Scene()
     scene.send(frame())
     at_ns = round(at_symbols * SYMBOL_NS)
@@ -354,16 +356,16 @@ def test_activity_is_found_in_preambles_only(at_symbols: float, *, present: bool
     assert not scene.rx.preamble_present(modulation(inverted_iq=True), at_ns)
 
 
-def test_activity_too_weak_is_not_found() -> None:
-    """A preamble below the threshold of detection is no activity."""
+def test_weak_preamble_is_no_activity() -> None:
+    """A preamble below the detection threshold is not found."""
     scene = Scene(link_with_snr(-25.0))
     scene.send(frame())
     scene.at(5.0)
     assert not scene.rx.preamble_present(modulation(), 5 * SYMBOL_NS)
 
 
-def test_old_frames_are_forgotten() -> None:
-    """The air remembers a frame as long as one that overlaps it is undecided, and no longer."""
+def test_decided_frames_are_dropped() -> None:
+    """A frame is kept only while a frame that overlaps it is undecided."""
     scene = Scene()
     scene.rx.listen(listening())
     for number in range(1000):

@@ -34,16 +34,16 @@ def path(tmp_path: Path) -> Path:
 
 
 class Radio:
-    """A client with an antenna that writes down what it is told."""
+    """A client with a listener that records its events."""
 
     def __init__(self, client: AirClient) -> None:
         self.client = client
-        self.antenna = RecordingListener()
-        self.port = client.join(self.antenna)
+        self.listener = RecordingListener()
+        self.port = client.join(self.listener)
 
 
 class Field:
-    """A server, clients that appear when they are named, all on virtual time."""
+    """A server with clients that join on request, on virtual time."""
 
     def __init__(self, path: Path, link: LinkModel | None = None) -> None:
         self.path = path
@@ -60,57 +60,57 @@ class Field:
         await self._stack.aclose()
 
     async def radio(self, name: str, *, crystal_ppm: float = 0.0) -> Radio:
-        """Join the air."""
+        """Join the channel."""
         client = AirClient(self.path, name, self.timeline, crystal_ppm=crystal_ppm)
         return Radio(await self._stack.enter_async_context(client))
 
     async def at(self, symbols: float) -> None:
-        """Wait until so many of the paper's symbols after the start."""
+        """Wait until this many symbols after the start."""
         await asyncio.sleep(symbols * SYMBOL_NS / 1e9 - asyncio.get_running_loop().time())
 
 
 async def settle() -> None:
-    """Let the event loop do everything that it can do without waiting."""
+    """Let the event loop run everything that is ready."""
     for _ in range(20):
         await asyncio.sleep(0)
 
 
 async def test_frames_pass_between_processes_as_within_one(path: Path) -> None:
-    """A receiver at another connection is told the same, at the same times, as on an air of its own."""
+    """A receiver at another connection gets the same events at the same times as within one process."""
     async with Field(path, LinkModel(path_loss=FixedLoss(pairs_db={("tx", "rx"): 100.0}))) as field:
         tx, rx = await field.radio("tx", crystal_ppm=5.0), await field.radio("rx")
         rx.port.listen(listening())
         tx.port.transmit(frame())
         await field.at(100.0)
-    assert rx.antenna.events == [
+    assert rx.listener.events == [
         (5 * SYMBOL_NS, "preamble"),
         (frame().header_end_ns, "header"),
         (frame().end_ns, "received"),
     ]
-    (reception,) = rx.antenna.receptions
+    (reception,) = rx.listener.receptions
     assert reception.payload == frame().payload
     assert reception.rssi_dbm == pytest.approx(-86.0)
     assert reception.frequency_error_hz == pytest.approx(905e6 * 5e-6)
-    assert tx.antenna.events == []
+    assert tx.listener.events == []
 
 
-async def test_late_news_change_nothing(path: Path) -> None:
-    """A frame that is heard of late is received with its true times."""
+async def test_delayed_message_does_not_change_the_times(path: Path) -> None:
+    """A frame whose message is late is received with its true times."""
     async with Field(path) as field:
         tx, rx = await field.radio("tx"), await field.radio("rx")
         rx.port.listen(listening())
         await field.at(7.0)
         tx.port.transmit(frame(0.0))
         await field.at(100.0)
-    assert [at_ns for at_ns, _ in rx.antenna.events] == [
+    assert [at_ns for at_ns, _ in rx.listener.events] == [
         5 * SYMBOL_NS,
         frame().header_end_ns,
         frame().end_ns,
     ]
 
 
-async def test_channel_can_be_measured_at_once(path: Path) -> None:
-    """RSSI and activity are known at the client without asking the server."""
+async def test_rssi_and_activity_are_known_locally(path: Path) -> None:
+    """The client answers RSSI and activity detection without the server."""
     async with Field(path) as field:
         tx, rx = await field.radio("tx"), await field.radio("rx")
         rx.port.listen(listening())
@@ -120,7 +120,7 @@ async def test_channel_can_be_measured_at_once(path: Path) -> None:
         assert rx.port.preamble_present(modulation(), 4 * SYMBOL_NS)
 
 
-async def test_stop_is_passed_on(path: Path) -> None:
+async def test_cut_is_forwarded(path: Path) -> None:
     """A frame that its sender cuts is cut for all."""
     async with Field(path) as field:
         tx, rx = await field.radio("tx"), await field.radio("rx")
@@ -129,11 +129,11 @@ async def test_stop_is_passed_on(path: Path) -> None:
         await field.at(30.0)
         tx.port.stop_transmitting(30 * SYMBOL_NS)
         await field.at(100.0)
-    assert rx.antenna.outcomes == ["damaged"]
+    assert rx.listener.outcomes == ["damaged"]
 
 
 async def test_link_may_change_at_run_time(path: Path) -> None:
-    """Attenuation and losses that are set at the server hold from the next frame on."""
+    """Changes of attenuation and loss at the server apply from the next frame on."""
     async with Field(path) as field:
         tx, rx = await field.radio("tx"), await field.radio("rx")
         rx.port.listen(listening())
@@ -142,14 +142,14 @@ async def test_link_may_change_at_run_time(path: Path) -> None:
             field.link.loss_probability = loss_probability
             tx.port.transmit(frame(number * 100.0))
             await field.at(number * 100.0 + 100.0)
-    assert [at_ns for at_ns, what in rx.antenna.events if what == "received"] == [
+    assert [at_ns for at_ns, what in rx.listener.events if what == "received"] == [
         frame().end_ns,
         frame(300.0).end_ns,
     ]
 
 
-async def test_client_that_vanishes_cuts_its_frame(path: Path) -> None:
-    """A process that dies in mid-frame leaves half a frame, and its name is free again."""
+async def test_disconnect_cuts_the_frame(path: Path) -> None:
+    """The frame of a client that disconnects is cut, and its name is free again."""
     async with Field(path) as field:
         rx = await field.radio("rx")
         rx.port.listen(listening())
@@ -161,12 +161,12 @@ async def test_client_that_vanishes_cuts_its_frame(path: Path) -> None:
         again = await field.radio("tx", crystal_ppm=20.0)
         again.port.transmit(frame(100.0))
         await field.at(200.0)
-    assert rx.antenna.outcomes == ["damaged", "received"]
-    assert rx.antenna.receptions[-1].frequency_error_hz == pytest.approx(905e6 * 20e-6)
+    assert rx.listener.outcomes == ["damaged", "received"]
+    assert rx.listener.receptions[-1].frequency_error_hz == pytest.approx(905e6 * 20e-6)
 
 
 async def test_names_are_unique(path: Path) -> None:
-    """A second radio of a name is refused with the reason, the first stays."""
+    """A second radio with the same name is rejected with the reason; the first stays."""
     async with Field(path) as field:
         await field.radio("tx")
         with pytest.raises(StreamError, match=rf"^{path}: .*radio 'tx' has joined already[^\n]*$"):
@@ -174,28 +174,28 @@ async def test_names_are_unique(path: Path) -> None:
         assert field.server.radio_names == {"tx"}
 
 
-async def test_nobody_serves(path: Path) -> None:
-    """Without a server the error names the socket and says what to do."""
+async def test_missing_server_is_an_error(path: Path) -> None:
+    """The error names the socket and suggests to start a server."""
     with pytest.raises(StreamError, match=rf"^{path}: no air server \([^\n]+\); start one$"):
         await AirClient(path, "tx", running_timeline()).__aenter__()
 
 
-async def test_silent_server_is_given_up(path: Path) -> None:
-    """Whoever serves the socket and says nothing is not waited for."""
+async def test_silent_server_times_out(path: Path) -> None:
+    """A server that does not respond to the join is an error."""
     connected: list[asyncio.StreamWriter] = []
     server = await asyncio.start_unix_server(lambda _, writer: connected.append(writer), path)
-    began_s = asyncio.get_running_loop().time()
+    start_s = asyncio.get_running_loop().time()
     with pytest.raises(StreamError, match="does not respond"):
         await AirClient(path, "tx", running_timeline()).__aenter__()
-    assert asyncio.get_running_loop().time() - began_s == pytest.approx(WELCOME_TIMEOUT_S)
+    assert asyncio.get_running_loop().time() - start_s == pytest.approx(WELCOME_TIMEOUT_S)
     connected[0].close()
     server.close()
     await settle()
 
 
 @pytest.mark.parametrize("answer", [b"hello\n", b'{"type":"left","sender":"x"}\n', b"\xff\x00\n"], ids=repr)
-async def test_garbage_from_a_server(path: Path, answer: bytes) -> None:
-    """Another kind of server is recognised."""
+async def test_invalid_message_from_the_server_is_an_error(path: Path, answer: bytes) -> None:
+    """Another kind of server is detected."""
 
     async def talk(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         writer.write(answer)
@@ -208,8 +208,8 @@ async def test_garbage_from_a_server(path: Path, answer: bytes) -> None:
     await settle()
 
 
-async def test_server_that_stops_leaves_clients_deaf(path: Path) -> None:
-    """A client learns that the server is gone, is told nothing more, and its port does no harm."""
+async def test_clients_of_a_stopped_server_are_disconnected(path: Path) -> None:
+    """The client raises, receives nothing more, and its port remains usable without effect."""
     async with AsyncExitStack() as stack:
         field = Field(path)
         async with field:
@@ -231,11 +231,11 @@ async def test_server_that_stops_leaves_clients_deaf(path: Path) -> None:
         rx.port.transmit(frame(31.0))
         rx.port.stop_transmitting(40 * SYMBOL_NS)
         await asyncio.sleep(1.0)
-        assert rx.antenna.outcomes == []
+        assert rx.listener.outcomes == []
 
 
-async def test_leaving_is_no_error(path: Path) -> None:
-    """A client that leaves by itself logs no loss."""
+async def test_client_may_leave(path: Path) -> None:
+    """A client that leaves logs no error."""
     with capture_logs() as logs:
         async with Field(path) as field, AirClient(path, "rx", field.timeline) as client:
             Radio(client)
@@ -243,7 +243,7 @@ async def test_leaving_is_no_error(path: Path) -> None:
 
 
 def transmit_line(**changes: Any) -> bytes:
-    """Make a line that sends a frame, with changes in the frame."""
+    """Encode a message that transmits a frame, with changes in the frame."""
     line = json.loads(encode_line(Transmit(frame=FrameMessage.of(frame()))))
     line["frame"] |= changes
     return json.dumps(line).encode() + b"\n"
@@ -270,8 +270,8 @@ def transmit_line(**changes: Any) -> bytes:
     ],
     ids=lambda value: repr(value)[:40],
 )
-async def test_client_that_talks_garbage_is_dropped(path: Path, lines: bytes, reason: str) -> None:
-    """What no client says ends that client, is logged with the reason, and costs the others nothing."""
+async def test_client_with_invalid_messages_is_rejected(path: Path, lines: bytes, reason: str) -> None:
+    """It is disconnected, the reason is logged, and other clients are unaffected."""
     async with Field(path) as field:
         tx, rx = await field.radio("tx"), await field.radio("rx")
         rx.port.listen(listening())
@@ -289,11 +289,11 @@ async def test_client_that_talks_garbage_is_dropped(path: Path, lines: bytes, re
         assert "\n" not in dropped[0]["reason"]
         assert field.server.radio_names == {"tx", "rx"}
         await field.at(100.0)
-    assert rx.antenna.outcomes == ["received"]
+    assert rx.listener.outcomes == ["received"]
 
 
-async def test_lines_may_come_in_pieces(path: Path) -> None:
-    """A line counts when it is whole, however it was cut on the way."""
+async def test_line_may_arrive_in_parts(path: Path) -> None:
+    """A message is processed when its line is complete."""
     async with Field(path) as field:
         reader, writer = await asyncio.open_unix_connection(path)
         for byte in JOIN:
@@ -305,8 +305,8 @@ async def test_lines_may_come_in_pieces(path: Path) -> None:
         await settle()
 
 
-async def test_client_that_does_not_read_is_dropped(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A process that sleeps cannot fill the server's memory."""
+async def test_client_that_does_not_read_is_disconnected(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A blocked client does not fill the server's memory."""
     monkeypatch.setattr(air_server, "MAX_WAITING_BYTES", 10_000)
     async with Field(path) as field:
         tx = await field.radio("tx")
@@ -323,8 +323,8 @@ async def test_client_that_does_not_read_is_dropped(path: Path, monkeypatch: pyt
         assert reasons == ["it does not read"]
 
 
-async def test_radio_without_position_is_told(path: Path) -> None:
-    """A radio that the link model does not know is not let in: nobody else's frames are to end by it."""
+async def test_radio_without_position_is_rejected(path: Path) -> None:
+    """The link model must know a radio; otherwise other radios' frames would fail."""
     link = LinkModel(path_loss=LogDistanceLoss(positions_m={"tx": (0, 0, 0)}))
     async with Field(path, link) as field:
         tx = await field.radio("tx")
@@ -335,8 +335,8 @@ async def test_radio_without_position_is_told(path: Path) -> None:
         assert field.server.radio_names == {"tx"}
 
 
-async def test_socket_is_the_users_own(path: Path) -> None:
-    """Nobody else may join; a stale socket of a killed server is no obstacle, a live one is."""
+async def test_socket_is_private_and_exclusive(path: Path) -> None:
+    """Mode 600; a stale socket is replaced, a live one is an error."""
     with socket.socket(socket.AF_UNIX) as stale:
         stale.bind(str(path))
     async with Field(path) as field:

@@ -1,4 +1,4 @@
-"""What the simulated SX1276 does beyond the conformance list: bus, sending, pins, FSK mode, faults."""
+"""The simulated SX1276 beyond the conformance list: bus, transmission, pins, FSK mode, faults."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def bench() -> Bench:
 # --- the bus
 
 
-def test_one_access_may_come_in_pieces(bench: Bench) -> None:
-    """Address and data may be exchanged one by one while NSS stays low, and a write counts at its byte."""
+def test_access_may_be_split_into_bytes(bench: Bench) -> None:
+    """Address and data may be exchanged byte by byte while NSS is low; each write takes effect at its byte."""
     bench.chip.select()
     assert bench.chip.exchange(0x80 | 0x39) == 0x00
     assert bench.chip.exchange(0x34) == 0x12
@@ -52,8 +52,8 @@ def test_one_access_may_come_in_pieces(bench: Bench) -> None:
 
 
 @given(st.lists(st.binary(min_size=1, max_size=20), min_size=1, max_size=12))
-def test_a_window_is_the_same_as_its_bytes(windows: list[bytes]) -> None:
-    """Whatever is written and read, also across the ends of registers and FIFO: at once or byte by byte."""
+def test_transfer_equals_bytewise_exchange(windows: list[bytes]) -> None:
+    """Also across the ends of registers and FIFO."""
     at_once, one_by_one = Bench(), Bench()
     for bench in (at_once, one_by_one):
         bench.enter_lora()
@@ -66,14 +66,14 @@ def test_a_window_is_the_same_as_its_bytes(windows: list[bytes]) -> None:
 
 
 def test_nothing_is_exchanged_without_chip_select(bench: Bench) -> None:
-    """Traffic for another chip on the bus passes it by."""
+    """Traffic for another chip on the bus is ignored."""
     for byte in (0x80 | 0x39, 0x34):
         assert bench.chip.exchange(byte) == 0x00
     assert bench.read(0x39) == 0x12
 
 
 def test_power_on_values() -> None:
-    """Registers hold the data sheet's reset values, on either page."""
+    """Registers of both pages have the data sheet's reset values."""
     bench = Bench()
     common = {0x06: 0x6C, 0x07: 0x80, 0x09: 0x4F, 0x0A: 0x09, 0x0B: 0x2B, 0x0C: 0x20, 0x44: 0x2D, 0x4D: 0x84}
     for address, value in (common | {0x24: 0x05, 0x39: 0xF5, 0x3B: 0x82}).items():
@@ -85,8 +85,8 @@ def test_power_on_values() -> None:
         assert bench.read(address) == value
 
 
-def test_image_calibration_is_done_at_once() -> None:
-    """The start bit clears itself and nothing is running."""
+def test_image_calibration_completes_immediately() -> None:
+    """The start bit clears itself."""
     bench = Bench()
     bench.write(0x3B, 0xC2)
     assert bench.read(0x3B) == 0x82
@@ -98,7 +98,7 @@ def test_image_calibration_is_done_at_once() -> None:
 @pytest.mark.parametrize(
     ("modes", "delay_ns"), [((TX,), 180_000), ((FSTX, TX), 120_000), ((SLEEP, TX), 430_000)]
 )
-def test_a_frame_starts_when_oscillator_synthesizer_and_ramp_are_up(
+def test_frame_starts_after_oscillator_synthesizer_and_ramp(
     bench: Bench, modes: tuple[int, ...], delay_ns: int
 ) -> None:
     """From STDBY a frame starts 180 us after the write, from SLEEP 250 us later, from FSTX 60 us earlier."""
@@ -109,8 +109,8 @@ def test_a_frame_starts_when_oscillator_synthesizer_and_ramp_are_up(
     assert bench.port.frames[0].start_ns == written_ns + delay_ns
 
 
-def test_the_oscillator_takes_its_time_after_sleep(bench: Bench) -> None:
-    """STDBY written on the way from SLEEP does not make the oscillator start faster."""
+def test_standby_does_not_speed_up_the_oscillator(bench: Bench) -> None:
+    """STDBY on the way from SLEEP does not shorten the oscillator's start."""
     bench.write(0x01, SLEEP)
     woken_ns = bench.timeline.now_ns()
     bench.write(0x01, STDBY)
@@ -122,7 +122,7 @@ def test_the_oscillator_takes_its_time_after_sleep(bench: Bench) -> None:
 
 @pytest.mark.parametrize("after_ns", [100_000, 20_000_000])
 def test_standby_aborts_a_transmission(bench: Bench, after_ns: int) -> None:
-    """A frame that is left is cut off the air, or never gets there, and there is no TxDone."""
+    """The frame is cut, or never starts, and there is no TxDone."""
     bench.write(0x01, TX)
     bench.timeline.advance(after_ns)
     bench.write(0x01, STDBY)
@@ -134,7 +134,7 @@ def test_standby_aborts_a_transmission(bench: Bench, after_ns: int) -> None:
 
 
 def test_continuous_transmission(bench: Bench) -> None:
-    """With TxContinuousMode one frame follows the other until the mode is changed."""
+    """With TxContinuousMode frames follow each other until the mode changes."""
     bench.write(0x1E, 0x7C)
     bench.write(0x01, TX)
     bench.timeline.advance(200_000_000)
@@ -144,8 +144,8 @@ def test_continuous_transmission(bench: Bench) -> None:
     assert bench.read(FLAGS) == 0
 
 
-def test_a_frame_is_sent_as_the_registers_say(bench: Bench) -> None:
-    """Modulation, coding, preamble and power come from the registers."""
+def test_frame_settings_come_from_the_registers(bench: Bench) -> None:
+    """Modulation, coding, preamble and power."""
     bench.write(0x06, 0xD9, 0x06, 0x66)
     bench.write(0x1D, 0x94)
     bench.write(0x1E, 0xC4)
@@ -179,7 +179,7 @@ def test_output_power(bench: Bench, pa_config: int, pa_dac: int, power_dbm: floa
     assert bench.transmit(b"x").power_dbm == pytest.approx(power_dbm)
 
 
-def test_a_carrier_counts_when_its_last_byte_is_written(bench: Bench) -> None:
+def test_carrier_takes_effect_with_its_last_byte(bench: Bench) -> None:
     """RegFrfMsb and Mid alone change nothing."""
     bench.write(0x06, 0xE2, 0x40)
     assert bench.transmit(b"x").modulation.frequency_hz == 434e6
@@ -225,7 +225,7 @@ def test_state_on_dio4_and_dio5(bench: Bench) -> None:
 
 
 def test_in_real_time_edges_carry_their_exact_time() -> None:
-    """On an asyncio loop callbacks come late; the time that they are given is the chip's, not theirs."""
+    """On an asyncio loop callbacks are late, but their time argument is the chip's."""
 
     async def main() -> None:
         timeline = LoopTimeline(asyncio.get_running_loop())
@@ -248,7 +248,7 @@ def test_in_real_time_edges_carry_their_exact_time() -> None:
 
 
 def test_fsk_mode_sends_nothing() -> None:
-    """FSK mode has its modes but no modem, and says so."""
+    """FSK mode is not simulated, which is warned about."""
     bench = Bench()
     bench.write(0x01, 0x0B)
     bench.timeline.advance(1_000_000_000)
@@ -258,8 +258,8 @@ def test_fsk_mode_sends_nothing() -> None:
 
 
 @pytest.mark.parametrize(("level", "answer"), [(False, 0x00), (True, 0xFF)])
-def test_a_dead_bus(bench: Bench, level: bool, answer: int) -> None:  # noqa: FBT001
-    """Without a bus MISO stays at one level and nothing is written, also after a reset."""
+def test_disconnected_bus(bench: Bench, level: bool, answer: int) -> None:  # noqa: FBT001
+    """MISO stays at one level and writes have no effect, also after a reset."""
     bench.chip.disconnect_bus(level)
     assert bench.read(0x42) == answer
     bench.write(0x39, 0x34)
@@ -270,8 +270,8 @@ def test_a_dead_bus(bench: Bench, level: bool, answer: int) -> None:  # noqa: FB
     assert bench.read(0x42) == 0x12
 
 
-def test_a_spontaneous_reset(bench: Bench) -> None:
-    """Everything is as after power-on, reception is over, and the pin falls."""
+def test_supply_dip_resets_the_chip(bench: Bench) -> None:
+    """Registers are as after power-on, reception ends, and the pin falls."""
     bench.listen()
     bench.receive(b"abcd")
     levels: list[bool] = []
@@ -282,8 +282,8 @@ def test_a_spontaneous_reset(bench: Bench) -> None:
     assert levels == [False]
 
 
-def test_a_chip_that_hangs(bench: Bench) -> None:
-    """A hung chip can be read, does nothing and takes nothing, until a reset."""
+def test_hung_chip_ignores_writes_until_a_reset(bench: Bench) -> None:
+    """It can be read but does nothing."""
     bench.write(0x01, TX)
     bench.timeline.advance(1_000_000)
     bench.chip.hang()
@@ -301,8 +301,8 @@ def test_a_chip_that_hangs(bench: Bench) -> None:
     assert bench.read(FLAGS) == TX_DONE
 
 
-def test_a_lost_tx_done(bench: Bench) -> None:
-    """The frame is sent, the chip stays in TX without a flag, and the next one is as usual."""
+def test_suppressed_tx_done(bench: Bench) -> None:
+    """The frame is sent, the chip stays in TX without a flag, and the next one is normal."""
     bench.chip.drop_tx_done()
     frame = bench.transmit(b"abcd")
     bench.timeline.advance(1_000_000_000)
@@ -315,8 +315,8 @@ def test_a_lost_tx_done(bench: Bench) -> None:
     assert bench.read(FLAGS) == TX_DONE
 
 
-def test_any_bus_traffic_leaves_a_working_chip() -> None:
-    """Ten thousand random accesses at random times raise nothing, and after a reset the chip sends as ever."""
+def test_random_bus_traffic_is_harmless() -> None:
+    """Ten thousand random accesses raise nothing, and after a reset the chip transmits normally."""
     rng = np.random.default_rng(7)
     bench = Bench()
     for _ in range(10_000):

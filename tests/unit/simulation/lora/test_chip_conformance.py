@@ -1,7 +1,7 @@
-"""The conformance list for simulated chips (facts/radio.md 12.4), points 1 to 6, 13, 19 and 20: bus, registers, sending.
+"""Conformance list for simulated chips (facts/radio.md 12.4), points 1 to 6, 13, 19, 20: bus, registers, transmission.
 
-Points 7, 17 and 18 stand in test_chip_conformance_timing.py, 8 to 12 and 14 in test_chip_conformance_receiving.py,
-15 and 16 in test_air.py.
+Points 7, 17 and 18 are in test_chip_conformance_timing.py, 8 to 12 and 14 in test_chip_conformance_receiving.py, 15 and
+16 in test_air_conformance.py.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def test_conformance_02_settings_written_in_fsk_mode_do_not_reach_lora() -> None
 
 
 def test_conformance_02_access_shared_reg_shows_the_fsk_page(bench: Bench) -> None:
-    """With bit 6 of RegOpMode the FSK page is seen in LoRa mode, and the LoRa page is as before after it."""
+    """With bit 6 of RegOpMode the FSK page is visible in LoRa mode; the LoRa page is unchanged afterwards."""
     bench.write(0x39, 0x34)
     bench.write(0x01, 0xC1)
     assert bench.read(0x01) == 0xC1
@@ -98,8 +98,8 @@ def test_conformance_03_other_addresses_increment(bench: Bench) -> None:
     assert bench.chip.transfer(bytes([0x06, 0, 0, 0])) == bytes([0, 1, 2, 3])
 
 
-def test_conformance_03_the_fifo_is_out_of_reach_in_sleep(bench: Bench) -> None:
-    """In SLEEP the FIFO answers nothing and takes nothing, and its content is lost."""
+def test_conformance_03_fifo_is_inaccessible_in_sleep(bench: Bench) -> None:
+    """In SLEEP the FIFO reads as zeros, ignores writes, and loses its content."""
     bench.write_fifo(0, b"abc")
     bench.write(0x01, SLEEP)
     bench.write_fifo(0, b"xyz")
@@ -111,8 +111,8 @@ def test_conformance_03_the_fifo_is_out_of_reach_in_sleep(bench: Bench) -> None:
 # 4 and 5: sending
 
 
-def test_conformance_04_what_is_sent_starts_at_tx_base(bench: Bench) -> None:
-    """The payload is taken from FifoTxBaseAddr, which is 0x80 after a reset, wherever the pointer is."""
+def test_conformance_04_payload_starts_at_tx_base(bench: Bench) -> None:
+    """The payload is taken from FifoTxBaseAddr, 0x80 after a reset, wherever the pointer is."""
     bench.write_fifo(0x00, b"wrong place")
     bench.write_fifo(0x80, b"right")
     bench.write(0x0D, 0x00)
@@ -122,8 +122,8 @@ def test_conformance_04_what_is_sent_starts_at_tx_base(bench: Bench) -> None:
     assert bench.port.frames[0].payload == b"right"
 
 
-def test_conformance_04_what_is_sent_wraps(bench: Bench) -> None:
-    """A payload that begins near the end of the FIFO goes on at its start, and stays in the FIFO after it."""
+def test_conformance_04_payload_wraps(bench: Bench) -> None:
+    """A payload near the end of the FIFO continues at its start, and stays in the FIFO."""
     assert bench.transmit(b"0123456789", base=0xFB).payload == b"0123456789"
     assert bench.read_fifo(0x00, 5) == b"56789"
 
@@ -183,7 +183,7 @@ def test_conformance_06_masking_a_flag_that_is_set_lowers_its_pin(bench: Bench) 
 
 
 def test_conformance_13_version_and_reset() -> None:
-    """0x12 is the version; held in reset (NRESET low) the chip answers 0x00; after it, all is as after power-on."""
+    """The version is 0x12; held in reset the chip reads as 0x00; afterwards all is as after power-on."""
     bench = Bench()
     bench.enter_lora()
     bench.write(0x39, 0x34)
@@ -200,8 +200,8 @@ def test_conformance_13_version_and_reset() -> None:
     assert not bench.chip.warnings
 
 
-def test_conformance_13_reset_ends_what_is_going_on(bench: Bench) -> None:
-    """A reset cuts a frame off the air, drops the pins and leaves the chip deaf."""
+def test_conformance_13_reset_aborts_all_operations(bench: Bench) -> None:
+    """A reset cuts the frame on the air, lowers the pins and stops the receiver."""
     bench.write(0x01, TX)
     bench.timeline.advance(1_000_000)
     bench.chip.set_reset(True)
@@ -215,8 +215,8 @@ def test_conformance_13_reset_ends_what_is_going_on(bench: Bench) -> None:
 # 19: read-back
 
 
-def test_conformance_19_what_is_written_reads_back_exactly(bench: Bench) -> None:
-    """Every register that can be written holds every value that is written to it."""
+def test_conformance_19_writable_registers_read_back(bench: Bench) -> None:
+    """Every writable register holds every value written to it."""
     # The FIFO, the mode and the flags have rules of their own; these others belong to the modem.
     not_plain = {0x00, 0x01, 0x10, *range(0x12, 0x1D), 0x25, 0x28, 0x29, 0x2A, 0x2C, 0x42, 0x5B}
     for address in set(range(0x80)) - not_plain:
@@ -226,7 +226,7 @@ def test_conformance_19_what_is_written_reads_back_exactly(bench: Bench) -> None
 
 
 def test_conformance_19_read_only_registers_ignore_writes(bench: Bench) -> None:
-    """What the modem tells cannot be overwritten."""
+    """Status registers cannot be overwritten."""
     bench.listen()
     bench.receive(b"abcd")
     bench.write(0x01, STDBY)
@@ -246,8 +246,8 @@ def test_conformance_19_op_mode_reads_back_at_once(bench: Bench, mode: int) -> N
 # 20: misuse
 
 
-def test_conformance_20_nothing_to_complain_of(bench: Bench) -> None:
-    """Proper use leaves no warning."""
+def test_conformance_20_proper_use_gives_no_warning(bench: Bench) -> None:
+    """Transmission and reception within the data sheet's limits."""
     bench.transmit(b"abcd")
     bench.listen()
     bench.receive(b"abcd")
@@ -268,10 +268,10 @@ def test_conformance_20_nothing_to_complain_of(bench: Bench) -> None:
         (((0x1D, 0xF2),), "undefined bandwidth"),
     ],
 )
-def test_conformance_20_illegal_settings_are_flagged(
+def test_conformance_20_illegal_settings_give_a_warning(
     bench: Bench, registers: tuple[tuple[int, int], ...], warning: str
 ) -> None:
-    """A setting that the data sheet forbids is warned of when it is used, once."""
+    """A setting that the data sheet forbids gives one warning when it is used."""
     for address, value in registers:
         bench.write(address, value)
     assert not bench.chip.warnings
@@ -283,8 +283,8 @@ def test_conformance_20_illegal_settings_are_flagged(
     assert warning in bench.chip.warnings[0]
 
 
-def test_conformance_20_a_new_carrier_while_receiving_is_flagged(bench: Bench) -> None:
-    """RegFrf belongs to SLEEP and STDBY, unless FastHopOn is set."""
+def test_conformance_20_carrier_change_while_receiving_gives_a_warning(bench: Bench) -> None:
+    """RegFrf may be written in SLEEP and STDBY only, unless FastHopOn is set."""
     bench.listen()
     bench.write(0x44, 0xAD)
     bench.write(0x06, 0xE2, 0x40, 0x00)
@@ -294,8 +294,8 @@ def test_conformance_20_a_new_carrier_while_receiving_is_flagged(bench: Bench) -
     assert "RegFrf" in bench.chip.warnings[0]
 
 
-def test_conformance_20_misuse_of_bus_and_pins_is_flagged(bench: Bench) -> None:
-    """FIFO access in SLEEP, a bus that is too fast, a reset that is too short or not waited for."""
+def test_conformance_20_misuse_of_bus_and_pins_gives_a_warning(bench: Bench) -> None:
+    """FIFO access in SLEEP, a bus clock that is too fast, a reset that is too short or not waited for."""
     bench.write(0x01, SLEEP)
     bench.read(0x00)
     bench.chip.set_sck(20_000_000)

@@ -1,4 +1,4 @@
-"""The conformance list for simulated chips (facts/radio.md 12.4), points 8 to 12 and 14: receiving."""
+"""Conformance list for simulated chips (facts/radio.md 12.4), points 8 to 12 and 14: reception."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ def test_conformance_11_leaving_reception_is_silent(bench: Bench, when: str) -> 
 
 
 def pair_on_the_air() -> tuple[Bench, Bench]:
-    """Return two chips in LoRa standby on one undisturbed air."""
+    """Return two chips in LoRa standby on an undisturbed channel."""
     timeline = VirtualTimeline()
     air = Air(timeline, np.random.default_rng(1), LinkModel())
     sender, receiver = (
@@ -170,15 +170,15 @@ def pair_on_the_air() -> tuple[Bench, Bench]:
 
 
 def send_on_the_air(sender: Bench, payload: bytes) -> None:
-    """Send, and wait until everybody is through with it."""
+    """Transmit, and wait for the end."""
     sender.write_fifo(0x80, payload)
     sender.write(0x22, len(payload))
     sender.write(0x01, TX)
     sender.timeline.advance(1_000_000_000)
 
 
-def test_conformance_12_alike_settings_meet() -> None:
-    """Two chips with the same settings hear each other."""
+def test_conformance_12_equal_settings_are_received() -> None:
+    """Two chips with the same settings receive each other."""
     sender, receiver = pair_on_the_air()
     receiver.listen()
     send_on_the_air(sender, b"hello")
@@ -197,8 +197,8 @@ def test_conformance_12_alike_settings_meet() -> None:
         pytest.param(((0x06, 0x6C), (0x07, 0x82), (0x08, 0x04)), id="31.5 kHz off"),
     ],
 )
-def test_conformance_12_different_settings_do_not_meet(registers: tuple[tuple[int, int], ...]) -> None:
-    """With one setting different nothing at all is heard."""
+def test_conformance_12_different_settings_are_not_received(registers: tuple[tuple[int, int], ...]) -> None:
+    """With one different setting nothing is received."""
     sender, receiver = pair_on_the_air()
     for address, value in registers:
         receiver.write(address, value)
@@ -239,7 +239,7 @@ def test_conformance_12_some_differences_do_not_matter(registers: tuple[tuple[in
 
 @pytest.mark.parametrize("mode", [SLEEP, STDBY, FSTX, TX, FSRX, CAD])
 def test_conformance_12_only_a_receiver_receives(mode: int) -> None:
-    """In any mode but reception nothing is heard, while sending included."""
+    """In any mode but reception nothing is received, transmission included."""
     sender, receiver = pair_on_the_air()
     receiver.write(0x22, 100)
     receiver.write(0x01, mode)
@@ -254,10 +254,10 @@ def test_conformance_12_only_a_receiver_receives(mode: int) -> None:
 @pytest.mark.parametrize(
     ("rssi_dbm", "snr_db"), [(-40.0, 12.0), (-80.0, 9.25), (-107.0, 0.0), (-115.0, -4.5), (-125.0, -12.25)]
 )
-def test_conformance_14_strength_decodes_to_the_mediums(
+def test_conformance_14_strength_decodes_to_the_channel_values(
     bench: Bench, frequency: tuple[int, int, int], rssi_dbm: float, snr_db: float
 ) -> None:
-    """The data sheet's formulas give back power and SNR of the packet, with SNR above and below zero."""
+    """The data sheet's formulas return power and SNR of the packet, with SNR above and below zero."""
     bench.write(0x06, *frequency)
     bench.listen()
     frame = bench.port.send(b"abcd", rssi_dbm=rssi_dbm, snr_db=snr_db)
@@ -271,7 +271,7 @@ def test_conformance_14_strength_decodes_to_the_mediums(
 
 
 def test_conformance_14_current_rssi(bench: Bench) -> None:
-    """RegRssiValue is the power on the channel now."""
+    """RegRssiValue is the current power on the channel."""
     bench.listen()
     bench.port.channel_dbm = -97.3
     assert -164 + bench.read(0x1B) == -97

@@ -1,4 +1,4 @@
-"""The conformance list for simulated chips (facts/radio.md 12.4), points 7, 17 and 18: pins, timing, the authors' node."""
+"""Conformance list for simulated chips (facts/radio.md 12.4), points 7, 17 and 18: pins, timing, the authors' node."""
 
 from __future__ import annotations
 

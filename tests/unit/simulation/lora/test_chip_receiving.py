@@ -1,4 +1,4 @@
-"""How the simulated SX1276 receives, beyond the conformance list: settings, registers of state, activity detection."""
+"""Reception of the simulated SX1276 beyond the conformance list: settings, status registers, activity detection."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def bench() -> Bench:
 # --- receiving
 
 
-def test_listening_begins_101_us_after_the_write(bench: Bench) -> None:
-    """What the receiver is set to is known to the air, with the time when it is ready."""
+def test_receiver_starts_101_us_after_the_write(bench: Bench) -> None:
+    """The channel gets the receiver settings with the time at which the receiver is ready."""
     bench.write(0x23, 64)
     bench.write(0x22, 12)
     written_ns = bench.timeline.now_ns()
@@ -35,8 +35,8 @@ def test_listening_begins_101_us_after_the_write(bench: Bench) -> None:
     assert (listening.coding_rate, listening.crc) == (5, True)
 
 
-def test_iq_of_sender_and_receiver_are_set_apart(bench: Bench) -> None:
-    """RegInvertIQ 0x67 is the LoRaWAN node's: it sends normal and hears inverted chirps."""
+def test_iq_of_transmitter_and_receiver_are_independent(bench: Bench) -> None:
+    """RegInvertIQ 0x67, as in a LoRaWAN node: transmits normal and receives inverted chirps."""
     bench.write(0x33, 0x67)
     bench.listen()
     assert bench.port.listening is not None
@@ -44,8 +44,8 @@ def test_iq_of_sender_and_receiver_are_set_apart(bench: Bench) -> None:
     assert not bench.transmit(b"x").modulation.inverted_iq
 
 
-def test_a_narrow_receiver_is_tuned_above_the_carrier(bench: Bench) -> None:
-    """With the settings of errata 2.3 a receiver at 31.25 kHz hears one bandwidth below its RegFrf."""
+def test_narrow_receiver_has_a_frequency_offset(bench: Bench) -> None:
+    """With the settings of errata 2.3 a receiver at 31.25 kHz is tuned one bandwidth below its RegFrf."""
     bench.write(0x1D, 0x42)
     bench.write(0x31, 0x43)
     bench.write(0x2F, 0x44)
@@ -55,8 +55,8 @@ def test_a_narrow_receiver_is_tuned_above_the_carrier(bench: Bench) -> None:
     assert bench.port.listening.modulation.frequency_hz == 434e6
 
 
-def test_a_hop_while_receiving(bench: Bench) -> None:
-    """With FastHopOn a new carrier takes effect at once, and the reception before it is lost."""
+def test_carrier_change_with_fast_hop_loses_the_reception(bench: Bench) -> None:
+    """With FastHopOn a new carrier takes effect at once."""
     bench.write(0x44, 0xAD)
     bench.listen()
     frame = bench.port.send(b"abcd")
@@ -108,8 +108,8 @@ def test_frequency_error(bench: Bench, error_hz: float) -> None:
     assert signed * 2**24 / 32e6 * 125 / 500 == pytest.approx(error_hz, abs=0.1)
 
 
-def test_an_implicit_header_is_taken_for_valid(bench: Bench) -> None:
-    """Without an explicit header ValidHeader comes with RxDone, as the data sheet says."""
+def test_implicit_header_sets_valid_header_with_rx_done(bench: Bench) -> None:
+    """As the data sheet says."""
     bench.write(0x1D, 0x73)
     bench.write(0x22, 4)
     bench.listen()
@@ -124,7 +124,7 @@ def test_an_implicit_header_is_taken_for_valid(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize(
-    ("spreading_factor", "optimize", "threshold", "hears"),
+    ("spreading_factor", "optimize", "threshold", "receives"),
     [(6, 0xC3, 0x0A, False), (6, 0xC5, 0x0A, False), (6, 0xC5, 0x0C, True), (7, 0xC5, 0x0C, False)],
 )
 def test_spreading_factor_6_needs_its_own_detection(
@@ -132,15 +132,15 @@ def test_spreading_factor_6_needs_its_own_detection(
     spreading_factor: int,
     optimize: int,
     threshold: int,
-    hears: bool,  # noqa: FBT001
+    receives: bool,  # noqa: FBT001
 ) -> None:
-    """SF6 works with RegDetectOptimize 5 and RegDetectionThreshold 0x0C and no other does."""
+    """SF6 works with RegDetectOptimize 5 and RegDetectionThreshold 0x0C, no other does."""
     bench.write(0x1E, spreading_factor << 4)
     bench.write(0x1D, 0x73)
     bench.write(0x31, optimize)
     bench.write(0x37, threshold)
     bench.listen()
-    assert (bench.port.listening is not None) is hears
+    assert (bench.port.listening is not None) is receives
 
 
 def test_random_numbers(bench: Bench) -> None:
@@ -150,8 +150,8 @@ def test_random_numbers(bench: Bench) -> None:
     assert 400 < ones < 600
 
 
-def test_what_the_air_tells_late_of_an_earlier_reception_is_ignored(bench: Bench) -> None:
-    """Events of before the present reception, late by the latency of a socket, are not of it."""
+def test_delayed_event_of_an_earlier_reception_is_ignored(bench: Bench) -> None:
+    """Events from before the current reception, delayed by a socket, do not belong to it."""
     bench.listen()
     listening = bench.port.listening
     assert listening is not None
@@ -159,10 +159,10 @@ def test_what_the_air_tells_late_of_an_earlier_reception_is_ignored(bench: Bench
     bench.write(0x01, STDBY)
     bench.timeline.advance_to(frame.end_ns)
     bench.listen()
-    bench.port.antenna.preamble_detected(frame.start_ns)
+    bench.port.listener.preamble_detected(frame.start_ns)
     assert bench.read(MODEM_STAT) == 0b00100
-    bench.port.antenna.header_received(frame.header_end_ns, Header(4, 5, crc=True))
-    bench.port.antenna.frame_ended(frame.end_ns, Reception(b"abcd", True, Header(4, 5, True), 8, -60, 0))
+    bench.port.listener.header_received(frame.header_end_ns, Header(4, 5, crc=True))
+    bench.port.listener.frame_ended(frame.end_ns, Reception(b"abcd", True, Header(4, 5, True), 8, -60, 0))
     bench.timeline.advance(100_000_000)
     assert bench.read(FLAGS) == 0
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def packets(bench: Bench, hal: SimulatedHal, count: int) -> list[Edge]:
-    """Receive so many packets, clearing the flags after each, and return the edges that were reported."""
+    """Receive packets, clearing the flags after each; return the reported edges."""
     edges: list[Edge] = []
 
     async def main() -> None:
@@ -33,7 +33,7 @@ def packets(bench: Bench, hal: SimulatedHal, count: int) -> list[Edge]:
     return edges
 
 
-def test_it_is_a_hal() -> None:
+def test_transfers_and_reset_reach_the_chip() -> None:
     """Transfers and reset reach the chip."""
     bench = Bench()
     hal: Hal = SimulatedHal(bench.chip, stamp_sigma_ns=5)
@@ -48,8 +48,8 @@ def test_it_is_a_hal() -> None:
     hal.close()
 
 
-def test_rising_edges_are_stamped() -> None:
-    """Each rising edge is reported with the chip's own time; falling ones are not."""
+def test_rising_edges_are_timestamped() -> None:
+    """Each rising edge is reported with the chip's time; falling ones are not."""
     bench = Bench(NO_JITTER)
     edges = packets(bench, SimulatedHal(bench.chip), 3)
     assert len(edges) == 3
@@ -57,24 +57,24 @@ def test_rising_edges_are_stamped() -> None:
     assert all(edge.lost == 0 for edge in edges)
 
 
-def test_lost_edges_are_counted_by_the_next() -> None:
-    """Edges that the host has lost are told with the one after them, where the host counts."""
+def test_missed_edges_are_counted() -> None:
+    """The next reported edge carries the number of missed ones, if the host counts them."""
     bench = Bench()
     hal = SimulatedHal(bench.chip)
     hal.drop_edges(2)
     assert [edge.lost for edge in packets(bench, hal, 4)] == [2, 0]
 
 
-def test_edges_may_get_lost_without_a_trace() -> None:
-    """Where the host does not count, nothing tells of a lost edge but the level."""
+def test_missed_edges_may_be_uncounted() -> None:
+    """If the host does not count, only the level shows a missed edge."""
     bench = Bench()
     hal = SimulatedHal(bench.chip)
     hal.drop_edges(1, counted=False)
     assert [edge.lost for edge in packets(bench, hal, 3)] == [0, 0]
 
 
-def test_an_edge_never_interrupts_the_driver() -> None:
-    """An edge that a register write causes is reported after the task that wrote has let go."""
+def test_edge_callback_does_not_interrupt_the_driver() -> None:
+    """An edge caused by a register write is reported after the writing task yields."""
     bench = Bench()
     bench.enter_lora()
     bench.transmit(b"abcd")

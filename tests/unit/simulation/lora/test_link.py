@@ -47,7 +47,7 @@ THEORY = {
 
 
 def error_rate(snr_db: float, spreading_factor: int, payload_bytes: int, coding_rate: int) -> float:
-    """Probability that a packet is not received, for whatever reason."""
+    """Return the packet error rate."""
     return 1 - (
         detection_probability(snr_db, spreading_factor)
         * header_probability(snr_db, spreading_factor)
@@ -56,10 +56,8 @@ def error_rate(snr_db: float, spreading_factor: int, payload_bytes: int, coding_
 
 
 @pytest.mark.parametrize(("spreading_factor", "payload_bytes", "coding_rate"), THEORY)
-def test_packet_error_rates_are_those_of_theory(
-    spreading_factor: int, payload_bytes: int, coding_rate: int
-) -> None:
-    """Losses of 90, 50, 10 and 1 % come at the SNR of the exact theory, to a quarter of a dB."""
+def test_packet_error_rates_match_theory(spreading_factor: int, payload_bytes: int, coding_rate: int) -> None:
+    """Error rates of 90, 50, 10 and 1 % are at the SNR of the exact theory, to a quarter of a dB."""
     grid_db = np.arange(-30.0, 0.0, 0.01)
     rates = np.array([error_rate(snr, spreading_factor, payload_bytes, coding_rate) for snr in grid_db])
     for expected, snr_db in zip(
@@ -69,14 +67,14 @@ def test_packet_error_rates_are_those_of_theory(
 
 
 @pytest.mark.parametrize("spreading_factor", range(6, 13))
-def test_data_sheet_limit_holds(spreading_factor: int) -> None:
-    """At the SNR that the data sheet asks for, nine of ten packets of 64 bytes at 4/6 get through."""
+def test_data_sheet_sensitivity(spreading_factor: int) -> None:
+    """At the data sheet's SNR limit at least 90 % of packets of 64 bytes at 4/6 are received."""
     assert error_rate(REQUIRED_SNR_DB[spreading_factor], spreading_factor, 64, 6) < 0.1
 
 
 @pytest.mark.parametrize("spreading_factor", range(6, 13))
 def test_preamble_is_more_robust_than_payload(spreading_factor: int) -> None:
-    """Where every other payload of 15 bytes is lost, most preambles and headers get through."""
+    """Where half of the payloads of 15 bytes are lost, most preambles and headers are received."""
     snr_db = -30.0
     while payload_probability(snr_db, spreading_factor, 6, 15) < 0.5:
         snr_db += 0.01
@@ -85,7 +83,7 @@ def test_preamble_is_more_robust_than_payload(spreading_factor: int) -> None:
 
 
 def test_probabilities_stay_in_range_at_extremes() -> None:
-    """Neither a dead nor a perfect link, nor an empty payload, overflows anything."""
+    """Extreme SNRs and an empty payload do not overflow."""
     for snr_db in (-1e6, 1e6):
         for probability in (
             detection_probability(snr_db, 12),
@@ -116,14 +114,14 @@ def test_exponent_and_antennas() -> None:
     assert bare.loss_db("a", "b", 905e6) - gained.loss_db("a", "b", 905e6) == pytest.approx(4.0)
 
 
-def test_radio_without_position_is_named() -> None:
-    """A name that the model does not know is said."""
+def test_radio_without_position_is_rejected() -> None:
+    """The error names it."""
     with pytest.raises(ValueError, match="radio 'b' has no position"):
         LogDistanceLoss(positions_m={"a": (0, 0, 0)}).loss_db("a", "b", 905e6)
 
 
-def test_shadowing_belongs_to_the_link() -> None:
-    """Shadowing is the same both ways and each time, and spreads over links as asked for."""
+def test_shadowing_is_constant_per_link() -> None:
+    """It is the same in both directions, and has the given spread over links."""
     positions_m = {str(number): (100.0, 0.0, 0.0) for number in range(40)}
     model = LogDistanceLoss(positions_m=positions_m, shadowing_sigma_db=6.0, seed=3)
     plain = LogDistanceLoss(positions_m=positions_m)
@@ -144,7 +142,7 @@ def test_fixed_losses() -> None:
 
 
 def test_attenuation_at_run_time() -> None:
-    """Something that comes between two radios adds to their loss until it is taken away."""
+    """An attenuation adds to the loss of a pair until it is removed."""
     link = LinkModel(path_loss=FixedLoss(default_db=70.0))
     link.set_attenuation("a", "b", 25.0)
     assert link.loss_db("b", "a", 905e6, (0.5, 0.5)) == 95.0
@@ -153,7 +151,7 @@ def test_attenuation_at_run_time() -> None:
     assert link.loss_db("a", "b", 905e6, (0.5, 0.5)) == 70.0
 
 
-def test_fading_is_distributed_as_asked_for() -> None:
+def test_fading_distributions() -> None:
     """Fading is normal in dB with the given sigma; Rayleigh fading keeps the mean power and fades 10 dB in 10 %."""
     draws = [uniform_draws(1, number) for number in range(4000)]
     normal_quantile = LinkModel(path_loss=FixedLoss(default_db=0.0), fading_sigma_db=3.0)
@@ -166,8 +164,8 @@ def test_fading_is_distributed_as_asked_for() -> None:
     assert np.mean(power < 0.1) == pytest.approx(1 - math.exp(-0.1), abs=0.015)
 
 
-def test_uniform_numbers_depend_on_their_key_alone() -> None:
-    """The same key gives the same numbers on every machine; any other key others; all within (0, 1)."""
+def test_uniform_draws_depend_on_their_key_only() -> None:
+    """The same key gives the same draws on every machine, another key others; all within (0, 1)."""
     assert uniform_draws(1, "a", 2)[0] == 0.720891533304458
     many = np.array([uniform_draws(seed, "key", number) for seed in range(20) for number in range(100)])
     assert len(np.unique(many)) == many.size

@@ -1,4 +1,4 @@
-"""Radios on the simulated air as a mission has them: hosts that take their time, stamps that scatter."""
+"""The real driver on simulated chips: host delays and timestamp jitter."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ PACKETS = 400
 
 
 async def _starts_ms(delay: HostDelay, *, lead_ns: int) -> list[float]:
-    """Ask for a packet each second, so long before it; return how late each began."""
+    """Schedule a packet each second, with this lead time; return how late each started."""
     clock, late_ms = VirtualClock(0), []
     air = Air(running_timeline(), np.random.default_rng(0), LinkModel())
     async with radio_opener(air, "here", clock, np.random.default_rng(1), PAPER, delay)() as radio:
@@ -24,22 +24,22 @@ async def _starts_ms(delay: HostDelay, *, lead_ns: int) -> list[float]:
     return late_ms
 
 
-async def test_a_host_is_woken_late() -> None:
-    """What has been prepared in time begins 0.3 ms late in the median, once in a hundred 3 ms, and never early."""
+async def test_host_wake_up_is_late() -> None:
+    """A transmission prepared in time starts 0.3 ms late in the median, 3 ms once in a hundred, and never early."""
     late_ms = await _starts_ms(HostDelay(), lead_ns=100 * MS)
     assert min(late_ms) > 0
     assert np.median(late_ms) == pytest.approx(0.3, rel=0.15)
     assert np.quantile(late_ms, 0.99) == pytest.approx(3.0, rel=0.4)
 
 
-async def test_what_is_asked_for_too_late_begins_later() -> None:
-    """A host that takes 10 ms to prepare a packet cannot begin within 4 ms."""
+async def test_short_lead_time_delays_the_start() -> None:
+    """A host that needs 10 ms to prepare a packet cannot start within 4 ms."""
     late_ms = await _starts_ms(HostDelay(work_ms=10.0, wake_median_ms=0.0), lead_ns=4 * MS)
     assert late_ms == pytest.approx([6.0] * PACKETS, abs=0.1)
 
 
-async def test_stamps_scatter() -> None:
-    """Stamps of both ends of the air are off by what is asked for, and the radio claims no less."""
+async def test_timestamp_jitter() -> None:
+    """Timestamps at both ends have the given jitter, and the radio states it."""
     clock = VirtualClock(0)
     air = Air(running_timeline(), np.random.default_rng(0), LinkModel())
     jitter = [TimestampJitter(20_000, np.random.default_rng(seed)) for seed in (1, 2)]

@@ -1,4 +1,4 @@
-"""Whole missions on virtual time: the real daemons, crashes and restarts included."""
+"""Whole missions on virtual time, crashes and restarts included."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from tsgt.simulation.options import StationSoftware
 
 
-def test_a_mission_of_a_minute(tmp_path: Path) -> None:
-    """Three stations deliver above 1.3 Hz each, stamped to 0.3 ms (their drift is not known at once), and the poses are good to centimetres."""
+def test_classic_mission(tmp_path: Path) -> None:
+    """Three stations deliver above 1.3 Hz each, timestamps are good to 0.3 ms, poses to centimetres."""
     run = mission(tmp_path, duration_s=60.0)
     assert check_invariants(run) == []
     for figure in station_figures(run).values():
@@ -40,18 +40,20 @@ def test_a_mission_of_a_minute(tmp_path: Path) -> None:
     assert poses.against_truth.orientation_rms_deg < 2
 
 
-def with_lines(scenario: ScenarioConfig) -> ScenarioConfig:
-    """Return a scenario whose master has the paper's estimator."""
+def with_linear_estimator(scenario: ScenarioConfig) -> ScenarioConfig:
+    """Return a scenario with the paper's estimator."""
     pipeline = scenario.pipeline.model_copy(update={"estimator": "linear"})
     return scenario.model_copy(update={"pipeline": pipeline})
 
 
-@pytest.mark.parametrize(("node", "least_hz", "most_hz"), [("ours", 1.5, 1.72), ("authors", 1.3, 1.6)])
-def test_rates_at_the_papers_settings(
-    tmp_path: Path, station_software: StationSoftware, least_hz: float, most_hz: float
+@pytest.mark.parametrize(
+    ("station_software", "min_hz", "max_hz"), [("ours", 1.5, 1.72), ("authors", 1.3, 1.6)]
+)
+def test_rates_with_the_papers_settings(
+    tmp_path: Path, station_software: StationSoftware, min_hz: float, max_hz: float
 ) -> None:
-    """Airtime bounds three stations at 1.72 Hz each; the paper measured about 1.4 Hz with its nodes."""
-    scenario = with_lines(find_scenario("dynamic"))
+    """Airtime limits three stations to 1.72 Hz each; the paper measured about 1.4 Hz."""
+    scenario = with_linear_estimator(find_scenario("dynamic"))
     run = mission(
         tmp_path,
         scenario,
@@ -60,11 +62,11 @@ def test_rates_at_the_papers_settings(
         protocol=ClassicMasterConfig(kind="classic"),
     )
     for figure in station_figures(run).values():
-        assert least_hz <= figure.rate_hz <= most_hz
+        assert min_hz <= figure.rate_hz <= max_hz
 
 
-def test_one_seed_is_one_run(tmp_path: Path) -> None:
-    """The same seed gives the same lines on the stream, to the last bit, and another seed others."""
+def test_same_seed_gives_the_same_stream(tmp_path: Path) -> None:
+    """Another seed gives another stream."""
     one, same, other = (
         mission(tmp_path / name, duration_s=10.0, seed=seed)
         for name, seed in (("one", 3), ("same", 3), ("other", 4))
@@ -74,8 +76,8 @@ def test_one_seed_is_one_run(tmp_path: Path) -> None:
     assert one.master_logs[0].line_hashes != other.master_logs[0].line_hashes
 
 
-def test_clocks_that_drift_either_way(tmp_path: Path) -> None:
-    """Stations drift by plus and minus what is asked for, are years behind, and the master knows both."""
+def test_clock_offsets_and_drifts_are_estimated(tmp_path: Path) -> None:
+    """Stations drift by plus and minus the given ppm, and are years behind."""
     run = mission(tmp_path, duration_s=40.0, drift_ppm=50.0)
     assert check_invariants(run) == []
     last = {clock.station: clock for clock in run.master_logs[0].clocks}
@@ -84,12 +86,14 @@ def test_clocks_that_drift_either_way(tmp_path: Path) -> None:
     assert all(clock.offset_ns < -(10**15) for clock in last.values())
 
 
-def test_the_authors_node_is_polled(tmp_path: Path) -> None:
-    """Stations with the authors' node deliver a little slower, stamped to a millisecond or two after they were read.
+def test_authors_node(tmp_path: Path) -> None:
+    """Stations with the authors' software are slower, with timestamp errors of a millisecond or two.
 
-    The master takes off how late they stamp a ping on average: half a look, and seven transfers from the chip.
+    The master subtracts their mean ping delay: half a polling interval and seven transfers.
     """
-    run = mission(tmp_path, with_lines(find_scenario("dynamic")), duration_s=40.0, station_software="authors")
+    run = mission(
+        tmp_path, with_linear_estimator(find_scenario("dynamic")), duration_s=40.0, station_software="authors"
+    )
     assert check_invariants(run) == []
     samples = [sample for clock in run.master_logs[0].clocks for sample in clock.samples]
     timing = AuthorsTiming()
@@ -101,8 +105,8 @@ def test_the_authors_node_is_polled(tmp_path: Path) -> None:
     assert estimator_figures(run)["linear"].valid_poses > 300
 
 
-def test_lost_packets_cost_measurements_and_nothing_else(tmp_path: Path) -> None:
-    """A tenth of all packets lost: fewer measurements arrive, all of them right."""
+def test_packet_loss_only_costs_measurements(tmp_path: Path) -> None:
+    """With a tenth of all packets lost, fewer measurements arrive, all of them correct."""
     scenario = find_scenario("dynamic")
     lossy = scenario.model_copy(update={"radio": scenario.radio.model_copy(update={"loss_probability": 0.1})})
     run = mission(tmp_path, lossy, duration_s=40.0)
@@ -111,10 +115,10 @@ def test_lost_packets_cost_measurements_and_nothing_else(tmp_path: Path) -> None
         assert 15 < figure.delivered < 50
 
 
-def test_hidden_prisms_never_enter_a_pose(tmp_path: Path) -> None:
-    """In the forest stations lose their prism; that is delivered as a status, and no pose is made of it.
+def test_occluded_prisms_give_no_poses(tmp_path: Path) -> None:
+    """An occlusion is delivered as a status.
 
-    Until an instrument has noticed that it has lost it, it says that it has angles only.
+    Until an instrument has detected the loss, it reports angles only.
     """
     run = mission(tmp_path, find_scenario("snowmobile"), duration_s=60.0, seed=1)
     assert check_invariants(run) == []
@@ -124,7 +128,7 @@ def test_hidden_prisms_never_enter_a_pose(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_fewer_or_more_stations_than_prisms(tmp_path: Path, count: int) -> None:
-    """Two stations measure but make no pose; five share three prisms."""
+    """Two stations measure but give no pose; five share three prisms."""
     run = mission(tmp_path, with_stations(find_scenario("dynamic"), count), duration_s=20.0)
     assert check_invariants(run) == []
     assert list(station_figures(run)) == list(range(1, count + 1))
@@ -132,8 +136,8 @@ def test_fewer_or_more_stations_than_prisms(tmp_path: Path, count: int) -> None:
     assert (estimator_figures(run)["linear"].valid_poses > 0) == (count >= 3)
 
 
-def test_a_client_that_crashes_and_comes_back(tmp_path: Path) -> None:
-    """The others go on, the station is back by itself after its restart, and poses with it."""
+def test_client_restart(tmp_path: Path) -> None:
+    """The other stations continue; the station and the poses recover."""
 
     async def crash(mission: Mission) -> None:
         await mission.sleep_until(15.0)
@@ -163,10 +167,8 @@ def test_a_client_that_crashes_and_comes_back(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("down_s", [2.2, 8.0, 15.0])
 @pytest.mark.parametrize("at_s", [0.85, 2.3, 15.45])
-def test_a_computer_whose_clock_stands_still_while_it_is_off(
-    tmp_path: Path, at_s: float, down_s: float
-) -> None:
-    """A Pi without a battery clock goes on from where it was, also when that was in a synchronisation: no stamp lies."""
+def test_clock_without_battery_stops_during_downtime(tmp_path: Path, at_s: float, down_s: float) -> None:
+    """Timestamps stay correct, also when the downtime interrupts a synchronisation."""
 
     async def reboot(mission: Mission) -> None:
         await mission.sleep_until(at_s)
@@ -183,8 +185,8 @@ def test_a_computer_whose_clock_stands_still_while_it_is_off(
     assert len(late) > 4
 
 
-def test_a_master_that_crashes_and_comes_back(tmp_path: Path) -> None:
-    """The second master makes a recording of its own, synchronises all clocks again, and poses come back."""
+def test_master_restart(tmp_path: Path) -> None:
+    """The second master has its own recording, resynchronises all clocks, and poses recover."""
 
     async def crash(mission: Mission) -> None:
         await mission.sleep_until(15.0)
@@ -200,8 +202,8 @@ def test_a_master_that_crashes_and_comes_back(tmp_path: Path) -> None:
     assert len(second.valid_poses().stamp_ns) > 150
 
 
-def test_an_outage(tmp_path: Path) -> None:
-    """While the robot is behind a hill for one station nothing arrives from it, and from the others more."""
+def test_outage(tmp_path: Path) -> None:
+    """During the outage nothing arrives from its station, and more from the others."""
     run = mission(tmp_path, duration_s=40.0, outages=(Outage((2,), 15.0, 10.0),))
     assert check_invariants(run) == []
     received_s = {
@@ -222,8 +224,8 @@ def test_an_outage(tmp_path: Path) -> None:
     assert 0 < outage.live_age_ms < 1000
 
 
-def test_an_outage_ends_between_two_nanoseconds(tmp_path: Path) -> None:
-    """Instants are rounded to whole ones; the hill must not stay for that."""
+def test_outage_with_a_fractional_nanosecond_ends(tmp_path: Path) -> None:
+    """Rounding of instants does not prolong it."""
     outage = Outage((2,), 2.1, 0.2)
     assert round(outage.end_s * 1e9) / 1e9 < outage.end_s
     run = mission(tmp_path, duration_s=20.0, outages=(outage,))
@@ -233,8 +235,8 @@ def test_an_outage_ends_between_two_nanoseconds(tmp_path: Path) -> None:
     assert max(received_s) > 15.0
 
 
-def test_restarts_that_are_asked_for(tmp_path: Path) -> None:
-    """A client and the master end when they are told to, and are back two seconds later."""
+def test_requested_restarts(tmp_path: Path) -> None:
+    """A client and the master are down for two seconds."""
     run = mission(tmp_path, duration_s=40.0, restarts=(Restart(1, 15.0), Restart(None, 20.0)))
     assert check_invariants(run) == []
     assert [len(station_log.journals) for station_log in run.station_logs.values()] == [2, 1, 1]
@@ -245,8 +247,8 @@ def test_restarts_that_are_asked_for(tmp_path: Path) -> None:
     assert np.sum(made_s > 17.0) > 50
 
 
-def test_somebody_else_on_the_channel(tmp_path: Path) -> None:
-    """Foreign packets cost some measurements and bend none, and change nothing of what is measured."""
+def test_interference_over_classic(tmp_path: Path) -> None:
+    """Interference costs measurements, but changes neither them nor what is measured."""
     alone, disturbed = (
         mission(tmp_path / name, duration_s=40.0, interference_rate_hz=per_s)
         for name, per_s in (("alone", 0.0), ("disturbed", 0.5))
@@ -257,10 +259,10 @@ def test_somebody_else_on_the_channel(tmp_path: Path) -> None:
         assert 0.5 * one.delivered < other.delivered < one.delivered
 
 
-def test_stamps_that_scatter_and_drifts_that_change(tmp_path: Path) -> None:
-    """Time errors grow by the stamps' scatter and stay within the bounds stated.
+def test_timestamp_jitter_and_drift_ramp(tmp_path: Path) -> None:
+    """Timestamp errors grow with the jitter and stay within the bounds.
 
-    The first synchronisation takes a second, so that 20 us of scatter make the frequency a guess until the second one.
+    The first synchronisation takes a second, so that 20 us of jitter leave the frequency uncertain until the second one.
     """
     run = mission(tmp_path, duration_s=60.0, stamp_jitter_us=20.0, drift_ramp_ppm_per_min=1.0)
     assert check_invariants(run) == []
@@ -268,8 +270,8 @@ def test_stamps_that_scatter_and_drifts_that_change(tmp_path: Path) -> None:
         assert 5 < figure.time_error_us[0] < 1500
 
 
-def test_a_clock_that_is_set_while_the_client_runs(tmp_path: Path) -> None:
-    """A step of a station's Unix clock bends nothing: its client has fixed its time at its start."""
+def test_unix_clock_step_has_no_effect_on_a_running_client(tmp_path: Path) -> None:
+    """The client fixes its time at its start."""
 
     async def step(mission: Mission) -> None:
         await mission.sleep_until(15.0)
@@ -280,11 +282,15 @@ def test_a_clock_that_is_set_while_the_client_runs(tmp_path: Path) -> None:
     assert not any(clock.restarted for clock in run.master_logs[0].clocks[3:])
 
 
-def test_the_paper_filter_lags_behind(tmp_path: Path) -> None:
-    """With the paper's filter and 50 ppm the stamps are off, by no more than its bound says."""
+def test_paper_filter_lags(tmp_path: Path) -> None:
+    """With the paper's filter and 50 ppm the timestamp errors are large, but within its bound."""
     paper = QUICK.model_copy(update={"clock_filter": "paper", "resync_interval_s": 20.0})
     run = mission(
-        tmp_path, with_lines(find_scenario("dynamic")), duration_s=120.0, drift_ppm=50.0, protocol=paper
+        tmp_path,
+        with_linear_estimator(find_scenario("dynamic")),
+        duration_s=120.0,
+        drift_ppm=50.0,
+        protocol=paper,
     )
     assert check_invariants(run) == []
     for figure in station_figures(run).values():
@@ -299,8 +305,8 @@ def _lossy(loss: float) -> ScenarioConfig:
     return scenario.model_copy(update={"radio": scenario.radio.model_copy(update={"loss_probability": loss})})
 
 
-def test_the_superframe_delivers_everything(tmp_path: Path) -> None:
-    """Three stations deliver all that they measure, at once and once, and the poses are better for it."""
+def test_superframe_delivers_everything(tmp_path: Path) -> None:
+    """Three stations deliver all measurements once and promptly, and the poses are better."""
     run = mission(tmp_path, duration_s=60.0, protocol=SUPERFRAME)
     assert check_invariants(run) == []
     for figure in station_figures(run).values():
@@ -317,8 +323,8 @@ def test_the_superframe_delivers_everything(tmp_path: Path) -> None:
     assert 350 < frame_ms(run) < 450
 
 
-def test_one_seed_is_one_run_of_the_superframe(tmp_path: Path) -> None:
-    """Nonces, keys and all."""
+def test_same_seed_gives_the_same_superframe_stream(tmp_path: Path) -> None:
+    """Nonces and keys included."""
     one, same, other = (
         mission(tmp_path / name, _lossy(0.1), duration_s=10.0, seed=seed, protocol=SUPERFRAME)
         for name, seed in (("one", 3), ("same", 3), ("other", 4))
@@ -329,8 +335,8 @@ def test_one_seed_is_one_run_of_the_superframe(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("authenticated", [True, False])
-def test_an_outage_over_the_superframe(tmp_path: Path, *, authenticated: bool) -> None:
-    """Behind a hill, with a tenth of all packets lost: everything arrives afterwards, what is live first."""
+def test_outage_over_superframe(tmp_path: Path, *, authenticated: bool) -> None:
+    """With a tenth of all packets lost, everything arrives afterwards, live measurements first."""
     run = mission(
         tmp_path,
         _lossy(0.1),
@@ -348,8 +354,8 @@ def test_an_outage_over_the_superframe(tmp_path: Path, *, authenticated: bool) -
     assert outage.time_error_us[2] < 200
 
 
-def test_restarts_over_the_superframe(tmp_path: Path) -> None:
-    """Nothing that was measured is lost when clients or the master end and start again, and no bound is broken."""
+def test_restarts_over_superframe(tmp_path: Path) -> None:
+    """No measurement is lost when clients or the master restart, and all bounds hold."""
     run = mission(
         tmp_path,
         _lossy(0.1),
@@ -366,8 +372,8 @@ def test_restarts_over_the_superframe(tmp_path: Path) -> None:
         assert figure.delivered == figure.measured
 
 
-def test_a_computer_that_was_off(tmp_path: Path) -> None:
-    """Its clock begins anew; what it has in its journal from before arrives with a bound that holds."""
+def test_reboot_over_superframe(tmp_path: Path) -> None:
+    """The clock restarts; journalled measurements from before arrive with valid bounds."""
 
     async def reboot(mission: Mission) -> None:
         await mission.reboot(1, at_s=30.0, off_s=10.0)
@@ -386,8 +392,8 @@ def test_a_computer_that_was_off(tmp_path: Path) -> None:
     assert station.delivered == station.measured == pytest.approx(2.5 * (60 - 4), abs=2)
 
 
-def test_forged_packets_over_the_superframe(tmp_path: Path) -> None:
-    """Somebody sends noise and what he has heard, changed and unchanged: it costs some packets and bends nothing."""
+def test_replay_attack_over_superframe(tmp_path: Path) -> None:
+    """Noise and replayed packets cost some packets and change nothing."""
     run = mission(tmp_path, duration_s=60.0, protocol=SUPERFRAME, interference_rate_hz=1.0)
     assert check_invariants(run) == []
     for figure in station_figures(run).values():
@@ -396,7 +402,7 @@ def test_forged_packets_over_the_superframe(tmp_path: Path) -> None:
 
 
 def test_many_stations(tmp_path: Path) -> None:
-    """Twelve stations share the channel, and each delivers what it measures."""
+    """Twelve stations share the channel, and each delivers its measurements."""
     run = mission(tmp_path, with_stations(find_scenario("dynamic"), 12), duration_s=30.0, protocol=SUPERFRAME)
     assert check_invariants(run) == []
     for figure in station_figures(run).values():

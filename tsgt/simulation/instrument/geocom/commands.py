@@ -17,22 +17,12 @@ Value = float | int | str | bytes
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """Response to a command.
+    """Response to a command."""
 
-    Attributes
-    ----------
-    code
-        GeoCOM return code of the command.
-    com_code
-        Return code of the transport; not 0: the request was not understood.
-    distance
-        The distance measurement that ``values`` report, if any.
-    """
-
-    code: int = 0
+    code: int = 0  # GeoCOM return code of the command
     values: tuple[Value, ...] = ()
-    com_code: int = 0
-    distance: ReportedDistance | None = None
+    com_code: int = 0  # return code of the transport; not 0: the request was not understood
+    distance: ReportedDistance | None = None  # the distance measurement that ``values`` report, if any
 
 
 OK = Response()
@@ -43,18 +33,10 @@ Job = Generator[int, None, Response]
 
 
 class Command(NamedTuple):
-    """Entry of a command table.
+    """Entry of a command table."""
 
-    Attributes
-    ----------
-    signature
-        One letter per parameter: d double, i integer, s string, b byte.
-    execute
-        Called with the instrument and the decoded parameters.
-    """
-
-    signature: str
-    execute: Callable[..., Response | Job]
+    signature: str  # one letter per parameter: d double, i integer, s string, b byte
+    execute: Callable[..., Response | Job]  # called with the instrument and the decoded parameters
 
 
 Commands = Mapping[int, Command]

@@ -35,22 +35,12 @@ _MAX_LINE: Final = 1024
 
 @dataclass(slots=True)
 class ForcedResponse:
-    """Return code to send instead of executing a command.
-
-    Attributes
-    ----------
-    com_code
-        Return code of the transport.
-    rpc
-        The command it applies to; None: any.
-    times
-        Number of uses.
-    """
+    """Return code to send instead of executing a command."""
 
     code: int = 0
-    com_code: int = 0
-    rpc: int | None = None
-    times: int = 1
+    com_code: int = 0  # return code of the transport
+    rpc: int | None = None  # the command it applies to; None: any
+    times: int = 1  # number of uses
 
 
 @dataclass(slots=True)
@@ -67,8 +57,6 @@ class GeoComServer:
     ----------
     on_send
         Called with each response when its first byte leaves.
-    forced
-        Responses to force.
     """
 
     def __init__(
@@ -90,7 +78,7 @@ class GeoComServer:
         self._job: Job | None = None
         self._event: Handle | None = None
         self.on_send: Callable[[bytes], None] = lambda _: None
-        self.forced: deque[ForcedResponse] = deque()
+        self.forced: deque[ForcedResponse] = deque()  # responses to force
 
     def receive(self, data: bytes) -> None:
         """Process bytes. CR or LF ends a line; empty lines are ignored."""

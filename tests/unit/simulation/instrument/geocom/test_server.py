@@ -1,4 +1,4 @@
-"""The instrument's side of GeoCOM: framing, checksums, codes of the transport, one request after the other."""
+"""The instrument's side of GeoCOM: framing, checksums, transport codes, sequential execution."""
 
 from __future__ import annotations
 
@@ -14,34 +14,34 @@ from tsgt.simulation.kernel import run_virtual
 from tsgt.station.geocom import Rpc
 
 
-async def test_a_request_without_a_number_is_answered_with_zero() -> None:
-    """The answer always has a transaction."""
-    answer = await Bench().type(b"%R1Q,5003:\r\n")
-    assert (answer.transaction, answer.code, answer.values) == (0, 0, ["230001"])
+async def test_request_without_transaction_number() -> None:
+    """The response has transaction 0."""
+    response = await Bench().type(b"%R1Q,5003:\r\n")
+    assert (response.transaction, response.code, response.values) == (0, 0, ["230001"])
 
 
 @pytest.mark.parametrize("end", [b"\r", b"\n", b"\r\n"])
-async def test_every_end_of_a_line_will_do(end: bytes) -> None:
+async def test_line_terminators(end: bytes) -> None:
     """CR, LF or both."""
     assert (await Bench().type(b"%R1Q,0,7:" + end)).transaction == 7
 
 
-async def test_empty_lines_are_not_answered() -> None:
-    """A client that wakes it up with LF CR LF gets one answer to its one request."""
+async def test_empty_lines_are_ignored() -> None:
+    """A client that wakes the instrument with LF CR LF gets one response to its request."""
     bench = Bench()
     assert (await bench.type(b"\n\r\n%R1Q,0,3:\r\n")).transaction == 3
     assert await bench.quiet(1.0)
 
 
-async def test_garbage_ends_with_a_line_feed() -> None:
-    """What stands before the line feed is forgotten."""
+async def test_line_feed_discards_garbage() -> None:
+    """The request after it is executed."""
     bench = Bench()
     assert (await bench.type(b"\x00\xffgarbage\n%R1Q,0,3:\r\n")).transaction == 3
     assert await bench.quiet(1.0)
 
 
-async def test_a_request_in_pieces() -> None:
-    """It waits for the end of the line."""
+async def test_request_in_parts() -> None:
+    """It is executed at the end of the line."""
     bench = Bench()
     await bench.send(b"%R1Q,")
     await asyncio.sleep(1.0)
@@ -59,13 +59,13 @@ async def test_a_request_in_pieces() -> None:
         (b"%R1Q,0,1,5:\r\n", 3101),
     ],
 )
-async def test_requests_that_cannot_be_understood(line: bytes, com_code: int) -> None:
-    """The code of the transport says why."""
+async def test_malformed_request_gives_a_transport_code(line: bytes, com_code: int) -> None:
+    """The code says why."""
     assert (await Bench().type(line)).com_code == com_code
 
 
 async def test_checksums() -> None:
-    """A request with a checksum gets an answer with one, over the line without it."""
+    """A request with a checksum gets a response with one."""
     bench = Bench()
     crc = crc_16(b"%R1Q,5003,9:")
     await bench.send(b"%%R1Q,5003,9,%d:\r\n" % crc)
@@ -76,21 +76,21 @@ async def test_checksums() -> None:
     assert int(checksum) == crc_16(b",".join((mark, com_code, transaction)) + b":" + tail)
 
 
-def test_the_checksum_is_crc_16_arc() -> None:
+def test_checksum_is_crc_16_arc() -> None:
     """By the published check value."""
     assert crc_16(b"123456789") == 0xBB3D
 
 
-async def test_numbers_have_the_decimals_that_are_set() -> None:
-    """Coarse numbers are possible, and refused beyond 15 digits."""
+async def test_decimals() -> None:
+    """The number of decimals can be set, to 15 at most."""
     bench = Bench()
     await bench.do((107, 4))
     assert len((await bench.ask(2107, 1)).values[0].partition(".")[2]) <= 4
     assert await bench.code(107, 16) == 2
 
 
-async def test_one_after_the_other() -> None:
-    """Requests that come meanwhile wait their turn; of too many the oldest are lost."""
+async def test_requests_are_queued() -> None:
+    """Requests wait in a short queue that drops the oldest."""
     bench = Bench()
     await bench.send(b"".join(b"%%R1Q,0,%d:\r\n" % number for number in range(1, 9)))
     answered = [(await bench.listen()).transaction for _ in range(5)]
@@ -98,33 +98,33 @@ async def test_one_after_the_other() -> None:
     assert await bench.quiet(1.0)
 
 
-async def test_a_long_function_is_aborted() -> None:
-    """A single c ends it with code 8, right away."""
+async def test_running_command_can_be_aborted() -> None:
+    """A single c ends it at once with code 8."""
     bench = Bench()
     await bench.do((9027, 1.0, 1.5, 0, 0, 0))
-    began_ns = bench.timeline.now_ns()
+    start_ns = bench.timeline.now_ns()
     await bench.send(b"%R1Q,9029,50:1.0,1.0,0\r\n")
     await asyncio.sleep(0.5)
     await bench.send(b"c\r\n")
     assert bench.port is not None
     assert (await bench.port.read()).data == b"?\r\n"
-    answer = await bench.listen()
-    assert (answer.transaction, answer.code) == (50, 8)
-    assert bench.timeline.now_ns() - began_ns < 0.6e9
+    response = await bench.listen()
+    assert (response.transaction, response.code) == (50, 8)
+    assert bench.timeline.now_ns() - start_ns < 0.6e9
     await bench.do((0,))
 
 
-async def test_a_wait_is_bounded() -> None:
-    """Without a distance it answers when the time given is over."""
+async def test_wait_for_a_distance_is_bounded() -> None:
+    """Without a distance it responds after the wait time."""
     bench = Bench()
     for wait_ms in (50, 500, 3000):
-        began_ns = bench.timeline.now_ns()
+        start_ns = bench.timeline.now_ns()
         assert await bench.code(2167, wait_ms, 1) == 1285
-        assert wait_ms < (bench.timeline.now_ns() - began_ns) / 1e6 < wait_ms + 90
+        assert wait_ms < (bench.timeline.now_ns() - start_ns) / 1e6 < wait_ms + 90
 
 
 async def test_forced_codes() -> None:
-    """A test can make it answer what it likes, to whom it likes, as often as it likes."""
+    """A test can force return codes, by command and number of uses."""
     bench = Bench()
     server = bench.instrument.server
     server.forced.append(ForcedResponse(code=1293, rpc=2008, times=2))
@@ -133,20 +133,20 @@ async def test_forced_codes() -> None:
     assert [await bench.code(2008, 1, 1) for _ in range(3)] == [1293, 1293, 0]
 
 
-async def test_every_procedure_answers() -> None:
-    """Whatever the procedure and however silly the numbers, there is one answer and it is well formed."""
+async def test_every_command_responds() -> None:
+    """Each command with arbitrary parameters gives one well-formed response."""
     for rpc, (signature, _) in COMMANDS.items():
         bench = Bench()
         bench.instrument.settings.power_mode = 0
         parameters = ['"x"' if kind == "s" else "1" for kind in signature]
-        answer = await bench.ask(rpc, *parameters)
-        assert answer.com_code == 0, Rpc(rpc)
+        response = await bench.ask(rpc, *parameters)
+        assert response.com_code == 0, Rpc(rpc)
         assert await bench.quiet(2.0)
 
 
 @given(st.binary(max_size=60))
-def test_no_bytes_break_it(data: bytes) -> None:
-    """After anything and a line feed it answers a proper request."""
+def test_arbitrary_bytes_are_harmless(data: bytes) -> None:
+    """After arbitrary bytes and a line feed it responds to a request."""
 
     async def run() -> None:
         bench = Bench(duration_s=1.0)
@@ -160,7 +160,7 @@ def test_no_bytes_break_it(data: bytes) -> None:
 
 
 async def test_settings_are_read_back() -> None:
-    """What is written is what is read."""
+    """Each setting reads as written."""
     bench = Bench()
     for write, read, *parameters in (
         (9031, 9030, 1),
@@ -200,13 +200,13 @@ async def test_settings_are_read_back() -> None:
         (2008, 9, 1),
     ],
 )
-async def test_settings_that_it_does_not_take(request_: tuple[int, ...]) -> None:
-    """Out of range is code 2."""
+async def test_out_of_range_settings_are_rejected(request_: tuple[int, ...]) -> None:
+    """With return code 2."""
     assert await Bench().code(*request_) == 2
 
 
-async def test_continuous_measuring_is_known() -> None:
-    """Whether it measures can be asked."""
+async def test_continuous_measurement_is_reported() -> None:
+    """Whether it runs can be queried."""
     bench = Bench()
     assert (await bench.ask(1070)).values == ["0"]
     await bench.do(*SETUP)

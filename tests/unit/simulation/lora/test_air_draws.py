@@ -1,4 +1,4 @@
-"""How often frames are lost, and on what their luck depends."""
+"""Loss rates of frames, and what the random draws depend on."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tsgt.simulation.lora.link import detection_probability, header_probability,
 
 
 def outcomes_of(count: int, link: LinkModel, seed: int = 0, **changes: Any) -> dict[str, int]:
-    """Send many frames; return how often each came to what, ``nothing`` included."""
+    """Send many frames; return the count of each outcome, ``nothing`` included."""
     scene = Scene(link, seed)
     scene.rx.listen(listening())
     for number in range(count):
@@ -24,8 +24,8 @@ def outcomes_of(count: int, link: LinkModel, seed: int = 0, **changes: Any) -> d
 
 
 @pytest.mark.parametrize("snr_db", [-17.0, -16.0, -15.0, -14.0])
-def test_losses_follow_the_probabilities(snr_db: float) -> None:
-    """How often nothing is found, the header is lost and the payload is damaged is what the link model says."""
+def test_loss_rates_match_the_link_model(snr_db: float) -> None:
+    """Rates of undetected preambles, lost headers and damaged payloads are those of the link model."""
     count = 2000
     outcomes = outcomes_of(count, link_with_snr(snr_db))
     detected = detection_probability(snr_db, 9)
@@ -43,39 +43,39 @@ def test_losses_follow_the_probabilities(snr_db: float) -> None:
 
 
 def test_loss_probability_is_independent_of_power() -> None:
-    """A given share of frames is not heard although the link is perfect."""
+    """The given share of frames is lost on a perfect link."""
     outcomes = outcomes_of(2000, LinkModel(loss_probability=0.2))
     assert outcomes["nothing"] / 2000 == pytest.approx(0.2, abs=0.04)
     assert outcomes["received"] + outcomes["nothing"] == 2000
 
 
-def test_fading_loses_frames_of_a_good_link() -> None:
-    """With Rayleigh fading, 10 dB above the limit is not enough for every frame."""
+def test_rayleigh_fading_loses_frames_of_a_good_link() -> None:
+    """With Rayleigh fading, some frames are lost 10 dB above the limit."""
     assert outcomes_of(500, link_with_snr(-4.0))["received"] == 500
     faded = link_with_snr(-4.0)
     faded.rayleigh_fading = True
     assert 350 < outcomes_of(500, faded)["received"] < 490
 
 
-def test_same_seed_same_fate() -> None:
-    """The same seed gives the same fates, another one others."""
+def test_same_seed_gives_the_same_outcomes() -> None:
+    """Another seed gives others."""
 
-    def fates(seed: int) -> list[tuple[int, str]]:
+    def outcomes_with(seed: int) -> list[tuple[int, str]]:
         scene = Scene(link_with_snr(-15.0), seed)
         scene.rx.listen(listening())
         for number in range(50):
             scene.send(frame(number * 70.0))
         scene.finish()
-        return scene.antenna.events
+        return scene.listener.events
 
-    assert fates(1) == fates(1)
-    assert fates(1) != fates(2)
+    assert outcomes_with(1) == outcomes_with(1)
+    assert outcomes_with(1) != outcomes_with(2)
 
 
-def test_further_radios_change_nothing_for_others() -> None:
-    """The fate of a frame at a receiver does not depend on who else is there."""
+def test_additional_radios_do_not_change_the_draws() -> None:
+    """The outcome of a frame at a receiver does not depend on other radios."""
 
-    def fates(bystanders: int) -> list[tuple[int, str]]:
+    def outcomes_with(bystanders: int) -> list[tuple[int, str]]:
         scene = Scene(link_with_snr(-15.0))
         for number in range(bystanders):
             scene.air.join(RecordingListener(), f"bystander {number}").listen(listening())
@@ -83,6 +83,6 @@ def test_further_radios_change_nothing_for_others() -> None:
         for number in range(50):
             scene.send(frame(number * 70.0))
         scene.finish()
-        return scene.antenna.events
+        return scene.listener.events
 
-    assert fates(0) == fates(3)
+    assert outcomes_with(0) == outcomes_with(3)

@@ -53,10 +53,9 @@ measurements of a station on a wrong prism, 500 sigmas off, rotated a robot by 0
 
 INITIAL_VELOCITY_SIGMA_MPS = 10.0
 INITIAL_ANGULAR_VELOCITY_SIGMA_RADPS = 10.0
-
 INITIAL_POSITION_SIGMA_M = 1e4
 INITIAL_ROTATION_SIGMA_RAD = 1e2
-"""Diffuse prior of the first pose."""
+"""Diffuse prior on the first knot."""
 
 MAX_ITERATIONS = 30
 COST_TOLERANCE = 1e-3
@@ -80,7 +79,7 @@ class AnchorPrior:
 
     linearisation_point: States  # One knot about which the error is counted, close to the trajectory
     information: FloatArray  # (18, 18) inverse covariance of the error
-    # (18,) of the error. In a direction with next to no information it may be metres or radians: as an error it keeps
+    # (18,) mean of the error. In a direction with next to no information it may be metres or radians: as an error it keeps
     # that direction, as a retracted linearisation point it would not.
     mean: FloatArray = field(default_factory=lambda: np.zeros(STATE_DIM))
 

@@ -45,30 +45,30 @@ class Planting:
     """
 
     def __init__(self) -> None:
-        self.planted: list[tuple[Any, str, Any]] = []
+        self.replaced: list[tuple[Any, str, Any]] = []
 
-    def put(self, owner: Any, name: str, make: Callable[[Any], Any]) -> None:
+    def replace_attribute(self, owner: Any, name: str, make: Callable[[Any], Any]) -> None:
         """Replace an attribute by what is made of it."""
-        right = owner.__dict__[name]
-        self.planted.append((owner, name, right))
-        setattr(owner, name, make(right))
+        original = owner.__dict__[name]
+        self.replaced.append((owner, name, original))
+        setattr(owner, name, make(original))
 
     def undo(self) -> None:
         """Put everything back."""
-        while self.planted:
-            setattr(*self.planted.pop())
+        while self.replaced:
+            setattr(*self.replaced.pop())
 
 
 # --- Acknowledgements -----------------------------------------------------------------------------------------
 
 
-def no_acknowledgement(planting: Planting) -> None:
+def never_acknowledge(planting: Planting) -> None:
     """Never tell a station what is in the recording."""
-    planting.put(ReceiveWindow, "ack_bitmap", lambda _: lambda _peer, _counter: 0)
-    planting.put(ReceiveWindow, "cumulative", lambda _: property(lambda _inbox: -1))
+    planting.replace_attribute(ReceiveWindow, "ack_bitmap", lambda _: lambda _peer, _counter: 0)
+    planting.replace_attribute(ReceiveWindow, "cumulative", lambda _: property(lambda _inbox: -1))
 
 
-def acknowledged_before_written(planting: Planting) -> None:
+def acknowledge_before_written(planting: Planting) -> None:
     """Take everything for written that has come."""
 
     def settle(link: Any) -> None:
@@ -76,82 +76,82 @@ def acknowledged_before_written(planting: Planting) -> None:
             reply = link._unwritten.popleft()
             link._master.station(reply.station).window.mark_written(reply.sequences)
 
-    planting.put(link.SuperframeLink, "_settle", lambda _: settle)
+    planting.replace_attribute(link.SuperframeLink, "_settle", lambda _: settle)
 
 
-def acknowledged_to_the_highest(planting: Planting) -> None:
+def acknowledge_up_to_highest(planting: Planting) -> None:
     """Acknowledge what is missing below the highest number."""
-    planting.put(SequenceSet, "cumulative", lambda _: property(lambda numbers: numbers.highest))
+    planting.replace_attribute(SequenceSet, "cumulative", lambda _: property(lambda numbers: numbers.highest))
 
 
-def deleted_when_sent(planting: Planting) -> None:
+def dequeue_when_sent(planting: Planting) -> None:
     """Delete what is on the air, whether it arrives or not."""
 
-    def sent(right: Any) -> Any:
-        def wrong(delivery: Any, sequences: Any) -> None:
-            right(delivery, sequences)
+    def sent(original: Any) -> Any:
+        def defective(delivery: Any, sequences: Any) -> None:
+            original(delivery, sequences)
             delivery._queue.remove(sequences)
 
-        return wrong
+        return defective
 
-    planting.put(DeliveryProgress, "mark_sent", sent)
+    planting.replace_attribute(DeliveryProgress, "mark_sent", sent)
 
 
-def repeats_kept(planting: Planting) -> None:
+def accept_duplicates(planting: Planting) -> None:
     """Hand on whatever comes."""
 
-    def take(right: Any) -> Any:
-        return lambda window, number: right(window, number) or True
+    def take(original: Any) -> Any:
+        return lambda window, number: original(window, number) or True
 
-    planting.put(ReceiveWindow, "accept", take)
+    planting.replace_attribute(ReceiveWindow, "accept", take)
 
 
-def repeats_kept_classic(planting: Planting) -> None:
+def accept_duplicates_classic(planting: Planting) -> None:
     """Know nothing of what has come before."""
 
-    def init(right: Any) -> Any:
-        def wrong(station: Any, *arguments: Any) -> None:
-            right(station, *arguments)
+    def init(original: Any) -> Any:
+        def defective(station: Any, *arguments: Any) -> None:
+            original(station, *arguments)
             station._known = deque(maxlen=0)
 
-        return wrong
+        return defective
 
-    planting.put(ingest._Station, "__init__", init)
+    planting.replace_attribute(ingest._Station, "__init__", init)
 
 
 # --- Numbers and codes ----------------------------------------------------------------------------------------
 
 
-def numbers_again(planting: Planting) -> None:
+def reuse_sequence_numbers(planting: Planting) -> None:
     """Begin with number 0 after each start."""
 
-    def read(right: Any) -> Any:
-        return lambda *arguments: replace(right(*arguments), first_sequence=0, queued=())
+    def read(original: Any) -> Any:
+        return lambda *arguments: replace(original(*arguments), first_sequence=0, queued=())
 
-    planting.put(daemon, "read_backlog", read)
+    planting.replace_attribute(daemon, "read_backlog", read)
 
 
-def nonce_again(planting: Planting) -> None:
+def reuse_nonce(planting: Planting) -> None:
     """Introduce a station to each session with the same nonce."""
 
-    def init(right: Any) -> Any:
-        def wrong(client: Any, *arguments: Any, **named: Any) -> None:
-            right(client, *arguments, **named)
+    def init(original: Any) -> Any:
+        def defective(client: Any, *arguments: Any, **named: Any) -> None:
+            original(client, *arguments, **named)
             client._random_bits = lambda _bits: 7
 
-        return wrong
+        return defective
 
-    planting.put(SuperframeStation, "__init__", init)
+    planting.replace_attribute(SuperframeStation, "__init__", init)
 
 
-def code_not_compared(planting: Planting) -> None:
+def skip_authentication(planting: Planting) -> None:
     """Take each code for the right one, at the master and at the stations."""
     anything = SimpleNamespace(compare_digest=lambda _one, _other: True)
     for module in (master, station):
-        planting.put(module, "hmac", lambda _: anything)
+        planting.replace_attribute(module, "hmac", lambda _: anything)
 
 
-def old_beacon_accepted(planting: Planting) -> None:
+def accept_old_beacon(planting: Planting) -> None:
     """Find the frame number of a beacon that is not new."""
 
     def counter_of(session: Any, beacon: Any) -> Any:
@@ -161,53 +161,53 @@ def old_beacon_accepted(planting: Planting) -> None:
         counter = beacon.session.counter_high << 8 | beacon.frame
         return counter if beacon.session.nonce == session.master_nonce else None
 
-    planting.put(StationSession, "counter_of", lambda _: counter_of)
+    planting.replace_attribute(StationSession, "counter_of", lambda _: counter_of)
 
 
 # --- Time -----------------------------------------------------------------------------------------------------
 
 
-def offset_added(planting: Planting) -> None:
+def add_clock_offset(planting: Planting) -> None:
     """Add the offset of a station's clock instead of taking it off."""
 
-    def measurement(right: Any) -> Any:
-        def wrong(station: Any, message: Any, received_ns: int) -> Any:
-            stamped = right(station, message, received_ns)
+    def measurement(original: Any) -> Any:
+        def defective(station: Any, message: Any, received_ns: int) -> Any:
+            stamped = original(station, message, received_ns)
             return replace(stamped, stamp_ns=2 * message.time_ns - stamped.stamp_ns)
 
-        return wrong
+        return defective
 
-    planting.put(ingest._Station, "_measurement", measurement)
+    planting.replace_attribute(ingest._Station, "_measurement", measurement)
 
 
-def frequency_reversed(planting: Planting) -> None:
+def reverse_frequency(planting: Planting) -> None:
     """Carry a clock's offset on with the frequency's wrong sign."""
 
     def at_ns(line: Any, station_ns: int) -> int:
         return int(line.base_ns + round(line.offset_ns - line.frequency * line._seconds(station_ns)))
 
-    planting.put(RegressionLine, "at_ns", lambda _: at_ns)
+    planting.replace_attribute(RegressionLine, "at_ns", lambda _: at_ns)
 
 
-def beacon_beside(planting: Planting) -> None:
+def use_time_of_next_beacon(planting: Planting) -> None:
     """Take the time at which a beacon left for that of the beacon after it."""
 
-    def reception(right: Any) -> Any:
-        def wrong(session: Any) -> Any:
-            found = right(session)
+    def reception(original: Any) -> Any:
+        def defective(session: Any) -> Any:
+            found = original(session)
             return found and replace(found, received_ns=session.beacon.received_ns)
 
-        return wrong
+        return defective
 
-    planting.put(StationSession, "reception", reception)
+    planting.replace_attribute(StationSession, "reception", reception)
 
 
-def slot_beside(planting: Planting) -> None:
+def reply_one_slot_late(planting: Planting) -> None:
     """Reply a slot too late."""
 
-    def slot_of(right: Any) -> Any:
-        def wrong(session: Any) -> Any:
-            slot = right(session)
+    def slot_of(original: Any) -> Any:
+        def defective(session: Any) -> Any:
+            slot = original(session)
             if slot is None:
                 return None
             late_ns = slot.slot.end_ns - slot.slot.start_ns + session.timing.guard_ns
@@ -216,125 +216,125 @@ def slot_beside(planting: Planting) -> None:
             )
             return slot._replace(slot=moved, start_ns=slot.start_ns + late_ns)
 
-        return wrong
+        return defective
 
-    planting.put(StationSession, "_reply_slot", slot_of)
+    planting.replace_attribute(StationSession, "_reply_slot", slot_of)
 
 
-def whole_milliseconds(planting: Planting) -> None:
+def truncate_times_to_ms(planting: Planting) -> None:
     """Round the time of a measurement down to whole milliseconds."""
     units = 1000 // TIME_UNIT_US
 
-    def timed(right: Any) -> Any:
-        def wrong(*arguments: Any) -> Any:
-            found = right(*arguments)
+    def timed(original: Any) -> Any:
+        def defective(*arguments: Any) -> Any:
+            found = original(*arguments)
             return found and found._replace(time=found.time // units * units)
 
-        return wrong
+        return defective
 
-    planting.put(StationSession, "timestamped", timed)
+    planting.replace_attribute(StationSession, "timestamped", timed)
 
 
-def latency_left_in(planting: Planting) -> None:
+def keep_instrument_latency(planting: Planting) -> None:
     """Leave the instrument's latency in the stamps."""
 
-    def stamp(right: Any) -> Any:
-        def wrong(times: Any, measured: Any) -> Any:
-            found = right(times, measured)
+    def stamp(original: Any) -> Any:
+        def defective(times: Any, measured: Any) -> Any:
+            found = original(times, measured)
             return found and found._replace(at_ns=found.at_ns + times.latency_ns)
 
-        return wrong
+        return defective
 
-    planting.put(DistanceTimestamper, "timestamp", stamp)
+    planting.replace_attribute(DistanceTimestamper, "timestamp", stamp)
 
 
 # --- Values ---------------------------------------------------------------------------------------------------
 
 
-def angle_short_of_a_bit(planting: Planting) -> None:
+def drop_lowest_angle_bit(planting: Planting) -> None:
     """Leave the lowest bit of the angles out."""
     for module in (backlog, station_link):
-        planting.put(module, "angle_code", lambda right: lambda angle_rad: right(angle_rad) & ~1)
+        planting.replace_attribute(module, "angle_code", lambda original: lambda angle_rad: original(angle_rad) & ~1)
 
 
-def other_calibration(planting: Planting) -> None:
+def use_stale_station_frame(planting: Planting) -> None:
     """Let the master have station 2's frame of before somebody moved it by 20 mm."""
 
-    def run_master(right: Any) -> Any:
-        def wrong(config: Any, parameters: Any, *arguments: Any, **named: Any) -> Any:
+    def run_master(original: Any) -> Any:
+        def defective(config: Any, parameters: Any, *arguments: Any, **named: Any) -> Any:
             first, station, *others = parameters.stations
             row, *rows = station.T_station1_station
             moved = replace(station, T_station1_station=((*row[:3], row[3] + 0.02), *rows))
             parameters = replace(parameters, stations=(first, moved, *others))
-            return right(config, parameters, *arguments, **named)
+            return original(config, parameters, *arguments, **named)
 
-        return wrong
+        return defective
 
-    planting.put(mission, "run_master", run_master)
+    planting.replace_attribute(mission, "run_master", run_master)
 
 
-def no_prism_constant(planting: Planting) -> None:
+def ignore_prism_constant(planting: Planting) -> None:
     """Leave the prism constant out."""
 
-    def corrected(right: Any) -> Any:
-        return lambda distance_m, *, constant_m, ppm: right(distance_m, constant_m=0 * constant_m, ppm=ppm)
+    def corrected(original: Any) -> Any:
+        return lambda distance_m, *, constant_m, ppm: original(distance_m, constant_m=0 * constant_m, ppm=ppm)
 
     for module in (tracks, observations):
-        planting.put(module, "corrected_distance", corrected)
+        planting.replace_attribute(module, "corrected_distance", corrected)
 
 
-def error_used(planting: Planting) -> None:
+def use_failed_measurements(planting: Planting) -> None:
     """Use a measurement whatever its instrument says of it."""
-    planting.put(Status, "usable", lambda _: property(lambda _status: True))
+    planting.replace_attribute(Status, "usable", lambda _: property(lambda _status: True))
 
 
 # --- Poses ----------------------------------------------------------------------------------------------------
 
 
-def covariance_a_quarter(planting: Planting) -> None:
+def quarter_covariance(planting: Planting) -> None:
     """State a quarter of the covariance."""
 
-    def ros_covariance(right: Any) -> Any:
-        return lambda *arguments: right(*arguments) / 4
+    def ros_covariance(original: Any) -> Any:
+        return lambda *arguments: original(*arguments) / 4
 
-    planting.put(pose_output, "ros_covariance", ros_covariance)
+    planting.replace_attribute(pose_output, "ros_covariance", ros_covariance)
 
 
-def smoothed_now(planting: Planting) -> None:
+def stamp_smoothed_poses_now(planting: Planting) -> None:
     """Stamp smoothed poses with the time at which they are made."""
 
-    def smoothed(right: Any) -> Any:
-        def wrong(poses: Any, stamp_ns: Any, *arguments: Any, **options: Any) -> Any:
-            batch = right(poses, stamp_ns, *arguments, **options)
+    def smoothed(original: Any) -> Any:
+        def defective(poses: Any, stamp_ns: Any, *arguments: Any, **options: Any) -> Any:
+            batch = original(poses, stamp_ns, *arguments, **options)
             return replace(batch, stamp_ns=batch.stamp_ns + poses._limits.lag_ns)
 
-        return wrong
+        return defective
 
-    planting.put(pose_output.ContinuousPoseOutput, "smoothed", smoothed)
+    planting.replace_attribute(pose_output.ContinuousPoseOutput, "smoothed", smoothed)
 
 
 # --- Files, queues, radios ------------------------------------------------------------------------------------
 
 
-def another_order(planting: Planting) -> None:
+def reorder_lines(planting: Planting) -> None:
     """Let each fiftieth line change places with the next one on its way to the disk."""
     held: dict[Any, bytes] = {}
 
-    def put(right: Any) -> Any:
-        def wrong(disk: Any, line: bytes) -> None:
+    def put(original: Any) -> Any:
+        def defective(disk: Any, line: bytes) -> None:
             if disk not in held and disk.line_count % 50 == 49:
                 held[disk] = line
                 return
-            right(disk, line)
+            original(disk, line)
             if disk in held:
-                right(disk, held.pop(disk))
+                original(disk, held.pop(disk))
 
-        return wrong
+        return defective
 
-    planting.put(RecordingThread, "put", put)
+    planting.replace_attribute(RecordingThread, "put", put)
 
 
-def journalled_afterwards(planting: Planting) -> None:
+def journal_after_delivery(planting: Planting) -> None:
     """Deliver at once, and write half a second later."""
 
     def measured(client: Any, reading: Any) -> None:
@@ -342,20 +342,20 @@ def journalled_afterwards(planting: Planting) -> None:
         client._link.offer(measurement)
         asyncio.get_running_loop().call_later(0.5, client._journal.write, measurement)
 
-    planting.put(daemon._StationClient, "_on_reading", lambda _: measured)
+    planting.replace_attribute(daemon._StationClient, "_on_reading", lambda _: measured)
 
 
-def torn_line_kept(planting: Planting) -> None:
+def keep_torn_line(planting: Planting) -> None:
     """Go on behind half a line."""
-    planting.put(RecordingWriter, "_cut_torn_line", lambda _: lambda _writer: None)
+    planting.replace_attribute(RecordingWriter, "_cut_torn_line", lambda _: lambda _writer: None)
 
 
-def endless_queue(planting: Planting) -> None:
+def unbound_reader_queue(planting: Planting) -> None:
     """Let lines wait for a slow reader without a bound."""
-    planting.put(stream_server._Reader, "full", lambda _: property(lambda _reader: False))
+    planting.replace_attribute(stream_server._Reader, "full", lambda _: property(lambda _reader: False))
 
 
-def radio_given_up(planting: Planting) -> None:
+def never_reopen_radio(planting: Planting) -> None:
     """Use a station's radio until its first fault, and never again."""
 
     async def supervise_radio(open_radio: Any, use: Any, _clock: Any) -> None:
@@ -364,4 +364,4 @@ def radio_given_up(planting: Planting) -> None:
                 await use(radio)
         await asyncio.Event().wait()
 
-    planting.put(daemon, "supervise_radio", lambda _: supervise_radio)
+    planting.replace_attribute(daemon, "supervise_radio", lambda _: supervise_radio)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING, NamedTuple
 
-from harness.exchange import START_NS, Exchange
+from harness.superframe_loop import START_NS, Exchange
 
 from tsgt.radio.superframe.wire import CODE_BYTES, Authenticator, decode_reply
 

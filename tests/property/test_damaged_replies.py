@@ -1,4 +1,4 @@
-"""Whatever comes on the line instead of an instrument's replies: no wrong reading, no hang, and it goes on afterwards."""
+"""Damaged replies of an instrument: no wrong reading, no hang, and normal operation afterwards."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ BACK_S = 30.0
 
 @dataclass(slots=True)
 class DamagedReplies(LineFaults):
-    """Replies that have been damaged, and whatever else somebody puts on the line, one after the other."""
+    """Damaged replies, and other bytes on the line, one after the other."""
 
     damages: deque[Damage | None] = field(default_factory=deque)
-    heard: list[bytes] = field(default_factory=list)
+    replies: list[bytes] = field(default_factory=list)
 
     def apply(self, data: bytes) -> list[tuple[int, bytes]]:
-        """Return what comes of an answer."""
-        self.heard.append(data)
+        """Return what arrives of a reply."""
+        self.replies.append(data)
         damage = self.damages.popleft() if self.damages else None
-        return [(0, data if damage is None else damage.to([data, *self.heard[-5:]]))]
+        return [(0, data if damage is None else damage.to([data, *self.replies[-5:]]))]
 
 
-async def keep(day: LeicaBench, until_s: float) -> None:
-    """Read, and connect again after each error, as the client does; check what is read."""
+async def read_until(day: LeicaBench, until_s: float) -> None:
+    """Read, and reconnect after each error, as the client does; check the readings."""
     connected = False
     while day.now_s < until_s:
         try:
@@ -79,7 +79,7 @@ def test_damaged_replies(
             if begun:
                 await day.begin()
             day.line._wire.faults = DamagedReplies(damages=deque(script))
-            await keep(day, day.now_s + HOSTILE_S)
+            await read_until(day, day.now_s + HOSTILE_S)
             day.line._wire.faults = LineFaults()
             await day.instrument.close()
             async with asyncio.timeout(BACK_S):

@@ -1,4 +1,4 @@
-"""Whoever has no key changes nothing, and without a key anybody may send anything: nothing falls over."""
+"""Forged packets have no effect with a key; without a key arbitrary packets raise no error."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from dataclasses import replace
 from unittest.mock import patch
 
 import numpy as np
-from harness.exchange import Exchange
+from harness.superframe_loop import Exchange
 from harness.forgery import KINDS, forge, state
-from harness.frames import KEY, TIMING
+from harness.scripted_stations import KEY, TIMING
 
 from tsgt.errors import MessageError
 from tsgt.model import Status
@@ -36,15 +36,15 @@ from tsgt.radio.superframe.wire import (
 
 
 def test_no_forged_packet_has_an_effect() -> None:
-    """Of all kinds, to both sides, at any moment of a frame: not a byte on the air is another one because of them."""
+    """Of any kind, to both sides, at any time of a frame: all packets stay the same."""
     result = forge(TIMING, KEY, 30_000, np.random.default_rng(1), per_step=50)
     assert min(result.sent[kind, target] for kind in KINDS for target in ("station", "master")) > 500
     assert +result.accepted == {}
     assert (result.diverged, result.same_state) == (0, True)
 
 
-def test_an_effect_would_be_seen() -> None:
-    """Were codes not compared, in all three ways in which it is looked for."""
+def test_missing_code_comparison_is_detected() -> None:
+    """By acceptance, by packets and by the final state."""
     with patch("hmac.compare_digest", return_value=True):
         result = forge(TIMING, KEY, 5000, np.random.default_rng(1), per_step=50)
     assert result.accepted.total() > 100
@@ -52,8 +52,8 @@ def test_an_effect_would_be_seen() -> None:
     assert not result.same_state
 
 
-def test_two_states_are_told_apart() -> None:
-    """Down to a counter in one of the stations."""
+def test_state_comparison_detects_one_counter() -> None:
+    """Of one station."""
     one, other = (Exchange(TIMING, Authenticator(KEY), lambda bits: 7 % (1 << bits)) for _ in range(2))
     for exchange in (one, other):
         exchange.frame()
@@ -64,14 +64,14 @@ def test_two_states_are_told_apart() -> None:
 
 
 class _Anybody:
-    """Sends what nobody would, with codes that are right: any values in any fields."""
+    """Sends valid codes with arbitrary values in all fields."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
         self._authenticator = Authenticator(None)
 
     def bits(self, width: int) -> int:
-        """Return a number: any, or one at the edge of its field."""
+        """Return any number, or one at the edge of its field."""
         last = (1 << width) - 1
         edges = (0, 1, last, last // 2)
         if self._rng.random() < 0.3:
@@ -79,11 +79,11 @@ class _Anybody:
         return int.from_bytes(self._rng.bytes(8), "big") & last
 
     def chance(self, share: float = 0.5) -> bool:
-        """Toss a coin."""
+        """Return True with this probability."""
         return bool(self._rng.random() < share)
 
     def beacon(self, exchange: Exchange, number: int) -> bytes:
-        """Make one that the station takes to be its master's, or that begins another session."""
+        """Return a beacon of the station's master, or of another session."""
         entries = int(self._rng.integers(1, 17)) if self.chance(0.2) else len(exchange.members)
         core = exchange.members[number].core
         session = core.session
@@ -120,7 +120,7 @@ class _Anybody:
         return content + self._authenticator.beacon_code(session=master, counter=counter, content=content)
 
     def reply(self, exchange: Exchange, number: int) -> bytes:
-        """Make one that the master takes to be a station's."""
+        """Return a reply that the master accepts as the station's."""
         station_state = exchange.master.station(number)
         join_request = JoinRequest(
             nonce=self.bits(32), stream_id=self.bits(2), first_sequence=self.bits(32), oldest=self.bits(32)
@@ -173,8 +173,8 @@ class _Anybody:
         )
 
 
-def test_without_a_key_nothing_falls_over() -> None:
-    """Orders, sessions, numbers and times of anybody, all of which is believed."""
+def test_arbitrary_messages_raise_no_error() -> None:
+    """Commands, sessions, numbers and times of any sender, all of which are accepted."""
     rng = np.random.default_rng(3)
     anybody = _Anybody(rng)
     exchange = Exchange(TIMING, Authenticator(None), anybody.bits)

@@ -1,4 +1,4 @@
-"""Somebody who sends damaged packets to both sides of a protocol: nobody falls over, and it goes on as soon as he stops."""
+"""Damaged packets to both sides of a protocol: no error, and normal operation as soon as they stop."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 from harness.damage import Damage, damages, examples
-from harness.exchange import Exchange
-from harness.frames import KEY, TIMING, counted
-from harness.missions import QUICK, SUPERFRAME, mission
+from harness.superframe_loop import Exchange
+from harness.scripted_stations import KEY, TIMING, counted
+from harness.missions import QUICK, SUPERFRAME, run_mission
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
@@ -42,7 +42,7 @@ class Channel(RuleBasedStateMachine):
 
     @initialize(joined=st.booleans())
     def begin(self, joined: bool) -> None:  # noqa: FBT001 (given by hypothesis)
-        """Begin, before the stations have joined or after."""
+        """Start, before or after the stations have joined."""
         self.authenticator = Authenticator(KEY if self.authenticated else None)
         self.exchange = Exchange(TIMING, self.authenticator, counted(), stations=STATIONS)
         self.beacons: deque[bytes] = deque(maxlen=REMEMBERED)
@@ -51,14 +51,14 @@ class Channel(RuleBasedStateMachine):
             self.frame()
 
     def frame(self) -> None:
-        """Run a frame to which nothing happens."""
+        """Run an undisturbed frame."""
         self.exchange.frame()
         self.beacons.append(self.exchange.beacon)
         self.replies.extend(self.exchange.replies.values())
 
     @rule(count=st.integers(1, 5))
     def frames(self, count: int) -> None:
-        """Leave them alone for a while."""
+        """Run undisturbed frames."""
         for _ in range(count):
             self.frame()
 
@@ -69,7 +69,7 @@ class Channel(RuleBasedStateMachine):
         right=st.booleans(),
     )
     def to_a_station(self, damage: Damage, station: int, late_ns: int, right: bool) -> None:  # noqa: FBT001 (as above)
-        """Send a station something like a beacon, or like another one's reply."""
+        """Send a station a damaged beacon, or a reply of another station."""
         self.exchange.begin()
         packet = damage.to([*self.beacons, *self.replies, self.exchange.beacon])
         master = self.exchange.master
@@ -91,7 +91,7 @@ class Channel(RuleBasedStateMachine):
         damage=damages, station=st.sampled_from(STATIONS), after_ns=st.integers(0, 10**9), right=st.booleans()
     )
     def to_the_master(self, damage: Damage, station: int, after_ns: int, right: bool) -> None:  # noqa: FBT001 (as above)
-        """Send the master something like a reply, or like a beacon, while it waits."""
+        """Send the master a damaged reply, or a beacon, while it waits for replies."""
         exchange = self.exchange
         packet = damage.to([*self.replies, *self.beacons] or [b""])
         exchange.begin()
@@ -119,7 +119,7 @@ class Channel(RuleBasedStateMachine):
         exchange.end()
 
     def teardown(self) -> None:
-        """Leave them alone: soon all that is measured from then on arrives, with its true time."""
+        """Run undisturbed frames: soon all new measurements arrive with accurate timestamps."""
         if not hasattr(self, "exchange"):
             return
         for _ in range(SETTLING_FRAMES):
@@ -160,7 +160,7 @@ pauses_ms = st.sampled_from([0, 1, 20, 60, 150, 300])
 
 
 async def attack(mission: Mission, script: list[tuple[Damage, int]]) -> None:
-    """Hear what is on the air and send damaged packets, for some seconds."""
+    """Receive the traffic and send damaged packets for some seconds."""
     heard: deque[bytes] = deque(maxlen=REMEMBERED)
 
     async def listen(radio: Radio) -> None:
@@ -183,7 +183,7 @@ async def attack(mission: Mission, script: list[tuple[Damage, int]]) -> None:
 
 
 def delivered(run: MissionResult, since_s: float) -> int:
-    """Count the measurements that were made since then and reached the pipeline."""
+    """Count the measurements made since then that reached the pipeline."""
     since_ns = run.start_ns + round(since_s * 1e9)
     return sum(
         measurement.stamp_ns >= since_ns
@@ -195,10 +195,10 @@ def delivered(run: MissionResult, since_s: float) -> int:
 @pytest.mark.parametrize("protocol", ["classic", "superframe", "superframe without a key"])
 @examples(1)
 @given(script=st.lists(st.tuples(damages, pauses_ms), min_size=20, max_size=80))
-def test_daemons_go_on(protocol: str, script: list[tuple[Damage, int]]) -> None:
-    """Master and clients live through it, and measure at their rate when it is over."""
+def test_daemons_survive_damaged_packets(protocol: str, script: list[tuple[Damage, int]]) -> None:
+    """Master and clients measure at their rate afterwards."""
     with tempfile.TemporaryDirectory() as folder, capture_logs():
-        run = mission(
+        run = run_mission(
             Path(folder),
             duration_s=END_S,
             protocol=QUICK if protocol == "classic" else SUPERFRAME,

@@ -1,4 +1,4 @@
-"""Beacons and replies come back as they were, and no packet from the air breaks the codec or has two meanings."""
+"""Beacons and replies round-trip, and no packet breaks the codec or has two meanings."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ sessions = st.builds(
 
 @st.composite
 def beacons(draw: st.DrawFn) -> Beacon:
-    """Any beacon; what it says to single stations it says to such as there are."""
+    """Any beacon; it addresses existing stations only."""
     stations = draw(st.lists(entries, min_size=1, max_size=16).map(tuple))
     numbers = st.integers(1, len(stations))
     tracks = st.builds(EncodedCommand, numbers, _bits(4), st.just(0), _bits(4))
@@ -84,7 +84,7 @@ distance_steps = st.integers(-100, 100) | st.integers(-(2**15), 2**15)
 
 @st.composite
 def blocks(draw: st.DrawFn, *, plain: bool = False) -> MeasurementBlock:
-    """Any run, with measurements near to each other, or far away; or one without anything special."""
+    """Any block, of close or distant measurements; or a plain one."""
     flags = st.just(False) if plain else st.booleans()
     wide = draw(flags)
     newer = EncodedMeasurement(

@@ -28,31 +28,18 @@ backlog; so does the first one, and one after a rejected beacon, because only a 
 
 
 class InstrumentState(NamedTuple):
-    """State of the instrument.
+    """State of the instrument."""
 
-    Attributes
-    ----------
-    prism
-        The tracked prism, or the last one before direct mode.
-    direct
-        It is in direct mode.
-    """
-
-    prism: int
-    direct: bool
+    prism: int  # the tracked prism, or the last one before direct mode
+    direct: bool  # it is in direct mode
     connected: bool
 
 
 class CommandExchange:
-    """The station's side.
-
-    Attributes
-    ----------
-    responses, single_measurements
-        Not acknowledged, oldest first.
-    """
+    """The station's side."""
 
     def __init__(self) -> None:
+        # Not acknowledged, oldest first.
         self.responses: deque[CommandResponse] = deque()
         self.single_measurements: deque[SingleMeasurement] = deque()
         self._command_ids: frozenset[int] = frozenset()
@@ -61,8 +48,6 @@ class CommandExchange:
         # Prisms that the master may assume to be tracked, with the latest frame that reported them.
         self._reported_prisms: dict[int, int] = {}
         self._replies_without_turnaround = MAX_REPLIES_WITHOUT_TURNAROUND
-
-    # --- Commands ---------------------------------------------------------------------------------------------
 
     def receive(self, encoded: Iterable[EncodedCommand]) -> None:
         """Queue the new ones among a beacon's commands to this station.
@@ -82,8 +67,6 @@ class CommandExchange:
     def next_command(self) -> tuple[int, Command] | None:
         """Remove and return the next command and its id; None without one."""
         return self._commands.popleft() if self._commands else None
-
-    # --- Replies ----------------------------------------------------------------------------------------------
 
     def needs_report(self, state: InstrumentState) -> bool:
         """Whether the master may not know the state of the instrument."""

@@ -13,6 +13,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 from tsgt.model import Status
+from tsgt.radio.commands import MeasureCommand
 from tsgt.radio.superframe.slots import COMPOSE_LEAD_NS, MAX_FRAME_NS
 from tsgt.radio.superframe.wire import (
     ACK_FRAMES,
@@ -31,6 +32,7 @@ from tsgt.timesync import Period, Periodicity
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from tsgt.radio.commands import Command
     from tsgt.radio.superframe.receive_window import ReceiveWindow
     from tsgt.radio.superframe.reception import ReplyTiming
     from tsgt.radio.superframe.slots import FrameTiming
@@ -86,24 +88,12 @@ AGE_WINDOW = 32
 
 @dataclass(frozen=True, slots=True)
 class Demand:
-    """Predicted content of a reply.
+    """Predicted content of a reply."""
 
-    Attributes
-    ----------
-    measurements
-        Their number.
-    scattered
-        Their sequence numbers have gaps.
-    plain
-        They fit a reply of the form ``single``: the station's clock has converged.
-    extended
-        With status report and turnaround.
-    """
-
-    measurements: int
-    scattered: bool = False
-    plain: bool = True
-    extended: bool = False
+    measurements: int  # their number
+    scattered: bool = False  # their sequence numbers have gaps
+    plain: bool = True  # they fit a reply of the form single: the station's clock has converged
+    extended: bool = False  # with status report and turnaround
     response: bool = False
     single_measurement: bool = False
 
@@ -130,13 +120,7 @@ def retry_stations(silent_frames: Mapping[int, int], granted: Sequence[int]) -> 
 
     With many stations a lost reply waits long for the next slot. After a frame for all, a short frame repeats the slots
     of the stations that are usually received and were not. A single loss of a single station is not worth a frame.
-
-    Parameters
-    ----------
-    silent_frames
-        By station index, since its last reply.
-    granted
-        By station index, in the previous frame; empty without one.
+    Both arguments are by station index; ``granted`` is that of the previous frame, empty without one.
     """
     present = {index for index, frames in silent_frames.items() if frames <= MAX_RETRY_SILENT_FRAMES}
     if len(present) < MANY_STATIONS or not granted or not all(granted[index] for index in present):
@@ -151,16 +135,8 @@ def expected_measurements(
 ) -> int:
     """Return how many measurements a station can send in its slot that it could not send before, at least one.
 
-    Parameters
-    ----------
-    newest_us
-        Time of its newest received measurement.
-    replied_us
-        Start of its last received reply.
-    slot_us
-        Start of its slot.
-    ready_us
-        Delay from a measurement until a reply can carry it.
+    ``newest_us`` is the time of its newest received measurement, ``replied_us`` the start of its last received reply,
+    ``slot_us`` the start of its slot, and ``ready_us`` the delay from a measurement until a reply can carry it.
     """
     if (
         newest_us <= replied_us - 1.5 * period.period_us
@@ -208,15 +184,7 @@ def _typical_measurement(number: int) -> EncodedMeasurement:
 
 
 class DemandEstimator:
-    """Predicts the replies of one station.
-
-    Parameters
-    ----------
-    number
-        Of the station.
-    initial_interval
-        Frames between its initial two-way exchanges.
-    """
+    """Predicts the replies of one station; ``initial_interval`` is the frames between its initial two-way exchanges."""
 
     def __init__(self, number: int, initial_interval: int) -> None:
         self._number = number
@@ -238,7 +206,6 @@ class DemandEstimator:
         at: ReplyTiming,
         measured_ns: Sequence[int],
         timing: StationTiming,
-        *,
         outstanding_before: int,
         outstanding: int,
     ) -> None:
@@ -266,17 +233,11 @@ class DemandEstimator:
         *,
         silent_frames: int,
         exchanges: int,
-        response: bool,
-        single_measurement: bool,
+        pending: Command | None,
     ) -> Demand | None:
-        """Predict the reply in a frame; None before the first reply with a measurement.
+        """Predict the reply in a frame whose slot starts at ``slot_us`` in session time, after ``exchanges`` two-way ones.
 
-        Parameters
-        ----------
-        slot_us
-            Start of the slot, session time.
-        exchanges
-            Two-way exchanges so far.
+        None before the first reply with a measurement.
         """
         newest_us = self._periodicity.newest_us
         if newest_us is None or self._replied_us is None:
@@ -302,8 +263,8 @@ class DemandEstimator:
             scattered=outstanding > 0,
             plain=self._plain,
             extended=exchange,
-            response=response,
-            single_measurement=single_measurement,
+            response=pending is not None,
+            single_measurement=isinstance(pending, MeasureCommand),
         )
 
     @property

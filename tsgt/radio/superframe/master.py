@@ -71,32 +71,18 @@ IDLE_FRAME_NS = 400_000_000
 
 @dataclass(slots=True)
 class _Frame:
-    """A frame; instants on the master's CLOCK_MONOTONIC.
-
-    Attributes
-    ----------
-    start_ns
-        Planned start of the beacon.
-    draft
-        The beacon without station entries, slot order and cumulative acknowledgement.
-    code
-        Authentication code of the beacon.
-    sent_ns, sent_sigma_ns
-        TxDone of the beacon; None before.
-    slots, pending
-        By station index; ``pending`` are the stations whose reply has not been received.
-    """
+    """A frame; instants on the master's CLOCK_MONOTONIC."""
 
     counter: int
-    start_ns: int
+    start_ns: int  # planned start of the beacon
     grants: tuple[int, ...]
     slot_order: SlotOrder
-    draft: Beacon
-    code: bytes = b""
-    sent_ns: int | None = None
+    draft: Beacon  # without station entries, slot order and cumulative acknowledgement
+    code: bytes = b""  # authentication code of the beacon
+    sent_ns: int | None = None  # TxDone of the beacon
     sent_sigma_ns: int = 0
-    slots: list[Slot | None] = field(default_factory=list)
-    pending: dict[int, StationState] = field(default_factory=dict)
+    slots: list[Slot | None] = field(default_factory=list)  # by station index
+    pending: dict[int, StationState] = field(default_factory=dict)  # no reply yet; by station index
 
 
 class SuperframeMaster:
@@ -106,8 +92,6 @@ class SuperframeMaster:
     ----------
     prisms
         Default prism by station number, 1 to 16.
-    random_bits
-        Returns a number of this many random bits.
     now_ns
         On the master's CLOCK_MONOTONIC, as all instants here; zero of the session time.
     phase_lock
@@ -117,10 +101,8 @@ class SuperframeMaster:
 
     Attributes
     ----------
-    session
-        Session nonce.
-    counter
-        Frame counter of the session; -1 before the first frame.
+    session, counter
+        Session nonce, and frame counter in the session; -1 before the first frame.
     rejected_packets
         Packets that were not a reply to the present beacon: of others, forged, late, repeated.
     """

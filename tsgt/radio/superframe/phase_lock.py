@@ -86,13 +86,7 @@ class _Frame(NamedTuple):
 
 
 class PhaseLock:
-    """Plans the start and slot order of frames.
-
-    Attributes
-    ----------
-    locked
-        Frames keep their phase to the instruments; otherwise they start as early as possible.
-    """
+    """Plans the start and slot order of frames; unless ``locked`` they start as early as possible."""
 
     def __init__(self, timing: FrameTiming, stations: int) -> None:
         self._timing = timing
@@ -122,16 +116,9 @@ class PhaseLock:
             self._learn_margin(index, 1000 * time_us)
 
     def plan(self, earliest_ns: int, grants: Sequence[int], beacon_bytes: int) -> FramePlan:
-        """Plan the next frame.
+        """Plan the next frame, which starts at ``earliest_ns`` in session time or later.
 
-        Parameters
-        ----------
-        earliest_ns
-            Earliest start of the beacon, session time.
-        grants
-            By station index.
-        beacon_bytes
-            Length of the beacon, authentication code included.
+        The grants are by station index; ``beacon_bytes`` includes the authentication code.
         """
         self._update_frame_length(earliest_ns)
         self._grants.append(tuple(grants))
@@ -171,8 +158,6 @@ class PhaseLock:
             beacon_ns + max((slot.end_ns for slot in slots if slot), default=0),
             {index: beacon_ns + slot.start_ns - COMPOSE_LEAD_NS for index, slot in enumerate(slots) if slot},
         )
-
-    # --- Estimates --------------------------------------------------------------------------------------------
 
     def _update_frame_length(self, earliest_ns: int) -> None:
         """Update the real frame length, and by how much frames in phase would lag behind."""
@@ -214,8 +199,6 @@ class PhaseLock:
                     1e3 * period.period_us, 1e3 * (period.phase_us + late_us) + margin_ns
                 )
         return ready, active
-
-    # --- Optimisation -----------------------------------------------------------------------------------------
 
     def _align(
         self, earliest_ns: int, beacon_bytes: int, ready: Mapping[int, _ReadyTimes], active: int

@@ -27,18 +27,7 @@ _start = attrgetter("start")
 
 
 class SequenceSet:
-    """Set of sequence numbers, stored as its gaps.
-
-    Parameters
-    ----------
-    first
-        All lower numbers are in the set.
-
-    Attributes
-    ----------
-    highest
-        The highest number in the set.
-    """
+    """Set of sequence numbers, stored as its gaps and its highest number; initially all numbers below ``first``."""
 
     __slots__ = ("_gaps", "highest")
 
@@ -98,13 +87,7 @@ class _Stream:
 
 
 class ReceiveWindow:
-    """Received and recorded measurements of one station.
-
-    Attributes
-    ----------
-    stream_id
-        See :class:`~tsgt.radio.superframe.wire.messages.JoinRequest`; None before the first one.
-    """
+    """Received and recorded measurements of one station; ``stream_id`` is None before the first join request."""
 
     def __init__(self) -> None:
         self.stream_id: int | None = None

@@ -12,58 +12,28 @@ if TYPE_CHECKING:
 
 
 class ReplyTiming(NamedTuple):
-    """Instants of a reply and of its frame, on the master's CLOCK_MONOTONIC.
+    """Instants of a reply and of its frame, on the master's CLOCK_MONOTONIC."""
 
-    Attributes
-    ----------
-    counter
-        Of the frame.
-    sent_ns, sent_sigma_ns
-        TxDone of the beacon.
-    slot_ns
-        Start of the station's slot.
-    received_ns, received_sigma_ns
-        RxDone of the reply.
-    lateness_ns
-        RxDone minus its nominal instant.
-    payload_bytes, granted_bytes
-        Length of the reply, and of the longest one that was granted.
-    """
-
-    counter: int
-    sent_ns: int
+    counter: int  # of the frame
+    sent_ns: int  # TxDone of the beacon
     sent_sigma_ns: int
-    slot_ns: int
-    received_ns: int
+    slot_ns: int  # start of the station's slot
+    received_ns: int  # RxDone of the reply
     received_sigma_ns: int
-    lateness_ns: int
+    lateness_ns: int  # RxDone minus its nominal instant
     payload_bytes: int
     granted_bytes: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TimedMeasurement:
-    """A measurement with its timestamp.
+    """A measurement with its timestamp, rounded to 0.37 microradians and 0.1 mm (1 mm beyond 1.6 km)."""
 
-    Attributes
-    ----------
-    sequence
-        Full sequence number.
-    measured_ns
-        On the master's CLOCK_MONOTONIC; may be negative, before the start of that clock.
-    sigma_ns
-        Standard deviation of ``measured_ns``.
-    bound_ns
-        Maximum error of ``measured_ns``.
-    horizontal_angle_rad, zenith_angle_rad, slope_distance_m
-        Rounded to the resolution of the air interface: 0.37 microradians, 0.1 mm (1 mm beyond 1.6 km).
-    """
-
-    sequence: int
+    sequence: int  # in full
     prism: int
-    measured_ns: int
-    sigma_ns: int
-    bound_ns: int
+    measured_ns: int  # on the master's CLOCK_MONOTONIC; negative before the start of that clock
+    sigma_ns: int  # standard deviation of measured_ns
+    bound_ns: int  # maximum error of measured_ns
     status: Status
     horizontal_angle_rad: float
     zenith_angle_rad: float
@@ -72,34 +42,18 @@ class TimedMeasurement:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReceivedReply:
-    """Content of an authentic reply.
-
-    Attributes
-    ----------
-    measurements
-        The new ones, in ascending order of sequence numbers.
-    repeated
-        Number of measurements received before.
-    joined
-        The station joined this session with this reply.
-    command, response, single_measurement
-        The command that this reply completes, with its response or measurement; set once per command.
-    rejected_beacons
-        Beacons that the station has rejected for an impossible time since its last report.
-    link_delay_anomaly
-        The measured link delay is impossible: packets may be delayed on purpose.
-    lateness_ns
-        RxDone minus its nominal instant.
-    """
+    """Content of an authentic reply."""
 
     station: int
-    measurements: tuple[TimedMeasurement, ...] = ()
-    repeated: int = 0
-    joined: bool = False
+    measurements: tuple[TimedMeasurement, ...] = ()  # the new ones, by ascending sequence number
+    repeated: int = 0  # number of measurements that had been received before
+    joined: bool = False  # the station joined this session with this reply
     status_report: StatusReport | None = None
-    command: Command | None = None
+    command: Command | None = None  # completed by this reply, with its response or measurement; set once
     response: CommandResponse | None = None
     single_measurement: SingleMeasurement | None = None
-    rejected_beacons: int = 0
-    link_delay_anomaly: bool = False
-    lateness_ns: int = 0
+    rejected_beacons: int = 0  # for an impossible time, since the station's last report
+    link_delay_anomaly: bool = (
+        False  # the measured link delay is impossible: packets may be delayed on purpose
+    )
+    lateness_ns: int = 0  # RxDone minus its nominal instant

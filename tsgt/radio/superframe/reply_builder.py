@@ -47,13 +47,7 @@ MAX_SKIPPED_REPLIES = 2
 
 
 class ReplyBuilder:
-    """Builds the replies of one station.
-
-    Parameters
-    ----------
-    stream_id
-        See :class:`~tsgt.radio.superframe.wire.messages.JoinRequest`.
-    """
+    """Builds the replies of one station."""
 
     def __init__(self, send_queue: SendQueue, stream_id: int) -> None:
         self._queue = send_queue
@@ -145,21 +139,16 @@ def pack(
     prism: int | None,
     is_narrow: Callable[[int, int], bool],
 ) -> tuple[Reply, tuple[StampedMeasurement, ...]]:
-    """Fill a reply with measurements; return it and the measurements in it, newest first.
+    """Fill a reply with measurements up to ``limit_bytes``; return it and the measurements in it, newest first.
 
     Parameters
     ----------
     parts
         The rest of the reply, which fits.
-    by_urgency
-        Most urgent first.
-    limit_bytes
-        Maximum length, authentication code included.
     prism
         The prism that the master assumes; None: each block names its own.
     is_narrow
-        Whether the master can reconstruct a sequence number from its low bits; the second number is the highest in the
-        reply.
+        See :meth:`~tsgt.radio.superframe.send_queue.DeliveryProgress.may_be_narrow`.
     """
 
     def filled(count: int) -> tuple[Reply, tuple[StampedMeasurement, ...]]:

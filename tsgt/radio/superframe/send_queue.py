@@ -28,49 +28,26 @@ Gaps = tuple[tuple[int, int], ...]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QueuedMeasurement:
-    """A journalled measurement that is to be delivered.
-
-    Attributes
-    ----------
-    at_ns
-        On CLOCK_MONOTONIC of the station's computer.
-    boot
-        Boot id that this clock belongs to.
-    horizontal, zenith
-        Encoded by :func:`~tsgt.radio.superframe.wire.codec.angle_code`.
-    distance_m
-        Slope distance; None: angles only.
-    """
+    """A journalled measurement that is to be delivered."""
 
     sequence: int
-    at_ns: int
-    boot: str
+    at_ns: int  # on CLOCK_MONOTONIC of the station's computer
+    boot: str  # boot id of that clock
     prism: int
     status: Status
-    horizontal: int
+    horizontal: int  # encoded by angle_code
     zenith: int
-    distance_m: float | None
+    distance_m: float | None  # slope distance
 
 
 class StampedMeasurement(NamedTuple):
-    """A queued measurement with its encoded time.
-
-    Attributes
-    ----------
-    time
-        In units of :data:`~tsgt.radio.superframe.wire.messages.TIME_UNIT_US`, not wrapped: session time, or from the end
-        of the beacon if ``beacon_relative``.
-    quality
-        Of the time, 0 to 15.
-    age_ns
-        At the start of the reply; None for a measurement of an earlier boot.
-    """
+    """A queued measurement with its encoded time."""
 
     queued: QueuedMeasurement
-    time: int
-    quality: int
-    beacon_relative: bool
-    age_ns: int | None
+    time: int  # in units of TIME_UNIT_US, not wrapped
+    quality: int  # 0 to 15
+    beacon_relative: bool  # the time counts from the end of the beacon; otherwise it is session time
+    age_ns: int | None  # at the start of the reply; None for a measurement of an earlier boot
 
 
 def quality_of(bound_us: float) -> int | None:
@@ -79,34 +56,17 @@ def quality_of(bound_us: float) -> int | None:
 
 
 class PendingRange(NamedTuple):
-    """Sequence numbers that a master waits for.
-
-    Attributes
-    ----------
-    oldest
-        The lowest.
-    gaps
-        First and last number of each higher range that will never be sent, ascending.
-    """
+    """Sequence numbers that a master waits for."""
 
     oldest: int
-    gaps: Gaps
+    gaps: Gaps  # first and last number of each higher range that will never be sent, ascending
 
 
 class SendQueue:
     """Measurements that are not acknowledged, by sequence number.
 
-    Parameters
-    ----------
-    first_sequence
-        First sequence number of this run of the client.
-    backlog
-        What earlier runs left, oldest first; numbers below ``first_sequence``.
-
-    Attributes
-    ----------
-    dropped_through
-        Highest number dropped because the queue was full; -1: none.
+    ``first_sequence`` is the first number of this run of the client, and ``backlog`` what earlier runs left, oldest first.
+    ``dropped_through`` is the highest number dropped because the queue was full; -1: none.
     """
 
     def __init__(self, first_sequence: int, backlog: Iterable[QueuedMeasurement] = ()) -> None:
@@ -124,13 +84,7 @@ class SendQueue:
         return next(iter(self._queue), self._next)
 
     def add(self, queued: QueuedMeasurement) -> None:
-        """Append a measurement; drop the oldest beyond :data:`QUEUE_CAPACITY`.
-
-        Raises
-        ------
-        ValueError
-            The sequence number is not higher than all before.
-        """
+        """Append a measurement with the highest sequence number; drop the oldest beyond :data:`QUEUE_CAPACITY`."""
         if queued.sequence < self._next:
             raise ValueError(f"measurement {queued.sequence} comes after {self._next - 1}")
         self._queue[queued.sequence] = queued
@@ -190,12 +144,7 @@ class DeliveryProgress:
     station sends one as soon as it has delivered everything below the numbers that a restart skipped, and otherwise when
     all gaps are below its oldest queued number.
 
-    Attributes
-    ----------
-    oldest
-        For the join request: lowest number that is still to be delivered.
-    join_pending
-        A join request has to be sent.
+    ``oldest`` is that of the join request, which has to be sent while ``join_pending``.
     """
 
     def __init__(self, send_queue: SendQueue, deliverable: Callable[[QueuedMeasurement], bool]) -> None:
@@ -207,8 +156,6 @@ class DeliveryProgress:
         self._known_oldest = self.oldest  # to the master
         self.join_pending = False
         self._reached = self.oldest - 1
-
-    # --- Join requests ----------------------------------------------------------------------------------------
 
     @property
     def outdated(self) -> bool:
@@ -233,16 +180,8 @@ class DeliveryProgress:
         self._reached = max(self._reached, oldest - 1)
         self._gaps = tuple((max(first, oldest), last) for first, last in self._gaps if last >= oldest)
 
-    # --- Sequence numbers -------------------------------------------------------------------------------------
-
     def may_be_narrow(self, sequence: int, newest: int) -> bool:
-        """Whether the master can reconstruct a number from its low bits and the highest number that it has.
-
-        Parameters
-        ----------
-        newest
-            The highest number of the same reply.
-        """
+        """Whether the master can reconstruct a number from its low bits; ``newest`` is the highest of the same reply."""
         if self._acknowledged is None:
             return False
         half = 1 << _SEQUENCE_BITS - 1
@@ -252,8 +191,6 @@ class DeliveryProgress:
     def mark_sent(self, sequences: Iterable[int]) -> None:
         """Mark numbers as sent."""
         self._highest_sent = max((self._highest_sent, *sequences))
-
-    # --- Acknowledgement --------------------------------------------------------------------------------------
 
     def acknowledge(self, sequences: Sequence[int]) -> None:
         """Remove measurements that the master has recorded."""

@@ -48,26 +48,14 @@ _SIGMAS = 4
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BeaconReception:
-    """A clock sample: a beacon's TxDone on the master's clock and its RxDone on the station's.
+    """A clock sample: a beacon's TxDone on the master's clock and its RxDone on the station's."""
 
-    Attributes
-    ----------
-    session
-        Session nonce.
-    received_ns, sigma_ns
-        RxDone on CLOCK_MONOTONIC of the station's computer.
-    sent_us
-        TxDone in session time.
-    boot
-        Boot id of the station's clock.
-    """
-
-    session: int
+    session: int  # session nonce
     counter: int
-    received_ns: int
+    received_ns: int  # RxDone on CLOCK_MONOTONIC of the station's computer
     sigma_ns: int
-    sent_us: int
-    boot: str
+    sent_us: int  # TxDone in session time
+    boot: str  # boot id of the station's clock
 
 
 class AuthenticBeacon(NamedTuple):
@@ -81,36 +69,22 @@ class AuthenticBeacon(NamedTuple):
 
 
 class ReplySlot(NamedTuple):
-    """The station's slot on its CLOCK_MONOTONIC; ``beacon_end_ns`` is the end of the beacon on the air."""
+    """The station's slot on its CLOCK_MONOTONIC."""
 
     slot: Slot
-    beacon_end_ns: int
+    beacon_end_ns: int  # on the air
     start_ns: int
 
 
 @dataclass(frozen=True, slots=True)
 class ReceivedBeacon:
-    """Result of an authentic beacon.
+    """Result of an authentic beacon."""
 
-    Attributes
-    ----------
-    slot_ns
-        Start of the station's slot on its CLOCK_MONOTONIC; None: no slot.
-    reception
-        Clock sample of the previous beacon, for the journal.
-    time_rejected
-        The time of the previous beacon is impossible and was rejected.
-    joined
-        The beacon confirms the station.
-    discarded
-        Number of measurements removed from the queue because they cannot be timestamped for this master.
-    """
-
-    slot_ns: int | None
-    reception: BeaconReception | None
-    time_rejected: bool
-    joined: bool
-    discarded: int
+    slot_ns: int | None  # start of the station's slot on its CLOCK_MONOTONIC
+    reception: BeaconReception | None  # clock sample of the previous beacon, for the journal
+    time_rejected: bool  # the time of the previous beacon is impossible
+    joined: bool  # the beacon confirms the station
+    discarded: int  # measurements removed from the queue because they cannot be timestamped for this master
 
 
 @dataclass(slots=True)
@@ -128,27 +102,19 @@ class StationSession:
 
     Parameters
     ----------
-    station
-        Number of the station.
-    beacon
-        The first beacon, with session info.
+    beacon, info
+        The first beacon, and its session info.
     nonce
         The station's nonce in this session, 32 bits.
-    boot
-        Boot id of this computer's clock.
-    clocks
-        Clocks of this session by boot id, from journalled receptions.
+    boot, clocks
+        The present boot id, and the clocks of this session by boot id, from journalled receptions.
 
     Attributes
     ----------
     confirmed
         A beacon has repeated the station's nonce: the session is not a replay.
-    beacon
-        The newest one.
-    clock
-        Of the present boot.
-    slot
-        For the reply to the newest beacon; None: no slot.
+    beacon, slot
+        The newest beacon, and the slot for the reply to it.
     """
 
     def __init__(
@@ -179,8 +145,6 @@ class StationSession:
         self.last_reply: SentReply | None = None
         self._unacknowledged: deque[SentReply] = deque(maxlen=ACK_FRAMES)
         self._queue_checked = False
-
-    # --- Beacons ----------------------------------------------------------------------------------------------
 
     def counter_of(self, beacon: Beacon) -> int | None:
         """Return the frame counter of a beacon; None if it is of another session or not newer than the newest."""
@@ -277,8 +241,6 @@ class StationSession:
         end_ns = received.received_ns - self.timing.reception_ns
         return ReplySlot(slot, end_ns, end_ns + slot.start_ns)
 
-    # --- Acknowledgements -------------------------------------------------------------------------------------
-
     def reply_sent(self, reply: Reply, sequences: tuple[int, ...]) -> None:
         """Take the reply to the newest beacon as sent."""
         self.last_reply = SentReply(self.beacon, reply, sequences)
@@ -300,8 +262,6 @@ class StationSession:
                 self.commands.acknowledged(sent.reply, sent.beacon.counter)
         if self.beacon.counter % len(beacon.stations) == mine:
             self.delivery.acknowledge_through(beacon.cumulative)
-
-    # --- Timestamps -------------------------------------------------------------------------------------------
 
     def can_timestamp(self, queued: QueuedMeasurement) -> bool:
         """Whether a measurement has, or may soon have, a time on this master's clock.

@@ -49,19 +49,11 @@ class Slot(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class FrameTiming:
-    """Durations of the parts of a frame.
-
-    Attributes
-    ----------
-    guard_ns
-        After each slot.
-    turnaround_ns
-        From the end of the beacon to the first slot.
-    """
+    """Durations of the parts of a frame."""
 
     settings: LoRaSettings
-    guard_ns: int
-    turnaround_ns: int
+    guard_ns: int  # after each slot
+    turnaround_ns: int  # from the end of the beacon to the first slot
 
     @classmethod
     def from_tolerances(

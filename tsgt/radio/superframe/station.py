@@ -51,8 +51,6 @@ class SuperframeStation:
 
     Parameters
     ----------
-    station
-        Number of the station, 1 to 16.
     send_queue
         Measurements are added to it as soon as they are journalled.
     stream_id
@@ -61,8 +59,6 @@ class SuperframeStation:
         Boot id of this computer's clock.
     receptions
         Clock samples journalled by earlier runs, in their order.
-    random_bits
-        Returns a number of this many random bits.
 
     Attributes
     ----------

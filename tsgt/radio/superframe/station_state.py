@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from tsgt.radio.commands import MeasureCommand, SearchCommand
+from tsgt.radio.commands import SearchCommand
 from tsgt.radio.superframe.demand import DEFAULT_GRANT, grant
 from tsgt.radio.superframe.receive_window import ReceiveWindow
 from tsgt.radio.superframe.reception import ReceivedReply, TimedMeasurement
@@ -33,37 +33,18 @@ class _PendingCommand(NamedTuple):
 
 
 class StationState:
-    """What the master knows of one station.
-
-    Parameters
-    ----------
-    number, prism
-        Of the station, and of the prism that it tracks unless it reports another.
-
-    Attributes
-    ----------
-    nonce
-        Of its join request in this session; None: it has not joined.
-    join_pending
-        Its last reply still contained a join request.
-    lacks_time
-        Its times are relative to the beacon, not session time.
-    silent_frames
-        Frames with a slot since its last reply.
-    missed_slots, rejected_beacons
-        Reported by the station, counted since its first report.
-    """
+    """What the master knows of one station; ``prism`` is tracked unless it reports another."""
 
     def __init__(self, number: int, prism: int, timing: StationTiming, demand: DemandEstimator) -> None:
         self.number = number
         self.window = ReceiveWindow()
         self.demand = demand
         self.timing = timing
-        self.nonce: int | None = None
-        self.join_pending = False
-        self.lacks_time = False
-        self.silent_frames = 0
-        self.missed_slots = 0
+        self.nonce: int | None = None  # of its join request in this session
+        self.join_pending = False  # the last reply still contained a join request
+        self.lacks_time = False  # its times are relative to the beacon, not session time
+        self.silent_frames = 0  # frames with a slot since its last reply
+        self.missed_slots = 0  # reported by the station, counted since its first report
         self.rejected_beacons = 0
         self._default_prism = prism
         self._confirmation_nonce: int | None = None
@@ -77,8 +58,6 @@ class StationState:
         self.nonce, self._confirmation_nonce, self._status = None, None, None
         self.timing.reset()
         self.window.forget_replies()
-
-    # --- Commands -----------------------------------------------------------------------------------------------
 
     def submit(self, command: Command) -> int:
         """Send a command, replacing a pending one; return its id."""
@@ -110,8 +89,6 @@ class StationState:
         tracked = self._default_prism if self._status is None else self._status.prism
         return encode_command(self.number, self._pending.command_id, self._pending.command, tracked)
 
-    # --- Beacons ------------------------------------------------------------------------------------------------
-
     @property
     def confirmation(self) -> JoinConfirmation | None:
         """Confirmation of a join request for the next beacon."""
@@ -137,15 +114,9 @@ class StationState:
             self.window,
             silent_frames=self.silent_frames,
             exchanges=self.timing.link_delay.exchanges,
-            response=self._pending is not None,
-            single_measurement=self._pending is not None
-            and isinstance(self._pending.command, MeasureCommand),
+            pending=None if self._pending is None else self._pending.command,
         )
-        if demand is None:
-            return DEFAULT_GRANT
-        return grant(demand, cap=cap, silent_frames=self.silent_frames)
-
-    # --- Replies ------------------------------------------------------------------------------------------------
+        return DEFAULT_GRANT if demand is None else grant(demand, cap=cap, silent_frames=self.silent_frames)
 
     def first_sequence(self, reply: Reply) -> int:
         """Return the full number of the first measurement of a reply; 0 without one."""
@@ -173,8 +144,8 @@ class StationState:
             at,
             [measurement.measured_ns for measurement in measurements],
             self.timing,
-            outstanding_before=outstanding,
-            outstanding=self.window.outstanding,
+            outstanding,
+            self.window.outstanding,
         )
         self.silent_frames = 0
         command, response, single_measurement = self._complete(reply)

@@ -39,13 +39,8 @@ class BeaconDelayMonitor:
     """Detects that beacons reach a station later than it can notice from the low bits of their times.
 
     The station's replies are then late by the same delay. While beacons carry their full time, the first one on time
-    contradicts the delayed ones, and with the next one the station knows.
-
-    Attributes
-    ----------
-    delay_ns
-        Maximum delay since it began; 0 from the second consecutive reply on time, if the beacon after the first one
-        carried its time.
+    contradicts the delayed ones, and with the next one the station knows. ``delay_ns`` is the maximum delay since it began;
+    0 from the second consecutive reply on time, if the beacon after the first one carried its time.
     """
 
     def __init__(self) -> None:
@@ -55,10 +50,7 @@ class BeaconDelayMonitor:
     def add(self, counter: int, lateness_ns: int, *, beacon_time_sent: bool) -> None:
         """Take the maximum lateness of the reply to a frame.
 
-        Parameters
-        ----------
-        beacon_time_sent
-            The next beacon carries the time of this frame's beacon; otherwise the station cannot compare it.
+        The station can compare this frame's beacon with others only if ``beacon_time_sent``: the next one carries its time.
         """
         if lateness_ns > MAX_AMBIGUOUS_DELAY_NS:
             self.delay_ns, self._on_time = max(self.delay_ns, lateness_ns), None
@@ -69,13 +61,7 @@ class BeaconDelayMonitor:
 
 
 class StationTiming:
-    """Puts one station's measurements on the master's CLOCK_MONOTONIC.
-
-    Parameters
-    ----------
-    zero_ns
-        Zero of the session time on that clock.
-    """
+    """Puts one station's measurements on the master's CLOCK_MONOTONIC, where session time starts at ``zero_ns``."""
 
     def __init__(self, link_delay: LinkDelayEstimator, zero_ns: int) -> None:
         self.link_delay = link_delay

@@ -1,4 +1,4 @@
-"""The master's side of the superframe, frame by frame against stations that a test plays."""
+"""The master's side of the superframe against scripted stations."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from unittest.mock import patch
 
 import pytest
-from harness.frames import KEY, TIMING, ZERO_NS, Frames, frames_of, measurement
 from harness.radios import MS
+from harness.scripted_stations import KEY, TIMING, ZERO_NS, ScriptedFrames, measurement, scripted_frames
 
 from tsgt.model import Status
 from tsgt.radio import DirectCommand, Direction, MeasureCommand, SearchCommand, TrackCommand
@@ -39,16 +39,16 @@ STATE = StatusReport(prism=1, direct=False, connected=True, missed_slots=0, reje
 
 
 @pytest.fixture
-def frames() -> Frames:
-    """Three stations that have joined, two frames ago."""
-    frames = frames_of()
+def frames() -> ScriptedFrames:
+    """Three stations that joined two frames ago."""
+    frames = scripted_frames()
     frames.join()
     frames.run(1)
     return frames
 
 
-def sessions(frames: Frames, count: int, silent: tuple[int, ...] = ()) -> list[int]:
-    """Run frames; return the numbers of those whose beacon could be joined by."""
+def sessions(frames: ScriptedFrames, count: int, silent: tuple[int, ...] = ()) -> list[int]:
+    """Run frames; return the counters of those with session info."""
     found = []
     for _ in range(count):
         frames.run(1, silent)
@@ -60,9 +60,9 @@ def sessions(frames: Frames, count: int, silent: tuple[int, ...] = ()) -> list[i
 # --- Beacons --------------------------------------------------------------------------------------------------------
 
 
-def test_the_first_beacon_says_what_is_needed_to_join() -> None:
-    """Session, times, and a slot for each that an introduction fits into; no earlier beacon left at any time."""
-    frames = frames_of()
+def test_first_beacon_invites_stations() -> None:
+    """It has session info and slots for join requests, and no time of a previous beacon."""
+    frames = scripted_frames()
     beacon = frames.begin()
     assert beacon.session == SessionInfo(
         nonce=frames.master.session,
@@ -76,8 +76,8 @@ def test_the_first_beacon_says_what_is_needed_to_join() -> None:
     assert [entry.ack_bitmap for entry in beacon.stations] == [0, 0, 0]
 
 
-def test_a_beacon_tells_when_the_one_before_it_left(frames: Frames) -> None:
-    """In full where a station may join, else its low bits; a time that looks like none is told a microsecond later."""
+def test_beacon_carries_time_of_previous_beacon(frames: ScriptedFrames) -> None:
+    """In full with session info, otherwise its low bits; low bits 0 are sent as 1."""
     frames.run(30)
     for _ in range(8):
         sent_us = frames.sent_us
@@ -93,17 +93,17 @@ def test_a_beacon_tells_when_the_one_before_it_left(frames: Frames) -> None:
 
 
 @pytest.mark.parametrize("lost", ["edge", "end"])
-def test_an_unknown_end_of_a_beacon_is_not_told(frames: Frames, lost: str) -> None:
-    """An edge that was lost, or a transmission that failed: 0 stands for it. Its number is used up."""
+def test_unknown_beacon_time_is_sent_as_zero(frames: ScriptedFrames, lost: str) -> None:
+    """An inexact TxDone, or a failed transmission, which uses up its frame counter."""
     before = frames.begin(sigma_ns=MS, fails=lost == "end").frame
     beacon = frames.begin()
     assert beacon.sent == 0
     assert beacon.frame == before + 1
 
 
-def test_a_beacon_that_failed_leaves_nothing_behind(frames: Frames) -> None:
-    """Nobody counts as silent in its frame, replies to it are refused, and what it confirmed is confirmed again."""
-    frames = frames_of()
+def test_failed_beacon_has_no_effect(frames: ScriptedFrames) -> None:
+    """No station counts as silent, replies to it are rejected, confirmations are repeated."""
+    frames = scripted_frames()
     frames.join()
     confirmations = frames.begin(fails=True).confirmations
     assert len(confirmations) == 3
@@ -113,17 +113,17 @@ def test_a_beacon_that_failed_leaves_nothing_behind(frames: Frames) -> None:
     assert frames.begin().confirmations == ()
 
 
-def test_how_to_join_is_told_more_often_while_somebody_is_missing(frames: Frames) -> None:
-    """In each fourth beacon while a station has not joined or is silent, otherwise in each thirty-second."""
+def test_session_info_is_frequent_while_a_station_is_missing(frames: ScriptedFrames) -> None:
+    """One beacon in four instead of one in 32."""
     assert [number for number in sessions(frames, 70) if number > FULL_TIME_FRAMES] == [32, 64]
     assert [number % 4 for number in sessions(frames, 21, silent=(2,))] == [0, 0, 0, 0]
-    unjoined = frames_of()
+    unjoined = scripted_frames()
     assert sessions(unjoined, 21, silent=(1, 2, 3)) == [*range(12), 12, 16, 20]
 
 
-def test_a_station_that_introduces_itself_is_told_the_time_in_full_at_once() -> None:
-    """Twice and once more, for it believes no time that is not confirmed; and again if it has not heard that."""
-    frames = frames_of((1,))
+def test_joining_station_gets_full_time_at_once() -> None:
+    """In three beacons, and again after another join request."""
+    frames = scripted_frames((1,))
     frames.run(20, silent=(1,))
     for _ in range(2):
         before = frames.begin().frame
@@ -134,11 +134,9 @@ def test_a_station_that_introduces_itself_is_told_the_time_in_full_at_once() -> 
 
 
 @pytest.mark.parametrize(("direct", "often"), [(True, 4), (False, 32)])
-def test_a_station_that_does_not_know_the_time_is_told_it_in_full_more_often(
-    *, direct: bool, often: int
-) -> None:
-    """It tells what it measures by the beacon that it has heard."""
-    frames = frames_of((1,))
+def test_beacon_relative_times_make_full_time_frequent(*, direct: bool, often: int) -> None:
+    """The station has no session time yet."""
+    frames = scripted_frames((1,))
     frames.join()
     frames.run(12)
     told = []
@@ -159,15 +157,15 @@ def test_a_station_that_does_not_know_the_time_is_told_it_in_full_more_often(
 
 
 def test_stations_may_have_any_numbers() -> None:
-    """Numbers that nobody has get no slot."""
-    frames = frames_of((2, 5))
+    """Unused numbers get no slot."""
+    frames = scripted_frames((2, 5))
     frames.join()
     frames.run(3)
     assert [bool(entry.grant) for entry in frames.beacon.stations] == [False, True, False, False, True]
 
 
-def test_a_session_ends_before_its_numbers_do(frames: Frames) -> None:
-    """The next one begins with another nonce; stations join again, and what came before is not taken twice."""
+def test_new_session_starts_before_counter_wraps(frames: ScriptedFrames) -> None:
+    """It has another nonce; stations join again, and repeated measurements are recognised."""
     with patch.object(master, "MAX_FRAMES_PER_SESSION", 5):
         before = frames.master.session
         frames.run(3)
@@ -180,27 +178,27 @@ def test_a_session_ends_before_its_numbers_do(frames: Frames) -> None:
         old = MeasurementBlock(
             measurements=(measurement(station.sequence - 1, frames.sent_us, wide=True),), wide=True
         )
-        heard = frames.reply(
+        received = frames.reply(
             1, Reply(blocks=(old,), join_request=station.join_request), sequence=station.sequence - 1
         )
-        assert heard.joined
-        assert (heard.measurements, heard.repeated) == ((), 1)
+        assert received.joined
+        assert (received.measurements, received.repeated) == ((), 1)
 
 
 # --- Who is believed ------------------------------------------------------------------------------------------------
 
 
-def test_a_station_joins_with_its_first_reply() -> None:
-    """Its measurement is taken; the next beacon proves to it that it was heard, and no further one does."""
-    frames = frames_of()
+def test_station_joins_with_first_reply() -> None:
+    """Its measurement is accepted, and one beacon confirms the join request."""
+    frames = scripted_frames()
     frames.begin()
-    heard = frames.measure(1, introduce=True)
-    assert heard.joined
-    assert len(heard.measurements) == 1
+    received = frames.measure(1, join=True)
+    assert received.joined
+    assert len(received.measurements) == 1
     frames.end()
     assert frames.begin().confirmations == (JoinConfirmation(1, frames.stations[1].nonce),)
-    heard = frames.measure(1, introduce=True)  # it has missed that
-    assert not heard.joined
+    received = frames.measure(1, join=True)  # it has missed that
+    assert not received.joined
     frames.end()
     assert frames.begin().confirmations == (JoinConfirmation(1, frames.stations[1].nonce),)
     frames.measure(1)
@@ -208,31 +206,31 @@ def test_a_station_joins_with_its_first_reply() -> None:
     assert frames.begin().confirmations == ()
 
 
-def test_a_station_that_starts_again_is_believed_at_once(frames: Frames) -> None:
-    """Another nonce counts from the reply on that it comes in, and the old one no more."""
+def test_restarted_station_joins_at_once(frames: ScriptedFrames) -> None:
+    """The new nonce replaces the old one."""
     station = frames.stations[2]
     old = station.nonce
     frames.begin()
     station.nonce, station.first_sequence, station.sequence = 0xCAFE, 1002, 1002
-    heard = frames.measure(2, introduce=True)
-    assert heard.joined
-    assert [each.sequence for each in heard.measurements] == [1002]
+    received = frames.measure(2, join=True)
+    assert received.joined
+    assert [each.sequence for each in received.measurements] == [1002]
     frames.end()
     assert frames.begin().confirmations == (JoinConfirmation(2, 0xCAFE),)
     assert frames.arrive(2, frames.packet(2, Reply(), nonce=old)) is None
     assert frames.arrive(2, frames.packet(2, Reply())) is not None
 
 
-def test_without_introduction_nobody_unknown_is_believed() -> None:
-    """A reply of a station that has not joined has a nonce that nobody knows."""
-    frames = frames_of()
+def test_reply_of_unjoined_station_is_rejected() -> None:
+    """Its nonce is unknown."""
+    frames = scripted_frames()
     frames.begin()
     assert frames.arrive(1, frames.packet(1, Reply())) is None
     assert frames.master.rejected_packets == 1
 
 
-def test_what_is_not_a_reply_to_this_beacon_is_refused(frames: Frames) -> None:
-    """Flipped, cut, of another station, of another frame, with another key, with another number: all counted."""
+def test_invalid_replies_are_rejected_and_counted(frames: ScriptedFrames) -> None:
+    """Corrupted, truncated, of another station, frame, key or sequence number."""
     frames.begin()
     early = frames.packet(1, Reply())
     frames.end()
@@ -255,8 +253,8 @@ def test_what_is_not_a_reply_to_this_beacon_is_refused(frames: Frames) -> None:
     assert frames.arrive(1, good) is not None
 
 
-def test_a_reply_counts_once_and_after_its_beacon(frames: Frames) -> None:
-    """One that is played again within the frame, or that came before the beacon was out, is none."""
+def test_replayed_or_early_reply_is_rejected(frames: ScriptedFrames) -> None:
+    """Within the frame, and before TxDone of the beacon."""
     frames.begin()
     good = frames.packet(1, Reply())
     assert frames.master.received(good, frames.sent_ns - 1, 0) is None
@@ -264,9 +262,9 @@ def test_a_reply_counts_once_and_after_its_beacon(frames: Frames) -> None:
     assert frames.arrive(2, good) is None
 
 
-def test_without_a_key_frames_run_all_the_same() -> None:
-    """The codes are those of a key that everybody knows."""
-    frames = frames_of(key=None)
+def test_frames_run_without_key() -> None:
+    """Replies with a keyed code are rejected."""
+    frames = scripted_frames(key=None)
     frames.join()
     frames.run(3)
     frames.begin()
@@ -279,8 +277,8 @@ def test_without_a_key_frames_run_all_the_same() -> None:
 # --- Acknowledgement ------------------------------------------------------------------------------------------------
 
 
-def test_only_what_is_written_is_acknowledged(frames: Frames) -> None:
-    """The history is that of the last four frames; a reply counts when its last measurement is in the recording."""
+def test_only_recorded_measurements_are_acknowledged(frames: ScriptedFrames) -> None:
+    """The bitmap covers four frames; a reply counts when all its measurements are recorded."""
     frames.writes = False
     frames.begin()
     first = frames.measure(1).measurements[0].sequence
@@ -292,16 +290,16 @@ def test_only_what_is_written_is_acknowledged(frames: Frames) -> None:
     assert [entry.ack_bitmap for entry in frames.begin().stations] == [0b1110, 0b1110, 0b1100]
 
 
-def test_a_repeated_measurement_is_acknowledged_when_the_first_one_is_written(frames: Frames) -> None:
-    """It is not handed on again."""
+def test_repeated_measurement_is_acknowledged_once_recorded(frames: ScriptedFrames) -> None:
+    """It is not published again."""
     frames.writes = False
     frames.begin()
     number = frames.measure(1).measurements[0].sequence
     frames.end()
     frames.begin()
-    run = MeasurementBlock(measurements=(measurement(number, frames.sent_us - 300_000),))
-    heard = frames.reply(1, Reply(blocks=(run,)), sequence=number)
-    assert (heard.measurements, heard.repeated) == ((), 1)
+    block = MeasurementBlock(measurements=(measurement(number, frames.sent_us - 300_000),))
+    received = frames.reply(1, Reply(blocks=(block,)), sequence=number)
+    assert (received.measurements, received.repeated) == ((), 1)
     frames.end()
     assert frames.begin().stations[0].ack_bitmap & 0b11 == 0
     frames.master.station(1).window.mark_written([number])
@@ -309,8 +307,8 @@ def test_a_repeated_measurement_is_acknowledged_when_the_first_one_is_written(fr
     assert frames.begin().stations[0].ack_bitmap & 0b111 == 0b110
 
 
-def test_the_cumulative_number_goes_round(frames: Frames) -> None:
-    """Each frame tells one station up to where nothing is missing."""
+def test_cumulative_acknowledgement_rotates_over_stations(frames: ScriptedFrames) -> None:
+    """One station per frame."""
     frames.run(300)
     for _ in range(3):
         beacon = frames.begin()
@@ -321,17 +319,17 @@ def test_the_cumulative_number_goes_round(frames: Frames) -> None:
         frames.end()
 
 
-def test_a_measurement_that_the_disk_lost_is_taken_again(frames: Frames) -> None:
-    """As if it had never come."""
+def test_lost_measurement_is_accepted_again(frames: ScriptedFrames) -> None:
+    """It was received but not recorded."""
     frames.writes = False
     frames.begin()
     number = frames.measure(1).measurements[0].sequence
     frames.end()
     frames.master.station(1).window.mark_lost([number])
     frames.begin()
-    run = MeasurementBlock(measurements=(measurement(number, frames.sent_us - 300_000),))
-    heard = frames.reply(1, Reply(blocks=(run,)), sequence=number)
-    assert [each.sequence for each in heard.measurements] == [number]
+    block = MeasurementBlock(measurements=(measurement(number, frames.sent_us - 300_000),))
+    received = frames.reply(1, Reply(blocks=(block,)), sequence=number)
+    assert [each.sequence for each in received.measurements] == [number]
 
 
 # --- Orders ---------------------------------------------------------------------------------------------------------
@@ -348,10 +346,10 @@ def test_a_measurement_that_the_disk_lost_is_taken_again(frames: Frames) -> None
         (MeasureCommand(), 3, 0),
     ],
 )
-def test_an_order_is_repeated_until_it_is_answered(
-    frames: Frames, order: Command, code: int, argument: int
+def test_command_is_repeated_until_response(
+    frames: ScriptedFrames, order: Command, code: int, argument: int
 ) -> None:
-    """With the same ticket; the answer is handed on once, however often the station gives it."""
+    """With the same id; the response is returned once."""
     command_id = frames.master.station(2).submit(order)
     for _ in range(3):
         frames.run(1)
@@ -362,15 +360,15 @@ def test_an_order_is_repeated_until_it_is_answered(
     assert (other.command, other.response) == (None, None)
     frames.end()
     frames.begin()
-    heard = frames.reply(2, Reply(response=CommandResponse(command_id, ok=False)))
-    assert (heard.command, heard.response) == (order, CommandResponse(command_id, ok=False))
+    received = frames.reply(2, Reply(response=CommandResponse(command_id, ok=False)))
+    assert (received.command, received.response) == (order, CommandResponse(command_id, ok=False))
     frames.end()
     assert frames.begin().commands == ()
     assert frames.reply(2, Reply(response=CommandResponse(command_id, ok=False))).response is None
 
 
-def test_an_order_that_is_withdrawn_is_said_no_more(frames: Frames) -> None:
-    """One of another kind stands; an answer that comes all the same is nobody's."""
+def test_withdrawn_command_is_not_sent(frames: ScriptedFrames) -> None:
+    """Commands of other kinds stay pending; a late response is ignored."""
     command_id = frames.master.station(2).submit(SearchCommand())
     frames.master.station(1).submit(TrackCommand(1))
     frames.run(1)
@@ -378,12 +376,12 @@ def test_an_order_that_is_withdrawn_is_said_no_more(frames: Frames) -> None:
         frames.master.station(station).withdraw(SearchCommand)
     frames.begin()
     assert [(part.station, part.code) for part in frames.beacon.commands] == [(1, 0)]
-    heard = frames.reply(2, Reply(response=CommandResponse(command_id, ok=True)))
-    assert (heard.command, heard.response) == (None, None)
+    received = frames.reply(2, Reply(response=CommandResponse(command_id, ok=True)))
+    assert (received.command, received.response) == (None, None)
 
 
-def test_whether_a_station_tracks_is_what_it_said_last(frames: Frames) -> None:
-    """Which prism, with an instrument, not in direct mode; not while it is away or has another order."""
+def test_is_tracking_follows_last_status_report(frames: ScriptedFrames) -> None:
+    """Prism, connection, direct mode; False while it is silent or has another command."""
     station_state = frames.master.station(2)
     state = replace(STATE, prism=2)
 
@@ -410,30 +408,30 @@ def test_whether_a_station_tracks_is_what_it_said_last(frames: Frames) -> None:
     assert not station_state.is_tracking(2)
 
 
-def test_a_shot_answers_an_order(frames: Frames) -> None:
-    """And there is room for it."""
+def test_single_measurement_completes_command(frames: ScriptedFrames) -> None:
+    """The grant has room for it."""
     command_id = frames.master.station(1).submit(MeasureCommand())
     frames.begin()
     shot = SingleMeasurement(command_id, Status.OK, 1, 2, 3)
     reply = Reply(single_measurement=shot)
     assert len(frames.packet(1, reply)) <= frames.span(1).max_reply_bytes
-    heard = frames.reply(1, reply)
-    assert (heard.single_measurement, heard.response) == (shot, None)
+    received = frames.reply(1, reply)
+    assert (received.single_measurement, received.response) == (shot, None)
 
 
-def test_orders_have_other_tickets(frames: Frames) -> None:
-    """Sixteen of them go round."""
+def test_command_ids_wrap_after_sixteen(frames: ScriptedFrames) -> None:
+    """Consecutive ids differ."""
     tickets = [frames.master.station(1).submit(SearchCommand()) for _ in range(17)]
     assert len(set(tickets)) == 16
     assert tickets[0] == tickets[16]
 
 
-def test_who_would_not_obey_is_told_no_order() -> None:
-    """A station that has not joined, or does not know yet that it has."""
-    frames = frames_of()
+def test_no_command_to_unconfirmed_station() -> None:
+    """Nor to one that may not know its confirmation."""
+    frames = scripted_frames()
     frames.master.station(1).submit(SearchCommand())
     assert frames.begin().commands == ()
-    frames.measure(1, introduce=True)
+    frames.measure(1, join=True)
     frames.end()
     assert frames.begin().commands == ()
     frames.measure(1)
@@ -444,9 +442,9 @@ def test_who_would_not_obey_is_told_no_order() -> None:
 # --- Slots ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_station_that_stays_away_costs_less_and_less() -> None:
-    """After twenty frames it has a slot only where it could join."""
-    frames = frames_of()
+def test_absent_station_has_slots_only_with_session_info() -> None:
+    """After 20 silent frames."""
+    frames = scripted_frames()
     frames.join()
     frames.run(40, silent=(3,))
     slots = []
@@ -458,9 +456,9 @@ def test_a_station_that_stays_away_costs_less_and_less() -> None:
     assert sum(slot for _, slot in slots) == 2
 
 
-def test_without_anybody_the_channel_is_left_alone() -> None:
-    """Frames without a slot do not follow each other at once."""
-    frames = frames_of()
+def test_idle_frames_are_spaced() -> None:
+    """Frames without slots do not follow each other immediately."""
+    frames = scripted_frames()
     for _ in range(21):
         frames.begin()
         assert frames.end()
@@ -473,8 +471,8 @@ def test_without_anybody_the_channel_is_left_alone() -> None:
     assert min(after - before for before, after in pairwise(starts)) >= 390 * MS
 
 
-def test_the_silent_are_named(frames: Frames) -> None:
-    """Those that had a slot and were not heard."""
+def test_finish_returns_silent_stations(frames: ScriptedFrames) -> None:
+    """Those with a slot and without a reply."""
     frames.begin()
     frames.measure(2)
     assert frames.end() == [1, 3]
@@ -484,8 +482,8 @@ def test_the_silent_are_named(frames: Frames) -> None:
     assert frames.end() == []
 
 
-def test_a_frame_waits_for_those_that_may_still_answer(frames: Frames) -> None:
-    """It ends with the last slot whose station has not been heard, and when all have been heard at once."""
+def test_reply_deadline_is_last_pending_slot(frames: ScriptedFrames) -> None:
+    """None when all stations have replied."""
     frames.begin()
     until_ns = [frames.master.reply_deadline_ns]
     for station in (3, 2, 1):
@@ -497,9 +495,9 @@ def test_a_frame_waits_for_those_that_may_still_answer(frames: Frames) -> None:
     assert len(set(whole)) == 3
 
 
-def test_frames_follow_the_instruments_where_a_lock_says_so() -> None:
+def test_phase_lock_sets_frame_length() -> None:
     """Measurements every 400 ms make frames of 400 ms."""
-    frames = frames_of(phase_lock=PhaseLock(TIMING, 3))
+    frames = scripted_frames(phase_lock=PhaseLock(TIMING, 3))
     frames.join()
     starts = []
     for _ in range(60):
@@ -514,19 +512,19 @@ def test_frames_follow_the_instruments_where_a_lock_says_so() -> None:
                 frames.reply(number, Reply())
                 continue
             station.sequence = made + 1
-            run = MeasurementBlock(
+            block = MeasurementBlock(
                 measurements=tuple(measurement(each, each * 400_000 + number * 95_000) for each in fitting)
             )
-            reply = Reply(blocks=(run,), turnaround_us=frames.turnarounds_us[number] if grant > 2 else None)
+            reply = Reply(blocks=(block,), turnaround_us=frames.turnarounds_us[number] if grant > 2 else None)
             frames.reply(number, reply, sequence=made)
         frames.end()
     lengths_ms = [(after - before) / MS for before, after in pairwise(starts[-20:])]
     assert median(lengths_ms) == pytest.approx(400, abs=0.1)
 
 
-def test_where_nothing_is_recorded_nothing_is_asked_for() -> None:
-    """Slots are those that an answer to an order needs, however much is not acknowledged."""
-    frames = frames_of(records=False)
+def test_default_grants_without_recording() -> None:
+    """However many measurements are unacknowledged."""
+    frames = scripted_frames(records=False)
     frames.writes = False
     frames.join()
     frames.run(10)
@@ -534,6 +532,6 @@ def test_where_nothing_is_recorded_nothing_is_asked_for() -> None:
     assert [entry.ack_bitmap for entry in frames.beacon.stations] == [0, 0, 0]
 
 
-def test_the_order_of_slots_is_that_of_the_numbers_without_a_lock(frames: Frames) -> None:
+def test_slots_follow_station_numbers_without_phase_lock(frames: ScriptedFrames) -> None:
     """The first station comes first."""
     assert frames.begin().slot_order == SlotOrder()

@@ -88,10 +88,10 @@ class Field:
             self._ready[index] += 1
 
 
-def beats(
+def periodic_measurements(
     phases_ms: list[float], *, seconds: float = 120, period_ns: float = PERIOD_NS, ppm: float = 0
 ) -> list[list[int]]:
-    """Return even measurements with these phases; each instrument's clock is faster than that of the one before."""
+    """Return periodic measurements with these phases; each clock is faster than the one before."""
     return [
         [
             round(phase_ms * MS + k * period_ns * (1 + number * ppm * 1e-6))
@@ -101,8 +101,8 @@ def beats(
     ]
 
 
-def shortest_wait_ms(phases_ms: list[float], slot_ms: float) -> float:
-    """Return the least mean wait that any order of slots and any start can give; an independent computation."""
+def min_wait_ms(phases_ms: list[float], slot_ms: float) -> float:
+    """Return the least mean wait over all slot orders and starts, by brute force."""
     waits = []
     count = len(phases_ms)
     for order in itertools.permutations(range(count)):
@@ -112,13 +112,13 @@ def shortest_wait_ms(phases_ms: list[float], slot_ms: float) -> float:
     return min(waits)
 
 
-def frames_apart_ns(plans: list[FramePlan]) -> list[int]:
-    """From one beacon to the next."""
+def frame_lengths_ns(plans: list[FramePlan]) -> list[int]:
+    """Return the times from beacon to beacon."""
     return [after.start_ns - before.start_ns for before, after in itertools.pairwise(plans)]
 
 
-def test_without_measurements_frames_begin_as_early_as_they_can() -> None:
-    """Nothing is known of the instruments."""
+def test_no_lock_without_measurements() -> None:
+    """Frames start as early as possible."""
     world = Field([[], [], []])
     world.run(10)
     assert [plan.start_ns for plan in world.plans] == world.earliest
@@ -126,88 +126,91 @@ def test_without_measurements_frames_begin_as_early_as_they_can() -> None:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_measurements_wait_as_short_as_any_order_and_start_allow(seed: int) -> None:
-    """At random phases the mean age is within 5 ms of the best that there is, and far below that of free running."""
+def test_age_is_near_optimal(seed: int) -> None:
+    """Within 5 ms of the optimum at random phases, and far below that of unlocked frames."""
     generator = np.random.default_rng(seed)
     phases_ms = list(generator.uniform(0, 400, 3))
-    world, free = Field(beats(phases_ms)), Field(beats(phases_ms), follow=False)
+    world, free = (
+        Field(periodic_measurements(phases_ms)),
+        Field(periodic_measurements(phases_ms), follow=False),
+    )
     slot_ms = (TIMING.airtime_ns(17) + TIMING.guard_ns) / MS
     on_air_ms = (COMPOSE_LEAD_NS + TIMING.airtime_ns(17) + TIMING.reception_ns) / MS
     age_ms = statistics.fmean(world.ages_after(20, 60))
-    assert age_ms < shortest_wait_ms(phases_ms, slot_ms) + on_air_ms + 5
+    assert age_ms < min_wait_ms(phases_ms, slot_ms) + on_air_ms + 5
     assert age_ms < statistics.fmean(free.ages_after(20, 60)) - 80
-    assert set(frames_apart_ns(world.plans[-60:])) <= {PERIOD_NS - 1, PERIOD_NS, PERIOD_NS + 1}
+    assert set(frame_lengths_ns(world.plans[-60:])) <= {PERIOD_NS - 1, PERIOD_NS, PERIOD_NS + 1}
 
 
-def test_a_frame_never_begins_before_it_can() -> None:
-    """Whatever gets lost."""
-    world = Field(beats([0, 100, 300]), loss=0.2)
+def test_frame_never_starts_early() -> None:
+    """At any packet loss."""
+    world = Field(periodic_measurements([0, 100, 300]), loss=0.2)
     world.run(60)
     assert all(plan.start_ns >= earliest for plan, earliest in zip(world.plans, world.earliest, strict=True))
 
 
 def test_drifting_clocks_are_followed() -> None:
-    """With 200 ppm between neighbours the phases turn by a third of a period within ten minutes; ages stay low."""
+    """200 ppm between neighbours turn the phases by a third of a period in ten minutes."""
     phases_ms = [50.0, 150.0, 250.0]
-    world = Field(beats(phases_ms, seconds=600, ppm=200))
+    world = Field(periodic_measurements(phases_ms, seconds=600, ppm=200))
     ages = world.ages_after(20, 600)
     assert statistics.fmean(ages) < 180
     assert statistics.quantiles(ages, n=100)[98] < 350
 
 
-def test_the_time_until_a_measurement_is_ready_is_learnt() -> None:
-    """A slow card or line keeps it for 25 ms; then it arrives 25 ms older, and not a frame."""
+def test_latency_is_learnt() -> None:
+    """A latency of 25 ms makes measurements 25 ms older, not a frame."""
     phases_ms = [20.0, 130.0, 220.0]
-    prompt = statistics.fmean(Field(beats(phases_ms)).ages_after(40, 110))
-    slow = statistics.fmean(Field(beats(phases_ms), latency_ns=25 * MS).ages_after(40, 110))
+    prompt = statistics.fmean(Field(periodic_measurements(phases_ms)).ages_after(40, 110))
+    slow = statistics.fmean(Field(periodic_measurements(phases_ms), latency_ns=25 * MS).ages_after(40, 110))
     assert prompt + 25 < slow < prompt + 35
 
 
-def test_jitter_of_the_instruments_is_waited_for() -> None:
-    """With 5 ms of it, measurements are 15 ms older rather than a frame now and then."""
+def test_jitter_is_absorbed_by_margin() -> None:
+    """5 ms of jitter make measurements 15 ms older, not a frame."""
     generator = np.random.default_rng(4)
-    exact = beats([20.0, 130.0, 220.0])
+    exact = periodic_measurements([20.0, 130.0, 220.0])
     made = [[time + round(generator.normal(0, 5 * MS)) for time in times] for times in exact]
     ages = Field(made).ages_after(20, 110)
     assert statistics.quantiles(ages, n=50)[48] < statistics.median(Field(exact).ages_after(20, 110)) + 100
 
 
-def test_frames_that_do_not_fit_run_freely() -> None:
-    """Where a frame needs 420 ms, 800 would make measurements older than no lock at all."""
-    world = Field(beats([20.0, 130.0, 220.0]), grants=[TWO] * 3)
+def test_no_lock_for_frames_longer_than_period() -> None:
+    """Frames that need 420 ms would be 800 ms long."""
+    world = Field(periodic_measurements([20.0, 130.0, 220.0]), grants=[TWO] * 3)
     world.run(60)
     assert not world.lock.locked
     assert [plan.start_ns for plan in world.plans] == world.earliest
 
 
-def test_two_periods_are_locked_to_where_they_nearly_fill() -> None:
-    """Five stations with two measurements in each frame need 700 ms, and have a frame of 800."""
-    world = Field(beats([0, 121, 242, 363, 84]), grants=[TWO] * 5)
+def test_lock_to_two_periods() -> None:
+    """Frames that need 700 ms are 800 ms long."""
+    world = Field(periodic_measurements([0, 121, 242, 363, 84]), grants=[TWO] * 5)
     world.run(60)
     needed_ns = world.earliest[-1] - world.plans[-2].start_ns
     assert 650 * MS < needed_ns < 800 * MS
     assert world.lock.locked
-    assert frames_apart_ns(world.plans)[-1] == pytest.approx(800 * MS, abs=10)
+    assert frame_lengths_ns(world.plans)[-1] == pytest.approx(800 * MS, abs=10)
 
 
-def test_a_frame_that_took_too_long_is_made_good() -> None:
-    """Frames follow each other at once until they are on the beat again; no beat is waited for."""
-    world = Field(beats([20.0, 130.0, 220.0]))
+def test_lag_is_recovered_without_skipping_a_period() -> None:
+    """Frames start immediately until they are in phase again."""
+    world = Field(periodic_measurements([20.0, 130.0, 220.0]))
     world.run(20)
     before_ns = world.plans[-1].start_ns
     world.grants = [TWO, TWO, ONE]  # 49 ms longer
     world.run(20.4)
     world.grants = [ONE] * 3
     world.run(30)
-    apart = frames_apart_ns([plan for plan in world.plans if plan.start_ns >= before_ns])
+    apart = frame_lengths_ns([plan for plan in world.plans if plan.start_ns >= before_ns])
     assert max(apart) < 440 * MS
     assert apart[-1] == pytest.approx(PERIOD_NS, abs=10)
     assert statistics.fmean(apart) == pytest.approx(PERIOD_NS, abs=2 * MS)
 
 
-def test_frames_that_have_become_longer_than_the_beat_do_not_wait_for_the_next() -> None:
-    """As in a backlog: the lock ends, and until it does no frame is put off by half an interval or more."""
-    world = Field(beats([20.0, 130.0, 220.0]))
+def test_lock_is_released_when_frames_grow() -> None:
+    """Meanwhile no frame is delayed by half a period or more."""
+    world = Field(periodic_measurements([20.0, 130.0, 220.0]))
     world.run(20)
     assert world.lock.locked
     before = len(world.plans)
@@ -218,9 +221,9 @@ def test_frames_that_have_become_longer_than_the_beat_do_not_wait_for_the_next()
     assert not world.lock.locked
 
 
-def test_an_instrument_that_stops_is_not_waited_for() -> None:
-    """The lock goes on with the others, also when it led."""
-    made = beats([20.0, 130.0, 220.0])
+def test_stopped_instrument_is_ignored() -> None:
+    """Also when it was the reference."""
+    made = periodic_measurements([20.0, 130.0, 220.0])
     for stopping in range(3):
         some = [times[:100] if index == stopping else times for index, times in enumerate(made)]
         world = Field(some)
@@ -229,17 +232,17 @@ def test_an_instrument_that_stops_is_not_waited_for() -> None:
         assert statistics.fmean(ages) < 160
 
 
-def test_with_one_station_frames_in_between_are_run() -> None:
-    """They give a lost reply another chance; the measurement still meets its slot."""
-    world = Field(beats([70.0]))
+def test_extra_frames_fit_between_measurements() -> None:
+    """They repeat a lost reply; the measurement still meets its slot."""
+    world = Field(periodic_measurements([70.0]))
     ages = world.ages_after(20, 60)
     assert max(ages) < 110
     assert len(world.plans) > 60 / 0.4 * 1.8
 
 
-def test_the_forecast_is_what_happens() -> None:
-    """When the grants stay as they were, the frame begins at the foreseen instant."""
-    world = Field(beats([20.0, 130.0, 220.0]))
+def test_forecast_equals_plan() -> None:
+    """With unchanged grants."""
+    world = Field(periodic_measurements([20.0, 130.0, 220.0]))
     world.run(30)
     earliest_ns = world.plans[-1].start_ns + 380 * MS
     forecast = world.lock.forecast(earliest_ns, BEACON_BYTES)

@@ -1,4 +1,4 @@
-"""Which of a station's measurements have come, and which are written."""
+"""Received, recorded and outstanding measurements of a station."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 
 def join_request(*, stream_id: int = 7, first_sequence: int = 0, oldest: int = 0) -> JoinRequest:
-    """Make an introduction."""
+    """Return a join request."""
     return JoinRequest(nonce=1, stream_id=stream_id, first_sequence=first_sequence, oldest=oldest)
 
 
 def window_with(numbers: Iterable[int]) -> ReceiveWindow:
-    """Make an inbox into which these have come."""
+    """Return a window that has received these numbers."""
     window = ReceiveWindow()
     window.join(join_request())
     for number in numbers:
@@ -41,8 +41,8 @@ _STEPS = st.lists(
 
 
 @given(st.integers(0, 20), _STEPS)
-def test_numbers_are_a_set(first: int, steps: list[tuple[str, int, int]]) -> None:
-    """As Python's own, with everything below the first number in it from the beginning."""
+def test_sequence_set_equals_python_set(first: int, steps: list[tuple[str, int, int]]) -> None:
+    """With all numbers below the first."""
     numbers, truth = SequenceSet(first), set(range(first))
     for what, start, length in steps:
         if what == "add":
@@ -59,8 +59,8 @@ def test_numbers_are_a_set(first: int, steps: list[tuple[str, int, int]]) -> Non
         assert numbers.cumulative == min(missing, default=highest + 1) - 1
 
 
-def test_a_gap_takes_no_memory_however_long_it_is() -> None:
-    """A station may say any number, and who has no key anything."""
+def test_large_gaps_take_no_memory() -> None:
+    """A station may send any number."""
     numbers = SequenceSet(0)
     numbers.add(range(2**32 - 1, 2**32))
     assert numbers.missing == 2**32 - 1
@@ -72,15 +72,15 @@ def test_a_gap_takes_no_memory_however_long_it_is() -> None:
 # --- Inbox ----------------------------------------------------------------------------------------------------------
 
 
-def test_what_came_is_not_new_again() -> None:
+def test_repeated_measurement_is_not_new() -> None:
     """In any order."""
     window = window_with([2, 0, 5])
     assert [window.accept(number) for number in (0, 1, 2, 5)] == [False, True, False, False]
     assert (window.outstanding, window.unwritten) == (2, 4)
 
 
-def test_only_what_is_written_counts_as_such() -> None:
-    """The cumulative number stops before the first that is not."""
+def test_cumulative_stops_before_first_unrecorded() -> None:
+    """However many later ones are recorded."""
     window = window_with([0, 1, 2])
     assert window.cumulative == -1
     window.mark_written([0, 2])
@@ -91,16 +91,16 @@ def test_only_what_is_written_counts_as_such() -> None:
     assert window.cumulative == 2
 
 
-def test_what_the_disk_lost_may_come_again() -> None:
-    """It is new then; what is written cannot be lost any more."""
+def test_lost_measurement_is_new_again() -> None:
+    """A recorded one cannot be lost."""
     window = window_with([0, 1])
     window.mark_written([0])
     window.mark_lost([0, 1])
     assert [window.accept(0), window.accept(1)] == [False, True]
 
 
-def test_a_restart_leaves_numbers_out() -> None:
-    """A thousand before its first are never given, unless they have come; what was missing before them still is."""
+def test_skipped_numbers_of_restart_are_not_outstanding() -> None:
+    """Unless they were received; earlier gaps stay outstanding."""
     window = window_with([0, 1, 3])
     window.mark_written([0, 1, 3])
     window.join(join_request(first_sequence=4 + RESTART_SKIP, oldest=2))
@@ -111,8 +111,8 @@ def test_a_restart_leaves_numbers_out() -> None:
     assert window.accept(4 + RESTART_SKIP)
 
 
-def test_what_a_station_still_has_is_to_be_written_after_a_restart() -> None:
-    """It deletes what is acknowledged."""
+def test_pending_measurements_are_unrecorded_after_restart() -> None:
+    """The station deletes what is acknowledged."""
     window = window_with(range(5))
     window.join(join_request(first_sequence=5 + RESTART_SKIP, oldest=1))
     assert window.cumulative == 0
@@ -121,8 +121,8 @@ def test_what_a_station_still_has_is_to_be_written_after_a_restart() -> None:
 
 
 @pytest.mark.parametrize(("lost_from", "oldest"), [(2, 0), (2, 2), (5, 5)])
-def test_what_a_station_has_no_more_does_not_wait_for_the_disk(lost_from: int, oldest: int) -> None:
-    """It takes all below its oldest and all that its restart left out for settled, and reads the number accordingly."""
+def test_numbers_below_oldest_count_as_recorded(lost_from: int, oldest: int) -> None:
+    """So do the numbers that the restart skipped."""
     window = window_with(range(5))
     window.mark_written([0, 1])
     first_sequence = lost_from + RESTART_SKIP
@@ -130,8 +130,8 @@ def test_what_a_station_has_no_more_does_not_wait_for_the_disk(lost_from: int, o
     assert window.cumulative == first_sequence - 1
 
 
-def test_what_the_disk_lost_is_not_waited_for_if_the_station_has_it_no_more() -> None:
-    """It was on the air, but not in the journal when the station was killed."""
+def test_lost_skipped_numbers_are_not_outstanding() -> None:
+    """They were sent, but not journalled when the station was killed."""
     window = window_with(range(5))
     window.mark_written([0, 1])
     window.join(join_request(first_sequence=2 + RESTART_SKIP))
@@ -139,8 +139,8 @@ def test_what_the_disk_lost_is_not_waited_for_if_the_station_has_it_no_more() ->
     assert (window.outstanding, window.cumulative, window.unwritten) == (0, 1 + RESTART_SKIP, 0)
 
 
-def test_what_a_station_does_not_have_any_more_is_not_waited_for() -> None:
-    """Everything below its oldest counts as settled."""
+def test_numbers_below_oldest_are_not_outstanding() -> None:
+    """The station no longer has them."""
     window = window_with([9])
     window.mark_written([9])
     assert window.outstanding == 9
@@ -148,7 +148,7 @@ def test_what_a_station_does_not_have_any_more_is_not_waited_for() -> None:
     assert (window.outstanding, window.cumulative) == (2, 6)
 
 
-def test_another_lineage_begins_anew() -> None:
+def test_another_stream_starts_empty() -> None:
     """The same numbers are other measurements."""
     window = window_with(range(100))
     window.join(join_request(stream_id=8))
@@ -157,8 +157,8 @@ def test_another_lineage_begins_anew() -> None:
     assert window.cumulative == -1
 
 
-def test_a_lineage_that_comes_back_is_known() -> None:
-    """What has come of it is no news; what was on its way to the disk meanwhile counts as written."""
+def test_returning_stream_is_remembered() -> None:
+    """Received measurements are not new, and recordings completed meanwhile count."""
     window = window_with(range(5))
     window.mark_written(range(3))
     window.join(join_request(stream_id=8, first_sequence=700_000))
@@ -169,15 +169,15 @@ def test_a_lineage_that_comes_back_is_known() -> None:
     assert window.cumulative == 4 + RESTART_SKIP
 
 
-def test_a_station_that_gives_numbers_again_is_believed() -> None:
-    """Its journal lost more than a restart leaves out; what it measures now must not pass for what has come."""
+def test_reused_numbers_are_accepted() -> None:
+    """The journal lost more than a restart skips."""
     window = window_with(range(2 * RESTART_SKIP))
     window.join(join_request(first_sequence=3000, oldest=3000))
     assert window.accept(3000)
 
 
-def test_an_introduction_that_is_repeated_changes_nothing() -> None:
-    """Until it is confirmed each reply holds it."""
+def test_repeated_join_request_has_no_effect() -> None:
+    """Every reply has it until it is confirmed."""
     window = window_with([0, 1])
     window.join(join_request(first_sequence=2 + RESTART_SKIP, oldest=0))
     assert window.accept(2 + RESTART_SKIP)
@@ -188,8 +188,8 @@ def test_an_introduction_that_is_repeated_changes_nothing() -> None:
 
 @pytest.mark.parametrize("highest", [0, 100, 127, 128, 255, 256, 70_000])
 @pytest.mark.parametrize("off", [-128, -1, 0, 1, 127])
-def test_low_bits_stand_for_the_nearest_number(highest: int, off: int) -> None:
-    """Next to the highest that has come; never below zero."""
+def test_unwrap_returns_nearest_number(highest: int, off: int) -> None:
+    """To the highest received one, never below zero."""
     window = window_with([highest])
     number = highest + off
     if number >= 0:
@@ -198,8 +198,8 @@ def test_low_bits_stand_for_the_nearest_number(highest: int, off: int) -> None:
         assert window.unwrap(number % 256) >= 0
 
 
-def test_low_bits_in_an_introduction_stand_next_to_what_it_says() -> None:
-    """Of another lineage the numbers so far mean nothing."""
+def test_unwrap_uses_numbers_of_join_request() -> None:
+    """Numbers of another stream do not count."""
     window = window_with([70_000])
     assert window.unwrap(1, join_request(stream_id=8)) == 1
     assert window.unwrap(5005 % 256, join_request(stream_id=8, oldest=5000)) == 5005

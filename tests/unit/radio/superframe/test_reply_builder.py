@@ -1,11 +1,11 @@
-"""Which measurements go into a reply, and how they are put together."""
+"""Selection of measurements for a reply, and their grouping into blocks."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import pytest
-from harness.hand_master import queued
+from harness.scripted_master import queued
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -34,7 +34,7 @@ def stamped(
     age_ns: int | None = 0,
     time: int | None = None,
 ) -> StampedMeasurement:
-    """Make a measurement every 0.4 s."""
+    """Return a measurement; one every 0.4 s."""
     made = queued(sequence, 0, prism=prism)
     made = made if distance_m is None else replace(made, distance_m=distance_m)
     return StampedMeasurement(
@@ -45,31 +45,33 @@ def stamped(
 def packed(
     *by_urgency: StampedMeasurement, limit: int = 125, prism: int | None = 1, narrow: bool = True
 ) -> Reply:
-    """Fill a reply that says nothing else."""
-    reply, taken = pack(Reply(), by_urgency, limit, prism=prism, is_narrow=lambda _sequence, _newest: narrow)
-    assert len(taken) == sum(len(run.measurements) for run in reply.blocks)
+    """Return a reply with measurements only."""
+    reply, packed_ones = pack(
+        Reply(), by_urgency, limit, prism=prism, is_narrow=lambda _sequence, _newest: narrow
+    )
+    assert len(packed_ones) == sum(len(block.measurements) for block in reply.blocks)
     assert reply_bytes(reply) <= limit
     decode_reply(encode_reply(reply))
     return reply
 
 
 def lengths(reply: Reply) -> list[int]:
-    """Return how many measurements each run has."""
-    return [len(run.measurements) for run in reply.blocks]
+    """Return the number of measurements per block."""
+    return [len(block.measurements) for block in reply.blocks]
 
 
 @pytest.mark.parametrize(
     ("bound_us", "quality"), [(0.0, 0), (16.0, 0), (16.1, 1), (128.0, 3), (524_288.0, 15), (524_289.0, None)]
 )
-def test_the_best_quality_that_is_true(bound_us: float, quality: int | None) -> None:
-    """It claims no more than the bound; there are bounds that none claims."""
+def test_quality_of_bound(bound_us: float, quality: int | None) -> None:
+    """The best quality that does not claim less."""
     assert quality_of(bound_us) == quality
     if quality is not None:
         assert bound_us <= quality_bound_us(quality)
 
 
-def test_as_many_as_fit_go_along() -> None:
-    """The newest first, all in one run."""
+def test_reply_is_filled() -> None:
+    """Newest first, in one block."""
     newest_first = [stamped(number) for number in range(40, 0, -1)]
     reply = packed(*newest_first, limit=71)
     assert len(reply.blocks) == 1
@@ -84,8 +86,8 @@ def test_as_many_as_fit_go_along() -> None:
 @given(
     st.integers(5, 125), st.lists(st.tuples(st.integers(1, 3), st.integers(0, 9), st.booleans()), max_size=30)
 )
-def test_no_other_number_would_do(limit: int, kinds: list[tuple[int, int, bool]]) -> None:
-    """One more does not fit, whatever there is."""
+def test_filled_reply_has_no_room(limit: int, kinds: list[tuple[int, int, bool]]) -> None:
+    """For any mixture of measurements."""
     newest_first = [
         stamped(1000 - index, prism=prism, quality=quality, beacon_relative=beacon_relative)
         for index, (prism, quality, beacon_relative) in enumerate(kinds)
@@ -107,22 +109,22 @@ def test_no_other_number_would_do(limit: int, kinds: list[tuple[int, int, bool]]
         stamped(1, time=-(1 << 36)),
     ],
 )
-def test_what_does_not_belong_together_gets_runs_of_its_own(other: StampedMeasurement) -> None:
-    """Another prism, another way of telling time, far away, worse by orders, or of another age."""
+def test_incompatible_measurements_get_their_own_block(other: StampedMeasurement) -> None:
+    """Another prism, time reference or unit, a much worse quality, another age."""
     assert lengths(packed(stamped(3), stamped(2), other)) == [2, 1]
 
 
-def test_a_little_worse_is_told_of_all() -> None:
-    """A run of its own would take more than that is worth."""
+def test_block_has_worst_quality() -> None:
+    """Of measurements of similar quality."""
     reply = packed(stamped(2, quality=1), stamped(1, quality=6))
     assert lengths(reply) == [2]
     assert reply.blocks[0].quality == 6
 
 
-def test_the_prism_is_named_where_it_is_another() -> None:
-    """Or where the master cannot be sure."""
-    assert [run.prism for run in packed(stamped(2), stamped(1, prism=4)).blocks] == [None, 4]
-    assert [run.prism for run in packed(stamped(2), prism=None).blocks] == [1]
+def test_block_names_unexpected_prism() -> None:
+    """And every prism while the master's is unknown."""
+    assert [block.prism for block in packed(stamped(2), stamped(1, prism=4)).blocks] == [None, 4]
+    assert [block.prism for block in packed(stamped(2), prism=None).blocks] == [1]
 
 
 @pytest.mark.parametrize(
@@ -135,22 +137,22 @@ def test_the_prism_is_named_where_it_is_another() -> None:
         (0, False, True),
     ],
 )
-def test_what_could_be_mistaken_is_wide(age_ns: int | None, narrow: bool, wide: bool) -> None:  # noqa: FBT001 (a case)
-    """Old times, times of another clock, and numbers that the master may not find again."""
+def test_ambiguous_block_is_wide(age_ns: int | None, narrow: bool, wide: bool) -> None:  # noqa: FBT001 (a case)
+    """Old times, times of another boot, ambiguous numbers."""
     assert packed(stamped(5, age_ns=age_ns), narrow=narrow).blocks[0].wide is wide
 
 
-def test_the_most_urgent_goes_along() -> None:
-    """In the order of time all the same."""
-    (run,) = packed(stamped(9), stamped(1), stamped(2), stamped(8), limit=32).blocks
-    assert [measurement.sequence for measurement in run.measurements] == [9, 2, 1]
-    (run,) = packed(stamped(1), stamped(9), limit=17).blocks
-    assert run.measurements[0].sequence == 1
+def test_most_urgent_measurements_are_packed() -> None:
+    """In the order of their numbers."""
+    (block,) = packed(stamped(9), stamped(1), stamped(2), stamped(8), limit=32).blocks
+    assert [measurement.sequence for measurement in block.measurements] == [9, 2, 1]
+    (block,) = packed(stamped(1), stamped(9), limit=17).blocks
+    assert block.measurements[0].sequence == 1
 
 
-def test_the_rest_of_the_reply_stays() -> None:
-    """And takes its room."""
+def test_other_parts_are_kept() -> None:
+    """They reduce the room for measurements."""
     parts = Reply(response=CommandResponse(3, ok=True))
-    reply, taken = pack(parts, [stamped(1)], 125, prism=1, is_narrow=lambda _sequence, _newest: True)
-    assert (reply.response, len(taken)) == (parts.response, 1)
+    reply, packed_ones = pack(parts, [stamped(1)], 125, prism=1, is_narrow=lambda _sequence, _newest: True)
+    assert (reply.response, len(packed_ones)) == (parts.response, 1)
     assert pack(parts, [stamped(1)], 17, prism=1, is_narrow=lambda _sequence, _newest: True) == (parts, ())

@@ -1,4 +1,4 @@
-"""The station's side of the superframe against a master that the test plays."""
+"""The station's side of the superframe against a scripted master."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.hand_master import (
+from harness.radios import MS
+from harness.scripted_master import (
     KEY,
     SECOND,
     TIMING,
     TRACKING,
-    HandMaster,
+    ScriptedMaster,
     counted,
     local_ns,
     make_station,
     queued,
 )
-from harness.radios import MS
 
 from tsgt.model import Status
 from tsgt.radio import DirectCommand, MeasureCommand, SearchCommand, TrackCommand, Transmission
@@ -34,7 +34,7 @@ from tsgt.radio.superframe.wire import (
 )
 
 if TYPE_CHECKING:
-    from harness.hand_master import Answered
+    from harness.scripted_master import ReceivedMessage
 
     from tsgt.radio.superframe import BeaconReception, SuperframeStation
 
@@ -42,7 +42,7 @@ PERIOD_NS = 400 * MS
 
 
 class Instrument:
-    """Fills an outbox in the course of the master's time."""
+    """Adds measurements to a send queue as the master's time passes."""
 
     def __init__(self, send_queue: SendQueue, first: int = 0) -> None:
         self._outbox = send_queue
@@ -51,7 +51,7 @@ class Instrument:
         self.made_ns: dict[int, int] = {}
 
     def until(self, true_ns: int) -> None:
-        """Measure as often as it is time."""
+        """Measure every :data:`PERIOD_NS` up to this time."""
         if self._due_ns is None:
             self._due_ns = true_ns - 1
         while self._due_ns <= true_ns:
@@ -61,20 +61,20 @@ class Instrument:
             self._due_ns += PERIOD_NS
 
 
-def joined() -> tuple[HandMaster, SuperframeStation, SendQueue]:
-    """Return a station that a master has confirmed, and that has nothing to say."""
+def joined() -> tuple[ScriptedMaster, SuperframeStation, SendQueue]:
+    """Return a confirmed station with an empty queue."""
     send_queue = SendQueue(0)
-    master, station = HandMaster(), make_station(send_queue)
+    master, station = ScriptedMaster(), make_station(send_queue)
     for _ in range(3):
         master.frame(station)
     assert station.joined
     return master, station, send_queue
 
 
-def test_a_station_joins_in_two_frames() -> None:
-    """It introduces itself with its first reply, measurement and all, and is confirmed by the next beacon."""
+def test_station_joins_in_two_frames() -> None:
+    """Its first reply has a join request and a measurement, and the next beacon confirms it."""
     send_queue = SendQueue(0)
-    master, station = HandMaster(grant=GRANT_BYTES.index(44)), make_station(send_queue)
+    master, station = ScriptedMaster(grant=GRANT_BYTES.index(44)), make_station(send_queue)
     send_queue.add(queued(0, master.now_ns))
     first = master.frame(station)
     assert first is not None
@@ -95,10 +95,10 @@ def test_a_station_joins_in_two_frames() -> None:
     assert len(send_queue) == 1
 
 
-def test_nothing_is_taken_for_delivered_before_the_master_is_known() -> None:
-    """Without a confirmation acknowledgements are not believed, whoever sends them."""
+def test_unconfirmed_master_cannot_acknowledge() -> None:
+    """Acknowledgements are ignored until a beacon has confirmed the station."""
     send_queue = SendQueue(0)
-    master, station = HandMaster(confirm=False), make_station(send_queue)
+    master, station = ScriptedMaster(confirm=False), make_station(send_queue)
     Instrument(send_queue).until(master.now_ns + SECOND)
     before = len(send_queue)
     for _ in range(20):
@@ -109,12 +109,12 @@ def test_nothing_is_taken_for_delivered_before_the_master_is_known() -> None:
 
 @pytest.mark.parametrize("loss", [0.0, 0.1, 0.3])
 @pytest.mark.parametrize("seed", range(3))
-def test_everything_arrives_with_its_time(loss: float, seed: int) -> None:
-    """At any loss, beyond where eight bits of sequence number begin anew, and never off by more than is claimed."""
+def test_all_measurements_arrive_within_their_bounds(loss: float, seed: int) -> None:
+    """At any packet loss, beyond the wrap of eight-bit sequence numbers."""
     rng = np.random.default_rng(seed)
     send_queue = SendQueue(0)
     master, station, instrument = (
-        HandMaster(session_every=4),
+        ScriptedMaster(session_every=4),
         make_station(send_queue),
         Instrument(send_queue),
     )
@@ -130,19 +130,19 @@ def test_everything_arrives_with_its_time(loss: float, seed: int) -> None:
     assert station.rejected_beacons == 0
 
 
-def check_times(answered: Answered, instrument: Instrument) -> None:
-    """Compare with the truth; the unit of time and the master's rounding come on top of what is claimed."""
-    for run in answered.reply.blocks:
-        bound_us = quality_bound_us(run.quality) + 10
-        low_bits = {measurement.sequence % 256 for measurement in run.measurements}
+def check_times(answered: ReceivedMessage, instrument: Instrument) -> None:
+    """Compare with the truth within the claimed bound, one time unit and the master's rounding."""
+    for block in answered.reply.blocks:
+        bound_us = quality_bound_us(block.quality) + 10
+        low_bits = {measurement.sequence % 256 for measurement in block.measurements}
         numbers = [number for number in answered.sequences if number % 256 in low_bits]
         assert numbers
         for number in numbers:
             assert abs(answered.times_ns[number] - instrument.made_ns[number]) <= 1000 * bound_us
 
 
-def test_what_is_not_written_is_sent_again() -> None:
-    """The master acknowledges what is in its recording, and nothing else."""
+def test_unrecorded_measurement_is_retransmitted() -> None:
+    """The master acknowledges recorded measurements only."""
     master, station, send_queue = joined()
     send_queue.add(queued(0, master.now_ns))
     for _ in range(3):
@@ -155,8 +155,8 @@ def test_what_is_not_written_is_sent_again() -> None:
     assert answered.sequences == ()
 
 
-def test_a_reply_without_anything_is_five_bytes() -> None:
-    """Code and all."""
+def test_empty_reply_has_five_bytes() -> None:
+    """Including the authentication code."""
     master, station, _ = joined()
     master.frame(station, beacon_lost=True)  # or it would tell how long the reply before took
     answered = master.frame(station)
@@ -164,10 +164,10 @@ def test_a_reply_without_anything_is_five_bytes() -> None:
     assert answered.payload_bytes == 5
 
 
-def test_a_plain_measurement_is_seventeen_bytes() -> None:
-    """Once the clock has settled."""
+def test_plain_measurement_has_seventeen_bytes() -> None:
+    """After the clock has converged."""
     send_queue = SendQueue(0)
-    master, station, instrument = HandMaster(), make_station(send_queue), Instrument(send_queue)
+    master, station, instrument = ScriptedMaster(), make_station(send_queue), Instrument(send_queue)
     for _ in range(40):
         instrument.until(master.now_ns + master.frame_ns)
         master.frame(station)
@@ -181,11 +181,11 @@ def test_a_plain_measurement_is_seventeen_bytes() -> None:
     assert bound_us < 100
 
 
-def test_after_an_outage_the_newest_comes_first() -> None:
-    """A thousand measurements of backlog arrive in all, and what is measured meanwhile does not wait for them."""
+def test_backlog_is_delivered_newest_first() -> None:
+    """New measurements do not wait for a backlog of a thousand, which arrives completely."""
     send_queue = SendQueue(0)
     master, station, instrument = (
-        HandMaster(session_every=4),
+        ScriptedMaster(session_every=4),
         make_station(send_queue),
         Instrument(send_queue),
     )
@@ -213,14 +213,14 @@ def test_after_an_outage_the_newest_comes_first() -> None:
     assert set(master.received) == set(instrument.made_ns)
 
 
-def test_a_late_slot_stays_empty() -> None:
-    """What would harm the next slot is not sent; it is counted, told, and sent in the next frame."""
+def test_late_reply_is_not_sent() -> None:
+    """A reply that would overlap the next slot counts as a missed slot and is sent in the next frame."""
     master, station, send_queue = joined()
     send_queue.add(queued(0, master.now_ns))
-    heard = station.received(master.packet(master.beacon()))
-    assert heard is not None
-    assert heard.slot_ns is not None
-    assert station.compose(TRACKING, heard.slot_ns + 400 * MS) is None
+    received = station.received(master.packet(master.beacon()))
+    assert received is not None
+    assert received.slot_ns is not None
+    assert station.compose(TRACKING, received.slot_ns + 400 * MS) is None
     assert station.missed_slots == 1
     answered = master.frame(station, InstrumentState(1, direct=False, connected=False))
     assert answered is not None
@@ -229,45 +229,45 @@ def test_a_late_slot_stays_empty() -> None:
     assert answered.reply.status_report.missed_slots == 1
 
 
-def test_a_reply_that_began_too_late_is_counted() -> None:
-    """The radio was held up after the reply had been put together."""
+def test_late_transmission_counts_as_missed_slot() -> None:
+    """The radio delayed the start of the reply."""
     master, station, _ = joined()
-    heard = station.received(master.packet(master.beacon()))
-    assert heard is not None
-    assert heard.slot_ns is not None
-    assert station.compose(TRACKING, heard.slot_ns - MS) is not None
-    started_ns = heard.slot_ns + 400 * MS
+    received = station.received(master.packet(master.beacon()))
+    assert received is not None
+    assert received.slot_ns is not None
+    assert station.compose(TRACKING, received.slot_ns - MS) is not None
+    started_ns = received.slot_ns + 400 * MS
     station.sent(Transmission(started_at_ns=started_ns, done_at_ns=started_ns + MS, stamp_sigma_ns=20_000))
     assert station.missed_slots == 1
 
 
-def test_the_slot_counts_from_the_end_of_the_beacon() -> None:
-    """By the station's own clock, behind the slots before it."""
+def test_slot_starts_relative_to_beacon_end() -> None:
+    """On the station's clock, after the slots of other stations."""
     master, station, _ = joined()
     payload = master.beacon()
-    heard = station.received(master.packet(payload))
-    assert heard is not None
-    assert heard.slot_ns is not None
+    received = station.received(master.packet(payload))
+    assert received is not None
+    assert received.slot_ns is not None
     end_ns = master.now_ns + TIMING.airtime_ns(len(payload))
     first_slot_ns = TIMING.airtime_ns(17) + TIMING.guard_ns
     expected_ns = local_ns(end_ns) + TIMING.turnaround_ns + first_slot_ns
-    assert abs(heard.slot_ns - expected_ns) < 10_000
+    assert abs(received.slot_ns - expected_ns) < 10_000
 
 
-def test_a_beacon_with_a_poor_stamp_gives_no_slot() -> None:
-    """Its edge was lost; a reply would be anywhere."""
+def test_inexact_beacon_timestamp_gives_no_slot() -> None:
+    """The start of the slot is unknown."""
     master, station, _ = joined()
-    heard = station.received(master.packet(master.beacon(), sigma_ns=2 * MS))
-    assert heard is not None
-    assert heard.slot_ns is None
+    received = station.received(master.packet(master.beacon(), sigma_ns=2 * MS))
+    assert received is not None
+    assert received.slot_ns is None
     assert station.compose(TRACKING, local_ns(master.now_ns)) is None
 
 
 @pytest.mark.parametrize("grant", range(len(GRANT_BYTES)))
 def test_a_reply_never_exceeds_its_grant(grant: int) -> None:
-    """Whatever there is to say; a station that is not known says nothing where its introduction does not fit."""
+    """An unknown station does not reply where its join request does not fit."""
     send_queue = SendQueue(0)
-    master, station = HandMaster(grant=grant), make_station(send_queue)
+    master, station = ScriptedMaster(grant=grant), make_station(send_queue)
     Instrument(send_queue).until(master.now_ns + 3 * SECOND)
     answered = master.frame(station)
     if GRANT_BYTES[grant] < 21:
@@ -280,36 +280,36 @@ def test_a_reply_never_exceeds_its_grant(grant: int) -> None:
         master.frame(station)
     Instrument(send_queue, 100).until(master.now_ns + 3 * SECOND)
     master.grant = grant
-    answered = master.frame(station, replace_prism(2))
+    answered = master.frame(station, tracking(2))
     if answered is not None:
         assert answered.payload_bytes <= GRANT_BYTES[grant]
 
 
-def replace_prism(prism: int) -> InstrumentState:
-    """Return a situation that the master has to be told."""
+def tracking(prism: int) -> InstrumentState:
+    """Return a state that the master does not know yet."""
     return InstrumentState(prism, direct=False, connected=True)
 
 
-def test_another_prism_is_named_until_the_master_knows() -> None:
-    """What was measured before an order stays with its prism, whenever it is delivered."""
+def test_blocks_name_their_prism_until_master_knows_it() -> None:
+    """A measurement keeps its prism, whenever it is delivered."""
     master, station, send_queue = joined()
     send_queue.add(queued(0, master.now_ns, prism=1))
     send_queue.add(queued(1, master.now_ns + 1, prism=3))
-    lost = master.frame(station, replace_prism(3), not_written=True)
+    lost = master.frame(station, tracking(3), not_written=True)
     assert lost is not None
     assert lost.reply.status_report is not None
-    assert [run.prism for run in lost.reply.blocks] == [3, 1]
-    known = master.frame(station, replace_prism(3))
+    assert [block.prism for block in lost.reply.blocks] == [3, 1]
+    known = master.frame(station, tracking(3))
     assert known is not None
-    assert [run.prism for run in known.reply.blocks] == [3, 1]
+    assert [block.prism for block in known.reply.blocks] == [3, 1]
     send_queue.add(queued(2, master.now_ns + 2, prism=3))
-    plain = master.frame(station, replace_prism(3))
+    plain = master.frame(station, tracking(3))
     assert plain is not None
-    assert [run.prism for run in plain.reply.blocks] == [None]
+    assert [block.prism for block in plain.reply.blocks] == [None]
 
 
-def test_an_order_is_carried_out_once() -> None:
-    """However often it is repeated; the answer is repeated until it is acknowledged."""
+def test_command_is_executed_once() -> None:
+    """Beacons repeat the command, replies repeat the response until it is acknowledged."""
     master, station, _ = joined()
     order = EncodedCommand(2, command_id=5, code=0, argument=2)
     assert master.frame(station, commands=[order, EncodedCommand(1, 6, 2)]) is not None
@@ -329,8 +329,8 @@ def test_an_order_is_carried_out_once() -> None:
     assert answered.reply.response is None
 
 
-def test_a_ticket_that_has_come_round_is_another_order() -> None:
-    """While the station did not hear the master, fifteen orders have come to nothing."""
+def test_wrapped_command_id_is_a_new_command() -> None:
+    """Fifteen commands were replaced while the station received no beacon."""
     master, station, _ = joined()
     master.frame(station, commands=[EncodedCommand(2, command_id=5, code=0, argument=2)])
     assert station.next_command() == TrackCommand(3)
@@ -342,8 +342,8 @@ def test_a_ticket_that_has_come_round_is_another_order() -> None:
     assert station.next_command() == DirectCommand()
 
 
-def test_orders_are_carried_out_one_after_the_other() -> None:
-    """Each kind, and each has its own answer."""
+def test_commands_are_executed_in_sequence() -> None:
+    """Each has its own response."""
     master, station, _ = joined()
     parts = [EncodedCommand(2, command_id, kind) for command_id, kind in ((1, 1), (2, 2), (3, 3))]
     master.frame(station, commands=parts)
@@ -367,16 +367,16 @@ def test_orders_are_carried_out_one_after_the_other() -> None:
         station.executed(ok=True)
 
 
-def test_an_order_of_an_unknown_master_is_not_obeyed() -> None:
-    """It may be a recording."""
-    master, station = HandMaster(confirm=False), make_station(SendQueue(0))
+def test_command_of_unconfirmed_master_is_ignored() -> None:
+    """It may be a replay."""
+    master, station = ScriptedMaster(confirm=False), make_station(SendQueue(0))
     for _ in range(3):
         master.frame(station, commands=[EncodedCommand(2, 1, 2)])
     assert station.next_command() is None
 
 
-def test_a_beacon_with_a_wrong_bit_is_no_beacon() -> None:
-    """Each bit of it counts, and so does its length."""
+def test_corrupted_beacon_is_rejected() -> None:
+    """Any flipped bit and any other length."""
     master, station, _ = joined()
     payload = master.beacon()
     for bit in range(8 * len(payload)):
@@ -389,25 +389,25 @@ def test_a_beacon_with_a_wrong_bit_is_no_beacon() -> None:
     assert station.received(master.packet(payload)) is not None
 
 
-def test_noise_is_no_beacon() -> None:
-    """Whatever its length."""
+def test_noise_is_rejected() -> None:
+    """Of any length."""
     rng = np.random.default_rng(1)
     master, station, _ = joined()
     for _ in range(3000):
         assert station.received(master.packet(rng.bytes(int(rng.integers(60))))) is None
 
 
-def test_a_master_with_another_key_is_refused() -> None:
-    """And noticed, for somebody has to put the right key there."""
+def test_master_with_another_key_is_rejected() -> None:
+    """The station counts authentication failures."""
     station = make_station(SendQueue(0))
-    master = HandMaster(authenticator=Authenticator(KEY[::-1]))
+    master = ScriptedMaster(authenticator=Authenticator(KEY[::-1]))
     assert master.frame(station) is None
     assert station.authentication_failures == 1
     assert station.heard_ns is None
 
 
-def test_a_beacon_is_heard_once() -> None:
-    """A recording of it, or of an earlier one, is not."""
+def test_replayed_beacon_is_rejected() -> None:
+    """The newest one and earlier ones."""
     master, station, _ = joined()
     payloads = [master.beacon() for _ in range(4)]
     assert station.received(master.packet(payloads[-1])) is not None
@@ -415,13 +415,13 @@ def test_a_beacon_is_heard_once() -> None:
         assert station.received(master.packet(payload)) is None
 
 
-def test_an_old_session_that_is_played_back_does_no_harm() -> None:
-    """While the master is silent it is answered, but neither believed nor obeyed; then all is as before."""
+def test_replayed_session_has_no_effect() -> None:
+    """The station replies to it while the master is silent, but accepts no acknowledgement or command."""
     send_queue = SendQueue(0)
     station = make_station(send_queue)
-    old = HandMaster(session=0x111)
+    old = ScriptedMaster(session=0x111)
     recorded = [old.beacon(commands=[EncodedCommand(2, 1, 2)]) for _ in range(30)]
-    master = HandMaster()
+    master = ScriptedMaster()
     instrument = Instrument(send_queue)
     for _ in range(20):
         instrument.until(master.now_ns + master.frame_ns)
@@ -432,11 +432,11 @@ def test_an_old_session_that_is_played_back_does_no_harm() -> None:
     for payload in recorded:
         master.now_ns += 4 * SECOND
         master.beacon_done_ns = master.now_ns
-        heard = station.received(master.packet(payload))
-        assert heard is not None
-        assert heard.reception is None
-        if heard.slot_ns is not None:
-            station.compose(TRACKING, heard.slot_ns - 6 * MS)
+        received = station.received(master.packet(payload))
+        assert received is not None
+        assert received.reception is None
+        if received.slot_ns is not None:
+            station.compose(TRACKING, received.slot_ns - 6 * MS)
     assert station.next_command() is None
     joined_meanwhile = station.joined
     assert len(send_queue) == before
@@ -447,12 +447,12 @@ def test_an_old_session_that_is_played_back_does_no_harm() -> None:
     assert station.rejected_beacons == 0
 
 
-def test_a_new_master_is_joined_after_three_seconds() -> None:
-    """It was started anew; everything that the old one has not acknowledged goes to the new one."""
+def test_restarted_master_is_joined_after_timeout() -> None:
+    """It gets everything that the previous session did not acknowledge."""
     master, station, send_queue = joined()
     master.frame(station)
     send_queue.add(queued(0, master.now_ns))
-    new = HandMaster(session=0x222, now_ns=master.now_ns, zero_ns=master.now_ns)
+    new = ScriptedMaster(session=0x222, now_ns=master.now_ns, zero_ns=master.now_ns)
     answers = [new.frame(station) for _ in range(12)]
     first = next(index for index, answered in enumerate(answers) if answered is not None)
     assert first == 7
@@ -461,54 +461,54 @@ def test_a_new_master_is_joined_after_three_seconds() -> None:
     assert len(send_queue) == 0
 
 
-def test_a_beacon_that_was_held_back_is_doubted() -> None:
-    """Its time is not used; the next ones are again."""
+def test_delayed_beacon_is_rejected() -> None:
+    """Its time is not used; those of the following beacons are."""
     master, station, _ = joined()
     for _ in range(30):
         master.frame(station)
     assert station.rejected_beacons == 0
     master.frame(station, late_ns=20 * MS)
     payload = master.beacon()
-    heard = station.received(master.packet(payload))
-    assert heard is not None
-    assert (heard.time_rejected, heard.reception, station.rejected_beacons) == (True, None, 1)
+    received = station.received(master.packet(payload))
+    assert received is not None
+    assert (received.time_rejected, received.reception, station.rejected_beacons) == (True, None, 1)
     for _ in range(5):
         master.frame(station)
     assert station.rejected_beacons == 1
 
 
-def test_a_long_outage_ends_with_the_next_beacon_that_tells_of_the_session() -> None:
-    """After 256 frames the low bits of the frame counter say nothing any more."""
+def test_long_outage_ends_with_session_info() -> None:
+    """After 256 frames the low bits of the frame counter are ambiguous."""
     master, station, _ = joined()
     master.counter += 1000
     master.session_every = 8
     answers = [master.frame(station) for _ in range(16)]
-    heard = [answered is not None for answered in answers]
-    assert heard.index(True) == next(i for i in range(16) if (master.counter - 15 + i) % 8 == 0)
-    assert all(heard[heard.index(True) :])
+    received = [answered is not None for answered in answers]
+    assert received.index(True) == next(i for i in range(16) if (master.counter - 15 + i) % 8 == 0)
+    assert all(received[received.index(True) :])
 
 
 def collect(
-    master: HandMaster, station: SuperframeStation, instrument: Instrument, frames: int
+    master: ScriptedMaster, station: SuperframeStation, instrument: Instrument, frames: int
 ) -> list[BeaconReception]:
-    """Play frames; return the receptions that a journal would have."""
+    """Run frames; return the journalled receptions."""
     receptions = []
     for _ in range(frames):
         instrument.until(master.now_ns + master.frame_ns)
-        heard = station.received(master.packet(master.beacon()))
-        assert heard is not None
-        if heard.reception is not None:
-            receptions.append(heard.reception)
-        reply = master.compose(station, heard)
+        received = station.received(master.packet(master.beacon()))
+        assert received is not None
+        if received.reception is not None:
+            receptions.append(received.reception)
+        reply = master.compose(station, received)
         assert reply is not None
         master.take(reply)
     return receptions
 
 
-def test_a_restarted_station_goes_on() -> None:
-    """What it measured before is delivered with times as good as before, what it had delivered is not sent again."""
+def test_restarted_station_continues() -> None:
+    """The backlog arrives with accurate timestamps; delivered measurements are not repeated."""
     send_queue = SendQueue(0)
-    master, instrument = HandMaster(session_every=4), Instrument(send_queue)
+    master, instrument = ScriptedMaster(session_every=4), Instrument(send_queue)
     source = counted()
     station = make_station(send_queue, random_bits=source)
     receptions = collect(master, station, instrument, 60)
@@ -531,10 +531,10 @@ def test_a_restarted_station_goes_on() -> None:
             assert abs(answered.times_ns[number] - instrument.made_ns[number]) < 60_000
 
 
-def test_a_restart_of_the_computer_keeps_times_that_can_be_told() -> None:
-    """Measurements of before are timed by the clock of before; where that is unknown they stay in the journal."""
+def test_reboot_keeps_timestamps_of_known_clocks() -> None:
+    """The clock of the earlier boot is used; measurements without one stay in the journal."""
     send_queue = SendQueue(0)
-    master, instrument = HandMaster(session_every=4), Instrument(send_queue)
+    master, instrument = ScriptedMaster(session_every=4), Instrument(send_queue)
     source = counted()
     station = make_station(send_queue, random_bits=source)
     receptions = collect(master, station, instrument, 60)
@@ -546,16 +546,16 @@ def test_a_restart_of_the_computer_keeps_times_that_can_be_told() -> None:
     again = SendQueue(5000, [*older, *old])
     moved = [replace(reception, boot="old") for reception in receptions]
     station = make_station(again, boot="new", receptions=moved, random_bits=source)
-    heard = station.received(master.packet(master.beacon(session=True)))
-    assert heard is not None
-    reply = master.compose(station, heard)
+    received = station.received(master.packet(master.beacon(session=True)))
+    assert received is not None
+    reply = master.compose(station, received)
     assert reply is not None
     join_request = master.take(reply).reply.join_request
     assert join_request is not None
     assert join_request.oldest == old[0].sequence
-    heard = station.received(master.packet(master.beacon()))
-    assert heard is not None
-    assert (heard.joined, heard.discarded) == (True, 2)
+    received = station.received(master.packet(master.beacon()))
+    assert received is not None
+    assert (received.joined, received.discarded) == (True, 2)
     for number, time_ns in master.received.items():
         assert abs(time_ns - instrument.made_ns[number]) < 150_000
     for _ in range(5):
@@ -565,12 +565,10 @@ def test_a_restart_of_the_computer_keeps_times_that_can_be_told() -> None:
 
 
 @pytest.mark.parametrize(("beacons", "expected"), [(4, set()), (5, {1000})])
-def test_a_clock_of_a_few_beacons_does_not_outlive_a_restart_of_the_computer(
-    beacons: int, expected: set[int]
-) -> None:
-    """They may have been held back, and what would have shown that was not heard any more."""
+def test_unconverged_clock_is_not_used_after_reboot(beacons: int, expected: set[int]) -> None:
+    """Its beacons may have been delayed."""
     send_queue = SendQueue(0)
-    master, instrument = HandMaster(session_every=1), Instrument(send_queue)
+    master, instrument = ScriptedMaster(session_every=1), Instrument(send_queue)
     source = counted()
     station = make_station(send_queue, random_bits=source)
     receptions = collect(master, station, instrument, 12)[:beacons]
@@ -584,10 +582,10 @@ def test_a_clock_of_a_few_beacons_does_not_outlive_a_restart_of_the_computer(
     assert len(again) == 0
 
 
-def test_what_can_be_timed_does_not_wait_behind_what_cannot() -> None:
-    """Of another start of the computer: minutes after the last beacon then, and hours."""
+def test_untimeable_measurements_do_not_block_others() -> None:
+    """Measurements of an earlier boot, minutes and hours after its last beacon."""
     send_queue = SendQueue(0)
-    master, instrument = HandMaster(session_every=4), Instrument(send_queue)
+    master, instrument = ScriptedMaster(session_every=4), Instrument(send_queue)
     source = counted()
     station = make_station(send_queue, random_bits=source)
     moved = [replace(each, boot="old") for each in collect(master, station, instrument, 60)]
@@ -604,10 +602,10 @@ def test_what_can_be_timed_does_not_wait_behind_what_cannot() -> None:
     assert len(again) == 0
 
 
-def test_what_was_measured_long_before_the_master_came_is_left_behind() -> None:
-    """Its time could not be told to half a second; what is younger is delivered, and the master waits for nothing else."""
+def test_measurements_long_before_first_beacon_are_discarded() -> None:
+    """Younger ones are delivered, and the master waits for no others."""
     send_queue = SendQueue(0)
-    master = HandMaster(session_every=4, now_ns=6 * 3600 * SECOND)
+    master = ScriptedMaster(session_every=4, now_ns=6 * 3600 * SECOND)
     for number in range(20):
         send_queue.add(queued(number, number * SECOND))
     for number in range(20, 40):
@@ -619,8 +617,8 @@ def test_what_was_measured_long_before_the_master_came_is_left_behind() -> None:
     assert set(master.received) == set(range(20, 40))
 
 
-def test_a_few_old_measurements_do_not_wait_for_ever() -> None:
-    """One that needs a run of its own, behind which a new one never fits, goes first for once."""
+def test_old_measurements_of_short_queue_are_delivered() -> None:
+    """One that needs a block of its own takes precedence once in a while."""
     master, station, send_queue = joined()
     send_queue.add(queued(0, master.now_ns - 40 * SECOND, prism=5))
     master.grant = GRANT_BYTES.index(26)
@@ -630,8 +628,8 @@ def test_a_few_old_measurements_do_not_wait_for_ever() -> None:
     assert 0 in master.received
 
 
-def test_how_long_the_reply_before_took_is_told() -> None:
-    """From RxDone of its beacon to its TxDone, on the master's clock; only of the frame before."""
+def test_turnaround_of_previous_frame_is_reported() -> None:
+    """From RxDone of the beacon to TxDone of the reply, at the master's clock rate."""
     master, station, _ = joined()
     answered = master.frame(station)
     assert answered is not None

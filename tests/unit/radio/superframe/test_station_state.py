@@ -1,322 +1,446 @@
-"""Beacons that somebody jams at a station and plays to it later: what it measures keeps its time, or a bound says so."""
+"""State of one station at the master: timestamps, prisms, link delay, status, grants."""
 
 from __future__ import annotations
 
-from random import Random
-from typing import TYPE_CHECKING
+from dataclasses import replace
 
 import pytest
-from harness.exchange import MS, Exchange
-from harness.frames import KEY, TIMING
+from harness.radios import MS
+from harness.scripted_stations import TIMING, ZERO_NS, ScriptedFrames, measurement, older, scripted_frames
 
-from tsgt.radio import DirectCommand
-from tsgt.radio.superframe.wire import Authenticator
+from tsgt.model import Status
+from tsgt.radio import MeasureCommand
+from tsgt.radio.superframe.wire import (
+    GRANT_BYTES,
+    EncodedMeasurement,
+    MeasurementBlock,
+    Reply,
+    StatusReport,
+    angle_code,
+)
 
-if TYPE_CHECKING:
-    from collections.abc import Collection
-
-    from harness.exchange import Member
-
-DELAYS_NS = (300_000, 3 * MS, 30 * MS)
-LONG_DELAYS_NS = (66 * MS, 80 * MS, 131 * MS, 248 * MS)
-"""Longer than the low bits of a time tell; by 131 ms they are nearly the same again."""
-
-
-def exchange_of(frames: int = 0) -> Exchange:
-    """Return an exchange of three stations that has been under way for so many frames."""
-    exchange = Exchange(TIMING, Authenticator(KEY), Random(1).getrandbits)  # noqa: S311 (a test has no secrets)
-    for _ in range(frames):
-        exchange.frame()
-    return exchange
+STATE = StatusReport(prism=1, direct=False, connected=True, missed_slots=0, rejected_beacons=0, rssi_dbm=-80)
+US = 1_000
+LINK_NS = TIMING.link_ns
+LINK_BOUND_NS = 0.2 * 2_048_000
+"""While it has not been measured; see :class:`~tsgt.timesync.link_delay.LinkDelayEstimator`."""
 
 
-def hold_back(exchange: Exchange, late_ns: int, frames: int, which: Collection[int]) -> dict[int, str]:
-    """Run frames, hold some beacons back from station 2; return in which frames the master has found that out, and how."""
-    told = {}
-    for frame in range(frames):
-        exchange.frame(late_ns={2: late_ns} if frame in which else {})
-        heard = exchange.heard.get(2)
-        if heard is not None and heard.rejected_beacons:
-            told[frame] = "beacon_time_rejected"
-        elif heard is not None and heard.link_delay_anomaly:
-            told[frame] = "link_delay_anomaly"
-    return told
+@pytest.fixture
+def frames() -> ScriptedFrames:
+    """Three stations that have joined."""
+    frames = scripted_frames()
+    frames.join()
+    return frames
 
 
-def timestamp_violations(member: Member) -> dict[int, int]:
-    """Return by how much times are further off than they are said to be."""
-    beyond = {k: abs(off) - member.received[k].bound_ns for k, off in member.errors_ns().items()}
-    return {number: ns for number, ns in beyond.items() if ns > 0}
+def slot_us(frames: ScriptedFrames, station: int = 1) -> int:
+    """Return the start of a station's slot in session time."""
+    return frames.sent_us + frames.span(station).start_ns // 1000
 
 
-@pytest.mark.parametrize("late_ns", DELAYS_NS + LONG_DELAYS_NS)
-def test_a_single_beacon_shifts_no_time(late_ns: int) -> None:
-    """Every tenth one is held back: times stay as good as they were, and the master is told of it."""
-    exchange = exchange_of(60)
-    told = hold_back(exchange, late_ns, 60, range(0, 60, 10))
-    member = exchange.members[2]
-    errors_ns = member.errors_ns()
-    assert max(abs(errors_ns[k]) for k in errors_ns if k > 20) < 60_000
-    assert timestamp_violations(member) == {}
-    if late_ns != 131 * MS:
-        assert list(told.values()).count("beacon_time_rejected") >= 3
-        assert min(told) == 1
+# --- Times ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("late_ns", DELAYS_NS + LONG_DELAYS_NS[:2])
-def test_from_some_time_on_all_are_held_back(late_ns: int) -> None:
-    """The station follows what it cannot tell from another rate; the master knows at once and says how far times are off."""
-    exchange = exchange_of(60)
-    told = hold_back(exchange, late_ns, 100, range(100))
-    assert min(told) == 1
-    assert list(told.values()).count("link_delay_anomaly") >= 3
-    assert timestamp_violations(exchange.members[2]) == {}
+@pytest.mark.parametrize("age_ms", [-15, 0, 6, 400, 1000, 2000])
+def test_narrow_time_is_unwrapped(frames: ScriptedFrames, age_ms: float) -> None:
+    """From two seconds before the slot to slightly after it; the master adds the link delay."""
+    frames.run(20)
+    frames.begin()
+    made_us = slot_us(frames) - round(1000 * age_ms)
+    (found,) = frames.measure(1, age_ms=age_ms).measurements
+    assert found.measured_ns == pytest.approx(ZERO_NS + 1000 * made_us + LINK_NS, abs=9 * US)
+    assert found.bound_ns == pytest.approx(128 * US + 9 * US + LINK_BOUND_NS, abs=60 * US)
+    assert 30 * US < found.sigma_ns < found.bound_ns / 3
 
 
-@pytest.mark.parametrize("late_ns", DELAYS_NS[1:] + LONG_DELAYS_NS[:-1])
-def test_all_are_held_back_from_the_start(late_ns: int) -> None:
-    """The round trip is longer than any chip makes it, and the bound contains what it may be."""
-    exchange = exchange_of()
-    assert "link_delay_anomaly" in hold_back(exchange, late_ns, 100, range(100)).values()
-    assert timestamp_violations(exchange.members[2]) == {}
+def test_measurement_made_during_late_slot_is_not_wrapped(frames: ScriptedFrames) -> None:
+    """A short reply may start late in a long slot."""
+    frames.begin()
+    made_us = slot_us(frames) + 50_000
+    block = MeasurementBlock(measurements=(measurement(1, made_us),))
+    (found,) = frames.reply(1, Reply(blocks=(block,)), sequence=1, late_ns=60 * MS).measurements
+    assert found.measured_ns == pytest.approx(ZERO_NS + 1000 * made_us + LINK_NS, abs=9 * US)
 
 
-def test_less_than_chips_may_differ_by_is_not_noticed_from_the_start() -> None:
-    """0.3 ms of delay pass for a link constant of 0.15 ms more; times are off by the other half."""
-    exchange = exchange_of()
-    assert hold_back(exchange, 300_000, 100, range(100)) == {}
-    errors_ns = exchange.members[2].errors_ns()
-    assert 140_000 < max(abs(errors_ns[k]) for k in errors_ns if k > 40) < 200_000
+@pytest.mark.parametrize("age_s", [3, 3600, 86_400, 12 * 86_400])
+def test_wide_time_before_master_start(frames: ScriptedFrames, age_s: int) -> None:
+    """Even before its clock was at zero."""
+    frames.begin()
+    made_us = slot_us(frames) - age_s * 1_000_000
+    (found,) = frames.measure(1, age_ms=1000 * age_s, wide=True).measurements
+    assert found.measured_ns == pytest.approx(ZERO_NS + 1000 * made_us + LINK_NS, abs=9 * US)
 
 
-@pytest.mark.parametrize("late_ns", [500_000, 900_000, 1_000_000])
-def test_what_a_delay_below_a_millisecond_shifts_times_by(late_ns: int) -> None:
-    """From the start on, times are off by half of it and a little, which no bound says; beyond a millisecond it is noticed."""
-    exchange = exchange_of()
-    told = hold_back(exchange, late_ns, 150, range(150))
-    errors_ns = exchange.members[2].errors_ns()
-    assert max(abs(errors_ns[k]) for k in errors_ns if k > 40) < 650_000
-    assert bool(told) == (late_ns >= MS)
+def test_session_time_wraps() -> None:
+    """After 12.7 days on the air, but not in the timestamps."""
+    frames = scripted_frames()
+    frames.join()
+    frames.run(1)
+    frames.now_ns = ZERO_NS + (1 << 40) * 1000 - 100 * MS
+    frames.begin()
+    frames.end()
+    frames.begin()
+    assert frames.sent_us < 10_000_000
+    (found,) = frames.measure(1, age_ms=1500).measurements
+    made_ns = frames.sent_ns + frames.span(1).start_ns - 1500 * MS
+    assert found.measured_ns == pytest.approx(made_ns + LINK_NS, abs=9 * US)
 
 
-@pytest.mark.parametrize("step_ns", [1_000, 10_000, 25_000])
-def test_a_delay_that_grows_is_noticed_and_bounded_to_half_a_millisecond(step_ns: int) -> None:
-    """It looks like a clock that runs fast; times are off by no more than that beyond what is stated of them."""
-    exchange = exchange_of(60)
+def test_block_is_decoded_oldest_first(frames: ScriptedFrames) -> None:
+    """Numbers and times of older measurements are relative to the newest."""
+    frames.run(4)
+    frames.begin()
+    newest_us = slot_us(frames) - 50_000
+    newest = measurement(7, newest_us)
+    measurements = (newest, older(newest, 1), older(newest, 2))
+    found = frames.reply(
+        1, Reply(blocks=(MeasurementBlock(measurements=measurements),)), sequence=7
+    ).measurements
+    assert [each.sequence for each in found] == [5, 6, 7]
+    assert [(found[-1].measured_ns - each.measured_ns) / MS for each in found] == pytest.approx(
+        [800, 400, 0], abs=0.02
+    )
+    assert found[0].horizontal_angle_rad == pytest.approx(5 / 1000, abs=2e-7)
+    assert found[0].zenith_angle_rad == pytest.approx(1.5, abs=2e-7)
+    assert found[0].slope_distance_m == 75.0
+
+
+@pytest.mark.parametrize("late_ms", [-0.5, 0.0, 4.0])
+def test_beacon_relative_time_counts_from_beacon(frames: ScriptedFrames, late_ms: float) -> None:
+    """The lateness of the reply enlarges its bound."""
+    frames.begin()
+    made_us = slot_us(frames) - 120_000
+    block = MeasurementBlock(
+        measurements=(measurement(1, made_us, origin_us=frames.sent_us),), beacon_relative=True, quality=0
+    )
+    received = frames.reply(1, Reply(blocks=(block,)), sequence=1, late_ns=round(late_ms * MS))
+    (found,) = received.measurements
+    assert found.measured_ns == pytest.approx(ZERO_NS + 1000 * made_us + LINK_NS, abs=9 * US)
+    assert received.lateness_ns == pytest.approx(late_ms * MS + 200 * US, abs=US)
+    on_time_ns = 16 * US + 9 * US + LINK_BOUND_NS + 12 * US
+    assert found.bound_ns == pytest.approx(on_time_ns + max(received.lateness_ns, 0), abs=60 * US)
+
+
+def test_delay_is_visible_on_short_link(frames: ScriptedFrames) -> None:
+    """Replies over a link shorter than the nominal one come early; delayed ones come on time."""
+    frames.link_ns = TIMING.link_ns - 100 * US
+    for _ in range(8):
+        exchange(frames)
+    late_us = 200
+    frames.begin()
+    made_us = slot_us(frames) - 120_000
+    block = MeasurementBlock(
+        measurements=(measurement(1, made_us - late_us, origin_us=frames.sent_us),),
+        beacon_relative=True,
+        quality=0,
+    )
+    received = frames.reply(1, Reply(blocks=(block,)), sequence=1, late_ns=late_us * US)
+    assert received.lateness_ns == pytest.approx(0, abs=US)
+    assert received.measurements[0].bound_ns > late_us * US
+
+
+def test_inexact_beacon_timestamp_enlarges_bound(frames: ScriptedFrames) -> None:
+    """By four sigma: 4 ms without the edge."""
+    frames.begin(sigma_ns=MS)
+    block = MeasurementBlock(
+        measurements=(measurement(1, slot_us(frames) - 9000, origin_us=frames.sent_us),),
+        beacon_relative=True,
+        quality=0,
+    )
+    (found,) = frames.reply(1, Reply(blocks=(block,)), sequence=1).measurements
+    assert 4 * MS < found.bound_ns < 5 * MS
+
+
+@pytest.mark.parametrize(("quality", "bound_us"), [(0, 16), (4, 256), (15, 524_288)])
+def test_quality_sets_bound(frames: ScriptedFrames, quality: int, bound_us: int) -> None:
+    """The master adds the uncertainty of the link delay."""
+    frames.begin()
+    newest = measurement(2, slot_us(frames))
+    block = MeasurementBlock(measurements=(newest, older(newest, 1)), quality=quality)
+    found = frames.reply(1, Reply(blocks=(block,)), sequence=2).measurements[-1]
+    assert found.bound_ns == pytest.approx(bound_us * US + 9 * US + LINK_BOUND_NS, abs=60 * US)
+    assert found.sigma_ns >= bound_us * US / 4
+
+
+def test_sequence_numbers_are_unwrapped(frames: ScriptedFrames) -> None:
+    """After hundreds of measurements, and across a gap."""
+    frames.run(600)
+    assert frames.master.station(2).window.cumulative == 600
+    frames.stations[2].sequence += 120
+    frames.begin()
+    assert frames.measure(2).measurements[0].sequence == 721
+    assert frames.master.station(2).window.outstanding == 120
+
+
+def test_negative_sequence_numbers_are_dropped(frames: ScriptedFrames) -> None:
+    """The rest of the block is accepted."""
+    frames.begin()
+    newest = measurement(1, slot_us(frames))
+    block = MeasurementBlock(measurements=(newest, older(newest, 2)))
+    received = frames.reply(1, Reply(blocks=(block,)), sequence=1)
+    assert [each.sequence for each in received.measurements] == [1]
+
+
+# --- Prisms, state --------------------------------------------------------------------------------------------------
+
+
+def test_prism_follows_status_report(frames: ScriptedFrames) -> None:
+    """Initially that of the configuration; a block may name another."""
+    frames.begin()
+    assert frames.measure(2).measurements[0].prism == 2
+    frames.end()
+    frames.begin()
+    frames.reply(2, Reply(status_report=replace(STATE, prism=5)))
+    frames.end()
+    frames.begin()
+    block = MeasurementBlock(measurements=(measurement(2, slot_us(frames, 2)),))
+    other = MeasurementBlock(measurements=(measurement(3, slot_us(frames, 2)),), prism=3)
+    received = frames.reply(2, Reply(blocks=(block, other)), sequence=2)
+    assert [(each.sequence, each.prism) for each in received.measurements] == [(2, 5), (3, 3)]
+
+
+def test_status_counters_are_unwrapped(frames: ScriptedFrames) -> None:
+    """From the first report on."""
     told = []
-    for frame in range(300):
-        exchange.frame(late_ns={2: min(frame * step_ns, 3 * MS)})
-        heard = exchange.heard.get(2)
-        if heard is not None and (heard.link_delay_anomaly or heard.rejected_beacons):
-            told.append(frame)
-    assert min(told) * step_ns < 400_000
-    assert max(timestamp_violations(exchange.members[2]).values(), default=0) < 500_000
+    for late, doubted in ((250, 14), (3, 1), (3, 1), (4, 1)):
+        frames.begin()
+        received = frames.reply(
+            1, Reply(status_report=replace(STATE, missed_slots=late, rejected_beacons=doubted))
+        )
+        told.append(received.rejected_beacons)
+        frames.end()
+    assert told == [0, 3, 0, 0]
+    assert (frames.master.station(1).missed_slots, frames.master.station(1).rejected_beacons) == (10, 3)
 
 
-@pytest.mark.parametrize("backlog_s", [0, 20])
-@pytest.mark.parametrize("which", [[0], [0, 1], [1], [2], [0, 1, 2], [3, 4], [0, 1, 2, 3]])
-@pytest.mark.parametrize("late_ns", DELAYS_NS + LONG_DELAYS_NS)
-def test_the_first_beacons_of_a_station(late_ns: int, which: list[int], backlog_s: int) -> None:
-    """It knows no better than them, and says so; also of what it measured before it heard any."""
-    exchange = exchange_of()
-    member = exchange.members[2]
-    member.next_ns -= backlog_s * 1000 * MS
-    hold_back(exchange, late_ns, 60, which)
-    assert timestamp_violations(member) == {}
-    assert set(member.made_ns) - set(member.received) <= set(
-        range(len(member.made_ns) - 3, len(member.made_ns))
+# --- Link constant --------------------------------------------------------------------------------------------------
+
+
+def exchange(
+    frames: ScriptedFrames,
+    *,
+    late_ns: int = 0,
+    off_us: int = 0,
+    sigma_ns: int = 3000,
+    sent_sigma_ns: int = 3000,
+) -> bool:
+    """Run a frame with a turnaround; return whether the master reports an anomaly."""
+    frames.begin(sigma_ns=sent_sigma_ns)
+    turnaround_us = frames.turnarounds_us[1] + off_us
+    received = frames.reply(1, Reply(turnaround_us=turnaround_us), late_ns=late_ns, sigma_ns=sigma_ns)
+    frames.end()
+    return received.link_delay_anomaly
+
+
+def link_error_ns(frames: ScriptedFrames) -> float:
+    """Return the error of a timestamp caused by the link delay."""
+    frames.begin()
+    made_us = slot_us(frames) - 100_000
+    (found,) = frames.measure(1).measurements
+    frames.end()
+    return found.measured_ns - (ZERO_NS + 1000 * made_us + frames.link_ns)
+
+
+def test_link_delay_is_measured(frames: ScriptedFrames) -> None:
+    """From four timestamps, however late a reply is."""
+    assert link_error_ns(frames) == pytest.approx(-100_000, abs=9 * US)
+    for late_ms in range(8):
+        assert not exchange(frames, late_ns=late_ms * MS)
+    assert link_error_ns(frames) == pytest.approx(0, abs=9 * US)
+
+
+def test_delayed_reply_is_an_anomaly(frames: ScriptedFrames) -> None:
+    """It took longer than the station states."""
+    for _ in range(8):
+        assert not exchange(frames)
+    assert exchange(frames, off_us=-2000)
+    assert link_error_ns(frames) == pytest.approx(0, abs=9 * US)
+
+
+@pytest.mark.parametrize("which", ["sigma_ns", "sent_sigma_ns"])
+def test_inexact_timestamps_measure_no_link_delay(frames: ScriptedFrames, which: str) -> None:
+    """Of the beacon or of the reply, in this exchange and the next."""
+    exchange(frames)
+    exchange(frames, **{which: MS})
+    assert not exchange(frames, off_us=5000)
+    assert not exchange(frames)
+
+
+def test_missed_frame_measures_no_link_delay(frames: ScriptedFrames) -> None:
+    """A turnaround is that of the previous frame."""
+    exchange(frames)
+    frames.run(1, silent=(1,))
+    assert not exchange(frames, off_us=5000)
+
+
+# --- Grants ---------------------------------------------------------------------------------------------------------
+
+
+def granted(frames: ScriptedFrames, station: int = 1) -> int:
+    """Return a station's grant in the next frame, in bytes; no station replies."""
+    frames.begin()
+    found = GRANT_BYTES[frames.beacon.stations[station - 1].grant]
+    frames.end()
+    return found
+
+
+def converged() -> ScriptedFrames:
+    """Return stations with a measured link delay."""
+    frames = scripted_frames()
+    frames.join()
+    for _ in range(9):
+        frames.begin()
+        for station in (1, 2, 3):
+            frames.reply(station, Reply(turnaround_us=frames.turnarounds_us[station]))
+        frames.end()
+    frames.run(12)
+    return frames
+
+
+def test_grant_of_one_measurement() -> None:
+    """17 bytes, and 26 with a turnaround in one of 32 frames."""
+    frames = converged()
+    found = []
+    for _ in range(64):
+        frames.run(1)
+        found += [GRANT_BYTES[entry.grant] for entry in frames.beacon.stations]
+    assert sorted(set(found)) == [17, 26]
+    assert found.count(26) == 3 * 64 / 32
+
+
+def test_silent_station_gets_larger_grants() -> None:
+    """Until it may be absent."""
+    frames = converged()
+    found = []
+    for _ in range(8):
+        frames.run(1, silent=(1,))
+        found.append(GRANT_BYTES[frames.beacon.stations[0].grant])
+    assert found[:3] == [17, 26, 35]
+    assert max(found[3:6]) > 44
+    assert set(found[6:]) == {44}
+
+
+def test_instrument_latency_is_learnt() -> None:
+    """Measurements younger than any before get no room."""
+    frames = converged()
+    frames.run(32)
+    frames.begin()
+    room = GRANT_BYTES[frames.beacon.stations[0].grant]
+    frames.end()
+    for _ in range(32):
+        frames.begin()
+        for station in frames.stations:
+            frames.measure(station, age_ms=300)
+        frames.end()
+    station_state = frames.master._stations[1]
+    assert station_state.demand.ready_us == pytest.approx(300_000, abs=12_000)
+    assert granted(frames) <= room
+
+
+def test_outstanding_measurements_are_granted() -> None:
+    """Up to the cap, and no more if the station had room and did not send them."""
+    frames = converged()
+    frames.stations[1].sequence += 50
+    frames.run(1)
+    assert granted(frames) == 71
+    frames.begin()
+    frames.measure(1)  # and it had room for more
+    frames.end()
+    assert granted(frames) <= 26
+
+
+def test_grant_continues_while_outstanding_ones_arrive() -> None:
+    """The next one may need a block of its own."""
+    frames = converged()
+    station = frames.stations[1]
+    first_missing = station.sequence
+    station.sequence += 50
+    frames.run(1)
+    frames.begin()
+    old = measurement(first_missing + 20, slot_us(frames) - 10_000_000, wide=True)
+    frames.reply(
+        1, Reply(blocks=(MeasurementBlock(measurements=(old,), wide=True),)), sequence=first_missing + 20
     )
+    frames.end()
+    assert granted(frames) == 71
 
 
-@pytest.mark.parametrize("frames", [0, 60])
-@pytest.mark.parametrize("late_ns", LONG_DELAYS_NS)
-@pytest.mark.parametrize("off_ms", [-49, 49])
-def test_a_reply_whose_end_the_master_has_not_seen_to_the_moment(
-    off_ms: int, late_ns: int, frames: int
-) -> None:
-    """An interrupt was lost and the reply found by looking, at best within 50 ms: by so much it may have been later."""
-    exchange = exchange_of(frames)
-    for _ in range(3):
-        exchange.begin()
-        received_ns = exchange.hear(2, late_ns=late_ns)
-        assert received_ns is not None
-        exchange.deliver(2, received_ns + off_ms * MS, sigma_ns=29 * MS)
-        exchange.end()
-    assert timestamp_violations(exchange.members[2]) == {}
+def test_unrecorded_measurements_are_granted_again() -> None:
+    """The station repeats them."""
+    frames = converged()
+    frames.writes = False
+    frames.run(1)
+    assert granted(frames) >= 26
 
 
-@pytest.mark.parametrize("many", [1, 4])
-@pytest.mark.parametrize(("away_s", "late_us"), [(60, 1_500), (120, 3_000), (300, 8_000)])
-def test_the_first_beacons_after_an_outage(away_s: int, late_us: int, many: int) -> None:
-    """A clock may have run off by so much meanwhile; but what a few beacons alone say is no reason to believe it."""
-    exchange = exchange_of(60)
-    member, until_ns = exchange.members[2], exchange.now_ns + away_s * 1000 * MS
-    while exchange.now_ns < until_ns:
-        exchange.frame(deaf=[2])
-    while many:
-        before_ns = member.core.heard_ns
-        exchange.frame(late_ns={2: 1000 * late_us})
-        many -= member.core.heard_ns != before_ns
-    for _ in range(120):
-        exchange.frame()
-    assert timestamp_violations(member) == {}
+def test_restarted_station_repeats_backlog() -> None:
+    """Until a reply leaves room."""
+    frames = converged()
+    station = frames.stations[1]
+    last = station.sequence - 1
+    station.nonce, station.oldest, station.first_sequence = 0xF00D, last - 9, last + 1001
+    station.sequence = station.first_sequence
+    frames.begin()
+    frames.measure(1, join=True)
+    frames.end()
+    frames.begin()
+    newest = measurement(last, slot_us(frames) - 10_000_000, wide=True)
+    block = MeasurementBlock(measurements=(newest, *(older(newest, back) for back in (1, 2, 3))), wide=True)
+    assert frames.reply(1, Reply(blocks=(block,)), sequence=last).repeated == 4
+    frames.end()
+    assert granted(frames) == 71
+    frames.begin()
+    frames.measure(1)  # and it had room for more
+    frames.end()
+    assert granted(frames) <= 26
 
 
-@pytest.mark.parametrize("late_ms", [65, 80])
-def test_an_interrupt_that_the_master_loses_after_it(late_ms: int) -> None:
-    """It cannot say when that beacon left, so that the station cannot find out that those before it were late."""
-    exchange = exchange_of()
-    for _ in range(40):
-        exchange.frame(deaf=[2])
-    member = exchange.members[2]
-    member.made_ns.clear()
-    member.next_ns = exchange.now_ns - 130_000 * MS
-    member.measure(exchange.now_ns - 90_000 * MS)
-    member.next_ns = exchange.now_ns + 1_000_000 * MS  # it has lost its prism
-    hold_back(exchange, 0, 1, ())
-    hold_back(exchange, late_ms * MS, 2, range(2))
-    exchange.begin(sigma_ns=MS)
-    received_ns = exchange.hear(2)
-    assert received_ns is not None
-    exchange.deliver(2, received_ns)
-    exchange.end()
-    hold_back(exchange, 0, 60, ())
-    assert timestamp_violations(member) == {}
+def test_worse_quality_gets_larger_grant() -> None:
+    """Also after a reply without measurements."""
+    frames = converged()
+    frames.begin()
+    number = frames.stations[1].next_number()
+    block = MeasurementBlock(measurements=(measurement(number, slot_us(frames)),), quality=5)
+    frames.reply(1, Reply(blocks=(block,)), sequence=number)
+    frames.reply(2, Reply())
+    frames.end()
+    frames.begin()
+    assert [GRANT_BYTES[entry.grant] for entry in frames.beacon.stations[:2]] == [21, 30]  # and a turn-round
 
 
-def test_what_five_in_a_row_that_were_held_back_leave_behind() -> None:
-    """They are a clock that was touched: what was measured before and is told afterwards is off by as much, unsaid."""
-    exchange = exchange_of()
-    member = exchange.members[2]
-    member.next_ns -= 60_000 * MS
-    hold_back(exchange, 40 * MS, 60, range(6))
-    assert 30 * MS < max(timestamp_violations(member).values()) < 40 * MS
+def test_pending_command_gets_room_for_response() -> None:
+    """And for a single measurement."""
+    frames = converged()
+    frames.master.station(1).submit(MeasureCommand())
+    assert granted(frames) >= 30
 
 
-@pytest.mark.parametrize("late_s", [2, 20])
-def test_beacons_that_were_missed_are_no_time(late_s: int) -> None:
-    """A station that hears no master is played what it has missed: authentic, new to it, and seconds old."""
-    exchange = exchange_of(60)
-    member = exchange.members[2]
-    late_ns = late_s * 1000 * MS
-    recorded, until_ns = list[tuple[int, bytes]](), exchange.now_ns + late_ns + 15_000 * MS
-    while exchange.now_ns < until_ns:
-        recorded.append((exchange.begin(), exchange.done_ns + late_ns)[::-1])
-        while recorded[0][0] <= exchange.done_ns:
-            played_ns, beacon = recorded.pop(0)
-            exchange.hear(2, late_ns=played_ns - exchange.done_ns, beacon=beacon)
-        exchange.end()
-    for _ in range(20):
-        exchange.frame()
-    assert member.core.rejected_beacons > 20
-    assert timestamp_violations(member) == {}
-    assert max(map(abs, member.errors_ns().values())) < 100_000
-    assert set(member.made_ns) - set(member.received) <= set(
-        range(len(member.made_ns) - 3, len(member.made_ns))
+def test_max_grant_depends_on_station_count() -> None:
+    """With eight stations a reply may have 15 measurements; with sixteen the frame limits it."""
+    caps = {}
+    for count in (7, 8, 16):
+        frames = scripted_frames(range(1, count + 1))
+        frames.join()
+        frames.begin()
+        for station in range(1, count + 1):
+            newest = measurement(60, slot_us(frames, station))
+            block = MeasurementBlock(measurements=(newest, *(older(newest, back) for back in range(1, 4))))
+            frames.reply(station, Reply(blocks=(block,)), sequence=60)
+        frames.end()
+        caps[count] = granted(frames)
+    assert caps == {7: 71, 8: 107, 16: 89}
+
+
+def test_values_round_trip(frames: ScriptedFrames) -> None:
+    """Within half a unit, far and near; no distance stays None."""
+    frames.begin()
+    far = MeasurementBlock(
+        measurements=(EncodedMeasurement(1, 0, Status.OK, angle_code(6.2), angle_code(4.0), 2_000_000),),
+        far=True,
     )
-
-
-def test_a_session_of_yesterday_played_back() -> None:
-    """To a station that hears no master: never confirmed, nothing deleted, nothing obeyed; the real one is heard at once."""
-    yesterday = Exchange(TIMING, Authenticator(KEY), Random(2).getrandbits, start_ns=1000 * MS)  # noqa: S311 (as above)
-    recorded = []
-    for frame in range(200):
-        if frame % 20 == 0:
-            yesterday.master.station(2).submit(DirectCommand())
-        yesterday.frame()
-        recorded.append(yesterday.beacon)
-    exchange = exchange_of(60)
-    member = exchange.members[2]
-    joined = []
-    for beacon in recorded:
-        exchange.frame(deaf=[2])
-        before = len(member.send_queue)
-        exchange.hear(2, beacon=beacon, late_ns=200 * MS)
-        joined.append(member.core.joined)
-        assert len(member.send_queue) >= before
-        assert member.core.next_command() is None
-    assert not any(joined[40:])  # from the first one on that tells of its session
-    exchange.frame()
-    assert 2 in exchange.heard
-    assert member.core.joined
-    for _ in range(60):
-        exchange.frame()
-    assert timestamp_violations(member) == {}
-    assert set(member.made_ns) - set(member.received) <= set(
-        range(len(member.made_ns) - 3, len(member.made_ns))
-    )
-
-
-def test_a_session_of_yesterday_played_to_a_station_that_was_just_started() -> None:
-    """It draws another nonce for each session, so that the confirmation of yesterday's is not one of today's."""
-    yesterday, today = exchange_of(), Exchange(TIMING, Authenticator(KEY), Random(3).getrandbits)  # noqa: S311 (as above)
-    recorded = []
-    for _ in range(20):
-        yesterday.frame()
-        recorded.append(yesterday.beacon)
-    assert yesterday.members[2].core.joined
-    for beacon in recorded:
-        today.frame(deaf=[1, 2, 3])
-        today.hear(2, beacon=beacon, late_ns=200 * MS)
-        assert not today.members[2].core.joined
-
-
-@pytest.mark.parametrize("earlier_ms", [40, 140])
-@pytest.mark.parametrize("late_ms", [50, 100, 220])
-def test_a_reply_with_an_old_measurement_is_held_back(earlier_ms: int, late_ms: int) -> None:
-    """Times that repeat after 2.1 s are not taken for the next ones, and nothing is acknowledged that was not taken."""
-    exchange = exchange_of(60)
-    member = exchange.members[2]
-    made = len(member.made_ns)
-    member.next_ns -= earlier_ms * MS
-    for frame in range(8):
-        exchange.begin()
-        for number in exchange.members:
-            received_ns = exchange.hear(number)
-            if number == 2 and frame == 3 and received_ns is not None:
-                exchange.deliver(2, received_ns + late_ms * MS)
-        if len(member.made_ns) > made:
-            member.next_ns = exchange.now_ns + 60_000 * MS  # the prism is out of sight
-        exchange.end()
-    for _ in range(20):
-        exchange.frame()
-    assert timestamp_violations(member) == {}
-    assert max(map(abs, member.errors_ns().values())) < 100_000
-    assert set(member.received) == set(member.made_ns)
-
-
-@pytest.mark.parametrize("which", [[0, 1], [1, 2], [0, 1, 2], [1, 2, 3], [1, 2, 3, 4]])
-@pytest.mark.parametrize("away_s", [0, 20, 60])
-@pytest.mark.parametrize("late_ms", [10, 20, 29])
-def test_what_was_measured_before_is_not_told_by_first_beacons_that_were_held_back_alike(
-    late_ms: int, away_s: int, which: list[int]
-) -> None:
-    """The prism was out of sight when the station joined: what it tells is old, and two beacons that agree are no clock yet."""
-    exchange = exchange_of()
-    member = exchange.members[2]
-    member.next_ns = exchange.now_ns - (away_s + 40) * 1000 * MS
-    member.measure(exchange.now_ns - away_s * 1000 * MS)
-    member.next_ns = exchange.now_ns + 1_000_000 * MS
-    hold_back(exchange, late_ms * MS, 60, which)
-    assert timestamp_violations(member) == {}
-    assert set(member.received) == set(member.made_ns)
-
-
-@pytest.mark.parametrize(("late_ms", "which"), [(2, [1, 2]), (3, [3, 4]), (5, [3])])
-def test_what_cannot_be_told_to_half_a_second_does_not_wait_for_ever(late_ms: int, which: list[int]) -> None:
-    """The master comes three hours late, and the first beacons tell the rate badly: nothing more is known of what is oldest."""
-    exchange = exchange_of()
-    member = exchange.members[2]
-    for minutes in range(180, 0, -1):
-        member.next_ns = exchange.now_ns - minutes * 60_000 * MS
-        member.measure(member.next_ns)
-    member.next_ns = exchange.now_ns
-    hold_back(exchange, late_ms * MS, 300, which)
-    assert timestamp_violations(member) == {}
-    left = (
-        set(member.made_ns) - set(member.received) - set(range(len(member.made_ns) - 3, len(member.made_ns)))
-    )
-    assert 10 < len(left) < 130
-    assert left == set(range(len(left)))
-    assert exchange.master.station(2).window.outstanding == 0
-    assert member.send_queue.oldest > max(left)
+    none = MeasurementBlock(measurements=(EncodedMeasurement(2, 0, Status.ANGLE_ONLY, 1, 2, None),))
+    received = frames.reply(1, Reply(blocks=(none, far)), sequence=2)
+    assert [each.slope_distance_m for each in received.measurements] == [2000.0, None]
+    assert received.measurements[0].horizontal_angle_rad == pytest.approx(6.2, abs=2e-7)
+    assert received.measurements[1].status is Status.ANGLE_ONLY

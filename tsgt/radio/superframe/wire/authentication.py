@@ -26,21 +26,8 @@ _HEADER = struct.Struct(">BQBIQ4sQH")
 class Authenticator:
     """Computes the codes of one mission; compare them with :func:`hmac.compare_digest`.
 
-    Parameters
-    ----------
-    key
-        :data:`KEY_BYTES` bytes, shared by all radios of the mission. None: anybody can compute the codes, which then only
-        separate sessions, frames and stations.
-
-    Attributes
-    ----------
-    authentic : bool
-        There is a key.
-
-    Raises
-    ------
-    ValueError
-        The key has another length.
+    The key has :data:`KEY_BYTES` bytes and is shared by all radios of the mission. Without a key anybody can compute the
+    codes, which then only separate sessions, frames and stations.
     """
 
     __slots__ = ("_key", "authentic")
@@ -52,15 +39,7 @@ class Authenticator:
         self.authentic = key is not None
 
     def beacon_code(self, *, session: int, counter: int, content: bytes) -> bytes:
-        """Return the code of a beacon with this content.
-
-        Parameters
-        ----------
-        session
-            Session nonce, 48 bits.
-        counter
-            Full frame counter.
-        """
+        """Return the code of a beacon, from the 48-bit session nonce and the full frame counter."""
         return self._code(content, _BEACON, session, 0, 0, counter, bytes(CODE_BYTES), 0)
 
     def reply_code(
@@ -74,20 +53,12 @@ class Authenticator:
         sequence: int,
         content: bytes,
     ) -> bytes:
-        """Return the code of a reply with this content.
+        """Return the code of a reply to the beacon with ``beacon_code``.
 
         Parameters
         ----------
-        session
-            Session nonce, 48 bits.
-        station
-            Number of the station, which the reply itself does not contain.
         station_nonce
             Nonce of the station's join request in this session, 32 bits.
-        counter
-            Full frame counter.
-        beacon_code
-            Code of the beacon replied to.
         sequence
             Full number of the first measurement of the first block, of which the reply may carry only the low bits;
             0 without blocks.

@@ -17,13 +17,7 @@ class BitWriter:
         self._bits = 0
 
     def put(self, value: int, width: int) -> None:
-        """Append a number as ``width`` bits.
-
-        Raises
-        ------
-        MessageError
-            The number is not in 0 to 2**width - 1.
-        """
+        """Append a number as ``width`` bits; raise MessageError if it is not in 0 to 2**width - 1."""
         if value < 0 or value >> width:
             raise MessageError(f"{value} does not fit into {width} bits")
         self._value = self._value << width | value
@@ -36,13 +30,7 @@ class BitWriter:
 
 
 class BitReader:
-    """Reads unsigned integers from a bit string.
-
-    Attributes
-    ----------
-    remaining
-        Number of unread bits.
-    """
+    """Reads unsigned integers from a bit string; ``remaining`` is the number of unread bits."""
 
     __slots__ = ("_value", "remaining")
 
@@ -51,13 +39,7 @@ class BitReader:
         self.remaining = _BYTE * len(content)
 
     def take(self, width: int) -> int:
-        """Return the next ``width`` bits.
-
-        Raises
-        ------
-        MessageError
-            Fewer bits are left.
-        """
+        """Return the next ``width`` bits; raise MessageError if fewer are left."""
         self.remaining -= width
         if self.remaining < 0:
             raise MessageError("the message is cut off")

@@ -42,6 +42,9 @@ _PRISM_BITS = 4
 _STATUS_BITS = 3
 _WIDTH_INDEX_BITS = 2
 
+_WIDTHS = ((SEQUENCE_BITS, TIME_BITS), (WIDE_SEQUENCE_BITS, WIDE_TIME_BITS))
+"""Of sequence number and time, narrow and wide."""
+
 _STATUSES = tuple(Status)
 _STATUS_CODES = {status: code for code, status in enumerate(_STATUSES)}
 
@@ -73,13 +76,7 @@ def put_status(writer: BitWriter, status: Status) -> None:
 
 
 def take_status(reader: BitReader) -> Status:
-    """Return the next status.
-
-    Raises
-    ------
-    MessageError
-        The code is not assigned.
-    """
+    """Return the next status; raise MessageError if its code is not assigned."""
     code = reader.take(_STATUS_BITS)
     if code >= len(_STATUSES):
         raise MessageError(f"there is no status {code}")
@@ -100,7 +97,7 @@ def take_values(reader: BitReader) -> tuple[int, int, int | None]:
 
 def put_newest(writer: BitWriter, measurement: EncodedMeasurement, *, wide: bool) -> None:
     """Append a measurement in full."""
-    sequence_bits, time_bits = _widths(wide=wide)
+    sequence_bits, time_bits = _WIDTHS[wide]
     writer.put(measurement.sequence % (1 << sequence_bits), sequence_bits)
     writer.put(measurement.time % (1 << time_bits), time_bits)
     put_status(writer, measurement.status)
@@ -109,19 +106,13 @@ def put_newest(writer: BitWriter, measurement: EncodedMeasurement, *, wide: bool
 
 def take_newest(reader: BitReader, *, wide: bool) -> EncodedMeasurement:
     """Return the next measurement in full."""
-    sequence_bits, time_bits = _widths(wide=wide)
+    sequence_bits, time_bits = _WIDTHS[wide]
     sequence, time = reader.take(sequence_bits), reader.take(time_bits)
     return EncodedMeasurement(sequence, time, take_status(reader), *take_values(reader))
 
 
 def put_block(writer: BitWriter, block: MeasurementBlock) -> None:
-    """Append a block.
-
-    Raises
-    ------
-    MessageError
-        The block has no measurement or more than 16, they are not newest first, or a number does not fit its field.
-    """
+    """Append a block; raise MessageError unless it has 1 to 16 measurements, newest first, that fit their fields."""
     writer.put(block.quality, _QUALITY_BITS)
     flags = (block.beacon_relative, block.wide, block.far, block.prism is not None)
     writer.put(any(flags), 1)
@@ -140,13 +131,7 @@ def put_block(writer: BitWriter, block: MeasurementBlock) -> None:
 
 
 def take_block(reader: BitReader) -> MeasurementBlock:
-    """Return the next block.
-
-    Raises
-    ------
-    MessageError
-        The bits are not a block.
-    """
+    """Return the next block; raise MessageError if the bits are none."""
     quality = reader.take(_QUALITY_BITS)
     beacon_relative = wide = far = has_prism = False
     if reader.take(1):
@@ -265,7 +250,3 @@ def _signed(number: int, bits: int) -> int:
     """Return the number modulo 2^bits, from -2^(bits-1) on."""
     half = 1 << bits - 1
     return (number + half) % (1 << bits) - half
-
-
-def _widths(*, wide: bool) -> tuple[int, int]:
-    return (WIDE_SEQUENCE_BITS, WIDE_TIME_BITS) if wide else (SEQUENCE_BITS, TIME_BITS)

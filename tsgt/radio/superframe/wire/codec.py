@@ -73,13 +73,7 @@ _ROUNDING_RAD = math.hypot(0.5, 0.5) * math.tau / _COMMAND_CIRCLE
 
 
 def encode_beacon(beacon: Beacon) -> bytes:
-    """Return the content of a beacon.
-
-    Raises
-    ------
-    MessageError
-        A number does not fit its field.
-    """
+    """Return the content of a beacon; raise MessageError if a number does not fit its field."""
     stations = len(beacon.stations)
     if not 1 <= stations <= MAX_STATIONS:
         raise MessageError(f"a beacon addresses 1 to {MAX_STATIONS} stations, got {stations}")
@@ -103,13 +97,7 @@ def encode_beacon(beacon: Beacon) -> bytes:
 
 
 def decode_beacon(content: bytes) -> Beacon:
-    """Return the beacon with this content.
-
-    Raises
-    ------
-    MessageError
-        :func:`encode_beacon` returns this content for no beacon.
-    """
+    """Return the beacon with this content; raise MessageError if :func:`encode_beacon` returns it for none."""
     reader = BitReader(content)
     _take_version(reader)
     frame = reader.take(8)
@@ -147,14 +135,18 @@ def _put_items(writer: BitWriter, beacon: Beacon) -> None:
         writer.put(_SESSION, 2)
         sent = {} if beacon.sent else {"sent_high": 0}
         _put_fields(writer, beacon.session, _SESSION_FIELDS, **sent)
+    addressed = [each.station for each in beacon.confirmations] + [each.station for each in beacon.commands]
+    for station in addressed:
+        if not 1 <= station <= len(beacon.stations):
+            raise MessageError(f"a beacon to {len(beacon.stations)} stations addresses station {station}")
     for confirmation in beacon.confirmations:
         writer.put(_CONFIRMATION, 2)
-        _put_station(writer, confirmation.station, beacon)
+        writer.put(confirmation.station - 1, 4)
         writer.put(confirmation.nonce, 32)
     for command in beacon.commands:
         _check_command(command)
         writer.put(_COMMAND, 2)
-        _put_station(writer, command.station, beacon)
+        writer.put(command.station - 1, 4)
         writer.put(command.command_id, 4)
         writer.put(command.code, 4)
         writer.put(command.argument, 4)
@@ -184,24 +176,13 @@ def _take_command(reader: BitReader) -> EncodedCommand:
     return EncodedCommand(station, command_id, code, argument, towards)
 
 
-def _put_station(writer: BitWriter, station: int, beacon: Beacon) -> None:
-    if not 1 <= station <= len(beacon.stations):
-        raise MessageError(f"a beacon to {len(beacon.stations)} stations addresses station {station}")
-    writer.put(station - 1, 4)
-
-
 # --- Replies ----------------------------------------------------------------------------------------------------------
 
 
 def encode_reply(reply: Reply) -> bytes:
-    """Return the content of a reply in its shortest form.
+    """Return the content of a reply in its shortest form; raise MessageError if a number does not fit its field.
 
     A single plain measurement of a quality better than :data:`SINGLE_QUALITY` is decoded with that quality.
-
-    Raises
-    ------
-    MessageError
-        A number does not fit its field, or a block is invalid.
     """
     writer = BitWriter()
     writer.put(VERSION, _VERSION_BITS)
@@ -228,13 +209,7 @@ def encode_reply(reply: Reply) -> bytes:
 
 
 def decode_reply(content: bytes) -> Reply:
-    """Return the reply with this content.
-
-    Raises
-    ------
-    MessageError
-        :func:`encode_reply` returns this content for no reply.
-    """
+    """Return the reply with this content; raise MessageError if :func:`encode_reply` returns it for none."""
     reader = BitReader(content)
     _take_version(reader)
     form = reader.take(2)
@@ -287,7 +262,18 @@ def _take_extended(reader: BitReader) -> Reply:
     # Keyword arguments are evaluated in this order, which is that of the fields.
     return Reply(
         join_request=JoinRequest(**_take_fields(reader, _JOIN_FIELDS)) if joins else None,
-        status_report=_take_status_report(reader) if reports else None,
+        status_report=(
+            StatusReport(
+                prism=reader.take(4) + 1,
+                direct=bool(reader.take(1)),
+                connected=bool(reader.take(1)),
+                missed_slots=reader.take(8),
+                rejected_beacons=reader.take(4),
+                rssi_dbm=-reader.take(7),
+            )
+            if reports
+            else None
+        ),
         turnaround_us=reader.take(TURNAROUND_BITS) if has_turnaround else None,
         response=CommandResponse(reader.take(4), bool(reader.take(1))) if responds else None,
         single_measurement=(
@@ -296,17 +282,6 @@ def _take_extended(reader: BitReader) -> Reply:
             else None
         ),
         blocks=_take_blocks(reader),
-    )
-
-
-def _take_status_report(reader: BitReader) -> StatusReport:
-    return StatusReport(
-        prism=reader.take(4) + 1,
-        direct=bool(reader.take(1)),
-        connected=bool(reader.take(1)),
-        missed_slots=reader.take(8),
-        rejected_beacons=reader.take(4),
-        rssi_dbm=-reader.take(7),
     )
 
 
@@ -327,18 +302,9 @@ def spread_rad(code: int) -> float:
 
 
 def encode_command(station: int, command_id: int, command: Command, tracked: int) -> EncodedCommand:
-    """Return a command as a beacon carries it.
+    """Return a command as a beacon carries it; a track command without a prism means the one ``tracked``.
 
-    Parameters
-    ----------
-    station
-        1 to 16.
-    command_id
-        4 bits.
-    command
-        The spread of a direction is increased by the rounding of its angles, and limited to 45 degrees.
-    tracked
-        Prism, 1 to 16, of a :class:`~tsgt.radio.commands.TrackCommand` that names none.
+    The spread of a search direction is increased by the rounding of its angles, and limited to 45 degrees.
     """
     match command:
         case TrackCommand(prism):

@@ -52,55 +52,29 @@ def quality_bound_us(quality: int) -> int:
 
 @dataclass(frozen=True, slots=True)
 class SlotOrder:
-    """Order of the slots: cyclic by station number, starting with station index ``first`` (modulo the number of stations).
-
-    Attributes
-    ----------
-    reverse
-        Descending numbers.
-    """
+    """Order of the slots: cyclic by station number, from station index ``first`` modulo the number of stations."""
 
     first: int = 0
-    reverse: bool = False
+    reverse: bool = False  # descending numbers
 
 
 @dataclass(frozen=True, slots=True)
 class StationEntry:
-    """Acknowledgement and grant of one station in a beacon.
+    """Acknowledgement and grant of one station in a beacon."""
 
-    Attributes
-    ----------
-    ack_bitmap
-        Four bits; bit j is set when the reply in frame ``counter - 1 - j`` is in the master's recording.
-    grant
-        Index into :data:`GRANT_BYTES`.
-    """
-
-    ack_bitmap: int
-    grant: int
+    ack_bitmap: int  # four bits; bit j: the reply in frame counter - 1 - j is in the master's recording
+    grant: int  # index into GRANT_BYTES
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SessionInfo:
-    """What a station needs to authenticate the beacons of a session.
+    """What a station needs to authenticate the beacons of a session."""
 
-    Attributes
-    ----------
-    nonce
-        48 random bits, new for each start of the master.
-    counter_high
-        Bits 8 to 23 of the frame counter.
-    sent_high
-        Bits 16 to 39 of the session time of the previous beacon; 0 when ``sent`` is 0.
-    guard, turnaround
-        Guard time, and time from the end of the beacon to the first slot, in units of 0.25 ms, 8 bits each.
-    """
-
-    nonce: int
-    counter_high: int
-    sent_high: int
-    guard: int
-    turnaround: int
+    nonce: int  # 48 random bits, new for each start of the master
+    counter_high: int  # bits 8 to 23 of the frame counter
+    sent_high: int  # bits 16 to 39 of the session time of the previous beacon; 0 when ``sent`` is 0
+    guard: int  # guard time in units of 0.25 ms, 8 bits
+    turnaround: int  # from the end of the beacon to the first slot, in units of 0.25 ms, 8 bits
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,25 +97,14 @@ class EncodedDirection:
 class EncodedCommand:
     """A command to a station.
 
-    Attributes
-    ----------
-    station
-        1 to 16.
-    command_id
-        4 bits, incremented with each command to this station; a station executes each command once.
-    code
-        4 bits: 0 track, 1 search, 2 direct, 3 measure, 4 search in a direction.
-    argument
-        4 bits. Code 0: number of the prism less one. Code 4: code of the search half-width, see
-        :func:`~tsgt.radio.superframe.wire.codec.spread_rad`. Otherwise 0.
-    towards
-        Search direction of code 4, otherwise None.
+    The argument is the prism less one for code 0, the code of the search half-width (see
+    :func:`~tsgt.radio.superframe.wire.codec.spread_rad`) for code 4, and 0 otherwise; ``towards`` is set for code 4 only.
     """
 
-    station: int
-    command_id: int
-    code: int
-    argument: int = 0
+    station: int  # 1 to 16
+    command_id: int  # 4 bits, incremented with each command to this station, which executes each one once
+    code: int  # 4 bits: 0 track, 1 search, 2 direct, 3 measure, 4 search in a direction
+    argument: int = 0  # 4 bits
     towards: EncodedDirection | None = None
 
 
@@ -149,25 +112,15 @@ class EncodedCommand:
 class Beacon:
     """What the master sends at the start of each frame.
 
-    Attributes
-    ----------
-    frame
-        The 8 low bits of the frame counter.
-    sent
-        The 16 low bits of the session time in us at which the previous beacon ended (TxDone); 0: unknown. A time
-        whose low bits are 0 is sent as 1.
-    cumulative
-        Cumulative acknowledgement of the station with index ``counter % len(stations)``: the 8 low bits of the highest
-        sequence number up to which, inclusive, the master's recording is complete.
-    stations
-        By index (number less one), 1 to 16 entries.
+    ``cumulative`` is the cumulative acknowledgement of the station with index ``counter % len(stations)``: the 8 low bits
+    of the highest sequence number up to which, inclusive, the master's recording is complete.
     """
 
-    frame: int
-    sent: int
+    frame: int  # the 8 low bits of the frame counter
+    sent: int  # the 16 low bits of the session time in us of the previous beacon's TxDone, sent as 1 if 0; 0: unknown
     cumulative: int
     slot_order: SlotOrder
-    stations: tuple[StationEntry, ...]
+    stations: tuple[StationEntry, ...]  # 1 to 16, by index: number less one
     session: SessionInfo | None = None
     confirmations: tuple[JoinConfirmation, ...] = ()
     commands: tuple[EncodedCommand, ...] = ()
@@ -175,26 +128,14 @@ class Beacon:
 
 @dataclass(frozen=True, slots=True)
 class EncodedMeasurement:
-    """One measurement.
+    """One measurement; angles in units of 2 pi / 2^24."""
 
-    Attributes
-    ----------
-    sequence
-        Sequence number; its low 8 bits, or 32 in a wide block.
-    time
-        In units of :data:`TIME_UNIT_US`, see :class:`MeasurementBlock`.
-    horizontal, zenith
-        In units of 2 pi / 2^24.
-    distance
-        Slope distance, 1 to 2^24 - 1, in units of 0.1 mm, or 1 mm in a far block. None: no distance.
-    """
-
-    sequence: int
-    time: int
+    sequence: int  # the low 8 bits, or 32 in a wide block
+    time: int  # in units of TIME_UNIT_US, see MeasurementBlock
     status: Status
     horizontal: int
     zenith: int
-    distance: int | None
+    distance: int | None  # slope distance, 1 to 2^24 - 1, in units of 0.1 mm, or 1 mm in a far block
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -203,79 +144,40 @@ class MeasurementBlock:
 
     Sequence number and time of the newest are known modulo the width of their fields. Decoded numbers and times of the
     older ones are relative to the newest and may be negative.
-
-    Attributes
-    ----------
-    measurements
-        1 to 16, descending sequence numbers.
-    beacon_relative
-        Times count from the end of this frame's beacon on the station's clock; otherwise they are session time.
-    quality
-        0 to 15, see :func:`quality_bound_us`.
-    wide
-        32-bit sequence numbers and 36-bit times instead of 8 and 17 bits.
-    prism
-        1 to 16; None: the prism of the station's last :class:`StatusReport`.
-    far
-        Distances are in units of 1 mm.
     """
 
-    measurements: tuple[EncodedMeasurement, ...]
-    beacon_relative: bool = False
-    quality: int = SINGLE_QUALITY
-    wide: bool = False
-    prism: int | None = None
-    far: bool = False
+    measurements: tuple[EncodedMeasurement, ...]  # 1 to 16, descending sequence numbers
+    beacon_relative: bool = (
+        False  # times count from the end of this frame's beacon; otherwise they are session time
+    )
+    quality: int = SINGLE_QUALITY  # 0 to 15, see quality_bound_us
+    wide: bool = False  # 32-bit sequence numbers and 36-bit times instead of 8 and 17 bits
+    prism: int | None = None  # 1 to 16; None: the prism of the station's last status report
+    far: bool = False  # distances in units of 1 mm
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JoinRequest:
-    """Identifies a station after a restart of the station or of the master.
+    """Identifies a station after a restart of the station or of the master."""
 
-    Attributes
-    ----------
-    nonce
-        32 random bits, new for each session that the station joins; authenticates all later replies.
-    stream_id
-        16 bits, constant while sequence numbers continue across restarts of the station.
-    first_sequence
-        32 bits: first sequence number of this run of the client. The :data:`RESTART_SKIP` numbers below it are unused.
-    oldest
-        32 bits: lowest number that is not delivered, or the next to be assigned.
-    """
-
-    nonce: int
-    stream_id: int
-    first_sequence: int
-    oldest: int
+    nonce: int  # 32 random bits, new for each session that the station joins; authenticates all later replies
+    stream_id: int  # 16 bits, constant while sequence numbers continue across restarts of the station
+    first_sequence: (
+        int  # 32 bits: first number of this run of the client; it skipped RESTART_SKIP numbers below
+    )
+    oldest: int  # 32 bits: lowest number that is not delivered, or the next to be assigned
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StatusReport:
-    """Status of a station.
+    """Status of a station."""
 
-    Attributes
-    ----------
-    prism
-        The tracked prism, or the last one tracked before direct mode, 1 to 16.
-    direct
-        The instrument is in direct mode.
-    connected
-        An instrument is connected.
-    missed_slots
-        Slots left empty because the reply was late; the low 8 bits.
-    rejected_beacons
-        Beacons rejected for an impossible time; the low 4 bits.
-    rssi_dbm
-        Of the last beacon, -127 to 0.
-    """
-
-    prism: int
-    direct: bool
+    prism: int  # the tracked prism, or the last one before direct mode, 1 to 16
+    direct: bool  # the instrument is in direct mode
     connected: bool
-    missed_slots: int
-    rejected_beacons: int
-    rssi_dbm: int
+    missed_slots: int  # slots left empty because the reply was late; the low 8 bits
+    rejected_beacons: int  # beacons rejected for an impossible time; the low 4 bits
+    rssi_dbm: int  # of the last beacon, -127 to 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -301,15 +203,11 @@ class SingleMeasurement:
 class Reply:
     """What a station sends in its slot.
 
-    Attributes
-    ----------
-    blocks
-        Newest first.
-    turnaround_us
-        From RxDone of the previous frame's beacon to TxDone of the reply to it, at the master's clock rate, in us, 22 bits.
+    ``turnaround_us`` is the time from RxDone of the previous frame's beacon to TxDone of the reply to it, at the master's
+    clock rate, in us, 22 bits.
     """
 
-    blocks: tuple[MeasurementBlock, ...] = ()
+    blocks: tuple[MeasurementBlock, ...] = ()  # newest first
     join_request: JoinRequest | None = None
     status_report: StatusReport | None = None
     turnaround_us: int | None = None

@@ -1,4 +1,4 @@
-"""The codes of the superframe."""
+"""Authentication codes of the superframe."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ REPLY: dict[str, Any] = {
 }
 
 
-def test_a_code_is_keyed_blake2s_over_all_that_makes_a_packet_unique() -> None:
-    """The specified bytes, put together by hand, give the code of a reply and that of a beacon."""
+def test_code_is_keyed_blake2s() -> None:
+    """Over the header and content of the specification."""
     head = bytes.fromhex("02 0000a1b2c3d4e5f6 03 deadbeef 0000000000000102 11223344 0000000100000007 0003")
     expected = hashlib.blake2s(head + b"\x01\x02\x03", digest_size=4, key=KEY, person=b"tsgt sf1").digest()
     assert Authenticator(KEY).reply_code(**REPLY) == expected
@@ -38,8 +38,8 @@ def test_a_code_is_keyed_blake2s_over_all_that_makes_a_packet_unique() -> None:
     ("name", "other"),
     [("session", 1), ("counter", 0x0102 + (1 << 24)), ("content", b"\x01\x02"), ("content", b"\x01\x02\x83")],
 )
-def test_another_beacon_has_another_code(name: str, other: object) -> None:
-    """A beacon fits in its own session and frame only, and no bit of it can be changed or cut off."""
+def test_beacon_code_covers_all_fields(name: str, other: object) -> None:
+    """Session, frame, and every bit and the length of the content."""
     code = Authenticator(KEY).beacon_code
     assert code(**BEACON) != code(**{**BEACON, name: other})
 
@@ -56,14 +56,14 @@ def test_another_beacon_has_another_code(name: str, other: object) -> None:
         ("content", b"\x01\x02\x03\x00"),
     ],
 )
-def test_another_reply_has_another_code(name: str, other: object) -> None:
-    """A reply fits for its own station, frame, beacon and full sequence number only."""
+def test_reply_code_covers_all_fields(name: str, other: object) -> None:
+    """Station, frame, beacon, full sequence number and content."""
     code = Authenticator(KEY).reply_code
     assert code(**REPLY) != code(**{**REPLY, name: other})
 
 
-def test_a_beacon_is_no_reply() -> None:
-    """The same bytes, sent in the other direction, do not fit."""
+def test_beacon_and_reply_codes_differ() -> None:
+    """For the same bytes."""
     authenticator = Authenticator(KEY)
     as_reply = authenticator.reply_code(
         **BEACON, station=0, station_nonce=0, beacon_code=bytes(CODE_BYTES), sequence=0
@@ -71,15 +71,15 @@ def test_a_beacon_is_no_reply() -> None:
     assert authenticator.beacon_code(**BEACON) != as_reply
 
 
-def test_only_the_key_gives_the_code() -> None:
-    """Another key, and none, give other codes; whether there is one can be asked."""
+def test_code_depends_on_key() -> None:
+    """Another key and no key give other codes."""
     authenticators = [Authenticator(KEY), Authenticator(bytes(KEY_BYTES)), Authenticator(None)]
     assert len({authenticator.beacon_code(**BEACON) for authenticator in authenticators}) == 3
     assert [authenticator.authentic for authenticator in authenticators] == [True, True, False]
 
 
 @pytest.mark.parametrize("length", [0, 16, KEY_BYTES + 1])
-def test_a_key_of_another_length_is_refused(length: int) -> None:
-    """An empty key would be none at all."""
+def test_key_of_wrong_length_is_rejected(length: int) -> None:
+    """Including an empty key."""
     with pytest.raises(ValueError, match="32 bytes"):
         Authenticator(bytes(length))

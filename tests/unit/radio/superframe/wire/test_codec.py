@@ -54,7 +54,7 @@ BEACON = Beacon(
 
 
 def robot(count: int) -> MeasurementBlock:
-    """Return measurements of a robot at 75 m that drives at 1.5 m/s at 45 degrees to the line of sight."""
+    """Return measurements of a robot at 75 m and 1.5 m/s, at 45 degrees to the line of sight."""
     measurements = []
     for k in range(count):
         ahead_m, aside_m = 75.0 - 0.424 * k, 0.424 * k
@@ -70,35 +70,35 @@ def robot(count: int) -> MeasurementBlock:
 
 
 @pytest.mark.parametrize(("stations", "length"), [(1, 6), (3, 8), (16, 21)])
-def test_a_plain_beacon_takes_a_byte_per_station(stations: int, length: int) -> None:
-    """Five bytes and one for each station."""
+def test_plain_beacon_length(stations: int, length: int) -> None:
+    """Five bytes and one per station."""
     beacon = replace(BEACON, stations=(StationEntry(1, 2),) * stations)
     assert len(encode_beacon(beacon)) == length
 
 
-def test_an_empty_reply_fits_the_smallest_grant() -> None:
-    """A station with nothing to say sends five bytes, code and all."""
+def test_empty_reply_length() -> None:
+    """Five bytes: the smallest grant."""
     assert reply_bytes(Reply()) == GRANT_BYTES[1] == 5
 
 
-def test_one_measurement_takes_thirteen_bytes() -> None:
-    """Seventeen with the code: the second grant."""
+def test_single_measurement_length() -> None:
+    """Thirteen bytes, seventeen with the code: the second grant."""
     assert len(encode_reply(SINGLE)) == 13
     assert reply_bytes(SINGLE) == GRANT_BYTES[2]
 
 
 @pytest.mark.parametrize(("count", "length"), [(2, 26), (3, 33), (4, 39), (8, 62)])
-def test_measurements_of_a_moving_robot_share_their_bits(count: int, length: int) -> None:
-    """Each further one costs about eight bytes instead of thirteen."""
+def test_block_length_of_moving_robot(count: int, length: int) -> None:
+    """About eight bytes per further measurement."""
     assert reply_bytes(Reply(blocks=(robot(count),))) <= length
 
 
-def test_a_station_that_joins_can_send_a_measurement_at_once() -> None:
-    """Introduction, state and a measurement with everything that can be said of it fit the grant of 44 bytes."""
-    run = MeasurementBlock(
+def test_join_request_with_measurement_fits_default_grant() -> None:
+    """With a status report and every option of a block."""
+    block = MeasurementBlock(
         measurements=(SIGHTING,), beacon_relative=True, quality=15, wide=True, prism=16, far=True
     )
-    assert reply_bytes(Reply(join_request=INTRODUCTION, status_report=STATE, blocks=(run,))) <= 44
+    assert reply_bytes(Reply(join_request=INTRODUCTION, status_report=STATE, blocks=(block,))) <= 44
 
 
 # --- What comes back ---------------------------------------------------------------------------------------------
@@ -120,8 +120,8 @@ def test_a_station_that_joins_can_send_a_measurement_at_once() -> None:
         ),
     ],
 )
-def test_beacons_come_back(beacon: Beacon) -> None:
-    """With nothing extra, with each extra, with all of them."""
+def test_beacons_round_trip(beacon: Beacon) -> None:
+    """With no part, each part, all parts."""
     assert decode_beacon(encode_beacon(beacon)) == beacon
 
 
@@ -152,28 +152,28 @@ def test_beacons_come_back(beacon: Beacon) -> None:
         Reply(response=CommandResponse(0, ok=False)),
     ],
 )
-def test_replies_come_back(reply: Reply) -> None:
+def test_replies_round_trip(reply: Reply) -> None:
     """Empty, of each form, with each part."""
     assert decode_reply(encode_reply(reply)) == reply
 
 
-def test_a_session_time_of_nothing_has_no_high_bits() -> None:
-    """Where the previous beacon's time is not known, neither half of it is."""
+def test_unknown_session_time_has_no_high_bits() -> None:
+    """Both halves are 0."""
     beacon = decode_beacon(encode_beacon(replace(BEACON, sent=0, session=SESSION)))
     assert beacon.session == replace(SESSION, sent_high=0)
 
 
 @pytest.mark.parametrize(("quality", "back"), [(0, 3), (3, 3), (4, 4)])
-def test_a_plain_single_measurement_claims_what_all_of_them_do(quality: int, back: int) -> None:
-    """A better quality is not worth the bits; a worse one is."""
+def test_single_form_has_fixed_quality(quality: int, back: int) -> None:
+    """Only a worse quality needs another form."""
     reply = decode_reply(
         encode_reply(Reply(blocks=(MeasurementBlock(measurements=(SIGHTING,), quality=quality),)))
     )
     assert reply.blocks[0].quality == back
 
 
-def test_the_newest_measurement_goes_modulo_its_fields() -> None:
-    """Sequence number and time keep their low bits: 8 and 17, or 32 and 36 in a wide run."""
+def test_newest_measurement_wraps() -> None:
+    """To 8 and 17 bits, or 32 and 36 in a wide block."""
     measurement = replace(SIGHTING, sequence=2**40 + 300, time=2**40 + 2**20 + 5)
     narrow, wide = (
         decode_reply(encode_reply(Reply(blocks=(MeasurementBlock(measurements=(measurement,), wide=wide),))))
@@ -185,21 +185,21 @@ def test_the_newest_measurement_goes_modulo_its_fields() -> None:
     assert (wide.sequence, wide.time) == (300, 2**20 + 5)
 
 
-def test_older_measurements_keep_their_distance_to_the_newest() -> None:
-    """However far back they are, over any gap, also below zero."""
-    run = MeasurementBlock(
+def test_older_measurements_are_relative_to_newest() -> None:
+    """Across any gap, also below zero."""
+    block = MeasurementBlock(
         measurements=(
             SIGHTING,
             replace(SIGHTING, sequence=SIGHTING.sequence - 9_000, time=SIGHTING.time - 225_000_000),
             replace(SIGHTING, sequence=SIGHTING.sequence - 9_001, time=SIGHTING.time - 225_025_000),
         )
     )
-    back = decode_reply(encode_reply(Reply(blocks=(run,)))).blocks[0]
-    assert back.measurements == run.measurements
-    assert reply_bytes(Reply(blocks=(run,))) < 35
+    back = decode_reply(encode_reply(Reply(blocks=(block,)))).blocks[0]
+    assert back.measurements == block.measurements
+    assert reply_bytes(Reply(blocks=(block,))) < 35
 
 
-def test_differences_go_round_the_circle() -> None:
+def test_angle_differences_wrap() -> None:
     """From just above 0 to just below a full turn is a small step."""
     across = MeasurementBlock(
         measurements=(replace(SIGHTING, horizontal=3), replace(SIGHTING, sequence=199, horizontal=2**24 - 3))
@@ -211,10 +211,10 @@ def test_differences_go_round_the_circle() -> None:
     assert reply_bytes(Reply(blocks=(across,))) == reply_bytes(Reply(blocks=(beside,)))
 
 
-def test_measurements_without_distance_stay_without() -> None:
-    """Between measurements that have one, and before them."""
+def test_missing_distances_round_trip() -> None:
+    """Between measurements with a distance, and before them."""
     bare = replace(SIGHTING, status=Status.ANGLE_ONLY, distance=None)
-    run = MeasurementBlock(
+    block = MeasurementBlock(
         measurements=(
             SIGHTING,
             replace(bare, sequence=199, time=75_000),
@@ -222,7 +222,7 @@ def test_measurements_without_distance_stay_without() -> None:
             replace(SIGHTING, sequence=197, time=25_000),
         )
     )
-    assert decode_reply(encode_reply(Reply(blocks=(run,)))).blocks == (run,)
+    assert decode_reply(encode_reply(Reply(blocks=(block,)))).blocks == (block,)
 
 
 # --- What is refused ---------------------------------------------------------------------------------------------
@@ -245,14 +245,14 @@ def test_measurements_without_distance_stay_without() -> None:
         replace(BEACON, commands=(EncodedCommand(1, 0, 4, 0, EncodedDirection(2**16, 2)),)),
     ],
 )
-def test_beacons_that_do_not_fit_are_refused(beacon: Beacon) -> None:
-    """Numbers beyond their fields, stations that are not there, orders that do not exist."""
+def test_invalid_beacons_are_rejected(beacon: Beacon) -> None:
+    """Numbers beyond their fields, unknown stations, unknown commands."""
     with pytest.raises(MessageError):
         encode_beacon(beacon)
 
 
 @pytest.mark.parametrize(
-    "run",
+    "block",
     [
         MeasurementBlock(measurements=()),
         MeasurementBlock(measurements=tuple(replace(SIGHTING, sequence=k) for k in range(17, 0, -1))),
@@ -268,10 +268,10 @@ def test_beacons_that_do_not_fit_are_refused(beacon: Beacon) -> None:
         MeasurementBlock(measurements=(SIGHTING, replace(SIGHTING, sequence=199, horizontal=-1))),
     ],
 )
-def test_runs_that_do_not_fit_are_refused(run: MeasurementBlock) -> None:
-    """None or too many measurements, not newest first, weeks apart, numbers beyond their fields."""
+def test_invalid_blocks_are_rejected(block: MeasurementBlock) -> None:
+    """No or too many measurements, wrong order, weeks apart, numbers beyond their fields."""
     with pytest.raises(MessageError):
-        encode_reply(Reply(blocks=(run,)))
+        encode_reply(Reply(blocks=(block,)))
 
 
 def _bits(*fields: tuple[int, int]) -> bytes:
@@ -300,8 +300,8 @@ _EXTENDED = ((1, 2), (7, 8), (1, 1), (9, 16), (3, 8), (0, 5), (0, 4), (0x12, 8))
         (_bits(*_EXTENDED, (2, 2), (0, 4), (0, 32), (1, 2), *[(0, 8)] * 13, (0, 2)), "canonical form"),
     ],
 )
-def test_foreign_beacons_are_refused(content: bytes, message: str) -> None:
-    """Cut off, of another version, padded with ones, with items that are not there or in another order."""
+def test_malformed_beacons_are_rejected(content: bytes, message: str) -> None:
+    """Truncated, of another version, padded with ones, items unknown or out of order."""
     with pytest.raises(MessageError, match=message):
         decode_beacon(content)
 
@@ -326,14 +326,14 @@ _RUN = ((3, 4), (0, 1), (1, 4), (200, 8), (100_000, 17), (0, 3), (5, 24), (6, 24
         (_bits(*_HEADER, *_RUN, (1, 1), (0, 3), (1, 1), (0, 10), (0, 9), (0, 9), (0, 10)), "canonical form"),
     ],
 )
-def test_foreign_replies_are_refused(content: bytes, message: str) -> None:
-    """Cut off, of another version or form, padded, in a form or in fields wider than need be."""
+def test_malformed_replies_are_rejected(content: bytes, message: str) -> None:
+    """Truncated, of another version or form, padded, in a longer form or wider field than necessary."""
     with pytest.raises(MessageError, match=message):
         decode_reply(content)
 
 
-def test_a_field_holds_nothing_wider() -> None:
-    """Neither too large a number nor one below zero; bits are taken as they were put, and no more of them."""
+def test_bit_fields_check_their_width() -> None:
+    """Values above and below the range, and reading past the end."""
     writer = BitWriter()
     for value in (4, -1):
         with pytest.raises(MessageError):
@@ -348,8 +348,8 @@ def test_a_field_holds_nothing_wider() -> None:
 # --- Angles and distances ----------------------------------------------------------------------------------------
 
 
-def test_angles_go_round() -> None:
-    """A full turn is 2^24; what is below zero or above a turn comes back within it."""
+def test_angles_wrap() -> None:
+    """A full turn is 2^24."""
     assert angle_code(math.pi) == 2**23
     assert angle_code(-math.pi / 2) == angle_code(1.5 * math.pi + 4 * math.pi) == 3 * 2**22
     assert angle_code(math.tau - 1e-9) == 0
@@ -370,13 +370,13 @@ def test_angles_go_round() -> None:
         (20_000.0, True, None),
     ],
 )
-def test_distances_are_whole_units(metres: float | None, *, far: bool, code: int | None) -> None:
-    """0.1 mm, or 1 mm in a far run; what does not fit is none."""
+def test_distance_codes(metres: float | None, *, far: bool, code: int | None) -> None:
+    """0.1 mm, or 1 mm in a far block; None outside the range."""
     assert distance_code(metres, far=far) == code
     if code is not None and metres is not None:
         assert distance_m(code, far=far) == pytest.approx(metres, abs=5.01e-4 if far else 5.01e-5)
 
 
-def test_long_distances_need_a_far_run() -> None:
-    """From where the field of 0.1 mm ends."""
+def test_long_distances_need_a_far_block() -> None:
+    """From the end of the 0.1 mm range."""
     assert [is_far(metres) for metres in (None, 1677.7215, 1677.7216, 5000.0)] == [False, False, True, True]

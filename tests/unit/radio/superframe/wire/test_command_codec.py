@@ -21,8 +21,8 @@ from tsgt.radio.superframe.wire.codec import spread_rad
         MeasureCommand(),
     ],
 )
-def test_orders_come_back(order: TrackCommand | SearchCommand | DirectCommand | MeasureCommand) -> None:
-    """As they were; a direction to within its rounding, which makes the spread one step wider."""
+def test_commands_round_trip(order: TrackCommand | SearchCommand | DirectCommand | MeasureCommand) -> None:
+    """A direction within its rounding, which increases the spread by one step."""
     part = encode_command(3, 9, order, tracked=2)
     assert (part.station, part.command_id) == (3, 9)
     back = decode_command(part)
@@ -31,8 +31,8 @@ def test_orders_come_back(order: TrackCommand | SearchCommand | DirectCommand | 
     assert back == order
 
 
-def test_to_track_without_a_prism_means_the_tracked_one() -> None:
-    """A station that knows of another one would otherwise take that."""
+def test_track_without_prism_means_tracked_prism() -> None:
+    """The station may know another one."""
     assert decode_command(encode_command(1, 0, TrackCommand(None), tracked=7)) == TrackCommand(7)
 
 
@@ -41,8 +41,10 @@ def test_to_track_without_a_prism_means_the_tracked_one() -> None:
     zenith_rad=st.floats(0.0, math.tau),
     wide_rad=st.floats(0.0, math.radians(45.2)),
 )
-def test_a_direction_covers_what_it_did(horizontal_rad: float, zenith_rad: float, wide_rad: float) -> None:
-    """All that was within the spread of the direction is so after its way over the air, and not much more."""
+def test_encoded_direction_covers_search_area(
+    horizontal_rad: float, zenith_rad: float, wide_rad: float
+) -> None:
+    """And not much more."""
     order = decode_command(
         encode_command(1, 0, SearchCommand(Direction(horizontal_rad, zenith_rad, wide_rad)), tracked=1)
     )
@@ -60,8 +62,8 @@ def test_a_direction_covers_what_it_did(horizontal_rad: float, zenith_rad: float
     assert back.spread_rad <= max(math.sqrt(2) * (wide_rad + 1e-4), spread_rad(0))
 
 
-def test_no_spread_is_wider_than_can_be_said() -> None:
-    """45 degrees to every side; nobody looks for a prism in more than that."""
+def test_spread_is_limited() -> None:
+    """To 45 degrees on every side."""
     order = decode_command(encode_command(1, 0, SearchCommand(Direction(0.0, 1.5, 3.0)), tracked=1))
     assert isinstance(order, SearchCommand)
     assert order.towards is not None

@@ -98,7 +98,7 @@ def queued(sequence: int, true_ns: int, *, prism: int = 1, boot: str = "boot") -
 
 
 @dataclass(frozen=True)
-class Answered:
+class ReceivedMessage:
     """A reply whose code was right.
 
     Attributes
@@ -118,7 +118,7 @@ class Answered:
 
 
 @dataclass
-class HandMaster:
+class ScriptedMaster:
     """Sends beacons to one station and keeps what it answers. Nothing is lost unless the test loses it."""
 
     session: int = 0xABCDEF
@@ -227,7 +227,7 @@ class HandMaster:
         not_written: bool = False,
         late_ns: int = 0,
         session: bool | None = None,
-    ) -> Answered | None:
+    ) -> ReceivedMessage | None:
         """Play a frame; return the reply, None where there is none or it is lost."""
         payload = self.beacon(commands=commands, session=session)
         if beacon_lost:
@@ -249,7 +249,7 @@ class HandMaster:
             station.sent(Transmission(started_at_ns=heard.slot_ns, done_at_ns=done_ns, stamp_sigma_ns=20_000))
         return reply
 
-    def take(self, payload: bytes, *, not_written: bool = False) -> Answered:
+    def take(self, payload: bytes, *, not_written: bool = False) -> ReceivedMessage:
         """Check a reply, and take it."""
         assert len(payload) <= GRANT_BYTES[self.grant]
         content, code = payload[:-CODE_BYTES], payload[-CODE_BYTES:]
@@ -262,8 +262,8 @@ class HandMaster:
             self._confirmation = join_request.nonce if self.confirm else None
         assert self.nonce is not None
         times_ns: dict[int, int] = {}
-        for run in reply.blocks:
-            times_ns |= self._times_ns(run)
+        for block in reply.blocks:
+            times_ns |= self._times_ns(block)
         sequences = tuple(times_ns)
         right = self.authenticator.reply_code(
             session=self.session,
@@ -280,20 +280,20 @@ class HandMaster:
         self.highest = max(self.highest, *sequences, -1)
         if not not_written:
             self.written |= set(sequences)
-        return Answered(reply, sequences, times_ns, len(payload))
+        return ReceivedMessage(reply, sequences, times_ns, len(payload))
 
-    def _times_ns(self, run: MeasurementBlock) -> dict[int, int]:
-        newest = run.measurements[0]
+    def _times_ns(self, block: MeasurementBlock) -> dict[int, int]:
+        newest = block.measurements[0]
         number = newest.sequence
-        if not run.wide:
+        if not block.wide:
             number = self.highest + (number - self.highest + 128) % 256 - 128
-        span_us = TIME_UNIT_US << (WIDE_TIME_BITS if run.wide else TIME_BITS)
+        span_us = TIME_UNIT_US << (WIDE_TIME_BITS if block.wide else TIME_BITS)
         sent_us = (self.beacon_done_ns - self.zero_ns) // 1000
-        time_us = TIME_UNIT_US * newest.time + (sent_us if run.beacon_relative else 0)
+        time_us = TIME_UNIT_US * newest.time + (sent_us if block.beacon_relative else 0)
         end_us = sent_us + 700_000  # later than any slot of three stations
         time_us = end_us - (end_us - time_us) % span_us
         result = {number: time_us}
-        for older in run.measurements[1:]:
+        for older in block.measurements[1:]:
             back = newest.sequence - older.sequence
             result[number - back] = time_us + TIME_UNIT_US * (older.time - newest.time)
         return {

@@ -1,4 +1,4 @@
-"""Replies that come late, and what they say of the beacons before them."""
+"""Delay of beacons, detected from late replies."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ def by_ms(*late_ms: int | None, untimed: Collection[int] = ()) -> list[int]:
     return found
 
 
-def test_replies_that_are_as_late_as_a_computer_makes_them_say_nothing() -> None:
-    """Some ms, and more."""
+def test_usual_lateness_is_ignored() -> None:
+    """Up to 30 ms."""
     assert by_ms(0, 5, 29, 0) == [0, 0, 0, 0]
 
 
-def test_the_longest_delay_counts_until_two_in_a_row_are_on_time() -> None:
-    """The first of them answers a beacon of which the station has not been told yet when it left."""
+def test_max_delay_holds_until_two_consecutive_replies_on_time() -> None:
+    """The station knows the beacon's time one frame later."""
     assert by_ms(0, 80, 120, 80, 0, 0) == [0, 80, 120, 120, 120, 0]
 
 
-def test_two_that_are_not_in_a_row_do_not_count() -> None:
-    """A beacon whose successor is lost tells no time."""
+def test_replies_on_time_must_be_consecutive() -> None:
+    """A beacon whose successor is lost has no time."""
     assert by_ms(80, 0, None, 0, 80, 0, 0) == [80, 80, 80, 80, 80, 80, 0]
 
 
-def test_the_first_one_on_time_counts_only_if_the_station_is_told_when_its_beacon_left() -> None:
-    """Else it has nothing to compare."""
+def test_reply_on_time_needs_beacon_time() -> None:
+    """The station has nothing to compare otherwise."""
     assert by_ms(80, 0, 0, 0, untimed=[1]) == [80, 80, 80, 0]
     assert by_ms(80, 0, 0, untimed=[2]) == [80, 80, 0]

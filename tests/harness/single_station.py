@@ -30,7 +30,7 @@ AGE_NS = 50 * MS
 """The instrument's newest measurement is so old when the master asks for it."""
 
 
-class LoneStation:
+class SingleStation:
     """The radio of a master, and at its other end station 1, which measures all the time.
 
     Attributes
@@ -141,9 +141,9 @@ class LoneStation:
 
 
 @asynccontextmanager
-async def lone_station() -> AsyncGenerator[LoneStation]:
+async def single_station() -> AsyncGenerator[SingleStation]:
     """Run a master's link with its one station."""
-    field = LoneStation()
+    field = SingleStation()
     stations = [StationConfig(station=1, prism=1, prism_constant_mm=0.0)]
     link = ClassicLink(
         stations, ClassicMasterConfig(kind="classic"), PAPER, field.clock, UnixTimeline(START), field.report

@@ -98,7 +98,7 @@ class Station:
 
 
 @dataclass
-class Frames:
+class ScriptedFrames:
     """A master among hand-played stations; the true constant of all links is 0.1 ms above the nominal one.
 
     Attributes
@@ -182,18 +182,18 @@ class Frames:
         return heard
 
     def measure(
-        self, station: int, *, age_ms: float = 100, introduce: bool = False, wide: bool | None = None
+        self, station: int, *, age_ms: float = 100, join: bool = False, wide: bool | None = None
     ) -> ReceivedReply:
         """Let a station answer with a new measurement, made so long before its slot."""
         sender = self.stations[station]
         number = sender.next_number()
-        wide = introduce if wide is None else wide
+        wide = join if wide is None else wide
         slot_us = self.sent_us + self.span(station).start_ns // 1000
-        run = MeasurementBlock(
+        block = MeasurementBlock(
             measurements=(measurement(number, slot_us - round(1000 * age_ms), wide=wide),), wide=wide
         )
-        join_request = sender.join_request if introduce else None
-        return self.reply(station, Reply(blocks=(run,), join_request=join_request), sequence=number)
+        join_request = sender.join_request if join else None
+        return self.reply(station, Reply(blocks=(block,), join_request=join_request), sequence=number)
 
     def end(self) -> list[int]:
         """End the frame; return who was silent."""
@@ -204,7 +204,7 @@ class Frames:
         """Have all stations introduce themselves, each with a measurement, and be confirmed."""
         self.begin()
         for station in self.stations:
-            self.measure(station, introduce=True)
+            self.measure(station, join=True)
         self.end()
 
     def run(self, frames: int, silent: Sequence[int] = ()) -> None:
@@ -217,14 +217,14 @@ class Frames:
             self.end()
 
 
-def frames_of(
+def scripted_frames(
     stations: Sequence[int] = (1, 2, 3),
     *,
     key: bytes | None = KEY,
     phase_lock: PhaseLock | None = None,
     zero_ns: int = ZERO_NS,
     **options: bool,
-) -> Frames:
+) -> ScriptedFrames:
     """Make a master and its stations, none of which has joined."""
     authenticator = Authenticator(key)
     master = SuperframeMaster(
@@ -237,4 +237,4 @@ def frames_of(
         **options,
     )
     made = {number: Station(number, nonce=0x5EED + number) for number in stations}
-    return Frames(made, master, authenticator, now_ns=zero_ns)
+    return ScriptedFrames(made, master, authenticator, now_ns=zero_ns)

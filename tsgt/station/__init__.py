@@ -6,7 +6,8 @@ instruments, ``geocom`` and ``serial`` carry the Leica driver's requests, ``link
 """
 
 from tsgt.station.control_socket import AtmosphereRequest, AtmosphereResponse
-from tsgt.station.daemon import ClientDependencies, run_client
+from tsgt.station.daemon import run_client
+from tsgt.station.dependencies import ClientDependencies
 from tsgt.station.instrument import Atmosphere, Condition, Instrument, Reading
 from tsgt.station.status import ClientStatus
 

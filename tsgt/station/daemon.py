@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import secrets
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -16,8 +15,7 @@ from tsgt import service
 from tsgt.clock import UnixTimeline
 from tsgt.errors import RecordingError
 from tsgt.radio import Command, MeasureCommand
-from tsgt.radio.superframe import InstrumentState, SendQueue, SuperframeStation
-from tsgt.radio.superframe.wire import Authenticator
+from tsgt.radio.superframe import InstrumentState
 from tsgt.radio.supervisor import supervise_radio
 from tsgt.recording import RecordingHeader, RecordingWriter, decode, encode_line, new_recording_path
 from tsgt.recording.journal import InstrumentRecord, JournalRecord
@@ -31,14 +29,13 @@ from tsgt.station.links import ClassicLink, SuperframeLink
 from tsgt.station.session import ClientSession
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
     from typing import NoReturn
 
-    from tsgt.clock import Clock
     from tsgt.config import ClientConfig
-    from tsgt.radio import LoRaSettings, Radio, RadioOpener
-    from tsgt.station.instrument import Instrument, Reading
+    from tsgt.radio import LoRaSettings, Radio
+    from tsgt.station.dependencies import ClientDependencies
+    from tsgt.station.instrument import Reading
     from tsgt.station.links import Link
     from tsgt.station.status import ClientStatus
 
@@ -46,34 +43,6 @@ _SKIP_BITS = 22
 """Random bits added to a 32-bit sequence number: two streams of a thousand measurements collide once in 4000 times."""
 
 log = structlog.get_logger()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ClientDependencies:
-    """Everything a station's client is given from outside.
-
-    Attributes
-    ----------
-    clock
-        Its Unix time is read once, at the start, and need not be right.
-    key
-        Key shared by the radios of a mission, for protocols with authentication; None: every sender is accepted.
-    random_bits
-        Returns a random number of so many bits.
-    boot
-        Identifies the start of this computer from which ``clock`` counts; empty where unknown: no other run is then
-        assumed to share the clock.
-    write
-        See :class:`~tsgt.recording.RecordingWriter`.
-    """
-
-    instrument: Instrument
-    open_radio: RadioOpener
-    clock: Clock
-    key: bytes | None = None
-    random_bits: Callable[[int], int] = secrets.randbits
-    boot: str = ""
-    write: Callable[[int, memoryview], int] | None = None
 
 
 async def run_client(config: ClientConfig, settings: LoRaSettings, dependencies: ClientDependencies) -> None:
@@ -190,39 +159,17 @@ class _StationClient:
                 create_task=group.create_task,
             )
             if backlog.stream_id is None
-            else self._superframe_link(config.station, settings, dependencies, backlog, backlog.stream_id)
-        )
-
-    def _superframe_link(
-        self,
-        station: int,
-        settings: LoRaSettings,
-        dependencies: ClientDependencies,
-        backlog: Backlog,
-        stream_id: int,
-    ) -> SuperframeLink:
-        authenticator = Authenticator(dependencies.key)
-        send_queue = SendQueue(backlog.first_sequence, backlog.queued)
-        core = SuperframeStation(
-            station,
-            settings,
-            authenticator,
-            send_queue,
-            stream_id=stream_id,
-            boot=dependencies.boot,
-            receptions=backlog.receptions,
-            random_bits=dependencies.random_bits,
-        )
-        return SuperframeLink(
-            core,
-            send_queue,
-            dependencies.boot,
-            self._clock,
-            self._timeline,
-            authenticated=authenticator.authentic,
-            instrument_state=self._instrument_state,
-            on_command=self._on_command,
-            write=self._journal.write,
+            else SuperframeLink(
+                config.station,
+                settings,
+                dependencies,
+                timeline,
+                backlog,
+                stream_id=backlog.stream_id,
+                instrument_state=self._instrument_state,
+                on_command=self._on_command,
+                write=journal.write,
+            )
         )
 
     # --- Instrument -------------------------------------------------------------------------------------------

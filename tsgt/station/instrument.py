@@ -91,7 +91,6 @@ class Instrument(Protocol):
 
     async def connect(self) -> str:
         """Find and identify the instrument; return its name and serial number. It does not track yet."""
-        ...
 
     async def track(self, prism: int, towards: Direction | None = None) -> None:
         """Track a prism and measure it continuously at the instrument's highest rate.
@@ -103,38 +102,29 @@ class Instrument(Protocol):
         towards
             Expected direction of the prism; None: where the telescope points, or the prism's last direction.
         """
-        ...
 
     async def read(self) -> Reading:
         """Return the next reading while tracking, each exactly once; one without a target has that status."""
-        ...
 
     async def direct(self) -> None:
         """Enter direct mode: stop tracking and prepare for single measurements of targets that the operator aims at."""
-        ...
 
     async def measure(self) -> Reading:
         """Measure the target in the line of sight once; only in direct mode."""
-        ...
 
     async def check(self) -> None:
         """Check that the instrument still responds; called every few seconds in direct mode."""
-        ...
 
     async def set_atmosphere(self, atmosphere: Atmosphere) -> None:
         """Set the atmospheric correction of distances, also while tracking, between two readings."""
-        ...
 
     @property
     def condition(self) -> Condition:
         """Current state, for the operator."""
-        ...
 
     @property
     def record(self) -> InstrumentRecord | None:
         """Identity and settings for the journal, updated when they change; None before :meth:`connect`."""
-        ...
 
     async def close(self) -> None:
         """Disconnect; :meth:`connect` may follow. The instrument stays on and keeps its lock."""
-        ...

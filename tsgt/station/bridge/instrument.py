@@ -87,7 +87,7 @@ class BridgeInstrument:
         except BaseException:
             await self.close()
             raise
-        hello = self._hello(session)
+        hello = self._hello()
         name = " ".join(filter(None, (hello.make, hello.model, hello.serial_number)))
         source = {
             "host": "timestamped by the bridge",
@@ -98,11 +98,10 @@ class BridgeInstrument:
 
     async def track(self, prism: int, towards: Direction | None = None) -> None:
         """Track a prism; a program without this command tracks what the operator has set up."""
-        session = self._connected()
-        if "track" in self._hello(session).commands:
+        if "track" in self._hello().commands:
             await self._execute(TrackLine(id=self._next_id(), prism=prism, towards=towards), tracking=prism)
         else:
-            session.set_tracking(prism)
+            self._connected().set_tracking(prism)
 
     async def read(self) -> Reading:
         """Return the oldest queued reading, or the next one."""
@@ -160,13 +159,9 @@ class BridgeInstrument:
         if session is None:
             return Condition()
         reported = session.status
-        default = (
-            "waiting for the program"
-            if session.hello is None
-            else ""
-            if session.tracking is None
-            else "tracking"
-        )
+        default = "" if session.tracking is None else "tracking"
+        if session.hello is None:
+            default = "waiting for the program"
         return Condition(
             activity=printable(reported.activity) or default,
             problem=printable(reported.problem)
@@ -228,7 +223,7 @@ class BridgeInstrument:
         return response
 
     def _require(self, command: str, purpose: str) -> None:
-        if command not in self._hello(self._connected()).commands:
+        if command not in self._hello().commands:
             raise InstrumentRefusedError(f"{self._name}: this program cannot {purpose}")
 
     def _connected(self) -> BridgeSession:
@@ -236,7 +231,8 @@ class BridgeInstrument:
             raise InstrumentError(f"{self._name}: not connected; call connect first")
         return self._session
 
-    def _hello(self, session: BridgeSession) -> HelloLine:
-        if session.hello is None:
+    def _hello(self) -> HelloLine:
+        hello = self._connected().hello
+        if hello is None:
             raise InstrumentError(f"{self._name}: not connected; call connect first")
-        return session.hello
+        return hello

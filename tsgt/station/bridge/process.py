@@ -37,11 +37,9 @@ class Listener(Protocol):
 
     def output_received(self, data: bytes, at_ns: int) -> None:
         """Handle data from stdout, which arrived at this time on CLOCK_MONOTONIC."""
-        ...
 
     def exited(self, reason: str) -> None:
         """Handle the end of the program, or of its output: called once, after all its output."""
-        ...
 
 
 class Program(Protocol):
@@ -49,15 +47,12 @@ class Program(Protocol):
 
     def write(self, data: bytes) -> None:
         """Queue data for its stdin, without waiting; no effect after its end."""
-        ...
 
     def kill(self) -> None:
         """Kill it and its children at once."""
-        ...
 
     async def terminate(self) -> None:
         """Terminate it, and kill it if it does not end; when this returns or is cancelled, it has ended."""
-        ...
 
 
 StartProgram = Callable[[Sequence[str], Listener], Coroutine[Any, Any, Program]]

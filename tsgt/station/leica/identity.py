@@ -104,13 +104,7 @@ def succeeded(reply: Reply) -> bool:
 
 
 async def identify(line: GeoComConnection, before: Identity | None = None) -> Identity:
-    """Query an instrument's identity; only what changes, if it is the one met before.
-
-    Raises
-    ------
-    InstrumentError
-        It does not respond.
-    """
+    """Query an instrument's identity; only what changes, if it is the one met before."""
     serial = await line.call(Rpc.CSV_GET_INSTRUMENT_NO)
     serial_number = str(serial.values[0]) if serial.values else ""
     robotic = await _has_robotic_licence(line)

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Final
 import structlog
 
 from tsgt.errors import InstrumentError, InstrumentRefusedError
-from tsgt.recording.journal import InstrumentRecord
 from tsgt.station.geocom import connect
 from tsgt.station.instrument import Condition
 from tsgt.station.leica.identity import Identity, identify, read_power
@@ -36,6 +35,7 @@ if TYPE_CHECKING:
     from tsgt.clock import Clock
     from tsgt.config import LeicaInstrumentConfig
     from tsgt.radio import Direction
+    from tsgt.recording.journal import InstrumentRecord
     from tsgt.station.geocom import GeoComConnection
     from tsgt.station.instrument import Atmosphere, Reading
     from tsgt.station.serial import OpenPort
@@ -289,31 +289,23 @@ class LeicaInstrument:
 
     async def _read_back(self, line: GeoComConnection) -> None:
         """Update the record with the instrument's current settings."""
-        settings = await read_settings(line)
-        angle_delay_ms = self._config.angle_delay_ms
-        angle_delay_ns = self._identity.properties.angle_delay_ns
-        air = settings.atmosphere
+        record, geometric_ppm = await read_settings(line)
+        identity, angle_delay_ms = self._identity, self._config.angle_delay_ms
         self._problems.pop("geometry", None)
-        if settings.ppm is not None and settings.atmospheric_ppm is not None:
-            geometric_ppm = settings.ppm - settings.atmospheric_ppm
-            if abs(geometric_ppm) > _PPM_TOLERANCE:
-                self._problems["geometry"] = (
-                    f"it scales distances by {geometric_ppm:.1f} ppm in addition to the atmospheric correction;"
-                    " set its geometric ppm to 0"
-                )
-        record = InstrumentRecord(
-            make="Leica",
-            model=self._identity.model,
-            serial_number=self._identity.serial_number,
-            firmware=self._identity.firmware,
-            prism_type=settings.prism_type,
-            prism_constant_m=settings.prism_constant_m,
-            atmospheric_ppm=settings.ppm if settings.ppm is not None else settings.atmospheric_ppm,
-            temperature_c=air.temperature_c if air is not None else None,
-            pressure_hpa=air.pressure_hpa if air is not None else None,
-            distance_mode=settings.distance_mode,
+        if geometric_ppm is not None and abs(geometric_ppm) > _PPM_TOLERANCE:
+            self._problems["geometry"] = (
+                f"it scales distances by {geometric_ppm:.1f} ppm in addition to the atmospheric correction;"
+                " set its geometric ppm to 0"
+            )
+        record = replace(
+            record,
+            model=identity.model,
+            serial_number=identity.serial_number,
+            firmware=identity.firmware,
             latency_ns=self._timestamper.latency_ns,
-            angle_delay_ns=angle_delay_ns if angle_delay_ms is None else round(angle_delay_ms * 1e6),
+            angle_delay_ns=identity.properties.angle_delay_ns
+            if angle_delay_ms is None
+            else round(angle_delay_ms * 1e6),
         )
         if self._record is None or record != replace(self._record, stamp_ns=0):
             self._record = replace(record, stamp_ns=self._clock.monotonic_ns())

@@ -1,4 +1,7 @@
-"""Settings of a Leica instrument: each is read, written where it differs, and read back."""
+"""Settings of a Leica instrument: each is read, written where it differs, and read back.
+
+Every call raises InstrumentError when the instrument does not respond.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import math
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from tsgt.errors import InstrumentError
+from tsgt.recording.journal import InstrumentRecord
 from tsgt.station.geocom import Outcome, Rpc, name_of, outcome_of
 from tsgt.station.instrument import Atmosphere
 from tsgt.station.leica.identity import numeric_values, succeeded
@@ -60,20 +64,6 @@ _TRIES: Final = 3
 _SYNCHRO: Final = 10
 _CONSTANT_TOLERANCE_M: Final = 1e-6
 _ATMOSPHERE_TOLERANCE: Final = 0.05  # hPa and degrees Celsius
-
-
-class Settings(NamedTuple):
-    """Distance measurement settings as read back; None or empty where the instrument does not report them."""
-
-    prism_type: str
-    prism_constant_m: float | None
-    ppm: float | None
-    atmospheric_ppm: float | None
-    atmosphere: Atmosphere | None
-    distance_mode: str
-
-
-# --- Settings -----------------------------------------------------------------------------------------------------
 
 
 class Setting(NamedTuple):
@@ -176,13 +166,7 @@ def wet_bulb_temperature_c(temperature_c: float) -> float:
 
 
 async def apply_setting(line: GeoComConnection, setting: Setting) -> str:
-    """Apply a setting; return the reason why it is not set, empty when it is.
-
-    Raises
-    ------
-    InstrumentError
-        The instrument does not respond.
-    """
+    """Apply a setting; return the reason why it is not set, empty when it is."""
     reply = await line.call(setting.read)
     before = numeric_values(reply, setting.size)
     if before is None:
@@ -211,13 +195,7 @@ async def clear_distance(line: GeoComConnection) -> None:
 
 
 async def set_up(line: GeoComConnection, config: LeicaInstrumentConfig, identity: Identity) -> list[str]:
-    """Stop the measurement and apply all settings but reflector and distance mode; return what could not be set, and why.
-
-    Raises
-    ------
-    InstrumentError
-        The instrument does not respond.
-    """
+    """Stop the measurement and apply all settings but reflector and distance mode; return what could not be set, and why."""
     await line.call(Rpc.COM_SET_DOUBLE_PRECISION, DECIMALS)
     await clear_distance(line)
     settings = required_settings(config, identity)
@@ -297,8 +275,8 @@ async def set_distance_mode(line: GeoComConnection, modes: tuple[int, ...]) -> s
     return f"distance mode {EDM_MODES[modes[0]]} cannot be set: {name_of(reply.code)}"
 
 
-async def read_settings(line: GeoComConnection) -> Settings:
-    """Read the settings of distance measurement back."""
+async def read_settings(line: GeoComConnection) -> tuple[InstrumentRecord, float | None]:
+    """Read the settings of distance measurement back; return also the geometric ppm, None where it is unknown."""
     prism = numeric_values(await line.call(Rpc.BAP_GET_PRISM_TYPE), 1)
     total = numeric_values(await line.call(Rpc.TMC_GET_SLOPE_DIST_CORR), 2)
     constant = (
@@ -307,11 +285,17 @@ async def read_settings(line: GeoComConnection) -> Settings:
     ppm = numeric_values(await line.call(Rpc.TMC_GET_ATM_PPM), 1)
     air = numeric_values(await line.call(Rpc.TMC_GET_ATM_CORR), 4)
     mode = numeric_values(await line.call(Rpc.TMC_GET_EDM_MODE), 1)
-    return Settings(
+    atmospheric_ppm = ppm[0] if ppm is not None else None
+    total_ppm = total[0] if total is not None else None
+    record = InstrumentRecord(
+        make="Leica",
         prism_type=_PRISM_TYPE_NAMES.get(int(prism[0]), f"type {prism[0]:.0f}") if prism is not None else "",
         prism_constant_m=constant[0] if constant is not None else None,
-        ppm=total[0] if total is not None else None,
-        atmospheric_ppm=ppm[0] if ppm is not None else None,
-        atmosphere=Atmosphere(temperature_c=air[2], pressure_hpa=air[1]) if air is not None else None,
+        atmospheric_ppm=atmospheric_ppm if total_ppm is None else total_ppm,
+        temperature_c=air[2] if air is not None else None,
+        pressure_hpa=air[1] if air is not None else None,
         distance_mode=EDM_MODES.get(int(mode[0]), f"mode {mode[0]:.0f}") if mode is not None else "",
     )
+    if total_ppm is None or atmospheric_ppm is None:
+        return record, None
+    return record, total_ppm - atmospheric_ppm

@@ -1,4 +1,7 @@
-"""Single-shot and two-face measurements of targets with a Leica instrument."""
+"""Single-shot and two-face measurements of targets with a Leica instrument.
+
+Every call raises InstrumentError when the instrument does not respond.
+"""
 
 from __future__ import annotations
 
@@ -37,8 +40,6 @@ async def measure_target(line: GeoComConnection, clock: Clock) -> FullMeasuremen
     ------
     InstrumentRefusedError
         The instrument does not start: its stored distance may be that of another target.
-    InstrumentError
-        The instrument does not respond.
     """
     await _start_program(line, _CLEAR)
     await _start_program(line, _MEASURE)
@@ -62,8 +63,6 @@ async def measure_in_two_faces(line: GeoComConnection, clock: Clock, *, at_prism
     ------
     InstrumentRefusedError
         The instrument cannot change its face, or the faces measured different targets.
-    InstrumentError
-        The instrument does not respond.
     """
     first = await measure_target(line, clock)
     if first.distance_m is None:

@@ -1,4 +1,7 @@
-"""Timestamps of a Leica instrument's distances on the host's clock, from exchanges with the instrument's own clock."""
+"""Timestamps of a Leica instrument's distances on the host's clock, from exchanges with the instrument's own clock.
+
+Every exchange raises InstrumentError when the instrument does not respond.
+"""
 
 from __future__ import annotations
 
@@ -71,13 +74,7 @@ class DistanceTimestamper:
         self._last_ms = None
 
     async def synchronise(self, line: GeoComConnection) -> None:
-        """Exchange times until the clock fit is good, or it is clear that this takes longer.
-
-        Raises
-        ------
-        InstrumentError
-            The instrument does not respond.
-        """
+        """Exchange times until the clock fit is good, or it is clear that this takes longer."""
         fit = self._clock_fit
         known = fit.initialised
         min_exchanges = _MIN_EXCHANGES if known else _MIN_FIRST_EXCHANGES
@@ -94,13 +91,7 @@ class DistanceTimestamper:
                 return
 
     async def maintain(self, line: GeoComConnection, clock: Clock, until_ns: int) -> None:
-        """Exchange times regularly, and in all idle time before ``until_ns`` while that improves the fit noticeably.
-
-        Raises
-        ------
-        InstrumentError
-            The instrument does not respond.
-        """
+        """Exchange times regularly, and in all idle time before ``until_ns`` while that improves the fit noticeably."""
         while True:
             now_ns = clock.monotonic_ns()
             idle = until_ns - now_ns >= self._exchange_ns + _RESERVE_NS

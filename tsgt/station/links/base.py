@@ -16,15 +16,12 @@ class Link(Protocol):
 
     def offer(self, measurement: PolarMeasurement) -> None:
         """Take a journalled measurement of a tracked prism for delivery."""
-        ...
 
     def respond(self, command: TrackCommand | SearchCommand | DirectCommand, *, ok: bool) -> None:
         """Respond to a command that was executed or has failed."""
-        ...
 
     def respond_single(self, target: TargetRecord | None) -> None:
         """Respond with a journalled single measurement; None: it has failed."""
-        ...
 
     async def run(self, radio: Radio) -> NoReturn:
         """Reply to the master over this radio until the radio fails.
@@ -34,8 +31,6 @@ class Link(Protocol):
         RadioError
             The radio has failed.
         """
-        ...
 
     def status(self) -> LinkStatus:
         """Return the link's current status."""
-        ...

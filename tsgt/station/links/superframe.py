@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, NoReturn
 
 import structlog
 
-from tsgt.radio.superframe.wire import angle_code
+from tsgt.radio.superframe import SendQueue, SuperframeStation
+from tsgt.radio.superframe.wire import Authenticator, angle_code
 from tsgt.recording.journal import AcknowledgedRecord, ReceptionRecord
 from tsgt.station.backlog import queued_measurement
 from tsgt.station.links.traffic_monitor import UnknownTrafficMonitor
@@ -16,17 +17,19 @@ from tsgt.station.status import LinkStatus
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from tsgt.clock import Clock, UnixTimeline
+    from tsgt.clock import UnixTimeline
     from tsgt.model import PolarMeasurement
-    from tsgt.radio import Command, DirectCommand, Radio, SearchCommand, TrackCommand
-    from tsgt.radio.superframe import InstrumentState, ReceivedBeacon, SendQueue, SuperframeStation
+    from tsgt.radio import Command, DirectCommand, LoRaSettings, Radio, SearchCommand, TrackCommand
+    from tsgt.radio.superframe import InstrumentState, ReceivedBeacon
     from tsgt.recording.journal import TargetRecord
+    from tsgt.station.backlog import Backlog
+    from tsgt.station.dependencies import ClientDependencies
 
 REPLY_LEAD_NS = 6_000_000
 """A reply is composed this long before its slot: the radio needs 3 ms, a Raspberry Pi the rest."""
 
 ACKNOWLEDGED_INTERVAL_NS = 5_000_000_000
-"""Interval of the journal\'s records of the cumulative acknowledgement."""
+"""Interval of the journal's records of the cumulative acknowledgement."""
 
 log = structlog.get_logger()
 
@@ -36,12 +39,8 @@ class SuperframeLink:
 
     Parameters
     ----------
-    send_queue
-        Measurements to deliver; shared with ``station``.
-    boot
-        Identifies the start of this computer from which its clock counts.
-    authenticated
-        Whether there is a key.
+    backlog
+        Measurements and receptions of earlier runs.
     instrument_state
         Returns the instrument's current state for the reply.
     on_command
@@ -52,30 +51,39 @@ class SuperframeLink:
 
     def __init__(
         self,
-        station: SuperframeStation,
-        send_queue: SendQueue,
-        boot: str,
-        clock: Clock,
+        station: int,
+        settings: LoRaSettings,
+        dependencies: ClientDependencies,
         timeline: UnixTimeline,
+        backlog: Backlog,
         *,
-        authenticated: bool,
+        stream_id: int,
         instrument_state: Callable[[], InstrumentState],
         on_command: Callable[[Command], None],
         write: Callable[[object], None],
     ) -> None:
-        self._station = station
-        self._send_queue = send_queue
-        self._boot = boot
-        self._clock = clock
+        self._clock = clock = dependencies.clock
         self._timeline = timeline
-        self._authenticated = authenticated
+        self._boot = dependencies.boot
+        self._authenticator = Authenticator(dependencies.key)
+        self._send_queue = SendQueue(backlog.first_sequence, backlog.queued)
+        self._station = SuperframeStation(
+            station,
+            settings,
+            self._authenticator,
+            self._send_queue,
+            stream_id=stream_id,
+            boot=self._boot,
+            receptions=backlog.receptions,
+            random_bits=dependencies.random_bits,
+        )
         self._instrument_state = instrument_state
         self._on_command = on_command
         self._write = write
-        self._acknowledged = send_queue.oldest
+        self._acknowledged = self._send_queue.oldest
         self._acknowledged_ns = clock.monotonic_ns()
         self._write_acknowledged()
-        if not authenticated:
+        if not self._authenticator.authentic:
             log.warning("unauthenticated", key_file=None)
         self._log_limiter = LogLimiter()
         self._traffic_monitor = UnknownTrafficMonitor(clock)
@@ -177,7 +185,7 @@ class SuperframeLink:
             snr_db=station.snr_db,
             unknown_packets=self._traffic_monitor.packets,
             refused=station.authentication_failures,
-            authenticated=self._authenticated,
+            authenticated=self._authenticator.authentic,
             joined=station.joined,
             queued=len(self._send_queue),
             missed_slots=station.missed_slots,

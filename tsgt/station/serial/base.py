@@ -22,28 +22,22 @@ class Port(Protocol):
     @property
     def name(self) -> str:
         """Name for messages."""
-        ...
 
     @property
     def baud(self) -> int:
         """Bits per second; a byte takes ten bits."""
-        ...
 
     def write(self, data: bytes) -> None:
         """Queue data for sending; does not wait."""
-        ...
 
     async def read(self) -> Chunk:
         """Return the next data; may be cancelled without loss."""
-        ...
 
     def drain(self) -> bytes:
         """Return and discard unread data; does not wait."""
-        ...
 
     async def close(self) -> None:
         """Close the port; unsent data is lost."""
-        ...
 
 
 OpenPort = Callable[[int], Coroutine[Any, Any, Port]]

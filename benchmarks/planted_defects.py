@@ -121,80 +121,80 @@ _YESTERDAY = (
     "unit/radio/test_held_back.py::test_a_session_of_yesterday_played_to_a_station_that_was_just_started"
 )
 _BEACONS = "unit/radio/test_held_back.py::test_a_single_beacon_shifts_no_time"
-_ERROR_STATUS = "unit/master/test_pipeline.py::test_an_error_status_is_named_as_the_reason"
+_ERROR_STATUS = "unit/master/test_pipeline.py::test_error_status_is_the_reason"
 
 DEFECTS: Final = {
-    "no-ack": Defect("the master acknowledges nothing", defects.no_acknowledgement, (F.LOSS,), duration_s=70),
+    "no-ack": Defect("the master acknowledges nothing", defects.never_acknowledge, (F.LOSS,), duration_s=70),
     "ack-early": Defect(
         "the master acknowledges what is not written yet",
-        defects.acknowledged_before_written,
+        defects.acknowledge_before_written,
         script=killed_with_a_full_disk,
     ),
     "ack-highest": Defect(
         "the master acknowledges all up to the highest number",
-        defects.acknowledged_to_the_highest,
+        defects.acknowledge_up_to_highest,
         (F.LOSS,),
         duration_s=80,
     ),
     "deleted": Defect(
-        "a station deletes what it has sent", defects.deleted_when_sent, (F.LOSS,), duration_s=80
+        "a station deletes what it has sent", defects.dequeue_when_sent, (F.LOSS,), duration_s=80
     ),
-    "repeats": Defect("the master hands on repeats", defects.repeats_kept, script=killed_with_a_full_disk),
+    "repeats": Defect("the master hands on repeats", defects.accept_duplicates, script=killed_with_a_full_disk),
     "repeats-classic": Defect(
         "the master does not know repeats, classic",
-        defects.repeats_kept_classic,
+        defects.accept_duplicates_classic,
         (F.LOSS,),
         protocol="classic",
         duration_s=80,
     ),
     "numbers": Defect(
-        "a station begins with number 0 again", defects.numbers_again, (F.CLIENT_CRASH,), duration_s=80
+        "a station begins with number 0 again", defects.reuse_sequence_numbers, (F.CLIENT_CRASH,), duration_s=80
     ),
-    "nonce": Defect("a station has one nonce for all sessions", defects.nonce_again, test=_YESTERDAY),
-    "code": Defect("the code of a packet is not compared", defects.code_not_compared),
+    "nonce": Defect("a station has one nonce for all sessions", defects.reuse_nonce, test=_YESTERDAY),
+    "code": Defect("the code of a packet is not compared", defects.skip_authentication),
     "old-beacon": Defect(
-        "an old beacon is accepted", defects.old_beacon_accepted, (F.FORGERY,), duration_s=80
+        "an old beacon is accepted", defects.accept_old_beacon, (F.FORGERY,), duration_s=80
     ),
-    "offset": Defect("the clock's offset is added, classic", defects.offset_added, protocol="classic"),
+    "offset": Defect("the clock's offset is added, classic", defects.add_clock_offset, protocol="classic"),
     "frequency": Defect(
         "the clock's frequency is reversed, classic",
-        defects.frequency_reversed,
+        defects.reverse_frequency,
         protocol="classic",
         duration_s=120,
         drift_ppm=50,
     ),
-    "beacon": Defect("a beacon's time is taken for that of the next", defects.beacon_beside, test=_BEACONS),
+    "beacon": Defect("a beacon's time is taken for that of the next", defects.use_time_of_next_beacon, test=_BEACONS),
     "slot": Defect(
-        "a station replies in the slot after its own", defects.slot_beside, (F.LOSS,), duration_s=80
+        "a station replies in the slot after its own", defects.reply_one_slot_late, (F.LOSS,), duration_s=80
     ),
-    "whole-ms": Defect("times are cut to whole milliseconds", defects.whole_milliseconds),
-    "latency": Defect("the instrument's latency is left in", defects.latency_left_in),
-    "angle": Defect("angles are cut by a bit", defects.angle_short_of_a_bit),
-    "calibration": Defect("a station's frame is 20 mm off", defects.other_calibration),
+    "whole-ms": Defect("times are cut to whole milliseconds", defects.truncate_times_to_ms),
+    "latency": Defect("the instrument's latency is left in", defects.keep_instrument_latency),
+    "angle": Defect("angles are cut by a bit", defects.drop_lowest_angle_bit),
+    "calibration": Defect("a station's frame is 20 mm off", defects.use_stale_station_frame),
     "calibration-continuous": Defect(
-        "the same, continuous", defects.other_calibration, estimator="continuous"
+        "the same, continuous", defects.use_stale_station_frame, estimator="continuous"
     ),
-    "constant": Defect("the prism constant is left out", defects.no_prism_constant),
-    "constant-continuous": Defect("the same, continuous", defects.no_prism_constant, estimator="continuous"),
-    "error": Defect("a measurement with an error status is used", defects.error_used, test=_ERROR_STATUS),
+    "constant": Defect("the prism constant is left out", defects.ignore_prism_constant),
+    "constant-continuous": Defect("the same, continuous", defects.ignore_prism_constant, estimator="continuous"),
+    "error": Defect("a measurement with an error status is used", defects.use_failed_measurements, test=_ERROR_STATUS),
     "covariance": Defect(
-        "the covariance is too small by 4", defects.covariance_a_quarter, estimator="continuous"
+        "the covariance is too small by 4", defects.quarter_covariance, estimator="continuous"
     ),
     "smoothed": Defect(
-        "smoothed poses have the time of predicted ones", defects.smoothed_now, estimator="continuous"
+        "smoothed poses have the time of predicted ones", defects.stamp_smoothed_poses_now, estimator="continuous"
     ),
-    "order": Defect("the recording has another order than the stream", defects.another_order),
+    "order": Defect("the recording has another order than the stream", defects.reorder_lines),
     "journal": Defect(
         "a measurement is delivered before it is written",
-        defects.journalled_afterwards,
+        defects.journal_after_delivery,
         (F.CLIENT_CRASH,),
         duration_s=100,
     ),
-    "torn": Defect("half a line is not cut off", defects.torn_line_kept, (F.DISK_FULL,), duration_s=100),
+    "torn": Defect("half a line is not cut off", defects.keep_torn_line, (F.DISK_FULL,), duration_s=100),
     "queue": Defect(
-        "a reader's queue has no bound", defects.endless_queue, script=sleeping_reader, duration_s=122
+        "a reader's queue has no bound", defects.unbound_reader_queue, script=sleeping_reader, duration_s=122
     ),
-    "radio": Defect("a station gives its radio up", defects.radio_given_up, (F.CHIP_HANG,), duration_s=100),
+    "radio": Defect("a station gives its radio up", defects.never_reopen_radio, (F.CHIP_HANG,), duration_s=100),
 }
 
 

@@ -1,4 +1,4 @@
-"""Damaged recordings and journals at the desk: a result, or one line that says what is wrong; never half a file."""
+"""Damaged recordings and journals: a result or an error in one line; never a partial file."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from collections import Counter
 
 import pytest
 from harness.cli import called
-from harness.damage import UNHARMED, Damage, Samples, damages, examples
-from harness.harmless import Files, check
+from harness.damage import UNDAMAGED, Damage, Samples, damages, examples
+from harness.cli_contract import Files, check_command
 from harness.merging import journals, recording
-from harness.missions import QUICK, SUPERFRAME, mission
-from harness.published import write_prisms, write_targets, write_tracks
+from harness.missions import QUICK, SUPERFRAME, run_mission
+from harness.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -40,7 +40,7 @@ def missions(tmp_path_factory: pytest.TempPathFactory) -> tuple[Samples, ...]:
     samples = []
     for protocol in (SUPERFRAME, QUICK):
         folder = tmp_path_factory.mktemp(protocol.kind)
-        run = mission(folder, duration_s=12.0, protocol=protocol)
+        run = run_mission(folder, duration_s=12.0, protocol=protocol)
         path = folder / "r.jsonl"
         contents = {
             "recording": recording(run, path).read_bytes(),
@@ -63,7 +63,7 @@ def recordings(missions: tuple[Samples, ...], tmp_path_factory: pytest.TempPathF
         assert called("merge", *paths).code == 0
         found.append(paths[0].read_bytes())
     tracks = ("--tracks", *write_tracks(folder), "--prisms", write_prisms(folder))
-    for targets in ((), ("--targets", write_targets(folder))):
+    for targets in ((), ("--targets", write_targets(folder), *CONSTANTS)):
         path = folder / "imported.jsonl"
         assert called("import", "rts", *tracks, *targets, "--output", path).code == 0
         found.append(path.read_bytes())
@@ -85,30 +85,30 @@ COMMANDS: dict[str, tuple[tuple[str, ...], str]] = {
 @pytest.mark.parametrize("command", COMMANDS)
 @examples(2)
 @given(damage=damages, keep_going=st.booleans())
-@example(damage=UNHARMED, keep_going=False)
-def test_at_the_desk(
+@example(damage=UNDAMAGED, keep_going=False)
+def test_commands_with_a_damaged_recording(
     recordings: Samples,
     command: str,
     damage: Damage,
     keep_going: bool,  # noqa: FBT001 (given by hypothesis)
 ) -> None:
-    """Each command works on a damaged recording or refuses it; its output is there as a whole or not at all."""
+    """Commands with a damaged recording."""
     arguments, output = COMMANDS[command]
     with Files({"input": damage.to(recordings.all)}) as files:
-        outcome = check(files, arguments, output=output, extra=("--keep-going",) * keep_going)
-    assert damage != UNHARMED or outcome.code in (0, 3), outcome
+        outcome = check_command(files, arguments, output=output, extra=("--keep-going",) * keep_going)
+    assert damage != UNDAMAGED or outcome.code in (0, 3), outcome
 
 
 @examples(2)
 @given(of=st.integers(0, 1), recording_damage=damages, journal_damage=damages, keep_going=st.booleans())
-def test_merging(
+def test_merge_of_damaged_journals(
     missions: tuple[Samples, ...],
     of: int,
     recording_damage: Damage,
     journal_damage: Damage,
     keep_going: bool,  # noqa: FBT001 (as above)
 ) -> None:
-    """Damaged journals into a damaged recording: a new recording, or an error."""
+    """Merge of damaged journals."""
     _, recording, *journals = missions[of].all
     contents = {
         "recording": recording_damage.to([recording]),
@@ -117,7 +117,7 @@ def test_merging(
     }
     with Files(contents) as files:
         extra = ("--keep-going",) * keep_going
-        check(files, ("merge", "@recording", "@one", "@two"), output="merged.jsonl", extra=extra)
+        check_command(files, ("merge", "@recording", "@one", "@two"), output="merged.jsonl", extra=extra)
 
 
 ODOMETRY = [
@@ -128,11 +128,11 @@ ODOMETRY = [
 @pytest.mark.skipif(settings().max_examples < FUZZ_EXAMPLES, reason="takes seconds each time; for make fuzz")
 @examples(1)
 @given(damage=damages, odometry_damage=damages)
-@example(damage=UNHARMED, odometry_damage=UNHARMED)
-def test_a_report(recordings: Samples, damage: Damage, odometry_damage: Damage) -> None:
-    """The page of a damaged recording, with damaged odometry, is written or it is not."""
+@example(damage=UNDAMAGED, odometry_damage=UNDAMAGED)
+def test_report_of_a_damaged_recording(recordings: Samples, damage: Damage, odometry_damage: Damage) -> None:
+    """Report of a damaged recording."""
     with Files({"input": damage.to(recordings.all), "odometry": odometry_damage.to(ODOMETRY)}) as files:
         odometry = ("--odometry", "@odometry") if damage.sample % 2 else ()
         arguments = ("evaluate", "@input", "--estimator", "linear", "--no-held-out", "--report", "@report")
-        outcome = check(files, (*arguments, *odometry), output="report")
+        outcome = check_command(files, (*arguments, *odometry), output="report")
     assert damage.edits or outcome.code == 0, outcome

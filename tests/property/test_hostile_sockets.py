@@ -1,4 +1,4 @@
-"""Whoever sits at the other end of a socket may say what he likes: nobody falls over, and the others are served."""
+"""Arbitrary data from the other end of a socket: no crash, and other peers are served."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from harness.client import client_config
 from harness.damage import Damage, damages, examples
 from harness.radios import PAPER, running_timeline
 from harness.records import CLOCK, EVENT, HELLO, NO_POSE, POINT, POSE, STATUS, measurement
-from harness.shots import ScriptedInstrument
+from harness.scripted_instrument import ScriptedInstrument
 from hypothesis import given
 from hypothesis import strategies as st
 from structlog.testing import capture_logs
@@ -97,8 +97,8 @@ def connected(path: Path, content: bytes, closing: str) -> Iterator[None]:
 
 @examples(20)
 @given(strangers=st.lists(st.tuples(damages, closings), min_size=1, max_size=4))
-def test_readers_of_the_stream(strangers: list[tuple[Damage, str]]) -> None:
-    """What a reader sends is passed over: another one gets every line."""
+def test_input_from_stream_readers_is_ignored(strangers: list[tuple[Damage, str]]) -> None:
+    """Input from stream readers is ignored."""
 
     async def run(folder: Path) -> None:
         path = folder / "s"
@@ -124,8 +124,8 @@ def _no_radio() -> AbstractAsyncContextManager[Radio]:
 
 @examples(15)
 @given(strangers=st.lists(st.tuples(damages, closings), min_size=1, max_size=4))
-def test_the_clients_socket(strangers: list[tuple[Damage, str]]) -> None:
-    """Whatever was said to a client before, the next one gets its status, and is done what it asks for."""
+def test_arbitrary_requests_to_the_client(strangers: list[tuple[Damage, str]]) -> None:
+    """The next one gets its status, and its command is executed."""
 
     async def run(folder: Path) -> None:
         clock = VirtualClock(1_700_000_000_000_000_000)
@@ -158,8 +158,8 @@ def test_the_clients_socket(strangers: list[tuple[Damage, str]]) -> None:
 
 @examples(20)
 @given(strangers=st.lists(st.tuples(damages, closings), min_size=1, max_size=3))
-def test_strangers_at_the_air_server(strangers: list[tuple[Damage, str]]) -> None:
-    """Two radios of the demo hear each other, whoever else is connected and whatever he says."""
+def test_unknown_peers_at_the_air_server(strangers: list[tuple[Damage, str]]) -> None:
+    """Two radios of the demo still exchange packets."""
 
     async def run(folder: Path) -> None:
         path = folder / "air"
@@ -187,8 +187,8 @@ def test_strangers_at_the_air_server(strangers: list[tuple[Damage, str]]) -> Non
 
 @examples(20)
 @given(damage=damages)
-def test_a_client_of_a_hostile_air_server(damage: Damage) -> None:
-    """A radio of the demo joins, is told that it cannot, or that the air is gone; nothing else."""
+def test_client_of_a_hostile_air_server(damage: Damage) -> None:
+    """It joins, is rejected, or loses the server; nothing else."""
 
     async def run(folder: Path) -> None:
         path = folder / "air"
@@ -261,8 +261,8 @@ COMMANDS = {
 @pytest.mark.parametrize("command", COMMANDS)
 @examples(25)
 @given(damage=damages)
-def test_commands_at_a_hostile_server(command: str, damage: Damage) -> None:
-    """The commands that people look at show lines or one error, and send nothing to the terminal but text."""
+def test_commands_with_a_hostile_server(command: str, damage: Damage) -> None:
+    """They show lines or one error, and print only text."""
     arguments, samples = COMMANDS[command]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "s"
@@ -275,8 +275,8 @@ def test_commands_at_a_hostile_server(command: str, damage: Damage) -> None:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_line_without_end_does_not_fill_the_memory(command: str) -> None:
-    """The commands take so many bytes for a line, and no more."""
+def test_endless_line_has_bounded_memory(command: str) -> None:
+    """Endless line has bounded memory."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "s"
         with serving(path, b"x" * (3 * MAX_LINE_BYTES)):

@@ -1,4 +1,4 @@
-"""Large files cost time in proportion to their size: ten times as long a file takes about ten times as long."""
+"""Reading time is proportional to the file size."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from harness.pos_files import Variant
 from harness.records import POSE, STATUS, measurement, recording_bytes
 
 from tsgt.analysis.evaluation import read_tum
-from tsgt.analysis.formats import read_pos, read_still_intervals, read_target_file
+from tsgt.analysis.formats import read_pos, read_stationary_intervals, read_target_file
 from tsgt.config import load_any
 from tsgt.errors import ConfigError, InputFileError, RecordingError
 from tsgt.recording import MAX_LINE_BYTES, load_recording
-from tsgt.station.bridge.messages import LineCutter
+from tsgt.station.bridge.messages import LineSplitter
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -46,7 +46,7 @@ READERS: dict[str, tuple[Callable[[Path], object], Callable[[int], bytes]]] = {
     "nested": (load_recording, lambda count: recording_bytes() + b"[" * 500 * count + b"\n"),
     "receiver": (read_pos, _pos),
     "trajectory": (read_tum, lambda count: b"".join(b"%d.5 1 2 3 0 0 0 1\n" % k for k in range(10 * count))),
-    "odometry": (read_still_intervals, lambda count: b"".join(b"%d,0,0\n" % k for k in range(10 * count))),
+    "odometry": (read_stationary_intervals, lambda count: b"".join(b"%d,0,0\n" % k for k in range(10 * count))),
     "targets": (
         read_target_file,
         lambda count: (
@@ -75,8 +75,8 @@ def _took_s(read: Callable[[Path], object], path: Path) -> float:
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_time_grows_with_the_size(tmp_path: Path, name: str) -> None:
-    """Each reader takes a file of a thousand lines in proportion to one of a hundred."""
+def test_time_is_proportional_to_the_size(tmp_path: Path, name: str) -> None:
+    """Time is proportional to the size."""
     read, content = READERS[name]
     small, large = tmp_path / "small", tmp_path / "large"
     small.write_bytes(content(150))
@@ -85,9 +85,9 @@ def test_time_grows_with_the_size(tmp_path: Path, name: str) -> None:
     assert _took_s(read, large) < MOST * TIMES * small_s + 0.02
 
 
-def test_a_line_of_a_bridge_without_end_is_cut() -> None:
-    """Byte by byte it costs no more than its length, and no more memory than its limit."""
-    cutter = LineCutter(1000)
+def test_endless_bridge_line_is_truncated() -> None:
+    """Time is proportional to its length, and memory is bounded."""
+    cutter = LineSplitter(1000)
     for _ in range(MAX_LINE_BYTES // 512):
         assert cutter.push(b"x" * 512) == []
     assert cutter.push(b"\nshort\n") == [b"x" * 1000, b"short"]

@@ -1,4 +1,4 @@
-"""What was streamed, what is replayed and what is processed later are the same poses, bit for bit."""
+"""Streamed, replayed and post-processed poses are equal bit for bit."""
 
 from __future__ import annotations
 
@@ -88,10 +88,10 @@ def poses(lines: list[bytes]) -> list[bytes]:
 
 @settings(max_examples=60)
 @given(arrivals(), st.lists(st.integers(START, START + 100 * 10**9), max_size=30), st.floats(0.0, 5.0))
-def test_the_desk_gives_what_the_stream_gave(
+def test_post_processing_equals_the_stream(
     measurements: list[PolarMeasurement], ticks_ns: list[int], wait_s: float
 ) -> None:
-    """All measurements at once in the order of time give the poses that arrived one by one."""
+    """Post processing equals the stream."""
     end_ns = max((m.received_ns for m in measurements), default=START) + round(wait_s * 1e9)
     pipeline = LinearEstimator(SCENE.parameters)
     for measurement in sorted(measurements, key=lambda m: m.stamp_ns):
@@ -102,10 +102,10 @@ def test_the_desk_gives_what_the_stream_gave(
 
 @settings(max_examples=60)
 @given(arrivals(FOUR), st.lists(st.integers(START, START + 100 * 10**9), max_size=30))
-def test_the_same_with_two_stations_on_one_prism(
+def test_post_processing_equals_the_stream_with_two_stations_on_one_prism(
     measurements: list[PolarMeasurement], ticks_ns: list[int]
 ) -> None:
-    """Each of the stations on a prism is waited for, so the order in which they arrive does not matter."""
+    """Both are waited for, so the order of arrival does not matter."""
     end_ns = max((m.received_ns for m in measurements), default=START)
     pipeline = LinearEstimator(FOUR.parameters)
     for measurement in sorted(measurements, key=lambda m: m.stamp_ns):
@@ -116,18 +116,18 @@ def test_the_same_with_two_stations_on_one_prism(
 
 @settings(max_examples=30)
 @given(arrivals(), st.lists(st.integers(START, START + 100 * 10**9), max_size=30))
-def test_the_timer_changes_no_line_and_no_order(
+def test_timer_does_not_change_the_stream(
     measurements: list[PolarMeasurement], ticks_ns: list[int]
 ) -> None:
-    """When the timer fires, or whether at all, leaves no trace on the stream."""
+    """Timer does not change the stream."""
     end_ns = max((m.received_ns for m in measurements), default=START)
     assert live(measurements, ticks_ns, end_ns) == live(measurements, [], end_ns)
 
 
 @settings(max_examples=10)
 @given(arrivals(CONTINUOUS), st.lists(st.integers(START, START + 10 * 10**9), max_size=30))
-def test_nor_does_it_with_predictions(measurements: list[PolarMeasurement], ticks_ns: list[int]) -> None:
-    """Predicted and smoothed poses are the same as well, to the last bit."""
+def test_timer_does_not_change_predictions(measurements: list[PolarMeasurement], ticks_ns: list[int]) -> None:
+    """Timer does not change predictions."""
     end_ns = START + 10 * 10**9
     early = [m for m in measurements if m.received_ns < end_ns]
     assert live(early, ticks_ns, end_ns, CONTINUOUS) == live(early, [], end_ns, CONTINUOUS)
@@ -136,7 +136,7 @@ def test_nor_does_it_with_predictions(measurements: list[PolarMeasurement], tick
 @settings(max_examples=30)
 @given(arrivals())
 def test_stamps_of_poses_increase_by_one_period(measurements: list[PolarMeasurement]) -> None:
-    """No epoch is left out and none is given twice."""
+    """Stamps of poses increase by one period."""
     pipeline = LinearEstimator(SCENE.parameters)
     stamps: list[int] = []
     for measurement in measurements:
@@ -148,8 +148,8 @@ def test_stamps_of_poses_increase_by_one_period(measurements: list[PolarMeasurem
 
 @settings(max_examples=60)
 @given(st.one_of(arrivals(), arrivals(FOUR)))
-def test_the_announced_deadline_is_when_the_next_pose_is_due(measurements: list[PolarMeasurement]) -> None:
-    """At the deadline there is a pose, one nanosecond before there is none."""
+def test_next_pose_is_due_at_the_deadline(measurements: list[PolarMeasurement]) -> None:
+    """And not one nanosecond before."""
     pipeline = LinearEstimator(
         FOUR.parameters if any(m.station == 4 for m in measurements) else SCENE.parameters
     )
@@ -171,12 +171,12 @@ def test_the_announced_deadline_is_when_the_next_pose_is_due(measurements: list[
     ),
     st.lists(st.integers(START, START + 40 * 10**9), max_size=20),
 )
-def test_a_replay_gives_every_line_of_the_stream_again(
+def test_replay_equals_the_stream(
     measurements: list[PolarMeasurement],
     others: list[tuple[int, ClockRecord | EventRecord | StatusRecord]],
     ticks_ns: list[int],
 ) -> None:
-    """Clock, status and event lines between the measurements, and a fence's own, come back in their places."""
+    """Clock, status and event records and a geofence's events keep their places."""
     _replayed_again(SCENE, measurements, others, ticks_ns)
 
 
@@ -189,12 +189,12 @@ def test_a_replay_gives_every_line_of_the_stream_again(
     ),
     st.lists(st.integers(START, START + 10 * 10**9), max_size=20),
 )
-def test_a_replay_of_predicted_and_smoothed_poses_gives_them_again(
+def test_replay_equals_the_stream_with_predictions(
     measurements: list[PolarMeasurement],
     others: list[tuple[int, ClockRecord | EventRecord | StatusRecord]],
     ticks_ns: list[int],
 ) -> None:
-    """What a prediction was made from does not depend on when the timer fired, but on what had come by its epoch."""
+    """Replay equals the stream with predictions."""
     early = [m for m in measurements if m.received_ns < START + 10 * 10**9]
     _replayed_again(CONTINUOUS, early, others, ticks_ns)
 

@@ -21,8 +21,8 @@ LINES_BEFORE = [WHOLE[:end].count(b"\n") for end in range(len(WHOLE) + 1)]
 
 
 @pytest.mark.parametrize("beginning", [True, False], ids=["header and parameters", "rest"])
-def test_cut_anywhere_loses_one_line_at_most(tmp_path: Path, *, beginning: bool) -> None:
-    """A recording cut at any byte reads as far as its whole lines go, and loses nothing else."""
+def test_truncation_loses_one_line_at_most(tmp_path: Path, *, beginning: bool) -> None:
+    """Truncation loses one line at most."""
     path = tmp_path / "r.jsonl"
     header = len(encode_line(HEADER))
     for end in range(header, BEGINNING) if beginning else range(BEGINNING, len(WHOLE) + 1):
@@ -35,8 +35,8 @@ def test_cut_anywhere_loses_one_line_at_most(tmp_path: Path, *, beginning: bool)
         assert len(numbers) - LINES_BEFORE[end] + len(problems) == bool(rest)
 
 
-def test_cut_anywhere_can_be_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A recording cut at any byte, the header included, goes on with the next session as if it were whole."""
+def test_truncated_recording_can_be_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Even within the header."""
     monkeypatch.setattr(os, "fsync", lambda _: None)  # thousands of them, and nobody cuts the power
     path = tmp_path / "r.jsonl"
     session = (HEADER, PARAMETERS, measurement(7))
@@ -56,8 +56,8 @@ def test_cut_anywhere_can_be_continued(tmp_path: Path, monkeypatch: pytest.Monke
 
 @examples(200)
 @given(at=st.integers(0, len(WHOLE) - 2), bits=st.integers(1, 255))
-def test_flipped_byte_is_found_or_harmless(at: int, bits: int) -> None:
-    """A flipped byte gives an error with the number of its line, or another valid value."""
+def test_flipped_byte_is_detected_or_valid(at: int, bits: int) -> None:
+    """An error with the line number, or another valid value."""
     spoilt = bytearray(WHOLE)
     spoilt[at] ^= bits
     with tempfile.TemporaryDirectory() as folder:
@@ -81,8 +81,8 @@ def test_flipped_byte_is_found_or_harmless(at: int, bits: int) -> None:
     st.tuples(*[st.floats(allow_nan=False, allow_infinity=False)] * 3),
     st.integers(0, 2**63 - 1),
 )
-def test_numbers_come_back_bit_for_bit(position_m: tuple[float, float, float], stamp_ns: int) -> None:
-    """Every finite number and every time is the same after a way through a line."""
+def test_numbers_round_trip_bit_for_bit(position_m: tuple[float, float, float], stamp_ns: int) -> None:
+    """Numbers round trip bit for bit."""
     point = PointMeasurement(
         station=1, prism=1, sequence=0, stamp_ns=stamp_ns, received_ns=stamp_ns, position_m=position_m
     )

@@ -30,7 +30,7 @@ def read(text: str | bytes) -> Reference:
 
 
 @given(stamps, st.data())
-def test_what_is_exported_is_read_back(stamps_ns: list[int], data: st.DataObject) -> None:
+def test_exported_trajectory_round_trips(stamps_ns: list[int], data: st.DataObject) -> None:
     """Times exactly, positions to the nanometre, orientations to 1e-12."""
     rows = [(data.draw(st.tuples(metres, metres, metres)), data.draw(parts)) for _ in stamps_ns]
     positions = np.array([position for position, _ in rows])
@@ -43,8 +43,8 @@ def test_what_is_exported_is_read_back(stamps_ns: list[int], data: st.DataObject
 
 
 @given(st.lists(lines, max_size=4).map("\n".join) | st.binary(max_size=80))
-def test_whatever_is_read_is_a_trajectory_or_an_error_of_ours(text: str | bytes) -> None:
-    """No number is so large, no byte so strange that another error comes of it."""
+def test_any_input_is_a_trajectory_or_a_tsgt_error(text: str | bytes) -> None:
+    """Any input is a trajectory or a tsgt error."""
     try:
         found = read(text)
     except InputFileError:

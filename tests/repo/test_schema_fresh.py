@@ -1,3 +1,5 @@
+"""The JSON Schema of the stream and its field tables are up to date."""
+
 from __future__ import annotations
 
 import dataclasses
@@ -29,7 +31,7 @@ RECORDS = [HELLO, measurement(0), POINT, POSE, NO_POSE, CLOCK, STATUS, EVENT, HE
 
 @pytest.fixture(scope="module")
 def validator() -> Draft202012Validator:
-    """Return a validator of the schema as it is committed."""
+    """Return a validator of the committed schema."""
     committed = json.loads((ROOT / schema.SCHEMA).read_text())
     Draft202012Validator.check_schema(committed)
     return Draft202012Validator(committed)
@@ -42,13 +44,13 @@ def decoded(record: object) -> dict[str, Any]:
 
 
 def test_generated_files_are_fresh() -> None:
-    """The schema and the field tables are what the code generates; if not, call `make generated`."""
+    """If not, call `make generated`."""
     stale = [path.name for path, text in schema.generated_files(ROOT).items() if path.read_text() != text]
     assert stale == []
 
 
-def test_pages_hold_a_table_for_every_class() -> None:
-    """The marks between which the tables stand are in the pages, and the tables between them."""
+def test_pages_have_a_table_for_every_class() -> None:
+    """The tables are between the marks."""
     for page, classes in schema.PAGES.items():
         text = (ROOT / page).read_text()
         generated = text[text.index(schema.BEGIN) : text.index(schema.END)]
@@ -57,7 +59,7 @@ def test_pages_hold_a_table_for_every_class() -> None:
 
 @pytest.mark.parametrize("record", RECORDS, ids=lambda record: type(record).__name__)
 def test_real_lines_are_valid(record: object, validator: Draft202012Validator) -> None:
-    """What the program writes obeys the schema."""
+    """Written lines satisfy the schema."""
     validator.validate(decoded(record))
 
 
@@ -67,8 +69,8 @@ def test_unknown_keys_are_valid(validator: Draft202012Validator) -> None:
 
 
 @pytest.mark.parametrize("record", RECORDS, ids=lambda record: type(record).__name__)
-def test_line_without_a_key_is_not_valid(record: object, validator: Draft202012Validator) -> None:
-    """The program writes every key of a record, and the schema says so."""
+def test_line_without_a_key_is_invalid(record: object, validator: Draft202012Validator) -> None:
+    """The program writes every key of a record."""
     for key in decoded(record):
         assert not validator.is_valid({name: value for name, value in decoded(record).items() if name != key})
 
@@ -83,21 +85,21 @@ def test_line_without_a_key_is_not_valid(record: object, validator: Draft202012V
         ("stamp_ns", 0.5),
     ],
 )
-def test_wrong_value_is_not_valid(key: str, value: object, validator: Draft202012Validator) -> None:
-    """Sizes, words and types are part of the schema."""
+def test_wrong_value_is_invalid(key: str, value: object, validator: Draft202012Validator) -> None:
+    """Sizes, enumerations and types are part of the schema."""
     assert not validator.is_valid(decoded(POSE) | {key: value})
 
 
 @dataclasses.dataclass
 class Undescribed:
-    """A record with a field without a docstring."""
+    """A record with a field without description."""
 
     type: Literal["undescribed"]
     forgotten: int
 
 
 def test_field_without_description_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A field without a docstring is an error."""
+    """A new field needs a description in the docstring."""
     monkeypatch.setattr(schema, "LINE_TYPES", [*schema.LINE_TYPES, Undescribed])
     monkeypatch.setattr(schema, "PAGES", schema.PAGES | {Path("page.md"): (Undescribed,)})
     with pytest.raises(ValueError, match=r"Undescribed\.forgotten has no docstring"):

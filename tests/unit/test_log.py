@@ -19,8 +19,8 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_entries_are_json_lines_off_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    """A file or the journal gets one JSON object per entry on stderr, with level and UTC time."""
+def test_entries_are_json_lines_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    """With level and UTC time."""
     configure_logging()
     structlog.get_logger().warning("reader_lost_lines", count=3)
     captured = capsys.readouterr()
@@ -31,7 +31,7 @@ def test_entries_are_json_lines_off_a_terminal(capsys: pytest.CaptureFixture[str
 
 
 def test_bound_context_is_in_every_entry(capsys: pytest.CaptureFixture[str]) -> None:
-    """What is bound to the context (the station, say) appears without being passed on."""
+    """Bound context is in every entry."""
     configure_logging()
     with structlog.contextvars.bound_contextvars(station_id=2):
         structlog.get_logger().info("something")
@@ -77,10 +77,10 @@ class Unwritable(io.StringIO):
 
 
 @pytest.mark.parametrize("stderr", [Unwritable(), None], ids=["full disk", "closed"])
-def test_a_log_that_cannot_be_written_ends_nothing(
+def test_failed_log_write_is_ignored(
     stderr: io.StringIO | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A daemon goes on without."""
+    """Failed log write is ignored."""
     monkeypatch.setattr(sys, "stderr", stderr)
     configure_logging()
     structlog.get_logger().error("something_happened")

@@ -1,4 +1,4 @@
-"""Polygons from above: sides, distances, and which are refused. Oracle: brute force and angles summed."""
+"""Polygons: sides, distances, validity. Oracles: brute force and winding number."""
 
 from __future__ import annotations
 
@@ -58,10 +58,10 @@ def test_inside_a_concave_polygon_with_parallel_edges(point: tuple[float, float]
 
 
 @given(POINT, POINT, POINT)
-def test_no_point_of_the_edge_is_nearer(
+def test_distance_to_edge_is_the_minimum(
     point: tuple[float, float], a: tuple[float, float], b: tuple[float, float]
 ) -> None:
-    """A thousand points along the edge come as near as the distance says and no nearer; the way is a unit vector."""
+    """Of a thousand points; the direction is a unit vector."""
     assume(math.dist(a, b) > 1e-3)
     distance, (u, v) = distance_to_edge(point, (a, b))
     parts = np.linspace(0, 1, 1001)[:, None]
@@ -71,8 +71,8 @@ def test_no_point_of_the_edge_is_nearer(
     assert math.hypot(u, v) == pytest.approx(1.0)
 
 
-def test_a_point_on_the_edge_has_the_normal_as_its_way() -> None:
-    """At distance zero the direction is across the edge, also where rounding keeps the point off it."""
+def test_point_on_the_edge_has_the_normal_as_direction() -> None:
+    """Also with rounding."""
     distance, way = distance_to_edge((3.0, 0.0), ((0.0, 0.0), (10.0, 0.0)))
     assert (distance, abs(way[1])) == (0.0, 1.0)
     _, (u, v) = distance_to_edge((0.1, 0.3), ((0.0, 0.0), (1.0, 3.0)))
@@ -80,8 +80,8 @@ def test_a_point_on_the_edge_has_the_normal_as_its_way() -> None:
 
 
 @given(star())
-def test_a_simple_polygon_is_accepted(corners: tuple[tuple[float, float], ...]) -> None:
-    """Whatever its order and however concave."""
+def test_simple_polygon_is_accepted(corners: tuple[tuple[float, float], ...]) -> None:
+    """Simple polygon is accepted."""
     assume(all(math.dist(a, b) > 0.1 for a, b in edges(corners)))
     # Spokes at least 2 pi / 18 apart; the polygon is simple, but its spikes may be narrower than the limit.
     assume(min_gap(corners) > 0.01)
@@ -111,7 +111,7 @@ def min_gap(corners: tuple[tuple[float, float], ...]) -> float:
         pytest.param([(0, 0), (10, 0), (10, 10), (10, -5)], "touch or fold back", id="a spike"),
     ],
 )
-def test_a_polygon_that_bounds_no_area_is_refused(corners: list[tuple[float, float]], words: str) -> None:
-    """The message names the corners."""
+def test_polygon_that_is_not_simple_is_rejected(corners: list[tuple[float, float]], words: str) -> None:
+    """The message states the corners."""
     with pytest.raises(ValueError, match=words):
         check_simple(corners)

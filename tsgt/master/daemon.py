@@ -24,7 +24,7 @@ from tsgt.master.classic import ClassicLink
 from tsgt.master.geofence import Geofence, run_geofence_command
 from tsgt.master.layout_monitor import LayoutMonitor
 from tsgt.master.link_events import MasterEvent
-from tsgt.master.publisher import Publisher
+from tsgt.master.publisher import Observer, Publisher
 from tsgt.master.reacquisition_hints import ReacquisitionHints
 from tsgt.master.recording_thread import RecordingThread
 from tsgt.master.station_events import StationEventDetector
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable, Sequence
 
     from tsgt.clock import Clock
-    from tsgt.config import FrameWatchConfig, GeofenceConfig, MasterConfig
+    from tsgt.config import GeofenceConfig, MasterConfig
     from tsgt.master.link_events import LinkStatus
     from tsgt.model import Measurement, Parameters
     from tsgt.radio import LoRaSettings, Radio, RadioOpener
@@ -82,12 +82,7 @@ class MasterDependencies:
 async def run_master(
     config: MasterConfig, parameters: Parameters, settings: LoRaSettings, dependencies: MasterDependencies
 ) -> None:
-    """Receive, compute, stream and record until cancelled.
-
-    Parameters
-    ----------
-    parameters
-        Of the set-up files and the configuration.
+    """Receive, compute, stream and record until cancelled; ``parameters`` are those in force.
 
     Raises
     ------
@@ -126,14 +121,14 @@ async def run_master(
         try:
             async with server, asyncio.TaskGroup() as group:
                 stations = [station.station for station in config.stations]
+                layout: Observer = LayoutMonitor(config.frame_watch, parameters.pipeline.period_ns)
+                if parameters.pipeline.estimator != "linear":
+                    layout = _LinearPoses(layout, parameters)
                 publisher = Publisher(
                     parameters,
                     Statistics(stations),
                     StationEventDetector(stations, start_ns),
-                    [
-                        _LayoutObserver(config.frame_watch, parameters),
-                        *(_GeofenceObserver(geofence, group) for geofence in config.geofences),
-                    ],
+                    [layout, *(_GeofenceObserver(geofence, group) for geofence in config.geofences)],
                     emit,
                     lambda: timeline.unix_ns(clock.monotonic_ns()),
                 )
@@ -272,33 +267,20 @@ class _Master:
         return opened
 
 
-class _LayoutObserver:
-    """Feeds the layout monitor with poses of the estimator ``linear``, whichever estimator is published."""
+class _LinearPoses(Observer):
+    """Gives an observer the poses of the estimator ``linear`` instead of the published ones."""
 
-    def __init__(self, config: FrameWatchConfig, parameters: Parameters) -> None:
-        self._monitor = LayoutMonitor(config, parameters.pipeline.period_ns)
-        self._linear: LiveEstimator | None = None  # None: the published poses are linear
-        if parameters.pipeline.estimator != "linear":
-            pipeline = replace(parameters.pipeline, estimator="linear")
-            self._linear = LiveEstimator(replace(parameters, pipeline=pipeline))
-
-    def pose(self, record: PoseRecord, now_ns: int) -> Sequence[EventRecord]:
-        return self._monitor.pose(record, now_ns) if self._linear is None else ()
+    def __init__(self, observer: Observer, parameters: Parameters) -> None:
+        self._observer = observer
+        pipeline = replace(parameters.pipeline, estimator="linear")
+        self._estimator = LiveEstimator(replace(parameters, pipeline=pipeline))
 
     def measurement(self, record: Measurement) -> Sequence[EventRecord]:
-        if self._linear is None:
-            return ()
-        poses = (found for found in self._linear.measurement(record) if isinstance(found, PoseRecord))
-        return [event for pose in poses for event in self._monitor.pose(pose, record.received_ns)]
-
-    def tick(self, now_ns: int) -> Sequence[EventRecord]:  # noqa: ARG002 (has no time-outs)
-        return ()
-
-    def next_deadline_ns(self) -> None:
-        return None
+        poses = (found for found in self._estimator.measurement(record) if isinstance(found, PoseRecord))
+        return [event for pose in poses for event in self._observer.pose(pose, record.received_ns)]
 
 
-class _GeofenceObserver:
+class _GeofenceObserver(Observer):
     """A geofence and the command that runs when it is crossed."""
 
     def __init__(self, config: GeofenceConfig, group: asyncio.TaskGroup) -> None:
@@ -308,9 +290,6 @@ class _GeofenceObserver:
 
     def pose(self, record: PoseRecord, now_ns: int) -> Sequence[EventRecord]:
         return self._run_command(self._geofence.pose(record, now_ns))
-
-    def measurement(self, record: Measurement) -> Sequence[EventRecord]:
-        return self._geofence.measurement(record)
 
     def tick(self, now_ns: int) -> Sequence[EventRecord]:
         return self._run_command(self._geofence.tick(now_ns))

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Protocol
 
 import structlog
 
+from tsgt.master.publisher import Observer
 from tsgt.polygon import contains, distance_to_edge, edges
 from tsgt.recording import EventRecord
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from tsgt.model import Measurement
     from tsgt.polygon import Point
     from tsgt.recording import PoseRecord
 
@@ -59,7 +59,7 @@ class GeofenceSettings(Protocol):
         """Time without a valid pose that counts as an exit."""
 
 
-class Geofence:
+class Geofence(Observer):
     """Monitors one area."""
 
     def __init__(self, settings: GeofenceSettings) -> None:
@@ -99,10 +99,6 @@ class Geofence:
             f"at x {x:.2f}, y {y:.2f} m"
         )
         return [*events, EventRecord(stamp_ns=now_ns, event=f"geofence_{change}", message=message)]
-
-    def measurement(self, record: Measurement) -> list[EventRecord]:  # noqa: ARG002 (a geofence uses poses)
-        """Ignore a measurement."""
-        return []
 
     def tick(self, now_ns: int) -> list[EventRecord]:
         """Return the event of a robot without a valid pose for too long."""
@@ -154,15 +150,7 @@ log = structlog.get_logger()
 
 
 async def run_geofence_command(command: Sequence[str], *, event: str, fence: str) -> None:
-    """Run a command at a crossing and log its outcome.
-
-    Parameters
-    ----------
-    command
-        Program and arguments.
-    event, fence
-        Its environment variables ``TSGT_EVENT`` and ``TSGT_FENCE``.
-    """
+    """Run a command with ``TSGT_EVENT`` and ``TSGT_FENCE`` in its environment, and log its outcome."""
     problem = await _problem(command, os.environ | {"TSGT_EVENT": event, "TSGT_FENCE": fence})
     if problem:
         log.error("fence_command_failed", fence=fence, command=command[0], error=problem)

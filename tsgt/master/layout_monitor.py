@@ -18,6 +18,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
+from tsgt.master.publisher import Observer
 from tsgt.recording import EventRecord
 
 if TYPE_CHECKING:
@@ -65,7 +66,7 @@ class _Sample:
         return self.residual_mm / self.limit_mm
 
 
-class LayoutMonitor:
+class LayoutMonitor(Observer):
     """Monitors the residuals of the prisms against their layout.
 
     Parameters

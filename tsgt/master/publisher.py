@@ -7,56 +7,40 @@ instants and gives the same lines bit for bit.
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from tsgt.estimation import LiveEstimator
-from tsgt.master.link_events import (
-    BeaconSent,
-    BeaconTimeRejected,
-    ClockStepped,
-    ClockUpdate,
-    LinkDelayAnomaly,
-    LinkStatus,
-    MasterEvent,
-    MeasurementReceived,
-    NoResponse,
-    ReplyReceived,
-    StationResponded,
-    SuperframeState,
-    TrackedPrism,
-    TrackingResult,
-)
+from tsgt.master import link_events
 from tsgt.model import PolarMeasurement
 from tsgt.recording import EventRecord, PoseRecord, encode_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from tsgt.master.link_events import LinkEvent
     from tsgt.master.station_events import StationEventDetector
     from tsgt.master.statistics import Statistics
     from tsgt.model import Measurement, Parameters
     from tsgt.recording import BeaconRecord, ClockRecord, StatusRecord
 
 
-class Observer(Protocol):
-    """Sees poses and measurements, and may add events."""
+class Observer:
+    """Sees poses and measurements when they are published, and may add events."""
 
-    def pose(self, record: PoseRecord, now_ns: int) -> Sequence[EventRecord]:
+    def pose(self, _record: PoseRecord, _now_ns: int, /) -> Sequence[EventRecord]:
         """Take a pose that was published at an instant."""
-        ...
+        return ()
 
-    def measurement(self, record: Measurement) -> Sequence[EventRecord]:
-        """Take a measurement that was published."""
-        ...
+    def measurement(self, _record: Measurement, /) -> Sequence[EventRecord]:
+        """Take a measurement."""
+        return ()
 
-    def tick(self, now_ns: int) -> Sequence[EventRecord]:
+    def tick(self, _now_ns: int, /) -> Sequence[EventRecord]:
         """Return the events of time-outs that have expired."""
-        ...
+        return ()
 
     def next_deadline_ns(self) -> int | None:
         """Return when :meth:`tick` has to be called; None while no time-out is running."""
-        ...
+        return None
 
 
 class Publisher:
@@ -64,10 +48,6 @@ class Publisher:
 
     Parameters
     ----------
-    statistics
-        Counts what the status records state.
-    detector
-        Turns changes of a station into events.
     observers
         See each pose and measurement.
     emit
@@ -93,47 +73,41 @@ class Publisher:
         self._now_ns = now_ns
         self._changed = asyncio.Event()
 
-    def report(self, event: LinkEvent) -> None:
+    def report(self, event: link_events.LinkEvent) -> None:
         """Count and publish what a link reports, with the events that follow from it."""
         statistics, detector, now_ns = self._statistics, self._detector, self._now_ns()
         match event:
-            case MeasurementReceived(measurement):
+            case link_events.MeasurementReceived(measurement):
                 self.measurement(measurement)
                 self._put_all(detector.measurement(measurement, now_ns))
-            case StationResponded(station, rssi_dbm, snr_db):
+            case link_events.StationResponded(station, rssi_dbm, snr_db):
                 statistics.exchange(station, responded=True)
                 self._put_all(detector.exchange(station, now_ns, responded=True))
                 statistics.packet(station, now_ns, rssi_dbm=rssi_dbm, snr_db=snr_db)
-            case NoResponse(station):
+            case link_events.NoResponse(station):
                 statistics.exchange(station, responded=False)
                 self._put_all(detector.exchange(station, now_ns, responded=False))
-            case ReplyReceived(station):
+            case link_events.ReplyReceived(station):
                 self._put_all(detector.reply(station, now_ns))
-            case BeaconSent(record) | ClockUpdate(record):
+            case link_events.BeaconSent(record) | link_events.ClockUpdate(record):
                 self.put(record)
-            case SuperframeState():
+            case link_events.SuperframeState():
                 statistics.superframe_state(event)
-            case TrackedPrism(station, prism):
+            case link_events.TrackedPrism(station, prism):
                 statistics.tracked_prism(station, prism)
-            case TrackingResult(station, prism, tracks):
+            case link_events.TrackingResult(station, prism, tracks):
                 self._put_all(detector.tracking_result(station, prism, now_ns, tracks=tracks))
-            case ClockStepped(station):
+            case link_events.ClockStepped(station):
                 self.put(detector.clock_stepped(station, now_ns))
-            case BeaconTimeRejected(station, count):
+            case link_events.BeaconTimeRejected(station, count):
                 self.put(detector.beacon_time_rejected(station, now_ns, count))
-            case LinkDelayAnomaly(station):
+            case link_events.LinkDelayAnomaly(station):
                 self.put(detector.link_delay_anomaly(station, now_ns))
-            case MasterEvent(name, message):
+            case link_events.MasterEvent(name, message):
                 self.put(EventRecord(stamp_ns=now_ns, event=name, message=message))
 
-    def publish_status(self, link: LinkStatus, *, realtime_ns: int) -> StatusRecord:
-        """Publish the events that time alone brings, and a status record; return the latter.
-
-        Parameters
-        ----------
-        realtime_ns
-            The present on the machine's Unix clock, which may be set.
-        """
+    def publish_status(self, link: link_events.LinkStatus, *, realtime_ns: int) -> StatusRecord:
+        """Publish the events of expired time-outs and a status record; ``realtime_ns`` is the machine's Unix clock."""
         now_ns = self._now_ns()
         self._put_all(self._detector.tick(now_ns, realtime_ns=realtime_ns))
         status = self._statistics.status(now_ns, link)

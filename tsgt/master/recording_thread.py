@@ -11,13 +11,7 @@ if TYPE_CHECKING:
 
 
 class RecordingThread:
-    """Takes lines without waiting, writes them in a thread and reports which were written.
-
-    Parameters
-    ----------
-    recorder
-        Of the open recording; the owner closes it.
-    """
+    """Takes lines without waiting, writes them in a thread and reports which were written. Does not close the recorder."""
 
     def __init__(self, recorder: Recorder) -> None:
         self._recorder = recorder

@@ -45,12 +45,7 @@ def replayed(
 ) -> Iterator[tuple[int, list[bytes]]]:
     """Repeat the calls of the live master, in the same order with the same instants.
 
-    Parameters
-    ----------
-    keep_going
-        Skip lines that cannot be read instead of raising.
-    on_problem
-        Called for each skipped line.
+    Corrupt lines are passed to ``on_problem`` and skipped if ``keep_going`` is set; else they raise.
 
     Yields
     ------
@@ -114,19 +109,9 @@ def _arrival(
 async def replay(
     arrivals: Iterator[tuple[int, list[bytes]]], server: StreamServer, clock: Clock, *, speed: float
 ) -> int:
-    """Publish replayed arrivals at a speed, waiting for slow readers.
+    """Publish replayed arrivals, waiting for slow readers; return the number of lines.
 
-    Parameters
-    ----------
-    arrivals
-        From :func:`replayed`.
-    speed
-        1 is real time, infinity as fast as the readers can take.
-
-    Returns
-    -------
-    int
-        Number of published lines.
+    A speed of 1 is real time, infinity as fast as the readers can take.
     """
     lines_published = 0
     start_ns: int | None = None

@@ -51,10 +51,6 @@ class StreamServer:
         The socket. A stale one is replaced; the folder is created.
     hello
         The greeting, without line end.
-    mode
-        Permissions of the socket.
-    queue_lines
-        Capacity of a reader's queue.
     unix_now_ns
         The master's Unix clock, for the event ``lines_lost``.
 

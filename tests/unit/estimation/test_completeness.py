@@ -1,4 +1,4 @@
-"""Up to when a station's measurements are all here."""
+"""Completeness of a station's measurements."""
 
 from tsgt.estimation.completeness import CompletenessTracker
 
@@ -7,31 +7,31 @@ LIMIT = 2 * SECOND
 
 
 def test_measurements_in_order_are_complete_at_once() -> None:
-    """Without a gap the last measurement is the answer."""
+    """Measurements in order are complete at once."""
     arrivals = CompletenessTracker(LIMIT)
     for sequence in range(3):
         arrivals.add(7 + sequence, sequence * SECOND)
     assert arrivals.complete_ns(2 * SECOND) == 2 * SECOND
 
 
-def test_what_lies_behind_a_gap_does_not_count() -> None:
-    """A number that is missing may still come."""
+def test_measurement_after_a_gap_does_not_count() -> None:
+    """A missing number may still arrive."""
     arrivals = CompletenessTracker(LIMIT)
     arrivals.add(0, SECOND)
     arrivals.add(2, 3 * SECOND)
     assert arrivals.complete_ns(3 * SECOND) == SECOND
 
 
-def test_closing_a_gap_completes_what_was_behind_it() -> None:
-    """Late measurements may come in any order."""
+def test_closing_a_gap_completes_what_follows() -> None:
+    """Late measurements arrive in any order."""
     arrivals = CompletenessTracker(LIMIT)
     for sequence in (0, 4, 2, 3, 1):
         arrivals.add(sequence, (sequence + 1) * SECOND)
     assert arrivals.complete_ns(5 * SECOND) == 5 * SECOND
 
 
-def test_a_gap_is_not_waited_for_for_ever() -> None:
-    """What has not come within the transport limit of the measurement behind it is given up."""
+def test_gap_ends_at_the_transport_limit() -> None:
+    """Of the measurement after it."""
     arrivals = CompletenessTracker(LIMIT)
     arrivals.add(0, SECOND)
     arrivals.add(2, 3 * SECOND)
@@ -40,8 +40,8 @@ def test_a_gap_is_not_waited_for_for_ever() -> None:
     assert arrivals.complete_ns(3 * SECOND + LIMIT + 1) == 4 * SECOND
 
 
-def test_a_backlog_from_before_the_first_measurement_changes_nothing() -> None:
-    """Newest first: what comes after an outage is older than what is known."""
+def test_backlog_before_the_first_measurement_is_ignored() -> None:
+    """It arrives newest first."""
     arrivals = CompletenessTracker(LIMIT)
     arrivals.add(100, 100 * SECOND)
     arrivals.add(99, 99 * SECOND)
@@ -49,8 +49,8 @@ def test_a_backlog_from_before_the_first_measurement_changes_nothing() -> None:
     assert arrivals.complete_ns(101 * SECOND) == 101 * SECOND
 
 
-def test_a_new_count_is_followed() -> None:
-    """A station that has lost its journal counts from the beginning again."""
+def test_restarted_numbers_are_followed() -> None:
+    """A station that has lost its journal counts from zero."""
     arrivals = CompletenessTracker(LIMIT)
     arrivals.add(500, 10 * SECOND)
     arrivals.add(0, 11 * SECOND)
@@ -58,8 +58,8 @@ def test_a_new_count_is_followed() -> None:
     assert arrivals.complete_ns(12 * SECOND) == 12 * SECOND
 
 
-def test_when_gaps_are_given_up() -> None:
-    """Everything up to a time is complete when the measurement behind the last gap before it is too old to wait."""
+def test_gaps_end_with_the_last_one() -> None:
+    """Everything up to a time is complete when the measurement after the last gap reaches the transport limit."""
     arrivals = CompletenessTracker(LIMIT)
     for sequence, second in ((0, 1), (2, 3), (3, 4), (5, 6)):
         arrivals.add(sequence, second * SECOND)

@@ -1,4 +1,4 @@
-"""The estimator ``continuous``, live: which poses come when, what they say, and why some are not valid."""
+"""The estimator ``continuous``, live: schedule, poses, and reasons of invalid ones."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from harness.scene import SECOND, START, Scene, with_origin, driving, at_rest, stationary_scene
+from harness.scene import SECOND, START, Scene, at_rest, driving, stationary_scene, with_origin
 
 from tsgt.errors import DegenerateGeometryError
 from tsgt.estimation import Kind, PoseBatch, Reason
@@ -67,16 +67,16 @@ def off(scene: Scene, poses: PoseBatch) -> tuple[float, float]:
     )
 
 
-def test_there_is_a_prediction_for_each_epoch_and_a_smoothed_pose_a_lag_later(scene: Scene) -> None:
-    """No epoch is left out and none is given twice, of either kind; a prediction comes at its epoch."""
+def test_each_epoch_has_a_predicted_and_a_smoothed_pose(scene: Scene) -> None:
+    """Exactly one of each; the prediction at its epoch, the other a lag later."""
     predicted, smoothed = stream(scene, every(scene, 8.0), 8.0)
     first = START + 200_000_000 + PERIOD
     assert predicted.stamp_ns.tolist() == list(range(first, START + 8 * SECOND + 1, PERIOD))
     assert smoothed.stamp_ns.tolist() == list(range(first, START + 5 * SECOND + 1, PERIOD))
 
 
-def test_what_is_predicted_and_smoothed_is_what_the_robot_does(scene: Scene) -> None:
-    """Exact measurements of a steady bend give poses that are as exact as a prior of unsteady motion allows."""
+def test_poses_follow_the_robot(scene: Scene) -> None:
+    """Exact measurements of a steady bend give poses as exact as the prior allows."""
     predicted, smoothed = stream(scene, every(scene, 10.0), 10.0)
     late = predicted.stamp_ns > START + 4 * SECOND
     assert predicted.valid[late].all()
@@ -86,8 +86,8 @@ def test_what_is_predicted_and_smoothed_is_what_the_robot_does(scene: Scene) -> 
     assert off(scene, smoothed.select(late)) < (0.001, 0.001)
 
 
-def test_where_a_layout_counts_from_does_not_matter(scene: Scene) -> None:
-    """With the origin metres off the prisms, live poses are the same ones of another point of the robot."""
+def test_origin_of_the_layout_does_not_matter(scene: Scene) -> None:
+    """With the origin metres off the prisms, the poses are those of another point of the robot."""
     arm = np.array([-3.0, 1.0, -1.5])
     measurements = every(scene, 8.0)
     far = replace(scene, parameters=with_origin(scene.parameters, arm))
@@ -100,8 +100,8 @@ def test_where_a_layout_counts_from_does_not_matter(scene: Scene) -> None:
         np.testing.assert_allclose(there.orientation_xyzw, here.orientation_xyzw, atol=1e-7)
 
 
-def test_predictions_rest_on_what_was_added_before(scene: Scene) -> None:
-    """A measurement changes the predictions from then on, and the smoothed poses that are still to come."""
+def test_predictions_use_earlier_measurements_only(scene: Scene) -> None:
+    """A measurement changes later predictions, and smoothed poses that are not computed yet."""
     measurements = every(scene, 6.0)
     wrong = [
         replace(m, slope_distance_m=(m.slope_distance_m or 0) + 0.03) if i == 30 else m
@@ -116,8 +116,8 @@ def test_predictions_rest_on_what_was_added_before(scene: Scene) -> None:
     assert not same[~before].any()
 
 
-def test_a_late_measurement_within_the_lag_changes_smoothed_poses(scene: Scene) -> None:
-    """What comes two seconds late fills the gap that it has left."""
+def test_late_measurement_within_the_lag_is_used(scene: Scene) -> None:
+    """It fills its gap two seconds later."""
     measurements = every(scene, 9.0)
     gap = [m for m in measurements if m.station == 2 and 4 * SECOND < m.stamp_ns - START < 5 * SECOND]
     rest = [m for m in measurements if m not in gap]
@@ -128,8 +128,8 @@ def test_a_late_measurement_within_the_lag_changes_smoothed_poses(scene: Scene) 
     assert variance[1] < 0.5 * variance[0]
 
 
-def test_what_comes_too_late_is_counted(scene: Scene) -> None:
-    """Measurements from before the window change nothing any more, and are counted by station."""
+def test_measurements_outside_the_lag_window_are_counted(scene: Scene) -> None:
+    """By station; they change nothing."""
     pipeline = ContinuousEstimator(scene.parameters)
     for measurement in every(scene, 8.0):
         pipeline.advance(measurement.received_ns)
@@ -139,8 +139,8 @@ def test_what_comes_too_late_is_counted(scene: Scene) -> None:
     assert pipeline.outside_lag_window == {3: 1}
 
 
-def test_what_was_measured_long_before_the_beginning_is_too_late(scene: Scene) -> None:
-    """A backlog of an hour, which a station sends first, makes no window of an hour."""
+def test_old_backlog_is_outside_the_lag_window(scene: Scene) -> None:
+    """An hour of backlog makes no window of an hour."""
     measurements = every(scene, 8.0)
     old = [
         replace(m, stamp_ns=m.stamp_ns - 3600 * SECOND, sequence=m.sequence + 10_000)
@@ -156,8 +156,8 @@ def test_what_was_measured_long_before_the_beginning_is_too_late(scene: Scene) -
 
 @pytest.mark.parametrize("before_ns", [9_000_000, 10_000_000, 11_000_000])
 @pytest.mark.parametrize("begun_s", [0.0, 0.082, 0.123, 1.0])
-def test_one_from_just_before_the_first_may_come_late(scene: Scene, before_ns: int, begun_s: float) -> None:
-    """Also as far before it as measurements share a knot, where rounding decides whether they do."""
+def test_measurement_just_before_the_first_is_used(scene: Scene, before_ns: int, begun_s: float) -> None:
+    """Also within the rounding of shared knots."""
     measurements = every(scene, 4.0)
     first_s = (measurements[0].stamp_ns - START - before_ns) / SECOND
     late = scene.measure(2, first_s, delay_s=1.9)
@@ -169,8 +169,8 @@ def test_one_from_just_before_the_first_may_come_late(scene: Scene, before_ns: i
     assert pipeline.advance(START + 4 * SECOND).valid.all()
 
 
-def test_a_distance_that_is_nothing_does_nothing(scene: Scene) -> None:
-    """A raw distance that the prism constant makes zero is an outlier like another; poses go on."""
+def test_zero_distance_is_an_outlier(scene: Scene) -> None:
+    """A raw distance that the prism constant makes zero."""
     stations = tuple(replace(station, prism_constant_m=-0.03) for station in scene.parameters.stations)
     scene = replace(scene, parameters=replace(scene.parameters, stations=stations))
     measurements = every(scene, 6.0)
@@ -180,24 +180,24 @@ def test_a_distance_that_is_nothing_does_nothing(scene: Scene) -> None:
     assert smoothed.valid[-20:].all()
 
 
-def test_a_measurement_that_comes_again_counts_once(scene: Scene) -> None:
-    """A station that has nothing new may send its last measurement again."""
+def test_repeated_measurement_counts_once(scene: Scene) -> None:
+    """Repeated measurement counts once."""
     measurements = every(scene, 6.0)
     again = [replace(m, received_ns=m.received_ns + 200_000_000) for m in measurements]
     once, twice = stream(scene, measurements, 6.0), stream(scene, [*measurements, *again], 6.0)
     np.testing.assert_array_equal(once[1].covariance, twice[1].covariance)
 
 
-def test_before_three_prisms_have_been_measured_there_is_an_outage(scene: Scene) -> None:
-    """The missing prism is named; there are no numbers."""
+def test_missing_prism_is_an_outage(scene: Scene) -> None:
+    """It is named; no numbers are computed."""
     predicted, _ = stream(scene, every(scene, 3.0, stations=(1, 2)), 3.0)
     assert set(predicted.reason.tolist()) == {Reason.OUTAGE}
     assert predicted.prism_reason[-1].tolist() == [Reason.VALID, Reason.VALID, Reason.OUTAGE]
     assert np.isnan(predicted.position_m).all()
 
 
-def test_with_one_prism_less_it_goes_on_as_long_as_it_honestly_can(scene: Scene) -> None:
-    """A station that falls silent is said to at once; the poses stay valid until they are too uncertain for its sake."""
+def test_poses_stay_valid_without_one_prism_until_uncertain(scene: Scene) -> None:
+    """The silent station is reported at once."""
     measurements = [*every(scene, 6.0), *every(scene, 20.0, stations=(1, 2), from_s=6.0)]
     predicted, _ = stream(scene, measurements, 20.0)
     after = predicted.select(predicted.stamp_ns > START + 6 * SECOND)
@@ -209,16 +209,16 @@ def test_with_one_prism_less_it_goes_on_as_long_as_it_honestly_can(scene: Scene)
     assert spread[-1] > 3 * spread[0]
 
 
-def test_a_station_with_an_error_is_the_reason(scene: Scene) -> None:
-    """When a prism is missing because its station reports an error, that is what the pose says."""
+def test_error_of_a_station_is_the_reason(scene: Scene) -> None:
+    """Error of a station is the reason."""
     errors = [scene.measure(3, 6.0 + i, status=Status.TILT) for i in range(15)]
     measurements = [*every(scene, 6.0), *every(scene, 20.0, stations=(1, 2), from_s=6.0), *errors]
     predicted, _ = stream(scene, measurements, 20.0)
     assert predicted.reason[-1] == Reason.STATION_STATUS
 
 
-def test_predictions_end_when_nothing_comes(scene: Scene) -> None:
-    """Without measurements a prediction becomes uncertain, then invalid, and then there is none."""
+def test_predictions_end_without_measurements(scene: Scene) -> None:
+    """They become uncertain, then invalid, then have no numbers."""
     predicted, smoothed = stream(scene, every(scene, 6.0), 30.0)
     assert predicted.valid[predicted.stamp_ns == START + 6 * SECOND + 2 * PERIOD]
     assert predicted.reason[-1] == Reason.OUTAGE
@@ -226,16 +226,16 @@ def test_predictions_end_when_nothing_comes(scene: Scene) -> None:
     assert smoothed.reason[-1] == Reason.OUTAGE
 
 
-def test_a_tight_limit_makes_poses_uncertain(scene: Scene) -> None:
-    """Where no prism is missing but the pose is not known well enough, it is uncertain."""
+def test_tight_limit_makes_poses_uncertain(scene: Scene) -> None:
+    """With all prisms measured."""
     tight = scene.with_limits(position_sigma_limit_m=0.005)
     predicted, smoothed = stream(tight, every(tight, 8.0), 8.0)
     assert Reason.UNCERTAIN in predicted.reason[-8:]
     assert smoothed.valid[-20:].all()
 
 
-def test_prisms_that_miss_their_layout_are_the_reason(scene: Scene) -> None:
-    """A layout that is not the robot's fits no measurements."""
+def test_wrong_layout_is_the_reason(scene: Scene) -> None:
+    """Wrong layout is the reason."""
     wrong = tuple(
         PrismPosition(
             prism=p.prism, position_m=(1.5 * p.position_m[0], 1.5 * p.position_m[1], p.position_m[2])
@@ -248,8 +248,8 @@ def test_prisms_that_miss_their_layout_are_the_reason(scene: Scene) -> None:
     assert smoothed.reason[-1] == Reason.RESIDUAL
 
 
-def test_a_robot_upside_down_is_refused() -> None:
-    """It leans further than the limit: a mirrored layout, or swapped prisms."""
+def test_robot_upside_down_is_invalid() -> None:
+    """A mirrored layout, or swapped prisms."""
     _, position = at_rest(0.0)
     scene = stationary_scene().with_limits(estimator="continuous")
     scene = scene.moving(lambda _: (exp_so3(np.array([3.0, 0.0, 0.0])), position))
@@ -257,16 +257,16 @@ def test_a_robot_upside_down_is_refused() -> None:
     assert smoothed.reason[-1] == Reason.TILT
 
 
-def test_no_noise_of_the_instruments_without_its_scale(scene: Scene) -> None:
-    """Twice the noise makes the smoothed poses of a well measured robot less certain."""
+def test_noise_scale_is_applied(scene: Scene) -> None:
+    """Twice the noise makes smoothed poses less certain."""
     plain = stream(scene, every(scene, 8.0), 8.0)[1]
     scaled = scene.with_limits(noise_scale=3.0)
     noisy = stream(scaled, every(scaled, 8.0), 8.0)[1]
     assert np.trace(noisy.covariance[-1]) > 3 * np.trace(plain.covariance[-1])
 
 
-def test_the_deadline_is_the_next_epoch(scene: Scene) -> None:
-    """Before the first measurement nothing waits; then a pose is due at each epoch."""
+def test_deadline_is_the_next_epoch(scene: Scene) -> None:
+    """None before the first measurement."""
     pipeline = ContinuousEstimator(scene.parameters)
     assert pipeline.next_deadline_ns() is None
     pipeline.begin_at(START + 1)
@@ -276,15 +276,15 @@ def test_the_deadline_is_the_next_epoch(scene: Scene) -> None:
     assert len(pipeline.advance(START + PERIOD)) == 1
 
 
-def test_a_layout_in_a_line_is_refused(scene: Scene) -> None:
-    """No pose can come of it."""
+def test_collinear_layout_is_rejected(scene: Scene) -> None:
+    """Collinear layout is rejected."""
     line = tuple(PrismPosition(prism=p, position_m=(float(p), 0.0, 0.0)) for p in (1, 2, 3))
     with pytest.raises(DegenerateGeometryError):
         ContinuousEstimator(replace(scene.parameters, prisms=line))
 
 
 def test_memory_is_bounded(scene: Scene) -> None:
-    """After a minute it keeps no more than after ten seconds."""
+    """After a minute it holds no more than after ten seconds."""
     pipeline = ContinuousEstimator(scene.parameters)
     sizes = []
     for measurement in [*every(scene, 30.0), *(scene.measure(3, 30.0, status=Status.TILT),)]:
@@ -294,8 +294,8 @@ def test_memory_is_bounded(scene: Scene) -> None:
     assert max(sizes[75:]) <= max(sizes[:75])
 
 
-def test_what_was_before_a_trajectory_began_is_not_valid(scene: Scene) -> None:
-    """From each prism seen twice a robot may be made that lies the other way about; what comes later does not tell."""
+def test_poses_before_the_initialisation_are_invalid(scene: Scene) -> None:
+    """Two measurements of each prism allow a mirrored robot."""
     measurements = every(scene, 8.0)
     _, smoothed = stream(scene, measurements, 8.0)
     twice_ns = max([m.stamp_ns for m in measurements if m.prism == prism][1] for prism in (1, 2, 3))
@@ -308,10 +308,10 @@ def test_what_was_before_a_trajectory_began_is_not_valid(scene: Scene) -> None:
 @pytest.mark.parametrize(
     ("wrong_m", "station", "sequence"), [(-0.12, 3, 5), (0.13, 2, 6), (0.05, 3, 5), (0.07, 1, 5)]
 )
-def test_where_a_single_reflection_was_believed_no_smoothed_pose_is_valid(
+def test_smoothed_pose_near_an_accepted_outlier_is_invalid(
     scene: Scene, wrong_m: float, station: int, sequence: int
 ) -> None:
-    """It is near enough to where the robot could be; the next measurements contradict, but the bend remains."""
+    """A reflection near the robot passes the gate; the next innovations are inconsistent."""
     measured = []
     for each in every(scene, 10.0, step_s=0.83):
         later = scene.measure(each.station, 0.83 * each.sequence + 0.27 * each.station)

@@ -1,4 +1,4 @@
-"""The pipeline: when a pose is due, what it says, and why it is not valid."""
+"""The estimator ``linear``: schedule, poses, and reasons of invalid ones."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.scene import LAYOUT, SECOND, START, driving, at_rest, stationary_scene
+from harness.scene import LAYOUT, SECOND, START, at_rest, driving, stationary_scene
 
 from tsgt.errors import DegenerateGeometryError
 from tsgt.estimation import LinearEstimator, PoseBatch, Reason
@@ -46,8 +46,8 @@ def every(
     return [scene.measure(station, time_s) for time_s in times_s for station in stations]
 
 
-def test_a_standing_robot_is_where_it_stands(scene: Scene) -> None:
-    """Exact measurements give the exact pose, at every epoch between the first and the last of them."""
+def test_stationary_robot_has_an_exact_pose(scene: Scene) -> None:
+    """At every epoch between the first and the last measurement."""
     poses = poses_of(scene, every(scene, [0.0, 0.4]), until_s=0.4)
     rotation, position = at_rest(0.0)
     assert poses.valid.tolist() == [False] + [True] * 8  # nothing brackets the very first instant
@@ -58,8 +58,8 @@ def test_a_standing_robot_is_where_it_stands(scene: Scene) -> None:
     assert np.trace(rotation) == pytest.approx(1 + 2 * np.cos(2 * np.arccos(quaternion[3])))
 
 
-def test_a_driving_robot_has_its_velocity(scene: Scene) -> None:
-    """Velocity comes in the world frame, angular velocity in the robot's."""
+def test_velocity_frames_are_as_documented(scene: Scene) -> None:
+    """Velocity in the world frame, angular velocity in the robot frame."""
     moving = scene.moving(driving)
     poses = poses_of(moving, every(moving, [-0.1, 0.1]), until_s=0.1)
     at_zero = poses.stamp_ns.tolist().index(START)
@@ -68,14 +68,14 @@ def test_a_driving_robot_has_its_velocity(scene: Scene) -> None:
 
 
 def test_epochs_are_whole_multiples_of_the_period(scene: Scene) -> None:
-    """Stamps do not depend on when the first measurement was made."""
+    """Whatever the time of the first measurement."""
     poses = poses_of(scene, every(scene, [0.013, 0.413]), until_s=1.0)
     assert poses.stamp_ns[0] == START + 50_000_000
     assert (poses.stamp_ns % 50_000_000 == 0).all()
 
 
-def test_a_pose_waits_for_the_last_station_and_no_longer(scene: Scene) -> None:
-    """Nothing is due while one station may still measure; everything is due with its measurement."""
+def test_pose_waits_for_the_last_station(scene: Scene) -> None:
+    """It is due with that station's measurement."""
     pipeline = LinearEstimator(scene.parameters)
     for measurement in [*every(scene, [0.0]), *every(scene, [0.4], stations=(1, 2))]:
         pipeline.add(measurement)
@@ -86,8 +86,8 @@ def test_a_pose_waits_for_the_last_station_and_no_longer(scene: Scene) -> None:
     assert pipeline.advance(START + SECOND // 2).valid.tolist() == [True] * 3
 
 
-def test_a_pose_waits_for_a_measurement_that_is_sent_again(scene: Scene) -> None:
-    """A gap in a station's numbers is not bridged by a straight line while what is missing may still come."""
+def test_pose_waits_for_a_retransmission(scene: Scene) -> None:
+    """A gap in the sequence numbers is not interpolated while the missing one may arrive."""
     pipeline = LinearEstimator(scene.parameters)
     for measurement in every(scene, [0.0, 0.4, 0.8], stations=(1, 2)):
         pipeline.add(replace(measurement, sequence=round((measurement.stamp_ns - START) / (0.4 * SECOND))))
@@ -100,8 +100,8 @@ def test_a_pose_waits_for_a_measurement_that_is_sent_again(scene: Scene) -> None
 
 
 @pytest.mark.parametrize(("gap_s", "valid"), [(1.0, True), (1.000000001, False)])
-def test_an_interval_longer_than_the_outage_limit_is_invalid(scene: Scene, gap_s: float, valid: bool) -> None:  # noqa: FBT001
-    """One second is the limit, and belongs to what is still valid."""
+def test_interval_beyond_the_outage_limit_is_invalid(scene: Scene, gap_s: float, valid: bool) -> None:  # noqa: FBT001
+    """The limit itself is valid."""
     measurements = [*every(scene, [0.0, 0.5, 1.0, 1.5], stations=(1, 2))]
     measurements += [scene.measure(3, 0.0), scene.measure(3, gap_s), scene.measure(3, 1.5)]
     poses = poses_of(scene, measurements, until_s=1.5)
@@ -111,8 +111,8 @@ def test_an_interval_longer_than_the_outage_limit_is_invalid(scene: Scene, gap_s
     assert poses.valid[poses.stamp_ns > START + 1.05 * SECOND].all()
 
 
-def test_a_silent_station_is_given_up_at_the_deadline(scene: Scene) -> None:
-    """An epoch is called an outage when its last chance has passed, at the instant announced."""
+def test_silent_station_is_an_outage_at_the_deadline(scene: Scene) -> None:
+    """At the announced instant."""
     pipeline = LinearEstimator(scene.parameters)
     for measurement in [*every(scene, [0.0]), *every(scene, [0.5, 1.0, 1.5, 2.0], stations=(1, 2))]:
         pipeline.add(measurement)
@@ -128,16 +128,16 @@ def test_a_silent_station_is_given_up_at_the_deadline(scene: Scene) -> None:
     assert record.position_m is None
 
 
-def test_a_station_never_seen_keeps_poses_invalid(scene: Scene) -> None:
-    """Two of three stations give no pose, and the third is named with no age."""
+def test_station_without_measurements_keeps_poses_invalid(scene: Scene) -> None:
+    """It is named, with no age."""
     poses = poses_of(scene, every(scene, [0.0, 0.4, 0.8], stations=(1, 2)), until_s=3.0)
     assert not poses.valid.any()
     missing = list(poses.records())[-1].stations[2]
     assert (missing.id, missing.age_s, missing.reason) == (3, None, "outage")
 
 
-def test_an_error_status_is_named_as_the_reason(scene: Scene) -> None:
-    """A measurement with an error status is not used; the gap that it leaves says so."""
+def test_error_status_is_the_reason(scene: Scene) -> None:
+    """The measurement is not used."""
     measurements = every(scene, [0.0, 0.4, 0.8, 1.2, 1.6], stations=(1, 2))
     measurements += [scene.measure(3, 0.0), scene.measure(3, 0.4, status=Status.TILT), scene.measure(3, 1.59)]
     poses = poses_of(scene, measurements, until_s=1.6)
@@ -146,21 +146,21 @@ def test_an_error_status_is_named_as_the_reason(scene: Scene) -> None:
 
 
 def test_low_accuracy_is_used(scene: Scene) -> None:
-    """An instrument in motion cannot promise its accuracy; that is no error."""
+    """It is normal in motion."""
     measurements = [replace(m, status=Status.LOW_ACCURACY) for m in every(scene, [0.0, 0.4])]
     assert poses_of(scene, measurements, until_s=0.4).valid[1:].all()
 
 
-def test_no_distance_is_no_position(scene: Scene) -> None:
-    """A status that claims success does not make a distance of zero one."""
+def test_zero_distance_is_not_usable(scene: Scene) -> None:
+    """Whatever the status."""
     measurements = [
         replace(m, slope_distance_m=0.0) if m.station == 2 else m for m in every(scene, [0.0, 0.4])
     ]
     assert not poses_of(scene, measurements, until_s=3.0).valid.any()
 
 
-def test_swapped_prisms_miss_the_layout(scene: Scene) -> None:
-    """Two stations on each other's prism leave a residual, and the pose is not valid."""
+def test_swapped_prisms_have_a_residual(scene: Scene) -> None:
+    """Swapped prisms have a residual."""
     swap = {1: 2, 2: 1, 3: 3}
     measurements = [
         replace(scene.measure(s, t, prism=swap[s]), prism=s) for t in (0.0, 0.4) for s in (1, 2, 3)
@@ -168,8 +168,8 @@ def test_swapped_prisms_miss_the_layout(scene: Scene) -> None:
     assert poses_of(scene, measurements, until_s=0.4).invalid_counts() == {"residual": 8, "outage": 1}
 
 
-def test_two_stations_on_one_prism_are_no_pose(scene: Scene) -> None:
-    """Measured triangles that collapse are called so rather than fitted."""
+def test_coincident_prisms_are_degenerate(scene: Scene) -> None:
+    """Coincident prisms are degenerate."""
     measurements = [replace(scene.measure(s, t, prism=1), prism=s) for t in (0.0, 0.4) for s in (1, 2, 3)]
     assert poses_of(scene, measurements, until_s=0.4).invalid_counts() == {
         "degenerate_geometry": 8,
@@ -177,8 +177,8 @@ def test_two_stations_on_one_prism_are_no_pose(scene: Scene) -> None:
     }
 
 
-def test_a_mirrored_layout_lies_upside_down(scene: Scene) -> None:
-    """A mirrored triangle fits without residual, but only upside down: the tilt gives it away."""
+def test_mirrored_layout_exceeds_the_tilt_limit(scene: Scene) -> None:
+    """It fits without a residual, but upside down."""
     mirrored = tuple(
         PrismPosition(prism=i + 1, position_m=(x, -y, z)) for i, (x, y, z) in enumerate(LAYOUT.tolist())
     )
@@ -188,15 +188,15 @@ def test_a_mirrored_layout_lies_upside_down(scene: Scene) -> None:
     assert poses.residual_m[1] < 1e-9
 
 
-def test_a_degenerate_layout_is_refused_at_the_start(scene: Scene) -> None:
-    """No pipeline is made for prisms that cannot give a pose."""
+def test_degenerate_layout_is_rejected(scene: Scene) -> None:
+    """Degenerate layout is rejected."""
     together = tuple(PrismPosition(prism=i, position_m=(0.0, 0.0, float(i // 3))) for i in (1, 2, 3))
     with pytest.raises(DegenerateGeometryError, match="prisms 1 and 2"):
         LinearEstimator(replace(scene.parameters, prisms=together))
 
 
-def test_latency_is_taken_off_the_stamp(scene: Scene) -> None:
-    """A station whose stamps are late by a known time gives the same poses as one whose stamps are not."""
+def test_latency_is_subtracted_from_the_stamp(scene: Scene) -> None:
+    """Latency is subtracted from the stamp."""
     moving = scene.moving(driving)
     exact = poses_of(moving, every(moving, [0.0, 0.4]), until_s=0.5)
     stations = tuple(replace(s, latency_ns=70_000_000 * s.station) for s in scene.parameters.stations)
@@ -206,22 +206,22 @@ def test_latency_is_taken_off_the_stamp(scene: Scene) -> None:
     )
 
 
-def test_a_repeated_measurement_changes_nothing(scene: Scene) -> None:
-    """A station with nothing new may send its last measurement again."""
+def test_repeated_measurement_changes_nothing(scene: Scene) -> None:
+    """Repeated measurement changes nothing."""
     measurements = every(scene, [0.0, 0.4])
     repeated = [m for m in measurements for _ in range(3)]
     once, again = (poses_of(scene, m, until_s=0.4) for m in (measurements, repeated))
     np.testing.assert_array_equal(once.position_m, again.position_m)
 
 
-def test_foreign_stations_and_prisms_are_passed_over(scene: Scene) -> None:
-    """What the parameters do not name cannot enter a pose, nor stop one."""
+def test_unknown_stations_and_prisms_are_ignored(scene: Scene) -> None:
+    """Unknown stations and prisms are ignored."""
     foreign = [replace(scene.measure(1, 0.2), station=9), replace(scene.measure(1, 0.2), prism=9)]
     assert poses_of(scene, [*every(scene, [0.0, 0.4]), *foreign], until_s=0.4).valid[1:].all()
 
 
-def test_covariance_grows_where_the_motion_is_not_seen(scene: Scene) -> None:
-    """In the middle between two measurements the unknown acceleration counts most; here it is all of the sigma."""
+def test_covariance_grows_between_measurements(scene: Scene) -> None:
+    """The unknown acceleration counts most in the middle; here it is all of the sigma."""
     blind = scene.with_limits(acceleration_sigma_mps2=0.5, angular_acceleration_sigma_radps2=0.0)
     poses = poses_of(blind, every(blind, [0.0, 0.8]), until_s=0.8)
     sigma_m = np.sqrt(poses.covariance[1:, 0, 0])
@@ -230,7 +230,7 @@ def test_covariance_grows_where_the_motion_is_not_seen(scene: Scene) -> None:
     assert sigma_m[7] == pytest.approx(np.hypot(sigma_m[-1] / np.sqrt(2), unseen_m), rel=0.01)
 
 
-def test_covariance_is_what_an_accelerating_robot_shows(scene: Scene) -> None:
+def test_covariance_is_consistent_for_an_accelerating_robot(scene: Scene) -> None:
     """Squared normalised errors of poses average to the number of their degrees of freedom.
 
     The robot accelerates, and turns faster and faster, as a whole and at random; stations measure at different times.
@@ -281,8 +281,8 @@ def noisy(measurement: PolarMeasurement, rng: np.random.Generator) -> PolarMeasu
     )
 
 
-def test_an_uncertain_stamp_counts_along_the_velocity(scene: Scene) -> None:
-    """Ten milliseconds of doubt at 0.3 m/s are 3 mm in the direction of travel."""
+def test_uncertain_stamp_counts_along_the_velocity(scene: Scene) -> None:
+    """10 ms at 0.3 m/s are 3 mm."""
     moving = scene.moving(driving).with_limits(
         acceleration_sigma_mps2=0.0, angular_acceleration_sigma_radps2=0.0
     )
@@ -293,16 +293,16 @@ def test_an_uncertain_stamp_counts_along_the_velocity(scene: Scene) -> None:
     assert added[2, 2] < 1e-9
 
 
-def test_the_tilt_limit_is_a_parameter(scene: Scene) -> None:
-    """What counts as upside down is for the user to say."""
+def test_tilt_limit_is_a_parameter(scene: Scene) -> None:
+    """Tilt limit is a parameter."""
     leaning = scene.moving(lambda _: (exp_so3(np.array([0.5, 0.0, 0.0])), np.array([30.0, 20.0, -1.0])))
     strict = leaning.with_limits(tilt_limit_rad=0.4)
     assert poses_of(leaning, every(leaning, [0.0, 0.4]), 0.4).valid[1:].all()
     assert poses_of(strict, every(strict, [0.0, 0.4]), 0.4).invalid_counts() == {"tilt": 8, "outage": 1}
 
 
-def test_a_stamp_from_the_future_stops_nothing(scene: Scene) -> None:
-    """One wrong stamp, a day ahead of its arrival, is passed over; the poses go on."""
+def test_stamp_from_the_future_is_ignored(scene: Scene) -> None:
+    """Poses continue."""
     wrong = scene.measure(2, 86_400.0, delay_s=-86_399.8)
     assert (
         poses_of(scene, [wrong, *every(scene, [0.0, 0.4])], until_s=0.5).valid.tolist()
@@ -310,8 +310,8 @@ def test_a_stamp_from_the_future_stops_nothing(scene: Scene) -> None:
     )
 
 
-def test_a_live_run_begins_when_it_begins(scene: Scene) -> None:
-    """A station that begins in another year does not make the live stream begin there."""
+def test_live_poses_start_at_the_start(scene: Scene) -> None:
+    """Not at the time of a station's wrong clock."""
     pipeline = LinearEstimator(scene.parameters)
     pipeline.begin_at(START)
     for measurement in [scene.measure(2, -40_000_000.0, delay_s=40_000_000.0), *every(scene, [0.0, 0.4])]:
@@ -321,8 +321,8 @@ def test_a_live_run_begins_when_it_begins(scene: Scene) -> None:
     assert poses.valid[-8:].all()
 
 
-def test_at_one_instant_the_lower_station_counts(scene: Scene) -> None:
-    """Two stations on one prism at the same nanosecond: which one counts does not depend on the order."""
+def test_lower_station_counts_at_equal_instants(scene: Scene) -> None:
+    """Whatever the order of arrival."""
     stations = (*scene.parameters.stations, replace(scene.parameters.stations[1], station=4, prism=1))
     two = replace(scene, parameters=replace(scene.parameters, stations=stations))
     other = replace(two.measure(4, 0.2), slope_distance_m=35.0)

@@ -1,4 +1,4 @@
-"""The feed: the order of records on stream and recording."""
+"""Live estimation: the order of records on stream and recording."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from tsgt.model import PolarMeasurement
 from tsgt.recording import PoseRecord
 
 
-def test_a_measurement_is_followed_by_the_poses_that_it_completes() -> None:
-    """A reader has every measurement that a pose is made of before the pose."""
+def test_measurement_precedes_the_poses_that_it_completes() -> None:
+    """Measurement precedes the poses that it completes."""
     scene = stationary_scene()
     feed = LiveEstimator(scene.parameters)
     records = [
@@ -25,8 +25,8 @@ def test_a_measurement_is_followed_by_the_poses_that_it_completes() -> None:
     assert poses[-2:] == [measured[-1] + 1, measured[-1] + 2]
 
 
-def test_what_was_due_before_comes_before() -> None:
-    """A pose whose deadline passed before a measurement arrived stands before that measurement."""
+def test_overdue_pose_precedes_the_measurement() -> None:
+    """Overdue pose precedes the measurement."""
     scene = stationary_scene()
     feed = LiveEstimator(scene.parameters)
     feed.measurement(scene.measure(1, 0.0))
@@ -35,8 +35,8 @@ def test_what_was_due_before_comes_before() -> None:
     assert isinstance(late[-1], PolarMeasurement)
 
 
-def test_the_record_says_when_the_pipeline_had_it() -> None:
-    """A measurement handed over after a later instant is recorded with that instant, for the replay's sake."""
+def test_received_time_is_not_before_an_earlier_call() -> None:
+    """A replay passes on the measurement at the same point."""
     scene = stationary_scene()
     feed = LiveEstimator(scene.parameters)
     feed.advance(START + 5_000_000_000)
@@ -46,8 +46,8 @@ def test_the_record_says_when_the_pipeline_had_it() -> None:
     assert records[0].stamp_ns == START
 
 
-def test_the_deadline_is_that_of_the_pipeline() -> None:
-    """Before the first measurement nothing waits; after it something does."""
+def test_deadline_is_the_estimators() -> None:
+    """Deadline is the estimators."""
     scene = stationary_scene()
     feed = LiveEstimator(scene.parameters)
     assert feed.next_deadline_ns() is None

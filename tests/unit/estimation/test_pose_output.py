@@ -1,19 +1,19 @@
-"""Which poses of a trajectory may be used."""
+"""Validity of the poses of a trajectory."""
 
 from __future__ import annotations
 
 import numpy as np
 from harness.scene import SECOND, START, at_rest, stationary_scene
 
-from tsgt.estimation import ContinuousPoseOutput, Reason, MeasurementHistory
+from tsgt.estimation import ContinuousPoseOutput, MeasurementHistory, Reason
 from tsgt.geometry.trajectory import States
 
 NONE = np.empty(0, np.int64)
 SEEN = MeasurementHistory(NONE, NONE, NONE.astype(np.intp), np.empty(0), [NONE] * 3)
 
 
-def test_a_covariance_that_rounding_has_spoilt_is_not_valid() -> None:
-    """A variance below zero says nothing of the position, however well the rotation is known."""
+def test_negative_variance_is_not_valid() -> None:
+    """However well the rotation is known."""
     parameters = stationary_scene().with_limits(estimator="continuous").parameters
     rotation, position = at_rest(0.0)
     still = np.zeros((2, 3))

@@ -1,4 +1,4 @@
-"""The master's daemon among simulated stations, driver and air and all, on virtual time."""
+"""The master's daemon with simulated stations, radio driver and channel, on virtual time."""
 
 from __future__ import annotations
 
@@ -54,11 +54,8 @@ def stamp_errors_ms(measurements: list[PolarMeasurement]) -> list[float]:
 @pytest.mark.parametrize(
     ("authors", "rate_hz", "error_ms"), [(False, 1.6, 0.5), (True, 1.5, 4.0)], ids=["ours", "authors'"]
 )
-async def test_poses_come_out(tmp_path: Path, *, authors: bool, rate_hz: float, error_ms: float) -> None:
-    """Stations with wrong clocks are told to track, synchronised and polled; stamps and poses are right.
-
-    The authors' node takes up to 4 ms from the interrupt to its stamp, of measurements and of packets.
-    """
+async def test_poses_are_correct(tmp_path: Path, *, authors: bool, rate_hz: float, error_ms: float) -> None:
+    """Stations with wrong clocks are commanded to track, synchronised and polled; stamps and poses are correct."""
     async with field_of(tmp_path, DRIVING, authors=authors) as field, running(field.master()):
         await asyncio.sleep(40)
     poses = [pose for pose in field.of(PoseRecord) if pose.valid]
@@ -82,8 +79,8 @@ async def test_poses_come_out(tmp_path: Path, *, authors: bool, rate_hz: float, 
     assert events(field) == []
 
 
-async def test_repeats_are_heard_but_not_sent_on(tmp_path: Path) -> None:
-    """Polls come more often than measurements where one station answers: each measurement is there once."""
+async def test_repeated_measurement_is_published_once(tmp_path: Path) -> None:
+    """Polls are more frequent than measurements when only one station responds."""
     async with field_of(tmp_path) as field:
         await field.stations[2].kill()
         await field.stations[3].kill()
@@ -95,8 +92,8 @@ async def test_repeats_are_heard_but_not_sent_on(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("authors", [False, True], ids=["ours", "authors'"])
-async def test_error_statuses_never_enter_a_pose_and_are_told(tmp_path: Path, *, authors: bool) -> None:
-    """Not levelled, wrong distance, too close, no prism: no pose, but status, measurement and event."""
+async def test_error_status_invalidates_the_pose(tmp_path: Path, *, authors: bool) -> None:
+    """Tilt, wrong distance, too near, no prism: no valid pose, but status, measurement and event."""
     async with field_of(tmp_path, authors=authors) as field, running(field.master()):
         await asyncio.sleep(20)
         for status in (Status.TILT, Status.WRONG_DISTANCE, Status.ANGLE_ONLY, Status.NO_TARGET):
@@ -118,8 +115,8 @@ async def test_error_statuses_never_enter_a_pose_and_are_told(tmp_path: Path, *,
     )
 
 
-async def test_a_station_dies_and_comes_back_with_another_clock(tmp_path: Path) -> None:
-    """The others go on as ever; it is found within seconds, its new clock is noticed, nothing is wrong."""
+async def test_restarted_station_with_another_clock_recovers(tmp_path: Path) -> None:
+    """The other stations are not affected; the station recovers within seconds and its new clock is detected."""
     async with field_of(tmp_path, DRIVING) as field, running(field.master()):
         await asyncio.sleep(40)
         await field.stations[2].kill()
@@ -136,8 +133,8 @@ async def test_a_station_dies_and_comes_back_with_another_clock(tmp_path: Path) 
     assert field.of(PoseRecord)[-1].valid
 
 
-async def test_a_step_of_the_station_clock_costs_no_measurement(tmp_path: Path) -> None:
-    """What comes before the new clock is known waits for it: every answer is on the stream in the end."""
+async def test_clock_step_of_a_station_loses_no_measurement(tmp_path: Path) -> None:
+    """Measurements are held until the next synchronisation."""
     async with field_of(tmp_path, authors=True) as field, running(field.master()):
         await asyncio.sleep(30)
         before = len(field.of(PolarMeasurement))
@@ -156,8 +153,8 @@ async def test_a_step_of_the_station_clock_costs_no_measurement(tmp_path: Path) 
     assert found.stamp_ns - stepped_ns < 2000 * MS
 
 
-async def test_a_station_left_in_direct_mode_tracks_again(tmp_path: Path) -> None:
-    """The master begins with the order to track, so that no poll is taken for an order to measure."""
+async def test_station_in_direct_mode_is_commanded_to_track(tmp_path: Path) -> None:
+    """The first command is to track, so that no poll is taken for a command to measure a target."""
     async with field_of(tmp_path) as field:
         field.stations[1].instrument.direct_mode = True
         async with running(field.master()):
@@ -166,8 +163,8 @@ async def test_a_station_left_in_direct_mode_tracks_again(tmp_path: Path) -> Non
     assert field.of(StatusRecord)[-1].stations[0].measurements > 10
 
 
-async def test_a_station_that_refuses_to_track_is_told_again(tmp_path: Path) -> None:
-    """An instrument that finds no prism is announced, not polled, and used as soon as it tracks."""
+async def test_refused_track_command_is_repeated(tmp_path: Path) -> None:
+    """A station that does not track has an event, is not polled, and is used as soon as it tracks."""
     async with field_of(tmp_path) as field:
         field.stations[1].instrument.refuses = True
         async with running(field.master()):
@@ -182,10 +179,8 @@ async def test_a_station_that_refuses_to_track_is_told_again(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("protocol", [{}, {"clock_filter": "paper"}], ids=["regression", "paper"])
-async def test_the_recording_is_the_stream_and_replays_bit_for_bit(
-    tmp_path: Path, protocol: dict[str, Any]
-) -> None:
-    """Header and parameters come first; then stand the lines of the stream, and a replay makes them again."""
+async def test_recording_equals_stream_and_replay(tmp_path: Path, protocol: dict[str, Any]) -> None:
+    """Header and parameters, then the lines of the stream; a replay reproduces them bit for bit."""
     fence = GeofenceConfig(
         name="yard", polygon_m=((29.5, 0), (40, 0), (40, 40), (29.5, 40)), hysteresis_m=0.1
     )
@@ -207,8 +202,8 @@ async def test_the_recording_is_the_stream_and_replays_bit_for_bit(
 
 
 @pytest.mark.parametrize("at_ms", [0, 1, 30, 200, 1000, 1777, 4000, 4100, 5321, 9000])
-async def test_it_can_be_stopped_at_any_moment_and_started_again(tmp_path: Path, at_ms: int) -> None:
-    """It ends within a second with its last lines on disk; the next run has a recording of its own, and poses."""
+async def test_master_stops_within_a_second_and_restarts(tmp_path: Path, at_ms: int) -> None:
+    """Its last lines are on disk; the next run has a new recording, and poses."""
     async with field_of(tmp_path) as field:
         task = asyncio.create_task(field.master())
         await asyncio.sleep(at_ms / 1e3)
@@ -226,8 +221,8 @@ async def test_it_can_be_stopped_at_any_moment_and_started_again(tmp_path: Path,
         assert len(list((tmp_path / "recordings").iterdir())) == 2
 
 
-async def test_a_radio_that_fails_is_opened_again(tmp_path: Path) -> None:
-    """Readers are told once, the status goes on, and poses come back by themselves."""
+async def test_failed_radio_is_reopened(tmp_path: Path) -> None:
+    """One event reports the failure, status records continue, and poses recover."""
     async with field_of(tmp_path) as field:
         works = True
 
@@ -258,7 +253,7 @@ async def test_a_radio_that_fails_is_opened_again(tmp_path: Path) -> None:
     assert len(field.of(StatusRecord)) >= 44
 
 
-async def test_a_step_of_the_masters_unix_clock_is_told_and_bends_nothing(tmp_path: Path) -> None:
+async def test_unix_clock_step_of_the_master_is_reported(tmp_path: Path) -> None:
     """Stamps stay on the timeline of the start."""
     async with field_of(tmp_path) as field:
         clock = _Steppable()
@@ -285,8 +280,8 @@ class _Steppable:
         return TRUE.realtime_ns() + self.ahead_ns
 
 
-async def test_garbage_and_foreign_packets_change_nothing(tmp_path: Path) -> None:
-    """A sender that fills the pauses with packets of other kinds costs measurements, but nothing is wrong."""
+async def test_interference_does_not_corrupt_measurements(tmp_path: Path) -> None:
+    """Unknown packets in the pauses cost measurements, but corrupt none."""
     async with field_of(tmp_path) as field:
 
         async def jam() -> None:
@@ -303,8 +298,8 @@ async def test_garbage_and_foreign_packets_change_nothing(tmp_path: Path) -> Non
     assert {m.station for m in field.of(PolarMeasurement)} == set(STATIONS)
 
 
-def test_a_fence_runs_its_command(tmp_path: Path) -> None:
-    """At a crossing the command runs with the event in its environment; one that fails is only logged."""
+def test_geofence_command_runs_at_a_crossing(tmp_path: Path) -> None:
+    """The command has the event in its environment; a failure is only logged."""
 
     async def commands() -> None:
         script = f'echo "$TSGT_EVENT $TSGT_FENCE" > {tmp_path}/said'
@@ -316,8 +311,8 @@ def test_a_fence_runs_its_command(tmp_path: Path) -> None:
     assert (tmp_path / "said").read_text() == "geofence_exited yard\n"
 
 
-def test_no_name_of_a_fence_is_a_command(tmp_path: Path) -> None:
-    """There is no shell between the master and the program, and no name among its arguments."""
+def test_geofence_name_is_not_executed(tmp_path: Path) -> None:
+    """The command runs without a shell, and the name is not an argument."""
     name = f'";touch {tmp_path}/owned;$(touch {tmp_path}/owned)`touch {tmp_path}/owned`'
 
     async def commands() -> None:
@@ -330,10 +325,10 @@ def test_no_name_of_a_fence_is_a_command(tmp_path: Path) -> None:
     assert {each.name for each in tmp_path.iterdir()} == {"said", "$TSGT_FENCE"}
 
 
-async def test_a_master_whose_turns_stand_still_is_not_kept_alive(
+async def test_stalled_link_stops_watchdog_notifications(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The watchdog hears of it while there are turns, and no more after a minute without the end of one."""
+    """Systemd is notified while transactions end, and no more after a minute without one."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(str(tmp_path / "notify"))
         systemd.setblocking(False)

@@ -1,4 +1,4 @@
-"""The geo-fence: crossing, uncertainty, margin, hysteresis, loss of the pose."""
+"""Geofences: crossing, uncertainty, margin, hysteresis, loss of the pose."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ def run(watched: Geofence, poses: list[PoseRecord]) -> list[str]:
     return words
 
 
-def test_the_first_pose_beyond_the_boundary_gives_the_event() -> None:
-    """It names the fence, the place and how far; its stamp is when it was noticed."""
+def test_first_pose_beyond_the_boundary_is_an_exit() -> None:
+    """The event states geofence, position and distance; its stamp is that of the detection."""
     watched = fence()
     assert watched.pose(at(9.9, 5.0), START) == []
     (event,) = watched.pose(at(10.25, 5.0), START + 7)
@@ -57,25 +57,25 @@ def test_the_first_pose_beyond_the_boundary_gives_the_event() -> None:
     assert event.message == "geofence yard exited: the robot is 0.25 m beyond its limit at x 10.25, y 5.00 m"
 
 
-def test_a_robot_that_starts_beyond_is_told_of_at_once() -> None:
-    """The first valid pose arms the fence; a start on the right side is no event."""
+def test_start_beyond_the_boundary_is_an_exit() -> None:
+    """The first valid pose arms the geofence; a start on the allowed side is no event."""
     assert run(fence(), [at(11, 5)]) == ["geofence_exited"]
     assert run(fence(), [at(5, 5)]) == [""]
 
 
-def test_it_is_back_only_beyond_the_hysteresis() -> None:
-    """Driving along the boundary gives one event, not a hundred."""
+def test_entry_requires_the_hysteresis() -> None:
+    """Driving along the boundary gives one event."""
     poses = [at(x, 5) for x in (9.0, 10.1, 9.9, 10.1, 9.6, 9.4, 9.9)]
     assert run(fence(), poses) == ["", "geofence_exited", "", "", "", "geofence_entered", ""]
 
 
-def test_allowed_side_outside_turns_it_round() -> None:
-    """An area that is forbidden is left by driving into it."""
+def test_allowed_side_outside_inverts_the_geofence() -> None:
+    """Driving into a forbidden area is an exit."""
     poses = [at(x, 5) for x in (12.0, 10.1, 9.9, 10.4, 10.6)]
     assert run(fence(allowed_side="outside"), poses) == ["", "", "geofence_exited", "", "geofence_entered"]
 
 
-def test_the_margin_keeps_the_origin_away() -> None:
+def test_margin_shifts_the_boundary() -> None:
     """A robot whose front is a metre ahead of its origin has to turn a metre earlier."""
     assert run(fence(margin_m=1.0), [at(8.9, 5), at(9.1, 5)]) == ["", "geofence_exited"]
     assert run(fence(margin_m=1.0, allowed_side="outside"), [at(11.1, 5), at(10.9, 5)]) == [
@@ -84,26 +84,26 @@ def test_the_margin_keeps_the_origin_away() -> None:
     ]
 
 
-def test_the_uncertainty_counts_across_the_edge_only() -> None:
-    """0.2 m of sigma along an edge is harmless beside it, across it three of them are not."""
+def test_uncertainty_counts_across_the_edge_only() -> None:
+    """0.2 m of sigma along an edge is harmless; across it three sigmas are an exit."""
     along, across = at(9.5, 5, sigma_y_m=0.2), at(9.5, 5, sigma_x_m=0.2)
     assert run(fence(sigmas=3.0), [along, across]) == ["", "geofence_exited"]
 
 
-def test_an_edge_further_off_counts_if_the_position_is_poor_that_way() -> None:
-    """The east edge is nearer, but it is the north edge that the robot may have crossed."""
+def test_distant_edge_counts_in_an_uncertain_direction() -> None:
+    """The east edge is nearer, but the robot may have crossed the north edge."""
     assert run(fence(sigmas=3.0), [at(9.5, 9.0, sigma_y_m=0.4)]) == ["geofence_exited"]
 
 
-def test_an_oblique_edge_sees_how_x_and_y_vary_together() -> None:
-    """0.7 m before an edge at 45 degrees: what errs towards it may have crossed it, what errs along it has not."""
+def test_oblique_edge_uses_the_covariance_of_x_and_y() -> None:
+    """0.7 m from an edge at 45 degrees: an error towards it may be a crossing, an error along it not."""
     diamond = ((10.0, 0.0), (0.0, 10.0), (-10.0, 0.0), (0.0, -10.0))
     poses = [at(4.5, 4.5, sigma_x_m=0.3, sigma_y_m=0.3, rho=rho) for rho in (-0.9, 0.9)]
     assert run(fence(polygon_m=diamond, sigmas=2.0), poses) == ["", "geofence_exited"]
 
 
-def test_on_the_boundary_the_uncertainty_counts_as_well() -> None:
-    """Wherever rounding puts a point on the boundary; without uncertainty it is still in."""
+def test_uncertainty_counts_on_the_boundary() -> None:
+    """Whichever side rounding puts the point on; without uncertainty it is still inside."""
     for point in ((10.0, 5.0), (0.0, 5.0), (5.0, 0.0), (5.0, 10.0), (0.0, 0.0), (10.0, 10.0)):
         assert run(fence(), [at(*point)]) == [""]
         assert run(fence(sigmas=1.0), [at(*point, sigma_x_m=0.1, sigma_y_m=0.1)]) == ["geofence_exited"]
@@ -113,10 +113,10 @@ def test_on_the_boundary_the_uncertainty_counts_as_well() -> None:
     x=st.floats(-2, 11), y=st.floats(-2, 11), sx=st.floats(0, 1), sy=st.floats(0, 1), rho=st.floats(-0.99, 0.99),
     allowed_side=st.sampled_from(["inside", "outside"]), margin=st.floats(0, 1),
 )  # fmt: skip
-def test_it_agrees_with_brute_force(
+def test_clearance_agrees_with_brute_force(
     x: float, y: float, sx: float, sy: float, rho: float, allowed_side: str, margin: float
 ) -> None:
-    """Oracle: every point of the boundary in steps of 5 mm; left if any of them is too near in sigmas, or beyond."""
+    """Oracle: points of the boundary in steps of 5 mm."""
     corners = np.array(BAY)
     steps = np.linspace(0, 1, 1801)[:, None]
     offsets = np.concatenate(
@@ -146,7 +146,7 @@ def test_it_agrees_with_brute_force(
 
 @given(st.lists(st.tuples(st.floats(-2, 12), st.floats(-2, 12), st.integers(0, 3 * SECOND)), max_size=30))
 def test_events_alternate(steps: list[tuple[float, float, int]]) -> None:
-    """Whatever the robot does and however long poses stay away: left, entered, left, and so on."""
+    """Exits and entries alternate, whatever the robot does and however long poses are missing."""
     watched, now_ns, events = fence(sigmas=1.0), START, []
     for x, y, wait_ns in steps:
         now_ns += wait_ns
@@ -155,8 +155,8 @@ def test_events_alternate(steps: list[tuple[float, float, int]]) -> None:
     assert words == (["geofence_exited", "geofence_entered"] * len(words))[: len(words)]
 
 
-def test_no_valid_pose_for_a_while_counts_as_leaving() -> None:
-    """At the deadline, once; invalid poses do not put it off. The next valid pose inside brings it back."""
+def test_missing_pose_is_an_exit() -> None:
+    """One event at the deadline; invalid poses do not postpone it. The next valid pose inside is an entry."""
     watched = fence(lost_after_s=2.0)
     assert watched.next_deadline_ns() is None
     assert watched.tick(START) == []
@@ -173,8 +173,8 @@ def test_no_valid_pose_for_a_while_counts_as_leaving() -> None:
     assert [e.event for e in watched.pose(at(9.9, 5), START + 10 * SECOND)] == ["geofence_entered"]
 
 
-def test_a_loss_is_noticed_with_the_next_pose_where_no_tick_came() -> None:
-    """An invalid pose or a valid one after the deadline does what the tick would have done."""
+def test_missing_pose_is_detected_without_tick() -> None:
+    """An invalid or valid pose after the deadline has the effect of the tick."""
     watched = fence()
     watched.pose(at(5, 5), START)
     assert [e.event for e in watched.pose(NO_POSE, START + 2 * SECOND)] == ["geofence_exited"]
@@ -183,8 +183,8 @@ def test_a_loss_is_noticed_with_the_next_pose_where_no_tick_came() -> None:
     assert [e.event for e in late] == ["geofence_exited", "geofence_entered"]
 
 
-def test_a_loss_beyond_the_boundary_is_no_second_event() -> None:
-    """It has left already; back it is when the hysteresis says so."""
+def test_missing_pose_beyond_the_boundary_is_no_second_exit() -> None:
+    """The entry needs the hysteresis."""
     watched = fence()
     watched.pose(at(11, 5), START)
     assert watched.tick(START + 5 * SECOND) == []
@@ -192,15 +192,15 @@ def test_a_loss_beyond_the_boundary_is_no_second_event() -> None:
     assert [e.event for e in watched.pose(at(9.0, 5), START + 7 * SECOND)] == ["geofence_entered"]
 
 
-def test_without_a_valid_pose_it_is_not_armed() -> None:
-    """A master that starts before its stations does not cry at once."""
+def test_geofence_without_a_valid_pose_is_not_armed() -> None:
+    """A master that starts before its stations raises no alarm."""
     watched = fence()
     assert watched.pose(NO_POSE, START) == []
     assert watched.tick(START + 100 * SECOND) == []
 
 
-def test_a_polygon_that_bounds_no_area_is_refused_by_the_configuration() -> None:
-    """With the words of the check."""
+def test_invalid_polygon_is_rejected_by_the_configuration() -> None:
+    """With the message of the check."""
     with pytest.raises(ValueError, match=r"edges 1-2 .* and 3-4 .* cross"):
         fence(polygon_m=((0.0, 0.0), (10.0, 10.0), (10.0, 0.0), (0.0, 10.0)))
     with pytest.raises(ValueError, match="less than or equal to 1000000"):

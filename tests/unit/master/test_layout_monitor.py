@@ -1,4 +1,4 @@
-"""The live alarm: quiet on good frames, real and simulated, and loud when a tripod has moved."""
+"""The layout monitor: no alarm on good frames, real and simulated; an alarm when a tripod has moved."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ def events(poses: Iterable[PoseRecord], **settings: float) -> list[EventRecord]:
     return [event for each in poses for event in watch.pose(each, each.stamp_ns + 7)]
 
 
-def test_the_alarm_names_station_and_figures() -> None:
-    """One event when three of four poses pass the limit, with the likeliest station and what cannot be seen."""
+def test_alarm_states_station_and_residual() -> None:
+    """One event when three of four poses exceed the limit, with the most likely station and what is not observable."""
     (event,) = events([pose(n, 4.0) for n in range(200)] + [pose(200 + n, 9.0) for n in range(300)])
     assert (event.event, event.station) == ("layout_residual_high", 2)
     assert event.message == (
@@ -65,7 +65,7 @@ def test_the_alarm_names_station_and_figures() -> None:
     assert event.stamp_ns == START + 349 * PERIOD_NS + 7
 
 
-def test_it_ends_well_below_the_limit_only() -> None:
+def test_alarm_ends_below_the_hysteresis() -> None:
     """Between 0.8 and 1 times the limit nothing changes; below there is one event."""
     steps = [
         (9.0, "layout_residual_high"),
@@ -78,27 +78,27 @@ def test_it_ends_well_below_the_limit_only() -> None:
     assert [e.event for e in events(poses)] == [word for _, word in steps if word]
 
 
-def test_a_few_good_poses_do_not_hide_it_and_half_of_all_bad_ones_are_none() -> None:
-    """Three of four have to miss: interpolation spoils some poses of a moving robot, a frame that is off all."""
+def test_alarm_needs_three_of_four_poses() -> None:
+    """Interpolation distorts some poses of a moving robot, a wrong frame all of them."""
     assert events([pose(n, 1.0 if n % 5 == 0 else 9.0) for n in range(300)])
     assert not events([pose(n, 1.0 if n % 3 == 0 else 9.0) for n in range(300)])
 
 
-def test_a_fast_robot_is_allowed_more() -> None:
-    """At 1 m/s 6 mm more by default."""
+def test_limit_grows_with_speed() -> None:
+    """By default 6 mm per m/s."""
     assert not events([pose(n, 11.9, speed_mps=1.0) for n in range(300)])
     assert events([pose(n, 12.1, speed_mps=1.0) for n in range(300)])
 
 
-def test_it_needs_a_third_of_the_window() -> None:
-    """67 of 200 poses; 66 are too few, and those of long ago do not count."""
+def test_alarm_needs_a_third_of_the_window() -> None:
+    """67 of 200 poses; 66 are too few, and older ones do not count."""
     assert not events([pose(n, 9.0) for n in range(66)])
     assert events([pose(n, 9.0) for n in range(67)])
     assert not events([pose(n + (200 if n >= 40 else 0), 9.0) for n in range(100)])
 
 
-def test_poses_with_too_large_a_residual_count_and_others_without_validity_do_not() -> None:
-    """A frame that is off by so much that no pose is valid any more is the very case."""
+def test_invalid_poses_count_for_their_residual_only() -> None:
+    """A frame so wrong that no pose is valid must raise the alarm."""
     assert events([pose(n, 80.0, reason="residual") for n in range(100)])
     assert not events([pose(n, 80.0, reason="tilt") for n in range(100)])
     assert not events([NO_POSE] * 100)
@@ -150,7 +150,7 @@ def test_no_false_alarm_on_the_reference_scenario(rate_hz: float) -> None:
 
 @pytest.mark.parametrize("segment", [".", "segment2"])
 def test_no_false_alarm_on_the_published_drives(field_data: Path, segment: str) -> None:
-    """Both drives of 14 March 2022, with the prism layout that the authors published."""
+    """Both drives of 14 March 2022, with the prism layout of the authors."""
     folder = field_data / "20220314"
     tracks = read_tracks([folder / segment / f"trimble{k}.csv" for k in (1, 2, 3)])
     stations = tuple(StationParameters(station=k, prism=k) for k in (1, 2, 3))
@@ -161,8 +161,8 @@ def test_no_false_alarm_on_the_published_drives(field_data: Path, segment: str) 
 
 
 @pytest.mark.parametrize(("station", "bearing_deg"), [(1, 0), (1, 120), (2, 90), (2, 0), (3, 200)])
-def test_a_tripod_moved_by_20_mm_is_noticed(station: int, bearing_deg: int) -> None:
-    """Within four minutes, on the reference scenario, whichever station and direction."""
+def test_tripod_moved_by_20_mm_raises_the_alarm(station: int, bearing_deg: int) -> None:
+    """Within four minutes, in the reference scenario, for every station and direction."""
     parameters, measurements = driven(1, rate_hz=1.5, duration_s=240.0)
     bearing = np.radians(bearing_deg)
     off = displaced(parameters, station, (0.02 * float(np.cos(bearing)), 0.02 * float(np.sin(bearing))))

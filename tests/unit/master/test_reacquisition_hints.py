@@ -66,8 +66,8 @@ def beside_rad(scene: Scene, towards: Direction, time_s: float, *, station: int 
     return math.acos(min(float(at @ told), 1.0))
 
 
-def test_a_station_without_its_prism_is_told_where_it_is() -> None:
-    """After two seconds, to within what the layout leaves open: 0.8 m in 38 m, and half a metre more."""
+def test_lost_prism_gives_a_hint() -> None:
+    """After two seconds, with the spread of the layout: 0.8 m in 38 m, plus half a metre."""
     scene = stationary_scene()
     hints = ReacquisitionHints(scene.parameters)
     watch(hints, scene)
@@ -78,8 +78,8 @@ def test_a_station_without_its_prism_is_told_where_it_is() -> None:
     assert hints.direction(1, ns(12.5)) is None
 
 
-def test_angles_alone_are_no_prism() -> None:
-    """An instrument that has lost it may still tell its angles."""
+def test_angle_only_status_is_a_lost_prism() -> None:
+    """An instrument that has lost the prism may still report angles."""
     scene = stationary_scene()
     hints = ReacquisitionHints(scene.parameters)
     watch(hints, scene, sees=lambda s, t: Status.ANGLE_ONLY if s == 2 and t > LOST_S else Status.OK)
@@ -87,8 +87,8 @@ def test_angles_alone_are_no_prism() -> None:
 
 
 @pytest.mark.parametrize("status", [Status.TILT, Status.ERROR, Status.WRONG_DISTANCE, Status.LOW_ACCURACY])
-def test_who_has_another_trouble_is_left_alone(status: Status) -> None:
-    """Looking for a prism does not level an instrument."""
+def test_other_errors_give_no_hint(status: Status) -> None:
+    """A search does not level an instrument."""
     scene = stationary_scene()
     hints = ReacquisitionHints(scene.parameters)
     watch(hints, scene, sees=lambda s, t: status if s == 2 and t > LOST_S else Status.OK)
@@ -122,10 +122,10 @@ def motion(
     tilt_rad=st.floats(-0.4, 0.4),
     lost=st.sampled_from([(2,), (2, 3), (1, 2)]),
 )
-def test_the_prism_is_within_the_spread(
+def test_prism_is_within_the_spread(
     speed_mps: float, yaw_rate_radps: float, heading_rad: float, tilt_rad: float, lost: tuple[int, ...]
 ) -> None:
-    """However the robot drives and leans, by one other prism as by two, for a second and a half from now on."""
+    """However the robot moves, with one other prism and with two, for the next second and a half."""
     scene = stationary_scene().moving(motion(speed_mps, yaw_rate_radps, heading_rad, tilt_rad))
     hints = ReacquisitionHints(scene.parameters)
     watch(hints, scene, sees=lambda s, t: Status.NO_TARGET if s in lost and t > LOST_S else Status.OK)
@@ -136,8 +136,8 @@ def test_the_prism_is_within_the_spread(
     assert towards.spread_rad < math.asin((1.0 + 0.5 + 1.1 * speed_mps + 0.5) / 40.0)
 
 
-def test_the_prism_is_found_in_the_reference_scenario() -> None:
-    """Which starts, stops and turns at any time: always there when the order is given, mostly when the telescope is."""
+def test_prism_is_within_the_spread_in_the_reference_scenario() -> None:
+    """The robot starts, stops and turns: always when the command is given, mostly when the telescope arrives."""
     world = scenario_world(ScenarioConfig(), 600.0, np.random.default_rng(0))
 
     def motion(time_s: float) -> Motion:
@@ -167,8 +167,8 @@ def _loses(station: int, time_s: float, *, from_s: float) -> Status:
     return Status.NO_TARGET if station == 2 and time_s >= from_s else Status.OK
 
 
-def test_nobody_sees_the_robot() -> None:
-    """Then nobody knows where it is: all have lost it, or what came of it is too old."""
+def test_no_hint_without_recent_points() -> None:
+    """All stations have lost their prism, or their points are too old."""
     scene = stationary_scene()
     hints = ReacquisitionHints(scene.parameters)
     watch(hints, scene, sees=lambda _, t: Status.NO_TARGET if t > LOST_S else Status.OK)
@@ -181,24 +181,24 @@ def test_nobody_sees_the_robot() -> None:
     assert hints.direction(2, ns(13.3)) is None
 
 
-def test_one_point_is_not_enough() -> None:
-    """It does not tell how fast the robot is."""
+def test_no_hint_from_a_single_point() -> None:
+    """The speed is unknown."""
     scene = stationary_scene()
     hints = ReacquisitionHints(scene.parameters)
     watch(hints, scene, sees=lambda s, t: Status.NO_TARGET if s == 2 else (Status.OK if t > 12.3 else None))
     assert hints.direction(2, ns(12.5)) is None
 
 
-def test_a_robot_that_is_very_near_may_be_anywhere() -> None:
-    """No direction says anything where the robot is about as large as its distance."""
+def test_no_hint_for_a_very_near_robot() -> None:
+    """No direction is useful when the robot's size is comparable to its distance."""
     near = stationary_scene().moving(lambda _: (np.eye(3), np.array([2.5, -2.0, -1.0])))
     hints = ReacquisitionHints(near.parameters)
     watch(hints, near)
     assert hints.direction(2, ns(12.5)) is None
 
 
-def test_another_station_on_the_same_prism_knows_best() -> None:
-    """Where stations outnumber prisms; only its start is left open."""
+def test_other_station_on_the_same_prism_is_preferred() -> None:
+    """With more stations than prisms; only a start of the robot remains uncertain."""
     scene = stationary_scene()
     hints = ReacquisitionHints(scene.parameters)
     watch(hints, scene)
@@ -210,8 +210,8 @@ def test_another_station_on_the_same_prism_knows_best() -> None:
     assert towards.spread_rad == pytest.approx(0.5 / 38, rel=0.1)
 
 
-def test_the_direction_is_in_the_face_of_the_telescope() -> None:
-    """Who measures in the second face would have to turn over otherwise."""
+def test_hint_is_in_the_face_of_the_telescope() -> None:
+    """An instrument in the second face need not transit."""
     scene = stationary_scene()
     hints, turned = ReacquisitionHints(scene.parameters), ReacquisitionHints(scene.parameters)
     watch(hints, scene)
@@ -235,8 +235,8 @@ def test_the_direction_is_in_the_face_of_the_telescope() -> None:
     assert abs(apart_rad) == pytest.approx(math.pi)
 
 
-def test_a_direction_holds_for_five_seconds_and_then_comes_anew() -> None:
-    """From the points of then; after six of them only every half minute, and none in between."""
+def test_hint_is_renewed_every_five_seconds() -> None:
+    """From the latest points; after six of them every half minute, and none in between."""
     scene = stationary_scene().moving(driving)
     hints = ReacquisitionHints(scene.parameters)
     told: list[tuple[float, Direction | None]] = [(0.0, None)]
@@ -267,8 +267,8 @@ def test_a_direction_holds_for_five_seconds_and_then_comes_anew() -> None:
         assert towards is None or beside_rad(scene, towards, time_s) <= towards.spread_rad
 
 
-def test_who_has_its_prism_again_needs_no_direction() -> None:
-    """At once; and when it loses it again, it is told again after two seconds."""
+def test_reacquired_prism_ends_the_hints() -> None:
+    """At once; the next loss gives a hint after two seconds."""
     scene = stationary_scene()
     hints = ReacquisitionHints(scene.parameters)
     watch(hints, scene)
@@ -284,7 +284,7 @@ def test_who_has_its_prism_again_needs_no_direction() -> None:
     assert again is not first
 
 
-def test_measurements_that_come_late_count_where_they_belong() -> None:
+def test_late_measurements_are_ordered_by_time() -> None:
     """One from before the loss changes nothing; one from within it shows that the prism was there."""
     scene = stationary_scene()
     before, within = ReacquisitionHints(scene.parameters), ReacquisitionHints(scene.parameters)
@@ -299,8 +299,8 @@ def test_measurements_that_come_late_count_where_they_belong() -> None:
     assert within.direction(2, ns(13.6)) is not None
 
 
-def test_strangers_and_the_future_are_passed_over() -> None:
-    """A station that nobody knows, and a measurement that says to be from tomorrow."""
+def test_unknown_station_and_future_measurement_are_ignored() -> None:
+    """Unknown station and future measurement are ignored."""
     scene = stationary_scene()
     hints = ReacquisitionHints(scene.parameters)
     hints.measured(replace(scene.measure(1, 1.0), station=9))

@@ -1,4 +1,4 @@
-"""The recording behind a thread: lines are taken at once, and what became of them can be found out."""
+"""The recording thread: lines are queued without waiting, and their fate can be queried."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-async def test_lines_are_written_beside_everything_else(tmp_path: Path) -> None:
-    """Who wants to know waits for the disk, but not for ever."""
+async def test_lines_are_written_in_the_background(tmp_path: Path) -> None:
+    """Waiting for the disk has a time-out."""
     with RecordingWriter(tmp_path / "run.jsonl") as writer:
         writer.write(HEADER)
         disk = RecordingThread(Recorder(writer))

@@ -1,4 +1,4 @@
-"""Replay: what is handed over when, what comes out, and what is said about recordings that do not fit."""
+"""Replay: order, output, and errors of unsuitable recordings."""
 
 from __future__ import annotations
 
@@ -43,15 +43,15 @@ def replayed_lines(path: Path) -> list[bytes]:
     return [line for _, lines in replayed(path) for line in lines]
 
 
-def test_a_replay_is_the_stream_again(tmp_path: Path) -> None:
-    """Poses, measurements and events come out as they did live, bit for bit."""
+def test_replay_equals_the_stream(tmp_path: Path) -> None:
+    """Poses, measurements and events, bit for bit."""
     path = tmp_path / "run.jsonl"
     lines = live_lines(path)
     assert len(lines) > 100
     assert replayed_lines(path) == lines
 
 
-def test_recorded_poses_are_made_again_not_copied(tmp_path: Path) -> None:
+def test_replay_recomputes_poses(tmp_path: Path) -> None:
     """Without its pose lines a recording gives the same stream."""
     path = tmp_path / "run.jsonl"
     lines = live_lines(path)
@@ -60,8 +60,8 @@ def test_recorded_poses_are_made_again_not_copied(tmp_path: Path) -> None:
     assert replayed_lines(path) == lines
 
 
-def test_poses_of_the_timer_are_replayed_after_a_crash(tmp_path: Path) -> None:
-    """When the stations fell silent, poses went on until the master was killed; the replay goes as far."""
+def test_poses_of_the_timer_are_replayed(tmp_path: Path) -> None:
+    """When the stations are silent, poses continue until the master is killed; the replay includes them."""
     path = tmp_path / "run.jsonl"
     feed = LiveEstimator(SCENE.parameters)
     records = [
@@ -77,8 +77,8 @@ def test_poses_of_the_timer_are_replayed_after_a_crash(tmp_path: Path) -> None:
     assert replayed_lines(path) == [encode_line(record) for record in records]
 
 
-def test_keys_of_a_newer_writer_are_passed_on(tmp_path: Path) -> None:
-    """A measurement goes out as it stands in the file, with what this program does not know of it."""
+def test_unknown_keys_are_replayed(tmp_path: Path) -> None:
+    """A measurement is published as in the file."""
     path = tmp_path / "run.jsonl"
     line = encode_line(SCENE.measure(1, 0.0))[:-1] + b',"temperature_degC":-12.5}'
     with RecordingWriter(path) as writer:
@@ -88,16 +88,16 @@ def test_keys_of_a_newer_writer_are_passed_on(tmp_path: Path) -> None:
     assert replayed_lines(path) == [line]
 
 
-def test_each_session_begins_anew(tmp_path: Path) -> None:
-    """A master that was restarted on the same file had an empty pipeline, and so has the replay."""
+def test_each_session_starts_with_a_new_estimator(tmp_path: Path) -> None:
+    """As in a master that was restarted on the same file."""
     path = tmp_path / "run.jsonl"
     lines = live_lines(path)
     assert live_lines(path) == lines
     assert replayed_lines(path) == lines + lines
 
 
-def test_a_measurement_without_parameters_is_an_error(tmp_path: Path) -> None:
-    """What nobody can compute with is not passed over in silence."""
+def test_measurement_before_parameters_is_an_error(tmp_path: Path) -> None:
+    """Measurement before parameters is an error."""
     path = tmp_path / "run.jsonl"
     with RecordingWriter(path) as writer:
         writer.write(HEADER)
@@ -106,8 +106,8 @@ def test_a_measurement_without_parameters_is_an_error(tmp_path: Path) -> None:
         replayed_lines(path)
 
 
-def test_a_line_with_a_wrong_field_stops_the_replay_unless_told_to_go_on(tmp_path: Path) -> None:
-    """A whole line that is no measurement is an error with its number, or reported and left out."""
+def test_invalid_line_stops_the_replay_unless_skipped(tmp_path: Path) -> None:
+    """An error with its number, or reported and skipped."""
     path = tmp_path / "run.jsonl"
     lines = live_lines(path)
     with path.open("ab") as file:
@@ -121,8 +121,8 @@ def test_a_line_with_a_wrong_field_stops_the_replay_unless_told_to_go_on(tmp_pat
 
 
 @pytest.mark.parametrize(("speed", "lasts_s"), [(1.0, 8.0), (4.0, 2.0), (float("inf"), 0.0)])
-async def test_the_speed_sets_the_pace_and_nothing_else(tmp_path: Path, speed: float, lasts_s: float) -> None:
-    """A reader gets the same lines at any speed, in the recording's time divided by it."""
+async def test_speed_changes_the_pace_only(tmp_path: Path, speed: float, lasts_s: float) -> None:
+    """The lines are the same at any speed."""
     path, clock = tmp_path / "run.jsonl", VirtualClock(0)
     lines = live_lines(path)
     began_ns = clock.monotonic_ns()

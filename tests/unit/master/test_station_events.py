@@ -1,4 +1,4 @@
-"""The detector: what happens to stations becomes an event once."""
+"""The station event detector: one event per change of a station's state."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from tsgt.master.station_events import StationEventDetector
 from tsgt.model import Status
 
 
-def test_a_station_is_lost_once_and_back_once() -> None:
-    """Five seconds without an answer to a request, and then one."""
+def test_station_is_lost_and_recovers() -> None:
+    """Five seconds without a response to a request, and then one."""
     detector = StationEventDetector([1, 2], START)
     assert detector.exchange(1, START + SECOND, responded=True) == []
     names = []
@@ -26,14 +26,14 @@ def test_a_station_is_lost_once_and_back_once() -> None:
     assert "after 60 s" in back.message
 
 
-def test_a_station_that_is_not_asked_is_not_lost() -> None:
-    """While the others are synchronised for the first time, nobody asks it."""
+def test_station_without_requests_is_not_lost() -> None:
+    """No requests are sent while others are first synchronised."""
     detector = StationEventDetector([1], START)
     assert detector.tick(START + 60 * SECOND, realtime_ns=START + 60 * SECOND) == []
 
 
-def test_one_lost_packet_is_no_lost_station() -> None:
-    """It had not been heard for long because it had not been asked."""
+def test_lost_packet_is_no_lost_station() -> None:
+    """There was no packet before because there was no request."""
     detector = StationEventDetector([1], START)
     detector.exchange(1, START + 24 * SECOND, responded=False)
     for second in (25, 40):
@@ -44,8 +44,8 @@ def test_one_lost_packet_is_no_lost_station() -> None:
     assert lost.event == "station_lost"
 
 
-def test_refusing_to_track_is_told_once() -> None:
-    """And so is the end of it; one that tracks at once is not worth a word."""
+def test_refusal_to_track_is_one_event() -> None:
+    """So is its end; a station that tracks at once has no event."""
     detector = StationEventDetector([1], START)
     assert detector.tracking_result(1, 4, START, tracks=True) == []
     events = [
@@ -54,8 +54,8 @@ def test_refusing_to_track_is_told_once() -> None:
     assert [event.event for event in events] == ["station_not_tracking", "station_tracking"]
 
 
-def test_a_change_of_what_the_instrument_says_is_told() -> None:
-    """Each kind of error once, and that it measures again; low accuracy is normal in motion."""
+def test_change_of_instrument_status_is_an_event() -> None:
+    """One per kind of error, and when it measures again; low accuracy is normal in motion."""
     detector = StationEventDetector([1], START)
     statuses = [
         Status.OK,
@@ -73,21 +73,21 @@ def test_a_change_of_what_the_instrument_says_is_told() -> None:
 
 
 @pytest.mark.parametrize(("steps_s", "told"), [([0.05, 0.09], 0), ([0.05, 0.2], 1), ([-3600.0, -3600.0], 1)])
-def test_a_step_of_the_unix_clock_is_told_once(steps_s: list[float], told: int) -> None:
-    """What slews by less than 0.1 s is not told; each further step is."""
+def test_unix_clock_step_is_one_event(steps_s: list[float], told: int) -> None:
+    """A slew of less than 0.1 s is none; each further step is one."""
     detector = StationEventDetector([1], START)
     events = [e for s in steps_s for e in detector.tick(START, realtime_ns=START + round(s * 1e9))]
     assert [event.event for event in events] == ["unix_clock_stepped"] * told
 
 
-def test_a_unix_clock_that_was_set_forward_is_ahead_of_the_stream() -> None:
-    """Signs in words and numbers: plus is forward."""
+def test_forward_step_has_a_positive_sign() -> None:
+    """Forward step has a positive sign."""
     (event,) = StationEventDetector([1], START).tick(START, realtime_ns=START + 2 * SECOND)
     assert "was set by +2.000 s and is now +2.000 s from" in event.message
 
 
-def test_a_station_whose_instrument_is_gone_is_told_of_once() -> None:
-    """It goes on answering with its last measurement: after ten seconds that is an event, and so is the next new one."""
+def test_station_without_new_measurements_is_idle() -> None:
+    """It repeats its last measurement: an event after ten seconds, and one with the next new measurement."""
     detector = StationEventDetector([1], START)
     detector.reply(1, START)
     detector.measurement(measurement(0), START)
@@ -99,8 +99,8 @@ def test_a_station_whose_instrument_is_gone_is_told_of_once() -> None:
     assert [event.event for event in events] == ["station_measuring"]
 
 
-def test_a_station_that_is_not_polled_is_not_idle() -> None:
-    """A first measurement half a minute after the last poll, as when others are synchronised, is nothing special."""
+def test_station_without_polls_is_not_idle() -> None:
+    """A first measurement half a minute after the last poll is normal while others are synchronised."""
     detector = StationEventDetector([1], START)
     detector.reply(1, START)
     detector.measurement(measurement(0), START)
@@ -108,15 +108,15 @@ def test_a_station_that_is_not_polled_is_not_idle() -> None:
     assert detector.measurement(measurement(0), START + 30 * SECOND) == []
 
 
-def test_an_error_that_is_repeated_is_not_idleness() -> None:
-    """The authors' nodes repeat an error without a time: the error itself has been told."""
+def test_repeated_error_is_not_idle() -> None:
+    """The authors' nodes repeat an error without a time; the error has its own event."""
     detector = StationEventDetector([1], START)
     detector.measurement(replace(measurement(0), status=Status.TILT), START)
     assert [e for second in range(60) for e in detector.reply(1, START + second * SECOND)] == []
 
 
-def test_a_status_that_comes_late_is_no_news() -> None:
-    """It tells how the instrument did, not how it does."""
+def test_late_status_is_no_event() -> None:
+    """It is out of date."""
     detector = StationEventDetector([1], START)
     newest = replace(measurement(9), station=1, stamp_ns=START + 9 * SECOND)
     assert detector.measurement(newest, START + 10 * SECOND) == []
@@ -128,8 +128,8 @@ def test_a_status_that_comes_late_is_no_news() -> None:
     ]
 
 
-def test_packets_that_were_held_back_are_told() -> None:
-    """By the station that was to be deceived, or by the time that a packet took."""
+def test_delay_attack_is_an_event() -> None:
+    """Detected by the station, or by the link delay."""
     detector = StationEventDetector([1], START)
     rejected = detector.beacon_time_rejected(1, START, 3)
     assert (rejected.event, rejected.station, rejected.count) == ("beacon_time_rejected", 1, 3)

@@ -1,4 +1,4 @@
-"""The statistics: what it counts and what it says before anything came."""
+"""The statistics of the status records."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ MEASUREMENT = PolarMeasurement(
 )
 
 
-def test_before_the_first_measurement() -> None:
-    """A silent station is reported, with nulls instead of made-up numbers."""
+def test_status_before_the_first_measurement() -> None:
+    """A silent station is reported with nulls."""
     status = Statistics([1, 2]).status(SECOND)
     assert [(s.id, s.measurements, s.usable, s.age_s, s.status) for s in status.stations] == [
         (1, 0, 0, None, None),
@@ -35,8 +35,8 @@ def test_before_the_first_measurement() -> None:
     ]
 
 
-def test_counts_what_came_and_what_was_usable() -> None:
-    """Measurements without position count, but not as usable; the last status is reported."""
+def test_counts_measurements_and_usable_ones() -> None:
+    """A measurement without a position is not usable; the last status is reported."""
     statistics = Statistics([1, 2])
     statistics.measurement(MEASUREMENT)
     statistics.measurement(replace(MEASUREMENT, sequence=1, stamp_ns=11 * SECOND, status=Status.NO_TARGET))
@@ -45,8 +45,8 @@ def test_counts_what_came_and_what_was_usable() -> None:
     assert station.age_s == 1.0
 
 
-def test_a_station_that_nobody_asked_about_is_passed_over() -> None:
-    """A foreign station does not appear in the report."""
+def test_unknown_station_is_ignored() -> None:
+    """Unknown station is ignored."""
     statistics = Statistics([1])
     statistics.measurement(MEASUREMENT)
     assert statistics.status(12 * SECOND) == Statistics([1]).status(12 * SECOND)
@@ -61,8 +61,8 @@ def test_counts_poses() -> None:
     assert (status.stamp_ns, status.poses, status.valid_poses) == (SECOND, 3, 2)
 
 
-def test_the_rate_is_that_of_the_last_ten_seconds() -> None:
-    """Measurements every 0.5 s are 2 Hz; when no more come the rate falls to nothing."""
+def test_rate_is_over_the_last_ten_seconds() -> None:
+    """Measurements every 0.5 s are 2 Hz; without more the rate falls to zero."""
     statistics = Statistics([2])
     for n in range(60):
         statistics.measurement(replace(MEASUREMENT, sequence=n, received_ns=n * SECOND // 2))
@@ -71,24 +71,24 @@ def test_the_rate_is_that_of_the_last_ten_seconds() -> None:
     assert statistics.status(60 * SECOND).stations[0].rate_hz == 0
 
 
-def test_loss_is_the_share_of_the_last_fifty_requests() -> None:
-    """Older ones are forgotten."""
+def test_loss_is_over_the_last_fifty_requests() -> None:
+    """Loss is over the last fifty requests."""
     statistics = Statistics([2])
     for n in range(150):
         statistics.exchange(2, responded=n >= 100 and n % 5 > 0)
     assert statistics.status(SECOND).stations[0].loss == pytest.approx(0.2)
 
 
-def test_the_last_radio_message_is_shown() -> None:
-    """With its strength, and how long ago it was."""
+def test_last_packet_is_reported() -> None:
+    """With signal strength and age."""
     statistics = Statistics([2])
     statistics.packet(2, 3 * SECOND, rssi_dbm=-91.5, snr_db=7.25)
     station = statistics.status(5 * SECOND).stations[0]
     assert (station.last_heard_s, station.rssi_dbm, station.snr_db) == (2.0, -91.5, 7.25)
 
 
-def test_the_clock_is_asked_for_at_the_time_of_the_status() -> None:
-    """Offset and bound are those of now."""
+def test_clock_is_evaluated_at_the_time_of_the_status() -> None:
+    """Clock is evaluated at the time of the status."""
     statistics = Statistics([2])
     status = statistics.status(
         5 * SECOND, LinkStatus(clock=lambda station, now_ns: ClockEstimate(now_ns + station, 1, 7, 0.0))
@@ -100,15 +100,15 @@ def test_the_clock_is_asked_for_at_the_time_of_the_status() -> None:
 @pytest.mark.parametrize(
     ("status", "locked"), [(Status.OK, True), (Status.ANGLE_ONLY, True), (Status.NO_TARGET, False)]
 )
-def test_a_station_is_locked_while_it_has_a_target(status: Status, locked: bool) -> None:  # noqa: FBT001 (a parameter)
+def test_station_is_locked_while_it_has_a_target(status: Status, locked: bool) -> None:  # noqa: FBT001 (a parameter)
     """By its last measurement; an angle without a distance has a target."""
     statistics = Statistics([2])
     statistics.measurement(replace(MEASUREMENT, status=status))
     assert statistics.status(SECOND).stations[0].locked is locked
 
 
-def test_a_measurement_that_comes_late_is_counted_but_is_not_the_newest() -> None:
-    """After an outage old ones come in between; a new count begins with younger times."""
+def test_late_measurement_is_counted_but_not_the_newest() -> None:
+    """As in a backlog after an outage; a restart has lower numbers with later times."""
     statistics = Statistics([2])
     statistics.measurement(replace(MEASUREMENT, sequence=9, stamp_bound_ns=5))
     late = replace(MEASUREMENT, sequence=3, stamp_ns=2 * SECOND, status=Status.TILT, stamp_bound_ns=7)
@@ -124,8 +124,8 @@ def test_a_measurement_that_comes_late_is_counted_but_is_not_the_newest() -> Non
     assert statistics.status(12 * SECOND).stations[0].status is Status.TILT
 
 
-def test_how_a_station_stands_on_the_superframe() -> None:
-    """Nulls until something is known, as with the other protocol."""
+def test_superframe_state_is_reported() -> None:
+    """Nulls until it is known."""
     statistics = Statistics([2])
     station = statistics.status(SECOND).stations[0]
     assert (station.joined, station.outstanding, station.missed_slots, station.rejected_beacons) == (

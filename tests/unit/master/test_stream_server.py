@@ -96,7 +96,7 @@ async def settle() -> None:
 
 
 async def test_greeting_comes_first(path: Path) -> None:
-    """A reader gets the greeting, then what is published after it came, not what was before."""
+    """Then what is published after the reader connected."""
     async with StreamServer(path, HELLO) as server:
         server.publish(line(0))
         client = await Client.connect(path)
@@ -116,8 +116,8 @@ async def test_every_reader_gets_every_line(path: Path) -> None:
             await client.close()
 
 
-async def test_slow_reader_is_told_what_it_lost(path: Path) -> None:
-    """A reader that sleeps finds one event with the number of lost lines in their place, then the newest lines."""
+async def test_slow_reader_gets_the_number_of_lost_lines(path: Path) -> None:
+    """One event in the place of the lost lines, then the newest lines."""
     async with StreamServer(path, HELLO, queue_lines=10, unix_now_ns=lambda: 77) as server:
         sleepy = SleepyClient(path)
         await server.wait_for_reader()
@@ -136,8 +136,8 @@ async def test_slow_reader_is_told_what_it_lost(path: Path) -> None:
     assert records[at]["count"] == 190 - at > 100
 
 
-async def test_slow_reader_does_not_cost_the_others(path: Path) -> None:
-    """While one reader sleeps and loses lines, another one gets all of them."""
+async def test_slow_reader_does_not_affect_others(path: Path) -> None:
+    """While one reader loses lines, another one gets all of them."""
     async with StreamServer(path, HELLO, queue_lines=10) as server:
         sleepy = SleepyClient(path)
         client = await Client.connect(path)
@@ -148,8 +148,8 @@ async def test_slow_reader_does_not_cost_the_others(path: Path) -> None:
         await client.close()
 
 
-async def test_lost_lines_are_counted_anew(path: Path) -> None:
-    """A reader that falls behind twice is told twice, each time with what it lost since."""
+async def test_lost_lines_are_counted_per_gap(path: Path) -> None:
+    """Lost lines are counted per gap."""
     async with StreamServer(path, HELLO, queue_lines=5) as server:
         sleepy = SleepyClient(path)
         await server.wait_for_reader()
@@ -166,8 +166,8 @@ async def test_lost_lines_are_counted_anew(path: Path) -> None:
     assert sum(counts) + sum(record["type"] == "test" for record in records) == 300
 
 
-async def test_patient_publishing_loses_nothing(path: Path) -> None:
-    """Publishing patiently waits for a reader that sleeps now and then."""
+async def test_publish_when_ready_loses_nothing(path: Path) -> None:
+    """It waits for a slow reader."""
     async with StreamServer(path, HELLO, queue_lines=3) as server:
         sleepy = SleepyClient(path)
         await server.wait_for_reader()
@@ -187,8 +187,8 @@ async def test_patient_publishing_loses_nothing(path: Path) -> None:
     assert [record["number"] for record in sleepy.records()] == list(range(100))
 
 
-async def test_patient_publishing_goes_on_when_the_slow_reader_leaves(path: Path) -> None:
-    """A reader that disconnects while it is waited for is waited for no longer."""
+async def test_publish_when_ready_continues_after_a_disconnect(path: Path) -> None:
+    """Publish when ready continues after a disconnect."""
     async with StreamServer(path, HELLO, queue_lines=1) as server:
         sleepy = SleepyClient(path)
         await server.wait_for_reader()
@@ -201,14 +201,14 @@ async def test_patient_publishing_goes_on_when_the_slow_reader_leaves(path: Path
             sleepy.socket.close()
 
 
-async def test_patient_publishing_without_readers_does_not_wait(path: Path) -> None:
-    """With nobody there, lines go nowhere at once."""
+async def test_publish_when_ready_without_readers_does_not_wait(path: Path) -> None:
+    """Publish when ready without readers does not wait."""
     async with StreamServer(path, HELLO) as server:
         await server.publish_when_ready(line(0))
 
 
-async def test_wait_for_reader_waits(path: Path) -> None:
-    """The wait ends when the first reader comes."""
+async def test_wait_for_reader_returns_with_the_first_reader(path: Path) -> None:
+    """Wait for reader returns with the first reader."""
     async with StreamServer(path, HELLO) as server, asyncio.TaskGroup() as group:
         waiting = group.create_task(server.wait_for_reader())
         await settle()
@@ -218,8 +218,8 @@ async def test_wait_for_reader_waits(path: Path) -> None:
         await client.close()
 
 
-async def test_abrupt_disconnect_does_no_harm(path: Path) -> None:
-    """A reader that goes in the middle of things leaves the others as they were."""
+async def test_abrupt_disconnect_does_not_affect_others(path: Path) -> None:
+    """Abrupt disconnect does not affect others."""
     async with StreamServer(path, HELLO) as server:
         sleepy = SleepyClient(path)
         client = await Client.connect(path)
@@ -231,7 +231,7 @@ async def test_abrupt_disconnect_does_no_harm(path: Path) -> None:
 
 
 async def test_half_closed_reader_gets_lines(path: Path) -> None:
-    """A reader that has closed its own sending direction still reads."""
+    """A reader that has closed its sending side still reads."""
     async with StreamServer(path, HELLO) as server:
         client = await Client.connect(path)
         client.writer.write_eof()
@@ -241,8 +241,8 @@ async def test_half_closed_reader_gets_lines(path: Path) -> None:
         await client.close()
 
 
-async def test_one_reader_too_many_is_let_go(path: Path) -> None:
-    """Also of those that come at once; when one of the others leaves, there is room again."""
+async def test_reader_beyond_the_limit_is_disconnected(path: Path) -> None:
+    """Also when they connect at once; a place becomes free when a reader leaves."""
     async with StreamServer(path, HELLO) as server:
         crowd = [socket.socket(socket.AF_UNIX) for _ in range(MAX_READERS + 20)]
         with capture_logs() as logs:
@@ -260,8 +260,8 @@ async def test_one_reader_too_many_is_let_go(path: Path) -> None:
         await client.close()
 
 
-async def test_garbage_from_a_reader_is_thrown_away(path: Path) -> None:
-    """A reader that talks, however much, gets the stream as any other."""
+async def test_input_from_a_reader_is_ignored(path: Path) -> None:
+    """Input from a reader is ignored."""
     async with StreamServer(path, HELLO) as server:
         client = await Client.connect(path)
         client.writer.write(b"\xff\0{garbage\n" * 100_000)
@@ -271,8 +271,8 @@ async def test_garbage_from_a_reader_is_thrown_away(path: Path) -> None:
         await client.close()
 
 
-async def test_closing_hands_over_what_waits(path: Path) -> None:
-    """At the end a reader gets all lines that still wait for it, then the end of the stream."""
+async def test_closing_delivers_the_queues(path: Path) -> None:
+    """A reader gets all queued lines, then the end of the stream."""
     async with asyncio.TaskGroup() as group, StreamServer(path, HELLO) as server:
         client = await Client.connect(path)
         for number in range(500):
@@ -281,8 +281,8 @@ async def test_closing_hands_over_what_waits(path: Path) -> None:
     assert [record["number"] for record in await reading] == list(range(500))
 
 
-async def test_closing_does_not_wait_for_ever(path: Path) -> None:
-    """A reader that sleeps at the end holds the program up for the stated time and no longer."""
+async def test_closing_has_a_timeout(path: Path) -> None:
+    """Closing has a timeout."""
     server = await StreamServer(path, HELLO).__aenter__()
     sleepy = SleepyClient(path)
     await server.wait_for_reader()
@@ -297,8 +297,8 @@ async def test_closing_does_not_wait_for_ever(path: Path) -> None:
 
 
 @pytest.mark.parametrize("umask", [0o000, 0o077])
-async def test_mode_is_as_asked_for(path: Path, umask: int) -> None:
-    """The socket has mode 0660 whatever the umask."""
+async def test_mode_is_0660(path: Path, umask: int) -> None:
+    """Whatever the umask."""
     before = os.umask(umask)
     try:
         async with StreamServer(path, HELLO):
@@ -307,8 +307,8 @@ async def test_mode_is_as_asked_for(path: Path, umask: int) -> None:
         os.umask(before)
 
 
-async def test_socket_is_never_open_to_all(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Before its mode is set by name the socket has no more rights than that, even without a umask."""
+async def test_socket_is_never_world_accessible(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not even before its mode is set, without a umask."""
     modes: list[int] = []
     really = Path.chmod
 
@@ -334,7 +334,7 @@ async def test_folder_is_created(tmp_path: Path) -> None:
 
 
 async def test_stale_socket_is_replaced(path: Path) -> None:
-    """A socket that a killed program left behind is no obstacle."""
+    """A killed program may leave its socket."""
     with socket.socket(socket.AF_UNIX) as stale:
         stale.bind(str(path))
         stale.listen()
@@ -343,8 +343,8 @@ async def test_stale_socket_is_replaced(path: Path) -> None:
         await (await Client.connect(path)).close()
 
 
-async def test_live_socket_is_refused(path: Path) -> None:
-    """A socket that is served stays with the one who serves it, and the error says what to do."""
+async def test_socket_in_use_is_an_error(path: Path) -> None:
+    """It stays with its server, and the error says what to do."""
     refused = pytest.raises(StreamError, match=rf"^{path}: another program serves this socket; [^\n]+$")
     async with StreamServer(path, HELLO):
         with refused:
@@ -352,8 +352,8 @@ async def test_live_socket_is_refused(path: Path) -> None:
         await (await Client.connect(path)).close()
 
 
-async def test_busy_live_socket_is_refused(path: Path) -> None:
-    """A server whose queue of connections is full is alive all the same."""
+async def test_socket_with_a_full_backlog_is_in_use(path: Path) -> None:
+    """Socket with a full backlog is in use."""
     with socket.socket(socket.AF_UNIX) as busy, socket.socket(socket.AF_UNIX) as waiting:
         busy.bind(str(path))
         busy.listen(0)
@@ -362,8 +362,8 @@ async def test_busy_live_socket_is_refused(path: Path) -> None:
             await StreamServer(path, HELLO).__aenter__()
 
 
-async def test_other_file_is_left_alone(path: Path) -> None:
-    """What is not a socket is not touched."""
+async def test_other_file_is_not_replaced(path: Path) -> None:
+    """Other file is not replaced."""
     path.write_bytes(b"notes")
     with pytest.raises(StreamError, match=rf"^{path}: is not a socket; [^\n]+$"):
         await StreamServer(path, HELLO).__aenter__()
@@ -385,14 +385,14 @@ async def test_long_path_is_one_line(tmp_path: Path) -> None:
 
 
 async def test_socket_is_removed_at_the_end(path: Path) -> None:
-    """Nothing is left of the socket when the server has closed."""
+    """Socket is removed at the end."""
     async with StreamServer(path, HELLO):
         pass
     assert not path.exists()
 
 
 async def test_socket_of_a_successor_is_not_removed(path: Path) -> None:
-    """Whoever has put another socket in place in the meantime keeps it."""
+    """Socket of a successor is not removed."""
     with socket.socket(socket.AF_UNIX) as other:
         async with StreamServer(path, HELLO):
             path.rename(path.with_suffix(".old"))
@@ -400,8 +400,8 @@ async def test_socket_of_a_successor_is_not_removed(path: Path) -> None:
         assert path.is_socket()
 
 
-async def test_a_reader_that_left_is_noticed_though_nothing_is_published(path: Path) -> None:
-    """Its connection goes at once, so that a stream with nothing to say does not fill up with the dead."""
+async def test_disconnect_is_detected_without_publishing(path: Path) -> None:
+    """So that an idle stream does not accumulate dead readers."""
     async with StreamServer(path, HELLO) as server:
         for _ in range(20):
             client = await Client.connect(path)
@@ -411,8 +411,8 @@ async def test_a_reader_that_left_is_noticed_though_nothing_is_published(path: P
 
 
 @pytest.mark.parametrize("turns", range(5))
-async def test_a_reader_that_comes_at_the_very_end_is_let_go(path: Path, turns: int) -> None:
-    """Whenever it connects while the server closes, its connection ends instead of hanging."""
+async def test_reader_that_connects_while_closing_is_disconnected(path: Path, turns: int) -> None:
+    """Reader that connects while closing is disconnected."""
     with socket.socket(socket.AF_UNIX) as late:
         async with StreamServer(path, HELLO) as server:
             late.setblocking(False)
@@ -426,8 +426,8 @@ async def test_a_reader_that_comes_at_the_very_end_is_let_go(path: Path, turns: 
             assert late.recv(1000) in (b"", HELLO + b"\n")
 
 
-async def test_finishing_waits_for_a_reader_however_slow(path: Path) -> None:
-    """A reader that comes back after a minute still gets every line, and only then the stream ends."""
+async def test_finish_waits_for_a_slow_reader(path: Path) -> None:
+    """It gets every line before the stream ends."""
     async with StreamServer(path, HELLO) as server:
         sleepy = SleepyClient(path)
         await server.wait_for_reader()

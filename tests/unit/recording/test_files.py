@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def test_result_appears_at_the_end_only(tmp_path: Path) -> None:
-    """Until the block has ended, the old file is there."""
+    """Until then the old file remains."""
     path = tmp_path / "poses.tum"
     path.write_bytes(b"old")
     with write_atomically(path) as file:
@@ -24,8 +24,8 @@ def test_result_appears_at_the_end_only(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_failure_leaves_everything_as_it_was(tmp_path: Path) -> None:
-    """An error in the block, of whatever kind, passes through and leaves the old file and nothing else."""
+def test_failure_keeps_the_old_file(tmp_path: Path) -> None:
+    """The error is raised, and no other file remains."""
     path = tmp_path / "poses.tum"
     path.write_bytes(b"old")
     with pytest.raises(InputFileError), write_atomically(path) as file:  # noqa: PT012 (the block fails halfway)
@@ -52,14 +52,14 @@ def test_full_disk_is_one_line(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_error_about_another_file_is_not_ours(tmp_path: Path) -> None:
-    """An input that is missing is not reported as a result that cannot be written."""
+def test_error_of_another_file_is_not_an_output_error(tmp_path: Path) -> None:
+    """Error of another file is not an output error."""
     with pytest.raises(FileNotFoundError, match=r"input\.csv"), write_atomically(tmp_path / "poses.tum"):
         (tmp_path / "input.csv").open()
 
 
-def test_device_is_written_not_replaced(tmp_path: Path) -> None:
-    """A pipe (as /dev/stdout or /dev/null may be) gets the bytes and stays what it is."""
+def test_pipe_is_written_directly(tmp_path: Path) -> None:
+    """Pipe is written directly."""
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     reading = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
@@ -72,8 +72,8 @@ def test_device_is_written_not_replaced(tmp_path: Path) -> None:
     assert pipe.is_fifo()
 
 
-def test_symbolic_link_stays(tmp_path: Path) -> None:
-    """A result behind a symbolic link is replaced there."""
+def test_symbolic_link_is_kept(tmp_path: Path) -> None:
+    """Its target is replaced."""
     (tmp_path / "link").symlink_to(tmp_path / "target")
     with write_atomically(tmp_path / "link") as file:
         file.write(b"poses")
@@ -81,8 +81,8 @@ def test_symbolic_link_stays(tmp_path: Path) -> None:
     assert (tmp_path / "target").read_bytes() == b"poses"
 
 
-def test_a_new_recording_never_has_the_name_of_another(tmp_path: Path) -> None:
-    """A clock that shows the same time at each start gives numbers; the folder is made."""
+def test_new_recording_has_a_new_name(tmp_path: Path) -> None:
+    """With a number at equal times; the folder is created."""
     folder = tmp_path / "a" / "b"
     paths = [new_recording_path(folder, "station1", 1_700_000_000_999_999_999) for _ in range(3)]
     stem = "station1-20231114T221320Z"
@@ -90,8 +90,8 @@ def test_a_new_recording_never_has_the_name_of_another(tmp_path: Path) -> None:
     assert all(path.read_bytes() == b"" for path in paths)
 
 
-def test_a_new_recording_where_none_can_be(tmp_path: Path) -> None:
-    """The error names the folder."""
+def test_impossible_folder_is_an_error(tmp_path: Path) -> None:
+    """Impossible folder is an error."""
     (tmp_path / "file").touch()
     with pytest.raises(RecordingError, match="file: no file can be created there"):
         new_recording_path(tmp_path / "file", "master", 0)

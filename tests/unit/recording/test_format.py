@@ -15,18 +15,18 @@ from tsgt.recording import decode, encode_line
     [HEADER, PARAMETERS, HELLO, measurement(3), POINT, POSE, NO_POSE, STATUS, EVENT],
     ids=lambda r: r.type,
 )
-def test_record_comes_back_as_it_was(record: object) -> None:
-    """A record of any type is equal to itself after a way through bytes."""
+def test_records_round_trip(record: object) -> None:
+    """Records round trip."""
     assert decode(type(record), encode_line(record)) == record
 
 
-def test_line_is_one_line() -> None:
-    """An encoded record has no line end, whatever its texts hold."""
+def test_encoded_record_has_no_line_end() -> None:
+    """Encoded record has no line end."""
     assert b"\n" not in encode_line(HEADER.__class__(software="a\nb", created_ns=0, source="\u2028\r\n"))
 
 
-def test_unknown_keys_are_passed_over() -> None:
-    """A newer writer may add keys."""
+def test_unknown_keys_are_ignored() -> None:
+    """Unknown keys are ignored."""
     data = json.loads(encode_line(measurement(1))) | {"colour": "red"}
     assert decode(PolarMeasurement, json.dumps(data).encode()) == measurement(1)
 
@@ -57,16 +57,16 @@ def test_missing_field_is_named() -> None:
 
 
 @pytest.mark.parametrize("stamp_ns", [-1, 2**63])
-def test_an_instant_that_no_clock_shows_is_refused(stamp_ns: int) -> None:
-    """Times are kept in 64 bits and begin in 1970; anything else is a broken line, not a measurement."""
+def test_impossible_time_is_rejected(stamp_ns: int) -> None:
+    """Before 1970 or beyond 64 bits."""
     line = b'{"type":"point","station":1,"prism":1,"sequence":0,"stamp_ns":%d,"received_ns":1,"position_m":[0,0,0]}'
     with pytest.raises(ValueError, match="outside what a clock can show"):
         decode(PointMeasurement, line % stamp_ns)
 
 
 @pytest.mark.parametrize("field", ["offset_ns", "bound_ns", "station"])
-def test_a_whole_number_beyond_64_bits_is_refused(field: str) -> None:
-    """Whoever computes with it would fail: a float cannot hold it, nor can an array."""
+def test_integer_beyond_64_bits_is_rejected(field: str) -> None:
+    """Integer beyond 64 bits is rejected."""
     record = json.loads(encode_line(CLOCK)) | {field: 10**400}
     with pytest.raises(ValueError, match=f"field {field}: "):
         decode(type(CLOCK), json.dumps(record).encode())

@@ -1,4 +1,4 @@
-"""Journals: what a client writes can be read back, and nothing else is taken for one."""
+"""Reading journals."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def write(path: Path, *records: object, tail: bytes = b"") -> Path:
     return path
 
 
-def test_round_trip(tmp_path: Path) -> None:
-    """Measurements and targets come back as they were; a torn last line is told and skipped."""
+def test_journal_round_trip(tmp_path: Path) -> None:
+    """A torn last line is reported and skipped."""
     problems: list[RecordingError] = []
     path = write(
         tmp_path / "j.jsonl", HEADER, HEAD, measurement(0), TARGET, measurement(1), tail=b'{"type":"mea'
@@ -47,31 +47,31 @@ def test_round_trip(tmp_path: Path) -> None:
     assert "torn" in str(problems[0])
 
 
-def test_a_recording_is_no_journal(tmp_path: Path) -> None:
-    """Whoever names the wrong file is told so."""
+def test_recording_is_not_a_journal(tmp_path: Path) -> None:
+    """Recording is not a journal."""
     path = write(tmp_path / "r.jsonl", HEADER, PARAMETERS, measurement(0))
     with pytest.raises(RecordingError, match="is not a station's journal"):
         load_journal(path)
 
 
-def test_two_journals_in_one_file_are_refused(tmp_path: Path) -> None:
-    """Their times would lie on different clocks."""
+def test_two_journals_in_one_file_are_rejected(tmp_path: Path) -> None:
+    """Their times would be of different clocks."""
     other = JournalRecord(station=1, unix_at_zero_ns=6)
     path = write(tmp_path / "j.jsonl", HEADER, HEAD, measurement(0), HEADER, other)
     with pytest.raises(CorruptLineError, match="line 5: begins a second journal"):
         load_journal(path)
 
 
-def test_a_target_that_cannot_be(tmp_path: Path) -> None:
-    """A field that is wrong is named, with its line."""
+def test_invalid_target_is_an_error(tmp_path: Path) -> None:
+    """With field and line."""
     line = encode_line(TARGET).replace(b'"stamp_ns":7', b'"stamp_ns":-1')
     path = write(tmp_path / "j.jsonl", HEADER, HEAD, tail=line + b"\n")
     with pytest.raises(CorruptLineError, match="line 3"):
         load_journal(path)
 
 
-def test_receptions_come_back(tmp_path: Path) -> None:
-    """With the time at which the journal was begun, they tell what the station's clock showed."""
+def test_receptions_are_read(tmp_path: Path) -> None:
+    """Receptions are read."""
     reception = ReceptionRecord(stamp_ns=7, stamp_sigma_ns=1, session=2, counter=3, sent_us=4)
     journal = load_journal(write(tmp_path / "j.jsonl", HEADER, HEAD, reception))
     assert journal.head == HEAD
@@ -79,8 +79,8 @@ def test_receptions_come_back(tmp_path: Path) -> None:
     assert journal.receptions == [reception]
 
 
-def test_lines_that_cannot_be_read_are_skipped_if_asked(tmp_path: Path) -> None:
-    """Each of them is told; whose journal it is has to be sure all the same."""
+def test_corrupt_lines_are_skipped_if_requested(tmp_path: Path) -> None:
+    """Each is reported; the head must be valid."""
     problems: list[RecordingError] = []
     wrong = encode_line(TARGET).replace(b'"stamp_ns":7', b'"stamp_ns":-1') + b"\n"
     path = write(tmp_path / "j.jsonl", HEADER, HEAD, tail=b"rubbish\n" + wrong + encode_line(TARGET) + b"\n")

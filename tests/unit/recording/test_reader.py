@@ -31,8 +31,8 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "r.jsonl"
 
 
-def test_measurements_come_in_order_of_arrival(path: Path) -> None:
-    """Loading gives header, parameters and the measurements of both kinds as they stand in the file."""
+def test_measurements_are_in_order_of_arrival(path: Path) -> None:
+    """Measurements are in order of arrival."""
     path.write_bytes(recording_bytes(measurement(1), POINT, POSE, measurement(0)))
     recording = load_recording(path)
     assert recording.header == HEADER
@@ -40,8 +40,8 @@ def test_measurements_come_in_order_of_arrival(path: Path) -> None:
     assert recording.measurements == [measurement(1), POINT, measurement(0)]
 
 
-def test_merged_measurements_count_like_others(path: Path) -> None:
-    """They stand behind the others, and may be later than all that the master knew of."""
+def test_merged_measurements_are_read(path: Path) -> None:
+    """They follow the others and may be later than every arrival."""
     merged = MergedRecord(journal="station1.jsonl", measurement=measurement(9))
     path.write_bytes(recording_bytes(measurement(1), merged))
     recording = load_recording(path)
@@ -64,8 +64,10 @@ def test_merged_measurements_count_like_others(path: Path) -> None:
     ],
     ids=["empty", "pose", "measurements", "status", "event", "point"],
 )
-def test_end_is_the_latest_time_known(path: Path, records: list[object], end_ns: int | None) -> None:
-    """Arrivals, status and events tell how far the recording goes; poses do not."""
+def test_end_is_the_latest_arrival_status_or_event(
+    path: Path, records: list[object], end_ns: int | None
+) -> None:
+    """Poses do not count."""
     path.write_bytes(recording_bytes(*records))
     assert load_recording(path).end_ns == end_ns
 
@@ -80,8 +82,8 @@ def test_last_parameters_are_in_force(path: Path) -> None:
     assert recording.header == HEADER
 
 
-def test_unknown_types_are_passed_over(path: Path) -> None:
-    """Lines of a type that nobody knows come from read_lines and do not disturb load_recording."""
+def test_unknown_types_are_ignored(path: Path) -> None:
+    """read_lines yields them."""
     path.write_bytes(recording_bytes(measurement(0)) + b'{"type":"weather","wind":"strong"}\n')
     assert [line.type for line in read_lines(path)] == ["recording", "parameters", "measurement", "weather"]
     assert load_recording(path).measurements == [measurement(0)]
@@ -94,15 +96,15 @@ def test_line_keeps_number_and_bytes(path: Path) -> None:
 
 
 def test_torn_last_line_is_reported_and_skipped(path: Path) -> None:
-    """A last line without its end is no error; whoever asked is told its number."""
+    """Torn last line is reported and skipped."""
     path.write_bytes(recording_bytes(measurement(0), measurement(1))[:-20])
     problems: list[RecordingError] = []
     assert load_recording(path, on_problem=problems.append).measurements == [measurement(0)]
     assert [(problem.line, "torn" in str(problem)) for problem in problems] == [(4, True)]
 
 
-def test_last_line_without_newline_counts(path: Path) -> None:
-    """A last line that lacks nothing but the newline is read, and nothing is reported."""
+def test_last_line_without_newline_is_read(path: Path) -> None:
+    """Last line without newline is read."""
     path.write_bytes(recording_bytes(measurement(0)).rstrip())
     problems: list[RecordingError] = []
     assert load_recording(path, on_problem=problems.append).measurements == [measurement(0)]
@@ -159,8 +161,8 @@ class TestCorruptLine:
         assert [problem.line for problem in problems] == [4]
 
 
-def test_line_that_is_too_long_is_one_problem(path: Path) -> None:
-    """An overlong line is neither kept in memory nor does it shift the numbers of the lines after it."""
+def test_overlong_line_is_one_problem(path: Path) -> None:
+    """It is not kept in memory, and line numbers stay correct."""
     long = b'{"type":"' + b"x" * (2 * MAX_LINE_BYTES + 5) + b'"}\n'
     path.write_bytes(recording_bytes() + long + encode_line(POSE) + b"\n")
     problems: list[RecordingError] = []
@@ -181,30 +183,30 @@ def test_line_that_is_too_long_is_one_problem(path: Path) -> None:
     ],
     ids=["empty", "blank", "text", "binary", "no-header", "half-header"],
 )
-def test_file_without_header_is_refused(path: Path, content: bytes) -> None:
-    """What does not begin with a header is no recording, not even with keep_going."""
+def test_file_without_header_is_rejected(path: Path, content: bytes) -> None:
+    """Also with keep_going."""
     path.write_bytes(content)
     with pytest.raises(RecordingError, match=r"^[^\n]*header of a recording[^\n]*$"):
         load_recording(path, keep_going=True)
 
 
-def test_empty_file_is_refused_by_read_lines(path: Path) -> None:
-    """Reading lines from an empty file is the same error as loading it."""
+def test_empty_file_is_rejected(path: Path) -> None:
+    """Empty file is rejected."""
     path.touch()
     with pytest.raises(RecordingError, match="header of a recording"):
         list(read_lines(path))
 
 
-def test_other_version_is_refused(path: Path) -> None:
-    """A header of another version is an error that names both versions, with keep_going as well."""
+def test_other_version_is_rejected(path: Path) -> None:
+    """The error states both versions."""
     header = json.loads(encode_line(HEADER)) | {"version": 7}
     path.write_bytes(json.dumps(header).encode() + b"\n")
     with pytest.raises(RecordingVersionError, match=r"version 7, this program reads version 1"):
         load_recording(path, keep_going=True)
 
 
-def test_recording_without_parameters_is_refused(path: Path) -> None:
-    """Without parameters nothing can be computed."""
+def test_recording_without_parameters_is_rejected(path: Path) -> None:
+    """Recording without parameters is rejected."""
     path.write_bytes(encode_line(HEADER) + b"\n" + encode_line(measurement(0)) + b"\n")
     with pytest.raises(RecordingError, match="contains no parameters"):
         load_recording(path)
@@ -222,8 +224,8 @@ def test_folder_is_one_line(tmp_path: Path) -> None:
         load_recording(tmp_path)
 
 
-def test_long_torn_tail_is_skipped_as_torn(tmp_path: Path) -> None:
-    """A power cut can leave a tail of zeros longer than any line; it is torn, not a corrupt line in the middle."""
+def test_long_tail_of_zeros_is_torn(tmp_path: Path) -> None:
+    """A power cut may leave it."""
     path = tmp_path / "r.jsonl"
     path.write_bytes(recording_bytes(measurement(0)) + b"\0" * 3_000_000)
     problems: list[RecordingError] = []

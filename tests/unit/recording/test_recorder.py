@@ -1,4 +1,4 @@
-"""The recorder on a disk that fills up and is emptied again."""
+"""The recorder on a failing disk."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def disk(tmp_path: Path) -> Iterator[FullDisk]:
         yield writer
 
 
-def test_what_a_full_disk_refused_is_written_when_there_is_room(disk: FullDisk) -> None:
-    """No line is lost and the order is kept; the user is told once that it failed, and that it recovered."""
+def test_pending_lines_are_written_when_the_disk_recovers(disk: FullDisk) -> None:
+    """In order; failure and recovery are logged once."""
     recorder = Recorder(disk)
     with capture_logs() as logs:
         for number in range(9):
@@ -53,8 +53,8 @@ def test_what_a_full_disk_refused_is_written_when_there_is_room(disk: FullDisk) 
     assert [entry["event"] for entry in logs] == ["recording_failed", "recording_recovered"]
 
 
-def test_memory_is_bounded_and_the_loss_is_counted(disk: FullDisk) -> None:
-    """Beyond the limit the oldest lines go, and the log says how many."""
+def test_oldest_lines_are_lost_beyond_the_capacity(disk: FullDisk) -> None:
+    """The log states how many."""
     recorder = Recorder(disk, max_pending_lines=4)
     with capture_logs() as logs:
         for number in range(10):
@@ -64,8 +64,8 @@ def test_memory_is_bounded_and_the_loss_is_counted(disk: FullDisk) -> None:
     assert logs[-1]["lost_lines"] == 5
 
 
-def test_what_still_waits_at_the_end_is_tried_once_more(disk: FullDisk) -> None:
-    """Closing writes what waited if there is room by now, and else says how many lines are lost."""
+def test_close_retries_pending_lines(disk: FullDisk) -> None:
+    """It logs how many lines are lost."""
     recorder = Recorder(disk)
     with capture_logs() as logs:
         for full in (False, True):
@@ -78,16 +78,16 @@ def test_what_still_waits_at_the_end_is_tried_once_more(disk: FullDisk) -> None:
     assert logs[-1] == {"event": "recording_incomplete", "lost_lines": 2, "log_level": "error"}
 
 
-def test_a_write_that_hangs_for_hours_does_not_fill_the_memory(disk: FullDisk) -> None:
-    """What waits for a disk that does not even answer is bounded; the newest lines go, and are counted."""
+def test_hanging_write_has_bounded_memory(disk: FullDisk) -> None:
+    """The newest lines are lost and counted."""
     recorder = Recorder(disk, max_pending_lines=10)
     for _ in range(50):
         recorder.put(b"{}")
     assert recorder.pending == 20
 
 
-def test_the_caller_finds_out_what_became_of_a_line(disk: FullDisk) -> None:
-    """Written, still waiting, or lost; by the number under which it was put."""
+def test_fate_of_a_line_can_be_queried(disk: FullDisk) -> None:
+    """Written, pending or lost, by its number."""
     recorder = Recorder(disk, max_pending_lines=2)
     recorder.write_line(b"0")
     disk.full = True
@@ -104,8 +104,8 @@ def test_the_caller_finds_out_what_became_of_a_line(disk: FullDisk) -> None:
     assert recorder.written(range(3, 5)) is True
 
 
-def test_a_line_that_could_not_even_wait_counts_as_lost(disk: FullDisk) -> None:
-    """While a write hangs; those before and after it are written."""
+def test_line_beyond_the_hung_capacity_is_lost(disk: FullDisk) -> None:
+    """Those before and after it are written."""
     recorder = Recorder(disk, max_pending_lines=1)
     for number in range(3):
         recorder.put(b"%d" % number)

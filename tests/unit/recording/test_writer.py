@@ -61,8 +61,8 @@ def disk(writer: RecordingWriter, monkeypatch: pytest.MonkeyPatch) -> Disk:  # n
     return disk
 
 
-def test_line_is_with_the_kernel_at_once(path: Path, writer: RecordingWriter) -> None:
-    """A written line can be read before any sync or close."""
+def test_line_is_readable_at_once(path: Path, writer: RecordingWriter) -> None:
+    """Before any sync or close."""
     writer.write(measurement(0))
     writer.write_line(encode_line(measurement(1)))
     assert path.read_bytes() == recording_bytes(measurement(0), measurement(1))
@@ -136,16 +136,16 @@ def test_torn_header_is_cut_off(path: Path) -> None:
 @pytest.mark.parametrize(
     "content", [b"my notes", b"my notes\n", b"1 2 3 4\n5 6", b'{"type":"pose"}\n', b"\0\0"]
 )
-def test_other_file_is_refused_and_left_alone(path: Path, content: bytes) -> None:
-    """A file that is no recording is neither appended to nor cut."""
+def test_other_file_is_rejected_unchanged(path: Path, content: bytes) -> None:
+    """Other file is rejected unchanged."""
     path.write_bytes(content)
     with pytest.raises(RecordingError, match="header of a recording"):
         RecordingWriter(path)
     assert path.read_bytes() == content
 
 
-def test_other_version_is_refused_and_left_alone(path: Path) -> None:
-    """A recording of another version is not appended to."""
+def test_other_version_is_rejected_unchanged(path: Path) -> None:
+    """Other version is rejected unchanged."""
     content = json.dumps(json.loads(encode_line(HEADER)) | {"version": 2}).encode() + b'\n{"to'
     path.write_bytes(content)
     with pytest.raises(RecordingVersionError, match="version 2, this program reads version 1"):
@@ -154,8 +154,8 @@ def test_other_version_is_refused_and_left_alone(path: Path) -> None:
 
 
 @pytest.mark.usefixtures("writer")
-def test_second_writer_is_refused(path: Path) -> None:
-    """One file has one writer; the second one is told so."""
+def test_second_writer_is_rejected(path: Path) -> None:
+    """Second writer is rejected."""
     with pytest.raises(RecordingError, match="another program is writing it"):
         RecordingWriter(path)
 
@@ -167,8 +167,8 @@ def test_file_is_free_after_close(path: Path, writer: RecordingWriter) -> None:
     RecordingWriter(path).close()
 
 
-def test_file_is_free_after_refusal(path: Path) -> None:
-    """A writer that refused a file holds neither lock nor descriptor."""
+def test_rejected_file_is_not_locked(path: Path) -> None:
+    """Rejected file is not locked."""
     path.write_bytes(b"my notes\n")
     descriptors = len(list(Path("/proc/self/fd").iterdir()))
     with pytest.raises(RecordingError):
@@ -184,8 +184,8 @@ def test_impossible_place_is_one_line(place: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("disk")
-def test_full_disk_leaves_no_half_line(path: Path, writer: RecordingWriter) -> None:
-    """A line that does not fit is an error in one line, and nothing of it stays."""
+def test_full_disk_leaves_no_partial_line(path: Path, writer: RecordingWriter) -> None:
+    """Full disk leaves no partial line."""
     with pytest.raises(
         RecordingError, match=r"^[^\n]*a line was not written \(No space left on device\)[^\n]*free[^\n]*$"
     ):
@@ -193,8 +193,8 @@ def test_full_disk_leaves_no_half_line(path: Path, writer: RecordingWriter) -> N
     assert path.read_bytes() == recording_bytes()
 
 
-def test_writing_goes_on_when_there_is_room_again(path: Path, writer: RecordingWriter, disk: Disk) -> None:
-    """After a failed write the next one is written as soon as it fits."""
+def test_writing_continues_when_the_disk_recovers(path: Path, writer: RecordingWriter, disk: Disk) -> None:
+    """Writing continues when the disk recovers."""
     with pytest.raises(RecordingError):
         writer.write(measurement(0))
     disk.room_bytes = 10_000
@@ -202,10 +202,10 @@ def test_writing_goes_on_when_there_is_room_again(path: Path, writer: RecordingW
     assert path.read_bytes() == recording_bytes(measurement(1))
 
 
-def test_half_line_that_cannot_be_cut_goes_later(
+def test_partial_line_is_removed_later(
     path: Path, writer: RecordingWriter, disk: Disk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """When even the cutting fails, the half line is removed before the next one is written."""
+    """Before the next line is written."""
     with monkeypatch.context() as patch:
         patch.setattr(os, "ftruncate", failing)
         with pytest.raises(RecordingError):
@@ -226,8 +226,8 @@ def test_sync_reaches_the_disk_once(writer: RecordingWriter, monkeypatch: pytest
     assert len(calls) == 1
 
 
-def test_failed_sync_is_tried_again(writer: RecordingWriter, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A disk error at a sync is reported, and the next sync does not pretend that all is well."""
+def test_failed_sync_is_retried(writer: RecordingWriter, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Failed sync is retried."""
     writer.write(measurement(0))
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", failing)

@@ -5,20 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from tsgt.master import link_events
 from tsgt.master.classic.ingest import MIN_RESTART_NS, Ingest
 from tsgt.master.classic.scheduler import Scheduler, StationPlan, SynchronisationSchedule
 from tsgt.master.classic.transport import Transport
-from tsgt.master.link_events import (
-    ClockStepped,
-    ClockUpdate,
-    LinkStatus,
-    MeasurementReceived,
-    NoResponse,
-    ReplyReceived,
-    StationResponded,
-    TrackedPrism,
-    TrackingResult,
-)
 from tsgt.radio.classic import CommandTransaction, LinkTiming, Poll, Synchronisation
 from tsgt.timesync.two_way import clock_filter
 
@@ -28,7 +18,6 @@ if TYPE_CHECKING:
     from tsgt.clock import Clock, UnixTimeline
     from tsgt.config import ClassicMasterConfig, StationConfig
     from tsgt.master.classic.scheduler import ScheduledTransaction
-    from tsgt.master.link_events import Report
     from tsgt.radio import LoRaSettings, Packet, Radio
 
 
@@ -48,7 +37,7 @@ class ClassicLink:
         settings: LoRaSettings,
         clock: Clock,
         timeline: UnixTimeline,
-        report: Report,
+        report: link_events.Report,
     ) -> None:
         self._clock = clock
         self._timeline = timeline
@@ -66,18 +55,12 @@ class ClassicLink:
         self._ingest = Ingest(self._prisms, lambda: clock_filter(protocol.clock_filter), delays_ns)
         self.exchange_start_ns: int | None = None
 
-    def status(self) -> LinkStatus:
+    def status(self) -> link_events.LinkStatus:
         """Return what the status record states about the link."""
-        return LinkStatus(protocol="classic", authenticated=False, clock=self._ingest.clock)
+        return link_events.LinkStatus(protocol="classic", authenticated=False, clock=self._ingest.clock)
 
     async def run(self, radio: Radio) -> None:
-        """Run transactions until the radio fails.
-
-        Raises
-        ------
-        RadioError
-            It has failed.
-        """
+        """Run transactions until the radio raises RadioError."""
         transport = Transport(radio, self._clock, self._timeline, self._timing)
         try:
             while True:
@@ -103,14 +86,14 @@ class ClassicLink:
             else transaction.has_reply
         )
         if not responded or transport.last is None:
-            self._report(NoResponse(station))
+            self._report(link_events.NoResponse(station))
             self._ingest.no_response(station)
             return
-        self._report(StationResponded(station, transport.last.rssi_dbm, transport.last.snr_db))
+        self._report(link_events.StationResponded(station, transport.last.rssi_dbm, transport.last.snr_db))
         if isinstance(transaction, CommandTransaction):
             prism = self._prisms[station]
-            self._report(TrackedPrism(station, prism if transaction.ok else None))
-            self._report(TrackingResult(station, prism, bool(transaction.ok)))
+            self._report(link_events.TrackedPrism(station, prism if transaction.ok else None))
+            self._report(link_events.TrackingResult(station, prism, bool(transaction.ok)))
         elif isinstance(transaction, Synchronisation):
             if transaction.missed_replies:
                 self._ingest.no_response(station)
@@ -127,26 +110,26 @@ class ClassicLink:
     def _synchronised(self, transaction: Synchronisation, now_ns: int) -> None:
         result = self._ingest.synchronised(transaction.station, transaction.samples, now_ns)
         if result.stepped:
-            self._report(ClockStepped(transaction.station))
-        self._report(ClockUpdate(result.record))
+            self._report(link_events.ClockStepped(transaction.station))
+        self._report(link_events.ClockUpdate(result.record))
         for measurement in result.measurements:
-            self._report(MeasurementReceived(measurement))
+            self._report(link_events.MeasurementReceived(measurement))
 
     def _polled(self, poll: Poll, packet: Packet, requested_ns: int) -> None:
         if poll.message is None:
             return
-        self._report(ReplyReceived(poll.station))
+        self._report(link_events.ReplyReceived(poll.station))
         result = self._ingest.reply(
             poll.message,
             requested_ns=requested_ns,
             received_ns=self._timeline.unix_ns(packet.received_at_ns),
         )
         if result.measurement is not None:
-            self._report(MeasurementReceived(result.measurement))
+            self._report(link_events.MeasurementReceived(result.measurement))
         if result.needs_synchronisation:
             self._scheduler.resynchronise(poll.station, self._now_ns())
         if result.stepped:
-            self._report(ClockStepped(poll.station))
+            self._report(link_events.ClockStepped(poll.station))
 
 
 def _is_inconclusive(transaction: Synchronisation) -> bool:

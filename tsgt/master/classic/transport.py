@@ -20,13 +20,6 @@ EXACT_SIGMA_NS = 1_000_000
 class Transport:
     """Runs transactions over a radio, one at a time.
 
-    Parameters
-    ----------
-    radio
-        Started; nobody else receives from it.
-    timeline
-        Of the transactions' instants.
-
     Attributes
     ----------
     last
@@ -47,13 +40,7 @@ class Transport:
         self.unrelated_packets = 0
 
     async def run(self, transaction: Transaction) -> None:
-        """Run a transaction to its end.
-
-        Raises
-        ------
-        RadioError
-            A request could not be sent; the transaction keeps what it has collected.
-        """
+        """Run a transaction to its end, or until the radio raises RadioError."""
         while (request := transaction.request()) is not None:
             sent = await self._radio.transmit(request.payload)
             if not request.reply_timeout_ns:

@@ -51,13 +51,7 @@ class FrameLoop:
         self._observer = observer
 
     async def run(self) -> NoReturn:
-        """Run frames until the radio fails.
-
-        Raises
-        ------
-        RadioError
-            It has failed. Another loop with another radio may continue with the same master.
-        """
+        """Run frames until the radio raises RadioError; another loop may continue with the same master."""
         while True:
             await self.frame()
 

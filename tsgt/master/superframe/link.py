@@ -8,20 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import structlog
 
-from tsgt.master.link_events import (
-    BeaconSent,
-    BeaconTimeRejected,
-    LinkDelayAnomaly,
-    LinkStatus,
-    MasterEvent,
-    MeasurementReceived,
-    NoResponse,
-    ReplyReceived,
-    StationResponded,
-    SuperframeState,
-    TrackedPrism,
-    TrackingResult,
-)
+from tsgt.master import link_events
 from tsgt.master.superframe.frame_loop import FrameLoop
 from tsgt.model import MAX_INSTANT_NS, PolarMeasurement
 from tsgt.radio import SearchCommand, TrackCommand
@@ -34,7 +21,6 @@ if TYPE_CHECKING:
 
     from tsgt.clock import Clock, UnixTimeline
     from tsgt.config import StationConfig, SuperframeMasterConfig
-    from tsgt.master.link_events import Report
     from tsgt.master.reacquisition_hints import ReacquisitionHints
     from tsgt.master.recording_thread import RecordingThread
     from tsgt.radio import Direction, LoRaSettings, Packet, Radio, Transmission
@@ -60,17 +46,6 @@ class _Unwritten(NamedTuple):
 class SuperframeLink:
     """Runs frames and reports the results.
 
-    Parameters
-    ----------
-    recording
-        Writes the reported measurements.
-    hints
-        Gives search directions to stations that have lost their prism.
-    key
-        Of the mission; None: the radio is not authenticated.
-    random_bits
-        For nonces.
-
     Attributes
     ----------
     exchange_start_ns
@@ -84,7 +59,7 @@ class SuperframeLink:
         settings: LoRaSettings,
         clock: Clock,
         timeline: UnixTimeline,
-        report: Report,
+        report: link_events.Report,
         recording: RecordingThread,
         hints: ReacquisitionHints,
         *,
@@ -116,20 +91,16 @@ class SuperframeLink:
         if key is None:
             log.warning("unauthenticated", key_file=protocol.key_file)
             message = "the radio has no key: anyone can send measurements and beacons; make one with `tsgt radio key`"
-            report(MasterEvent("unauthenticated", message))
+            report(link_events.MasterEvent("unauthenticated", message))
 
-    def status(self) -> LinkStatus:
+    def status(self) -> link_events.LinkStatus:
         """Return what the status record states about the link."""
-        return LinkStatus(protocol="superframe", authenticated=self._authenticated, frame_ms=self._frame_ms())
+        return link_events.LinkStatus(
+            protocol="superframe", authenticated=self._authenticated, frame_ms=self._frame_ms()
+        )
 
     async def run(self, radio: Radio) -> None:
-        """Run frames until the radio fails.
-
-        Raises
-        ------
-        RadioError
-            It has failed.
-        """
+        """Run frames until the radio raises RadioError."""
         try:
             await FrameLoop(radio, self._clock, self._master, self).run()
         finally:
@@ -159,35 +130,35 @@ class SuperframeLink:
             session=self._master.session,
             counter=self._master.counter,
         )
-        self._report(BeaconSent(record))
+        self._report(link_events.BeaconSent(record))
 
     def received(self, reply: ReceivedReply, packet: Packet) -> None:
         """Report a reply."""
         report, now_ns, station = self._report, self._now_ns(), reply.station
-        report(StationResponded(station, packet.rssi_dbm, packet.snr_db))
+        report(link_events.StationResponded(station, packet.rssi_dbm, packet.snr_db))
         if reply.joined:
             log.info("station_joined", station=station)
         first_line = self._recording.line_count
         received_ns = self._timeline.unix_ns(packet.received_at_ns)
-        report(ReplyReceived(station))
+        report(link_events.ReplyReceived(station))
         for timed in reply.measurements:
             measurement = self._measurement(station, timed, received_ns)
-            report(MeasurementReceived(measurement))
+            report(link_events.MeasurementReceived(measurement))
             self._hints.measured(measurement)
         if reply.measurements:
             sequences = tuple(timed.sequence for timed in reply.measurements)
             lines = range(first_line, self._recording.line_count)
             self._unwritten.append(_Unwritten(station, sequences, lines))
         if reply.rejected_beacons:
-            report(BeaconTimeRejected(station, reply.rejected_beacons))
+            report(link_events.BeaconTimeRejected(station, reply.rejected_beacons))
         if reply.link_delay_anomaly:
-            report(LinkDelayAnomaly(station))
+            report(link_events.LinkDelayAnomaly(station))
         self._report_state(reply, now_ns)
 
     def not_received(self, stations: Sequence[int]) -> None:
         """Report the stations whose slots stayed empty."""
         for station in stations:
-            self._report(NoResponse(station))
+            self._report(link_events.NoResponse(station))
 
     # ----------------------------------------------------------------------------------------------------------------
 
@@ -212,7 +183,7 @@ class SuperframeLink:
         station, prism = reply.station, self._prisms[reply.station]
         state, status = self._master.station(station), reply.status_report
         self._report(
-            SuperframeState(
+            link_events.SuperframeState(
                 station,
                 joined=not state.join_pending,
                 outstanding=state.window.outstanding,
@@ -221,13 +192,13 @@ class SuperframeLink:
             )
         )
         if reply.response is not None and isinstance(reply.command, TrackCommand):
-            self._report(TrackingResult(station, prism, reply.response.ok))
+            self._report(link_events.TrackingResult(station, prism, reply.response.ok))
         if status is None:
             return
         tracked = None if status.direct else status.prism
-        self._report(TrackedPrism(station, tracked))
+        self._report(link_events.TrackedPrism(station, tracked))
         if tracked == prism:
-            self._report(TrackingResult(station, prism, tracks=True))
+            self._report(link_events.TrackingResult(station, prism, tracks=True))
         elif (
             now_ns - self._track_commanded_ns.get(station, -TRACK_RETRY_INTERVAL_NS)
             >= TRACK_RETRY_INTERVAL_NS

@@ -1,4 +1,4 @@
-"""Restarts of a station that cost the paper's protocol its answers: the master learns of each before it believes it."""
+"""Restarts of a station whose responses are lost: the master detects each before it uses the new clock."""
 
 from __future__ import annotations
 
@@ -7,25 +7,25 @@ from itertools import count
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.lone_station import SECOND, lone_station
 from harness.radios import MS
+from harness.single_station import SECOND, single_station
 
 if TYPE_CHECKING:
-    from harness.lone_station import LoneStation
+    from harness.single_station import SingleStation
 
 STEP_NS = 30 * MS
 """Less than a measurement's time can show, more than a stamp's bound."""
 
 
-def outside(field: LoneStation) -> list[tuple[int, int]]:
+def outside(field: SingleStation) -> list[tuple[int, int]]:
     """Return the stamps that were off by more than their bound, and that bound; in ns."""
     return [(error_ns, bound_ns) for error_ns, bound_ns in field.stamp_errors_ns if abs(error_ns) > bound_ns]
 
 
 @pytest.mark.parametrize("lost", range(12))
-async def test_a_restart_is_learnt_of_although_the_first_answers_after_it_are_lost(lost: int) -> None:
-    """Within five seconds after it; a longer silence makes the master doubt by itself."""
-    async with lone_station() as field:
+async def test_restart_is_detected_after_lost_responses(lost: int) -> None:
+    """Within five seconds; after a longer silence the master suspends the clock anyway."""
+    async with single_station() as field:
         await asyncio.sleep(20.0)
         field.station = None
         await asyncio.sleep(0.5)
@@ -38,7 +38,7 @@ async def test_a_restart_is_learnt_of_although_the_first_answers_after_it_are_lo
     assert outside(field) == []
 
 
-def restart_at(field: LoneStation, request: bytes, *, cycle: int, step_ns: int) -> list[int]:
+def restart_at(field: SingleStation, request: bytes, *, cycle: int, step_ns: int) -> list[int]:
     """Kill the station before a request of a cycle, and start it 0.6 s later with its clock set; return when it died."""
     died_ns: list[int] = []
 
@@ -56,13 +56,13 @@ def restart_at(field: LoneStation, request: bytes, *, cycle: int, step_ns: int) 
 
 
 @pytest.mark.parametrize("step_ns", [STEP_NS, 1_500_000])
-async def test_a_restart_within_a_synchronisation_is_learnt_of(step_ns: int) -> None:
+async def test_restart_within_a_synchronisation_is_detected(step_ns: int) -> None:
     """The new program is pinged, so it does not introduce itself, but that answer is lost: all samples are of before.
 
     Its prism is ordered again and a third synchronisation follows at once; not even a step that exchanges do not tell
     passes for a frequency.
     """
-    async with lone_station() as field:
+    async with single_station() as field:
         # 50 cycles at the start, then three of the second synchronisation.
         died_ns = restart_at(field, b"e1", cycle=53, step_ns=step_ns)
         field.lost = lambda payload: payload == b"e1" and field.count(b"e1") == 55
@@ -73,9 +73,9 @@ async def test_a_restart_within_a_synchronisation_is_learnt_of(step_ns: int) -> 
     assert abs(field.clocks[-1].frequency_ppm) < 5
 
 
-async def test_samples_of_before_a_restart_do_not_count() -> None:
-    """Four of the five cycles are of before, and what is ahead by 3 ms looks like a late stamp beside them."""
-    async with lone_station() as field:
+async def test_samples_before_a_restart_are_not_used() -> None:
+    """Four of five cycles precede it, and an offset of 3 ms looks like a late stamp."""
+    async with single_station() as field:
         # 50 cycles at the start, then four of the second synchronisation.
         died_ns = restart_at(field, b"s1", cycle=54, step_ns=3 * MS)
         await asyncio.sleep(60.0)
@@ -84,11 +84,11 @@ async def test_samples_of_before_a_restart_do_not_count() -> None:
     assert field.count(b"n11") == 2
 
 
-async def test_a_restart_before_a_synchronisation_without_samples_is_learnt_of() -> None:
-    """The new program's first ping is answered, then everything is lost for a second."""
+async def test_restart_before_a_synchronisation_without_samples_is_detected() -> None:
+    """The first ping is answered, then everything is lost for a second."""
     answers = count()
     begun_ns: list[int] = []
-    async with lone_station() as field:
+    async with single_station() as field:
 
         def before(payload: bytes) -> int:
             if payload == b"p1" and field.count(b"p1") == 1 and not begun_ns:

@@ -1,4 +1,4 @@
-"""The intake: from answers to measurements on the master's clock."""
+"""Ingest: replies to measurements on the master's clock."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import settings as limits
 
 from tsgt.master.classic import UNTIMED_SIGMA_NS
-from tsgt.master.classic.ingest import Ingest
+from tsgt.master.classic.ingest import ClockEvent, ClockState, Ingest, next_clock_state
 from tsgt.model import ClockSample, Status
 from tsgt.radio.classic import MeasurementMessage
 from tsgt.radio.classic.messages import decode_reply, no_measurement_yet
@@ -79,8 +79,8 @@ class Master:
         return self.ingest.reply(answer, requested_ns=received_ns - 194 * MS, received_ns=received_ns)
 
 
-def test_a_measurement_is_put_on_the_masters_clock() -> None:
-    """Its stamp is the host's less what the station is ahead; everything raw is kept."""
+def test_measurement_is_converted_to_the_masters_clock() -> None:
+    """The stamp is the host's minus the station's offset; raw values are unchanged."""
     result = Master().poll(1000, message(START + 750 * MS + AHEAD_NS))
     assert not result.stepped
     measurement = result.measurement
@@ -92,8 +92,8 @@ def test_a_measurement_is_put_on_the_masters_clock() -> None:
     assert 0 < measurement.stamp_sigma_ns < MS
 
 
-def test_a_repeat_is_no_measurement() -> None:
-    """The same station time again is the same measurement."""
+def test_repeated_measurement_is_ignored() -> None:
+    """Repeated measurement is ignored."""
     master = Master()
     assert master.poll(1000, message(START + 750 * MS + AHEAD_NS)).measurement is not None
     assert master.poll(1500, message(START + 750 * MS + AHEAD_NS)).measurement is None
@@ -107,14 +107,14 @@ def test_a_repeat_is_no_measurement() -> None:
     [no_measurement_yet(1), replace(message(0), zenith_angle_rad=0.0, slope_distance_m=0.0)],
     ids=["ours", "authors'"],
 )
-def test_before_its_first_measurement_a_station_says_nothing(answer: MeasurementMessage) -> None:
-    """Time 0 is no time, whatever the status."""
+def test_no_measurement_yet_is_ignored(answer: MeasurementMessage) -> None:
+    """Time 0 means none, whatever the status."""
     result = Master().poll(1000, answer)
     assert result == (None, False, False)
 
 
-def test_an_error_without_a_time_is_told_once_until_it_changes() -> None:
-    """It is stamped with its result, very uncertain, and never taken for a sign of another clock."""
+def test_error_without_a_time_is_reported_once_per_change() -> None:
+    """Its stamp is the arrival, with a large sigma; it is no sign of a clock step."""
     master = Master()
     results = [master.poll(1000 * n, failure(status)) for n, status in enumerate((1, 1, 2, 2, 2, 1), start=1)]
     told = [result.measurement for result in results if result.measurement is not None]
@@ -125,8 +125,8 @@ def test_an_error_without_a_time_is_told_once_until_it_changes() -> None:
     assert not any(result.stepped for result in results)
 
 
-def test_an_error_with_a_wild_time_is_one_without() -> None:
-    """The time field of an authors' node that reports an error means nothing."""
+def test_error_with_an_impossible_time_has_none() -> None:
+    """The time field of an authors' node that reports an error is meaningless."""
     master = Master()
     master.poll(500, message(START + 250 * MS + AHEAD_NS))
     result = master.poll(1000, replace(failure(3), time_ns=12_345 * SECOND))
@@ -135,8 +135,8 @@ def test_an_error_with_a_wild_time_is_one_without() -> None:
     assert not result.stepped
 
 
-def test_an_error_with_a_good_time_is_stamped_with_it() -> None:
-    """Our clients stamp errors as they stamp everything."""
+def test_error_with_a_valid_time_is_stamped_with_it() -> None:
+    """Clients stamp errors like measurements."""
     result = Master().poll(1000, message(START + 800 * MS + AHEAD_NS, status=1))
     assert result.measurement is not None
     assert result.measurement.status is Status.TILT
@@ -144,8 +144,8 @@ def test_an_error_with_a_good_time_is_stamped_with_it() -> None:
 
 
 @pytest.mark.parametrize("step_s", [3600, 0.4, -3.0, -1e6, -1.6e9])
-def test_after_a_step_measurements_wait_for_the_new_clock(step_s: float) -> None:
-    """The first that cannot be says so, once; then all come in their order, with the new clock."""
+def test_measurements_after_a_step_are_held(step_s: float) -> None:
+    """The first one reports the step; all are released with the new clock."""
     master = Master()
     step_ns = round(step_s * 1e9)
     master.poll(1000, message(START + 750 * MS + AHEAD_NS))
@@ -165,8 +165,8 @@ def test_after_a_step_measurements_wait_for_the_new_clock(step_s: float) -> None
     assert master.poll(5000, message(START + 4900 * MS + AHEAD_NS + step_ns)).measurement is not None
 
 
-def test_a_step_that_only_a_synchronisation_can_see_is_told_by_it() -> None:
-    """20 ms could as well be the way; the next synchronisation finds them."""
+def test_small_step_is_detected_by_a_synchronisation() -> None:
+    """20 ms could also be a delay."""
     master = Master()
     assert master.poll(1000, message(START + 750 * MS + AHEAD_NS + 5 * MS)).measurement is not None
     found = master.synchronise(30_000, AHEAD_NS + 20 * MS)
@@ -174,8 +174,8 @@ def test_a_step_that_only_a_synchronisation_can_see_is_told_by_it() -> None:
     assert found.record.restarted
 
 
-def test_the_clock_line_says_what_was_found() -> None:
-    """Offset at its stamp, with the raw exchanges."""
+def test_clock_record_has_estimate_and_samples() -> None:
+    """Clock record has estimate and samples."""
     found = Master(synchronised=False).synchronise(0)
     assert found.measurements == []
     assert found.record.offset_ns == pytest.approx(AHEAD_NS, abs=20_000)
@@ -183,16 +183,16 @@ def test_the_clock_line_says_what_was_found() -> None:
     assert (found.record.filter, found.record.restarted, found.record.rejected) == ("regression", True, 0)
 
 
-def test_before_the_first_synchronisation_measurements_wait() -> None:
-    """None is lost, and none is stamped by guess."""
+def test_measurements_before_the_first_synchronisation_are_held() -> None:
+    """Measurements before the first synchronisation are held."""
     master = Master(synchronised=False)
     assert master.poll(1000, message(START + 750 * MS + AHEAD_NS)) == (None, False, False)
     (measurement,) = master.synchronise(2300).measurements
     assert measurement.stamp_ns == pytest.approx(START + 750 * MS, abs=20_000)
 
 
-def test_a_measurement_without_distance_has_none() -> None:
-    """Distance 0 stands for none."""
+def test_distance_zero_is_none() -> None:
+    """Distance zero is none."""
     result = Master().poll(1000, message(START + 750 * MS + AHEAD_NS, status=4, distance_m=0.0))
     assert result.measurement is not None
     assert result.measurement.status is Status.ANGLE_ONLY
@@ -216,8 +216,8 @@ def test_a_measurement_without_distance_has_none() -> None:
         max_size=12,
     )
 )
-def test_no_message_can_break_it(answers: list[bytes | None]) -> None:
-    """Whatever 34 bytes say, and whenever a synchronisation comes: measurements have instants that clocks show."""
+def test_any_message_gives_valid_instants(answers: list[bytes | None]) -> None:
+    """Any 34 bytes, with synchronisations at any time."""
     master = Master()
     for number, answer in enumerate(answers, start=1):
         if answer is None:
@@ -229,8 +229,8 @@ def test_no_message_can_break_it(answers: list[bytes | None]) -> None:
             master.poll(number * 1000, decoded)
 
 
-def test_a_station_that_was_silent_is_synchronised_before_it_is_believed() -> None:
-    """A clock that stood still while the station was off makes new measurements look old: they wait."""
+def test_silent_station_needs_a_synchronisation() -> None:
+    """A clock that was stopped during the outage makes new measurements look old."""
     master = Master()
     assert master.poll(1000, message(START + 700 * MS + AHEAD_NS)).measurement is not None
     master.ingest.no_response(1)
@@ -245,8 +245,8 @@ def test_a_station_that_was_silent_is_synchronised_before_it_is_believed() -> No
     assert measurement.stamp_ns == pytest.approx(START + 21_000 * MS, abs=MS)
 
 
-def test_a_station_that_was_only_not_asked_is_believed_at_once() -> None:
-    """While others are synchronised nobody asks it: that is no silence of its own."""
+def test_station_that_was_not_polled_needs_no_synchronisation() -> None:
+    """While others are synchronised it is not polled."""
     master = Master()
     master.poll(1000, message(START + 700 * MS + AHEAD_NS))
     later = master.poll(30_000, message(START + 29_800 * MS + AHEAD_NS))
@@ -254,8 +254,8 @@ def test_a_station_that_was_only_not_asked_is_believed_at_once() -> None:
     assert not later.needs_synchronisation
 
 
-def test_after_a_silence_the_same_clock_is_not_called_another_one() -> None:
-    """The synchronisation agrees with what was known, so what waited is let go and nothing is announced."""
+def test_consistent_synchronisation_after_a_silence_is_no_step() -> None:
+    """Held measurements are released without an event."""
     master = Master()
     master.poll(1000, message(START + 700 * MS + AHEAD_NS))
     master.ingest.no_response(1)
@@ -265,8 +265,8 @@ def test_after_a_silence_the_same_clock_is_not_called_another_one() -> None:
     assert [m.stamp_ns for m in found.measurements] == [pytest.approx(START + 21_000 * MS, abs=MS)]
 
 
-def test_a_backward_step_while_nothing_new_was_measured_is_noticed() -> None:
-    """Repeats say that nothing was measured before them, so an older measurement cannot come after."""
+def test_backward_step_between_repeats_is_detected() -> None:
+    """Repeats show that there was no measurement before them."""
     master = Master()
     same = message(START + 700 * MS + AHEAD_NS)
     for at_ms in (1000, 1600, 2200, 2800):
@@ -274,8 +274,8 @@ def test_a_backward_step_while_nothing_new_was_measured_is_noticed() -> None:
     assert master.poll(3400, message(START + 3200 * MS + AHEAD_NS - 1500 * MS)).stepped
 
 
-def test_a_clock_that_stood_still_while_nobody_asked_is_doubted() -> None:
-    """Others were synchronised meanwhile, and no request was lost: what looks old waits for a synchronisation."""
+def test_stale_measurement_is_held() -> None:
+    """The clock was stopped while others were synchronised, and no request was lost."""
     master = Master()
     off_ns = 15 * SECOND
     back = master.poll(15_200, message(START + 15_000 * MS - off_ns + AHEAD_NS))
@@ -285,8 +285,8 @@ def test_a_clock_that_stood_still_while_nobody_asked_is_doubted() -> None:
 
 
 @pytest.mark.parametrize("step_s", [6.0, -6.0, 1e8, -1e8, 3e9])
-def test_what_was_held_before_a_restart_gets_no_time_of_the_clock_after_it(step_s: float) -> None:
-    """Nobody knows when it was; the station's journal has it."""
+def test_held_measurement_of_an_earlier_clock_is_dropped(step_s: float) -> None:
+    """Its time is unknown; the station's journal has it."""
     master = Master()
     master.poll(1000, message(START + 700 * MS + AHEAD_NS))
     master.ingest.no_response(1)
@@ -297,8 +297,8 @@ def test_what_was_held_before_a_restart_gets_no_time_of_the_clock_after_it(step_
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_what_was_held_while_the_station_may_have_got_another_clock_is_let_go(known: bool) -> None:  # noqa: FBT001
-    """Half a second apart, both clocks explain it; only without a lost request it is certain which one it is of."""
+def test_held_measurement_of_an_ambiguous_clock_is_dropped(known: bool) -> None:  # noqa: FBT001
+    """Half a second apart, both clocks explain it, unless no request was lost."""
     master = Master(synchronised=known)
     master.ingest.no_response(1)
     master.poll(8000, message(START + 7800 * MS + AHEAD_NS))
@@ -307,19 +307,19 @@ def test_what_was_held_while_the_station_may_have_got_another_clock_is_let_go(kn
 
 
 @pytest.mark.parametrize(("silent_ms", "let_go"), [(300, False), (600, True)])
-def test_what_was_held_before_a_pause_that_is_long_enough_for_a_restart_is_let_go(
+def test_held_measurement_before_a_pause_for_a_restart_is_dropped(
     silent_ms: int,
     let_go: bool,  # noqa: FBT001
 ) -> None:
-    """While others were asked no request could be lost, and the program may have been started again all the same."""
+    """Without polls no request can be lost, but the station may have restarted."""
     master = Master(synchronised=False)
     master.poll(8000, message(START + 7800 * MS + AHEAD_NS))
     found = master.synchronise(8000 + silent_ms + 1000 + 110, AHEAD_NS + 40 * MS)
     assert (found.measurements == []) == let_go
 
 
-def test_an_error_that_was_held_while_the_station_may_have_got_another_clock_has_no_time() -> None:
-    """It is told, but with the time of its result: 11 ms apart, the clock that was found explains it just as well."""
+def test_held_error_of_an_ambiguous_clock_has_no_time() -> None:
+    """It is stamped with its arrival: 11 ms apart, both clocks explain it."""
     master = Master()
     master.ingest.no_response(1)
     master.poll(8000, message(START + 7800 * MS + AHEAD_NS, status=3, distance_m=-1.0))
@@ -329,8 +329,8 @@ def test_an_error_that_was_held_while_the_station_may_have_got_another_clock_has
     assert measurement.stamp_sigma_ns == UNTIMED_SIGMA_NS
 
 
-def test_what_was_held_is_used_if_the_clock_is_the_same_after_lost_requests() -> None:
-    """The clock that was known goes on: there is but one that it can be of."""
+def test_held_measurement_of_the_same_clock_is_released() -> None:
+    """After lost requests too."""
     master = Master()
     master.ingest.no_response(1)
     master.poll(8000, message(START + 7800 * MS + AHEAD_NS))
@@ -338,8 +338,8 @@ def test_what_was_held_is_used_if_the_clock_is_the_same_after_lost_requests() ->
     assert len(master.synchronise(20_000).measurements) == 1
 
 
-def test_what_was_held_may_be_of_the_clock_before_or_of_the_one_after_a_small_step() -> None:
-    """A station that answers late may have stepped by as much, unnoticed: the bound contains both."""
+def test_bound_of_a_held_measurement_covers_a_small_step() -> None:
+    """A station with a late stamp may have stepped by as much."""
     master, step_ns = Master(synchronised=False), 5 * MS
     master.synchronise(0, late_ns=5 * MS)
     master.ingest.no_response(1)
@@ -356,8 +356,8 @@ def test_what_was_held_may_be_of_the_clock_before_or_of_the_one_after_a_small_st
         assert abs(measurement.stamp_ns - truth_ns) <= 3 * measurement.stamp_sigma_ns
 
 
-def test_what_is_played_back_is_no_measurement_and_no_step() -> None:
-    """An answer of before, received again, is known; the station's own next one is taken as ever."""
+def test_replayed_message_is_ignored() -> None:
+    """The next genuine one is used."""
     master = Master()
     old = message(START + 750 * MS + AHEAD_NS)
     master.poll(1000, old)
@@ -366,8 +366,8 @@ def test_what_is_played_back_is_no_measurement_and_no_step() -> None:
     assert master.poll(9600, message(START + 9400 * MS + AHEAD_NS)).measurement is not None
 
 
-def test_a_station_that_begins_anew_is_doubted() -> None:
-    """It had measured, and now has no measurement yet: its program was started again, with whatever clock."""
+def test_restart_suspends_the_clock() -> None:
+    """The station had measured, and now has no measurement yet."""
     master = Master()
     master.poll(1000, message(START + 750 * MS + AHEAD_NS))
     assert master.poll(1600, no_measurement_yet(1)) == (None, False, True)
@@ -378,8 +378,8 @@ def test_a_station_that_begins_anew_is_doubted() -> None:
     assert measurement.stamp_ns == pytest.approx(START + 2000 * MS, abs=MS)
 
 
-def test_a_station_that_begins_anew_once_more_is_doubted_once_more() -> None:
-    """There was no measurement in between, but a request was lost; without that, one that has none is left alone."""
+def test_restart_without_a_measurement_needs_a_lost_request() -> None:
+    """Restart without a measurement needs a lost request."""
     master = Master()
     assert master.poll(1000, no_measurement_yet(1)) == (None, False, False)
     master.ingest.no_response(1)
@@ -388,8 +388,8 @@ def test_a_station_that_begins_anew_once_more_is_doubted_once_more() -> None:
     assert master.poll(3600, no_measurement_yet(1)) == (None, False, False)
 
 
-def test_the_papers_filter_begins_anew_after_a_restart() -> None:
-    """A tenth of the way each time, it would need an hour to get there."""
+def test_papers_filter_is_reset_after_a_restart() -> None:
+    """At a tenth of the error per synchronisation it would need an hour."""
     master = Master()
     master.ingest = Ingest({1: 4}, lambda: clock_filter("paper"))
     master.synchronise(0)
@@ -401,8 +401,8 @@ def test_the_papers_filter_begins_anew_after_a_restart() -> None:
     assert found.record.offset_ns == pytest.approx(AHEAD_NS - 20 * SECOND, abs=MS)
 
 
-def test_the_papers_filter_begins_anew_after_a_step_that_a_measurement_has_shown() -> None:
-    """The next mean is taken whole."""
+def test_papers_filter_is_reset_after_a_step() -> None:
+    """Papers filter is reset after a step."""
     master = Master()
     master.ingest = Ingest({1: 4}, lambda: clock_filter("paper"))
     master.synchronise(0)
@@ -413,16 +413,16 @@ def test_the_papers_filter_begins_anew_after_a_step_that_a_measurement_has_shown
     assert found.record.offset_ns == pytest.approx(ahead_ns, abs=MS)
 
 
-def test_a_stamp_that_is_late_by_an_average_may_be_off_by_as_much() -> None:
-    """The bound says so."""
+def test_bound_includes_the_stamp_delay() -> None:
+    """Bound includes the stamp delay."""
     plain, late = Master(synchronised=False), Master(synchronised=False)
     late.ingest = Ingest({1: 4}, lambda: clock_filter("regression"), {1: 700_000})
     bounds = [master.synchronise(0).record.bound_ns for master in (plain, late)]
     assert bounds[1] - bounds[0] == 700_000
 
 
-def test_the_first_measurement_after_nothing_waits_for_a_synchronisation() -> None:
-    """Between the two the station's program may have been started again, with a clock a little off."""
+def test_first_measurement_after_none_is_held() -> None:
+    """The station may have restarted in between, with a slightly different clock."""
     master = Master()
     master.poll(1000, no_measurement_yet(1))
     first = master.poll(1600, message(START + 1300 * MS + AHEAD_NS + 30 * MS))
@@ -431,3 +431,60 @@ def test_the_first_measurement_after_nothing_waits_for_a_synchronisation() -> No
     (measurement,) = master.synchronise(3000, AHEAD_NS + 30 * MS).measurements
     assert measurement.stamp_ns == pytest.approx(START + 1300 * MS, abs=MS)
     assert master.poll(3600, message(START + 3300 * MS + AHEAD_NS + 30 * MS)).measurement is not None
+
+
+def in_state(state: ClockState) -> Master:
+    """Return a station in a state, its last reply at 0 ms."""
+    master = Master(synchronised=state is not ClockState.UNSYNCHRONISED)
+    if state is ClockState.AWAITING_MEASUREMENT:
+        master.poll(0, no_measurement_yet(1))
+    elif state is ClockState.SUSPENDED:
+        master.ingest.suspend(1)
+    assert master.ingest.clock_state(1) is state
+    return master
+
+
+def cause(master: Master, event: ClockEvent) -> None:
+    """Let the station do what causes an event, 1 s later."""
+    match event:
+        case ClockEvent.SYNCHRONISATION:
+            master.synchronise(1500)
+        case ClockEvent.NO_MEASUREMENT_YET:
+            master.poll(1000, no_measurement_yet(1))
+        case ClockEvent.POSSIBLE_RESTART:
+            master.ingest.suspend(1)
+        case ClockEvent.IMPOSSIBLE_TIMESTAMP:
+            master.poll(1000, message(START + 3600 * SECOND + AHEAD_NS))
+
+
+UNSYNCHRONISED, SYNCHRONISED, AWAITING, SUSPENDED = ClockState
+TRANSITIONS = {
+    ClockEvent.SYNCHRONISATION: [SYNCHRONISED, SYNCHRONISED, SYNCHRONISED, SYNCHRONISED],
+    ClockEvent.NO_MEASUREMENT_YET: [UNSYNCHRONISED, AWAITING, AWAITING, SUSPENDED],
+    ClockEvent.POSSIBLE_RESTART: [UNSYNCHRONISED, SUSPENDED, SUSPENDED, SUSPENDED],
+    ClockEvent.IMPOSSIBLE_TIMESTAMP: [UNSYNCHRONISED, UNSYNCHRONISED, UNSYNCHRONISED, SUSPENDED],
+}
+"""By event, the next state from each state in the order of the enum."""
+
+
+@pytest.mark.parametrize("event", ClockEvent)
+@pytest.mark.parametrize("state", ClockState)
+def test_clock_state_transitions(state: ClockState, event: ClockEvent) -> None:
+    """Each event leads from each state to the state of the table, also when a station causes it."""
+    expected = TRANSITIONS[event][list(ClockState).index(state)]
+    assert next_clock_state(state, event) is expected
+    master = in_state(state)
+    cause(master, event)
+    assert master.ingest.clock_state(1) is expected
+
+
+@pytest.mark.parametrize("state", ClockState)
+def test_measurements_are_published_while_synchronised_only(state: ClockState) -> None:
+    """In every other state they are held; a first measurement also suspends the clock."""
+    master = in_state(state)
+    result = master.poll(1000, message(START + 750 * MS + AHEAD_NS))
+    assert (result.measurement is not None) == (state is SYNCHRONISED)
+    assert result.needs_synchronisation == (state is AWAITING)
+    assert master.ingest.clock_state(1) is (SUSPENDED if state is AWAITING else state)
+    released = master.synchronise(2500).measurements
+    assert len(released) == (state is not SYNCHRONISED)

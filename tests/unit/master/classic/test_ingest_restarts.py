@@ -1,4 +1,4 @@
-"""The intake: what may be of another clock, because the station's program may have been started again."""
+"""Ingest: clocks that may have been reset by a restart."""
 
 from __future__ import annotations
 
@@ -59,10 +59,8 @@ class Master:
 @pytest.mark.parametrize(
     ("first_ms", "second_ms", "apart_s"), [(1.5, 3.0, 60), (-1.5, -3.0, 60), (1.5, 1.0, 20)]
 )
-def test_two_restarts_with_small_steps_do_not_pass_for_a_frequency(
-    first_ms: float, second_ms: float, apart_s: float
-) -> None:
-    """Each step is less than an exchange can tell; until the next synchronisation all stamps are within their bounds."""
+def test_two_small_steps_are_not_taken_for_a_skew(first_ms: float, second_ms: float, apart_s: float) -> None:
+    """Each step is too small for an exchange; stamps stay within their bounds."""
     master = Master()
     master.synchronise(0, cycles=50)
     master.restart(24, round(first_ms * MS))
@@ -78,8 +76,8 @@ def test_two_restarts_with_small_steps_do_not_pass_for_a_frequency(
         assert abs(stamp_ns - (START_NS + round(at_s * SECOND) - 244 * MS)) <= bound_ns
 
 
-def test_no_line_reaches_over_what_may_have_been_a_restart() -> None:
-    """The frequency that was known stays a first guess; what the step would make of it is left out."""
+def test_regression_does_not_span_a_restart() -> None:
+    """The known skew remains a prior."""
     through, anew = RegressionFilter(), RegressionFilter()
     for clock in (through, anew):
         clock.update(synchronisation(0, lambda _: 0.0, cycles=50, turnaround_ns=TURNAROUND_NS))
@@ -92,8 +90,8 @@ def test_no_line_reaches_over_what_may_have_been_a_restart() -> None:
 
 
 @pytest.mark.parametrize("apart_s", [28, 60])
-def test_a_station_that_had_nothing_yet_was_restarted_while_nobody_asked_it(apart_s: int) -> None:
-    """The others were synchronised meanwhile; no line reaches over the step, though there was no measurement before."""
+def test_unnoticed_restart_before_the_first_measurement_is_handled(apart_s: int) -> None:
+    """The station was not polled meanwhile; the regression does not span the step."""
     master = Master()
     master.synchronise(0)
     master.ahead_ns += 1_800_000
@@ -112,8 +110,8 @@ def test_a_station_that_had_nothing_yet_was_restarted_while_nobody_asked_it(apar
         assert abs(stamp_ns - (START_NS + round(at_s * SECOND) - 244 * MS)) <= bound_ns
 
 
-def test_the_papers_filter_takes_a_tenth_all_the_same() -> None:
-    """It is as the paper has it."""
+def test_papers_filter_ignores_restarts() -> None:
+    """As in the paper."""
     plain, anew = clock_filter("paper"), clock_filter("paper")
     for clock in (plain, anew):
         clock.update(synchronisation(0, lambda _: 0.0))
@@ -123,8 +121,8 @@ def test_the_papers_filter_takes_a_tenth_all_the_same() -> None:
     assert plain.at(stepped[-1].station_ns) == anew.at(stepped[-1].station_ns)
 
 
-def test_what_comes_while_the_clock_is_doubted_waits_for_a_synchronisation() -> None:
-    """It is stamped with the clock that is found then."""
+def test_measurement_with_a_suspended_clock_is_held() -> None:
+    """It is stamped with the clock of the next synchronisation."""
     master = Master()
     master.synchronise(0)
     assert master.poll(2.0) is not None
@@ -136,8 +134,8 @@ def test_what_comes_while_the_clock_is_doubted_waits_for_a_synchronisation() -> 
     assert master.poll(6.0) is not None
 
 
-def test_an_error_that_came_late_is_told_once() -> None:
-    """With the time of its result, as it looked old; after a silence it comes again, and its clock is known by then."""
+def test_late_error_is_reported_once() -> None:
+    """With its arrival as time, as it appeared old; its repetition is recognised."""
     master = Master()
     master.synchronise(0)
     assert master.poll(2.0) is not None
@@ -148,8 +146,8 @@ def test_an_error_that_came_late_is_told_once() -> None:
     assert master.synchronise(12.0) == []
 
 
-def test_errors_of_an_authors_node_are_told_although_their_time_is_always_the_same() -> None:
-    """It means nothing; they are known by their status."""
+def test_authors_node_errors_are_recognised_by_their_status() -> None:
+    """Their time is constant and meaningless."""
     master = Master()
     master.synchronise(0)
     told = []

@@ -1,4 +1,4 @@
-"""The scheduler on a made-up channel where each turn takes its time, without radio and clock."""
+"""The scheduler on a model of the channel, without radio and clock."""
 
 from __future__ import annotations
 
@@ -97,8 +97,8 @@ class Channel:
         return len(polls) / (self.now_ns / SECOND - since_s)
 
 
-def test_each_station_is_told_to_track_then_synchronised_then_polled() -> None:
-    """The order goes first with the station's prism; all are synchronised before the first poll."""
+def test_stations_are_commanded_synchronised_and_polled() -> None:
+    """All are synchronised before the first poll."""
     channel = Channel()
     channel.run(60)
     kinds = [(type(turn), turn.station) for _, turn in channel.turns[:9]]
@@ -107,7 +107,7 @@ def test_each_station_is_told_to_track_then_synchronised_then_polled() -> None:
     assert [turn._cycles for _, turn in channel.of(Synchronisation)[:3]] == [50, 50, 50]
 
 
-def test_three_stations_get_the_rate_that_the_air_allows() -> None:
+def test_three_stations_get_the_channel_capacity() -> None:
     """Round robin; synchronisations take less than a twentieth of the time."""
     channel = Channel()
     channel.run(700)
@@ -129,16 +129,16 @@ def test_synchronisations_are_staggered_evenly() -> None:
         assert other == one % 3 + 1
 
 
-def test_early_synchronisations_leave_time_for_polls_between_them() -> None:
-    """Stations that were first synchronised one after the other do not take the channel together again."""
+def test_early_synchronisations_are_spaced() -> None:
+    """Stations that were synchronised one after the other do not take the channel together."""
     channel = Channel(SynchronisationSchedule(initial_cycles=5, resync_cycles=5, interval_ns=300 * SECOND))
     channel.run(300)
     starts_ns = [at for at, _ in channel.of(Synchronisation, since_s=10)]
     assert min(b - a for a, b in pairwise(starts_ns)) > 5 * SECOND
 
 
-def test_a_dead_station_costs_the_others_little() -> None:
-    """It gets a twentieth of the time; the others are polled more often than with it alive."""
+def test_dead_station_gets_a_twentieth_of_the_time() -> None:
+    """The others are polled more often than with it alive."""
     channel = Channel()
     channel.run(120)
     channel.dead.add(3)
@@ -151,8 +151,8 @@ def test_a_dead_station_costs_the_others_little() -> None:
     assert channel.rate_hz(2, 150) > 0.93 * two_alone_hz
 
 
-def test_a_station_that_was_never_there_costs_the_others_little() -> None:
-    """Its first synchronisation fails, and so do the next ones, further and further apart."""
+def test_absent_station_gets_a_twentieth_of_the_time() -> None:
+    """Its synchronisations fail at growing intervals."""
     channel = Channel(dead={2})
     channel.run(60)
     assert not [turn for _, turn in channel.of(Poll) if turn.station == 2]
@@ -169,8 +169,8 @@ def test_a_station_that_was_never_there_costs_the_others_little() -> None:
 
 
 @pytest.mark.parametrize(("outage_s", "found_s"), [(0.5, 1.0), (10, 6.0), (300, 25.0)])
-def test_a_station_is_found_again_soon(outage_s: float, found_s: float) -> None:
-    """The longer it was silent the longer it may take; from then on it has its turn in every round."""
+def test_recovered_station_is_found_soon(outage_s: float, found_s: float) -> None:
+    """In proportion to its silence; then it is part of every round."""
     channel = Channel()
     channel.run(60)
     channel.dead.add(1)
@@ -182,8 +182,8 @@ def test_a_station_is_found_again_soon(outage_s: float, found_s: float) -> None:
     assert channel.rate_hz(1, since_s) == pytest.approx(channel.rate_hz(2, since_s), rel=0.05)
 
 
-def test_one_lost_packet_costs_no_more_than_itself() -> None:
-    """After a single time-out the stations have their turns one after the other as before."""
+def test_lost_packet_causes_no_back_off() -> None:
+    """Lost packet causes no back off."""
     channel = Channel()
     channel.run(60)
     channel.dead.add(1)
@@ -197,8 +197,8 @@ def test_one_lost_packet_costs_no_more_than_itself() -> None:
     )
 
 
-def test_a_poll_without_an_answer_is_repeated_at_once_but_only_once() -> None:
-    """The packet may have been lost; a round later, the gap between two measurements would be twice as long."""
+def test_failed_poll_is_repeated_once() -> None:
+    """A round later the gap between two measurements would be twice as long."""
     channel = Channel()
     channel.run(60)
     channel.dead.add(2)
@@ -208,8 +208,8 @@ def test_a_poll_without_an_answer_is_repeated_at_once_but_only_once() -> None:
     assert stations[unanswered : unanswered + 4] == [2, 2, 3, 1]
 
 
-def test_a_station_that_refuses_to_track_is_told_again_and_never_polled() -> None:
-    """In direct mode a poll would be an order to measure; orders come less and less often."""
+def test_refusing_station_is_commanded_again_and_never_polled() -> None:
+    """In direct mode a poll would be a command to measure; commands back off."""
     channel = Channel(refusing={3})
     channel.run(300)
     assert not [turn for _, turn in channel.of(Poll) if turn.station == 3]
@@ -221,8 +221,8 @@ def test_a_station_that_refuses_to_track_is_told_again_and_never_polled() -> Non
     assert [turn for _, turn in channel.of(Poll) if turn.station == 3]
 
 
-def test_an_order_lost_after_many_refusals_costs_no_more_than_itself() -> None:
-    """An instrument that is being connected refuses often, which costs little; a lost packet is not paid for as often."""
+def test_lost_command_after_refusals_causes_no_long_back_off() -> None:
+    """Refusals cost little, a lost packet much."""
     channel = Channel(stations=1, refusing={1})
     channel.run(20)
     assert [turn.ok for _, turn in channel.of(CommandTransaction)[:5]] == [False] * 5
@@ -232,8 +232,8 @@ def test_an_order_lost_after_many_refusals_costs_no_more_than_itself() -> None:
     assert isinstance(channel.scheduler.next(channel.now_ns + SECOND), Synchronisation)
 
 
-def test_a_station_with_another_clock_is_synchronised_before_anything_else() -> None:
-    """Whoever is next in the round waits; it may have been restarted, so it is told its prism again."""
+def test_reset_clock_is_synchronised_first() -> None:
+    """The station may have restarted, so the command to track is repeated."""
     channel = Channel()
     channel.run(90)
     channel.scheduler.resynchronise(2, channel.now_ns)
@@ -247,8 +247,8 @@ def test_a_station_with_another_clock_is_synchronised_before_anything_else() -> 
     assert following[0] < 190  # its frequency is learnt anew
 
 
-def test_a_station_whose_synchronisation_leaves_doubt_is_synchronised_again_at_once() -> None:
-    """As one whose clock was found to be another one; its measurements wait meanwhile."""
+def test_inconclusive_synchronisation_is_repeated_at_once() -> None:
+    """Inconclusive synchronisation is repeated at once."""
     channel = Channel(inconclusive={2})
     channel.run(44)
     channel.inconclusive.clear()
@@ -267,10 +267,8 @@ def share_of_2(channel: Channel) -> float:
 
 
 @pytest.mark.parametrize("samples", [True, False])
-def test_a_station_whose_synchronisations_always_leave_doubt_gets_no_more_than_its_share(
-    *, samples: bool
-) -> None:
-    """Each leads to the next, but others have their turns in between."""
+def test_inconclusive_synchronisations_back_off(*, samples: bool) -> None:
+    """The other stations get their share."""
     channel = Channel()
     channel.run(60)
     channel.inconclusive.add(2)
@@ -284,8 +282,8 @@ def test_a_station_whose_synchronisations_always_leave_doubt_gets_no_more_than_i
     assert channel.rate_hz(2, 1150) == pytest.approx(channel.rate_hz(1, 1150), rel=0.1)
 
 
-def test_doubts_that_are_far_apart_cost_no_pause() -> None:
-    """Only those count that come one after the other, without a poll in between."""
+def test_separate_inconclusive_synchronisations_do_not_back_off() -> None:
+    """Only consecutive ones count, without a poll in between."""
     channel = Channel()
     channel.run(60)
     for until_s in range(70, 130, 10):
@@ -299,8 +297,8 @@ def test_doubts_that_are_far_apart_cost_no_pause() -> None:
         ]
 
 
-def test_a_station_that_answers_but_has_no_stamps_gets_no_more_than_its_share() -> None:
-    """Its clock was found to be another one, and no synchronisation says which."""
+def test_synchronisations_without_samples_back_off() -> None:
+    """Synchronisations without samples back off."""
     channel = Channel()
     channel.run(60)
     channel.stampless.add(2)
@@ -308,23 +306,23 @@ def test_a_station_that_answers_but_has_no_stamps_gets_no_more_than_its_share() 
     assert share_of_2(channel) < 0.34
 
 
-def test_a_late_yes_of_one_station_is_not_taken_for_another_ones() -> None:
-    """While a station may still answer its order, the others have to say twice that they track."""
+def test_late_confirmation_is_not_attributed_to_another_station() -> None:
+    """While a station may still respond, the others have to confirm twice."""
     channel = Channel(stations=2, dead={1})
     channel.run(40)
     assert len([turn for _, turn in channel.of(CommandTransaction) if turn.station == 2]) == 2
     assert [turn for _, turn in channel.of(Synchronisation) if turn.station == 2]
 
 
-def test_with_nobody_there_the_channel_rests() -> None:
-    """When every station is left alone there is an instant to wait for."""
+def test_idle_channel_has_a_deadline() -> None:
+    """When every station is backed off there is an instant to wait for."""
     channel = Channel(stations=1, dead={1})
     channel.run(600)
     assert channel.spent_ns[1] < 60 * SECOND
 
 
-def test_a_turn_that_was_broken_off_is_taken_again() -> None:
-    """The radio failed within the first order: the station is told once more in its next turn."""
+def test_aborted_transaction_is_repeated() -> None:
+    """The radio failed within the first command."""
     channel = Channel()
     first = channel.scheduler.next(0)
     assert isinstance(first, CommandTransaction)

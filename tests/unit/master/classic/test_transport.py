@@ -1,4 +1,4 @@
-"""The collector: what a transaction asks for goes out, what comes back is handed to it with its instants."""
+"""Transport: sends a transaction's requests and passes replies with their instants."""
 
 from __future__ import annotations
 
@@ -61,8 +61,8 @@ async def answer(both: Bench, replies: Sequence[tuple[int, bytes]]) -> None:
         await both.there.radio.transmit(payload, at_ns=packet.received_at_ns + after_ms * MS)
 
 
-async def test_instants_are_those_on_the_air() -> None:
-    """The request's begin is its TxDone less lag and airtime; the reply's is its RxDone; both are edges."""
+async def test_instants_are_those_of_the_transmission() -> None:
+    """The request starts at its TxDone minus lag and airtime; the reply ends at its RxDone."""
     async with bench() as both:
         task = asyncio.create_task(answer(both, [(1, b"e1")]))
         transaction, transport = ScriptedTransaction([Request(b"e1", 250 * MS)]), transport_on(both)
@@ -80,8 +80,8 @@ async def test_instants_are_those_on_the_air() -> None:
     assert transport.requested_ns == sent_ns
 
 
-async def test_without_a_reply_the_turn_learns_of_it_when_the_time_is_over() -> None:
-    """The time-out counts from the end of the transmission."""
+async def test_missing_reply_is_a_timeout() -> None:
+    """It counts from the end of the transmission."""
     async with bench() as both:
         transaction = ScriptedTransaction([Request(b"e1", 250 * MS)])
         began_ns = both.clock.monotonic_ns()
@@ -91,8 +91,8 @@ async def test_without_a_reply_the_turn_learns_of_it_when_the_time_is_over() -> 
     assert took_ns == pytest.approx(TIMING.airtime_ns(2) + 250 * MS, abs=MS)
 
 
-async def test_a_request_without_reply_is_not_waited_for() -> None:
-    """The next one follows at once."""
+async def test_request_without_reply_does_not_wait() -> None:
+    """Request without reply does not wait."""
     async with bench() as both:
         transaction = ScriptedTransaction([Request(b"p1", 0), Request(b"c1", 0)])
         began_ns = both.clock.monotonic_ns()
@@ -102,8 +102,8 @@ async def test_a_request_without_reply_is_not_waited_for() -> None:
     assert took_ns == pytest.approx(2 * TIMING.airtime_ns(2), abs=2 * MS)
 
 
-async def test_foreign_packets_are_counted_and_the_wait_goes_on() -> None:
-    """What the transaction does not accept changes nothing else."""
+async def test_unrelated_packets_are_counted() -> None:
+    """Waiting continues."""
     async with bench() as both:
         task = asyncio.create_task(answer(both, [(1, b"x"), (80, b"e1")]))
         transaction, transport = ScriptedTransaction([Request(b"e1", 250 * MS)]), transport_on(both)
@@ -114,8 +114,8 @@ async def test_foreign_packets_are_counted_and_the_wait_goes_on() -> None:
     assert transport.unrelated_packets == 1
 
 
-async def test_what_came_before_the_request_is_no_answer_to_it() -> None:
-    """A reply that was late for one transaction is not taken by the next."""
+async def test_packet_before_the_request_is_no_reply() -> None:
+    """It is a late reply to the previous transaction."""
     async with bench() as both:
         await both.there.radio.transmit(b"e1")
         await asyncio.sleep(0.1)
@@ -126,8 +126,8 @@ async def test_what_came_before_the_request_is_no_answer_to_it() -> None:
     assert transport.unrelated_packets == 1
 
 
-async def test_a_lost_edge_makes_an_inexact_stamp() -> None:
-    """The reply was found by polling; the transaction is told not to trust its instant."""
+async def test_lost_edge_makes_an_inexact_stamp() -> None:
+    """The reply was found by polling."""
     async with bench() as both:
 
         async def answer_without_edge() -> None:
@@ -142,8 +142,8 @@ async def test_a_lost_edge_makes_an_inexact_stamp() -> None:
     assert [exact for *_, exact in transaction.accepted] == [False]
 
 
-async def test_a_packet_that_was_there_in_time_counts_even_if_the_program_was_late() -> None:
-    """The loop was held up beyond the time-out while the packet came."""
+async def test_packet_in_time_counts_when_the_program_is_late() -> None:
+    """The event loop was blocked beyond the time-out."""
     async with bench() as both:
         task = asyncio.create_task(answer(both, [(1, b"e1")]))
         transaction = ScriptedTransaction([Request(b"e1", 250 * MS)])
@@ -155,8 +155,8 @@ async def test_a_packet_that_was_there_in_time_counts_even_if_the_program_was_la
     assert transaction.timeouts == 0
 
 
-async def test_errors_of_the_radio_reach_the_caller() -> None:
-    """Whoever owns the radio decides what to do."""
+async def test_radio_error_is_raised() -> None:
+    """Radio error is raised."""
     async with bench() as both:
         await both.here.radio.close()
         with pytest.raises(RadioError):

@@ -1,4 +1,4 @@
-"""The loop of the frames: beacons go out when they are due, replies are handed on, silence is told."""
+"""The frame loop: beacons on time, replies and empty slots to the observer."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 from harness.field import running
-from harness.frames import KEY, TIMING, counted
 from harness.radios import MS, Bench, bench
+from harness.scripted_stations import KEY, TIMING, counted
 
 from tsgt.master.superframe import FrameLoop
 from tsgt.radio.superframe import FramePlan, SuperframeMaster
@@ -113,8 +113,8 @@ async def answer(both: Bench, master: SuperframeMaster, *, early_ns: int = 0) ->
         await both.there.radio.transmit(content + code, at_ns=at_ns)
 
 
-async def test_frames_go_round() -> None:
-    """Composed, out, heard, silent; the next one follows when the last slot is over."""
+async def test_frames_follow_each_other() -> None:
+    """Composed, sent, received, not received; the next one follows the last slot."""
     async with bench() as both:
         master, call_log = master_on(both), CallLog()
         async with (
@@ -127,8 +127,8 @@ async def test_frames_go_round() -> None:
         assert (after_ns - before_ns) / MS < 500
 
 
-async def test_a_frame_ends_when_nobody_is_waited_for_any_more() -> None:
-    """Without an answer it lasts until the last slot is over."""
+async def test_frame_without_replies_ends_with_its_last_slot() -> None:
+    """Frame without replies ends with its last slot."""
     async with bench() as both:
         master, call_log = master_on(both), CallLog()
         async with running(FrameLoop(both.here.radio, both.clock, master, call_log).run()):
@@ -140,8 +140,8 @@ async def test_a_frame_ends_when_nobody_is_waited_for_any_more() -> None:
     assert first_ns == pytest.approx(slots_ns, abs=8 * MS)
 
 
-async def test_a_frame_that_is_to_begin_later_is_composed_later() -> None:
-    """So that it acknowledges what is written until then."""
+async def test_later_frame_is_composed_later() -> None:
+    """It acknowledges what is written until then."""
     async with bench() as both:
         master, call_log = master_on(both, late=True), CallLog()
         async with running(FrameLoop(both.here.radio, both.clock, master, call_log).run()):
@@ -151,8 +151,8 @@ async def test_a_frame_that_is_to_begin_later_is_composed_later() -> None:
             assert call_log.calls == ["composing"]
 
 
-async def test_nothing_is_sent_before_all_is_put_away() -> None:
-    """The listener says when."""
+async def test_frame_waits_for_the_observer() -> None:
+    """Frame waits for the observer."""
     async with bench() as both:
         master, call_log = master_on(both), CallLog(ready_after_s=1.0)
         async with running(FrameLoop(both.here.radio, both.clock, master, call_log).run()):

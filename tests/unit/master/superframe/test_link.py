@@ -1,4 +1,4 @@
-"""The master's daemon on the superframe, among stations on one simulated air, on virtual time."""
+"""The master's daemon with the superframe, with stations on one simulated channel, on virtual time."""
 
 from __future__ import annotations
 
@@ -76,8 +76,8 @@ def undelivered(field: Field, *, until_s: float) -> dict[int, set[int]]:
 NOTHING: dict[int, set[int]] = {number: set() for number in STATIONS}
 
 
-async def test_every_measurement_comes_and_makes_poses(tmp_path: Path) -> None:
-    """2.5 Hz from each station, stamped to microseconds; poses are valid, and the status says how it stands."""
+async def test_every_measurement_is_delivered(tmp_path: Path) -> None:
+    """2.5 Hz per station with stamps accurate to microseconds; poses are valid, and the status is correct."""
     scene = stationary_scene().moving(driving)
     async with field_of(tmp_path, scene, superframe=True) as field, running(field.master()):
         await asyncio.sleep(40)
@@ -106,8 +106,8 @@ async def test_every_measurement_comes_and_makes_poses(tmp_path: Path) -> None:
     assert events(field) == []
 
 
-async def test_beacons_stand_in_the_recording(tmp_path: Path) -> None:
-    """Each with its number and TxDone; frames last as long as what is sent in them."""
+async def test_beacons_are_recorded(tmp_path: Path) -> None:
+    """With number and TxDone; frames last as long as their packets."""
     async with field_of(tmp_path, superframe=True) as field, running(field.master()):
         await asyncio.sleep(30)
     beacons = field.of(BeaconRecord)
@@ -117,8 +117,8 @@ async def test_beacons_stand_in_the_recording(tmp_path: Path) -> None:
     assert mean(lengths_ms) == pytest.approx(378, abs=8)
 
 
-async def test_a_lock_makes_measurements_younger(tmp_path: Path) -> None:
-    """Frames of 400 ms, because the instruments measure every 400 ms."""
+async def test_phase_lock_reduces_the_age(tmp_path: Path) -> None:
+    """Frames of 400 ms, the instruments' period."""
     ages_ms = {}
     for locked in (False, True):
         folder = tmp_path / str(locked)
@@ -132,8 +132,8 @@ async def test_a_lock_makes_measurements_younger(tmp_path: Path) -> None:
     assert ages_ms[True] < 220 < ages_ms[False] < 310
 
 
-async def test_a_lossy_channel_loses_nothing(tmp_path: Path) -> None:
-    """One packet in five is not heard: all comes in the end, some of it late, and the newest status stands."""
+async def test_lossy_channel_loses_no_measurement(tmp_path: Path) -> None:
+    """At 20 % packet loss everything is delivered, and the status is the newest."""
     async with (
         field_of(tmp_path, superframe=True, link=LinkModel(loss_probability=0.2)) as field,
         running(field.master()),
@@ -148,8 +148,8 @@ async def test_a_lossy_channel_loses_nothing(tmp_path: Path) -> None:
         assert 0.1 < station.loss < 0.7
 
 
-async def test_without_a_key_it_runs_and_says_so(tmp_path: Path) -> None:
-    """Stations with another key, or without one, are not heard by a master with one, and the other way round."""
+async def test_missing_key_is_reported(tmp_path: Path) -> None:
+    """Stations and masters with different keys, or without one, ignore each other."""
     with capture_logs() as logs:
         async with field_of(tmp_path, superframe=True) as field, running(field.master(key=None)):
             await asyncio.sleep(10)
@@ -162,8 +162,8 @@ async def test_without_a_key_it_runs_and_says_so(tmp_path: Path) -> None:
 # --- Disk -------------------------------------------------------------------------------------------------------------
 
 
-async def test_what_is_not_written_is_not_acknowledged(tmp_path: Path) -> None:
-    """A full disk: poses go on, stations keep everything; when there is room all is written, nothing twice."""
+async def test_unwritten_measurements_are_not_acknowledged(tmp_path: Path) -> None:
+    """With a full disk poses continue and stations keep everything; later all is written once."""
     write_line = RecordingWriter.write_line
     full = threading.Event()
 
@@ -190,8 +190,8 @@ async def test_what_is_not_written_is_not_acknowledged(tmp_path: Path) -> None:
     assert written == [encode_line(m) for m in field.of(PolarMeasurement)]
 
 
-async def test_a_disk_that_hangs_holds_up_no_frame(tmp_path: Path) -> None:
-    """Beacons wait for it for some milliseconds and then go out."""
+async def test_hanging_disk_does_not_delay_frames(tmp_path: Path) -> None:
+    """Beacons wait for it for some milliseconds."""
     write_line = RecordingWriter.write_line
     hangs = threading.Event()
     freed = threading.Event()
@@ -235,8 +235,8 @@ async def _in_a_thread_of_its_own(function: object) -> None:
 # --- Radio and stations -----------------------------------------------------------------------------------------------
 
 
-async def test_a_radio_that_fails_within_a_frame_goes_on_with_the_next(tmp_path: Path) -> None:
-    """The session stays, so nobody has to join again; nothing is lost or comes twice."""
+async def test_radio_failure_continues_the_session(tmp_path: Path) -> None:
+    """No station has to join again; nothing is lost or duplicated."""
     async with field_of(tmp_path, superframe=True) as field:
         fails = False
 
@@ -268,8 +268,8 @@ async def test_a_radio_that_fails_within_a_frame_goes_on_with_the_next(tmp_path:
     assert all(after.counter > before.counter for before, after in pairwise(beacons))
 
 
-async def test_a_station_that_is_killed_comes_back_with_what_it_had(tmp_path: Path) -> None:
-    """At once, with right times; the numbers that it leaves out are not waited for."""
+async def test_killed_station_delivers_its_backlog(tmp_path: Path) -> None:
+    """With correct times; skipped numbers are not waited for."""
     async with field_of(tmp_path, superframe=True) as field, running(field.master()):
         await asyncio.sleep(20.1)
         await field.stations[2].kill()
@@ -282,8 +282,8 @@ async def test_a_station_that_is_killed_comes_back_with_what_it_had(tmp_path: Pa
     assert undelivered(field, until_s=40) == NOTHING
 
 
-async def test_after_an_outage_everything_comes_live_data_first(tmp_path: Path) -> None:
-    """A robot behind a hill for a minute; the status never speaks of an old measurement as the newest."""
+async def test_backlog_follows_live_data_after_an_outage(tmp_path: Path) -> None:
+    """The status never shows an old measurement as the newest."""
     link = LinkModel()
     async with field_of(tmp_path, superframe=True, link=link) as field, running(field.master()):
         await asyncio.sleep(20)
@@ -308,8 +308,8 @@ async def test_after_an_outage_everything_comes_live_data_first(tmp_path: Path) 
     assert events(field) == ["station_lost 3", "station_recovered 3"]
 
 
-async def test_statuses_that_come_late_are_no_news(tmp_path: Path) -> None:
-    """What the instrument reported during an outage is told when it has come, but not as its present state."""
+async def test_late_status_is_not_the_present_one(tmp_path: Path) -> None:
+    """Late status is not the present one."""
     link = LinkModel()
     async with field_of(tmp_path, superframe=True, link=link) as field, running(field.master()):
         await asyncio.sleep(20)
@@ -326,8 +326,8 @@ async def test_statuses_that_come_late_are_no_news(tmp_path: Path) -> None:
     assert "instrument_status 1" not in events(field)
 
 
-async def test_a_station_in_direct_mode_is_put_back_to_tracking(tmp_path: Path) -> None:
-    """As whoever measured targets may have left it; told when it refuses, and when it does after all."""
+async def test_station_in_direct_mode_is_commanded_to_track(tmp_path: Path) -> None:
+    """A refusal and its end are events."""
     async with field_of(tmp_path, superframe=True) as field:
         tool = field.stations[1].instrument
         await field.stations[1].kill()
@@ -344,8 +344,8 @@ async def test_a_station_in_direct_mode_is_put_back_to_tracking(tmp_path: Path) 
     assert not tool.direct_mode
 
 
-async def test_a_station_without_its_prism_is_told_where_the_robot_is(tmp_path: Path) -> None:
-    """Every 5 s, in its own circles, until it has it again; nobody else notices, and nothing is lost."""
+async def test_lost_prism_gets_search_commands(tmp_path: Path) -> None:
+    """Every 5 s, in its own circles, until it is reacquired; the others are not affected."""
     scene = stationary_scene().moving(driving)
     with capture_logs() as logs:
         async with field_of(tmp_path, scene, superframe=True) as field, running(field.master()):
@@ -376,8 +376,8 @@ async def test_a_station_without_its_prism_is_told_where_the_robot_is(tmp_path: 
     assert station_status(field, 1).rate_hz == pytest.approx(2.5, abs=0.11)
 
 
-async def test_directions_cost_the_others_nothing(tmp_path: Path) -> None:
-    """Frames on the instruments' beat last as long as before, and measurements come as early."""
+async def test_search_commands_do_not_delay_others(tmp_path: Path) -> None:
+    """Phase-locked frames keep their length, and measurements their age."""
     async with field_of(tmp_path, superframe=True) as field:
         async with running(field.master(field.config(protocol={"phase_lock": True}))):
             await asyncio.sleep(40)
@@ -400,8 +400,8 @@ async def test_directions_cost_the_others_nothing(tmp_path: Path) -> None:
         assert max(ages_ms[True]) < max(ages_ms[False]) + 40
 
 
-async def test_who_does_something_else_is_not_told_to_search(tmp_path: Path) -> None:
-    """A station in direct mode, whose operator aims at targets; it is asked to track, as ever."""
+async def test_station_in_direct_mode_gets_no_search_command(tmp_path: Path) -> None:
+    """Its operator aims at targets; it is commanded to track."""
     async with field_of(tmp_path, superframe=True) as field, running(field.master()):
         tool = field.stations[1].instrument
         await asyncio.sleep(10)
@@ -415,8 +415,8 @@ async def test_who_does_something_else_is_not_told_to_search(tmp_path: Path) -> 
         assert "station_not_tracking 1" in events(field)
 
 
-async def test_a_search_that_is_refused_is_no_refusal_to_track(tmp_path: Path) -> None:
-    """It is told again after 5 s; nobody is alarmed."""
+async def test_refused_search_is_no_refusal_to_track(tmp_path: Path) -> None:
+    """It is repeated after 5 s, without an event."""
     async with field_of(tmp_path, superframe=True) as field, running(field.master()):
         tool = field.stations[3].instrument
         await asyncio.sleep(10)
@@ -426,8 +426,8 @@ async def test_a_search_that_is_refused_is_no_refusal_to_track(tmp_path: Path) -
     assert events(field) == ["instrument_status 3"]
 
 
-async def test_a_direction_that_has_grown_old_is_not_given_any_more(tmp_path: Path) -> None:
-    """A station that was away in the meantime gets one of now, or none."""
+async def test_expired_search_command_is_withdrawn(tmp_path: Path) -> None:
+    """A station that was away gets a new one, or none."""
     link = LinkModel()
     driven = stationary_scene().moving(lambda time_s: (np.eye(3), np.array([30.0, time_s - 20.0, -1.0])))
     async with field_of(tmp_path, driven, superframe=True, link=link) as field, running(field.master()):
@@ -463,7 +463,7 @@ class _Seventies:
 
 
 async def test_measurements_from_before_1970_are_kept(tmp_path: Path) -> None:
-    """A master without a battery clock: a recording holds no negative times, so the bound says how far off they are."""
+    """A master without a battery clock: recordings have no negative times, so the bound covers the difference."""
     async with field_of(tmp_path, superframe=True) as field:
         await asyncio.sleep(60)
         async with running(field.master(clock=_Seventies())):
@@ -476,8 +476,8 @@ async def test_measurements_from_before_1970_are_kept(tmp_path: Path) -> None:
         assert abs(true_ns) <= m.stamp_bound_ns
 
 
-async def test_a_replay_gives_every_line_again(tmp_path: Path) -> None:
-    """Beacons, late measurements and all."""
+async def test_replay_equals_the_stream(tmp_path: Path) -> None:
+    """Beacons and late measurements included."""
     link = LinkModel(loss_probability=0.2)
     async with field_of(tmp_path, superframe=True, link=link) as field, running(field.master()):
         await asyncio.sleep(30)

@@ -33,10 +33,8 @@ class LoRaSettings:
     ----------
     frequency_hz
         137 MHz to 1020 MHz; board and regulations allow far less.
-    spreading_factor
-        7 to 12.
-    bandwidth_hz
-        One of :data:`BANDWIDTHS_HZ`.
+    spreading_factor, bandwidth_hz
+        7 to 12; one of :data:`BANDWIDTHS_HZ`.
     coding_rate
         Denominator of the rate: 5 to 8 for 4/5 to 4/8.
     preamble_symbols

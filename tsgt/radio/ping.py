@@ -112,10 +112,6 @@ class Summary:
 
     Attributes
     ----------
-    sent, received
-        Requests, and replies in time.
-    late, unknown
-        Sums of those of :class:`Exchange`.
     packets_per_s
         Packets of complete exchanges, both ways, over the time from the first to the last.
     local, remote
@@ -146,7 +142,7 @@ class ResponderSummary:
 
     Attributes
     ----------
-    answered, repeated, unknown
+    replied, repeated, unknown
         Requests with a reply, repeated requests, unknown packets.
     signal
         Mean of the requests with a reply.
@@ -154,7 +150,7 @@ class ResponderSummary:
         Median and maximum.
     """
 
-    answered: int
+    replied: int
     repeated: int
     unknown: int
     signal: SignalStrength | None
@@ -238,8 +234,8 @@ async def respond(radio: Radio) -> AsyncGenerator[Response, None]:
 def summarise(exchanges: Iterable[Exchange]) -> Summary:
     """Compute the statistics of a session."""
     exchanges = list(exchanges)
-    answered = [(exchange, exchange.reply) for exchange in exchanges if exchange.reply is not None]
-    replies = [reply for _, reply in answered]
+    replied = [(exchange, exchange.reply) for exchange in exchanges if exchange.reply is not None]
+    replies = [reply for _, reply in replied]
     duration_ns = replies[-1].received_at_ns - exchanges[0].started_at_ns if replies else 0
     return Summary(
         sent=len(exchanges),
@@ -250,7 +246,7 @@ def summarise(exchanges: Iterable[Exchange]) -> Summary:
         local=_mean(reply.local for reply in replies),
         remote=_mean(reply.remote for reply in replies),
         round_trip_ns=_median_and_max(
-            reply.received_at_ns - exchange.sent_at_ns for exchange, reply in answered
+            reply.received_at_ns - exchange.sent_at_ns for exchange, reply in replied
         ),
         turnaround_ns=_median_and_max(
             reply.previous_turnaround_ns for reply in replies if reply.previous_turnaround_ns is not None
@@ -264,7 +260,7 @@ def summarise_responses(responses: Iterable[Response]) -> ResponderSummary:
     turnarounds_ns = [each.turnaround_ns for each in responses if each.turnaround_ns is not None]
     unknown = sum(each.number is None for each in responses)
     return ResponderSummary(
-        answered=len(turnarounds_ns),
+        replied=len(turnarounds_ns),
         repeated=len(responses) - len(turnarounds_ns) - unknown,
         unknown=unknown,
         signal=_mean(each.signal for each in responses if each.turnaround_ns is not None),

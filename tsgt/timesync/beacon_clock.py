@@ -126,12 +126,6 @@ class BeaconClock:
     ----------
     initialised
         Two unambiguous samples have agreed, one of them live; before that there is no time.
-    converged
-        Enough samples agree that delayed beacons would have been outvoted.
-    samples
-        How many the fit rests on.
-    first_received_ns, last_received_ns
-        Reception of the oldest and the newest of them.
     """
 
     def __init__(self) -> None:
@@ -146,22 +140,22 @@ class BeaconClock:
 
     @property
     def first_received_ns(self) -> int | None:
-        """See the class."""
+        """Reception of the oldest sample."""
         return self._segments[0].first_ns if self._segments else None
 
     @property
     def last_received_ns(self) -> int | None:
-        """See the class."""
+        """Reception of the newest sample of the fit."""
         return self._segments[-1].last_ns if self._segments else None
 
     @property
     def samples(self) -> int:
-        """See the class."""
+        """Number of samples that the fit rests on."""
         return sum(map(len, self._segments))
 
     @property
     def converged(self) -> bool:
-        """See the class."""
+        """Whether enough samples agree that delayed beacons would have been outvoted."""
         return self.initialised and len(self._segments[-1]) >= _MIN_CANDIDATE_SAMPLES
 
     def add(

@@ -59,14 +59,7 @@ _CANDIDATE_WINDOW = 32
 class HostTime(NamedTuple):
     """An instant of the instrument on the host's CLOCK_MONOTONIC, plus the minimum delay.
 
-    Attributes
-    ----------
-    host_ns
-        The instant.
-    sigma_ns
-        One sigma of the samples' information.
-    bound_ns
-        The truth is within this of ``host_ns``, as long as the minimum delay stays the same.
+    The bound holds as long as the minimum delay stays the same.
     """
 
     host_ns: int

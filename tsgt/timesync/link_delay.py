@@ -47,8 +47,6 @@ class LinkDelayEstimator:
         One sigma, and the bound of its error.
     anomaly_ns
         Extra delay of the last exchange, possibly all on one of the two ways; 0 if that was consistent.
-    exchanges
-        How many of the last 256 the estimate rests on.
     """
 
     def __init__(self, nominal_ns: int, symbol_ns: int) -> None:
@@ -62,7 +60,7 @@ class LinkDelayEstimator:
 
     @property
     def exchanges(self) -> int:
-        """See the class."""
+        """How many of the last 256 the estimate rests on."""
         return len(self._accepted_ns)
 
     def add(self, round_trip_ns: int) -> bool:

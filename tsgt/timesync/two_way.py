@@ -55,12 +55,10 @@ class ClockEstimate:
     ----------
     offset_ns
         Positive when the station's clock is ahead.
-    sigma_ns
-        One sigma from scatter and ageing.
     bound_ns
         The truth is within this of ``offset_ns``, delay asymmetry included.
     skew_ppm
-        Skew of the station's clock; positive when it runs fast. 0 where the filter does not estimate it.
+        Positive when the station's clock runs fast; 0 where the filter does not estimate it.
     """
 
     offset_ns: int
@@ -83,14 +81,9 @@ class ClockFilter(Protocol):
     name: str
 
     def update(self, samples: Sequence[ClockSample], *, may_have_restarted: bool = False) -> FilterUpdate:
-        """Take the exchanges of one synchronisation.
+        """Take the exchanges of one synchronisation, at least one, in the order of time.
 
-        Parameters
-        ----------
-        samples
-            At least one, in the order of time.
-        may_have_restarted
-            The station's program may have restarted since the last synchronisation, with another clock.
+        The station's program ``may_have_restarted`` since the last synchronisation, with another clock.
         """
         ...
 
@@ -119,12 +112,7 @@ def interpolate(
 ) -> ClockEstimate:
     """Return the offset on the straight line between two estimates, bounded by the wander of the skew in between.
 
-    Parameters
-    ----------
-    before, after
-        Estimates at the station times ``before_ns`` and ``after_ns``.
-    station_ns
-        A station time between these.
+    The estimates are those at the station times ``before_ns`` and ``after_ns``; ``station_ns`` lies in between.
     """
     since_ns, until_ns = station_ns - before_ns, after_ns - station_ns
     share = since_ns / (since_ns + until_ns)

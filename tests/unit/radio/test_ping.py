@@ -137,7 +137,7 @@ async def test_repeated_request_has_one_reply() -> None:
         (None, False),
     ]
     summary = summarise_responses(answers)
-    assert (summary.answered, summary.repeated, summary.unknown) == (1, 1, 1)
+    assert (summary.replied, summary.repeated, summary.unknown) == (1, 1, 1)
 
 
 async def test_packet_rate_counts_both_ways() -> None:

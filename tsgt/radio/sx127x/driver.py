@@ -61,16 +61,10 @@ class RadioStatistics:
 
     Attributes
     ----------
-    received
-        Packets with a valid CRC.
     crc_errors, no_crc
         Packets dropped because their CRC was wrong, or missing though the settings require one.
     lost_edges
         Interrupts that were missed or could not be reported.
-    tx_timeouts
-        Transmissions without TxDone.
-    resets
-        After a fault.
     queue_overflows
         Packets dropped from a full queue.
     """

@@ -34,7 +34,7 @@ from tsgt.analysis.evaluation import (
     pose_errors,
     stationary_errors,
 )
-from tsgt.analysis.evaluation.stationary import StationaryErrors
+from tsgt.analysis.evaluation.reference import StationaryErrors
 from tsgt.analysis.processing import process, with_estimator
 from tsgt.cli.output import print_json
 from tsgt.config import ClassicMasterConfig, SuperframeMasterConfig

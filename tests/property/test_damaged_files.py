@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from harness.cli import called
-from harness.damage import UNHARMED, Damage, Samples, damages, examples
-from harness.harmless import Files, check
+from harness.damage import UNDAMAGED, Damage, Samples, damages, examples
+from harness.cli_contract import Files, check_command
 from harness.pos_files import SECOND, write_pos
-from harness.published import CONSTANTS, write_prisms, write_targets, write_tracks
+from harness.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
 from hypothesis import example, given
 from hypothesis import strategies as st
 
@@ -49,7 +49,12 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Samples:
         == 0
     )
     frames = folder / "frames.toml"
-    assert called("calibrate", "targets", folder / "GCP.txt", "--output", frames).code == 0
+    assert (
+        called(
+            *("calibrate", "targets", folder / "GCP.txt", "--target-constant-mm", "0", "--output", frames)
+        ).code
+        == 0
+    )
     assert called("process", folder / "r.jsonl", "--output", folder / "r.tum").code == 0
     (folder / "polar.csv").write_text(
         called("export", folder / "r.jsonl", "--format", "csv", "--records", "measurements").out
@@ -97,13 +102,13 @@ COMMANDS: dict[str, tuple[tuple[str, ...], str, str]] = {
 @pytest.mark.parametrize("command", COMMANDS)
 @examples(3)
 @given(damage=damages)
-@example(damage=UNHARMED)
+@example(damage=UNDAMAGED)
 def test_damaged_data_files(good: Samples, command: str, damage: Damage) -> None:
     """Data and set-up files: each command succeeds with a damaged one or rejects it."""
     arguments, name, output = COMMANDS[command]
     name = name or arguments[-1].removeprefix("@")
     with Files({**good.of, name: damage.to([good.of[name]])}) as files:
-        outcome = check(files, arguments, output=output)
+        outcome = check_command(files, arguments, output=output)
     assert damage.edits or outcome.code == 0, outcome
 
 
@@ -113,7 +118,7 @@ def test_damaged_target_files(damage: Damage, command: str, levelled: bool) -> N
     """Our CSV and the authors' marker file, in all forms of the reference page."""
     with Files({"measured.csv": damage.to(DOCUMENTED)}) as files:
         extra = ("--levelled",) * (levelled and command == "targets")
-        check(files, ("calibrate", command, "@measured.csv"), output="o.toml", extra=extra)
+        check_command(files, ("calibrate", command, "@measured.csv"), output="o.toml", extra=extra)
 
 
 @examples(40)
@@ -121,7 +126,7 @@ def test_damaged_target_files(damage: Damage, command: str, levelled: bool) -> N
 def test_damaged_configurations(damage: Damage) -> None:
     """Every example configuration, damaged, is valid or one line of error."""
     with Files({**SETUP, "c.toml": damage.to(EXAMPLES)}) as files:
-        check(files, ("config", "check", "@c.toml"))
+        check_command(files, ("config", "check", "@c.toml"))
 
 
 @examples(15)
@@ -129,7 +134,7 @@ def test_damaged_configurations(damage: Damage) -> None:
 def test_damaged_files_named_by_a_configuration(damage: Damage, master: bytes, name: str) -> None:
     """A valid configuration with a damaged set-up file."""
     with Files({**SETUP, name: damage.to([SETUP[name]]), "c.toml": master}) as files:
-        check(files, ("config", "check", "@c.toml"))
+        check_command(files, ("config", "check", "@c.toml"))
 
 
 @examples(1)
@@ -139,10 +144,10 @@ def test_damaged_studies(damage: Damage) -> None:
     content = damage.to([LAYOUT, *SCENARIOS])
     with Files({"f.toml": content}) as files:
         if b'kind = "scenario"' in content:
-            check(files, ("analyse", "layout", "--scenario", "@f.toml"))
+            check_command(files, ("analyse", "layout", "--scenario", "@f.toml"))
         else:
-            check(
+            check_command(
                 files,
                 ("analyse", "perturbation", "--step-mm", "200", "--samples", "3", "--prisms", "@f.toml"),
             )
-            check(files, ("analyse", "layout", "@f.toml"))
+            check_command(files, ("analyse", "layout", "@f.toml"))

@@ -37,24 +37,15 @@ def process(
     Measurements are processed in the order of their timestamps. With ``linear`` the poses equal those of the live stream if
     no measurement arrived late; with ``continuous`` each pose depends on the measurements before and after it.
 
-    Parameters
-    ----------
-    path
-        The recording's file, for messages.
-    on_progress
-        Called with the completed fraction, 0 to 1.
+    ``on_progress``: Called with the completed fraction, 0 to 1.
 
-    Returns
-    -------
-    PoseBatch
-        All epochs, valid or not; at least one is valid.
+    Returns all epochs, valid or not; at least one is valid.
 
     Raises
     ------
     RecordingError
         There are no measurements, none of one of the prisms, they span days, or no epoch has a valid pose.
-    DegenerateGeometryError
-        The prisms coincide or lie in a line.
+    DegenerateGeometryError : The prisms coincide or lie in a line.
     """
     if recording.parameters.pipeline.estimator == "continuous":
         return smooth_recording(recording, path=path, on_progress=on_progress).poses
@@ -85,17 +76,11 @@ def with_estimator(recording: Recording, estimator: Estimator) -> Recording:
 def with_frames(parameters: Parameters, frames: Mapping[int, Matrix4], *, path: Path) -> Parameters:
     """Replace the frames of all stations by those of a set-up file.
 
-    Parameters
-    ----------
-    frames
-        ``T_station1_station`` by station number.
-    path
-        The set-up file, for messages.
+    ``frames``: ``T_station1_station`` by station number.
 
     Raises
     ------
-    ConfigError
-        A station of the recording has no frame in the file.
+    ConfigError : A station of the recording has no frame in the file.
     """
     missing = [s.station for s in parameters.stations if s.station not in frames]
     if missing:
@@ -127,17 +112,11 @@ def with_latencies(parameters: Parameters, latencies_ns: Mapping[int, int]) -> P
 def with_layout(parameters: Parameters, layout: Mapping[int, Vector3], *, path: Path) -> Parameters:
     """Replace the prism layout by that of a set-up file; prisms that the recording does not have are ignored.
 
-    Parameters
-    ----------
-    layout
-        Positions in the robot frame in m by prism number.
-    path
-        The set-up file, for messages.
+    ``layout``: Positions in the robot frame in m by prism number.
 
     Raises
     ------
-    ConfigError
-        A prism of the recording has no position in the file, or the layout determines no pose.
+    ConfigError : A prism of the recording has no position in the file, or the layout determines no pose.
     """
     missing = [p.prism for p in parameters.prisms if p.prism not in layout]
     if missing:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from tsgt.analysis.calibration import solve_stations, target_residuals
-from tsgt.analysis.formats.target_file import read_target_file
+from tsgt.analysis.formats import read_target_file
 from tsgt.errors import GeometryError, InputFileError
 from tsgt.geometry import cartesian_to_polar, invert, raw_distance, transform_points
 from tsgt.model import IDENTITY4, PointMeasurement, PolarMeasurement, StationParameters
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from tsgt.analysis.formats.rts_files import PublishedTrack
+    from tsgt.analysis.formats import PublishedTrack
     from tsgt.model import Matrix4, Measurement
 
 
@@ -52,21 +52,16 @@ def stations_from_targets(
 
     Parameters
     ----------
-    path
-        The authors' marker file or our own target file.
-    target_constant_m
-        Added to the slope distances of the targets, in m.
-    prism_constant_m
-        Prism constant assigned to the stations, in m.
-    tracked
-        Prism number by station number.
+    path : The authors' marker file or our own target file.
+    target_constant_m : Added to the slope distances of the targets, in m.
+    prism_constant_m : Prism constant assigned to the stations, in m.
+    tracked : Prism number by station number.
 
     Raises
     ------
     InputFileError
         The file cannot be used, holds no targets of one of the stations, or its targets are inconsistent.
-    DegenerateGeometryError
-        A station has too few targets in common with station 1, or they lie in a line.
+    DegenerateGeometryError : A station has too few targets in common with station 1, or they lie in a line.
     """
     measured = read_target_file(path)
     solved = solve_stations(measured, target_constant_m=target_constant_m)
@@ -137,8 +132,7 @@ def polar_measurements(
 
     Raises
     ------
-    GeometryError
-        A position is closer to its station than the prism constant.
+    GeometryError : A position is closer to its station than the prism constant.
     """
     measurements: list[Measurement] = []
     for station, track in zip(stations, tracks, strict=True):

@@ -45,10 +45,8 @@ class MotionModel:
 
     Attributes
     ----------
-    noise_scale
-        Factor on the stated sigmas of the instruments.
-    tuned
-        True: estimated from the measurements. False: they were too few, the values are those of the recording.
+    noise_scale : Factor on the stated sigmas of the instruments.
+    tuned : True: estimated from the measurements. False: they were too few, the values are those of the recording.
     """
 
     prior: MotionPrior
@@ -62,12 +60,9 @@ class SmoothedRecording:
 
     Attributes
     ----------
-    poses
-        One per epoch from the first to the last usable measurement.
-    sources
-        The measurement of each observation of ``fit``.
-    origin_ns
-        Unix time at which the time of ``fit`` is zero.
+    poses : One per epoch from the first to the last usable measurement.
+    sources : The measurement of each observation of ``fit``.
+    origin_ns : Unix time at which the time of ``fit`` is zero.
     """
 
     poses: PoseBatch
@@ -85,20 +80,14 @@ def smooth_recording(
     The hyperparameters are estimated from the measurements. Those of the recording, which the live estimator used, bound the
     process noise: at least a third of them, and all of them while prisms are occluded.
 
-    Parameters
-    ----------
-    path
-        The recording's file, for messages.
-    on_progress
-        Called with the completed fraction, 0 to 1.
+    ``on_progress``: Called with the completed fraction, 0 to 1.
 
     Raises
     ------
     RecordingError
         There are no measurements, none of one of the prisms, they span days, no trajectory fits them, or no epoch has
         a valid pose.
-    DegenerateGeometryError
-        The prisms coincide or lie in a line.
+    DegenerateGeometryError : The prisms coincide or lie in a line.
     """
     parameters = recording.parameters
     names = [prism.prism for prism in parameters.prisms]

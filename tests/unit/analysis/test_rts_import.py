@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.published import TARGET_CONSTANT_M, write_targets, write_tracks
+from harness.authors_files import TARGET_CONSTANT_M, write_targets, write_tracks
 from harness.scene import FRAMES
 
 from tsgt.analysis.formats.rts_files import PublishedTrack, read_track

@@ -35,12 +35,9 @@ class HeldOutComparison:
 
     Attributes
     ----------
-    linear
-        Straight lines between each prism's own measurements.
-    before
-        Trajectory with the recording's set-up; None if its frames are unknown.
-    after
-        Trajectory with a set-up calibrated without the held-out measurements.
+    linear : Straight lines between each prism's own measurements.
+    before : Trajectory with the recording's set-up; None if its frames are unknown.
+    after : Trajectory with a set-up calibrated without the held-out measurements.
     """
 
     linear: HeldOutErrors
@@ -54,12 +51,9 @@ class CalibratedRecording:
 
     Attributes
     ----------
-    calibration
-        From all measurements.
-    parameters
-        Those of the recording, with the calibrated set-up.
-    held_out
-        Held-out prediction; None if not requested.
+    calibration : From all measurements.
+    parameters : Those of the recording, with the calibrated set-up.
+    held_out : Held-out prediction; None if not requested.
     """
 
     calibration: MotionCalibration
@@ -79,19 +73,14 @@ def calibrate_recording(
 
     Parameters
     ----------
-    known
-        Which parameters to estimate, and their priors.
-    frames_known
-        Start from the recording's frames; otherwise initialise them from motion (frame 1 remains).
-    held_out
-        Cross-validate.
-    on_progress
-        Called with a short description of each step.
+    known : Which parameters to estimate, and their priors.
+    frames_known : Start from the recording's frames; otherwise initialise them from motion (frame 1 remains).
+    held_out : Cross-validate.
+    on_progress : Called with a short description of each step.
 
     Raises
     ------
-    GeometryError
-        The recording has no measurements, or its motion does not determine the set-up.
+    GeometryError : The recording has no measurements, or its motion does not determine the set-up.
     """
     if not recording.measurements:
         raise GeometryError("the recording has no measurements")

@@ -35,19 +35,15 @@ class StationCheck:
 
     Attributes
     ----------
-    shifts_m
-        By target: distance between its reference position and its current one in the station's frame.
+    shifts_m : By target: distance between its reference position and its current one in the station's frame.
     moved_m
         Distance that the station has moved. With one target it is that target's shift: a rotation of the station and
         a movement across the line of sight cannot be separated.
-    moved_sigma_m
-        One sigma of ``moved_m`` along the movement, from the instrument's noise.
-    turned_rad
-        Rotation angle of the station; None with one target.
+    moved_sigma_m : One sigma of ``moved_m`` along the movement, from the instrument's noise.
+    turned_rad : Rotation angle of the station; None with one target.
     levelled
         ``turned_rad`` is the heading only: the targets do not determine tilt, the station is assumed to be levelled.
-    ok
-        The shifts are within noise, or none exceeds the limit.
+    ok : The shifts are within noise, or none exceeds the limit.
     consistent
         One rigid movement of the station explains all shifts. False: a target has moved or was confused with another.
     """
@@ -66,15 +62,10 @@ def check_station(reference: PointSet, current: PointSet, *, limit_m: float = 0.
 
     Parameters
     ----------
-    reference, current
-        Targets in the station's frame; the current ones are a subset of the reference, at least one.
-    limit_m
-        Shifts up to this are accepted even if they exceed noise.
+    reference, current : Targets in the station's frame; the current ones are a subset of the reference, at least one.
+    limit_m : Shifts up to this are accepted even if they exceed noise.
 
-    Returns
-    -------
-    StationCheck
-        The chi-square test of the shifts has a false-alarm probability of 1e-4.
+    The chi-square test of the shifts has a false-alarm probability of 1e-4.
     """
     pairs = PointPairs(current, reference.select(current.names), levelled=False)
     unmoved = FrameFit(np.eye(3), np.zeros(3), np.zeros((6, 6)))

@@ -30,12 +30,9 @@ class TargetCollection:
 
     Parameters
     ----------
-    path
-        The target file.
-    stations, targets
-        Numbers, in the order in which they are to be measured.
-    repeats
-        Measurements per target: 2 for both faces.
+    path : The target file.
+    stations, targets : Numbers, in the order in which they are to be measured.
+    repeats : Measurements per target: 2 for both faces.
     """
 
     def __init__(
@@ -53,8 +50,7 @@ class TargetCollection:
 
         Raises
         ------
-        InputFileError
-            It is a file of another kind, has an invalid line, or cannot be read.
+        InputFileError : It is a file of another kind, has an invalid line, or cannot be read.
         """
         try:
             lines = self.path.read_text(encoding="utf-8").splitlines()

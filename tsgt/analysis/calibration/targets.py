@@ -35,22 +35,15 @@ def solve_stations(
 
     Parameters
     ----------
-    target_constant_m
-        Added to each slope distance whose line has no constant of its own, in m.
-    weighted, levelled
-        As for :func:`tsgt.geometry.calibration.targets.calibrate_frame`.
+    target_constant_m : Added to each slope distance whose line has no constant of its own, in m.
+    weighted, levelled : As for :func:`tsgt.geometry.calibration.targets.calibrate_frame`.
 
-    Returns
-    -------
-    dict
-        By station number, without station 1; ``T`` is ``T_station1_station``.
+    The frames, without station 1, are by station number; ``T`` is ``T_station1_station``.
 
     Raises
     ------
-    DegenerateGeometryError
-        A station has fewer than three targets in common with station 1, or they lie in a line.
-    InputFileError
-        Repeated measurements of one target are inconsistent, or a constant exceeds a distance.
+    DegenerateGeometryError : A station has fewer than three targets in common with station 1, or they lie in a line.
+    InputFileError : Repeated measurements of one target are inconsistent, or a constant exceeds a distance.
     """
     points = {
         station: mean_points(file.path, targets, target_constant_m, f"target {{}} of station {station}")
@@ -98,17 +91,13 @@ def solve_prisms(file: PrismFile, *, target_constant_m: float, prism_constant_m:
     target_constant_m, prism_constant_m
         Added to the slope distances of body points and of prisms whose line has no constant of its own, in m.
 
-    Returns
-    -------
-    PrismCalibration
-        The names of the prisms are their numbers.
+    The names of the solved prisms are their numbers.
 
     Raises
     ------
     DegenerateGeometryError
         There are fewer than three body points or they lie in a line; or three or more prisms do.
-    InputFileError
-        Repeated measurements of one point are inconsistent, or a constant exceeds a distance.
+    InputFileError : Repeated measurements of one point are inconsistent, or a constant exceeds a distance.
     """
     body = mean_points(file.path, file.body, target_constant_m, "body point {}")
     prisms = mean_points(file.path, file.prisms, prism_constant_m, "prism {}")
@@ -136,17 +125,12 @@ def mean_points(
 
     Parameters
     ----------
-    path
-        The file, for messages.
-    constant_m
-        Added to the slope distances that have no constant of their own, in m.
-    what
-        Name of a target in messages, with ``{}`` for its number.
+    constant_m : Added to the slope distances that have no constant of their own, in m.
+    what : Name of a target in messages, with ``{}`` for its number.
 
     Raises
     ------
-    InputFileError
-        Repeated measurements of one target are inconsistent, or a constant exceeds a distance.
+    InputFileError : Repeated measurements of one target are inconsistent, or a constant exceeds a distance.
     """
     names: list[PointName] = []
     points, covariances = [], []

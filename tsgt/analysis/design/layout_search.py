@@ -43,16 +43,11 @@ class LayoutProblem:
 
     Attributes
     ----------
-    envelope_m
-        Minimum and maximum x, y, z in the robot frame, (2, 3).
-    count
-        Number of prisms.
-    min_separation_m
-        Between any two prisms.
-    criterion
-        Whether the rotation or the position of the point is to be most accurate.
-    stations, robot_poses, point_m
-        As for :func:`tsgt.analysis.design.layout_study.pose_covariances`.
+    envelope_m : Minimum and maximum x, y, z in the robot frame, (2, 3).
+    count : Number of prisms.
+    min_separation_m : Between any two prisms.
+    criterion : Whether the rotation or the position of the point is to be most accurate.
+    stations, robot_poses, point_m : As for :func:`tsgt.analysis.design.layout_study.pose_covariances`.
     """
 
     envelope_m: FloatArray
@@ -84,20 +79,14 @@ def optimal_layout(
 
     Parameters
     ----------
-    random
-        Source of the random starts.
-    on_progress
-        Called with the completed fraction, 0 to 1.
+    random : Source of the random starts.
+    on_progress : Called with the completed fraction, 0 to 1.
 
-    Returns
-    -------
-    FloatArray
-        Prism positions in the robot frame in m, (count, 3).
+    Returns prism positions in the robot frame in m, (count, 3).
 
     Raises
     ------
-    GeometryError
-        The envelope is too small for the minimal separation.
+    GeometryError : The envelope is too small for the minimal separation.
     """
     axes = [np.unique(np.linspace(low, high, _GRID)) for low, high in zip(*problem.envelope_m, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

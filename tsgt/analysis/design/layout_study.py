@@ -35,12 +35,9 @@ class Station:
 
     Attributes
     ----------
-    position_m
-        In the world, (3,).
-    noise
-        Of a single measurement.
-    prism_index
-        Index in the layout of the prism that it tracks.
+    position_m : In the world, (3,).
+    noise : Of a single measurement.
+    prism_index : Index in the layout of the prism that it tracks.
     """
 
     position_m: FloatArray
@@ -62,10 +59,8 @@ class RobotPoses:
 
     Attributes
     ----------
-    rotation
-        ``R_world_robot``, (N, 3, 3).
-    position_m
-        The robot's origin in the world, (N, 3).
+    rotation : ``R_world_robot``, (N, 3, 3).
+    position_m : The robot's origin in the world, (N, 3).
     """
 
     rotation: FloatArray
@@ -91,12 +86,9 @@ class PoseAccuracy:
 
     Attributes
     ----------
-    position_m, rotation_rad
-        Norm of the position error, angle of the rotation error.
-    position_axes_m, rotation_axes_rad
-        Along and about x, y, z of the robot, (3,).
-    worst_position_m, worst_rotation_rad
-        Norm and angle at the worst of the robot poses.
+    position_m, rotation_rad : Norm of the position error, angle of the rotation error.
+    position_axes_m, rotation_axes_rad : Along and about x, y, z of the robot, (3,).
+    worst_position_m, worst_rotation_rad : Norm and angle at the worst of the robot poses.
     """
 
     position_m: float
@@ -128,22 +120,15 @@ def pose_covariances(
 
     Parameters
     ----------
-    layout
-        P >= 3 prisms in the robot frame in m, (P, 3).
-    stations
-        At least one per prism.
-    point_m
-        Point of the robot whose position is evaluated, in the robot frame, (3,).
+    layout : P >= 3 prisms in the robot frame in m, (P, 3).
+    stations : At least one per prism.
+    point_m : Point of the robot whose position is evaluated, in the robot frame, (3,).
 
-    Returns
-    -------
-    FloatArray
-        (N, 6, 6), in the axes of the robot: position of the point in m, rotation vector in rad.
+    Returns (N, 6, 6), in the axes of the robot: position of the point in m, rotation vector in rad.
 
     Raises
     ------
-    GeometryError
-        The layout determines no pose, a prism has no station, or the point is far from the robot.
+    GeometryError : The layout determines no pose, a prism has no station, or the point is far from the robot.
     """
     check_layout(layout)
     untracked = set(range(len(layout))) - {station.prism_index for station in stations}
@@ -177,15 +162,10 @@ def prism_information(
 
     Parameters
     ----------
-    places_m
-        In the robot frame, (M, 3).
-    prism_index, stations, robot_poses, point_m
-        As for :class:`Station` and :func:`pose_covariances`.
+    places_m : In the robot frame, (M, 3).
+    prism_index, stations, robot_poses, point_m : As for :class:`Station` and :func:`pose_covariances`.
 
-    Returns
-    -------
-    FloatArray
-        (M, N, 6, 6), in the order and axes of :func:`pose_covariances`.
+    Returns (M, N, 6, 6), in the order and axes of :func:`pose_covariances`.
     """
     in_world = rotate(robot_poses.rotation, places_m[:, None]) + robot_poses.position_m
     weight = np.zeros((*in_world.shape, 3))
@@ -211,10 +191,7 @@ def station_arrangements(
 
     The direction of the first station and the heights of all are kept.
 
-    Returns
-    -------
-    dict
-        The stations ``together`` and ``around``.
+    Returns the stations ``together`` and ``around``.
     """
     offset = stations[0].position_m - centre_m
     bearing = math.atan2(offset[1], offset[0])

@@ -33,18 +33,14 @@ class Perturbation:
 
     Attributes
     ----------
-    noise_m
-        One sigma of the noise on each coordinate of each prism.
-    inter_prism_mean_m, inter_prism_std_m
-        Of |measured - true distance| over all pairs of prisms.
+    noise_m : One sigma of the noise on each coordinate of each prism.
+    inter_prism_mean_m, inter_prism_std_m : Of |measured - true distance| over all pairs of prisms.
     position_mean_m, position_std_m, position_abs_mean_m
         Position error along x, y, z of the robot frame, (3,): mean, standard deviation, mean of the absolute value.
     euler_mean_rad, euler_std_rad, euler_abs_mean_rad
         Rotation error as angles about x, y, z (roll, pitch, yaw; R = Rz Ry Rx), (3,).
-    position_norm_mean_m, position_norm_std_m
-        Norm of the position error.
-    rotation_norm_mean_rad, rotation_norm_std_rad
-        Angle of the rotation error.
+    position_norm_mean_m, position_norm_std_m : Norm of the position error.
+    rotation_norm_mean_rad, rotation_norm_std_rad : Angle of the rotation error.
     """
 
     noise_m: float
@@ -75,23 +71,16 @@ def perturbation_study(
 
     Parameters
     ----------
-    layout
-        P >= 3 prisms in the robot frame in m, (P, 3).
-    noises_m
-        Sigmas of the noise, one or more.
-    samples
-        Number of poses per sigma.
-    point_m
-        Point of the robot whose position is evaluated, in the robot frame, (3,).
-    random
-        Source of the noise; independent for each sigma.
-    on_progress
-        Called with the completed fraction, 0 to 1.
+    layout : P >= 3 prisms in the robot frame in m, (P, 3).
+    noises_m : Sigmas of the noise, one or more.
+    samples : Number of poses per sigma.
+    point_m : Point of the robot whose position is evaluated, in the robot frame, (3,).
+    random : Source of the noise; independent for each sigma.
+    on_progress : Called with the completed fraction, 0 to 1.
 
     Raises
     ------
-    GeometryError
-        The layout determines no pose.
+    GeometryError : The layout determines no pose.
     """
     check_layout(layout)
     found = []
@@ -146,10 +135,8 @@ def equivalent_noise(
 
     Parameters
     ----------
-    layout, samples, point_m, random
-        As for :func:`perturbation_study`.
-    inter_prism_m
-        Mean of |measured - true distance|, above zero.
+    layout, samples, point_m, random : As for :func:`perturbation_study`.
+    inter_prism_m : Mean of |measured - true distance|, above zero.
 
     Raises
     ------
@@ -175,10 +162,8 @@ def first_order_sigmas(
 
     Returns
     -------
-    position_m : FloatArray
-        One sigma along x, y, z, (3,).
-    rotation_rad : FloatArray
-        One sigma about x, y, z, (3,).
+    position_m : FloatArray : One sigma along x, y, z, (3,).
+    rotation_rad : FloatArray : One sigma about x, y, z, (3,).
     """
     covariances = np.broadcast_to(noise_m**2 * np.eye(3), (1, *layout.shape, 3))
     # The propagation yields the covariance of the origin, which is moved to the point.

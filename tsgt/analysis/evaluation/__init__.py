@@ -29,7 +29,14 @@ from tsgt.analysis.evaluation.metrics import (
     interior_mask,
     pose_errors,
 )
-from tsgt.analysis.evaluation.reference import Reference, compare, compare_aligned, read_tum
+from tsgt.analysis.evaluation.reference import (
+    Reference,
+    StationaryStatistics,
+    compare,
+    compare_aligned,
+    read_tum,
+    stationary_errors,
+)
 from tsgt.analysis.evaluation.residuals import (
     Outlier,
     ResidualStatistics,
@@ -37,7 +44,6 @@ from tsgt.analysis.evaluation.residuals import (
     outliers,
     residual_statistics,
 )
-from tsgt.analysis.evaluation.stationary import StationaryStatistics, stationary_errors
 
 __all__ = [
     "Align",

@@ -41,12 +41,9 @@ class Fold:
 
     Attributes
     ----------
-    number
-        0 to 4.
-    test, training
-        Rows of the observations that are held out, and all others; increasing.
-    at_gap
-        For each of ``test``: the prism's neighbours before and after it are more than :data:`GAP_S` apart.
+    number : 0 to 4.
+    test, training : Rows of the observations that are held out, and all others; increasing.
+    at_gap : For each of ``test``: the prism's neighbours before and after it are more than :data:`GAP_S` apart.
     """
 
     number: int
@@ -84,10 +81,8 @@ class HeldOutErrors:
 
     Attributes
     ----------
-    error_m
-        (N,) distance between measured and predicted position of the prism.
-    at_gap
-        (N,) as in :class:`Fold`.
+    error_m : (N,) distance between measured and predicted position of the prism.
+    at_gap : (N,) as in :class:`Fold`.
     """
 
     error_m: FloatArray
@@ -141,10 +136,7 @@ def training_rows(observations: Observations, number: int) -> NDArray[np.intp]:
 def cross_validate(splits: Sequence[Fold], error_m: Callable[[Fold], FloatArray]) -> HeldOutErrors:
     """Collect prediction errors over folds.
 
-    Parameters
-    ----------
-    error_m
-        Predicts the test measurements of a fold from its training measurements; returns the error of each in m.
+    ``error_m``: Predicts the test measurements of a fold from its training measurements; returns the error of each in m.
     """
     if not splits:
         return HeldOutErrors(np.empty(0), np.empty(0, np.bool_))
@@ -186,17 +178,13 @@ def held_out_errors(
 
     Parameters
     ----------
-    observations
-        In the order of time, with the stated noise.
-    pipeline
-        Hyperparameters if the measurements are too few to estimate them, and their lower bounds.
-    on_progress
-        Called with the completed fraction, 0 to 1.
+    observations : In the order of time, with the stated noise.
+    pipeline : Hyperparameters if the measurements are too few to estimate them, and their lower bounds.
+    on_progress : Called with the completed fraction, 0 to 1.
 
     Raises
     ------
-    GeometryError
-        No trajectory fits the training measurements.
+    GeometryError : No trajectory fits the training measurements.
     """
     report = on_progress or (lambda _: None)
     splits = folds(observations)

@@ -38,14 +38,10 @@ class DistanceStatistics:
 
     Attributes
     ----------
-    reference
-        Distance in the prism layout.
-    mean, std
-        Of the distances.
-    mean_abs_error, p95
-        Mean and 95th percentile of |distance - reference|.
-    valid, invalid
-        Number of distances, and of epochs without one.
+    reference : Distance in the prism layout.
+    mean, std : Of the distances.
+    mean_abs_error, p95 : Mean and 95th percentile of |distance - reference|.
+    valid, invalid : Number of distances, and of epochs without one.
     """
 
     reference: float
@@ -63,12 +59,9 @@ class PairDistances:
 
     Attributes
     ----------
-    prisms
-        Numbers of the two prisms.
-    reference_m
-        Their distance in the prism layout.
-    invalid
-        Number of epochs without a valid distance.
+    prisms : Numbers of the two prisms.
+    reference_m : Their distance in the prism layout.
+    invalid : Number of epochs without a valid distance.
     """
 
     prisms: tuple[int, int]
@@ -105,16 +98,11 @@ class InterPrismDistances:
 
     Attributes
     ----------
-    dynamic
-        Per pair, at 20 Hz from interpolated tracks.
-    static
-        Per pair, from raw measurements in stationary intervals.
-    epochs
-        Number of 20 Hz epochs in the span that all tracks cover.
-    invalid_epochs
-        Number of epochs at which the neighbours in a track are further apart than the outage limit.
-    stationary_ns
-        Start and end of the stationary intervals, in the order of time.
+    dynamic : Per pair, at 20 Hz from interpolated tracks.
+    static : Per pair, from raw measurements in stationary intervals.
+    epochs : Number of 20 Hz epochs in the span that all tracks cover.
+    invalid_epochs : Number of epochs at which the neighbours in a track are further apart than the outage limit.
+    stationary_ns : Start and end of the stationary intervals, in the order of time.
     """
 
     dynamic: tuple[PairDistances, ...]
@@ -135,14 +123,10 @@ class EpochDistances:
 
     Attributes
     ----------
-    stamp_ns
-        (N,) whole multiples of 50 ms in Unix time, in the span that all tracks cover.
-    valid
-        (N,) no track has a gap. All tracks are required, so that the pairs are compared over the same epochs.
-    distances_m
-        By pair of prisms, (N,); NaN where not valid.
-    references_m
-        By pair of prisms, the distance in the prism layout.
+    stamp_ns : (N,) whole multiples of 50 ms in Unix time, in the span that all tracks cover.
+    valid : (N,) no track has a gap. All tracks are required, so that the pairs are compared over the same epochs.
+    distances_m : By pair of prisms, (N,); NaN where not valid.
+    references_m : By pair of prisms, the distance in the prism layout.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -179,19 +163,12 @@ def inter_prism(
 
     Parameters
     ----------
-    parameters
-        The prism layout (the reference distances) and the outage limit.
-    tracks
-        One track per prism of the layout, in frame ``station1``, none of them empty.
-    stationary_ns
-        Stationary intervals from another source, such as odometry; clipped to the time of the tracks.
-    found
-        Result of :func:`distances_at_epochs`, if already computed.
+    parameters : The prism layout (the reference distances) and the outage limit.
+    tracks : One track per prism of the layout, in frame ``station1``, none of them empty.
+    stationary_ns : Stationary intervals from another source, such as odometry; clipped to the time of the tracks.
+    found : Result of :func:`distances_at_epochs`, if already computed.
 
-    Returns
-    -------
-    InterPrismDistances
-        Without epochs where the tracks do not overlap in time.
+    There are no epochs if the tracks do not overlap in time.
     """
     chosen = [tracks[prism.prism] for prism in parameters.prisms]
     found = distances_at_epochs(parameters, tracks) if found is None else found
@@ -223,10 +200,8 @@ def stationary_intervals(tracks: Sequence[Track], outage_limit_ns: int) -> list[
 
     Parameters
     ----------
-    tracks
-        None of them empty.
-    outage_limit_ns
-        Positions further apart in time are an outage.
+    tracks : None of them empty.
+    outage_limit_ns : Positions further apart in time are an outage.
 
     Returns
     -------

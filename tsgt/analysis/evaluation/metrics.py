@@ -25,10 +25,8 @@ class PoseErrors:
 
     Attributes
     ----------
-    position_m
-        (N,) norm of the position error at the chosen point of the robot.
-    rotation_rad
-        (N,) angle of the rotation between estimate and truth.
+    position_m : (N,) norm of the position error at the chosen point of the robot.
+    rotation_rad : (N,) angle of the rotation between estimate and truth.
     """
 
     position_m: NDArray[np.float64]
@@ -57,10 +55,8 @@ class NeesStatistics:
 
     Attributes
     ----------
-    mean
-        6 for consistent covariances; larger if they are overconfident.
-    above_95
-        Share above :data:`NEES_95`; 0.05 for consistent covariances.
+    mean : 6 for consistent covariances; larger if they are overconfident.
+    above_95 : Share above :data:`NEES_95`; 0.05 for consistent covariances.
     """
 
     mean: float
@@ -97,10 +93,8 @@ class PoseErrorStatistics:
 
         Parameters
         ----------
-        estimated, true, point_m
-            As for :func:`pose_errors`.
-        covariance
-            (N, 6, 6) of ``estimated``, rotations about the axes of the world.
+        estimated, true, point_m : As for :func:`pose_errors`.
+        covariance : (N, 6, 6) of ``estimated``, rotations about the axes of the world.
         """
         errors = pose_errors(estimated, true, point_m)
         rotation = log_so3(estimated[:, :3, :3] @ np.swapaxes(true[:, :3, :3], 1, 2))
@@ -121,8 +115,7 @@ def pose_errors(
 
     Parameters
     ----------
-    estimated, true
-        ``T_station1_robot``, (N, 4, 4) each.
+    estimated, true : ``T_station1_robot``, (N, 4, 4) each.
     point_m
         Point of the robot whose position is compared, in the frame ``robot``, (3,): usually the centroid of the prisms.
     """
@@ -150,12 +143,9 @@ class AlignedErrorStatistics:
 
     Attributes
     ----------
-    translation_mm
-        Shift of the centroid of the compared positions.
-    rotation_deg
-        Rotation of the alignment; 0 with ``translation``.
-    position_rms_mm, orientation_rms_deg
-        Root mean squares after the alignment.
+    translation_mm : Shift of the centroid of the compared positions.
+    rotation_deg : Rotation of the alignment; 0 with ``translation``.
+    position_rms_mm, orientation_rms_deg : Root mean squares after the alignment.
     hidden_position_mm, hidden_orientation_deg
         Root mean squares before minus after. The orientation may be negative, since only positions are aligned.
     """
@@ -175,17 +165,14 @@ def aligned_statistics(
 
     Parameters
     ----------
-    estimated, true
-        ``T_station1_robot``, (N, 4, 4) each.
-    point_m
-        Point of the robot whose positions are aligned and compared, in the frame ``robot``, (3,).
+    estimated, true : ``T_station1_robot``, (N, 4, 4) each.
+    point_m : Point of the robot whose positions are aligned and compared, in the frame ``robot``, (3,).
     mode
         ``translation``: shift only. ``rigid``: shift and rotation without scale (Umeyama 1991), as evo's ``-a`` does.
 
     Raises
     ------
-    DegenerateGeometryError
-        ``rigid``, and the positions lie in a line or coincide, or there are fewer than three.
+    DegenerateGeometryError : ``rigid``, and the positions lie in a line or coincide, or there are fewer than three.
     """
     before = pose_errors(estimated, true, point_m)
     points, true_points = transform_points(estimated, point_m), transform_points(true, point_m)

@@ -1,4 +1,4 @@
-"""Reference trajectory: a file in the TUM format, of the robot frame in frame ``station1``."""
+"""Errors of poses against a reference trajectory, a file in the TUM format: of each pose, and of stationary intervals."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from tsgt.analysis.evaluation.metrics import PoseErrorStatistics, aligned_statistics, interior_mask
 from tsgt.errors import InputFileError
-from tsgt.geometry import rotation_from_quaternion, transform_from
+from tsgt.geometry import rotation_from_quaternion, transform_from, transform_points
 from tsgt.model import MAX_COORDINATE_M, check_instants
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -34,12 +35,9 @@ class Reference:
 
     Attributes
     ----------
-    stamp_ns
-        (N,) Unix time, strictly increasing.
-    position_m
-        (N, 3) in frame ``station1``.
-    orientation_xyzw
-        (N, 4).
+    stamp_ns : (N,) Unix time, strictly increasing.
+    position_m : (N, 3) in frame ``station1``.
+    orientation_xyzw : (N, 4).
     """
 
     stamp_ns: NDArray[np.int64]
@@ -70,8 +68,7 @@ def read_tum(path: Path) -> Reference:
 
     Raises
     ------
-    InputFileError
-        It cannot be read, has fewer than two poses, a line is not a pose, or times do not increase.
+    InputFileError : It cannot be read, has fewer than two poses, a line is not a pose, or times do not increase.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -123,10 +120,8 @@ def match_poses(poses: PoseBatch, reference: Reference) -> tuple[NDArray[np.intp
 
     Returns
     -------
-    rows
-        (N,) of the poses.
-    true
-        (N, 4, 4) ``T_station1_robot`` of the reference at their instants.
+    rows : (N,) of the poses.
+    true : (N, 4, 4) ``T_station1_robot`` of the reference at their instants.
     """
     ends_ns = int(reference.stamp_ns[0]), int(reference.stamp_ns[-1])
     rows = np.flatnonzero(poses.valid & interior_mask(poses.stamp_ns, *ends_ns))
@@ -139,10 +134,8 @@ def compare(poses: PoseBatch, reference: Reference, point_m: FloatArray) -> Pose
 
     Parameters
     ----------
-    reference
-        Poses of the same robot frame in frame ``station1``.
-    point_m
-        Point of the robot whose position is compared, (3,): the centroid of the prisms.
+    reference : Poses of the same robot frame in frame ``station1``.
+    point_m : Point of the robot whose position is compared, (3,): the centroid of the prisms.
     """
     rows, true = match_poses(poses, reference)
     return PoseErrorStatistics.of(_transforms(poses, rows), poses.covariance[rows], true, point_m)
@@ -158,3 +151,77 @@ def compare_aligned(
 
 def _transforms(poses: PoseBatch, rows: NDArray[np.intp]) -> FloatArray:
     return transform_from(rotation_from_quaternion(poses.orientation_xyzw[rows]), poses.position_m[rows])
+
+
+MIN_POSES = 20
+"""One second at 20 Hz: intervals with fewer poses are ignored."""
+
+
+@dataclass(frozen=True, slots=True)
+class StationaryStatistics:
+    """Errors of mean poses over the stationary intervals that count (``stops``); NaN without any."""
+
+    stops: int
+    position_mean_mm: float
+    position_max_mm: float
+    rotation_mean_deg: float
+    rotation_max_deg: float
+
+
+@dataclass(frozen=True, slots=True)
+class StationaryErrors:
+    """Errors of the mean pose of each of K stationary intervals.
+
+    Attributes
+    ----------
+    position_m : (K,) norm of the position error at the chosen point of the robot.
+    rotation_rad : (K,) angle of the rotation error.
+    """
+
+    position_m: FloatArray
+    rotation_rad: FloatArray
+
+    def statistics(self) -> StationaryStatistics:
+        """Summarise the intervals."""
+        if not len(self.position_m):
+            return StationaryStatistics(0, *(math.nan,) * 4)
+        position_mm, rotation_deg = 1e3 * self.position_m, np.degrees(self.rotation_rad)
+        return StationaryStatistics(
+            stops=len(position_mm),
+            position_mean_mm=float(position_mm.mean()),
+            position_max_mm=float(position_mm.max()),
+            rotation_mean_deg=float(rotation_deg.mean()),
+            rotation_max_deg=float(rotation_deg.max()),
+        )
+
+
+def stationary_errors(
+    poses: PoseBatch, reference: Reference, stationary_ns: Sequence[tuple[int, int]], point_m: FloatArray
+) -> StationaryErrors:
+    """Compare the mean pose of each stationary interval with the mean of the reference at the same instants, unaligned.
+
+    Parameters
+    ----------
+    poses : Invalid ones are ignored.
+    reference : Poses of the same robot frame in frame ``station1``.
+    stationary_ns : Start and end of the intervals, in Unix ns.
+    point_m : Point of the robot whose position is compared, (3,).
+
+    Returns one entry per interval with at least :data:`MIN_POSES` poses that have a reference.
+    """
+    position_m, rotation_rad = [], []
+    for start_ns, end_ns in stationary_ns:
+        rows = np.flatnonzero(poses.valid & (poses.stamp_ns >= start_ns) & (poses.stamp_ns <= end_ns))
+        true, known = reference.at(poses.stamp_ns[rows])
+        rows, true = rows[known], true[known]
+        if len(rows) < MIN_POSES:
+            continue
+        rotation = rotation_from_quaternion(poses.orientation_xyzw[rows])
+        estimated = transform_from(rotation, poses.position_m[rows])
+        offset = transform_points(estimated, point_m).mean(axis=0) - transform_points(true, point_m).mean(
+            axis=0
+        )
+        mean, true_mean = (Rotation.from_matrix(T[:, :3, :3]).mean() for T in (estimated, true))
+        position_m.append(float(np.linalg.norm(offset)))
+        rotation_rad.append(float((true_mean.inv() * mean).magnitude()))
+    return StationaryErrors(np.array(position_m), np.array(rotation_rad))

@@ -35,10 +35,8 @@ class ResidualStatistics:
 
     Attributes
     ----------
-    mean, std
-        0 and 1 if motion prior and noise are as assumed.
-    beyond_3_sigma
-        Share with an absolute value above 3; 0.0027 for a normal distribution.
+    mean, std : 0 and 1 if motion prior and noise are as assumed.
+    beyond_3_sigma : Share with an absolute value above 3; 0.0027 for a normal distribution.
     """
 
     mean: float
@@ -65,12 +63,9 @@ class Outlier:
 
     Attributes
     ----------
-    stamp_ns
-        As recorded, on the master's Unix clock.
-    missed_mm
-        Distance between measured and fitted position.
-    sigmas
-        The same in sigmas of the measurement noise.
+    stamp_ns : As recorded, on the master's Unix clock.
+    missed_mm : Distance between measured and fitted position.
+    sigmas : The same in sigmas of the measurement noise.
     """
 
     station: int
@@ -87,10 +82,7 @@ def normalised_residuals(fit: TrajectoryFit) -> FloatArray:
     trajectory follows the measurement: Q_vv = Q_ll - A Q_xx A^T (Baarda 1968, A testing procedure for use in geodetic
     networks).
 
-    Returns
-    -------
-    FloatArray
-        (M, 3): along the line of sight, horizontally and vertically across it.
+    Returns (M, 3): along the line of sight, horizontally and vertically across it.
     """
     at = nearest_knots(fit.trajectory.knots.time_s, fit.observations.time_s)
     linearised = linearise(fit.observations, fit.trajectory.knots, at)

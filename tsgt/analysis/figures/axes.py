@@ -39,10 +39,8 @@ class TimeAxis:
 
     Attributes
     ----------
-    origin_ns
-        Unix time at 0.
-    unit_s
-        Seconds in one unit.
+    origin_ns : Unix time at 0.
+    unit_s : Seconds in one unit.
     """
 
     origin_ns: int

@@ -48,17 +48,13 @@ def draw_gnss(
 
     Parameters
     ----------
-    receivers
-        Drawn in the time interval of ``gnss``.
-    gnss, prisms
-        Distances between receivers, at least one; and between prisms, which are drawn together.
+    receivers : Drawn in the time interval of ``gnss``.
+    gnss, prisms : Distances between receivers, at least one; and between prisms, which are drawn together.
 
     Raises
     ------
-    MissingExtraError
-        matplotlib is not installed.
-    OutputFileError
-        The file cannot be written.
+    MissingExtraError : matplotlib is not installed.
+    OutputFileError : The file cannot be written.
     """
     series = [_series(f"receivers {pair.name}", [pair]) for pair in gnss if len(pair.times_ns)]
     if prisms:

@@ -33,13 +33,11 @@ def draw_layouts(
     covariances
         By name of the layout, in the order of the ranking: (N, 6, 6) of robot poses with
         :data:`tsgt.analysis.design.layout_study.HEADING_COUNT` headings at each place.
-    distances
-        By the stations' distance in m and the name of their arrangement.
+    distances : By the stations' distance in m and the name of their arrangement.
 
     Raises
     ------
-    MissingExtraError, OutputFileError
-        matplotlib is not installed; the file cannot be written.
+    MissingExtraError, OutputFileError : matplotlib is not installed; the file cannot be written.
     """
     heading_deg = np.arange(HEADING_COUNT + 1) * (360 / HEADING_COUNT)
     distance_m = list(distances)

@@ -29,15 +29,12 @@ def draw_perturbation(
 
     Parameters
     ----------
-    study
-        In the order of the noise.
-    first_order_per_mm
-        Sigmas of position (m) and rotation (rad) for 1 mm of noise, (3,) each.
+    study : In the order of the noise.
+    first_order_per_mm : Sigmas of position (m) and rotation (rad) for 1 mm of noise, (3,) each.
 
     Raises
     ------
-    MissingExtraError, OutputFileError
-        matplotlib is not installed; a file cannot be written.
+    MissingExtraError, OutputFileError : matplotlib is not installed; a file cannot be written.
     """
     noise_mm = np.array([1e3 * each.noise_m for each in study])
     position_mm = 1e3 * np.array(

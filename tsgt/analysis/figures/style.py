@@ -71,8 +71,7 @@ def drawing(*, width_mm: float, height_mm: float) -> Iterator[Figure]:
 
     Raises
     ------
-    MissingExtraError
-        matplotlib is not installed.
+    MissingExtraError : matplotlib is not installed.
     """
     try:
         import matplotlib as mpl  # noqa: PLC0415 (an extra)
@@ -88,8 +87,7 @@ def save(figure: Figure, path: Path) -> None:
 
     Raises
     ------
-    OutputFileError
-        Another suffix, or the file cannot be written.
+    OutputFileError : Another suffix, or the file cannot be written.
     """
     if path.suffix not in FORMATS:
         raise OutputFileError(f"figures end in {', '.join(FORMATS)}", path=path)

@@ -142,8 +142,7 @@ def read_table(path: Path) -> tuple[Header, Iterator[Row]]:
 
     Raises
     ------
-    InputFileError
-        The file cannot be read or has no rows; on iteration: a row has not as many cells as the header.
+    InputFileError : The file cannot be read or has no rows; on iteration: a row has not as many cells as the header.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")  # spreadsheets write a byte order mark

@@ -37,15 +37,9 @@ MEASUREMENT_COLUMNS = (
 def tum_lines(poses: Iterable[tuple[int, Sequence[float], Sequence[float]]]) -> Iterator[str]:
     """Format poses as the TUM RGB-D benchmark does: ``stamp_s x y z qx qy qz qw``.
 
-    Parameters
-    ----------
-    poses
-        Valid poses: Unix time in ns, position in m, unit quaternion x, y, z, w.
+    ``poses``: Valid poses: Unix time in ns, position in m, unit quaternion x, y, z, w.
 
-    Yields
-    ------
-    str
-        One line per pose: seconds with nine decimals, exact to the nanosecond; metres to the nanometre.
+    Yields one line per pose: seconds with nine decimals, exact to the nanosecond; metres to the nanometre.
     """
     row = "{:d}.{:09d} {:.9f} {:.9f} {:.9f} {:.12f} {:.12f} {:.12f} {:.12f}\n".format
     for stamp_ns, position_m, orientation_xyzw in poses:

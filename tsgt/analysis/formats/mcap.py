@@ -63,8 +63,7 @@ def write_mcap(file: BinaryIO, messages: Iterable[Message]) -> None:
 
     Raises
     ------
-    MissingExtraError
-        mcap or rosbags is not installed.
+    MissingExtraError : mcap or rosbags is not installed.
     """
     try:
         from mcap.writer import Writer  # noqa: PLC0415 (an extra)
@@ -96,19 +95,14 @@ def messages(
 
     Parameters
     ----------
-    recording
-        Measurements, from which the prism positions are computed, and the frames of stations and prisms.
-    poses
-        In the order of time; invalid ones are skipped.
-    reference
-        A reference trajectory for display together with the poses.
+    recording : Measurements, from which the prism positions are computed, and the frames of stations and prisms.
+    poses : In the order of time; invalid ones are skipped.
+    reference : A reference trajectory for display together with the poses.
 
     Raises
     ------
-    MessageError
-        A time is after January 2038, which ROS 2 cannot represent.
-    MissingExtraError
-        rosbags is not installed.
+    MessageError : A time is after January 2038, which ROS 2 cannot represent.
+    MissingExtraError : rosbags is not installed.
     """
     tracks = build_tracks(recording.parameters, recording.measurements)
     sources = [_pose_messages(poses), *(_track_messages(prism, track) for prism, track in tracks.items())]

@@ -36,8 +36,7 @@ def read_stationary_intervals(path: Path) -> list[tuple[int, int]]:
 
     Raises
     ------
-    InputFileError
-        It cannot be read, a line is not three finite numbers, or times do not increase.
+    InputFileError : It cannot be read, a line is not three finite numbers, or times do not increase.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")

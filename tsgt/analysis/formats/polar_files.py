@@ -38,8 +38,7 @@ def read_polar_tracks(paths: Sequence[Path]) -> list[Measurement]:
 
     Raises
     ------
-    InputFileError
-        A file cannot be read, is empty, has a wrong column or number, or contains a measurement twice.
+    InputFileError : A file cannot be read, is empty, has a wrong column or number, or contains a measurement twice.
     """
     measurements: list[Measurement] = []
     counts: dict[int, int] = {}
@@ -148,8 +147,7 @@ def check_tracks(measurements: Sequence[Measurement], paths: Sequence[Path]) -> 
 
     Raises
     ------
-    InputFileError
-        Names the stations.
+    InputFileError : Names the stations.
     """
     spans: dict[int, tuple[int, int]] = {}
     for m in measurements:

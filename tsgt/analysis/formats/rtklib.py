@@ -66,21 +66,15 @@ class PosFile:
 
     Attributes
     ----------
-    time_system
-        GPS time, UTC, or Japan standard time (UTC + 9 h).
-    times_ns
-        (M,) ns from 1970-01-01 00:00:00 on the calendar of ``time_system``, strictly increasing.
+    time_system : GPS time, UTC, or Japan standard time (UTC + 9 h).
+    times_ns : (M,) ns from 1970-01-01 00:00:00 on the calendar of ``time_system``, strictly increasing.
     coordinates
         ``geodetic``: latitude and longitude in rad, height in m. ``ecef``: x, y, z in m. ``baseline``: east, north and up
         from the base in m.
-    positions
-        (M, 3) in these coordinates.
-    quality
-        (M,) RTKLIB's Q, see :data:`QUALITIES`.
-    satellites
-        (M,) number of satellites.
-    base
-        Latitude, longitude (rad) and height (m) of the base; None unless the coordinates are relative to it.
+    positions : (M, 3) in these coordinates.
+    quality : (M,) RTKLIB's Q, see :data:`QUALITIES`.
+    satellites : (M,) number of satellites.
+    base : Latitude, longitude (rad) and height (m) of the base; None unless the coordinates are relative to it.
     """
 
     path: Path

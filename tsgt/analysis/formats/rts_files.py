@@ -32,10 +32,8 @@ class PublishedTrack:
 
     Attributes
     ----------
-    stamps_ns
-        (M,) Unix time, strictly increasing.
-    points_m
-        (M, 3) in the frame ``station1``.
+    stamps_ns : (M,) Unix time, strictly increasing.
+    points_m : (M, 3) in the frame ``station1``.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -49,8 +47,7 @@ def read_track(path: Path) -> PublishedTrack:
 
     Raises
     ------
-    InputFileError
-        The file is empty, a line has not four finite numbers, or times do not increase.
+    InputFileError : The file is empty, a line has not four finite numbers, or times do not increase.
     """
     stamps: list[int] = []
     points: list[list[float]] = []
@@ -87,8 +84,7 @@ def read_tracks(paths: Sequence[Path]) -> tuple[PublishedTrack, ...]:
 
     Raises
     ------
-    InputFileError
-        As :func:`read_track`; also if the tracks do not overlap in time.
+    InputFileError : As :func:`read_track`; also if the tracks do not overlap in time.
     """
     tracks = tuple(read_track(path) for path in paths)
     latest = max(range(len(tracks)), key=lambda i: int(tracks[i].stamps_ns[0]))
@@ -111,15 +107,12 @@ def read_prisms(path: Path, numbers: Sequence[int] = (1, 2, 3)) -> tuple[PrismPo
         The authors' ``sensor_positions.csv``: separated by spaces, rows 1 to 3 are the prisms 1 to 3, starting with x, y, z
         in m in the robot frame; the rest (other sensors, covariances) is ignored. With the suffix ``.toml`` our own
         set-up file of kind ``prism_layout``.
-    numbers
-        Tracked prisms; others are ignored.
+    numbers : Tracked prisms; others are ignored.
 
     Raises
     ------
-    InputFileError
-        A row or a number is missing, or the prisms coincide or lie in a line.
-    ConfigError
-        The set-up file cannot be used.
+    InputFileError : A row or a number is missing, or the prisms coincide or lie in a line.
+    ConfigError : The set-up file cannot be used.
     """
     positions = load_prism_layout(path) if path.suffix == ".toml" else _read_sensor_positions(path)
     missing = [prism for prism in numbers if prism not in positions]

@@ -29,21 +29,15 @@ def write_station_frames(
 
     Parameters
     ----------
-    frames
-        (4, 4) ``T_station1_station`` in m by station number.
-    rms_m
-        Root mean square of the target residuals against station 1, by number of the other stations.
-    comment
-        Origin of the frames, written as one comment line at the top.
-    latencies_ms
-        From the measurement to its timestamp by station number, if calibrated.
-    targets
-        Target residuals by station number, if the frames come from targets.
+    frames : (4, 4) ``T_station1_station`` in m by station number.
+    rms_m : Root mean square of the target residuals against station 1, by number of the other stations.
+    comment : Origin of the frames, written as one comment line at the top.
+    latencies_ms : From the measurement to its timestamp by station number, if calibrated.
+    targets : Target residuals by station number, if the frames come from targets.
 
     Raises
     ------
-    OutputFileError
-        The file cannot be written.
+    OutputFileError : The file cannot be written.
     """
     tables = {}
     for station, T in sorted(frames.items()):
@@ -67,13 +61,11 @@ def write_prism_layout(
     ----------
     positions_m, sigmas_m
         (3,) position in the frame ``robot`` in m, and one sigma of each coordinate, by prism number.
-    comment
-        Origin of the positions, written as one comment line at the top.
+    comment : Origin of the positions, written as one comment line at the top.
 
     Raises
     ------
-    OutputFileError
-        The file cannot be written.
+    OutputFileError : The file cannot be written.
     """
     tables = {
         str(prism): {"position_m": list(map(float, position)), "sigma_m": list(map(float, sigmas_m[prism]))}

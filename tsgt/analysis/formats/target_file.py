@@ -33,16 +33,11 @@ class TargetMeasurement:
 
     Attributes
     ----------
-    horizontal_angle_rad
-        Clockwise.
-    zenith_angle_rad
-        From the zenith; above pi in face 2.
-    slope_distance_m
-        Without corrections.
-    constant_m
-        Added to this distance; None: use the constant of the command line.
-    line
-        Line number in the file, from 1.
+    horizontal_angle_rad : Clockwise.
+    zenith_angle_rad : From the zenith; above pi in face 2.
+    slope_distance_m : Without corrections.
+    constant_m : Added to this distance; None: use the constant of the command line.
+    line : Line number in the file, from 1.
     """
 
     horizontal_angle_rad: float
@@ -58,10 +53,8 @@ class TargetFile:
 
     Attributes
     ----------
-    measurements
-        By station number and target number: at least one.
-    skipped
-        One sentence for each line that was skipped because of an error status.
+    measurements : By station number and target number: at least one.
+    skipped : One sentence for each line that was skipped because of an error status.
     """
 
     path: Path
@@ -75,10 +68,8 @@ class PrismFile:
 
     Attributes
     ----------
-    prisms, body
-        By prism number and by name of the body point: at least one measurement.
-    cad_m
-        By name of the body point: position in the frame ``robot`` from CAD.
+    prisms, body : By prism number and by name of the body point: at least one measurement.
+    cad_m : By name of the body point: position in the frame ``robot`` from CAD.
     """
 
     path: Path
@@ -95,8 +86,7 @@ def read_target_file(path: Path) -> TargetFile:
 
     Raises
     ------
-    InputFileError
-        The file cannot be read, is empty, has a wrong column or number, or a station is missing.
+    InputFileError : The file cannot be read, is empty, has a wrong column or number, or a station is missing.
     """
     file = read_partial_target_file(path)
     if 1 not in file.measurements:
@@ -113,8 +103,7 @@ def read_partial_target_file(path: Path) -> TargetFile:
 
     Raises
     ------
-    InputFileError
-        The file cannot be read, is empty, or has a wrong column or number.
+    InputFileError : The file cannot be read, is empty, or has a wrong column or number.
     """
     header, rows = read_table(path)
     measurements: dict[int, dict[int, list[TargetMeasurement]]] = {}

@@ -45,18 +45,12 @@ class Receiver:
 
     Attributes
     ----------
-    path, time_system
-        The file and its time system.
-    times_ns
-        (M,) Unix time, strictly increasing.
-    points_m
-        (M, 3) east, north and up in the local frame common to all receivers.
-    quality
-        (M,) RTKLIB's Q.
-    satellites
-        (M,) number of satellites.
-    without_position
-        Number of epochs in the file without a position.
+    path, time_system : The file and its time system.
+    times_ns : (M,) Unix time, strictly increasing.
+    points_m : (M, 3) east, north and up in the local frame common to all receivers.
+    quality : (M,) RTKLIB's Q.
+    satellites : (M,) number of satellites.
+    without_position : Number of epochs in the file without a position.
     """
 
     name: str
@@ -81,10 +75,8 @@ class DistanceErrorStatistics:
 
     Attributes
     ----------
-    valid
-        Number of distances.
-    std_abs_error
-        Standard deviation with divisor n.
+    valid : Number of distances.
+    std_abs_error : Standard deviation with divisor n.
     """
 
     valid: int
@@ -114,18 +106,12 @@ class DistanceSeries:
 
     Attributes
     ----------
-    name
-        Name of the pair in reports.
-    times_ns
-        (N,) Unix time.
-    distances_m
-        (N,).
-    reference_m
-        True distance; NaN if unknown.
-    quality
-        (N,) the worse Q of the two positions; None for prisms.
-    invalid_ns
-        (K,) Unix times of the epochs without a distance.
+    name : Name of the pair in reports.
+    times_ns : (N,) Unix time.
+    distances_m : (N,).
+    reference_m : True distance; NaN if unknown.
+    quality : (N,) the worse Q of the two positions; None for prisms.
+    invalid_ns : (K,) Unix times of the epochs without a distance.
     """
 
     name: str
@@ -164,10 +150,8 @@ def receivers(files: Sequence[PosFile]) -> tuple[Receiver, ...]:
 
     Raises
     ------
-    InputFileError
-        A file contains no position at all.
-    MissingExtraError
-        pymap3d is not installed.
+    InputFileError : A file contains no position at all.
+    MissingExtraError : pymap3d is not installed.
     """
     try:
         from pymap3d import ecef2enu, ecef2geodetic  # noqa: PLC0415 (an extra)
@@ -244,8 +228,7 @@ def receiver_distances(
 
     Parameters
     ----------
-    found
-        As :func:`receivers` returns them.
+    found : As :func:`receivers` returns them.
     references_m
         True distances for the pairs 1-2, 1-3, ..., 2-3, ...; None: the median of the distances from fixed positions (Q = 1),
         or of all without fixed ones. A median hides constant errors.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,36 +11,13 @@ from tsgt.analysis.formats import SECOND_NS
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-# Month of change and GPS - UTC in s from then on: IERS Bulletin C. No change has been announced since 2017.
+# GPS - UTC grew by 1 s at the begin of each of these months: IERS Bulletin C. None has been announced since 2017.
 _LEAP_SECONDS = (
-    ((1981, 7), 1),
-    ((1982, 7), 2),
-    ((1983, 7), 3),
-    ((1985, 7), 4),
-    ((1988, 1), 5),
-    ((1990, 1), 6),
-    ((1991, 1), 7),
-    ((1992, 7), 8),
-    ((1993, 7), 9),
-    ((1994, 7), 10),
-    ((1996, 1), 11),
-    ((1997, 7), 12),
-    ((1999, 1), 13),
-    ((2006, 1), 14),
-    ((2009, 1), 15),
-    ((2012, 7), 16),
-    ((2015, 7), 17),
-    ((2017, 1), 18),
+    "1981-07 1982-07 1983-07 1985-07 1988-01 1990-01 1991-01 1992-07 1993-07 "
+    "1994-07 1996-01 1997-07 1999-01 2006-01 2009-01 2012-07 2015-07 2017-01"
 )
-
-_OFFSET_S = np.array([0, *(seconds for _, seconds in _LEAP_SECONDS)], dtype=np.int64)
-_FROM_GPS_NS = np.array(
-    [
-        (round(datetime(year, month, 1, tzinfo=UTC).timestamp()) + seconds) * SECOND_NS
-        for (year, month), seconds in _LEAP_SECONDS
-    ],
-    dtype=np.int64,
-)
+_MONTHS_S = np.array(_LEAP_SECONDS.split(), dtype="datetime64[s]").astype(np.int64)
+_FROM_GPS_NS = (_MONTHS_S + np.arange(1, len(_MONTHS_S) + 1)) * SECOND_NS
 
 
 def utc_from_gps(gps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -49,4 +25,4 @@ def utc_from_gps(gps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
 
     Unix time cannot represent a leap second: during one it runs through the first second of the new day, which then repeats.
     """
-    return gps_ns - _OFFSET_S[np.searchsorted(_FROM_GPS_NS, gps_ns, side="right")] * SECOND_NS
+    return gps_ns - np.searchsorted(_FROM_GPS_NS, gps_ns, side="right").astype(np.int64) * SECOND_NS

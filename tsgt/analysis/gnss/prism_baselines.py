@@ -25,17 +25,12 @@ def prism_distances(
 
     Parameters
     ----------
-    parameters
-        The prism layout (the reference distances) and the outage limit.
-    tracks
-        One track per prism of the layout, in frame ``station1``.
-    path
-        The recording, for messages.
+    parameters : The prism layout (the reference distances) and the outage limit.
+    tracks : One track per prism of the layout, in frame ``station1``.
 
     Raises
     ------
-    RecordingError
-        A prism was not measured, or the layout has only one prism.
+    RecordingError : A prism was not measured, or the layout has only one prism.
     """
     missing = [prism.prism for prism in parameters.prisms if not len(tracks[prism.prism])]
     if missing or len(parameters.prisms) < 2:
@@ -60,15 +55,9 @@ def common_interval(
 ) -> tuple[tuple[DistanceSeries, ...], tuple[DistanceSeries, ...]]:
     """Cut distances between receivers and between prisms to the time interval that both cover.
 
-    Parameters
-    ----------
-    path
-        The recording, for messages.
-
     Raises
     ------
-    RecordingError
-        They do not overlap in time.
+    RecordingError : They do not overlap in time.
     """
     gnss_span, prism_span = time_span(gnss), time_span(prisms)
     if gnss_span is None or prism_span is None:

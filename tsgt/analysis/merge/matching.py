@@ -77,10 +77,8 @@ class Boot:
 
     Attributes
     ----------
-    journals
-        In the order of their creation.
-    entries
-        All measurements in the order of time.
+    journals : In the order of their creation.
+    entries : All measurements in the order of time.
     """
 
     def __init__(self, journals: Iterable[IndexedJournal]) -> None:
@@ -221,16 +219,11 @@ class Match:
 
     Attributes
     ----------
-    times
-        Time of each entry on the master's clock; None if unknown.
-    delivered
-        Indices of entries that were delivered over the radio.
-    same_content
-        Indices of entries whose content was delivered; their times may contradict that.
-    clock_related
-        Synchronisations or beacons relate the station's clock to the master's.
-    beacons_received
-        The station received beacons of this session.
+    times : Time of each entry on the master's clock; None if unknown.
+    delivered : Indices of entries that were delivered over the radio.
+    same_content : Indices of entries whose content was delivered; their times may contradict that.
+    clock_related : Synchronisations or beacons relate the station's clock to the master's.
+    beacons_received : The station received beacons of this session.
     """
 
     times: list[MasterTime | None]

@@ -44,18 +44,12 @@ class MergedJournal:
 
     Attributes
     ----------
-    measurements
-        Total number.
-    added
-        Written to the recording.
-    already_there
-        Delivered over the radio, or merged before.
-    outside
-        Made long before or after the recording.
-    untimed
-        Without a time on the master's clock, or with too large a bound.
-    skipped
-        Why the journal cannot be merged at all, one line; empty if it can.
+    measurements : Total number.
+    added : Written to the recording.
+    already_there : Delivered over the radio, or merged before.
+    outside : Made long before or after the recording.
+    untimed : Without a time on the master's clock, or with too large a bound.
+    skipped : Why the journal cannot be merged at all, one line; empty if it can.
     """
 
     path: Path
@@ -74,10 +68,8 @@ class Merged:
 
     Attributes
     ----------
-    bounds_ns
-        Time bounds of the added measurements, increasing.
-    cut_bytes
-        Length of an incomplete line removed from the end of the recording.
+    bounds_ns : Time bounds of the added measurements, increasing.
+    cut_bytes : Length of an incomplete line removed from the end of the recording.
     """
 
     journals: tuple[MergedJournal, ...]
@@ -115,14 +107,10 @@ def merge(
 
     Parameters
     ----------
-    recording
-        Of the master; lines are appended to it unless ``output`` is given.
-    journals
-        Of the stations, of any number of runs; journals of the same boot share clock samples.
-    output
-        Receives the recording and the additions; the recording remains unchanged.
-    keep_going
-        Skip unreadable lines instead of raising.
+    recording : Of the master; lines are appended to it unless ``output`` is given.
+    journals : Of the stations, of any number of runs; journals of the same boot share clock samples.
+    output : Receives the recording and the additions; the recording remains unchanged.
+    keep_going : Skip unreadable lines instead of raising.
     on_problem
         Called with every skipped line: an incomplete last line always, others with ``keep_going``; and with a journal that
         has no content yet.

@@ -25,14 +25,10 @@ class Session:
 
     Attributes
     ----------
-    start_ns, end_ns
-        From the header to the last line with a time.
-    clocks
-        Synchronisations by station, in their order.
-    beacons
-        By session number in the protocol, then by frame counter.
-    delivered
-        Measurements received over the radio, by station.
+    start_ns, end_ns : From the header to the last line with a time.
+    clocks : Synchronisations by station, in their order.
+    beacons : By session number in the protocol, then by frame counter.
+    delivered : Measurements received over the radio, by station.
     """
 
     start_ns: int
@@ -48,10 +44,8 @@ class RecordingIndex:
 
     Attributes
     ----------
-    stations
-        Numbers of all stations in the parameters.
-    merged
-        Measurements merged before.
+    stations : Numbers of all stations in the parameters.
+    merged : Measurements merged before.
     """
 
     stations: set[int] = field(default_factory=set)
@@ -85,15 +79,11 @@ def index_recording(
 ) -> RecordingIndex:
     """Read a recording.
 
-    Parameters
-    ----------
-    path, keep_going, on_problem
-        See :func:`~tsgt.recording.load_recording`.
+    ``path``, ``keep_going``, ``on_problem``: See :func:`~tsgt.recording.load_recording`.
 
     Raises
     ------
-    RecordingError
-        As :func:`~tsgt.recording.load_recording`; also for a file that was not written by a master.
+    RecordingError : As :func:`~tsgt.recording.load_recording`; also for a file that was not written by a master.
     """
     index = RecordingIndex()
     for line in read_lines(path, keep_going=keep_going, on_problem=on_problem):

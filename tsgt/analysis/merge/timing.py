@@ -63,10 +63,8 @@ def times_from_synchronisations(
 
     Parameters
     ----------
-    synchronisations
-        Exchanges with the station in the order of time; at least one, none of them empty.
-    stamps_ns
-        Increasing.
+    synchronisations : Exchanges with the station in the order of time; at least one, none of them empty.
+    stamps_ns : Increasing.
 
     Returns
     -------
@@ -123,10 +121,8 @@ def times_from_beacons(
 
     Parameters
     ----------
-    receptions
-        Beacons of one session of the master, in the order of reception.
-    stamps_ns
-        Increasing.
+    receptions : Beacons of one session of the master, in the order of reception.
+    stamps_ns : Increasing.
 
     Returns
     -------

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tsgt.analysis.figures import hatch, stroke
-from tsgt.analysis.report.elements import format_number, page_figure
-from tsgt.analysis.report.page import Section, Table
+from tsgt.analysis.report.page import Section, Table, format_number, page_figure
 from tsgt.model import PolarMeasurement
 
 if TYPE_CHECKING:

@@ -66,10 +66,8 @@ class Difference:
 
     Attributes
     ----------
-    position_m
-        (N,) distance between the positions of the prisms' centroid.
-    rotation_rad
-        (N,) angle between the rotations.
+    position_m : (N,) distance between the positions of the prisms' centroid.
+    rotation_rad : (N,) angle between the rotations.
     """
 
     stamp_ns: np.ndarray[Any, np.dtype[np.int64]]
@@ -83,12 +81,9 @@ class PoseNoise:
 
     Attributes
     ----------
-    study
-        For noise of several sigmas.
-    first_order_per_mm
-        Sigmas of position (m) and rotation (rad) for 1 mm of noise, (3,) each.
-    as_measured
-        For the noise that explains the mean inter-prism error; None without distances.
+    study : For noise of several sigmas.
+    first_order_per_mm : Sigmas of position (m) and rotation (rad) for 1 mm of noise, (3,) each.
+    as_measured : For the noise that explains the mean inter-prism error; None without distances.
     """
 
     study: list[Perturbation]
@@ -102,24 +97,16 @@ class Findings:
 
     Attributes
     ----------
-    start_ns, end_ns
-        First and last measurement.
-    log
-        Radio, clocks, events.
-    inter_prism, distance_errors
-        Inter-prism distances; None if a prism was not measured.
-    odometry_stationary_ns
-        Stationary intervals of the odometry, within the recording or not; None without odometry.
-    difference
-        Between the estimators.
-    held_out
-        Prediction errors, if requested.
-    residuals, outliers, normalised
-        Of the continuous trajectory.
+    start_ns, end_ns : First and last measurement.
+    log : Radio, clocks, events.
+    inter_prism, distance_errors : Inter-prism distances; None if a prism was not measured.
+    odometry_stationary_ns : Stationary intervals of the odometry, within the recording or not; None without odometry.
+    difference : Between the estimators.
+    held_out : Prediction errors, if requested.
+    residuals, outliers, normalised : Of the continuous trajectory.
     reference_errors, aligned_errors, stationary_errors
         Against the reference by estimator: unaligned, after an alignment, and mean poses of stationary intervals.
-    problems
-        Reasons for missing content, as sentences, by its name.
+    problems : Reasons for missing content, as sentences, by its name.
     """
 
     recording: Recording
@@ -179,23 +166,16 @@ def collect_findings(
 
     Parameters
     ----------
-    path
-        The recording's file.
-    reference
-        Trajectory to compare poses with.
-    with_held_out
-        Cross-validate both estimators.
-    align
-        Compare with the reference after this alignment as well.
-    stationary_ns
-        Stationary intervals from another source than the measurements.
-    on_progress
-        Called with the completed fraction, 0 to 1.
+    path : The recording's file.
+    reference : Trajectory to compare poses with.
+    with_held_out : Cross-validate both estimators.
+    align : Compare with the reference after this alignment as well.
+    stationary_ns : Stationary intervals from another source than the measurements.
+    on_progress : Called with the completed fraction, 0 to 1.
 
     Raises
     ------
-    RecordingError
-        There is no measurement at all, or the file cannot be read.
+    RecordingError : There is no measurement at all, or the file cannot be read.
     """
     report = on_progress or (lambda _: None)
     parameters = recording.parameters

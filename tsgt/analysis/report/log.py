@@ -30,12 +30,9 @@ class RadioSeries:
 
     Attributes
     ----------
-    stamp_ns
-        (N,) on the master's Unix clock.
-    rssi_dbm, snr_db
-        (N,) of its last radio message.
-    loss
-        (N,) share of its last requests without a response, 0 to 1.
+    stamp_ns : (N,) on the master's Unix clock.
+    rssi_dbm, snr_db : (N,) of its last radio message.
+    loss : (N,) share of its last requests without a response, 0 to 1.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -50,14 +47,10 @@ class ClockSeries:
 
     Attributes
     ----------
-    stamp_ns
-        (N,) on the master's Unix clock.
-    offset_ns
-        (N,) positive: station ahead.
-    bound_ns
-        (N,) of the error of the offset.
-    restarted
-        (N,) whether the clock filter was reset.
+    stamp_ns : (N,) on the master's Unix clock.
+    offset_ns : (N,) positive: station ahead.
+    bound_ns : (N,) of the error of the offset.
+    restarted : (N,) whether the clock filter was reset.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -72,12 +65,9 @@ class Log:
 
     Attributes
     ----------
-    radio, clocks
-        By station; empty without records.
-    events
-        (stamp_ns, message) in the order of the file.
-    protocol, authenticated
-        Of the last status; None without a radio.
+    radio, clocks : By station; empty without records.
+    events : (stamp_ns, message) in the order of the file.
+    protocol, authenticated : Of the last status; None without a radio.
     """
 
     radio: dict[int, RadioSeries]
@@ -94,8 +84,7 @@ def read_log(path: Path) -> Log:
 
     Raises
     ------
-    RecordingError
-        The file cannot be read.
+    RecordingError : The file cannot be read.
     """
     statuses: list[dict[str, Any]] = []
     clocks: dict[int, list[dict[str, Any]]] = defaultdict(list)

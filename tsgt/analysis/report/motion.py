@@ -28,12 +28,9 @@ class RobotMotion:
 
     Attributes
     ----------
-    speed_mps
-        (N,) of the prisms' centroid.
-    acceleration_mps2
-        (N,) derivative of the speed; negative while braking.
-    angular_rate_radps
-        (N,) norm of the angular velocity.
+    speed_mps : (N,) of the prisms' centroid.
+    acceleration_mps2 : (N,) derivative of the speed; negative while braking.
+    angular_rate_radps : (N,) norm of the angular velocity.
     """
 
     speed_mps: FloatArray
@@ -52,12 +49,9 @@ class DistanceErrorSeries:
 
     Attributes
     ----------
-    stamp_ns
-        (N,) 20 Hz epochs in the time that all tracks cover.
-    error_m
-        By name of the pair, (N,) measured distance minus that of the layout; NaN where a track has a gap.
-    motion
-        Of the robot at these epochs.
+    stamp_ns : (N,) 20 Hz epochs in the time that all tracks cover.
+    error_m : By name of the pair, (N,) measured distance minus that of the layout; NaN where a track has a gap.
+    motion : Of the robot at these epochs.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -71,12 +65,9 @@ class Bins:
 
     Attributes
     ----------
-    edges
-        (B + 1,) of the bins.
-    counts
-        (B,).
-    median, mean, p95
-        (B,) of |error| in m; NaN with too few errors.
+    edges : (B + 1,) of the bins.
+    counts : (B,).
+    median, mean, p95 : (B,) of |error| in m; NaN with too few errors.
     """
 
     edges: FloatArray
@@ -92,12 +83,9 @@ class Grid:
 
     Attributes
     ----------
-    x_edges, y_edges
-        (X + 1,) and (Y + 1,).
-    mean
-        (Y, X) in m; NaN with too few errors.
-    counts
-        (Y, X).
+    x_edges, y_edges : (X + 1,) and (Y + 1,).
+    mean : (Y, X) in m; NaN with too few errors.
+    counts : (Y, X).
     """
 
     x_edges: FloatArray
@@ -140,10 +128,8 @@ def binned(error_m: FloatArray, quantity: FloatArray) -> Bins | None:
 
     Parameters
     ----------
-    error_m
-        (P, N) of P pairs at N epochs; NaN if unknown.
-    quantity
-        (N,); NaN if unknown.
+    error_m : (P, N) of P pairs at N epochs; NaN if unknown.
+    quantity : (N,); NaN if unknown.
     """
     edges = _edges(quantity)
     if edges is None:

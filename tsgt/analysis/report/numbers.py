@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tsgt.analysis.report.calibration import calibration_numbers
-from tsgt.analysis.report.elements import nan_median
 from tsgt.analysis.report.findings import position_sigma_mm
 from tsgt.analysis.report.motion import binned, gridded
+from tsgt.analysis.report.page import nan_median
 from tsgt.analysis.report.verdicts import bound_and_speed, verdicts
 from tsgt.estimation import Kind
 

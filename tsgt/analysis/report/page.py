@@ -1,12 +1,17 @@
-"""Content types of a report and its HTML page, which embeds all figures. The template is page.html.j2. Sans-I/O."""
+"""Content types of a report, formatted values, and its HTML page, which embeds all figures (page.html.j2)."""
 
 from __future__ import annotations
 
 import base64
+import math
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from importlib.resources import files
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from tsgt.analysis.figures import PAGE_WIDTH_MM, drawing, save
 from tsgt.analysis.report.verdicts import Level
 from tsgt.errors import MissingExtraError
 
@@ -14,7 +19,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
+    from matplotlib.figure import Figure
+
     from tsgt.analysis.report.verdicts import Verdict
+    from tsgt.geometry import FloatArray
+
+MAX_LISTED = 20
+"""Rows of a table that may be long."""
 
 _MARK = {
     Level.GOOD: ("good", "\N{CHECK MARK}"),
@@ -38,10 +49,8 @@ class ReportFigure:
 
     Attributes
     ----------
-    name
-        Of its files, without a suffix.
-    write
-        Draws the figure and writes it to the given files.
+    name : Of its files, without a suffix.
+    write : Draws the figure and writes it to the given files.
     """
 
     name: str
@@ -59,6 +68,40 @@ class Section:
     plots: tuple[ReportFigure, ...] = ()
 
 
+def page_figure(name: str, caption: str, height_mm: float, fill: Callable[[Figure], None]) -> ReportFigure:
+    """Return a figure of page width that ``fill`` draws when it is written."""
+
+    def write(paths: Sequence[Path]) -> None:
+        with drawing(width_mm=PAGE_WIDTH_MM, height_mm=height_mm) as figure:
+            fill(figure)
+            for path in paths:
+                save(figure, path)
+
+    return ReportFigure(name, caption, write)
+
+
+def format_number(value: float, digits: int = 1) -> str:
+    """Format a number; a dash for NaN."""
+    return f"{value:.{digits}f}" if math.isfinite(value) else "-"
+
+
+def nan_median(values: FloatArray | None) -> float:
+    """Return the median of the finite values; NaN without any."""
+    if values is None or not np.isfinite(values).any():
+        return math.nan
+    return float(np.nanmedian(values))
+
+
+def format_utc(stamp_ns: int) -> str:
+    """Format a Unix time to the millisecond, in UTC."""
+    return datetime.fromtimestamp(stamp_ns / 1e9, UTC).isoformat(sep=" ", timespec="milliseconds")[:-6]
+
+
+def format_cells(name: str, *values: tuple[float, int]) -> tuple[str, ...]:
+    """Format a row of a table: its name, and numbers with their digits."""
+    return (name, *(format_number(value, digits) for value, digits in values))
+
+
 def render_page(
     title: str,
     summary: Table,
@@ -70,8 +113,7 @@ def render_page(
 
     Raises
     ------
-    MissingExtraError
-        jinja2 is not installed.
+    MissingExtraError : jinja2 is not installed.
     """
     try:
         from jinja2 import Environment, StrictUndefined  # noqa: PLC0415 (an extra)

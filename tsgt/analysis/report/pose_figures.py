@@ -136,10 +136,8 @@ def draw_residuals(
 
     Parameters
     ----------
-    normalised
-        (M, 3) in sigmas, along the line of sight, horizontally and vertically across it.
-    stamp_ns, station
-        (M,) of the measurements.
+    normalised : (M, 3) in sigmas, along the line of sight, horizontally and vertically across it.
+    stamp_ns, station : (M,) of the measurements.
     """
     numbers = np.unique(station).tolist()
     axes = figure.subplots(len(numbers), 3, sharex=True, sharey=True, squeeze=False)

@@ -9,9 +9,17 @@ import numpy as np
 
 from tsgt.analysis.figures import draw_perturbation, panels_height_mm
 from tsgt.analysis.report import pose_figures as draw
-from tsgt.analysis.report.elements import MAX_LISTED, format_number, format_utc, page_figure
 from tsgt.analysis.report.numbers import difference_numbers, pose_numbers
-from tsgt.analysis.report.page import ReportFigure, Section, Table
+from tsgt.analysis.report.page import (
+    MAX_LISTED,
+    ReportFigure,
+    Section,
+    Table,
+    format_cells,
+    format_number,
+    format_utc,
+    page_figure,
+)
 from tsgt.estimation import Kind
 from tsgt.model import PolarMeasurement
 
@@ -28,48 +36,34 @@ def reference_tables(f: Findings) -> list[Table]:
     tables = []
     if f.aligned_errors:
         rows = [
-            (
+            format_cells(
                 name,
-                format_number(a.position_rms_mm),
-                format_number(a.orientation_rms_deg, 3),
-                format_number(a.translation_mm),
-                format_number(a.rotation_deg, 3),
-                format_number(a.hidden_position_mm),
-                format_number(a.hidden_orientation_deg, 3),
+                *(
+                    (a.position_rms_mm, 1),
+                    (a.orientation_rms_deg, 3),
+                    (a.translation_mm, 1),
+                    (a.rotation_deg, 3),
+                ),
+                *((a.hidden_position_mm, 1), (a.hidden_orientation_deg, 3)),
             )
             for name, a in f.aligned_errors.items()
         ]
-        header = (
-            *("estimator", "rms (mm)", "rms (deg)", "translation (mm)", "rotation (deg)"),
-            *("hidden (mm)", "hidden (deg)"),
-        )
-        tables.append(
-            Table(
-                "Aligned with the reference: remaining errors, the alignment, and the part of the rms that it hides",
-                header,
-                tuple(rows),
-            )
-        )
-    rows_stationary = [
-        (
+        caption = "Aligned with the reference: remaining errors, the alignment, and the part of the rms that it hides"
+        header = "estimator|rms (mm)|rms (deg)|translation (mm)|rotation (deg)|hidden (mm)|hidden (deg)"
+        tables.append(Table(caption, tuple(header.split("|")), tuple(rows)))
+    rows = [
+        format_cells(
             name,
-            str(s.stops),
-            format_number(s.position_mean_mm, 2),
-            format_number(s.position_max_mm, 2),
-            format_number(s.rotation_mean_deg, 3),
-            format_number(s.rotation_max_deg, 3),
+            *((s.stops, 0), (s.position_mean_mm, 2), (s.position_max_mm, 2)),
+            *((s.rotation_mean_deg, 3), (s.rotation_max_deg, 3)),
         )
         for name, s in f.stationary_errors.items()
         if s.stops
     ]
-    if rows_stationary:
-        tables.append(
-            Table(
-                "Error of the mean pose of each stationary interval against the reference, unaligned",
-                ("estimator", "intervals", "mean (mm)", "max (mm)", "mean (deg)", "max (deg)"),
-                tuple(rows_stationary),
-            )
-        )
+    if rows:
+        caption = "Error of the mean pose of each stationary interval against the reference, unaligned"
+        header = "estimator|intervals|mean (mm)|max (mm)|mean (deg)|max (deg)"
+        tables.append(Table(caption, tuple(header.split("|")), tuple(rows)))
     return tables
 
 
@@ -85,17 +79,12 @@ def estimator_section(f: Findings, axis: TimeAxis) -> Section:
         tables.append(_poses_of(f))
     if f.held_out is not None:
         rows = [
-            (label, str(m.n), format_number(m.mean), format_number(m.median), format_number(m.p95))
+            format_cells(label, (m.n, 0), (m.mean, 1), (m.median, 1), (m.p95, 1))
             for name, each in f.held_out.items()
             for label, m in ((name, each.statistics), (f"{name}, at gaps over 1 s", each.gaps))
         ]
-        tables.append(
-            Table(
-                "Held-out prediction error (mm)",
-                ("estimator", "n", "mean", "median", "95 %"),
-                tuple(rows),
-            )
-        )
+        header = ("estimator", "n", "mean", "median", "95 %")
+        tables.append(Table("Held-out prediction error (mm)", header, tuple(rows)))
         held_out = f.held_out
         plots.append(
             page_figure(
@@ -112,12 +101,9 @@ def estimator_section(f: Findings, axis: TimeAxis) -> Section:
             "--held-out does it, and takes several times as long."
         )
     if f.reference_errors:
-        compared = [
+        rows = [
             (
-                name,
-                str(e.compared),
-                format_number(e.position_rms_mm),
-                format_number(e.orientation_rms_deg, 3),
+                *format_cells(name, (e.compared, 0), (e.position_rms_mm, 1), (e.orientation_rms_deg, 3)),
                 format_number(e.nees.mean),
                 "-" if math.isnan(e.nees.above_95) else f"{e.nees.above_95:.1%}",
             )
@@ -131,9 +117,7 @@ def estimator_section(f: Findings, axis: TimeAxis) -> Section:
             "NEES (expected 6)",
             "above 95 % (expected 5 %)",
         )
-        tables.append(
-            Table("Against the reference, unaligned, at the prisms' centroid", header, tuple(compared))
-        )
+        tables.append(Table("Against the reference, unaligned, at the prisms' centroid", header, tuple(rows)))
         tables += reference_tables(f)
         if f.reference is not None and not any(e.compared for e in f.reference_errors.values()):
             text.append(
@@ -166,13 +150,10 @@ def _poses_of(f: Findings) -> Table:
         numbers = pose_numbers(poses)
         sigma = numbers["position_sigma_mm"]
         reasons = ", ".join(f"{reason} {n}" for reason, n in numbers["invalid"].items()) or "-"
-        counts = str(numbers["poses"]), str(numbers["valid_poses"]), reasons
-        rows.append((name, *counts, format_number(sigma["median"]), format_number(sigma["p95"])))
-    return Table(
-        "Poses, and the stated position sigma per axis of the valid ones",
-        ("estimator", "poses", "valid", "not valid", "median sigma (mm)", "95 % sigma (mm)"),
-        tuple(rows),
-    )
+        counts = format_cells(name, (numbers["poses"], 0), (numbers["valid_poses"], 0))
+        rows.append((*counts, *format_cells(reasons, (sigma["median"], 1), (sigma["p95"], 1))))
+    header = ("estimator", "poses", "valid", "not valid", "median sigma (mm)", "95 % sigma (mm)")
+    return Table("Poses, and the stated position sigma per axis of the valid ones", header, tuple(rows))
 
 
 def trajectory_section(f: Findings, axis: TimeAxis) -> Section:

@@ -9,9 +9,17 @@ import numpy as np
 from tsgt.analysis.figures import TimeAxis, panels_height_mm
 from tsgt.analysis.report import station_figures as draw
 from tsgt.analysis.report.calibration import calibration_section
-from tsgt.analysis.report.elements import MAX_LISTED, format_number, format_utc, nan_median, page_figure
 from tsgt.analysis.report.motion import binned, gridded
-from tsgt.analysis.report.page import ReportFigure, Section, Table
+from tsgt.analysis.report.page import (
+    MAX_LISTED,
+    ReportFigure,
+    Section,
+    Table,
+    format_number,
+    format_utc,
+    nan_median,
+    page_figure,
+)
 from tsgt.analysis.report.pose_sections import (
     estimator_section,
     perturbation_section,

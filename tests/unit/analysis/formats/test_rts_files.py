@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.published import write_prisms
+from harness.authors_files import write_prisms
 from harness.scene import LAYOUT
 
 from tsgt.analysis.formats import read_prisms

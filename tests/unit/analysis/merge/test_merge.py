@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from harness.merging import assert_true, journals, merged_in, recording
-from harness.missions import SUPERFRAME, mission
+from harness.missions import SUPERFRAME, run_mission
 
 from tsgt.analysis.merge import merge
 from tsgt.analysis.merge.merge import MAX_TIME_BOUND_NS, SESSION_MARGIN_NS
@@ -37,7 +37,7 @@ S = 1_000_000_000
 @pytest.fixture(scope="module")
 def outage(tmp_path_factory: pytest.TempPathFactory) -> MissionResult:
     """Over classic, two minutes without reception between the stations and the master."""
-    return mission(
+    return run_mission(
         tmp_path_factory.mktemp("outage"),
         duration_s=240.0,
         drift_ppm=20.0,
@@ -49,13 +49,13 @@ def outage(tmp_path_factory: pytest.TempPathFactory) -> MissionResult:
 @pytest.fixture(scope="module")
 def short(tmp_path_factory: pytest.TempPathFactory) -> MissionResult:
     """Over classic, some seconds."""
-    return mission(tmp_path_factory.mktemp("short"), duration_s=12.0)
+    return run_mission(tmp_path_factory.mktemp("short"), duration_s=12.0)
 
 
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory: pytest.TempPathFactory) -> MissionResult:
     """Over superframe; without any reception in the last half minute."""
-    return mission(
+    return run_mission(
         tmp_path_factory.mktemp("frames"),
         protocol=SUPERFRAME,
         duration_s=60.0,
@@ -185,7 +185,7 @@ def test_restarts_of_master_and_station(tmp_path: Path) -> None:
         await mission.sleep_until(50.0)
         mission.computers["station2"].clock.step(3_000_000_000)
 
-    run = mission(
+    run = run_mission(
         tmp_path / "m",
         duration_s=110.0,
         drift_ppm=40.0,
@@ -211,7 +211,7 @@ def test_repeated_unix_time_after_a_reboot(tmp_path: Path) -> None:
         mission.computers["station2"].clock.step(-35 * S)  # only the next run sees it
         await mission.reboot(2, 40.0, 15.0)
 
-    run = mission(tmp_path / "m", duration_s=90.0, script=reboot)
+    run = run_mission(tmp_path / "m", duration_s=90.0, script=reboot)
     first, last = (load_journal(path).measurements for path in run.station_logs[2].journals)
     assert first[-1].stamp_ns > last[0].stamp_ns
     path = tmp_path / "r.jsonl"
@@ -222,7 +222,7 @@ def test_repeated_unix_time_after_a_reboot(tmp_path: Path) -> None:
 def test_error_statuses_are_merged(tmp_path: Path) -> None:
     """A tilted instrument explains why ``linear`` has no poses."""
     scenario = ScenarioConfig(faults=(StatusFaultConfig(station=2, status="tilt", start_s=15.0, end_s=25.0),))
-    run = mission(tmp_path / "m", scenario, duration_s=40.0, outages=(Outage((1, 2, 3), 10.0, 20.0),))
+    run = run_mission(tmp_path / "m", scenario, duration_s=40.0, outages=(Outage((1, 2, 3), 10.0, 20.0),))
     path = tmp_path / "r.jsonl"
     added = added_to(run, path)
     assert any(m.station == 2 and m.status is Status.TILT for m in added)
@@ -244,7 +244,7 @@ def test_measurements_long_before_the_master_are_excluded(tmp_path: Path) -> Non
         await mission.sleep_until(180.0)
         mission.start_master()
 
-    run = mission(tmp_path / "m", duration_s=200.0, script=late_master)
+    run = run_mission(tmp_path / "m", duration_s=200.0, script=late_master)
     del run.master_logs[0]
     path = tmp_path / "r.jsonl"
     recording(run, path)
@@ -302,7 +302,7 @@ def test_restarts_and_reboots_over_superframe(tmp_path: Path) -> None:
     async def reboot(mission: Mission) -> None:
         await mission.reboot(3, 30.0, 10.0)
 
-    run = mission(
+    run = run_mission(
         tmp_path / "m",
         protocol=SUPERFRAME,
         duration_s=80.0,
@@ -329,7 +329,7 @@ def test_reused_sequence_numbers(tmp_path: Path) -> None:
         mission.station_logs[1].journals[0].rename(kept)
         mission.start_station(1)
 
-    run = mission(tmp_path / "m", protocol=SUPERFRAME, duration_s=40.0, script=emptied)
+    run = run_mission(tmp_path / "m", protocol=SUPERFRAME, duration_s=40.0, script=emptied)
     path = recording(run, tmp_path / "r.jsonl", without=2)
     of_both = [load_journal(journal).measurements for journal in (kept, *run.station_logs[1].journals)]
     assert of_both[0][5].sequence == of_both[1][5].sequence
@@ -359,7 +359,7 @@ def test_journal_of_another_master_is_skipped(frames: MissionResult, tmp_path: P
 
 def test_journals_of_another_mission_are_skipped(short: MissionResult, tmp_path: Path) -> None:
     """With a reason; if no other journals are given, the merge fails and writes nothing."""
-    other = mission(tmp_path / "other", duration_s=5.0, seed=9)
+    other = run_mission(tmp_path / "other", duration_s=5.0, seed=9)
     path = recording(short, tmp_path / "r.jsonl")
     content = path.read_bytes()
     with pytest.raises(RecordingError, match=r"none of the journals can be merged; .* of another mission"):

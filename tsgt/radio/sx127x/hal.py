@@ -6,6 +6,7 @@ import asyncio
 import errno
 import fcntl
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
@@ -119,61 +120,51 @@ def open_hal(wiring: Wiring) -> Hal:
     """
     spi = _Spi(wiring)
     try:
-        pins = _GpiodPins(wiring) if wiring.backend == "gpiod" else _RpiGpioPins(wiring)
+        return _GpiodHal(wiring, spi) if wiring.backend == "gpiod" else _RpiGpioHal(wiring, spi)
     except RadioError:
         spi.close()
         raise
-    return _PiHal(spi, pins)
 
 
-class _Pins(Protocol):
-    """Common interface of the two GPIO packages."""
+class _PiHal(ABC):
+    """Bus and pins, with chip select as GPIO; a subclass for each GPIO package."""
 
     stamp_sigma_ns: int
+    _open: ExitStack  # releases the pins
 
-    def set_nss(self, *, low: bool) -> None: ...
+    def __init__(self, wiring: Wiring, spi: _Spi) -> None:
+        self._spi = spi
+        self._nss_pin, self._reset_pin, self._dio0_pin = wiring.nss_pin, wiring.reset_pin, wiring.dio0_pin
 
-    def set_reset(self, *, low: bool) -> None: ...
+    @abstractmethod
+    def _drive(self, pin: int, *, low: bool) -> None: ...
 
+    @abstractmethod
     def dio0(self) -> bool: ...
 
+    @abstractmethod
     def on_dio0(self, callback: EdgeCallback) -> None: ...
-
-    def close(self) -> None: ...
-
-
-class _PiHal:
-    """Bus and pins, with chip select as GPIO."""
-
-    def __init__(self, spi: _Spi, pins: _Pins) -> None:
-        self._spi = spi
-        self._pins = pins
-        self.stamp_sigma_ns = pins.stamp_sigma_ns
 
     def transfer(self, data: bytes) -> bytes:
         try:
-            self._pins.set_nss(low=True)
+            if self._nss_pin is None:
+                return self._spi.transfer(data)
+            self._drive(self._nss_pin, low=True)
             try:
                 return self._spi.transfer(data)
             finally:
-                self._pins.set_nss(low=False)
+                self._drive(self._nss_pin, low=False)
         except OSError as error:
             raise RadioError(f"{self._spi.path}: transfer failed: {error}") from error
 
     def set_reset(self, *, low: bool) -> None:
         try:
-            self._pins.set_reset(low=low)
+            self._drive(self._reset_pin, low=low)
         except OSError as error:
             raise RadioError(f"{self._spi.path}: the reset pin cannot be set: {error}") from error
 
-    def dio0(self) -> bool:
-        return self._pins.dio0()
-
-    def on_dio0(self, callback: EdgeCallback) -> None:
-        self._pins.on_dio0(callback)
-
     def close(self) -> None:
-        self._pins.close()
+        self._open.close()
         self._spi.close()
 
 
@@ -236,7 +227,7 @@ class _Spi:
         self._bus.close()
 
 
-class _GpiodPins:
+class _GpiodHal(_PiHal):
     """Pins of the GPIO character device; the kernel timestamps each edge in its interrupt handler."""
 
     stamp_sigma_ns = 10_000
@@ -246,7 +237,8 @@ class _GpiodPins:
     _CHIP_LABELS = ("pinctrl-bcm2835", "pinctrl-bcm2711", "pinctrl-rp1")
     """Labels of the pin header's chip: Pi 0 to 3, 4, 5."""
 
-    def __init__(self, wiring: Wiring) -> None:
+    def __init__(self, wiring: Wiring, spi: _Spi) -> None:
+        super().__init__(wiring, spi)
         try:
             import gpiod  # noqa: PLC0415 (only on a Pi)
         except ImportError as error:
@@ -264,13 +256,13 @@ class _GpiodPins:
             bias=line.Bias.PULL_DOWN,
             event_clock=line.Clock.MONOTONIC,
         )
-        self._nss_pin, self._reset_pin, self._dio0_pin = wiring.nss_pin, wiring.reset_pin, wiring.dio0_pin
         self._last_seqno = 0
+        self._lines: dict[int, Any] = {}
         with ExitStack() as stack:
             if self._nss_pin is not None:
-                self._nss = self._request(stack, self._nss_pin, "NSS", output)
-            self._reset = self._request(stack, self._reset_pin, "reset", output)
-            self._dio0 = self._request(stack, self._dio0_pin, "DIO0", edges)
+                self._request(stack, self._nss_pin, "NSS", output)
+            self._request(stack, self._reset_pin, "reset", output)
+            self._request(stack, self._dio0_pin, "DIO0", edges)
             self._open = stack.pop_all()
 
     def _find_chip(self) -> str:
@@ -286,9 +278,9 @@ class _GpiodPins:
             "name it as gpio_chip"
         )
 
-    def _request(self, stack: ExitStack, pin: int, role: str, settings: object) -> Any:
+    def _request(self, stack: ExitStack, pin: int, role: str, settings: object) -> None:
         try:
-            request = self._gpiod.request_lines(
+            self._lines[pin] = self._gpiod.request_lines(
                 self._chip, consumer="tsgt", config={pin: settings}, event_buffer_size=self._EVENT_BUFFER
             )
         except FileNotFoundError as error:
@@ -299,41 +291,36 @@ class _GpiodPins:
             if error.errno == errno.EBUSY:
                 raise _busy(pin, role) from error
             raise RadioError(f"BCM {pin} ({role}) is not available: {error}") from error
-        stack.callback(request.release)
-        return request
+        stack.callback(self._lines[pin].release)
 
-    def set_nss(self, *, low: bool) -> None:
-        if self._nss_pin is not None:
-            self._nss.set_value(self._nss_pin, self._low if low else self._released)
-
-    def set_reset(self, *, low: bool) -> None:
-        self._reset.set_value(self._reset_pin, self._low if low else self._released)
+    def _drive(self, pin: int, *, low: bool) -> None:
+        self._lines[pin].set_value(pin, self._low if low else self._released)
 
     def dio0(self) -> bool:
-        return bool(self._dio0.get_value(self._dio0_pin) == self._released)
+        return bool(self._lines[self._dio0_pin].get_value(self._dio0_pin) == self._released)
 
     def on_dio0(self, callback: EdgeCallback) -> None:
+        line = self._lines[self._dio0_pin]
+
         def read_edges() -> None:
-            for event in self._dio0.read_edge_events():
+            for event in line.read_edge_events():
                 # The sequence number increments with each edge; a full buffer drops the oldest.
                 lost = event.line_seqno - self._last_seqno - 1
                 self._last_seqno = event.line_seqno
                 callback(Edge(event.timestamp_ns, lost))
 
         loop = asyncio.get_running_loop()
-        loop.add_reader(self._dio0.fd, read_edges)
-        self._open.callback(loop.remove_reader, self._dio0.fd)
-
-    def close(self) -> None:
-        self._open.close()
+        loop.add_reader(line.fd, read_edges)
+        self._open.callback(loop.remove_reader, line.fd)
 
 
-class _RpiGpioPins:
+class _RpiGpioHal(_PiHal):
     """Pins of RPi.GPIO or rpi-lgpio; a Python thread timestamps edges when it is scheduled."""
 
     stamp_sigma_ns = 1_000_000
 
-    def __init__(self, wiring: Wiring) -> None:
+    def __init__(self, wiring: Wiring, spi: _Spi) -> None:
+        super().__init__(wiring, spi)
         try:
             from RPi import GPIO  # noqa: PLC0415 (only on a Pi)
         except ImportError as error:
@@ -343,7 +330,6 @@ class _RpiGpioPins:
                 f"RPi.GPIO does not work on this board ({error}): use gpiod or rpi-lgpio"
             ) from error
         self._gpio = GPIO
-        self._nss_pin, self._reset_pin, self._dio0_pin = wiring.nss_pin, wiring.reset_pin, wiring.dio0_pin
         GPIO.setwarnings(False)  # a killed program leaves its pins configured
         GPIO.setmode(GPIO.BCM)
         with ExitStack() as stack:
@@ -364,12 +350,8 @@ class _RpiGpioPins:
             raise RadioError(f"BCM {pin} ({role}) is not available: {error}") from error
         stack.callback(self._gpio.cleanup, pin)
 
-    def set_nss(self, *, low: bool) -> None:
-        if self._nss_pin is not None:
-            self._gpio.output(self._nss_pin, self._gpio.LOW if low else self._gpio.HIGH)
-
-    def set_reset(self, *, low: bool) -> None:
-        self._gpio.output(self._reset_pin, self._gpio.LOW if low else self._gpio.HIGH)
+    def _drive(self, pin: int, *, low: bool) -> None:
+        self._gpio.output(pin, self._gpio.LOW if low else self._gpio.HIGH)
 
     def dio0(self) -> bool:
         return bool(self._gpio.input(self._dio0_pin))
@@ -389,6 +371,3 @@ class _RpiGpioPins:
                 f"RPi.GPIO gets no interrupts ({error}), as on every kernel since 6.6: use gpiod or rpi-lgpio"
             ) from error
         self._open.callback(self._gpio.remove_event_detect, self._dio0_pin)
-
-    def close(self) -> None:
-        self._open.close()

@@ -53,8 +53,8 @@ class ConfigError(TsgtError):
         self.key = key
 
 
-class InputFileError(TsgtError):
-    """Invalid data file from another program: empty, wrong columns, NaN, time running backwards."""
+class _FileError(TsgtError):
+    """Base of errors with a place in a file."""
 
     def __init__(self, message: str, *, path: Path, line: int | None = None) -> None:
         where = str(path) if line is None else f"{path}, line {line}"
@@ -63,12 +63,12 @@ class InputFileError(TsgtError):
         self.line = line
 
 
-class OutputFileError(TsgtError):
-    """A result cannot be written: disk full, no such folder, no permission."""
+class InputFileError(_FileError):
+    """Invalid data file from another program: empty, wrong columns, NaN, time running backwards."""
 
-    def __init__(self, message: str, *, path: Path) -> None:
-        super().__init__(f"{path}: {message}")
-        self.path = path
+
+class OutputFileError(_FileError):
+    """A result cannot be written: disk full, no such folder, no permission."""
 
 
 class MissingExtraError(TsgtError, ImportError):
@@ -80,14 +80,8 @@ class MissingExtraError(TsgtError, ImportError):
         self.extra = extra
 
 
-class RecordingError(TsgtError):
+class RecordingError(_FileError):
     """A recording cannot be read or written: no header, disk full, no such station."""
-
-    def __init__(self, message: str, *, path: Path, line: int | None = None) -> None:
-        where = str(path) if line is None else f"{path}, line {line}"
-        super().__init__(f"{where}: {message}")
-        self.path = path
-        self.line = line
 
 
 class CorruptLineError(RecordingError):

@@ -84,6 +84,13 @@ def _check_limits(record: object, **limits: tuple[float, float]) -> None:
             raise ValueError(f"{name} is {getattr(record, name)}, expected {lower:g} to {upper:g}")
 
 
+class FiniteNumbers:
+    """Base of records that pydantic validates to have finite numbers."""
+
+    __slots__ = ()
+    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
+
+
 class Status(StrEnum):
     """The instrument's status of a measurement, in one vocabulary for all makes."""
 
@@ -102,10 +109,8 @@ class Status(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PolarMeasurement:
+class PolarMeasurement(FiniteNumbers):
     """One raw measurement of a prism by a total station."""
-
-    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
     type: Literal["measurement"] = "measurement"
     station: int
@@ -150,10 +155,8 @@ class PolarMeasurement:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PointMeasurement:
+class PointMeasurement(FiniteNumbers):
     """A prism position that was imported as Cartesian coordinates, without polar raw values."""
-
-    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
     type: Literal["point"] = "point"
     station: int
@@ -212,10 +215,8 @@ class ClockSample:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class InstrumentNoise:
+class InstrumentNoise(FiniteNumbers):
     """One-sigma noise of a single measurement of a total station, in the form of its data sheet."""
-
-    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
     range_sigma_m: float
     """Constant part of the slope distance's noise in m."""
@@ -260,10 +261,8 @@ TARGET_NOISE = InstrumentNoise(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TargetResidual:
+class TargetResidual(FiniteNumbers):
     """The residual of one target in the frame that was solved from all of them."""
-
-    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
     target: int
     """Number of the target."""
@@ -282,10 +281,8 @@ class TargetResidual:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StationParameters:
+class StationParameters(FiniteNumbers):
     """Parameters that turn a station's raw measurements into positions in the frame ``station1``."""
-
-    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
     station: int
     """Number of the station, from 1."""
@@ -319,10 +316,8 @@ class StationParameters:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MotionPrior:
+class MotionPrior(FiniteNumbers):
     """Motion prior of the estimator ``continuous``: acceleration as an Ornstein-Uhlenbeck process."""
-
-    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
     acceleration_sigma_mps2: Vector3 = (0.4, 0.4, 0.2)
     """One sigma of the acceleration of the prisms' centroid along x, y, z of frame ``station1``."""
@@ -346,10 +341,8 @@ class MotionPrior:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PipelineParameters:
+class PipelineParameters(FiniteNumbers):
     """Parameters of the estimators."""
-
-    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
     estimator: Literal["linear", "continuous"] = "continuous"
     """Name of the estimator: ``linear`` (straight lines between measurements) or ``continuous`` (one smooth trajectory
@@ -402,10 +395,8 @@ class PipelineParameters:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PrismPosition:
+class PrismPosition(FiniteNumbers):
     """The position of a prism on the robot."""
-
-    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
     prism: int
     """Number of the prism, from 1."""

@@ -1,4 +1,4 @@
-"""Radios without chips: an antenna that writes down what it is told, frames and listeners in one line."""
+"""Radios without chips: a listener that logs events; short constructors of frames and receivers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from tsgt.simulation.kernel import VirtualTimeline
 from tsgt.simulation.lora import Air, LinkModel
-from tsgt.simulation.lora.frames import Frame, Header, ReceiverSettings, Modulation, Reception
+from tsgt.simulation.lora.frames import Frame, Header, Modulation, ReceiverSettings, Reception
 from tsgt.simulation.lora.link import FixedLoss
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ SYMBOL_NS = 2_048_000
 
 
 def frame(start_symbols: float = 0.0, **changes: Any) -> Frame:
-    """Make a frame of the paper's modulation; ``modulation`` takes a Modulation."""
+    """Return a frame with the paper's modulation and changes."""
     settings: dict[str, Any] = {
         "modulation": PAPER,
         "coding_rate": 6,
@@ -44,7 +44,7 @@ def frame(start_symbols: float = 0.0, **changes: Any) -> Frame:
 
 
 def listening(since_symbols: float = 0.0, **changes: Any) -> ReceiverSettings:
-    """Make a receiver's settings that match :func:`frame`."""
+    """Return receiver settings that match :func:`frame`, with changes."""
     settings: dict[str, Any] = {
         "modulation": PAPER,
         "since_ns": round(since_symbols * SYMBOL_NS),
@@ -58,12 +58,12 @@ def listening(since_symbols: float = 0.0, **changes: Any) -> ReceiverSettings:
 
 
 def modulation(**changes: Any) -> Modulation:
-    """Make the paper's modulation with changes."""
+    """Return the paper's modulation with changes."""
     return replace(PAPER, **changes)
 
 
 class RecordingListener:
-    """Writes down what the air tells."""
+    """Logs the events of a receiver."""
 
     def __init__(self) -> None:
         self.events: list[tuple[int, str]] = []
@@ -71,16 +71,16 @@ class RecordingListener:
         self.receptions: list[Reception] = []
 
     def preamble_detected(self, at_ns: int) -> None:
-        """Write it down."""
+        """Log it."""
         self.events.append((at_ns, "preamble"))
 
     def header_received(self, at_ns: int, header: Header) -> None:
-        """Write it down."""
+        """Log it."""
         self.events.append((at_ns, "header"))
         self.headers.append(header)
 
     def frame_ended(self, at_ns: int, reception: Reception | None) -> None:
-        """Write it down."""
+        """Log it."""
         if reception is None:
             self.events.append((at_ns, "lost"))
             return
@@ -89,19 +89,19 @@ class RecordingListener:
 
     @property
     def outcomes(self) -> list[str]:
-        """How it ended with each frame that it was locked to: received, damaged, lost."""
+        """The outcome of each frame that it was locked to: received, damaged, lost."""
         return [what for _, what in self.events if what in {"received", "damaged", "lost"}]
 
 
 class Scene:
-    """One receiver ``rx`` and senders that appear when they are named."""
+    """One receiver ``rx``, and senders that join when they are named."""
 
     def __init__(self, link: LinkModel | None = None, seed: int = 0) -> None:
         self.timeline = VirtualTimeline()
         self.link = link or LinkModel()
         self.air = Air(self.timeline, np.random.default_rng(seed), self.link)
-        self.antenna = RecordingListener()
-        self.rx = self.air.join(self.antenna, "rx")
+        self.listener = RecordingListener()
+        self.rx = self.air.join(self.listener, "rx")
         self._senders: dict[str, AirPort] = {}
 
     def sender(self, name: str, *, crystal_ppm: float = 0.0) -> AirPort:
@@ -111,22 +111,22 @@ class Scene:
         return self._senders[name]
 
     def send(self, sent: Frame, name: str = "tx") -> Frame:
-        """Let a sender send, at the frame's start."""
+        """Send a frame at its start."""
         self.timeline.advance_to(sent.start_ns)
         self.sender(name).transmit(sent)
         return sent
 
     def at(self, symbols: float) -> None:
-        """Let time pass until so many of the paper's symbols after the start."""
+        """Let time pass until a number of the paper's symbols after the start."""
         self.timeline.advance_to(round(symbols * SYMBOL_NS))
 
     def finish(self) -> list[str]:
-        """Let everything end; return how it ended with each frame that the receiver was locked to."""
+        """Run to the end; return the outcome of each frame that the receiver was locked to."""
         while (next_ns := self.timeline.next_ns()) is not None:
             self.timeline.advance_to(next_ns)
-        return self.antenna.outcomes
+        return self.listener.outcomes
 
 
 def link_with_snr(snr_db: float) -> LinkModel:
-    """Make a link at which a frame of 14 dBm in 250 kHz arrives with that SNR."""
+    """Return a link at which a frame of 14 dBm in 250 kHz has an SNR."""
     return LinkModel(path_loss=FixedLoss(default_db=14.0 - snr_db - LinkModel().noise_dbm(250_000)))

@@ -1,4 +1,4 @@
-"""Measurements of a scenario without daemons and radio: each arrives after a random delay, and that is all."""
+"""Simulated measurements of a scenario without daemons and radio; each arrives after a random delay."""
 
 from __future__ import annotations
 
@@ -21,29 +21,15 @@ if TYPE_CHECKING:
     from tsgt.simulation.world import World
 
 DELAY_S = (0.05, 0.25)
-"""From a measurement to its arrival, evenly distributed."""
+"""Limits of the uniform delay from a measurement to its arrival."""
 
 
 def simulated_measurements(
     scenario: ScenarioConfig, world: World, generator: np.random.Generator, *, start_ns: int
 ) -> list[PolarMeasurement]:
-    """Let every station of a scenario track its prism through the whole of a world.
+    """Return the measurements of all stations of a scenario in the order of arrival, until the world ends.
 
-    Parameters
-    ----------
-    scenario
-        Stations and their noise.
-    world
-        The truth; its prisms in the order of the scenario's.
-    generator
-        Source of all randomness.
-    start_ns
-        Unix time of the world's start in ns.
-
-    Returns
-    -------
-    list[PolarMeasurement]
-        In the order of arrival; only what arrives before the world ends.
+    The world's prisms are in the order of the scenario's; ``start_ns`` is the Unix time of its start.
     """
     end_ns = start_ns + round(world.duration_s * 1e9)
     rows = {prism.prism: row for row, prism in enumerate(scenario.prisms)}
@@ -63,7 +49,7 @@ def _measured(
     generator: np.random.Generator,
     start_ns: int,
 ) -> Iterator[PolarMeasurement]:
-    """One station's measurements of a prism that is at the given points, (N, 3) in ``station1``."""
+    """Yield one station's measurements of a prism at points (N, 3) in ``station1``."""
     delays_s = generator.uniform(*DELAY_S, len(times_s))
     seen = transform_points(invert(np.array(station.T_station1_station)), points)
     horizontal, zenith, distance = measure_polar(seen, station.noise, generator)

@@ -1,4 +1,4 @@
-"""Programs that block and poll, as most drivers for the SX127x do, in virtual time beside an event loop."""
+"""Runs blocking, polling programs, as most drivers for the SX127x are, in virtual time with an event loop."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 ACCESS_S = 100e-6
-"""What an access to the bus takes on a Pi, system call and Python together."""
+"""Duration of a bus access on a Pi, with system call and Python."""
 
-GLANCE_S = 20e-6
-"""What a look at the clock takes, so that a program cannot wait for ever in no time."""
+CLOCK_READ_S = 20e-6
+"""Duration of reading the clock, so that polling the clock lets time pass."""
 
 
 class BlockingProgram:
-    """Runs a program in a thread of its own, in strict turns with the event loop, so that nothing depends on chance.
+    """Runs a program in a thread, alternating with the event loop, so that it is deterministic.
 
-    While the program computes, the loop's thread stands still, and time with it. Time passes, and the loop's tasks
-    run, only while the program is in one of the methods below, which stand in for those of the module ``time``.
+    While the program computes, the loop's thread and time are stopped. Time passes, and the loop's tasks run, only while
+    the program is in one of the methods below, which replace those of the module ``time``.
     """
 
     def __init__(self) -> None:
@@ -40,7 +40,7 @@ class BlockingProgram:
         def work() -> None:
             try:
                 outcome.set_result(program())
-            except BaseException as error:  # noqa: BLE001 (it is handed on)
+            except BaseException as error:  # noqa: BLE001 (passed to the caller)
                 outcome.set_exception(error)
             finally:
                 self._sleeps.put(None)
@@ -68,11 +68,11 @@ class BlockingProgram:
 
     def monotonic(self) -> float:
         """Return the virtual time in s, a little later with each call."""
-        self.sleep(GLANCE_S)
+        self.sleep(CLOCK_READ_S)
         return self._loop.time()
 
     time = monotonic
 
     def interrupt(self, callback: Callable[[], None]) -> None:
-        """Call back in the program's thread the next time that it looks up."""
+        """Call back in the program's thread at its next sleep."""
         self._interrupts.append(callback)

@@ -1,4 +1,4 @@
-"""A master among stations on one simulated air, on virtual time: three of them see the robot of a scene."""
+"""A master and three stations on a simulated channel, on virtual time; the stations track the robot of a scene."""
 
 from __future__ import annotations
 
@@ -53,22 +53,22 @@ STATIONS = (1, 2, 3)
 PERIOD_NS = 400_000_000
 KEY = bytes(range(32))
 TRUE = VirtualClock(START)
-"""The true time, which the master's clock shows; zero of the loop is the start of the scene."""
+"""True time and the master's clock; zero of the loop is the start of the scene."""
 
 
 class SceneInstrument:
-    """A total station that sees its prism of the scene without error, 2.5 times in a second.
+    """A total station that measures its prism of the scene without error at 2.5 Hz.
 
     Attributes
     ----------
     status
-        What it says of its measurements.
+        Status of its measurements.
     refuses
-        It does not track when it is told to.
+        It refuses the command to track.
     direct_mode
-        It was told to measure single targets.
-    sought
-        Where it was told to look for its prism, with the true time.
+        It was commanded to measure single targets.
+    searches
+        Search commands, with the true time.
     """
 
     def __init__(self, scene: Scene, station: int, clock: DriftingClock) -> None:
@@ -78,16 +78,16 @@ class SceneInstrument:
         self.status = Status.OK
         self.refuses = False
         self.direct_mode = False
-        self.sought: list[tuple[int, Direction]] = []
+        self.searches: list[tuple[int, Direction]] = []
 
     async def connect(self) -> str:
-        """Say what it is."""
+        """Return its name."""
         return "scene"
 
     async def track(self, prism: int, towards: Direction | None = None) -> None:
-        """Track, or refuse to."""
+        """Track, or refuse."""
         if towards is not None:
-            self.sought.append((TRUE.monotonic_ns(), towards))
+            self.searches.append((TRUE.monotonic_ns(), towards))
         if self.refuses:
             raise InstrumentError(f"no prism {prism}")
         self.direct_mode = False
@@ -108,22 +108,22 @@ class SceneInstrument:
         return self._reading(TRUE.monotonic_ns())
 
     async def check(self) -> None:
-        """Be there."""
+        """Succeed."""
 
     async def close(self) -> None:
         """Do nothing."""
 
     async def set_atmosphere(self, atmosphere: Atmosphere) -> None:
-        """Do nothing: there is none."""
+        """Do nothing."""
 
     @property
     def condition(self) -> Condition:
-        """Nobody asks."""
+        """Return an empty condition."""
         return Condition()
 
     @property
     def record(self) -> InstrumentRecord | None:
-        """Nobody writes one."""
+        """Return no record."""
         return None
 
     def _reading(self, true_ns: int) -> Reading:
@@ -139,7 +139,7 @@ class SceneInstrument:
 
 
 async def classic_client(station: int, radio: Radio, clock: DriftingClock, tool: SceneInstrument) -> NoReturn:
-    """Answer as a station's client does; the timeline is fixed now, as at a start."""
+    """Run the client of a classic station."""
     timeline = UnixTimeline.fixed_now(clock)
     session = ClassicStation(station)
 
@@ -182,14 +182,14 @@ async def classic_client(station: int, radio: Radio, clock: DriftingClock, tool:
 
 
 class Notebook:
-    """What a station of the superframe keeps across its starts, as a journal does: measurements, and times of beacons.
+    """What a superframe station keeps across restarts, like a journal.
 
     Attributes
     ----------
-    outbox
-        What is not acknowledged.
+    send_queue
+        Measurements that are not acknowledged.
     made_ns
-        True time of each measurement, by its number.
+        True time of each measurement, by sequence number.
     """
 
     def __init__(self) -> None:
@@ -198,7 +198,7 @@ class Notebook:
         self.receptions: list[BeaconReception] = []
 
     def start(self) -> None:
-        """Leave out the numbers that a torn journal may have lost."""
+        """Skip the sequence numbers that a torn journal may have lost."""
         if self.made_ns:
             first_sequence = max(self.made_ns) + 1 + RESTART_SKIP
             self.send_queue = SendQueue(first_sequence, reversed(list(self.send_queue.newest_first())))
@@ -212,7 +212,7 @@ async def superframe_client(
     notes: Notebook,
     rng: np.random.Generator,
 ) -> NoReturn:
-    """Answer beacons as a station's client does."""
+    """Run the client of a superframe station."""
     notes.start()
     send_queue = notes.send_queue
     instrument_state = InstrumentState(prism=number, direct=tool.direct_mode, connected=True)
@@ -246,19 +246,19 @@ async def superframe_client(
             notes.made_ns[sequence] = TRUE.realtime_ns() - (TRUE.realtime_ns() - number) % PERIOD_NS
             sequence += 1
 
-    async def obey() -> None:
+    async def execute_command() -> None:
         nonlocal instrument_state
-        order = station.next_command()
-        if isinstance(order, TrackCommand | SearchCommand):
-            prism = (order.prism if isinstance(order, TrackCommand) else None) or instrument_state.prism
+        command = station.next_command()
+        if isinstance(command, TrackCommand | SearchCommand):
+            prism = (command.prism if isinstance(command, TrackCommand) else None) or instrument_state.prism
             try:
-                await tool.track(prism, order.towards if isinstance(order, SearchCommand) else None)
+                await tool.track(prism, command.towards if isinstance(command, SearchCommand) else None)
             except InstrumentError:
                 station.executed(ok=False)
             else:
                 instrument_state = instrument_state._replace(prism=prism, direct=False)
                 station.executed(ok=True)
-        elif isinstance(order, DirectCommand):
+        elif isinstance(command, DirectCommand):
             await tool.direct()
             instrument_state = instrument_state._replace(direct=True)
             station.executed(ok=True)
@@ -266,28 +266,28 @@ async def superframe_client(
     async with asyncio.TaskGroup() as group:
         group.create_task(read())
         while True:
-            heard = station.received(await radio.receive())
-            if heard is not None and heard.reception is not None:
-                notes.receptions.append(heard.reception)
-            await obey()
-            if heard is None or heard.slot_ns is None:
+            received = station.received(await radio.receive())
+            if received is not None and received.reception is not None:
+                notes.receptions.append(received.reception)
+            await execute_command()
+            if received is None or received.slot_ns is None:
                 continue
-            await clock.sleep_until(heard.slot_ns - 6_000_000)
+            await clock.sleep_until(received.slot_ns - 6_000_000)
             reply = station.compose(instrument_state, clock.monotonic_ns())
             if reply is not None:
-                station.sent(await radio.transmit(reply, at_ns=heard.slot_ns))
+                station.sent(await radio.transmit(reply, at_ns=received.slot_ns))
 
 
 @dataclass
 class Station:
-    """A station of the field, which can be killed and started.
+    """A station that can be killed and started.
 
     Attributes
     ----------
     clock
-        Its computer's: seconds to hours off the master's, and 10 ppm fast.
+        Of its computer: an offset of seconds to hours, and 10 ppm of skew.
     notes
-        What it keeps, on the superframe.
+        What it keeps across restarts, with the superframe.
     """
 
     number: int
@@ -305,12 +305,12 @@ class Station:
         self.instrument = SceneInstrument(self.scene, self.number, self.clock)
 
     def start(self) -> None:
-        """Start its program."""
+        """Start its client."""
         self._starts += 1
         self._task = asyncio.create_task(self._run(), name=f"station-{self.number}")
 
     async def kill(self) -> None:
-        """Stop its program."""
+        """Kill its client."""
         if self._task is not None:
             self._task.cancel()
             await asyncio.wait([self._task])
@@ -338,7 +338,7 @@ class Field:
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(11))
 
     def config(self, **changes: Any) -> MasterConfig:
-        """Make the master's configuration; with a short first synchronisation, or frames without a lock."""
+        """Return the master's configuration, with a short first synchronisation, or without phase lock."""
         changed = changes.pop("protocol", {})
         protocol: ClassicMasterConfig | SuperframeMasterConfig
         if self.stations[1].superframe:
@@ -367,7 +367,7 @@ class Field:
         )
 
     def open_radio(self) -> RadioOpener:
-        """Return what opens the master's radio."""
+        """Return the opener of the master's radio."""
         return radio_opener(self.air, "master", TRUE, np.random.default_rng(100), PAPER)
 
     async def master(
@@ -378,7 +378,7 @@ class Field:
         clock: Clock = TRUE,
         key: bytes | None = KEY,
     ) -> None:
-        """Run the master until cancelled; what goes out is kept in :attr:`records`."""
+        """Run the master until cancelled; published records are appended to :attr:`records`."""
         await run_master(
             config or self.config(),
             self.scene.parameters,
@@ -393,11 +393,11 @@ class Field:
         )
 
     def of(self, cls: type[T]) -> list[T]:
-        """Return what went out of one type."""
+        """Return the published records of one type."""
         return [record for record in self.records if isinstance(record, cls)]
 
     def recording(self) -> Path:
-        """Return the one recording, or the last one."""
+        """Return the last recording."""
         return max((self.folder / "recordings").iterdir())
 
 
@@ -410,7 +410,7 @@ async def field_of(
     superframe: bool = False,
     link: LinkModel | None = None,
 ) -> AsyncGenerator[Field]:
-    """Start three stations, and stop what is left of them at the end."""
+    """Start three stations; kill them at the end."""
     air = Air(running_timeline(), np.random.default_rng(7), link or LinkModel())
     scene = scene or stationary_scene()
     offsets_s = {1: 0.3, 2: -7200.0, 3: 86_400.0}
@@ -436,7 +436,7 @@ async def field_of(
 
 @asynccontextmanager
 async def running(coroutine: Coroutine[Any, Any, None]) -> AsyncGenerator[asyncio.Task[None]]:
-    """Run something beside the test, and cancel it at the end."""
+    """Run a task during the test, and cancel it at the end."""
     task = asyncio.create_task(coroutine)
     try:
         yield task

@@ -1,4 +1,4 @@
-"""One record of every type, for tests of what carries them."""
+"""One record of every type."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ EVENT = EventRecord(stamp_ns=START + 3 * SECOND, event="lines_lost", message="lo
 
 
 def measurement(sequence: int) -> PolarMeasurement:
-    """One of a run of measurements, 0.4 s apart."""
+    """Return one of a sequence of measurements, 0.4 s apart."""
     stamp_ns = START + sequence * 400_000_000
     return PolarMeasurement(
         station=1,
@@ -115,5 +115,5 @@ def measurement(sequence: int) -> PolarMeasurement:
 
 
 def recording_bytes(*records: object) -> bytes:
-    """Header, parameters and the given records as they stand in a file."""
+    """Return a file with header, parameters and records."""
     return b"".join(encode_line(record) + b"\n" for record in (HEADER, PARAMETERS, *records))

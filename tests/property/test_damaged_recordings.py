@@ -16,14 +16,14 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 FUZZ_EXAMPLES = 1000
-"""Of a test that does not say how many it wants: what tells `make fuzz` from `make test`."""
+"""Default number of examples, which distinguishes `make fuzz` from `make test`."""
 
 KEPT_OF_A_TYPE = 40
 """Lines of a recording; a damaged one among thousands of poses would show the same."""
 
 
 def shortened(content: bytes) -> bytes:
-    """Leave out most of the lines of which there are many."""
+    """Drop most of the frequent lines."""
     seen: Counter[str] = Counter()
     kept = []
     for line in content.splitlines(keepends=True):
@@ -36,7 +36,7 @@ def shortened(content: bytes) -> bytes:
 
 @pytest.fixture(scope="module")
 def missions(tmp_path_factory: pytest.TempPathFactory) -> tuple[Samples, ...]:
-    """Twelve seconds over each protocol; the second recording lacks what the radio might not have carried."""
+    """Twelve seconds with each protocol; the second recording lacks measurements as after a lossy radio."""
     samples = []
     for protocol in (SUPERFRAME, QUICK):
         folder = tmp_path_factory.mktemp(protocol.kind)

@@ -75,14 +75,14 @@ closings = st.sampled_from(["reads on", "says no more", "goes"])
 
 
 async def settle() -> None:
-    """Let the event loop do everything that it can do without waiting."""
+    """Run the event loop until it is idle."""
     for _ in range(30):
         await asyncio.sleep(0)
 
 
 @contextmanager
 def connected(path: Path, content: bytes, closing: str) -> Iterator[None]:
-    """Say something to a server, and go then, or stay."""
+    """Send data to a server, then disconnect or stay."""
     with socket.socket(socket.AF_UNIX) as connection:
         connection.connect(str(path))
         connection.setblocking(False)
@@ -96,8 +96,8 @@ def connected(path: Path, content: bytes, closing: str) -> Iterator[None]:
 
 
 @examples(20)
-@given(strangers=st.lists(st.tuples(damages, closings), min_size=1, max_size=4))
-def test_input_from_stream_readers_is_ignored(strangers: list[tuple[Damage, str]]) -> None:
+@given(peers=st.lists(st.tuples(damages, closings), min_size=1, max_size=4))
+def test_input_from_stream_readers_is_ignored(peers: list[tuple[Damage, str]]) -> None:
     """Input from stream readers is ignored."""
 
     async def run(folder: Path) -> None:
@@ -105,12 +105,12 @@ def test_input_from_stream_readers_is_ignored(strangers: list[tuple[Damage, str]
         async with StreamServer(path, b"hello") as server:
             reader, writer = await asyncio.open_unix_connection(path)
             with ExitStack() as stack:
-                for number, (damage, closing) in enumerate(strangers):
+                for number, (damage, closing) in enumerate(peers):
                     stack.enter_context(connected(path, damage.to([STREAM, *REQUESTS]), closing))
                     await settle()
                     server.publish(b"%d" % number)
             server.publish(b"end")
-            for expected in (b"hello", *(b"%d" % number for number in range(len(strangers))), b"end"):
+            for expected in (b"hello", *(b"%d" % number for number in range(len(peers))), b"end"):
                 assert await reader.readline() == expected + b"\n"
             writer.close()
             await settle()
@@ -123,8 +123,8 @@ def _no_radio() -> AbstractAsyncContextManager[Radio]:
 
 
 @examples(15)
-@given(strangers=st.lists(st.tuples(damages, closings), min_size=1, max_size=4))
-def test_arbitrary_requests_to_the_client(strangers: list[tuple[Damage, str]]) -> None:
+@given(peers=st.lists(st.tuples(damages, closings), min_size=1, max_size=4))
+def test_arbitrary_requests_to_the_client(peers: list[tuple[Damage, str]]) -> None:
     """The next one gets its status, and its command is executed."""
 
     async def run(folder: Path) -> None:
@@ -139,7 +139,7 @@ def test_arbitrary_requests_to_the_client(strangers: list[tuple[Damage, str]]) -
         )
         await asyncio.sleep(2.0)
         with ExitStack() as stack:
-            for damage, closing in strangers:
+            for damage, closing in peers:
                 stack.enter_context(connected(path, damage.to(REQUESTS), closing))
                 await settle()
             reader, writer = await asyncio.open_unix_connection(path)
@@ -157,8 +157,8 @@ def test_arbitrary_requests_to_the_client(strangers: list[tuple[Damage, str]]) -
 
 
 @examples(20)
-@given(strangers=st.lists(st.tuples(damages, closings), min_size=1, max_size=3))
-def test_unknown_peers_at_the_air_server(strangers: list[tuple[Damage, str]]) -> None:
+@given(peers=st.lists(st.tuples(damages, closings), min_size=1, max_size=3))
+def test_unknown_peers_at_the_air_server(peers: list[tuple[Damage, str]]) -> None:
     """Two radios of the demo still exchange packets."""
 
     async def run(folder: Path) -> None:
@@ -174,7 +174,7 @@ def test_unknown_peers_at_the_air_server(strangers: list[tuple[Damage, str]]) ->
             port = sender.join(RecordingListener())
             receiver.join(RecordingListener())
             with ExitStack() as stack:
-                for damage, closing in strangers:
+                for damage, closing in peers:
                     stack.enter_context(connected(path, damage.to(TO_AIR), closing))
                     await settle()
                 assert {"tx", "rx"} <= server.radio_names
@@ -230,7 +230,7 @@ def _in_folder(run: object) -> None:
 
 @contextmanager
 def serving(path: Path, content: bytes) -> Iterator[None]:
-    """Say something to whoever comes first, and hang up."""
+    """Send data to the first client and disconnect."""
 
     def serve() -> None:
         connection, _ = listener.accept()

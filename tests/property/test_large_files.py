@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 TIMES = 8
 MOST = 4
-"""How many times longer than in proportion it may take on a busy machine; what is quadratic takes eight times longer."""
+"""Allowed excess over proportional time on a busy machine; quadratic time would be eight times longer."""
 
 
 def _recording(count: int) -> bytes:

@@ -72,7 +72,7 @@ def arrivals(draw: st.DrawFn, scene: Scene = SCENE) -> list[PolarMeasurement]:
 def live(
     measurements: list[PolarMeasurement], ticks_ns: list[int], end_ns: int, scene: Scene = SCENE
 ) -> list[bytes]:
-    """Lines of a live run whose timer also fires at the instants given."""
+    """Return the lines of a live run whose timer also fires at given instants."""
     feed = LiveEstimator(scene.parameters)
     calls = [(m.received_ns, m) for m in measurements] + [(tick, None) for tick in ticks_ns if tick < end_ns]
     records: list[Measurement | PoseRecord] = []

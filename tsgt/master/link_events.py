@@ -13,6 +13,13 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
+class _OfStation:
+    """An event that only has a station."""
+
+    station: int
+
+
+@dataclass(frozen=True, slots=True)
 class StationResponded:
     """A station answered a request or replied in its slot."""
 
@@ -21,18 +28,12 @@ class StationResponded:
     snr_db: float
 
 
-@dataclass(frozen=True, slots=True)
-class NoResponse:
+class NoResponse(_OfStation):
     """A station did not answer a request, or its slot stayed empty."""
 
-    station: int
 
-
-@dataclass(frozen=True, slots=True)
-class ReplyReceived:
+class ReplyReceived(_OfStation):
     """A reply that may carry measurements; reported before them."""
-
-    station: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,11 +71,8 @@ class SuperframeState:
     rejected_beacons: int
 
 
-@dataclass(frozen=True, slots=True)
-class ClockStepped:
+class ClockStepped(_OfStation):
     """A station's clock was stepped or reset."""
-
-    station: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,11 +97,8 @@ class BeaconTimeRejected:
     count: int
 
 
-@dataclass(frozen=True, slots=True)
-class LinkDelayAnomaly:
+class LinkDelayAnomaly(_OfStation):
     """The measured link delay to a station is impossible."""
-
-    station: int
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from tsgt.errors import CorruptLineError, RecordingError
-from tsgt.model import PolarMeasurement, Status, check_finite, check_instants
+from tsgt.model import FiniteNumbers, PolarMeasurement, Status, check_finite, check_instants
 from tsgt.recording.format import HEADER_START, MAX_LINE_BYTES, RecordingHeader, decode_line
 from tsgt.recording.reader import read_lines
 
@@ -35,10 +35,8 @@ class JournalRecord:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class InstrumentRecord:
+class InstrumentRecord(FiniteNumbers):
     """The instrument and its settings as read back from it, after each connection and each change."""
-
-    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
     type: Literal["instrument"] = "instrument"
     stamp_ns: int = 0
@@ -99,10 +97,8 @@ class AcknowledgedRecord:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TargetRecord:
+class TargetRecord(FiniteNumbers):
     """A single measurement of a target that the operator had aimed at."""
-
-    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
     type: Literal["target"] = "target"
     station: int
@@ -188,25 +184,19 @@ def load_journal(
     """
     head: JournalRecord | None = None
     created_ns = 0
-    measurements: list[PolarMeasurement] = []
-    targets: list[TargetRecord] = []
-    receptions: list[ReceptionRecord] = []
+    records: dict[str, list[Any]] = {"measurement": [], "target": [], "reception": []}
+    types = {"measurement": PolarMeasurement, "target": TargetRecord, "reception": ReceptionRecord}
     for line in read_lines(path, keep_going=keep_going, on_problem=on_problem):
         try:
-            match line.type:
-                case "recording":
-                    created_ns = created_ns or decode_line(RecordingHeader, line, path).created_ns
-                case "journal":
-                    record = decode_line(JournalRecord, line, path)
-                    if head is not None and head != record:
-                        raise CorruptLineError("begins a second journal", path=path, line=line.number)
-                    head = record
-                case "measurement":
-                    measurements.append(decode_line(PolarMeasurement, line, path))
-                case "target":
-                    targets.append(decode_line(TargetRecord, line, path))
-                case "reception":
-                    receptions.append(decode_line(ReceptionRecord, line, path))
+            if line.type == "recording":
+                created_ns = created_ns or decode_line(RecordingHeader, line, path).created_ns
+            elif line.type == "journal":
+                record = decode_line(JournalRecord, line, path)
+                if head is not None and head != record:
+                    raise CorruptLineError("begins a second journal", path=path, line=line.number)
+                head = record
+            elif line.type in types:
+                records[line.type].append(decode_line(types[line.type], line, path))
         except CorruptLineError as problem:
             if not keep_going or line.type == "journal":
                 raise
@@ -214,6 +204,7 @@ def load_journal(
                 on_problem(problem)
     if head is None:
         raise RecordingError("is not a station's journal; give a file that tsgt-client wrote", path=path)
+    measurements, targets, receptions = records.values()
     return Journal(
         head=head,
         created_ns=created_ns,

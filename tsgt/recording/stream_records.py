@@ -7,12 +7,21 @@ docstrings (``make generated``).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 import tsgt
-from tsgt.model import ROBOT_FRAME, WORLD_FRAME, ClockSample, Row4, Status, Vector3, check_instants
+from tsgt.model import (
+    ROBOT_FRAME,
+    WORLD_FRAME,
+    ClockSample,
+    FiniteNumbers,
+    Row4,
+    Status,
+    Vector3,
+    check_instants,
+)
 
 PROTOCOL_VERSION = 1
 
@@ -42,10 +51,8 @@ class HelloRecord:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StationShare:
+class StationShare(FiniteNumbers):
     """The contribution of one station to a pose, or why there is none."""
-
-    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
     id: int
     """Number of the station, from 1."""
@@ -62,10 +69,8 @@ class StationShare:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PoseRecord:
+class PoseRecord(FiniteNumbers):
     """The pose of the robot at one epoch, or why there is none."""
-
-    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
     type: Literal["pose"] = "pose"
     stamp_ns: int
@@ -105,10 +110,8 @@ class PoseRecord:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StationStatus:
+class StationStatus(FiniteNumbers):
     """The status of one station."""
-
-    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
     id: int
     """Number of the station, from 1."""
@@ -157,10 +160,8 @@ class StationStatus:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StatusRecord:
+class StatusRecord(FiniteNumbers):
     """The status of the master and its stations, about once per second."""
-
-    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
     type: Literal["status"] = "status"
     stamp_ns: int
@@ -184,10 +185,8 @@ class StatusRecord:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ClockRecord:
+class ClockRecord(FiniteNumbers):
     """The result of a synchronisation with a station, with its raw samples."""
-
-    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
     type: Literal["clock"] = "clock"
     stamp_ns: int

@@ -32,7 +32,7 @@ def every(
     stations: tuple[int, ...] = (1, 2, 3),
     from_s: float = 0.0,
 ) -> list[PolarMeasurement]:
-    """Measurements in turn: each station's every so many seconds."""
+    """Return measurements of the stations in turn, each at an interval."""
     return [
         replace(scene.measure(station, time_s + 0.1 * station), sequence=number)
         for number, time_s in enumerate(np.arange(from_s, until_s, step_s).tolist())
@@ -42,12 +42,12 @@ def every(
 
 def stream(scene: Scene, measurements: list[PolarMeasurement], until_s: float) -> tuple[PoseBatch, PoseBatch]:
     """Predicted and smoothed poses of a live run."""
-    pipeline = ContinuousEstimator(scene.parameters)
+    estimator = ContinuousEstimator(scene.parameters)
     batches = []
     for measurement in sorted(measurements, key=lambda m: m.received_ns):
-        batches.append(pipeline.advance(measurement.received_ns))
-        pipeline.add(measurement)
-    batches.append(pipeline.advance(START + round(until_s * SECOND)))
+        batches.append(estimator.advance(measurement.received_ns))
+        estimator.add(measurement)
+    batches.append(estimator.advance(START + round(until_s * SECOND)))
     return of_kind(batches, Kind.PREDICTED), of_kind(batches, Kind.SMOOTHED)
 
 
@@ -130,13 +130,13 @@ def test_late_measurement_within_the_lag_is_used(scene: Scene) -> None:
 
 def test_measurements_outside_the_lag_window_are_counted(scene: Scene) -> None:
     """By station; they change nothing."""
-    pipeline = ContinuousEstimator(scene.parameters)
+    estimator = ContinuousEstimator(scene.parameters)
     for measurement in every(scene, 8.0):
-        pipeline.advance(measurement.received_ns)
-        pipeline.add(measurement)
-    pipeline.add(replace(scene.measure(3, 1.05), received_ns=START + 8 * SECOND))
-    pipeline.advance(START + 9 * SECOND)
-    assert pipeline.outside_lag_window == {3: 1}
+        estimator.advance(measurement.received_ns)
+        estimator.add(measurement)
+    estimator.add(replace(scene.measure(3, 1.05), received_ns=START + 8 * SECOND))
+    estimator.advance(START + 9 * SECOND)
+    assert estimator.outside_lag_window == {3: 1}
 
 
 def test_old_backlog_is_outside_the_lag_window(scene: Scene) -> None:
@@ -146,12 +146,12 @@ def test_old_backlog_is_outside_the_lag_window(scene: Scene) -> None:
         replace(m, stamp_ns=m.stamp_ns - 3600 * SECOND, sequence=m.sequence + 10_000)
         for m in measurements[:6]
     ]
-    pipeline = ContinuousEstimator(scene.parameters)
+    estimator = ContinuousEstimator(scene.parameters)
     for measurement in (*old, *measurements):
-        pipeline.add(measurement)
-        pipeline.advance(measurement.received_ns)
-    assert sum(pipeline.outside_lag_window.values()) == len(old)
-    assert pipeline.advance(START + 8 * SECOND).valid.all()
+        estimator.add(measurement)
+        estimator.advance(measurement.received_ns)
+    assert sum(estimator.outside_lag_window.values()) == len(old)
+    assert estimator.advance(START + 8 * SECOND).valid.all()
 
 
 @pytest.mark.parametrize("before_ns", [9_000_000, 10_000_000, 11_000_000])
@@ -161,12 +161,12 @@ def test_measurement_just_before_the_first_is_used(scene: Scene, before_ns: int,
     measurements = every(scene, 4.0)
     first_s = (measurements[0].stamp_ns - START - before_ns) / SECOND
     late = scene.measure(2, first_s, delay_s=1.9)
-    pipeline = ContinuousEstimator(scene.parameters)
-    pipeline.begin_at(START - round(begun_s * SECOND))
+    estimator = ContinuousEstimator(scene.parameters)
+    estimator.begin_at(START - round(begun_s * SECOND))
     for measurement in sorted([*measurements, late], key=lambda m: m.received_ns):
-        pipeline.advance(measurement.received_ns)
-        pipeline.add(measurement)
-    assert pipeline.advance(START + 4 * SECOND).valid.all()
+        estimator.advance(measurement.received_ns)
+        estimator.add(measurement)
+    assert estimator.advance(START + 4 * SECOND).valid.all()
 
 
 def test_zero_distance_is_an_outlier(scene: Scene) -> None:
@@ -267,13 +267,13 @@ def test_noise_scale_is_applied(scene: Scene) -> None:
 
 def test_deadline_is_the_next_epoch(scene: Scene) -> None:
     """None before the first measurement."""
-    pipeline = ContinuousEstimator(scene.parameters)
-    assert pipeline.next_deadline_ns() is None
-    pipeline.begin_at(START + 1)
-    pipeline.add(scene.measure(1, 0.0))
-    assert pipeline.next_deadline_ns() == START + PERIOD
-    assert len(pipeline.advance(START + PERIOD - 1)) == 0
-    assert len(pipeline.advance(START + PERIOD)) == 1
+    estimator = ContinuousEstimator(scene.parameters)
+    assert estimator.next_deadline_ns() is None
+    estimator.begin_at(START + 1)
+    estimator.add(scene.measure(1, 0.0))
+    assert estimator.next_deadline_ns() == START + PERIOD
+    assert len(estimator.advance(START + PERIOD - 1)) == 0
+    assert len(estimator.advance(START + PERIOD)) == 1
 
 
 def test_collinear_layout_is_rejected(scene: Scene) -> None:
@@ -285,12 +285,12 @@ def test_collinear_layout_is_rejected(scene: Scene) -> None:
 
 def test_memory_is_bounded(scene: Scene) -> None:
     """After a minute it holds no more than after ten seconds."""
-    pipeline = ContinuousEstimator(scene.parameters)
+    estimator = ContinuousEstimator(scene.parameters)
     sizes = []
     for measurement in [*every(scene, 30.0), *(scene.measure(3, 30.0, status=Status.TILT),)]:
-        pipeline.advance(measurement.received_ns)
-        pipeline.add(measurement)
-        sizes.append(len(pipeline._history.times_ns))
+        estimator.advance(measurement.received_ns)
+        estimator.add(measurement)
+        sizes.append(len(estimator._history.times_ns))
     assert max(sizes[75:]) <= max(sizes[:75])
 
 
@@ -300,9 +300,9 @@ def test_poses_before_the_initialisation_are_invalid(scene: Scene) -> None:
     _, smoothed = stream(scene, measurements, 8.0)
     twice_ns = max([m.stamp_ns for m in measurements if m.prism == prism][1] for prism in (1, 2, 3))
     assert smoothed.stamp_ns[smoothed.valid].min() >= twice_ns
-    told = np.isfinite(smoothed.position_m[:, 0]) & (smoothed.stamp_ns < twice_ns)
-    assert told.any()
-    assert (smoothed.reason[told] != Reason.VALID).all()
+    known = np.isfinite(smoothed.position_m[:, 0]) & (smoothed.stamp_ns < twice_ns)
+    assert known.any()
+    assert (smoothed.reason[known] != Reason.VALID).all()
 
 
 @pytest.mark.parametrize(

@@ -32,11 +32,11 @@ def scene() -> Scene:
 
 
 def poses_of(scene: Scene, measurements: Sequence[PolarMeasurement], until_s: float) -> PoseBatch:
-    """All poses that are decided at so many seconds after the start, everything added at once."""
-    pipeline = LinearEstimator(scene.parameters)
+    """Return all poses that are decided at an instant in s after the start, with all measurements added at once."""
+    estimator = LinearEstimator(scene.parameters)
     for measurement in measurements:
-        pipeline.add(measurement)
-    return pipeline.advance(START + round(until_s * SECOND))
+        estimator.add(measurement)
+    return estimator.advance(START + round(until_s * SECOND))
 
 
 def every(
@@ -76,27 +76,27 @@ def test_epochs_are_whole_multiples_of_the_period(scene: Scene) -> None:
 
 def test_pose_waits_for_the_last_station(scene: Scene) -> None:
     """It is due with that station's measurement."""
-    pipeline = LinearEstimator(scene.parameters)
+    estimator = LinearEstimator(scene.parameters)
     for measurement in [*every(scene, [0.0]), *every(scene, [0.4], stations=(1, 2))]:
-        pipeline.add(measurement)
-    assert len(pipeline.advance(START + SECOND // 2)) == 1  # the first epoch, which nothing precedes
-    pipeline.add(scene.measure(3, 0.25))
-    assert pipeline.advance(START + SECOND // 2).stamp_ns[-1] == START + SECOND // 4
-    pipeline.add(scene.measure(3, 0.4))
-    assert pipeline.advance(START + SECOND // 2).valid.tolist() == [True] * 3
+        estimator.add(measurement)
+    assert len(estimator.advance(START + SECOND // 2)) == 1  # the first epoch, which nothing precedes
+    estimator.add(scene.measure(3, 0.25))
+    assert estimator.advance(START + SECOND // 2).stamp_ns[-1] == START + SECOND // 4
+    estimator.add(scene.measure(3, 0.4))
+    assert estimator.advance(START + SECOND // 2).valid.tolist() == [True] * 3
 
 
 def test_pose_waits_for_a_retransmission(scene: Scene) -> None:
     """A gap in the sequence numbers is not interpolated while the missing one may arrive."""
-    pipeline = LinearEstimator(scene.parameters)
+    estimator = LinearEstimator(scene.parameters)
     for measurement in every(scene, [0.0, 0.4, 0.8], stations=(1, 2)):
-        pipeline.add(replace(measurement, sequence=round((measurement.stamp_ns - START) / (0.4 * SECOND))))
-    pipeline.add(scene.measure(3, 0.0))
-    pipeline.add(replace(scene.measure(3, 0.8), sequence=2))
-    assert len(pipeline.advance(START + SECOND)) == 1
-    assert pipeline.next_deadline_ns() == START + round(2.8 * SECOND) + 1
-    pipeline.add(replace(scene.measure(3, 0.4), sequence=1))
-    assert len(pipeline.advance(START + SECOND)) == 16
+        estimator.add(replace(measurement, sequence=round((measurement.stamp_ns - START) / (0.4 * SECOND))))
+    estimator.add(scene.measure(3, 0.0))
+    estimator.add(replace(scene.measure(3, 0.8), sequence=2))
+    assert len(estimator.advance(START + SECOND)) == 1
+    assert estimator.next_deadline_ns() == START + round(2.8 * SECOND) + 1
+    estimator.add(replace(scene.measure(3, 0.4), sequence=1))
+    assert len(estimator.advance(START + SECOND)) == 16
 
 
 @pytest.mark.parametrize(("gap_s", "valid"), [(1.0, True), (1.000000001, False)])
@@ -113,14 +113,14 @@ def test_interval_beyond_the_outage_limit_is_invalid(scene: Scene, gap_s: float,
 
 def test_silent_station_is_an_outage_at_the_deadline(scene: Scene) -> None:
     """At the announced instant."""
-    pipeline = LinearEstimator(scene.parameters)
+    estimator = LinearEstimator(scene.parameters)
     for measurement in [*every(scene, [0.0]), *every(scene, [0.5, 1.0, 1.5, 2.0], stations=(1, 2))]:
-        pipeline.add(measurement)
-    pipeline.advance(START + 2 * SECOND)
-    deadline = pipeline.next_deadline_ns()
+        estimator.add(measurement)
+    estimator.advance(START + 2 * SECOND)
+    deadline = estimator.next_deadline_ns()
     assert deadline == START + 3 * SECOND + 1  # last seen + outage limit + transport limit
-    assert len(pipeline.advance(deadline - 1)) == 0
-    given_up = pipeline.advance(deadline)
+    assert len(estimator.advance(deadline - 1)) == 0
+    given_up = estimator.advance(deadline)
     assert given_up.stamp_ns[-1] == START + SECOND
     assert (given_up.reason == Reason.OUTAGE).all()
     (record, *_) = given_up.records()
@@ -216,8 +216,8 @@ def test_repeated_measurement_changes_nothing(scene: Scene) -> None:
 
 def test_unknown_stations_and_prisms_are_ignored(scene: Scene) -> None:
     """Unknown stations and prisms are ignored."""
-    foreign = [replace(scene.measure(1, 0.2), station=9), replace(scene.measure(1, 0.2), prism=9)]
-    assert poses_of(scene, [*every(scene, [0.0, 0.4]), *foreign], until_s=0.4).valid[1:].all()
+    unknown = [replace(scene.measure(1, 0.2), station=9), replace(scene.measure(1, 0.2), prism=9)]
+    assert poses_of(scene, [*every(scene, [0.0, 0.4]), *unknown], until_s=0.4).valid[1:].all()
 
 
 def test_covariance_grows_between_measurements(scene: Scene) -> None:
@@ -312,11 +312,11 @@ def test_stamp_from_the_future_is_ignored(scene: Scene) -> None:
 
 def test_live_poses_start_at_the_start(scene: Scene) -> None:
     """Not at the time of a station's wrong clock."""
-    pipeline = LinearEstimator(scene.parameters)
-    pipeline.begin_at(START)
+    estimator = LinearEstimator(scene.parameters)
+    estimator.begin_at(START)
     for measurement in [scene.measure(2, -40_000_000.0, delay_s=40_000_000.0), *every(scene, [0.0, 0.4])]:
-        pipeline.add(measurement)
-    poses = pipeline.advance(START + SECOND // 2)
+        estimator.add(measurement)
+    poses = estimator.advance(START + SECOND // 2)
     assert poses.stamp_ns[0] == START - 2 * SECOND
     assert poses.valid[-8:].all()
 

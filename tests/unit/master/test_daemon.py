@@ -38,12 +38,12 @@ MS = 1_000_000
 
 
 def events(field: Field) -> list[str]:
-    """Names of the events so far, with the station that each is about."""
+    """Return the names of the events so far, with their stations."""
     return [f"{e.event} {e.station or ''}".strip() for e in field.of(EventRecord)]
 
 
 def stamp_errors_ms(measurements: list[PolarMeasurement]) -> list[float]:
-    """How far stamps are from the truth, which stands in the instants of the scene's instrument."""
+    """Return the errors of the stamps against the scene's instants, in ms."""
     errors_ms = []
     for measurement in measurements:
         off_ns = (measurement.stamp_ns - START - measurement.station) % (400 * MS)
@@ -286,7 +286,7 @@ async def test_interference_does_not_corrupt_measurements(tmp_path: Path) -> Non
 
         async def jam() -> None:
             rng = np.random.default_rng(1)
-            async with radio_opener(field.air, "foreign", TRUE, rng, PAPER)() as radio:
+            async with radio_opener(field.air, "interferer", TRUE, rng, PAPER)() as radio:
                 while True:
                     await radio.transmit(rng.bytes(int(rng.integers(1, 40))))
                     await asyncio.sleep(float(rng.uniform(0.5, 2.0)))
@@ -337,11 +337,11 @@ async def test_stalled_link_stops_watchdog_notifications(
 
         signs_of_life = 0
 
-        def heard() -> None:
+        def notified() -> None:
             nonlocal signs_of_life
             signs_of_life += b"WATCHDOG=1" in systemd.recv(1000)
 
-        asyncio.get_running_loop().add_reader(systemd, heard)
+        asyncio.get_running_loop().add_reader(systemd, notified)
         async with field_of(tmp_path) as field:
             stuck = asyncio.Event()
 

@@ -23,7 +23,7 @@ BAY = ((0.0, 0.0), (9.0, 0.0), (9.0, 9.0), (6.0, 9.0), (6.0, 3.0), (3.0, 3.0), (
 
 
 def fence(**changes: object) -> Geofence:
-    """Build a fence around the square that takes the position as exact."""
+    """Return a geofence around the square with exact positions."""
     settings = {"name": "yard", "polygon_m": SQUARE, "sigmas": 0.0, "hysteresis_m": 0.5}
     return Geofence(GeofenceConfig.model_validate(settings | changes))
 
@@ -39,7 +39,7 @@ def at(x: float, y: float, *, sigma_x_m: float = 0.0, sigma_y_m: float = 0.0, rh
 
 
 def run(watched: Geofence, poses: list[PoseRecord]) -> list[str]:
-    """Hand over poses a tenth of a second apart; what each of them brought, the empty word for nothing."""
+    """Return the event of each pose, 0.1 s apart; an empty string for none."""
     words = []
     for number, pose in enumerate(poses):
         events = watched.pose(pose, START + number * SECOND // 10)

@@ -105,14 +105,14 @@ def test_invalid_poses_count_for_their_residual_only() -> None:
 
 
 def live(parameters: Parameters, measurements: Iterable[Measurement]) -> list[PoseRecord]:
-    """Make the poses that the master would have sent."""
+    """Return the poses that the master would have published."""
     pipeline = dataclasses.replace(parameters.pipeline, estimator="linear")
     feed = LiveEstimator(dataclasses.replace(parameters, pipeline=pipeline))
     return [r for m in measurements for r in feed.measurement(m) if isinstance(r, PoseRecord)]
 
 
 def driven(seed: int, *, rate_hz: float, duration_s: float) -> tuple[Parameters, list[Measurement]]:
-    """Let stations that measure at a given rate track the reference scenario's robot."""
+    """Return measurements of the reference scenario at a rate."""
     plain = ScenarioConfig()
     stations = tuple(s.model_copy(update={"rate_hz": rate_hz}) for s in plain.stations)
     scenario = plain.model_copy(update={"stations": stations})

@@ -49,7 +49,7 @@ def watch(
         station, time_s, from_s=LOST_S
     ),
 ) -> None:
-    """Let all stations measure for a while; by default the second one loses its prism. None: it is not heard."""
+    """Let all stations measure for a while; by default the second one loses its prism; None: it is not received."""
     for step in range(math.ceil(since_s / STEP_S), math.ceil(until_s / STEP_S)):
         for station in (1, 2, 3):
             time_s = STEP_S * step + 0.01 * station
@@ -62,8 +62,8 @@ def beside_rad(scene: Scene, towards: Direction, time_s: float, *, station: int 
     """Return how far a direction is from where the station's prism is, or another one."""
     true = scene.measure(station, time_s, prism=prism)
     at = polar_to_cartesian(true.horizontal_angle_rad, true.zenith_angle_rad, 1.0)
-    told = polar_to_cartesian(towards.horizontal_angle_rad, towards.zenith_angle_rad, 1.0)
-    return math.acos(min(float(at @ told), 1.0))
+    hinted = polar_to_cartesian(towards.horizontal_angle_rad, towards.zenith_angle_rad, 1.0)
+    return math.acos(min(float(at @ hinted), 1.0))
 
 
 def test_lost_prism_gives_a_hint() -> None:
@@ -98,10 +98,10 @@ def test_other_errors_give_no_hint(status: Status) -> None:
 def motion(
     speed_mps: float, yaw_rate_radps: float, heading_rad: float, tilt_rad: float
 ) -> Callable[[float], Motion]:
-    """Make a robot that drives a bend, leaning; it is 50 m away after twelve seconds and a half."""
+    """Return a robot that leans and drives a bend; after 12.5 s it is 50 m away."""
 
     def along_m(time_s: float) -> NDArray[np.float64]:
-        """Give the way from where it is after 12.5 s, by the sum of small steps."""
+        """Return the path from its position after 12.5 s, as a sum of small steps."""
         turned = heading_rad + yaw_rate_radps * (12.5 + (time_s - 12.5) * (np.arange(200) + 0.5) / 200)
         mean = np.array([np.cos(turned).mean(), np.sin(turned).mean(), 0.0])
         return speed_mps * (time_s - 12.5) * mean
@@ -239,14 +239,14 @@ def test_hint_is_renewed_every_five_seconds() -> None:
     """From the latest points; after six of them every half minute, and none in between."""
     scene = stationary_scene().moving(driving)
     hints = ReacquisitionHints(scene.parameters)
-    told: list[tuple[float, Direction | None]] = [(0.0, None)]
+    hinted: list[tuple[float, Direction | None]] = [(0.0, None)]
     for tenth in range(1000):
         time_s = 0.1 * tenth
         watch(hints, scene, since_s=time_s, until_s=time_s + 0.1)
         towards = hints.direction(2, ns(time_s + 0.2))
-        if towards is not told[-1][1]:
-            told.append((time_s + 0.2, towards))
-    changes_s = [round(time_s - told[1][0], 6) for time_s, _ in told[1:]]
+        if towards is not hinted[-1][1]:
+            hinted.append((time_s + 0.2, towards))
+    changes_s = [round(time_s - hinted[1][0], 6) for time_s, _ in hinted[1:]]
     again_s, seldom_s = HINT_INTERVAL_NS / SECOND, SLOW_HINT_INTERVAL_NS / SECOND
     assert changes_s == pytest.approx(
         [
@@ -257,13 +257,13 @@ def test_hint_is_renewed_every_five_seconds() -> None:
         ],
         abs=0.11,
     )
-    assert [towards is None for _, towards in told[1:]] == [False] * MAX_FREQUENT_HINTS + [
+    assert [towards is None for _, towards in hinted[1:]] == [False] * MAX_FREQUENT_HINTS + [
         True,
         False,
         True,
         False,
     ]
-    for time_s, towards in told:
+    for time_s, towards in hinted:
         assert towards is None or beside_rad(scene, towards, time_s) <= towards.spread_rad
 
 

@@ -72,12 +72,12 @@ def test_change_of_instrument_status_is_an_event() -> None:
     assert [text in event.message for text, event in zip(texts, events, strict=True)] == [True] * 4
 
 
-@pytest.mark.parametrize(("steps_s", "told"), [([0.05, 0.09], 0), ([0.05, 0.2], 1), ([-3600.0, -3600.0], 1)])
-def test_unix_clock_step_is_one_event(steps_s: list[float], told: int) -> None:
+@pytest.mark.parametrize(("steps_s", "count"), [([0.05, 0.09], 0), ([0.05, 0.2], 1), ([-3600.0, -3600.0], 1)])
+def test_unix_clock_step_is_one_event(steps_s: list[float], count: int) -> None:
     """A slew of less than 0.1 s is none; each further step is one."""
     detector = StationEventDetector([1], START)
     events = [e for s in steps_s for e in detector.tick(START, realtime_ns=START + round(s * 1e9))]
-    assert [event.event for event in events] == ["unix_clock_stepped"] * told
+    assert [event.event for event in events] == ["unix_clock_stepped"] * count
 
 
 def test_forward_step_has_a_positive_sign() -> None:

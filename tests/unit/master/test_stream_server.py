@@ -28,12 +28,12 @@ def path(tmp_path: Path) -> Path:
 
 
 def line(number: int, size: int = 0) -> bytes:
-    """Make a line that says its number and has about the size."""
+    """Return a line with its number and about a size."""
     return json.dumps({"type": "test", "number": number, "fill": "x" * size}).encode()
 
 
 class Client:
-    """A reader that reads when it is told to."""
+    """A reader that reads on request."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.reader = reader
@@ -41,7 +41,7 @@ class Client:
 
     @classmethod
     async def connect(cls, path: Path) -> Client:
-        """Connect and take the greeting."""
+        """Connect and read the greeting."""
         client = cls(*await asyncio.open_unix_connection(path, limit=2 * BIG))
         assert await client.reader.readline() == HELLO + b"\n"
         return client
@@ -73,7 +73,7 @@ class SleepyClient:
         self._data = b""
 
     def take(self) -> None:
-        """Take what the kernel has."""
+        """Read what the kernel has."""
         while True:
             try:
                 piece = self.socket.recv(1 << 20)
@@ -84,13 +84,13 @@ class SleepyClient:
             self._data += piece
 
     def records(self) -> list[dict[str, Any]]:
-        """Return the whole lines that have been taken, without the greeting."""
+        """Return the complete lines that were read, without the greeting."""
         whole_lines = self._data.split(b"\n")[1:-1]
         return [json.loads(text) for text in whole_lines]
 
 
 async def settle() -> None:
-    """Let the event loop do everything that it can do without waiting."""
+    """Run the event loop until it is idle."""
     for _ in range(20):
         await asyncio.sleep(0)
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class FullDisk(RecordingWriter):
-    """A real recording on a disk that is full whenever the test says so."""
+    """A real recording on a disk that the test can fill."""
 
     full = False
 

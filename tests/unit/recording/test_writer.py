@@ -36,7 +36,7 @@ def writer(path: Path) -> Iterator[RecordingWriter]:
 
 @dataclass
 class Disk:
-    """A disk with little room: takes what fits of a write, as a real one does, then none.
+    """A nearly full disk: takes a part of a write, as a real one does, then none.
 
     A limit by the kernel (RLIMIT_FSIZE) would hold for all files of the process, the log of the test run included.
     """
@@ -92,7 +92,7 @@ def test_mode_is_0644(path: Path) -> None:
 
 
 def test_session_is_appended(path: Path) -> None:
-    """Opening a recording again keeps what is there."""
+    """A reopened recording keeps its content."""
     path.write_bytes(recording_bytes(measurement(0)))
     with RecordingWriter(path) as writer:
         writer.write(measurement(1))
@@ -101,7 +101,7 @@ def test_session_is_appended(path: Path) -> None:
 
 
 def test_torn_tail_is_cut_off(path: Path) -> None:
-    """A torn last line is removed when the file is opened for writing, and its length is told."""
+    """A torn last line is removed when the file is opened for writing, and its length reported."""
     path.write_bytes(recording_bytes(measurement(0)) + b'{"type":"measurem')
     with RecordingWriter(path) as writer:
         writer.write(measurement(1))
@@ -110,7 +110,7 @@ def test_torn_tail_is_cut_off(path: Path) -> None:
 
 
 def test_torn_tail_of_zeros_is_cut_off(path: Path) -> None:
-    """A power cut can leave a long tail of zeros; it goes as a whole, also when it is longer than any line."""
+    """A power cut can leave a long tail of zeros; it is removed, even if longer than any line."""
     path.write_bytes(recording_bytes(measurement(0)) + b"\0" * 3_000_000)
     with RecordingWriter(path) as writer:
         assert writer.cut_bytes == 3_000_000
@@ -161,7 +161,7 @@ def test_second_writer_is_rejected(path: Path) -> None:
 
 
 def test_file_is_free_after_close(path: Path, writer: RecordingWriter) -> None:
-    """Closing, also twice, lets the next writer in."""
+    """Closing, also twice, releases the lock."""
     writer.close()
     writer.close()
     RecordingWriter(path).close()

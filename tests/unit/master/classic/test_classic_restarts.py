@@ -19,7 +19,9 @@ STEP_NS = 30 * MS
 
 def outside(field: SingleStation) -> list[tuple[int, int]]:
     """Return the stamps that were off by more than their bound, and that bound; in ns."""
-    return [(error_ns, bound_ns) for error_ns, bound_ns in field.stamp_errors_ns if abs(error_ns) > bound_ns]
+    return [
+        (error_ns, bound_ns) for error_ns, bound_ns in field.timestamp_errors_ns if abs(error_ns) > bound_ns
+    ]
 
 
 @pytest.mark.parametrize("lost", range(12))
@@ -31,43 +33,42 @@ async def test_restart_is_detected_after_lost_responses(lost: int) -> None:
         await asyncio.sleep(0.5)
         field.restart(STEP_NS)
         answers = count()
-        field.lost = lambda _: next(answers) < lost
-        before = len(field.stamp_errors_ns)
+        field.is_lost = lambda _: next(answers) < lost
+        before = len(field.timestamp_errors_ns)
         await asyncio.sleep(40.0)
-    assert len(field.stamp_errors_ns) > before
+    assert len(field.timestamp_errors_ns) > before
     assert outside(field) == []
 
 
 def restart_at(field: SingleStation, request: bytes, *, cycle: int, step_ns: int) -> list[int]:
-    """Kill the station before a request of a cycle, and start it 0.6 s later with its clock set; return when it died."""
-    died_ns: list[int] = []
+    """Kill the station before a request of a cycle, restart it 0.6 s later with its clock stepped; return when it was killed."""
+    killed_ns: list[int] = []
 
     def before(payload: bytes) -> int:
         now_ns = field.clock.monotonic_ns()
-        if payload == request and field.count(b"e1") == cycle and not died_ns:
-            died_ns.append(now_ns)
+        if payload == request and field.count(b"e1") == cycle and not killed_ns:
+            killed_ns.append(now_ns)
             field.station = None
-        elif field.station is None and now_ns - died_ns[0] > 600 * MS:
+        elif field.station is None and now_ns - killed_ns[0] > 600 * MS:
             field.restart(step_ns)
         return 0
 
-    field.before = before
-    return died_ns
+    field.before_request = before
+    return killed_ns
 
 
 @pytest.mark.parametrize("step_ns", [STEP_NS, 1_500_000])
 async def test_restart_within_a_synchronisation_is_detected(step_ns: int) -> None:
-    """The new program is pinged, so it does not introduce itself, but that answer is lost: all samples are of before.
+    """The restarted client is pinged, so it does not report its restart, but that reply is lost: all samples precede it.
 
-    Its prism is ordered again and a third synchronisation follows at once; not even a step that exchanges do not tell
-    passes for a frequency.
+    The command to track is repeated and a third synchronisation follows at once; no step is taken for a skew.
     """
     async with single_station() as field:
         # 50 cycles at the start, then three of the second synchronisation.
-        died_ns = restart_at(field, b"e1", cycle=53, step_ns=step_ns)
-        field.lost = lambda payload: payload == b"e1" and field.count(b"e1") == 55
+        killed_ns = restart_at(field, b"e1", cycle=53, step_ns=step_ns)
+        field.is_lost = lambda payload: payload == b"e1" and field.count(b"e1") == 55
         await asyncio.sleep(60.0)
-    assert died_ns
+    assert killed_ns
     assert outside(field) == []
     assert field.count(b"n11") == len(field.clocks) - 1 == 2
     assert abs(field.clocks[-1].frequency_ppm) < 5
@@ -77,9 +78,9 @@ async def test_samples_before_a_restart_are_not_used() -> None:
     """Four of five cycles precede it, and an offset of 3 ms looks like a late stamp."""
     async with single_station() as field:
         # 50 cycles at the start, then four of the second synchronisation.
-        died_ns = restart_at(field, b"s1", cycle=54, step_ns=3 * MS)
+        killed_ns = restart_at(field, b"s1", cycle=54, step_ns=3 * MS)
         await asyncio.sleep(60.0)
-    assert died_ns
+    assert killed_ns
     assert outside(field) == []
     assert field.count(b"n11") == 2
 
@@ -97,8 +98,8 @@ async def test_restart_before_a_synchronisation_without_samples_is_detected() ->
                 return 700 * MS
             return 0
 
-        field.before = before
-        field.lost = lambda _: bool(begun_ns) and 1 <= next(answers) <= 3
+        field.before_request = before
+        field.is_lost = lambda _: bool(begun_ns) and 1 <= next(answers) <= 3
         await asyncio.sleep(60.0)
     assert begun_ns
     assert begun_ns[0] > 40 * SECOND

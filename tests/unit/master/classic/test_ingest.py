@@ -28,7 +28,7 @@ AHEAD_NS = 7200 * SECOND
 
 
 def samples(at_ns: int, ahead_ns: int = AHEAD_NS, count: int = 5, *, late_ns: int = 0) -> list[ClockSample]:
-    """Exchanges 0.25 s apart, the last of which ends at an instant; the station answers so late."""
+    """Return exchanges 0.25 s apart, the last of which ends at an instant, with a delayed station."""
     return [
         ClockSample(
             sent_ns=received_ns - late_ns - 2 * AIR_NS,
@@ -42,7 +42,7 @@ def samples(at_ns: int, ahead_ns: int = AHEAD_NS, count: int = 5, *, late_ns: in
 
 
 def message(time_ns: int, *, status: int = 0, distance_m: float = 30.0) -> MeasurementMessage:
-    """Make an answer of station 1."""
+    """Return a message of station 1."""
     return MeasurementMessage(
         station=1,
         status=status,
@@ -54,14 +54,14 @@ def message(time_ns: int, *, status: int = 0, distance_m: float = 30.0) -> Measu
 
 
 def failure(status: int) -> MeasurementMessage:
-    """Make the answer of an authors' node that reports an error."""
+    """Return the message of an authors' node that reports an error."""
     return replace(
         message(0, status=status), zenith_angle_rad=-1.0, horizontal_angle_rad=-1.0, slope_distance_m=-1.0
     )
 
 
 class Master:
-    """One station's intake, polled at instants that count from the start, in ms."""
+    """Ingest of one station, polled at instants in ms from the start."""
 
     def __init__(self, *, synchronised: bool = True) -> None:
         self.ingest = Ingest({1: 4}, lambda: clock_filter("regression"))
@@ -69,12 +69,12 @@ class Master:
             self.synchronise(0)
 
     def synchronise(self, at_ms: int, ahead_ns: int = AHEAD_NS, *, late_ns: int = 0) -> SynchronisationResult:
-        """Take a synchronisation whose last exchange ends at an instant."""
+        """Pass a synchronisation whose last exchange ends at an instant."""
         at_ns = START + at_ms * MS
         return self.ingest.synchronised(1, samples(at_ns, ahead_ns, late_ns=late_ns), at_ns)
 
     def poll(self, at_ms: int, answer: MeasurementMessage) -> PollResult:
-        """Take an answer that has been received at an instant, 194 ms after the request for it began."""
+        """Pass a reply that is received at an instant, 194 ms after the start of its request."""
         received_ns = START + at_ms * MS
         return self.ingest.reply(answer, requested_ns=received_ns - 194 * MS, received_ns=received_ns)
 
@@ -117,11 +117,11 @@ def test_error_without_a_time_is_reported_once_per_change() -> None:
     """Its stamp is the arrival, with a large sigma; it is no sign of a clock step."""
     master = Master()
     results = [master.poll(1000 * n, failure(status)) for n, status in enumerate((1, 1, 2, 2, 2, 1), start=1)]
-    told = [result.measurement for result in results if result.measurement is not None]
-    assert [m.status for m in told] == [Status.TILT, Status.WRONG_DISTANCE, Status.TILT]
-    assert [m.stamp_ns - START for m in told] == [1000 * MS, 3000 * MS, 6000 * MS]
-    assert {m.stamp_sigma_ns for m in told} == {UNTIMED_SIGMA_NS}
-    assert {m.slope_distance_m for m in told} == {None}
+    reported = [result.measurement for result in results if result.measurement is not None]
+    assert [m.status for m in reported] == [Status.TILT, Status.WRONG_DISTANCE, Status.TILT]
+    assert [m.stamp_ns - START for m in reported] == [1000 * MS, 3000 * MS, 6000 * MS]
+    assert {m.stamp_sigma_ns for m in reported} == {UNTIMED_SIGMA_NS}
+    assert {m.slope_distance_m for m in reported} == {None}
     assert not any(result.stepped for result in results)
 
 
@@ -159,7 +159,7 @@ def test_measurements_after_a_step_are_held(step_s: float) -> None:
     assert master.ingest.clock(1, START + 3000 * MS) is None
     found = master.synchronise(4500, AHEAD_NS + step_ns)
     assert found.record.restarted
-    assert not found.stepped  # it has been told
+    assert not found.stepped  # already reported
     assert [round((m.stamp_ns - START) / MS) for m in found.measurements] == list(made_ms)
     assert [m.sequence for m in found.measurements] == [1, 2, 3]
     assert master.poll(5000, message(START + 4900 * MS + AHEAD_NS + step_ns)).measurement is not None

@@ -15,20 +15,20 @@ TURNAROUND_NS = 1_500_000
 
 
 class Master:
-    """One station's intake, at instants that count from the start in s."""
+    """Ingest of one station, at instants in s from the start."""
 
     def __init__(self, filter_name: str = "regression") -> None:
         self.ingest = Ingest({1: 4}, lambda: clock_filter(filter_name))  # type: ignore[arg-type]
         self.ahead_ns = 0
 
     def synchronise(self, at_s: float, *, cycles: int = 5) -> list[tuple[int, int | None]]:
-        """Exchange packets from an instant on; return stamp and bound of what was held until then, in ns."""
+        """Synchronise from an instant on; return stamp and bound of the released measurements, in ns."""
         samples = synchronisation(at_s, lambda _: self.ahead_ns, cycles=cycles, turnaround_ns=TURNAROUND_NS)
         found = self.ingest.synchronised(1, samples, samples[-1].received_ns)
         return [(m.stamp_ns, m.stamp_bound_ns) for m in found.measurements]
 
     def restart(self, at_s: float, step_ns: int) -> None:
-        """Start the station's program again, with a clock that is ahead by so much more; it says so."""
+        """Restart the station with a clock step, which it reports."""
         self.ahead_ns += step_ns
         now_ns = START_NS + round(at_s * SECOND)
         self.ingest.no_response(1)
@@ -40,7 +40,7 @@ class Master:
     def poll(
         self, at_s: float, *, made_s: float | None = None, status: int = 0
     ) -> tuple[int, int | None] | None:
-        """Ask for a measurement, made then or 50 ms before the request; return its stamp and bound, in ns."""
+        """Poll a measurement, made at an instant or 50 ms before the request; return its stamp and bound, in ns."""
         received_ns = START_NS + round(at_s * SECOND)
         made_ns = received_ns - 244 * MS if made_s is None else START_NS + round(made_s * SECOND)
         message = MeasurementMessage(
@@ -78,15 +78,15 @@ def test_two_small_steps_are_not_taken_for_a_skew(first_ms: float, second_ms: fl
 
 def test_regression_does_not_span_a_restart() -> None:
     """The known skew remains a prior."""
-    through, anew = RegressionFilter(), RegressionFilter()
-    for clock in (through, anew):
+    through, restarted = RegressionFilter(), RegressionFilter()
+    for clock in (through, restarted):
         clock.update(synchronisation(0, lambda _: 0.0, cycles=50, turnaround_ns=TURNAROUND_NS))
     stepped = synchronisation(30, lambda _: 1.0 * MS, turnaround_ns=TURNAROUND_NS)
     through.update(stepped)
-    assert not anew.update(stepped, may_have_restarted=True).restarted  # as far as exchanges tell
+    assert not restarted.update(stepped, may_have_restarted=True).restarted  # as far as exchanges tell
     at_ns = stepped[-1].station_ns
     assert abs(through.at(at_ns).skew_ppm) > 20
-    assert abs(anew.at(at_ns).skew_ppm) < 2
+    assert abs(restarted.at(at_ns).skew_ppm) < 2
 
 
 @pytest.mark.parametrize("apart_s", [28, 60])
@@ -112,13 +112,13 @@ def test_unnoticed_restart_before_the_first_measurement_is_handled(apart_s: int)
 
 def test_papers_filter_ignores_restarts() -> None:
     """As in the paper."""
-    plain, anew = clock_filter("paper"), clock_filter("paper")
-    for clock in (plain, anew):
+    plain, restarted = clock_filter("paper"), clock_filter("paper")
+    for clock in (plain, restarted):
         clock.update(synchronisation(0, lambda _: 0.0))
     stepped = synchronisation(30, lambda _: 1.0 * MS)
     plain.update(stepped)
-    anew.update(stepped, may_have_restarted=True)
-    assert plain.at(stepped[-1].station_ns) == anew.at(stepped[-1].station_ns)
+    restarted.update(stepped, may_have_restarted=True)
+    assert plain.at(stepped[-1].station_ns) == restarted.at(stepped[-1].station_ns)
 
 
 def test_measurement_with_a_suspended_clock_is_held() -> None:
@@ -150,7 +150,7 @@ def test_authors_node_errors_are_recognised_by_their_status() -> None:
     """Their time is constant and meaningless."""
     master = Master()
     master.synchronise(0)
-    told = []
+    reported = []
     for number, status in enumerate((1, 2, 2, 1)):
         received_ns = START_NS + (2 + number) * SECOND
         message = MeasurementMessage(
@@ -162,5 +162,5 @@ def test_authors_node_errors_are_recognised_by_their_status() -> None:
             time_ns=12_345 * SECOND,
         )
         result = master.ingest.reply(message, requested_ns=received_ns - 194 * MS, received_ns=received_ns)
-        told.append(None if result.measurement is None else result.measurement.raw_status)
-    assert told == [1, 2, None, 1]
+        reported.append(None if result.measurement is None else result.measurement.raw_status)
+    assert reported == [1, 2, None, 1]

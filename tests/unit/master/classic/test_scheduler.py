@@ -33,7 +33,7 @@ PAPERS = SynchronisationSchedule(initial_cycles=50, resync_cycles=5, interval_ns
 
 @dataclass
 class Channel:
-    """Carries turns out: stations answer, are dead, refuse orders, give no stamps, or leave their clock open."""
+    """Executes transactions: stations respond, are dead, refuse commands, give no samples, or are inconclusive."""
 
     schedule: SynchronisationSchedule = PAPERS
     stations: int = 3
@@ -42,7 +42,7 @@ class Channel:
     refusing: set[int] = field(default_factory=set)
     stampless: set[int] = field(default_factory=set)
     inconclusive: set[int] = field(default_factory=set)
-    turns: list[tuple[int, ScheduledTransaction]] = field(default_factory=list)
+    transactions: list[tuple[int, ScheduledTransaction]] = field(default_factory=list)
     spent_ns: Counter[int] = field(default_factory=Counter)
 
     def __post_init__(self) -> None:
@@ -54,45 +54,51 @@ class Channel:
         )
 
     def run(self, until_s: float) -> None:
-        """Take turns until an instant."""
+        """Run transactions until an instant."""
         while self.now_ns < until_s * SECOND:
-            turn = self.scheduler.next(self.now_ns)
-            if isinstance(turn, int):
-                assert turn > self.now_ns
-                self.now_ns = turn
+            transaction = self.scheduler.next(self.now_ns)
+            if isinstance(transaction, int):
+                assert transaction > self.now_ns
+                self.now_ns = transaction
                 continue
-            self.turns.append((self.now_ns, turn))
-            took_ns = self._carry_out(turn)
-            self.spent_ns[turn.station] += took_ns
+            self.transactions.append((self.now_ns, transaction))
+            took_ns = self._execute(transaction)
+            self.spent_ns[transaction.station] += took_ns
             self.now_ns += took_ns
-            self.scheduler.finished(turn, self.now_ns)
-            if isinstance(turn, Synchronisation) and turn.station in self.inconclusive:
-                self.scheduler.synchronisation_inconclusive(turn.station, self.now_ns)
+            self.scheduler.finished(transaction, self.now_ns)
+            if isinstance(transaction, Synchronisation) and transaction.station in self.inconclusive:
+                self.scheduler.synchronisation_inconclusive(transaction.station, self.now_ns)
 
-    def _carry_out(self, turn: ScheduledTransaction) -> int:
-        dead = turn.station in self.dead
-        if isinstance(turn, CommandTransaction):
-            turn.ok = None if dead else turn.station not in self.refusing
+    def _execute(self, transaction: ScheduledTransaction) -> int:
+        dead = transaction.station in self.dead
+        if isinstance(transaction, CommandTransaction):
+            transaction.ok = None if dead else transaction.station not in self.refusing
             return 10 * SECOND if dead else 500 * MS
-        if isinstance(turn, Poll):
-            turn.message = None if dead else no_measurement_yet(turn.station)
+        if isinstance(transaction, Poll):
+            transaction.message = None if dead else no_measurement_yet(transaction.station)
             return TIMEOUT_NS if dead else POLL_NS
-        turn.has_reply = not dead
+        transaction.has_reply = not dead
         if dead:
             return FRAME_NS + 3 * TIMEOUT_NS
-        if turn.station in self.stampless:
-            return FRAME_NS + 2 * turn._cycles * CYCLE_NS
-        turn.samples = [SAMPLE] * turn._cycles
-        return FRAME_NS + turn._cycles * CYCLE_NS
+        if transaction.station in self.stampless:
+            return FRAME_NS + 2 * transaction._cycles * CYCLE_NS
+        transaction.samples = [SAMPLE] * transaction._cycles
+        return FRAME_NS + transaction._cycles * CYCLE_NS
 
     def of(self, kind: type[Any], *, since_s: float = 0) -> list[tuple[int, Any]]:
-        """Return turns of a kind with their instants."""
-        return [(at, turn) for at, turn in self.turns if isinstance(turn, kind) and at >= since_s * SECOND]
+        """Return transactions of a kind with their instants."""
+        return [
+            (at, transaction)
+            for at, transaction in self.transactions
+            if isinstance(transaction, kind) and at >= since_s * SECOND
+        ]
 
     def rate_hz(self, station: int, since_s: float) -> float:
         """How often a station was polled with success."""
         polls = [
-            turn for _, turn in self.of(Poll, since_s=since_s) if turn.station == station and turn.has_reply
+            transaction
+            for _, transaction in self.of(Poll, since_s=since_s)
+            if transaction.station == station and transaction.has_reply
         ]
         return len(polls) / (self.now_ns / SECOND - since_s)
 
@@ -101,10 +107,10 @@ def test_stations_are_commanded_synchronised_and_polled() -> None:
     """All are synchronised before the first poll."""
     channel = Channel()
     channel.run(60)
-    kinds = [(type(turn), turn.station) for _, turn in channel.turns[:9]]
+    kinds = [(type(transaction), transaction.station) for _, transaction in channel.transactions[:9]]
     assert kinds == [(kind, n) for kind in (CommandTransaction, Synchronisation, Poll) for n in (1, 2, 3)]
     assert channel.of(CommandTransaction)[0][1]._command.to_bytes() == b"n14"
-    assert [turn._cycles for _, turn in channel.of(Synchronisation)[:3]] == [50, 50, 50]
+    assert [transaction._cycles for _, transaction in channel.of(Synchronisation)[:3]] == [50, 50, 50]
 
 
 def test_three_stations_get_the_channel_capacity() -> None:
@@ -113,15 +119,17 @@ def test_three_stations_get_the_channel_capacity() -> None:
     channel.run(700)
     for station in (1, 2, 3):
         assert channel.rate_hz(station, 100) == pytest.approx(SECOND / POLL_NS / 3, rel=0.05)
-    assert all(turn.station == place % 3 + 1 for place, (_, turn) in enumerate(channel.turns))
+    assert all(
+        transaction.station == place % 3 + 1 for place, (_, transaction) in enumerate(channel.transactions)
+    )
 
 
 def test_synchronisations_are_staggered_evenly() -> None:
     """After the first minutes each station has its own every 300 s, 100 s after the one before it."""
     channel = Channel()
     channel.run(3000)
-    later = [(at, turn.station) for at, turn in channel.of(Synchronisation, since_s=700)]
-    assert [turn._cycles for _, turn in channel.of(Synchronisation, since_s=100)] == [5] * len(
+    later = [(at, transaction.station) for at, transaction in channel.of(Synchronisation, since_s=700)]
+    assert [transaction._cycles for _, transaction in channel.of(Synchronisation, since_s=100)] == [5] * len(
         channel.of(Synchronisation, since_s=100)
     )
     for (one_ns, one), (other_ns, other) in pairwise(later):
@@ -155,7 +163,7 @@ def test_absent_station_gets_a_twentieth_of_the_time() -> None:
     """Its synchronisations fail at growing intervals."""
     channel = Channel(dead={2})
     channel.run(60)
-    assert not [turn for _, turn in channel.of(Poll) if turn.station == 2]
+    assert not [transaction for _, transaction in channel.of(Poll) if transaction.station == 2]
     spent_ns = channel.spent_ns[2]
     channel.run(660)
     assert (channel.spent_ns[2] - spent_ns) / (600 * SECOND) < 0.055
@@ -163,7 +171,9 @@ def test_absent_station_gets_a_twentieth_of_the_time() -> None:
     channel.run(720)
     assert channel.rate_hz(2, 690) > 1.5
     back = [
-        turn for _, turn in channel.of(Synchronisation, since_s=660) if turn.station == 2 and turn.samples
+        transaction
+        for _, transaction in channel.of(Synchronisation, since_s=660)
+        if transaction.station == 2 and transaction.samples
     ]
     assert back[0]._cycles == 5  # the others do not wait 12 s for it
 
@@ -190,7 +200,7 @@ def test_lost_packet_causes_no_back_off() -> None:
     channel.run(60.5)
     channel.dead.clear()
     channel.run(70)
-    assert [turn.station for _, turn in channel.of(Poll)[-9:]] in (
+    assert [transaction.station for _, transaction in channel.of(Poll)[-9:]] in (
         [1, 2, 3] * 3,
         [2, 3, 1] * 3,
         [3, 1, 2] * 3,
@@ -203,8 +213,10 @@ def test_failed_poll_is_repeated_once() -> None:
     channel.run(60)
     channel.dead.add(2)
     channel.run(62)
-    stations = [turn.station for _, turn in channel.of(Poll)]
-    unanswered = next(place for place, (_, turn) in enumerate(channel.of(Poll)) if not turn.has_reply)
+    stations = [transaction.station for _, transaction in channel.of(Poll)]
+    unanswered = next(
+        place for place, (_, transaction) in enumerate(channel.of(Poll)) if not transaction.has_reply
+    )
     assert stations[unanswered : unanswered + 4] == [2, 2, 3, 1]
 
 
@@ -212,20 +224,20 @@ def test_refusing_station_is_commanded_again_and_never_polled() -> None:
     """In direct mode a poll would be a command to measure; commands back off."""
     channel = Channel(refusing={3})
     channel.run(300)
-    assert not [turn for _, turn in channel.of(Poll) if turn.station == 3]
-    orders_ns = [at for at, turn in channel.of(CommandTransaction) if turn.station == 3]
+    assert not [transaction for _, transaction in channel.of(Poll) if transaction.station == 3]
+    orders_ns = [at for at, transaction in channel.of(CommandTransaction) if transaction.station == 3]
     gaps_ns = [b - a for a, b in pairwise(orders_ns[2:])]
     assert gaps_ns[-1] > 9 * SECOND
     channel.refusing.clear()
     channel.run(330)
-    assert [turn for _, turn in channel.of(Poll) if turn.station == 3]
+    assert [transaction for _, transaction in channel.of(Poll) if transaction.station == 3]
 
 
 def test_lost_command_after_refusals_causes_no_long_back_off() -> None:
     """Refusals cost little, a lost packet much."""
     channel = Channel(stations=1, refusing={1})
     channel.run(20)
-    assert [turn.ok for _, turn in channel.of(CommandTransaction)[:5]] == [False] * 5
+    assert [transaction.ok for _, transaction in channel.of(CommandTransaction)[:5]] == [False] * 5
     lost = channel.scheduler.next(channel.now_ns)
     assert isinstance(lost, CommandTransaction)
     channel.scheduler.finished(lost, channel.now_ns + SECOND)
@@ -238,13 +250,13 @@ def test_reset_clock_is_synchronised_first() -> None:
     channel.run(90)
     channel.scheduler.resynchronise(2, channel.now_ns)
     channel.run(92)
-    first, second = [turn for at, turn in channel.turns if at >= 90 * SECOND][:2]
+    first, second = [transaction for at, transaction in channel.transactions if at >= 90 * SECOND][:2]
     assert isinstance(first, CommandTransaction)
     assert isinstance(second, Synchronisation)
     assert first.station == second.station == 2
     channel.run(400)
     following = [at / SECOND for at, t in channel.of(Synchronisation, since_s=91) if t.station == 2]
-    assert following[0] < 190  # its frequency is learnt anew
+    assert following[0] < 190  # its skew is estimated again
 
 
 def test_inconclusive_synchronisation_is_repeated_at_once() -> None:
@@ -252,14 +264,14 @@ def test_inconclusive_synchronisation_is_repeated_at_once() -> None:
     channel = Channel(inconclusive={2})
     channel.run(44)
     channel.inconclusive.clear()
-    kinds = [type(turn) for _, turn in channel.turns if turn.station == 2]
+    kinds = [type(transaction) for _, transaction in channel.transactions if transaction.station == 2]
     assert kinds[:4] == [CommandTransaction, Synchronisation] * 2
     channel.run(100)
     assert channel.rate_hz(2, 80) == pytest.approx(channel.rate_hz(1, 80), rel=0.1)
 
 
 def share_of_2(channel: Channel) -> float:
-    """Return which part of the time station 2 takes in the quarter of an hour from the third minute on."""
+    """Return the share of the time that station 2 takes in the quarter of an hour from the third minute on."""
     channel.run(180)
     spent_ns = channel.spent_ns[2]
     channel.run(1080)
@@ -290,8 +302,8 @@ def test_separate_inconclusive_synchronisations_do_not_back_off() -> None:
         before_ns = channel.now_ns
         channel.scheduler.synchronisation_inconclusive(2, before_ns)
         channel.run(until_s)
-        at_once = [turn for at, turn in channel.turns if at >= before_ns][:2]
-        assert [(type(turn), turn.station) for turn in at_once] == [
+        at_once = [transaction for at, transaction in channel.transactions if at >= before_ns][:2]
+        assert [(type(transaction), transaction.station) for transaction in at_once] == [
             (CommandTransaction, 2),
             (Synchronisation, 2),
         ]
@@ -310,8 +322,11 @@ def test_late_confirmation_is_not_attributed_to_another_station() -> None:
     """While a station may still respond, the others have to confirm twice."""
     channel = Channel(stations=2, dead={1})
     channel.run(40)
-    assert len([turn for _, turn in channel.of(CommandTransaction) if turn.station == 2]) == 2
-    assert [turn for _, turn in channel.of(Synchronisation) if turn.station == 2]
+    assert (
+        len([transaction for _, transaction in channel.of(CommandTransaction) if transaction.station == 2])
+        == 2
+    )
+    assert [transaction for _, transaction in channel.of(Synchronisation) if transaction.station == 2]
 
 
 def test_idle_channel_has_a_deadline() -> None:
@@ -327,4 +342,4 @@ def test_aborted_transaction_is_repeated() -> None:
     first = channel.scheduler.next(0)
     assert isinstance(first, CommandTransaction)
     channel.run(60)
-    assert [turn.station for _, turn in channel.of(CommandTransaction)] == [2, 3, 1]
+    assert [transaction.station for _, transaction in channel.of(CommandTransaction)] == [2, 3, 1]

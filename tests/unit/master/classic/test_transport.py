@@ -37,7 +37,7 @@ class ScriptedTransaction(Transaction):
         return self.requests.pop(0) if self.requests else None
 
     def accept_reply(self, payload: bytes, *, sent_ns: int, received_ns: int, exact: bool) -> bool:
-        """Take what begins with e."""
+        """Accept payloads that begin with e."""
         if payload[:1] != b"e":
             self.refused.append(payload)
             return False
@@ -50,12 +50,12 @@ class ScriptedTransaction(Transaction):
 
 
 def transport_on(both: Bench) -> Transport:
-    """Make one on the bench's first radio."""
+    """Return a transport on the bench's first radio."""
     return Transport(both.here.radio, both.clock, TIMELINE, TIMING)
 
 
 async def answer(both: Bench, replies: Sequence[tuple[int, bytes]]) -> None:
-    """Send replies, each so many ms after the request; the other side's radio."""
+    """Send replies with the other radio, each with its delay in ms after the request."""
     packet = await both.there.radio.receive()
     for after_ms, payload in replies:
         await both.there.radio.transmit(payload, at_ns=packet.received_at_ns + after_ms * MS)

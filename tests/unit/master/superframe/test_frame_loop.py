@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class CallLog:
-    """A listener that writes down what it is told."""
+    """An observer that logs its calls."""
 
     calls: list[str] = field(default_factory=list)
     sent_ns: list[int] = field(default_factory=list)
@@ -44,21 +44,21 @@ class CallLog:
         await asyncio.sleep(self.ready_after_s)
 
     def composing(self) -> None:
-        """Note it."""
+        """Log it."""
         self.calls.append("composing")
 
     def beacon_sent(self, sent: Transmission) -> None:
-        """Note it."""
+        """Log it."""
         self.calls.append("beacon")
         self.sent_ns.append(sent.done_at_ns)
 
     def received(self, reply: ReceivedReply, packet: Packet) -> None:
-        """Note who."""
+        """Log the station."""
         assert packet.payload
         self.calls.append(f"received {reply.station}")
 
     def not_received(self, stations: Sequence[int]) -> None:
-        """Note who."""
+        """Log the station."""
         self.calls.append(f"not received {list(stations)}")
 
 
@@ -78,7 +78,7 @@ class LateLock:
 
 
 def master_on(both: Bench, *, late: bool = False) -> SuperframeMaster:
-    """Make a master of two stations."""
+    """Return a master of two stations."""
     lock = LateLock() if late else None
     return SuperframeMaster(
         {1: 1, 2: 2},
@@ -135,7 +135,7 @@ async def test_frame_without_replies_ends_with_its_last_slot() -> None:
             await asyncio.sleep(2)
     assert call_log.calls[:6] == ["composing", "beacon", "not received [1, 2]"] * 2
     slots_ns = 2 * (TIMING.airtime_ns(44) + TIMING.guard_ns) + TIMING.turnaround_ns
-    session_bytes = 25  # of a beacon that tells two stations how to join
+    session_bytes = 25  # of a beacon with session item
     first_ns = call_log.sent_ns[1] - call_log.sent_ns[0] - TIMING.airtime_ns(session_bytes)
     assert first_ns == pytest.approx(slots_ns, abs=8 * MS)
 

@@ -46,12 +46,12 @@ SECOND = 1000 * MS
 
 
 def events(field: Field) -> list[str]:
-    """Names of the events so far, with the station that each is about."""
+    """Return the names of the events so far, with their stations."""
     return [f"{e.event} {e.station or ''}".strip() for e in field.of(EventRecord)]
 
 
 def station_status(field: Field, station: int) -> StationStatus:
-    """Return what the last status says of a station."""
+    """Return the last status of a station."""
     return field.of(StatusRecord)[-1].stations[station - 1]
 
 
@@ -351,16 +351,16 @@ async def test_lost_prism_gets_search_commands(tmp_path: Path) -> None:
         async with field_of(tmp_path, scene, superframe=True) as field, running(field.master()):
             tool = field.stations[2].instrument
             await asyncio.sleep(20)
-            assert tool.sought == []
+            assert tool.searches == []
             tool.status = Status.NO_TARGET
             await asyncio.sleep(14)
             tool.status = Status.OK
             await asyncio.sleep(20)
-    assert len(tool.sought) == 3
-    assert field.stations[1].instrument.sought == field.stations[3].instrument.sought == []
-    after_s = [at_ns / SECOND - 20 for at_ns, _ in tool.sought]
+    assert len(tool.searches) == 3
+    assert field.stations[1].instrument.searches == field.stations[3].instrument.searches == []
+    after_s = [at_ns / SECOND - 20 for at_ns, _ in tool.searches]
     assert after_s == pytest.approx([2.6, 7.8, 13.0], abs=0.4)
-    for at_ns, towards in tool.sought:
+    for at_ns, towards in tool.searches:
         assert towards.spread_rad < math.radians(5)
         for ahead_s in (0.0, 1.0):
             true = scene.measure(2, at_ns / SECOND + ahead_s)
@@ -383,7 +383,7 @@ async def test_search_commands_do_not_delay_others(tmp_path: Path) -> None:
             await asyncio.sleep(40)
             field.stations[2].instrument.status = Status.NO_TARGET
             await asyncio.sleep(40)
-        assert len(field.stations[2].instrument.sought) == 6
+        assert len(field.stations[2].instrument.searches) == 6
     middle_ns = START + 40 * SECOND
     lengths_ms = [
         (after.stamp_ns - before.stamp_ns) / MS
@@ -411,7 +411,7 @@ async def test_station_in_direct_mode_gets_no_search_command(tmp_path: Path) -> 
         field.stations[1].start()
         await asyncio.sleep(20)
         assert station_status(field, 1).status is Status.NO_TARGET
-        assert tool.sought == []
+        assert tool.searches == []
         assert "station_not_tracking 1" in events(field)
 
 
@@ -422,7 +422,7 @@ async def test_refused_search_is_no_refusal_to_track(tmp_path: Path) -> None:
         await asyncio.sleep(10)
         tool.status, tool.refuses = Status.NO_TARGET, True
         await asyncio.sleep(10)
-    assert len(tool.sought) == 2
+    assert len(tool.searches) == 2
     assert events(field) == ["instrument_status 3"]
 
 
@@ -439,10 +439,10 @@ async def test_expired_search_command_is_withdrawn(tmp_path: Path) -> None:
         with capture_logs() as logs:
             await asyncio.sleep(20)
         assert [log["event"] for log in logs].count("search_commanded") == 1
-        assert tool.sought == []
+        assert tool.searches == []
         link.set_attenuation("master", "station-3", 0)
         await asyncio.sleep(5)
-    ((at_ns, towards),) = tool.sought
+    ((at_ns, towards),) = tool.searches
     true = driven.measure(3, at_ns / SECOND)
     aside_rad = math.remainder(towards.horizontal_angle_rad - true.horizontal_angle_rad, math.tau)
     assert abs(aside_rad) < towards.spread_rad
@@ -452,7 +452,7 @@ async def test_expired_search_command_is_withdrawn(tmp_path: Path) -> None:
 
 
 class _Seventies:
-    """The true time on a computer that believed to be in 1970 when it started, half a minute ago."""
+    """The true time on a computer whose clock showed 1970 at its start, half a minute ago."""
 
     def __init__(self) -> None:
         self.monotonic_ns = TRUE.monotonic_ns

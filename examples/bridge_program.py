@@ -40,7 +40,7 @@ def rows_of(path: str) -> Iterable[Row]:
     return itertools.cycle(rows)
 
 
-def say(record: dict[str, Any]) -> None:
+def send(record: dict[str, Any]) -> None:
     """Print a line and flush the output, which is buffered otherwise."""
     print(json.dumps(record), flush=True)
 
@@ -69,7 +69,7 @@ def main() -> None:
     rows = iter(rows_of(sys.argv[1]) if len(sys.argv) > 1 else circling())
     commands: queue.Queue[dict[str, Any] | None] = queue.Queue()
     threading.Thread(target=listen, args=(commands,), daemon=True).start()
-    say(
+    send(
         {
             "type": "hello",
             "bridge": 1,
@@ -79,7 +79,7 @@ def main() -> None:
             "commands": ["track", "direct", "measure"],
         }
     )
-    say({"type": "settings", "prism_type": "360", "prism_constant_m": 0.0})
+    send({"type": "settings", "prism_type": "360", "prism_constant_m": 0.0})
     prism: int | None = None
     next_ns = time.monotonic_ns()
     while True:
@@ -89,15 +89,15 @@ def main() -> None:
             next_ns += PERIOD_NS
             row = next(rows)
             if prism is not None:
-                say({"type": "measurement", "prism": prism} | measured(row))
+                send({"type": "measurement", "prism": prism} | measured(row))
             continue
         if command is None:
             return
         if command["type"] == "measure":
-            say({"type": "shot", "id": command["id"]} | measured(next(rows)))
+            send({"type": "shot", "id": command["id"]} | measured(next(rows)))
             continue
         prism = command["prism"] if command["type"] == "track" else None
-        say({"type": "done", "id": command["id"]})
+        send({"type": "done", "id": command["id"]})
 
 
 if __name__ == "__main__":

@@ -40,7 +40,7 @@ class FakeProgram:
         self.on_command: Callable[[dict[str, Any]], None] = self.done
         self.ended = False
 
-    def say(self, *records: dict[str, Any] | bytes) -> None:
+    def print_lines(self, *records: dict[str, Any] | bytes) -> None:
         """Print lines in one piece."""
         self.print(b"".join(_line(record) + b"\n" for record in records))
 
@@ -51,7 +51,7 @@ class FakeProgram:
 
     def measure(self, distance_m: float = 10.0, **more: Any) -> None:
         """Print a measurement of this moment."""
-        self.say(self.measurement(distance_m, **more))
+        self.print_lines(self.measurement(distance_m, **more))
 
     def measurement(self, distance_m: float = 10.0, **more: Any) -> dict[str, Any]:
         """Return the line of a measurement of this moment."""
@@ -60,7 +60,7 @@ class FakeProgram:
 
     def done(self, command: dict[str, Any], error: str = "") -> None:
         """Respond to a command."""
-        self.say({"type": "done", "id": command["id"], "error": error})
+        self.print_lines({"type": "done", "id": command["id"], "error": error})
 
     def exit(self, how: str = "exit status 1") -> None:
         """End."""
@@ -98,7 +98,7 @@ class FakeStart:
         del command
         program = FakeProgram(listener, self._clock)
         self.programs.append(program)
-        program.say(*self._first_lines)
+        program.print_lines(*self._first_lines)
         return program
 
 
@@ -142,7 +142,7 @@ class _Serving:
     async def _run(self) -> None:
         try:
             name = await self._instrument.connect()
-            self._say(HELLO | {"make": name, "commands": COMMANDS})
+            self._print(HELLO | {"make": name, "commands": COMMANDS})
             while True:
                 command = json.loads(await self._commands.get())
                 if command["type"] != "atmosphere":
@@ -168,16 +168,16 @@ class _Serving:
                     await instrument.direct()
                 case {"type": "measure", "id": number}:
                     measured = _fields(await instrument.measure())
-                    self._say({"type": "shot", "id": number} | measured)
+                    self._print({"type": "shot", "id": number} | measured)
                     return
                 case {"type": "atmosphere", "temperature_c": temperature_c, "pressure_hpa": pressure_hpa}:
                     await instrument.set_atmosphere(
                         Atmosphere(temperature_c=temperature_c, pressure_hpa=pressure_hpa)
                     )
         except InstrumentError as error:
-            self._say({"type": "done", "id": command["id"], "error": str(error)})
+            self._print({"type": "done", "id": command["id"], "error": str(error)})
             return
-        self._say({"type": "done", "id": command["id"]})
+        self._print({"type": "done", "id": command["id"]})
         if tracked:
             self._reading = asyncio.create_task(self._read())
 
@@ -185,7 +185,7 @@ class _Serving:
         try:
             while True:
                 reading = await self._instrument.read()
-                self._say({"type": "measurement", "prism": reading.prism} | _fields(reading))
+                self._print({"type": "measurement", "prism": reading.prism} | _fields(reading))
         except InstrumentError as error:
             self._listener.exited(f"exit status 1: {error}")
 
@@ -196,7 +196,7 @@ class _Serving:
             with suppress(asyncio.CancelledError):
                 await task
 
-    def _say(self, record: dict[str, Any]) -> None:
+    def _print(self, record: dict[str, Any]) -> None:
         self._listener.output_received(_line(record) + b"\n", self._clock.monotonic_ns())
 
 

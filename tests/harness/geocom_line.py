@@ -36,7 +36,7 @@ def checksum_of(text: str) -> int:
     return sum(bit << place for place, bit in enumerate(bits[-16:]))
 
 
-def answered(line: str) -> list[tuple[float, bytes]]:
+def intact(line: str) -> list[tuple[float, bytes]]:
     """Send the reply."""
     return [(REPLY_S, line.encode() + b"\r\n")]
 
@@ -53,7 +53,7 @@ def late(seconds: float) -> Fault:
 
 def doubled(line: str) -> list[tuple[float, bytes]]:
     """Send the reply twice."""
-    return [*answered(line), (REPLY_S + 0.001, line.encode() + b"\r\n")]
+    return [*intact(line), (REPLY_S + 0.001, line.encode() + b"\r\n")]
 
 
 def torn(place: int, pause_s: float = 0.05) -> Fault:
@@ -80,12 +80,12 @@ def damaged(line: str) -> list[tuple[float, bytes]]:
 
 def garbage_before(garbage: bytes) -> Fault:
     """Send garbage before the reply."""
-    return lambda line: [(REPLY_S / 2, garbage), *answered(line)]
+    return lambda line: [(REPLY_S / 2, garbage), *intact(line)]
 
 
 def not_taken(com_code: int) -> Fault:
     """Execute nothing: the request and its transaction were not understood."""
-    return lambda _: answered(f"%R1P,{com_code},0:0")
+    return lambda _: intact(f"%R1P,{com_code},0:0")
 
 
 @dataclass
@@ -128,7 +128,7 @@ class FakeInstrument:
         if self.checksums:
             head, body = reply.split(":", 1)
             reply = f"{head},{checksum_of(reply)}:{body}"
-        fault = self.faults.popleft() if self.faults else answered
+        fault = self.faults.popleft() if self.faults else intact
         return fault(reply)
 
     @property

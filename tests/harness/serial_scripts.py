@@ -188,12 +188,12 @@ def _same(offered: ReportedDistance, reading: Reading) -> bool:
 def all_scripts() -> list[Script]:
     """Return the two hundred scripts, grouped by kind; the same in every run."""
     kinds: list[tuple[int, str, float, Callable[[Bench], Awaitable[None]], bool]] = [
-        *((8, f"answers {fault}", 3.0, partial(_spoil, (fault,), 0.1), False) for fault in _LINE_FAULTS),
+        *((8, f"replies {fault}", 3.0, partial(_spoil, (fault,), 0.1), False) for fault in _LINE_FAULTS),
         (16, "all of these", 3.0, partial(_spoil, _LINE_FAULTS, 0.05), False),
         (16, "all of these, with checksums", 3.0, partial(_spoil, _LINE_FAULTS, 0.05), True),
-        (8, "answers with other digits, with checksums", 3.0, _change_digits, True),
+        (8, "replies with other digits, with checksums", 3.0, _change_digits, True),
         *((4, f"codes of {name}", 3.0, partial(_force, codes), False) for name, codes in _families().items()),
-        (12, "no answers", 5.0, partial(_silence, "drop_responses"), False),
+        (12, "no replies", 5.0, partial(_silence, "drop_responses"), False),
         (8, "nothing reaches the instrument", 5.0, partial(_silence, "drop_requests"), False),
         (20, "unplugged", 3.0, _unplug, False),
         (12, "switched off and on, locked by hand", 3.0, _switch_off, False),

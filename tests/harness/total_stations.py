@@ -63,9 +63,9 @@ class Bench:
         """Send a request and return its reply."""
         self._asked += 1
         text = ",".join(str(parameter) for parameter in parameters)
-        answer = await self.type(f"%R1Q,{rpc},{self._asked}:{text}\r\n".encode())
-        assert answer.transaction == self._asked
-        return answer
+        reply = await self.type(f"%R1Q,{rpc},{self._asked}:{text}\r\n".encode())
+        assert reply.transaction == self._asked
+        return reply
 
     async def type(self, data: bytes) -> RawReply:
         """Send data and return the next line."""
@@ -99,8 +99,8 @@ class Bench:
         """Send requests, all of which must succeed."""
         for rpc, *parameters in requests:
             assert isinstance(rpc, int)
-            answer = await self.ask(rpc, *parameters)
-            assert (answer.com_code, answer.code) == (0, 0), (rpc, parameters, answer)
+            reply = await self.ask(rpc, *parameters)
+            assert (reply.com_code, reply.code) == (0, 0), (rpc, parameters, reply)
 
     async def quiet(self, seconds: float) -> bool:
         """Return whether nothing arrives for a duration."""

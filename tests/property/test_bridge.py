@@ -53,7 +53,7 @@ lines = st.tuples(
 
 @given(st.sampled_from(STAMPS), st.lists(lines, max_size=20), st.binary(max_size=20))
 def test_readings_are_plausible(
-    stamps: str, said: list[tuple[str, dict[str, Any], int, int | None]], garbage: bytes
+    stamps: str, printed: list[tuple[str, dict[str, Any], int, int | None]], garbage: bytes
 ) -> None:
     """No line raises; every usable reading has valid angles, distance and time, each time once."""
     readings: deque[Reading] = deque()
@@ -64,7 +64,7 @@ def test_readings_are_plausible(
         now_ns = 20 * 10**9
         run.output_received(json.dumps(HELLO | {"stamps": stamps}).encode() + b"\n", now_ns)
         run.set_tracking(1)
-        for kind, wrong, after_ns, age_ns in said:
+        for kind, wrong, after_ns, age_ns in printed:
             record = measured() | {"type": kind, "id": 1} | wrong
             now_ns += after_ns
             if age_ns is not None:

@@ -118,7 +118,7 @@ async def test_atmosphere_is_set_and_journalled(tmp_path: Path) -> None:
 async def test_refused_atmosphere_is_reported(tmp_path: Path) -> None:
     """The response has the instrument's reason."""
     async with client(tmp_path) as instrument:
-        instrument.air_refusal = InstrumentRefusedError("it has no such setting")
+        instrument.atmosphere_error = InstrumentRefusedError("it has no such setting")
         _, response = await talk(tmp_path, WARM + b"\n")
     assert response["problem"] == "it has no such setting"
 
@@ -192,8 +192,8 @@ async def test_full_disk_is_reported_with_waiting_and_lost_lines(
 
     monkeypatch.setattr(RecordingWriter, "write_line", write_if_room)
     monkeypatch.setattr(Recorder.__init__, "__kwdefaults__", {"max_pending_lines": 10})
-    said: list[str] = []
-    monkeypatch.setattr("tsgt.service.sd_notify", lambda *assignments: said.extend(assignments))
+    notified: list[str] = []
+    monkeypatch.setattr("tsgt.service.sd_notify", lambda *assignments: notified.extend(assignments))
     async with client(tmp_path) as instrument:
         full = True
         for _ in range(15):
@@ -204,5 +204,5 @@ async def test_full_disk_is_reported_with_waiting_and_lost_lines(
         full = False
     assert (status["journal_ok"], status["journal_waiting"], status["journal_lost"]) == (False, 10, 5)
     assert status["measurements"] == 15
-    assert any("disk fails: 10 lines not written, 5 lines lost" in line for line in said)
+    assert any("disk fails: 10 lines not written, 5 lines lost" in line for line in notified)
     assert len(journalled(tmp_path, "measurement")) == 10

@@ -91,10 +91,10 @@ async def bench(
 async def test_refused_command_keeps_connection() -> None:
     """The result is negative, and the next reading follows."""
     async with bench() as day:
-        day.instrument.refusal = InstrumentRefusedError("there is no prism 9")
+        day.instrument.mode_error = InstrumentRefusedError("there is no prism 9")
         with capture_logs() as logs:
             assert await day.execute(TrackCommand(9)) == CommandResult(TrackCommand(9), ok=False)
-            day.instrument.refusal = None
+            day.instrument.mode_error = None
             reading = day.instrument.give()
             await asyncio.sleep(0.1)
         assert day.out == [reading]
@@ -210,9 +210,9 @@ async def test_atmosphere_is_set_after_each_connection() -> None:
 async def test_refused_atmosphere_is_not_retried() -> None:
     """The request gets the reason."""
     async with bench() as day:
-        day.instrument.air_refusal = InstrumentRefusedError("it has no such setting")
+        day.instrument.atmosphere_error = InstrumentRefusedError("it has no such setting")
         assert await day.supervisor.set_atmosphere(WARM) == "it has no such setting"
-        day.instrument.air_refusal = None
+        day.instrument.atmosphere_error = None
         day.instrument.fail()
         await asyncio.sleep(3.0)
         assert day.instrument.record == RECORD
@@ -221,9 +221,9 @@ async def test_refused_atmosphere_is_not_retried() -> None:
 async def test_atmosphere_is_set_after_reconnection() -> None:
     """A request interrupted by a lost instrument gets a response."""
     async with bench() as day:
-        day.instrument.air_refusal = InstrumentError(GONE)
+        day.instrument.atmosphere_error = InstrumentError(GONE)
         assert await day.supervisor.set_atmosphere(WARM) == NOT_CONNECTED
-        day.instrument.air_refusal = None
+        day.instrument.atmosphere_error = None
         await asyncio.sleep(3.0)
         assert day.instrument.record is not None
         assert day.instrument.record.temperature_c == 25.0

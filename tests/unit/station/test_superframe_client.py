@@ -39,13 +39,13 @@ class OnAir:
     def __init__(self, day: Field) -> None:
         self._day = day
         self._clock = VirtualClock(START_NS)
-        self.master = ScriptedMaster(stations=1, station=1, session_every=4)
+        self.master = ScriptedMaster(stations=1, station=1, session_interval=4)
 
     async def frame(self, commands: Sequence[EncodedCommand] = ()) -> ReceivedMessage | None:
         """Run one frame, from beacon to reply."""
         radio = self._day.master.radio
         payload = self.master.beacon(commands=commands)
-        self.master.left(await radio.transmit(payload))
+        self.master.sent_by_radio(await radio.transmit(payload))
         deadline_ns = self.master.beacon_done_ns + 400 * MS
         with suppress(TimeoutError):
             async with asyncio.timeout((deadline_ns - self._clock.monotonic_ns()) / 1e9):
@@ -100,7 +100,7 @@ async def test_every_measurement_is_delivered_with_its_time(tmp_path: Path) -> N
 async def test_killed_client_loses_no_measurement(tmp_path: Path) -> None:
     """Restarted after any number of steps of the event loop, it delivers all readings."""
     async with superframe_day(tmp_path) as (day, air):
-        air.master.session_every = 1
+        air.master.session_interval = 1
         for run in range(25):
             await air.frames(2.5)
             await day.kill()
@@ -271,7 +271,7 @@ async def test_reply_starts_at_slot(tmp_path: Path) -> None:
     async with superframe_day(tmp_path) as (day, air):
         await air.frames(10.0)
         payload = air.master.beacon()
-        air.master.left(await day.master.radio.transmit(payload))
+        air.master.sent_by_radio(await day.master.radio.transmit(payload))
         packet = await day.master.radio.receive()
         began_ns = packet.received_at_ns - TIMING.reception_ns - TIMING.airtime_ns(len(packet.payload))
         slot_ns = air.master.beacon_done_ns - 67_000 + TIMING.turnaround_ns

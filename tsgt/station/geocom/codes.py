@@ -241,7 +241,7 @@ def outcome_of(code: int, *, has_values: bool) -> Outcome:
 
 
 def name_of(code: int) -> str:
-    """Return a code for people: its number with its name, or with the component of the software that it belongs to."""
+    """Return a code for messages: its number with its name, or with the component of the software that it belongs to."""
     known = _BY_NUMBER.get(code)
     if known is not None:
         return f"{code} {known.name}"

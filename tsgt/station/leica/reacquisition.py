@@ -85,13 +85,19 @@ class SearchWindow:
 def window_at_pointing(centre: Pointing | None = None) -> SearchWindow:
     """Return the window for the target recognition at the current pointing, or at a known one."""
     size_rad = 2 * ATR_FIELD_OF_VIEW_RAD
-    return SearchWindow("looking where the telescope points", False, centre, size_rad, size_rad)
+    return SearchWindow("recognising the target at the current pointing", False, centre, size_rad, size_rad)
 
 
 def window_at_direction(direction: Direction) -> SearchWindow:
     """Return the window for the target recognition at a direction from the master."""
     size_rad = min(max(2 * direction.spread_rad, ATR_FIELD_OF_VIEW_RAD), MAX_FINE_ADJUST_RAD)
-    return SearchWindow("looking where the master says", False, centre_of(direction), size_rad, size_rad)
+    return SearchWindow(
+        "recognising the target at the direction from the master",
+        False,
+        centre_of(direction),
+        size_rad,
+        size_rad,
+    )
 
 
 class ReacquisitionSequence:
@@ -197,7 +203,7 @@ class ReacquisitionSequence:
             width = max(size, 2 * ATR_FIELD_OF_VIEW_RAD)
             windows = [
                 window_at_direction(self._towards),
-                SearchWindow("searching where the master says", True, centre, width, size),
+                SearchWindow("searching at the direction from the master", True, centre, width, size),
             ]
         else:
             windows = [window_at_pointing(last if self._telescope_moved else None)]
@@ -207,9 +213,9 @@ class ReacquisitionSequence:
             SearchWindow("searching around its last direction", True, last, narrow_rad, narrow_height_rad)
         )
         if narrow_rad < width_rad < FULL_CIRCLE_RAD:
-            windows.append(SearchWindow("searching wide", True, last, width_rad, height_rad))
+            windows.append(SearchWindow("searching the widest window", True, last, width_rad, height_rad))
         if width_rad >= FULL_CIRCLE_RAD:
-            windows.append(SearchWindow("searching all around", True, None, math.tau, height_rad))
+            windows.append(SearchWindow("searching the full circle", True, None, math.tau, height_rad))
         return windows
 
 

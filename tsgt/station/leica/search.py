@@ -26,9 +26,7 @@ _FULL_CIRCLE_TIMEOUT_S: Final = 120.0
 _CLOCKWISE, _WITH_SWING = 1, 1
 _MAX_SWEEPS: Final = 3
 _HERE: Final = SearchWindow("pointing at it", False, None, ATR_FIELD_OF_VIEW_RAD, ATR_FIELD_OF_VIEW_RAD)
-_NEARBY: Final = SearchWindow(
-    "searching where it was found", True, None, MAX_FINE_ADJUST_RAD, MAX_FINE_ADJUST_RAD
-)
+_NEARBY: Final = SearchWindow("searching nearby", True, None, MAX_FINE_ADJUST_RAD, MAX_FINE_ADJUST_RAD)
 
 
 class RoboticLicenceMissing(Exception):  # noqa: N818 (not an error: the operator takes over)

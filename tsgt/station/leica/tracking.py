@@ -158,7 +158,7 @@ class Tracking:
     async def start(self, prism: int) -> None:
         """Start with a prism; an instrument that is locked on keeps its lock."""
         self._readings.prism = prism
-        self.activity = f"beginning with prism {prism}"
+        self.activity = f"starting with prism {prism}"
         if self.target_search is not None:
             await self._query_lock(self.target_search)
         await self.start_measuring()

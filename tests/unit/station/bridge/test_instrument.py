@@ -129,20 +129,22 @@ async def test_single_measurement() -> None:
         await instrument.measure()
     await instrument.direct()
     single = measured(20.0) | {"type": "shot"}
-    program.on_command = lambda command: program.say(single | {"id": command["id"]})
+    program.on_command = lambda command: program.print_lines(single | {"id": command["id"]})
     reading = await instrument.measure()
     assert (reading.prism, reading.slope_distance_m, reading.at_ns) == (None, 20.0, CLOCK.monotonic_ns())
-    program.on_command = lambda command: program.say(
+    program.on_command = lambda command: program.print_lines(
         {"type": "shot", "id": command["id"], "status": "no_target"}
     )
     reading = await instrument.measure()
     assert (reading.status, reading.slope_distance_m) == (Status.NO_TARGET, None)
-    for answer in (
+    for response in (
         single | {"slope_distance_m": -1.0},
         {"type": "done"},
         {"type": "done", "error": "no foil"},
     ):
-        program.on_command = lambda command, answer=answer: program.say(answer | {"id": command["id"]})  # type: ignore[misc]
+        program.on_command = lambda command, response=response: program.print_lines(
+            response | {"id": command["id"]}
+        )  # type: ignore[misc]
         with pytest.raises(InstrumentRefusedError, match=r"expected metres|contains no measurement|no foil"):
             await instrument.measure()
 
@@ -152,10 +154,12 @@ async def test_readings_of_old_prism_are_dropped_after_change() -> None:
     instrument, program, _ = await tracking()
     program.measure(1.0)
 
-    def answer(command: dict[str, Any]) -> None:
-        program.say(program.measurement(2.0), {"type": "done", "id": command["id"]}, program.measurement(3.0))
+    def response(command: dict[str, Any]) -> None:
+        program.print_lines(
+            program.measurement(2.0), {"type": "done", "id": command["id"]}, program.measurement(3.0)
+        )
 
-    program.on_command = answer
+    program.on_command = response
     await asyncio.sleep(0.4)
     await instrument.track(3)
     await asyncio.sleep(0.4)
@@ -168,13 +172,13 @@ async def test_repeated_measurement_is_dropped() -> None:
     """By time and values, also after a restart of the program."""
     instrument, program, start = await tracking()
     line = program.measurement(instrument_time_ns=1000)
-    program.say(line, line)
+    program.print_lines(line, line)
     program.measure(host_time_ns=CLOCK.monotonic_ns(), instrument_time_ns=1000)
     program.exit()
     assert len(await instrument_readings(instrument)) == 1
     await instrument.connect()
     await instrument.track(1)
-    start.programs[1].say(line)
+    start.programs[1].print_lines(line)
     assert await queued(instrument) == []
 
 
@@ -226,9 +230,9 @@ async def test_silence_while_tracking_is_a_stall() -> None:
 
     async def talk() -> None:
         await asyncio.sleep(4.0)
-        program.say({"type": "status", "activity": "looking around"})
+        program.print_lines({"type": "status", "activity": "looking around"})
         await asyncio.sleep(4.0)
-        program.say(b"garbage")
+        program.print_lines(b"garbage")
 
     talking = asyncio.create_task(talk())
     with pytest.raises(
@@ -263,7 +267,7 @@ async def test_exit_in_direct_mode_is_detected() -> None:
 async def test_missing_response_is_a_stall() -> None:
     """After 30 s, whatever else the program prints."""
     instrument, program, _ = await tracking()
-    program.on_command = lambda _: program.say({"type": "done", "id": 77})
+    program.on_command = lambda _: program.print_lines({"type": "done", "id": 77})
     start_ns = CLOCK.monotonic_ns()
     with pytest.raises(InstrumentError, match="does not respond to direct"):
         await instrument.direct()
@@ -278,9 +282,9 @@ async def test_status_lines_extend_hello_timeout() -> None:
     connecting = asyncio.create_task(instrument.connect())
     for _ in range(10):
         await asyncio.sleep(20.0)
-        start.programs[0].say({"type": "status", "problem": "switch the instrument on"})
+        start.programs[0].print_lines({"type": "status", "problem": "switch the instrument on"})
         assert instrument.condition.problem == "switch the instrument on"
-    start.programs[0].say(HELLO)
+    start.programs[0].print_lines(HELLO)
     await connecting
     start_ns = CLOCK.monotonic_ns()
     with pytest.raises(InstrumentError, match="has not sent hello"):
@@ -302,7 +306,7 @@ async def test_other_version_is_rejected() -> None:
 async def test_second_hello_ends_session() -> None:
     """A wrapper has restarted its program, which knows no commands."""
     instrument, program, _ = await tracking()
-    program.say(FULL)
+    program.print_lines(FULL)
     with pytest.raises(InstrumentError, match="second hello"):
         await instrument.read()
 
@@ -340,7 +344,7 @@ async def test_invalid_line_is_rejected(wrong: bytes | dict[str, Any]) -> None:
     """Log and condition report it, and the next valid line is read."""
     with capture_logs() as logs:
         instrument, program, _ = await tracking()
-        program.say(wrong if isinstance(wrong, bytes) else program.measurement() | wrong)
+        program.print_lines(wrong if isinstance(wrong, bytes) else program.measurement() | wrong)
         assert await queued(instrument) == []
         assert "was rejected" in instrument.condition.problem
         await asyncio.sleep(0.4)
@@ -357,7 +361,7 @@ async def test_rejected_lines_are_logged_once_a_minute() -> None:
         _, program, _ = await tracking()
         for _ in range(130):
             await asyncio.sleep(1.0)
-            program.say(b"garbage")
+            program.print_lines(b"garbage")
     assert [entry["rejected"] for entry in logs] == [1, 61, 121]
 
 
@@ -393,22 +397,22 @@ async def test_missing_target_is_reported_twice_a_second_at_most() -> None:
     instrument, program, _ = await tracking()
     for _ in range(100):
         await asyncio.sleep(0.05)
-        program.say({"type": "measurement", "status": "no_target"})
+        program.print_lines({"type": "measurement", "status": "no_target"})
     assert len(await queued(instrument)) == 10
     for status in ("no_target", "angle_only", "no_target"):
         program.measure()
         await asyncio.sleep(0.01)
-        program.say({"type": "measurement", "status": status})
+        program.print_lines({"type": "measurement", "status": status})
     assert len(await queued(instrument)) == 6
 
 
 async def test_arrival_is_timestamp_of_single_lines() -> None:
     """Lines that arrive together are rejected."""
     instrument, program, _ = await tracking(HELLO | {"stamps": "arrival"})
-    program.say(measured(1.0))
+    program.print_lines(measured(1.0))
     at_ns = CLOCK.monotonic_ns()
     await asyncio.sleep(0.4)
-    program.say(measured(2.0), measured(3.0))
+    program.print_lines(measured(2.0), measured(3.0))
     assert [(reading.slope_distance_m, reading.at_ns) for reading in await queued(instrument)] == [
         (1.0, at_ns)
     ]
@@ -426,7 +430,7 @@ async def test_instrument_time_is_mapped_to_host_clock() -> None:
         time_ns = 3_600_000_000_000 + round(made_ns * (1 + 20e-6))
         true_ns[time_ns] = made_ns
         await asyncio.sleep(generator.expovariate(1 / 0.005) if number != 100 else 1.0)
-        program.say(measured(instrument_time_ns=time_ns))
+        program.print_lines(measured(instrument_time_ns=time_ns))
         readings += await queued(instrument)
         if number == 3:
             assert readings == []
@@ -446,7 +450,7 @@ async def test_power_cycle_resets_clock_fit() -> None:
             switched_on_ns = CLOCK.monotonic_ns() - 1
         time_ns = CLOCK.monotonic_ns() - switched_on_ns
         true_ns[time_ns] = CLOCK.monotonic_ns()
-        program.say(measured(instrument_time_ns=time_ns))
+        program.print_lines(measured(instrument_time_ns=time_ns))
         readings += await queued(instrument)
     assert len(readings) > 55
     assert all(abs(reading.at_ns - true_ns[reading.instrument_time_ns or 0]) < 1e6 for reading in readings)
@@ -459,10 +463,10 @@ async def test_condition_and_record_follow_program() -> None:
     instrument, program, _ = await tracking(HELLO | {"model": "S7"}, config)
     before = instrument.record
     assert (instrument.condition.activity, instrument.condition.problem) == ("tracking", "")
-    program.say({"type": "status", "problem": "not level", "battery_percent": 30})
+    program.print_lines({"type": "status", "problem": "not level", "battery_percent": 30})
     assert instrument.record == before
     assert (instrument.condition.problem, instrument.condition.battery_percent) == ("not level", 30)
-    program.say({"type": "settings", "prism_type": "360", "prism_constant_m": 0.002})
+    program.print_lines({"type": "settings", "prism_type": "360", "prism_constant_m": 0.002})
     record = instrument.record
     assert record is not None
     assert (record.make, record.model, record.prism_type, record.latency_ns) == (
@@ -541,9 +545,9 @@ async def test_random_exits_lose_and_repeat_no_measurement() -> None:
             if program.ended or not tracks:
                 continue
             if last is not None:
-                program.say(last)
+                program.print_lines(last)
             last = program.measurement(1.0 + number)
-            program.say(last)
+            program.print_lines(last)
             printed.append(1.0 + number)
             if generator.random() < 0.05:
                 program.exit()

@@ -24,8 +24,8 @@ FASTEST_NS = 20 * MS
 def error_ms(reported_ns: Callable[[int], int], seed: int, count: int = 300) -> float:
     """Return the mean error of timestamps in ms, given how the instrument reports its times."""
     random = np.random.default_rng(seed)
-    stamper = LineTimestamper(latency_ns=FASTEST_NS)
-    stamper.program_started(decode(HelloLine, json.dumps(HELLO | {"stamps": "instrument"}).encode()))
+    timestamper = LineTimestamper(latency_ns=FASTEST_NS)
+    timestamper.program_started(decode(HelloLine, json.dumps(HELLO | {"stamps": "instrument"}).encode()))
     true_ns: dict[float, int] = {}
     errors = []
     for number in range(count):
@@ -33,9 +33,9 @@ def error_ms(reported_ns: Callable[[int], int], seed: int, count: int = 300) -> 
         distance_m = 10.0 + 0.001 * number
         true_ns[distance_m] = at_ns
         record = measured(distance_m, instrument_time_ns=reported_ns(at_ns - 10**11))
-        arrived_ns = at_ns + FASTEST_NS + int(random.uniform(0, 2 * MS))
+        received_ns = at_ns + FASTEST_NS + int(random.uniform(0, 2 * MS))
         line = decode(MeasurementLine, json.dumps(record).encode())
-        for stamped in stamper.push(line, 1, arrived_ns, together=False):
+        for stamped in timestamper.push(line, 1, received_ns, together=False):
             assert isinstance(stamped, TimestampedLine)
             assert stamped.line.slope_distance_m is not None
             errors.append((stamped.at_ns - true_ns[stamped.line.slope_distance_m]) / MS)

@@ -260,7 +260,7 @@ async def test_abort_without_procedure_is_harmless() -> None:
 
 
 async def test_lost_reply_of_search_is_detected() -> None:
-    """A probe is answered without it, and replies come in order."""
+    """A probe gets its reply first, and replies come in order."""
     connection, instrument = await connected()
     instrument.faults.append(silent)
     with pytest.raises(InstrumentError, match="AUT_PS_SEARCH_WINDOW was lost"):
@@ -270,7 +270,7 @@ async def test_lost_reply_of_search_is_detected() -> None:
 
 
 async def test_long_search_is_awaited() -> None:
-    """The instrument does not respond during a search; probes are answered afterwards."""
+    """The instrument does not respond during a search; replies to probes follow."""
     connection, instrument = await connected()
     port: MemoryPort = connection.port  # type: ignore[assignment]
     instrument.busy = True
@@ -358,7 +358,7 @@ async def test_configured_baud_rate_is_tried_every_second() -> None:
 
 
 async def test_connect_fails_after_all_baud_rates() -> None:
-    """The message says what to check, and no port stays open."""
+    """The message names what to check, and no port stays open."""
     cable = Cable(FakeInstrument(faults=deque([silent] * 100)))
     with pytest.raises(InstrumentError, match="line: no instrument responds at 115200 baud"):
         await connect(cable.open, 115_200, VirtualClock(0), checksum=False)
@@ -375,7 +375,7 @@ async def test_connect_aborts_search_of_earlier_client() -> None:
 
 
 async def test_missing_checksum_support_is_reported() -> None:
-    """The message says which setting to change."""
+    """The message names which setting to change."""
     instrument = FakeInstrument()
     instrument.faults.append(not_taken(3110))
     cable = Cable(instrument)

@@ -168,7 +168,9 @@ async def test_command_does_not_interrupt_lock_on() -> None:
         await day.read_for(4.0)
         day.station.blocked = False
         elsewhere = Direction(reading.horizontal_angle_rad + 1.0, reading.zenith_angle_rad, 0.05)
-        while not day.instrument.condition.activity.startswith("looking") or not day.station.settings.lock:
+        while (
+            not day.instrument.condition.activity.startswith("recognising") or not day.station.settings.lock
+        ):
             await day.read_for(0.05)
         await day.instrument.track(1, elsewhere)
         found = await day.read_until(Status.OK, within_s=2.0)
@@ -322,7 +324,7 @@ async def test_new_prism_is_found_at_direction_from_master() -> None:
         assert not day.station.beeps
 
 
-# --- What the instrument says of itself ---------------------------------------------------------------------------
+# --- Condition and settings ---------------------------------------------------------------------------------------
 
 
 async def test_faults_are_reported_as_status() -> None:

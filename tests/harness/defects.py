@@ -1,6 +1,6 @@
-"""Defects for the program: wrong functions in the place of right ones, for as long as a test or benchmark wants them.
+"""Planted defects: functions of the program replaced by defective ones for a test or benchmark.
 
-`benchmarks/planted_defects.py` shows which checkers and tests see them.
+`benchmarks/planted_defects.py` shows which invariants and tests detect them.
 """
 
 from __future__ import annotations
@@ -36,25 +36,25 @@ if TYPE_CHECKING:
 
 
 class Planting:
-    """Puts wrong things in the place of right ones, and the right ones back.
+    """Replaces attributes by defective ones, and restores them.
 
     Attributes
     ----------
-    planted
-        Where, and what was there before: owner, name, right one.
+    replaced
+        Owner, name and original of each replaced attribute.
     """
 
     def __init__(self) -> None:
         self.replaced: list[tuple[Any, str, Any]] = []
 
     def replace_attribute(self, owner: Any, name: str, make: Callable[[Any], Any]) -> None:
-        """Replace an attribute by what is made of it."""
+        """Replace an attribute by what ``make`` returns for the original."""
         original = owner.__dict__[name]
         self.replaced.append((owner, name, original))
         setattr(owner, name, make(original))
 
     def undo(self) -> None:
-        """Put everything back."""
+        """Restore all originals."""
         while self.replaced:
             setattr(*self.replaced.pop())
 
@@ -63,29 +63,29 @@ class Planting:
 
 
 def never_acknowledge(planting: Planting) -> None:
-    """Never tell a station what is in the recording."""
+    """Never acknowledge a measurement."""
     planting.replace_attribute(ReceiveWindow, "ack_bitmap", lambda _: lambda _peer, _counter: 0)
     planting.replace_attribute(ReceiveWindow, "cumulative", lambda _: property(lambda _inbox: -1))
 
 
 def acknowledge_before_written(planting: Planting) -> None:
-    """Take everything for written that has come."""
+    """Acknowledge measurements before they are written."""
 
-    def settle(link: Any) -> None:
+    def acknowledge(link: Any) -> None:
         while link._unwritten:
             reply = link._unwritten.popleft()
             link._master.station(reply.station).window.mark_written(reply.sequences)
 
-    planting.replace_attribute(link.SuperframeLink, "_settle", lambda _: settle)
+    planting.replace_attribute(link.SuperframeLink, "_acknowledge", lambda _: acknowledge)
 
 
 def acknowledge_up_to_highest(planting: Planting) -> None:
-    """Acknowledge what is missing below the highest number."""
+    """Acknowledge missing sequence numbers below the highest one."""
     planting.replace_attribute(SequenceSet, "cumulative", lambda _: property(lambda numbers: numbers.highest))
 
 
 def dequeue_when_sent(planting: Planting) -> None:
-    """Delete what is on the air, whether it arrives or not."""
+    """Remove measurements from the queue when they are sent."""
 
     def sent(original: Any) -> Any:
         def defective(delivery: Any, sequences: Any) -> None:
@@ -98,7 +98,7 @@ def dequeue_when_sent(planting: Planting) -> None:
 
 
 def accept_duplicates(planting: Planting) -> None:
-    """Hand on whatever comes."""
+    """Deliver duplicates."""
 
     def take(original: Any) -> Any:
         return lambda window, number: original(window, number) or True
@@ -107,7 +107,7 @@ def accept_duplicates(planting: Planting) -> None:
 
 
 def accept_duplicates_classic(planting: Planting) -> None:
-    """Know nothing of what has come before."""
+    """Deliver duplicates over protocol classic."""
 
     def init(original: Any) -> Any:
         def defective(station: Any, *arguments: Any) -> None:
@@ -123,7 +123,7 @@ def accept_duplicates_classic(planting: Planting) -> None:
 
 
 def reuse_sequence_numbers(planting: Planting) -> None:
-    """Begin with number 0 after each start."""
+    """Start with sequence number 0 after each restart."""
 
     def read(original: Any) -> Any:
         return lambda *arguments: replace(original(*arguments), first_sequence=0, queued=())
@@ -132,7 +132,7 @@ def reuse_sequence_numbers(planting: Planting) -> None:
 
 
 def reuse_nonce(planting: Planting) -> None:
-    """Introduce a station to each session with the same nonce."""
+    """Use the same nonce in each session."""
 
     def init(original: Any) -> Any:
         def defective(client: Any, *arguments: Any, **named: Any) -> None:
@@ -145,14 +145,14 @@ def reuse_nonce(planting: Planting) -> None:
 
 
 def skip_authentication(planting: Planting) -> None:
-    """Take each code for the right one, at the master and at the stations."""
+    """Accept every authentication code, at the master and at the stations."""
     anything = SimpleNamespace(compare_digest=lambda _one, _other: True)
     for module in (master, station):
         planting.replace_attribute(module, "hmac", lambda _: anything)
 
 
 def accept_old_beacon(planting: Planting) -> None:
-    """Find the frame number of a beacon that is not new."""
+    """Accept a beacon that is not newer than the last."""
 
     def counter_of(session: Any, beacon: Any) -> Any:
         newest = session.beacon.counter
@@ -168,7 +168,7 @@ def accept_old_beacon(planting: Planting) -> None:
 
 
 def add_clock_offset(planting: Planting) -> None:
-    """Add the offset of a station's clock instead of taking it off."""
+    """Add a station's clock offset instead of subtracting it."""
 
     def measurement(original: Any) -> Any:
         def defective(station: Any, message: Any, received_ns: int) -> Any:
@@ -181,7 +181,7 @@ def add_clock_offset(planting: Planting) -> None:
 
 
 def reverse_frequency(planting: Planting) -> None:
-    """Carry a clock's offset on with the frequency's wrong sign."""
+    """Extrapolate a clock offset with the wrong sign of the frequency."""
 
     def at_ns(line: Any, station_ns: int) -> int:
         return int(line.base_ns + round(line.offset_ns - line.frequency * line._seconds(station_ns)))
@@ -190,7 +190,7 @@ def reverse_frequency(planting: Planting) -> None:
 
 
 def use_time_of_next_beacon(planting: Planting) -> None:
-    """Take the time at which a beacon left for that of the beacon after it."""
+    """Associate a beacon's transmit time with the reception of the next beacon."""
 
     def reception(original: Any) -> Any:
         def defective(session: Any) -> Any:
@@ -203,7 +203,7 @@ def use_time_of_next_beacon(planting: Planting) -> None:
 
 
 def reply_one_slot_late(planting: Planting) -> None:
-    """Reply a slot too late."""
+    """Reply one slot late."""
 
     def slot_of(original: Any) -> Any:
         def defective(session: Any) -> Any:
@@ -222,7 +222,7 @@ def reply_one_slot_late(planting: Planting) -> None:
 
 
 def truncate_times_to_ms(planting: Planting) -> None:
-    """Round the time of a measurement down to whole milliseconds."""
+    """Truncate measurement times to whole milliseconds."""
     units = 1000 // TIME_UNIT_US
 
     def timed(original: Any) -> Any:
@@ -236,7 +236,7 @@ def truncate_times_to_ms(planting: Planting) -> None:
 
 
 def keep_instrument_latency(planting: Planting) -> None:
-    """Leave the instrument's latency in the stamps."""
+    """Do not subtract the instrument's latency."""
 
     def stamp(original: Any) -> Any:
         def defective(times: Any, measured: Any) -> Any:
@@ -252,13 +252,15 @@ def keep_instrument_latency(planting: Planting) -> None:
 
 
 def drop_lowest_angle_bit(planting: Planting) -> None:
-    """Leave the lowest bit of the angles out."""
+    """Clear the lowest bit of encoded angles."""
     for module in (backlog, station_link):
-        planting.replace_attribute(module, "angle_code", lambda original: lambda angle_rad: original(angle_rad) & ~1)
+        planting.replace_attribute(
+            module, "angle_code", lambda original: lambda angle_rad: original(angle_rad) & ~1
+        )
 
 
 def use_stale_station_frame(planting: Planting) -> None:
-    """Let the master have station 2's frame of before somebody moved it by 20 mm."""
+    """Give the master a frame of station 2 that is wrong by 20 mm."""
 
     def run_master(original: Any) -> Any:
         def defective(config: Any, parameters: Any, *arguments: Any, **named: Any) -> Any:
@@ -274,7 +276,7 @@ def use_stale_station_frame(planting: Planting) -> None:
 
 
 def ignore_prism_constant(planting: Planting) -> None:
-    """Leave the prism constant out."""
+    """Do not apply the prism constant."""
 
     def corrected(original: Any) -> Any:
         return lambda distance_m, *, constant_m, ppm: original(distance_m, constant_m=0 * constant_m, ppm=ppm)
@@ -284,7 +286,7 @@ def ignore_prism_constant(planting: Planting) -> None:
 
 
 def use_failed_measurements(planting: Planting) -> None:
-    """Use a measurement whatever its instrument says of it."""
+    """Treat every status as usable."""
     planting.replace_attribute(Status, "usable", lambda _: property(lambda _status: True))
 
 
@@ -292,7 +294,7 @@ def use_failed_measurements(planting: Planting) -> None:
 
 
 def quarter_covariance(planting: Planting) -> None:
-    """State a quarter of the covariance."""
+    """Publish a quarter of the covariance."""
 
     def ros_covariance(original: Any) -> Any:
         return lambda *arguments: original(*arguments) / 4
@@ -301,7 +303,7 @@ def quarter_covariance(planting: Planting) -> None:
 
 
 def stamp_smoothed_poses_now(planting: Planting) -> None:
-    """Stamp smoothed poses with the time at which they are made."""
+    """Timestamp smoothed poses with the time of their computation."""
 
     def smoothed(original: Any) -> Any:
         def defective(poses: Any, stamp_ns: Any, *arguments: Any, **options: Any) -> Any:
@@ -317,7 +319,7 @@ def stamp_smoothed_poses_now(planting: Planting) -> None:
 
 
 def reorder_lines(planting: Planting) -> None:
-    """Let each fiftieth line change places with the next one on its way to the disk."""
+    """Swap every fiftieth recorded line with the next one."""
     held: dict[Any, bytes] = {}
 
     def put(original: Any) -> Any:
@@ -335,7 +337,7 @@ def reorder_lines(planting: Planting) -> None:
 
 
 def journal_after_delivery(planting: Planting) -> None:
-    """Deliver at once, and write half a second later."""
+    """Deliver at once and write the journal half a second later."""
 
     def measured(client: Any, reading: Any) -> None:
         measurement = client._session.measurement(reading, client._timeline.unix_ns(reading.at_ns))
@@ -346,17 +348,17 @@ def journal_after_delivery(planting: Planting) -> None:
 
 
 def keep_torn_line(planting: Planting) -> None:
-    """Go on behind half a line."""
+    """Append to a torn line instead of cutting it."""
     planting.replace_attribute(RecordingWriter, "_cut_torn_line", lambda _: lambda _writer: None)
 
 
 def unbound_reader_queue(planting: Planting) -> None:
-    """Let lines wait for a slow reader without a bound."""
+    """Never disconnect a slow stream subscriber."""
     planting.replace_attribute(stream_server._Reader, "full", lambda _: property(lambda _reader: False))
 
 
 def never_reopen_radio(planting: Planting) -> None:
-    """Use a station's radio until its first fault, and never again."""
+    """Do not reopen a station's radio after its first fault."""
 
     async def supervise_radio(open_radio: Any, use: Any, _clock: Any) -> None:
         with contextlib.suppress(RadioError, StreamError):

@@ -1,8 +1,7 @@
-"""Somebody who sends what he likes to the cores of a master and its stations, as often as he likes, at the worst moment.
+"""An attacker without the key, who sends packets to a master and its stations at any time and rate.
 
-He knows all that was on the air, of this session and of an earlier one, but not the key. Beside the exchange that he
-attacks runs another one with the same random numbers, which nobody attacks: as long as both say the same on the air,
-and end in the same state, nothing of his has had an effect.
+The attacker knows all packets of this session and of an earlier one. A second exchange with the same random numbers is not
+attacked: as long as both send the same packets and end in the same state, no forged packet has had an effect.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING, NamedTuple
 
-from harness.superframe_loop import START_NS, Exchange
+from harness.superframe_loop import START_NS, SuperframeLoop
 
 from tsgt.radio.superframe.wire import CODE_BYTES, Authenticator, decode_reply
 
@@ -38,32 +37,30 @@ KINDS = (
     "no key",
 )
 
-LONGEST_PACKET_BYTES = 255
+MAX_PACKET_BYTES = 255
 _STAMP_SIGMA_NS = 3_000
 _LOSS = 0.05
 _JOINING_FRAMES = 8
-_OLD_FRAMES = 200
-_REMEMBERED = 2000
-_LONG_AGO_NS = 1_000_000_000_000
+_EARLIER_FRAMES = 200
+_TRAFFIC_CAPACITY = 2000
+_SESSION_AGE_NS = 1_000_000_000_000
 
 _COUNTERS = frozenset({"rejected_packets", "authentication_failures"})
-"""What is there to count such packets."""
+"""Attributes that count such packets."""
 
 
 @dataclass
 class Forgeries:
-    """What became of forged packets.
+    """Result of an attack.
 
     Attributes
     ----------
-    sent
-        How many, by kind and by whom they were sent to.
-    accepted
-        How many of them had an effect.
+    sent, accepted
+        Forged packets, and those that had an effect, by kind and by recipient.
     diverged
-        In how many frames the exchange was another one than without them.
+        Frames whose packets differed from the exchange without an attack.
     same_state
-        Whether all cores ended as they did without them.
+        All cores ended in the same state as without an attack.
     """
 
     sent: Counter[tuple[str, str]] = field(default_factory=Counter)
@@ -72,15 +69,15 @@ class Forgeries:
     same_state: bool = False
 
 
-class _Heard(NamedTuple):
-    """What was on the air: beacons, and replies to which of them."""
+class _Traffic(NamedTuple):
+    """Recorded traffic."""
 
     beacons: deque[bytes]
     replies: deque[bytes]
 
 
-def _heard() -> _Heard:
-    return _Heard(deque(maxlen=_REMEMBERED), deque(maxlen=_REMEMBERED))
+def _traffic() -> _Traffic:
+    return _Traffic(deque(maxlen=_TRAFFIC_CAPACITY), deque(maxlen=_TRAFFIC_CAPACITY))
 
 
 class _Attack:
@@ -96,37 +93,37 @@ class _Attack:
         self._per_step = per_step
         self._others = {"another key": Authenticator(bytes(range(100, 132))), "no key": Authenticator(None)}
         self.result = Forgeries()
-        self.now, self._old = _heard(), _heard()
-        old = Exchange(timing, Authenticator(key), _bits(old_rng), start_ns=START_NS - _LONG_AGO_NS)
-        for _ in range(_OLD_FRAMES):
-            old.frame()
+        self.now, self._old = _traffic(), _traffic()
+        old = SuperframeLoop(timing, Authenticator(key), _bits(old_rng), start_ns=START_NS - _SESSION_AGE_NS)
+        for _ in range(_EARLIER_FRAMES):
+            old.run_frame()
             self._old.beacons.append(old.beacon)
             self._old.replies.extend(old.replies.values())
 
-    def on_station(self, exchange: Exchange, number: int) -> None:
-        """Send to a station that is about to hear the beacon, or has heard it."""
-        core, own = exchange.members[number].core, self.now.beacons
+    def on_station(self, loop: SuperframeLoop, number: int) -> None:
+        """Send to a station that is about to hear the beacon, or has received it."""
+        core, own = loop.members[number].core, self.now.beacons
         for kind in self._rng.choice(KINDS, self._per_step).tolist():
             if kind in self._others:
-                payload = self._beacon(self._others[kind], exchange)
+                payload = self._beacon(self._others[kind], loop)
             else:
-                payload = self._payload(kind, exchange.beacon, own, self._old.beacons, self.now.replies)
-            if kind == "spliced" and payload == exchange.beacon:
+                payload = self._payload(kind, loop.beacon, own, self._old.beacons, self.now.replies)
+            if kind == "spliced" and payload == loop.beacon:
                 continue
-            heard = core.received(exchange.packet(number, payload, late_ns=-1000))
-            self._note(kind, "station", effect=heard is not None)
+            received = core.received(loop.beacon_packet(number, payload, delay_ns=-1000))
+            self._note(kind, "station", effect=received is not None)
 
-    def on_master(self, exchange: Exchange, reply: bytes, received_ns: int) -> None:
-        """Send to the master that is about to hear a reply, or has heard it."""
+    def on_master(self, loop: SuperframeLoop, reply: bytes, received_ns: int) -> None:
+        """Send to the master that is about to hear a reply, or has received it."""
         for kind in self._rng.choice(KINDS, self._per_step).tolist():
             if kind in self._others:
-                payload = self._reply(self._others[kind], reply[:-CODE_BYTES], exchange)
+                payload = self._reply(self._others[kind], reply[:-CODE_BYTES], loop)
             else:
                 payload = self._payload(kind, reply, self.now.replies, self._old.replies, self.now.beacons)
             if kind == "spliced" and payload == reply:
                 continue
-            heard = exchange.master.received(payload, received_ns, _STAMP_SIGMA_NS)
-            self._note(kind, "master", effect=heard is not None)
+            received = loop.master.received(payload, received_ns, _STAMP_SIGMA_NS)
+            self._note(kind, "master", effect=received is not None)
 
     def _note(self, kind: str, target: str, *, effect: bool) -> None:
         self.result.sent[kind, target] += 1
@@ -138,7 +135,7 @@ class _Attack:
         rng = self._rng
         match kind:
             case "noise":
-                return rng.bytes(int(rng.integers(LONGEST_PACKET_BYTES + 1)))
+                return rng.bytes(int(rng.integers(MAX_PACKET_BYTES + 1)))
             case "altered":
                 return self._altered(coming)
             case "cut short":
@@ -161,29 +158,29 @@ class _Attack:
         return packets[int(self._rng.integers(len(packets)))] if packets else b""
 
     def _altered(self, packet: bytes) -> bytes:
-        """Turn one to three bits over."""
+        """Flip one to three bits."""
         number = int.from_bytes(packet, "big")
         for bit in self._rng.choice(8 * len(packet), int(self._rng.integers(1, 4)), replace=False).tolist():
             number ^= 1 << bit
         return number.to_bytes(len(packet), "big")
 
-    def _beacon(self, authenticator: Authenticator, exchange: Exchange) -> bytes:
-        """Make a beacon that is right but for the key."""
-        content, master = exchange.beacon[:-CODE_BYTES], exchange.master
+    def _beacon(self, authenticator: Authenticator, loop: SuperframeLoop) -> bytes:
+        """Return the beacon with a code of another key."""
+        content, master = loop.beacon[:-CODE_BYTES], loop.master
         return content + authenticator.beacon_code(
             session=master.session, counter=master.counter, content=content
         )
 
-    def _reply(self, authenticator: Authenticator, content: bytes, exchange: Exchange) -> bytes:
-        """Make a reply that is right but for the key."""
-        number = int(self._rng.integers(1, len(exchange.members) + 1))
-        station_state = exchange.master.station(number)
+    def _reply(self, authenticator: Authenticator, content: bytes, loop: SuperframeLoop) -> bytes:
+        """Return a reply with a code of another key."""
+        number = int(self._rng.integers(1, len(loop.members) + 1))
+        station_state = loop.master.station(number)
         return content + authenticator.reply_code(
-            session=exchange.master.session,
+            session=loop.master.session,
             station=number,
             station_nonce=station_state.nonce or 0,
-            counter=exchange.master.counter,
-            beacon_code=exchange.beacon[-CODE_BYTES:],
+            counter=loop.master.counter,
+            beacon_code=loop.beacon[-CODE_BYTES:],
             sequence=station_state.first_sequence(decode_reply(content)),
             content=content,
         )
@@ -192,41 +189,37 @@ class _Attack:
 def forge(
     timing: FrameTiming, key: bytes, count: int, rng: np.random.Generator, *, per_step: int
 ) -> Forgeries:
-    """Attack an exchange that is under way, in which one in twenty packets is lost.
+    """Attack an exchange in which one in twenty packets is lost.
 
     Parameters
     ----------
-    timing
-        Of the frames.
-    key
-        Of the mission.
     count
-        How many packets to send, or some more.
+        Minimum number of packets.
     rng
-        What is sent, and what is lost.
+        For the forged packets and the losses.
     per_step
-        So many before each packet of the exchange, and after it.
+        Number of forged packets before and after each packet of the exchange.
     """
     nonces, sent, old = rng.spawn(3)
     attacked, alone = (
-        Exchange(timing, Authenticator(key), _bits(twin)) for twin in (nonces, deepcopy(nonces))
+        SuperframeLoop(timing, Authenticator(key), _bits(twin)) for twin in (nonces, deepcopy(nonces))
     )
     for _ in range(_JOINING_FRAMES):
-        attacked.frame()
-        alone.frame()
+        attacked.run_frame()
+        alone.run_frame()
     attack = _Attack(timing, key, sent, old, per_step)
     while attack.result.sent.total() < count:
-        deaf = [number for number in attacked.members if rng.random() < _LOSS]
-        unheard = [number for number in attacked.members if rng.random() < _LOSS]
-        _frame(alone, deaf, unheard, None)
-        _frame(attacked, deaf, unheard, attack)
+        missing_beacon = [number for number in attacked.members if rng.random() < _LOSS]
+        missing_reply = [number for number in attacked.members if rng.random() < _LOSS]
+        _frame(alone, missing_beacon, missing_reply, None)
+        _frame(attacked, missing_beacon, missing_reply, attack)
         attack.result.diverged += (attacked.beacon, attacked.replies) != (alone.beacon, alone.replies)
     attack.result.same_state = state(attacked) == state(alone)
     return attack.result
 
 
 def state(thing: object) -> object:
-    """Return all that an object holds, to be compared; but for counters of what was refused, and random numbers."""
+    """Return the state of an object for comparison, without random sources and counters of rejected packets."""
     if isinstance(thing, dict):
         return {state(key): state(value) for key, value in thing.items()}
     if isinstance(thing, list | tuple | deque):
@@ -239,31 +232,33 @@ def state(thing: object) -> object:
     return type(thing).__name__, tuple(sorted(held.items()))
 
 
-def _frame(exchange: Exchange, deaf: Sequence[int], unheard: Sequence[int], attack: _Attack | None) -> None:
-    """Run a frame whose beacon some stations do not hear, and in which the master does not hear some."""
-    exchange.begin()
+def _frame(
+    loop: SuperframeLoop, missing_beacon: Sequence[int], missing_reply: Sequence[int], attack: _Attack | None
+) -> None:
+    """Run a frame in which some stations miss the beacon, and the master misses some replies."""
+    loop.send_beacon()
     arrivals = []
-    for number in exchange.members:
+    for number in loop.members:
         if attack:
-            attack.on_station(exchange, number)
-        received_ns = None if number in deaf else exchange.hear(number)
+            attack.on_station(loop, number)
+        received_ns = None if number in missing_beacon else loop.receive_beacon(number)
         if received_ns is not None:
             arrivals.append((received_ns, number))
     if attack:
-        if not deaf:  # to a station that has missed it a beacon that is played to it later is new
-            attack.now.beacons.append(exchange.beacon)
-        for number in exchange.members:
-            attack.on_station(exchange, number)
+        if not missing_beacon:  # a station that missed it would accept a replay
+            attack.now.beacons.append(loop.beacon)
+        for number in loop.members:
+            attack.on_station(loop, number)
     for received_ns, number in sorted(arrivals):
-        reply = exchange.replies[number]
+        reply = loop.replies[number]
         if attack:
-            attack.on_master(exchange, reply, received_ns)
-        if number not in unheard:
-            exchange.deliver(number, received_ns)
-        if attack and number not in unheard:
+            attack.on_master(loop, reply, received_ns)
+        if number not in missing_reply:
+            loop.deliver_reply(number, received_ns)
+        if attack and number not in missing_reply:
             attack.now.replies.append(reply)
-            attack.on_master(exchange, reply, received_ns)
-    exchange.end()
+            attack.on_master(loop, reply, received_ns)
+    loop.end_frame()
 
 
 def _bits(rng: np.random.Generator) -> Callable[[int], int]:

@@ -1,4 +1,4 @@
-"""An instrument whose measurements a test makes up."""
+"""An instrument with scripted measurements."""
 
 from __future__ import annotations
 
@@ -29,35 +29,29 @@ RECORD = InstrumentRecord(make="Script", prism_type="round", prism_constant_m=0.
 
 
 class ScriptedInstrument:
-    """A total station that measures when and what it is told to.
-
-    Parameters
-    ----------
-    clock
-        Of its host.
-    """
+    """A total station whose results the test sets."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._readings: asyncio.Queue[Reading | InstrumentError] = asyncio.Queue()
         self.target: Reading | InstrumentError = READING
-        """What a single measurement gives; it takes two seconds."""
-        self.refusal: InstrumentError | None = None
-        """What a change of mode ends with; else it takes a second."""
+        """Result of a single measurement, after two seconds."""
+        self.mode_error: InstrumentError | None = None
+        """Error of a change of mode; None: it succeeds after a second."""
         self.prisms: list[int | None] = []
-        """What it was told to track; None stands for single measurements."""
+        """Tracked prisms, in order; None: direct mode."""
         self.towards: list[Direction | None] = []
-        """Where it was told to look for each prism."""
+        """Search directions, in order."""
         self.plugged = True
-        """Without its cable it cannot be connected; :meth:`fail` pulls it out while somebody reads."""
+        """The cable is connected; :meth:`fail` disconnects it during a read."""
         self.condition = Condition(activity="tracking", battery_percent=80)
         self.record: InstrumentRecord | None = None
-        """What it says of its settings; set by a connection and by :meth:`set_atmosphere`."""
-        self.air_refusal: InstrumentError | None = None
-        """What setting the air ends with."""
+        """Its settings; set by a connection and by :meth:`set_atmosphere`."""
+        self.atmosphere_error: InstrumentError | None = None
+        """Error of :meth:`set_atmosphere`."""
 
     def give(self, status: Status = Status.OK) -> Reading:
-        """Make a measurement of the tracked prism now."""
+        """Make a measurement of the tracked prism."""
         distance_m = READING.slope_distance_m if status.usable else None
         reading = replace(
             READING, at_ns=self._clock.monotonic_ns(), status=status, slope_distance_m=distance_m
@@ -66,11 +60,11 @@ class ScriptedInstrument:
         return reading
 
     def fail(self) -> None:
-        """Pull the plug."""
+        """Disconnect the cable."""
         self._readings.put_nowait(InstrumentError("the instrument is gone"))
 
     async def connect(self) -> str:
-        """Be there, with the settings that a person has made."""
+        """Connect, with the operator.s settings."""
         if not self.plugged:
             raise InstrumentError("nobody answers; is the cable in?")
         self.record = RECORD
@@ -82,28 +76,28 @@ class ScriptedInstrument:
         self.towards.append(towards)
 
     async def read(self) -> Reading:
-        """Return what :meth:`give` made."""
+        """Return the next measurement of :meth:`give`."""
         return self._checked(await self._readings.get())
 
     async def direct(self) -> None:
-        """Get ready for single measurements, after a second."""
+        """Enter direct mode after a second."""
         await self._change(None)
 
     async def measure(self) -> Reading:
-        """Return the target."""
+        """Return :attr:`target`."""
         await self._sleep(2)
         return self._checked(self.target)
 
     async def check(self) -> None:
-        """Be there with its cable only."""
+        """Check the connection."""
         if not self.plugged:
             raise InstrumentError("nobody answers; is the cable in?")
 
     async def set_atmosphere(self, atmosphere: Atmosphere) -> None:
-        """Apply 10 ppm in any air, after a tenth of a second."""
+        """Apply 10 ppm for any atmosphere, after 0.1 s."""
         await self._sleep(0.1)
-        if self.air_refusal is not None:
-            raise self.air_refusal
+        if self.atmosphere_error is not None:
+            raise self.atmosphere_error
         self.record = replace(
             RECORD,
             atmospheric_ppm=10.0,
@@ -116,8 +110,8 @@ class ScriptedInstrument:
 
     async def _change(self, prism: int | None) -> None:
         await self._sleep(1)
-        if self.refusal is not None:
-            raise self.refusal
+        if self.mode_error is not None:
+            raise self.mode_error
         self.prisms.append(prism)
 
     async def _sleep(self, duration_s: float) -> None:

@@ -1,4 +1,4 @@
-"""A master of the superframe that a test plays by hand, frame by frame, against the pure core of a station."""
+"""A scripted superframe master, frame by frame, against the sans-I/O core of a station."""
 
 from __future__ import annotations
 
@@ -52,12 +52,12 @@ DRIFT_PPM = 30
 
 
 def local_ns(true_ns: int) -> int:
-    """Return what the station's clock shows; the true time is that of the master's clock."""
+    """Return the station's clock reading; true time is that of the master."""
     return OFFSET_NS + true_ns + true_ns * DRIFT_PPM // 1_000_000
 
 
 def counted() -> Callable[[int], int]:
-    """Return a source of numbers that are not random, and never the same."""
+    """Return a deterministic source of distinct numbers."""
     numbers = iter(range(1_000_000, 2_000_000))
     return lambda bits: next(numbers) % (1 << bits)
 
@@ -70,7 +70,7 @@ def make_station(
     authenticator: Authenticator = AUTHENTICATOR,
     random_bits: Callable[[int], int] | None = None,
 ) -> SuperframeStation:
-    """Make station 2 of 3."""
+    """Return station 2 of 3."""
     return SuperframeStation(
         2,
         PAPER,
@@ -84,7 +84,7 @@ def make_station(
 
 
 def queued(sequence: int, true_ns: int, *, prism: int = 1, boot: str = "boot") -> QueuedMeasurement:
-    """Make a measurement of a robot that moves on."""
+    """Return a measurement of a moving robot."""
     return QueuedMeasurement(
         sequence=sequence,
         at_ns=local_ns(true_ns),
@@ -99,16 +99,12 @@ def queued(sequence: int, true_ns: int, *, prism: int = 1, boot: str = "boot") -
 
 @dataclass(frozen=True)
 class ReceivedMessage:
-    """A reply whose code was right.
+    """A reply with a valid code.
 
     Attributes
     ----------
-    reply
-        As decoded.
     sequences, times_ns
-        Of its measurements, the times true ones as the master would tell them.
-    payload_bytes
-        Its length.
+        Sequence numbers, and true times by sequence number, of its measurements.
     """
 
     reply: Reply
@@ -119,14 +115,14 @@ class ReceivedMessage:
 
 @dataclass
 class ScriptedMaster:
-    """Sends beacons to one station and keeps what it answers. Nothing is lost unless the test loses it."""
+    """Sends beacons to one station and records its replies; losses are scripted."""
 
     session: int = 0xABCDEF
     authenticator: Authenticator = AUTHENTICATOR
     stations: int = 3
     station: int = 2
     grant: int = len(GRANT_BYTES) - 1
-    session_every: int = 1
+    session_interval: int = 1
     frame_ns: int = 400 * MS
     counter: int = -1
     now_ns: int = 5 * SECOND
@@ -136,7 +132,7 @@ class ScriptedMaster:
     received: dict[int, int] = field(default_factory=dict)
     written: set[int] = field(default_factory=set)
     replies: dict[int, tuple[int, ...]] = field(default_factory=dict)
-    settled: set[int] = field(default_factory=set)
+    not_pending: set[int] = field(default_factory=set)
     confirm: bool = True
     sent_us: int = 0
     beacon_done_ns: int = 0
@@ -145,17 +141,17 @@ class ScriptedMaster:
 
     @property
     def cumulative(self) -> int:
-        """The number up to which, itself included, nothing is missing."""
+        """The cumulative acknowledgement."""
         number = 0
-        while number in self.written or number in self.settled:
+        while number in self.written or number in self.not_pending:
             number += 1
         return number - 1
 
     def beacon(self, *, commands: Sequence[EncodedCommand] = (), session: bool | None = None) -> bytes:
-        """Begin the next frame; return its beacon."""
+        """Start the next frame; return its beacon."""
         self.counter += 1
         self.now_ns += self.frame_ns
-        with_session = self.counter % self.session_every == 0 if session is None else session
+        with_session = self.counter % self.session_interval == 0 if session is None else session
         confirmations = (
             () if self._confirmation is None else (JoinConfirmation(self.station, self._confirmation),)
         )
@@ -193,15 +189,15 @@ class ScriptedMaster:
             session=self.session, counter=self.counter, content=content
         )
         payload = content + self.code
-        self._left(self.now_ns + TIMING.airtime_ns(len(payload)) + TX_DONE_NS)
+        self._sent_at(self.now_ns + TIMING.airtime_ns(len(payload)) + TX_DONE_NS)
         return payload
 
-    def left(self, transmitted: Transmission) -> None:
-        """Take it that the beacon was sent by a radio."""
+    def sent_by_radio(self, transmitted: Transmission) -> None:
+        """Take the transmission of the beacon by a radio."""
         self.now_ns = transmitted.started_at_ns
-        self._left(transmitted.done_at_ns)
+        self._sent_at(transmitted.done_at_ns)
 
-    def _left(self, done_ns: int) -> None:
+    def _sent_at(self, done_ns: int) -> None:
         self.beacon_done_ns = done_ns
         self.sent_us = (done_ns - self.zero_ns) // 1000
         self.sent_us += not self.sent_us % (1 << 16)
@@ -228,36 +224,41 @@ class ScriptedMaster:
         late_ns: int = 0,
         session: bool | None = None,
     ) -> ReceivedMessage | None:
-        """Play a frame; return the reply, None where there is none or it is lost."""
+        """Run a frame; return the reply, None without one or if it is lost."""
         payload = self.beacon(commands=commands, session=session)
         if beacon_lost:
             return None
-        heard = station.received(self.packet(payload, late_ns=late_ns))
-        if heard is None or heard.slot_ns is None:
+        received = station.received(self.packet(payload, late_ns=late_ns))
+        if received is None or received.slot_ns is None:
             return None
-        reply = self.compose(station, heard, instrument_state)
+        reply = self.compose(station, received, instrument_state)
         return None if reply is None or reply_lost else self.take(reply, not_written=not_written)
 
     def compose(
-        self, station: SuperframeStation, heard: ReceivedBeacon, instrument_state: InstrumentState = TRACKING
+        self,
+        station: SuperframeStation,
+        received: ReceivedBeacon,
+        instrument_state: InstrumentState = TRACKING,
     ) -> bytes | None:
-        """Let the station answer in time."""
-        assert heard.slot_ns is not None
-        reply = station.compose(instrument_state, heard.slot_ns - 6 * MS)
+        """Let the station compose its reply in time."""
+        assert received.slot_ns is not None
+        reply = station.compose(instrument_state, received.slot_ns - 6 * MS)
         if reply is not None:
-            done_ns = heard.slot_ns + TIMING.airtime_ns(len(reply)) + TX_DONE_NS
-            station.sent(Transmission(started_at_ns=heard.slot_ns, done_at_ns=done_ns, stamp_sigma_ns=20_000))
+            done_ns = received.slot_ns + TIMING.airtime_ns(len(reply)) + TX_DONE_NS
+            station.sent(
+                Transmission(started_at_ns=received.slot_ns, done_at_ns=done_ns, stamp_sigma_ns=20_000)
+            )
         return reply
 
     def take(self, payload: bytes, *, not_written: bool = False) -> ReceivedMessage:
-        """Check a reply, and take it."""
+        """Verify and record a reply."""
         assert len(payload) <= GRANT_BYTES[self.grant]
         content, code = payload[:-CODE_BYTES], payload[-CODE_BYTES:]
         reply = decode_reply(content)
         join_request = reply.join_request
         if join_request is not None:
             start = join_request.first_sequence
-            self.settled |= {*range(join_request.oldest), *range(max(0, start - RESTART_SKIP), start)}
+            self.not_pending |= {*range(join_request.oldest), *range(max(0, start - RESTART_SKIP), start)}
             self.nonce = join_request.nonce
             self._confirmation = join_request.nonce if self.confirm else None
         assert self.nonce is not None
@@ -265,7 +266,7 @@ class ScriptedMaster:
         for block in reply.blocks:
             times_ns |= self._times_ns(block)
         sequences = tuple(times_ns)
-        right = self.authenticator.reply_code(
+        expected = self.authenticator.reply_code(
             session=self.session,
             station=self.station,
             station_nonce=self.nonce,
@@ -274,7 +275,7 @@ class ScriptedMaster:
             sequence=sequences[0] if sequences else 0,
             content=content,
         )
-        assert code == right
+        assert code == expected
         self.replies[self.counter] = sequences
         self.received |= times_ns
         self.highest = max(self.highest, *sequences, -1)

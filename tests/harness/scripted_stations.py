@@ -1,4 +1,4 @@
-"""The master's side of the superframe without radios: a test says what its stations answer, frame by frame."""
+"""Scripted superframe stations, frame by frame, against the sans-I/O core of a master."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ TIMING = FrameTiming.from_tolerances(
 )
 EXACT_NS = 3_000
 ZERO_NS = 1_000_000 * MS
-"""The master starts when its clock has run for a quarter of an hour."""
+"""Start of the master on its clock."""
 
 
 def counted() -> Callable[[int], int]:
-    """Return a source of numbers that are not random, and never the same."""
+    """Return a deterministic source of distinct numbers."""
     numbers = iter(range(0xABCDEF, 0xFFFFFF))
     return lambda bits: next(numbers) % (1 << bits)
 
@@ -52,7 +52,7 @@ def counted() -> Callable[[int], int]:
 def measurement(
     sequence: int, session_us: int, *, origin_us: int = 0, wide: bool = False
 ) -> EncodedMeasurement:
-    """Make a measurement whose angles tell its number, with its time as it goes over the air."""
+    """Return an encoded measurement whose angle follows its sequence number."""
     return EncodedMeasurement(
         sequence=sequence % (1 << 32 if wide else 1 << 8),
         time=round((session_us - origin_us) / TIME_UNIT_US) % (1 << (WIDE_TIME_BITS if wide else TIME_BITS)),
@@ -64,7 +64,7 @@ def measurement(
 
 
 def older(newest: EncodedMeasurement, back: int) -> EncodedMeasurement:
-    """Make the measurement so many numbers before another one in its run, at 2.5 Hz."""
+    """Return the measurement ``back`` numbers before another one, at 2.5 Hz."""
     return replace(
         newest,
         sequence=newest.sequence - back,
@@ -75,7 +75,7 @@ def older(newest: EncodedMeasurement, back: int) -> EncodedMeasurement:
 
 @dataclass
 class Station:
-    """What a station has to remember to be believed, and the numbers of its measurements."""
+    """Identity of a station, and its next sequence number."""
 
     number: int
     nonce: int = 0x5EED
@@ -86,29 +86,27 @@ class Station:
 
     @property
     def join_request(self) -> JoinRequest:
-        """Say who it is."""
+        """The join request."""
         return JoinRequest(
             nonce=self.nonce, stream_id=self.stream_id, first_sequence=self.first_sequence, oldest=self.oldest
         )
 
     def next_number(self) -> int:
-        """Return the number of a new measurement."""
+        """Return the sequence number of a new measurement."""
         self.sequence += 1
         return self.sequence - 1
 
 
 @dataclass
 class ScriptedFrames:
-    """A master among hand-played stations; the true constant of all links is 0.1 ms above the nominal one.
+    """A master and scripted stations; the true delay of all links is 0.1 ms above the nominal one.
 
     Attributes
     ----------
     now_ns
         The master's clock.
-    beacon
-        Of the present frame.
     writes
-        What is heard is written at once.
+        Received measurements are recorded at once.
     """
 
     stations: dict[int, Station]
@@ -121,15 +119,15 @@ class ScriptedFrames:
     sent_ns: int = 0
     link_ns: int = TIMING.link_ns + 100_000
     turnarounds_us: dict[int, int] = field(default_factory=dict)
-    """By station: from RxDone of the last beacon that it answered to TxDone of its reply."""
+    """Turnaround of the last reply, by station."""
 
     @property
     def sent_us(self) -> int:
-        """TxDone of the present beacon in session time."""
+        """TxDone of the beacon in session time."""
         return (self.sent_ns - ZERO_NS + 500) // 1000 % (1 << SESSION_TIME_BITS)
 
     def begin(self, *, sigma_ns: int = EXACT_NS, fails: bool = False) -> Beacon:
-        """Begin a frame; a beacon that fails is heard by nobody, and nobody knows when it went out."""
+        """Start a frame; a failed beacon is not received, and its TxDone is unknown."""
         start_ns = self.master.prepare(self.now_ns)
         assert start_ns >= self.now_ns
         self.payload = self.master.compose()
@@ -147,7 +145,7 @@ class ScriptedFrames:
         return span
 
     def packet(self, station: int, reply: Reply, *, sequence: int = 0, nonce: int | None = None) -> bytes:
-        """Return a reply as the station sends it; ``sequence`` is the full number of its first measurement."""
+        """Return the packet of a reply; ``sequence`` is the full number of its first measurement."""
         content = encode_reply(reply)
         return content + self.authenticator.reply_code(
             session=self.master.session,
@@ -162,29 +160,31 @@ class ScriptedFrames:
     def arrive(
         self, station: int, packet: bytes, *, late_ns: int = 0, sigma_ns: int = EXACT_NS
     ) -> ReceivedReply | None:
-        """Let a packet arrive as one in the station's slot does."""
+        """Deliver a packet in the slot of the station."""
         begins_ns = self.sent_ns + self.link_ns - TIMING.reception_ns + self.span(station).start_ns + late_ns
         ends_ns = begins_ns + TIMING.airtime_ns(len(packet)) + TX_DONE_NS + self.link_ns
-        heard = self.master.received(packet, ends_ns, sigma_ns)
+        received = self.master.received(packet, ends_ns, sigma_ns)
         self.turnarounds_us[station] = round((ends_ns - self.sent_ns - 2 * self.link_ns) / 1000)
         self.now_ns = max(self.now_ns, ends_ns)
-        if heard is not None and self.writes:
-            self.master.station(station).window.mark_written([each.sequence for each in heard.measurements])
-        return heard
+        if received is not None and self.writes:
+            self.master.station(station).window.mark_written(
+                [each.sequence for each in received.measurements]
+            )
+        return received
 
     def reply(
         self, station: int, reply: Reply, *, sequence: int = 0, late_ns: int = 0, sigma_ns: int = EXACT_NS
     ) -> ReceivedReply:
-        """Let a station answer, which the master has to accept."""
+        """Deliver a reply that the master has to accept."""
         packet = self.packet(station, reply, sequence=sequence)
-        heard = self.arrive(station, packet, late_ns=late_ns, sigma_ns=sigma_ns)
-        assert heard is not None
-        return heard
+        received = self.arrive(station, packet, late_ns=late_ns, sigma_ns=sigma_ns)
+        assert received is not None
+        return received
 
     def measure(
         self, station: int, *, age_ms: float = 100, join: bool = False, wide: bool | None = None
     ) -> ReceivedReply:
-        """Let a station answer with a new measurement, made so long before its slot."""
+        """Deliver a reply with a new measurement of this age at the start of the slot."""
         sender = self.stations[station]
         number = sender.next_number()
         wide = join if wide is None else wide
@@ -196,19 +196,19 @@ class ScriptedFrames:
         return self.reply(station, Reply(blocks=(block,), join_request=join_request), sequence=number)
 
     def end(self) -> list[int]:
-        """End the frame; return who was silent."""
+        """End the frame; return the silent stations."""
         self.now_ns = max(self.now_ns, self.master.reply_deadline_ns or 0) + 5 * MS
         return self.master.finish()
 
     def join(self) -> None:
-        """Have all stations introduce themselves, each with a measurement, and be confirmed."""
+        """Let all stations join, each with a measurement."""
         self.begin()
         for station in self.stations:
             self.measure(station, join=True)
         self.end()
 
     def run(self, frames: int, silent: Sequence[int] = ()) -> None:
-        """Run frames in which all stations answer with a new measurement, but for the silent ones."""
+        """Run frames in which all stations but the silent ones send a new measurement."""
         for _ in range(frames):
             self.begin()
             for station in self.stations:
@@ -225,7 +225,7 @@ def scripted_frames(
     zero_ns: int = ZERO_NS,
     **options: bool,
 ) -> ScriptedFrames:
-    """Make a master and its stations, none of which has joined."""
+    """Return a master and stations that have not joined."""
     authenticator = Authenticator(key)
     master = SuperframeMaster(
         {number: number for number in stations},

@@ -1,4 +1,4 @@
-"""The master's side of the paper's protocol with one station, without chips: a test says what is lost and restarted."""
+"""The polling protocol's link of a master with one station, without radios; the test scripts losses and restarts."""
 
 from __future__ import annotations
 
@@ -27,51 +27,51 @@ SECOND = 1000 * MS
 START = 1_600_000_000 * SECOND
 TURNAROUND_NS = 3 * MS
 AGE_NS = 50 * MS
-"""The instrument's newest measurement is so old when the master asks for it."""
+"""Age of the newest measurement when the master polls it."""
 
 
 class SingleStation:
-    """The radio of a master, and at its other end station 1, which measures all the time.
+    """Radio of a master whose other end is station 1, which measures continuously.
 
     Attributes
     ----------
     station
-        Its program; None while it is not running.
-    ahead_ns
-        By how much its clock is ahead of the master's.
-    asked
-        What the master has sent, and when that ended, on the master's clock in ns since the start.
-    before
-        Called with each request before it is sent: what happens meanwhile; returns for how many ns the master is busy.
-    lost
-        Called with each request that the station answers: whether its answer is lost.
-    stamp_errors_ns
-        Of each measurement that has come out, how far its stamp is off, and its bound.
+        None while its program is not running.
+    offset_ns
+        Clock offset; positive: station ahead of master.
+    requests
+        Payloads that the master has sent, with the end of each on its clock in ns since the start.
+    before_request
+        Called with each request before it is sent; returns for how many ns the master is busy.
+    is_lost
+        Called with each request that the station responds to: whether the response is lost.
+    timestamp_errors_ns
+        Timestamp error and bound of each published measurement.
     clocks
-        What the synchronisations have found.
+        Results of the clock synchronisation.
     """
 
     def __init__(self) -> None:
         self.clock = VirtualClock(START)
         self.station: ClassicStation | None = ClassicStation(1)
-        self.ahead_ns = 7200 * SECOND
-        self.asked: list[tuple[bytes, int]] = []
-        self.before: Callable[[bytes], int] = lambda _: 0
-        self.lost: Callable[[bytes], bool] = lambda _: False
-        self.stamp_errors_ns: list[tuple[int, int]] = []
+        self.offset_ns = 7200 * SECOND
+        self.requests: list[tuple[bytes, int]] = []
+        self.before_request: Callable[[bytes], int] = lambda _: 0
+        self.is_lost: Callable[[bytes], bool] = lambda _: False
+        self.timestamp_errors_ns: list[tuple[int, int]] = []
         self.clocks: list[ClockRecord] = []
         self._timing = LinkTiming(PAPER, 250 * MS)
         self._made_ns: dict[int, int] = {}
         self._arriving: asyncio.Queue[Packet] = asyncio.Queue()
 
     def restart(self, step_ns: int) -> None:
-        """Start its program anew, with a clock that is ahead by so much more."""
+        """Restart the station with a clock that has stepped."""
         self.station = ClassicStation(1)
-        self.ahead_ns += step_ns
+        self.offset_ns += step_ns
 
     def count(self, payload: bytes) -> int:
-        """Return how often the master has sent this."""
-        return sum(asked == payload for asked, _ in self.asked)
+        """Return how often the master has sent this payload."""
+        return sum(asked == payload for asked, _ in self.requests)
 
     async def configure(self, settings: LoRaSettings) -> None:
         """Do nothing."""
@@ -80,25 +80,25 @@ class SingleStation:
         """Do nothing."""
 
     async def receive(self) -> Packet:
-        """Return the station's next answer."""
+        """Return the next response of the station."""
         return await self._arriving.get()
 
     async def transmit(self, payload: bytes, *, at_ns: int | None = None) -> Transmission:
-        """Send a request; what the station answers arrives when it would."""
+        """Send a request; the response arrives with its delay."""
         del at_ns  # the paper's protocol sends at once
-        await asyncio.sleep(self.before(payload) / 1e9)
+        await asyncio.sleep(self.before_request(payload) / 1e9)
         started_ns = self.clock.monotonic_ns()
         end_ns = started_ns + self._timing.airtime_ns(len(payload))
-        heard_ns = end_ns + self._timing.rx_done_ns
+        received_ns = end_ns + self._timing.rx_done_ns
         await self.clock.sleep_until(end_ns + TX_DONE_NS)
-        self.asked.append((payload, end_ns))
-        answer = self._answer(payload, heard_ns)
-        if answer is not None and not self.lost(payload):
+        self.requests.append((payload, end_ns))
+        response = self._response(payload, received_ns)
+        if response is not None and not self.is_lost(payload):
             arrives_ns = (
-                heard_ns + TURNAROUND_NS + self._timing.airtime_ns(len(answer)) + self._timing.rx_done_ns
+                received_ns + TURNAROUND_NS + self._timing.airtime_ns(len(response)) + self._timing.rx_done_ns
             )
             packet = Packet(
-                payload=answer,
+                payload=response,
                 rssi_dbm=-80.0,
                 snr_db=9.0,
                 received_at_ns=arrives_ns,
@@ -108,11 +108,11 @@ class SingleStation:
             asyncio.get_running_loop().call_later(delay_s, self._arriving.put_nowait, packet)
         return Transmission(started_at_ns=started_ns, done_at_ns=end_ns + TX_DONE_NS, stamp_sigma_ns=1)
 
-    def _answer(self, payload: bytes, heard_ns: int) -> bytes | None:
+    def _response(self, payload: bytes, received_ns: int) -> bytes | None:
         if self.station is None:
             return None
-        made_ns = START + heard_ns - AGE_NS
-        self._made_ns[made_ns + self.ahead_ns] = made_ns
+        made_ns = START + received_ns - AGE_NS
+        self._made_ns[made_ns + self.offset_ns] = made_ns
         self.station.measured(
             MeasurementMessage(
                 station=1,
@@ -120,13 +120,13 @@ class SingleStation:
                 zenith_angle_rad=1.5,
                 horizontal_angle_rad=0.5,
                 slope_distance_m=30.0,
-                time_ns=made_ns + self.ahead_ns,
+                time_ns=made_ns + self.offset_ns,
             )
         )
-        answer = self.station.received(payload, START + heard_ns + self.ahead_ns)
-        if isinstance(answer, TrackCommand):
-            return self.station.executed(answer, ok=True)
-        return answer if isinstance(answer, bytes) else None
+        response = self.station.received(payload, START + received_ns + self.offset_ns)
+        if isinstance(response, TrackCommand):
+            return self.station.executed(response, ok=True)
+        return response if isinstance(response, bytes) else None
 
     def report(self, event: LinkEvent) -> None:
         """Take what the link reports."""
@@ -137,12 +137,12 @@ class SingleStation:
             assert measurement.host_time_ns is not None
             assert measurement.stamp_bound_ns is not None
             error_ns = measurement.stamp_ns - self._made_ns[measurement.host_time_ns]
-            self.stamp_errors_ns.append((error_ns, measurement.stamp_bound_ns))
+            self.timestamp_errors_ns.append((error_ns, measurement.stamp_bound_ns))
 
 
 @asynccontextmanager
 async def single_station() -> AsyncGenerator[SingleStation]:
-    """Run a master's link with its one station."""
+    """Run the link of a master with one station."""
     field = SingleStation()
     stations = [StationConfig(station=1, prism=1, prism_constant_mm=0.0)]
     link = ClassicLink(

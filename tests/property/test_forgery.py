@@ -7,9 +7,9 @@ from dataclasses import replace
 from unittest.mock import patch
 
 import numpy as np
-from harness.superframe_loop import Exchange
 from harness.forgery import KINDS, forge, state
 from harness.scripted_stations import KEY, TIMING
+from harness.superframe_loop import SuperframeLoop
 
 from tsgt.errors import MessageError
 from tsgt.model import Status
@@ -54,10 +54,10 @@ def test_missing_code_comparison_is_detected() -> None:
 
 def test_state_comparison_detects_one_counter() -> None:
     """Of one station."""
-    one, other = (Exchange(TIMING, Authenticator(KEY), lambda bits: 7 % (1 << bits)) for _ in range(2))
-    for exchange in (one, other):
-        exchange.frame()
-        exchange.frame()
+    one, other = (SuperframeLoop(TIMING, Authenticator(KEY), lambda bits: 7 % (1 << bits)) for _ in range(2))
+    for loop in (one, other):
+        loop.run_frame()
+        loop.run_frame()
     assert state(one) == state(other)
     other.members[3].core.missed_slots += 1
     assert state(one) != state(other)
@@ -82,10 +82,10 @@ class _Anybody:
         """Return True with this probability."""
         return bool(self._rng.random() < share)
 
-    def beacon(self, exchange: Exchange, number: int) -> bytes:
+    def beacon(self, loop: SuperframeLoop, number: int) -> bytes:
         """Return a beacon of the station's master, or of another session."""
-        entries = int(self._rng.integers(1, 17)) if self.chance(0.2) else len(exchange.members)
-        core = exchange.members[number].core
+        entries = int(self._rng.integers(1, 17)) if self.chance(0.2) else len(loop.members)
+        core = loop.members[number].core
         session = core.session
         assert session is not None
         counter = session.beacon.counter + 1 + (self.bits(3) if self.chance() else 0)
@@ -119,9 +119,9 @@ class _Anybody:
         )
         return content + self._authenticator.beacon_code(session=master, counter=counter, content=content)
 
-    def reply(self, exchange: Exchange, number: int) -> bytes:
+    def reply(self, loop: SuperframeLoop, number: int) -> bytes:
         """Return a reply that the master accepts as the station's."""
-        station_state = exchange.master.station(number)
+        station_state = loop.master.station(number)
         join_request = JoinRequest(
             nonce=self.bits(32), stream_id=self.bits(2), first_sequence=self.bits(32), oldest=self.bits(32)
         )
@@ -145,11 +145,11 @@ class _Anybody:
         content = encode_reply(reply)
         nonce = station_state.nonce if reply.join_request is None else reply.join_request.nonce
         return content + self._authenticator.reply_code(
-            session=exchange.master.session,
+            session=loop.master.session,
             station=number,
             station_nonce=nonce or 0,
-            counter=exchange.master.counter,
-            beacon_code=exchange.beacon[-CODE_BYTES:],
+            counter=loop.master.counter,
+            beacon_code=loop.beacon[-CODE_BYTES:],
             sequence=station_state.first_sequence(decode_reply(content)),
             content=content,
         )
@@ -177,30 +177,32 @@ def test_arbitrary_messages_raise_no_error() -> None:
     """Commands, sessions, numbers and times of any sender, all of which are accepted."""
     rng = np.random.default_rng(3)
     anybody = _Anybody(rng)
-    exchange = Exchange(TIMING, Authenticator(None), anybody.bits)
-    exchange.frame()
-    believed = 0
+    loop = SuperframeLoop(TIMING, Authenticator(None), anybody.bits)
+    loop.run_frame()
+    accepted = 0
     for _ in range(250):
-        exchange.begin()
-        for number, member in exchange.members.items():
-            own = exchange.hear(number) if anybody.chance() else None
+        loop.send_beacon()
+        for number, member in loop.members.items():
+            own = loop.receive_beacon(number) if anybody.chance() else None
             with suppress(MessageError):
-                beacon = anybody.beacon(exchange, number)
-                exchange.hear(number, beacon=beacon, late_ns=anybody.bits(33) if anybody.chance(0.1) else 0)
+                beacon = anybody.beacon(loop, number)
+                loop.receive_beacon(
+                    number, beacon=beacon, delay_ns=anybody.bits(33) if anybody.chance(0.1) else 0
+                )
             if member.core.next_command() is not None:
                 member.core.executed(ok=anybody.chance())
             if own is not None and anybody.chance():
-                exchange.deliver(number, own)
+                loop.deliver_reply(number, own)
             with suppress(MessageError):
-                reply = anybody.reply(exchange, number)
-                received_ns = exchange.done_ns + anybody.bits(29)
-                heard = exchange.master.received(
+                reply = anybody.reply(loop, number)
+                received_ns = loop.done_ns + anybody.bits(29)
+                received = loop.master.received(
                     reply, received_ns, 3000 if anybody.chance(0.9) else 1_000_000
                 )
-                if heard is not None:
-                    believed += 1
-                    exchange.master.station(number).window.mark_written(
-                        [got.sequence for got in heard.measurements]
+                if received is not None:
+                    accepted += 1
+                    loop.master.station(number).window.mark_written(
+                        [got.sequence for got in received.measurements]
                     )
-        exchange.end()
-    assert believed > 200
+        loop.end_frame()
+    assert accepted > 200

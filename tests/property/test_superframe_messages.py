@@ -33,7 +33,7 @@ from tsgt.radio.superframe.wire import (
     reply_bytes,
 )
 
-LONGEST_PACKET_BYTES = 255
+MAX_PACKET_BYTES = 255
 
 
 def _bits(width: int) -> st.SearchStrategy[int]:
@@ -75,7 +75,7 @@ def beacons(draw: st.DrawFn) -> Beacon:
 angles = _bits(24)
 distances = st.none() | st.integers(1, 2**24 - 1)
 statuses = st.sampled_from(Status)
-# Small steps mostly, as of a robot, and now and then any at all.
+# Mostly the small steps of a robot, and sometimes any step.
 number_steps = st.just(1) | st.integers(1, 300) | st.integers(1, 2**32 - 1)
 time_steps = st.integers(24_000, 26_000) | st.integers(-(2**18), 2**18) | st.integers(1 - 2**35, 2**35)
 angle_steps = st.integers(-100, 100) | st.integers(-(2**17), 2**17) | angles
@@ -214,7 +214,7 @@ def test_every_damaged_reply_is_refused_or_means_what_it_says(reply: Reply, data
 
 
 @examples(500)
-@given(st.binary(max_size=LONGEST_PACKET_BYTES), st.integers(0, 15))
+@given(st.binary(max_size=MAX_PACKET_BYTES), st.integers(0, 15))
 def test_foreign_packets_break_nothing(content: bytes, start: int) -> None:
     """Whatever comes over the air, also with a beginning like ours, is refused or has one meaning."""
     for packet in (content, bytes([0x40 | start << 2]) + content):
@@ -222,7 +222,7 @@ def test_foreign_packets_break_nothing(content: bytes, start: int) -> None:
         _check_reply(packet)
 
 
-@given(st.integers(0, LONGEST_PACKET_BYTES))
+@given(st.integers(0, MAX_PACKET_BYTES))
 def test_zeros_and_ones_break_nothing(length: int) -> None:
     """A run of equal bits is the likeliest packet of a chip gone wrong."""
     for byte in (b"\x00", b"\xff"):

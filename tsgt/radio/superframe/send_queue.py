@@ -140,7 +140,7 @@ class DeliveryProgress:
     delete anything that the master has not recorded. It therefore reads the lowest number with these bits that is not
     below a number that the master has certainly reached: everything below the oldest queued number. The exception are
     gaps, numbers that the master waits for and that are never sent, because an earlier master has them or they were lost.
-    Nothing beyond a gap counts until a new join request, with a higher oldest number, tells the master not to wait. The
+    Nothing beyond a gap counts until a new join request, with a higher oldest number, ends the wait. The
     station sends one as soon as it has delivered everything below the numbers that a restart skipped, and otherwise when
     all gaps are below its oldest queued number.
 
@@ -159,7 +159,7 @@ class DeliveryProgress:
 
     @property
     def outdated(self) -> bool:
-        """Whether the master waits for numbers that are never sent, and a join request would tell it so."""
+        """Whether the master waits for numbers that are never sent, and needs a join request."""
         gaps = self._current_gaps()
         passed = [(first, last) for first, last in gaps if last < self._queue.oldest]
         all_passed = bool(passed) and len(passed) == len(gaps)

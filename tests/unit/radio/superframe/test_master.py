@@ -139,11 +139,11 @@ def test_beacon_relative_times_make_full_time_frequent(*, direct: bool, often: i
     frames = scripted_frames((1,))
     frames.join()
     frames.run(12)
-    told = []
+    frames_with_session = []
     for number in range(13, 13 + 2 * often):
         session = frames.begin().session
         if session is not None:
-            told.append(frames.master.counter)
+            frames_with_session.append(frames.master.counter)
         origin_us = frames.sent_us if direct else 0
         measured = measurement(number, frames.sent_us + 10_000, origin_us=origin_us, wide=True)
         frames.reply(
@@ -152,8 +152,8 @@ def test_beacon_relative_times_make_full_time_frequent(*, direct: bool, often: i
             sequence=number,
         )
         frames.end()
-    assert len(told) == 2
-    assert told[1] - told[0] == often
+    assert len(frames_with_session) == 2
+    assert frames_with_session[1] - frames_with_session[0] == often
 
 
 def test_stations_may_have_any_numbers() -> None:
@@ -185,7 +185,7 @@ def test_new_session_starts_before_counter_wraps(frames: ScriptedFrames) -> None
         assert (received.measurements, received.repeated) == ((), 1)
 
 
-# --- Who is believed ------------------------------------------------------------------------------------------------
+# --- Authentication ------------------------------------------------------------------------------------------
 
 
 def test_station_joins_with_first_reply() -> None:
@@ -332,7 +332,7 @@ def test_lost_measurement_is_accepted_again(frames: ScriptedFrames) -> None:
     assert [each.sequence for each in received.measurements] == [number]
 
 
-# --- Orders ---------------------------------------------------------------------------------------------------------
+# --- Commands ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -23,8 +23,8 @@ SECOND_NS = 1000 * MS
 class Field:
     """Stations with an instrument each and a master, without radios.
 
-    ``made`` are the instruments' measurements in ns, ``latency_ns`` is what they need to be ready. Each reply brings the
-    newest ones that are ready, as many as the grant takes; the oldest wait for the next one, which is longer.
+    ``made`` are the times of the measurements in ns, ``latency_ns`` is the delay until they are ready. Each reply has the newest
+    ready ones, as many as its grant allows; the others wait for the next reply, whose grant is larger.
     """
 
     made: list[list[int]]
@@ -46,12 +46,12 @@ class Field:
         self.grants = self.grants or [ONE] * len(self.made)
 
     def run(self, seconds: float) -> None:
-        """Run frames up to so many seconds from the start."""
+        """Run frames up to this time."""
         while self._earliest_ns < seconds * SECOND_NS:
             self._frame()
 
     def ages_after(self, seconds: float, until: float) -> list[float]:
-        """Run up to a time, then on; return the ages of what came in between, in ms."""
+        """Run frames up to the second time; return the ages of measurements received after the first, in ms."""
         self.run(seconds)
         self.ages_ms.clear()
         self.run(until)

@@ -45,7 +45,7 @@ class Instrument:
     """Adds measurements to a send queue as the master's time passes."""
 
     def __init__(self, send_queue: SendQueue, first: int = 0) -> None:
-        self._outbox = send_queue
+        self._queue = send_queue
         self._next = first
         self._due_ns: int | None = None
         self.made_ns: dict[int, int] = {}
@@ -55,7 +55,7 @@ class Instrument:
         if self._due_ns is None:
             self._due_ns = true_ns - 1
         while self._due_ns <= true_ns:
-            self._outbox.add(queued(self._next, self._due_ns))
+            self._queue.add(queued(self._next, self._due_ns))
             self.made_ns[self._next] = self._due_ns
             self._next += 1
             self._due_ns += PERIOD_NS
@@ -89,7 +89,7 @@ def test_station_joins_in_two_frames() -> None:
     assert second is not None
     assert (joined_before, station.joined) == (False, True)
     assert second.reply.join_request is None
-    assert second.sequences == (1,)  # the other one is acknowledged with the same beacon
+    assert second.sequences == (1,)  # the same beacon acknowledges the other one
     assert not second.reply.blocks[0].wide
     assert second.reply.blocks[0].prism is None
     assert len(send_queue) == 1
@@ -114,7 +114,7 @@ def test_all_measurements_arrive_within_their_bounds(loss: float, seed: int) -> 
     rng = np.random.default_rng(seed)
     send_queue = SendQueue(0)
     master, station, instrument = (
-        ScriptedMaster(session_every=4),
+        ScriptedMaster(session_interval=4),
         make_station(send_queue),
         Instrument(send_queue),
     )
@@ -158,7 +158,7 @@ def test_unrecorded_measurement_is_retransmitted() -> None:
 def test_empty_reply_has_five_bytes() -> None:
     """Including the authentication code."""
     master, station, _ = joined()
-    master.frame(station, beacon_lost=True)  # or it would tell how long the reply before took
+    master.frame(station, beacon_lost=True)  # or the reply would have a turnaround
     answered = master.frame(station)
     assert answered is not None
     assert answered.payload_bytes == 5
@@ -185,7 +185,7 @@ def test_backlog_is_delivered_newest_first() -> None:
     """New measurements do not wait for a backlog of a thousand, which arrives completely."""
     send_queue = SendQueue(0)
     master, station, instrument = (
-        ScriptedMaster(session_every=4),
+        ScriptedMaster(session_interval=4),
         make_station(send_queue),
         Instrument(send_queue),
     )
@@ -426,7 +426,7 @@ def test_replayed_session_has_no_effect() -> None:
     for _ in range(20):
         instrument.until(master.now_ns + master.frame_ns)
         master.frame(station)
-    assert station.received(master.packet(recorded[0])) is None  # the master has just been heard
+    assert station.received(master.packet(recorded[0])) is None  # the master is not silent
     instrument.until(master.now_ns + 4 * SECOND)
     before = len(send_queue)
     for payload in recorded:
@@ -481,7 +481,7 @@ def test_long_outage_ends_with_session_info() -> None:
     """After 256 frames the low bits of the frame counter are ambiguous."""
     master, station, _ = joined()
     master.counter += 1000
-    master.session_every = 8
+    master.session_interval = 8
     answers = [master.frame(station) for _ in range(16)]
     received = [answered is not None for answered in answers]
     assert received.index(True) == next(i for i in range(16) if (master.counter - 15 + i) % 8 == 0)
@@ -508,7 +508,7 @@ def collect(
 def test_restarted_station_continues() -> None:
     """The backlog arrives with accurate timestamps; delivered measurements are not repeated."""
     send_queue = SendQueue(0)
-    master, instrument = ScriptedMaster(session_every=4), Instrument(send_queue)
+    master, instrument = ScriptedMaster(session_interval=4), Instrument(send_queue)
     source = counted()
     station = make_station(send_queue, random_bits=source)
     receptions = collect(master, station, instrument, 60)
@@ -534,7 +534,7 @@ def test_restarted_station_continues() -> None:
 def test_reboot_keeps_timestamps_of_known_clocks() -> None:
     """The clock of the earlier boot is used; measurements without one stay in the journal."""
     send_queue = SendQueue(0)
-    master, instrument = ScriptedMaster(session_every=4), Instrument(send_queue)
+    master, instrument = ScriptedMaster(session_interval=4), Instrument(send_queue)
     source = counted()
     station = make_station(send_queue, random_bits=source)
     receptions = collect(master, station, instrument, 60)
@@ -568,7 +568,7 @@ def test_reboot_keeps_timestamps_of_known_clocks() -> None:
 def test_unconverged_clock_is_not_used_after_reboot(beacons: int, expected: set[int]) -> None:
     """Its beacons may have been delayed."""
     send_queue = SendQueue(0)
-    master, instrument = ScriptedMaster(session_every=1), Instrument(send_queue)
+    master, instrument = ScriptedMaster(session_interval=1), Instrument(send_queue)
     source = counted()
     station = make_station(send_queue, random_bits=source)
     receptions = collect(master, station, instrument, 12)[:beacons]
@@ -585,7 +585,7 @@ def test_unconverged_clock_is_not_used_after_reboot(beacons: int, expected: set[
 def test_untimeable_measurements_do_not_block_others() -> None:
     """Measurements of an earlier boot, minutes and hours after its last beacon."""
     send_queue = SendQueue(0)
-    master, instrument = ScriptedMaster(session_every=4), Instrument(send_queue)
+    master, instrument = ScriptedMaster(session_interval=4), Instrument(send_queue)
     source = counted()
     station = make_station(send_queue, random_bits=source)
     moved = [replace(each, boot="old") for each in collect(master, station, instrument, 60)]
@@ -605,7 +605,7 @@ def test_untimeable_measurements_do_not_block_others() -> None:
 def test_measurements_long_before_first_beacon_are_discarded() -> None:
     """Younger ones are delivered, and the master waits for no others."""
     send_queue = SendQueue(0)
-    master = ScriptedMaster(session_every=4, now_ns=6 * 3600 * SECOND)
+    master = ScriptedMaster(session_interval=4, now_ns=6 * 3600 * SECOND)
     for number in range(20):
         send_queue.add(queued(number, number * SECOND))
     for number in range(20, 40):

@@ -23,7 +23,7 @@ STATE = StatusReport(prism=1, direct=False, connected=True, missed_slots=0, reje
 US = 1_000
 LINK_NS = TIMING.link_ns
 LINK_BOUND_NS = 0.2 * 2_048_000
-"""While it has not been measured; see :class:`~tsgt.timesync.link_delay.LinkDelayEstimator`."""
+"""Of the nominal link delay; see :class:`~tsgt.timesync.link_delay.LinkDelayEstimator`."""
 
 
 @pytest.fixture
@@ -182,7 +182,7 @@ def test_negative_sequence_numbers_are_dropped(frames: ScriptedFrames) -> None:
     assert [each.sequence for each in received.measurements] == [1]
 
 
-# --- Prisms, state --------------------------------------------------------------------------------------------------
+# --- Prisms, status ---------------------------------------------------------------------------------------------
 
 
 def test_prism_follows_status_report(frames: ScriptedFrames) -> None:
@@ -202,19 +202,19 @@ def test_prism_follows_status_report(frames: ScriptedFrames) -> None:
 
 def test_status_counters_are_unwrapped(frames: ScriptedFrames) -> None:
     """From the first report on."""
-    told = []
-    for late, doubted in ((250, 14), (3, 1), (3, 1), (4, 1)):
+    counts = []
+    for missed, rejected in ((250, 14), (3, 1), (3, 1), (4, 1)):
         frames.begin()
         received = frames.reply(
-            1, Reply(status_report=replace(STATE, missed_slots=late, rejected_beacons=doubted))
+            1, Reply(status_report=replace(STATE, missed_slots=missed, rejected_beacons=rejected))
         )
-        told.append(received.rejected_beacons)
+        counts.append(received.rejected_beacons)
         frames.end()
-    assert told == [0, 3, 0, 0]
+    assert counts == [0, 3, 0, 0]
     assert (frames.master.station(1).missed_slots, frames.master.station(1).rejected_beacons) == (10, 3)
 
 
-# --- Link constant --------------------------------------------------------------------------------------------------
+# --- Link delay -------------------------------------------------------------------------------------------------
 
 
 def exchange(
@@ -345,7 +345,7 @@ def test_outstanding_measurements_are_granted() -> None:
     frames.run(1)
     assert granted(frames) == 71
     frames.begin()
-    frames.measure(1)  # and it had room for more
+    frames.measure(1)  # and leave room for more
     frames.end()
     assert granted(frames) <= 26
 
@@ -391,7 +391,7 @@ def test_restarted_station_repeats_backlog() -> None:
     frames.end()
     assert granted(frames) == 71
     frames.begin()
-    frames.measure(1)  # and it had room for more
+    frames.measure(1)  # and leave room for more
     frames.end()
     assert granted(frames) <= 26
 
@@ -406,7 +406,7 @@ def test_worse_quality_gets_larger_grant() -> None:
     frames.reply(2, Reply())
     frames.end()
     frames.begin()
-    assert [GRANT_BYTES[entry.grant] for entry in frames.beacon.stations[:2]] == [21, 30]  # and a turn-round
+    assert [GRANT_BYTES[entry.grant] for entry in frames.beacon.stations[:2]] == [21, 30]  # and a turnaround
 
 
 def test_pending_command_gets_room_for_response() -> None:

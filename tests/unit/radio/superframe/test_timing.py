@@ -13,15 +13,15 @@ if TYPE_CHECKING:
 
 
 def by_ms(*late_ms: int | None, untimed: Collection[int] = ()) -> list[int]:
-    """Return what is thought after each frame, by how late its reply came; None: there was none.
+    """Return the detected delay after each frame, by the lateness of its reply; None: no reply.
 
-    Of some frames, by their index, the next beacon does not tell when theirs left.
+    The beacons after the frames with the indices ``untimed`` do not carry the time of their beacon.
     """
-    held, found = BeaconDelayMonitor(), []
+    monitor, found = BeaconDelayMonitor(), []
     for index, late in enumerate(late_ms):
         if late is not None:
-            held.add(7 + index, late * MS, beacon_time_sent=index not in untimed)
-        found.append(held.delay_ns // MS)
+            monitor.add(7 + index, late * MS, beacon_time_sent=index not in untimed)
+        found.append(monitor.delay_ns // MS)
     return found
 
 

@@ -204,11 +204,11 @@ def test_angle_differences_wrap() -> None:
     across = MeasurementBlock(
         measurements=(replace(SIGHTING, horizontal=3), replace(SIGHTING, sequence=199, horizontal=2**24 - 3))
     )
-    beside = MeasurementBlock(
+    nearby = MeasurementBlock(
         measurements=(replace(SIGHTING, horizontal=9), replace(SIGHTING, sequence=199, horizontal=3))
     )
     assert decode_reply(encode_reply(Reply(blocks=(across,)))).blocks == (across,)
-    assert reply_bytes(Reply(blocks=(across,))) == reply_bytes(Reply(blocks=(beside,)))
+    assert reply_bytes(Reply(blocks=(across,))) == reply_bytes(Reply(blocks=(nearby,)))
 
 
 def test_missing_distances_round_trip() -> None:

@@ -116,7 +116,7 @@ def accept_duplicates_classic(planting: Planting) -> None:
 
         return defective
 
-    planting.replace_attribute(ingest._Station, "__init__", init)
+    planting.replace_attribute(ingest.StationIngest, "__init__", init)
 
 
 # --- Numbers and codes ----------------------------------------------------------------------------------------
@@ -177,7 +177,7 @@ def add_clock_offset(planting: Planting) -> None:
 
         return defective
 
-    planting.replace_attribute(ingest._Station, "_measurement", measurement)
+    planting.replace_attribute(ingest.StationIngest, "_measurement", measurement)
 
 
 def reverse_frequency(planting: Planting) -> None:

@@ -19,7 +19,7 @@ from tsgt.recording import ClockRecord
 from tsgt.timesync.two_way import TimestampCheck
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Sequence
 
     from tsgt.model import ClockSample
     from tsgt.radio.classic import MeasurementMessage
@@ -93,67 +93,6 @@ def next_clock_state(state: ClockState, event: ClockEvent) -> ClockState:
     return _TRANSITIONS[event].get(state, state)
 
 
-class Ingest:
-    """Validates and stamps the stations' replies.
-
-    Parameters
-    ----------
-    prisms
-        Number of the prism by number of the station that tracks it.
-    new_filter
-        Makes the clock filter of one station.
-    stamp_delays_ns
-        By station: by how much its computer's reception stamps are late on average, in ns. A single stamp may be off
-        by as much.
-    """
-
-    def __init__(
-        self,
-        prisms: Mapping[int, int],
-        new_filter: Callable[[], ClockFilter],
-        stamp_delays_ns: Mapping[int, int] | None = None,
-    ) -> None:
-        delays_ns = stamp_delays_ns or {}
-        self._stations = {
-            station: _Station(station, prism, new_filter(), delays_ns.get(station, 0))
-            for station, prism in prisms.items()
-        }
-
-    def reply(self, message: MeasurementMessage, *, requested_ns: int, received_ns: int) -> PollResult:
-        """Take the reply to a poll.
-
-        Parameters
-        ----------
-        requested_ns
-            When the transmission of the request began, on the master's Unix clock in ns.
-        received_ns
-            End of the reply's reception, on the same clock.
-        """
-        return self._stations[message.station].reply(message, requested_ns, received_ns)
-
-    def no_response(self, station: int) -> None:
-        """Record that a station did not respond to a request."""
-        self._stations[station].no_response()
-
-    def suspend(self, station: int) -> None:
-        """Hold a station's measurements until it is synchronised: it may have restarted with another clock."""
-        self._stations[station].handle(ClockEvent.POSSIBLE_RESTART)
-
-    def synchronised(
-        self, station: int, samples: Sequence[ClockSample], now_ns: int
-    ) -> SynchronisationResult:
-        """Take the samples of a synchronisation, at least one; held measurements are stamped and released."""
-        return self._stations[station].synchronised(samples, now_ns)
-
-    def clock(self, station: int, now_ns: int) -> ClockEstimate | None:
-        """Return the estimate of a station's clock at an instant; None while unsynchronised."""
-        return self._stations[station].clock(now_ns)
-
-    def clock_state(self, station: int) -> ClockState:
-        """Return what is known of a station's clock."""
-        return self._stations[station].state
-
-
 class PollResult(NamedTuple):
     """The result of a poll."""
 
@@ -183,10 +122,21 @@ class _Untimed:
     raw_status: int
 
 
-class _Station:
-    """Clock and last replies of one station."""
+class StationIngest:
+    """Validates and stamps the replies of one station.
 
-    def __init__(self, station: int, prism: int, clock: ClockFilter, stamp_delay_ns: int) -> None:
+    Parameters
+    ----------
+    stamp_delay_ns
+        By how much its computer's reception stamps are late on average, in ns. A single stamp may be off by as much.
+
+    Attributes
+    ----------
+    state
+        What is known of the station's clock.
+    """
+
+    def __init__(self, station: int, prism: int, clock: ClockFilter, stamp_delay_ns: int = 0) -> None:
         self.state = ClockState.UNSYNCHRONISED
         self._station = station
         self._prism = prism
@@ -205,21 +155,31 @@ class _Station:
         self._unanswered = False
         """A request after the last reply was not answered."""
 
-    def handle(self, event: ClockEvent) -> None:
-        self.state = next_clock_state(self.state, event)
-
     def no_response(self) -> None:
+        """Record that the station did not respond to a request."""
         self._unanswered = True
         self._held_before_restart = bool(self._held)
 
-    def reply(self, message: MeasurementMessage, requested_ns: int, received_ns: int) -> PollResult:
+    def suspend(self) -> None:
+        """Hold measurements until the station is synchronised: it may have restarted with another clock."""
+        self._handle(ClockEvent.POSSIBLE_RESTART)
+
+    def _handle(self, event: ClockEvent) -> None:
+        self.state = next_clock_state(self.state, event)
+
+    def reply(self, message: MeasurementMessage, *, requested_ns: int, received_ns: int) -> PollResult:
+        """Take the reply to a poll.
+
+        ``requested_ns`` is the start of the request's transmission, ``received_ns`` the end of the reply's reception, both
+        on the master's Unix clock.
+        """
         not_polled = self._received_ns is not None and received_ns - self._received_ns > SILENCE_TIMEOUT_NS
         unnoticed_restart = self._unanswered or not_polled
         was_silent = self._end_silence(received_ns)
         if message.time_ns == 0:
             self._check.no_new_measurement(requested_ns)
             if message.status == OK or not (message.zenith_angle_rad or message.horizontal_angle_rad):
-                self.handle(ClockEvent.NO_MEASUREMENT_YET)
+                self._handle(ClockEvent.NO_MEASUREMENT_YET)
                 restarted = self._no_measurement_yet(unnoticed_restart=unnoticed_restart)
                 return PollResult(needs_synchronisation=restarted or was_silent)
             return PollResult(self._untimed(message, received_ns), needs_synchronisation=was_silent)
@@ -244,13 +204,13 @@ class _Station:
                 self._known.append(message.time_ns)
             return PollResult(error)
         if not possible:
-            self.handle(ClockEvent.IMPOSSIBLE_TIMESTAMP)
+            self._handle(ClockEvent.IMPOSSIBLE_TIMESTAMP)
             self._clock.reset()
             self._check = TimestampCheck()
             self._hold(message, received_ns)
             return PollResult(stepped=True, needs_synchronisation=True)
         if stale or self.state is ClockState.AWAITING_MEASUREMENT:
-            self.handle(ClockEvent.POSSIBLE_RESTART)
+            self.suspend()
             self._hold(message, received_ns)
             return PollResult(needs_synchronisation=True)
         self._remember(message)
@@ -271,7 +231,7 @@ class _Station:
         """
         restarted, self._last = unnoticed_restart or self._last is not None, None
         if restarted:
-            self.handle(ClockEvent.POSSIBLE_RESTART)
+            self.suspend()
             self._held_before_restart = bool(self._held)
         return restarted
 
@@ -287,10 +247,11 @@ class _Station:
         )
         self._received_ns, self._unanswered = received_ns, False
         if silent:
-            self.handle(ClockEvent.POSSIBLE_RESTART)
+            self.suspend()
         return silent
 
     def synchronised(self, samples: Sequence[ClockSample], now_ns: int) -> SynchronisationResult:
+        """Take the samples of a synchronisation, at least one; held measurements are stamped and released."""
         newest = samples[-1]
         if self._received_ns is None or samples[0].sent_ns - self._received_ns > MIN_RESTART_NS:
             self._held_before_restart = bool(self._held)
@@ -301,7 +262,7 @@ class _Station:
             self._clock.reset()  # the paper's filter would only take a tenth of the step
         earlier_ns = self._earlier_offsets_ns() if known and not forgotten else {}
         updated = self._clock.update(samples, may_have_restarted=suspended)
-        self.handle(ClockEvent.SYNCHRONISATION)
+        self._handle(ClockEvent.SYNCHRONISATION)
         self._received_ns, self._unanswered = now_ns, False
         other_clock = self._held_before_restart and (updated.restarted or not known)
         self._offset_ns = newest.station_ns - newest.sent_ns - newest.forward_ns
@@ -342,6 +303,7 @@ class _Station:
         return lowest_ns <= estimate.offset_ns <= sample.max_offset_ns + estimate.bound_ns
 
     def clock(self, now_ns: int) -> ClockEstimate | None:
+        """Return the estimate of the station's clock at an instant; None while unsynchronised."""
         return None if self.state is ClockState.UNSYNCHRONISED else self._at(now_ns + self._offset_ns)
 
     def _at(self, station_ns: int) -> ClockEstimate:

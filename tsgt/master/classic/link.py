@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from tsgt.master import link_events
-from tsgt.master.classic.ingest import MIN_RESTART_NS, Ingest
+from tsgt.master.classic.ingest import MIN_RESTART_NS, StationIngest
 from tsgt.master.classic.scheduler import Scheduler, StationPlan, SynchronisationSchedule
 from tsgt.master.classic.transport import Transport
 from tsgt.radio.classic import CommandTransaction, LinkTiming, Poll, Synchronisation
@@ -52,12 +52,19 @@ class ClassicLink:
             for station in stations
         ]
         self._scheduler = Scheduler(plans, _schedule(protocol), self._timing, self._now_ns())
-        self._ingest = Ingest(self._prisms, lambda: clock_filter(protocol.clock_filter), delays_ns)
+        self._ingest = {
+            station: StationIngest(station, prism, clock_filter(protocol.clock_filter), delays_ns[station])
+            for station, prism in self._prisms.items()
+        }
         self.exchange_start_ns: int | None = None
 
     def status(self) -> link_events.LinkStatus:
         """Return what the status record states about the link."""
-        return link_events.LinkStatus(protocol="classic", authenticated=False, clock=self._ingest.clock)
+        return link_events.LinkStatus(
+            protocol="classic",
+            authenticated=False,
+            clock=lambda station, now_ns: self._ingest[station].clock(now_ns),
+        )
 
     async def run(self, radio: Radio) -> None:
         """Run transactions until the radio raises RadioError."""
@@ -87,7 +94,7 @@ class ClassicLink:
         )
         if not responded or transport.last is None:
             self._report(link_events.NoResponse(station))
-            self._ingest.no_response(station)
+            self._ingest[station].no_response()
             return
         self._report(link_events.StationResponded(station, transport.last.rssi_dbm, transport.last.snr_db))
         if isinstance(transaction, CommandTransaction):
@@ -96,19 +103,19 @@ class ClassicLink:
             self._report(link_events.TrackingResult(station, prism, bool(transaction.ok)))
         elif isinstance(transaction, Synchronisation):
             if transaction.missed_replies:
-                self._ingest.no_response(station)
+                self._ingest[station].no_response()
             if transaction.restarted:
-                self._ingest.suspend(station)
+                self._ingest[station].suspend()
             if transaction.samples:
                 self._synchronised(transaction, now_ns)
-            if _is_inconclusive(transaction) and self._ingest.clock(station, now_ns) is not None:
-                self._ingest.suspend(station)
+            if _is_inconclusive(transaction) and self._ingest[station].clock(now_ns) is not None:
+                self._ingest[station].suspend()
                 self._scheduler.synchronisation_inconclusive(station, now_ns)
         elif isinstance(transaction, Poll):
             self._polled(transaction, transport.last, transport.requested_ns)
 
     def _synchronised(self, transaction: Synchronisation, now_ns: int) -> None:
-        result = self._ingest.synchronised(transaction.station, transaction.samples, now_ns)
+        result = self._ingest[transaction.station].synchronised(transaction.samples, now_ns)
         if result.stepped:
             self._report(link_events.ClockStepped(transaction.station))
         self._report(link_events.ClockUpdate(result.record))
@@ -119,7 +126,7 @@ class ClassicLink:
         if poll.message is None:
             return
         self._report(link_events.ReplyReceived(poll.station))
-        result = self._ingest.reply(
+        result = self._ingest[poll.station].reply(
             poll.message,
             requested_ns=requested_ns,
             received_ns=self._timeline.unix_ns(packet.received_at_ns),

@@ -16,7 +16,7 @@ MAX_ENTRIES = 500
 
 STATED_BOUNDS = {
     ("_Reader", "_queue"): QUEUE_LINES,
-    ("_Station", "_known"): DUPLICATE_WINDOW,
+    ("StationIngest", "_known"): DUPLICATE_WINDOW,
     ("Recorder", "_queue"): HUNG_DISK_FACTOR * MAX_PENDING_LINES,
     ("SendQueue", "_queue"): QUEUE_CAPACITY,
     **dict.fromkeys(

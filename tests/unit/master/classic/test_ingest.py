@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import settings as limits
 
 from tsgt.master.classic import UNTIMED_SIGMA_NS
-from tsgt.master.classic.ingest import ClockEvent, ClockState, Ingest, next_clock_state
+from tsgt.master.classic.ingest import ClockEvent, ClockState, StationIngest, next_clock_state
 from tsgt.model import ClockSample, Status
 from tsgt.radio.classic import MeasurementMessage
 from tsgt.radio.classic.messages import decode_reply, no_measurement_yet
@@ -64,14 +64,14 @@ class Master:
     """Ingest of one station, polled at instants in ms from the start."""
 
     def __init__(self, *, synchronised: bool = True) -> None:
-        self.ingest = Ingest({1: 4}, lambda: clock_filter("regression"))
+        self.ingest = StationIngest(1, 4, clock_filter("regression"))
         if synchronised:
             self.synchronise(0)
 
     def synchronise(self, at_ms: int, ahead_ns: int = AHEAD_NS, *, late_ns: int = 0) -> SynchronisationResult:
         """Pass a synchronisation whose last exchange ends at an instant."""
         at_ns = START + at_ms * MS
-        return self.ingest.synchronised(1, samples(at_ns, ahead_ns, late_ns=late_ns), at_ns)
+        return self.ingest.synchronised(samples(at_ns, ahead_ns, late_ns=late_ns), at_ns)
 
     def poll(self, at_ms: int, answer: MeasurementMessage) -> PollResult:
         """Pass a reply that is received at an instant, 194 ms after the start of its request."""
@@ -156,7 +156,7 @@ def test_measurements_after_a_step_are_held(step_s: float) -> None:
         (None, False, False),
         (None, False, False),
     ]
-    assert master.ingest.clock(1, START + 3000 * MS) is None
+    assert master.ingest.clock(START + 3000 * MS) is None
     found = master.synchronise(4500, AHEAD_NS + step_ns)
     assert found.record.restarted
     assert not found.stepped  # already reported
@@ -233,7 +233,7 @@ def test_silent_station_needs_a_synchronisation() -> None:
     """A clock that was stopped during the outage makes new measurements look old."""
     master = Master()
     assert master.poll(1000, message(START + 700 * MS + AHEAD_NS)).measurement is not None
-    master.ingest.no_response(1)
+    master.ingest.no_response()
     off_ns = 20 * SECOND  # its clock went on from where it was when the power went
     back = master.poll(21_200, message(START + 21_000 * MS - off_ns + AHEAD_NS))
     assert back.measurement is None
@@ -258,7 +258,7 @@ def test_consistent_synchronisation_after_a_silence_is_no_step() -> None:
     """Held measurements are released without an event."""
     master = Master()
     master.poll(1000, message(START + 700 * MS + AHEAD_NS))
-    master.ingest.no_response(1)
+    master.ingest.no_response()
     assert master.poll(21_200, message(START + 21_000 * MS + AHEAD_NS)).needs_synchronisation
     found = master.synchronise(23_000)
     assert not found.stepped
@@ -289,7 +289,7 @@ def test_held_measurement_of_an_earlier_clock_is_dropped(step_s: float) -> None:
     """Its time is unknown; the station's journal has it."""
     master = Master()
     master.poll(1000, message(START + 700 * MS + AHEAD_NS))
-    master.ingest.no_response(1)
+    master.ingest.no_response()
     assert master.poll(8000, message(START + 7800 * MS + AHEAD_NS)).needs_synchronisation
     found = master.synchronise(20_000, AHEAD_NS + round(step_s * 1e9) if step_s < 1e9 else AHEAD_NS - START)
     assert found.stepped
@@ -300,9 +300,9 @@ def test_held_measurement_of_an_earlier_clock_is_dropped(step_s: float) -> None:
 def test_held_measurement_of_an_ambiguous_clock_is_dropped(known: bool) -> None:  # noqa: FBT001
     """Half a second apart, both clocks explain it, unless no request was lost."""
     master = Master(synchronised=known)
-    master.ingest.no_response(1)
+    master.ingest.no_response()
     master.poll(8000, message(START + 7800 * MS + AHEAD_NS))
-    master.ingest.no_response(1)
+    master.ingest.no_response()
     assert master.synchronise(20_000, AHEAD_NS + 500 * MS).measurements == []
 
 
@@ -321,9 +321,9 @@ def test_held_measurement_before_a_pause_for_a_restart_is_dropped(
 def test_held_error_of_an_ambiguous_clock_has_no_time() -> None:
     """It is stamped with its arrival: 11 ms apart, both clocks explain it."""
     master = Master()
-    master.ingest.no_response(1)
+    master.ingest.no_response()
     master.poll(8000, message(START + 7800 * MS + AHEAD_NS, status=3, distance_m=-1.0))
-    master.ingest.no_response(1)
+    master.ingest.no_response()
     (measurement,) = master.synchronise(9000, AHEAD_NS + 11 * MS).measurements
     assert measurement.stamp_ns == START + 8000 * MS
     assert measurement.stamp_sigma_ns == UNTIMED_SIGMA_NS
@@ -332,9 +332,9 @@ def test_held_error_of_an_ambiguous_clock_has_no_time() -> None:
 def test_held_measurement_of_the_same_clock_is_released() -> None:
     """After lost requests too."""
     master = Master()
-    master.ingest.no_response(1)
+    master.ingest.no_response()
     master.poll(8000, message(START + 7800 * MS + AHEAD_NS))
-    master.ingest.no_response(1)
+    master.ingest.no_response()
     assert len(master.synchronise(20_000).measurements) == 1
 
 
@@ -342,10 +342,10 @@ def test_bound_of_a_held_measurement_covers_a_small_step() -> None:
     """A station with a late stamp may have stepped by as much."""
     master, step_ns = Master(synchronised=False), 5 * MS
     master.synchronise(0, late_ns=5 * MS)
-    master.ingest.no_response(1)
+    master.ingest.no_response()
     held = message(START + 23_000 * MS + AHEAD_NS)
     assert master.poll(23_200, held).needs_synchronisation
-    master.ingest.no_response(1)
+    master.ingest.no_response()
     found = master.synchronise(25_000, AHEAD_NS + step_ns, late_ns=5 * MS)
     assert not found.record.restarted
     (measurement,) = found.measurements
@@ -382,7 +382,7 @@ def test_restart_without_a_measurement_needs_a_lost_request() -> None:
     """Restart without a measurement needs a lost request."""
     master = Master()
     assert master.poll(1000, no_measurement_yet(1)) == (None, False, False)
-    master.ingest.no_response(1)
+    master.ingest.no_response()
     assert master.poll(1600, no_measurement_yet(1)) == (None, False, True)
     master.synchronise(3000)
     assert master.poll(3600, no_measurement_yet(1)) == (None, False, False)
@@ -391,10 +391,10 @@ def test_restart_without_a_measurement_needs_a_lost_request() -> None:
 def test_papers_filter_is_reset_after_a_restart() -> None:
     """At a tenth of the error per synchronisation it would need an hour."""
     master = Master()
-    master.ingest = Ingest({1: 4}, lambda: clock_filter("paper"))
+    master.ingest = StationIngest(1, 4, clock_filter("paper"))
     master.synchronise(0)
     master.poll(1000, message(START + 700 * MS + AHEAD_NS))
-    master.ingest.no_response(1)
+    master.ingest.no_response()
     assert master.poll(21_200, message(START + 1200 * MS + AHEAD_NS)).needs_synchronisation
     found = master.synchronise(23_000, AHEAD_NS - 20 * SECOND)
     assert found.stepped
@@ -404,7 +404,7 @@ def test_papers_filter_is_reset_after_a_restart() -> None:
 def test_papers_filter_is_reset_after_a_step() -> None:
     """Papers filter is reset after a step."""
     master = Master()
-    master.ingest = Ingest({1: 4}, lambda: clock_filter("paper"))
+    master.ingest = StationIngest(1, 4, clock_filter("paper"))
     master.synchronise(0)
     ahead_ns = AHEAD_NS + 3600 * SECOND
     assert master.poll(1000, message(START + 800 * MS + ahead_ns)).stepped
@@ -416,7 +416,7 @@ def test_papers_filter_is_reset_after_a_step() -> None:
 def test_bound_includes_the_stamp_delay() -> None:
     """Bound includes the stamp delay."""
     plain, late = Master(synchronised=False), Master(synchronised=False)
-    late.ingest = Ingest({1: 4}, lambda: clock_filter("regression"), {1: 700_000})
+    late.ingest = StationIngest(1, 4, clock_filter("regression"), 700_000)
     bounds = [master.synchronise(0).record.bound_ns for master in (plain, late)]
     assert bounds[1] - bounds[0] == 700_000
 
@@ -439,8 +439,8 @@ def in_state(state: ClockState) -> Master:
     if state is ClockState.AWAITING_MEASUREMENT:
         master.poll(0, no_measurement_yet(1))
     elif state is ClockState.SUSPENDED:
-        master.ingest.suspend(1)
-    assert master.ingest.clock_state(1) is state
+        master.ingest.suspend()
+    assert master.ingest.state is state
     return master
 
 
@@ -452,7 +452,7 @@ def cause(master: Master, event: ClockEvent) -> None:
         case ClockEvent.NO_MEASUREMENT_YET:
             master.poll(1000, no_measurement_yet(1))
         case ClockEvent.POSSIBLE_RESTART:
-            master.ingest.suspend(1)
+            master.ingest.suspend()
         case ClockEvent.IMPOSSIBLE_TIMESTAMP:
             master.poll(1000, message(START + 3600 * SECOND + AHEAD_NS))
 
@@ -475,7 +475,7 @@ def test_clock_state_transitions(state: ClockState, event: ClockEvent) -> None:
     assert next_clock_state(state, event) is expected
     master = in_state(state)
     cause(master, event)
-    assert master.ingest.clock_state(1) is expected
+    assert master.ingest.state is expected
 
 
 @pytest.mark.parametrize("state", ClockState)
@@ -485,6 +485,6 @@ def test_measurements_are_published_while_synchronised_only(state: ClockState) -
     result = master.poll(1000, message(START + 750 * MS + AHEAD_NS))
     assert (result.measurement is not None) == (state is SYNCHRONISED)
     assert result.needs_synchronisation == (state is AWAITING)
-    assert master.ingest.clock_state(1) is (SUSPENDED if state is AWAITING else state)
+    assert master.ingest.state is (SUSPENDED if state is AWAITING else state)
     released = master.synchronise(2500).measurements
     assert len(released) == (state is not SYNCHRONISED)

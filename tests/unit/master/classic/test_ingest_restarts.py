@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from harness.clock_exchanges import SECOND, START_NS, synchronisation
 
-from tsgt.master.classic.ingest import Ingest
+from tsgt.master.classic.ingest import StationIngest
 from tsgt.radio.classic import MeasurementMessage
 from tsgt.radio.classic.messages import no_measurement_yet
 from tsgt.timesync.two_way import RegressionFilter, clock_filter
@@ -18,20 +18,20 @@ class Master:
     """Ingest of one station, at instants in s from the start."""
 
     def __init__(self, filter_name: str = "regression") -> None:
-        self.ingest = Ingest({1: 4}, lambda: clock_filter(filter_name))  # type: ignore[arg-type]
+        self.ingest = StationIngest(1, 4, clock_filter(filter_name))  # type: ignore[arg-type]
         self.ahead_ns = 0
 
     def synchronise(self, at_s: float, *, cycles: int = 5) -> list[tuple[int, int | None]]:
         """Synchronise from an instant on; return stamp and bound of the released measurements, in ns."""
         samples = synchronisation(at_s, lambda _: self.ahead_ns, cycles=cycles, turnaround_ns=TURNAROUND_NS)
-        found = self.ingest.synchronised(1, samples, samples[-1].received_ns)
+        found = self.ingest.synchronised(samples, samples[-1].received_ns)
         return [(m.stamp_ns, m.stamp_bound_ns) for m in found.measurements]
 
     def restart(self, at_s: float, step_ns: int) -> None:
         """Restart the station with a clock step, which it reports."""
         self.ahead_ns += step_ns
         now_ns = START_NS + round(at_s * SECOND)
-        self.ingest.no_response(1)
+        self.ingest.no_response()
         answer = no_measurement_yet(1)
         assert self.ingest.reply(
             answer, requested_ns=now_ns - 194 * MS, received_ns=now_ns
@@ -126,7 +126,7 @@ def test_measurement_with_a_suspended_clock_is_held() -> None:
     master = Master()
     master.synchronise(0)
     assert master.poll(2.0) is not None
-    master.ingest.suspend(1)
+    master.ingest.suspend()
     master.ahead_ns += 30 * MS
     assert master.poll(3.0) is None
     ((stamp_ns, _),) = master.synchronise(3.5)
@@ -139,9 +139,9 @@ def test_late_error_is_reported_once() -> None:
     master = Master()
     master.synchronise(0)
     assert master.poll(2.0) is not None
-    master.ingest.no_response(1)
+    master.ingest.no_response()
     assert master.poll(5.0, made_s=2.5, status=3) is not None
-    master.ingest.no_response(1)
+    master.ingest.no_response()
     assert master.poll(11.0, made_s=2.5, status=3) is None
     assert master.synchronise(12.0) == []
 

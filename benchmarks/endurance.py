@@ -31,7 +31,7 @@ from endurance_watch import (  # type: ignore[import-not-found]  # the script be
     lossy_scenario,
     memory_slope,
 )
-from harness.aftermath import aftermath
+from harness.kill_checks import check_files_after_kills
 
 from tsgt.clock import SystemClock
 from tsgt.log import configure_logging
@@ -243,7 +243,7 @@ class Endurance:
 
     def _result(self, queued: dict[int, int], *, air_ended: bool) -> dict[str, Any]:
         recordings = sorted(self._files.recordings.glob("*.jsonl"))
-        found = aftermath(
+        found = check_files_after_kills(
             recordings,
             {number: self._files.journals(number) for number in self._files.stations},
             {number: instrument.reported_distances for number, instrument in self._instruments.items()},

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from harness.aftermath import Found, aftermath
+from harness.kill_checks import FileReport, check_files_after_kills
 
 from tsgt.clock import SystemClock
 from tsgt.config import ScenarioConfig
@@ -106,7 +106,7 @@ class KillLoop:
         self._problems: list[Violation] = []
         self.counts: Counter[str] = Counter()
 
-    async def run(self) -> Found:
+    async def run(self) -> FileReport:
         """Run it all; return what was found."""
         air_rng, *instrument_rngs = np.random.default_rng(self._seed).spawn(1 + len(self._files.stations))
         timeline = LoopTimeline(asyncio.get_running_loop())
@@ -132,7 +132,7 @@ class KillLoop:
                     task.cancel()
                 await asyncio.wait(tasks)
         self._look_at_ends()
-        found = aftermath(
+        found = check_files_after_kills(
             sorted(self._files.recordings.glob("*.jsonl")),
             {number: self._files.journals(number) for number in self._files.stations},
             {number: instrument.reported_distances for number, instrument in instruments.items()},

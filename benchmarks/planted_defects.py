@@ -118,10 +118,10 @@ async def sleeping_reader(mission: Mission) -> None:
 
 F: Final = FaultKind
 _YESTERDAY = (
-    "unit/radio/test_held_back.py::test_a_session_of_yesterday_played_to_a_station_that_was_just_started"
+    "unit/radio/superframe/test_delayed_beacons.py::test_replayed_session_does_not_confirm_new_station"
 )
-_BEACONS = "unit/radio/test_held_back.py::test_a_single_beacon_shifts_no_time"
-_ERROR_STATUS = "unit/master/test_pipeline.py::test_error_status_is_the_reason"
+_BEACONS = "unit/radio/superframe/test_delayed_beacons.py::test_single_delayed_beacon_is_rejected"
+_ERROR_STATUS = "unit/estimation/test_linear.py::test_error_status_is_the_reason"
 
 DEFECTS: Final = {
     "no-ack": Defect("the master acknowledges nothing", defects.never_acknowledge, (F.LOSS,), duration_s=70),
@@ -139,7 +139,9 @@ DEFECTS: Final = {
     "deleted": Defect(
         "a station deletes what it has sent", defects.dequeue_when_sent, (F.LOSS,), duration_s=80
     ),
-    "repeats": Defect("the master hands on repeats", defects.accept_duplicates, script=killed_with_a_full_disk),
+    "repeats": Defect(
+        "the master hands on repeats", defects.accept_duplicates, script=killed_with_a_full_disk
+    ),
     "repeats-classic": Defect(
         "the master does not know repeats, classic",
         defects.accept_duplicates_classic,
@@ -148,13 +150,14 @@ DEFECTS: Final = {
         duration_s=80,
     ),
     "numbers": Defect(
-        "a station begins with number 0 again", defects.reuse_sequence_numbers, (F.CLIENT_CRASH,), duration_s=80
+        "a station begins with number 0 again",
+        defects.reuse_sequence_numbers,
+        (F.CLIENT_CRASH,),
+        duration_s=80,
     ),
     "nonce": Defect("a station has one nonce for all sessions", defects.reuse_nonce, test=_YESTERDAY),
     "code": Defect("the code of a packet is not compared", defects.skip_authentication),
-    "old-beacon": Defect(
-        "an old beacon is accepted", defects.accept_old_beacon, (F.FORGERY,), duration_s=80
-    ),
+    "old-beacon": Defect("an old beacon is accepted", defects.accept_old_beacon, (F.FORGERY,), duration_s=80),
     "offset": Defect("the clock's offset is added, classic", defects.add_clock_offset, protocol="classic"),
     "frequency": Defect(
         "the clock's frequency is reversed, classic",
@@ -163,7 +166,9 @@ DEFECTS: Final = {
         duration_s=120,
         drift_ppm=50,
     ),
-    "beacon": Defect("a beacon's time is taken for that of the next", defects.use_time_of_next_beacon, test=_BEACONS),
+    "beacon": Defect(
+        "a beacon's time is taken for that of the next", defects.use_time_of_next_beacon, test=_BEACONS
+    ),
     "slot": Defect(
         "a station replies in the slot after its own", defects.reply_one_slot_late, (F.LOSS,), duration_s=80
     ),
@@ -175,13 +180,19 @@ DEFECTS: Final = {
         "the same, continuous", defects.use_stale_station_frame, estimator="continuous"
     ),
     "constant": Defect("the prism constant is left out", defects.ignore_prism_constant),
-    "constant-continuous": Defect("the same, continuous", defects.ignore_prism_constant, estimator="continuous"),
-    "error": Defect("a measurement with an error status is used", defects.use_failed_measurements, test=_ERROR_STATUS),
+    "constant-continuous": Defect(
+        "the same, continuous", defects.ignore_prism_constant, estimator="continuous"
+    ),
+    "error": Defect(
+        "a measurement with an error status is used", defects.use_failed_measurements, test=_ERROR_STATUS
+    ),
     "covariance": Defect(
         "the covariance is too small by 4", defects.quarter_covariance, estimator="continuous"
     ),
     "smoothed": Defect(
-        "smoothed poses have the time of predicted ones", defects.stamp_smoothed_poses_now, estimator="continuous"
+        "smoothed poses have the time of predicted ones",
+        defects.stamp_smoothed_poses_now,
+        estimator="continuous",
     ),
     "order": Defect("the recording has another order than the stream", defects.reorder_lines),
     "journal": Defect(
@@ -194,7 +205,9 @@ DEFECTS: Final = {
     "queue": Defect(
         "a reader's queue has no bound", defects.unbound_reader_queue, script=sleeping_reader, duration_s=122
     ),
-    "radio": Defect("a station gives its radio up", defects.never_reopen_radio, (F.CHIP_HANG,), duration_s=100),
+    "radio": Defect(
+        "a station gives its radio up", defects.never_reopen_radio, (F.CHIP_HANG,), duration_s=100
+    ),
 }
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class AuthorsMeasurement(NamedTuple):
-    """What their master takes out of a reply, unchecked."""
+    """A measurement of a reply, unchecked."""
 
     station: int
     status: int
@@ -30,31 +30,29 @@ class AuthorsMeasurement(NamedTuple):
 
 
 class AuthorsMaster:
-    """A master as the authors have it.
+    """The authors' master.
 
     Parameters
     ----------
     stations
-        Whom it polls, in this order.
-    radio, clock, rng, timing
-        As for :class:`AuthorsNode`.
+        Polling order.
     initial_cycles, cycles
         Of the first synchronisation of each station, and of later ones.
 
     Attributes
     ----------
     offset_ns
-        By station; positive: its clock is ahead of the master's. Clocks of different machines: no more exact.
+        Clock offset by station; positive: ahead of the master.
     measurements
-        Everything that came, repeats included.
+        All received measurements, repeats included.
     """
 
     INTERVAL_NS = 300_000_000_000
-    """From one round of synchronisations to the next."""
+    """Between two rounds of synchronisation."""
     STAGGER_NS = 10_000_000_000
-    """Between the stations of such a round."""
+    """Between the stations of a round."""
     WEIGHT = 0.1
-    """Of a later synchronisation against what was there before."""
+    """Weight of a later synchronisation against the previous offset."""
 
     def __init__(
         self,
@@ -91,7 +89,7 @@ class AuthorsMaster:
                 await self._radio.pause()
 
     async def synchronise(self, station: int) -> None:
-        """Compare a station's clock with ours; without a single answer nothing changes."""
+        """Measure a station's clock offset; without a reply the previous one stays."""
         first = station not in self.offset_ns
         await self._radio.send(b"p%d" % station)
         offsets_ns = []
@@ -111,7 +109,7 @@ class AuthorsMaster:
             self.offset_ns[station] = self.WEIGHT * new_ns + (1 - self.WEIGHT) * old_ns
 
     async def poll(self, station: int, timeout_ns: int | None = None) -> AuthorsMeasurement | None:
-        """Ask for a measurement, or in direct mode for a single one; None without an answer in time."""
+        """Request a measurement, in direct mode a single one; None: no reply in time."""
         reply = await self.request(b"t%d" % station, timeout_ns)
         if reply is None or len(reply) != MEASUREMENT_FORMAT.size:
             return None
@@ -119,7 +117,7 @@ class AuthorsMaster:
         return self.measurements[-1]
 
     async def request(self, payload: bytes, timeout_ns: int | None = None) -> bytes | None:
-        """Send a command and return whatever comes next; None if nothing comes in time."""
+        """Send a command and return the next packet; None: timeout."""
         await self._radio.send(payload)
         try:
             async with asyncio.timeout((self._timing.timeout_ns if timeout_ns is None else timeout_ns) / 1e9):

@@ -1,4 +1,4 @@
-"""Damage to real bytes, for property tests of whatever reads them: bits, values, lines, cuts, repetitions, splices."""
+"""Mutations of real files for property tests of their readers: bits, values, lines, cuts, repetitions, splices."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ ODD_VALUES = (
     b"\r",
     b"\n",
 )
-"""What may stand where a number, a word or a text is expected."""
+"""Replacements for a number, a word or a text."""
 
 _VALUE = re.compile(rb'-?\d[\d.eE+-]*|"[^"\n]*"|[A-Za-z_]\w*')
 
@@ -68,18 +68,12 @@ _LINES = ("line dropped", "line repeated", "lines swapped", "line of another")
 
 
 def examples(count: int) -> settings:
-    """Return settings that try so many examples, and as many times more as the profile tries more than usual."""
+    """Return settings for this many examples, scaled as the current profile scales the default."""
     return settings(max_examples=max(1, count * settings().max_examples // _PLAIN_EXAMPLES))
 
 
 class Samples:
-    """Real files by name, as a fixture gives them; hypothesis shows every argument, and these would be long.
-
-    Attributes
-    ----------
-    of
-        The files.
-    """
+    """Real files by name, with a short repr for hypothesis."""
 
     def __init__(self, of: Mapping[str, bytes]) -> None:
         self.of = of
@@ -89,13 +83,13 @@ class Samples:
 
     @property
     def all(self) -> list[bytes]:
-        """Their contents."""
+        """Contents of the files."""
         return list(self.of.values())
 
 
 @dataclass(frozen=True)
 class Edit:
-    """One thing that goes wrong; what its numbers mean depends on what that is, and on what it is done to."""
+    """A mutation; the meaning of its numbers depends on its kind and on the data."""
 
     kind: str
     first: int
@@ -107,13 +101,13 @@ class Edit:
 
 @dataclass(frozen=True)
 class Damage:
-    """What goes wrong with one of several samples."""
+    """Mutations of one of several samples."""
 
     sample: int
     edits: tuple[Edit, ...]
 
     def to(self, samples: Sequence[bytes]) -> bytes:
-        """Take one of the samples and damage it."""
+        """Return one of the samples, mutated."""
         data = samples[self.sample % len(samples)]
         for edit in self.edits:
             if edit.kind in ("value", "nudge"):
@@ -125,14 +119,14 @@ class Damage:
         return data
 
 
-UNHARMED = Damage(0, ())
-"""The first sample as it is."""
+UNDAMAGED = Damage(0, ())
+"""The first sample, unchanged."""
 
 _numbers = st.integers(0, 1 << 20)
 _edits = st.builds(
     Edit,
     kind=st.sampled_from([*["value"] * 6, "nudge", "nudge", *_BYTES, *_LINES]),
-    # The first lines as often as all others: there stands what the others depend on.
+    # The first lines as often as all others, because the others depend on them.
     first=st.integers(0, 2) | _numbers,
     second=_numbers,
     length=st.integers(1, 200),
@@ -140,24 +134,24 @@ _edits = st.builds(
     factor=st.sampled_from([0.0, -1.0, 1.0 + 1e-9, 1.001, 1e9, -1e-9]) | st.floats(-10, 10),
 )
 damages = st.builds(Damage, _numbers, st.lists(_edits, max_size=4).map(tuple))
-"""Up to four things, now and then none."""
+"""Zero to four mutations."""
 
 
 def _with_value(data: bytes, edit: Edit) -> bytes:
-    """Put another value in the place of one in a line."""
+    """Replace a value in a line."""
     lines = data.split(b"\n")
     at = edit.first % len(lines)
     values = list(_VALUE.finditer(lines[at]))
     if not values:
         return data
     start, end = values[edit.second % len(values)].span()
-    new = edit.value if edit.kind == "value" else _nudged(lines[at][start:end], edit)
+    new = edit.value if edit.kind == "value" else _scaled(lines[at][start:end], edit)
     lines[at] = lines[at][:start] + new + lines[at][end:]
     return b"\n".join(lines)
 
 
-def _nudged(value: bytes, edit: Edit) -> bytes:
-    """Change a number a little, or much; leave a word alone."""
+def _scaled(value: bytes, edit: Edit) -> bytes:
+    """Scale a number; leave a word unchanged."""
     if value.lstrip(b"-").isdigit() and len(value) < 25:
         return b"%d" % (int(value) + round(edit.factor * edit.length))
     try:
@@ -177,8 +171,8 @@ def _with_lines(data: bytes, edit: Edit, samples: Sequence[bytes]) -> bytes:
         case "lines swapped":
             lines[one], lines[other] = lines[other], lines[one]
         case _:
-            foreign = samples[edit.length % len(samples)].split(b"\n")
-            lines.insert(one, foreign[edit.second % len(foreign)])
+            inserted = samples[edit.length % len(samples)].split(b"\n")
+            lines.insert(one, inserted[edit.second % len(inserted)])
     return b"\n".join(lines)
 
 

@@ -101,7 +101,7 @@ class _Attack:
             self._old.replies.extend(old.replies.values())
 
     def on_station(self, loop: SuperframeLoop, number: int) -> None:
-        """Send to a station that is about to hear the beacon, or has received it."""
+        """Send to a station before or after it receives the beacon."""
         core, own = loop.members[number].core, self.now.beacons
         for kind in self._rng.choice(KINDS, self._per_step).tolist():
             if kind in self._others:
@@ -114,7 +114,7 @@ class _Attack:
             self._note(kind, "station", effect=received is not None)
 
     def on_master(self, loop: SuperframeLoop, reply: bytes, received_ns: int) -> None:
-        """Send to the master that is about to hear a reply, or has received it."""
+        """Send to the master before or after it receives a reply."""
         for kind in self._rng.choice(KINDS, self._per_step).tolist():
             if kind in self._others:
                 payload = self._reply(self._others[kind], reply[:-CODE_BYTES], loop)

@@ -15,12 +15,12 @@ if TYPE_CHECKING:
     from tsgt.simulation.mission import Mission, MissionResult
 
 QUICK = ClassicMasterConfig(kind="classic", initial_cycles=5)
-"""The protocol with a short synchronisation at the start: 1.2 s for each station."""
+"""Protocol classic with a short first synchronisation: 1.2 s per station."""
 
 SUPERFRAME = SuperframeMasterConfig(kind="superframe")
 
 
-def mission(
+def run_mission(
     folder: Path,
     scenario: ScenarioConfig | None = None,
     *,
@@ -28,7 +28,7 @@ def mission(
     protocol: ClassicMasterConfig | SuperframeMasterConfig = QUICK,
     **options: Any,
 ) -> MissionResult:
-    """Run half a minute of the reference scenario, or what else is asked for."""
+    """Simulate half a minute of the reference scenario, or as given."""
     settings: dict[str, Any] = {"duration_s": 30.0, "protocol": protocol} | options
     folder.mkdir(parents=True, exist_ok=True)
     return simulate(scenario or ScenarioConfig(), SimulationOptions(**settings), folder=folder, script=script)

@@ -1,4 +1,4 @@
-"""Solution files as RTKLIB writes them, in all its variants, from positions in a local frame."""
+"""RTKLIB solution files in all variants, from positions in a local frame."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 SECOND = 1_000_000_000
 BASE = (math.radians(46.7794), math.radians(-71.2746), 61.02)
-"""Latitude, longitude and height of a base near Quebec."""
+"""Latitude and longitude in rad and height in m of a base near Quebec."""
 
 LEGEND = ",Q=1:fix,2:float,3:sbas,4:dgps,5:single,6:ppp,ns=# of satellites)"
 _SIGMAS = {
@@ -37,7 +37,7 @@ _NAMES = {
 
 @dataclass(frozen=True)
 class Variant:
-    """How RTKLIB was told to write."""
+    """Options of RTKLIB's output."""
 
     coordinates: str = "geodetic"
     system: str = "GPST"
@@ -47,7 +47,7 @@ class Variant:
     decimals: int = 3
 
     def header(self) -> list[str]:
-        """Return the header, the line of the columns last."""
+        """Return the header; its last line names the columns."""
         names = f"{_NAMES[self.coordinates]} Q ns {_SIGMAS[self.coordinates]} age(s) ratio"
         if self.velocity:
             names += " vn(m/s) ve(m/s) vu(m/s) sdvn sdve sdvu sdvne sdveu sdvun"
@@ -70,13 +70,13 @@ class Variant:
         enu_m: NDArray[np.float64],
         quality: int = 1,
         satellites: int = 15,
-        ahead_s: int = 18,
+        gps_utc_s: int = 18,
     ) -> str:
-        """Write one position: ``time_ns`` is Unix time, ``ahead_s`` by how much GPS is ahead of UTC."""
-        shift_s = {"GPST": ahead_s, "UTC": 0, "JST": 9 * 3600}[self.system]
+        """Format one position; ``time_ns`` is Unix time, ``gps_utc_s`` the offset of GPS time to UTC."""
+        shift_s = {"GPST": gps_utc_s, "UTC": 0, "JST": 9 * 3600}[self.system]
         fields = [
             *self._time(time_ns + shift_s * SECOND),
-            *self._place(enu_m),
+            *self._position(enu_m),
             f"{quality:3d}",
             f"{satellites:3d}",
             *["  0.0058"] * 6,
@@ -95,7 +95,7 @@ class Variant:
         then = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=second)
         return [f"{then:%Y/%m/%d %H:%M:%S}{fraction}"]
 
-    def _place(self, enu_m: NDArray[np.float64]) -> list[str]:
+    def _position(self, enu_m: NDArray[np.float64]) -> list[str]:
         if self.coordinates == "baseline":
             return [f"{value:14.4f}" for value in enu_m]
         ecef_m = enu2ecef(*enu_m, *BASE, deg=False)

@@ -35,7 +35,7 @@ def test_planted_defect_is_detected_and_removed(script: ModuleType, key: str, ch
     defect: Any = dataclasses.replace(script.DEFECTS[key], duration_s=8.0)
     planting = Planting()
     defect.plant(planting)
-    places = planting.planted[:]
+    places = planting.replaced[:]
     planting.undo()
     assert check in script.hunt(defect, seeds=1).checks
     assert all(owner.__dict__[name] is right for owner, name, right in places)
@@ -46,7 +46,7 @@ def test_every_defect_replaces_existing_code(script: ModuleType) -> None:
     for defect in script.DEFECTS.values():
         planting = Planting()
         defect.plant(planting)
-        places = [(owner, name, getattr(owner, name)) for owner, name, _ in planting.planted]
+        places = [(owner, name, getattr(owner, name)) for owner, name, _ in planting.replaced]
         planting.undo()
         assert places
         assert all(owner.__dict__[name] is not wrong for owner, name, wrong in places)

@@ -196,7 +196,7 @@ def test_restarts_of_master_and_station(tmp_path: Path) -> None:
     assert len(run.master_logs) == 2
     assert len(run.station_logs[2].journals) == 3
     path = tmp_path / "r.jsonl"
-    # The run from 42 to 55 s was never heard; it shares the computer's clock with the others.
+    # The run from 42 to 55 s had no radio contact; it shares the computer's clock with the others.
     added = added_to(run, path)
     silent = load_journal(run.station_logs[2].journals[1]).measurements
     assert {identity(m) for m in silent} <= {identity(m) for m in added}

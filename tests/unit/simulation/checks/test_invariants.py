@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from harness.missions import QUICK, SUPERFRAME, mission
+from harness.missions import QUICK, SUPERFRAME, run_mission
 
 from tsgt.config import ScenarioConfig
 from tsgt.model import Status
@@ -36,10 +36,10 @@ def good(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     """Half a minute without faults, with each protocol and each estimator."""
     folder = tmp_path_factory.mktemp("run")
     if request.param == "superframe":
-        return mission(folder, protocol=SUPERFRAME)
+        return run_mission(folder, protocol=SUPERFRAME)
     plain = ScenarioConfig()
     linear = plain.pipeline.model_copy(update={"estimator": "linear"})
-    return mission(folder, plain.model_copy(update={"pipeline": linear}), protocol=QUICK)
+    return run_mission(folder, plain.model_copy(update={"pipeline": linear}), protocol=QUICK)
 
 
 @pytest.fixture

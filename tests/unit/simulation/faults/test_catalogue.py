@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from harness.missions import QUICK, SUPERFRAME, mission
+from harness.missions import QUICK, SUPERFRAME, run_mission
 
 from tsgt.config import ScenarioConfig
 from tsgt.errors import ConfigError
@@ -86,7 +86,7 @@ def test_daemon_killed_during_shutdown_counts_as_stopped(tmp_path: Path) -> None
         with pytest.raises(OSError):  # noqa: PT011 (it has no text)
             await computer.stop()
 
-    mission(tmp_path, duration_s=1.0, script=end_programs)
+    run_mission(tmp_path, duration_s=1.0, script=end_programs)
 
 
 def test_crash_window_ends_at_the_kill(tmp_path: Path) -> None:
@@ -101,7 +101,7 @@ def test_crash_window_ends_at_the_kill(tmp_path: Path) -> None:
         await run.crash("station1", down_s=1.0)
 
     ((_, crash_windows_ns),) = (
-        mission(tmp_path, duration_s=15.0, script=crash).station_logs[1].crash_windows_ns
+        run_mission(tmp_path, duration_s=15.0, script=crash).station_logs[1].crash_windows_ns
     )
     assert crash_windows_ns / 1e9 == pytest.approx(killed_s[0], abs=1e-6)
 
@@ -119,7 +119,7 @@ def test_invariants_hold_under_all_faults(tmp_path: Path, protocol: Any, estimat
     plain = ScenarioConfig()
     pipeline = plain.pipeline.model_copy(update={"estimator": estimator})
     scenario = plain.model_copy(update={"pipeline": pipeline})
-    run = mission(
+    run = run_mission(
         tmp_path,
         scenario,
         protocol=protocol,

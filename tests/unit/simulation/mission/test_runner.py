@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.missions import QUICK, SUPERFRAME, mission
+from harness.missions import QUICK, SUPERFRAME, run_mission
 
 from tsgt.cli.simulate.figures import figures, frame_ms, outage_figures, station_figures
 from tsgt.cli.simulate.poses import estimator_figures
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 def test_classic_mission(tmp_path: Path) -> None:
     """Three stations deliver above 1.3 Hz each, timestamps are good to 0.3 ms, poses to centimetres."""
-    run = mission(tmp_path, duration_s=60.0)
+    run = run_mission(tmp_path, duration_s=60.0)
     assert check_invariants(run) == []
     for figure in station_figures(run).values():
         assert figure.measured == pytest.approx(144, abs=2)  # 2.5 Hz, but for the time that connecting takes
@@ -54,7 +54,7 @@ def test_rates_with_the_papers_settings(
 ) -> None:
     """Airtime limits three stations to 1.72 Hz each; the paper measured about 1.4 Hz."""
     scenario = with_linear_estimator(find_scenario("dynamic"))
-    run = mission(
+    run = run_mission(
         tmp_path,
         scenario,
         duration_s=120.0,
@@ -68,7 +68,7 @@ def test_rates_with_the_papers_settings(
 def test_same_seed_gives_the_same_stream(tmp_path: Path) -> None:
     """Another seed gives another stream."""
     one, same, other = (
-        mission(tmp_path / name, duration_s=10.0, seed=seed)
+        run_mission(tmp_path / name, duration_s=10.0, seed=seed)
         for name, seed in (("one", 3), ("same", 3), ("other", 4))
     )
     assert json.dumps(figures(one)) == json.dumps(figures(same))
@@ -78,7 +78,7 @@ def test_same_seed_gives_the_same_stream(tmp_path: Path) -> None:
 
 def test_clock_offsets_and_drifts_are_estimated(tmp_path: Path) -> None:
     """Stations drift by plus and minus the given ppm, and are years behind."""
-    run = mission(tmp_path, duration_s=40.0, drift_ppm=50.0)
+    run = run_mission(tmp_path, duration_s=40.0, drift_ppm=50.0)
     assert check_invariants(run) == []
     last = {clock.station: clock for clock in run.master_logs[0].clocks}
     drifts = [last[station].frequency_ppm for station in (1, 2, 3)]
@@ -91,7 +91,7 @@ def test_authors_node(tmp_path: Path) -> None:
 
     The master subtracts their mean ping delay: half a polling interval and seven transfers.
     """
-    run = mission(
+    run = run_mission(
         tmp_path, with_linear_estimator(find_scenario("dynamic")), duration_s=40.0, station_software="authors"
     )
     assert check_invariants(run) == []
@@ -109,7 +109,7 @@ def test_packet_loss_only_costs_measurements(tmp_path: Path) -> None:
     """With a tenth of all packets lost, fewer measurements arrive, all of them correct."""
     scenario = find_scenario("dynamic")
     lossy = scenario.model_copy(update={"radio": scenario.radio.model_copy(update={"loss_probability": 0.1})})
-    run = mission(tmp_path, lossy, duration_s=40.0)
+    run = run_mission(tmp_path, lossy, duration_s=40.0)
     assert check_invariants(run) == []
     for figure in station_figures(run).values():
         assert 15 < figure.delivered < 50
@@ -120,7 +120,7 @@ def test_occluded_prisms_give_no_poses(tmp_path: Path) -> None:
 
     Until an instrument has detected the loss, it reports angles only.
     """
-    run = mission(tmp_path, find_scenario("snowmobile"), duration_s=60.0, seed=1)
+    run = run_mission(tmp_path, find_scenario("snowmobile"), duration_s=60.0, seed=1)
     assert check_invariants(run) == []
     statuses = {measurement.status for measurement in run.master_logs[0].measurements}
     assert {"ok", "no_target"} <= statuses <= {"ok", "no_target", "angle_only"}
@@ -129,7 +129,7 @@ def test_occluded_prisms_give_no_poses(tmp_path: Path) -> None:
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_fewer_or_more_stations_than_prisms(tmp_path: Path, count: int) -> None:
     """Two stations measure but give no pose; five share three prisms."""
-    run = mission(tmp_path, with_stations(find_scenario("dynamic"), count), duration_s=20.0)
+    run = run_mission(tmp_path, with_stations(find_scenario("dynamic"), count), duration_s=20.0)
     assert check_invariants(run) == []
     assert list(station_figures(run)) == list(range(1, count + 1))
     assert all(figure.delivered > 5 for figure in station_figures(run).values())
@@ -145,7 +145,7 @@ def test_client_restart(tmp_path: Path) -> None:
         await mission.sleep_until(20.0)
         mission.start_station(2)
 
-    run = mission(tmp_path, duration_s=45.0, script=crash)
+    run = run_mission(tmp_path, duration_s=45.0, script=crash)
     assert check_invariants(run) == []
     stamps = {
         station: np.array(
@@ -177,7 +177,7 @@ def test_clock_without_battery_stops_during_downtime(tmp_path: Path, at_s: float
         await mission.sleep_until(at_s + down_s)
         mission.start_station(1)
 
-    run = mission(tmp_path, duration_s=35.0, script=reboot)
+    run = run_mission(tmp_path, duration_s=35.0, script=reboot)
     assert check_invariants(run) == []
     late = [
         m for m in run.master_logs[0].measurements if m.station == 1 and m.stamp_ns > run.end_ns - 5 * 10**9
@@ -194,7 +194,7 @@ def test_master_restart(tmp_path: Path) -> None:
         await mission.sleep_until(17.0)
         mission.start_master()
 
-    run = mission(tmp_path, duration_s=45.0, script=crash)
+    run = run_mission(tmp_path, duration_s=45.0, script=crash)
     assert check_invariants(run) == []
     first, second = run.master_logs
     assert first.recording() != second.recording()
@@ -204,7 +204,7 @@ def test_master_restart(tmp_path: Path) -> None:
 
 def test_outage(tmp_path: Path) -> None:
     """During the outage nothing arrives from its station, and more from the others."""
-    run = mission(tmp_path, duration_s=40.0, outages=(Outage((2,), 15.0, 10.0),))
+    run = run_mission(tmp_path, duration_s=40.0, outages=(Outage((2,), 15.0, 10.0),))
     assert check_invariants(run) == []
     received_s = {
         station: np.array(
@@ -228,7 +228,7 @@ def test_outage_with_a_fractional_nanosecond_ends(tmp_path: Path) -> None:
     """Rounding of instants does not prolong it."""
     outage = Outage((2,), 2.1, 0.2)
     assert round(outage.end_s * 1e9) / 1e9 < outage.end_s
-    run = mission(tmp_path, duration_s=20.0, outages=(outage,))
+    run = run_mission(tmp_path, duration_s=20.0, outages=(outage,))
     received_s = [
         (m.received_ns - run.start_ns) / 1e9 for m in run.master_logs[0].measurements if m.station == 2
     ]
@@ -237,7 +237,7 @@ def test_outage_with_a_fractional_nanosecond_ends(tmp_path: Path) -> None:
 
 def test_requested_restarts(tmp_path: Path) -> None:
     """A client and the master are down for two seconds."""
-    run = mission(tmp_path, duration_s=40.0, restarts=(Restart(1, 15.0), Restart(None, 20.0)))
+    run = run_mission(tmp_path, duration_s=40.0, restarts=(Restart(1, 15.0), Restart(None, 20.0)))
     assert check_invariants(run) == []
     assert [len(station_log.journals) for station_log in run.station_logs.values()] == [2, 1, 1]
     assert [len(station_log.statuses) for station_log in run.station_logs.values()] == [2, 1, 1]
@@ -250,7 +250,7 @@ def test_requested_restarts(tmp_path: Path) -> None:
 def test_interference_over_classic(tmp_path: Path) -> None:
     """Interference costs measurements, but changes neither them nor what is measured."""
     alone, disturbed = (
-        mission(tmp_path / name, duration_s=40.0, interference_rate_hz=per_s)
+        run_mission(tmp_path / name, duration_s=40.0, interference_rate_hz=per_s)
         for name, per_s in (("alone", 0.0), ("disturbed", 0.5))
     )
     assert check_invariants(disturbed) == []
@@ -264,7 +264,7 @@ def test_timestamp_jitter_and_drift_ramp(tmp_path: Path) -> None:
 
     The first synchronisation takes a second, so that 20 us of jitter leave the frequency uncertain until the second one.
     """
-    run = mission(tmp_path, duration_s=60.0, stamp_jitter_us=20.0, drift_ramp_ppm_per_min=1.0)
+    run = run_mission(tmp_path, duration_s=60.0, stamp_jitter_us=20.0, drift_ramp_ppm_per_min=1.0)
     assert check_invariants(run) == []
     for figure in station_figures(run).values():
         assert 5 < figure.time_error_us[0] < 1500
@@ -277,7 +277,7 @@ def test_unix_clock_step_has_no_effect_on_a_running_client(tmp_path: Path) -> No
         await mission.sleep_until(15.0)
         mission.computers["station1"].clock.step(3_600_000_000_000)
 
-    run = mission(tmp_path, duration_s=30.0, script=step)
+    run = run_mission(tmp_path, duration_s=30.0, script=step)
     assert check_invariants(run) == []
     assert not any(clock.restarted for clock in run.master_logs[0].clocks[3:])
 
@@ -285,7 +285,7 @@ def test_unix_clock_step_has_no_effect_on_a_running_client(tmp_path: Path) -> No
 def test_paper_filter_lags(tmp_path: Path) -> None:
     """With the paper's filter and 50 ppm the timestamp errors are large, but within its bound."""
     paper = QUICK.model_copy(update={"clock_filter": "paper", "resync_interval_s": 20.0})
-    run = mission(
+    run = run_mission(
         tmp_path,
         with_linear_estimator(find_scenario("dynamic")),
         duration_s=120.0,
@@ -307,7 +307,7 @@ def _lossy(loss: float) -> ScenarioConfig:
 
 def test_superframe_delivers_everything(tmp_path: Path) -> None:
     """Three stations deliver all measurements once and promptly, and the poses are better."""
-    run = mission(tmp_path, duration_s=60.0, protocol=SUPERFRAME)
+    run = run_mission(tmp_path, duration_s=60.0, protocol=SUPERFRAME)
     assert check_invariants(run) == []
     for figure in station_figures(run).values():
         assert figure.delivered == figure.measured == pytest.approx(144, abs=2)
@@ -326,7 +326,7 @@ def test_superframe_delivers_everything(tmp_path: Path) -> None:
 def test_same_seed_gives_the_same_superframe_stream(tmp_path: Path) -> None:
     """Nonces and keys included."""
     one, same, other = (
-        mission(tmp_path / name, _lossy(0.1), duration_s=10.0, seed=seed, protocol=SUPERFRAME)
+        run_mission(tmp_path / name, _lossy(0.1), duration_s=10.0, seed=seed, protocol=SUPERFRAME)
         for name, seed in (("one", 3), ("same", 3), ("other", 4))
     )
     assert json.dumps(figures(one)) == json.dumps(figures(same))
@@ -337,7 +337,7 @@ def test_same_seed_gives_the_same_superframe_stream(tmp_path: Path) -> None:
 @pytest.mark.parametrize("authenticated", [True, False])
 def test_outage_over_superframe(tmp_path: Path, *, authenticated: bool) -> None:
     """With a tenth of all packets lost, everything arrives afterwards, live measurements first."""
-    run = mission(
+    run = run_mission(
         tmp_path,
         _lossy(0.1),
         duration_s=70.0,
@@ -356,7 +356,7 @@ def test_outage_over_superframe(tmp_path: Path, *, authenticated: bool) -> None:
 
 def test_restarts_over_superframe(tmp_path: Path) -> None:
     """No measurement is lost when clients or the master restart, and all bounds hold."""
-    run = mission(
+    run = run_mission(
         tmp_path,
         _lossy(0.1),
         duration_s=70.0,
@@ -378,7 +378,7 @@ def test_reboot_over_superframe(tmp_path: Path) -> None:
     async def reboot(mission: Mission) -> None:
         await mission.reboot(1, at_s=30.0, off_s=10.0)
 
-    run = mission(
+    run = run_mission(
         tmp_path,
         duration_s=70.0,
         protocol=SUPERFRAME,
@@ -394,7 +394,7 @@ def test_reboot_over_superframe(tmp_path: Path) -> None:
 
 def test_replay_attack_over_superframe(tmp_path: Path) -> None:
     """Noise and replayed packets cost some packets and change nothing."""
-    run = mission(tmp_path, duration_s=60.0, protocol=SUPERFRAME, interference_rate_hz=1.0)
+    run = run_mission(tmp_path, duration_s=60.0, protocol=SUPERFRAME, interference_rate_hz=1.0)
     assert check_invariants(run) == []
     for figure in station_figures(run).values():
         assert figure.delivered >= figure.measured - 1
@@ -403,7 +403,7 @@ def test_replay_attack_over_superframe(tmp_path: Path) -> None:
 
 def test_many_stations(tmp_path: Path) -> None:
     """Twelve stations share the channel, and each delivers its measurements."""
-    run = mission(tmp_path, with_stations(find_scenario("dynamic"), 12), duration_s=30.0, protocol=SUPERFRAME)
+    run = run_mission(tmp_path, with_stations(find_scenario("dynamic"), 12), duration_s=30.0, protocol=SUPERFRAME)
     assert check_invariants(run) == []
     for figure in station_figures(run).values():
         assert figure.delivered >= figure.measured - 2  # frames last 2.5 s, and the drain 5 s

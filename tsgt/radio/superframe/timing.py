@@ -39,7 +39,7 @@ class BeaconDelayMonitor:
     """Detects that beacons reach a station later than it can notice from the low bits of their times.
 
     The station's replies are then late by the same delay. While beacons carry their full time, the first one on time
-    contradicts the delayed ones, and with the next one the station knows. ``delay_ns`` is the maximum delay since it began;
+    contradicts the delayed ones, and with the next one the station knows. ``delay_ns`` is the maximum delay so far;
     0 from the second consecutive reply on time, if the beacon after the first one carried its time.
     """
 

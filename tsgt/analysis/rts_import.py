@@ -20,7 +20,7 @@ from tsgt.geometry import cartesian_to_polar, invert, raw_distance, transform_po
 from tsgt.model import IDENTITY4, PointMeasurement, PolarMeasurement, StationParameters
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -105,21 +105,18 @@ def point_measurements(tracks: Sequence[PublishedTrack]) -> list[Measurement]:
 
     Track k, counted from 1, is that of station k and prism k.
     """
-    measurements: list[Measurement] = []
-    for station, track in enumerate(tracks, start=1):
-        for sequence, (stamp_ns, (x, y, z)) in enumerate(
-            zip(track.stamps_ns.tolist(), track.points_m.tolist(), strict=True)
-        ):
-            measurements.append(
-                PointMeasurement(
-                    station=station,
-                    prism=station,
-                    sequence=sequence,
-                    stamp_ns=stamp_ns,
-                    received_ns=stamp_ns,
-                    position_m=(x, y, z),
-                )
-            )
+    measurements: list[Measurement] = [
+        PointMeasurement(
+            station=station,
+            prism=station,
+            sequence=sequence,
+            stamp_ns=stamp_ns,
+            received_ns=stamp_ns,
+            position_m=(x, y, z),
+        )
+        for station, track in enumerate(tracks, start=1)
+        for sequence, (stamp_ns, (x, y, z)) in _numbered(track, track.points_m)
+    ]
     return _by_time(measurements)
 
 
@@ -146,23 +143,27 @@ def polar_measurements(
                 "closer than a station can measure: check that tracks and targets are of the same day"
             )
         polar = np.stack([horizontal, zenith, slope], axis=-1)
-        for sequence, (stamp_ns, (h, z, d)) in enumerate(
-            zip(track.stamps_ns.tolist(), polar.tolist(), strict=True)
-        ):
-            measurements.append(
-                PolarMeasurement(
-                    station=station.station,
-                    prism=station.prism,
-                    sequence=sequence,
-                    stamp_ns=stamp_ns,
-                    received_ns=stamp_ns,
-                    horizontal_angle_rad=h,
-                    zenith_angle_rad=z,
-                    slope_distance_m=d,
-                    host_time_ns=stamp_ns,
-                )
+        measurements += [
+            PolarMeasurement(
+                station=station.station,
+                prism=station.prism,
+                sequence=sequence,
+                stamp_ns=stamp_ns,
+                received_ns=stamp_ns,
+                horizontal_angle_rad=h,
+                zenith_angle_rad=z,
+                slope_distance_m=d,
+                host_time_ns=stamp_ns,
             )
+            for sequence, (stamp_ns, (h, z, d)) in _numbered(track, polar)
+        ]
     return _by_time(measurements)
+
+
+def _numbered(
+    track: PublishedTrack, values: NDArray[np.float64]
+) -> Iterator[tuple[int, tuple[int, list[float]]]]:
+    return enumerate(zip(track.stamps_ns.tolist(), values.tolist(), strict=True))
 
 
 def _by_time(measurements: list[Measurement]) -> list[Measurement]:

@@ -41,12 +41,9 @@ _POSE_DIM = 6
 
 @dataclass(frozen=True, slots=True)
 class MotionModel:
-    """Process noise and measurement noise of a recording.
+    """Process noise, and the factor on the stated sigmas of the instruments.
 
-    Attributes
-    ----------
-    noise_scale : Factor on the stated sigmas of the instruments.
-    tuned : True: estimated from the measurements. False: they were too few, the values are those of the recording.
+    ``tuned``: estimated from the measurements; otherwise they were too few, and the values are those of the recording.
     """
 
     prior: MotionPrior
@@ -56,13 +53,9 @@ class MotionModel:
 
 @dataclass(frozen=True, slots=True)
 class SmoothedRecording:
-    """Trajectory fitted to a recording.
+    """Trajectory fitted to a recording, and its poses at the epochs from the first to the last usable measurement.
 
-    Attributes
-    ----------
-    poses : One per epoch from the first to the last usable measurement.
-    sources : The measurement of each observation of ``fit``.
-    origin_ns : Unix time at which the time of ``fit`` is zero.
+    ``sources`` has the measurement of each observation of the fit, ``origin_ns`` the Unix time at which its time is zero.
     """
 
     poses: PoseBatch

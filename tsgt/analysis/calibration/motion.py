@@ -47,14 +47,7 @@ class HeldOutComparison:
 
 @dataclass(frozen=True, slots=True)
 class CalibratedRecording:
-    """Set-up from the motion in a recording.
-
-    Attributes
-    ----------
-    calibration : From all measurements.
-    parameters : Those of the recording, with the calibrated set-up.
-    held_out : Held-out prediction; None if not requested.
-    """
+    """Set-up calibrated from all measurements, the recording's parameters with it, and held-out prediction if requested."""
 
     calibration: MotionCalibration
     parameters: Parameters

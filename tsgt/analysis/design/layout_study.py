@@ -31,13 +31,9 @@ HEADING_COUNT = 8
 
 @dataclass(frozen=True, slots=True)
 class Station:
-    """A station at its place.
+    """A station at ``position_m`` in the world, (3,), with the noise of a single measurement.
 
-    Attributes
-    ----------
-    position_m : In the world, (3,).
-    noise : Of a single measurement.
-    prism_index : Index in the layout of the prism that it tracks.
+    ``prism_index`` is the index in the layout of the prism that it tracks.
     """
 
     position_m: FloatArray
@@ -55,13 +51,7 @@ class Station:
 
 @dataclass(frozen=True, slots=True)
 class RobotPoses:
-    """N poses of a level robot.
-
-    Attributes
-    ----------
-    rotation : ``R_world_robot``, (N, 3, 3).
-    position_m : The robot's origin in the world, (N, 3).
-    """
+    """N poses of a level robot: ``R_world_robot``, (N, 3, 3), and the robot's origin in the world, (N, 3)."""
 
     rotation: FloatArray
     position_m: FloatArray
@@ -82,13 +72,9 @@ class RobotPoses:
 
 @dataclass(frozen=True, slots=True)
 class PoseAccuracy:
-    """Root mean squares over N robot poses of one sigma.
+    """Root mean squares over N robot poses of one sigma: norm of the position error, angle of the rotation error.
 
-    Attributes
-    ----------
-    position_m, rotation_rad : Norm of the position error, angle of the rotation error.
-    position_axes_m, rotation_axes_rad : Along and about x, y, z of the robot, (3,).
-    worst_position_m, worst_rotation_rad : Norm and angle at the worst of the robot poses.
+    ``axes``: along and about x, y, z of the robot, (3,). ``worst``: norm and angle at the worst of the robot poses.
     """
 
     position_m: float

@@ -29,18 +29,11 @@ _RELATIVE_TOLERANCE = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class Perturbation:
-    """Pose errors due to noise of one sigma; means and standard deviations over the samples.
+    """Pose errors due to noise of one sigma on each coordinate of each prism (``noise_m``), over all samples.
 
-    Attributes
-    ----------
-    noise_m : One sigma of the noise on each coordinate of each prism.
-    inter_prism_mean_m, inter_prism_std_m : Of |measured - true distance| over all pairs of prisms.
-    position_mean_m, position_std_m, position_abs_mean_m
-        Position error along x, y, z of the robot frame, (3,): mean, standard deviation, mean of the absolute value.
-    euler_mean_rad, euler_std_rad, euler_abs_mean_rad
-        Rotation error as angles about x, y, z (roll, pitch, yaw; R = Rz Ry Rx), (3,).
-    position_norm_mean_m, position_norm_std_m : Norm of the position error.
-    rotation_norm_mean_rad, rotation_norm_std_rad : Angle of the rotation error.
+    ``inter_prism``: |measured - true distance| over all pairs of prisms. ``position``: along x, y, z of the robot frame, (3,).
+    ``euler``: rotation error about x, y, z (roll, pitch, yaw; R = Rz Ry Rx), (3,). ``norm``: norm of the position error, angle of
+    the rotation error. ``mean``, ``std``, ``abs_mean``: mean, standard deviation, mean of the absolute value.
     """
 
     noise_m: float

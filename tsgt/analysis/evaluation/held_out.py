@@ -77,12 +77,9 @@ class PredictionErrorStatistics:
 
 @dataclass(frozen=True, slots=True)
 class HeldOutErrors:
-    """Prediction errors of N held-out measurements, in the order of the folds.
+    """Distance between measured and predicted position of N held-out measurements, in the order of the folds.
 
-    Attributes
-    ----------
-    error_m : (N,) distance between measured and predicted position of the prism.
-    at_gap : (N,) as in :class:`Fold`.
+    ``at_gap``, (N,), is as in :class:`Fold`.
     """
 
     error_m: FloatArray

@@ -36,12 +36,8 @@ MIN_STATIONARY_NS = 3_000_000_000
 class DistanceStatistics:
     """Inter-prism distances in mm, as ``tsgt evaluate`` prints them; NaN without distances.
 
-    Attributes
-    ----------
-    reference : Distance in the prism layout.
-    mean, std : Of the distances.
-    mean_abs_error, p95 : Mean and 95th percentile of |distance - reference|.
-    valid, invalid : Number of distances, and of epochs without one.
+    ``reference`` is the distance in the layout; ``mean`` and ``std`` are of the distances, ``mean_abs_error`` and ``p95`` mean and
+    95th percentile of |distance - reference|; ``valid`` and ``invalid`` count distances, and epochs without one.
     """
 
     reference: float
@@ -55,14 +51,7 @@ class DistanceStatistics:
 
 @dataclass(frozen=True, slots=True)
 class PairDistances:
-    """N measured distances between two prisms.
-
-    Attributes
-    ----------
-    prisms : Numbers of the two prisms.
-    reference_m : Their distance in the prism layout.
-    invalid : Number of epochs without a valid distance.
-    """
+    """N measured distances between the prisms with these numbers, their distance in the layout, and epochs without a distance."""
 
     prisms: tuple[int, int]
     distances_m: NDArray[np.float64]

@@ -21,13 +21,7 @@ EDGE_MARGIN_NS = 2_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class PoseErrors:
-    """Errors of N poses.
-
-    Attributes
-    ----------
-    position_m : (N,) norm of the position error at the chosen point of the robot.
-    rotation_rad : (N,) angle of the rotation between estimate and truth.
-    """
+    """Errors of N poses: norm of the position error at a point of the robot, (N,), and angle of the rotation error, (N,)."""
 
     position_m: NDArray[np.float64]
     rotation_rad: NDArray[np.float64]

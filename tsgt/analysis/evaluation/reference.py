@@ -31,14 +31,7 @@ MAX_INTERPOLATION_GAP_NS = 100_000_000
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """Poses of a reference.
-
-    Attributes
-    ----------
-    stamp_ns : (N,) Unix time, strictly increasing.
-    position_m : (N, 3) in frame ``station1``.
-    orientation_xyzw : (N, 4).
-    """
+    """Reference poses: (N,) Unix times, strictly increasing, (N, 3) positions in frame ``station1``, (N, 4) orientations."""
 
     stamp_ns: NDArray[np.int64]
     position_m: FloatArray
@@ -170,13 +163,7 @@ class StationaryStatistics:
 
 @dataclass(frozen=True, slots=True)
 class StationaryErrors:
-    """Errors of the mean pose of each of K stationary intervals.
-
-    Attributes
-    ----------
-    position_m : (K,) norm of the position error at the chosen point of the robot.
-    rotation_rad : (K,) angle of the rotation error.
-    """
+    """Errors of the mean poses of K stationary intervals: norm of the position error, (K,), angle of the rotation error, (K,)."""
 
     position_m: FloatArray
     rotation_rad: FloatArray

@@ -11,14 +11,14 @@ from tsgt.analysis.figures.axes import (
     dots,
     hatch,
     legend_above,
+    note,
     panels_height_mm,
     plain_log,
     shade,
     stroke,
 )
+from tsgt.analysis.figures.design import draw_layouts, draw_perturbation
 from tsgt.analysis.figures.gnss import draw_gnss
-from tsgt.analysis.figures.layout import draw_layouts
-from tsgt.analysis.figures.perturbation import draw_perturbation
 from tsgt.analysis.figures.style import FORMATS, PAGE_WIDTH_MM, drawing, save
 
 __all__ = [
@@ -34,6 +34,7 @@ __all__ = [
     "drawing",
     "hatch",
     "legend_above",
+    "note",
     "panels_height_mm",
     "plain_log",
     "save",

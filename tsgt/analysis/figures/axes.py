@@ -35,13 +35,7 @@ HATCHES = ("", "///", "...", "xxx", "\\\\\\", "+++")
 
 @dataclass(frozen=True, slots=True)
 class TimeAxis:
-    """Time axis from the first measurement, in a unit that keeps the numbers small.
-
-    Attributes
-    ----------
-    origin_ns : Unix time at 0.
-    unit_s : Seconds in one unit.
-    """
+    """Time axis from the first measurement (``origin_ns``), in a unit (``unit_s``) that keeps the numbers small."""
 
     origin_ns: int
     unit_s: float
@@ -154,6 +148,11 @@ def dots(panel: Axes, x: FloatArray, y: FloatArray, row: int, *, label: str | No
         label=label,
         rasterized=True,
     )
+
+
+def note(panel: Axes, text: str, *, x: float = 0.5) -> None:
+    """Write a text in the middle of an empty panel."""
+    panel.text(x, 0.5, text, transform=panel.transAxes, ha="center", va="center")
 
 
 def panels_height_mm(rows: int) -> float:

@@ -28,13 +28,7 @@ NS_MAX = 2**63 - 1
 
 @dataclass(frozen=True, slots=True)
 class PublishedTrack:
-    """Track of one prism as published.
-
-    Attributes
-    ----------
-    stamps_ns : (M,) Unix time, strictly increasing.
-    points_m : (M, 3) in the frame ``station1``.
-    """
+    """Track of one prism: (M,) Unix times, strictly increasing, and (M, 3) positions in the frame ``station1``."""
 
     stamps_ns: NDArray[np.int64]
     points_m: NDArray[np.float64]

@@ -31,13 +31,8 @@ _CAD = ("x_m", "y_m", "z_m")
 class TargetMeasurement:
     """A raw single-shot measurement of a target, in either face.
 
-    Attributes
-    ----------
-    horizontal_angle_rad : Clockwise.
-    zenith_angle_rad : From the zenith; above pi in face 2.
-    slope_distance_m : Without corrections.
-    constant_m : Added to this distance; None: use the constant of the command line.
-    line : Line number in the file, from 1.
+    The horizontal angle is clockwise, the zenith angle above pi in face 2, the distance without corrections; ``constant_m`` is
+    added to it (None: use the constant of the command line). ``line`` is the line number in the file, from 1.
     """
 
     horizontal_angle_rad: float
@@ -49,12 +44,9 @@ class TargetMeasurement:
 
 @dataclass(frozen=True, slots=True)
 class TargetFile:
-    """Measurements of common targets by several stations.
+    """Measurements of common targets by several stations, by station number and target number: at least one each.
 
-    Attributes
-    ----------
-    measurements : By station number and target number: at least one.
-    skipped : One sentence for each line that was skipped because of an error status.
+    ``skipped`` has one sentence for each line that was skipped because of an error status.
     """
 
     path: Path
@@ -64,12 +56,9 @@ class TargetFile:
 
 @dataclass(frozen=True, slots=True)
 class PrismFile:
-    """Measurements of the robot's prisms and body points by one station.
+    """Measurements of the robot's prisms (by number) and body points (by name), at least one each.
 
-    Attributes
-    ----------
-    prisms, body : By prism number and by name of the body point: at least one measurement.
-    cad_m : By name of the body point: position in the frame ``robot`` from CAD.
+    ``cad_m``: position of each body point in the frame ``robot`` from CAD.
     """
 
     path: Path

@@ -9,11 +9,13 @@ from tsgt.analysis.gnss.baselines import (
     DistanceErrorStatistics,
     DistanceSeries,
     Receiver,
+    common_interval,
+    prism_distances,
     quality_shares,
     receiver_distances,
     receivers,
+    time_span,
 )
-from tsgt.analysis.gnss.prism_baselines import common_interval, prism_distances, time_span
 
 __all__ = [
     "QUALITY_ORDER",

@@ -1,4 +1,4 @@
-"""Distances between GNSS receivers on a robot.
+"""Distances over time between GNSS receivers on a robot, and between its prisms for comparison.
 
 The distance between two receivers on a rigid robot is constant, as that between two prisms: the same figure rates both
 systems, in the open and under trees (Vaidis et al. 2021, section IV-F).
@@ -13,18 +13,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tsgt.analysis.evaluation import distances_at_epochs
 from tsgt.analysis.formats import QUALITIES, SECOND_NS
 from tsgt.analysis.gnss.leap_seconds import utc_from_gps
-from tsgt.errors import InputFileError, MissingExtraError
+from tsgt.errors import InputFileError, MissingExtraError, RecordingError
 from tsgt.geometry import interpolate
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from tsgt.analysis.formats import PosFile, TimeSystem
+    from tsgt.estimation import Track
+    from tsgt.model import Parameters
 
 JST_OFFSET_NS = 9 * 3600 * SECOND_NS
 
@@ -41,16 +44,10 @@ _RANK = np.argsort(QUALITY_ORDER)
 
 @dataclass(frozen=True, slots=True)
 class Receiver:
-    """Positions of one receiver.
+    """Positions of one receiver at M Unix times, strictly increasing.
 
-    Attributes
-    ----------
-    path, time_system : The file and its time system.
-    times_ns : (M,) Unix time, strictly increasing.
-    points_m : (M, 3) east, north and up in the local frame common to all receivers.
-    quality : (M,) RTKLIB's Q.
-    satellites : (M,) number of satellites.
-    without_position : Number of epochs in the file without a position.
+    ``points_m``: (M, 3) east, north and up in the local frame common to all receivers. ``quality``: (M,) RTKLIB's Q.
+    ``satellites``: (M,). ``without_position``: number of epochs in the file without a position.
     """
 
     name: str
@@ -71,13 +68,7 @@ class Receiver:
 
 @dataclass(frozen=True, slots=True)
 class DistanceErrorStatistics:
-    """|distance - reference| in mm; NaN without distances.
-
-    Attributes
-    ----------
-    valid : Number of distances.
-    std_abs_error : Standard deviation with divisor n.
-    """
+    """Statistics of |distance - reference| in mm; NaN without distances. The standard deviation has divisor n."""
 
     valid: int
     mean_abs_error: float
@@ -102,16 +93,10 @@ class DistanceErrorStatistics:
 
 @dataclass(frozen=True, slots=True)
 class DistanceSeries:
-    """Distances over time between two receivers or two prisms.
+    """Distances over time between two receivers or two prisms, with the name of the pair in reports.
 
-    Attributes
-    ----------
-    name : Name of the pair in reports.
-    times_ns : (N,) Unix time.
-    distances_m : (N,).
-    reference_m : True distance; NaN if unknown.
-    quality : (N,) the worse Q of the two positions; None for prisms.
-    invalid_ns : (K,) Unix times of the epochs without a distance.
+    ``times_ns``, ``distances_m``: (N,) Unix times and distances. ``reference_m``: true distance; NaN if unknown. ``quality``: (N,)
+    the worse Q of the two positions; None for prisms. ``invalid_ns``: (K,) Unix times of epochs without a distance.
     """
 
     name: str
@@ -276,3 +261,70 @@ def quality_shares(receiver: Receiver) -> dict[str, float]:
     """Return the share of each quality among a receiver's positions, best first."""
     counts = {QUALITIES[q]: int(np.sum(receiver.quality == q)) for q in QUALITY_ORDER}
     return {name: count / len(receiver.quality) for name, count in counts.items() if count}
+
+
+def prism_distances(
+    parameters: Parameters, tracks: Mapping[int, Track], path: Path
+) -> tuple[DistanceSeries, ...]:
+    """Measure the distances between all prisms over time, as ``tsgt evaluate`` does: at 20 Hz, all pairs or none.
+
+    Parameters
+    ----------
+    parameters : The prism layout (the reference distances) and the outage limit.
+    tracks : One track per prism of the layout, in frame ``station1``.
+
+    Raises
+    ------
+    RecordingError : A prism was not measured, or the layout has only one prism.
+    """
+    missing = [prism.prism for prism in parameters.prisms if not len(tracks[prism.prism])]
+    if missing or len(parameters.prisms) < 2:
+        reason = f"prism {missing[0]} was not measured" if missing else "it has one prism only"
+        raise RecordingError(f"no distances between prisms: {reason}", path=path)
+    found = distances_at_epochs(parameters, tracks)
+    return tuple(
+        DistanceSeries(
+            name=f"{a}-{b}",
+            times_ns=found.stamp_ns[found.valid],
+            distances_m=distances_m[found.valid],
+            reference_m=found.references_m[a, b],
+            quality=None,
+            invalid_ns=found.stamp_ns[~found.valid],
+        )
+        for (a, b), distances_m in found.distances_m.items()
+    )
+
+
+def common_interval(
+    gnss: Sequence[DistanceSeries], prisms: Sequence[DistanceSeries], path: Path
+) -> tuple[tuple[DistanceSeries, ...], tuple[DistanceSeries, ...]]:
+    """Cut distances between receivers and between prisms to the time interval that both cover.
+
+    Raises
+    ------
+    RecordingError : They do not overlap in time.
+    """
+    gnss_span, prism_span = time_span(gnss), time_span(prisms)
+    if gnss_span is None or prism_span is None:
+        which = "receivers" if gnss_span is None else "prisms"
+        raise RecordingError(f"nothing to compare: there are no distances between {which}", path=path)
+    start_ns, end_ns = max(gnss_span[0], prism_span[0]), min(gnss_span[1], prism_span[1])
+    if start_ns > end_ns:
+        late = prism_span[0] > gnss_span[1]
+        raise RecordingError(
+            f"its distances {'begin' if late else 'end'} {(start_ns - end_ns) / 1e9:.1f} s "
+            f"{'after the end' if late else 'before the start'} of the receivers'; was the master's clock right?",
+            path=path,
+        )
+    both = tuple(tuple(pair.between(start_ns, end_ns) for pair in pairs) for pairs in (gnss, prisms))
+    if None in map(time_span, both):
+        raise RecordingError(
+            "while its prisms were measured the receivers had no common positions", path=path
+        )
+    return both[0], both[1]
+
+
+def time_span(pairs: Sequence[DistanceSeries]) -> tuple[int, int] | None:
+    """Return the first and the last time of any distance; None without one."""
+    times = np.concatenate([np.empty(0, np.int64), *(pair.times_ns for pair in pairs)])
+    return (int(times.min()), int(times.max())) if len(times) else None

@@ -73,13 +73,7 @@ class JournalMeasurement(NamedTuple):
 
 
 class Boot:
-    """Journals of one station that share a CLOCK_MONOTONIC.
-
-    Attributes
-    ----------
-    journals : In the order of their creation.
-    entries : All measurements in the order of time.
-    """
+    """Journals of one station that share a CLOCK_MONOTONIC, in the order of their creation, and their measurements by time."""
 
     def __init__(self, journals: Iterable[IndexedJournal]) -> None:
         self.journals = sorted(journals, key=lambda source: source.begin_ns)
@@ -223,7 +217,6 @@ class Match:
     delivered : Indices of entries that were delivered over the radio.
     same_content : Indices of entries whose content was delivered; their times may contradict that.
     clock_related : Synchronisations or beacons relate the station's clock to the master's.
-    beacons_received : The station received beacons of this session.
     """
 
     times: list[MasterTime | None]

@@ -40,12 +40,10 @@ MAX_TIME_BOUND_NS = 50_000_000
 
 @dataclass(slots=True)
 class MergedJournal:
-    """Result for one journal.
+    """Number of measurements of one journal, by result.
 
     Attributes
     ----------
-    measurements : Total number.
-    added : Written to the recording.
     already_there : Delivered over the radio, or merged before.
     outside : Made long before or after the recording.
     untimed : Without a time on the master's clock, or with too large a bound.
@@ -64,13 +62,7 @@ class MergedJournal:
 
 @dataclass(frozen=True, slots=True)
 class Merged:
-    """Result of a merge.
-
-    Attributes
-    ----------
-    bounds_ns : Time bounds of the added measurements, increasing.
-    cut_bytes : Length of an incomplete line removed from the end of the recording.
-    """
+    """Result of a merge: the journals, increasing time bounds of the added measurements, bytes of an incomplete line removed."""
 
     journals: tuple[MergedJournal, ...]
     bounds_ns: tuple[int, ...]

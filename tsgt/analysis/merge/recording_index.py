@@ -21,14 +21,10 @@ Identity = tuple[int, int, float, float, float | None]
 
 @dataclass(slots=True)
 class Session:
-    """One session of the master. Its times share a Unix timeline; that of another session may differ.
+    """One session of the master, from the header to the last line with a time. Another session may have another Unix timeline.
 
-    Attributes
-    ----------
-    start_ns, end_ns : From the header to the last line with a time.
-    clocks : Synchronisations by station, in their order.
-    beacons : By session number in the protocol, then by frame counter.
-    delivered : Measurements received over the radio, by station.
+    ``clocks`` and ``delivered`` are synchronisations and received measurements by station, ``beacons`` are by session number in
+    the protocol, then by frame counter.
     """
 
     start_ns: int
@@ -40,13 +36,7 @@ class Session:
 
 @dataclass(slots=True)
 class RecordingIndex:
-    """Content of a recording that merging needs.
-
-    Attributes
-    ----------
-    stations : Numbers of all stations in the parameters.
-    merged : Measurements merged before.
-    """
+    """Numbers of all stations in the parameters, sessions of the master, and identities of measurements merged before."""
 
     stations: set[int] = field(default_factory=set)
     sessions: list[Session] = field(default_factory=list)

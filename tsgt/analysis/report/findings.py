@@ -62,13 +62,7 @@ _EQUIVALENT_SAMPLES = 20_000
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """Poses of the two estimators compared at N epochs at which both are valid.
-
-    Attributes
-    ----------
-    position_m : (N,) distance between the positions of the prisms' centroid.
-    rotation_rad : (N,) angle between the rotations.
-    """
+    """Poses of the two estimators compared at N epochs: distance of the prisms' centroids, (N,), angle between rotations, (N,)."""
 
     stamp_ns: np.ndarray[Any, np.dtype[np.int64]]
     position_m: FloatArray
@@ -79,11 +73,8 @@ class Difference:
 class PoseNoise:
     """Effect of prism noise on a pose, for the layout of the recording.
 
-    Attributes
-    ----------
-    study : For noise of several sigmas.
-    first_order_per_mm : Sigmas of position (m) and rotation (rad) for 1 mm of noise, (3,) each.
-    as_measured : For the noise that explains the mean inter-prism error; None without distances.
+    ``study`` is for several sigmas, ``as_measured`` for the noise that explains the mean inter-prism error (None without
+    distances), ``first_order_per_mm`` has the sigmas of position (m) and rotation (rad) for 1 mm of noise, (3,) each.
     """
 
     study: list[Perturbation]

@@ -26,13 +26,10 @@ _SKIPPED_PREFIXES = (b'{"type":"pose"', b'{"type":"measurement"', b'{"type":"poi
 
 @dataclass(frozen=True, slots=True)
 class RadioSeries:
-    """Radio quality of a station at N status records; NaN where nothing was recorded.
+    """Radio quality of a station at N status records, on the master's Unix clock; NaN where nothing was recorded.
 
-    Attributes
-    ----------
-    stamp_ns : (N,) on the master's Unix clock.
-    rssi_dbm, snr_db : (N,) of its last radio message.
-    loss : (N,) share of its last requests without a response, 0 to 1.
+    ``rssi_dbm`` and ``snr_db``, (N,), are of its last radio message, ``loss``, (N,), is the share of its last requests without
+    a response, 0 to 1.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -43,14 +40,9 @@ class RadioSeries:
 
 @dataclass(frozen=True, slots=True)
 class ClockSeries:
-    """A station's clock relative to the master's at N synchronisations.
+    """A station's clock relative to the master's at N synchronisations, on the master's Unix clock.
 
-    Attributes
-    ----------
-    stamp_ns : (N,) on the master's Unix clock.
-    offset_ns : (N,) positive: station ahead.
-    bound_ns : (N,) of the error of the offset.
-    restarted : (N,) whether the clock filter was reset.
+    ``offset_ns``, (N,), is positive if the station is ahead, ``bound_ns`` the bound of its error; ``restarted``: filter reset.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -63,11 +55,8 @@ class ClockSeries:
 class Log:
     """Records of a recording other than measurements and poses.
 
-    Attributes
-    ----------
-    radio, clocks : By station; empty without records.
-    events : (stamp_ns, message) in the order of the file.
-    protocol, authenticated : Of the last status; None without a radio.
+    ``radio`` and ``clocks`` are by station, ``events`` are (stamp_ns, message) in the order of the file, ``protocol`` and
+    ``authenticated`` are those of the last status (None without a radio).
     """
 
     radio: dict[int, RadioSeries]

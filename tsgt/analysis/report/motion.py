@@ -26,11 +26,7 @@ MIN_BIN_COUNT = 20
 class RobotMotion:
     """Motion of a robot at N epochs; NaN where no pose is valid.
 
-    Attributes
-    ----------
-    speed_mps : (N,) of the prisms' centroid.
-    acceleration_mps2 : (N,) derivative of the speed; negative while braking.
-    angular_rate_radps : (N,) norm of the angular velocity.
+    Speed of the prisms' centroid, its derivative (negative while braking), and norm of the angular velocity, (N,) each.
     """
 
     speed_mps: FloatArray
@@ -45,13 +41,9 @@ class RobotMotion:
 
 @dataclass(frozen=True, slots=True)
 class DistanceErrorSeries:
-    """Inter-prism errors over time.
+    """Inter-prism errors and motion of the robot at N 20 Hz epochs in the time that all tracks cover.
 
-    Attributes
-    ----------
-    stamp_ns : (N,) 20 Hz epochs in the time that all tracks cover.
-    error_m : By name of the pair, (N,) measured distance minus that of the layout; NaN where a track has a gap.
-    motion : Of the robot at these epochs.
+    ``error_m``: by name of the pair, (N,) measured distance minus that of the layout; NaN where a track has a gap.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -61,14 +53,7 @@ class DistanceErrorSeries:
 
 @dataclass(frozen=True, slots=True)
 class Bins:
-    """Statistics of |error| in B bins of equal width.
-
-    Attributes
-    ----------
-    edges : (B + 1,) of the bins.
-    counts : (B,).
-    median, mean, p95 : (B,) of |error| in m; NaN with too few errors.
-    """
+    """Number, median, mean and 95th percentile of |error| in m, (B,), in B bins of equal width; NaN with too few errors."""
 
     edges: FloatArray
     counts: NDArray[np.int64]
@@ -79,14 +64,7 @@ class Bins:
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Mean |error| by two quantities.
-
-    Attributes
-    ----------
-    x_edges, y_edges : (X + 1,) and (Y + 1,).
-    mean : (Y, X) in m; NaN with too few errors.
-    counts : (Y, X).
-    """
+    """Mean |error| in m, (Y, X), and number of errors by two quantities; NaN with too few errors."""
 
     x_edges: FloatArray
     y_edges: FloatArray

@@ -70,7 +70,7 @@ def report_numbers(findings: Findings) -> dict[str, Any]:
                 station: {axis: dataclasses.asdict(each) for axis, each in axes.items()}
                 for station, axes in f.residuals.items()
             },
-            "outliers": [dataclasses.asdict(stray) for stray in f.outliers],
+            "outliers": [dataclasses.asdict(outlier) for outlier in f.outliers],
         }
     if f.reference_errors:
         found["estimators"] = {name: _compared(f, name) for name in f.reference_errors}
@@ -119,10 +119,10 @@ def pose_numbers(poses: PoseBatch) -> dict[str, Any]:
 
 def _station(f: Findings, station: int) -> dict[str, Any]:
     series = f.log.radio.get(station)
-    heard = (None, None, None) if series is None else (series.rssi_dbm, series.snr_db, series.loss)
+    quality = (None, None, None) if series is None else (series.rssi_dbm, series.snr_db, series.loss)
     names = ("rssi_median_dbm", "snr_median_db", "loss_median")
     found = dataclasses.asdict(f.station_statistics[station])
-    return {**found, **{name: nan_median(values) for name, values in zip(names, heard, strict=True)}}
+    return {**found, **{name: nan_median(values) for name, values in zip(names, quality, strict=True)}}
 
 
 def _distances(found: InterPrismDistances) -> dict[str, Any]:

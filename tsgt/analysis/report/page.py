@@ -45,13 +45,7 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class ReportFigure:
-    """A figure.
-
-    Attributes
-    ----------
-    name : Of its files, without a suffix.
-    write : Draws the figure and writes it to the given files.
-    """
+    """A figure, with the name of its files without a suffix; ``write`` draws it and writes the given files."""
 
     name: str
     caption: str

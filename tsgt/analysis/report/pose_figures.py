@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.figures import banded, curve, dots, plain_log, stroke
+from tsgt.analysis.figures import banded, curve, dots, note, plain_log, stroke
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -102,7 +102,7 @@ def draw_held_out(figure: Figure, held_out: Mapping[Estimator, HeldOutErrors]) -
         if reach_mm:
             panel.set_xlim(0.0, reach_mm)
         else:
-            panel.text(0.5, 0.5, "none", transform=panel.transAxes, ha="center", va="center")
+            note(panel, "none")
             panel.set_xticks([])
         panel.set_title(title, loc="left")
         panel.set_xlabel("prediction error (mm)")

@@ -31,6 +31,10 @@ if TYPE_CHECKING:
     from tsgt.analysis.report.findings import Findings
 
 
+def _table(caption: str, columns: str, rows: Sequence[tuple[str, ...]]) -> Table:
+    return Table(caption, tuple(columns.split("|")), tuple(rows))
+
+
 def reference_tables(f: Findings) -> list[Table]:
     """Return tables of the aligned errors, if requested, and of the stationary intervals, if there are any."""
     tables = []
@@ -49,8 +53,13 @@ def reference_tables(f: Findings) -> list[Table]:
             for name, a in f.aligned_errors.items()
         ]
         caption = "Aligned with the reference: remaining errors, the alignment, and the part of the rms that it hides"
-        header = "estimator|rms (mm)|rms (deg)|translation (mm)|rotation (deg)|hidden (mm)|hidden (deg)"
-        tables.append(Table(caption, tuple(header.split("|")), tuple(rows)))
+        tables.append(
+            _table(
+                caption,
+                "estimator|rms (mm)|rms (deg)|translation (mm)|rotation (deg)|hidden (mm)|hidden (deg)",
+                rows,
+            )
+        )
     rows = [
         format_cells(
             name,
@@ -62,8 +71,7 @@ def reference_tables(f: Findings) -> list[Table]:
     ]
     if rows:
         caption = "Error of the mean pose of each stationary interval against the reference, unaligned"
-        header = "estimator|intervals|mean (mm)|max (mm)|mean (deg)|max (deg)"
-        tables.append(Table(caption, tuple(header.split("|")), tuple(rows)))
+        tables.append(_table(caption, "estimator|intervals|mean (mm)|max (mm)|mean (deg)|max (deg)", rows))
     return tables
 
 
@@ -83,8 +91,7 @@ def estimator_section(f: Findings, axis: TimeAxis) -> Section:
             for name, each in f.held_out.items()
             for label, m in ((name, each.statistics), (f"{name}, at gaps over 1 s", each.gaps))
         ]
-        header = ("estimator", "n", "mean", "median", "95 %")
-        tables.append(Table("Held-out prediction error (mm)", header, tuple(rows)))
+        tables.append(_table("Held-out prediction error (mm)", "estimator|n|mean|median|95 %", rows))
         held_out = f.held_out
         plots.append(
             page_figure(
@@ -109,15 +116,8 @@ def estimator_section(f: Findings, axis: TimeAxis) -> Section:
             )
             for name, e in f.reference_errors.items()
         ]
-        header = (
-            "estimator",
-            "poses",
-            "rms (mm)",
-            "rms (deg)",
-            "NEES (expected 6)",
-            "above 95 % (expected 5 %)",
-        )
-        tables.append(Table("Against the reference, unaligned, at the prisms' centroid", header, tuple(rows)))
+        columns = "estimator|poses|rms (mm)|rms (deg)|NEES (expected 6)|above 95 % (expected 5 %)"
+        tables.append(_table("Against the reference, unaligned, at the prisms' centroid", columns, rows))
         tables += reference_tables(f)
         if f.reference is not None and not any(e.compared for e in f.reference_errors.values()):
             text.append(
@@ -152,8 +152,8 @@ def _poses_of(f: Findings) -> Table:
         reasons = ", ".join(f"{reason} {n}" for reason, n in numbers["invalid"].items()) or "-"
         counts = format_cells(name, (numbers["poses"], 0), (numbers["valid_poses"], 0))
         rows.append((*counts, *format_cells(reasons, (sigma["median"], 1), (sigma["p95"], 1))))
-    header = ("estimator", "poses", "valid", "not valid", "median sigma (mm)", "95 % sigma (mm)")
-    return Table("Poses, and the stated position sigma per axis of the valid ones", header, tuple(rows))
+    columns = "estimator|poses|valid|not valid|median sigma (mm)|95 % sigma (mm)"
+    return _table("Poses, and the stated position sigma per axis of the valid ones", columns, rows)
 
 
 def trajectory_section(f: Findings, axis: TimeAxis) -> Section:

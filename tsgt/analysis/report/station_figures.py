@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.figures import curve, dots, hatch, legend_above, plain_log, shade, stroke
+from tsgt.analysis.figures import curve, dots, hatch, legend_above, note, plain_log, shade, stroke
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -64,7 +64,7 @@ def draw_gaps(
         plain_log(panel.yaxis)
         panel.set_title(f"station {station.station}", loc="left")
         if not len(station.stamp_ns):
-            panel.text(0.5, 0.5, "no measurements", transform=panel.transAxes, ha="center", va="center")
+            note(panel, "no measurements")
     low, high = axes[0].get_ylim()
     # The highest mark, a gap, must be clear of the edge.
     axes[0].set_ylim(min(low, 0.15), max(1.4 * high, 3.0))
@@ -159,7 +159,7 @@ def _histogram(panel: Axes, pair: PairDistances, reach_mm: float, row: int) -> N
     error_mm = 1e3 * (pair.distances_m - pair.reference_m)
     panel.axvline(0.0, color="black", linewidth=1.2, label="layout")
     if not len(error_mm):
-        panel.text(0.25, 0.5, "no\ndistances", transform=panel.transAxes, ha="center", va="center")
+        note(panel, "no\ndistances", x=0.25)
         panel.set_yticks([])
         return
     panel.hist(
@@ -221,7 +221,7 @@ def draw_bins(figure: Figure, bins: Sequence[tuple[str, Bins | None]]) -> None:
         above, below = axes[:, column]
         below.set_xlabel(label)
         if found is None or not found.counts.any():  # a logarithmic axis cannot be empty
-            above.text(0.5, 0.5, "unknown", transform=above.transAxes, ha="center", va="center")
+            note(above, "unknown")
             continue
         middle = (found.edges[1:] + found.edges[:-1]) / 2
         for row, (name, values) in enumerate(

@@ -26,8 +26,6 @@ class StationRecord:
 
     Attributes
     ----------
-    prisms : Numbers of the measured prisms.
-    stamp_ns : (N,) on the master's Unix clock.
     usable : (N,) whether status and distance allow its use in a pose.
     bound_ns : (N,) of the timestamp error; NaN if unknown.
     delay_s : (N,) from the measurement to its arrival at the master.
@@ -47,17 +45,15 @@ class StationRecord:
 
 @dataclass(frozen=True, slots=True)
 class StationStatistics:
-    """Statistics of a station.
+    """Statistics of a station; NaN if unknown.
 
     Attributes
     ----------
     rate_hz : Usable measurements per second, from the first to the last; NaN with fewer than two.
     longest_gap_s : Longest time without a usable measurement, including start and end of the recording.
     gaps, in_gaps : Number of gaps longer than the outage limit, and their share of the recording.
-    statuses : Number of measurements by status.
     delay_median_s, delay_p95_s : From the measurement to its arrival at the master.
-    bound_max_ms : Largest timestamp bound; NaN if none was recorded.
-    distance_min_m, distance_max_m : Slope distances; NaN without distances.
+    distance_min_m, distance_max_m : Slope distances.
     """
 
     measurements: int

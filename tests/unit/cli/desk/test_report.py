@@ -1,4 +1,4 @@
-"""The report of ``tsgt evaluate``, through the real command line; drawing is slow, so it is made once for many tests."""
+"""The report of ``tsgt evaluate``; drawing is slow, so one report serves many tests."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import re
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
-from harness.published import write_prisms, write_targets, write_tracks
-from harness.scene import driving, standing
+from harness.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
+from harness.scene import at_rest, driving
 
 from tsgt.analysis.evaluation import read_tum
-from tsgt.analysis.formats import read_still_intervals
-from tsgt.analysis.report import Findings, figures_of, find, sections, verdicts
+from tsgt.analysis.formats import read_stationary_intervals
+from tsgt.analysis.report import Findings, collect_findings, report_numbers, sections, verdicts
 from tsgt.cli.main import cli, run
 from tsgt.recording import load_recording
 
@@ -43,12 +43,12 @@ FIGURES = {
 }
 
 
-CONSTANTS = {"1", "3", "20", "95"}
-"""Seconds of a gap and of standing, Hz, and percent, which sentences name."""
+FIXED_NUMBERS = {"1", "3", "20", "95"}
+"""Numbers in sentences: seconds of a gap and of a stationary interval, Hz, and percent."""
 
 
 class Made(NamedTuple):
-    """A report, and what the command printed."""
+    """A report, and the output of the command."""
 
     recording: Path
     folder: Path
@@ -61,7 +61,7 @@ def stop_and_go(time_s: float) -> Motion:
 
 
 def called(*arguments: object) -> str:
-    """Run ``tsgt``, which is to succeed, and return what it prints."""
+    """Run ``tsgt`` successfully and return its output."""
     with contextlib.redirect_stdout(io.StringIO()) as printed, pytest.raises(SystemExit) as ending:
         run(cli, [str(argument) for argument in arguments])
     assert ending.value.code == 0
@@ -73,7 +73,7 @@ def recorded(folder: Path, motion: Callable[[float], Motion] = stop_and_go, *, k
     path = folder / "drive.jsonl"
     tracks = write_tracks(folder, motion)
     importing = ["import", "rts", "--tracks", *tracks, "--prisms", write_prisms(folder)]
-    called(*importing, "--targets", write_targets(folder), "--output", path)
+    called(*importing, "--targets", write_targets(folder), *CONSTANTS, "--output", path)
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
     kept = [line for line in lines if str(json.loads(line).get("station", keep))[0] in keep]
     path.write_text("".join(kept), encoding="utf-8")
@@ -81,9 +81,9 @@ def recorded(folder: Path, motion: Callable[[float], Motion] = stop_and_go, *, k
 
 
 def findings(recording: Path, **options: Any) -> Findings:
-    """Find what a report tells, without drawing it."""
+    """Collect the findings of a report without drawing it."""
     options = {"reference": None, "with_held_out": False, **options}
-    return find(load_recording(recording), recording, **options)
+    return collect_findings(load_recording(recording), recording, **options)
 
 
 def told(found: Findings) -> str:
@@ -94,7 +94,7 @@ def told(found: Findings) -> str:
 
 
 def drawn(found: Findings, folder: Path, *names: str) -> set[str]:
-    """Draw those figures of a report that have these names; return the names of all."""
+    """Draw the named figures of a report; return the names of all."""
     plots = {plot.name: plot for section in sections(found) for plot in section.plots}
     for name in names:
         plots[name].write([folder / f"{name}.png"])
@@ -111,8 +111,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     )
 
 
-def test_the_page_holds_all_its_figures(made: Made) -> None:
-    """Each stands beside it as PNG and PDF too, and the page asks for nothing from elsewhere."""
+def test_page_embeds_all_figures(made: Made) -> None:
+    """Each figure is also a PNG and a PDF file, and the page loads nothing else."""
     page = (made.folder / "report.html").read_text(encoding="utf-8")
     assert {path.stem for path in made.folder.glob("*.png")} == FIGURES
     assert {path.stem for path in made.folder.glob("*.pdf")} == FIGURES
@@ -120,8 +120,8 @@ def test_the_page_holds_all_its_figures(made: Made) -> None:
     assert not re.search(r'(src|href)="(?!data:|#)', page)
 
 
-def test_json_has_the_numbers_of_the_report_and_of_evaluate(made: Made) -> None:
-    """The same names mean the same; the file beside the page holds what is printed."""
+def test_json_agrees_with_report_and_evaluate(made: Made) -> None:
+    """Equal keys have equal values; report.json holds what is printed."""
     printed = json.loads(made.out)
     assert json.loads((made.folder / "report.json").read_text(encoding="utf-8")) == printed
     evaluated = json.loads(called("evaluate", made.recording, "--no-held-out", "--json"))
@@ -130,8 +130,8 @@ def test_json_has_the_numbers_of_the_report_and_of_evaluate(made: Made) -> None:
     assert set(printed["held_out_mm"]) == {"linear", "continuous"}
 
 
-def test_every_number_of_the_page_is_in_its_json(made: Made) -> None:
-    """Those of all tables and sentences, as they are rounded there; figures draw what these sum up."""
+def test_every_number_of_the_page_is_in_the_json(made: Made) -> None:
+    """It covers all tables and sentences, with their rounding."""
     page = (made.folder / "report.html").read_text(encoding="utf-8")
     printed = json.loads(made.out)
     assert [
@@ -143,13 +143,13 @@ def test_every_number_of_the_page_is_in_its_json(made: Made) -> None:
     for text in map("".join, shown):
         for word in re.findall(r"(?<![\w.:-])[-+]?\d+(?:\.\d+)?(?![\w:-])", text):
             digits = len(word.partition(".")[2])
-            assert word in CONSTANTS or any(f"{v:.{digits}f}" == word for v in known), (word, text)
+            assert word in FIXED_NUMBERS or any(f"{v:.{digits}f}" == word for v in known), (word, text)
             checked += 1
     assert checked > 100
 
 
 def numbers_in(value: Any) -> Iterator[float]:
-    """All numbers of a JSON value; those of keys too, which name stations."""
+    """Return all numbers of a JSON value and of its keys."""
     if isinstance(value, dict):
         yield from (float(key) for key in value if key.isdigit())
         value = list(value.values())
@@ -160,84 +160,86 @@ def numbers_in(value: Any) -> Iterator[float]:
         yield float(value)
 
 
-def test_the_colour_of_a_verdict_is_not_overruled(made: Made) -> None:
-    """A rule for all of the list's lines is more particular than one for a class alone."""
+def test_verdict_colours_have_the_higher_specificity(made: Made) -> None:
+    """A rule for all lines of the list must not override the colour of a verdict."""
     page = (made.folder / "report.html").read_text(encoding="utf-8")
     for level in ("good", "care", "bad"):
         assert f"ul.verdicts li.{level} {{ border-color: #" in page
 
 
-def test_one_station_only_is_said(tsgt: Tsgt, tmp_path: Path) -> None:
-    """There are no poses and no distances; what there is of the station is shown."""
+def test_report_of_one_station(tsgt: Tsgt, tmp_path: Path) -> None:
+    """There are no poses and no distances; the data of the station is shown."""
     recording = recorded(tmp_path, keep="1")
     outcome = tsgt("evaluate", recording, "--report", tmp_path / "report")
     assert outcome.code == 0
     assert "do not trust: No poses by continuous and linear: prism 2 has no usable measurement" in outcome.out
     page = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
-    assert "nothing usable was measured of prism 2 and prism 3" in page
+    assert "no usable measurement of prism 2 and prism 3" in page
     assert {path.stem for path in (tmp_path / "report").glob("*.png")} == {
         *("calibration", "gaps", "perturbation", "statuses")
     }
 
 
-def test_no_static_interval_is_said(tmp_path: Path) -> None:
-    """The figure of standing distances has nothing then."""
+def test_report_without_stationary_interval(tmp_path: Path) -> None:
+    """The figure of stationary distances says so."""
     found = findings(recorded(tmp_path, driving))
-    assert "never stood still" in told(found)
-    assert "There is no interval of 3 s or more" in told(found)
+    assert "never stationary" in told(found)
+    assert "There is no stationary interval of 3 s or more" in told(found)
     drawn(found, tmp_path, "distances", "distances_over_time")
 
 
-def test_a_robot_that_only_stands_has_a_report(tmp_path: Path) -> None:
-    """Its errors are sorted by a motion that is next to none, or not at all."""
-    found = findings(recorded(tmp_path, standing))
+def test_report_of_a_stationary_robot(tmp_path: Path) -> None:
+    """Its errors are plotted against almost no motion, or not at all."""
+    found = findings(recorded(tmp_path, at_rest))
     drawn(found, tmp_path, "map", "trajectory", "estimators_apart")
-    assert "never stood still" not in told(found)
+    assert "never stationary" not in told(found)
 
 
-def test_a_reference_of_another_day_is_said(tmp_path: Path) -> None:
-    """Both spans are named, so that one sees which clock was wrong."""
+def test_report_with_a_reference_of_another_day(tmp_path: Path) -> None:
+    """Both time spans are named."""
     reference = tmp_path / "other.tum"
     reference.write_text("1600000000 0 0 0 0 0 0 1\n1600000100 0 0 0 0 0 0 1\n", encoding="utf-8")
     found = findings(recorded(tmp_path), reference=read_tum(reference))
     assert "nothing was compared" in told(found)
-    assert "it goes from 2020-09-13" in told(found)
-    assert figures_of(found)["compared"] == 0
+    assert "it covers 2020-09-13" in told(found)
+    assert report_numbers(found)["compared"] == 0
 
 
-def test_odometry_says_when_the_robot_stood(tmp_path: Path) -> None:
-    """Distances of standing are then from its intervals."""
+def test_odometry_defines_the_stationary_intervals(tmp_path: Path) -> None:
+    """Stationary distances come from its intervals."""
     odometry = tmp_path / "odometry.csv"
     odometry.write_text("".join(f"{1_700_000_000.05 + i / 10},0,0\n" for i in range(41)), encoding="utf-8")
-    found = figures_of(findings(recorded(tmp_path), still_ns=read_still_intervals(odometry)))
+    found = report_numbers(findings(recorded(tmp_path), stationary_ns=read_stationary_intervals(odometry)))
     assert found["still_s"] == pytest.approx(4.0)
     assert found["inter_prism_static_mm"]["1-2"]["valid"] == 10
 
 
-def test_odometry_of_another_day_is_said(tmp_path: Path) -> None:
-    """It says nothing of this drive, and what it says is not taken for standing."""
+def test_odometry_of_another_day_is_not_used(tmp_path: Path) -> None:
+    """The report says that it does not cover the drive."""
     other_day = (1_600_000_000_000_000_000, 1_600_000_100_000_000_000)
-    found = findings(recorded(tmp_path), still_ns=[other_day])
-    assert "By the odometry, the robot stood still before or after this recording only" in told(found)
-    assert "standing from 2020-09-13" in told(found)
-    assert figures_of(found)["still_s"] == 0.0
+    found = findings(recorded(tmp_path), stationary_ns=[other_day])
+    assert "According to the odometry, the robot was stationary before or after this recording only" in told(
+        found
+    )
+    assert "stationary from 2020-09-13" in told(found)
+    assert report_numbers(found)["still_s"] == 0.0
 
 
-def test_a_short_recording_is_not_called_good(tmp_path: Path) -> None:
-    """From a few residuals nobody can tell what noise makes, nor how the robot moves."""
+def test_short_recording_gets_no_good_verdict(tmp_path: Path) -> None:
+    """A few residuals do not determine noise and motion."""
     recording = recorded(tmp_path)
     lines = recording.read_text(encoding="utf-8").splitlines(keepends=True)
     late_ns = 1_700_000_003_000_000_000
     kept = [line for line in lines if json.loads(line).get("stamp_ns", 0) < late_ns or "sequence" not in line]
     recording.write_text("".join(kept), encoding="utf-8")
     said = told(findings(recording))
-    assert "too few to tell how the robot moves" in said
-    assert "what their noise makes" not in said
+    assert "too few measurements to estimate motion prior and noise scale" in said
+    assert "consistent with their noise" not in said
 
 
-def test_stations_that_never_measure_together_are_not_called_driving(tmp_path: Path) -> None:
-    """Whether the robot stood cannot be told then, and nothing is."""
-    recording = recorded(tmp_path, standing)
+def test_stations_without_common_time_have_no_motion(tmp_path: Path) -> None:
+    """Stationary intervals are unknown then, and the report states none."""
+    recording = recorded(tmp_path, at_rest)
     lines = recording.read_text(encoding="utf-8").splitlines(keepends=True)
     begins_s = {1: 0, 2: 3, 3: 6}
     kept = [
@@ -252,26 +254,26 @@ def test_stations_that_never_measure_together_are_not_called_driving(tmp_path: P
     recording.write_text("".join(kept), encoding="utf-8")
     said = told(findings(recording))
     assert "At no time were all prisms measured without a gap" in said
-    assert "never stood still" not in said
+    assert "never stationary" not in said
 
 
-def test_odometry_without_a_report_is_refused(tsgt: Tsgt, tmp_path: Path) -> None:
-    """It would change nothing."""
+def test_odometry_needs_a_report(tsgt: Tsgt, tmp_path: Path) -> None:
+    """--odometry without --report is a usage error."""
     outcome = tsgt("evaluate", tmp_path / "drive.jsonl", "--odometry", tmp_path / "odometry.csv")
     assert outcome.code == 2
-    assert "add --report" in outcome.err
+    assert "--odometry needs --report" in outcome.err
 
 
-def test_a_recording_without_measurements_has_no_report(tsgt: Tsgt, tmp_path: Path) -> None:
-    """There is nothing to show, and no folder is left behind."""
+def test_recording_without_measurements_has_no_report(tsgt: Tsgt, tmp_path: Path) -> None:
+    """No folder is created."""
     outcome = tsgt("evaluate", recorded(tmp_path, keep="9"), "--report", tmp_path / "report")
     assert outcome.code == 1
     assert "holds no measurements" in outcome.err
     assert not (tmp_path / "report").exists()
 
 
-def test_a_report_needs_a_folder_that_can_be_written(tsgt: Tsgt, tmp_path: Path) -> None:
-    """A file of its name is no folder."""
+def test_report_needs_a_writable_folder(tsgt: Tsgt, tmp_path: Path) -> None:
+    """A file with the name of the folder is an error."""
     (tmp_path / "taken").write_text("x", encoding="utf-8")
     outcome = tsgt("evaluate", recorded(tmp_path, keep="1"), "--report", tmp_path / "taken")
     assert outcome.code == 1

@@ -35,16 +35,9 @@ def simulate(
     progress: Callable[[float], None] = lambda now_s: None,  # noqa: ARG005 (default: not reported)
     script: Callable[[Mission], Coroutine[None, None, None]] | None = None,
 ) -> MissionResult:
-    """Simulate a mission on virtual time; the same scenario, options and script give the same result.
+    """Simulate a mission on virtual time in an empty folder; the same scenario, options and script give the same result.
 
-    Parameters
-    ----------
-    folder
-        An empty folder for recordings, journals and sockets.
-    progress
-        Called with the virtual time in s, every virtual second.
-    script
-        Runs concurrently with the daemons: stops and starts them, steps clocks.
+    ``progress`` is called with the virtual time in s, every virtual second; ``script`` runs concurrently with the daemons.
 
     Raises
     ------

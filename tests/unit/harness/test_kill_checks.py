@@ -159,7 +159,7 @@ def test_duplicate_in_a_recording_is_found(files: KilledDaemonFiles) -> None:
 
 
 def test_reused_sequence_number_is_found(files: KilledDaemonFiles) -> None:
-    """By a restart that continues too early, numbers anew, or skips a number."""
+    """By a restart that continues too early, restarts at zero, or skips a number."""
     files.journal("b", SECOND_START - 1, range(SECOND_START, SECOND_START + 5))
     assert "number" in files.checks()
     files.journal("b", SECOND_START, range(SECOND_START, SECOND_START + 5), stream_id=8)

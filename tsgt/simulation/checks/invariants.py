@@ -1,6 +1,6 @@
 """Invariants of every simulated mission, whatever faults occur.
 
-Each check uses its own path to the data: journals are read from disk, poses are fitted anew.
+Each check uses its own path to the data: journals are read from disk, poses are refitted.
 """
 
 from __future__ import annotations

@@ -88,12 +88,7 @@ class Demo:
         self._ending = False
 
     async def run(self, on_line: Callable[[bytes], None]) -> None:
-        """Run to the end or until cancelled; stops the daemons in either case.
-
-        Parameters
-        ----------
-        on_line
-            Called with each line of the master's stream.
+        """Run to the end or until cancelled; stops the daemons in either case. ``on_line`` gets the lines of the master's stream.
 
         Raises
         ------

@@ -35,12 +35,7 @@ _JITTER_COUNT: Final = 1024
 class EdmSchedule:
     """Times of distance measurements: evenly spaced with jitter in continuous mode, or a single one. Computed on request.
 
-    Parameters
-    ----------
-    jitter_ns
-        One sigma; limited to 40 % of the period.
-    phase_ns
-        True time of a measurement without jitter.
+    The jitter (one sigma) is limited to 40 % of the period.
     """
 
     def __init__(

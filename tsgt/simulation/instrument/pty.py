@@ -36,12 +36,7 @@ _BAUDS = {
 class PtyLine:
     """A cable to a pseudo-terminal; an async context manager.
 
-    Parameters
-    ----------
-    instrument
-        Its timeline is a :class:`~tsgt.simulation.kernel.timeline.LoopTimeline`.
-    link
-        Symbolic link to the terminal, stable like the names in /dev/serial/by-id.
+    ``link`` is a symbolic link to the terminal, stable like the names in /dev/serial/by-id.
     """
 
     def __init__(self, instrument: SimulatedTotalStation, link: Path) -> None:

@@ -105,18 +105,7 @@ BITS_PER_BYTE = 10
 
 
 class Wire:
-    """Carries bytes between program and instrument at the line's bit rate.
-
-    Parameters
-    ----------
-    deliver
-        Called with bytes that arrive at the program's end.
-
-    Attributes
-    ----------
-    host_baud
-        Bit rate at the program's end in bits per second; if it differs from the instrument's, all bytes are garbage.
-    """
+    """Carries bytes between program and instrument at the line's bit rate; ``deliver`` gets those for the program."""
 
     def __init__(
         self,
@@ -168,17 +157,7 @@ class Wire:
 
 
 class SimulatedLine:
-    """A serial line in memory, for one program at a time.
-
-    Parameters
-    ----------
-    timeline
-        True time.
-    clock
-        Clock of the program's host.
-    name
-        Name in error messages.
-    """
+    """A serial line in memory, for one program at a time; ``clock`` is that of the program's host."""
 
     def __init__(
         self, instrument: SimulatedTotalStation, timeline: Timeline, clock: Clock, *, name: str = "simulated"

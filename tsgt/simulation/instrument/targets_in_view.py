@@ -50,15 +50,7 @@ class TargetObservation(NamedTuple):
 
 
 class TargetsInView:
-    """Prisms and foil targets around a station.
-
-    Attributes
-    ----------
-    prisms
-        Visibility by prism number.
-    foils
-        Foil targets in the frame of the station, each (3,) in m.
-    """
+    """Prisms and foil targets around a station."""
 
     def __init__(self, station: SimulatedStation, scenario: ScenarioConfig, world: World) -> None:
         faults = [fault for fault in scenario.faults if fault.station == station.station]
@@ -72,6 +64,7 @@ class TargetsInView:
             for row, prism in enumerate(scenario.prisms)
         }
         T_station_station1 = invert(np.array(level_frame(station)))
+        # Foil targets in the frame of the station, each (3,) in m.
         self.foils = [transform_points(T_station_station1, np.array(target)) for target in scenario.targets_m]
 
     def fault_at(self, world_s: float) -> str | None:

@@ -97,12 +97,9 @@ class Telescope:
         self.lock, self.prism = Lock.IN, prism
 
     def nearest_prism(self, across_rad: float, up_rad: float) -> int | None:
-        """Return the visible prism nearest to the line of sight within a window, or within the field of view if that is larger.
+        """Return the visible prism nearest to the line of sight within a window of this half width and height.
 
-        Parameters
-        ----------
-        across_rad, up_rad
-            Half the width and height of the window.
+        The field of view counts if it is larger than the window.
         """
         if self.blocked:
             return None

@@ -46,17 +46,7 @@ PolarDirection = tuple[float, float]
 
 
 class PrismVisibility:
-    """One prism as one station sees it, computed in blocks on request.
-
-    The prism is at rest before the start of the world and after its end.
-
-    Parameters
-    ----------
-    row
-        Row of the prism in the world's layout.
-    occluded_s
-        Occlusions: start and end in s from the start.
-    """
+    """One prism as one station sees it, computed in blocks on request; at rest before and after the world's duration."""
 
     def __init__(
         self,

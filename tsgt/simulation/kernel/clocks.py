@@ -26,13 +26,7 @@ class SimulatedClock(Clock, Protocol):
 
 
 class VirtualClock:
-    """The time of the running event loop, used as true time.
-
-    Parameters
-    ----------
-    unix_at_zero_ns
-        Unix time in ns at loop time zero.
-    """
+    """The time of the running event loop, used as true time."""
 
     def __init__(self, unix_at_zero_ns: int) -> None:
         self._unix_at_zero_ns = unix_at_zero_ns
@@ -156,16 +150,9 @@ _RAMP_STEP_NS = 10**9
 
 
 def drift_ramp(drift_ppm: float, ramp_ppm_per_min: float, until_ns: int) -> list[tuple[int, float]]:
-    """Return the drift changes of a triangular drift ramp, for :class:`DriftingClock`.
+    """Return the drift changes of a triangular drift ramp until a true time, for :class:`DriftingClock`.
 
-    Parameters
-    ----------
-    drift_ppm
-        Initial frequency offset in 1e-6.
-    ramp_ppm_per_min
-        Slope; its sign alternates after each :data:`RAMP_HALF_PERIOD_NS`.
-    until_ns
-        True time of the last change, in ns.
+    The slope's sign alternates after each :data:`RAMP_HALF_PERIOD_NS`.
     """
     steps = []
     for from_ns in range(0, until_ns, _RAMP_STEP_NS):

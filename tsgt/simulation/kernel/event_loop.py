@@ -133,15 +133,7 @@ class _Timer(asyncio.TimerHandle):
 def run_virtual(
     main: Callable[[], Awaitable[T]], timeline: VirtualTimeline | None = None, *, isolated: bool = False
 ) -> T:
-    """Run a coroutine function to completion on virtual time, like :func:`asyncio.run`.
-
-    Parameters
-    ----------
-    timeline
-        None: a new one that starts at zero.
-    isolated
-        See :class:`VirtualEventLoop`.
-    """
+    """Run a coroutine function to completion on virtual time, like :func:`asyncio.run`; see :class:`VirtualEventLoop`."""
 
     async def run() -> T:
         return await main()

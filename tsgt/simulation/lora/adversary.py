@@ -17,13 +17,7 @@ _CAPTURE_CAPACITY = 64
 
 
 class ReplayAttacker:
-    """Sends at random times random bytes or a captured packet, whole, truncated or with one bit flipped.
-
-    Parameters
-    ----------
-    rate_hz
-        Average packet rate.
-    """
+    """Sends random bytes or captured packets, whole, truncated or with one bit flipped, at random times of an average rate."""
 
     def __init__(self, clock: Clock, rng: np.random.Generator, rate_hz: float) -> None:
         self._clock = clock

@@ -78,23 +78,13 @@ class _FrameLock:
 
 
 class Transceiver:
-    """A radio's port to the channel, and the state of its receiver.
-
-    Parameters
-    ----------
-    listener
-        Notified of receptions.
-    name
-        Its name in the link model.
-    crystal_ppm
-        Offset of its carrier and receiver frequency in 1e-6.
-    """
+    """A radio's port to the channel, and the state of its receiver."""
 
     def __init__(self, air: Air, listener: FrameListener, name: str, crystal_ppm: float) -> None:
         self.name = name
         self.carrier_factor = 1 + crystal_ppm * 1e-6
         self._air = air
-        self._antenna = listener
+        self._listener = listener
         self._lock: _FrameLock | None = None
         self._search: _PreambleSearch | None = None
         self._sending: FrameOnAir | None = None
@@ -187,18 +177,18 @@ class Transceiver:
         self._lock = lock = _FrameLock(on_air, arrival, search.listening)
         self._air.timeline.call_at(lock.read_times_ns, partial(self._read_header, lock))
         if not takes_over:
-            self._antenna.preamble_detected(at_ns)
+            self._listener.preamble_detected(at_ns)
 
     def _read_header(self, lock: _FrameLock) -> None:
         if lock is not self._lock:
             return
         if not self._header_arrives(lock):
             self._resume_search(lock.read_times_ns)
-            self._antenna.frame_ended(lock.read_times_ns, None)
+            self._listener.frame_ended(lock.read_times_ns, None)
             return
         self._air.timeline.call_at(lock.end_ns, partial(self._end, lock))
         if lock.on_air.frame.modulation.explicit_header:
-            self._antenna.header_received(lock.read_times_ns, lock.header)
+            self._listener.header_received(lock.read_times_ns, lock.header)
 
     def _header_arrives(self, lock: _FrameLock) -> bool:
         """Whether the frame is complete and free of interference until its header ends, and the header, if any, is intact."""
@@ -219,7 +209,7 @@ class Transceiver:
             return
         reception = self._reception(lock)
         self._resume_search(lock.end_ns)
-        self._antenna.frame_ended(lock.end_ns, reception)
+        self._listener.frame_ended(lock.end_ns, reception)
 
     def _payload_arrives(self, lock: _FrameLock) -> bool:
         on_air, arrival = lock.on_air, lock.arrival
@@ -330,17 +320,8 @@ class FrameOnAir:
 class Air:
     """A channel shared by all radios that join.
 
-    Parameters
-    ----------
-    rng
-        One draw gives the seed.
-    link
-        Path loss, fading and packet loss; may be changed at any time.
-
-    Attributes
-    ----------
-    frames
-        Frames on the air, and those that overlap a frame whose reception is undecided.
+    Path loss, fading and packet loss of ``link`` may be changed at any time. ``frames`` are those on the air, and those
+    that overlap a frame whose reception is undecided.
     """
 
     def __init__(self, timeline: Timeline, rng: np.random.Generator, link: LinkModel) -> None:
@@ -353,14 +334,7 @@ class Air:
         self._radios: dict[str, Transceiver] = {}
 
     def join(self, listener: FrameListener, name: str, *, crystal_ppm: float = 0.0) -> Transceiver:
-        """Add a radio.
-
-        Parameters
-        ----------
-        name
-            Unique name in the link model.
-        crystal_ppm
-            Offset of its carrier and receiver frequency in 1e-6.
+        """Add a radio with a unique name in the link model and a frequency offset in 1e-6.
 
         Raises
         ------

@@ -54,15 +54,6 @@ log = structlog.get_logger()
 class AirClient:
     """One radio's connection to an air server; an async context manager.
 
-    Parameters
-    ----------
-    name
-        The radio's name in the server's link model.
-    timeline
-        CLOCK_MONOTONIC; shared with the chip.
-    crystal_ppm
-        Offset of the radio's carrier and receiver frequency in 1e-6.
-
     Raises
     ------
     StreamError

@@ -57,16 +57,7 @@ log = structlog.get_logger()
 class AirServer:
     """Forwards frames between the connected processes; an async context manager.
 
-    Parameters
-    ----------
-    path
-        The socket; a stale one is replaced.
-    link
-        Path loss, fading and packet loss by radio names; may be changed at any time.
-    rng
-        One draw gives the seed.
-    now_ns
-        CLOCK_MONOTONIC.
+    Path loss, fading and packet loss of ``link`` may be changed at any time; ``now_ns`` returns CLOCK_MONOTONIC.
 
     Raises
     ------

@@ -66,15 +66,7 @@ _LORA_MODE_BITS = 0x4F
 
 
 class SX1276Chip:
-    """One chip, powered on and out of reset.
-
-    Parameters
-    ----------
-    join
-        Connects it to a channel; called once.
-    rng
-        Interrupt jitter.
-    """
+    """One chip, powered on and out of reset; ``join`` connects it to a channel, ``rng`` draws the interrupt jitter."""
 
     def __init__(
         self,

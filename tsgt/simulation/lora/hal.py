@@ -17,14 +17,8 @@ if TYPE_CHECKING:
 class SimulatedHal:
     """A :class:`tsgt.radio.sx127x.hal.Hal` on a simulated chip; transfers take no time.
 
-    Edges are timestamped with the time at which the chip raised the pin.
-
-    Parameters
-    ----------
-    stamp_sigma_ns
-        One sigma that the host states for its timestamps, the chip's jitter included.
-    local_ns
-        Converts the chip's timeline to the host's CLOCK_MONOTONIC.
+    Edges have the time at which the chip raised the pin, converted by ``local_ns`` to the host's CLOCK_MONOTONIC.
+    ``stamp_sigma_ns`` is what the host states for them, the chip's jitter included.
     """
 
     def __init__(
@@ -70,13 +64,7 @@ class SimulatedHal:
         self._chip.on_dio(0, changed)
 
     def drop_edges(self, count: int, *, counted: bool = True) -> None:
-        """Suppress the next rising edges.
-
-        Parameters
-        ----------
-        counted
-            Whether the next reported edge carries the number of missed ones, as with gpiod but not with RPi.GPIO.
-        """
+        """Suppress the next rising edges; ``counted``: the next edge carries their number, as with gpiod, not with RPi.GPIO."""
         self._edges_to_drop = count
         self._count_dropped = counted
 

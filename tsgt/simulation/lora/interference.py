@@ -59,14 +59,10 @@ def required_sir_db(wanted: Modulation, interferer: Modulation) -> float | None:
 def is_above_interference(
     signal_mw: float, needed_mw: Sequence[tuple[float, int, int]], from_ns: int
 ) -> bool:
-    """Whether a signal is above the sum of its interferers throughout a section.
+    """Whether a signal is above the sum of its interferers throughout a section that starts at ``from_ns``.
 
-    Parameters
-    ----------
-    needed_mw
-        For each interferer that overlaps the section: its power times the required ratio, its start and its end.
-    from_ns
-        Start of the section; the sum can only increase there and at the start of an interferer.
+    ``needed_mw`` has, for each interferer that overlaps the section, its power times the required ratio, its start and its
+    end. The sum can only increase at the start of the section or of an interferer.
     """
     instants = [from_ns, *(start_ns for _, start_ns, _ in needed_mw if start_ns > from_ns)]
     worst_mw = max(

@@ -57,15 +57,7 @@ def header_probability(snr_db: float, spreading_factor: int) -> float:
 
 
 def payload_probability(snr_db: float, spreading_factor: int, coding_rate: int, payload_bytes: int) -> float:
-    """Return the probability that a payload arrives intact, given detection and header.
-
-    Parameters
-    ----------
-    snr_db
-        Signal-to-noise ratio in the signal bandwidth.
-    coding_rate
-        Denominator, 5 to 8.
-    """
+    """Return the probability that a payload arrives intact, given detection and header; SNR in the signal bandwidth."""
     return _block_probability(snr_db, spreading_factor, coding_rate, payload_bytes)
 
 
@@ -171,13 +163,7 @@ class LinkModel:
         self._attenuations_db[frozenset((one, other))] = attenuation_db
 
     def loss_db(self, sender: str, receiver: str, frequency_hz: float, draws: Sequence[float]) -> float:
-        """Return the path loss of one frame, fading included.
-
-        Parameters
-        ----------
-        draws
-            Two uniform draws in (0, 1) for the fading.
-        """
+        """Return the path loss of one frame; ``draws`` are two uniform draws in (0, 1) for the fading."""
         loss_db = self.path_loss.loss_db(sender, receiver, frequency_hz)
         if self._attenuations_db:
             loss_db += self._attenuations_db.get(frozenset((sender, receiver)), 0.0)

@@ -81,14 +81,7 @@ class Report(Protocol):
 class Modem:
     """Transmitter and receiver; the channel's frame listener.
 
-    Parameters
-    ----------
-    join
-        Connects it to a channel.
-    rng
-        Interrupt jitter.
-    report, warn
-        Called with flags; called with violations of the data sheet.
+    ``report`` is called with flags, ``warn`` with violations of the data sheet; ``rng`` draws the interrupt jitter.
     """
 
     def __init__(

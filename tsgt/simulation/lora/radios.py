@@ -78,17 +78,7 @@ def simulated_radio(
     rng: np.random.Generator,
     jitter: TimestampJitter | None = None,
 ) -> SX127x:
-    """Create a radio on the channel, not yet started.
-
-    Parameters
-    ----------
-    timeline, clock
-        Timeline of the chip; clock of the driver's host, which timestamps the edges.
-    rng
-        Interrupt jitter of the chip.
-    jitter
-        Of the host's timestamps; None: no more than the chip's.
-    """
+    """Create a radio on the channel, not yet started; its timestamps have ``jitter`` in addition to the chip's."""
     return SX127x(_hardware(air, name, timeline, clock, rng, jitter).hal, clock)
 
 
@@ -123,14 +113,7 @@ def radio_opener(
 ) -> RadioOpener:
     """Return a callable that opens a radio on the channel, as a daemon does; it may be reopened after closing.
 
-    Parameters
-    ----------
-    air, name, clock, rng, jitter
-        As for :func:`simulated_radio`, on the channel's timeline.
-    host_delay
-        None: the host transmits without delay.
-    on_open
-        Called with the hardware on each opening.
+    Parameters as of :func:`simulated_radio`; ``on_open`` is called with the hardware on each opening.
     """
 
     @asynccontextmanager

@@ -22,15 +22,7 @@ MASTER = "master"
 
 
 class Computer:
-    """A computer; its state outlives the daemons that run on it.
-
-    Parameters
-    ----------
-    name
-        Name of its radio and daemon: ``master``, ``station1``, ...
-    rng
-        Draws of its radio and of its host delays.
-    """
+    """A computer; its state outlives the daemons that run on it."""
 
     def __init__(
         self,

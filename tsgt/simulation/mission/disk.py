@@ -76,15 +76,7 @@ class DiskWriter:
         return os.write(fd, data)
 
     def tear_next_write(self, share: float, then: Callable[[], object]) -> None:
-        """Kill the daemon during its next write.
-
-        Parameters
-        ----------
-        share
-            Part of the data that reaches the disk, 0 to 1.
-        then
-            Called when it has happened, possibly from another thread.
-        """
+        """Kill the daemon during its next write, of which a share (0 to 1) reaches the disk, and call ``then`` in that thread."""
         self._tear = (share, then)
 
     def kill(self) -> None:

@@ -62,22 +62,7 @@ _YEAR_NS = 365 * 86_400 * 10**9
 
 
 class Mission:
-    """A mission; create and use it in a running event loop on virtual time.
-
-    Parameters
-    ----------
-    folder
-        For recordings, journals and sockets.
-    timeline
-        Timeline of the running loop.
-
-    Attributes
-    ----------
-    computers
-        By name.
-    instruments, lines, prisms
-        Total stations, their serial lines, and the prisms they track, by station number.
-    """
+    """A mission; create and use it in a running event loop on virtual time. Dictionaries are keyed by station number."""
 
     def __init__(
         self, scenario: ScenarioConfig, options: SimulationOptions, *, folder: Path, timeline: Timeline
@@ -243,15 +228,7 @@ class Mission:
         await radio.run(self.interferer_radio(INTERFERER))
 
     def interferer_radio(self, name: str, gain_db: float = 0.0, sync_word: int | None = None) -> RadioOpener:
-        """Return the opener of a radio that does not belong to the mission.
-
-        Parameters
-        ----------
-        gain_db
-            Gain of its signal at all receivers.
-        sync_word
-            None: the mission's.
-        """
+        """Return the opener of a radio that does not belong to the mission; sync word None: the mission's."""
         self._positions_m[name] = _INTERFERER_POSITION_M
         for other in self.computers:
             self.air.link.set_attenuation(name, other, -gain_db)

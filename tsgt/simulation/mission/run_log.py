@@ -181,12 +181,7 @@ class StationLog:
     def may_be_unwritten(self, true_ns: int, before_ns: int = 0, *, write_errors_only: bool = False) -> bool:
         """Whether a client was killed before it must have journalled what it read at a true time in ns from the start.
 
-        Parameters
-        ----------
-        before_ns
-            Uncertainty of ``true_ns``: the reading may be this much later.
-        write_errors_only
-            Only accept kills during a write error of the disk.
+        The reading may be up to ``before_ns`` later. ``write_errors_only`` accepts only kills during a write error of the disk.
         """
         return any(
             from_ns - before_ns <= true_ns <= to_ns + _SHUTDOWN_NS
@@ -204,11 +199,6 @@ class JournalIndex:
     """Finds the journal entry and the true time of delivered measurements of a station.
 
     Over protocol ``classic`` a measurement is identified by its host time, over ``superframe`` by its sequence number.
-
-    Attributes
-    ----------
-    journalled
-        All measurements in the journals, in order.
     """
 
     def __init__(self, station_log: StationLog) -> None:

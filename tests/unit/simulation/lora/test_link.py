@@ -17,7 +17,7 @@ from tsgt.simulation.lora.link import (
 
 ERROR_RATES = (0.9, 0.5, 0.1, 0.01)
 
-# SNR in dB at which so many packets are lost: facts/radio.md 6.2, exact theory of non-coherent detection.
+# SNR in dB for these packet error rates: facts/radio.md 6.2, exact theory of non-coherent detection.
 THEORY = {
     (7, 15, 6): (-10.59, -9.57, -8.39, -7.32),
     (7, 34, 6): (-9.90, -9.03, -8.00, -7.02),

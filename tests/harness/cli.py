@@ -1,4 +1,4 @@
-"""Calls ``tsgt`` inside the test's own process, exit code included."""
+"""Run ``tsgt`` inside the test's process, with its exit code."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ if TYPE_CHECKING:
 
 
 class Outcome(NamedTuple):
-    """What a command left behind."""
+    """Exit code and output of a command."""
 
     code: int
     out: str
     err: str
 
     def json(self) -> Any:
-        """Parse what it printed as JSON."""
+        """Parse stdout as JSON."""
         return json.loads(self.out)
 
 
 def called(*arguments: object) -> Outcome:
-    """Run ``tsgt`` with the given arguments, in a test that calls it more than once for each of its fixtures."""
+    """Run ``tsgt`` with the given arguments, without a fixture."""
     # Bytes below the text, as a terminal and a pipe have: what cannot be written in UTF-8 fails here, too.
     out, err = (io.TextIOWrapper(io.BytesIO(), encoding="utf-8", write_through=True) for _ in range(2))
     with redirect_stdout(out), redirect_stderr(err), pytest.raises(SystemExit) as ending:

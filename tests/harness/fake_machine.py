@@ -1,4 +1,4 @@
-"""A made-up machine in a temporary folder, for the checks of ``tsgt doctor``: its devices are plain files."""
+"""A fake machine in a temporary folder for the checks of ``tsgt doctor``: its devices are plain files."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ ENABLED = {
 
 
 class FakeMachine:
-    """Everything that is outside of the checks, at first with nothing wrong; a test changes what it is about.
+    """The machine interface, at first without problems; a test changes what it is about.
 
     Attributes
     ----------
@@ -181,7 +181,7 @@ class FakeMachine:
         path.write_text(text.replace(old, new))
 
     def machine(self) -> Machine:
-        """Return it as the checks see it."""
+        """Return the interface for the checks."""
         return Machine(
             dev=self.folder / "dev",
             sys=self.folder / "sys",
@@ -203,14 +203,14 @@ class FakeMachine:
         )
 
     async def run_checks(self, name: str = "client.toml") -> dict[str, Finding]:
-        """Make all checks; return the findings by name, of which none comes twice."""
+        """Run all checks; return the findings by name."""
         found = [finding async for finding in run_checks(self.machine(), self.folder / name)]
         by_name = {finding.name: finding for finding in found}
         assert len(by_name) == len(found)
         return by_name
 
     def ask_client(self, _path: Path) -> ClientStatus | None:
-        """Return what the client says."""
+        """Return the status of the client."""
         return self.status
 
     def _make_system(self) -> None:

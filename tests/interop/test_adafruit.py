@@ -106,7 +106,7 @@ async def test_another_sync_word_is_not_heard() -> None:
 async def test_no_chip_is_noticed_by_adafruit() -> None:
     """Where nothing answers on the bus, that driver says so: the stand-ins do not hide a fault."""
     async with lab(_settings(7, 125_000, 5)) as bench:
-        bench.chip.lose_bus(level=False)
+        bench.chip.disconnect_bus(level=False)
         with pytest.raises(RuntimeError, match="expected version"):
             await bench.program.run(lambda: _rfm9x(bench, 7, 125_000, 5))
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from harness.authors_master import AuthorsMaster
 from harness.radios import MS, running_timeline
-from harness.shots import READING, ScriptedInstrument
+from harness.scripted_instrument import READING, ScriptedInstrument
 
 from tsgt.clock import UnixTimeline
 from tsgt.errors import InstrumentError
@@ -306,10 +306,10 @@ async def test_a_failed_target_of_theirs_is_an_error() -> None:
     async with _field() as site:
         await site.add_authors_node(1)
         instrument, master = site.instruments[1], site.our_master()
-        instrument.refusal = InstrumentError("busy")
+        instrument.mode_error = InstrumentError("busy")
         refused = CommandTransaction(1, CommandMessage("d", 1), 3 * SECOND)
         await master.run(refused)
-        instrument.refusal = None
+        instrument.mode_error = None
         await master.run(CommandTransaction(1, CommandMessage("d", 1), 3 * SECOND))
         instrument.target = InstrumentError("nothing there")
         shot = SingleMeasurementPoll(1, site.timing)

@@ -105,7 +105,7 @@ def test_a_full_measurement(client: GeoCom, station: SimulatedTotalStation) -> N
     assert answer.error is GeoComCode.OK
     assert answer.params is not None
     *_, distance_m, _time = answer.params
-    assert distance_m == station.offered[-1].distance_m
+    assert distance_m == station.reported_distances[-1].distance_m
     assert distance_m == pytest.approx(74.7, abs=0.3)
     assert client.tmc.do_measurement(Measurement.CLEAR)
 

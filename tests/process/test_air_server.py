@@ -1,4 +1,4 @@
-"""The real driver on simulated chips in processes of their own, over an air server in a third, in real time."""
+"""The real driver on simulated chips in separate processes, over an air server in a third, in real time."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ except* Exception as errors:
 
 @contextmanager
 def running(program: str, *arguments: object) -> Iterator[subprocess.Popen[str]]:
-    """Run a program until the end of the block, at most."""
+    """Run a program, at most until the end of the block."""
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
     with subprocess.Popen(
         [sys.executable, "-c", program, *map(str, arguments)],
@@ -110,8 +110,8 @@ def first_line(process: subprocess.Popen[str]) -> str:
     return process.stdout.readline().rstrip()
 
 
-def test_two_processes_talk_over_a_third(tmp_path: Path) -> None:
-    """Questions and answers pass between two processes; the end of each answer is where airtime puts it."""
+def test_two_processes_exchange_packets_over_the_air_server(tmp_path: Path) -> None:
+    """The end of each reply is at the time on air."""
     path = tmp_path / "air.sock"
     with running(SERVER, path) as server:
         assert first_line(server) == "ready"

@@ -51,7 +51,7 @@ def with_program(
 
 
 def alive(pid: int) -> bool:
-    """Whether a process is there and no zombie."""
+    """Whether a process exists and is no zombie."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
     except FileNotFoundError:
@@ -59,20 +59,20 @@ def alive(pid: int) -> bool:
 
 
 def gone(pid: int) -> bool:
-    """Wait until a process is gone, for a second at most."""
+    """Wait up to a second until a process is gone."""
     until = time.monotonic() + 1.0
     while alive(pid) and time.monotonic() < until:
         time.sleep(0.01)
     return not alive(pid)
 
 
-def test_the_example_measures_and_takes_commands(tmp_path: Path) -> None:
-    """It gives the rows of a file in their order, each with a time that has just passed, and single measurements."""
+def test_example_program_measures_and_accepts_commands(tmp_path: Path) -> None:
+    """It reports the rows of a file in order with recent times, and single measurements."""
     table = tmp_path / "rows.csv"
     table.write_text("1.0,1.5,10.0\n1.1,1.5,11.0\n")
 
     async def use(instrument: BridgeInstrument) -> None:
-        assert await instrument.connect() == "Example invented, stamped by the bridge"
+        assert await instrument.connect() == "Example invented, timestamped by the bridge"
         await instrument.track(3)
         readings = [await instrument.read() for _ in range(2)]
         assert {reading.slope_distance_m for reading in readings} == {10.0, 11.0}
@@ -89,11 +89,11 @@ def test_the_example_measures_and_takes_commands(tmp_path: Path) -> None:
     with_program(sys.executable, "-I", str(EXAMPLE), str(table), use=use)
 
 
-def test_a_shell_script_will_do() -> None:
-    """What it printed before it ended is read; what it complained of is in the log and in the error."""
+def test_shell_script_is_a_valid_program() -> None:
+    """Its output before its end is read; its stderr is in the log and in the error."""
 
     async def use(instrument: BridgeInstrument) -> None:
-        assert await instrument.connect() == "Shell, stamped on arrival"
+        assert await instrument.connect() == "Shell, timestamped on arrival"
         await instrument.track(1)
         assert (await instrument.read()).slope_distance_m == 12.5
         with pytest.raises(InstrumentError, match=r"sh: the program has ended \(exit status 3: no licence\)"):
@@ -104,12 +104,12 @@ def test_a_shell_script_will_do() -> None:
     assert [(entry["event"], entry["text"]) for entry in logs] == [("bridge_stderr", "no licence")]
 
 
-def test_one_that_cannot_be_started() -> None:
-    """The error says which key of the configuration to see to."""
+def test_program_that_cannot_be_started() -> None:
+    """The error names the key of the configuration."""
 
     async def use(instrument: BridgeInstrument) -> None:
         with pytest.raises(
-            InstrumentError, match=r"cannot be started \(No such file or directory\); see to instr"
+            InstrumentError, match=r"cannot be started \(No such file or directory\); check instr"
         ):
             await instrument.connect()
 
@@ -118,8 +118,8 @@ def test_one_that_cannot_be_started() -> None:
         with_program("a\0b", use=BridgeInstrument.connect)  # type: ignore[arg-type]
 
 
-def test_one_that_does_not_want_to_end(tmp_path: Path) -> None:
-    """It is killed soon, and so are those that it has started."""
+def test_program_that_ignores_sigterm_is_killed(tmp_path: Path) -> None:
+    """Its child processes are killed as well."""
     pids = tmp_path / "pids"
 
     async def use(instrument: BridgeInstrument) -> None:
@@ -137,8 +137,8 @@ def test_one_that_does_not_want_to_end(tmp_path: Path) -> None:
     assert all(gone(int(pid)) for pid in pids.read_text().split())
 
 
-def test_what_it_leaves_behind_is_killed(tmp_path: Path) -> None:
-    """A child that has the output open does not hide that the program has ended, nor keeps the instrument."""
+def test_orphaned_child_is_killed(tmp_path: Path) -> None:
+    """A child that holds the output open does not hide the end of the program."""
     pids = tmp_path / "pids"
 
     async def use(instrument: BridgeInstrument) -> None:
@@ -151,14 +151,14 @@ def test_what_it_leaves_behind_is_killed(tmp_path: Path) -> None:
     assert gone(int(pids.read_text()))
 
 
-def test_one_that_stalls_is_killed_and_works_when_started_again(tmp_path: Path) -> None:
-    """A stopped process does not even see SIGTERM."""
+def test_stalled_program_is_killed_and_restarted(tmp_path: Path) -> None:
+    """A stopped process does not see SIGTERM."""
     mark = tmp_path / "mark"
 
     async def use(instrument: BridgeInstrument) -> None:
         await instrument.connect()
         await instrument.track(1)
-        with pytest.raises(InstrumentError, match=r"has said nothing for 0\.5 s"):
+        with pytest.raises(InstrumentError, match=r"has printed nothing usable for 0\.5 s"):
             await instrument.read()
         await instrument.connect()
         await instrument.track(1)
@@ -173,8 +173,8 @@ def test_one_that_stalls_is_killed_and_works_when_started_again(tmp_path: Path) 
     )
 
 
-def test_it_is_not_the_service(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It has a session of its own, and cannot speak for the client to systemd."""
+def test_program_cannot_notify_systemd(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It has a session of its own."""
     monkeypatch.setenv("NOTIFY_SOCKET", "/run/systemd/notify")
 
     async def use(instrument: BridgeInstrument) -> None:
@@ -185,8 +185,8 @@ def test_it_is_not_the_service(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "NOTIFY_SOCKET" in os.environ
 
 
-def test_output_without_end_is_survived() -> None:
-    """Neither memory nor time goes to a program that prints as fast as it can."""
+def test_endless_output_is_bounded() -> None:
+    """A program that prints as fast as it can costs neither memory nor time."""
 
     async def use(instrument: BridgeInstrument) -> None:
         began = time.monotonic()
@@ -241,8 +241,8 @@ ENOUGH = 10
 """So often each program measures before it is killed."""
 
 
-def test_a_client_whose_program_is_killed_again_and_again(tmp_path: Path) -> None:
-    """The journal has everything that was measured, once, and the client goes on."""
+def test_client_survives_repeated_kills_of_its_program(tmp_path: Path) -> None:
+    """The journal has every measurement once."""
     notes = tmp_path / "notes"
     notes.touch()
     (tmp_path / "program.py").write_text(NOTING)
@@ -281,7 +281,7 @@ def test_a_client_whose_program_is_killed_again_and_again(tmp_path: Path) -> Non
 
 
 def last_started(notes: Path, runs: int) -> int:
-    """Wait until the program was started so many times and has measured often enough; return its process."""
+    """Wait until the program has started and measured often enough; return its process."""
     for _ in range(2000):
         *_, last = ["", *notes.read_text().split("start ")]
         if notes.read_text().count("start") == runs and last.count("\n") > ENOUGH:

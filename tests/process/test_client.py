@@ -1,4 +1,4 @@
-"""The client's daemon as a process, with air and instrument in another one, in real time."""
+"""The client's daemon as a process, with channel and instrument in another one, in real time."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ async def main(folder):
             print("ready", flush=True)
             while command := (await asyncio.to_thread(sys.stdin.readline)).strip():
                 getattr(line, command)()
-                times_ns = [[each.instrument_ms * 1_000_000, each.true_ns] for each in instrument.offered]
+                times_ns = [[each.instrument_ms * 1_000_000, each.true_ns] for each in instrument.reported_distances]
                 where = os.readlink(tty) if tty.is_symlink() else None
                 state = {"now_ns": time.monotonic_ns(), "tty": where, "offered": times_ns}
                 print(json.dumps(state), flush=True)
@@ -85,14 +85,14 @@ asyncio.run(main(Path(sys.argv[1])))
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Folder with a configuration."""
+    """Return a folder with a configuration."""
     (tmp_path / "client.toml").write_text(CONFIG)
     return tmp_path
 
 
 @contextmanager
 def surroundings(folder: Path) -> Iterator[Callable[[str], dict[str, Any]]]:
-    """Run air and instrument in another process; what is yielded plugs and unplugs the instrument and says how it is."""
+    """Run channel and instrument in another process; yield its control."""
     with subprocess.Popen(
         [sys.executable, "-c", SURROUNDINGS, str(folder)],
         stdin=subprocess.PIPE,
@@ -119,7 +119,7 @@ def surroundings(folder: Path) -> Iterator[Callable[[str], dict[str, Any]]]:
 
 @contextmanager
 def client(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], socket.socket]]:
-    """Run the client, kill it at the end; with the socket that systemd would listen on."""
+    """Run the client with the socket of systemd, kill it at the end."""
     notify = folder / "notify.sock"
     notify.unlink(missing_ok=True)
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
@@ -151,7 +151,7 @@ def _environment() -> dict[str, str]:
 
 
 def asked(folder: Path) -> dict[str, Any]:
-    """Ask the client how it does."""
+    """Request the status of the client."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
         connection.settimeout(5.0)
         connection.connect(str(folder / "client.sock"))
@@ -162,7 +162,7 @@ def asked(folder: Path) -> dict[str, Any]:
 
 
 def wait_for(folder: Path, measurements: int) -> dict[str, Any]:
-    """Wait until the client has read so many measurements."""
+    """Wait until the client has read the given number of measurements."""
     for _ in range(400):
         status = asked(folder)
         if status["measurements"] >= measurements:
@@ -171,8 +171,8 @@ def wait_for(folder: Path, measurements: int) -> dict[str, Any]:
     raise AssertionError(f"no {measurements} measurements in 20 s")
 
 
-def test_a_client_runs_and_ends_as_systemd_wants_it(folder: Path) -> None:
-    """It says when it is ready and that it lives; SIGTERM ends it within a second, with status 0."""
+def test_client_notifies_systemd_and_ends_on_sigterm(folder: Path) -> None:
+    """It reports readiness and liveness; SIGTERM ends it within a second with status 0."""
     with surroundings(folder), client(folder) as (process, systemd):
         assert systemd.recv(1000).startswith(b"READY=1\nSTATUS=station 1: ")
         assert systemd.recv(1000).startswith(b"WATCHDOG=1\nSTATUS=")
@@ -192,7 +192,7 @@ def test_a_client_runs_and_ends_as_systemd_wants_it(folder: Path) -> None:
 
 
 def drain(systemd: socket.socket) -> None:
-    """Receive what waits."""
+    """Receive all waiting messages."""
     patience_s = systemd.gettimeout()
     systemd.setblocking(False)
     with suppress(BlockingIOError):
@@ -201,8 +201,8 @@ def drain(systemd: socket.socket) -> None:
     systemd.settimeout(patience_s)
 
 
-def test_a_client_that_is_killed_leaves_a_readable_journal(folder: Path) -> None:
-    """After kill -9 every journal is whole but for a torn line, and a new client begins another one."""
+def test_killed_client_leaves_a_readable_journal(folder: Path) -> None:
+    """At most the last line is torn, and a new client starts another journal."""
     for _ in range(2):
         with surroundings(folder), client(folder) as (process, _):
             systemd_ready(folder)
@@ -215,8 +215,8 @@ def test_a_client_that_is_killed_leaves_a_readable_journal(folder: Path) -> None
     assert len(list((folder / "journals").iterdir())) == 2
 
 
-def test_a_client_outlives_what_is_around_it(folder: Path) -> None:
-    """When air and instrument are gone it waits for them, and goes on with both when they are back."""
+def test_client_recovers_channel_and_instrument(folder: Path) -> None:
+    """It waits while both are gone, and continues with both."""
     with client(folder):
         systemd_ready(folder)
         with surroundings(folder):
@@ -227,8 +227,8 @@ def test_a_client_outlives_what_is_around_it(folder: Path) -> None:
             wait_for(folder, alone["measurements"] + 5)
 
 
-def test_a_cable_that_comes_back_under_another_name(folder: Path) -> None:
-    """The stable name leads to another terminal: readings come within 3 s, and from then on all that are offered."""
+def test_cable_that_returns_under_another_name(folder: Path) -> None:
+    """The stable name leads to another terminal: measurements come within 3 s."""
     with surroundings(folder) as tell, client(folder) as (process, _):
         systemd_ready(folder)
         wait_for(folder, 5)
@@ -275,8 +275,8 @@ def systemd_ready(folder: Path) -> None:
     raise AssertionError("the client does not start")
 
 
-def test_a_bad_configuration_is_told_in_one_line(tmp_path: Path) -> None:
-    """Exit code 2 and the key that is wrong."""
+def test_invalid_configuration_is_one_line(tmp_path: Path) -> None:
+    """Exit code 2 and the invalid key."""
     (tmp_path / "client.toml").write_text(CONFIG.replace("spreading_factor = 7", "spreading_factor = 6"))
     done = subprocess.run(
         [

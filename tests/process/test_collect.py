@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from tsgt.analysis.formats import read_some_targets
+from tsgt.analysis.formats import read_partial_target_file
 from tsgt.radio.key_file import write_key
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def process(*arguments: str, **options: Any) -> Iterator[subprocess.Popen[bytes]
 
 @pytest.fixture(params=PROTOCOLS)
 def folder(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]:
-    """Folder with both configurations; air, instrument and client run."""
+    """Return a folder with both configurations; channel, instrument and client run."""
     protocol = PROTOCOLS[request.param]
     (tmp_path / "client.toml").write_text(CLIENT + RADIO.format(name="station1", protocol=protocol))
     (tmp_path / "master.toml").write_text(MASTER + RADIO.format(name="master", protocol=protocol))
@@ -136,7 +136,7 @@ def folder(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]:
 
 
 def wait_for_mode(folder: Path, mode: str) -> None:
-    """Ask the client until its instrument is connected and does that."""
+    """Wait until the client's instrument is connected and in a mode."""
     found = None
     deadline_s = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline_s:
@@ -152,14 +152,25 @@ def wait_for_mode(folder: Path, mode: str) -> None:
 
 
 def collect_command(folder: Path, output: Path) -> tuple[str, ...]:
-    """Arguments of Python that collect targets into a file."""
+    """Return Python arguments that collect targets into a file."""
     config = str(folder / "master.toml")
-    return ("-m", "tsgt", "calibrate", "collect", "--config", config, "--output", str(output))
+    return (
+        "-m",
+        "tsgt",
+        "calibrate",
+        "collect",
+        "--config",
+        config,
+        "--output",
+        str(output),
+        "--target-constant-mm",
+        "0",
+    )
 
 
 @pytest.mark.parametrize("waiting", [True, False])
-def test_ctrl_c_leaves_what_was_measured_and_a_station_that_tracks(folder: Path, *, waiting: bool) -> None:
-    """While it waits for a key, and while the instrument measures; the exit code is that of Ctrl-C."""
+def test_ctrl_c_keeps_measurements_and_returns_to_tracking(folder: Path, *, waiting: bool) -> None:
+    """While waiting for a key and while measuring; the exit code is that of Ctrl-C."""
     path = folder / "targets.csv"
     command = collect_command(folder, path)
     with process(*command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as collect:
@@ -178,16 +189,16 @@ def test_ctrl_c_leaves_what_was_measured_and_a_station_that_tracks(folder: Path,
         assert collect.stderr is not None
         assert collect.stderr.read().endswith(b"stopped\n")
     wait_for_mode(folder, "tracking")
-    (sight,) = read_some_targets(path).sights[1][1]
+    (sight,) = read_partial_target_file(path).measurements[1][1]
     assert sight.slope_distance_m == pytest.approx((12.0**2 + 5.0**2 + 1.0) ** 0.5, abs=0.03)
 
 
-def test_keys_may_come_from_a_file(folder: Path) -> None:
-    """The end of the input is the end of the work; what is missing is said."""
+def test_keys_are_read_from_stdin(folder: Path) -> None:
+    """The end of the input ends the command, which reports missing measurements."""
     path = folder / "targets.csv"
     command = collect_command(folder, path)
     done = subprocess.run(
-        [sys.executable, *command, "--targets", "3"],
+        [sys.executable, *command, "--target-count", "3"],
         env=ENVIRONMENT, input=b"\ns\n", capture_output=True, timeout=60, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -195,7 +206,7 @@ def test_keys_may_come_from_a_file(folder: Path) -> None:
     wait_for_mode(folder, "tracking")
     check = ("-m", "tsgt", "calibrate", "check", "--config", str(folder / "master.toml"), "--json")
     done = subprocess.run(
-        [sys.executable, *check, "--targets-file", str(path)],
+        [sys.executable, *check, "--targets", str(path)],
         env=ENVIRONMENT, input=b"\n", capture_output=True, timeout=60, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

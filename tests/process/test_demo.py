@@ -1,4 +1,4 @@
-"""The demo as a newcomer runs it: real daemons, real sockets, real time, and daemons that are killed."""
+"""``tsgt demo``: real daemons, real sockets, real time, and killed daemons."""
 
 from __future__ import annotations
 
@@ -30,30 +30,30 @@ PATIENCE_S = 60.0
 
 @dataclass
 class Demo:
-    """A demo under way, and what it has said so far."""
+    """A running demo and its output so far."""
 
     process: subprocess.Popen[str]
     said: list[str] = field(default_factory=list)
 
     def follow(self) -> None:
-        """Read what it says until it ends."""
+        """Read the output until its end."""
         assert self.process.stderr is not None
         self.said.extend(self.process.stderr)
 
     def pids(self) -> dict[str, int]:
-        """Process numbers of the daemons, as it said last."""
+        """Return the latest process ids of the daemons."""
         lines = [line for line in self.said if line.startswith("processes")]
         return (
             {name: int(pid) for name, pid in re.findall(r"(\w+(?: \d)?): (\d+)", lines[-1])} if lines else {}
         )
 
     def valid_poses(self) -> int:
-        """How many valid poses it has reported so far."""
+        """Return the reported number of valid poses."""
         counts = [re.search(r"(\d+)/\d+ poses valid", line) for line in self.said]
         return max((int(count[1]) for count in counts if count), default=0)
 
     def wait_for_poses(self, more_than: int) -> None:
-        """Return when it has reported more valid poses than so many."""
+        """Wait until it has reported more valid poses."""
         deadline_s = time.monotonic() + PATIENCE_S
         while self.valid_poses() <= more_than:
             assert time.monotonic() < deadline_s, "".join(self.said)
@@ -61,7 +61,7 @@ class Demo:
             time.sleep(0.1)
 
     def connect(self, path: Path) -> socket.socket:
-        """Return a connection to its poses, as soon as its master listens."""
+        """Connect to the stream as soon as the master listens."""
         deadline_s = time.monotonic() + PATIENCE_S
         while True:
             connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -81,14 +81,14 @@ Start = Callable[..., Demo]
 
 @pytest.fixture
 def folder() -> Iterator[Path]:
-    """Return a folder whose path leaves room for names of sockets: pytest's own is too long with several processes."""
+    """Return a folder with a short path: sockets have a length limit."""
     with tempfile.TemporaryDirectory(prefix="demo-") as path:
         yield Path(path)
 
 
 @pytest.fixture
 def start(folder: Path) -> Iterator[Start]:
-    """Return a function that starts a demo with further arguments."""
+    """Return a function that starts a demo with additional arguments."""
     with ExitStack() as stack:
 
         def begin(*arguments: str) -> Demo:
@@ -130,8 +130,8 @@ def _end(demo: Demo, timeout_s: float) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("protocol", ["superframe", "classic"])
-def test_demo_streams_records_and_sums_up(start: Start, folder: Path, protocol: str) -> None:
-    """A reader gets live poses; at the end the result says how good they were and where the recording is."""
+def test_demo_streams_records_and_summarises(start: Start, folder: Path, protocol: str) -> None:
+    """A reader gets live poses; the result has errors and the recording."""
     output = folder / "kept.jsonl"
     demo = start("--protocol", protocol, "--duration", "20", "--output", str(output))
     with demo.connect(folder / "poses.sock") as connection:
@@ -156,7 +156,7 @@ def test_demo_streams_records_and_sums_up(start: Start, folder: Path, protocol: 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
 def test_demo_ends_cleanly_on_a_signal(start: Start, folder: Path, number: signal.Signals) -> None:
-    """Ctrl-C and kill end it and its daemons, with the result so far, exit 0, and no socket left behind."""
+    """SIGINT and SIGTERM end demo and daemons with the result so far, exit 0, and no socket left."""
     demo = start("--duration", "60")
     deadline_s = time.monotonic() + PATIENCE_S
     while not demo.pids():
@@ -179,10 +179,10 @@ def test_demo_ends_cleanly_on_a_signal(start: Start, folder: Path, number: signa
         (("--output", "{}/none/x.jsonl"), "there is no such folder"),
     ],
 )
-def test_what_cannot_be_is_said_at_once(
+def test_invalid_options_fail_at_once(
     start: Start, folder: Path, arguments: tuple[str, str], reason: str
 ) -> None:
-    """Neither after a minute without poses nor after the whole run."""
+    """Not after a minute without poses, nor after the run."""
     demo = start(arguments[0], arguments[1].format(folder))
     assert demo.process.wait(20) in {1, 2}
     assert demo.process.stdout is not None
@@ -193,8 +193,8 @@ def test_what_cannot_be_is_said_at_once(
         time.sleep(0.01)
 
 
-def test_daemons_do_not_outlive_a_demo_that_is_killed(start: Start) -> None:
-    """Kill -9 of the demo itself leaves no process behind."""
+def test_daemons_end_with_a_killed_demo(start: Start) -> None:
+    """SIGKILL of the demo leaves no process."""
     demo = start("--duration", "60")
     deadline_s = time.monotonic() + PATIENCE_S
     while not demo.pids():
@@ -216,7 +216,7 @@ def _command_line(pid: int) -> bytes:
 
 
 def _delivered(folder: Path) -> set[tuple[int, int]]:
-    """Station and number of all that is recorded."""
+    """Return station and number of all recorded measurements."""
     return {
         (m.station, m.sequence)
         for path in (folder / "recordings").glob("master-*.jsonl")
@@ -226,7 +226,7 @@ def _delivered(folder: Path) -> set[tuple[int, int]]:
 
 
 def _journalled(folder: Path, station: int) -> dict[int, int]:
-    """Stamps of all that a station has read, by number."""
+    """Return the stamps of all journalled measurements by number."""
     return {
         m.sequence: m.stamp_ns
         for path in sorted((folder / f"journals{station}").glob("*.jsonl"))
@@ -234,8 +234,8 @@ def _journalled(folder: Path, station: int) -> dict[int, int]:
     }
 
 
-def test_killed_daemons_come_back_and_nothing_read_is_lost(start: Start, folder: Path) -> None:
-    """Kill -9 of each daemon in turn: poses come back by themselves, and what the clients had read is delivered."""
+def test_killed_daemons_restart_without_loss(start: Start, folder: Path) -> None:
+    """After SIGKILL of each daemon poses continue, and every journalled measurement is delivered."""
     demo = start("--duration", "120")
     demo.wait_for_poses(20)
     for name in ("client 2", "master"):

@@ -1,4 +1,4 @@
-"""`tsgt doctor` as a process, with a simulated instrument on a pseudo-terminal, in real time."""
+"""``tsgt doctor`` as a process, with a simulated instrument on a pseudo-terminal, in real time."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from harness.made_up_machine import CLIENT
+from harness.fake_machine import CLIENT
 
 from tsgt.config import ScenarioConfig
 from tsgt.simulation.instrument import PtyLine, SimulatedTotalStation
@@ -38,8 +38,8 @@ async def _examined(folder: Path) -> tuple[int | None, Any]:
     return process.returncode, json.loads(out)["checks"]
 
 
-def test_instrument_on_a_real_line_is_asked(tmp_path: Path) -> None:
-    """The command opens the terminal, identifies the instrument, and says what this machine lacks: a radio, a key."""
+def test_doctor_identifies_an_instrument_on_a_real_line(tmp_path: Path) -> None:
+    """The findings name what this machine lacks: a radio, a key."""
     lines = ['port = "instrument"' if line.startswith("port =") else line for line in CLIENT.splitlines()]
     (tmp_path / "client.toml").write_text("\n".join(lines))
     code, checks = asyncio.run(_examined(tmp_path))

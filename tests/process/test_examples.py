@@ -1,4 +1,4 @@
-"""The examples, run as a reader of the documentation would run them."""
+"""The examples, run as in the documentation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FOLLOW_STREAM = Path(__file__).parents[2] / "examples" / "follow_stream.py"
 
 
 def followed(tmp_path: Path, lines: list[bytes]) -> tuple[int, list[str]]:
-    """Serve lines to the example; return its exit code and what it printed."""
+    """Serve lines to the example; return its exit code and its output."""
     path = tmp_path / "s"
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(str(path))
@@ -35,7 +35,7 @@ def followed(tmp_path: Path, lines: list[bytes]) -> tuple[int, list[str]]:
 
 
 def test_example_follows_the_stream(tmp_path: Path) -> None:
-    """The stdlib-only reader shows poses, reasons and events, and passes over everything else."""
+    """The example uses the standard library only and ignores unknown records."""
     records = [HELLO, measurement(0), POSE, NO_POSE, EVENT]
     lines = [*map(encode_line, records), b'{"type":"weather"}']
     assert followed(tmp_path, lines) == (
@@ -49,7 +49,7 @@ def test_example_follows_the_stream(tmp_path: Path) -> None:
 
 
 def test_example_stops_at_another_protocol(tmp_path: Path) -> None:
-    """The reader does not guess what another protocol means."""
+    """It does not interpret another version of the protocol."""
     code, (line,) = followed(tmp_path, [b'{"type":"hello","protocol":2}'])
     assert code == 1
     assert "speaks protocol 2" in line

@@ -1,4 +1,4 @@
-"""The master's daemon as a process, in real time; the air that its radio wants is not there."""
+"""The master's daemon as a process, in real time, without its channel."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LONGEST_START_S = 30.0
 
 @pytest.fixture
 def config(tmp_path: Path) -> Path:
-    """Return the example of the repository, with a simulated radio and everything in one folder."""
+    """Return the example of the repository with a simulated radio and everything in one folder."""
     for name in ("prism_layout", "station_frames"):
         shutil.copy(ROOT / "configs" / f"{name}.example.toml", tmp_path)
     text = (ROOT / "configs" / "master.example.toml").read_text()
@@ -42,7 +42,7 @@ def config(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def daemon(config: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """Start it, and kill it at the end if it is still there."""
+    """Start the master, and kill it at the end."""
     program = "from tsgt.cli.daemons import main_master; main_master()"
     command = [sys.executable, "-c", program, "--config", str(config)]
     with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE) as process:
@@ -51,7 +51,7 @@ def daemon(config: Path) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def connected(path: Path) -> socket.socket:
-    """Connect to the stream as soon as it is there."""
+    """Connect to the stream as soon as it is served."""
     give_up = time.monotonic() + LONGEST_START_S
     while True:
         reader = socket.socket(socket.AF_UNIX)
@@ -66,10 +66,10 @@ def connected(path: Path) -> socket.socket:
             return reader
 
 
-def test_it_streams_without_its_radio_and_ends_when_it_is_told_to(
+def test_master_streams_without_radio_and_ends_on_sigterm(
     config: Path, daemon: subprocess.Popen[bytes]
 ) -> None:
-    """Readers get status lines each second; SIGTERM ends it within a second, with status 0 and a whole recording."""
+    """Readers get a status each second; SIGTERM ends it within a second with status 0 and a whole recording."""
     with connected(config.parent / "poses.sock") as reader, reader.makefile("rb") as lines:
         while json.loads(lines.readline())["type"] != "status":
             pass
@@ -86,8 +86,8 @@ def test_it_streams_without_its_radio_and_ends_when_it_is_told_to(
     assert {"stream_opened", "master_started", "radio_lost", "master_stopped"} <= set(logged)
 
 
-def test_a_configuration_that_cannot_be_used_is_one_line(tmp_path: Path) -> None:
-    """Exit status 2, and what is wrong."""
+def test_invalid_configuration_is_one_line(tmp_path: Path) -> None:
+    """Exit status 2 and the reason."""
     program = "from tsgt.cli.daemons import main_master; main_master()"
     command = [sys.executable, "-c", program, "--config", str(tmp_path / "none.toml")]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)

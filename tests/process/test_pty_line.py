@@ -1,4 +1,4 @@
-"""The simulated total station behind a pseudo-terminal, in real time: kept as short as it can be."""
+"""The simulated total station behind a pseudo-terminal, in real time."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @asynccontextmanager
 async def line(link: Path, baud: int = 115_200) -> AsyncGenerator[PtyLine]:
-    """Serve an instrument in this loop."""
+    """Serve an instrument in this event loop."""
     scenario = ScenarioConfig()
     timeline = LoopTimeline(asyncio.get_running_loop())
     world = scenario_world(scenario, 10.0, np.random.default_rng(1))
@@ -36,7 +36,7 @@ async def line(link: Path, baud: int = 115_200) -> AsyncGenerator[PtyLine]:
 
 
 def ask(link: Path, baud: int, request: bytes = b"\n%R1Q,5004,1:\r\n") -> tuple[bytes, float]:
-    """Ask once, as another program does; the answer and how long it took in s."""
+    """Send a request as another program; return the response and its duration in s."""
     with serial.Serial(str(link), baud, timeout=0.3) as port:
         began_s = time.monotonic()
         port.write(request)
@@ -44,8 +44,8 @@ def ask(link: Path, baud: int, request: bytes = b"\n%R1Q,5004,1:\r\n") -> tuple[
         return answer, time.monotonic() - began_s
 
 
-def test_it_is_a_serial_port_with_the_pace_of_one(tmp_path: Path) -> None:
-    """A program that opens the link and sets the speed gets an answer, not sooner than the line can carry it."""
+def test_pseudo_terminal_has_the_pace_of_a_serial_line(tmp_path: Path) -> None:
+    """A response does not arrive faster than the line can carry it."""
 
     async def run() -> None:
         async with line(tmp_path / "rts0", 9600):
@@ -56,8 +56,8 @@ def test_it_is_a_serial_port_with_the_pace_of_one(tmp_path: Path) -> None:
     asyncio.run(run())
 
 
-def test_another_speed_gives_garbage(tmp_path: Path) -> None:
-    """The speed that the program has set counts, though a pseudo-terminal has none."""
+def test_wrong_baud_rate_gives_garbage(tmp_path: Path) -> None:
+    """The rate set by the program counts, though a pseudo-terminal has none."""
 
     async def run() -> None:
         async with line(tmp_path / "rts0"):
@@ -69,8 +69,8 @@ def test_another_speed_gives_garbage(tmp_path: Path) -> None:
     asyncio.run(run())
 
 
-def test_unplugged_and_plugged_in_again(tmp_path: Path) -> None:
-    """The program's port breaks and the link is gone; afterwards the same link leads to a port again."""
+def test_unplug_and_plug_in_again(tmp_path: Path) -> None:
+    """The open port breaks and the link is gone; afterwards the link leads to a port again."""
     link = tmp_path / "rts0"
 
     async def run() -> None:

@@ -1,4 +1,4 @@
-"""kill -9 while a recording is being written."""
+"""SIGKILL while a recording is being written."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ with RecordingWriter(Path(sys.argv[1])) as writer:
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    """Where the recording is."""
+    """Return the path of the recording."""
     return tmp_path / "r.jsonl"
 
 
 def write_until_killed(path: Path, after_s: float) -> None:
-    """Let another process write to the file as fast as it can, and kill it after a while."""
+    """Have another process write as fast as it can, and kill it after a while."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(str(p) for p in (ROOT, ROOT / "tests"))}
     with subprocess.Popen(
         [sys.executable, "-c", WRITE_FOR_EVER, str(path)], stdout=subprocess.PIPE, env=environment
@@ -56,7 +56,7 @@ def write_until_killed(path: Path, after_s: float) -> None:
 
 
 def test_kill_tears_one_line_at_most(path: Path) -> None:
-    """After kills at random moments every session is whole but for its last line, and the file can be continued."""
+    """After kills at random times every session is whole but for its last line, and the file can be continued."""
     rng = random.Random(20220314)  # noqa: S311 (moments, not secrets)
     for session in range(1, KILLS + 1):
         write_until_killed(path, rng.uniform(0.0, 0.1))
@@ -72,8 +72,8 @@ def test_kill_tears_one_line_at_most(path: Path) -> None:
     assert len(sequences) > KILLS
 
 
-def test_file_of_a_killed_writer_goes_on(path: Path) -> None:
-    """The lock dies with the process; the next writer appends behind the last whole line."""
+def test_file_of_a_killed_writer_can_be_continued(path: Path) -> None:
+    """The lock ends with the process; the next writer appends after the last whole line."""
     write_until_killed(path, 0.02)
     with RecordingWriter(path) as writer:
         writer.write(HEADER)

@@ -1,4 +1,4 @@
-"""Serial ports, on pseudo-terminals in real time: what comes, what goes wrong, and who else has one."""
+"""Serial ports on pseudo-terminals in real time."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ if TYPE_CHECKING:
 
 @dataclass
 class Pty:
-    """A pseudo-terminal; its other end is ours."""
+    """A pseudo-terminal whose other end is ours."""
 
     master: int
     path: Path
 
     def unplug(self) -> None:
-        """Pull the plug."""
+        """Remove the device."""
         if self.master >= 0:
             os.close(self.master)
         self.master = -1
@@ -43,7 +43,7 @@ class Pty:
 
 @pytest.fixture
 def pty() -> Iterator[Pty]:
-    """Make a pseudo-terminal that nobody has open."""
+    """Return a pseudo-terminal that no process has open."""
     master, slave = os.openpty()
     made = Pty(master, Path(os.ttyname(slave)))
     os.close(slave)
@@ -56,8 +56,8 @@ async def opened(path: Path, baud: int = 115_200) -> Port:
     return await open_serial_port(path, baud, SystemClock())
 
 
-def test_bytes_go_both_ways_and_are_stamped(pty: Pty) -> None:
-    """What is written arrives as it is, what comes has the time at which it came."""
+def test_bytes_are_sent_received_and_timestamped(pty: Pty) -> None:
+    """Received bytes have their time of arrival."""
 
     async def run() -> None:
         port = await opened(pty.path)
@@ -75,8 +75,8 @@ def test_bytes_go_both_ways_and_are_stamped(pty: Pty) -> None:
     asyncio.run(run())
 
 
-def test_a_cancelled_read_loses_nothing(pty: Pty) -> None:
-    """What comes after a reader has given up is there for the next, or is drained."""
+def test_cancelled_read_loses_nothing(pty: Pty) -> None:
+    """Later bytes are left for the next reader."""
 
     async def run() -> None:
         port = await opened(pty.path)
@@ -94,8 +94,8 @@ def test_a_cancelled_read_loses_nothing(pty: Pty) -> None:
     asyncio.run(run())
 
 
-def test_an_unplugged_port_says_so_and_comes_back_under_another_name(pty: Pty, tmp_path: Path) -> None:
-    """Whoever reads is told at once, everybody later too; the same link then leads to another device."""
+def test_unplugged_port_fails_and_returns_under_another_name(pty: Pty, tmp_path: Path) -> None:
+    """Readers fail at once; the same link then leads to another device."""
     link = tmp_path / "instrument"
     link.symlink_to(pty.path)
 
@@ -125,8 +125,8 @@ def test_an_unplugged_port_says_so_and_comes_back_under_another_name(pty: Pty, t
     asyncio.run(run())
 
 
-def test_a_port_is_closed_though_its_line_has_just_gone(pty: Pty) -> None:
-    """What the terminal's interface raises then is no OSError; nobody has to know."""
+def test_close_after_unplug_does_not_fail(pty: Pty) -> None:
+    """The error of the terminal interface is no OSError."""
 
     async def run() -> None:
         port = await opened(pty.path)
@@ -139,10 +139,10 @@ def test_a_port_is_closed_though_its_line_has_just_gone(pty: Pty) -> None:
     asyncio.run(run())
 
 
-def test_writing_to_a_line_that_has_just_gone_says_so(
+def test_write_after_unplug_fails(
     pty: Pty, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """The writer is told, whoever reads as well, and nothing is said to anybody else."""
+    """Writer and reader get the error."""
 
     async def run() -> None:
         port = await opened(pty.path)
@@ -161,8 +161,8 @@ def test_writing_to_a_line_that_has_just_gone_says_so(
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_line_that_takes_nothing_holds_nobody_up(pty: Pty) -> None:
-    """Bytes that cannot be sent are dropped when the port is closed."""
+def test_blocked_line_does_not_delay_close(pty: Pty) -> None:
+    """Unsent bytes are dropped."""
 
     async def run() -> None:
         port = await opened(pty.path)
@@ -175,8 +175,8 @@ def test_a_line_that_takes_nothing_holds_nobody_up(pty: Pty) -> None:
     asyncio.run(run())
 
 
-def test_a_taken_port_says_by_whom_and_is_free_afterwards(pty: Pty) -> None:
-    """The message names the process; once it has closed the port, it can be opened."""
+def test_busy_port_names_its_holder(pty: Pty) -> None:
+    """After the holder has closed it, the port can be opened."""
 
     async def run() -> None:
         first = await opened(pty.path)
@@ -189,8 +189,8 @@ def test_a_taken_port_says_by_whom_and_is_free_afterwards(pty: Pty) -> None:
     asyncio.run(run())
 
 
-def test_the_holder_of_a_port_is_found(pty: Pty, tmp_path: Path) -> None:
-    """Any process that has the device open, under whatever name."""
+def test_holder_of_a_port_is_found(pty: Pty, tmp_path: Path) -> None:
+    """Any process that has the device open, under any name."""
     assert port_holder(pty.path) is None
     link = tmp_path / "instrument"
     link.symlink_to(pty.path)
@@ -205,8 +205,8 @@ def test_the_holder_of_a_port_is_found(pty: Pty, tmp_path: Path) -> None:
         holder.wait(timeout=10)
 
 
-def test_a_holder_who_hides_what_he_has_open_is_found_by_his_lock(pty: Pty, tmp_path: Path) -> None:
-    """Other users' open files are not to be seen, but locks are."""
+def test_holder_of_another_user_is_found_by_its_lock(pty: Pty, tmp_path: Path) -> None:
+    """Open files of other users are not visible, but locks are."""
     status = pty.path.stat()
     place = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
     (tmp_path / "proc/77").mkdir(parents=True)
@@ -221,21 +221,21 @@ def test_a_holder_who_hides_what_he_has_open_is_found_by_his_lock(pty: Pty, tmp_
 
 
 @pytest.mark.parametrize("name", ["/dev/null", "/tmp", "/dev/nothing"])
-def test_what_is_no_port_is_refused(name: str) -> None:
-    """A device without a line, a folder, nothing at all: an error of ours."""
+def test_other_files_are_no_ports(name: str) -> None:
+    """A device without a line, a folder, a missing file: an error of ours."""
     with pytest.raises(InstrumentError, match=name):
         asyncio.run(opened(Path(name)))
 
 
 def adapter(root: Path, path: Path) -> Path:
-    """Make the files of an FTDI adapter; return that of its timer."""
+    """Make the files of an FTDI adapter; return that of its latency timer."""
     folder = root / "sys/bus/usb-serial/devices" / path.name
     folder.mkdir(parents=True)
     return folder / "latency_timer"
 
 
-def test_the_timer_of_an_adapter_is_read(tmp_path: Path) -> None:
-    """In milliseconds, through a link; none where there is no such adapter."""
+def test_latency_timer_is_read(tmp_path: Path) -> None:
+    """In milliseconds, through a link; None without such an adapter."""
     device, link = tmp_path / "ttyUSB7", tmp_path / "instrument"
     link.symlink_to(device)
     assert latency_timer_ms(link, root=tmp_path) is None
@@ -243,10 +243,8 @@ def test_the_timer_of_an_adapter_is_read(tmp_path: Path) -> None:
     assert latency_timer_ms(link, root=tmp_path) == 16
 
 
-def test_the_timer_of_an_adapter_is_lowered(
-    pty: Pty, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Where it may be written, nobody has to do anything."""
+def test_latency_timer_is_lowered(pty: Pty, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """If it is writable."""
     timer = adapter(tmp_path, pty.path)
     timer.write_text("16\n")
     monkeypatch.setattr(serial_port, "_ROOT", tmp_path)
@@ -260,7 +258,7 @@ def test_the_timer_of_an_adapter_is_lowered(
     assert logs == []
 
 
-def test_a_slow_timer_that_cannot_be_changed_is_warned_of_once(
+def test_slow_latency_timer_is_a_single_warning(
     pty: Pty, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """However often the port is opened."""
@@ -268,7 +266,7 @@ def test_a_slow_timer_that_cannot_be_changed_is_warned_of_once(
         "/proc/sys/kernel/ngroups_max"
     )  # a number that not even root can set
     monkeypatch.setattr(serial_port, "_ROOT", tmp_path)
-    serial_port._warn_of_latency.cache_clear()
+    serial_port._warn_latency.cache_clear()
 
     async def run() -> None:
         for _ in range(3):
@@ -279,8 +277,8 @@ def test_a_slow_timer_that_cannot_be_changed_is_warned_of_once(
     assert [(entry["event"], entry["latency_ms"]) for entry in logs] == [("serial_latency", 65_536)]
 
 
-def test_a_connection_works_over_a_port(pty: Pty) -> None:
-    """A request goes out, its reply comes in, stamped between the two."""
+def test_connection_works_over_a_port(pty: Pty) -> None:
+    """The reply is timestamped after the request."""
 
     async def run() -> None:
         connection = GeoComConnection(await opened(pty.path), SystemClock())

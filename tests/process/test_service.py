@@ -1,4 +1,4 @@
-"""How a program ends when it is told to: real signals to real processes."""
+"""Signals to real processes."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ print(run(main))
 
 
 def ended_by(number: signal.Signals, program: str) -> tuple[int, list[str]]:
-    """Run a program, send it a signal when it runs, return its exit code and its output."""
+    """Run a program, send it a signal, return its exit code and its output."""
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
     with subprocess.Popen(
         [sys.executable, "-c", program],
@@ -61,19 +61,19 @@ def ended_by(number: signal.Signals, program: str) -> tuple[int, list[str]]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_ends_a_service_cleanly(number: signal.Signals) -> None:
-    """It cancels the program, its clean-up runs, and the exit code is that of success, within a second."""
+def test_signal_ends_a_service_cleanly(number: signal.Signals) -> None:
+    """The program is cancelled, its clean-up runs, and it exits with 0 within a second."""
     assert ended_by(number, PROGRAM) == (0, ["running", "cleaned up"])
 
 
 def test_sigint_ends_a_program_cleanly() -> None:
-    """SIGINT does the same and then counts as an interruption."""
+    """SIGINT counts as an interruption."""
     code, lines = ended_by(signal.SIGINT, PROGRAM)
     assert lines == ["running", "cleaned up"]
     assert code == -signal.SIGINT
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM])
-def test_program_may_sum_up(number: signal.Signals) -> None:
-    """A program that catches the cancellation may return its result."""
+def test_program_may_return_a_result_after_a_signal(number: signal.Signals) -> None:
+    """It catches the cancellation."""
     assert ended_by(number, SUMMING_UP) == (0, ["running", "summary"])

@@ -1,4 +1,4 @@
-"""The example configurations and the schema in the repository are those of the code."""
+"""The example configurations and the schema in the repository are up to date."""
 
 from __future__ import annotations
 
@@ -19,36 +19,36 @@ EXAMPLES = sorted(CONFIGS.rglob("*.toml"))
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_every_example_loads(path: Path) -> None:
-    """Whoever copies an example starts with a file that works."""
+    """Every example is a valid file."""
     load_any(path)
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_every_example_fits_the_schema(path: Path) -> None:
-    """An editor that knows the schema finds nothing wrong in an example."""
+    """An editor that knows the schema reports no problem."""
     jsonschema.validate(tomllib.loads(path.read_text()), json_schema())
 
 
-def test_the_schema_file_is_fresh() -> None:
-    """The schema file is what `tsgt config schema` prints now."""
+def test_schema_file_is_fresh() -> None:
+    """The schema file is the output of `tsgt config schema`."""
     stored = json.loads((CONFIGS / "schema" / "config.schema.json").read_text())
     assert stored == json_schema(), "run `tsgt config schema > configs/schema/config.schema.json`"
 
 
-def test_the_reference_scenario_is_the_default() -> None:
-    """`dynamic.toml` and no file at all are the same world."""
+def test_reference_scenario_is_the_default() -> None:
+    """`dynamic.toml` and no file are the same world."""
     assert load(CONFIGS / "scenarios" / "dynamic.toml", ScenarioConfig) == ScenarioConfig()
 
 
-def test_the_reference_scenario_spells_everything_out() -> None:
-    """Every value of the scenario can be read in its file."""
+def test_reference_scenario_has_every_key() -> None:
+    """Every value of the scenario is in its file."""
     written = tomllib.loads((CONFIGS / "scenarios" / "dynamic.toml").read_text())
     assert _keys(written) == _keys(ScenarioConfig().model_dump())
 
 
 @pytest.mark.parametrize("name", ["master", "master.classic"])
-def test_the_master_examples_spell_the_defaults_out(name: str) -> None:
-    """What an example calls a default is one, and it leaves out nothing of its protocol."""
+def test_master_examples_state_the_defaults(name: str) -> None:
+    """The values called defaults are the defaults, and all keys of the protocol are present."""
     raw = tomllib.loads((CONFIGS / f"{name}.example.toml").read_text())
     minimal = {key: raw[key] for key in ("kind", "setup", "stations")}
     minimal["radio"] = {
@@ -64,14 +64,14 @@ def test_the_master_examples_spell_the_defaults_out(name: str) -> None:
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.example.toml")), ids=lambda path: path.stem)
-def test_every_example_says_why_it_speaks_its_protocol(path: Path) -> None:
-    """There is no silent choice: beside the name of the protocol stands the reason."""
+def test_every_example_gives_the_reason_for_its_protocol(path: Path) -> None:
+    """There is no silent default."""
     _, given, protocol = path.read_text().partition("[protocol]\n")
     assert "because" in protocol.partition("\n[")[0] or not given
 
 
-def test_the_geofence_in_the_master_example_works() -> None:
-    """It is commented out; whoever takes the comment signs away has a fence, with the defaults spelt out."""
+def test_commented_geofence_example_is_valid() -> None:
+    """Without the comment signs it is a geofence with the defaults."""
     text = (CONFIGS / "master.example.toml").read_text()
     start = text.index("# [[geofences]]")
     fence = "\n".join(line[2:] for line in text[start : text.index("\n\n", start)].splitlines())
@@ -80,8 +80,8 @@ def test_the_geofence_in_the_master_example_works() -> None:
     assert written == written.model_copy(update={"sigmas": 3.0, "hysteresis_m": 0.5, "lost_after_s": 2.0})
 
 
-def test_the_set_up_examples_are_those_of_the_reference_scenario() -> None:
-    """The example set-up is the simulated one, so that it can be tried out."""
+def test_set_up_examples_are_the_reference_scenario() -> None:
+    """They can be used with the simulation."""
     example = parameters(load(CONFIGS / "master.example.toml", MasterConfig))
     scenario = si(ScenarioConfig())
     assert example.prisms == scenario.prisms

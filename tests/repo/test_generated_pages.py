@@ -1,4 +1,4 @@
-"""Reference pages that are generated say what the code says."""
+"""Generated reference pages are up to date."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from tsgt.config import reference as configuration
 PAGES = Path(__file__).parents[2] / "docs" / "reference"
 
 
-def test_the_command_reference_is_fresh() -> None:
-    """The page is what the commands say of themselves; if not, call `make generated`."""
+def test_command_reference_is_fresh() -> None:
+    """If not, call `make generated`."""
     assert (PAGES / "cli.md").read_text() == commands.markdown()
 
 
-def test_the_configuration_reference_is_fresh() -> None:
-    """The page is what the models say of themselves; if not, call `make generated`."""
+def test_configuration_reference_is_fresh() -> None:
+    """If not, call `make generated`."""
     assert (PAGES / "configuration.md").read_text() == configuration.markdown()
 
 
-def test_every_command_says_what_it_is_for() -> None:
-    """Each command has a help text, and each of its options too."""
+def test_every_command_and_option_has_help() -> None:
+    """Every sub-command is included."""
     context = click.Context(cli)
     for name in COMMANDS:
         command = cli.get_command(context, name)

@@ -1,4 +1,4 @@
-"""What both daemons are put together from, by what their configurations name."""
+"""Parts of the daemons, made as their configurations say."""
 
 from __future__ import annotations
 
@@ -23,21 +23,13 @@ if TYPE_CHECKING:
 
     from tsgt.clock import Clock
     from tsgt.config import ClassicConfig, InstrumentConfig, RadioConfig
-    from tsgt.radio import LoRaSettings, OpenRadio, Radio
+    from tsgt.radio import LoRaSettings, Radio, RadioOpener
     from tsgt.station import Instrument
 
 
 def make_instrument(config: InstrumentConfig, clock: Clock) -> Instrument:
-    """Return the instrument that a configuration names under ``[instrument]``; nothing is connected yet.
-
-    Parameters
-    ----------
-    config
-        What stands there.
-    clock
-        The machine's.
-    """
-    # Each only where it is needed: a client is small, and whoever has no serial port needs no package for one.
+    """Return the instrument of a configuration, not connected yet."""
+    # Imported here: a client is small, and one without a serial port needs no package for it.
     match config:
         case LeicaInstrumentConfig():
             from tsgt.station.leica import LeicaInstrument
@@ -51,36 +43,20 @@ def make_instrument(config: InstrumentConfig, clock: Clock) -> Instrument:
 
 
 def radio_key(protocol: ClassicConfig | SuperframeConfig) -> bytes | None:
-    """Return the key that a configuration names under ``[protocol]``; None without one, and for a protocol without.
-
-    Raises
-    ------
-    ConfigError
-        As :func:`~tsgt.radio.key_file.read_key`.
-    """
+    """Return the configured key; None without one. Raises as :func:`~tsgt.radio.key_file.read_key`."""
     if isinstance(protocol, SuperframeConfig) and protocol.key_file is not None:
         return read_key(protocol.key_file)
     return None
 
 
-def radio_opener(config: RadioConfig, settings: LoRaSettings, clock: Clock) -> OpenRadio:
-    """Return what opens the radio that a configuration names.
-
-    Parameters
-    ----------
-    config
-        What stands under ``[radio]``.
-    settings
-        Those of :func:`~tsgt.radio.from_config.lora_settings`.
-    clock
-        The machine's.
-    """
+def radio_opener(config: RadioConfig, settings: LoRaSettings, clock: Clock) -> RadioOpener:
+    """Return a function that opens the configured radio with the settings of a modem."""
     if isinstance(config, HardwareRadioConfig):
         return _hardware(config, settings, clock)
     return _simulated(config, settings, clock)
 
 
-def _hardware(config: HardwareRadioConfig, settings: LoRaSettings, clock: Clock) -> OpenRadio:
+def _hardware(config: HardwareRadioConfig, settings: LoRaSettings, clock: Clock) -> RadioOpener:
     @asynccontextmanager
     async def open_radio() -> AsyncGenerator[Radio]:
         radio = SX127x(open_hal(wiring(config.wiring)), clock, allow_20_dbm=config.allow_20_dbm)
@@ -93,18 +69,14 @@ def _hardware(config: HardwareRadioConfig, settings: LoRaSettings, clock: Clock)
     return open_radio
 
 
-def _simulated(config: SimulatedRadioConfig, settings: LoRaSettings, clock: Clock) -> OpenRadio:
+def _simulated(config: SimulatedRadioConfig, settings: LoRaSettings, clock: Clock) -> RadioOpener:
     @asynccontextmanager
     async def open_radio() -> AsyncGenerator[Radio]:
-        # Only here, so that a daemon in the field does not load the simulation.
+        # Imported here, so that a daemon in the field does not load the simulation.
         import numpy as np
 
         from tsgt.simulation.kernel import LoopTimeline
-        from tsgt.simulation.lora import (
-            AirClient,
-            SimulatedHal,
-            SX1276Chip,
-        )
+        from tsgt.simulation.lora import AirClient, SimulatedHal, SX1276Chip
 
         timeline = LoopTimeline(asyncio.get_running_loop())
         async with AirClient(config.air_socket, config.name, timeline) as air:
@@ -112,9 +84,9 @@ def _simulated(config: SimulatedRadioConfig, settings: LoRaSettings, clock: Cloc
             radio = SX127x(SimulatedHal(chip), clock, allow_20_dbm=config.allow_20_dbm)
             try:
                 await radio.start(settings)
-                # Without its air the radio would be deaf for ever and not know it.
+                # If the air server ends, the radio would receive nothing for ever without an error.
                 async with asyncio.TaskGroup() as group:
-                    losing = group.create_task(air.wait_lost())
+                    losing = group.create_task(air.wait_disconnected())
                     yield radio
                     losing.cancel()
             except ExceptionGroup as errors:

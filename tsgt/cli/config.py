@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
 
-from tsgt.cli.options import json_option
+from tsgt.cli.composition import radio_key
+from tsgt.cli.options import json_option, path_type
 from tsgt.cli.output import print_json
 from tsgt.config import (
     KINDS,
@@ -21,8 +21,9 @@ from tsgt.config import (
     ScenarioConfig,
     StationFramesFile,
     SuperframeConfig,
+    check_permissions,
+    find_problems,
     json_schema,
-    load_any,
     parameters,
     scenario_parameters,
 )
@@ -31,51 +32,113 @@ from tsgt.geometry import check_layout
 from tsgt.model import Parameters, PrismPosition
 from tsgt.radio.from_config import lora_settings
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+USAGE_ERROR = 2
+
 
 @click.group("config")
 def config() -> None:
-    """Check configuration and set-up files, and describe what may stand in them."""
+    """Check configuration and set-up files."""
 
 
 @config.command()
-@click.argument("file", type=click.Path(path_type=Path))
+@click.argument("files", type=path_type, nargs=-1, required=True, metavar="FILE...")
 @json_option
-def check(file: Path, as_json: bool) -> None:  # noqa: FBT001 (click passes options by name)
-    """Check FILE, of whatever kind it is, together with the files that it names."""
-    content = load_any(file)
-    summary = {
-        "kind": next(kind for kind, model in KINDS.items() if type(content) is model),
-        **_summary(file, content),
-    }
+def check(*, files: tuple[Path, ...], as_json: bool) -> int:
+    """Check files as a daemon does when it starts.
+
+    FILE is a configuration, a set-up file or a scenario; the files that it names are checked as well. All problems of
+    all files are reported. Run it as the user of the daemon, who alone may read the key.
+
+    Exit code 2: a daemon would not start. --json prints "ok" and, under "files", a list with "file", "ok", "errors"
+    and a summary of each file.
+    """
+    reports = [_report(file) for file in files]
+    ok = all(report["ok"] for report in reports)
     if as_json:
-        print_json({"file": str(file), **summary})
-        return
-    for key, value in summary.items():
-        click.echo(f"{key.replace('_', ' '):16}{_text(value)}")
+        print_json({"ok": ok, "files": reports})
+    for report in reports:
+        if not as_json and report["ok"]:
+            _print(report, heading=len(files) > 1)
+        for problem in report["errors"]:
+            click.echo(f"error: {problem}", err=True)
+    return 0 if ok else USAGE_ERROR
 
 
 @config.command()
-@click.option("--kind", type=click.Choice(list(KINDS)), help="Only this kind of file; else all of them.")
+@click.option("--kind", type=click.Choice(list(KINDS)), help="Kind of file.  [default: all]")
 def schema(kind: str | None) -> None:
-    """Print the JSON Schema of configuration and set-up files."""
+    """Print the JSON Schema of configuration files."""
     click.echo(json.dumps(json_schema(kind), indent=2))
 
 
-def _summary(file: Path, content: Model) -> dict[str, Any]:
-    """Say what the file comes to, after the checks that need more than the file itself."""
+def _report(file: Path) -> dict[str, Any]:
+    content, problems = find_problems(file)
+    summary: dict[str, Any] = {}
+    if content is not None:
+        summary["kind"] = next(kind for kind, model in KINDS.items() if type(content) is model)
+        problems = _problems_at_start(file, content)
+        if not problems:
+            summary |= _summary(content)
+    errors = list(dict.fromkeys(str(problem) for problem in problems))
+    return {"file": str(file), "ok": not errors, "errors": errors, **summary}
+
+
+def _problems_at_start(file: Path, content: Model) -> list[ConfigError]:
+    """Return what keeps a daemon from starting although the file itself is valid."""
+    problems: list[ConfigError] = []
+
+    def attempt(step: Callable[..., object], *arguments: Any) -> None:
+        try:
+            step(*arguments)
+        except ConfigError as problem:
+            problems.append(problem)
+
+    if not isinstance(content, ScenarioConfig):
+        attempt(check_permissions, file)
+    if isinstance(content, ClientConfig | MasterConfig):
+        attempt(lora_settings, content.radio, file)
+        attempt(radio_key, content.protocol)
     match content:
         case MasterConfig():
-            known = parameters(content)
-            lora_settings(content.radio, file)
-            _check_layout(content.setup.prism_layout, known.prisms)
+            before = len(problems)
+            for path in (content.setup.station_frames, content.setup.prism_layout):
+                problems += find_problems(path)[1]
+                attempt(check_permissions, path)
+            if len(problems) == before:
+                attempt(lambda: _check_layout(content.setup.prism_layout, parameters(content).prisms))
+        case ScenarioConfig():
+            attempt(_check_layout, file, scenario_parameters(content).prisms)
+        case PrismLayoutFile():
+            prisms = [
+                PrismPosition(prism=int(number), position_m=entry.position_m)
+                for number, entry in content.prisms.items()
+            ]
+            attempt(_check_layout, file, tuple(prisms))
+    return problems
+
+
+def _check_layout(path: Path, prisms: tuple[PrismPosition, ...]) -> None:
+    names = [prism.prism for prism in prisms]
+    try:
+        check_layout(np.array([prism.position_m for prism in prisms]).reshape(-1, 3), names=names)
+    except GeometryError as error:
+        raise ConfigError(f"{path}: prisms: {error}", path=path, key="prisms") from error
+
+
+def _summary(content: Model) -> dict[str, Any]:
+    match content:
+        case MasterConfig():
             return {
-                **_numbers(known),
+                **_numbers(parameters(content)),
                 **_protocol(content.protocol),
                 "socket": str(content.stream.socket),
                 "recordings": str(content.recording.directory),
             }
         case ClientConfig():
-            lora_settings(content.radio, file)
             return {
                 "station": content.station,
                 "prism": content.prism,
@@ -86,29 +149,23 @@ def _summary(file: Path, content: Model) -> dict[str, Any]:
             }
         case ScenarioConfig():
             known = scenario_parameters(content)
-            _check_layout(file, known.prisms)
             return {**_numbers(known), "name": content.name, "duration_s": content.duration_s}
         case PrismLayoutFile():
-            prisms = tuple(
-                PrismPosition(prism=int(number), position_m=entry.position_m)
-                for number, entry in content.prisms.items()
-            )
-            _check_layout(file, prisms)
-            return {"prisms": [prism.prism for prism in prisms]}
+            return {"prisms": [int(number) for number in content.prisms]}
         case StationFramesFile():
             return {"stations": [int(number) for number in content.stations]}
     raise TypeError(f"no summary for {type(content).__name__}")
 
 
 def _protocol(protocol: ClassicConfig | SuperframeConfig) -> dict[str, Any]:
-    """Name protocol and key. The key itself is its user's alone, so that who checks may not be able to read it."""
-    said: dict[str, Any] = {"protocol": protocol.kind}
-    if isinstance(protocol, SuperframeConfig):
-        key = protocol.key_file
-        said["key"] = "none, anybody can take part" if key is None else str(key)
-        if key is not None and not key.exists():
-            said["key"] += " (there is no such file; `tsgt radio key` makes one)"
-    return said
+    if not isinstance(protocol, SuperframeConfig):
+        return {"protocol": protocol.kind}
+    key = (
+        "none, unauthenticated: anybody can take part"
+        if protocol.key_file is None
+        else str(protocol.key_file)
+    )
+    return {"protocol": protocol.kind, "key": key}
 
 
 def _numbers(known: Parameters) -> dict[str, Any]:
@@ -120,13 +177,10 @@ def _numbers(known: Parameters) -> dict[str, Any]:
     }
 
 
-def _check_layout(path: Path, prisms: tuple[PrismPosition, ...]) -> None:
-    names = [prism.prism for prism in prisms]
-    try:
-        check_layout(np.array([prism.position_m for prism in prisms]).reshape(-1, 3), names=names)
-    except GeometryError as error:
-        raise ConfigError(f"{path}: prisms: {error}", path=path, key="prisms") from error
-
-
-def _text(value: object) -> str:
-    return ", ".join(str(item) for item in value) if isinstance(value, list) else str(value)
+def _print(report: dict[str, Any], *, heading: bool) -> None:
+    if heading:
+        click.echo(f"# {report['file']}")
+    for key, value in report.items():
+        if key not in ("file", "ok", "errors"):
+            text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+            click.echo(f"{key.replace('_', ' '):16}{text}")

@@ -1,4 +1,4 @@
-"""The command ``doctor``, which tells whether this machine is ready for the field."""
+"""The command ``doctor``: checks whether this machine is ready for the field."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from tsgt.doctor import (
     Machine,
     Outcome,
     current_user,
-    examine,
     find_user,
     free_bytes,
     group_name,
+    run_checks,
     run_command,
 )
 from tsgt.log import configure_logging
@@ -32,56 +32,55 @@ if TYPE_CHECKING:
     from tsgt.station import ClientStatus
     from tsgt.station.serial import OpenPort, Port
 
-USUAL = (Path("/etc/tsgt/client.toml"), Path("/etc/tsgt/master.toml"))
+DEFAULT_CONFIGS = (Path("/etc/tsgt/client.toml"), Path("/etc/tsgt/master.toml"))
 
-WORDS = {Outcome.OK: "ok", Outcome.NOTE: "note", Outcome.FAILED: "FAILED", Outcome.SKIPPED: "skipped"}
+LABELS = {Outcome.OK: "ok", Outcome.NOTE: "note", Outcome.FAILED: "FAILED", Outcome.SKIPPED: "skipped"}
 
 
 @click.command()
 @click.argument("config", type=path_type, required=False)
 @json_option
-def doctor(config: Path | None, as_json: bool) -> int:  # noqa: FBT001 (click passes options by name)
-    """Check this machine before it goes into the field: a station's client or the master.
+def doctor(*, config: Path | None, as_json: bool) -> int:
+    """Check that this machine is ready for the field.
 
-    CONFIG is its configuration; without it /etc/tsgt/client.toml or /etc/tsgt/master.toml. A daemon may run meanwhile:
-    what it has in use is left alone then. Nothing is changed and nothing is sent. With sudo more can be looked at.
+    CONFIG is the configuration of a client or a master; default: /etc/tsgt/client.toml or /etc/tsgt/master.toml. What
+    a running daemon uses is left alone. Nothing is changed and nothing is transmitted. With sudo more can be checked.
 
-    Exit code 3: a check failed. What is only noted, or could not be checked, fails nothing.
+    Exit code 3: a check failed. Notes and skipped checks do not fail.
     """
-    configure_logging("error")  # the findings say it all
-    path = config or _usual_config()
+    configure_logging("error")  # the findings say everything
+    path = config or _default_config()
     findings = service.run(lambda: _report(this_machine(), path, quiet=as_json))
-    bad = [finding.name for finding in findings if finding.ok is False]
+    failures = [finding.name for finding in findings if finding.ok is False]
     if as_json:
         checks = {
             finding.name: {"ok": finding.ok, "outcome": str(finding.outcome), "detail": finding.detail}
             for finding in findings
         }
-        print_json({"config": str(path), "ok": not bad, "checks": checks})
+        print_json({"config": str(path), "ok": not failures, "checks": checks})
     else:
         made = sum(finding.ok is not None for finding in findings)
-        click.echo(f"{len(bad)} of {made} checks failed" if bad else f"all {made} checks passed")
-    return CHECK_FAILED if bad else 0
+        click.echo(f"{len(failures)} of {made} checks failed" if failures else f"all {made} checks passed")
+    return CHECK_FAILED if failures else 0
 
 
 async def _report(machine: Machine, path: Path, *, quiet: bool) -> list[Finding]:
     found = []
-    async with aclosing(examine(machine, path)) as findings:
+    async with aclosing(run_checks(machine, path)) as findings:
         async for finding in findings:
             found.append(finding)
             if not quiet:
-                word = click.style(
-                    f"{WORDS[finding.outcome]:7}", bold=finding.ok is False, reverse=finding.ok is False
-                )
-                click.echo(f"{word} {finding.name.replace('_', ' '):17}{finding.detail}")
+                failed = finding.ok is False
+                label = click.style(f"{LABELS[finding.outcome]:7}", bold=failed, reverse=failed)
+                click.echo(f"{label} {finding.name.replace('_', ' '):17}{finding.detail}")
     return found
 
 
-def _usual_config() -> Path:
-    there = [path for path in USUAL if path.exists()]
-    if len(there) > 1:
-        raise click.UsageError(f"there are {' and '.join(map(str, there))}: name the one to check")
-    return there[0] if there else USUAL[0]
+def _default_config() -> Path:
+    existing = [path for path in DEFAULT_CONFIGS if path.exists()]
+    if len(existing) > 1:
+        raise click.UsageError(f"{' and '.join(map(str, existing))} exist; give the one to check")
+    return existing[0] if existing else DEFAULT_CONFIGS[0]
 
 
 def this_machine() -> Machine:
@@ -119,13 +118,13 @@ def this_machine() -> Machine:
         open_port=open_port,
         open_hal=open_hal,
         client_status=_client_status,
-        serves=_serves,
+        serves=_is_served,
     )
 
 
 def _client_status(path: Path) -> ClientStatus | None:
-    """Ask the client behind a socket; None where nobody serves it."""
-    if not _serves(path):
+    """Request the status of a client; None if its socket is not served."""
+    if not _is_served(path):
         return None
     from tsgt.cli.status import status_of
     from tsgt.station import ClientStatus
@@ -134,13 +133,13 @@ def _client_status(path: Path) -> ClientStatus | None:
     return record if isinstance(record, ClientStatus) else None
 
 
-def _serves(path: Path) -> bool:
-    """Whether somebody listens on a UNIX socket."""
+def _is_served(path: Path) -> bool:
+    """Whether a process listens on a UNIX socket."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         try:
             probe.connect(str(path))
-        except BlockingIOError:  # so many wait there
+        except BlockingIOError:  # its queue of connections is full
             return True
         except OSError:
             return False

@@ -12,8 +12,10 @@ import click
 from tsgt.analysis.evaluation import read_tum
 from tsgt.analysis.formats import measurement_csv, messages, pose_csv, tum_lines, valid_records, write_mcap
 from tsgt.analysis.processing import process
-from tsgt.cli.options import keep_going_option, path_type, recording_argument
-from tsgt.cli.recordings import TUNING, load, progress, refuse_to_replace, report_problem, write_lines
+from tsgt.cli.options import keep_going_option, path_type, recording_argument, unknown_suffix
+from tsgt.cli.output import refuse_overwrite, report_problem, require_extra
+from tsgt.cli.progress import TUNING, progress
+from tsgt.cli.recordings import load, write_lines
 from tsgt.errors import CorruptLineError, RecordingError
 from tsgt.recording import PoseRecord, decode_line, read_lines, write_atomically
 
@@ -24,67 +26,77 @@ if TYPE_CHECKING:
 
 STDOUT = Path("-")
 
+FORMATS = {".tum": "tum", ".csv": "csv", ".mcap": "mcap"}
+
 
 @click.command()
 @recording_argument
 @click.option(
     "--format",
     "format_name",
-    type=click.Choice(["tum", "csv", "mcap"]),
-    required=True,
-    help="TUM for evo, CSV for spreadsheets, MCAP (ROS 2 messages) for Foxglove and bag readers.",
+    type=click.Choice(list(FORMATS.values())),
+    help="TUM for evo, CSV for spreadsheets, MCAP (ROS 2 messages) for Foxglove and bag readers.  "
+    "[default: from the suffix of --output]",
 )
 @click.option(
     "--records",
     type=click.Choice(["poses", "measurements"]),
     default="poses",
     show_default=True,
-    help="What a CSV file holds; TUM holds poses, MCAP poses and prism positions.",
+    help="Content of a CSV file. TUM contains poses, MCAP poses and prism positions.",
 )
 @click.option(
     "--kind",
     type=click.Choice(["interpolated", "predicted", "smoothed"]),
-    help="Which poses of a recording that holds several.  [default: all but predicted ones]",
+    help="Kind of poses, if a recording contains several.  [default: all but predicted]",
 )
 @click.option(
     "--reference",
     "reference_path",
     type=path_type,
-    help="MCAP only: a trajectory to look at beside the poses; TUM, of the robot's frame in the frame of station 1.",
+    help="Reference trajectory to add to an MCAP file: TUM, of the robot frame in the frame of station 1.",
 )
 @click.option(
     "--output",
     type=click.Path(path_type=Path, allow_dash=True),
     default=STDOUT,
-    help="File to write.  [default: stdout; MCAP needs a file]",
+    help="File to write: .tum, .csv or .mcap.  [default: stdout, except for MCAP]",
 )
 @keep_going_option
 def export(
     *,
     recording: Path,
-    format_name: str,
+    format_name: str | None,
     records: str,
     kind: Kind | None,
     reference_path: Path | None,
     output: Path,
     keep_going: bool,
 ) -> None:
-    """Write the poses or measurements of RECORDING for other programs.
+    """Convert a recording to TUM, CSV or MCAP.
 
-    Poses are those that stand in the recording as they were streamed or processed; a recording without any is
-    processed first. Of each epoch that was both predicted and smoothed, the smoothed pose is taken. TUM and MCAP get
-    the valid poses, CSV all of them with the reason.
+    Exports the poses of the recording; a recording without poses is processed first. If an epoch has a predicted and
+    a smoothed pose, the smoothed one is exported. TUM and MCAP contain valid poses only, CSV all poses with the reason
+    why one is invalid.
     """
+    if format_name is None:
+        if output == STDOUT:
+            raise click.UsageError("give --format, or --output with a suffix that selects it")
+        if output.suffix not in FORMATS:
+            raise click.UsageError(unknown_suffix(output, tuple(FORMATS)))
+        format_name = FORMATS[output.suffix]
     if records == "measurements" and format_name != "csv":
         raise click.UsageError(
-            "TUM holds poses only, MCAP poses and prism positions; export raw measurements with --format csv"
+            "TUM contains poses only, MCAP poses and prism positions; export raw measurements with --format csv"
         )
     if reference_path is not None and format_name != "mcap":
-        raise click.UsageError("--reference is for --format mcap; tsgt evaluate --reference compares")
-    if output == STDOUT and format_name == "mcap":
-        raise click.UsageError("an MCAP file is not for the terminal; give --output FILE")
+        raise click.UsageError("--reference needs --format mcap; `tsgt evaluate --reference` compares")
+    if format_name == "mcap":
+        if output == STDOUT:
+            raise click.UsageError("MCAP is binary and is not written to stdout; give --output FILE")
+        require_extra("MCAP files", "mcap.writer", "rosbags.typesys", extra="mcap")
     if output != STDOUT:
-        refuse_to_replace([recording, reference_path], output)
+        refuse_overwrite([recording, reference_path], output)
     if format_name == "mcap":
         reference = None if reference_path is None else read_tum(reference_path)
         loaded = load(recording, keep_going=keep_going)
@@ -107,13 +119,13 @@ def export(
 def _poses_of(
     path: Path, kind: Kind | None, *, keep_going: bool, quiet: bool = False, loaded: Recording | None = None
 ) -> Iterator[PoseRecord]:
-    """Yield the poses as they stand in a recording; where it has none, those that its measurements give.
+    """Yield the poses of a recording; if it has none, compute them.
 
-    No bar is shown when ``quiet``: it would stand among the lines on the terminal. Of what is ``loaded`` already, the
-    user has been told what could not be read.
+    ``quiet`` suppresses the progress bar, which would mix with lines on the terminal. Problems of a recording that is
+    ``loaded`` have been reported already.
     """
     found = False
-    for pose in _recorded_poses(path, keep_going=keep_going, quiet=quiet, told=loaded is not None):
+    for pose in _recorded_poses(path, keep_going=keep_going, quiet=quiet, reported=loaded is not None):
         if pose.kind != "predicted" if kind is None else pose.kind == kind:
             found = True
             yield pose
@@ -121,7 +133,7 @@ def _poses_of(
         return
     if kind is not None:
         raise RecordingError(
-            f"holds no {kind} poses; leave --kind out to take or compute what there is", path=path
+            f"holds no {kind} poses; omit --kind to export or compute other poses", path=path
         )
     click.echo(f"{path} holds no poses; processing its measurements", err=True)
     with progress("fitting", first=TUNING) as on_progress:
@@ -129,8 +141,8 @@ def _poses_of(
     yield from batch.records()
 
 
-def _recorded_poses(path: Path, *, keep_going: bool, quiet: bool, told: bool) -> Iterator[PoseRecord]:
-    on_problem = None if told else report_problem
+def _recorded_poses(path: Path, *, keep_going: bool, quiet: bool, reported: bool) -> Iterator[PoseRecord]:
+    on_problem = None if reported else report_problem
     done_bytes = 0
     with nullcontext() if quiet else progress("exporting") as on_progress:
         for line in read_lines(path, keep_going=keep_going, on_problem=on_problem):

@@ -1,116 +1,115 @@
-"""The command ``import``. A module of its own: what solves station frames is slow to load."""
+"""The command ``import``."""
 
 from __future__ import annotations
 
 from collections import Counter
+from itertools import chain
 from typing import TYPE_CHECKING
 
 import click
 
-from tsgt.analysis.formats import check_tracks, read_polar_tracks, read_prisms, read_tracks, station_prisms
-from tsgt.analysis.processing import with_frames, with_latencies, with_targets
-from tsgt.analysis.rts_import import point_measurements, polar_measurements, stations_from_targets
-from tsgt.cli.options import constant_type, finite, json_option, path_type
-from tsgt.cli.output import print_json
-from tsgt.cli.recordings import refuse_to_replace, write_recording
-from tsgt.config import load_station_frames, load_station_latencies, load_target_residuals
+from tsgt.analysis.formats import (
+    check_tracks,
+    read_partial_target_file,
+    read_polar_tracks,
+    read_prisms,
+    read_tracks,
+    tracked_prisms,
+)
+from tsgt.analysis.rts_import import (
+    DEFAULT_TRACKED_PRISMS,
+    point_measurements,
+    polar_measurements,
+    stations_from_targets,
+)
+from tsgt.cli.options import (
+    RECORDING_SUFFIXES,
+    OutputFile,
+    PathsOption,
+    constant_m,
+    constant_option,
+    json_option,
+    path_type,
+)
+from tsgt.cli.output import print_json, refuse_overwrite
+from tsgt.cli.recordings import with_calibration, write_recording
 from tsgt.model import Parameters, StationParameters
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from tsgt.analysis.rts_import import SolvedStations
     from tsgt.model import Measurement
 
-
-def _three_files(
-    _context: click.Context, _parameter: click.Parameter, value: tuple[Path, Path, Path]
-) -> tuple[Path, Path, Path]:
-    """Refuse options among the files: click takes the next three words, whatever they are."""
-    for path in value:
-        if str(path).startswith("--"):
-            raise click.BadParameter(
-                f"takes three files, one after the other, but {path} stands between them"
-            )
-    return value
+PRISM_CONSTANT = "--prism-constant-mm"
+TARGET_CONSTANT = "--target-constant-mm"
 
 
 @click.group("import")
 def import_group() -> None:
-    """Bring other people's data into a recording."""
+    """Convert other formats to a recording."""
 
 
-target_constant_option = click.option(
-    "--target-constant-mm",
-    type=constant_type,
-    callback=finite,
-    default=10.0,
-    show_default=True,
-    help="Added to the distances of the targets.",
+prisms_option = click.option(
+    "--prisms",
+    type=path_type,
+    required=True,
+    help="Prism layout (set-up file), or the authors' sensor_positions.csv.",
+)
+targets_option = click.option(
+    "--targets", type=path_type, help="Targets of the same day, from which the station frames are solved."
+)
+target_constant_option = constant_option(
+    TARGET_CONSTANT, "Constant added to the distances of targets, required if their file has none."
 )
 output_option = click.option(
-    "--output", type=path_type, required=True, help="The recording to write; replaced if it exists."
+    "--output",
+    type=OutputFile(*RECORDING_SUFFIXES),
+    required=True,
+    help="Recording to write (.jsonl); replaced if it exists.",
 )
 
 
 @import_group.command("rts")
-@click.option(
-    "--tracks",
-    type=path_type,
-    nargs=3,
-    required=True,
-    callback=_three_files,
-    help="Published tracks of prisms 1, 2 and 3.",
-)
-@click.option(
-    "--prisms",
-    type=path_type,
-    required=True,
-    help="The authors' sensor_positions.csv, or a prism layout (.toml).",
-)
-@click.option(
-    "--targets", type=path_type, help="Targets of the same day: solve the stations, go back to raw angles."
-)
+@click.option("--tracks", cls=PathsOption, required=True, help="Published tracks of prisms 1, 2 and 3.")
+@prisms_option
+@targets_option
 @target_constant_option
-@click.option(
-    "--prism-constant-mm",
-    type=constant_type,
-    callback=finite,
-    default=10.0,
-    show_default=True,
-    help="Taken off the distances to the prisms on the way back to raw measurements.",
+@constant_option(
+    PRISM_CONSTANT,
+    "Constant subtracted from the distances to the prisms to obtain raw measurements, required with --targets.",
 )
 @output_option
 @json_option
 def import_rts(
     *,
-    tracks: tuple[Path, Path, Path],
+    tracks: tuple[Path, ...],
     prisms: Path,
     targets: Path | None,
-    target_constant_mm: float,
-    prism_constant_mm: float,
+    target_constant_mm: float | None,
+    prism_constant_mm: float | None,
     output: Path,
     as_json: bool,
 ) -> None:
-    """Import the tracks that the authors of the founding paper published.
+    """Import the published tracks of the paper.
 
-    A track is a text file with Unix time (s) and x, y, z (m) in the frame of station 1, separated by spaces. With
-    the day's targets each point is taken back to the angles and the distance that its station measured; without
-    them the points are recorded as they are.
+    A track is a text file with Unix time (s) and x, y, z (m) in the frame of station 1, separated by spaces. With the
+    targets of the day each point is converted back to the angles and the distance that its station measured; without
+    them the points are recorded.
     """
+    if len(tracks) != len(DEFAULT_TRACKED_PRISMS):
+        raise click.UsageError(
+            f"--tracks takes {len(DEFAULT_TRACKED_PRISMS)} files, one per prism; got {len(tracks)}"
+        )
     sources = [*tracks, prisms, *([targets] if targets else [])]
-    refuse_to_replace(sources, output)
-    published = read_tracks(tracks)
+    refuse_overwrite(sources, output)
+    published = read_tracks((tracks[0], tracks[1], tracks[2]))
     layout = read_prisms(prisms)
     if targets is None:
         stations = tuple(StationParameters(station=k, prism=k) for k in (1, 2, 3))
         measurements = point_measurements(published)
     else:
-        solved = stations_from_targets(
-            targets, target_constant_m=target_constant_mm / 1e3, prism_constant_m=prism_constant_mm / 1e3
-        )
-        stations = _told(solved)
+        stations = _solved_stations(targets, target_constant_mm, prism_constant_mm, DEFAULT_TRACKED_PRISMS)
         measurements = polar_measurements(published, stations)
     write_recording(
         output,
@@ -118,33 +117,22 @@ def import_rts(
         parameters=Parameters(stations=stations, prisms=layout),
         records=measurements,
     )
-    _tell(output, measurements, as_json=as_json)
+    _print_summary(output, measurements, as_json=as_json)
 
 
 @import_group.command("polar")
 @click.option(
     "--tracks",
-    type=path_type,
-    multiple=True,
+    cls=PathsOption,
     required=True,
-    help="CSV of raw measurements; once for a file of all stations, or once for each.",
+    help="CSV files of raw measurements: one for all stations, or one each.",
 )
-@click.option(
-    "--prisms",
-    type=path_type,
-    required=True,
-    help="A prism layout (.toml), or the authors' sensor_positions.csv.",
-)
-@click.option("--frames", type=path_type, help="Where the stations stand (set-up file).")
-@click.option("--targets", type=path_type, help="Targets of the same day instead: solve the stations.")
+@prisms_option
+@click.option("--frames", type=path_type, help="Station frames (set-up file).")
+@targets_option
 @target_constant_option
-@click.option(
-    "--prism-constant-mm",
-    type=constant_type,
-    callback=finite,
-    default=0.0,
-    show_default=True,
-    help="What the distances to the prisms lack: added to them whenever poses are computed.",
+@constant_option(
+    PRISM_CONSTANT, "Constant added to the distances to the prisms when poses are computed.", required=True
 )
 @output_option
 @json_option
@@ -154,67 +142,77 @@ def import_polar(
     prisms: Path,
     frames: Path | None,
     targets: Path | None,
-    target_constant_mm: float,
+    target_constant_mm: float | None,
     prism_constant_mm: float,
     output: Path,
     as_json: bool,
 ) -> None:
-    """Import raw measurements of total stations: time, horizontal angle, zenith angle, slope distance.
+    """Import raw measurements of total stations.
 
-    A track is a CSV file whose first line names the columns, with their units: those of `tsgt export --format csv
-    --records measurements`, or fewer. Needed are stamp_ns or time_s (Unix time), horizontal_angle_rad, _deg or _gon,
-    zenith_angle_rad, _deg or _gon, and slope_distance_m. Without a column station the first file is that of station 1, and
-    so on; without a column prism each station tracks the prism of its own number.
+    A track is a CSV file whose header names the columns with their units, as written by `tsgt export --format csv
+    --records measurements`. Required are stamp_ns or time_s (Unix time), horizontal_angle_rad, _deg or _gon,
+    zenith_angle_rad, _deg or _gon, and slope_distance_m. Without a column station the first file is that of station 1,
+    and so on; without a column prism each station tracks the prism of its own number.
     """
     if (frames is None) == (targets is None):
-        raise click.UsageError("where the stations stand has to be known: give --frames or --targets")
+        raise click.UsageError("the station frames are unknown: give --frames or --targets")
     sources = [*tracks, prisms, *(path for path in (frames, targets) if path is not None)]
-    refuse_to_replace(sources, output)
+    refuse_overwrite(sources, output)
     measurements = read_polar_tracks(tracks)
     check_tracks(measurements, tracks)
-    tracked = station_prisms(measurements)
+    tracked = tracked_prisms(measurements)
     layout = read_prisms(prisms, sorted({m.prism for m in measurements}))
-    constant_m = prism_constant_mm / 1e3
     if targets is not None:
-        solved = stations_from_targets(
-            targets,
-            target_constant_m=target_constant_mm / 1e3,
-            prism_constant_m=constant_m,
-            tracked=tracked,
-        )
-        parameters = Parameters(stations=_told(solved), prisms=layout)
+        solved = _solved_stations(targets, target_constant_mm, prism_constant_mm, tracked)
+        parameters = Parameters(stations=solved, prisms=layout)
     else:
         assert frames is not None  # noqa: S101 (one of them is given)
+        constant = prism_constant_mm / 1e3
         stations = (
-            StationParameters(station=k, prism=p, prism_constant_m=constant_m) for k, p in tracked.items()
+            StationParameters(station=k, prism=p, prism_constant_m=constant) for k, p in tracked.items()
         )
-        parameters = Parameters(stations=tuple(stations), prisms=layout)
-        parameters = with_frames(parameters, load_station_frames(frames), path=frames)
-        parameters = with_latencies(parameters, load_station_latencies(frames))
-        parameters = with_targets(parameters, load_target_residuals(frames))
+        parameters = with_calibration(Parameters(stations=tuple(stations), prisms=layout), frames)
     write_recording(
         output,
         source=f"import polar: {' '.join(path.name for path in sources)}",
         parameters=parameters,
         records=measurements,
     )
-    _tell(output, measurements, as_json=as_json)
+    _print_summary(output, measurements, as_json=as_json)
 
 
-def _told(solved: SolvedStations) -> tuple[StationParameters, ...]:
-    """Take the solved stations, and say what the user should know of the targets."""
+def _solved_stations(
+    targets: Path,
+    target_constant_mm: float | None,
+    prism_constant_mm: float | None,
+    tracked: Mapping[int, int],
+) -> tuple[StationParameters, ...]:
+    """Solve the station frames from targets, and print notes on them."""
+    if prism_constant_mm is None:
+        raise click.UsageError(
+            f"--targets needs {PRISM_CONSTANT}: what the instruments had to add to the distances to the prisms"
+        )
+    measured = read_partial_target_file(targets)
+    sights = (
+        sight for seen in measured.measurements.values() for sight in chain.from_iterable(seen.values())
+    )
+    solved = stations_from_targets(
+        targets,
+        target_constant_m=constant_m(TARGET_CONSTANT, target_constant_mm, sights, targets),
+        prism_constant_m=prism_constant_mm / 1e3,
+        tracked=tracked,
+    )
     for note in solved.notes:
         click.echo(f"note: {note}", err=True)
     return solved.stations
 
 
-def _tell(output: Path, measurements: Sequence[Measurement], *, as_json: bool) -> None:
-    """Say what has been imported."""
+def _print_summary(output: Path, measurements: Sequence[Measurement], *, as_json: bool) -> None:
     stamps = [m.stamp_ns for m in measurements]
     duration_s = (max(stamps) - min(stamps)) / 1e9
     per_station = dict(sorted(Counter(m.station for m in measurements).items()))
     if as_json:
         print_json({"measurements": len(measurements), "duration_s": duration_s, "stations": per_station})
         return
-    counts = ", ".join(f"{n} of station {k}" for k, n in per_station.items())
+    counts = ", ".join(f"station {k}: {n}" for k, n in per_station.items())
     click.echo(f"{output}: {len(measurements)} measurements ({counts}) over {duration_s:.1f} s")

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
-import socket
-from typing import TYPE_CHECKING
+import math
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from tsgt import service
-from tsgt.cli.options import a_number, keep_going_option, recording_argument, socket_option
-from tsgt.cli.output import harmless
-from tsgt.cli.recordings import report_problem
+from tsgt.cli.line_reader import connect
+from tsgt.cli.options import keep_going_option, recording_argument, socket_option
+from tsgt.cli.output import printable, report_problem
 from tsgt.cli.render import render
 from tsgt.clock import SystemClock
 from tsgt.errors import RecordingError, StreamError
-from tsgt.master import StreamServer
-from tsgt.recording import MAX_LINE_BYTES, HelloRecord, Typed, decode, encode_line
+from tsgt.master.stream_server import StreamServer
+from tsgt.recording import HelloRecord, Typed, decode, encode_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -26,10 +25,13 @@ if TYPE_CHECKING:
 
 @click.command()
 @socket_option
-@click.option("--json", "as_json", is_flag=True, help="Print the lines as they come, one JSON object each.")
-@click.option("--count", type=click.IntRange(min=1), help="Stop after so many lines.")
+@click.option("--json", "as_json", is_flag=True, help="Print the lines as received, one JSON object each.")
+@click.option("--count", type=click.IntRange(min=1), help="Number of lines to print.  [default: all]")
 def listen(socket_path: Path, *, as_json: bool, count: int | None) -> None:
-    """Show the stream, one line each, until it ends."""
+    """Print the pose stream as text.
+
+    Prints one line per record until the stream ends.
+    """
     for line in itertools.islice(_lines(socket_path), count):
         if as_json:
             click.echo(line, nl=False)
@@ -37,10 +39,21 @@ def listen(socket_path: Path, *, as_json: bool, count: int | None) -> None:
         try:
             text = render(decode(Typed, line).type, line)
         except ValueError as error:
-            click.echo(f"a line cannot be shown: {error}", err=True)
+            click.echo(f"warning: unreadable line: {error}", err=True)
         else:
             if text is not None:
-                click.echo(harmless(text))
+                click.echo(printable(text))
+
+
+class _Speed(click.FloatRange):
+    """A factor that may be infinite, but not NaN."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Reject NaN."""
+        speed = float(super().convert(value, param, ctx))
+        if math.isnan(speed):
+            self.fail("nan is not a number", param, ctx)
+        return speed
 
 
 @click.command()
@@ -48,28 +61,24 @@ def listen(socket_path: Path, *, as_json: bool, count: int | None) -> None:
 @socket_option
 @click.option(
     "--speed",
-    type=click.FloatRange(min=0.001),
-    callback=a_number,
+    type=_Speed(min=0.001),
     default=1.0,
     show_default=True,
-    help="Times the pace of the recording; inf: as fast as the readers take it.",
+    help="Factor on the pace of the recording; inf: as fast as the readers receive.",
 )
 @click.option(
-    "--wait/--no-wait",
-    default=True,
-    show_default=True,
-    help="Begin when the first reader is there, or at once.",
+    "--wait/--no-wait", default=True, show_default=True, help="Start when the first reader has connected."
 )
 @keep_going_option
 def replay(recording: Path, *, socket_path: Path, speed: float, wait: bool, keep_going: bool) -> None:
-    """Put a recording through the live pipeline into the socket again.
+    """Stream a recording again.
 
-    Whatever arrived is handed over in the order and at the instants of the recording, so the stream is the same to
-    the last bit, at any speed. A slow reader is waited for.
+    The recorded measurements pass through the live pipeline in their order and at their times of arrival, so that the
+    stream is identical to the last bit at any speed. The replay waits for slow readers.
     """
-    # Only here, so that `tsgt listen` starts without numpy.
-    from tsgt.master import replay as play
-    from tsgt.master import replayed
+    # Imported here, so that `tsgt listen` starts without numpy.
+    from tsgt.master.replay import replay as play
+    from tsgt.master.replay import replayed
 
     arrivals = replayed(recording, keep_going=keep_going, on_problem=report_problem)
     first = next(arrivals, None)
@@ -89,19 +98,20 @@ def replay(recording: Path, *, socket_path: Path, speed: float, wait: bool, keep
 
 
 def _lines(socket_path: Path) -> Iterator[bytes]:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
-        try:
-            connection.connect(str(socket_path))
-        except OSError as error:
-            raise StreamError(
-                f"{socket_path}: no stream there ({error.strerror or error}); start tsgt-master, tsgt demo or "
-                "tsgt replay, or give the right --socket"
-            ) from error
-        # A server that gives up on us, because we were too slow at its end, resets the connection.
-        with connection.makefile("rb") as file, contextlib.suppress(ConnectionResetError):
-            while line := file.readline(MAX_LINE_BYTES):
-                if len(line) == MAX_LINE_BYTES and not line.endswith(b"\n"):
-                    raise StreamError(
-                        f"{socket_path}: what it says is no stream of tsgt: a line is longer than {MAX_LINE_BYTES} bytes"
-                    )
+    connected = False
+    try:
+        with connect(socket_path) as reader:
+            connected = True
+            while line := reader.line():
                 yield line
+    except ConnectionResetError:  # the server closes the connection of a reader that is too slow at the end
+        return
+    except ValueError as error:
+        raise StreamError(f"{socket_path}: not a stream of tsgt: {error}") from error
+    except OSError as error:
+        if connected:
+            raise
+        raise StreamError(
+            f"{socket_path}: no stream ({error.strerror or error}); start tsgt-master, tsgt demo or tsgt replay, or "
+            "give the right --socket"
+        ) from error

@@ -1,4 +1,4 @@
-"""The command ``tsgt``: its sub-commands, loaded when called, and how errors become exit codes.
+"""The command ``tsgt``: its sub-commands, imported on use, and the mapping from errors to exit codes.
 
 Exit codes: 0 done, 1 failed with one line that says why, 2 usage or configuration, 3 ran but a check failed.
 """
@@ -16,44 +16,61 @@ import tsgt
 from tsgt.errors import ConfigError, TsgtError
 from tsgt.log import configure_logging
 
-# Where each command lives. A command's module is imported only when it is called or asked for help, so that
-# `tsgt listen` on a small computer does not load scipy.
-COMMANDS = {
-    "analyse": "tsgt.cli.analyse.group:analyse",
-    "atmosphere": "tsgt.cli.atmosphere:atmosphere",
-    "calibrate": "tsgt.cli.calibrate.group:calibrate",
-    "config": "tsgt.cli.config:config",
-    "demo": "tsgt.cli.simulate.demo:demo",
-    "doctor": "tsgt.cli.doctor:doctor",
-    "evaluate": "tsgt.cli.desk.evaluate:evaluate",
-    "export": "tsgt.cli.exporting:export",
-    "import": "tsgt.cli.importing:import_group",
-    "listen": "tsgt.cli.live:listen",
-    "merge": "tsgt.cli.merge:merge",
-    "process": "tsgt.cli.desk.process:process",
-    "radio": "tsgt.cli.radio.group:radio",
-    "replay": "tsgt.cli.live:replay",
-    "status": "tsgt.cli.status:status",
-    "simulate": "tsgt.cli.simulate.command:simulate_command",
+GROUPS: dict[str, dict[str, tuple[str, str]]] = {
+    "Field": {
+        "doctor": ("doctor:doctor", "Check that this machine is ready for the field."),
+        "config": ("config:config", "Check configuration and set-up files."),
+        "calibrate": ("calibrate.group:calibrate", "Solve station frames, prism layout and latencies."),
+        "status": ("status:status", "Show the status of the daemon on this machine."),
+        "listen": ("live:listen", "Print the pose stream as text."),
+        "atmosphere": ("atmosphere:atmosphere", "Set temperature and pressure of the instrument."),
+    },
+    "Desk": {
+        "import": ("importing:import_group", "Convert other formats to a recording."),
+        "merge": ("merge:merge", "Add the stations' journals to a recording."),
+        "process": ("desk.process:process", "Compute poses from a recording."),
+        "evaluate": ("desk.evaluate:evaluate", "Assess the accuracy of a recording."),
+        "export": ("exporting:export", "Convert a recording to TUM, CSV or MCAP."),
+    },
+    "Planning": {
+        "analyse": ("analyse.group:analyse", "Study layouts, noise and GNSS receivers."),
+        "radio": ("radio.group:radio", "Plan and test the radio channel."),
+    },
+    "Development": {
+        "demo": ("simulate.demo:demo", "Run simulated stations and a master in real time."),
+        "simulate": ("simulate.command:simulate_command", "Simulate a mission in virtual time."),
+        "replay": ("live:replay", "Stream a recording again."),
+    },
 }
+"""By heading of ``tsgt --help``: each command, where it is defined in this package, and its summary.
+
+A module is imported only when its command is called, so that ``tsgt listen`` does not load scipy.
+"""
+
+COMMANDS = {name: entry for commands in GROUPS.values() for name, entry in commands.items()}
 
 
 class LazyGroup(click.Group):
-    """A group whose commands are imported by name when they are needed."""
+    """A group that imports a command by name when it is used."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 (click's signature)
-        """Names of all commands, sorted."""
+        """Return the names of all commands, sorted."""
         return sorted(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002 (as above)
-        """Import one command; None where there is none of that name."""
-        target = COMMANDS.get(cmd_name)
-        if target is None:
+        """Import a command; None for an unknown name."""
+        if cmd_name not in COMMANDS:
             return None
-        module, attribute = target.split(":")
-        command = getattr(importlib.import_module(module), attribute)
+        module, attribute = COMMANDS[cmd_name][0].split(":")
+        command = getattr(importlib.import_module(f"tsgt.cli.{module}"), attribute)
         assert isinstance(command, click.Command)  # noqa: S101 (our own table)
         return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002 (as above)
+        """Write the commands by group, without importing them."""
+        for heading, commands in GROUPS.items():
+            with formatter.section(heading):
+                formatter.write_dl([(name, summary) for name, (_, summary) in commands.items()])
 
 
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"]}
@@ -62,7 +79,7 @@ HELP_OPTIONS = {"help_option_names": ["-h", "--help"]}
 @click.group(cls=LazyGroup, context_settings=HELP_OPTIONS)
 @click.version_option(tsgt.__version__, prog_name="tsgt")
 def cli() -> None:
-    """Outdoor 6-DOF reference poses for robots, from robotic total stations.
+    """Compute outdoor 6-DOF reference poses for robots from robotic total stations.
 
     Results go to stdout, logs to stderr. Exit codes: 0 done, 1 failed (one line says why), 2 usage or
     configuration, 3 ran but a check failed.
@@ -70,7 +87,7 @@ def cli() -> None:
 
 
 def run(command: click.Command, arguments: list[str] | None = None) -> NoReturn:
-    """Run a command and end the process with the exit code that its outcome deserves."""
+    """Run a command and exit with the code of its outcome."""
     configure_logging()
     try:
         result = command.main(args=arguments, standalone_mode=False)
@@ -80,20 +97,17 @@ def run(command: click.Command, arguments: list[str] | None = None) -> NoReturn:
     except click.ClickException as error:
         error.show()
         sys.exit(error.exit_code)
-    except ConfigError as error:
-        click.echo(f"error: {error}", err=True)
-        sys.exit(2)
     except TsgtError as error:
         click.echo(f"error: {error}", err=True)
-        sys.exit(1)
+        sys.exit(2 if isinstance(error, ConfigError) else 1)
     except BrokenPipeError:
-        # The reader of our output went away (`tsgt ... | head`); Python must not complain at exit.
+        # The reader of our output has ended (`tsgt ... | head`); Python would complain at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except OSError as error:
         if error.strerror is None:
             raise
-        click.echo(f"error: {error.filename or 'the output cannot be written'}: {error.strerror}", err=True)
+        click.echo(f"error: {error.filename or 'cannot write the output'}: {error.strerror}", err=True)
         sys.exit(1)
     sys.exit(result if isinstance(result, int) else 0)
 

@@ -1,4 +1,4 @@
-"""The person at the terminal, or a script in their place: questions to stderr, answers from stdin."""
+"""The operator at the terminal, or a script: questions to stderr, replies from stdin."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ STDIN = 0
 
 
 class Operator(Protocol):
-    """Who aims the instruments."""
+    """Aims the instruments."""
 
     async def ask(self, question: str) -> str | None:
-        """Return the answer without blanks around it; None when there will be no more."""
+        """Return the stripped reply; None at the end of the input."""
         ...
 
     def say(self, text: str) -> None:
@@ -26,7 +26,7 @@ class Operator(Protocol):
 
 
 class Terminal:
-    """Reads lines from stdin, also from a pipe or a file, without stopping the event loop."""
+    """Reads lines from stdin, also from a pipe or a file, without blocking the event loop."""
 
     def __init__(self) -> None:
         self._lines: asyncio.Queue[str | None] = asyncio.Queue()
@@ -36,7 +36,7 @@ class Terminal:
         """See :meth:`Operator.ask`."""
         if self._loop is None:
             self._loop = asyncio.get_running_loop()
-            # A daemon thread, as nothing else lets Ctrl-C end the program while it waits for a line.
+            # A daemon thread: only then Ctrl-C ends the program while it waits for a line.
             threading.Thread(target=self._read, args=(self._loop,), name="stdin", daemon=True).start()
         click.echo(f"{question} > ", nl=False, err=True)
         line = await self._lines.get()
@@ -50,11 +50,11 @@ class Terminal:
         click.echo(text, err=True)
 
     def _read(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Hand lines over to the event loop; in the thread."""
+        """Pass lines to the event loop; runs in the thread."""
         rest = b""
         # The event loop may be closed before the input is.
         with suppress(RuntimeError):
-            # Past Python's buffers: a thread that dies with the program while it holds their lock would crash it.
+            # Not through Python's buffers: a thread killed at exit while it holds their lock crashes the program.
             while data := os.read(STDIN, 4096):
                 *lines, rest = (rest + data).split(b"\n")
                 for line in lines:

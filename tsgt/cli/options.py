@@ -1,34 +1,103 @@
-"""Options that several commands share."""
+"""Options and parameter types that several commands share."""
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from click.parser import _OptionParser, _ParsingState
+
+    from tsgt.analysis.formats import TargetMeasurement
 
 DEFAULT_SOCKET = Path("/run/tsgt/poses.sock")
 DEFAULT_CLIENT_SOCKET = Path("/run/tsgt/client.sock")
 
+RECORDING_SUFFIXES = (".jsonl", ".json")
+
 path_type = click.Path(path_type=Path)
 
 
-def finite(_context: click.Context, _parameter: click.Parameter, value: float | None) -> float | None:
-    """Refuse NaN and infinity, which click takes for numbers; for the ``callback`` of an option."""
-    if value is not None and not math.isfinite(value):
-        raise click.BadParameter(f"{value} is not a finite number")
-    return value
+class FiniteRange(click.FloatRange):
+    """A range of finite numbers; click's own range accepts NaN."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Reject NaN and infinity as well as what is out of range."""
+        number = float(super().convert(value, param, ctx))
+        if not math.isfinite(number):
+            self.fail(f"{number} is not a finite number", param, ctx)
+        return number
 
 
-def a_number(_context: click.Context, _parameter: click.Parameter, value: float | None) -> float | None:
-    """Refuse NaN, but not infinity; for the ``callback`` of an option."""
-    if value is not None and math.isnan(value):
-        raise click.BadParameter("nan is not a number")
-    return value
+class OutputFile(click.Path):
+    """A file to write, whose format follows from its suffix; an unknown suffix is a usage error."""
+
+    def __init__(self, *suffixes: str) -> None:
+        super().__init__(path_type=Path)
+        self.suffixes = suffixes
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Check the suffix before any work is done."""
+        path = Path(str(super().convert(value, param, ctx)))
+        if path.suffix not in self.suffixes:
+            self.fail(unknown_suffix(path, self.suffixes), param, ctx)
+        return path
 
 
-constant_type = click.FloatRange(-10_000, 10_000)
-"""For constants of reflectors in mm: no reflector adds ten metres. With ``finite`` for the ``callback``: NaN is in any range."""
+def unknown_suffix(path: Path, known: tuple[str, ...]) -> str:
+    """Return the message for an output file whose suffix selects no format."""
+    problem = f"unknown suffix {path.suffix}" if path.suffix else "no suffix"
+    return f"{path}: {problem}, so the format is unknown; known suffixes: {', '.join(known)}"
+
+
+class PathsOption(click.Option):
+    """An option that takes all following paths, up to the next option; may be repeated."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **{**kwargs, "multiple": True, "type": path_type})
+
+    def add_to_parser(self, parser: _OptionParser, ctx: click.Context) -> None:
+        """Let the option consume more than one argument; click's ``nargs`` is a fixed number."""
+        super().add_to_parser(parser, ctx)
+        for name in self.opts:
+            option = parser._long_opt[name]  # noqa: SLF001 (click has no public way)
+            take_one = option.process
+
+            def take_all(value: Any, state: _ParsingState, take_one: Callable[..., None] = take_one) -> None:
+                take_one(value, state)
+                while state.rargs and not state.rargs[0].startswith("-"):
+                    take_one(state.rargs.pop(0), state)
+
+            option.process = take_all  # type: ignore[method-assign]
+
+
+constant_type = FiniteRange(-10_000, 10_000)
+"""For reflector constants in mm: no reflector adds ten metres."""
+
+
+def constant_option(name: str, text: str, *, required: bool = False) -> Callable[[Any], Any]:
+    """Return an option for a reflector constant in mm. It has no default: a constant changes every result."""
+    return click.option(name, type=constant_type, required=required, help=text)
+
+
+def constant_m(
+    option: str, given_mm: float | None, measurements: Iterable[TargetMeasurement], path: Path
+) -> float:
+    """Return the constant in m of the lines without ``constant_mm``; a usage error if there are some but no option."""
+    if given_mm is None:
+        for measurement in measurements:
+            if measurement.constant_m is None:
+                raise click.UsageError(
+                    f"{path}, line {measurement.line}: has no constant_mm; give {option}, what is added to the distance (0 for foil "
+                    "with most instruments)"
+                )
+    return (given_mm or 0.0) / 1e3
+
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
 
@@ -46,11 +115,11 @@ socket_option = click.option(
 keep_going_option = click.option(
     "--keep-going",
     is_flag=True,
-    help="Skip lines that cannot be read, reporting each, instead of stopping at the first.",
+    help="Report and skip unreadable lines instead of stopping at the first.",
 )
 
 recording_argument = click.argument("recording", type=path_type)
 
 master_config_option = click.option(
-    "--config", "config_path", type=path_type, required=True, help="Configuration of the master, TOML."
+    "--config", "config_path", type=path_type, required=True, help="Configuration of the master (TOML)."
 )

@@ -1,22 +1,31 @@
-"""Results on stdout, as text for people or as JSON for machines."""
+"""Results on stdout as text, tables or JSON, and checks of the files that results go to."""
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
+import sys
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from tsgt.errors import MissingExtraError
+
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
+
+    from tsgt.errors import RecordingError
 
 CHECK_FAILED = 3
 
+_TABLE_WIDTH = 10_000
+"""More than any table needs, so that the layout does not depend on the terminal."""
+
 
 def print_json(data: Mapping[str, Any]) -> None:
-    """Print one JSON object; a number that is not finite becomes null, as JSON has none."""
+    """Print one JSON object; a number that is not finite becomes null."""
     click.echo(json_text(data))
 
 
@@ -25,37 +34,76 @@ def json_text(data: Mapping[str, Any]) -> str:
     return json.dumps(_finite(data), indent=2, allow_nan=False)
 
 
-def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print aligned columns, the first to the left and the others to the right."""
-    widths = [max(len(row[i]) for row in (header, *rows)) for i in range(len(header))]
-    for row in (header, *rows):
-        cells = [
-            row[0].ljust(widths[0]),
-            *(cell.rjust(w) for cell, w in zip(row[1:], widths[1:], strict=True)),
-        ]
-        click.echo("  ".join(cells).rstrip())
-
-
-def harmless(text: str) -> str:
-    """Return a line with text from outside as one that only writes to a terminal and does not steer it."""
-    return "".join(sign if sign.isprintable() else "?" for sign in text)
-
-
 def _finite(value: Any) -> Any:
     if isinstance(value, dict):
         return {str(key): _finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_finite(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a table, the first column aligned left, the others right; plain text unless stdout is a terminal."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for index, title in enumerate(header):
+        table.add_column(title, justify="right" if index else "left", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    console = Console(
+        width=_TABLE_WIDTH,
+        color_system="auto" if sys.stdout.isatty() else None,
+        markup=False,
+        highlight=False,
+        emoji=False,
+    )
+    console.print(table)
+
+
+def numbers(*values: float, digits: int = 2) -> list[str]:
+    """Return table cells; NaN becomes a dash."""
+    return ["-" if math.isnan(value) else f"{value:.{digits}f}" for value in values]
+
+
+def printable(text: str) -> str:
+    """Return text from outside without characters that control a terminal."""
+    return "".join(sign if sign.isprintable() else "?" for sign in text)
+
+
+def report_problem(problem: RecordingError) -> None:
+    """Print a warning about a skipped line."""
+    click.echo(f"warning: {problem}", err=True)
+
+
+def require_extra(purpose: str, *libraries: str, extra: str) -> None:
+    """Check that an optional dependency is installed, before the work that needs it.
+
+    Raises
+    ------
+    MissingExtraError
+        A library cannot be imported.
+    """
+    for library in libraries:
+        try:
+            importlib.import_module(library)
+        except ImportError as error:
+            raise MissingExtraError(purpose, library=library.partition(".")[0], extra=extra) from error
 
 
 def require_new_file(path: Path | None) -> None:
-    """Refuse a file that exists, or whose folder does not: before a long run, not after it."""
+    """Reject an existing file and a missing folder before a long run."""
     if path is None:
         return
     if path.is_file():
         raise click.UsageError(f"{path} exists; choose another file")
     if not path.absolute().parent.is_dir():
-        raise click.UsageError(f"{path}: there is no such folder")
+        raise click.UsageError(f"{path}: no such folder")
+
+
+def refuse_overwrite(inputs: Iterable[Path | None], output: Path | None) -> None:
+    """Reject an output that would replace one of its inputs."""
+    for path in inputs:
+        if path is not None and output is not None and output.resolve() == path.resolve():
+            raise click.UsageError(f"the output would replace its own input {path}; choose another file")

@@ -1,14 +1,9 @@
-"""Writing results from the command line, and telling of what could not be read in them.
-
-What the commands of the desk share: options, reading a recording, summing poses up.
-"""
+"""Recordings on the command line: options, reading with replaced parameters, writing, and summaries of poses."""
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
-import sys
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -24,24 +19,36 @@ from tsgt.analysis.processing import (
     with_targets,
 )
 from tsgt.cli.options import path_type
+from tsgt.cli.output import report_problem
 from tsgt.clock import SystemClock
 from tsgt.config import load_prism_layout, load_station_frames, load_station_latencies, load_target_residuals
 from tsgt.recording import RecordingHeader, encode_line, load_recording, write_atomically
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Iterable
     from pathlib import Path
 
     from tsgt.analysis.processing import Estimator
-    from tsgt.analysis.smoothing import Motion
-    from tsgt.errors import RecordingError
+    from tsgt.analysis.smoothing import MotionModel
     from tsgt.estimation import PoseBatch
     from tsgt.model import Parameters
     from tsgt.recording import Recording
 
+estimator_option = click.option(
+    "--estimator",
+    type=click.Choice(["linear", "continuous"]),
+    help="Linear interpolation between measurements, or one smooth trajectory.  [default: as recorded]",
+)
+frames_option = click.option(
+    "--frames", type=path_type, help="Station frames (set-up file) that replace the recorded ones."
+)
+prisms_option = click.option(
+    "--prisms", type=path_type, help="Prism layout (set-up file) that replaces the recorded one."
+)
+
 
 def write_recording(path: Path, *, source: str, parameters: Parameters, records: Iterable[object]) -> None:
-    """Write a whole recording, or nothing: header, parameters, records in the order given."""
+    """Write header, parameters and records in this order; nothing is written if that fails."""
     header = RecordingHeader(
         software=f"tsgt {tsgt.__version__}", created_ns=SystemClock().realtime_ns(), source=source
     )
@@ -51,34 +58,9 @@ def write_recording(path: Path, *, source: str, parameters: Parameters, records:
 
 
 def write_lines(path: Path, lines: Iterable[str]) -> None:
-    """Write a text, or nothing."""
+    """Write text; nothing is written if that fails."""
     with write_atomically(path) as file:
         file.writelines(line.encode() for line in lines)
-
-
-def report_problem(problem: RecordingError) -> None:
-    """Tell the user of a line that is skipped."""
-    click.echo(f"warning: {problem}", err=True)
-
-
-def refuse_to_replace(inputs: Iterable[Path | None], output: Path | None) -> None:
-    """Refuse to write a result over a file that it is made from; a path that is None was not given."""
-    for path in inputs:
-        if path is not None and output is not None and output.resolve() == path.resolve():
-            raise click.UsageError(f"the output would replace its own input {path}; choose another file")
-
-
-estimator_option = click.option(
-    "--estimator",
-    type=click.Choice(["linear", "continuous"]),
-    help="Straight lines between measurements, or one smooth trajectory through all of them.  [default: as recorded]",
-)
-frames_option = click.option(
-    "--frames", type=path_type, help="Station frames (set-up file) instead of those in the recording."
-)
-prisms_option = click.option(
-    "--prisms", type=path_type, help="Prism layout (set-up file) instead of that in the recording."
-)
 
 
 def load(
@@ -90,7 +72,7 @@ def load(
     frames: Path | None = None,
     prisms: Path | None = None,
 ) -> Recording:
-    """Read a recording, and put what the user gives in place of what was recorded."""
+    """Read a recording and replace the parameters that are given."""
     recording = load_recording(path, keep_going=keep_going, on_problem=report_problem)
     parameters = recording.parameters
     if rate_hz is not None:
@@ -99,48 +81,24 @@ def load(
     if frames is not None:
         if not has_raw_angles(recording.measurements):
             raise click.UsageError(
-                f"{path} holds points in frame station1 only; --frames has nothing to change"
+                f"{path} holds points in the frame of station 1, no raw measurements: --frames has no effect"
             )
-        parameters = with_frames(parameters, load_station_frames(frames), path=frames)
-        parameters = with_latencies(parameters, load_station_latencies(frames))
-        parameters = with_targets(parameters, load_target_residuals(frames))
+        parameters = with_calibration(parameters, frames)
     if prisms is not None:
         parameters = with_layout(parameters, load_prism_layout(prisms), path=prisms)
     recording = dataclasses.replace(recording, parameters=parameters)
     return recording if estimator is None else with_estimator(recording, estimator)
 
 
-TUNING = "finding how the robot moves"
-"""What takes a while before the first share of a fit is known: nobody can say how many steps it will need."""
-
-
-@contextmanager
-def progress(label: str, *, first: str | None = None) -> Iterator[Callable[[float], None] | None]:
-    """Give what shows the share of a long computation that is done, where somebody looks at it.
-
-    Parameters
-    ----------
-    label
-        What is being done.
-    first
-        What is being done until the first share is told, if that is something else.
-    """
-    if not sys.stderr.isatty():
-        yield None
-        return
-    with click.progressbar(length=1000, label=first or label, file=sys.stderr) as bar:
-
-        def show(share: float) -> None:
-            if bar.label != label:
-                bar.label = label
-                bar.render_progress()
-            bar.update(round(1000 * share) - bar.pos)
-
-        yield show
+def with_calibration(parameters: Parameters, frames: Path) -> Parameters:
+    """Return parameters with the frames, latencies and target residuals of a station-frames file."""
+    parameters = with_frames(parameters, load_station_frames(frames), path=frames)
+    parameters = with_latencies(parameters, load_station_latencies(frames))
+    return with_targets(parameters, load_target_residuals(frames))
 
 
 def pose_counts(poses: PoseBatch) -> dict[str, Any]:
-    """Count poses, for ``--json``."""
+    """Return the numbers of poses for ``--json``."""
     return {
         "poses": len(poses),
         "valid_poses": int(np.count_nonzero(poses.valid)),
@@ -149,19 +107,19 @@ def pose_counts(poses: PoseBatch) -> dict[str, Any]:
 
 
 def pose_summary(poses: PoseBatch) -> str:
-    """Count poses, for people."""
+    """Return the numbers of poses as text."""
     counts = pose_counts(poses)
     invalid = "".join(f", {reason} {count}" for reason, count in counts["invalid"].items())
     return f"{counts['valid_poses']} of {counts['poses']} poses valid{invalid}"
 
 
 def duration_s(poses: PoseBatch) -> float:
-    """From the first epoch to the last, in s."""
+    """Return the time from the first to the last epoch in s."""
     return int(poses.stamp_ns[-1] - poses.stamp_ns[0]) / 1e9
 
 
-def motion_keys(motion: Motion) -> dict[str, Any]:
-    """Tell what a trajectory was fitted with, for ``--json``."""
+def motion_keys(motion: MotionModel) -> dict[str, Any]:
+    """Return motion prior and noise scale for ``--json``."""
     return {
         "motion": dataclasses.asdict(motion.prior),
         "noise_scale": motion.noise_scale,
@@ -169,16 +127,15 @@ def motion_keys(motion: Motion) -> dict[str, Any]:
     }
 
 
-def motion_text(motion: Motion) -> str:
-    """Tell people what a trajectory was fitted with: as it stands in a master's configuration."""
-    prior = dataclasses.asdict(motion.prior)
+def motion_text(motion: MotionModel) -> str:
+    """Return motion prior and noise scale as they are written in a master's configuration."""
     values = {
         key: "[" + ", ".join(f"{v:.3g}" for v in value) + "]" if isinstance(value, tuple) else f"{value:.3g}"
-        for key, value in prior.items()
+        for key, value in dataclasses.asdict(motion.prior).items()
     }
-    origin = "found from the measurements" if motion.tuned else "as recorded: too few measurements to tell"
+    origin = "tuned to the measurements" if motion.tuned else "as recorded: too few measurements to tune it"
     lines = [
-        f"How the robot moves, {origin}:",
+        f"Motion prior, {origin}:",
         "  [pipeline]",
         f"  noise_scale = {motion.noise_scale:.3g}",
         "  [pipeline.motion]",

@@ -1,4 +1,4 @@
-"""docs/reference/cli.md, generated from the commands themselves: ``python -m tsgt.cli.reference FILE``."""
+"""Generate docs/reference/cli.md from the commands: ``python -m tsgt.cli.reference FILE``."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Generated from the commands' own `--help` (`make generated`); do not edit.
 
 
 def markdown() -> str:
-    """Return the page: a section with the help text for every command."""
+    """Return the page: one section per command with its help text."""
     sections = [_INTRODUCTION]
     for name, command in (("tsgt", cli), ("tsgt-client", client), ("tsgt-master", master)):
         for path, context in _walk(name, command, None):

@@ -1,4 +1,4 @@
-"""Lines of the stream as text for people: one line each, degrees and millimetres."""
+"""Records of the stream as text, one line each, in degrees and millimetres."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def render(kind: str, line: bytes) -> str | None:
-    """Put a line of the stream into words.
+    """Return a line of the stream as text; None for an unknown type.
 
     Parameters
     ----------
@@ -32,15 +32,10 @@ def render(kind: str, line: bytes) -> str | None:
     line
         The JSON object.
 
-    Returns
-    -------
-    str or None
-        One line of text; None for a type that this version does not know.
-
     Raises
     ------
     ValueError
-        The line is of a known type, but a field is missing or wrong.
+        The type is known, but a field is missing or invalid.
     """
     match kind:
         case "hello":
@@ -65,7 +60,7 @@ def render(kind: str, line: bytes) -> str | None:
 def _hello(hello: HelloRecord) -> str:
     text = f"tsgt {hello.version}, stream protocol {hello.protocol}: {', '.join(hello.capabilities)}"
     if hello.protocol != PROTOCOL_VERSION:
-        text += f" (made for protocol {PROTOCOL_VERSION}; figures may be misread, use tsgt listen of that version)"
+        text += f" (this program is made for protocol {PROTOCOL_VERSION}; values may be wrong, use a matching tsgt listen)"
     return text
 
 
@@ -86,12 +81,8 @@ def _point(point: PointMeasurement) -> str:
 
 
 def _pose(pose: PoseRecord) -> str:
-    parts = [
-        clock_time(pose.stamp_ns),
-        "pose",
-        pose.kind,
-        "valid" if pose.valid else f"invalid ({pose.reason})",
-    ]
+    validity = "valid" if pose.valid else f"invalid ({pose.reason})"
+    parts = [clock_time(pose.stamp_ns), "pose", pose.kind, validity]
     if pose.position_m is not None and pose.orientation_xyzw is not None:
         yaw, pitch, roll = yaw_pitch_roll_deg(pose.orientation_xyzw)
         parts.append(f"{_vector(pose.position_m)} m")
@@ -104,13 +95,12 @@ def _pose(pose: PoseRecord) -> str:
 
 
 def _clock(clock: ClockRecord) -> str:
-    # Of a clock that was never set the microseconds are of no use beside the years, but nor do they harm.
     side = "ahead of" if clock.offset_ns >= 0 else "behind"
     return (
         f"{clock_time(clock.stamp_ns)}  clock of station {clock.station} is {abs(clock.offset_ns) / 1e9:.6f} s {side} the "
-        f"master's, within {clock.bound_ns / 1e6:.3f} ms, {clock.frequency_ppm:+.2f} ppm; "
+        f"master's, bound {clock.bound_ns / 1e6:.3f} ms, {clock.frequency_ppm:+.2f} ppm; "
         f"{len(clock.samples) - clock.rejected} of {len(clock.samples)} exchanges used ({clock.filter})"
-        f"{', begun anew' if clock.restarted else ''}"
+        f"{', reset' if clock.restarted else ''}"
     )
 
 
@@ -128,7 +118,7 @@ def _station(station: StationStatus) -> str:
             f"last {station.status} {_age(station.age_s)} ago",
         ]
     if station.last_heard_s is not None:
-        parts.append(f"heard {_age(station.last_heard_s)} ago")
+        parts.append(f"received {_age(station.last_heard_s)} ago")
     if station.rate_hz is not None:
         parts.append(f"{station.rate_hz:.1f} Hz")
     if station.loss is not None:
@@ -136,16 +126,16 @@ def _station(station: StationStatus) -> str:
     if station.rssi_dbm is not None and station.snr_db is not None:
         parts.append(f"{station.rssi_dbm:.0f} dBm, SNR {station.snr_db:.0f} dB")
     if station.clock_bound_ns is not None:
-        parts.append(f"clock within {station.clock_bound_ns / 1e6:.1f} ms")
+        parts.append(f"clock bound {station.clock_bound_ns / 1e6:.1f} ms")
     return f"station {station.id}: {', '.join(parts)}"
 
 
 def clock_time(stamp_ns: int) -> str:
-    """Write the time of day in UTC, to the millisecond; seconds for a time that no calendar has."""
+    """Return the time of day in UTC to the millisecond; seconds for a time outside the calendar."""
     seconds, rest_ns = divmod(stamp_ns, 1_000_000_000)
     try:
         text = datetime.fromtimestamp(seconds, tz=UTC).strftime("%H:%M:%S")
-    except (ValueError, OverflowError, OSError):  # a clock that was never set right
+    except (ValueError, OverflowError, OSError):  # a clock that was never set
         return f"{seconds} s"
     return f"{text}.{rest_ns // 1_000_000:03d}"
 
@@ -159,9 +149,9 @@ def _age(age_s: float | None) -> str:
 
 
 def yaw_pitch_roll_deg(quaternion_xyzw: Row4) -> tuple[float, float, float]:
-    """Angles in degrees of R = Rz(yaw) Ry(pitch) Rx(roll), from a unit quaternion.
+    """Return the ZYX Euler angles of a unit quaternion in degrees: R = Rz(yaw) Ry(pitch) Rx(roll).
 
-    Computed here with the standard library, so that ``tsgt listen`` starts without numpy and scipy.
+    Uses the standard library alone, so that ``tsgt listen`` starts without numpy and scipy.
     """
     x, y, z, w = quaternion_xyzw
     yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))

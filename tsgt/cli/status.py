@@ -1,10 +1,9 @@
-"""The command ``status``: what runs on this computer and how well, readable on a small screen in the sun."""
+"""The command ``status``: the state of the daemon on this machine, legible on a small screen in sunlight."""
 
 from __future__ import annotations
 
 import contextlib
 import math
-import socket
 import textwrap
 import time
 from pathlib import Path
@@ -12,34 +11,34 @@ from typing import TYPE_CHECKING
 
 import click
 
+from tsgt.cli.line_reader import connect
 from tsgt.cli.options import DEFAULT_CLIENT_SOCKET, DEFAULT_SOCKET, path_type
-from tsgt.cli.output import CHECK_FAILED, harmless
+from tsgt.cli.output import CHECK_FAILED, printable
 from tsgt.cli.render import clock_time
 from tsgt.errors import StreamError
 from tsgt.model import Status
-from tsgt.recording import MAX_LINE_BYTES, HelloRecord, StationStatus, StatusRecord, Typed, decode
+from tsgt.recording import HelloRecord, StationStatus, StatusRecord, Typed, decode
 from tsgt.station import ClientStatus
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from tsgt.recording.journal import InstrumentRecord
 
 TIMEOUT_S = 5.0
-"""A master sends a status each second; one that sends none for this long is stuck."""
+"""A master sends its status each second; one that sends none for this long is stuck."""
 
-LATE_S = 3.0
-"""A station that was last heard, or measured, longer ago than this needs somebody to look."""
+MAX_AGE_S = 3.0
+"""A station whose last packet or measurement is older needs the operator."""
 
-MASTER_LATE_S = 10.0
-"""A master that synchronises with another station is silent here for a second or two."""
+MAX_MASTER_AGE_S = 10.0
+"""While the master synchronises another station, a client receives nothing for a second or two."""
 
 WIDTH = 40
-"""Characters of the narrowest terminal that is used in the field."""
+"""Characters of the narrowest terminal used in the field."""
 
-MASTER_NOT_HEARD = "MASTER NOT HEARD"
+NO_MASTER = "MASTER NOT RECEIVED"
+NO_KEY = "NO KEY: anybody can take part"
 
-WORDS = {
+LABELS = {
     Status.OK: "TRACKING",
     Status.LOW_ACCURACY: "TRACKING",
     Status.ANGLE_ONLY: "NO DISTANCE",
@@ -48,7 +47,6 @@ WORDS = {
     Status.WRONG_DISTANCE: "WRONG TARGET",
     Status.ERROR: "ERROR",
 }
-"""What an instrument's status is called where there is no room for a sentence."""
 
 
 @click.command()
@@ -58,27 +56,25 @@ WORDS = {
     type=path_type,
     envvar="TSGT_SOCKET",
     show_envvar=True,
-    help=f"Socket of a master or of a client.  [default: {DEFAULT_SOCKET}, else {DEFAULT_CLIENT_SOCKET}]",
+    help=f"Socket of a master or a client.  [default: {DEFAULT_SOCKET}, else {DEFAULT_CLIENT_SOCKET}]",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print the status record as it comes.")
+@click.option("--json", "as_json", is_flag=True, help="Print the status record as received.")
 def status(socket_path: Path | None, *, as_json: bool) -> int:
-    """Tell how the daemon on this computer does: the master with all its stations, or a station's client.
+    """Show the status of the daemon on this machine.
 
-    Exit code 1: none runs. 3: one runs, but something needs a person: a station that is not heard or does not track,
-    no valid pose.
+    A master reports all its stations, a client its own station.
+
+    Exit code 1: no daemon runs. 3: a daemon runs, but action is required: a station is not received or does not track,
+    or no pose is valid.
     """
-    record, line = _ask(socket_path)
-    if isinstance(record, ClientStatus):
-        text, well = client_text(record)
-    else:
-        text, well = master_text(record)
+    record, line = _request(socket_path)
+    text, ok = client_text(record) if isinstance(record, ClientStatus) else master_text(record)
     click.echo(line.rstrip() if as_json else "\n".join(text))
-    return 0 if well else CHECK_FAILED
+    return 0 if ok else CHECK_FAILED
 
 
 def master_text(record: StatusRecord) -> tuple[list[str], bool]:
-    """Put a master's status into lines of at most 40 characters, and tell whether all is well."""
-    valid = record.valid_poses > 0
+    """Return a master's status in lines of at most 40 characters, and whether no action is required."""
     lines = [
         f"MASTER  {clock_time(record.stamp_ns)} UTC",
         f"poses {record.poses}, valid {record.valid_poses}",
@@ -86,34 +82,32 @@ def master_text(record: StatusRecord) -> tuple[list[str], bool]:
     if record.frame_ms is not None:
         lines.append(f"frame {record.frame_ms:.0f} ms")
     if record.protocol == "superframe" and not record.authenticated:
-        lines.append(_headline("NO KEY: anybody can take part", good=False))
-    well = valid
+        lines.append(_headline(NO_KEY, ok=False))
+    ok = record.valid_poses > 0
     for station in record.stations:
-        word, good = station_word(station)
-        lines += ["", _headline(f"STATION {station.id}  {word}", good=good), *_station_lines(station)]
-        well = well and good
-    return lines, well
+        label, station_ok = station_label(station)
+        lines += ["", _headline(f"STATION {station.id}  {label}", ok=station_ok), *_station_lines(station)]
+        ok = ok and station_ok
+    return lines, ok
 
 
-def station_word(station: StationStatus) -> tuple[str, bool]:
-    """Say in a word or two how a station does, and whether that is well."""
+def station_label(station: StationStatus) -> tuple[str, bool]:
+    """Return the state of a station in a word or two, and whether no action is required."""
     if station.last_heard_s is None:
-        return "NOT HEARD YET", False
-    if station.last_heard_s > LATE_S and not station.answering:
+        return "NOT RECEIVED YET", False
+    if station.last_heard_s > MAX_AGE_S and not station.answering:
         return f"SILENT {duration(station.last_heard_s)}", False
     if station.status is None or station.age_s is None:
         return "NO MEASUREMENT YET", False
-    if (
-        station.status.usable and station.age_s - station.last_heard_s > LATE_S
-    ):  # it answers, but always the same
+    # The station responds, but always with the same measurement.
+    if station.status.usable and station.age_s - station.last_heard_s > MAX_AGE_S:
         return f"OLD {duration(station.age_s)}", False
-    return WORDS[station.status], station.status.usable
+    return LABELS[station.status], station.status.usable
 
 
 def _station_lines(station: StationStatus) -> list[str]:
-    """Return some lines of figures, as far as they are known."""
     if station.last_heard_s is None:
-        return ["  off, too far, or other key, protocol", "  or radio: `tsgt status` there tells"]
+        return ["  off, out of range, or another key,", "  protocol or radio: run `tsgt status` there"]
     lines = []
     prism = "" if station.prism is None else f"prism {station.prism}  "
     rate = "" if station.rate_hz is None else f"{station.rate_hz:.2f} Hz  "
@@ -124,35 +118,35 @@ def _station_lines(station: StationStatus) -> list[str]:
     snr = "" if station.snr_db is None else f"SNR {station.snr_db:.0f}"
     lines.append(f"  {loss}{strength}{snr}".rstrip())
     if station.clock_bound_ns is not None:
-        lines.append(f"  clock within {station.clock_bound_ns / 1e6:.2f} ms")
+        lines.append(f"  clock bound {station.clock_bound_ns / 1e6:.2f} ms")
     elif station.stamp_bound_ns is not None:
-        lines.append(f"  time within {station.stamp_bound_ns / 1e6:.2f} ms")
+        lines.append(f"  timestamp bound {station.stamp_bound_ns / 1e6:.2f} ms")
     counts = {
         "outstanding": station.outstanding,
         "missed slots": station.missed_slots,
         "rejected beacons": station.rejected_beacons,
     }
-    lines += [f"  {count} {of_what}" for of_what, count in counts.items() if count]
+    lines += [f"  {count} {name}" for name, count in counts.items() if count]
     return [line for line in lines if line.strip()]
 
 
 def client_text(record: ClientStatus) -> tuple[list[str], bool]:
-    """Put a client's status into lines of at most 40 characters, and tell whether all is well."""
+    """Return a client's status in lines of at most 40 characters, and whether no action is required."""
     problems = _client_problems(record)
-    lines = [_headline(f"STATION {record.station}  {problems[0] if problems else 'OK'}", good=not problems)]
-    lines += [_headline(problem, good=False) for problem in problems[1:]]
-    lines += [_headline(part, good=False) for part in _wrapped(record.problem)]
+    lines = [_headline(f"STATION {record.station}  {problems[0] if problems else 'OK'}", ok=not problems)]
+    lines += [_headline(problem, ok=False) for problem in problems[1:]]
+    lines += [_headline(part, ok=False) for part in _wrapped(record.problem)]
     lines += ["", *_instrument_lines(record)]
     if record.mode == "direct":
         lines.append("direct: single measurements")
     elif record.instrument is not None:
         lines.append(f"tracking prism {record.prism}, {record.rate_hz:.2f} Hz")
-    if not lines[-1].startswith(record.activity):  # an instrument that tracks says so itself
+    if not lines[-1].startswith(record.activity):
         lines += _wrapped(record.activity, "  ")
     if (last := record.last) is not None:
         distance = "no distance" if last.slope_distance_m is None else f"{last.slope_distance_m:.4f} m"
         lines += [
-            f"last {duration(last.age_s)}: {WORDS[last.status]}",
+            f"last {duration(last.age_s)}: {LABELS[last.status]}",
             f"  hz {math.degrees(last.horizontal_angle_rad):.4f} v {math.degrees(last.zenith_angle_rad):.4f} deg",
             f"  {distance}",
         ]
@@ -161,21 +155,20 @@ def client_text(record: ClientStatus) -> tuple[list[str], bool]:
         lines.append(f"  {record.journal_waiting} lines not written yet")
     if record.journal_lost:
         lines.append(f"  {record.journal_lost} lines lost")
-    lines.append(f"  {harmless(Path(record.journal).name)}")
+    lines.append(f"  {printable(Path(record.journal).name)}")
     if record.master_heard_s is None:
-        lines.append("master not heard yet")
+        lines.append("master not received yet")
     else:
-        lines.append(f"master heard {duration(record.master_heard_s)} ago")
+        lines.append(f"master received {duration(record.master_heard_s)} ago")
         lines.append(f"  {record.rssi_dbm or 0:.0f} dBm  SNR {record.snr_db or 0:.0f}")
-    if MASTER_NOT_HEARD in problems:
-        lines += _why_not_heard(record)
+    if NO_MASTER in problems:
+        lines += _reception_hints(record)
     if record.protocol == "superframe":
         lines += _superframe_lines(record)
     return lines, not problems
 
 
 def _instrument_lines(record: ClientStatus) -> list[str]:
-    """Say which instrument it is, and what it adds to distances by itself."""
     lines = _wrapped(record.instrument or "no instrument")
     if record.battery_percent is not None:
         lines.append(f"  battery {record.battery_percent} %")
@@ -185,10 +178,10 @@ def _instrument_lines(record: ClientStatus) -> list[str]:
 
 
 def setting_lines(settings: InstrumentRecord) -> list[str]:
-    """Say in lines of at most 40 characters what an instrument adds to a distance, as far as it is known."""
+    """Return prism constant and atmospheric correction, as far as known, in lines of at most 40 characters."""
     lines = []
     if settings.prism_constant_m is not None:
-        lines.append(f"  prism {harmless(settings.prism_type)} {1e3 * settings.prism_constant_m:+.1f} mm")
+        lines.append(f"  prism {printable(settings.prism_type)} {1e3 * settings.prism_constant_m:+.1f} mm")
     if settings.atmospheric_ppm is not None:
         air = f"  air {settings.atmospheric_ppm:+.1f} ppm"
         if settings.temperature_c is not None and settings.pressure_hpa is not None:
@@ -198,61 +191,60 @@ def setting_lines(settings: InstrumentRecord) -> list[str]:
 
 
 def _wrapped(text: str, indent: str = "") -> list[str]:
-    """Break a text from outside into lines that do not steer the terminal."""
+    """Wrap a text from outside and remove its control characters."""
     lines = textwrap.wrap(
         text, WIDTH, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False
     )
-    # Before it is styled: afterwards our own codes would be made harmless, too.
-    return [harmless(line) for line in lines]
+    # Before styling, which adds control characters of our own.
+    return [printable(line) for line in lines]
 
 
-def _why_not_heard(record: ClientStatus) -> list[str]:
-    """Say what the radio hears instead of the master, and what is to be compared with the master's configuration."""
+def _reception_hints(record: ClientStatus) -> list[str]:
+    """Return what the radio receives instead of the master, and what to compare with its configuration."""
     if record.refused and record.unknown_packets:
-        return [f"  {record.refused} beacons refused: compare the keys"]
+        return [f"  {record.refused} beacons failed to authenticate:", "  compare the keys"]
     if record.unknown_packets:
-        return [f"  {record.unknown_packets} packets not understood:", "  compare protocols and keys"]
-    return ["  nothing heard: master off, too far,", "  or other frequency, SF, bandwidth"]
+        return [f"  {record.unknown_packets} packets not decoded:", "  compare protocols and keys"]
+    return ["  nothing received: master off, too far,", "  or other frequency, SF, bandwidth"]
 
 
 def _superframe_lines(record: ClientStatus) -> list[str]:
-    """Say how delivery and time of the protocol superframe do."""
     lines = [f"{record.queued} to deliver, {record.missed_slots} missed slots"]
     if record.clock_bound_ns is not None:
-        lines.append(f"  clock within {record.clock_bound_ns / 1e6:.2f} ms")
+        lines.append(f"  clock bound {record.clock_bound_ns / 1e6:.2f} ms")
     if record.rejected_beacons:
         lines.append(f"  {record.rejected_beacons} rejected beacons")
     if not record.authenticated:
-        lines.append(_headline("NO KEY: anybody can take part", good=False))
+        lines.append(_headline(NO_KEY, ok=False))
     return lines
 
 
 def _client_problems(record: ClientStatus) -> list[str]:
-    """Say what needs a person, the most urgent first, in a few words each."""
+    """Return what requires action, the most urgent first."""
     last = record.last
     problems = []
     if record.instrument is None:
         problems.append("NO INSTRUMENT")
     elif record.problem:
-        problems.append("SEE TO THE INSTRUMENT")
+        problems.append("CHECK THE INSTRUMENT")
     if record.instrument is not None and record.mode == "tracking":
-        if last is None or (last.status.usable and last.age_s > LATE_S):
+        if last is None or (last.status.usable and last.age_s > MAX_AGE_S):
             problems.append("NO MEASUREMENT" if last is None else f"OLD {duration(last.age_s)}")
         elif not last.status.usable:
-            problems.append(WORDS[last.status])
+            problems.append(LABELS[last.status])
     if not record.journal_ok:
         problems.append("DISK FAILS")
     if not record.radio_ok:
         problems.append("NO RADIO")
-    elif record.master_heard_s is None or record.master_heard_s > MASTER_LATE_S:
-        problems.append(MASTER_NOT_HEARD)
+    elif record.master_heard_s is None or record.master_heard_s > MAX_MASTER_AGE_S:
+        problems.append(NO_MASTER)
     elif record.joined is False:
         problems.append("NOT JOINED")
     return problems
 
 
 def duration(seconds: float) -> str:
-    """Write a duration so that it takes little room: 0.4 s, 12 s, 3 min, 2 h."""
+    """Return a short duration: 0.4 s, 12 s, 3 min, 2 h."""
     if seconds < 10:
         return f"{seconds:.1f} s"
     if seconds < 100:
@@ -260,66 +252,43 @@ def duration(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.0f} h"
 
 
-def _headline(text: str, *, good: bool) -> str:
-    """Write what needs a person so that it is seen; click leaves the codes out where there is no terminal."""
-    return click.style(text, bold=True, reverse=not good)
+def _headline(text: str, *, ok: bool) -> str:
+    """Style a headline, reversed if action is required; click removes the style without a terminal."""
+    return click.style(text, bold=True, reverse=not ok)
 
 
-def _ask(socket_path: Path | None) -> tuple[StatusRecord | ClientStatus, bytes]:
-    """Ask at the socket given, else at where a master, then a client would be."""
+def _request(socket_path: Path | None) -> tuple[StatusRecord | ClientStatus, bytes]:
+    """Read the status from the given socket, else from the default of a master, then of a client."""
     if socket_path is not None:
         return status_of(socket_path)
-    try:
-        return status_of(DEFAULT_SOCKET)
-    except StreamError:
+    for path in (DEFAULT_SOCKET, DEFAULT_CLIENT_SOCKET):
         with contextlib.suppress(StreamError):
-            return status_of(DEFAULT_CLIENT_SOCKET)
+            return status_of(path)
     raise StreamError(
-        f"nothing runs here: nobody serves {DEFAULT_SOCKET} or {DEFAULT_CLIENT_SOCKET}; "
+        f"no daemon runs here: neither {DEFAULT_SOCKET} nor {DEFAULT_CLIENT_SOCKET} responds; "
         "start tsgt-master or tsgt-client, or give --socket"
     )
 
 
 def status_of(path: Path) -> tuple[StatusRecord | ClientStatus, bytes]:
     """Wait for the first status line on a socket."""
-    for line in _lines(path):
-        try:
-            match decode(Typed, line).type:
-                case "status":
-                    return decode(StatusRecord, line), line
-                case "client_status":
-                    return decode(ClientStatus, line), line
-                case "hello":
-                    decode(HelloRecord, line)
-        except ValueError as error:
-            raise StreamError(f"{path}: what it says is no stream of tsgt ({error})") from error
-    raise StreamError(f"{path}: it ended without a status; is it a replay?")
-
-
-def _lines(path: Path) -> Iterator[bytes]:
-    deadline_s = time.monotonic() + TIMEOUT_S
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
-        connection.settimeout(TIMEOUT_S)
-        received = b""
-        try:
-            connection.connect(str(path))
-            while chunk := connection.recv(65536):
-                *lines, received = (received + chunk).split(b"\n")
-                yield from lines
-                if len(received) > MAX_LINE_BYTES:
-                    break
-                # For the whole, or one that sends something else now and then would hold us for ever.
-                if (left_s := deadline_s - time.monotonic()) <= 0:
-                    raise TimeoutError
-                connection.settimeout(left_s)
-            else:
-                return
-        except TimeoutError as error:
-            raise StreamError(
-                f"{path}: no status within {TIMEOUT_S:g} s; the daemon is stuck, see its log"
-            ) from error
-        except OSError as error:
-            raise StreamError(f"{path}: nobody answers ({error.strerror or error})") from error
-    raise StreamError(
-        f"{path}: what it says is no stream of tsgt: a line is longer than {MAX_LINE_BYTES} bytes"
-    )
+    until_s = time.monotonic() + TIMEOUT_S  # for the status, not for each line
+    try:
+        with connect(path, TIMEOUT_S) as reader:
+            while line := reader.line(until_s):
+                match decode(Typed, line).type:
+                    case "status":
+                        return decode(StatusRecord, line), line
+                    case "client_status":
+                        return decode(ClientStatus, line), line
+                    case "hello":
+                        decode(HelloRecord, line)
+    except TimeoutError as error:
+        raise StreamError(
+            f"{path}: no status within {TIMEOUT_S:g} s; the daemon is stuck, see its log"
+        ) from error
+    except OSError as error:
+        raise StreamError(f"{path}: no connection to a daemon ({error.strerror or error})") from error
+    except ValueError as error:
+        raise StreamError(f"{path}: not a stream of tsgt ({error})") from error
+    raise StreamError(f"{path}: the stream ended without a status; is it a replay?")

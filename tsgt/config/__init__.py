@@ -1,7 +1,8 @@
-"""Configuration and set-up files: TOML in, checked models out, and from these the parameters in SI units.
+"""Configuration and set-up files: TOML in, validated models and parameters in SI units out.
 
-Each file says by its top-level key ``kind`` what it is: ``client``, ``master``, ``station_frames``, ``prism_layout`` or
-``scenario``. A path inside a file is relative to the folder of that file.
+The top-level key ``kind`` of a file selects its model: ``client``, ``master``, ``station_frames``, ``prism_layout`` or
+``scenario``. A path in a file is relative to the folder of that file. ``files`` reads, the models validate,
+``parameters`` converts, ``permissions`` rejects files that everybody can change.
 """
 
 from tsgt.config.base import Model, NoiseConfig
@@ -16,6 +17,7 @@ from tsgt.config.client import (
     TemperatureC,
 )
 from tsgt.config.files import (
+    find_problems,
     json_schema,
     load,
     load_any,
@@ -24,7 +26,7 @@ from tsgt.config.files import (
     load_station_latencies,
     load_target_residuals,
 )
-from tsgt.config.instrument_models import KINDS
+from tsgt.config.kinds import KINDS
 from tsgt.config.master import (
     FrameWatchConfig,
     GeofenceConfig,
@@ -35,10 +37,10 @@ from tsgt.config.master import (
     StreamConfig,
 )
 from tsgt.config.parameters import level_frame, noise, parameters, scenario_parameters
-from tsgt.config.permissions import check_trust
+from tsgt.config.permissions import check_permissions
 from tsgt.config.pipeline import PipelineConfig
 from tsgt.config.radio import (
-    LARGEST_NUMBERS,
+    MAX_STATION_NUMBERS,
     ClassicConfig,
     ClassicMasterConfig,
     HardwareRadioConfig,
@@ -63,7 +65,7 @@ from tsgt.config.setup import PrismLayoutFile, StationFramesFile
 
 __all__ = [
     "KINDS",
-    "LARGEST_NUMBERS",
+    "MAX_STATION_NUMBERS",
     "Baud",
     "BridgeInstrumentConfig",
     "ClassicConfig",
@@ -101,7 +103,8 @@ __all__ = [
     "SuperframeMasterConfig",
     "TemperatureC",
     "WiringConfig",
-    "check_trust",
+    "check_permissions",
+    "find_problems",
     "json_schema",
     "level_frame",
     "load",

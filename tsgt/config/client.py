@@ -1,4 +1,4 @@
-"""What the configuration of a station client holds."""
+"""Configuration of a station client."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PressureHpa = Annotated[float, Field(ge=400, le=1200)]
 
 
 class AtmosphereConfig(Model):
-    """The air between instrument and prism, as thermometer and barometer beside the instrument show it."""
+    """Air between instrument and prism, measured at the instrument."""
 
     temperature_c: TemperatureC
     """Temperature in the shade."""
@@ -33,84 +33,84 @@ class LeicaInstrumentConfig(Model):
     kind: Literal["leica"]
     """A Leica instrument on a serial line."""
     port: RelativePath
-    """The line; best a name under /dev/serial/by-id/, which stays the same when the cable is plugged in again."""
+    """Serial device, preferably a name under /dev/serial/by-id/, which does not change when it is plugged in again."""
     baud: Baud = 115_200
-    """Bits per second as set in the instrument; other usual ones are tried when it does not answer."""
+    """Baud rate set in the instrument; other common rates are tried if it does not respond."""
     checksum: bool = False
-    """Whether every line carries a checksum, for long cables and radio modems; older instruments cannot."""
+    """Whether to add a checksum to every line, for long cables and radio modems; older instruments do not support it."""
     prism_type: PrismType
-    """Which reflector is on the robot; the instrument is set to it."""
+    """Reflector on the robot; the instrument is set to it."""
     prism_constant_mm: Annotated[float, Field(ge=-1000, le=1000)] | None = None
-    """Constant that the instrument adds, in Leica's convention (a round prism has 0); without it that of the type."""
+    """Prism constant in Leica's convention (0 for a round prism); default: that of the type."""
     distance_mode: Literal["auto", "continuous_fast", "continuous_dynamic", "synchro"] = "auto"
-    """How it measures while tracking; "auto" takes the fastest that the instrument accepts."""
+    """Distance mode while tracking; "auto" selects the fastest that the instrument accepts."""
     latency_ms: Annotated[float, Field(ge=0, le=1000)] | None = None
-    """From a measurement to the fastest answer, taken off each stamp; without it what is known of the model, or 0."""
+    """Latency from a measurement to the fastest response, subtracted from each timestamp; default: that of the model, or 0."""
     angle_delay_ms: Annotated[float, Field(ge=-100, le=100)] | None = None
-    """By how much angles are newer than the distance; recorded, not corrected. Without it that of the model, or 0."""
+    """Delay of the angles after the distance; recorded, not corrected. Default: that of the model, or 0."""
     atmosphere: AtmosphereConfig | None = None
-    """The air; without it the instrument keeps what a person has set in it."""
+    """Atmospheric correction; default: the setting of the instrument."""
     search_window_deg: Annotated[float, Field(ge=1, le=360)] = 40.0
-    """Width of the widest window in which it looks for a lost prism by itself; a tenth of it, at least 1.5, comes first."""
+    """Width of the largest search window for a lost prism; a tenth of it, at least 1.5, is searched first."""
     search_height_deg: Annotated[float, Field(ge=1, le=90)] = 15.0
-    """Height of that window."""
+    """Height of the search window."""
     search_distance_m: tuple[Annotated[int, Field(ge=0, le=390)], Annotated[int, Field(ge=10, le=400)]] = (
         1,
         400,
     )
-    """Between these distances it looks for the prism: something shiny outside is passed over."""
+    """Range of distances in which the prism is searched; reflections outside are ignored."""
     reduced_field_of_view: bool = False
-    """Whether to see only the middle of the field of view, so that a neighbouring prism is not taken for the tracked one."""
+    """Whether to reduce the field of view to its centre, so that a neighbouring prism is not tracked instead."""
     target: Literal["foil", "prism"] = "foil"
-    """What single measurements are made of."""
+    """Type of targets for single measurements."""
     target_faces: Literal[1, 2] = 1
-    """In how many faces a target is measured; with two the errors of the axes cancel, and a shot takes 10 s longer."""
+    """Faces in which a target is measured; two cancel the axis errors and take 10 s longer."""
 
 
 class BridgeInstrumentConfig(Model):
-    """An instrument read by a program of the user's, which prints a line for each measurement; see the page bridge."""
+    """An instrument read by a program of the user that prints one line per measurement; see the page bridge."""
 
     kind: Literal["bridge"]
-    """A program that knows the instrument."""
+    """An instrument behind a program."""
     command: Annotated[tuple[str, ...], Field(min_length=1)]
-    """The program and its arguments; it is started again when it ends."""
+    """Program and arguments; it is restarted when it ends."""
     stall_timeout_s: Positive = 5.0
-    """A program that says nothing for so long while it should measure has stalled, and is started again."""
+    """A program without output for this long while it should measure is restarted."""
     latency_ms: Annotated[float, Field(ge=-1000, le=1000)] = 0.0
-    """From a measurement to the time that the program gives, taken off each stamp."""
+    """Latency from a measurement to the time that the program reports, subtracted from each timestamp."""
 
 
 InstrumentConfig = Annotated[LeicaInstrumentConfig | BridgeInstrumentConfig, Field(discriminator="kind")]
 
 
 class JournalConfig(Model):
-    """Where the client writes every measurement before anything else is done with it."""
+    """Journal of the client; every measurement is written before it is used."""
 
     directory: RelativePath = Path("/var/lib/tsgt")
-    """Folder that gets one journal per run."""
+    """Folder of the journals, one per start."""
     fsync_interval_s: Positive = 1.0
-    """What a power cut can cost at most."""
+    """Maximum loss after a power cut."""
 
 
 class ClientConfig(Model):
-    """The client beside one total station: instrument in, radio out."""
+    """Client of one total station: instrument in, radio out."""
 
     kind: Literal["client"]
-    """What this file is."""
+    """Kind of this file."""
     station: Annotated[int, Field(ge=1, le=16)]
-    """Number of this station; 1 to 9 with the protocol `classic`, to 16 with `superframe`."""
+    """Station number: 1 to 9 with the protocol `classic`, 1 to 16 with `superframe`."""
     prism: Annotated[int, Field(ge=1, le=16)]
-    """Number of the prism that it tracks from the start; the same."""
+    """Number of the prism that is tracked after the start; same range."""
     instrument: InstrumentConfig
-    """The total station."""
+    """Total station."""
     radio: RadioConfig
-    """The radio; the same modem settings as the master's."""
+    """Radio; modem settings as the master's."""
     protocol: ProtocolConfig
-    """What is spoken over it; the same as the master's."""
+    """Radio protocol; as the master's."""
     journal: JournalConfig = JournalConfig()
-    """What stays."""
+    """Journal on disk."""
     status_socket: RelativePath = Path("/run/tsgt/client.sock")
-    """UNIX socket on which `tsgt status` asks."""
+    """UNIX socket for `tsgt status`."""
 
     @model_validator(mode="after")
     def _numbers_fit_the_protocol(self) -> ClientConfig:

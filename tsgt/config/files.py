@@ -1,4 +1,4 @@
-"""Reading configuration and set-up files, with one clear line for whatever is wrong in them."""
+"""Reading of configuration and set-up files, with one line per problem."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from tsgt.config.base import Model
-from tsgt.config.instrument_models import KINDS, Config
+from tsgt.config.kinds import KINDS, Config
 from tsgt.config.setup import PrismLayoutFile, StationFramesFile
 from tsgt.errors import ConfigError
 from tsgt.model import TargetResidual
@@ -33,39 +33,50 @@ def load(path: Path, model: type[M]) -> M:
     Parameters
     ----------
     path
-        The TOML file.
+        TOML file.
     model
-        What it has to be, for example :class:`MasterConfig`.
+        Expected kind, for example :class:`MasterConfig`.
 
     Raises
     ------
     ConfigError
-        Missing file, bad TOML, another kind, unknown key, missing key or bad value; names file, key and value.
+        Missing file, invalid TOML, other kind, unknown key, missing key or invalid value; names file, key and value.
     """
     raw = _read(path)
     kind = _kind(path, raw)
     if KINDS[kind] is not model:
         wanted = next(name for name, known in KINDS.items() if known is model)
-        raise ConfigError(
-            f'{path}: kind = "{kind}", but a file of kind "{wanted}" is needed', path=path, key="kind"
-        )
+        raise ConfigError(f'{path}: kind = "{kind}", but kind "{wanted}" is expected', path=path, key="kind")
     return _validated(path, raw, model)
 
 
 def load_any(path: Path) -> Model:
-    """Read a file of whatever kind it says it is; raises as :func:`load`."""
+    """Read a file of any kind; raises as :func:`load`."""
     raw = _read(path)
     return _validated(path, raw, KINDS[_kind(path, raw)])
 
 
+def find_problems(path: Path) -> tuple[Model | None, list[ConfigError]]:
+    """Read a file of any kind; return its content, or None and all its problems."""
+    try:
+        raw = _read(path)
+        model = KINDS[_kind(path, raw)]
+    except ConfigError as problem:
+        return None, [problem]
+    try:
+        return _parsed(path, raw, model), []
+    except ValidationError as error:
+        return None, _problems(path, raw, model, error)
+
+
 def load_station_frames(path: Path) -> dict[int, Matrix4]:
-    """Read where the stations stand: ``T_station1_station`` by station number; raises as :func:`load`."""
+    """Read ``T_station1_station`` by station number; raises as :func:`load`."""
     stations = load(path, StationFramesFile).stations
     return {int(number): entry.T_station1_station for number, entry in stations.items()}
 
 
 def load_station_latencies(path: Path) -> dict[int, int]:
-    """Read the stations' latencies in ns by station number, of those in the file that have one; raises as :func:`load`."""
+    """Read latencies in ns by station number, as far as given; raises as :func:`load`."""
     stations = load(path, StationFramesFile).stations
     return {
         int(number): round(entry.latency_ms * 1e6)
@@ -75,14 +86,14 @@ def load_station_latencies(path: Path) -> dict[int, int]:
 
 
 def load_target_residuals(path: Path) -> dict[int, tuple[TargetResidual, ...]]:
-    """Read how well the targets fitted, by station number, of those in the file that have some; raises as :func:`load`."""
+    """Read target residuals by station number, as far as given; raises as :func:`load`."""
     stations = load(path, StationFramesFile).stations
     return {
         int(number): tuple(
             TargetResidual(
                 target=fit.target,
                 residual_m=_metres(fit.residual_mm),
-                left_out_m=_metres(fit.leave_one_out_mm),
+                leave_one_out_m=_metres(fit.leave_one_out_mm),
             )
             for fit in entry.targets
         )
@@ -92,13 +103,13 @@ def load_target_residuals(path: Path) -> dict[int, tuple[TargetResidual, ...]]:
 
 
 def load_prism_layout(path: Path) -> dict[int, Vector3]:
-    """Read where the prisms sit on the robot, in m, by prism number; raises as :func:`load`."""
+    """Read the prism positions in the robot frame in m by prism number; raises as :func:`load`."""
     prisms = load(path, PrismLayoutFile).prisms
     return {int(number): entry.position_m for number, entry in prisms.items()}
 
 
 def json_schema(kind: str | None = None) -> dict[str, Any]:
-    """Return the JSON Schema of one kind of file, or of all of them."""
+    """Return the JSON Schema of one kind of file, or of all kinds."""
     if kind is not None:
         return KINDS[kind].model_json_schema()
     return TypeAdapter[Any](Config).json_schema()
@@ -117,14 +128,14 @@ def _read(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: {error.strerror}", path=path) from error
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: not UTF-8 text (byte {error.start})", path=path) from error
-    except (tomllib.TOMLDecodeError, ValueError, RecursionError) as error:  # endless numbers, endless nesting
+    except (tomllib.TOMLDecodeError, ValueError, RecursionError) as error:  # huge numbers, deep nesting
         raise ConfigError(f"{path}: not TOML: {error}", path=path) from error
 
 
 def _kind(path: Path, raw: dict[str, Any]) -> str:
     kind, known = raw.get("kind"), ", ".join(f'"{name}"' for name in KINDS)
     if kind is None:
-        raise ConfigError(f"{path}: kind: missing key; one of {known} is needed", path=path, key="kind")
+        raise ConfigError(f"{path}: kind: missing key; one of {known} is expected", path=path, key="kind")
     if not isinstance(kind, str) or kind not in KINDS:
         raise ConfigError(f"{path}: kind = {_shown(kind)}: should be one of {known}", path=path, key="kind")
     return kind
@@ -132,13 +143,25 @@ def _kind(path: Path, raw: dict[str, Any]) -> str:
 
 def _validated(path: Path, raw: dict[str, Any], model: type[M]) -> M:
     try:
-        # Through JSON: there strict types and the arrays that stand for tuples go together.
-        return model.model_validate_json(json.dumps(raw, default=str), context={"folder": path.parent})
+        return _parsed(path, raw, model)
     except ValidationError as error:
-        # A mistyped key is reported as one unknown and one missing; the unknown one says more.
-        problem = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
+        raise _problems(path, raw, model, error)[0] from error
+
+
+def _parsed(path: Path, raw: dict[str, Any], model: type[M]) -> M:
+    # Through JSON, where arrays are valid tuples in strict mode.
+    return model.model_validate_json(json.dumps(raw, default=str), context={"folder": path.parent})
+
+
+def _problems(
+    path: Path, raw: dict[str, Any], model: type[Model], error: ValidationError
+) -> list[ConfigError]:
+    """Return the problems, unknown keys first: a misspelt key is reported as unknown and as missing."""
+    found = []
+    for problem in sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden"):
         key = _key(_without_tags(problem["loc"], raw))
-        raise ConfigError(f"{path}: {_explained(problem, key, model)}", path=path, key=key) from error
+        found.append(ConfigError(f"{path}: {_explained(problem, key, model)}", path=path, key=key))
+    return found
 
 
 def _explained(problem: ErrorDetails, key: str, model: type[Model]) -> str:
@@ -146,7 +169,7 @@ def _explained(problem: ErrorDetails, key: str, model: type[Model]) -> str:
         case "extra_forbidden":
             known = _known_keys(model, problem["loc"][:-1])
             near = difflib.get_close_matches(str(problem["loc"][-1]), known, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
+            hint = f"did you mean {near[0]}?" if near else f"known keys: {', '.join(known)}"
             return f"{key}: unknown key; {hint}"
         case "missing":
             return f"{key}: missing key"
@@ -168,23 +191,23 @@ def _shown(value: object) -> str:
 
 
 def _key(location: tuple[int | str, ...]) -> str:
-    """Write a place as in TOML; an entry of an array by its ordinal: ``stations[#2].prism``."""
+    """Return a location in TOML notation, entries of an array by ordinal: ``stations[#2].prism``."""
     key = ""
     for part in location:
-        if part == "[key]":  # pydantic's mark that a table's name is meant, not its content
+        if part == "[key]":  # pydantic's mark for the name of a table
             continue
         key += f"[#{part + 1}]" if isinstance(part, int) else f".{_name(part)}" if key else _name(part)
     return key
 
 
 def _name(key: str) -> str:
-    """Return a key as it can stand in a line; between quotes a file may call it what it likes."""
+    """Return a key in printable form; a quoted key may contain anything."""
     name = key if key.isprintable() else json.dumps(key)
     return name if len(name) <= _SHOWN_CHARACTERS else f"{name[: _SHOWN_CHARACTERS - 3]}..."
 
 
 def _without_tags(location: tuple[int | str, ...], raw: Any) -> tuple[int | str, ...]:
-    """Leave out what a place has between a table and its keys where the table is of one of several kinds."""
+    """Remove the tags of discriminated unions from a location."""
     place: list[int | str] = []
     for part in location:
         if isinstance(raw, dict) and part not in raw and raw.get("kind") == part:
@@ -198,7 +221,7 @@ def _without_tags(location: tuple[int | str, ...], raw: Any) -> tuple[int | str,
 
 
 def _known_keys(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
-    """Names of the fields of the model that a place inside another model belongs to."""
+    """Return the field names of the model at a location."""
     kinds: list[type[BaseModel]] = []
     for part in location:
         if isinstance(part, str) and part in model.model_fields:
@@ -210,12 +233,12 @@ def _known_keys(model: type[BaseModel], location: tuple[int | str, ...]) -> list
 
 
 def _names(model: type[BaseModel]) -> tuple[Any, ...]:
-    """Return what a table may say under its key ``kind`` to be of this model."""
+    """Return the values of the key ``kind`` that select this model."""
     return get_args(model.model_fields["kind"].annotation) if "kind" in model.model_fields else ()
 
 
 def _innermost_models(annotation: Any) -> list[type[BaseModel]]:
-    """Find the models in an annotation such as ``tuple[StationConfig, ...]``."""
+    """Return the models in an annotation such as ``tuple[StationConfig, ...]``."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [found for arg in get_args(annotation) for found in _innermost_models(arg)]

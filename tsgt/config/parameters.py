@@ -1,4 +1,4 @@
-"""From what a file says to what the program computes with: metres, radians and nanoseconds, in one place."""
+"""Parameters in metres, radians and nanoseconds from configuration and set-up files."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ MIN_PRISMS = 3
 
 
 def parameters(config: MasterConfig) -> Parameters:
-    """Read the set-up files that a master's configuration names, and put everything into SI units.
+    """Read the set-up files of a master's configuration and convert everything to SI units.
 
-    Prisms of the layout that no station tracks are left out: every pose would wait for them in vain.
+    Prisms that no station tracks are omitted: every pose would wait for them.
 
     Raises
     ------
     ConfigError
-        A set-up file cannot be used, a station has no frame, a prism has no position, or the stations track
-        fewer than three prisms.
+        A set-up file is invalid, a station has no frame, a prism has no position, or the stations track fewer than three
+        prisms.
     """
     frames = load_station_frames(config.setup.station_frames)
     latencies_ns = load_station_latencies(config.setup.station_frames)
@@ -87,7 +87,7 @@ def parameters(config: MasterConfig) -> Parameters:
 
 
 def scenario_parameters(scenario: ScenarioConfig) -> Parameters:
-    """Return what a master in the simulated world would know: the exact set-up, and the noise as it is."""
+    """Return the parameters of a master in the simulated world: exact set-up and true noise."""
     return Parameters(
         stations=tuple(
             StationParameters(
@@ -105,7 +105,7 @@ def scenario_parameters(scenario: ScenarioConfig) -> Parameters:
 
 
 def pipeline_parameters(pipeline: PipelineConfig) -> PipelineParameters:
-    """Convert the limits of the pipeline."""
+    """Convert the configuration of the pipeline."""
     return PipelineParameters(
         estimator=pipeline.estimator,
         period_ns=round(1e9 / pipeline.rate_hz),
@@ -119,7 +119,7 @@ def pipeline_parameters(pipeline: PipelineConfig) -> PipelineParameters:
             acceleration_sigma_mps2=pipeline.motion.acceleration_sigma_mps2,
             acceleration_correlation_time_s=pipeline.motion.acceleration_correlation_time_s,
             angular_acceleration_sigma_radps2=pipeline.motion.angular_acceleration_sigma_radps2,
-            angular_acceleration_time_s=pipeline.motion.angular_acceleration_time_s,
+            angular_acceleration_correlation_time_s=pipeline.motion.angular_acceleration_correlation_time_s,
         ),
         noise_scale=pipeline.noise_scale,
         lag_ns=round(pipeline.lag_s * 1e9),
@@ -139,7 +139,7 @@ def noise(config: NoiseConfig) -> InstrumentNoise:
 
 
 def level_frame(station: SimulatedStation) -> Matrix4:
-    """Return ``T_station1_station`` of a levelled instrument, turned about the plumb line."""
+    """Return ``T_station1_station`` of a levelled instrument, rotated about the vertical."""
     yaw = math.radians(station.yaw_deg)
     c, s = math.cos(yaw), math.sin(yaw)
     x, y, z = station.position_m

@@ -1,10 +1,10 @@
-"""Which files a daemon may believe: those that not everybody on the computer can change.
+"""Permissions of the files that daemons read: not everybody on the computer may be able to change them.
 
-Problem: whoever can write the configuration of a daemon can have it run any program, and whoever can write where the
-stations stand moves every pose. Refusing all that a group may write would refuse what a Debian or a Raspberry Pi makes by
-default: there every user has a group of his own, the umask is 002, and new files have mode 0664. Idea: refuse only what
-everybody can change, the file itself or through a folder above it. Who shares a group, and whose files are in /etc, is
-for the administrator to say. A key is another matter, because to read it is enough: see :mod:`tsgt.radio.key_file`.
+Problem: write access to the configuration of a daemon means running any program as its user, and write access to the
+station frames moves every pose. Group-writable files cannot be rejected: on Debian and Raspberry Pi OS each user has a
+group of their own, the umask is 002, and new files have mode 0664. Solution: reject what everybody can change, directly or
+through a parent folder; groups and owners are left to the administrator. A key is also protected against reading, see
+:mod:`tsgt.radio.key_file`.
 """
 
 from __future__ import annotations
@@ -23,26 +23,24 @@ if TYPE_CHECKING:
 _ROOT = 0
 
 
-def check_trust(path: Path, *, user: int | None = None) -> None:
-    """Refuse a file that everybody can change; one that is not there, or out of sight, is for its reader to refuse.
+def check_permissions(path: Path, *, user: int | None = None) -> None:
+    """Reject a file that everybody can change; a missing or inaccessible file is left to its reader.
 
     Parameters
     ----------
-    path
-        Of a configuration, a set-up file or a key.
     user
-        Number of the user whose daemon reads it; None: who runs this program.
+        User id of the daemon that reads the file; None: of this process.
 
     Raises
     ------
     ConfigError
-        Everybody may write the file or a folder above it; or a folder above it is for everybody, such as /tmp, where
-        only owners may rename what they made, and what leads on from there belongs to neither root nor the user.
+        The file or a parent folder is world-writable; in a world-writable folder with the sticky bit, such as /tmp: the
+        path below it belongs to neither root nor the user.
     """
     owners = (_ROOT, os.geteuid() if user is None else user)
     try:
         found = path.stat()
-        # Both the way that the name goes and the one that links lead to.
+        # The path as given, and with links resolved.
         ways = [
             [(each, each.lstat()) for each in (way, *way.parents)]
             for way in (path.absolute(), path.resolve())
@@ -51,7 +49,7 @@ def check_trust(path: Path, *, user: int | None = None) -> None:
         return
     if found.st_mode & stat.S_IWOTH:
         raise ConfigError(
-            f"{path}: everybody on this computer may write it (mode {stat.S_IMODE(found.st_mode):04o}); "
+            f"{path}: everybody on this computer can write it (mode {stat.S_IMODE(found.st_mode):04o}); "
             f"`chmod o-w {path}`",
             path=path,
         )
@@ -60,14 +58,14 @@ def check_trust(path: Path, *, user: int | None = None) -> None:
             continue
         if not place.st_mode & stat.S_ISVTX:
             raise ConfigError(
-                f"{path}: everybody on this computer may put another file into its place, as {folder} has mode "
+                f"{path}: everybody on this computer can replace it, as {folder} has mode "
                 f"{stat.S_IMODE(place.st_mode):04o}; `chmod o-w {folder}`",
                 path=path,
             )
         if what.st_uid not in owners:
             raise ConfigError(
-                f"{path}: {each} belongs to the user {_name(what.st_uid)} and lies in {folder}, where everybody may "
-                "make files; use a folder of yours",
+                f"{path}: {each} belongs to the user {_name(what.st_uid)} and lies in {folder}, where everybody can "
+                "create files; use a folder of your own",
                 path=path,
             )
 

@@ -1,4 +1,4 @@
-"""How measurements become poses: the part that a master's configuration and a scenario share."""
+"""Pipeline from measurements to poses: shared by the configuration of a master and by scenarios."""
 
 from __future__ import annotations
 
@@ -8,51 +8,51 @@ from pydantic import Field
 
 from tsgt.config.base import Model, NotNegative, Positive
 
-# No narrower and no wider than what the estimator takes: see MotionPrior.
+# The limits of the estimator, see MotionPrior.
 Acceleration = Annotated[float, Field(ge=1e-6, le=1e6)]
 PerAxis = tuple[Acceleration, Acceleration, Acceleration]
 Lasting = Annotated[float, Field(ge=1e-3, le=1e4)]
 
 
 class MotionConfig(Model):
-    """How the robot moves, as the estimator ``continuous`` expects it; `tsgt process` prints what suits a recording."""
+    """Motion prior of the estimator ``continuous``; `tsgt process` prints the one tuned to a recording."""
 
     acceleration_sigma_mps2: PerAxis = (0.4, 0.4, 0.2)
     """One sigma of the acceleration of the prisms' middle along x, y, z of station 1."""
     acceleration_correlation_time_s: Lasting = 0.8
-    """How long an acceleration lasts."""
+    """Correlation time of the acceleration."""
     angular_acceleration_sigma_radps2: PerAxis = (0.15, 0.15, 0.2)
     """One sigma of the angular acceleration about x, y, z of the robot."""
-    angular_acceleration_time_s: Lasting = 0.4
-    """How long an angular acceleration lasts."""
+    angular_acceleration_correlation_time_s: Lasting = 0.4
+    """Correlation time of the angular acceleration."""
 
 
 class PipelineConfig(Model):
-    """How measurements become poses."""
+    """Pipeline from measurements to poses."""
 
     estimator: Literal["linear", "continuous"] = "continuous"
-    """Name of the estimator: straight lines between measurements, or one smooth trajectory through all of them."""
+    """Estimator: linear interpolation between measurements, or one smooth trajectory."""
     rate_hz: Annotated[float, Field(ge=0.01, le=1000)] = 20.0
     """Poses per second."""
     outage_limit_s: Positive = 1.0
-    """Two measurements of one prism further apart than this leave the time between them without pose."""
+    """Maximum gap between two measurements of a prism; no poses in longer gaps."""
     transport_limit_s: Positive = 2.0
-    """A measurement that has not arrived this long after it was made is not waited for."""
+    """Maximum time to wait for a measurement."""
     residual_limit_mm: Positive = 50.0
-    """A pose whose prisms miss their layout by more than this (root mean square) is not valid."""
+    """Maximum layout residual of a valid pose (root mean square)."""
     tilt_limit_deg: Annotated[float, Field(gt=0, le=180)] = 90.0
-    """A pose whose robot leans further than this is not valid: mirrored layout or swapped prisms."""
+    """Maximum tilt of a valid pose; more indicates a mirrored layout or swapped prisms."""
     acceleration_sigma_mps2: NotNegative = 0.3
     """One sigma of the robot's acceleration between two measurements, per axis; for `linear`."""
     angular_acceleration_sigma_radps2: NotNegative = 0.15
-    """One sigma of its angular acceleration, per axis; for `linear`."""
+    """One sigma of the robot's angular acceleration, per axis; for `linear`."""
     motion: MotionConfig = MotionConfig()
-    """How the robot moves; for `continuous`."""
+    """Motion prior; for `continuous`."""
     noise_scale: Annotated[float, Field(ge=0.001, le=1000)] = 1.0
-    """What the noise of all instruments is multiplied by; for `continuous`."""
+    """Factor on the noise of all instruments; for `continuous`."""
     lag_s: Annotated[float, Field(gt=0, le=60)] = 3.0
-    """How long a live pose waits for late measurements until it is smoothed for good; for `continuous`."""
+    """Lag after which a live pose is smoothed and final; for `continuous`."""
     position_sigma_limit_mm: Positive = 100.0
-    """A pose whose position is known worse than this (one sigma) is not valid; for `continuous`."""
+    """Maximum position sigma of a valid pose; for `continuous`."""
     rotation_sigma_limit_deg: Annotated[float, Field(gt=0, le=180)] = 5.0
-    """A pose whose rotation is known worse than this (one sigma) is not valid; for `continuous`."""
+    """Maximum rotation sigma of a valid pose; for `continuous`."""

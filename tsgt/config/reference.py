@@ -1,4 +1,4 @@
-"""docs/reference/configuration.md, generated from the models: ``python -m tsgt.config.reference FILE``."""
+"""Generate docs/reference/configuration.md from the models: ``python -m tsgt.config.reference FILE``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tsgt.config.files import json_schema
-from tsgt.config.instrument_models import KINDS
+from tsgt.config.kinds import KINDS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
 _INTRODUCTION = """\
 # Configuration and set-up files
 
-Generated from the models (`make generated`); do not edit. All files are TOML. The key `kind` says what a file is;
-unknown keys are refused; a path is relative to the folder of the file that names it. Commented examples stand in
-`configs/`, and `tsgt config check FILE` says what is wrong with yours.
+Generated from the models (`make generated`); do not edit. All files are TOML. The key `kind` selects the kind of file;
+unknown keys are errors; a path is relative to the folder of the file that contains it. Commented examples are in
+`configs/`, and `tsgt config check FILE...` reports all problems of files.
 """
 
 
 def markdown() -> str:
-    """Return the page: a section per kind of file, a table per TOML table."""
+    """Return the page: one section per kind of file, one table per TOML table."""
     return "\n".join([_INTRODUCTION, *map(_section, KINDS)])
 
 
@@ -35,7 +35,7 @@ def _section(kind: str) -> str:
 def _tables(
     model: dict[str, Any], definitions: dict[str, Any], heading: str, kind: str = ""
 ) -> Iterator[str]:
-    """Yield the table of a model's own keys, then those of the models within."""
+    """Yield the table of a model's keys, then the tables of its inner models."""
     own, within = [], []
     required = model.get("required", [])
     for key, field in model["properties"].items():
@@ -58,7 +58,7 @@ def _tables(
 def _inner_models(
     key: str, field: dict[str, Any], definitions: dict[str, Any], heading: str
 ) -> tuple[dict[str, dict[str, Any]], str]:
-    """Find the models behind a key, by their kind if there are several, and how its TOML table is written."""
+    """Return the inner models of a key by kind, and the TOML notation of its table."""
     path = f"{heading.strip('[]')}.{key}".strip(".")
     if "discriminator" in field:
         kinds = field["discriminator"]["mapping"]

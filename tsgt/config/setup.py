@@ -1,4 +1,4 @@
-"""What the set-up files of the day hold, as ``tsgt calibrate`` writes them."""
+"""Set-up files, as written by ``tsgt calibrate``."""
 
 from __future__ import annotations
 
@@ -11,51 +11,51 @@ from tsgt.model import Matrix4
 
 
 class TargetFit(Model):
-    """How well one target fits the solved frame."""
+    """Residuals of one target."""
 
     target: Number
     """Number of the target."""
     residual_mm: NotNegative | None = None
-    """Where the station sees it less where station 1 does, in the solved frame; a rejected target has none."""
+    """Distance between its positions measured by the station and by station 1, in the solved frame; none if rejected."""
     leave_one_out_mm: NotNegative | None = None
-    """The same with the frame solved from the other targets alone; none where these were too few."""
+    """The same with the frame solved from the other targets only; none if these are too few."""
 
 
 class StationFrame(Model):
-    """Where one station stands."""
+    """Frame of one station."""
 
     T_station1_station: Annotated[Matrix4, AfterValidator(rigid)]
     """Rigid transform, 4x4 row by row, from the station's frame to that of station 1, in m."""
     rms_mm: NotNegative | None = None
-    """By how much its targets missed those of station 1, root mean square, as the calibration found it."""
+    """Root mean square of the target residuals."""
     targets: tuple[TargetFit, ...] = ()
-    """The targets that it was solved from, for reports."""
+    """Targets of the solution, for reports."""
     latency_ms: Annotated[float, Field(ge=-1e6, le=1e6)] | None = None
-    """From the measurement to its time stamp, as ``tsgt calibrate motion`` found it; instead of the configuration's."""
+    """Latency from the measurement to its timestamp by ``tsgt calibrate motion``; replaces that of the configuration."""
 
 
 class StationFramesFile(Model):
-    """Where the stations stand: written by ``tsgt calibrate targets`` or ``motion``."""
+    """Station frames, written by ``tsgt calibrate targets`` or ``motion``."""
 
     kind: Literal["station_frames"]
-    """What this file is."""
+    """Kind of this file."""
     stations: dict[NumberKey, StationFrame]
     """One table per station, named by its number."""
 
 
 class PrismEntry(Model):
-    """Where one prism sits on the robot."""
+    """Position of one prism on the robot."""
 
     position_m: Place
-    """Its centre in the frame of the robot, [x, y, z]."""
+    """Centre in the robot frame, [x, y, z]."""
     sigma_m: tuple[NotNegative, NotNegative, NotNegative] | None = None
-    """One sigma of each coordinate, as the calibration found it."""
+    """One sigma of each coordinate."""
 
 
 class PrismLayoutFile(Model):
-    """Where the prisms sit on the robot: written by ``tsgt calibrate prisms``."""
+    """Prism layout, written by ``tsgt calibrate prisms``."""
 
     kind: Literal["prism_layout"]
-    """What this file is."""
+    """Kind of this file."""
     prisms: dict[NumberKey, PrismEntry]
     """One table per prism, named by its number."""

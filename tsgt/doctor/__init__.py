@@ -1,10 +1,10 @@
-"""Whether a machine is ready for the field: one check per thing that keeps a client or a master from working.
+"""Checks whether a machine is ready for the field, one per possible cause of failure of a client or a master.
 
-Each check returns findings: one line that says in plain words what is wrong and what to type. What is outside (devices,
-commands, users, the radio's bus) is handed in as a :class:`~tsgt.doctor.machine.Machine`.
+In comes the path of a configuration and a :class:`~tsgt.doctor.machine.Machine`, the interface to devices, commands,
+users and the radio's bus. Out come findings: one line each, with what is wrong and what to type.
 """
 
-from tsgt.doctor.checklist import examine
+from tsgt.doctor.checklist import run_checks
 from tsgt.doctor.finding import Finding, Outcome
 from tsgt.doctor.machine import Machine, current_user, find_user, free_bytes, group_name, run_command
 
@@ -13,9 +13,9 @@ __all__ = [
     "Machine",
     "Outcome",
     "current_user",
-    "examine",
     "find_user",
     "free_bytes",
     "group_name",
+    "run_checks",
     "run_command",
 ]

@@ -1,4 +1,4 @@
-"""All checks of a machine, in an order in which what others depend on comes first."""
+"""All checks of a machine, in the order of their dependencies."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from tsgt.config import ClientConfig, LeicaInstrumentConfig, MasterConfig
 from tsgt.doctor import computer, files, radio, serial_line
 from tsgt.doctor.finding import Finding, failed, note, ok, skipped
-from tsgt.doctor.instrument import RunningDaemon, check_instrument
+from tsgt.doctor.instrument import DaemonState, check_instrument
 from tsgt.errors import TsgtError
 
 if TYPE_CHECKING:
@@ -22,15 +22,13 @@ if TYPE_CHECKING:
     Check = Callable[[], Findings | Awaitable[Findings]]
 
 
-async def examine(machine: Machine, path: Path) -> AsyncGenerator[Finding]:
-    """Make all checks; each finding comes as soon as it is there.
+async def run_checks(machine: Machine, path: Path) -> AsyncGenerator[Finding]:
+    """Run all checks and yield each finding at once.
 
     Parameters
     ----------
-    machine
-        What is looked at.
     path
-        Configuration of a client or a master. Where it cannot be used, what needs none is checked nevertheless.
+        Configuration of a client or a master; if it is invalid, only the checks that need none are run.
     """
     finding, config = files.check_configuration(path)
     yield finding
@@ -53,35 +51,36 @@ async def examine(machine: Machine, path: Path) -> AsyncGenerator[Finding]:
 
 def _client(
     machine: Machine, config: ClientConfig, service: Mapping[str, str] | None
-) -> tuple[RunningDaemon, Finding]:
-    """Ask the client that may run here."""
+) -> tuple[DaemonState, Finding]:
+    """Request the status of a client on this machine."""
     try:
         status = machine.client_status(config.status_socket)
     except TsgtError as error:
-        return RunningDaemon(runs=True), failed("daemon", f"{error}: sudo systemctl restart tsgt-client")
+        return DaemonState(running=True), failed("daemon", f"{error}: sudo systemctl restart tsgt-client")
     if status is None:
-        return _unasked(machine, service, "client")
-    text = f"a client runs here, {status.measurements} measured; `tsgt status` tells how it does"
-    return RunningDaemon(runs=True, status=status), ok("daemon", text)
+        return _without_response(machine, service, "client")
+    text = f"a client is running, {status.measurements} measured; `tsgt status` shows its status"
+    return DaemonState(running=True, status=status), ok("daemon", text)
 
 
 def _master(
     machine: Machine, config: MasterConfig, service: Mapping[str, str] | None
-) -> tuple[RunningDaemon, Finding]:
-    """Look for the master that may run here."""
+) -> tuple[DaemonState, Finding]:
+    """Look for a running master."""
     if machine.serves(config.stream.socket):
-        return RunningDaemon(runs=True), ok("daemon", "a master runs here; `tsgt status` tells how it does")
-    return _unasked(machine, service, "master")
+        return DaemonState(running=True), ok("daemon", "a master is running; `tsgt status` shows its status")
+    return _without_response(machine, service, "master")
 
 
-def _unasked(
+def _without_response(
     machine: Machine, service: Mapping[str, str] | None, kind: computer.Kind
-) -> tuple[RunningDaemon, Finding]:
-    """Tell what systemd knows of a daemon that does not answer, perhaps only because this user may not ask it."""
+) -> tuple[DaemonState, Finding]:
+    """Return the state that systemd reports of a daemon whose socket does not respond, perhaps for lack of permission."""
     if service is None or service.get("ActiveState") != "active":
-        return RunningDaemon(runs=False), ok("daemon", f"no {kind} runs here now")
-    return RunningDaemon(runs=True), note(
-        "daemon", f"a {kind} runs here, but does not answer you, {machine.user.name}: sudo tsgt doctor"
+        return DaemonState(running=False), ok("daemon", f"no {kind} is running")
+    return DaemonState(running=True), note(
+        "daemon",
+        f"a {kind} is running, but does not respond to the user {machine.user.name}: sudo tsgt doctor",
     )
 
 
@@ -90,7 +89,7 @@ def _client_checks(
     path: Path,
     config: ClientConfig,
     service: Mapping[str, str] | None,
-    daemon: RunningDaemon,
+    daemon: DaemonState,
 ) -> Iterator[tuple[str, Check]]:
     user = computer.daemon_user(machine, service) or machine.user
     instrument = config.instrument
@@ -99,7 +98,7 @@ def _client_checks(
         yield "serial_port", partial(serial_line.check_serial_port, machine, port, user)
         yield (
             "serial_port_free",
-            partial(serial_line.check_serial_port_free, machine, port, daemon=daemon.runs),
+            partial(serial_line.check_serial_port_free, machine, port, daemon=daemon.running),
         )
         yield "latency_timer", partial(serial_line.check_latency_timer, machine, port)
     yield "instrument", partial(check_instrument, machine, instrument, daemon)
@@ -111,7 +110,7 @@ def _master_checks(
     path: Path,
     config: MasterConfig,
     service: Mapping[str, str] | None,
-    daemon: RunningDaemon,
+    daemon: DaemonState,
 ) -> Iterator[tuple[str, Check]]:
     yield "setup", partial(files.check_setup, machine, config)
     yield from _common_checks(machine, path, config, service, daemon)
@@ -122,11 +121,11 @@ def _common_checks(
     path: Path,
     config: ClientConfig | MasterConfig,
     service: Mapping[str, str] | None,
-    daemon: RunningDaemon,
+    daemon: DaemonState,
 ) -> Iterator[tuple[str, Check]]:
     user = computer.daemon_user(machine, service) or machine.user
     yield "radio_devices", partial(radio.check_radio_devices, machine, config.radio, user)
-    yield "radio", partial(radio.check_radio, machine, config.radio, path, daemon=daemon.runs)
+    yield "radio", partial(radio.check_radio, machine, config.radio, path, daemon=daemon.running)
     yield "limits", partial(radio.check_limits, config, path)
     yield "key", partial(files.check_key, machine, config.protocol, user)
     yield "disk", partial(files.check_disk, machine, config, user, service)
@@ -142,26 +141,26 @@ def _computer_checks(machine: Machine, kind: computer.Kind) -> Iterator[tuple[st
 
 
 async def _made(machine: Machine, name: str, check: Check) -> list[Finding]:
-    """Make a check; whatever goes wrong in it is a finding, so that the others are made as well."""
+    """Run a check; an error becomes a finding, so that the other checks run as well."""
     try:
         found = check()
         if isawaitable(found):
             found = await found
-    except Exception as error:  # noqa: BLE001 (a driver by others raises what it likes)
-        return [_in_words(machine, name, error)]
+    except Exception as error:  # noqa: BLE001 (a third-party driver may raise anything)
+        return [_as_finding(machine, name, error)]
     return [found] if isinstance(found, Finding) else found
 
 
-def _in_words(machine: Machine, name: str, error: Exception) -> Finding:
-    """Say what kept a check from being made."""
+def _as_finding(machine: Machine, name: str, error: Exception) -> Finding:
+    """Return the error of a check as a finding."""
     match error:
         case PermissionError():
             where = error.filename or "this"
-            return skipped(name, f"you, {machine.user.name}, may not look at {where}: sudo tsgt doctor")
+            return skipped(name, f"the user {machine.user.name} may not read {where}: sudo tsgt doctor")
         case TsgtError():
             return failed(name, str(error))
         case OSError():
             return failed(name, f"{error.filename or name}: {error.strerror or error}")
         case ImportError():
-            return failed(name, f"{error}: install tsgt again with all that it needs (pip install tsgt)")
-    return failed(name, f"this could not be checked ({type(error).__name__}: {error}); please report it")
+            return failed(name, f"{error}: install tsgt again with its dependencies (pip install tsgt)")
+    return failed(name, f"the check failed to run ({type(error).__name__}: {error}); please report it")

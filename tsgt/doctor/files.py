@@ -1,4 +1,4 @@
-"""Checks of files: the configuration, the key, the set-up of the day, and the disk that everything goes to."""
+"""Checks of files: configuration, key, set-up files, and the disk of journals and recordings."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tsgt.config import (
     PrismLayoutFile,
     StationFramesFile,
     SuperframeConfig,
-    check_trust,
+    check_permissions,
     load,
     load_any,
     parameters,
@@ -36,37 +36,37 @@ if TYPE_CHECKING:
 Daemon = ClientConfig | MasterConfig
 
 BYTES_PER_HOUR = {"client": 22_000_000, "master": 145_000_000}
-"""A journal at 20 Hz; a recording of three stations at 2.5 Hz with 20 poses per second."""
+"""Journal at 20 Hz; recording of three stations at 2.5 Hz with 20 poses per second."""
 
-ENOUGH_H = 12
+MIN_HOURS = 12
 """A day in the field."""
 
 SLOW_FSYNC_NS = 1_000_000_000
-"""A disk that takes longer costs more than the second that a power cut may cost."""
+"""A slower disk loses more than the second that a power cut may cost."""
 
 _FSYNC_BYTES = 65_536
 _FSYNCS = 5
 
-OLD_FRAMES_NS = 12 * 3600 * 1_000_000_000
-"""Station frames of another day are those of another set-up, unless the tripods have stayed."""
+MAX_FRAMES_AGE_NS = 12 * 3600 * 1_000_000_000
+"""Older station frames belong to another set-up, unless the tripods have stayed."""
 
 VOLATILE = {"tmpfs", "ramfs", "overlay"}
-"""File systems that are gone, or as before, when the power is."""
+"""File systems that lose their changes at a power cut."""
 
 
 def check_configuration(path: Path) -> tuple[Finding, Daemon | None]:
-    """Tell whether a daemon takes this configuration, and return it."""
+    """Check that a daemon accepts the configuration, and return it."""
     try:
-        check_trust(path)
+        check_permissions(path)
         content = load_any(path)
         if not isinstance(content, ClientConfig | MasterConfig):
-            return failed("configuration", f"{path}: is not the configuration of a client or a master"), None
+            return failed("configuration", f"{path}: not the configuration of a client or a master"), None
         lora_settings(content.radio, path)
     except ConfigError as error:
         hint = ""
         with suppress(OSError):
             if not path.exists():
-                hint = "; copy an example of configs/ to there, or name another file: tsgt doctor FILE"
+                hint = "; copy an example from configs/, or give another file: tsgt doctor FILE"
         return failed("configuration", f"{error}{hint}"), None
     match content:
         case ClientConfig():
@@ -77,14 +77,14 @@ def check_configuration(path: Path) -> tuple[Finding, Daemon | None]:
 
 
 def check_key(machine: Machine, protocol: ProtocolConfig, user: User) -> Finding:
-    """Tell whether there is a key that the daemon can use."""
+    """Check that the daemon can use the key."""
     if not isinstance(protocol, SuperframeConfig):
-        return skipped("key", f"the protocol {protocol.kind} has none")
+        return skipped("key", f"the protocol {protocol.kind} has no key")
     path = protocol.key_file
     if path is None:
         return note(
             "key",
-            "there is none, so that anybody with such a radio can take part: `tsgt radio key mission.key` makes one "
+            "no key is configured, so anybody with such a radio can take part: `tsgt radio key mission.key` makes one "
             "for all radios of the mission",
         )
     try:
@@ -92,26 +92,26 @@ def check_key(machine: Machine, protocol: ProtocolConfig, user: User) -> Finding
     except FileNotFoundError:
         return failed(
             "key",
-            f"{path}: no such file; copy the key of the mission to there, or make one by `tsgt radio key {path}`",
+            f"{path}: no such file; copy the key of the mission, or make one with `tsgt radio key {path}`",
         )
     except PermissionError:
-        return skipped("key", f"{path}: you, {machine.user.name}, may not look at it: sudo tsgt doctor")
+        return skipped("key", f"{path}: the user {machine.user.name} may not access it: sudo tsgt doctor")
     except ConfigError as error:
         return failed("key", str(error))
     if machine.user.uid not in (0, user.uid):
         return ok(
             "key",
-            f"{path}: belongs to the user {user.name} alone; what is in it only sudo tsgt doctor can tell",
+            f"{path}: belongs to the user {user.name} only; sudo tsgt doctor checks its content",
         )
     try:
         read_key(path, owner=user.uid)
     except ConfigError as error:
         return failed("key", str(error))
-    return ok("key", f"{path}: a key, of the user {user.name} alone")
+    return ok("key", f"{path}: a key, readable by the user {user.name} only")
 
 
 def check_setup(machine: Machine, config: MasterConfig) -> list[Finding]:
-    """Tell whether the set-up files fit the stations, who wrote them, when, and how good they are."""
+    """Check that the set-up files fit the stations, and report origin, age and quality."""
     problem: ConfigError | None = None
     try:
         _check_layout(config)
@@ -123,13 +123,13 @@ def check_setup(machine: Machine, config: MasterConfig) -> list[Finding]:
         if problem is not None and problem.path == path:
             found.append(failed(name, str(problem)))
         else:
-            found.append(_judge_setup(machine, name, path))
+            found.append(_check_setup_file(machine, name, path))
     return found
 
 
 def _check_layout(config: MasterConfig) -> None:
-    """Raise ConfigError with the path of the file that cannot be used."""
-    # Only here, as a client has no scipy.
+    """Raise ConfigError with the path of the invalid file."""
+    # Imported here, as a client has no scipy.
     import numpy as np  # noqa: PLC0415
 
     from tsgt.geometry import check_layout  # noqa: PLC0415
@@ -145,9 +145,9 @@ def _check_layout(config: MasterConfig) -> None:
         raise ConfigError(f"{path}: prisms: {error}", path=path, key="prisms") from error
 
 
-def _judge_setup(machine: Machine, name: str, path: Path) -> Finding:
+def _check_setup_file(machine: Machine, name: str, path: Path) -> Finding:
     try:
-        check_trust(path)
+        check_permissions(path)
         quality = _frames_quality(path) if name == "station_frames" else _layout_quality(path)
         head = path.read_text(encoding="utf-8").partition("\n")[0]
         written_ns = path.stat().st_mtime_ns
@@ -158,13 +158,13 @@ def _judge_setup(machine: Machine, name: str, path: Path) -> Finding:
         return note(name, f"{path}: not written by `{command}`; is it the example? {quality}")
     now_ns = machine.clock.realtime_ns()
     if now_ns < EARLIEST.timestamp() * 1e9 or written_ns > now_ns:
-        return note(name, f"{path}: {quality}; its age is not known, as this clock is not right")
+        return note(name, f"{path}: {quality}; its age is unknown, as this clock is wrong")
     age_ns = now_ns - written_ns
     text = f"{path}: {quality}; written {_age(age_ns)} ago"
-    if name == "station_frames" and age_ns > OLD_FRAMES_NS:
+    if name == "station_frames" and age_ns > MAX_FRAMES_AGE_NS:
         return note(
             name,
-            f"{text}: if any tripod has been moved since, measure the targets anew; `tsgt calibrate check` tells",
+            f"{text}: if a tripod has moved since, measure the targets again; `tsgt calibrate check` detects that",
         )
     return ok(name, text)
 
@@ -176,14 +176,14 @@ def _frames_quality(path: Path) -> str:
     if not residuals:
         return text
     worst = max(residuals, key=lambda number: residuals[number])
-    return f"{text}, targets missed by {residuals[worst]:.1f} mm at worst (station {worst}, root mean square)"
+    return f"{text}, target residuals up to {residuals[worst]:.1f} mm rms (station {worst})"
 
 
 def _layout_quality(path: Path) -> str:
     prisms = load(path, PrismLayoutFile).prisms
     sigmas_m = [max(entry.sigma_m) for entry in prisms.values() if entry.sigma_m is not None]
     text = f"prisms {', '.join(sorted(prisms, key=int))}"
-    return f"{text}, known to {1e3 * max(sigmas_m):.1f} mm (one sigma)" if sigmas_m else text
+    return f"{text}, one sigma up to {1e3 * max(sigmas_m):.1f} mm" if sigmas_m else text
 
 
 def _age(age_ns: int) -> str:
@@ -196,73 +196,69 @@ def _age(age_ns: int) -> str:
 def check_disk(
     machine: Machine, config: Daemon, user: User, service: Mapping[str, str] | None
 ) -> list[Finding]:
-    """Tell whether the folder that everything is written to stays, has room, and is quick enough.
+    """Check that the folder of journals or recordings is persistent, writable, large and fast enough.
 
     Parameters
     ----------
-    machine
-        Where it is.
-    config
-        Names the folder.
     user
-        Who is to write there.
+        User of the daemon.
     service
-        What systemd knows of the daemon's unit: with one it makes the folder.
+        Properties of the daemon's unit, which creates the folder.
     """
     folder = (config.journal if isinstance(config, ClientConfig) else config.recording).directory
-    there = _first_that_exists(folder)
+    existing = _existing_parent(folder)
     if not may_write(service, folder):
         return [
             failed(
                 "disk",
-                f"the service is not let into {folder}, whatever its rights are: sudo systemctl edit tsgt-{config.kind}, "
-                f"and there, under [Service]: ReadWritePaths={folder}",
+                f"the sandbox of the service excludes {folder}: sudo systemctl edit tsgt-{config.kind}, "
+                f"and add, under [Service]: ReadWritePaths={folder}",
             ),
-            skipped("disk_write", "the service may not write there"),
+            skipped("disk_write", "the service may not write to it"),
         ]
-    if there != folder and not is_installed(service) and not user.may_use(there):
+    if existing != folder and not is_installed(service) and not user.may_use(existing):
         return [
             failed(
                 "disk",
-                f"{folder} is not there and the user {user.name} may not make it: "
+                f"{folder} does not exist and the user {user.name} may not create it: "
                 f"sudo install -d -o {user.name} -m 750 {folder}",
             ),
-            skipped("disk_write", "there is no folder"),
+            skipped("disk_write", "the folder does not exist"),
         ]
-    if there == folder and not user.may_use(folder):
+    if existing == folder and not user.may_use(folder):
         return [
             failed(
                 "disk",
-                f"the user {user.name} may not write into {folder}: sudo chown -R {user.name} {folder}",
+                f"the user {user.name} may not write to {folder}: sudo chown -R {user.name} {folder}",
             ),
-            skipped("disk_write", "who runs the daemon may not write there"),
+            skipped("disk_write", "the user of the daemon may not write to it"),
         ]
     return [
-        _judge_room(machine, folder, there, config.kind),
-        _judge_writing(machine, folder)
-        if there == folder
-        else skipped("disk_write", f"{folder} is not there yet; it is made when the daemon starts"),
+        _check_space(machine, folder, existing, config.kind),
+        _check_writing(machine, folder)
+        if existing == folder
+        else skipped("disk_write", f"{folder} does not exist yet; the daemon creates it"),
     ]
 
 
-def _judge_room(machine: Machine, folder: Path, there: Path, kind: str) -> Finding:
-    hours = machine.free_bytes(there) / BYTES_PER_HOUR[kind]
-    if (system := _file_system(machine, there)) in VOLATILE:
+def _check_space(machine: Machine, folder: Path, existing: Path, kind: str) -> Finding:
+    hours = machine.free_bytes(existing) / BYTES_PER_HOUR[kind]
+    if (system := _file_system(machine, existing)) in VOLATILE:
         return failed(
             "disk",
-            f"{folder} lies in memory ({system}): all that is written is gone with the power. Name another folder, or "
-            "switch the overlay off: sudo raspi-config nonint do_overlayfs 1, and reboot",
+            f"{folder} is in memory ({system}): everything written is lost at a power cut. Use another folder, or "
+            "disable the overlay: sudo raspi-config nonint do_overlayfs 1, and reboot",
         )
-    if hours < ENOUGH_H:
+    if hours < MIN_HOURS:
         return failed(
             "disk",
-            f"{folder}: room for {hours:.1f} hours; copy old files to elsewhere and remove them (ls {folder})",
+            f"{folder}: space for {hours:.1f} hours; move old files elsewhere (ls {folder})",
         )
-    return ok("disk", f"{folder}: room for {min(hours, 9999):.0f} hours")
+    return ok("disk", f"{folder}: space for {min(hours, 9999):.0f} hours")
 
 
-def _judge_writing(machine: Machine, folder: Path) -> Finding:
-    longest_ns = 0
+def _check_writing(machine: Machine, folder: Path) -> Finding:
+    max_ns = 0
     try:
         with tempfile.TemporaryFile(dir=folder, prefix=".doctor-") as file:
             for _ in range(_FSYNCS):
@@ -270,35 +266,31 @@ def _judge_writing(machine: Machine, folder: Path) -> Finding:
                 file.write(bytes(_FSYNC_BYTES))
                 file.flush()
                 os.fsync(file.fileno())
-                longest_ns = max(longest_ns, machine.clock.monotonic_ns() - started_ns)
+                max_ns = max(max_ns, machine.clock.monotonic_ns() - started_ns)
     except PermissionError:
-        return skipped(
-            "disk_write", f"you, {machine.user.name}, may not write there: sudo tsgt doctor tries it"
-        )
+        return skipped("disk_write", f"the user {machine.user.name} may not write to it: sudo tsgt doctor")
     except OSError as error:
         if error.errno == errno.EROFS:
             return failed(
                 "disk_write",
-                f"{folder} can only be read: sudo mount -o remount,rw /; where that fails the card is worn out",
+                f"{folder} is read-only: sudo mount -o remount,rw /; if that fails, the card is worn out",
             )
         return failed("disk_write", f"{folder} cannot be written ({error.strerror}): df -h {folder}")
-    if longest_ns > SLOW_FSYNC_NS:
+    if max_ns > SLOW_FSYNC_NS:
         return note(
             "disk_write",
-            f"{folder}: the disk took {longest_ns / 1e9:.1f} s for {_FSYNC_BYTES // 1024} kB, so that a power cut costs "
-            "as much: take a better card, and keep one in reserve",
+            f"{folder}: fsync of {_FSYNC_BYTES // 1024} kB took {max_ns / 1e9:.1f} s, which a power cut may lose: use a better "
+            "card, and keep a spare one",
         )
-    return ok(
-        "disk_write", f"{folder}: what is written is on the disk after {longest_ns / 1e6:.0f} ms at worst"
-    )
+    return ok("disk_write", f"{folder}: fsync takes at most {max_ns / 1e6:.0f} ms")
 
 
-def _first_that_exists(folder: Path) -> Path:
+def _existing_parent(folder: Path) -> Path:
     return next((path for path in (folder, *folder.absolute().parents) if path.is_dir()), Path("/"))
 
 
 def _file_system(machine: Machine, folder: Path) -> str:
-    """Return the kind of the file system that a folder lies on; empty where the kernel does not say."""
+    """Return the type of the file system of a folder; empty if unknown."""
     kinds: dict[Path, str] = {}
     for line in (machine.read(machine.proc / "mounts") or "").splitlines():
         fields = line.split()

@@ -1,4 +1,4 @@
-"""What a check found: one line."""
+"""The result of a check."""
 
 from __future__ import annotations
 
@@ -7,28 +7,18 @@ from typing import NamedTuple
 
 
 class Outcome(StrEnum):
-    """How a check ended."""
+    """Outcome of a check."""
 
     OK = "ok"
     NOTE = "note"
-    """It works; a person should know this nevertheless."""
+    """Passed, with something that the operator should know."""
     FAILED = "failed"
     SKIPPED = "skipped"
-    """It cannot be made here and now."""
+    """Not possible here and now."""
 
 
 class Finding(NamedTuple):
-    """What one check found.
-
-    Attributes
-    ----------
-    name
-        Of the check, as programs read it.
-    outcome
-        How it ended.
-    detail
-        For people: what was found, and after a colon or semicolon what to do or to type.
-    """
+    """Result of one check; ``detail`` is a line for the operator, with what to do after a colon or semicolon."""
 
     name: str
     outcome: Outcome
@@ -36,25 +26,25 @@ class Finding(NamedTuple):
 
     @property
     def ok(self) -> bool | None:
-        """Whether all is well; None where that is not known."""
+        """Whether the check passed; None if it was skipped."""
         return None if self.outcome is Outcome.SKIPPED else self.outcome is not Outcome.FAILED
 
 
 def ok(name: str, detail: str) -> Finding:
-    """Return that all is well."""
+    """Return a passed check."""
     return Finding(name, Outcome.OK, detail)
 
 
 def note(name: str, detail: str) -> Finding:
-    """Return that it works, and that there is something to know."""
+    """Return a passed check with a note."""
     return Finding(name, Outcome.NOTE, detail)
 
 
 def failed(name: str, detail: str) -> Finding:
-    """Return that a person has to do something."""
+    """Return a failed check."""
     return Finding(name, Outcome.FAILED, detail)
 
 
 def skipped(name: str, detail: str) -> Finding:
-    """Return that it cannot be told here and now."""
+    """Return a skipped check."""
     return Finding(name, Outcome.SKIPPED, detail)

@@ -1,4 +1,4 @@
-"""What the checks may ask of the machine that they look at, and the machine that they run on."""
+"""Interface of the checks to a machine, and its implementation for this machine."""
 
 from __future__ import annotations
 
@@ -21,29 +21,19 @@ if TYPE_CHECKING:
     from tsgt.station.serial import OpenPort
 
 COMMAND_TIMEOUT_S = 5.0
-"""timedatectl asks a service that may have to be started first; none of the commands takes longer than this."""
+"""timedatectl may have to start a service first; no command takes longer."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class User:
-    """A user, as far as rights go.
-
-    Attributes
-    ----------
-    name
-        For people.
-    uid
-        The user's number; 0 may do everything.
-    groups
-        Numbers of all groups.
-    """
+    """A user with user id and group ids; user id 0 may do everything."""
 
     name: str
     uid: int
     groups: frozenset[int]
 
     def may_use(self, path: Path) -> bool:
-        """Whether this user may read and write a file or use a folder, by its mode; raises OSError without one."""
+        """Whether the mode permits this user to read and write a file or use a folder; raises OSError without one."""
         found = path.stat()
         if self.uid == 0:
             return True
@@ -59,40 +49,32 @@ class User:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Machine:
-    """A machine: what is read, called and opened from outside.
-
-    Paths in a configuration are taken as they are.
+    """A machine: everything that the checks read, call and open.
 
     Attributes
     ----------
-    dev, sys, proc, etc
-        The folders of these names.
-    clock
-        The machine's.
     user
-        Who runs the checks.
+        User that runs the checks.
     find_user
-        Returns a user by name, with further groups by name; None where there is no such user or group.
+        Returns a user by name, with additional groups by name; None if a name does not exist.
     group_name
         Returns the name of a group by number.
     run
-        Calls a command and returns what it prints; None where there is no such command, or it does not answer.
+        Runs a command and returns its output; None if it is missing or fails.
     which
-        Returns where a program is; None where there is none.
+        Returns the path of a program; None if it is missing.
     free_bytes
-        How much room a folder's disk has for users.
+        Returns the free space of a folder's disk.
     port_holder
-        Returns who has a device open; None where nobody does, or it cannot be told.
+        Returns the process that has a device open; None if there is none or it is unknown.
     latency_timer_ms
-        Returns how long a serial adapter keeps bytes back, in ms; None where it has no such setting.
-    open_port
-        Returns what opens a serial line.
-    open_hal
-        Opens bus and pins of a radio.
+        Returns the latency timer of a serial adapter in ms; None without one.
+    open_port, open_hal
+        Open a serial line; bus and pins of a radio.
     client_status
-        Asks the client behind a socket how it does; None where there is none. Raises StreamError where it is stuck.
+        Returns the status of the client behind a socket; None without one. Raises StreamError if it is stuck.
     serves
-        Whether somebody serves a socket.
+        Whether a process serves a socket.
     """
 
     dev: Path = Path("/dev")
@@ -114,7 +96,7 @@ class Machine:
     serves: Callable[[Path], bool]
 
     def read(self, path: Path) -> str | None:
-        """Return what a small file of the system says; None where it cannot be read."""
+        """Return the content of a system file; None if it cannot be read."""
         try:
             return path.read_text(encoding="utf-8", errors="replace").strip()
         except OSError:
@@ -122,7 +104,7 @@ class Machine:
 
 
 def current_user() -> User:
-    """Return who runs this program."""
+    """Return the user of this process."""
     uid = os.geteuid()
     try:
         name = pwd.getpwuid(uid).pw_name
@@ -132,7 +114,7 @@ def current_user() -> User:
 
 
 def find_user(name: str, groups: Sequence[str]) -> User | None:
-    """Return a user of this machine by name, with further groups by name; None where there is no such one."""
+    """Return a user of this machine by name, with additional groups by name; None if a name does not exist."""
     try:
         entry = pwd.getpwnam(name)
         further = [grp.getgrnam(group).gr_gid for group in groups]
@@ -143,7 +125,7 @@ def find_user(name: str, groups: Sequence[str]) -> User | None:
 
 
 def group_name(gid: int) -> str:
-    """Return the name of a group of this machine; its number where it has none."""
+    """Return the name of a group of this machine; its number without one."""
     try:
         return grp.getgrgid(gid).gr_name
     except KeyError:
@@ -151,7 +133,7 @@ def group_name(gid: int) -> str:
 
 
 def run_command(arguments: Sequence[str]) -> str | None:
-    """Call a command of this machine and return what it prints; None where that fails."""
+    """Run a command of this machine and return its output; None if that fails."""
     program = shutil.which(arguments[0])
     if program is None:
         return None
@@ -165,6 +147,6 @@ def run_command(arguments: Sequence[str]) -> str | None:
 
 
 def free_bytes(folder: Path) -> int:
-    """Return how much room the disk of a folder has for users, in bytes; raises OSError."""
+    """Return the free space of a folder's disk for users in bytes; raises OSError."""
     found = os.statvfs(folder)
     return found.f_bavail * found.f_frsize

@@ -1,4 +1,4 @@
-"""Checks of the radio: its devices, the chip behind them, and what the law says to its settings."""
+"""Checks of the radio: devices, chip, and legal limits of its settings."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from tsgt.config import (
     SuperframeMasterConfig,
 )
 from tsgt.doctor.finding import failed, note, ok, skipped
-from tsgt.doctor.serial_line import no_right
+from tsgt.doctor.serial_line import access_hint
 from tsgt.radio.from_config import lora_settings, planned_cycle, wiring
-from tsgt.radio.planning import DIPOLE_DBI, Load, Use, exceeded
+from tsgt.radio.planning import DIPOLE_DBI, ChannelUse, TrafficLoad, violations
 from tsgt.radio.sx127x import Chip, Register, RegisterAccess
 
 if TYPE_CHECKING:
@@ -24,20 +24,20 @@ if TYPE_CHECKING:
     from tsgt.doctor.machine import Machine, User
 
 STATIONS = 3
-"""A client does not know how many stations there are; most missions have so many."""
+"""Assumed by a client, which does not know the number of stations."""
 
 RATE_HZ = 2.5
 
 
 def check_radio_devices(machine: Machine, config: RadioConfig, user: User) -> Finding:
-    """Tell whether bus and pins are there, and may be used."""
+    """Check that bus and pins exist and may be used."""
     if not isinstance(config, HardwareRadioConfig):
         return skipped("radio_devices", "the radio is simulated")
     bus = spi_device(machine, config)
     if not bus.exists():
         return failed(
             "radio_devices",
-            f"there is no {bus}: switch SPI on (sudo raspi-config nonint do_spi 0) and reboot",
+            f"{bus} does not exist: enable SPI (sudo raspi-config nonint do_spi 0) and reboot",
         )
     chips = sorted(machine.dev.glob("gpiochip*"))
     if config.wiring.gpio_chip is not None:
@@ -45,48 +45,42 @@ def check_radio_devices(machine: Machine, config: RadioConfig, user: User) -> Fi
     if config.wiring.backend == "gpiod" and not (chips and chips[0].exists()):
         return failed(
             "radio_devices",
-            f"there is no {chips[0] if chips else machine.dev / 'gpiochip*'}: the kernel has no driver for the pins; "
-            "`gpiodetect` lists them, gpio_chip under [radio.wiring] names one",
+            f"{chips[0] if chips else machine.dev / 'gpiochip*'} does not exist: the kernel has no driver for the pins; "
+            "`gpiodetect` lists GPIO devices, gpio_chip under [radio.wiring] selects one",
         )
     devices = [bus, *(chips if config.wiring.backend == "gpiod" else [])]
-    refused = [no_right(machine, device, user) for device in devices if not user.may_use(device)]
+    refused = [access_hint(machine, device, user) for device in devices if not user.may_use(device)]
     if refused:
         return failed("radio_devices", "; ".join(refused))
-    return ok("radio_devices", f"{bus} and the pins are there, and the user {user.name} may use them")
+    return ok("radio_devices", f"{bus} and the pins exist, and the user {user.name} may use them")
 
 
 def spi_device(machine: Machine, config: HardwareRadioConfig) -> Path:
-    """Return the bus that the radio is on."""
+    """Return the SPI device of the radio."""
     return machine.dev / f"spidev{config.wiring.spi_bus}.{config.wiring.spi_device}"
 
 
 async def check_radio(machine: Machine, config: RadioConfig, path: Path, *, daemon: bool) -> Finding:
-    """Tell whether the radio answers and takes its settings. Nothing is sent.
+    """Check that the radio responds and accepts its settings, without transmitting.
 
     Parameters
     ----------
-    machine
-        Opens it.
-    config
-        What stands under ``[radio]``.
     path
-        In this file.
+        File of the configuration, for messages.
     daemon
-        Whether the daemon runs and so has the radio; it is left alone then.
+        Whether the daemon is running; it owns the radio then, and the check is skipped.
     """
     if not isinstance(config, HardwareRadioConfig):
-        return skipped("radio", "it is simulated")
+        return skipped("radio", "the radio is simulated")
     if daemon:
-        return skipped("radio", "the daemon that runs here has it; `tsgt status` says how it does")
+        return skipped("radio", "the running daemon has it open; `tsgt status` shows its status")
     bus = spi_device(machine, config)
     if not bus.exists():
-        return skipped("radio", f"there is no {bus}")
+        return skipped("radio", f"{bus} does not exist")
     if not machine.user.may_use(bus):
-        return skipped("radio", f"you, {machine.user.name}, may not use {bus}: sudo tsgt doctor tries it")
+        return skipped("radio", f"the user {machine.user.name} may not use {bus}: sudo tsgt doctor")
     if holder := machine.port_holder(bus):
-        return failed(
-            "radio", f"{bus} is open in {holder}: end that one, or stop the service that it belongs to"
-        )
+        return failed("radio", f"{bus} is open in {holder}: end it, or stop its service")
     settings = lora_settings(config, path)
     hal = machine.open_hal(wiring(config.wiring))
     try:
@@ -96,21 +90,24 @@ async def check_radio(machine: Machine, config: RadioConfig, path: Path, *, daem
         chip.sleep()
     finally:
         hal.close()
-    return ok("radio", f"a radio answers (version 0x{version:02X}) and keeps its settings; nothing was sent")
+    return ok(
+        "radio",
+        f"the radio responds (version 0x{version:02X}) and accepts its settings; nothing was transmitted",
+    )
 
 
 def check_limits(config: ClientConfig | MasterConfig, path: Path) -> Finding:
-    """Tell whether power and time on air are within what the region and the chip allow."""
+    """Check power and duty cycle against the limits of the region and the chip."""
     settings = lora_settings(config.radio, path)
     stations = len(config.stations) if isinstance(config, MasterConfig) else STATIONS
-    cycle = planned_cycle(_protocol(config), Load(stations=stations, rate_hz=RATE_HZ), settings)
-    use = Use(settings, DIPOLE_DBI, cycle.master_duty, cycle.station_duty)
+    cycle = planned_cycle(_protocol(config), TrafficLoad(stations=stations, rate_hz=RATE_HZ), settings)
+    use = ChannelUse(settings, DIPOLE_DBI, cycle.master_duty, cycle.station_duty)
     duty = cycle.master_duty if isinstance(config, MasterConfig) else cycle.station_duty
     text = (
         f"{settings.frequency_hz / 1e6:g} MHz, SF {settings.spreading_factor}, {settings.bandwidth_hz / 1e3:g} kHz, "
-        f"{settings.power_dbm} dBm, sends {100 * duty:.0f} % of the time with {stations} stations"
+        f"{settings.power_dbm} dBm, duty cycle {100 * duty:.0f} % with {stations} stations"
     )
-    found = [sentence.partition(". Would comply")[0] for sentence in exceeded(use, config.radio.region, ())]
+    found = [sentence.partition(". Would comply")[0] for sentence in violations(use, config.radio.region, ())]
     if found:
         plan = (
             f"tsgt radio plan --protocol {config.protocol.kind} --stations {stations} --sf {settings.spreading_factor} "
@@ -119,17 +116,17 @@ def check_limits(config: ClientConfig | MasterConfig, path: Path) -> Finding:
         )
         if config.radio.region is not None:
             plan += f" --region {config.radio.region}"
-        return note("limits", f"{text}. {'; '.join(found)}. What would comply: `{plan}`")
+        return note("limits", f"{text}. {'; '.join(found)}. For settings that comply: `{plan}`")
     if config.radio.region is None:
         return note(
             "limits",
-            f'{text}; no region is named, so that nobody knows whether that is allowed: region = "EU868"',
+            f'{text}; no region is configured, so the legal limits are unknown: region = "EU868"',
         )
-    return ok("limits", f"{text}; within the limits of {config.radio.region} that tsgt knows, with a dipole")
+    return ok("limits", f"{text}; within the known limits of {config.radio.region}, with a dipole")
 
 
 def _protocol(config: ClientConfig | MasterConfig) -> MasterProtocolConfig:
-    """Return the protocol as the master runs it; a client takes the usual."""
+    """Return the protocol settings of the master; for a client the defaults."""
     if isinstance(config, MasterConfig):
         return config.protocol
     if isinstance(config.protocol, ClassicConfig):

@@ -1,4 +1,4 @@
-"""Numbers that no place, drive or instrument has: one line of error at the door, no overflow further inside."""
+"""Absurd numbers in files and options: one line of error on input, no overflow later."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from harness.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
 from harness.cli import called
-from harness.harmless import Files, check
-from harness.published import CONSTANTS, write_prisms, write_targets, write_tracks
+from harness.cli_contract import Files, check_command
 
 if TYPE_CHECKING:
     from harness.cli import Tsgt
@@ -33,7 +33,7 @@ A,body,11.0,81.0,20.1,10,1.0,0.0,0.5
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Good files by name: of the set-up, recordings of angles and of points, and what they were made from."""
+    """Return valid files by name: set-up files, recordings of angles and of points, and their sources."""
     folder = tmp_path_factory.mktemp("good")
     tracks = write_tracks(folder, duration_s=6.0)
     prisms, targets = write_prisms(folder), write_targets(folder)
@@ -45,15 +45,16 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 
 def refused(good: dict[str, str], arguments: tuple[str, ...], name: str, content: str, words: str) -> None:
-    """Check that a command says these words of a file, in its one line of error."""
+    """Check that a command reports a file with these words in one line."""
+    output = {"process": "o.tum", "import": "o.jsonl", "calibrate": "o.toml"}.get(arguments[0], "o")
     with Files({key: text.encode() for key, text in {**good, name: content}.items()}) as files:
-        outcome = check(files, arguments, output="o")
+        outcome = check_command(files, arguments, output=output)
     assert outcome.code in (1, 2), outcome
     assert words in outcome.err
 
 
 def with_number(text: str, key: str, number: str) -> str:
-    """Put a number in the place of the first one after a key."""
+    """Replace the first number after a key."""
     changed, count = re.subn(rf"(\b{key}\W*?)-?\d[\d.e-]*", rf"\g<1>{number}", text, count=1)
     assert count == 1
     return changed
@@ -67,25 +68,25 @@ def with_number(text: str, key: str, number: str) -> str:
         ("station_frames.example.toml", "0.0, 0.0, 1.0,", "--frames"),
     ],
 )
-def test_a_place_in_a_set_up_file(
+def test_absurd_coordinate_in_a_set_up_file(
     good: dict[str, str], name: str, key: str, option: str, number: str
 ) -> None:
-    """The file and the key are named."""
+    """The error names file and key."""
     content = with_number(good[name], re.escape(key) if option == "--frames" else key, number)
     refused(good, ("process", "@r.jsonl", option, f"@{name}"), name, content, f"{name}: ")
     with Files(
         {key: text.encode() for key, text in {**good, name: content, "c.toml": MASTER}.items()}
     ) as files:
-        assert check(files, ("config", "check", "@c.toml")).code == 2
+        assert check_command(files, ("config", "check", "@c.toml")).code == 2
 
 
 @pytest.mark.parametrize("number", [1e300, -1e300, 1e9])
 @pytest.mark.parametrize("recording", ["r.jsonl", "p.jsonl"])
 @pytest.mark.parametrize("what", ["prism", "frame", "rotation"])
-def test_a_place_in_the_parameters_of_a_recording(
+def test_absurd_coordinate_in_a_recording(
     good: dict[str, str], recording: str, what: str, number: float
 ) -> None:
-    """The line is named."""
+    """The error names the line."""
     head, parameters, *others = good[recording].splitlines(keepends=True)
     changed = json.loads(parameters)
     if what == "prism":
@@ -97,8 +98,8 @@ def test_a_place_in_the_parameters_of_a_recording(
         refused(good, (*command, f"@{recording}"), recording, content, f"{recording}, line 2")
 
 
-def test_what_is_no_rotation_in_the_parameters_of_a_recording(good: dict[str, str]) -> None:
-    """A frame that would bend space is refused, small as its numbers are."""
+def test_frame_that_is_not_a_rotation_in_a_recording(good: dict[str, str]) -> None:
+    """A scaled rotation is rejected although its numbers are small."""
     head, parameters, *others = good["r.jsonl"].splitlines(keepends=True)
     changed = json.loads(parameters)
     changed["stations"][1]["T_station1_station"][0][0] *= 0.9
@@ -107,8 +108,8 @@ def test_what_is_no_rotation_in_the_parameters_of_a_recording(good: dict[str, st
 
 
 @pytest.mark.parametrize("number", ["1e300", "-1e300", "1e9"])
-def test_a_prism_of_the_authors(good: dict[str, str], number: str) -> None:
-    """The line is named."""
+def test_absurd_prism_position(good: dict[str, str], number: str) -> None:
+    """The error names the line."""
     content = re.sub(r"^\S+", number, good["sensor_positions.csv"])
     tracks = ("@trimble1.csv", "@trimble2.csv", "@trimble3.csv")
     arguments = ("import", "rts", "--tracks", *tracks, "--prisms", "@sensor_positions.csv")
@@ -125,15 +126,15 @@ def test_a_prism_of_the_authors(good: dict[str, str], number: str) -> None:
         ("1.0,0.0,0.5", "1.0,1e300,0.5", "line 3: y_m is '1e300'; expected"),
     ],
 )
-def test_a_target(good: dict[str, str], before: str, after: str, words: str) -> None:
-    """Line, column and what was expected are named."""
+def test_absurd_target(good: dict[str, str], before: str, after: str, words: str) -> None:
+    """The error names line, column and limits."""
     content = PRISM_LINES.replace(before, after)
     assert content != PRISM_LINES
     refused(good, ("calibrate", "prisms", "@prisms.csv"), "prisms.csv", content, words)
 
 
-def test_a_distance_in_the_authors_marker_file(good: dict[str, str]) -> None:
-    """A distance of 10^12 m made the equations singular."""
+def test_absurd_distance_in_a_marker_file(good: dict[str, str]) -> None:
+    """A distance of 10^12 m would make the equations singular."""
     lines = good["GCP.txt"].splitlines()
     cells = lines[1].split(",")
     lines[1] = ",".join([*cells[:5], " 1e12 ", *cells[6:]])
@@ -141,14 +142,14 @@ def test_a_distance_in_the_authors_marker_file(good: dict[str, str]) -> None:
 
 
 @pytest.mark.parametrize("number", ["1e300", "-1e300"])
-def test_a_reference(good: dict[str, str], number: str) -> None:
-    """The line is named."""
+def test_absurd_reference(good: dict[str, str], number: str) -> None:
+    """The error names the line."""
     first, second, *others = good["r.tum"].splitlines(keepends=True)
     words = second.split()
     content = "".join([first, " ".join([words[0], number, *words[2:]]) + "\n", *others])
     arguments = ("evaluate", "@r.jsonl", "--estimator", "linear", "--no-held-out", "--reference", "@r.tum")
     with Files({key: text.encode() for key, text in {**good, "r.tum": content}.items()}) as files:
-        outcome = check(files, arguments)
+        outcome = check_command(files, arguments)
     assert outcome.code == 1
     assert "line 2: is not a pose" in outcome.err
 
@@ -172,20 +173,22 @@ def test_a_reference(good: dict[str, str], number: str) -> None:
         (DYNAMIC, "interval_min_s", "1e-300"),
     ],
 )
-def test_a_scenario(scenario: str, key: str, number: str) -> None:
-    """The key is named."""
+def test_absurd_scenario(scenario: str, key: str, number: str) -> None:
+    """The error names the key."""
     with Files({"s.toml": with_number(scenario, key, number).encode()}) as files:
-        outcome = check(files, ("simulate", "@s.toml", "--duration", "1"))
+        outcome = check_command(files, ("simulate", "@s.toml", "--duration", "1"))
     assert outcome.code == 2, outcome
     assert re.findall(r"\w+_\w+", key)[0] in outcome.err
 
 
-@pytest.mark.parametrize("key", ["acceleration_correlation_time_s", "angular_acceleration_correlation_time_s"])
-def test_how_a_robot_moves(good: dict[str, str], key: str) -> None:
-    """What no estimator can compute with is an error of the configuration, and names its key."""
+@pytest.mark.parametrize(
+    "key", ["acceleration_correlation_time_s", "angular_acceleration_correlation_time_s"]
+)
+def test_absurd_motion_prior(good: dict[str, str], key: str) -> None:
+    """Values outside the limits of the estimator are configuration errors."""
     content = with_number(MASTER, key, "1e-300")
     with Files({name: text.encode() for name, text in {**good, "c.toml": content}.items()}) as files:
-        outcome = check(files, ("config", "check", "@c.toml"))
+        outcome = check_command(files, ("config", "check", "@c.toml"))
     assert outcome.code == 2
     assert f"pipeline.motion.{key}" in outcome.err
 
@@ -204,10 +207,10 @@ def test_how_a_robot_moves(good: dict[str, str], key: str) -> None:
         (("import", "polar"), "--prism-constant-mm"),
     ],
 )
-def test_a_constant_on_the_command_line(
+def test_absurd_constant_is_a_usage_error(
     tsgt: Tsgt, command: tuple[str, ...], option: str, millimetres: str
 ) -> None:
-    """It is a usage error: ten metres are more than any reflector adds."""
+    """No reflector adds ten metres."""
     outcome = tsgt(*command, option, millimetres)
     assert outcome.code == 2
     assert option in outcome.err
@@ -215,16 +218,16 @@ def test_a_constant_on_the_command_line(
 
 
 @pytest.mark.parametrize("option", [("--point", "1e300", "0", "0"), ("--area", "0", "1e12", "0", "30")])
-def test_a_place_on_the_command_line(good: dict[str, str], option: tuple[str, ...]) -> None:
-    """It is a usage error."""
+def test_absurd_coordinate_is_a_usage_error(good: dict[str, str], option: tuple[str, ...]) -> None:
+    """Exit code 2."""
     with Files({name: text.encode() for name, text in good.items()}) as files:
-        assert check(files, ("analyse", "layout", "@prism_layout.example.toml", *option)).code == 2
+        assert check_command(files, ("analyse", "layout", "@prism_layout.example.toml", *option)).code == 2
 
 
-def test_a_point_that_is_none_of_the_robot(good: dict[str, str]) -> None:
-    """Where it would be is known so badly that no number says how badly."""
+def test_point_far_from_the_robot_is_an_error(good: dict[str, str]) -> None:
+    """Its uncertainty would be meaningless."""
     with Files({name: text.encode() for name, text in good.items()}) as files:
-        outcome = check(
+        outcome = check_command(
             files,
             ("analyse", "layout", "@prism_layout.example.toml", "--point", "2e7", "2e7", "2e7"),
         )
@@ -233,12 +236,12 @@ def test_a_point_that_is_none_of_the_robot(good: dict[str, str]) -> None:
 
 
 @pytest.mark.parametrize("number", ["500000.0", "5500000.0", "-9999999.0"])
-def test_coordinates_of_a_map_are_places(good: dict[str, str], number: str) -> None:
-    """UTM has metres by the million, on either hemisphere."""
+def test_map_coordinates_are_accepted(good: dict[str, str], number: str) -> None:
+    """UTM coordinates have millions of metres on either hemisphere."""
     layout = re.sub(r"position_m = \[", f"position_m = [{number} + ", good["prism_layout.example.toml"])
     layout = re.sub(r"\[(\S+) \+ (-?[\d.]+)", lambda m: f"[{float(m[1]) + float(m[2])!r}", layout)
     frames = with_number(good["station_frames.example.toml"], re.escape("0.0, 0.0, 1.0,"), number)
     contents = {**good, "prism_layout.example.toml": layout, "station_frames.example.toml": frames}
     with Files({name: text.encode() for name, text in (contents | {"c.toml": MASTER}).items()}) as files:
-        outcome = check(files, ("config", "check", "@c.toml"))
+        outcome = check_command(files, ("config", "check", "@c.toml"))
     assert outcome.code == 0, outcome

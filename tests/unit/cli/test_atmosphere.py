@@ -1,4 +1,4 @@
-"""`tsgt atmosphere`: what it says to a client, and what it makes of the answer."""
+"""``tsgt atmosphere`` against a simulated client."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 from tsgt.recording import encode_line
 from tsgt.recording.journal import InstrumentRecord
-from tsgt.station import Answer
+from tsgt.station import AtmosphereResponse
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -28,11 +28,11 @@ SETTINGS = InstrumentRecord(
 
 @contextmanager
 def client(path: Path, *lines: bytes, drip: bytes = b"") -> Iterator[list[bytes]]:
-    """Play a client that says these lines to whoever comes, and then a bit of one again and again, for as long as it is heard.
+    """Simulate a client that sends these lines, then a fragment repeatedly; yield the requests it receives.
 
-    What it is told is collected.
+    What it is requests is collected.
     """
-    told: list[bytes] = []
+    requests: list[bytes] = []
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     listener.bind(str(path))
     listener.listen()
@@ -40,7 +40,7 @@ def client(path: Path, *lines: bytes, drip: bytes = b"") -> Iterator[list[bytes]
     def answer() -> None:
         connection, _ = listener.accept()
         with connection, connection.makefile("rb") as file:
-            told.append(file.readline())
+            requests.append(file.readline())
             connection.sendall(b"".join(line + b"\n" for line in lines))
             with suppress(OSError):
                 while drip and not over.wait(0.02):
@@ -50,29 +50,29 @@ def client(path: Path, *lines: bytes, drip: bytes = b"") -> Iterator[list[bytes]
     thread = threading.Thread(target=answer)
     thread.start()
     try:
-        yield told
+        yield requests
     finally:
         over.set()
         thread.join()
         listener.close()
 
 
-def test_the_air_is_told_and_the_settings_are_shown(tsgt: Tsgt, tmp_path: Path) -> None:
-    """A temperature below zero is no option."""
-    with client(tmp_path / "s", STATUS, encode_line(Answer(settings=SETTINGS))) as told:
+def test_request_is_sent_and_settings_are_printed(tsgt: Tsgt, tmp_path: Path) -> None:
+    """A negative temperature is not an option."""
+    with client(tmp_path / "s", STATUS, encode_line(AtmosphereResponse(settings=SETTINGS))) as requests:
         outcome = tsgt("atmosphere", "-5", "987.5", "--socket", tmp_path / "s")
     assert outcome.code == 0, outcome.err
-    assert json.loads(told[0]) == {"type": "atmosphere", "temperature_c": -5.0, "pressure_hpa": 987.5}
+    assert json.loads(requests[0]) == {"type": "atmosphere", "temperature_c": -5.0, "pressure_hpa": 987.5}
     assert outcome.out.splitlines() == [
-        "set; distances are measured with",
+        "set; distances are corrected by",
         "  prism round +0.0 mm",
         "  air -13.1 ppm",
     ]
 
 
-def test_what_is_refused_is_an_error(tsgt: Tsgt, tmp_path: Path) -> None:
-    """Exit code 1 and the reason, in one line; with --json the record and the same code."""
-    answer = encode_line(Answer(problem="no instrument is connected"))
+def test_rejected_request_is_an_error(tsgt: Tsgt, tmp_path: Path) -> None:
+    """Exit code 1 and the reason in one line; with --json the record and the same code."""
+    answer = encode_line(AtmosphereResponse(problem="no instrument is connected"))
     with client(tmp_path / "s", STATUS, answer):
         outcome = tsgt("atmosphere", "20", "1000", "--socket", tmp_path / "s")
     assert outcome.code == 1
@@ -86,34 +86,32 @@ def test_what_is_refused_is_an_error(tsgt: Tsgt, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("lines", "words"),
     [
-        ([b'{"type":"hello"}'], "that is a master"),
-        ([b"SSH-2.0-OpenSSH"], "does not answer as a client"),
-        ([STATUS], "does not answer as a client"),
-        ([], "does not answer as a client"),
+        ([b'{"type":"hello"}'], "this is a master"),
+        ([b"SSH-2.0-OpenSSH"], "not the response of a client"),
+        ([STATUS], "not the response of a client"),
+        ([], "not the response of a client"),
     ],
 )
-def test_something_else_on_the_socket_is_an_error(
+def test_other_server_on_the_socket_is_an_error(
     tsgt: Tsgt, tmp_path: Path, lines: list[bytes], words: str
 ) -> None:
-    """One line that says what is wrong, and exit code 1."""
+    """Exit code 1 and one line."""
     with client(tmp_path / "s", *lines):
         outcome = tsgt("atmosphere", "20", "1000", "--socket", tmp_path / "s")
     assert outcome.code == 1
     assert words in outcome.err
 
 
-def test_nobody_at_the_socket(tsgt: Tsgt, tmp_path: Path) -> None:
-    """One line that names the socket, and exit code 1."""
+def test_missing_socket_is_an_error(tsgt: Tsgt, tmp_path: Path) -> None:
+    """Exit code 1 and one line that names the socket."""
     outcome = tsgt("atmosphere", "20", "1000", "--socket", tmp_path / "nobody")
     assert outcome.code == 1
-    assert "nobody answers" in outcome.err
+    assert "no connection to a client" in outcome.err
 
 
-def test_a_client_that_says_nothing_whole_is_not_waited_for(
-    tsgt: Tsgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The time limit is for its status as a whole, not for the next byte, and not that of an instrument."""
-    monkeypatch.setattr("tsgt.cli.atmosphere.STATUS_S", 0.2)
+def test_incomplete_status_times_out(tsgt: Tsgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The timeout applies to the whole status, not to each byte."""
+    monkeypatch.setattr("tsgt.cli.atmosphere.STATUS_TIMEOUT_S", 0.2)
     with client(tmp_path / "s", drip=b"x"):
         outcome = tsgt("atmosphere", "20", "1000", "--socket", tmp_path / "s")
     assert outcome.code == 1
@@ -122,24 +120,20 @@ def test_a_client_that_says_nothing_whole_is_not_waited_for(
     ]
 
 
-def test_an_instrument_that_is_busy_is_waited_for_and_that_is_said(
-    tsgt: Tsgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """First that it is waited for, and in the end that the air is not forgotten."""
-    monkeypatch.setattr("tsgt.cli.atmosphere.QUIET_S", 0.05)
-    monkeypatch.setattr("tsgt.cli.atmosphere.ANSWER_S", 0.2)
+def test_busy_instrument_is_waited_for(tsgt: Tsgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The wait is announced, and the error says that the request stays in force."""
+    monkeypatch.setattr("tsgt.cli.atmosphere.NOTICE_AFTER_S", 0.05)
+    monkeypatch.setattr("tsgt.cli.atmosphere.RESPONSE_TIMEOUT_S", 0.2)
     with client(tmp_path / "s", STATUS, drip=b" "):
         outcome = tsgt("atmosphere", "20", "1000", "--socket", tmp_path / "s")
     assert outcome.code == 1
     waiting, error = outcome.err.splitlines()
-    assert waiting == "waiting for the instrument, which is busy; 0.2 s at most"
-    assert error.startswith(
-        f"error: {tmp_path / 's'}: the instrument has not been free for 0.2 s; it is told as"
-    )
+    assert waiting == "waiting up to 0.2 s for the busy instrument"
+    assert error.startswith(f"error: {tmp_path / 's'}: the instrument has been busy for 0.2 s; ")
 
 
-def test_a_typing_mistake_is_a_usage_error(tsgt: Tsgt) -> None:
-    """Before anybody is asked."""
+def test_invalid_arguments_are_usage_errors(tsgt: Tsgt) -> None:
+    """No client is contacted."""
     assert tsgt("atmosphere", "20").code == 2
     assert tsgt("atmosphere", "warm", "1000").code == 2
     assert tsgt("atmosphere", "20", "1000", "--sockets", "x").code == 2

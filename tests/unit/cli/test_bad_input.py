@@ -1,4 +1,4 @@
-"""Bad input: one clear line on stderr, a non-zero exit, and no output file, not even half of one."""
+"""Invalid input: one line on stderr, a non-zero exit code, and no output file."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.published import write_prisms, write_targets, write_tracks
+from harness.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
 from harness.scene import LAYOUT
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 TRACK_EDITS: dict[str, tuple[Callable[[list[str]], list[str]], str]] = {
-    "empty file": (lambda _: [], "holds no positions"),
+    "empty file": (lambda _: [], "contains no positions"),
     "wrong column count": (
         lambda lines: [*lines[:4], lines[4] + " 1.0", *lines[5:]],
         "line 5: expected 4 columns",
@@ -36,10 +36,10 @@ TRACK_EDITS: dict[str, tuple[Callable[[list[str]], list[str]], str]] = {
         lambda lines: [*lines[:4], _with_last(lines[4], "9" * 100_000), *lines[5:]],
         f"line 5: expected a finite number, got '{'9' * 56}...\n",
     ),
-    "unsorted time stamps": (lambda lines: [lines[1], lines[0], *lines[2:]], "line 2: time runs backwards"),
+    "unsorted time stamps": (lambda lines: [lines[1], lines[0], *lines[2:]], "line 2: time decreases"),
     "repeated time stamps": (
         lambda lines: [lines[0], *lines],
-        "line 2: time stamp 1700000000.1100123 stands here",
+        "line 2: duplicate time 1700000000.1100123",
     ),
 }
 
@@ -50,7 +50,7 @@ def _with_last(line: str, word: str) -> str:
 
 @pytest.fixture
 def files(tmp_path: Path) -> dict[str, Path]:
-    """Good files, for a test to spoil one of them."""
+    """Return valid files, for a test to spoil one of them."""
     one, two, three = write_tracks(tmp_path)
     return {
         "track1": one,
@@ -64,13 +64,13 @@ def files(tmp_path: Path) -> dict[str, Path]:
 
 
 def import_arguments(files: dict[str, Path]) -> list[object]:
-    """Arguments that import the files without their targets."""
+    """Return arguments that import the files without their targets."""
     tracks = [files["track1"], files["track2"], files["track3"]]
     return ["import", "rts", "--tracks", *tracks, "--prisms", files["prisms"], "--output", files["recording"]]
 
 
 def assert_refused(tsgt: Tsgt, arguments: list[object], output: Path, expected: str) -> None:
-    """Check the exit code, the one line, and that the folder holds the same files as before."""
+    """Check the exit code, the one line, and that the folder is unchanged."""
     before = {path: path.stat().st_mtime_ns for path in output.parent.iterdir()}
     outcome = tsgt(*arguments)
     assert outcome.code == 1
@@ -81,41 +81,59 @@ def assert_refused(tsgt: Tsgt, arguments: list[object], output: Path, expected: 
     assert {path: path.stat().st_mtime_ns for path in output.parent.iterdir()} == before
 
 
-def test_the_option_of_the_tracks_said_three_times_is_refused(tsgt: Tsgt, files: dict[str, Path]) -> None:
-    """``import polar`` takes its option once for each file, ``import rts`` once for all: the message says so."""
+def test_tracks_may_be_given_one_by_one(tsgt: Tsgt, files: dict[str, Path]) -> None:
+    """The option takes several files, and may be repeated."""
     tracks = [word for k in (1, 2, 3) for word in ("--tracks", files[f"track{k}"])]
-    outcome = tsgt("import", "rts", *tracks, "--prisms", files["prisms"], "--output", files["recording"])
+    others = ["--prisms", files["prisms"], "--output", files["recording"]]
+    assert tsgt("import", "rts", *tracks, *others, "--json").json()["measurements"] == 75
+
+
+def test_import_rts_needs_three_tracks(tsgt: Tsgt, files: dict[str, Path]) -> None:
+    """The paper has three prisms."""
+    others = ["--prisms", files["prisms"], "--output", files["recording"]]
+    outcome = tsgt("import", "rts", "--tracks", files["track1"], files["track2"], *others)
     assert outcome.code == 2
-    assert "takes three files, one after the other, but --prisms stands between them" in outcome.err
+    assert "--tracks takes 3 files, one per prism; got 2" in outcome.err
+    assert not files["recording"].exists()
+
+
+@pytest.mark.parametrize("missing", ["--target-constant-mm", "--prism-constant-mm"])
+def test_constants_have_no_default(tsgt: Tsgt, files: dict[str, Path], missing: str) -> None:
+    """The authors' marker file has no constants, and a wrong one changes every result."""
+    index = CONSTANTS.index(missing)
+    constants = CONSTANTS[:index] + CONSTANTS[index + 2 :]
+    outcome = tsgt(*import_arguments(files), "--targets", files["targets"], *constants)
+    assert outcome.code == 2
+    assert missing in outcome.err
     assert not files["recording"].exists()
 
 
 @pytest.mark.parametrize("case", TRACK_EDITS)
-def test_a_bad_track_is_refused(tsgt: Tsgt, files: dict[str, Path], case: str) -> None:
-    """A track that cannot be used is named with the line and what is wrong in it."""
+def test_invalid_track_is_rejected(tsgt: Tsgt, files: dict[str, Path], case: str) -> None:
+    """The error names the line and the problem."""
     edit, expected = TRACK_EDITS[case]
     lines = edit(files["track2"].read_text(encoding="utf-8").splitlines())
     files["track2"].write_text("\n".join(lines), encoding="utf-8")
     assert_refused(tsgt, import_arguments(files), files["recording"], expected)
 
 
-def test_a_missing_track_is_refused(tsgt: Tsgt, files: dict[str, Path]) -> None:
-    """A file that is not there is named."""
+def test_missing_track_is_rejected(tsgt: Tsgt, files: dict[str, Path]) -> None:
+    """The error names the file."""
     files["track3"].unlink()
     assert_refused(tsgt, import_arguments(files), files["recording"], "trimble3.csv: No such file")
 
 
-def test_a_track_that_is_no_text_is_refused(tsgt: Tsgt, files: dict[str, Path]) -> None:
-    """A binary file is called that."""
+def test_binary_track_is_rejected(tsgt: Tsgt, files: dict[str, Path]) -> None:
+    """The error says that it is not text."""
     files["track1"].write_bytes(b"\xff\xfe\x00\x01")
     assert_refused(tsgt, import_arguments(files), files["recording"], "is not a text file")
 
 
-def test_a_failed_import_leaves_an_older_recording_alone(tsgt: Tsgt, files: dict[str, Path]) -> None:
-    """What was there before is still there, byte for byte."""
+def test_failed_import_keeps_an_older_recording(tsgt: Tsgt, files: dict[str, Path]) -> None:
+    """The file is unchanged."""
     assert tsgt(*import_arguments(files)).code == 0
     files["track1"].write_text("", encoding="utf-8")
-    assert_refused(tsgt, import_arguments(files), files["recording"], "holds no positions")
+    assert_refused(tsgt, import_arguments(files), files["recording"], "contains no positions")
 
 
 @pytest.mark.parametrize(
@@ -128,32 +146,32 @@ def test_a_failed_import_leaves_an_older_recording_alone(tsgt: Tsgt, files: dict
     ],
     ids=["two at one place", "in a line", "one missing", "NaN"],
 )
-def test_a_bad_prism_layout_is_refused(
+def test_degenerate_prism_layout_is_rejected(
     tsgt: Tsgt,
     files: dict[str, Path],
     layout: NDArray[np.float64],
     expected: str,
 ) -> None:
-    """A layout from which no pose can come is refused at the door."""
+    """A layout must determine a pose."""
     write_prisms(files["prisms"].parent, layout)
     assert_refused(tsgt, import_arguments(files), files["recording"], expected)
 
 
 @pytest.mark.parametrize(("stations", "missing"), [((1, 2), "3"), ((1, 3), "2")])
-def test_targets_without_a_station_are_refused(
+def test_targets_without_a_station_are_rejected(
     tsgt: Tsgt,
     files: dict[str, Path],
     stations: tuple[int, ...],
     missing: str,
 ) -> None:
-    """A station that no target was measured from is named."""
+    """The error names the station."""
     targets = write_targets(files["targets"].parent, stations)
-    arguments = [*import_arguments(files), "--targets", targets]
+    arguments = [*import_arguments(files), "--targets", targets, *CONSTANTS]
     assert_refused(tsgt, arguments, files["recording"], f"holds no targets of station {missing}")
 
 
 def process_arguments(files: dict[str, Path]) -> list[object]:
-    """Arguments that process the recording."""
+    """Return arguments that process the recording."""
     return ["process", files["recording"], "--output", files["poses"]]
 
 
@@ -163,8 +181,8 @@ def imported(tsgt: Tsgt, files: dict[str, Path]) -> list[str]:
     return files["recording"].read_text(encoding="utf-8").splitlines(keepends=True)
 
 
-def test_a_mirrored_layout_is_found_when_processing(tsgt: Tsgt, files: dict[str, Path]) -> None:
-    """Distances cannot tell it, but the robot would drive upside down."""
+def test_mirrored_layout_is_detected(tsgt: Tsgt, files: dict[str, Path]) -> None:
+    """Distances agree, but the robot would be upside down."""
     write_prisms(files["prisms"].parent, LAYOUT * [1.0, -1.0, 1.0])
     imported(tsgt, files)
     assert_refused(
@@ -172,25 +190,23 @@ def test_a_mirrored_layout_is_found_when_processing(tsgt: Tsgt, files: dict[str,
     )
 
 
-def test_swapped_prisms_are_found_when_processing(tsgt: Tsgt, files: dict[str, Path]) -> None:
-    """Where the distances differ, the prisms miss their layout, and by how much is said."""
+def test_swapped_prisms_are_detected(tsgt: Tsgt, files: dict[str, Path]) -> None:
+    """The error states the layout residual."""
     write_prisms(files["prisms"].parent, LAYOUT[[0, 2, 1]])
     imported(tsgt, files)
-    assert_refused(
-        tsgt, process_arguments(files), files["poses"], "the prisms miss their layout by 218 mm (median)"
-    )
+    assert_refused(tsgt, process_arguments(files), files["poses"], "is 218 mm (median)")
 
 
-def test_a_recording_without_a_station_is_refused(tsgt: Tsgt, files: dict[str, Path]) -> None:
-    """The prism that nobody measured is named, and the station that should have."""
+def test_recording_without_a_station_is_rejected(tsgt: Tsgt, files: dict[str, Path]) -> None:
+    """The error names the prism and its station."""
     lines = imported(tsgt, files)
     files["recording"].write_text("".join(lines[:2] + [x for x in lines[2:] if '"station":3' not in x]))
-    expected = "prism 3 has no usable measurement (station 3 sent none of it)"
+    expected = "prism 3 has no usable measurement (station 3 "
     assert_refused(tsgt, process_arguments(files), files["poses"], expected)
 
 
-def test_a_recording_with_a_station_in_error_is_refused(tsgt: Tsgt, files: dict[str, Path]) -> None:
-    """What the instrument said instead of measuring is passed on."""
+def test_recording_with_a_station_in_error_is_rejected(tsgt: Tsgt, files: dict[str, Path]) -> None:
+    """The error has the instrument's status."""
     lines = imported(tsgt, files)
     spoilt = [x.replace('"ok"', '"tilt"') if '"station":2' in x else x for x in lines[2:]]
     files["recording"].write_text("".join(lines[:2] + spoilt))
@@ -202,16 +218,16 @@ def test_a_recording_with_a_station_in_error_is_refused(tsgt: Tsgt, files: dict[
     )
 
 
-def test_tracks_of_different_drives_are_refused(tsgt: Tsgt, files: dict[str, Path]) -> None:
-    """Tracks that have no time in common cannot belong together."""
+def test_tracks_of_different_drives_are_rejected(tsgt: Tsgt, files: dict[str, Path]) -> None:
+    """They do not overlap in time."""
     text = files["track1"].read_text(encoding="utf-8")
     files["track1"].write_text(text.replace("17000000", "17000009"), encoding="utf-8")
     expected = "trimble1.csv: begins 890.3 s after the end of"
     assert_refused(tsgt, import_arguments(files), files["recording"], expected)
 
 
-def test_measurements_of_a_wrong_clock_are_refused(tsgt: Tsgt, files: dict[str, Path]) -> None:
-    """A single stamp from 1970 must not make a billion empty poses."""
+def test_measurement_of_a_wrong_clock_is_rejected(tsgt: Tsgt, files: dict[str, Path]) -> None:
+    """A single stamp of 1970 must not make a billion empty poses."""
     lines = imported(tsgt, files)
     old = re.sub(r'"stamp_ns":\d+', '"stamp_ns":5000000000', lines[-1])
     files["recording"].write_text("".join([*lines, old]), encoding="utf-8")
@@ -220,40 +236,40 @@ def test_measurements_of_a_wrong_clock_are_refused(tsgt: Tsgt, files: dict[str, 
 
 
 @pytest.mark.parametrize("option", ["--target-constant-mm", "--prism-constant-mm"])
-def test_a_constant_is_a_finite_number(tsgt: Tsgt, files: dict[str, Path], option: str) -> None:
-    """The command line takes no NaN either."""
+def test_constant_must_be_finite(tsgt: Tsgt, files: dict[str, Path], option: str) -> None:
+    """NaN is a usage error."""
     outcome = tsgt(*import_arguments(files), option, "nan")
     assert outcome.code == 2
     assert "nan is not a finite number" in outcome.err
     assert not files["recording"].exists()
 
 
-def test_a_track_is_no_output(tsgt: Tsgt, files: dict[str, Path]) -> None:
-    """Importing never replaces what it reads."""
-    text = files["track2"].read_text(encoding="utf-8")
-    files["recording"] = files["track2"]
+def test_import_does_not_replace_a_track(tsgt: Tsgt, files: dict[str, Path]) -> None:
+    """Exit code 2."""
+    files["track2"] = files["track2"].rename(files["recording"])
+    text = files["recording"].read_text(encoding="utf-8")
     outcome = tsgt(*import_arguments(files))
     assert outcome.code == 2
     assert "would replace its own input" in outcome.err
-    assert files["track2"].read_text(encoding="utf-8") == text
+    assert files["recording"].read_text(encoding="utf-8") == text
 
 
-def test_one_track_thrice_is_refused(tsgt: Tsgt, files: dict[str, Path]) -> None:
-    """Prisms that were all measured at one place give no pose."""
+def test_identical_tracks_are_rejected(tsgt: Tsgt, files: dict[str, Path]) -> None:
+    """Coincident prisms determine no pose."""
     for track in ("track2", "track3"):
         files[track].write_bytes(files["track1"].read_bytes())
     imported(tsgt, files)
     assert_refused(tsgt, process_arguments(files), files["poses"], "in a line or at one place")
 
 
-def test_a_recording_without_measurements_is_refused(tsgt: Tsgt, files: dict[str, Path]) -> None:
-    """There is nothing to process in header and parameters alone."""
+def test_recording_without_measurements_is_rejected(tsgt: Tsgt, files: dict[str, Path]) -> None:
+    """It has header and parameters only."""
     files["recording"].write_text("".join(imported(tsgt, files)[:2]), encoding="utf-8")
     assert_refused(tsgt, process_arguments(files), files["poses"], "holds no measurements")
 
 
-def test_a_recording_of_another_version_is_refused(tsgt: Tsgt, files: dict[str, Path]) -> None:
-    """Both versions are named."""
+def test_recording_of_another_version_is_rejected(tsgt: Tsgt, files: dict[str, Path]) -> None:
+    """The error names both versions."""
     first, *rest = imported(tsgt, files)
     files["recording"].write_text(
         first.replace('"version":1', '"version":2') + "".join(rest), encoding="utf-8"
@@ -263,14 +279,14 @@ def test_a_recording_of_another_version_is_refused(tsgt: Tsgt, files: dict[str, 
     )
 
 
-def test_a_file_that_is_no_recording_is_refused(tsgt: Tsgt, files: dict[str, Path]) -> None:
-    """A track given as a recording is not mistaken for one."""
+def test_track_is_not_a_recording(tsgt: Tsgt, files: dict[str, Path]) -> None:
+    """The error names the file."""
     files["recording"] = files["track1"]
     assert_refused(tsgt, process_arguments(files), files["poses"], "trimble1.csv")
 
 
-def test_an_unwritable_output_is_one_line(tsgt: Tsgt, files: dict[str, Path]) -> None:
-    """A folder that is not there is said, not traced."""
+def test_unwritable_output_is_one_line(tsgt: Tsgt, files: dict[str, Path]) -> None:
+    """The error names the file."""
     imported(tsgt, files)
     files["poses"] = Path("/nowhere/poses.tum")
     outcome = tsgt(*process_arguments(files))
@@ -278,8 +294,8 @@ def test_an_unwritable_output_is_one_line(tsgt: Tsgt, files: dict[str, Path]) ->
     assert "/nowhere/poses.tum: cannot be written" in outcome.err
 
 
-def test_the_recording_itself_is_no_output(tsgt: Tsgt, files: dict[str, Path]) -> None:
-    """Processing never replaces the measurements that it reads."""
+def test_process_does_not_replace_the_recording(tsgt: Tsgt, files: dict[str, Path]) -> None:
+    """Exit code 2."""
     lines = imported(tsgt, files)
     outcome = tsgt("process", files["recording"], "--output", files["recording"])
     assert outcome.code == 2

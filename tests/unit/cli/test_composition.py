@@ -1,4 +1,4 @@
-"""What the daemons are put together from."""
+"""Parts that the daemons are made of."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from tsgt.simulation.kernel import VirtualClock
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 
-# What a client beside a Leica instrument loads before it says its first word.
+# Imports of a client with a Leica instrument.
 CLIENT = f"""
 import sys
 from pathlib import Path
 from tsgt.cli.composition import make_instrument
 from tsgt.clock import SystemClock
 from tsgt.config import ClientConfig, load
-import tsgt.station.daemon
+import tsgt.cli.daemons, tsgt.station.daemon
 make_instrument(load(Path({str(CONFIGS)!r}) / "client.example.toml", ClientConfig).instrument, SystemClock())
-print(*[name for name in ("numpy", "scipy", "matplotlib", "tsgt.simulation") if name in sys.modules])
+print(*[name for name in ("numpy", "scipy", "matplotlib", "rich", "tsgt.simulation") if name in sys.modules])
 """
 
 
@@ -32,7 +32,7 @@ print(*[name for name in ("numpy", "scipy", "matplotlib", "tsgt.simulation") if 
     ("example", "kind"), [("client", "LeicaInstrument"), ("client.bridge", "BridgeInstrument")]
 )
 async def test_each_kind_of_instrument_is_made(example: str, kind: str) -> None:
-    """Of the kind that the configuration names; it needs neither port nor program before it is connected."""
+    """An instrument that is not connected needs neither port nor program."""
     config = load(CONFIGS / f"{example}.example.toml", ClientConfig)
     instrument = make_instrument(config.instrument, VirtualClock(0))
     assert type(instrument).__name__ == kind
@@ -41,7 +41,7 @@ async def test_each_kind_of_instrument_is_made(example: str, kind: str) -> None:
     await instrument.close()
 
 
-def test_a_client_beside_an_instrument_is_small() -> None:
-    """It loads nothing that takes a small computer seconds to load."""
+def test_client_loads_no_heavy_libraries() -> None:
+    """A station client starts without scipy, matplotlib and rich."""
     done = subprocess.run([sys.executable, "-c", CLIENT], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""

@@ -1,11 +1,11 @@
-"""The commands ``config check`` and ``config schema``."""
+"""``tsgt config check`` and ``config schema``."""
 
 from __future__ import annotations
 
 import json
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from harness.cli import tsgt  # noqa: F401 (a fixture)
@@ -13,7 +13,7 @@ from harness.cli import tsgt  # noqa: F401 (a fixture)
 from tsgt.config import KINDS, json_schema
 
 if TYPE_CHECKING:
-    from harness.cli import Tsgt
+    from harness.cli import Outcome, Tsgt
 
 EXAMPLES = Path(__file__).parents[3] / "configs"
 
@@ -21,39 +21,82 @@ KIND_OF = {
     "master.example": "master",
     "station_frames.example": "station_frames",
     "prism_layout.example": "prism_layout",
-    "scenarios/dynamic": "scenario",
+    "dynamic": "scenario",
 }
 
 
+@pytest.fixture
+def examples(tsgt: Tsgt, tmp_path: Path) -> Path:  # noqa: F811 (a fixture)
+    """Copy the examples, and make the key that they name."""
+    for path in [*EXAMPLES.glob("*.example.toml"), EXAMPLES / "scenarios" / "dynamic.toml"]:
+        shutil.copy(path, tmp_path)
+    assert tsgt("radio", "key", tmp_path / "radio.key").code == 0
+    return tmp_path
+
+
+def summary(outcome: Outcome) -> dict[str, Any]:
+    """Return the JSON summary of a single checked file."""
+    (found,) = outcome.json()["files"]
+    return dict(found)
+
+
 @pytest.mark.parametrize("name", KIND_OF)
-def test_check_says_what_a_file_is(tsgt: Tsgt, name: str) -> None:  # noqa: F811 (a fixture)
-    """Each example is recognised by its kind, as text and as JSON."""
-    path = EXAMPLES / f"{name}.toml"
+def test_check_reports_the_kind_of_a_file(tsgt: Tsgt, examples: Path, name: str) -> None:  # noqa: F811 (a fixture)
+    """As text and as JSON."""
+    path = examples / f"{name}.toml"
     text, as_json = tsgt("config", "check", path), tsgt("config", "check", path, "--json")
     assert (text.code, as_json.code) == (0, 0)
     assert KIND_OF[name] in text.out.splitlines()[0]
-    assert as_json.json()["kind"] == KIND_OF[name]
+    assert summary(as_json)["kind"] == KIND_OF[name]
     assert "[1, 2, 3]" in str(as_json.json())
 
 
 @pytest.mark.parametrize("name", ["client.example", "client.sf8.example"])
-def test_check_says_what_a_client_is(tsgt: Tsgt, name: str) -> None:  # noqa: F811 (a fixture)
-    """The examples are as the installation guide has them checked."""
-    outcome = tsgt("config", "check", EXAMPLES / f"{name}.toml", "--json")
+def test_check_summarises_a_client(tsgt: Tsgt, examples: Path, name: str) -> None:  # noqa: F811 (a fixture)
+    """The installation guide has these examples checked."""
+    outcome = tsgt("config", "check", examples / f"{name}.toml", "--json")
     assert outcome.code == 0
-    assert (outcome.json()["kind"], outcome.json()["station"]) == ("client", 1)
+    assert (summary(outcome)["kind"], summary(outcome)["station"]) == ("client", 1)
+
+
+def test_check_takes_all_examples_at_once(tsgt: Tsgt, examples: Path) -> None:  # noqa: F811 (a fixture)
+    """Each file has a summary."""
+    files = sorted(examples.glob("*.toml"))
+    found = tsgt("config", "check", *files, "--json")
+    assert (found.code, found.json()["ok"]) == (0, True)
+    assert [Path(each["file"]) for each in found.json()["files"]] == files
+    text = tsgt("config", "check", *files)
+    assert [line for line in text.out.splitlines() if line.startswith("#")] == [f"# {path}" for path in files]
+
+
+def test_check_reports_all_problems_of_all_files(tsgt: Tsgt, examples: Path) -> None:  # noqa: F811 (a fixture)
+    """One line for each problem; valid files are summarised nevertheless."""
+    client, layout = examples / "client.example.toml", examples / "prism_layout.example.toml"
+    client.write_text(
+        client.read_text().replace("baud = ", "baudrate = ").replace("station = 1", "station = 99")
+    )
+    master = examples / "master.example.toml"
+    (examples / "station_frames.example.toml").unlink()
+    outcome = tsgt("config", "check", client, master, layout)
+    assert outcome.code == 2
+    lines = outcome.err.splitlines()
+    assert all(line.startswith("error: ") for line in lines)
+    assert [any(words in line for line in lines) for words in ("baudrate: unknown key", "station = 99")] == [
+        True,
+        True,
+    ]
+    assert f"error: {examples / 'station_frames.example.toml'}: no such file" in lines
+    assert str(layout) in outcome.out
+    report = tsgt("config", "check", client, layout, "--json")
+    assert report.code == 2
+    assert [each["ok"] for each in report.json()["files"]] == [False, True]
+    assert len(report.json()["files"][0]["errors"]) == len(lines) - 1
 
 
 @pytest.mark.parametrize("name", ["client.example", "master.example"])
-def test_check_refuses_what_the_radio_cannot_do(
-    tsgt: Tsgt,  # noqa: F811 (a fixture)
-    tmp_path: Path,
-    name: str,
-) -> None:
-    """What the daemon would not start with is no good configuration."""
-    for path in EXAMPLES.glob("*.example.toml"):
-        shutil.copy(path, tmp_path)
-    path = tmp_path / f"{name}.toml"
+def test_check_rejects_an_illegal_channel(tsgt: Tsgt, examples: Path, name: str) -> None:  # noqa: F811 (a fixture)
+    """The daemon would not start."""
+    path = examples / f"{name}.toml"
     path.write_text(path.read_text().replace("frequency_mhz = 905.0", "frequency_mhz = 868.1"))
     outcome = tsgt("config", "check", path)
     assert outcome.code == 2
@@ -61,27 +104,37 @@ def test_check_refuses_what_the_radio_cannot_do(
 
 
 @pytest.mark.parametrize("kind", ["client", "master"])
-def test_check_names_protocol_and_key(tsgt: Tsgt, tmp_path: Path, kind: str) -> None:  # noqa: F811 (a fixture)
-    """Who copies an example learns that the key is still to be made, and who does without one what that means."""
-    for path in EXAMPLES.glob("*.example.toml"):
-        shutil.copy(path, tmp_path)
-    path = tmp_path / f"{kind}.example.toml"
-    found = tsgt("config", "check", path, "--json").json()
-    assert found["protocol"] == "superframe"
-    assert found["key"].startswith(f"{tmp_path / 'radio.key'} (there is no such file")
-    tsgt("radio", "key", tmp_path / "radio.key")
-    assert tsgt("config", "check", path, "--json").json()["key"] == str(tmp_path / "radio.key")
+def test_check_needs_the_key(tsgt: Tsgt, examples: Path, kind: str) -> None:  # noqa: F811 (a fixture)
+    """A missing key or one with wrong permissions fails; without a key the summary warns."""
+    path, key = examples / f"{kind}.example.toml", examples / "radio.key"
+    found = summary(tsgt("config", "check", path, "--json"))
+    assert (found["protocol"], found["key"]) == ("superframe", str(key))
+    key.chmod(0o644)
+    outcome = tsgt("config", "check", path)
+    assert (outcome.code, f"`chmod 600 {key}`" in outcome.err) == (2, True)
+    key.unlink()
+    outcome = tsgt("config", "check", path)
+    assert (outcome.code, f"error: {key}: no such file" in outcome.err) == (2, True)
     path.write_text(path.read_text().replace('key_file = "radio.key"', ""))
     assert "anybody can take part" in tsgt("config", "check", path).out
-    assert "key " not in tsgt("config", "check", tmp_path / f"{kind}.classic.example.toml").out
+    assert "key " not in tsgt("config", "check", examples / f"{kind}.classic.example.toml").out
 
 
-def test_check_follows_the_set_up_files(tsgt: Tsgt, tmp_path: Path) -> None:  # noqa: F811 (a fixture)
-    """A configuration whose set-up files are not there is no good one: exit 2 and one line."""
-    shutil.copy(EXAMPLES / "master.example.toml", tmp_path)
-    outcome = tsgt("config", "check", tmp_path / "master.example.toml")
+def test_check_rejects_world_writable_files(tsgt: Tsgt, examples: Path) -> None:  # noqa: F811 (a fixture)
+    """The daemon would not start with them."""
+    (examples / "prism_layout.example.toml").chmod(0o666)
+    outcome = tsgt("config", "check", examples / "master.example.toml")
+    assert (outcome.code, outcome.err.count("chmod o-w")) == (2, 1)
+
+
+def test_check_reports_all_missing_set_up_files(tsgt: Tsgt, examples: Path) -> None:  # noqa: F811 (a fixture)
+    """One line for each, exit code 2."""
+    names = ("station_frames.example.toml", "prism_layout.example.toml")
+    for name in names:
+        (examples / name).unlink()
+    outcome = tsgt("config", "check", examples / "master.example.toml")
     assert outcome.code == 2
-    assert outcome.err == f"error: {tmp_path / 'station_frames.example.toml'}: no such file\n"
+    assert outcome.err == "".join(f"error: {examples / name}: no such file\n" for name in names)
     assert outcome.out == ""
 
 
@@ -91,34 +144,32 @@ def test_check_follows_the_set_up_files(tsgt: Tsgt, tmp_path: Path) -> None:  # 
     ids=["two prisms at one place", "prisms in a line"],
 )
 @pytest.mark.parametrize("file", ["master", "prism_layout"])
-def test_check_refuses_a_degenerate_layout(
+def test_check_rejects_a_degenerate_layout(
     tsgt: Tsgt,  # noqa: F811 (a fixture)
-    tmp_path: Path,
+    examples: Path,
     file: str,
     position: str,
     problem: str,
 ) -> None:
-    """Prisms that no pose can come of are found before the robot drives, whichever file is checked."""
-    for path in EXAMPLES.glob("*.toml"):
-        shutil.copy(path, tmp_path)
-    layout = tmp_path / "prism_layout.example.toml"
+    """In the configuration of a master and in the layout itself."""
+    layout = examples / "prism_layout.example.toml"
     layout.write_text(layout.read_text().replace("[-0.0285, 0.3519, 1.0667]", position))
-    outcome = tsgt("config", "check", tmp_path / f"{file}.example.toml")
+    outcome = tsgt("config", "check", examples / f"{file}.example.toml")
     assert outcome.code == 2
     assert outcome.err.startswith(f"error: {layout}: prisms: ")
     assert problem in outcome.err
     assert outcome.err.count("\n") == 1
 
 
-def test_check_refuses_a_layout_of_two(tsgt: Tsgt, tmp_path: Path) -> None:  # noqa: F811 (a fixture)
-    """Two prisms are too few, and that is said as such."""
+def test_check_rejects_a_layout_of_two_prisms(tsgt: Tsgt, tmp_path: Path) -> None:  # noqa: F811 (a fixture)
+    """The error says how many are needed."""
     layout = tmp_path / "layout.toml"
     layout.write_text('kind = "prism_layout"\n[prisms.1]\nposition_m = [1, 0, 0]\n')
     outcome = tsgt("config", "check", layout)
     assert (outcome.code, "at least 3 prisms" in outcome.err) == (2, True)
 
 
-def test_schema_of_everything(tsgt: Tsgt) -> None:  # noqa: F811 (a fixture)
+def test_schema_of_all_kinds(tsgt: Tsgt) -> None:  # noqa: F811 (a fixture)
     """Without --kind the schema covers all kinds."""
     assert json.loads(tsgt("config", "schema").out) == json_schema()
 
@@ -130,5 +181,5 @@ def test_schema_of_one_kind(tsgt: Tsgt, kind: str) -> None:  # noqa: F811 (a fix
 
 
 def test_unknown_kind_is_a_usage_error(tsgt: Tsgt) -> None:  # noqa: F811 (a fixture)
-    """A kind that does not exist is refused with exit 2."""
+    """Exit code 2."""
     assert tsgt("config", "schema", "--kind", "tripod").code == 2

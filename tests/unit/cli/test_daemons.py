@@ -1,4 +1,4 @@
-"""What the daemons make sure of before they start."""
+"""Checks of the daemons before they start."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from click.testing import CliRunner
-from harness.made_up_machine import MadeUpMachine
+from harness.fake_machine import FakeMachine
 
 from tsgt.cli.daemons import client, master
 from tsgt.errors import ConfigError
@@ -24,11 +24,9 @@ if TYPE_CHECKING:
         ("master", "layout.toml"),
     ],
 )
-def test_no_daemon_starts_with_a_file_that_everybody_may_write(
-    tmp_path: Path, daemon: str, file: str
-) -> None:
-    """Neither configuration, which can have any program run, nor set-up files, which move every pose."""
-    MadeUpMachine(tmp_path)
+def test_daemon_rejects_world_writable_files(tmp_path: Path, daemon: str, file: str) -> None:
+    """A configuration can run any program, and set-up files move every pose."""
+    FakeMachine(tmp_path)
     (tmp_path / file).chmod(0o666)
     command = {"client": client, "master": master}[daemon]
     refused = CliRunner().invoke(command, ["--config", str(tmp_path / f"{daemon}.toml")]).exception

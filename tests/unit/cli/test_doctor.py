@@ -1,4 +1,4 @@
-"""`tsgt doctor`: lines, JSON and exit code; what the checks find is tested with them."""
+"""``tsgt doctor``: text, JSON and exit code."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import socket
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.made_up_machine import ADAPTER, MadeUpMachine
+from harness.fake_machine import ADAPTER, FakeMachine
 
 from tsgt.cli import doctor
 from tsgt.cli.doctor import this_machine
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture
-def made_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> MadeUpMachine:
-    """Make a machine and let the command look at it; without hardware, whose checks need virtual time."""
-    made = MadeUpMachine(tmp_path)
+def made_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakeMachine:
+    """Return a fake machine without hardware, whose checks need virtual time."""
+    made = FakeMachine(tmp_path)
     made.change("client.toml", 'kind = "sx127x"', 'kind = "simulated"\nair_socket = "air"\nname = "one"')
     made.change("client.toml", 'kind = "leica"', 'kind = "bridge"')
     made.change("client.toml", f'port = "dev/serial/by-id/{ADAPTER}"', 'command = ["my-program", "--all"]')
@@ -31,8 +31,8 @@ def made_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> MadeUpMachine:
     return made
 
 
-def test_machine_that_is_ready_ends_with_0(tsgt: Tsgt, made_up: MadeUpMachine) -> None:
-    """One line per check, each with its verdict and its name, then the sum."""
+def test_ready_machine_exits_with_0(tsgt: Tsgt, made_up: FakeMachine) -> None:
+    """One line per check, then the sum."""
     done = tsgt("doctor", made_up.folder / "client.toml")
     assert done.code == 0, done.out
     *lines, total = done.out.splitlines()
@@ -41,8 +41,8 @@ def test_machine_that_is_ready_ends_with_0(tsgt: Tsgt, made_up: MadeUpMachine) -
     assert total == f"all {sum(not line.startswith('skipped') for line in lines)} checks passed"
 
 
-def test_failed_check_ends_with_3(tsgt: Tsgt, made_up: MadeUpMachine) -> None:
-    """The others are made as well; the failed one is written so that it is seen."""
+def test_failed_check_exits_with_3(tsgt: Tsgt, made_up: FakeMachine) -> None:
+    """The other checks run as well."""
     made_up.programs = set()
     done = tsgt("doctor", made_up.folder / "client.toml")
     assert done.code == 3
@@ -52,8 +52,8 @@ def test_failed_check_ends_with_3(tsgt: Tsgt, made_up: MadeUpMachine) -> None:
     assert done.out.splitlines()[-1].startswith("1 of ")
 
 
-def test_json_has_each_check_by_name(tsgt: Tsgt, made_up: MadeUpMachine) -> None:
-    """A check that could not be made is neither true nor false."""
+def test_json_has_each_check_by_name(tsgt: Tsgt, made_up: FakeMachine) -> None:
+    """``ok`` of a skipped check is null."""
     made_up.programs = set()
     done = tsgt("doctor", made_up.folder / "client.toml", "--json")
     assert done.code == 3
@@ -68,32 +68,32 @@ def test_json_has_each_check_by_name(tsgt: Tsgt, made_up: MadeUpMachine) -> None
     assert all(check["detail"] and check["outcome"] for check in checks.values())
 
 
-def test_usual_configuration_is_found(
-    tsgt: Tsgt, made_up: MadeUpMachine, monkeypatch: pytest.MonkeyPatch
+def test_default_configuration_is_found(
+    tsgt: Tsgt, made_up: FakeMachine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where the installation guide puts it, nothing need be named; where there are two, one has to be."""
+    """If both defaults exist, one has to be given."""
     there, missing = made_up.folder / "client.toml", made_up.folder / "no.toml"
-    monkeypatch.setattr(doctor, "USUAL", (there, missing))
+    monkeypatch.setattr(doctor, "DEFAULT_CONFIGS", (there, missing))
     assert tsgt("doctor").code == 0
-    monkeypatch.setattr(doctor, "USUAL", (there, there))
+    monkeypatch.setattr(doctor, "DEFAULT_CONFIGS", (there, there))
     assert tsgt("doctor").code == 2
-    monkeypatch.setattr(doctor, "USUAL", (missing, missing))
+    monkeypatch.setattr(doctor, "DEFAULT_CONFIGS", (missing, missing))
     done = tsgt("doctor")
     assert done.code == 3
     assert "no such file" in done.out
 
 
-def test_this_machine_can_be_asked_everything(tsgt: Tsgt, tmp_path: Path) -> None:
-    """Without a fake: whatever is missing on the machine of the tests is a finding, not an error."""
-    MadeUpMachine(tmp_path)
+def test_doctor_on_this_machine(tsgt: Tsgt, tmp_path: Path) -> None:
+    """Missing hardware is a finding, not an error."""
+    FakeMachine(tmp_path)
     done = tsgt("doctor", tmp_path / "client.toml", "--json")
     assert done.code == 3  # the adapter of a made-up machine is no terminal
     assert all(check["detail"] for check in done.json()["checks"].values())
     assert "please report" not in done.out
 
 
-def test_socket_that_nobody_serves_is_no_daemon(tmp_path: Path) -> None:
-    """A stale socket, a file, nothing at all; one that somebody serves is told from these."""
+def test_only_a_served_socket_is_a_daemon(tmp_path: Path) -> None:
+    """A stale socket and a missing file are not."""
     machine = this_machine()
     stale, served = tmp_path / "stale", tmp_path / "served"
     with socket.socket(socket.AF_UNIX) as listener:

@@ -1,4 +1,4 @@
-"""What ``evo`` finds between two exported trajectories is what ``tsgt evaluate --reference`` says."""
+"""Agreement of ``evo`` with ``tsgt evaluate --reference``."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from harness.published import write_prisms, write_tracks
+from harness.authors_files import write_prisms, write_tracks
 from harness.scene import LAYOUT
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 def test_evo_agrees_with_evaluate(
     tsgt: Tsgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, estimator: str
 ) -> None:
-    """To 1e-6 m and 1e-6 degrees, unaligned, at the prisms' centroid and 2 s away from the reference's ends."""
+    """To 1e-6 m and 1e-6 degrees, unaligned, at the prisms' centroid, without 2 s at both ends of the reference."""
     monkeypatch.setenv("HOME", str(tmp_path))  # evo writes its settings there when it is first imported
     metrics = pytest.importorskip("evo.core.metrics")
     sync = pytest.importorskip("evo.core.sync")

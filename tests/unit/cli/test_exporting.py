@@ -1,4 +1,4 @@
-"""``tsgt export``: which poses are taken, MCAP files, what is refused. The formats themselves are tested elsewhere."""
+"""``tsgt export``: selection of poses, MCAP files, and errors."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PERIOD_NS = 50_000_000
 
 
 def pose(epoch: int, kind: Kind, x_m: float) -> PoseRecord:
-    """Make a pose of the continuous estimator that is known by its x."""
+    """Make a pose of the continuous estimator, identified by its x."""
     return dataclasses.replace(
         POSE,
         stamp_ns=START + epoch * PERIOD_NS,
@@ -34,7 +34,7 @@ def pose(epoch: int, kind: Kind, x_m: float) -> PoseRecord:
 
 @pytest.fixture
 def live(tmp_path: Path) -> Path:
-    """Write what a live master records: each epoch predicted at once and smoothed later, measurements in between."""
+    """Write a recording of a live master: each epoch predicted at once and smoothed later."""
     predicted = [pose(k, "predicted", 100.0 + k) for k in range(4)]
     smoothed = [pose(k, "smoothed", float(k)) for k in range(2)]
     records = [measurement(0), *predicted[:3], smoothed[0], predicted[3], measurement(1), smoothed[1], EVENT]
@@ -50,7 +50,7 @@ def xs(outcome: Outcome) -> list[float]:
 
 
 def read(path: Path) -> dict[str, list[Any]]:
-    """Messages of each topic."""
+    """Return the messages by topic."""
     found: dict[str, list[Any]] = {}
     with AnyReader([path]) as reader:
         for connection, _, raw in reader.messages():
@@ -58,27 +58,27 @@ def read(path: Path) -> dict[str, list[Any]]:
     return found
 
 
-def test_of_predicted_and_smoothed_poses_the_smoothed_are_taken(tsgt: Tsgt, live: Path) -> None:
-    """An epoch must not stand in a trajectory twice, and the better of the two is the later one."""
+def test_smoothed_poses_replace_predicted_ones(tsgt: Tsgt, live: Path) -> None:
+    """Each epoch is exported once."""
     assert xs(tsgt("export", live, "--format", "tum")) == [0.0, 1.0]
 
 
-def test_predicted_poses_are_there_for_the_asking(tsgt: Tsgt, live: Path) -> None:
-    """They are what a robot had at that moment."""
+def test_predicted_poses_are_exported_on_request(tsgt: Tsgt, live: Path) -> None:
+    """They are what the robot had at that time."""
     outcome = tsgt("export", live, "--format", "tum", "--kind", "predicted")
     assert xs(outcome) == [100.0, 101.0, 102.0, 103.0]
 
 
-def test_csv_says_what_each_pose_is(tsgt: Tsgt, live: Path) -> None:
-    """Who joins two files can tell them apart."""
+def test_csv_has_estimator_and_kind(tsgt: Tsgt, live: Path) -> None:
+    """Joined files can be separated again."""
     outcome = tsgt("export", live, "--format", "csv", "--kind", "predicted")
     rows = list(csv.DictReader(outcome.out.splitlines()))
     assert {(row["estimator"], row["kind"]) for row in rows} == {("continuous", "predicted")}
     assert len(rows) == 4
 
 
-def test_a_kind_that_is_not_there_is_an_error(tsgt: Tsgt, live: Path, tmp_path: Path) -> None:
-    """Nothing is computed in its place, and no empty file is left."""
+def test_missing_kind_is_an_error(tsgt: Tsgt, live: Path, tmp_path: Path) -> None:
+    """Nothing is computed instead, and no file is written."""
     output = tmp_path / "out.tum"
     outcome = tsgt("export", live, "--format", "tum", "--kind", "interpolated", "--output", output)
     assert outcome.code == 1
@@ -87,7 +87,7 @@ def test_a_kind_that_is_not_there_is_an_error(tsgt: Tsgt, live: Path, tmp_path: 
 
 
 def test_mcap_of_a_live_recording(tsgt: Tsgt, live: Path, tmp_path: Path) -> None:
-    """Poses as recorded, prisms as measured, and the trajectory to compare with."""
+    """Poses, prism positions and the reference are in the file."""
     reference, output = tmp_path / "reference.tum", tmp_path / "out.mcap"
     reference.write_text("1700000000.5 7 8 9 0 0 0 1\n1700000000.6 7 8 9 0 0 0 1\n", encoding="utf-8")
     arguments = ["--format", "mcap", "--reference", reference, "--output", output]
@@ -104,8 +104,8 @@ def test_mcap_of_a_live_recording(tsgt: Tsgt, live: Path, tmp_path: Path) -> Non
     }
 
 
-def test_mcap_of_what_was_only_measured_is_processed_first(tsgt: Tsgt, live: Path, tmp_path: Path) -> None:
-    """As for the other formats; here it cannot be, and what is missing is named."""
+def test_mcap_of_measurements_is_processed_first(tsgt: Tsgt, live: Path, tmp_path: Path) -> None:
+    """Processing fails here, and the error names the missing prism."""
     live.write_bytes(recording_bytes(measurement(0), measurement(1)))
     outcome = tsgt("export", live, "--format", "mcap", "--output", tmp_path / "out.mcap")
     assert outcome.code == 1
@@ -114,8 +114,8 @@ def test_mcap_of_what_was_only_measured_is_processed_first(tsgt: Tsgt, live: Pat
     assert list(tmp_path.iterdir()) == [live]
 
 
-def test_a_torn_line_is_told_of_once(tsgt: Tsgt, live: Path, tmp_path: Path) -> None:
-    """MCAP needs the file twice, the user the warning once."""
+def test_torn_line_is_reported_once(tsgt: Tsgt, live: Path, tmp_path: Path) -> None:
+    """MCAP export reads the file twice."""
     with live.open("ab") as file:
         file.write(b'{"type":"pose","st')
     outcome = tsgt("export", live, "--format", "mcap", "--output", tmp_path / "out.mcap")
@@ -123,7 +123,7 @@ def test_a_torn_line_is_told_of_once(tsgt: Tsgt, live: Path, tmp_path: Path) -> 
 
 
 def test_invalid_poses_have_no_message(tsgt: Tsgt, tmp_path: Path) -> None:
-    """A ROS message cannot say that it is not to be used."""
+    """A ROS message has no validity."""
     path, output = tmp_path / "poses.jsonl", tmp_path / "out.mcap"
     path.write_bytes(
         recording_bytes(POSE, NO_POSE, dataclasses.replace(POSE, valid=False, reason="residual"))
@@ -140,17 +140,15 @@ def test_invalid_poses_have_no_message(tsgt: Tsgt, tmp_path: Path) -> None:
         (["--format", "tum", "--reference", "x"], "tsgt evaluate"),
     ],
 )
-def test_combinations_without_a_meaning_are_refused(
-    tsgt: Tsgt, live: Path, arguments: list[str], says: str
-) -> None:
-    """With what to type instead."""
+def test_inconsistent_options_are_rejected(tsgt: Tsgt, live: Path, arguments: list[str], says: str) -> None:
+    """The error says what to use instead."""
     outcome = tsgt("export", live, *arguments)
     assert outcome.code == 2
     assert says in outcome.err
 
 
-def test_neither_input_is_overwritten(tsgt: Tsgt, live: Path, tmp_path: Path) -> None:
-    """Neither the recording nor the reference."""
+def test_inputs_are_not_overwritten(tsgt: Tsgt, live: Path, tmp_path: Path) -> None:
+    """Recording and reference."""
     reference = tmp_path / "reference.tum"
     reference.write_text("1 7 8 9 0 0 0 1\n2 7 8 9 0 0 0 1\n", encoding="utf-8")
     for output in (live, reference):
@@ -158,10 +156,10 @@ def test_neither_input_is_overwritten(tsgt: Tsgt, live: Path, tmp_path: Path) ->
         assert tsgt("export", live, *arguments).code == 2
 
 
-def test_a_missing_library_is_one_line(
+def test_missing_library_fails_before_the_work(
     tsgt: Tsgt, live: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It says what to install."""
+    """The error says what to install."""
     monkeypatch.setitem(sys.modules, "mcap.writer", None)
     outcome = tsgt("export", live, "--format", "mcap", "--output", tmp_path / "out.mcap")
     assert outcome.code == 1
@@ -169,8 +167,8 @@ def test_a_missing_library_is_one_line(
     assert "pip install 'tsgt[mcap]'" in outcome.err
 
 
-def test_a_clock_beyond_ros_2_is_one_line(tsgt: Tsgt, live: Path, tmp_path: Path) -> None:
-    """A recording may hold a time that ROS 2 cannot tell."""
+def test_time_beyond_ros_2_is_one_line(tsgt: Tsgt, live: Path, tmp_path: Path) -> None:
+    """ROS 2 times end in January 2038."""
     live.write_bytes(recording_bytes(dataclasses.replace(POSE, stamp_ns=2**62)))
     output = tmp_path / "out.mcap"
     outcome = tsgt("export", live, "--format", "mcap", "--output", output)

@@ -1,4 +1,4 @@
-"""The authors' field data through the real command line, against figures computed outside of tsgt."""
+"""The authors' field data against figures computed outside of tsgt."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pytest
+from harness.authors_files import CONSTANTS
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -33,7 +34,7 @@ def imported(tsgt: Tsgt, field_data: Path, segment: str, output: Path, *, target
     """Import one segment."""
     day = field_data / "20220314"
     tracks = [day / segment / f"trimble{k}.csv" for k in (1, 2, 3)]
-    extra = ["--targets", day / "GCP.txt"] if targets else []
+    extra = ["--targets", day / "GCP.txt", *CONSTANTS] if targets else []
     arguments = ["--tracks", *tracks, "--prisms", day / "sensor_positions.csv", *extra, "--output", output]
     assert tsgt("import", "rts", *arguments).code == 0
     return output
@@ -44,7 +45,7 @@ def imported(tsgt: Tsgt, field_data: Path, segment: str, output: Path, *, target
 def test_inter_prism_distances(
     tsgt: Tsgt, field_data: Path, tmp_path: Path, segment: str, *, targets: bool
 ) -> None:
-    """Mean distances at 20 Hz to a hundredth of a millimetre, gaps counted apart, with and without targets."""
+    """Mean distances at 20 Hz to a hundredth of a millimetre, with and without targets."""
     recording = imported(tsgt, field_data, segment, tmp_path / "r.jsonl", targets=targets)
     options = ("--estimator", "linear", "--no-held-out", "--json")
     result = tsgt("evaluate", recording, *options).json()
@@ -58,7 +59,7 @@ def test_inter_prism_distances(
 
 
 def test_static_distances(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
-    """The robot stands at the beginning of the first segment; its raw distances are those of SOURCE.md."""
+    """Raw distances while stationary at the start of the first segment are those of SOURCE.md."""
     recording = imported(tsgt, field_data, ".", tmp_path / "r.jsonl", targets=False)
     result = tsgt("evaluate", recording, "--no-held-out", "--json").json()
     assert result["still_s"] > 20.0
@@ -69,7 +70,7 @@ def test_static_distances(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
         assert figures["valid"] >= 40
 
 
-def test_the_second_segment_never_stands(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
+def test_second_segment_has_no_stationary_interval(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
     """It has no static distances."""
     recording = imported(tsgt, field_data, "segment2", tmp_path / "r.jsonl", targets=False)
     result = tsgt("evaluate", recording, "--no-held-out", "--json").json()
@@ -85,7 +86,7 @@ def test_evo_reads_the_trajectory(
     segment: str,
     estimator: str,
 ) -> None:
-    """The tool evo finds the trajectory valid, with the length that our poses have."""
+    """Evo finds the trajectory valid, with the length of our poses."""
     monkeypatch.setenv("HOME", str(tmp_path))  # evo writes its settings there when it is first imported
     file_interface = pytest.importorskip("evo.tools.file_interface")
     recording = imported(tsgt, field_data, segment, tmp_path / "r.jsonl", targets=True)
@@ -105,7 +106,7 @@ def test_evo_reads_the_trajectory(
     assert trajectory.path_length == pytest.approx(length_m, abs=1e-5)
 
 
-class HeldOut(NamedTuple):
+class HeldOutErrors(NamedTuple):
     """What linear misses on average in mm, at gaps too; how many points; how much of that continuous may miss."""
 
     linear_mm: float
@@ -118,14 +119,16 @@ class HeldOut(NamedTuple):
 
 
 HELD_OUT = {
-    ".": HeldOut(14.70, 29.68, 395, 206, mean=0.72, p95=0.62, at_gaps=0.49),
-    "segment2": HeldOut(21.71, 36.21, 437, 163, mean=0.77, p95=0.75, at_gaps=0.52),
+    ".": HeldOutErrors(14.70, 29.68, 395, 206, mean=0.72, p95=0.62, at_gaps=0.49),
+    "segment2": HeldOutErrors(21.71, 36.21, 437, 163, mean=0.77, p95=0.75, at_gaps=0.52),
 }
 
 
 @pytest.mark.parametrize("segment", SEGMENTS)
-def test_held_out_measurements(tsgt: Tsgt, field_data: Path, tmp_path: Path, segment: str) -> None:
-    """The smooth trajectory predicts what it has not seen better than straight lines do, and far better at gaps."""
+def test_held_out_errors_of_the_field_data(
+    tsgt: Tsgt, field_data: Path, tmp_path: Path, segment: str
+) -> None:
+    """The continuous estimator predicts better than the linear one, far better in gaps."""
     recording = imported(tsgt, field_data, segment, tmp_path / "r.jsonl", targets=True)
     found = tsgt("evaluate", recording, "--estimator", "continuous", "--json").json()
     linear, continuous = found["held_out_mm"]["linear"], found["held_out_mm"]["continuous"]
@@ -140,7 +143,7 @@ def test_held_out_measurements(tsgt: Tsgt, field_data: Path, tmp_path: Path, seg
     assert found["valid_poses"] > 0.95 * found["poses"]
 
 
-def test_the_robot_frame_keeps_the_layout(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
+def test_robot_frame_keeps_the_layout(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
     """Reference distances are those of the authors' calibration_results.csv."""
     recording = imported(tsgt, field_data, ".", tmp_path / "r.jsonl", targets=False)
     result = tsgt("evaluate", recording, "--no-held-out", "--json").json()

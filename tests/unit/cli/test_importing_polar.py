@@ -1,4 +1,4 @@
-"""``tsgt import polar``: measurements as CSV become a recording again; calibration residuals come along."""
+"""``tsgt import polar``: exported measurements become a recording again."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.published import write_prisms, write_targets, write_tracks
+from harness.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
 
 from tsgt.recording import load_recording
 
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 def recording(tsgt: Tsgt, tmp_path: Path) -> Path:
     """Raw measurements of a drive, with frames solved from targets."""
     path = tmp_path / "drive.jsonl"
-    sources = ("--prisms", write_prisms(tmp_path), "--targets", write_targets(tmp_path))
+    sources = ("--prisms", write_prisms(tmp_path), "--targets", write_targets(tmp_path), *CONSTANTS)
     outcome = tsgt("import", "rts", "--tracks", *write_tracks(tmp_path), *sources, "--output", path)
     assert outcome.code == 0, outcome.err
     return path
 
 
 def exported(tsgt: Tsgt, recording: Path) -> Path:
-    """Write its measurements as CSV."""
+    """Export its measurements as CSV."""
     path = recording.with_name("measurements.csv")
     outcome = tsgt("export", recording, "--format", "csv", "--records", "measurements", "--output", path)
     assert outcome.code == 0, outcome.err
@@ -35,7 +35,7 @@ def exported(tsgt: Tsgt, recording: Path) -> Path:
 
 
 def imported(tsgt: Tsgt, tracks: Path, *where: object, constant_mm: float = 10.0) -> Path:
-    """Read them back."""
+    """Import them again."""
     path = tracks.with_name("again.jsonl")
     prisms = tracks.with_name("sensor_positions.csv")
     options = ("--prisms", prisms, "--prism-constant-mm", constant_mm, *where)
@@ -45,18 +45,18 @@ def imported(tsgt: Tsgt, tracks: Path, *where: object, constant_mm: float = 10.0
     return path
 
 
-def test_with_targets_it_is_the_same_recording(tsgt: Tsgt, recording: Path) -> None:
-    """Measurements, frames, prisms and residuals of the targets: all that the way back has to keep."""
+def test_import_with_targets_restores_the_recording(tsgt: Tsgt, recording: Path) -> None:
+    """Measurements, frames, prisms and target residuals are equal."""
     targets = recording.with_name("GCP.txt")
-    again = imported(tsgt, exported(tsgt, recording), "--targets", targets)
+    again = imported(tsgt, exported(tsgt, recording), "--targets", targets, *CONSTANTS[:2])
     first, second = (load_recording(path, keep_going=False) for path in (recording, again))
     assert second.measurements == first.measurements
     assert second.parameters == first.parameters
     assert [target.target for target in second.parameters.stations[1].targets] == [1, 2, 3, 4, 5]
 
 
-def test_with_frames_of_a_calibration(tsgt: Tsgt, recording: Path) -> None:
-    """The file that ``tsgt calibrate targets`` writes holds the frames, and how well the targets fitted, to a micrometre."""
+def test_import_with_calibrated_frames(tsgt: Tsgt, recording: Path) -> None:
+    """The set-up file has frames and target residuals, to a micrometre."""
     frames = recording.with_name("frames.toml")
     targets = recording.with_name("GCP.txt")
     solving = ("--target-constant-mm", 10, "--output", frames)
@@ -68,11 +68,11 @@ def test_with_frames_of_a_calibration(tsgt: Tsgt, recording: Path) -> None:
         assert [t.target for t in found.targets] == [t.target for t in station.targets]
         for a, b in zip(found.targets, station.targets, strict=True):
             assert a.residual_m == pytest.approx(b.residual_m, abs=1e-6)
-            assert a.left_out_m == pytest.approx(b.left_out_m, abs=1e-6)
+            assert a.leave_one_out_m == pytest.approx(b.leave_one_out_m, abs=1e-6)
 
 
-def test_frames_replaced_at_the_desk_have_their_own_residuals(tsgt: Tsgt, recording: Path) -> None:
-    """Those of the recording are not shown for frames that come from elsewhere."""
+def test_replaced_frames_drop_the_recorded_residuals(tsgt: Tsgt, recording: Path) -> None:
+    """Recorded target residuals do not belong to other frames."""
     frames, poses = recording.with_name("frames.toml"), recording.with_name("poses.jsonl")
     parameters = json.loads(recording.read_text(encoding="utf-8").splitlines()[1])
     tables = [
@@ -86,9 +86,9 @@ def test_frames_replaced_at_the_desk_have_their_own_residuals(tsgt: Tsgt, record
 
 
 @pytest.mark.parametrize("given", [(), ("--frames", "frames.toml", "--targets", "GCP.txt")])
-def test_where_the_stations_stand_is_told_once(tsgt: Tsgt, recording: Path, given: tuple[str, ...]) -> None:
-    """Neither and both are refused."""
-    options = ("--prisms", recording.with_name("sensor_positions.csv"), *given)
+def test_frames_and_targets_exclude_each_other(tsgt: Tsgt, recording: Path, given: tuple[str, ...]) -> None:
+    """Neither and both are rejected."""
+    options = ("--prisms", recording.with_name("sensor_positions.csv"), *given, *CONSTANTS[2:])
     out = recording.with_name("no.jsonl")
     outcome = tsgt("import", "polar", "--tracks", exported(tsgt, recording), *options, "--output", out)
     assert outcome.code == 2
@@ -96,8 +96,8 @@ def test_where_the_stations_stand_is_told_once(tsgt: Tsgt, recording: Path, give
     assert not out.exists()
 
 
-def test_a_bad_line_is_named(tsgt: Tsgt, recording: Path) -> None:
-    """One line on stderr with file and line; no recording is made."""
+def test_invalid_line_is_named(tsgt: Tsgt, recording: Path) -> None:
+    """One line with file and line number; no recording is written."""
     tracks = exported(tsgt, recording)
     lines = tracks.read_text(encoding="utf-8").splitlines()
     lines[3] = lines[3].replace(",ok,", ",good,")
@@ -108,6 +108,7 @@ def test_a_bad_line_is_named(tsgt: Tsgt, recording: Path) -> None:
         recording.with_name("sensor_positions.csv"),
         "--targets",
         recording.with_name("GCP.txt"),
+        *CONSTANTS,
     )
     outcome = tsgt("import", "polar", "--tracks", tracks, *sources, "--output", out)
     assert outcome.code == 1

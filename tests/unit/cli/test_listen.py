@@ -1,3 +1,5 @@
+"""``tsgt listen`` against a simulated server."""
+
 from __future__ import annotations
 
 import json
@@ -34,7 +36,7 @@ STATUS_TEXT = (
 
 @contextmanager
 def serving(path: Path, data: bytes) -> Iterator[None]:
-    """Serve one reader the data, then hang up."""
+    """Serve one reader the data, then close the connection."""
 
     def serve() -> None:
         connection, _ = listener.accept()
@@ -52,16 +54,16 @@ def serving(path: Path, data: bytes) -> Iterator[None]:
             thread.join()
 
 
-def test_text_from_outside_does_not_steer_the_terminal(tsgt: Tsgt, tmp_path: Path) -> None:
-    """A recording of somebody else's may hold any characters."""
+def test_control_characters_are_replaced(tsgt: Tsgt, tmp_path: Path) -> None:
+    """Messages of a stream cannot control the terminal."""
     steering = replace(EVENT, message="\x1b]0;owned\x07\x1b[2J\r\nnext \u202e\u009b1m end")
     with serving(tmp_path / "s", encode_line(steering) + b"\n"):
         outcome = tsgt("listen", "--socket", tmp_path / "s")
     assert outcome.out.endswith(": ?]0;owned??[2J??next ??1m end\n")
 
 
-def test_every_type_is_shown_on_one_line(tsgt: Tsgt, tmp_path: Path) -> None:
-    """Each line of the stream becomes one readable line, and the end of the stream is success."""
+def test_every_record_is_one_line(tsgt: Tsgt, tmp_path: Path) -> None:
+    """The end of the stream is success."""
     with serving(tmp_path / "s", b"".join(line + b"\n" for line in LINES)):
         outcome = tsgt("listen", "--socket", tmp_path / "s")
     assert outcome.code == 0
@@ -78,15 +80,15 @@ def test_every_type_is_shown_on_one_line(tsgt: Tsgt, tmp_path: Path) -> None:
 
 
 def test_json_is_the_stream_byte_for_byte(tsgt: Tsgt, tmp_path: Path) -> None:
-    """With --json the lines come out as they went in, of unknown types as well."""
+    """With --json lines of unknown types are printed as well."""
     data = b"".join(line + b"\n" for line in [*LINES, b'{"type":"weather", "wind":  1}'])
     with serving(tmp_path / "s", data):
         outcome = tsgt("listen", "--socket", tmp_path / "s", "--json")
     assert outcome.out.encode() == data
 
 
-def test_unknown_types_and_keys_are_passed_over(tsgt: Tsgt, tmp_path: Path) -> None:
-    """Lines of a newer server are shown as far as they are known."""
+def test_unknown_types_and_keys_are_ignored(tsgt: Tsgt, tmp_path: Path) -> None:
+    """Lines of a newer server are printed as far as known."""
     event = json.dumps(json.loads(encode_line(EVENT)) | {"colour": "red"}).encode()
     with serving(tmp_path / "s", b'{"type":"weather"}\n' + event + b"\n"):
         outcome = tsgt("listen", "--socket", tmp_path / "s")
@@ -94,15 +96,15 @@ def test_unknown_types_and_keys_are_passed_over(tsgt: Tsgt, tmp_path: Path) -> N
     assert outcome.err == ""
 
 
-def test_other_protocol_is_pointed_out(tsgt: Tsgt, tmp_path: Path) -> None:
-    """A server of another protocol is shown with a warning."""
+def test_other_protocol_version_is_a_warning(tsgt: Tsgt, tmp_path: Path) -> None:
+    """The first line has a warning."""
     hello = json.dumps(json.loads(encode_line(HELLO)) | {"protocol": 2}).encode()
     with serving(tmp_path / "s", hello + b"\n"):
         assert "made for protocol 1" in tsgt("listen", "--socket", tmp_path / "s").out
 
 
-def test_line_that_cannot_be_shown_is_reported(tsgt: Tsgt, tmp_path: Path) -> None:
-    """A broken line goes to stderr in one line, and listening goes on."""
+def test_invalid_line_is_reported(tsgt: Tsgt, tmp_path: Path) -> None:
+    """One line on stderr, and listening continues."""
     with serving(tmp_path / "s", b'{"type":"event"}\ngarbage\n' + LINES[-1] + b"\n"):
         outcome = tsgt("listen", "--socket", tmp_path / "s")
     assert outcome.code == 0
@@ -111,14 +113,14 @@ def test_line_that_cannot_be_shown_is_reported(tsgt: Tsgt, tmp_path: Path) -> No
 
 
 def test_count_stops_listening(tsgt: Tsgt, tmp_path: Path) -> None:
-    """After so many lines the command is done."""
+    """The command ends after the given number of lines."""
     with serving(tmp_path / "s", b"".join(line + b"\n" for line in LINES)):
         outcome = tsgt("listen", "--socket", tmp_path / "s", "--json", "--count", "3")
     assert len(outcome.out.splitlines()) == 3
 
 
-def test_nobody_there_is_one_line(tsgt: Tsgt, tmp_path: Path) -> None:
-    """Without a server the command fails in one line that says what to do."""
+def test_missing_server_is_one_line(tsgt: Tsgt, tmp_path: Path) -> None:
+    """The error says what to do."""
     outcome = tsgt("listen", "--socket", tmp_path / "s")
     assert outcome.code == 1
     assert len(outcome.err.splitlines()) == 1
@@ -126,7 +128,7 @@ def test_nobody_there_is_one_line(tsgt: Tsgt, tmp_path: Path) -> None:
 
 
 def test_stale_socket_is_one_line(tsgt: Tsgt, tmp_path: Path) -> None:
-    """A socket that nobody serves is as good as none."""
+    """The error has the reason."""
     with socket.socket(socket.AF_UNIX) as stale:
         stale.bind(str(tmp_path / "s"))
     outcome = tsgt("listen", "--socket", tmp_path / "s")
@@ -135,6 +137,6 @@ def test_stale_socket_is_one_line(tsgt: Tsgt, tmp_path: Path) -> None:
 
 
 def test_listening_needs_neither_numpy_nor_scipy() -> None:
-    """The command is up at once on a small computer."""
+    """The command starts fast on a small computer."""
     check = "import sys, tsgt.cli.live; sys.exit(bool({'numpy', 'scipy'} & sys.modules.keys()))"
     assert subprocess.run([sys.executable, "-c", check], check=False).returncode == 0

@@ -1,4 +1,4 @@
-"""``tsgt merge`` through the real command line."""
+"""``tsgt merge``."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ from typing import TYPE_CHECKING
 
 import pytest
 from harness.merging import journals, recording
-from harness.missions import mission
+from harness.missions import run_mission
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from harness.cli import Tsgt
 
-    from tsgt.simulation.mission import Run
+    from tsgt.simulation.mission import MissionResult
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Half a minute over classic."""
-    return mission(tmp_path_factory.mktemp("mission"))
+def run(tmp_path_factory: pytest.TempPathFactory) -> MissionResult:
+    """Half a minute with the protocol classic."""
+    return run_mission(tmp_path_factory.mktemp("mission"))
 
 
-def test_what_it_says(tsgt: Tsgt, run: Run, tmp_path: Path) -> None:
-    """A line for each journal, one for all; figures for machines say the same, and that the second time adds nothing."""
+def test_merge_reports_each_journal(tsgt: Tsgt, run: MissionResult, tmp_path: Path) -> None:
+    """Text and JSON agree, and a second merge adds nothing."""
     path = recording(run, tmp_path / "r.jsonl")
     told = tsgt("merge", path, *journals(run), "--output", tmp_path / "o.jsonl")
     assert told.code == 0
@@ -35,11 +35,11 @@ def test_what_it_says(tsgt: Tsgt, run: Run, tmp_path: Path) -> None:
     counts = figures["journals"][0]
     assert first == (
         f"{counts['path']}: {counts['added']} of {counts['measurements']} measurements added, "
-        f"{counts['already_there']} already there"
+        f"{counts['already_there']} already in the recording"
     )
     assert last == (
-        f"{tmp_path / 'o.jsonl'}: {figures['added']} measurements added, times within "
-        f"{figures['bound_ms']['p50']:.2f} ms (median), {figures['bound_ms']['max']:.2f} ms (largest)"
+        f"{tmp_path / 'o.jsonl'}: {figures['added']} measurements added, timestamp bound "
+        f"{figures['bound_ms']['p50']:.2f} ms (median), {figures['bound_ms']['max']:.2f} ms (max)"
     )
     again = tsgt("merge", path, *journals(run), "--json").json()
     assert again["added"] == 0
@@ -47,8 +47,10 @@ def test_what_it_says(tsgt: Tsgt, run: Run, tmp_path: Path) -> None:
     assert again["bound_ms"] == {"p50": None, "max": None}
 
 
-def test_what_was_merged_is_processed_and_exported(tsgt: Tsgt, run: Run, tmp_path: Path) -> None:
-    """The desk takes what was merged for measurements like the others."""
+def test_merged_measurements_are_processed_and_exported(
+    tsgt: Tsgt, run: MissionResult, tmp_path: Path
+) -> None:
+    """They are used like all others."""
     path = recording(run, tmp_path / "r.jsonl")
     added = tsgt("merge", path, *journals(run), "--json").json()["added"]
     kept = sum(json.loads(line)["type"] == "measurement" for line in path.read_bytes().splitlines())
@@ -60,40 +62,38 @@ def test_what_was_merged_is_processed_and_exported(tsgt: Tsgt, run: Run, tmp_pat
     assert len(csv.splitlines()) == 1 + kept + added
 
 
-def test_a_skipped_journal_is_a_warning(tsgt: Tsgt, run: Run, tmp_path: Path) -> None:
-    """One line says which and why; without any other it is an error."""
+def test_skipped_journal_is_a_warning(tsgt: Tsgt, run: MissionResult, tmp_path: Path) -> None:
+    """If no journal is left, it is an error."""
     path, other = recording(run, tmp_path / "r.jsonl"), tmp_path / "station9.jsonl"
     other.write_bytes(journals(run)[0].read_bytes().replace(b'"station":1', b'"station":9'))
     told = tsgt("merge", path, *journals(run), other)
     assert told.code == 0
-    assert told.err == f"warning: {other}: skipped: is of station 9, and the recording has only 1, 2, 3\n"
+    assert told.err == f"warning: {other}: skipped: is of station 9, but the recording has only 1, 2, 3\n"
     told = tsgt("merge", path, other)
     assert told.code == 1
     assert told.err.startswith(f"error: {path}: none of the journals can be merged; {other}: is of station 9")
 
 
 @pytest.mark.parametrize("content", [b"", b'{"type":"recor', b'{"type":"recording","version":1}\n{"ty'])
-def test_a_journal_that_was_only_begun_is_passed_over(
-    tsgt: Tsgt, run: Run, tmp_path: Path, content: bytes
-) -> None:
-    """A client that is killed as it starts leaves one; the others are merged all the same."""
+def test_empty_journal_is_skipped(tsgt: Tsgt, run: MissionResult, tmp_path: Path, content: bytes) -> None:
+    """A client killed at its start leaves one; the others are merged."""
     path, begun = recording(run, tmp_path / "r.jsonl"), tmp_path / "station1-begun.jsonl"
     begun.write_bytes(content)
     told = tsgt("merge", path, *journals(run), begun)
     assert told.code == 0
-    assert f"{begun}: was only begun" in told.err
+    assert f"{begun}: is empty" in told.err
     assert "0 measurements added" in tsgt("merge", path, begun).out
 
 
-def test_a_torn_line_is_told(tsgt: Tsgt, run: Run, tmp_path: Path) -> None:
-    """The recording of a master that was killed ends in one, and has to be whole before anything follows."""
+def test_torn_line_is_removed_with_a_warning(tsgt: Tsgt, run: MissionResult, tmp_path: Path) -> None:
+    """The recording of a killed master ends with one."""
     path = recording(run, tmp_path / "r.jsonl")
     path.write_bytes(path.read_bytes() + b'{"type":"mea')
     told = tsgt("merge", path, *journals(run))
-    assert told.err == f"warning: {path}: a torn last line of 12 bytes was cut off\n"
+    assert told.err == f"warning: {path}: removed a torn last line of 12 bytes\n"
 
 
-def test_the_output_replaces_no_input(tsgt: Tsgt, run: Run, tmp_path: Path) -> None:
+def test_merge_does_not_replace_an_input(tsgt: Tsgt, run: MissionResult, tmp_path: Path) -> None:
     """Neither the recording nor a journal."""
     path = recording(run, tmp_path / "r.jsonl")
     for input_path in (path, journals(run)[1]):
@@ -102,6 +102,6 @@ def test_the_output_replaces_no_input(tsgt: Tsgt, run: Run, tmp_path: Path) -> N
         assert "would replace its own input" in told.err
 
 
-def test_it_needs_a_journal(tsgt: Tsgt, run: Run, tmp_path: Path) -> None:
+def test_merge_needs_a_journal(tsgt: Tsgt, run: MissionResult, tmp_path: Path) -> None:
     """A recording alone is a usage error."""
     assert tsgt("merge", recording(run, tmp_path / "r.jsonl")).code == 2

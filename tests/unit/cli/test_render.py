@@ -1,3 +1,5 @@
+"""Records of the stream as text."""
+
 from __future__ import annotations
 
 import math
@@ -20,29 +22,29 @@ def test_angles_agree_with_scipy(seed: int) -> None:
     assert yaw_pitch_roll_deg((x, y, z, w)) == pytest.approx(rotation.as_euler("ZYX", degrees=True))
 
 
-def test_straight_up_has_a_pitch() -> None:
-    """A pitch of 90 degrees, where rounding goes beyond what asin takes, is shown as such."""
+def test_pitch_of_90_degrees() -> None:
+    """Rounding beyond the domain of asin is tolerated."""
     s = math.sqrt(0.5) * (1 + 1e-15)
     assert yaw_pitch_roll_deg((0.0, s, 0.0, s))[1] == pytest.approx(90.0)
 
 
 def test_measurement_without_distance_says_so() -> None:
-    """An angle-only measurement has no distance to show."""
+    """An angle-only measurement has no distance."""
     text = render("measurement", encode_line(replace(measurement(0), slope_distance_m=None)))
     assert text is not None
     assert "no distance" in text
 
 
-def test_a_clock_says_on_which_side_it_is() -> None:
+def test_clock_text_has_the_sign_in_words() -> None:
     """A negative offset is a clock that is behind."""
     assert render("clock", encode_line(CLOCK)) == (
-        "22:13:22.000  clock of station 2 is 7200.000123 s behind the master's, within 0.310 ms, +9.70 ppm; "
-        "1 of 1 exchanges used (regression), begun anew"
+        "22:13:22.000  clock of station 2 is 7200.000123 s behind the master's, bound 0.310 ms, +9.70 ppm; "
+        "1 of 1 exchanges used (regression), reset"
     )
 
 
-def test_a_status_shows_what_is_known() -> None:
-    """What a station has not shown yet is left out; the rest stands with its unit."""
+def test_status_text_omits_unknown_values() -> None:
+    """Known values have their units."""
     station = replace(
         STATUS.stations[0],
         last_heard_s=0.1,
@@ -55,12 +57,12 @@ def test_a_status_shows_what_is_known() -> None:
     text = render("status", encode_line(replace(STATUS, stations=(station, STATUS.stations[1]))))
     assert text is not None
     assert (
-        "station 1: 4 of 5 usable, last ok 0.20 s ago, heard 0.10 s ago, 1.7 Hz, 2 % lost, -90 dBm, SNR 8 dB, "
-        "clock within 0.3 ms; station 2: no measurement yet"
+        "station 1: 4 of 5 usable, last ok 0.20 s ago, received 0.10 s ago, 1.7 Hz, 2 % lost, -90 dBm, SNR 8 dB, "
+        "clock bound 0.3 ms; station 2: no measurement yet"
     ) in text
 
 
 @pytest.mark.parametrize("stamp_ns", [0, 2**63 - 1])
-def test_any_time_can_be_shown(stamp_ns: int) -> None:
-    """A clock that was never set right does not stop the display."""
+def test_any_time_can_be_printed(stamp_ns: int) -> None:
+    """A clock that was never set does not fail."""
     assert render("event", encode_line(replace(EVENT, stamp_ns=stamp_ns))) is not None

@@ -1,4 +1,4 @@
-"""`tsgt status`: what it says of a master and of a client, and what its exit code says."""
+"""``tsgt status`` of a master and of a client, and its exit code."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tsgt.cli.status import client_text, duration, master_text, station_word
+from tsgt.cli.status import client_text, duration, master_text, station_label
 from tsgt.model import Status
 from tsgt.recording import HelloRecord, StationStatus, StatusRecord, encode_line
 from tsgt.recording.journal import InstrumentRecord
@@ -91,19 +91,19 @@ CLIENT = ClientStatus(
 )
 
 
-def test_a_master_that_is_well() -> None:
-    """Its poses, and of each station what it does, how often, how strong, and how well its clock is known."""
+def test_master_without_problems() -> None:
+    """The text has poses, and rate, loss, signal and clock bound of each station."""
     lines, well = master_text(MASTER)
     text = "\n".join(lines)
     assert well
-    for part in ("valid 390", "STATION 2  TRACKING", "1.58 Hz", "loss 2 %", "-81 dBm", "within 0.84 ms"):
+    for part in ("valid 390", "STATION 2  TRACKING", "1.58 Hz", "loss 2 %", "-81 dBm", "clock bound 0.84 ms"):
         assert part in text
 
 
 @pytest.mark.parametrize(
     ("change", "word"),
     [
-        ({"last_heard_s": None, "answering": None}, "NOT HEARD YET"),
+        ({"last_heard_s": None, "answering": None}, "NOT RECEIVED YET"),
         ({"last_heard_s": 12.0, "answering": False}, "SILENT 12 s"),
         ({"status": None, "age_s": None}, "NO MEASUREMENT YET"),
         ({"age_s": 5.0}, "OLD 5.0 s"),
@@ -113,17 +113,17 @@ def test_a_master_that_is_well() -> None:
         ({"status": Status.ANGLE_ONLY}, "NO DISTANCE"),
     ],
 )
-def test_a_station_that_needs_somebody_is_said_to(change: dict[str, object], word: str) -> None:
-    """Each way of not being well has its word, and spoils the verdict."""
+def test_station_problem_has_a_label_and_fails(change: dict[str, object], word: str) -> None:
+    """Each problem of a station has its label."""
     station = dataclasses.replace(STATION, **change)  # type: ignore[arg-type]
-    assert station_word(station) == (word, False)
+    assert station_label(station) == (word, False)
     assert not master_text(dataclasses.replace(MASTER, stations=(station,)))[1]
 
 
-def test_a_station_that_was_not_asked_is_not_called_silent() -> None:
-    """While others are synchronised a station waits its turn: that is no fault of it."""
+def test_station_that_was_not_polled_is_not_silent() -> None:
+    """While others are synchronised a station is not polled."""
     station = dataclasses.replace(STATION, last_heard_s=24.0, age_s=24.3)
-    assert station_word(station) == ("TRACKING", True)
+    assert station_label(station) == ("TRACKING", True)
 
 
 @pytest.mark.parametrize(
@@ -133,17 +133,17 @@ def test_a_station_that_was_not_asked_is_not_called_silent() -> None:
         ({"last": None}, "NO MEASUREMENT"),
         ({"journal_ok": False, "journal_waiting": 17}, "DISK FAILS"),
         ({"journal_ok": False, "journal_waiting": 17}, "17 lines not written yet"),
-        ({"problem": "battery low, 9 %"}, "SEE TO THE INSTRUMENT"),
+        ({"problem": "battery low, 9 %"}, "CHECK THE INSTRUMENT"),
         ({"problem": "battery low, 9 %"}, "battery low, 9 %"),
-        ({"instrument": None, "problem": "nobody answers on /dev/ttyUSB0"}, "nobody answers"),
+        ({"instrument": None, "problem": "no response on /dev/ttyUSB0"}, "no response"),
         ({"radio_ok": False}, "NO RADIO"),
-        ({"master_heard_s": None}, "MASTER NOT HEARD"),
-        ({"master_heard_s": 60.0}, "MASTER NOT HEARD"),
+        ({"master_heard_s": None}, "MASTER NOT RECEIVED"),
+        ({"master_heard_s": 60.0}, "MASTER NOT RECEIVED"),
         ({"joined": False}, "NOT JOINED"),
     ],
 )
-def test_a_client_that_needs_somebody_is_said_to(change: dict[str, object], words: str) -> None:
-    """Each way of not being well has its words, and spoils the verdict."""
+def test_client_problem_has_a_label_and_fails(change: dict[str, object], words: str) -> None:
+    """Each problem of a client has its label."""
     lines, well = client_text(dataclasses.replace(CLIENT, **change))  # type: ignore[arg-type]
     assert not well
     assert any(words in line for line in lines)
@@ -152,20 +152,20 @@ def test_a_client_that_needs_somebody_is_said_to(change: dict[str, object], word
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"unknown_packets": 0}, "nothing heard: master off"),
-        ({"unknown_packets": 40}, "40 packets not understood"),
-        ({"unknown_packets": 40, "refused": 9}, "9 beacons refused: compare the keys"),
+        ({"unknown_packets": 0}, "nothing received: master off"),
+        ({"unknown_packets": 40}, "40 packets not decoded"),
+        ({"unknown_packets": 40, "refused": 9}, "9 beacons failed to authenticate"),
     ],
 )
-def test_a_client_says_why_it_does_not_hear_its_master(change: dict[str, object], words: str) -> None:
-    """What its radio hears tells a missing master from one with another protocol or key."""
+def test_client_reports_why_no_master_is_received(change: dict[str, object], words: str) -> None:
+    """Received packets distinguish a missing master from another protocol or key."""
     lines, _ = client_text(dataclasses.replace(CLIENT, master_heard_s=None, **change))  # type: ignore[arg-type]
     assert any(words in line for line in lines)
     assert max(len(line) for line in lines[1:]) <= 40
 
 
-def test_a_client_says_what_its_instrument_does_and_how_it_is_set() -> None:
-    """Battery, what it adds to distances, and what it does when that is not the usual."""
+def test_client_text_has_instrument_settings_and_activity() -> None:
+    """Battery, prism constant, atmospheric correction, and unusual activity."""
     text = "\n".join(client_text(CLIENT)[0])
     for part in ("battery 57 %", "prism mini_360 +30.0 mm", "air +8.1 ppm: 20.0 C, 1013.2 hPa"):
         assert part in text
@@ -180,38 +180,38 @@ def test_a_client_says_what_its_instrument_does_and_how_it_is_set() -> None:
     )
 
 
-def test_a_line_without_terminal_has_no_trace_of_its_headline(tsgt: Tsgt, tmp_path: Path) -> None:
-    """Neither codes nor what stands in their place."""
+def test_text_without_terminal_has_no_control_codes(tsgt: Tsgt, tmp_path: Path) -> None:
+    """Plain text only."""
     serving = _serve(tmp_path / "s", encode_line(CLIENT))
     outcome = tsgt("status", "--socket", tmp_path / "s")
     serving.join()
     assert outcome.out.startswith("STATION 3  OK\n")
 
 
-def test_a_client_says_what_the_disk_has_lost() -> None:
-    """Also when the disk is well again; then nobody needs to do anything."""
+def test_client_reports_lost_journal_lines() -> None:
+    """A recovered disk needs no action."""
     lines, well = client_text(dataclasses.replace(CLIENT, journal_lost=3))
     assert well
     assert "  3 lines lost" in lines
 
 
-def test_a_client_says_how_delivery_and_clock_do() -> None:
-    """Over the protocol superframe; and loudly that there is no key, which is no fault."""
+def test_client_text_has_queue_slots_and_clock() -> None:
+    """A missing key is shown, but is no failure."""
     assert "2 to deliver, 1 missed slots" in client_text(CLIENT)[0]
-    assert "  clock within 0.08 ms" in client_text(CLIENT)[0]
+    assert "  clock bound 0.08 ms" in client_text(CLIENT)[0]
     lines, well = client_text(dataclasses.replace(CLIENT, authenticated=False, rejected_beacons=3))
     assert well
     assert any("NO KEY" in line for line in lines)
-    assert "  3 beacons doubted" in lines
+    assert "  3 rejected beacons" in lines
 
 
-def test_a_client_in_direct_mode_is_well_without_measurements() -> None:
+def test_direct_mode_needs_no_measurements() -> None:
     """Between two targets nothing is measured."""
     assert client_text(dataclasses.replace(CLIENT, mode="direct", last=None))[1]
 
 
-def test_both_fit_on_a_small_screen() -> None:
-    """No line is longer than forty characters."""
+def test_lines_have_at_most_40_characters() -> None:
+    """For both daemons."""
     troubled = dataclasses.replace(CLIENT, problem="word " * 30, activity="doing " * 20)
     lines = [*master_text(MASTER)[0], *client_text(CLIENT)[0], *client_text(troubled)[0]]
     assert (
@@ -221,8 +221,8 @@ def test_both_fit_on_a_small_screen() -> None:
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(0.34, "0.3 s"), (47, "47 s"), (600, "10 min"), (9000, "2 h")])
-def test_durations_take_little_room(seconds: float, text: str) -> None:
-    """A figure and a unit that fits it."""
+def test_durations_are_short(seconds: float, text: str) -> None:
+    """A number with a suitable unit."""
     assert duration(seconds) == text
 
 
@@ -241,8 +241,8 @@ def _serve(path: Path, *lines: bytes) -> threading.Thread:
     return thread
 
 
-def test_a_master_is_asked_over_its_stream(tsgt: Tsgt, tmp_path: Path) -> None:
-    """The first status line after the greeting is shown; poses before it are passed over."""
+def test_master_status_is_read_from_the_stream(tsgt: Tsgt, tmp_path: Path) -> None:
+    """Other records before the status are skipped."""
     serving = _serve(tmp_path / "s", encode_line(HelloRecord()), b'{"type":"pose"}', encode_line(MASTER))
     outcome = tsgt("status", "--socket", tmp_path / "s")
     serving.join()
@@ -250,10 +250,10 @@ def test_a_master_is_asked_over_its_stream(tsgt: Tsgt, tmp_path: Path) -> None:
     assert outcome.out.startswith("MASTER  22:13:20")
 
 
-def test_a_terminal_shows_a_headline_and_obeys_no_text_from_outside(
+def test_terminal_styles_headlines_and_removes_control_characters(
     tsgt: Tsgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What needs somebody is bold and reverse; whatever a text of the client's holds, it is only written."""
+    """Problems are bold and reversed; text from outside cannot control the terminal."""
     monkeypatch.setattr("click.utils.should_strip_ansi", lambda *_: False)
     steering = "\x1b]0;owned\x07\x1b[2J"
     settings = InstrumentRecord(make="Leica", prism_type=steering, prism_constant_m=0.03)
@@ -269,14 +269,14 @@ def test_a_terminal_shows_a_headline_and_obeys_no_text_from_outside(
     outcome = tsgt("status", "--socket", tmp_path / "s")
     serving.join()
     first, *others = outcome.out.splitlines()
-    assert first == "\x1b[1m\x1b[7mSTATION 3  SEE TO THE INSTRUMENT\x1b[0m"
+    assert first == "\x1b[1m\x1b[7mSTATION 3  CHECK THE INSTRUMENT\x1b[0m"
     assert others[0] == "\x1b[1m\x1b[7m?]0;owned??[2J\x1b[0m"
     assert sum("?]0;owned??[2J" in line for line in others) == 5
     assert not any("\x1b" in line or "?[" in line.replace("??[2J", "") for line in others[1:])
 
 
-def test_a_client_is_asked_at_its_own_socket(tsgt: Tsgt, tmp_path: Path) -> None:
-    """With --json the record comes as it is; a client that needs somebody makes exit code 3."""
+def test_client_status_is_printed_as_json(tsgt: Tsgt, tmp_path: Path) -> None:
+    """The record is unchanged; a problem gives exit code 3."""
     serving = _serve(tmp_path / "s", encode_line(dataclasses.replace(CLIENT, instrument=None)))
     outcome = tsgt("status", "--socket", tmp_path / "s", "--json")
     serving.join()
@@ -286,12 +286,12 @@ def test_a_client_is_asked_at_its_own_socket(tsgt: Tsgt, tmp_path: Path) -> None
 
 @pytest.mark.parametrize(
     ("lines", "words"),
-    [([], "ended without a status"), ([b"SSH-2.0-OpenSSH"], "no stream of tsgt")],
+    [([], "ended without a status"), ([b"SSH-2.0-OpenSSH"], "not a stream of tsgt")],
 )
-def test_something_else_on_the_socket_is_an_error(
+def test_other_server_on_the_socket_is_an_error(
     tsgt: Tsgt, tmp_path: Path, lines: list[bytes], words: str
 ) -> None:
-    """One line that says what is wrong, and exit code 1."""
+    """Exit code 1 and one line."""
     serving = _serve(tmp_path / "s", *lines)
     outcome = tsgt("status", "--socket", tmp_path / "s")
     serving.join()
@@ -299,17 +299,15 @@ def test_something_else_on_the_socket_is_an_error(
     assert words in outcome.err
 
 
-def test_nobody_at_the_socket(tsgt: Tsgt, tmp_path: Path) -> None:
-    """One line that names the socket, and exit code 1."""
+def test_missing_socket_is_an_error(tsgt: Tsgt, tmp_path: Path) -> None:
+    """Exit code 1 and one line that names the socket."""
     outcome = tsgt("status", "--socket", tmp_path / "nobody")
     assert outcome.code == 1
-    assert "nobody answers" in outcome.err
+    assert "no connection to a daemon" in outcome.err
 
 
-def test_one_that_talks_of_something_else_is_not_listened_to_for_ever(
-    tsgt: Tsgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The time limit is for the status, not for the next line."""
+def test_stream_without_status_times_out(tsgt: Tsgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The timeout applies to the status, not to each line."""
     monkeypatch.setattr("tsgt.cli.status.TIMEOUT_S", 0.2)
     path = tmp_path / "a.sock"
     over = threading.Event()
@@ -335,8 +333,8 @@ def test_one_that_talks_of_something_else_is_not_listened_to_for_ever(
     assert "no status within" in outcome.err
 
 
-def test_the_superframe_shows_frames_times_and_what_is_missing() -> None:
-    """A missing key is not to be overlooked; what is zero is left out."""
+def test_master_text_of_the_superframe() -> None:
+    """A missing key is prominent; counts of zero are omitted."""
     station = dataclasses.replace(
         STATION,
         clock_bound_ns=None,
@@ -354,7 +352,7 @@ def test_the_superframe_shows_frames_times_and_what_is_missing() -> None:
     assert well
     assert "frame 378 ms" in plain
     assert "NO KEY" in plain
-    assert "time within 0.15 ms" in plain
+    assert "timestamp bound 0.15 ms" in plain
     assert "12 outstanding" in plain
     assert "1 rejected beacons" in plain
     assert "missed" not in plain

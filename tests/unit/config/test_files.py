@@ -1,4 +1,4 @@
-"""Configuration files: what is wrong in one is said in one line that names file, key and value."""
+"""Problems of configuration files: one line with file, key and value."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PROBLEMS = {
     ),
     "unknown key near no other": (
         ("[recording]", "[zzz]"),
-        "zzz: unknown key; known are kind, setup, stations, radio, protocol, pipeline, frame_watch, geofences, stream",
+        "zzz: unknown key; known keys: kind, setup, stations, radio, protocol, pipeline, frame_watch, geofences, stream",
     ),
     "unknown key inside a table in an array": (
         ("range_sigma_ppm", "range_sigma_pm"),
@@ -62,7 +62,7 @@ PROBLEMS = {
     ),
     "two stations of one number": (
         ("station = 2", "station = 1"),
-        "stations: station 1 stands there more than once",
+        "stations: station 1 is given more than once",
     ),
     "unknown key in a table of several kinds": (
         ("spreading_factor", "spreadin_factor"),
@@ -70,7 +70,7 @@ PROBLEMS = {
     ),
     "key of another kind of table": (
         ('kind = "sx127x"', 'kind = "simulated"'),
-        "radio.wiring: unknown key; known are frequency_mhz,",
+        "radio.wiring: unknown key; known keys: frequency_mhz,",
     ),
     "value in a table of several kinds": (
         ("reset_pin = 17", "reset_pin = -2"),
@@ -99,8 +99,8 @@ PROBLEMS = {
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
-def test_a_problem_is_one_line_with_file_key_and_value(name: str, tmp_path: Path) -> None:
-    """Each kind of mistake is reported with the file, where in it, and what stands there."""
+def test_problem_is_one_line_with_file_key_and_value(name: str, tmp_path: Path) -> None:
+    """For each kind of mistake."""
     (good, bad), expected = PROBLEMS[name]
     path = tmp_path / "master.toml"
     assert good in MASTER
@@ -112,8 +112,8 @@ def test_a_problem_is_one_line_with_file_key_and_value(name: str, tmp_path: Path
     assert error.value.path == path
 
 
-def test_the_key_of_a_problem_is_kept_as_data(tmp_path: Path) -> None:
-    """A program finds the key of the mistake in the error itself."""
+def test_error_has_the_key_as_data(tmp_path: Path) -> None:
+    """Programs find the key in the error."""
     path = tmp_path / "master.toml"
     path.write_text(MASTER.replace("outage_limit_s = 1.0", "outage_limit_s = 0"))
     with pytest.raises(ConfigError) as error:
@@ -122,19 +122,19 @@ def test_the_key_of_a_problem_is_kept_as_data(tmp_path: Path) -> None:
 
 
 def test_missing_file(tmp_path: Path) -> None:
-    """A file that is not there is named."""
+    """The error names the file."""
     with pytest.raises(ConfigError, match=r"nowhere\.toml: no such file"):
         load(tmp_path / "nowhere.toml", MasterConfig)
 
 
 def test_folder_instead_of_a_file(tmp_path: Path) -> None:
-    """A folder is refused in words, not with a traceback."""
+    """A folder is a configuration error."""
     with pytest.raises(ConfigError, match="Is a directory"):
         load_any(tmp_path)
 
 
 def test_binary_file(tmp_path: Path) -> None:
-    """A file that is no text is refused in words."""
+    """A file that is not text is a configuration error."""
     path = tmp_path / "master.toml"
     path.write_bytes(b"kind = \xff")
     with pytest.raises(ConfigError, match=r"not UTF-8 text \(byte 7\)"):
@@ -142,24 +142,24 @@ def test_binary_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["x = " + 5000 * "[", "x = " + 5000 * "9", "x = " + 5000 * "{a="])
-def test_what_has_no_end(text: str, tmp_path: Path) -> None:
-    """Neither nesting nor digits break the reader."""
+def test_deep_nesting_and_huge_numbers(text: str, tmp_path: Path) -> None:
+    """They are configuration errors."""
     path = tmp_path / "a.toml"
     path.write_text(text)
     with pytest.raises(ConfigError, match=r"a\.toml: not TOML: "):
         load_any(path)
 
 
-def test_a_file_of_another_kind(tmp_path: Path) -> None:
-    """Handing the prism layout where the scenario belongs says what was expected."""
+def test_file_of_another_kind(tmp_path: Path) -> None:
+    """The error names the expected kind."""
     path = tmp_path / "scenario.toml"
     path.write_text('kind = "prism_layout"\n[prisms]\n')
-    with pytest.raises(ConfigError, match='kind = "prism_layout", but a file of kind "scenario" is needed'):
+    with pytest.raises(ConfigError, match='kind = "prism_layout", but kind "scenario" is expected'):
         load(path, ScenarioConfig)
 
 
-def test_a_long_value_is_cut(tmp_path: Path) -> None:
-    """The line stays readable when a whole list stands where a number belongs."""
+def test_long_value_is_shortened(tmp_path: Path) -> None:
+    """The line stays readable."""
     path = tmp_path / "master.toml"
     path.write_text(MASTER.replace("rate_hz = 20.0", f"rate_hz = {list(range(100))}"))
     with pytest.raises(ConfigError) as error:
@@ -168,8 +168,8 @@ def test_a_long_value_is_cut(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("key", ["x" * 3000, "a\\nb\\u001b[2J"], ids=["long", "of two lines"])
-def test_an_odd_key_stays_in_its_line(key: str, tmp_path: Path) -> None:
-    """A key between quotes may be anything; of a long one the beginning is shown."""
+def test_unprintable_key_is_escaped(key: str, tmp_path: Path) -> None:
+    """A long key is shortened."""
     path = tmp_path / "c.toml"
     path.write_text(f'kind = "prism_layout"\n"{key}" = 1\n')
     with pytest.raises(ConfigError) as caught:
@@ -181,7 +181,7 @@ def test_an_odd_key_stays_in_its_line(key: str, tmp_path: Path) -> None:
 
 
 def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
-    """A configuration works from any working folder; an absolute path stays as it is."""
+    """An absolute path is unchanged."""
     path = tmp_path / "master.toml"
     path.write_text(MASTER)
     config = load(path, MasterConfig)
@@ -190,8 +190,8 @@ def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
 
 
 FRAME_PROBLEMS = {
-    "scaled": (("0.9063077870366499, -0.42", "0.9163077870366499, -0.42"), "not a rotation: off by"),
-    "mirrored": (("[0.0, 0.0, 1.0, 0.1]", "[0.0, 0.0, -1.0, 0.1]"), "mirrors"),
+    "scaled": (("0.9063077870366499, -0.42", "0.9163077870366499, -0.42"), "not a rotation: error"),
+    "mirrored": (("[0.0, 0.0, 1.0, 0.1]", "[0.0, 0.0, -1.0, 0.1]"), "reflection"),
     "last row": (("[0.0, 0.0, 0.0, 1.0]", "[0.0, 0.0, 0.0, 2.0]"), r"the last row of a rigid transform"),
     "short row": (
         ("[0.0, 0.0, 1.0, 0.1]", "[0.0, 0.0, 1.0]"),
@@ -204,8 +204,8 @@ FRAME_PROBLEMS = {
 
 
 @pytest.mark.parametrize("name", FRAME_PROBLEMS)
-def test_frames_that_are_not_rigid_are_refused(name: str, tmp_path: Path) -> None:
-    """A station frame is a rotation and a translation, or it is an error that names the station."""
+def test_frame_that_is_not_rigid_is_rejected(name: str, tmp_path: Path) -> None:
+    """The error names the station."""
     (good, bad), expected = FRAME_PROBLEMS[name]
     path = tmp_path / "frames.toml"
     path.write_text(FRAMES.replace(good, bad, 1))
@@ -214,8 +214,8 @@ def test_frames_that_are_not_rigid_are_refused(name: str, tmp_path: Path) -> Non
     assert "stations." in str(error.value)
 
 
-def test_frames_typed_with_seven_digits_are_taken(tmp_path: Path) -> None:
-    """Rounding to what a report shows is no error."""
+def test_frame_with_seven_digits_is_accepted(tmp_path: Path) -> None:
+    """Rounding as in a report is tolerated."""
     path = tmp_path / "frames.toml"
     path.write_text(
         FRAMES.replace("0.9063077870366499", "0.9063078").replace("0.42261826174069944", "0.4226183")
@@ -223,8 +223,8 @@ def test_frames_typed_with_seven_digits_are_taken(tmp_path: Path) -> None:
     assert load_station_frames(path)[2][0] == (0.9063078, -0.4226183, 0.0, 2.0)
 
 
-def test_layout_with_uncertainty(tmp_path: Path) -> None:
-    """The sigmas that a calibration adds are allowed; integers are numbers too."""
+def test_layout_with_sigmas_is_accepted(tmp_path: Path) -> None:
+    """Integers are valid numbers."""
     path = tmp_path / "layout.toml"
     path.write_text(
         'kind = "prism_layout"\n[prisms.7]\nposition_m = [1, 2.5, 0]\nsigma_m = [0.001, 0.001, 0.002]\n'
@@ -245,8 +245,8 @@ SCENARIO_PROBLEMS = {
 
 
 @pytest.mark.parametrize("text", SCENARIO_PROBLEMS)
-def test_scenarios_that_contradict_themselves(text: str, tmp_path: Path) -> None:
-    """Values that are good each but not together are refused with the place."""
+def test_inconsistent_scenario_is_rejected(text: str, tmp_path: Path) -> None:
+    """The error names the key."""
     path = tmp_path / "scenario.toml"
     path.write_text(f'kind = "scenario"\n{text}\n')
     with pytest.raises(ConfigError) as error:
@@ -255,13 +255,13 @@ def test_scenarios_that_contradict_themselves(text: str, tmp_path: Path) -> None
 
 
 def test_every_key_is_described() -> None:
-    """The schema explains each key of each kind of file."""
+    """The schema describes each key of each kind of file."""
     for name, model in json_schema()["$defs"].items():
         for key, entry in model["properties"].items():
             # A table is described where it is defined.
             assert "description" in entry or "$ref" in entry, f"{name}.{key}"
 
 
-def test_schema_of_one_kind_is_that_kind_alone() -> None:
-    """Asked for one kind, the schema does not mention the others."""
+def test_schema_of_one_kind_omits_the_others() -> None:
+    """The schema of one kind does not mention the others."""
     assert "ScenarioConfig" not in json.dumps(json_schema("prism_layout"))

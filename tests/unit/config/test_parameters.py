@@ -1,4 +1,4 @@
-"""From files to parameters: units, and whether everything fits together."""
+"""Conversion of configuration and set-up files to parameters."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_units_become_si(folder: Path) -> None:
 
 
 def test_set_up_files_are_read(folder: Path) -> None:
-    """Frames and prism positions come from the files of the day."""
+    """Frames and prism positions come from the set-up files."""
     known = _parameters(folder)
     assert known.stations[1].T_station1_station[0][3] == 2.0
     assert [prism.prism for prism in known.prisms] == [1, 2, 3]
@@ -76,53 +76,53 @@ def test_set_up_files_are_read(folder: Path) -> None:
 
 
 def test_defaults_are_those_of_the_model() -> None:
-    """A configuration that says nothing means the same as the program's own defaults."""
+    """An empty configuration has the defaults of the parameters."""
     assert pipeline_parameters(PipelineConfig()) == PipelineParameters()
     assert noise(NoiseConfig()) == TRACKING_NOISE
 
 
-def test_a_prism_that_nobody_tracks_is_left_out(folder: Path) -> None:
-    """A spare prism on the robot does not keep every pose waiting."""
+def test_untracked_prism_is_omitted(folder: Path) -> None:
+    """Poses do not wait for a spare prism."""
     layout = folder / "prism_layout.example.toml"
     layout.write_text(layout.read_text() + "\n[prisms.4]\nposition_m = [0.0, 0.0, 2.0]\n")
     assert [prism.prism for prism in _parameters(folder).prisms] == [1, 2, 3]
 
 
-def test_a_station_without_frame(folder: Path) -> None:
-    """The file that lacks the frame is named, and the station."""
+def test_missing_frame_is_named(folder: Path) -> None:
+    """The error names file and station."""
     with pytest.raises(ConfigError, match=r"station_frames\.example\.toml: stations\.5: missing"):
         _parameters(folder, ("station = 3", "station = 5"))
 
 
-def test_a_prism_without_position(folder: Path) -> None:
-    """The file that lacks the prism is named, and who tracks it."""
+def test_missing_prism_is_named(folder: Path) -> None:
+    """The error names file, prism and station."""
     with pytest.raises(
         ConfigError, match=r"prism_layout\.example\.toml: prisms\.4: missing; station 3 tracks it"
     ):
         _parameters(folder, ("prism = 3", "prism = 4"))
 
 
-def test_fewer_than_three_prisms(folder: Path) -> None:
-    """Three stations on two prisms give no pose, and that is said before the robot drives."""
+def test_fewer_than_three_prisms_are_rejected(folder: Path) -> None:
+    """Three stations on two prisms determine no pose."""
     with pytest.raises(ConfigError, match="a pose needs 3 tracked prisms, the stations track 2"):
         _parameters(folder, ("prism = 3", "prism = 2"))
 
 
-def test_a_missing_set_up_file(folder: Path) -> None:
-    """A set-up file that is not there yet is named."""
+def test_missing_set_up_file_is_named(folder: Path) -> None:
+    """The error names the file."""
     with pytest.raises(ConfigError, match=r"tomorrow\.toml: no such file"):
         _parameters(folder, ("prism_layout.example.toml", "tomorrow.toml"))
 
 
 def test_reference_scenario_has_the_published_prism_distances() -> None:
-    """The layout is the one whose distances DESIGN gives: 0.987, 0.681 and 0.815 m."""
+    """0.987, 0.681 and 0.815 m, as in DESIGN."""
     a, b, c = (np.array(prism.position_m) for prism in ScenarioConfig().prisms)
     distances = [np.linalg.norm(a - b), np.linalg.norm(a - c), np.linalg.norm(b - c)]
     np.testing.assert_allclose(distances, [0.987, 0.681, 0.815], atol=6e-4)
 
 
 def test_scenario_frames_are_level_and_rigid() -> None:
-    """A simulated station is turned about the plumb line alone, and stands where the scenario says."""
+    """A simulated station is rotated about the vertical only."""
     for station in scenario_parameters(ScenarioConfig()).stations:
         T = np.array(station.T_station1_station)
         check_transform(T)

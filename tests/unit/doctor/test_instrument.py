@@ -1,4 +1,4 @@
-"""The checks of ``tsgt doctor`` that ask the instrument, or the client that has it."""
+"""Checks of ``tsgt doctor``: the instrument, directly or through the client."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.made_up_machine import NOW_NS, MadeUpMachine
+from harness.fake_machine import NOW_NS, FakeMachine
 from harness.radios import running_timeline
 
 from tsgt.config import LeicaInstrumentConfig, ScenarioConfig
 from tsgt.doctor import Outcome
-from tsgt.doctor.instrument import judge_identity
+from tsgt.doctor.instrument import check_identity
 from tsgt.errors import InstrumentError, StreamError
 from tsgt.simulation.instrument import SimulatedLine, SimulatedTotalStation
 from tsgt.simulation.kernel import VirtualClock
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 NAMES = ("instrument", "licence", "battery", "level")
 
 
-def connected(made_up: MadeUpMachine) -> tuple[SimulatedTotalStation, SimulatedLine]:
-    """Put a simulated total station at the end of a machine's line."""
+def connected(made_up: FakeMachine) -> tuple[SimulatedTotalStation, SimulatedLine]:
+    """Connect a simulated total station to a machine's line."""
     scenario = ScenarioConfig()
     timeline = running_timeline()
     rng = np.random.default_rng(1)
@@ -43,7 +43,7 @@ def connected(made_up: MadeUpMachine) -> tuple[SimulatedTotalStation, SimulatedL
 def client_status(
     instrument: str | None = "Leica TS16 1234567", *, problem: str = "", battery: int | None = 72
 ) -> ClientStatus:
-    """Make what a client says of itself."""
+    """Make the status of a client."""
     return ClientStatus(
         stamp_ns=NOW_NS,
         station=1,
@@ -78,11 +78,11 @@ def client_status(
     )
 
 
-async def test_instrument_that_is_ready_is_well(tmp_path: Path) -> None:
+async def test_ready_instrument_passes(tmp_path: Path) -> None:
     """It is identified, licensed, charged and level, and the line is closed again."""
-    made_up = MadeUpMachine(tmp_path)
+    made_up = FakeMachine(tmp_path)
     _, line = connected(made_up)
-    findings = await made_up.examine()
+    findings = await made_up.run_checks()
     assert {name: findings[name].outcome for name in NAMES} == dict.fromkeys(NAMES, Outcome.OK)
     assert "85 %" in findings["battery"].detail
     port = await line.open(115_200)  # raises while somebody has it
@@ -90,11 +90,11 @@ async def test_instrument_that_is_ready_is_well(tmp_path: Path) -> None:
 
 
 async def test_missing_licence_fails(tmp_path: Path) -> None:
-    """Without it nothing searches or locks by itself; the line says so before the field does."""
-    made_up = MadeUpMachine(tmp_path)
+    """Without the licence it does not search or lock."""
+    made_up = FakeMachine(tmp_path)
     instrument, _ = connected(made_up)
     instrument.robotic_licence = False
-    found = (await made_up.examine())["licence"]
+    found = (await made_up.run_checks())["licence"]
     assert found.ok is False
     assert "GeoCOM Robotic" in found.detail
 
@@ -103,77 +103,77 @@ async def test_missing_licence_fails(tmp_path: Path) -> None:
     ("percent", "external", "outcome"),
     [(45.0, False, Outcome.NOTE), (10.0, False, Outcome.FAILED), (10.0, True, Outcome.OK)],
 )
-async def test_battery_that_will_not_last_is_told(
+async def test_low_battery_is_reported(
     tmp_path: Path,
     percent: float,
     external: bool,  # noqa: FBT001 (a case)
     outcome: Outcome,
 ) -> None:
-    """A half is too little for a day, a fifth for an hour; on external power it does not matter."""
-    made_up = MadeUpMachine(tmp_path)
+    """Half is a note, a fifth is a failure, external power passes."""
+    made_up = FakeMachine(tmp_path)
     instrument, _ = connected(made_up)
     instrument.battery_percent, instrument.external_power = percent, external
-    assert (await made_up.examine())["battery"].outcome is outcome
+    assert (await made_up.run_checks())["battery"].outcome is outcome
 
 
 @pytest.mark.parametrize(("tilt_rad", "tells"), [(0.0009, "3.1'"), (0.01, "not level")])
-async def test_instrument_that_is_not_level_is_noted(tmp_path: Path, tilt_rad: float, tells: str) -> None:
-    """A note only: on a desk no instrument is level."""
-    made_up = MadeUpMachine(tmp_path)
+async def test_instrument_that_is_not_level_is_a_note(tmp_path: Path, tilt_rad: float, tells: str) -> None:
+    """On a desk no instrument is level."""
+    made_up = FakeMachine(tmp_path)
     instrument, _ = connected(made_up)
     instrument.tilt_rad = (tilt_rad, 0.0)
-    found = (await made_up.examine())["level"]
+    found = (await made_up.run_checks())["level"]
     assert found.outcome is Outcome.NOTE
     assert tells in found.detail
 
 
-async def test_other_baud_rate_is_noted(tmp_path: Path) -> None:
-    """It is found by trying, which takes its time; the line says what to set."""
-    made_up = MadeUpMachine(tmp_path)
+async def test_other_baud_rate_is_a_note(tmp_path: Path) -> None:
+    """The finding says what to set."""
+    made_up = FakeMachine(tmp_path)
     connected(made_up)
     made_up.change("client.toml", 'kind = "leica"', 'kind = "leica"\nbaud = 19_200')
-    found = (await made_up.examine())["instrument"]
+    found = (await made_up.run_checks())["instrument"]
     assert found.outcome is Outcome.NOTE
     assert "baud = 115200" in found.detail
 
 
 async def test_instrument_that_is_off_fails(tmp_path: Path) -> None:
-    """One failure; what follows from it is skipped."""
-    made_up = MadeUpMachine(tmp_path)
+    """One failure; dependent checks are skipped."""
+    made_up = FakeMachine(tmp_path)
     _, line = connected(made_up)
-    line.faults.deaf = True  # nothing wakes it: its battery is out
-    findings = await made_up.examine()
+    line.faults.drop_requests = True  # nothing wakes it: its battery is out
+    findings = await made_up.run_checks()
     assert findings["instrument"].ok is False
-    assert "is it on" in findings["instrument"].detail
+    assert "check that it is on" in findings["instrument"].detail
     assert {findings[name].ok for name in NAMES[1:]} == {None}
 
 
 def test_instrument_without_target_recognition_fails(tmp_path: Path) -> None:
-    """A manual instrument answers as well, and cannot follow a prism."""
+    """A manual instrument responds, but cannot track a prism."""
     config = LeicaInstrumentConfig(kind="leica", port=tmp_path, prism_type="round")
-    found = judge_identity(Identity(model="TC1202", atr=False), config, 115_200)
+    found = check_identity(Identity(model="TC1202", atr=False), config, 115_200)
     assert found.ok is False
     assert "TC1202, number unknown" in found.detail
 
 
 async def test_line_that_cannot_be_opened_fails(tmp_path: Path) -> None:
-    """The words of the port are those of the line."""
-    made_up = MadeUpMachine(tmp_path)
+    """The finding has the error of the port."""
+    made_up = FakeMachine(tmp_path)
 
     async def refuse(_baud: int) -> Port:
         raise InstrumentError("ttyUSB0: is locked by somebody")
 
     made_up.port = refuse
-    assert "locked by somebody" in (await made_up.examine())["instrument"].detail
+    assert "locked by somebody" in (await made_up.run_checks())["instrument"].detail
 
 
-async def test_running_client_is_asked_instead(tmp_path: Path) -> None:
-    """Instrument and radio stay in its hands; what it says of the instrument is taken over."""
-    made_up = MadeUpMachine(tmp_path)
+async def test_running_client_reports_the_instrument(tmp_path: Path) -> None:
+    """Instrument and radio stay open in the client."""
+    made_up = FakeMachine(tmp_path)
     made_up.status = client_status()
     made_up.holders = {"ttyUSB0": "tsgt-client (process 71)", "spidev0.0": "tsgt-client (process 71)"}
     made_up.hal_error = AssertionError("must not be opened")
-    findings = await made_up.examine()
+    findings = await made_up.run_checks()
     assert [each for each in findings.values() if each.ok is False] == []
     assert "1234 measured" in findings["daemon"].detail
     assert "Leica TS16 1234567" in findings["instrument"].detail
@@ -183,50 +183,50 @@ async def test_running_client_is_asked_instead(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["Leica TS16 1234567", None])
-async def test_problem_that_the_client_has_is_a_failure(tmp_path: Path, name: str | None) -> None:
-    """Whatever it says that a person should see to."""
-    made_up = MadeUpMachine(tmp_path)
+async def test_problem_of_the_client_fails(tmp_path: Path, name: str | None) -> None:
+    """The problem is in the finding."""
+    made_up = FakeMachine(tmp_path)
     made_up.status = client_status(name, problem="the licence GeoCOM Robotic is missing", battery=None)
-    findings = await made_up.examine()
+    findings = await made_up.run_checks()
     assert findings["instrument"].ok is False
     assert "GeoCOM Robotic is missing" in findings["instrument"].detail
     assert findings["battery"].ok is None
 
 
 @pytest.mark.parametrize("name", ["client.toml", "master.toml"])
-async def test_daemon_that_may_not_be_asked_is_left_alone(tmp_path: Path, name: str) -> None:
-    """Its socket is for its group; systemd knows that it runs."""
-    made_up = MadeUpMachine(tmp_path)
+async def test_daemon_without_access_is_left_alone(tmp_path: Path, name: str) -> None:
+    """Systemd reports that it is running."""
+    made_up = FakeMachine(tmp_path)
     assert made_up.service is not None
     made_up.service |= {"ActiveState": "active", "SubState": "running"}
     made_up.hal_error = AssertionError("must not be opened")
-    findings = await made_up.examine(name)
+    findings = await made_up.run_checks(name)
     assert findings["daemon"].outcome is Outcome.NOTE
     assert "sudo tsgt doctor" in findings["daemon"].detail
     assert findings["radio"].ok is None
     assert [each for each in findings.values() if each.ok is False] == []
 
 
-async def test_client_that_is_stuck_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One that takes the question and does not answer is to be restarted."""
+async def test_stuck_client_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It must be restarted."""
 
     def stuck(_path: Path) -> ClientStatus | None:
         raise StreamError("client.sock: no status within 5 s; the daemon is stuck, see its log")
 
-    made_up = MadeUpMachine(tmp_path)
+    made_up = FakeMachine(tmp_path)
     monkeypatch.setattr(made_up, "ask_client", stuck)
-    found = (await made_up.examine())["daemon"]
+    found = (await made_up.run_checks())["daemon"]
     assert found.ok is False
     assert "sudo systemctl restart tsgt-client" in found.detail
 
 
 async def test_bridge_needs_its_program(tmp_path: Path) -> None:
-    """A program that is not there, or may not be run, would be started in vain again and again."""
-    made_up = MadeUpMachine(tmp_path)
+    """A missing or non-executable program fails."""
+    made_up = FakeMachine(tmp_path)
     made_up.change("client.toml", 'kind = "leica"', 'kind = "bridge"\ncommand = ["my-program"]')
     text = (tmp_path / "client.toml").read_text()
     lines = [line for line in text.splitlines() if not line.startswith(("port =", "prism_type"))]
     made_up.write("client.toml", "\n".join(lines))
-    assert (await made_up.examine())["instrument"].ok is False
+    assert (await made_up.run_checks())["instrument"].ok is False
     made_up.programs = {"my-program"}
-    assert (await made_up.examine())["instrument"].ok is True
+    assert (await made_up.run_checks())["instrument"].ok is True

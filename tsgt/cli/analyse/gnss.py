@@ -1,4 +1,4 @@
-"""The command ``analyse gnss``: distances between satellite receivers, beside those between prisms."""
+"""The command ``analyse gnss``: distances between GNSS receivers and between prisms of the same drive."""
 
 from __future__ import annotations
 
@@ -13,18 +13,19 @@ import numpy as np
 from tsgt.analysis.figures import draw_gnss
 from tsgt.analysis.formats import QUALITIES, read_pos
 from tsgt.analysis.gnss import (
-    DistanceErrors,
-    common_part,
-    prism_pairs,
+    DistanceErrorStatistics,
+    common_interval,
+    prism_distances,
     quality_shares,
-    receiver_pairs,
+    receiver_distances,
     receivers,
-    span,
+    time_span,
 )
 from tsgt.cli.analyse.options import figure_option
 from tsgt.cli.options import json_option, keep_going_option, path_type
-from tsgt.cli.output import print_json, print_table
-from tsgt.cli.recordings import load, progress
+from tsgt.cli.output import numbers, print_json, print_table, require_extra
+from tsgt.cli.progress import progress
+from tsgt.cli.recordings import load
 from tsgt.cli.render import clock_time
 from tsgt.errors import InputFileError
 from tsgt.estimation import build_tracks
@@ -35,19 +36,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from tsgt.analysis.gnss import Distances, Receiver
+    from tsgt.analysis.gnss import DistanceSeries, Receiver
 
-_HEADER = [
-    "pair",
-    "n",
-    "reference",
-    "mean",
-    "std",
-    "mean |error|",
-    "std |error|",
-    "p95 |error|",
-    "max |error|",
-]
+_ERROR_COLUMNS = ("mean |error|", "std |error|", "p95 |error|", "max |error|")
 
 
 @click.command()
@@ -57,13 +48,13 @@ _HEADER = [
     "references_mm",
     type=click.FloatRange(min=0.0, min_open=True, max=1e6),
     multiple=True,
-    help="Distance between two receivers, once per pair: of 1-2, then 1-3, ..., 2-3, as the files are given.  "
-    "[default: the median of the fixed ones]",
+    help="Distance between two receivers, once per pair in the order of the files: 1-2, 1-3, ..., 2-3.  "
+    "[default: median of the fixed solutions]",
 )
 @click.option(
     "--recording",
     type=path_type,
-    help="Recording of the same drive: the distances between its prisms, over the time that both have.",
+    help="Recording of the same drive, to add the distances between its prisms.",
 )
 @keep_going_option
 @figure_option
@@ -77,12 +68,13 @@ def gnss(
     figure: Path | None,
     as_json: bool,
 ) -> None:
-    """Compare satellite receivers with total stations.
+    """Compare GNSS receivers with total stations.
 
-    Each FILE is one receiver's solution as RTKLIB wrote it (.pos). However the robot moves, the distances between
-    receivers on it do not change, nor do those between its prisms: how far they stray tells how good either is.
+    Each FILE is the solution of one receiver by RTKLIB (.pos). On a rigid robot the distances between receivers and
+    those between prisms are constant; their variation is a measure of the accuracy of either. Needs tsgt[gnss].
     """
     references_m = _references_m(files, references_mm)
+    require_extra("GNSS files", "pymap3d", extra="gnss")
     solutions = []
     with progress("reading") as on_progress:
         for number, path in enumerate(files, start=1):
@@ -90,19 +82,19 @@ def gnss(
             if on_progress is not None:
                 on_progress(number / len(files))
     found = receivers(solutions)
-    pairs = receiver_pairs(found, references_m)
-    if span(pairs) is None:
-        raise InputFileError(
-            "the receivers have no time in common; take the files of one drive", path=files[0]
-        )
-    prisms: tuple[Distances, ...] = ()
+    pairs = receiver_distances(found, references_m)
+    if time_span(pairs) is None:
+        raise InputFileError("the receivers do not overlap in time; use files of one drive", path=files[0])
+    prisms: tuple[DistanceSeries, ...] = ()
     if recording is not None:
         loaded = load(recording, keep_going=keep_going)
         tracks = build_tracks(loaded.parameters, loaded.measurements)
-        pairs, prisms = common_part(pairs, prism_pairs(loaded.parameters, tracks, recording), recording)
-    # Receivers are switched on long before the drive; their figures are to be of the same time as the distances.
-    both = span(pairs)
-    assert both is not None  # noqa: S101 (refused above, and by common_part)
+        pairs, prisms = common_interval(
+            pairs, prism_distances(loaded.parameters, tracks, recording), recording
+        )
+    # Receivers are switched on long before the drive: reduce them to the time span of the distances.
+    both = time_span(pairs)
+    assert both is not None  # noqa: S101 (rejected above, and by common_part)
     found = tuple(receiver.between(*both) for receiver in found)
     if figure is not None:
         draw_gnss(found, pairs, prisms, figure)
@@ -114,9 +106,9 @@ def gnss(
     origin = (
         "as given"
         if references_m
-        else "the median of fixed ones (of all, where none is): an error that is always there does not show"
+        else "median of the fixed solutions (of all, if none is fixed), which hides a constant error"
     )
-    click.echo(f"\nDistances between receivers (mm); reference {origin}")
+    click.echo(f"\nDistances between receivers (mm); reference: {origin}")
     _print_pairs(pairs)
     if prisms:
         click.echo("\nDistances between prisms at 20 Hz, interpolated, over the same time (mm)")
@@ -125,9 +117,9 @@ def gnss(
 
 def _references_m(files: Sequence[Path], references_mm: Sequence[float]) -> list[float] | None:
     if len(files) < 2:
-        raise click.UsageError("takes the files of two receivers at least")
+        raise click.UsageError("give the files of at least two receivers")
     if len({path.resolve() for path in files}) < len(files):
-        raise click.UsageError("one of the files is given twice")
+        raise click.UsageError("a file is given twice")
     if not references_mm:
         return None
     if not all(map(math.isfinite, references_mm)):
@@ -136,20 +128,20 @@ def _references_m(files: Sequence[Path], references_mm: Sequence[float]) -> list
     if len(references_mm) != len(names):
         raise click.UsageError(
             f"{len(files)} receivers have {len(names)} distances ({', '.join(names)}); "
-            f"give --reference-mm so many times, not {len(references_mm)} times"
+            f"give --reference-mm {len(names)} times, not {len(references_mm)} times"
         )
     return [reference_mm / 1e3 for reference_mm in references_mm]
 
 
 def _keys(
     found: Sequence[Receiver],
-    pairs: Sequence[Distances],
-    prisms: Sequence[Distances],
+    pairs: Sequence[DistanceSeries],
+    prisms: Sequence[DistanceSeries],
     both: tuple[int, int],
     *,
     given: bool,
 ) -> dict[str, Any]:
-    return {
+    keys = {
         "receivers": {
             receiver.name: {
                 "file": str(receiver.path),
@@ -165,16 +157,12 @@ def _keys(
         "end_ns": both[1],
         "reference": "given" if given else "median",
         "inter_receiver_mm": {pair.name: _figures(pair) for pair in pairs},
-        "inter_receiver_all_mm": _together(pairs),
-        **(
-            {
-                "inter_prism_mm": {pair.name: _figures(pair) for pair in prisms},
-                "inter_prism_all_mm": _together(prisms),
-            }
-            if prisms
-            else {}
-        ),
+        "inter_receiver_all_mm": _errors(_all_errors_m(pairs)),
     }
+    if prisms:
+        keys["inter_prism_mm"] = {pair.name: _figures(pair) for pair in prisms}
+        keys["inter_prism_all_mm"] = _errors(_all_errors_m(prisms))
+    return keys
 
 
 def _satellites(receiver: Receiver) -> dict[str, float]:
@@ -189,26 +177,26 @@ def _satellites(receiver: Receiver) -> dict[str, float]:
     }
 
 
-def _figures(pair: Distances) -> dict[str, Any]:
+def _figures(pair: DistanceSeries) -> dict[str, Any]:
     found = 1e3 * pair.distances_m
-    nothing = len(found) == 0
+    empty = len(found) == 0
     by_quality = {QUALITIES[q]: _errors(errors_m) for q, errors_m in pair.by_quality().items()}
     return {
         "reference": 1e3 * pair.reference_m,
-        "mean": math.nan if nothing else float(np.mean(found)),
-        "std": math.nan if nothing else float(np.std(found)),
+        "mean": math.nan if empty else float(np.mean(found)),
+        "std": math.nan if empty else float(np.std(found)),
         **_errors(pair.errors_m),
         "invalid": len(pair.invalid_ns),
         **({"by_quality": by_quality} if pair.quality is not None else {}),
     }
 
 
-def _together(pairs: Sequence[Distances]) -> dict[str, Any]:
-    return _errors(np.concatenate([pair.errors_m for pair in pairs]))
+def _all_errors_m(pairs: Sequence[DistanceSeries]) -> NDArray[np.float64]:
+    return np.concatenate([pair.errors_m for pair in pairs])
 
 
 def _errors(errors_m: NDArray[np.float64]) -> dict[str, Any]:
-    return dataclasses.asdict(DistanceErrors.of(errors_m))
+    return dataclasses.asdict(DistanceErrorStatistics.of(errors_m))
 
 
 def _print_receivers(found: Sequence[Receiver]) -> None:
@@ -220,7 +208,7 @@ def _print_receivers(found: Sequence[Receiver]) -> None:
                 receiver.name,
                 str(len(receiver.times_ns)),
                 str(receiver.without_position),
-                *_numbers(satellites["mean"], satellites["std"]),
+                *numbers(satellites["mean"], satellites["std"], digits=1),
                 f"{satellites['min']} to {satellites['max']}" if len(receiver.times_ns) else "-",
                 ", ".join(f"{name} {share:.1%}" for name, share in quality_shares(receiver).items()) or "-",
             ]
@@ -228,18 +216,12 @@ def _print_receivers(found: Sequence[Receiver]) -> None:
     print_table(["receiver", "positions", "epochs without", "satellites", "std", "range", "quality"], rows)
 
 
-def _print_pairs(pairs: Sequence[Distances]) -> None:
+def _print_pairs(pairs: Sequence[DistanceSeries]) -> None:
     rows = []
     for pair in pairs:
         figures = _figures(pair)
-        rows.append(
-            [
-                pair.name,
-                str(figures["valid"]),
-                *_numbers(figures["reference"], figures["mean"], figures["std"]),
-                *_error_cells(pair.errors_m),
-            ]
-        )
+        cells = numbers(figures["reference"], figures["mean"], figures["std"], digits=1)
+        rows.append([pair.name, str(figures["valid"]), *cells, *_error_cells(pair.errors_m)])
         of_quality = pair.by_quality()
         if len(of_quality) > 1:
             rows += [
@@ -247,15 +229,11 @@ def _print_pairs(pairs: Sequence[Distances]) -> None:
                 for q, errors_m in of_quality.items()
             ]
     if len(pairs) > 1:
-        together = np.concatenate([pair.errors_m for pair in pairs])
-        rows.append(["all", str(len(together)), "", "", "", *_error_cells(together)])
-    print_table(_HEADER, rows)
+        errors_m = _all_errors_m(pairs)
+        rows.append(["all", str(len(errors_m)), "", "", "", *_error_cells(errors_m)])
+    print_table(["pair", "n", "reference", "mean", "std", *_ERROR_COLUMNS], rows)
 
 
 def _error_cells(errors_m: NDArray[np.float64]) -> list[str]:
-    found = DistanceErrors.of(errors_m)
-    return _numbers(found.mean_abs_error, found.std_abs_error, found.p95, found.max)
-
-
-def _numbers(*figures: float) -> list[str]:
-    return ["-" if math.isnan(figure) else f"{figure:.1f}" for figure in figures]
+    found = DistanceErrorStatistics.of(errors_m)
+    return numbers(found.mean_abs_error, found.std_abs_error, found.p95, found.max, digits=1)

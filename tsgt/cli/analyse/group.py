@@ -1,4 +1,4 @@
-"""The command group ``analyse``: studies of what poses can be expected to be, and how they compare."""
+"""The command group ``analyse``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tsgt.cli.analyse.perturbation import perturbation_command
 
 @click.group()
 def analyse() -> None:
-    """Studies: what noise does to poses, where to put prisms and stations, how satellite receivers compare."""
+    """Study layouts, noise and GNSS receivers."""
 
 
 analyse.add_command(gnss)

@@ -1,4 +1,4 @@
-"""The command ``analyse layout``: where to put prisms and stations, before anybody drives."""
+"""The command ``analyse layout``: expected pose accuracy of prism layouts and station positions."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ import click
 import numpy as np
 
 from tsgt.analysis.design import (
-    LayoutFigures,
-    Stances,
+    LayoutProblem,
+    PoseAccuracy,
+    RobotPoses,
     Station,
-    Task,
-    best_layout,
+    optimal_layout,
     pose_covariances,
-    together_or_around,
+    station_arrangements,
 )
 from tsgt.cli.analyse.options import figure_option, read_layout, usable_layout
-from tsgt.cli.options import finite, json_option, path_type
+from tsgt.cli.options import FiniteRange, json_option, path_type
 from tsgt.cli.output import print_json, print_table
-from tsgt.cli.recordings import progress
+from tsgt.cli.progress import progress
 from tsgt.config import MasterConfig, load, parameters, scenario_parameters
 from tsgt.errors import ConfigError
-from tsgt.model import LARGEST_COORDINATE_M
+from tsgt.model import MAX_COORDINATE_M
 from tsgt.simulation.scenario_files import find_scenario
 
 if TYPE_CHECKING:
@@ -37,20 +37,20 @@ if TYPE_CHECKING:
     from tsgt.model import Parameters, Vector3
 
 _DISTANCES_M = (25.0, 50.0, 100.0, 200.0, 400.0)
-_ENVELOPE = "best in the envelope"
+_BEST = "best in the envelope"
 
 
 @dataclass(frozen=True, slots=True)
 class _Candidate:
-    """A layout and how well poses from it are known."""
+    """A layout and the covariances of its poses."""
 
     name: str
     layout: FloatArray
     covariance: FloatArray
 
     @property
-    def figures(self) -> LayoutFigures:
-        return LayoutFigures.of(self.covariance)
+    def figures(self) -> PoseAccuracy:
+        return PoseAccuracy.of(self.covariance)
 
 
 @click.command()
@@ -58,33 +58,32 @@ class _Candidate:
 @click.option(
     "--scenario",
     "scenario_name",
-    help="Stations, their noise, prisms, and where the robot drives: name, or path of a file.  [default: dynamic]",
+    help="Scenario with stations, their noise, prisms and area: name, or path of a file.  [default: dynamic]",
 )
 @click.option(
     "--config",
     "config_path",
     type=path_type,
-    help="Configuration of a master, TOML, instead of a scenario: its stations where they stand. Needs --area.",
+    help="Configuration of a master (TOML) instead of a scenario. Needs --area.",
 )
 @click.option(
     "--area",
     type=(float, float, float, float),
     metavar="X Y Z RADIUS",
-    help="Where the robot drives, in the frame of station 1, in m.  [default: the scenario's]",
+    help="Area of the drive, in the frame of station 1 in m.  [default: that of the scenario]",
 )
 @click.option(
     "--envelope",
     type=(float, float, float, float, float, float),
     metavar="XMIN XMAX YMIN YMAX ZMIN ZMAX",
-    help="Find the best layout in this box, in the frame of the robot, in m.",
+    help="Box in the robot frame, in m, in which to search for the best layout.",
 )
 @click.option(
     "--min-separation-mm",
-    type=click.FloatRange(10, 10_000),
-    callback=finite,
+    type=FiniteRange(10, 10_000),
     default=300.0,
     show_default=True,
-    help="Between two prisms in the envelope: instruments have to tell them apart.",
+    help="Minimum distance of two prisms in the envelope, so that instruments can tell them apart.",
 )
 @click.option(
     "--objective",
@@ -92,7 +91,7 @@ class _Candidate:
     type=click.Choice(["rotation", "position"]),
     default="rotation",
     show_default=True,
-    help="What has to be known best.",
+    help="Accuracy to optimise.",
 )
 @click.option(
     "--point",
@@ -101,11 +100,9 @@ class _Candidate:
     metavar="X Y Z",
     default=(0.0, 0.0, 0.0),
     show_default=True,
-    help="Point of the robot whose position counts, in its frame, in m: that of a sensor, say.",
+    help="Point whose position accuracy counts, in the robot frame in m, for example of a sensor.",
 )
-@click.option(
-    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the starts of the search."
-)
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the search.")
 @figure_option
 @json_option
 def layout_command(
@@ -122,46 +119,47 @@ def layout_command(
     figure: Path | None,
     as_json: bool,
 ) -> None:
-    """Rank prism LAYOUTS (set-up files) by how well they let the pose be known; find the best one in a box.
+    """Rank prism layouts by expected pose accuracy.
 
-    The robot stands level at several places and headings, each station measures its prism once, and the noise of the
-    instruments is propagated into the pose, to first order. The layout of the scenario or configuration is ranked
-    with the others. Then the stations move: how does the pose of the first-ranked layout depend on their distance, and
-    on whether they stand together or around the robot?
+    LAYOUTS are set-up files; that of the scenario or configuration is ranked with them. The level robot is placed at
+    several positions and headings, each station measures its prism once, and the instrument noise is propagated to the
+    pose to first order. Then the stations are moved, to show the effect of their distance, and of placing them together
+    or around the robot.
     """
-    # No NaN is less than anything.
+    # Comparisons with NaN are false.
     if not all(
-        abs(number_m) <= LARGEST_COORDINATE_M for number_m in (*(area or ()), *(envelope or ()), *point_m)
+        abs(number_m) <= MAX_COORDINATE_M for number_m in (*(area or ()), *(envelope or ()), *point_m)
     ):
         raise click.UsageError(
-            f"--area, --envelope and --point need finite numbers, at most {LARGEST_COORDINATE_M:g} m"
+            f"--area, --envelope and --point need finite numbers, at most {MAX_COORDINATE_M:g} m"
         )
-    known, places, source = _setting(scenario_name, config_path, area)
+    known, places, source = _setup(scenario_name, config_path, area)
     slots = {prism: slot for slot, prism in enumerate(sorted({s.prism for s in known.stations}))}
     stations = tuple(
         Station(np.array(s.T_station1_station)[:3, 3], s.noise, slots[s.prism]) for s in known.stations
     )
-    stances, point = Stances.at(places), np.array(point_m)
+    robot_poses, point = RobotPoses.at(places), np.array(point_m)
     wanted = {source: _tracked({p.prism: p.position_m for p in known.prisms}, slots, source)}
     for path in layouts:
         wanted[str(path)] = _tracked(read_layout(path), slots, path)
-    candidates = [
-        _candidate(name, np.array(list(prisms.values())), stations, stances, point)
-        for name, prisms in wanted.items()
-    ]
+
+    def candidate(name: str, layout: FloatArray) -> _Candidate:
+        return _Candidate(name, layout, pose_covariances(layout, stations, robot_poses, point))
+
+    candidates = [candidate(name, np.array(list(prisms.values()))) for name, prisms in wanted.items()]
     if envelope is not None:
-        task = Task(
+        task = LayoutProblem(
             envelope_m=_box(envelope),
             count=len(slots),
             min_separation_m=min_separation_mm / 1e3,
             criterion=criterion,
             stations=stations,
-            stances=stances,
+            robot_poses=robot_poses,
             point_m=point,
         )
         with progress("searching") as on_progress:
-            found = best_layout(task, np.random.default_rng(seed), on_progress=on_progress)
-        candidates.append(_candidate(_ENVELOPE, found, stations, stances, point))
+            found = optimal_layout(task, np.random.default_rng(seed), on_progress=on_progress)
+        candidates.append(candidate(_BEST, found))
     candidates.sort(key=lambda c: c.figures.rotation_rad if criterion == "rotation" else c.figures.position_m)
     centre = places.mean(axis=0)
     distances = {d: _by_arrangement(candidates[0], stations, centre, d, point) for d in _DISTANCES_M}
@@ -174,8 +172,8 @@ def layout_command(
             {
                 "by": criterion,
                 "point_m": point.tolist(),
-                "stances": len(stances.position_m),
-                "ranking": [candidate.name for candidate in candidates],
+                "stances": len(robot_poses.position_m),
+                "ranking": [each.name for each in candidates],
                 "layouts": {
                     c.name: {
                         "prisms": dict(zip(slots, c.layout.tolist(), strict=True)),
@@ -190,21 +188,23 @@ def layout_command(
             }
         )
         return
-    _print(candidates, point, len(stances.position_m))
+    _print(candidates, point, len(robot_poses.position_m))
     if envelope is not None:
-        _print_found(next(c for c in candidates if c.name == _ENVELOPE), slots)
+        _print_best(next(c for c in candidates if c.name == _BEST), slots)
     _print_distances(candidates[0].name, distances)
 
 
-def _setting(
+def _setup(
     scenario_name: str | None, config_path: Path | None, area: tuple[float, ...] | None
 ) -> tuple[Parameters, FloatArray, str]:
-    """Who stands where, at which places the robot stands, (M, 3), and the name of what says so."""
+    """Return the parameters, the places of the robot, (M, 3), and the name of their source."""
     if config_path is not None:
         if scenario_name is not None:
             raise click.UsageError("--scenario and --config exclude each other")
         if area is None:
-            raise click.UsageError("--config does not say where the robot drives; give --area")
+            raise click.UsageError(
+                "--config needs --area: a configuration does not define the area of the drive"
+            )
         return parameters(load(config_path, MasterConfig)), _places(area), str(config_path)
     scenario = find_scenario(scenario_name or "dynamic")
     places = _places(area) if area is not None else _scenario_places(scenario)
@@ -219,7 +219,7 @@ def _scenario_places(scenario: ScenarioConfig) -> FloatArray:
 
 
 def _places(area: Sequence[float]) -> FloatArray:
-    """Centre of the area and four places around it, on the circle that halves it."""
+    """Return the centre of an area and four places on the circle that halves it."""
     x, y, z, radius = area
     if radius < 0:
         raise click.UsageError("--area: the radius is below zero")
@@ -230,7 +230,7 @@ def _places(area: Sequence[float]) -> FloatArray:
 def _tracked(
     layout: Mapping[int, Vector3], slots: Mapping[int, int], source: Path | str
 ) -> Mapping[int, Vector3]:
-    """Take those prisms of a layout that the stations track."""
+    """Return the prisms of a layout that the stations track."""
     for prism in slots:
         if prism not in layout:
             raise ConfigError(
@@ -246,27 +246,21 @@ def _box(envelope: tuple[float, ...]) -> FloatArray:
     return box
 
 
-def _candidate(
-    name: str, layout: FloatArray, stations: tuple[Station, ...], stances: Stances, point: FloatArray
-) -> _Candidate:
-    return _Candidate(name, layout, pose_covariances(layout, stations, stances, point))
-
-
 def _by_arrangement(
     candidate: _Candidate,
     stations: tuple[Station, ...],
     centre: FloatArray,
     distance_m: float,
     point: FloatArray,
-) -> dict[str, LayoutFigures]:
-    stances = Stances.at(centre[None])
+) -> dict[str, PoseAccuracy]:
+    robot_poses = RobotPoses.at(centre[None])
     return {
-        name: LayoutFigures.of(pose_covariances(candidate.layout, moved, stances, point))
-        for name, moved in together_or_around(stations, centre, distance_m).items()
+        name: PoseAccuracy.of(pose_covariances(candidate.layout, moved, robot_poses, point))
+        for name, moved in station_arrangements(stations, centre, distance_m).items()
     }
 
 
-def _keys(figures: LayoutFigures) -> dict[str, Any]:
+def _keys(figures: PoseAccuracy) -> dict[str, Any]:
     return {
         "position_sigma_mm": 1e3 * figures.position_m,
         "position_axes_sigma_mm": (1e3 * figures.position_axes_m).tolist(),
@@ -277,17 +271,17 @@ def _keys(figures: LayoutFigures) -> dict[str, Any]:
     }
 
 
-def _print(candidates: Sequence[_Candidate], point: FloatArray, stances: int) -> None:
+def _print(candidates: Sequence[_Candidate], point: FloatArray, robot_poses: int) -> None:
     x, y, z = point
     click.echo(
-        f"One measurement of each prism, the robot standing: root mean square over {stances} places and headings\n"
-        f"of one sigma, of the position of ({x:g}, {y:g}, {z:g}) m and of the rotation (mm, mrad)\n"
+        f"One measurement of each prism, the robot stationary: one sigma, root mean square over {robot_poses} places and\n"
+        f"headings, of the position of ({x:g}, {y:g}, {z:g}) m and of the rotation (mm, mrad)\n"
     )
     rows = [
         [
             candidate.name,
-            *_numbers(f.position_m, *f.position_axes_m, f.worst_position_m),
-            *_numbers(f.rotation_rad, *f.rotation_axes_rad, f.worst_rotation_rad),
+            *_thousandths(f.position_m, *f.position_axes_m, f.worst_position_m),
+            *_thousandths(f.rotation_rad, *f.rotation_axes_rad, f.worst_rotation_rad),
         ]
         for candidate in candidates
         for f in [candidate.figures]
@@ -295,23 +289,23 @@ def _print(candidates: Sequence[_Candidate], point: FloatArray, stances: int) ->
     print_table(["layout", "position", *"xyz", "worst", "rotation", "roll", "pitch", "yaw", "worst"], rows)
 
 
-def _print_found(found: _Candidate, slots: Mapping[int, int]) -> None:
-    click.echo("\nThe best in the envelope, as it stands in a prism layout\n")
+def _print_best(found: _Candidate, slots: Mapping[int, int]) -> None:
+    click.echo("\nBest layout in the envelope, as in a prism layout file\n")
     for prism, slot in slots.items():
         x, y, z = found.layout[slot]
         click.echo(f"  [prisms.{prism}]\n  position_m = [{x:.3f}, {y:.3f}, {z:.3f}]")
 
 
-def _print_distances(name: str, distances: Mapping[float, Mapping[str, LayoutFigures]]) -> None:
-    click.echo(f"\nIf the stations stood elsewhere, with {name} (mm, mrad)\n")
+def _print_distances(name: str, distances: Mapping[float, Mapping[str, PoseAccuracy]]) -> None:
+    click.echo(f"\nOther station positions, with {name} (mm, mrad)\n")
     rows = []
     for distance_m, found in distances.items():
         figures = [value for f in found.values() for value in (f.position_m, f.rotation_rad)]
-        rows.append([f"{distance_m:g} m", *_numbers(*figures)])
+        rows.append([f"{distance_m:g} m", *_thousandths(*figures)])
     header = [f"{what}, {how}" for how in next(iter(distances.values())) for what in ("position", "rotation")]
     print_table(["distance", *header], rows)
 
 
-def _numbers(*values: float) -> list[str]:
-    """Thousandths: mm of m, mrad of rad."""
+def _thousandths(*values: float) -> list[str]:
+    """Return table cells: mm of m, mrad of rad."""
     return [f"{1e3 * value:.2f}" for value in values]

@@ -1,4 +1,4 @@
-"""The command ``analyse perturbation``: what noise on the prisms means in position and rotation."""
+"""The command ``analyse perturbation``: effect of noise on the prisms on position and rotation."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
-from tsgt.analysis.design import Perturbation, equivalent, first_order_sigmas, perturbation_study
+from tsgt.analysis.design import Perturbation, equivalent_noise, first_order_sigmas, perturbation_study
 from tsgt.cli.analyse.options import figure_option, read_layout
-from tsgt.cli.options import finite, json_option, path_type
+from tsgt.cli.options import FiniteRange, json_option, path_type
 from tsgt.cli.output import print_json, print_table
-from tsgt.cli.recordings import progress
+from tsgt.cli.progress import progress
 from tsgt.config import ScenarioConfig
 
 if TYPE_CHECKING:
@@ -21,31 +21,29 @@ if TYPE_CHECKING:
 
     from tsgt.geometry import FloatArray
 
-_EQUIVALENT_DRAWS = 100_000
-"""One noise alone can be drawn so often that three digits of its figures hold."""
-_MOST_LEVELS = 10_000
+_EQUIVALENT_SAMPLES = 100_000
+"""Enough for three digits of the figures of one noise level."""
+_MAX_LEVELS = 10_000
 _LISTED_LEVELS = 10
 
-# What the paper says that its mean inter-prism error means (section IV-E).
+# Section IV-E of the paper, on its mean inter-prism error.
 _PAPER = "The paper: 10 mm between prisms are 10 mm in position and 0.01 rad in rotation."
 
 
 @click.command()
 @click.option(
     "--noise-mm-max",
-    type=click.FloatRange(0, 10_000),
-    callback=finite,
+    type=FiniteRange(0, 10_000),
     default=400.0,
     show_default=True,
     help="Largest noise: one sigma per coordinate of each prism.",
 )
 @click.option(
     "--step-mm",
-    type=click.FloatRange(0, 10_000, min_open=True),
-    callback=finite,
+    type=FiniteRange(0, 10_000, min_open=True),
     default=4.0,
     show_default=True,
-    help="From 0 in steps of this.",
+    help="Step between noise levels, starting at 0.",
 )
 @click.option(
     "--samples",
@@ -54,15 +52,14 @@ _PAPER = "The paper: 10 mm between prisms are 10 mm in position and 0.01 rad in 
     type=click.IntRange(2, 1_000_000),
     default=1000,
     show_default=True,
-    help="Poses for each noise.",
+    help="Poses per noise level.",
 )
 @click.option(
     "--inter-prism-mm",
-    type=click.FloatRange(0, 10_000, min_open=True),
-    callback=finite,
+    type=FiniteRange(0, 10_000, min_open=True),
     default=10.0,
     show_default=True,
-    help="Mean error of the distances between prisms, as `tsgt evaluate` finds it: what does it mean for poses?",
+    help="Mean error of the distances between prisms, as from `tsgt evaluate`, to convert to pose errors.",
 )
 @click.option(
     "--prisms",
@@ -74,9 +71,9 @@ _PAPER = "The paper: 10 mm between prisms are 10 mm in position and 0.01 rad in 
     "point_m",
     type=(float, float, float),
     metavar="X Y Z",
-    help="Point of the robot whose position counts, in its frame, in m.  [default: the prisms' centroid]",
+    help="Point whose position error is studied, in the robot frame in m.  [default: centroid of the prisms]",
 )
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the noise.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the noise.")
 @figure_option
 @json_option
 def perturbation_command(
@@ -91,15 +88,17 @@ def perturbation_command(
     figure: Path | None,
     as_json: bool,
 ) -> None:
-    """Put noise on the prisms and see what becomes of the pose: the paper's perturbation study.
+    """Study the effect of prism noise on poses.
 
-    White noise on every coordinate of every prism, from nothing to far beyond what measurements have; mean and
-    spread of the errors along and about each axis, and of their lengths. Small noise does what a propagation of first
-    order says; the study shows where that ends.
+    The paper's perturbation study: white noise on every coordinate of every prism, and mean and spread of the pose
+    errors along and about each axis, and of their norms. First-order propagation holds for small noise; the study
+    shows its limit.
     """
     levels = math.floor(noise_mm_max / step_mm + 1e-9) + 1
-    if levels > _MOST_LEVELS:
-        raise click.UsageError(f"{levels} sizes of noise are too many: enlarge --step-mm")
+    if levels > _MAX_LEVELS:
+        raise click.UsageError(
+            f"{levels} noise levels, at most {_MAX_LEVELS} are allowed: increase --step-mm"
+        )
     if point_m is not None and not np.isfinite(point_m).all():
         raise click.UsageError("--point needs finite numbers")
     known = _default_layout() if prisms is None else read_layout(prisms)
@@ -110,13 +109,13 @@ def perturbation_command(
         study = perturbation_study(
             layout,
             [1e-3 * step_mm * level for level in range(levels)],
-            draws=samples,
+            samples=samples,
             point_m=point,
             random=random,
             on_progress=on_progress,
         )
-    as_measured = equivalent(
-        layout, inter_prism_mm / 1e3, draws=_EQUIVALENT_DRAWS, point_m=point, random=random
+    as_measured = equivalent_noise(
+        layout, inter_prism_mm / 1e3, samples=_EQUIVALENT_SAMPLES, point_m=point, random=random
     )
     per_mm = first_order_sigmas(layout, 1e-3, point_m=point)
     if figure is not None:
@@ -165,7 +164,7 @@ def _keys(found: Perturbation) -> dict[str, Any]:
 
 
 def _print(study: Sequence[Perturbation], samples: int) -> None:
-    click.echo(f"{len(study)} sizes of noise, {samples} poses each; mean and standard deviation (mm, mrad)\n")
+    click.echo(f"{len(study)} noise levels, {samples} poses each; mean and standard deviation (mm, mrad)\n")
     stride = max(1, (len(study) - 1) // _LISTED_LEVELS)
     rows = [
         [
@@ -182,16 +181,16 @@ def _print(study: Sequence[Perturbation], samples: int) -> None:
 
 
 def _spreads(mean: FloatArray, std: FloatArray) -> list[str]:
-    """Mean and standard deviation of three axes, in thousandths."""
-    # The mean rounded before it is written, as nothing is to be minus nothing.
+    """Return mean and standard deviation of three axes in thousandths."""
+    # The mean is rounded first, to avoid -0.0.
     return [f"{round(1e3 * m, 1) + 0:.1f} ± {1e3 * s:.1f}" for m, s in zip(mean, std, strict=True)]
 
 
 def _print_equivalent(found: Perturbation, per_mm: tuple[FloatArray, FloatArray], point: FloatArray) -> None:
     noise_mm = 1e3 * found.noise_m
     click.echo(
-        f"\nA mean error of {1e3 * found.inter_prism_mean_m:g} mm between prisms is noise of {noise_mm:.2f} mm "
-        "per coordinate. For the pose it means\n"
+        f"\nA mean error of {1e3 * found.inter_prism_mean_m:g} mm between prisms corresponds to noise of {noise_mm:.2f} mm "
+        "per coordinate. Pose errors with this noise:\n"
     )
     rows = [
         [
@@ -211,9 +210,9 @@ def _print_equivalent(found: Perturbation, per_mm: tuple[FloatArray, FloatArray]
     header = ["", "mean norm", *(f"mean |{a}|" for a in axes), *(f"std {a}" for a in axes)]
     print_table([*header, *(f"1st order {a}" for a in axes)], rows)
     where = ", ".join(f"{round(float(value), 3) + 0:.3f}" for value in point)
-    click.echo(f"\nPosition is that of the point ({where}) m of the robot. {_PAPER}")
+    click.echo(f"\nThe position is that of the point ({where}) m in the robot frame. {_PAPER}")
 
 
 def _mm(values: FloatArray) -> list[float]:
-    """Thousandths: mm of m, mrad of rad."""
+    """Return thousandths: mm of m, mrad of rad."""
     return [1e3 * float(value) for value in values]

@@ -1,1 +1,5 @@
-"""TODO face."""
+"""The group ``calibrate``: targets, prisms and recordings in, station frames, prism layout and latencies out.
+
+``group`` solves from files, ``motion`` from a recording. ``collect`` and ``check`` measure targets over the radio:
+``session`` opens it, ``commands`` sends commands to the stations in either protocol.
+"""

@@ -1,4 +1,4 @@
-"""The command ``tsgt calibrate collect``: an operator aims, the stations measure over the radio."""
+"""The command ``tsgt calibrate collect``: the operator aims, the stations measure over the radio."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import click
 
 from tsgt.analysis.calibration import TargetCollection
-from tsgt.cli.calibrate.session import shot, target_session
+from tsgt.cli.calibrate.session import target_session
 from tsgt.cli.operator import Terminal
-from tsgt.cli.options import constant_type, finite, master_config_option, path_type
+from tsgt.cli.options import OutputFile, constant_option, master_config_option
 from tsgt.cli.output import print_table
 from tsgt.clock import SystemClock
 from tsgt.config import MasterConfig, load
@@ -21,56 +21,53 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from tsgt.analysis.calibration import Cell
+    from tsgt.analysis.calibration import StationTarget
     from tsgt.cli.calibrate.session import TargetSession
     from tsgt.cli.operator import Operator
-    from tsgt.geometry.calibration import Name
+    from tsgt.geometry.calibration import PointName
 
-KEYS = "Enter measures, s skips, r redoes the last one (r 3: target 3, r 2 3: of station 2), q quits"
+KEYS = "Enter measures, s skips, r repeats the last one (r 3: target 3, r 2 3: of station 2), q quits"
 
 
 @click.command()
 @master_config_option
 @click.option(
     "--output",
-    type=path_type,
+    type=OutputFile(".csv"),
     required=True,
-    help="File of targets; if it is there, collecting goes on with it.",
+    help="File of targets to write (.csv); an existing one is continued.",
 )
 @click.option(
-    "--targets",
-    "count",
+    "--target-count",
     type=click.IntRange(min=3),
     default=6,
     show_default=True,
-    help="How many targets there are, numbered from 1.",
+    help="Number of targets, numbered from 1.",
 )
 @click.option(
     "--repeats",
     type=click.IntRange(min=1),
     default=1,
     show_default=True,
-    help="How often each station measures each target: 2 for both faces.",
+    help="Measurements of each target by each station; 2 for both faces.",
 )
-@click.option(
-    "--target-constant-mm",
-    type=constant_type,
-    callback=finite,
-    default=0.0,
-    show_default=True,
-    help="Added to each measured distance; goes into the file.",
+@constant_option(
+    "--target-constant-mm", "Constant added to each distance, written to the file.", required=True
 )
-def collect(*, config_path: Path, output: Path, count: int, repeats: int, target_constant_mm: float) -> None:
-    """Measure targets with all stations over the radio, guided step by step.
+def collect(
+    *, config_path: Path, output: Path, target_count: int, repeats: int, target_constant_mm: float
+) -> None:
+    """Measure targets with all stations over the radio.
 
-    Stop tsgt-master first, which owns the radio. Someone aims each instrument by hand; Enter has it measure. The file
-    holds every measurement as soon as it is made: after Ctrl-C or q the same command goes on where it stopped.
+    Stop tsgt-master first, which owns the radio. The command asks for one target after the other: aim the instrument
+    by hand, then press Enter to measure. Every measurement is written to the file at once; after Ctrl-C or q the same
+    command continues.
     """
     config = load(config_path, MasterConfig)
     stations = sorted(station.station for station in config.stations)
-    collection = TargetCollection(output, stations, range(1, count + 1), repeats=repeats)
+    collection = TargetCollection(output, stations, range(1, target_count + 1), repeats=repeats)
     collection.resume()
-    _write(collection)  # before anybody aims: the folder may not be there
+    _write(collection)  # before anybody aims: the folder may not exist
 
     async def run() -> None:
         operator = Terminal()
@@ -78,11 +75,9 @@ def collect(*, config_path: Path, output: Path, count: int, repeats: int, target
             await collect_targets(collection, session, operator, constant_m=target_constant_mm / 1e3)
 
     asyncio.run(run())
-    missing = len(list(collection.missing()))
+    missing = len(list(collection.outstanding()))
     if missing:
-        click.echo(
-            f"{output}: {missing} measurements are missing; the same command goes on with them", err=True
-        )
+        click.echo(f"{output}: {missing} measurements are missing; the same command continues", err=True)
     else:
         click.echo(f"{output}: complete. Next: tsgt calibrate targets {output}", err=True)
 
@@ -90,63 +85,59 @@ def collect(*, config_path: Path, output: Path, count: int, repeats: int, target
 async def collect_targets(
     collection: TargetCollection, session: TargetSession, operator: Operator, *, constant_m: float
 ) -> None:
-    """Guide the operator until everything is measured or skipped, or they quit.
+    """Guide the operator until every target is measured or skipped, or the operator quits.
 
     Parameters
     ----------
     collection
-        What there is already; its file is written after each change.
-    session
-        The stations.
-    operator
-        Who aims.
+        Existing measurements; its file is written after each change.
     constant_m
-        Of the targets, in m.
+        Constant of the targets in m.
     """
-    skipped: set[Cell] = set()
-    last: Cell | None = None
+    skipped: set[StationTarget] = set()
+    last: StationTarget | None = None
     while True:
         cell = collection.next(skipped)
         if cell is None:
-            question = "nothing is left to be measured. Enter ends, r redoes as above"
+            question = "all targets are measured or skipped. Enter ends, r repeats as above"
         else:
             question = f"station {cell[0]}, target {cell[1]}: aim. {KEYS}"
-        answer = await operator.ask(question)
-        key, *numbers = (answer or "").split() or [""]
-        if answer is None or key == "q" or (cell is None and key == ""):
+        reply = await operator.ask(question)
+        key, *arguments = (reply or "").split() or [""]
+        if reply is None or key == "q" or (cell is None and key == ""):
             return
         if key == "r":
-            _redo(collection, operator, numbers, last)
-        elif cell is None or numbers or key not in ("", "s"):
-            operator.say(f"{answer!r} is none of the keys")
+            _repeat(collection, operator, arguments, last)
+        elif cell is None or arguments or key not in ("", "s"):
+            operator.say(f"unknown key {reply!r}")
         elif key == "s":
             skipped.add(cell)
-        elif (sight := await shot(session, operator, cell[0], constant_m)) is not None:
+        elif (sight := await session.try_measure(operator, cell[0], constant_m)) is not None:
             collection.add(*cell, sight)
             _write(collection)
             last = cell
-            operator.say(f"good: {sight.slope_distance_m:.4f} m")
+            operator.say(f"measured: {sight.slope_distance_m:.4f} m")
             _print_progress(collection, skipped, cell[0])
 
 
-def _redo(
-    collection: TargetCollection, operator: Operator, numbers: Sequence[str], last: Cell | None
+def _repeat(
+    collection: TargetCollection, operator: Operator, arguments: Sequence[str], last: StationTarget | None
 ) -> None:
-    """Forget the last target, or the one with these numbers: ``[station] target``."""
+    """Delete the last target, or the one with these numbers: ``[station] target``."""
     if (
-        not all(number.isdecimal() for number in numbers)
-        or len(numbers) > 2
-        or (len(numbers) < 2 and last is None)
+        not all(number.isdecimal() for number in arguments)
+        or len(arguments) > 2
+        or (len(arguments) < 2 and last is None)
     ):
         operator.say("which one? Type r, station and target, for example r 2 5")
         return
-    given = [int(number) for number in numbers]
+    given = [int(number) for number in arguments]
     station, target = (*(last or ())[: 2 - len(given)], *given)
-    if not collection.drop(station, target):
+    if not collection.remove(station, target):
         operator.say(f"station {station} has not measured target {target} yet")
         return
     _write(collection)
-    operator.say(f"station {station}, target {target} is forgotten; aim at it again")
+    operator.say(f"station {station}, target {target} is deleted; aim at it again")
 
 
 def _write(collection: TargetCollection) -> None:
@@ -154,16 +145,17 @@ def _write(collection: TargetCollection) -> None:
         file.write(collection.text().encode())
 
 
-def _print_progress(collection: TargetCollection, skipped: set[Cell], station: int) -> None:
-    """Print which station has measured what, and how well the present one fits station 1."""
+def _print_progress(collection: TargetCollection, skipped: set[StationTarget], station: int) -> None:
+    """Print the measurements of all stations, and the residuals of one station against station 1."""
     solved = None if station == 1 else collection.residuals(station)
-    residuals_mm: dict[Name, str] = {}
+    residuals_mm: dict[PointName, str] = {}
     if isinstance(solved, FrameCalibration):
         residuals_mm = {
-            name: f"{1e3 * miss:.1f}" for name, miss in zip(solved.used, solved.residuals_m, strict=True)
-        } | {bad.name: f"rejected, {1e3 * bad.miss_m:.0f}" for bad in solved.rejected}
+            name: f"{1e3 * residual:.1f}"
+            for name, residual in zip(solved.used, solved.residuals_m, strict=True)
+        } | {bad.name: f"rejected, {1e3 * bad.prediction_error_m:.0f}" for bad in solved.rejected}
 
-    def state(cell: Cell) -> str:
+    def state(cell: StationTarget) -> str:
         return str(collection.count(*cell)) if collection.count(*cell) else "X" if cell in skipped else "-"
 
     rows = [
@@ -181,10 +173,10 @@ def _print_progress(collection: TargetCollection, skipped: set[Cell], station: i
 
 
 def _verdict(solved: FrameCalibration) -> str:
-    words = [f"rms {1e3 * solved.rms_m:.1f} mm"]
+    parts = [f"rms {1e3 * solved.rms_m:.1f} mm"]
     if not solved.consistent:
-        words.append("the targets contradict each other, one more shows which is wrong")
-    words += [f"target {bad.name} contradicts the others, redo it" for bad in solved.rejected]
+        parts.append("the targets are inconsistent; one more target identifies the bad one")
+    parts += [f"target {bad.name} is an outlier, repeat it" for bad in solved.rejected]
     if solved.weak:
-        words.append("the frame is weak, add a target off the line of the others")
-    return "; ".join(words)
+        parts.append("the frame is weakly determined, add a target off the line of the others")
+    return "; ".join(parts)

@@ -1,9 +1,8 @@
-"""The group ``tsgt calibrate``, with the commands that solve: ``targets`` and ``prisms``."""
+"""The group ``tsgt calibrate``, with the commands that solve from files: ``targets`` and ``prisms``."""
 
 from __future__ import annotations
 
 import itertools
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -14,36 +13,31 @@ from tsgt.analysis.formats import read_prism_file, read_target_file, write_prism
 from tsgt.cli.calibrate.check import check
 from tsgt.cli.calibrate.collect import collect
 from tsgt.cli.calibrate.motion import motion
-from tsgt.cli.options import constant_type, finite, json_option
-from tsgt.cli.output import CHECK_FAILED, print_json, print_table
-from tsgt.cli.recordings import refuse_to_replace
+from tsgt.cli.options import OutputFile, constant_m, constant_option, json_option, path_type
+from tsgt.cli.output import CHECK_FAILED, numbers, print_json, print_table, refuse_overwrite
 from tsgt.geometry import cartesian_to_polar
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
+    from pathlib import Path
 
     from tsgt.geometry import FloatArray
     from tsgt.geometry.calibration import FrameCalibration, WeakAxis
 
-file_argument = click.argument("file", type=click.Path(path_type=Path))
+TARGET_CONSTANT = "--target-constant-mm"
+PRISM_CONSTANT = "--prism-constant-mm"
 
-target_constant_option = click.option(
-    "--target-constant-mm",
-    type=constant_type,
-    callback=finite,
-    default=0.0,
-    show_default=True,
-    help="Added to each measured distance of a target, where its line has no constant_mm.",
+file_argument = click.argument("file", type=path_type)
+target_constant_option = constant_option(
+    TARGET_CONSTANT,
+    "Constant added to the distances of targets, required if a line of FILE has no constant_mm.",
 )
-
-output_option = click.option(
-    "--output", type=click.Path(path_type=Path), help="Set-up file to write, for the configuration."
-)
+output_option = click.option("--output", type=OutputFile(".toml"), help="Set-up file to write (.toml).")
 
 
 @click.group()
 def calibrate() -> None:
-    """Find where the stations stand and where the prisms sit."""
+    """Solve station frames, prism layout and latencies."""
 
 
 calibrate.add_command(collect)
@@ -59,26 +53,31 @@ calibrate.add_command(motion)
     type=click.Choice(["model", "none"]),
     default="model",
     show_default=True,
-    help="Weigh each target by the noise of both instruments, or all alike (the paper's way).",
+    help="Weight targets by the noise of both instruments, or equally (the paper's method).",
 )
-@click.option(
-    "--levelled", is_flag=True, help="All stations are levelled: solve heading and position only, no tilt."
-)
+@click.option("--levelled", is_flag=True, help="Solve heading and position only: all stations are levelled.")
 @output_option
 @json_option
 def targets(
-    *, file: Path, target_constant_mm: float, weights: str, levelled: bool, output: Path | None, as_json: bool
+    *,
+    file: Path,
+    target_constant_mm: float | None,
+    weights: str,
+    levelled: bool,
+    output: Path | None,
+    as_json: bool,
 ) -> int:
-    """Solve the stations' frames from targets that they all measured.
+    """Solve station frames from common targets.
 
-    FILE is our CSV or the authors' marker file. Exit code 3: targets contradict each other and it cannot be told
-    which is wrong (nothing is written then), they fix a frame only weakly, or --levelled stations are not level.
+    FILE is a CSV of targets or the authors' marker file. Exit code 3: the targets are inconsistent and the bad one
+    cannot be identified (nothing is written), a frame is weakly determined, or --levelled stations are not level.
     """
-    refuse_to_replace([file], output)
+    refuse_overwrite([file], output)
     measured = read_target_file(file)
+    sights = (sight for seen in measured.measurements.values() for each in seen.values() for sight in each)
     frames = solve_stations(
         measured,
-        target_constant_m=target_constant_mm / 1e3,
+        target_constant_m=constant_m(TARGET_CONSTANT, target_constant_mm, sights, file),
         weighted=weights == "model",
         levelled=levelled,
     )
@@ -101,13 +100,12 @@ def targets(
     for station, frame in frames.items():
         _warn(f"station {station}", "target", frame)
     if output is not None and _may_write(output, frames.values()):
-        constant = f"--target-constant-mm {target_constant_mm:g}"
-        options = f"{constant} --weights {weights}{' --levelled' if levelled else ''}"
+        options = f"{_given(TARGET_CONSTANT, target_constant_mm)} --weights {weights}{' --levelled' if levelled else ''}"
         write_station_frames(
             output,
             {1: np.eye(4)} | {station: frame.T for station, frame in frames.items()},
             {station: frame.rms_m for station, frame in frames.items()},
-            comment=f"written by tsgt calibrate targets {file} {options}",
+            comment=f"written by tsgt calibrate targets {file}{options}",
             targets={station: target_residuals(frame) for station, frame in frames.items()},
         )
     return _exit_code(frames.values())
@@ -116,30 +114,35 @@ def targets(
 @calibrate.command()
 @file_argument
 @target_constant_option
-@click.option(
-    "--prism-constant-mm",
-    type=constant_type,
-    callback=finite,
-    default=0.0,
-    show_default=True,
-    help="Added to each measured distance of a prism, where its line has no constant_mm.",
+@constant_option(
+    PRISM_CONSTANT,
+    "Constant added to the distances of prisms, required if a line of FILE has no constant_mm.",
 )
 @output_option
 @json_option
 def prisms(
-    *, file: Path, target_constant_mm: float, prism_constant_mm: float, output: Path | None, as_json: bool
+    *,
+    file: Path,
+    target_constant_mm: float | None,
+    prism_constant_mm: float | None,
+    output: Path | None,
+    as_json: bool,
 ) -> int:
-    """Solve the prisms' positions on the robot from what one station measured.
+    """Solve the prism layout from measurements of one station.
 
-    FILE is a CSV with the prisms and at least three body points whose positions on the robot are known from CAD. Exit
-    code 3: body points contradict each other and it cannot be told which is wrong (nothing is written then),
-    or they fix the robot frame only weakly.
+    FILE is a CSV with the prisms and at least three body points whose positions in the robot frame are known from CAD.
+    Exit code 3: the body points are inconsistent and the bad one cannot be identified (nothing is written), or the
+    robot frame is weakly determined.
     """
-    refuse_to_replace([file], output)
+    refuse_overwrite([file], output)
+    measured = read_prism_file(file)
+    bodies, sights = (
+        itertools.chain.from_iterable(each.values()) for each in (measured.body, measured.prisms)
+    )
     solved = solve_prisms(
-        read_prism_file(file),
-        target_constant_m=target_constant_mm / 1e3,
-        prism_constant_m=prism_constant_mm / 1e3,
+        measured,
+        target_constant_m=constant_m(TARGET_CONSTANT, target_constant_mm, bodies, file),
+        prism_constant_m=constant_m(PRISM_CONSTANT, prism_constant_mm, sights, file),
     )
     positions = {
         int(name): point for name, point in zip(solved.prisms.names, solved.prisms.points_m, strict=True)
@@ -166,11 +169,15 @@ def prisms(
         _print_frame("robot frame", "body point", solved.body)
     _warn("robot frame", "body point", solved.body)
     if output is not None and _may_write(output, [solved.body]):
-        options = f"--target-constant-mm {target_constant_mm:g} --prism-constant-mm {prism_constant_mm:g}"
+        options = _given(TARGET_CONSTANT, target_constant_mm) + _given(PRISM_CONSTANT, prism_constant_mm)
         write_prism_layout(
-            output, positions, sigmas, comment=f"written by tsgt calibrate prisms {file} {options}"
+            output, positions, sigmas, comment=f"written by tsgt calibrate prisms {file}{options}"
         )
     return _exit_code([solved.body])
+
+
+def _given(option: str, constant_mm: float | None) -> str:
+    return "" if constant_mm is None else f" {option} {constant_mm:g}"
 
 
 def _frame_json(frame: FrameCalibration) -> dict[str, Any]:
@@ -182,7 +189,7 @@ def _frame_json(frame: FrameCalibration) -> dict[str, Any]:
         "leave_one_out_mm": dict(zip(frame.used, (1e3 * frame.leave_one_out_m).tolist(), strict=True)),
         "used": list(frame.used),
         "rejected": [point.name for point in frame.rejected],
-        "rejected_miss_mm": {point.name: 1e3 * point.miss_m for point in frame.rejected},
+        "rejected_miss_mm": {point.name: 1e3 * point.prediction_error_m for point in frame.rejected},
         "consistent": frame.consistent,
         "sigma_mm": (1e3 * sigmas[:3]).tolist(),
         "sigma_mrad": (1e3 * sigmas[3:]).tolist(),
@@ -202,7 +209,7 @@ def _weak_json(weak: WeakAxis) -> dict[str, Any]:
 
 
 def _bearing_and_elevation_deg(weak: WeakAxis) -> tuple[float, float]:
-    """Bearing clockwise as on the horizontal circle of the frame, elevation from the horizon."""
+    """Return the bearing, clockwise as the horizontal circle, and the elevation from the horizon."""
     horizontal_rad, zenith_rad, _ = cartesian_to_polar(weak.axis)
     return float(np.degrees(horizontal_rad)), float(90 - np.degrees(zenith_rad))
 
@@ -212,22 +219,18 @@ def _print_frame(title: str, point: str, frame: FrameCalibration) -> None:
         f"{title}: {len(frame.used)} {point}s used, rms {1e3 * frame.rms_m:.2f} mm, max {1e3 * frame.max_m:.2f} mm"
     )
     rows = [
-        [str(name), f"{1e3 * residual:.2f}", "-" if np.isnan(left_out) else f"{1e3 * left_out:.2f}"]
-        for name, residual, left_out in zip(frame.used, frame.residuals_m, frame.leave_one_out_m, strict=True)
+        [str(name), *numbers(1e3 * residual, 1e3 * held_out)]
+        for name, residual, held_out in zip(frame.used, frame.residuals_m, frame.leave_one_out_m, strict=True)
     ]
-    rows += [[str(bad.name), "rejected", f"{1e3 * bad.miss_m:.2f}"] for bad in frame.rejected]
-    print_table([point, "residual mm", "predicted by the others mm"], rows)
+    rows += [[str(bad.name), "rejected", f"{1e3 * bad.prediction_error_m:.2f}"] for bad in frame.rejected]
+    print_table([point, "residual mm", "leave-one-out mm"], rows)
 
 
 def _print_prisms(
     positions: Mapping[int, FloatArray], sigmas: Mapping[int, FloatArray], distances_mm: Mapping[str, float]
 ) -> None:
     rows = [
-        [
-            str(prism),
-            *(f"{value:.4f}" for value in position),
-            *(f"{1e3 * sigma:.2f}" for sigma in sigmas[prism]),
-        ]
+        [str(prism), *numbers(*position, digits=4), *numbers(*(1e3 * sigmas[prism]))]
         for prism, position in positions.items()
     ]
     print_table(["prism", "x m", "y m", "z m", "sigma x mm", "y mm", "z mm"], rows)
@@ -238,28 +241,27 @@ def _print_prisms(
 
 
 def _warn(title: str, point: str, frame: FrameCalibration) -> None:
-    """Say on stderr what is wrong with a frame, one line each."""
+    """Print the problems of a frame to stderr, one line each."""
     for bad in frame.rejected:
         click.echo(
-            f"note: {title}: {point} {bad.name} rejected: it lies {1e3 * bad.miss_m:.1f} mm from where the others "
-            "put it; measure it again",
+            f"note: {title}: {point} {bad.name} rejected: it lies {1e3 * bad.prediction_error_m:.1f} mm from its position predicted "
+            "by the others; measure it again",
             err=True,
         )
     if not frame.consistent:
         click.echo(
-            f"check failed: {title}: the {point}s contradict each other (rms {1e3 * frame.rms_m:.1f} mm) and it cannot "
-            f"be told which is wrong; measure more, or check constants and levelling",
+            f"check failed: {title}: the {point}s are inconsistent (rms {1e3 * frame.rms_m:.1f} mm) and the bad one cannot "
+            "be identified; measure more, or check constants and levelling",
             err=True,
         )
     for weak in frame.weak:
         bearing, elevation = _bearing_and_elevation_deg(weak)
         click.echo(
-            f"check failed: {title}: weak, it may turn by {1e3 * weak.sigma_rad:.2g} mrad (one sigma) about the "
-            f"direction with bearing {bearing:.1f} and elevation {elevation:.1f} degrees; add {point}s well off the line "
+            f"check failed: {title}: weakly determined: rotation of {1e3 * weak.sigma_rad:.2g} mrad (one sigma) about the "
+            f"direction with bearing {bearing:.1f} and elevation {elevation:.1f} degrees; add {point}s far off the line "
             "in that direction",
             err=True,
         )
-
     if frame.tilt_rad is not None:
         click.echo(
             f"check failed: {title}: not level with station 1, the {point}s show {1e3 * frame.tilt_rad:.2f} mrad between "
@@ -271,10 +273,10 @@ def _warn(title: str, point: str, frame: FrameCalibration) -> None:
 def _may_write(output: Path, frames: Iterable[FrameCalibration]) -> bool:
     if all(frame.consistent for frame in frames):
         return True
-    click.echo(f"note: {output} is not written, as a frame above is not to be used", err=True)
+    click.echo(f"note: {output} is not written, as a frame above is inconsistent", err=True)
     return False
 
 
 def _exit_code(frames: Iterable[FrameCalibration]) -> int:
-    sound = all(frame.consistent and not frame.weak and frame.tilt_rad is None for frame in frames)
-    return 0 if sound else CHECK_FAILED
+    ok = all(frame.consistent and not frame.weak and frame.tilt_rad is None for frame in frames)
+    return 0 if ok else CHECK_FAILED

@@ -1,46 +1,46 @@
-"""The command ``tsgt calibrate motion``: set-up from the motion of the robot."""
+"""The command ``tsgt calibrate motion``: set-up parameters from the motion of the robot."""
 
 from __future__ import annotations
 
 import sys
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
 
 from tsgt.analysis.calibration import calibrate_recording
 from tsgt.analysis.formats import write_prism_layout, write_station_frames
-from tsgt.cli.options import json_option, keep_going_option, path_type, recording_argument
-from tsgt.cli.output import CHECK_FAILED, print_json, print_table
-from tsgt.cli.recordings import refuse_to_replace, report_problem
+from tsgt.cli.model_options import add_options
+from tsgt.cli.options import FiniteRange, OutputFile, json_option, keep_going_option, recording_argument
+from tsgt.cli.output import (
+    CHECK_FAILED,
+    print_json,
+    print_table,
+    refuse_overwrite,
+    report_problem,
+)
 from tsgt.geometry.calibration import SetupPrior, unobservable_directions
 from tsgt.recording import load_recording
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
 
     from tsgt.analysis.calibration import CalibratedRecording, HeldOutComparison
     from tsgt.analysis.evaluation import HeldOutErrors
     from tsgt.geometry.calibration import UnobservableDirection
 
-Command = TypeVar("Command", bound="Callable[..., Any] | click.Command")
-
 UNKNOWN_SHIFT_M = 10.0
 UNKNOWN_TURN_RAD = 0.2
 UNKNOWN_LATENCY_S = 1.0
-"""One sigma of what is found from the motion alone, about a first guess that is good to centimetres."""
+"""One sigma about an initial guess found from the motion alone, which is good to centimetres."""
 
-
-def _sigma_option(name: str, default: float, text: str) -> Callable[[Command], Command]:
-    return click.option(
-        name,
-        type=click.FloatRange(min=0, min_open=True, max=1e6),
-        default=default,
-        show_default=True,
-        help=text,
-    )
+_SIGMAS = {
+    "--frame-sigma-mm": (20.0, "One sigma of the known frames at the robot, translation."),
+    "--frame-sigma-mrad": (2.0, "One sigma of the known frames, rotation."),
+    "--latency-sigma-ms": (100.0, "One sigma of the latencies."),
+    "--prism-sigma-mm": (5.0, "One sigma of the prism positions."),
+}
 
 
 @click.command()
@@ -51,33 +51,46 @@ def _sigma_option(name: str, default: float, text: str) -> Callable[[Command], C
     type=click.Choice(["known", "unknown"]),
     default="known",
     show_default=True,
-    help="Refine the recording's frames, or find them from nothing but the motion.",
+    help="Refine the recorded frames, or solve them from the motion alone.",
 )
 @click.option(
     "--dof",
     type=click.Choice(["6", "4"]),
     default="6",
     show_default=True,
-    help="Degrees of freedom of a station; 4: all stations are level, only heading and position change.",
+    help="Degrees of freedom of a station; 4: heading and position of levelled stations.",
 )
 @click.option(
-    "--latency/--no-latency", default=True, show_default=True, help="Find latencies beside station 1's."
+    "--latency/--no-latency",
+    default=True,
+    show_default=True,
+    help="Estimate latencies relative to station 1.",
 )
-@click.option("--prisms", is_flag=True, help="Find how the prisms sit to each other on the robot, too.")
-@_sigma_option("--frame-sigma-mm", 20.0, "How well known frames are known at the robot, one sigma.")
-@_sigma_option("--frame-sigma-mrad", 2.0, "The same for how a station is turned.")
-@_sigma_option("--latency-sigma-ms", 100.0, "The same for latencies.")
-@_sigma_option("--prism-sigma-mm", 5.0, "The same for prisms.")
+@click.option("--estimate-prisms", is_flag=True, help="Estimate the prism positions as well.")
+@add_options(
+    *(
+        click.option(
+            name,
+            type=FiniteRange(min=0, min_open=True, max=1e6),
+            default=default,
+            show_default=True,
+            help=text,
+        )
+        for name, (default, text) in _SIGMAS.items()
+    )
+)
 @click.option(
     "--held-out/--no-held-out",
     default=True,
     show_default=True,
-    help="Judge it by calibrating five times more, each without a fifth of the measurements.",
+    help="Compute the held-out prediction error: five more calibrations, each without a fifth of the measurements.",
 )
 @click.option(
-    "--output", type=path_type, help="File of station frames and latencies to write, for the configuration."
+    "--output", type=OutputFile(".toml"), help="File of station frames and latencies to write (.toml)."
 )
-@click.option("--prism-output", type=path_type, help="Prism layout file to write; with --prisms.")
+@click.option(
+    "--prism-output", type=OutputFile(".toml"), help="Prism layout to write (.toml); with --estimate-prisms."
+)
 @keep_going_option
 @json_option
 def motion(
@@ -86,7 +99,7 @@ def motion(
     frames: str,
     dof: str,
     latency: bool,
-    prisms: bool,
+    estimate_prisms: bool,
     frame_sigma_mm: float,
     frame_sigma_mrad: float,
     latency_sigma_ms: float,
@@ -97,15 +110,15 @@ def motion(
     keep_going: bool,
     as_json: bool,
 ) -> int:
-    """Refine frames and latencies from the motion in RECORDING, or find them from nothing else.
+    """Refine frames and latencies from motion.
 
-    Wrong ones bend the rigid robot as it drives. No targets are needed. What the motion did not determine is named. Exit
-    code 3: measurements that were left out are predicted worse than before; the files are written all the same.
+    Wrong frames and latencies deform the rigid robot as it drives, so no targets are needed. Unobservable directions
+    are named. Exit code 3: the held-out prediction error has grown; the files are written nevertheless.
     """
-    refuse_to_replace([recording], output)
-    refuse_to_replace([recording], prism_output)
-    if prism_output is not None and not prisms:
-        raise click.UsageError("--prism-output needs --prisms: the layout is held otherwise")
+    for path in (output, prism_output):
+        refuse_overwrite([recording], path)
+    if prism_output is not None and not estimate_prisms:
+        raise click.UsageError("--prism-output needs --estimate-prisms; without it the layout is fixed")
     known = frames == "known"
     found = calibrate_recording(
         load_recording(recording, keep_going=keep_going, on_problem=report_problem),
@@ -114,7 +127,7 @@ def motion(
             rotation_sigma_rad=frame_sigma_mrad / 1e3 if known else UNKNOWN_TURN_RAD,
             levelled=dof == "4",
             latency_sigma_s=(latency_sigma_ms / 1e3 if known else UNKNOWN_LATENCY_S) if latency else 0.0,
-            prism_sigma_m=prism_sigma_mm / 1e3 if prisms else 0.0,
+            prism_sigma_m=prism_sigma_mm / 1e3 if estimate_prisms else 0.0,
         ),
         frames_known=known,
         held_out=held_out,
@@ -127,9 +140,9 @@ def motion(
     if as_json:
         print_json(_json(found, stations, weak, positions, sigmas))
     else:
-        _print(found, stations, positions if prisms else {}, sigmas)
+        _print(found, stations, positions if estimate_prisms else {}, sigmas)
     for direction in weak:
-        click.echo(f"note: the motion did not determine (one sigma): {direction.sentence}", err=True)
+        click.echo(f"note: unobservable from this motion (one sigma): {direction.description}", err=True)
     comment = f"written by tsgt calibrate motion {recording} --initial-frames {frames} --dof {dof}"
     if output is not None:
         write_station_frames(
@@ -141,20 +154,24 @@ def motion(
         )
     if prism_output is not None:
         write_prism_layout(prism_output, positions, sigmas, comment=comment)
-    judged = found.judgement
-    if judged is None or judged.before is None or judged.after.statistics.mean <= judged.before.statistics.mean:
+    judged = found.held_out
+    if (
+        judged is None
+        or judged.before is None
+        or judged.after.statistics.mean <= judged.before.statistics.mean
+    ):
         return 0
-    click.echo("check failed: measurements that were left out are predicted worse than before", err=True)
+    click.echo("check failed: the held-out prediction error has grown", err=True)
     return CHECK_FAILED
 
 
-def _progress(words: str) -> None:
-    click.echo(f"{words} ...", err=True)
+def _progress(step: str) -> None:
+    click.echo(f"{step} ...", err=True)
 
 
 def _stations(found: CalibratedRecording) -> dict[int, dict[str, Any]]:
     calibration = found.calibration
-    unknowns = calibration.unknowns
+    unknowns = calibration.parameters
     shifts_m, turns_rad = calibration.corrections()
     sigmas = np.sqrt(np.diag(calibration.covariance))
     result = {}
@@ -185,12 +202,12 @@ def _json(
     positions: dict[int, Any],
     sigmas: dict[int, Any],
 ) -> dict[str, Any]:
-    calibration, judged = found.calibration, found.judgement
+    calibration, judged = found.calibration, found.held_out
     return {
         "stations": stations,
         "prisms": {prism: position.tolist() for prism, position in positions.items()},
         "prism_sigma_mm": {prism: (1e3 * sigma).tolist() for prism, sigma in sigmas.items()},
-        "pivot_m": calibration.unknowns.pivot.tolist(),
+        "pivot_m": calibration.parameters.pivot.tolist(),
         "unobservable": [direction.description for direction in weak],
         "measurements": calibration.measurements,
         "outliers": calibration.outliers,
@@ -217,11 +234,10 @@ def _print(
     calibration = found.calibration
     click.echo(
         f"{calibration.measurements} measurements, {calibration.outliers} outliers, "
-        f"noise {calibration.noise_scale:.2f} times the stated one; sigmas times {calibration.disagreement:.2f}, "
-        "as parts of the recording contradict each other"
+        f"noise scale {calibration.noise_scale:.2f}; sigmas scaled by {calibration.birge_ratio:.2f} (Birge ratio of parts of the recording)"
     )
-    if len(calibration.unknowns.latencies):
-        click.echo(f"time stamps of a station wander by {1e3 * calibration.wander_s:.2f} ms")
+    if len(calibration.parameters.latencies):
+        click.echo(f"wander of the timestamps of a station: {1e3 * calibration.wander_s:.2f} ms")
     rows = []
     for station, each in stations.items():
         for axis, name in enumerate("xyz"):
@@ -234,9 +250,9 @@ def _print(
                     f"{each['sigma_mrad'][axis]:.3f}",
                 ]
             )
-    print_table(["corrected by", "mm at the robot", "sigma", "mrad", "sigma"], rows)
+    print_table(["correction", "mm at the robot", "sigma", "mrad", "sigma"], rows)
     click.echo()
-    late = [
+    latencies = [
         [
             f"station {station}",
             f"{each['latency_ms']:.2f}",
@@ -245,7 +261,7 @@ def _print(
         ]
         for station, each in stations.items()
     ]
-    print_table(["latency beside station 1", "ms", "corrected by", "sigma"], late)
+    print_table(["latency relative to station 1", "ms", "correction", "sigma"], latencies)
     if positions:
         click.echo()
         print_table(
@@ -255,9 +271,9 @@ def _print(
                 for prism, position in positions.items()
             ],
         )
-    if found.judgement is not None:
+    if found.held_out is not None:
         click.echo()
-        _print_judgement(found.judgement)
+        _print_judgement(found.held_out)
 
 
 def _print_judgement(judged: HeldOutComparison) -> None:
@@ -268,4 +284,4 @@ def _print_judgement(judged: HeldOutComparison) -> None:
             numbers = (figures.mean, figures.median, figures.p95, gaps.mean)
             rows.append([name, *(f"{number:.2f}" for number in numbers)])
     title = f"{judged.after.statistics.n} measurements left out, missed by mm"
-    print_table([title, "mean", "median", "p95", f"mean of {judged.after.gaps.n} at gaps"], rows)
+    print_table([title, "mean", "median", "p95", f"mean of {judged.after.gaps.n} in gaps"], rows)

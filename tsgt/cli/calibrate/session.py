@@ -1,4 +1,4 @@
-"""Single measurements of targets over the radio, for ``tsgt calibrate collect`` and ``check``; no master runs then."""
+"""Single measurements of targets over the radio, for ``tsgt calibrate collect`` and ``check``, while no master runs."""
 
 from __future__ import annotations
 
@@ -6,41 +6,39 @@ import asyncio
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from typing import TYPE_CHECKING
 
-from tsgt.analysis.formats import Sight
-from tsgt.cli.calibrate.commands import ClassicOrders, superframe_orders
+from tsgt.analysis.formats import TargetMeasurement
+from tsgt.cli.calibrate.commands import ClassicCommandSender, superframe_command_sender
 from tsgt.cli.composition import radio_key, radio_opener
 from tsgt.config import ClassicMasterConfig
 from tsgt.errors import InstrumentError, RadioError, StreamError, TsgtError
 from tsgt.model import Status
-from tsgt.radio import DirectOrder, MeasureOrder, TrackOrder
+from tsgt.radio import DirectCommand, MeasureCommand, TrackCommand
 from tsgt.radio.from_config import lora_settings
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable, Mapping
     from pathlib import Path
 
-    from tsgt.cli.calibrate.commands import Answer, Orders
+    from tsgt.cli.calibrate.commands import CommandResponse, CommandSender
     from tsgt.cli.operator import Operator
     from tsgt.clock import Clock
     from tsgt.config import MasterConfig
-    from tsgt.radio import OpenRadio, Order
+    from tsgt.radio import Command, RadioOpener
 
-MEANING = {
-    Status.TILT: "the instrument is not level; level it, then all its targets have to be measured again",
-    Status.WRONG_DISTANCE: "the instrument says that the distance is wrong; aim at the middle of the foil",
+PROBLEMS = {
+    Status.TILT: "the instrument is not level; level it, then measure all its targets again",
+    Status.WRONG_DISTANCE: "the instrument reports a wrong distance; aim at the centre of the foil",
     Status.NO_TARGET: "the instrument found no target, or reports another error; aim again",
-    Status.ANGLE_ONLY: "angles but no distance; aim at the middle of the foil, no nearer than 1 m",
+    Status.ANGLE_ONLY: "angles but no distance; aim at the centre of the foil, from at least 1 m",
     Status.ERROR: "the instrument reports an error; look at its display",
 }
 
 
 class TargetSession:
-    """Lets stations measure targets, and puts them back to tracking.
+    """Has stations measure targets, and returns them to tracking.
 
     Parameters
     ----------
-    orders
-        Gives them to the stations.
     prisms
         By station: the prism that it tracks otherwise.
 
@@ -50,83 +48,79 @@ class TargetSession:
         Stations that may be in direct mode.
     """
 
-    def __init__(self, orders: Orders, prisms: Mapping[int, int]) -> None:
-        self._orders = orders
+    def __init__(self, sender: CommandSender, prisms: Mapping[int, int]) -> None:
+        self._sender = sender
         self._prisms = prisms
         self.direct: set[int] = set()
 
-    async def shoot(self, station: int, *, constant_m: float) -> Sight:
-        """Have a station measure what it points at, once.
-
-        Parameters
-        ----------
-        station
-            Its number.
-        constant_m
-            Goes into the result.
+    async def measure(self, station: int, *, constant_m: float) -> TargetMeasurement:
+        """Measure the target at which a station is aimed, once.
 
         Raises
         ------
         InstrumentError
-            There is no measurement; the text tells the operator why and what to do.
+            There is no measurement; the text says why and what to do.
         RadioError
             The master's radio failed.
         """
-        # Each time: a station that has started anew tracks its prism, and would answer with that.
+        # Each time: a client that has restarted tracks its prism, and would respond with that.
         self.direct.add(station)
-        if not (await self._give(station, DirectOrder())).ok:
+        if not (await self._send(station, DirectCommand())).ok:
             raise InstrumentError(
-                f"station {station} cannot leave its tracking; look at its instrument, then try again"
+                f"station {station} cannot stop tracking; look at its instrument, then try again"
             )
-        answer = await self._orders.give(station, MeasureOrder())
-        if answer is None:
-            raise InstrumentError(f"station {station} has not sent a measurement; aim again and repeat")
-        status = answer.status if answer.slope_distance_m or not answer.status.usable else Status.ANGLE_ONLY
+        response = await self._sender.send(station, MeasureCommand())
+        if response is None:
+            raise InstrumentError(f"station {station} has not sent a measurement; aim and measure again")
+        status = response.status
+        if status.usable and not response.slope_distance_m:
+            status = Status.ANGLE_ONLY
         if not status.usable:
-            raise InstrumentError(f"station {station}: {MEANING[status]}")
-        return Sight(
-            horizontal_angle_rad=answer.horizontal_angle_rad,
-            zenith_angle_rad=answer.zenith_angle_rad,
-            slope_distance_m=answer.slope_distance_m,
+            raise InstrumentError(f"station {station}: {PROBLEMS[status]}")
+        return TargetMeasurement(
+            horizontal_angle_rad=response.horizontal_angle_rad,
+            zenith_angle_rad=response.zenith_angle_rad,
+            slope_distance_m=response.slope_distance_m,
             constant_m=constant_m,
             line=0,
         )
 
+    async def try_measure(
+        self, operator: Operator, station: int, constant_m: float
+    ) -> TargetMeasurement | None:
+        """Measure as :meth:`measure`; report a failure to the operator and return None."""
+        operator.say("measuring ...")
+        try:
+            return await self.measure(station, constant_m=constant_m)
+        except InstrumentError as error:
+            operator.say(f"failed: {error}")
+            return None
+
     async def release(self) -> list[str]:
-        """Put the stations back to tracking; return a sentence for each one that does not say that it does."""
+        """Return the stations to tracking; return a sentence for each one that does not confirm it."""
         sentences = []
         for station in sorted(self.direct):
             try:
-                if (await self._give(station, TrackOrder(self._prisms[station]))).ok:
+                if (await self._send(station, TrackCommand(self._prisms[station]))).ok:
                     continue
-                trouble = f"it does not find prism {self._prisms[station]}; see that it has sight of it"
+                problem = f"it does not find prism {self._prisms[station]}; check its line of sight"
             except InstrumentError:
-                trouble = "it does not answer; see that its client runs"
+                problem = "it does not respond; check that its client runs"
             except RadioError as error:
-                trouble = f"the radio failed ({error})"
+                problem = f"the radio failed ({error})"
             sentences.append(
-                f"station {station} is not tracking again: {trouble}. tsgt-master puts it back when it starts"
+                f"station {station} has not returned to tracking: {problem}. tsgt-master returns it when it starts"
             )
         self.direct.clear()
         return sentences
 
-    async def _give(self, station: int, order: Order) -> Answer:
-        answer = await self._orders.give(station, order)
-        if answer is None:
+    async def _send(self, station: int, command: Command) -> CommandResponse:
+        response = await self._sender.send(station, command)
+        if response is None:
             raise InstrumentError(
-                f"station {station} does not answer; see that its client runs and is in reach, then try again"
+                f"station {station} does not respond; check that its client runs and is in range, then try again"
             )
-        return answer
-
-
-async def shot(session: TargetSession, operator: Operator, station: int, constant_m: float) -> Sight | None:
-    """Have a station measure; tell the operator what was wrong and return None where there is nothing."""
-    operator.say("measuring ...")
-    try:
-        return await session.shoot(station, constant_m=constant_m)
-    except InstrumentError as error:
-        operator.say(f"failed: {error}")
-        return None
+        return response
 
 
 @asynccontextmanager
@@ -135,32 +129,30 @@ async def target_session(
     path: Path,
     clock: Clock,
     say: Callable[[str], None],
-    open_radio: OpenRadio | None = None,
+    open_radio: RadioOpener | None = None,
 ) -> AsyncGenerator[TargetSession]:
-    """Open the master's radio; at the end, however it comes, stations are put back to tracking.
+    """Open the master's radio; at the end, also after an error, return the stations to tracking.
 
     Parameters
     ----------
     config, path
-        Of the master, and where it stands.
-    clock
-        The machine's.
+        Of the master, and its file.
     say
-        Told at the end which stations are not back to tracking.
+        Called at the end with each station that has not returned to tracking.
     open_radio
-        Another radio than the configuration names.
+        Radio to use instead of the configured one.
 
     Raises
     ------
     TsgtError
-        The radio cannot be opened, as a rule because the master uses it.
+        The radio cannot be opened, usually because the master uses it.
     ConfigError
-        The chip cannot do what the configuration asks of it, or the key cannot be read.
+        The chip does not support the settings, or the key cannot be read.
     """
     settings = lora_settings(config.radio, path)
     protocol = config.protocol
     key = radio_key(protocol)
-    if await _answers(config.stream.socket):
+    if await _is_served(config.stream.socket):
         raise TsgtError(
             f"tsgt-master is running (it serves {config.stream.socket}) and owns the radio; stop it first: "
             "sudo systemctl stop tsgt-master"
@@ -175,25 +167,25 @@ async def target_session(
                 f"{error}; if another program such as tsgt-master uses the radio, stop it first"
             ) from error
         prisms = {station.station: station.prism for station in config.stations}
-        orders: Orders
+        sender: CommandSender
         if isinstance(protocol, ClassicMasterConfig):
-            orders = ClassicOrders(radio, clock, protocol, settings)
+            sender = ClassicCommandSender(radio, clock, protocol, settings)
         else:
-            orders = await stack.enter_async_context(
-                superframe_orders(radio, clock, prisms, protocol, settings, key)
+            sender = await stack.enter_async_context(
+                superframe_command_sender(radio, clock, prisms, protocol, settings, key)
             )
-        session = TargetSession(orders, prisms)
+        session = TargetSession(sender, prisms)
         try:
             yield session
         finally:
             if session.direct:
-                say("putting the stations back to tracking ...")
+                say("returning the stations to tracking ...")
             for sentence in await session.release():
                 say(f"note: {sentence}")
 
 
-async def _answers(socket_path: Path) -> bool:
-    """Tell whether somebody serves a UNIX socket."""
+async def _is_served(socket_path: Path) -> bool:
+    """Whether a process serves a UNIX socket."""
     with suppress(OSError):
         _, writer = await asyncio.open_unix_connection(socket_path)
         writer.close()

@@ -1,4 +1,4 @@
-"""What ``tsgt evaluate`` says of poses against a reference: unaligned, aligned, and standing still."""
+"""Poses against a reference for ``tsgt evaluate``: unaligned, aligned, and the mean pose of each stop."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from tsgt.analysis.evaluation import compare, compare_aligned, stationary_errors
 from tsgt.analysis.processing import process, with_estimator
-from tsgt.cli.output import print_table
+from tsgt.cli.output import numbers, print_table
 from tsgt.errors import DegenerateGeometryError, InputFileError, RecordingError
 from tsgt.estimation import PoseBatch
 
@@ -21,32 +21,28 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from tsgt.analysis.evaluation import Align, AlignedErrorStatistics, PoseErrorStatistics, Reference, StationaryStatistics
+    from tsgt.analysis.evaluation import (
+        Align,
+        AlignedErrorStatistics,
+        PoseErrorStatistics,
+        Reference,
+        StationaryStatistics,
+    )
     from tsgt.analysis.processing import Estimator
     from tsgt.analysis.smoothing import SmoothedRecording
     from tsgt.recording import Recording
 
 
 @dataclass(frozen=True, slots=True)
-class Against:
-    """One estimator's poses against a reference.
-
-    Attributes
-    ----------
-    unaligned
-        As they are.
-    aligned
-        After an alignment, if one was asked for.
-    standing
-        The mean pose of each stop.
-    """
+class Comparison:
+    """Errors of one estimator's poses against a reference; ``aligned`` only if an alignment was requested."""
 
     unaligned: PoseErrorStatistics
     aligned: AlignedErrorStatistics | None
     stationary: StationaryStatistics
 
     def keys(self) -> dict[str, Any]:
-        """Put the figures under their names, for ``--json``."""
+        """Return the figures for ``--json``."""
         return {
             **dataclasses.asdict(self.unaligned),
             "stationary": dataclasses.asdict(self.stationary),
@@ -54,7 +50,7 @@ class Against:
         }
 
 
-def against(
+def compare_estimators(
     loaded: Recording,
     continuous: SmoothedRecording,
     reference: Reference,
@@ -62,46 +58,42 @@ def against(
     *,
     stationary_ns: Sequence[tuple[int, int]],
     align: Align | None,
-) -> dict[Estimator, Against]:
+) -> dict[Estimator, Comparison]:
     """Compare the poses of both estimators with a reference.
 
     Parameters
     ----------
     loaded, continuous
-        The recording, and its smoothed poses.
-    reference
-        What they are compared with.
+        The recording and its smoothed poses.
     paths
         Of the recording and of the reference, for messages.
     still_ns
-        When the robot stood still.
-    align
-        How poses are aligned besides; None: not at all.
+        Stationary intervals.
 
     Raises
     ------
     InputFileError
-        No valid pose has a reference, or the compared positions do not say how to align.
+        No valid pose overlaps the reference, or the alignment is degenerate.
     """
     path, reference_path = paths
     centroid_m = np.mean([prism.position_m for prism in loaded.parameters.prisms], axis=0)
     try:
         linear = process(with_estimator(loaded, "linear"), path=path)
     except RecordingError:
-        # It has no valid pose, which is a result as well.
+        # No valid pose, which is a result as well.
         linear = PoseBatch.blank(np.empty(0, np.int64), continuous.poses.prisms)
     both: tuple[tuple[Estimator, PoseBatch], ...] = (("linear", linear), ("continuous", continuous.poses))
     unaligned = {name: compare(poses, reference, centroid_m) for name, poses in both}
     if not any(found.compared for found in unaligned.values()):
         stamps = np.concatenate([poses.stamp_ns[poses.valid] for _, poses in both])
         raise InputFileError(
-            f"has no pose within 0.1 s of a valid one of {path}: it goes from {_span(reference.stamp_ns)}, the valid poses "
-            f"from {_span(stamps)} (UTC); 2 s at both ends of the reference do not count",
+            f"has no pose within 0.1 s of a valid one of {path}: it covers {_span(reference.stamp_ns)}, the valid poses "
+            f"{_span(stamps)} (UTC); 2 s at both ends of the reference are not used",
             path=reference_path,
         )
     try:
         return {
-            name: Against(
+            name: Comparison(
                 unaligned=unaligned[name],
                 aligned=None
                 if align is None or not unaligned[name].compared
@@ -112,32 +104,32 @@ def against(
         }
     except DegenerateGeometryError as error:
         raise InputFileError(
-            f"cannot be aligned with --align {align}, which needs a way that is not straight ({error}); use --align "
+            f"cannot be aligned with --align {align}, which needs a path that is not straight ({error}); use --align "
             "translation or none",
             path=reference_path,
         ) from error
 
 
-def print_against(found: dict[Estimator, Against], reference_path: Path, align: Align | None) -> None:
-    """Print the tables of all that was compared."""
-    click.echo(f"\nAgainst {reference_path}, unaligned")
+def print_comparisons(found: dict[Estimator, Comparison], reference_path: Path, align: Align | None) -> None:
+    """Print the errors as tables."""
+    click.echo(f"\nErrors against {reference_path}, unaligned")
     rows = [
         [
             name,
             str(f.compared),
-            *_numbers(f.position_rms_mm, f.orientation_rms_deg, f.nees.mean, f.nees.max),
+            *numbers(f.position_rms_mm, f.orientation_rms_deg, f.nees.mean, f.nees.max),
             "-" if math.isnan(f.nees.above_95) else f"{f.nees.above_95:.1%}",
         ]
         for name, each in found.items()
         for f in (each.unaligned,)
     ]
-    print_table(["estimator", "n", "rms mm", "rms deg", "NEES (6)", "largest", "above 95 %"], rows)
+    print_table(["estimator", "n", "rms mm", "rms deg", "NEES (6)", "max", "above 95 %"], rows)
     rows = [
         [
             f"{name}, aligned",
-            *_numbers(a.position_rms_mm, a.orientation_rms_deg, a.translation_mm),
-            f"{a.rotation_deg:.3f}",
-            *_numbers(a.hidden_position_mm, a.hidden_orientation_deg),
+            *numbers(a.position_rms_mm, a.orientation_rms_deg, a.translation_mm),
+            *numbers(a.rotation_deg, digits=3),
+            *numbers(a.hidden_position_mm, a.hidden_orientation_deg),
         ]
         for name, each in found.items()
         for a in (each.aligned,)
@@ -145,31 +137,27 @@ def print_against(found: dict[Estimator, Against], reference_path: Path, align: 
     ]
     if rows:
         click.echo(
-            f"\nAligned ({align}): what is left, what was removed, and how much of the error that hides"
+            f"\nAligned ({align}): remaining error, alignment, and the part of the error that it hides"
         )
         print_table(
-            ["estimator", "rms mm", "rms deg", "shifted mm", "turned deg", "hides mm", "hides deg"], rows
+            ["estimator", "rms mm", "rms deg", "shift mm", "rotation deg", "hidden mm", "hidden deg"], rows
         )
     rows = [
         [
             f"{name}, stops",
             str(s.stops),
-            *_numbers(s.position_mean_mm, s.position_max_mm),
-            *(f"{value:.3f}" for value in (s.rotation_mean_deg, s.rotation_max_deg)),
+            *numbers(s.position_mean_mm, s.position_max_mm),
+            *numbers(s.rotation_mean_deg, s.rotation_max_deg, digits=3),
         ]
         for name, each in found.items()
         for s in (each.stationary,)
         if s.stops
     ]
     if rows:
-        click.echo("\nThe mean pose of each stop, unaligned: mean and largest error")
-        print_table(["estimator", "n", "mean mm", "largest mm", "mean deg", "largest deg"], rows)
+        click.echo("\nMean pose of each stop, unaligned: mean and maximum error")
+        print_table(["estimator", "n", "mean mm", "max mm", "mean deg", "max deg"], rows)
 
 
 def _span(stamp_ns: np.ndarray[Any, np.dtype[np.int64]]) -> str:
     first, last = (datetime.fromtimestamp(int(t) / 1e9, UTC) for t in (stamp_ns.min(), stamp_ns.max()))
     return f"{first:%Y-%m-%d %H:%M:%S} to {last:%Y-%m-%d %H:%M:%S}"
-
-
-def _numbers(*figures: float) -> list[str]:
-    return ["-" if math.isnan(figure) else f"{figure:.2f}" for figure in figures]

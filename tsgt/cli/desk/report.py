@@ -1,30 +1,91 @@
-"""The report of ``tsgt evaluate``: found, drawn, and written to a folder."""
+"""Verdict and report of ``tsgt evaluate``."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 import click
+import numpy as np
 
-from tsgt.analysis.formats import read_still_intervals
-from tsgt.analysis.report import figures_of, find, page, verdicts
+from tsgt.analysis.evaluation import distances_at_epochs, outliers, residual_statistics
+from tsgt.analysis.formats import read_stationary_intervals
+from tsgt.analysis.report import Findings, collect_findings, render_page, report_numbers, verdicts
+from tsgt.analysis.report.log import read_log
+from tsgt.analysis.report.motion import distance_error_series
+from tsgt.analysis.report.stations import station_records, station_statistics
+from tsgt.analysis.validation import plausible_measurements
 from tsgt.cli.output import json_text, print_json
-from tsgt.cli.recordings import TUNING, progress
+from tsgt.cli.progress import TUNING, progress
 from tsgt.errors import OutputFileError
+from tsgt.estimation import build_tracks
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from tsgt.analysis.evaluation import Align, Reference
-    from tsgt.analysis.report import Findings
+    from tsgt.analysis.evaluation import Align, InterPrismDistances, PoseErrorStatistics, Reference
+    from tsgt.analysis.processing import Estimator
+    from tsgt.analysis.report.verdicts import Verdict
+    from tsgt.analysis.smoothing import SmoothedRecording
     from tsgt.recording import Recording
 
-HELD_OUT_UP_TO_S = 900.0
-"""Predicting the measurements of a longer recording takes minutes, and is left to those who ask for it."""
+MAX_HELD_OUT_S = 900.0
+"""The held-out prediction of a longer recording takes minutes and is made on request only."""
 
 PAGE_NAME = "report.html"
 NUMBERS_NAME = "report.json"
+
+
+def assess(
+    recording: Recording,
+    path: Path,
+    continuous: SmoothedRecording,
+    distances: InterPrismDistances,
+    compared: dict[Estimator, PoseErrorStatistics],
+) -> list[Verdict]:
+    """Return the verdicts on an evaluated recording, without what only a report computes."""
+    parameters = recording.parameters
+    measurements = plausible_measurements(recording)
+    stamps = [m.stamp_ns for m in measurements]
+    start_ns, end_ns = min(stamps), max(stamps)
+    records = station_records(measurements, [s.station for s in parameters.stations])
+    limit_ns = parameters.pipeline.outage_limit_ns
+    epochs = distances_at_epochs(parameters, build_tracks(parameters, measurements))
+    findings = Findings(
+        recording=recording,
+        path=path,
+        start_ns=start_ns,
+        end_ns=end_ns,
+        log=read_log(path),
+        station_records=records,
+        station_statistics={
+            each.station: station_statistics(each, start_ns=start_ns, end_ns=end_ns, outage_limit_ns=limit_ns)
+            for each in records
+        },
+        inter_prism=distances,
+        distance_errors=distance_error_series(parameters, epochs, continuous.poses),
+        odometry_stationary_ns=None,
+        continuous=continuous,
+        linear=None,
+        difference=None,
+        held_out=None,
+        residuals=residual_statistics(continuous.fit, continuous.sources),
+        outliers=outliers(continuous.fit, continuous.sources),
+        normalised=np.empty((0, 3)),
+        reference_errors=compared,
+        aligned_errors={},
+        stationary_errors={},
+        reference=None,
+        pose_noise=None,
+        problems={},
+    )
+    return verdicts(findings)
+
+
+def print_verdicts(found: Sequence[Verdict]) -> None:
+    """Print verdicts, the worst first."""
+    for verdict in found:
+        click.echo(f"{verdict.level.value}: {verdict.text}")
 
 
 def report_evaluation(
@@ -38,64 +99,55 @@ def report_evaluation(
     with_held_out: bool | None,
     as_json: bool,
 ) -> None:
-    """Find what there is to tell of a recording, and write it.
+    """Evaluate a recording and write the report.
 
     Parameters
     ----------
-    recording
-        Measurements and the parameters in force.
-    path
-        Its file.
+    recording, path
+        Measurements with the parameters in force, and their file.
     folder
-        Where the report goes; made if it is not there.
-    reference
-        What to compare poses with, if anything.
-    align
-        How poses are aligned with it besides, if at all.
+        Folder of the report, created if necessary.
     odometry
-        File that tells when the robot stood still; None: the measurements tell it.
+        File that defines the stationary intervals; None: from the measurements.
     with_held_out
-        Whether to leave measurements out and predict them; None: if the recording is short.
+        Whether to compute the held-out prediction error; None: only for a short recording.
     as_json
-        Print the numbers instead of the summary.
+        Print the numbers instead of the verdicts.
     """
     stamps = [m.stamp_ns for m in recording.measurements]
     if with_held_out is None:
-        with_held_out = not stamps or max(stamps) - min(stamps) <= HELD_OUT_UP_TO_S * 1e9
-    still_ns = None if odometry is None else read_still_intervals(odometry)
+        with_held_out = not stamps or max(stamps) - min(stamps) <= MAX_HELD_OUT_S * 1e9
+    stationary_ns = None if odometry is None else read_stationary_intervals(odometry)
     with progress("evaluating", first=TUNING) as on_progress:
-        findings = find(
+        findings = collect_findings(
             recording,
             path,
             reference=reference,
             align=align,
             with_held_out=with_held_out,
-            still_ns=still_ns,
+            stationary_ns=stationary_ns,
             on_progress=on_progress,
         )
     with progress("drawing") as on_progress:
         write_report(findings, folder, on_progress=on_progress)
     if as_json:
-        print_json(figures_of(findings))
+        print_json(report_numbers(findings))
         return
-    for verdict in verdicts(findings):
-        click.echo(f"{verdict.level.value}: {verdict.text}")
+    print_verdicts(verdicts(findings))
     click.echo(f"\n{folder / PAGE_NAME}")
 
 
 def write_report(
     findings: Findings, folder: Path, *, on_progress: Callable[[float], None] | None = None
 ) -> None:
-    """Write the page, all its figures as PNG and PDF, and its numbers as JSON.
+    """Write the page, its figures as PNG and PDF, and its numbers as JSON.
 
     Raises
     ------
     OutputFileError
         A file cannot be written.
-    MissingExtraError
-        matplotlib is not installed.
     """
-    from tsgt.analysis.report import facts, sections
+    from tsgt.analysis.report import sections, summary_table
 
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -103,13 +155,15 @@ def write_report(
         plots = [plot for section in made for plot in section.plots]
         images = {}
         for number, plot in enumerate(plots, start=1):
-            files = [folder / f"{plot.name}{ending}" for ending in (".png", ".pdf")]
+            files = [folder / f"{plot.name}{suffix}" for suffix in (".png", ".pdf")]
             plot.write(files)
             images[plot.name] = files[0].read_bytes()
             if on_progress is not None:
                 on_progress(number / len(plots))
-        text = page(f"Report of {findings.path.name}", facts(findings), verdicts(findings), made, images)
+        text = render_page(
+            f"Report of {findings.path.name}", summary_table(findings), verdicts(findings), made, images
+        )
         (folder / PAGE_NAME).write_text(text, encoding="utf-8")
-        (folder / NUMBERS_NAME).write_text(json_text(figures_of(findings)) + "\n", encoding="utf-8")
+        (folder / NUMBERS_NAME).write_text(json_text(report_numbers(findings)) + "\n", encoding="utf-8")
     except OSError as error:
         raise OutputFileError(error.strerror or str(error), path=folder) from error

@@ -1,15 +1,12 @@
-"""The command group ``radio``: what a channel carries, a bench test of two radios, the key of a mission.
-
-The command ``radio key``: makes the key that all radios of a mission share.
-"""
+"""The command group ``radio``, with the commands ``airtime`` and ``key``."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from tsgt.cli.options import json_option
+from tsgt.cli.options import json_option, path_type
 from tsgt.cli.output import print_json
 from tsgt.cli.radio.options import Modem, modem_options
 from tsgt.cli.radio.ping import ping_command
@@ -24,34 +21,37 @@ from tsgt.radio import (
 )
 from tsgt.radio.key_file import write_key
 
+if TYPE_CHECKING:
+    from pathlib import Path
 
-@click.command()
-@click.argument("file", type=click.Path(path_type=Path))
+
+@click.group()
+def radio() -> None:
+    """Plan and test the radio channel."""
+
+
+radio.add_command(ping_command, "ping")
+radio.add_command(plan_command, "plan")
+
+
+@radio.command("key")
+@click.argument("file", type=path_type)
 def key_command(file: Path) -> None:
-    """Make a random key and write it to FILE, which nobody but its owner may read.
+    """Make the key of a mission.
 
-    All radios of a mission that speak the superframe share one key. With it, master and stations take only each
-    other's packets, and none that was recorded and played back. An existing file is never overwritten.
+    Writes a random key to FILE, readable by its owner only; an existing file is never overwritten. All radios of a
+    mission with the protocol superframe share one key. With it, master and stations reject packets of others and
+    replayed packets.
     """
     write_key(file)
-    click.echo(f"""{file}: a new key, for all radios of one mission. Whoever has it can take part: keep it secret.
+    click.echo(f"""{file}: a new key for all radios of one mission. Whoever has it can take part: keep it secret.
 
 On each machine of the mission, for the daemon's user:
   sudo install -o tsgt -g tsgt -m 600 {file.name} /etc/tsgt/radio.key
 In the configuration of each daemon, under [protocol]:
   kind = "superframe"
   key_file = "radio.key"
-`tsgt status` says of each daemon whether it has one.""")
-
-
-@click.group()
-def radio() -> None:
-    """LoRa radios: time on air, what a channel carries, a bench test of two, a key."""
-
-
-radio.add_command(ping_command, "ping")
-radio.add_command(plan_command, "plan")
-radio.add_command(key_command, "key")
+`tsgt status` shows for each daemon whether it has a key.""")
 
 
 @radio.command()
@@ -65,10 +65,10 @@ radio.add_command(key_command, "key")
 )
 @json_option
 def airtime(*, modem: Modem, payload_bytes: int, as_json: bool) -> None:
-    """Compute how long a packet is on the air, by the data sheet of the SX1276.
+    """Compute the time on air of a packet.
 
-    Explicit header, CRC, and low data rate optimisation where a symbol lasts longer than 16 ms. The bit rate is that
-    of the payload alone.
+    By the formula of the SX1276 data sheet, section 4.1.1.7, with explicit header, CRC, and low data rate optimisation
+    if a symbol is longer than 16 ms. The bit rate is that of the payload alone.
     """
     low_data_rate = low_data_rate_required(modem.spreading_factor, modem.bandwidth_hz)
     airtime_ms = (

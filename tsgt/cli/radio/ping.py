@@ -11,40 +11,42 @@ from typing import TYPE_CHECKING
 import click
 
 from tsgt import service
-from tsgt.cli.options import finite, json_option
+from tsgt.cli.model_options import model_option
+from tsgt.cli.options import json_option
 from tsgt.cli.output import CHECK_FAILED, print_json
 from tsgt.cli.radio.options import Modem, modem_options, wiring_options
 from tsgt.clock import SystemClock
+from tsgt.config import ModemConfig
 from tsgt.radio import MAX_PAYLOAD_BYTES, LoRaSettings, airtime_us
 from tsgt.radio.ping import (
-    RUNS,
-    SHORTEST_PAYLOAD_BYTES,
-    Answer,
+    MIN_PAYLOAD_BYTES,
+    SESSION_IDS,
     Exchange,
-    answer,
+    Response,
     ping,
+    respond,
     summarise,
-    summarise_answers,
+    summarise_responses,
 )
-from tsgt.radio.planning import LOWEST_DBM, REGIONS, preset_power_dbm
+from tsgt.radio.planning import MIN_POWER_DBM, REGIONS, preset_power_dbm
 from tsgt.radio.sx127x import RadioStatistics, SX127x, Wiring, open_hal
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable
 
     from tsgt.clock import Clock
-    from tsgt.radio.ping import Strength
+    from tsgt.radio.ping import SignalStrength
 
     Session = Callable[[SX127x, Clock], Awaitable[None]]
 
 DEFAULT_COUNT = 100
 SIMULATED_FREQUENCY_MHZ = 905.0
 REPLY_MARGIN_MS = 250
-"""How much longer than the reply's time on air a request waits: the time-out of the authors' master."""
+"""Added to the reply's time on air: the timeout of the authors' master."""
 
 
 def _byte(_context: click.Context, _parameter: click.Parameter, value: str) -> int:
-    """Take a byte as people write it, 0x34 or 52."""
+    """Parse a byte, 0x34 or 52."""
     try:
         return bytes([int(value, 0)])[0]
     except ValueError:
@@ -52,17 +54,17 @@ def _byte(_context: click.Context, _parameter: click.Parameter, value: str) -> i
 
 
 @click.command()
-@click.option("--simulated", is_flag=True, help="Two simulated radios in virtual time, no hardware.")
-@click.option("--answer", "answering", is_flag=True, help="Answer the requests of the other radio.")
+@click.option("--simulated", is_flag=True, help="Simulate both radios in virtual time, without hardware.")
+@click.option("--answer", "answering", is_flag=True, help="Respond to the requests of the other radio.")
 @click.option(
     "--count",
     type=click.IntRange(1, 65_536),
-    help=f"Requests to send, or to answer.  [default: {DEFAULT_COUNT}; with --answer until Ctrl-C]",
+    help=f"Number of requests to send or to respond to.  [default: {DEFAULT_COUNT}; with --answer until Ctrl-C]",
 )
 @click.option(
     "--payload",
     "payload_bytes",
-    type=click.IntRange(SHORTEST_PAYLOAD_BYTES, MAX_PAYLOAD_BYTES),
+    type=click.IntRange(MIN_PAYLOAD_BYTES, MAX_PAYLOAD_BYTES),
     default=34,
     show_default=True,
     help="Length of request and reply in bytes.",
@@ -70,32 +72,30 @@ def _byte(_context: click.Context, _parameter: click.Parameter, value: str) -> i
 @click.option(
     "--timeout-ms",
     type=click.IntRange(min=1),
-    help=f"How long to wait for a reply.  [default: its time on air and {REPLY_MARGIN_MS} ms]",
+    help=f"Timeout of a reply.  [default: its time on air plus {REPLY_MARGIN_MS} ms]",
 )
 @modem_options
-@click.option(
-    "--frequency-mhz",
-    type=click.FloatRange(137, 1020),
-    callback=finite,
-    help="Carrier; which one is free depends on the country.  "
-    f"[required; with --simulated {SIMULATED_FREQUENCY_MHZ:g}]",
+@model_option(
+    ModemConfig,
+    "frequency_mhz",
+    help=f"Carrier frequency; legal ones depend on the country.  [required; with --simulated {SIMULATED_FREQUENCY_MHZ:g}]",
 )
 @click.option(
     "--region",
     type=click.Choice(sorted(REGIONS)),
-    help="Take the power that the region allows on this channel, and refuse a channel outside its bands.",
+    help="Use the power that the region allows on this channel; reject a channel outside its bands.",
 )
 @click.option(
     "--power-dbm",
     type=click.IntRange(2, 17),
-    help="Power.  [default: that of --region; without one 2, which is plenty within a building]",
+    help="Transmit power.  [default: that of --region, else 2, which suffices within a building]",
 )
 @click.option(
     "--sync-word",
     callback=_byte,
     default="0x34",
     show_default=True,
-    help="A byte, the same on both sides.",
+    help="Sync word, one byte, the same on both sides.",
 )
 @wiring_options
 @click.option(
@@ -103,14 +103,14 @@ def _byte(_context: click.Context, _parameter: click.Parameter, value: str) -> i
     type=click.FloatRange(1, 1e6),
     default=100.0,
     show_default=True,
-    help="How far apart they are, if simulated; free space.",
+    help="Distance of simulated radios in free space.",
 )
 @click.option(
     "--seed",
     type=click.IntRange(min=0),
     default=0,
     show_default=True,
-    help="Another seed, another simulation.",
+    help="Seed of the simulation.",
 )
 @json_option
 def ping_command(
@@ -130,22 +130,22 @@ def ping_command(
     seed: int,
     as_json: bool,
 ) -> int:
-    """Test two radios: loss, strength of the signal, round trip, turn-round.
+    """Test the link between two radios.
 
-    On one machine `tsgt radio ping --answer`, on the other `tsgt radio ping`, with the same modem options. Ctrl-C ends
-    it with the summary so far. Exit code 3: no reply at all.
+    Run `tsgt radio ping --answer` on one machine and `tsgt radio ping` on the other, with the same modem options.
+    Measures loss, signal strength, round trip (here, from TxDone of the request to RxDone of the reply) and turnaround
+    (there, from RxDone of the request to the start of the reply). Ctrl-C ends the test with the summary so far.
 
-    The turn-round is measured by the answering side, from RxDone of a request to the start of the reply; the round
-    trip by this side, from TxDone of the request to RxDone of the reply.
+    Exit code 3: no reply was received.
     """
     if simulated and answering:
-        raise click.UsageError("--simulated runs both sides; leave out --answer")
+        raise click.UsageError("--simulated runs both sides; omit --answer")
     if frequency_mhz is None:
         if not simulated:
-            raise click.UsageError("give --frequency-mhz, a carrier that you may use where you are")
+            raise click.UsageError("give --frequency-mhz, a carrier frequency that is legal where you are")
         frequency_mhz = SIMULATED_FREQUENCY_MHZ
     frequency_hz = round(frequency_mhz * 1e6)
-    preset_dbm = LOWEST_DBM
+    preset_dbm = MIN_POWER_DBM
     if region is not None:
         preset_dbm = preset_power_dbm(region, frequency_hz=frequency_hz, bandwidth_hz=modem.bandwidth_hz)
     settings = LoRaSettings(
@@ -165,7 +165,7 @@ def ping_command(
         requests = ping(
             radio,
             clock,
-            run=0 if simulated else secrets.randbelow(RUNS),
+            session=0 if simulated else secrets.randbelow(SESSION_IDS),
             count=count or DEFAULT_COUNT,
             payload_bytes=payload_bytes,
             timeout_ns=round((timeout_ms or airtime_ms + REPLY_MARGIN_MS) * 1e6),
@@ -190,14 +190,14 @@ def ping_command(
                 "received": summary.received,
                 "loss": summary.loss,
                 "late": summary.late,
-                "foreign": summary.foreign,
+                "foreign": summary.unknown,
                 "crc_errors": statistics.crc_errors,
                 "lost_edges": statistics.lost_edges,
                 "packets_per_s": summary.packets_per_s,
-                "here": _strength(summary.here),
-                "there": _strength(summary.there),
+                "here": _strength(summary.local),
+                "there": _strength(summary.remote),
                 "round_trip_ms": _times(summary.round_trip_ns),
-                "turnaround_ms": _times(summary.turn_round_ns),
+                "turnaround_ms": _times(summary.turnaround_ns),
             }
         )
     else:
@@ -208,57 +208,57 @@ def ping_command(
         )
         click.echo(f"received     {summary.received} replies{loss}{rate}")
         click.echo(
-            f"besides      {summary.late} late replies, {summary.foreign} packets of others, "
+            f"rejected     {summary.late} late replies, {summary.unknown} unknown packets, "
             f"{statistics.crc_errors} with a wrong CRC, {statistics.lost_edges} edges lost"
         )
-        click.echo(f"replies      {_strength_text(summary.here)}")
-        click.echo(f"requests     {_strength_text(summary.there)}, at the other side")
+        click.echo(f"replies      {_strength_text(summary.local)}")
+        click.echo(f"requests     {_strength_text(summary.remote)}, at the other side")
         click.echo(f"round trip   {_times_text(summary.round_trip_ns)}, TxDone to RxDone")
-        click.echo(f"turn-round   {_times_text(summary.turn_round_ns)}, RxDone to start of the reply, there")
+        click.echo(f"turnaround   {_times_text(summary.turnaround_ns)}, RxDone to start of the reply, there")
     return 0 if summary.received else CHECK_FAILED
 
 
 def _answer(settings: LoRaSettings, wiring: Wiring, *, count: int | None, as_json: bool) -> None:
-    """Answer on real hardware until enough has been answered or Ctrl-C."""
-    answers: list[Answer] = []
+    """Respond on real hardware until the count is reached or Ctrl-C."""
+    answers: list[Response] = []
 
     async def session(radio: SX127x, _clock: Clock) -> None:
         answered = 0
-        async with aclosing(answer(radio)) as results:
+        async with aclosing(respond(radio)) as results:
             async for result in results:
                 answers.append(result)
                 if not as_json:
-                    click.echo(_answer_line(result), err=True)
-                answered += result.turn_round_ns is not None
+                    click.echo(_response_line(result), err=True)
+                answered += result.turnaround_ns is not None
                 if answered == count:
                     return
 
     statistics = _on_hardware(session, settings, wiring)
-    summary = summarise_answers(answers)
+    summary = summarise_responses(answers)
     if as_json:
         print_json(
             {
-                "answered": summary.answered,
+                "answered": summary.replied,
                 "repeated": summary.repeated,
-                "foreign": summary.foreign,
+                "foreign": summary.unknown,
                 "crc_errors": statistics.crc_errors,
                 "lost_edges": statistics.lost_edges,
-                "here": _strength(summary.heard),
-                "turnaround_ms": _times(summary.turn_round_ns),
+                "here": _strength(summary.signal),
+                "turnaround_ms": _times(summary.turnaround_ns),
             }
         )
     else:
-        click.echo(f"answered     {summary.answered} requests")
+        click.echo(f"answered     {summary.replied} requests")
         click.echo(
-            f"besides      {summary.repeated} repeated requests, {summary.foreign} packets of others, "
+            f"rejected     {summary.repeated} repeated requests, {summary.unknown} unknown packets, "
             f"{statistics.crc_errors} with a wrong CRC, {statistics.lost_edges} edges lost"
         )
-        click.echo(f"requests     {_strength_text(summary.heard)}")
-        click.echo(f"turn-round   {_times_text(summary.turn_round_ns)}, RxDone to start of the reply")
+        click.echo(f"requests     {_strength_text(summary.signal)}")
+        click.echo(f"turnaround   {_times_text(summary.turnaround_ns)}, RxDone to start of the reply")
 
 
 def _on_hardware(session: Session, settings: LoRaSettings, wiring: Wiring) -> RadioStatistics:
-    """Run a session on the radio of this machine, to its end or to Ctrl-C."""
+    """Run a session on the radio of this machine until its end or Ctrl-C."""
 
     async def run() -> RadioStatistics:
         clock = SystemClock()
@@ -277,8 +277,8 @@ def _on_hardware(session: Session, settings: LoRaSettings, wiring: Wiring) -> Ra
 def _on_simulation(
     session: Session, settings: LoRaSettings, *, distance_m: float, seed: int
 ) -> RadioStatistics:
-    """Run a session with a simulated radio, another one answering."""
-    # Only here, so that a station's small computer does not load numpy to ping.
+    """Run a session with a simulated radio; another one responds."""
+    # Imported here, so that the small computer of a station does not load numpy.
     import numpy as np
 
     from tsgt.simulation.kernel import (
@@ -301,7 +301,7 @@ def _on_simulation(
         here, there = (simulated_radio(air, name, timeline, clock, rng) for name in places)
         await here.start(settings)
         await there.start(settings)
-        answering = asyncio.create_task(_drain(answer(there)))
+        answering = asyncio.create_task(_drain(respond(there)))
         try:
             with suppress(asyncio.CancelledError):
                 await session(here, clock)
@@ -315,7 +315,7 @@ def _on_simulation(
     return run_virtual(run, timeline)
 
 
-async def _drain(answers: AsyncIterator[Answer]) -> None:
+async def _drain(answers: AsyncIterator[Response]) -> None:
     async for _ in answers:
         pass
 
@@ -327,23 +327,23 @@ def _airtime_ms(payload_bytes: int, modem: Modem) -> float:
 def _exchange_line(exchange: Exchange) -> str:
     if exchange.reply is None or exchange.round_trip_ns is None:
         return f"{exchange.number:5d}  no reply"
-    here, there = _strength_text(exchange.reply.here), _strength_text(exchange.reply.there)
+    here, there = _strength_text(exchange.reply.local), _strength_text(exchange.reply.remote)
     return f"{exchange.number:5d}  {exchange.round_trip_ns / 1e6:.3f} ms  here {here}  there {there}"
 
 
-def _answer_line(result: Answer) -> str:
+def _response_line(result: Response) -> str:
     if result.number is None:
-        return f"    -  a packet of somebody else, {_strength_text(result.heard)}"
-    if result.turn_round_ns is None:
-        return f"{result.number:5d}  came again, {_strength_text(result.heard)}"
-    return f"{result.number:5d}  answered after {result.turn_round_ns / 1e6:.3f} ms, {_strength_text(result.heard)}"
+        return f"    -  unknown packet, {_strength_text(result.signal)}"
+    if result.turnaround_ns is None:
+        return f"{result.number:5d}  repeated, {_strength_text(result.signal)}"
+    return f"{result.number:5d}  replied after {result.turnaround_ns / 1e6:.3f} ms, {_strength_text(result.signal)}"
 
 
-def _strength(strength: Strength | None) -> dict[str, float] | None:
+def _strength(strength: SignalStrength | None) -> dict[str, float] | None:
     return None if strength is None else strength._asdict()
 
 
-def _strength_text(strength: Strength | None) -> str:
+def _strength_text(strength: SignalStrength | None) -> str:
     return "-" if strength is None else f"{strength.rssi_dbm:.1f} dBm, SNR {strength.snr_db:.1f} dB"
 
 
@@ -356,4 +356,4 @@ def _times(median_and_max_ns: tuple[int, int] | None) -> dict[str, float] | None
 def _times_text(median_and_max_ns: tuple[int, int] | None) -> str:
     if median_and_max_ns is None:
         return "-"
-    return f"median {median_and_max_ns[0] / 1e6:.3f} ms, longest {median_and_max_ns[1] / 1e6:.3f} ms"
+    return f"median {median_and_max_ns[0] / 1e6:.3f} ms, max {median_and_max_ns[1] / 1e6:.3f} ms"

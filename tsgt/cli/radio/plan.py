@@ -1,4 +1,4 @@
-"""The command ``radio plan``: what a channel carries, before anybody drives into the field."""
+"""The command ``radio plan``: capacity, link margin and legal limits of a channel."""
 
 from __future__ import annotations
 
@@ -7,23 +7,30 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tsgt.cli.options import finite, json_option
+from tsgt.cli.model_options import model_option
+from tsgt.cli.options import FiniteRange, json_option
 from tsgt.cli.output import print_json, print_table
 from tsgt.cli.radio.options import Modem, modem_options
-from tsgt.config import LARGEST_NUMBERS, ClassicMasterConfig, SuperframeMasterConfig
+from tsgt.config import (
+    MAX_STATION_NUMBERS,
+    ClassicMasterConfig,
+    ModemConfig,
+    ScenarioRadioConfig,
+    SuperframeMasterConfig,
+)
 from tsgt.radio import LoRaSettings
 from tsgt.radio.from_config import planned_cycle
 from tsgt.radio.planning import (
     DIPOLE_DBI,
-    LOWEST_DBM,
+    MIN_POWER_DBM,
     REGIONS,
-    Cycle,
-    Load,
-    Use,
-    exceeded,
+    ChannelUse,
+    CycleEstimate,
+    TrafficLoad,
     path_loss_db,
     preset_power_dbm,
     sensitivity_dbm,
+    violations,
 )
 
 if TYPE_CHECKING:
@@ -35,26 +42,26 @@ _CLASSIC = ClassicMasterConfig(kind="classic")
 _SUPERFRAME = SuperframeMasterConfig(kind="superframe")
 
 _FREQUENCIES_MHZ = {"EU868": 869.525, "EU433": 433.92, "US915": 905.0, "CA915": 905.0}
-"""A channel for each region: in Europe that with the highest limits, in North America the paper's."""
+"""Default channel by region: in Europe the one with the highest limits, in North America the paper's."""
 
 _TABLE_STATIONS = (1, 2, 3, 4, 6, 8, 12, 16)
-_ENOUGH_MARGIN_DB = 10.0
-"""For fading, trees and people in the way."""
-_ALL = 0.999
-"""So much of what the instruments measure is all of it."""
+_MIN_MARGIN_DB = 10.0
+"""Reserve for fading, trees and people in the line of sight."""
+_COMPLETE = 0.999
+"""Share of the measurements from which on delivery counts as complete."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Row:
-    """What becomes of one choice of settings and stations."""
+    """Estimate for one choice of settings and number of stations."""
 
     settings: LoRaSettings
     stations: int
     margin_db: float
-    cycle: Cycle
+    cycle: CycleEstimate
 
-    def use(self, antenna_gain_dbi: float) -> Use:
-        return Use(self.settings, antenna_gain_dbi, self.cycle.master_duty, self.cycle.station_duty)
+    def use(self, antenna_gain_dbi: float) -> ChannelUse:
+        return ChannelUse(self.settings, antenna_gain_dbi, self.cycle.master_duty, self.cycle.station_duty)
 
     def json(self) -> dict[str, Any]:
         return {
@@ -69,77 +76,50 @@ class _Row:
 @click.command()
 @click.option(
     "--protocol",
-    type=click.Choice(list(LARGEST_NUMBERS)),
+    type=click.Choice(list(MAX_STATION_NUMBERS)),
     required=True,
-    help="classic is the paper's, superframe sends everything.",
+    help="The paper's polling protocol, or the TDMA protocol superframe.",
 )
-@click.option("--stations", type=click.IntRange(1, 16), required=True, help="How many.")
+@click.option("--stations", type=click.IntRange(1, 16), required=True, help="Number of stations.")
 @modem_options
 @click.option(
     "--rate-hz",
-    type=click.FloatRange(0.01, 100),
-    callback=finite,
+    type=FiniteRange(0.01, 100),
     default=2.5,
     show_default=True,
-    help="How often each instrument measures.",
+    help="Measurement rate of each instrument.",
 )
 @click.option(
     "--loss",
-    type=click.FloatRange(0, 0.9),
-    callback=finite,
+    type=FiniteRange(0, 0.9),
     default=0.0,
     show_default=True,
-    help="Probability that a radio does not hear a packet.",
+    help="Probability that a packet is lost.",
 )
-@click.option("--region", type=click.Choice(list(REGIONS)), help="Whose limits to hold it against.")
+@click.option("--region", type=click.Choice(list(REGIONS)), help="Region whose legal limits apply.")
+@model_option(
+    ModemConfig, "frequency_mhz", help="Carrier frequency.  [default: a channel of the region, or 905]"
+)
 @click.option(
-    "--frequency-mhz",
-    type=click.FloatRange(137, 1020),
-    callback=finite,
-    help="Carrier.  [default: a channel of the region, or 905]",
+    "--power-dbm", type=int, help="Transmit power, 2 to 17 or 20.  [default: that of the region, or 2]"
 )
-@click.option("--power-dbm", type=int, help="At the radio, 2 to 17 or 20.  [default: the region's, or 2]")
 @click.option(
     "--distance-m",
-    type=click.FloatRange(1, 1e6),
-    callback=finite,
+    type=FiniteRange(1, 1e6),
     default=1000.0,
     show_default=True,
-    help="For the link margin.",
+    help="Distance for the link margin.",
 )
-@click.option(
-    "--path-loss-exponent",
-    type=click.FloatRange(1.5, 6),
-    callback=finite,
-    default=3.0,
-    show_default=True,
-    help="2 in free space, 2.7 to 3.5 over ground and through trees.",
-)
-@click.option(
-    "--antenna-gain-db",
-    type=click.FloatRange(-30, 30),
-    callback=finite,
+@model_option(ScenarioRadioConfig, "path_loss_exponent", default=3.0)
+@model_option(
+    ScenarioRadioConfig,
+    "antenna_gain_db",
     default=DIPOLE_DBI,
-    show_default=True,
-    help="Of each antenna, its cable deducted, in dBi; 2.15 is a dipole.",
+    help="Gain of each antenna less its cable loss, in dBi; a dipole has 2.15.",
 )
-@click.option(
-    "--start-jitter-ms",
-    type=click.FloatRange(0.5, 50),
-    callback=finite,
-    default=_SUPERFRAME.start_jitter_ms,
-    show_default=True,
-    help="How late a computer starts a transmission at worst; as in the master's configuration.",
-)
-@click.option(
-    "--turnaround-ms",
-    type=click.FloatRange(3, 60),
-    callback=finite,
-    default=_SUPERFRAME.turnaround_ms,
-    show_default=True,
-    help="What a computer needs from a beacon to the first slot; likewise.",
-)
-@click.option("--no-phase-lock", is_flag=True, help="Frames do not follow the instruments; likewise.")
+@model_option(SuperframeMasterConfig, "start_jitter_ms")
+@model_option(SuperframeMasterConfig, "turnaround_ms")
+@click.option("--no-phase-lock", is_flag=True, help="Do not lock the frame phase to the instruments.")
 @json_option
 def plan_command(
     *,
@@ -159,20 +139,20 @@ def plan_command(
     no_phase_lock: bool,
     as_json: bool,
 ) -> None:
-    """Compute what the radio channel carries: how often, how old, how far, and whether it is allowed.
+    """Compute rate, age, range and legality of a channel.
 
-    Rate is of different measurements per station that reach the master, age the time from when the client has a
-    measurement to its arrival there: add what the instrument needs, 80 to 140 ms for a simulated one on a fast line.
-    The table shows both for other spreading factors, coding rates and numbers of stations. Frequencies, powers and
-    limits are for orientation: the law of the place decides.
+    Rate counts distinct measurements per station that reach the master. Age is the time from the client's reading to
+    the arrival at the master; add the latency of the instrument, 80 to 140 ms for a simulated one on a fast line. The
+    table shows both for other spreading factors, coding rates and numbers of stations. Frequencies, powers and limits
+    are for orientation only: check the law of the country.
     """
-    if stations > LARGEST_NUMBERS[protocol]:
+    if stations > MAX_STATION_NUMBERS[protocol]:
         raise click.UsageError(
-            f"--stations {stations}: {protocol} can have {LARGEST_NUMBERS[protocol]} at most"
+            f"--stations {stations}: {protocol} supports at most {MAX_STATION_NUMBERS[protocol]}"
         )
     frequency_hz = round(1e6 * (frequency_mhz or _FREQUENCIES_MHZ.get(region or "", 905.0)))
     if power_dbm is None:
-        power_dbm = LOWEST_DBM
+        power_dbm = MIN_POWER_DBM
         if region is not None:
             power_dbm = preset_power_dbm(region, frequency_hz=frequency_hz, bandwidth_hz=modem.bandwidth_hz)
     settings = LoRaSettings(
@@ -198,11 +178,11 @@ def plan_command(
 
     def row(settings: LoRaSettings, stations: int) -> _Row:
         needed_dbm = sensitivity_dbm(settings.spreading_factor, settings.bandwidth_hz)
-        load = Load(stations=stations, rate_hz=rate_hz, loss=loss)
+        load = TrafficLoad(stations=stations, rate_hz=rate_hz, loss=loss)
         return _Row(settings, stations, received_dbm - needed_dbm, planned_cycle(spoken, load, settings))
 
     planned = row(settings, stations)
-    numbers = sorted({stations, *(n for n in _TABLE_STATIONS if n <= LARGEST_NUMBERS[protocol])})
+    numbers = sorted({stations, *(n for n in _TABLE_STATIONS if n <= MAX_STATION_NUMBERS[protocol])})
     table = [
         row(replace(settings, spreading_factor=sf, coding_rate=coding_rate), n)
         for sf in range(7, 13)
@@ -210,12 +190,16 @@ def plan_command(
         for n in numbers
     ]
     warnings = _warnings(planned, table, spoken, rate_hz=rate_hz)
-    # What reaches furthest first, then what transmits least.
+    # Longest range first, then least airtime.
     others = sorted(
-        (other for other in table if other.stations == stations and other.cycle.rate_hz >= _ALL * rate_hz),
+        (
+            other
+            for other in table
+            if other.stations == stations and other.cycle.rate_hz >= _COMPLETE * rate_hz
+        ),
         key=lambda other: (-other.margin_db, other.cycle.master_duty),
     )
-    warnings += exceeded(planned.use(antenna_gain_db), region, [o.use(antenna_gain_db) for o in others])
+    warnings += violations(planned.use(antenna_gain_db), region, [o.use(antenna_gain_db) for o in others])
     if as_json:
         print_json(
             {
@@ -238,7 +222,7 @@ def plan_command(
     _print_table(table, numbers)
 
 
-def _figures(cycle: Cycle) -> dict[str, Any]:
+def _figures(cycle: CycleEstimate) -> dict[str, Any]:
     figures = asdict(cycle)
     return {
         "cycle_ms": figures["cycle_ms"],
@@ -250,9 +234,11 @@ def _figures(cycle: Cycle) -> dict[str, Any]:
 
 def _warnings(planned: _Row, table: Sequence[_Row], spoken: MasterProtocol, *, rate_hz: float) -> list[str]:
     found = []
-    if planned.cycle.rate_hz < _ALL * rate_hz:
+    if planned.cycle.rate_hz < _COMPLETE * rate_hz:
         enough = [
-            row for row in table if row.stations == planned.stations and row.cycle.rate_hz >= _ALL * rate_hz
+            row
+            for row in table
+            if row.stations == planned.stations and row.cycle.rate_hz >= _COMPLETE * rate_hz
         ]
         remedies = [
             f"SF {row.settings.spreading_factor} with 4/{row.settings.coding_rate}, link margin {row.margin_db:.0f} dB"
@@ -262,13 +248,13 @@ def _warnings(planned: _Row, table: Sequence[_Row], spoken: MasterProtocol, *, r
             remedies.append("--protocol superframe")
         remedies.append("fewer stations")
         found.append(
-            f"{planned.cycle.rate_hz:.2f} of {rate_hz:g} measurements per second and station get through. "
-            f"More do with: {'; '.join(remedies)}"
+            f"{planned.cycle.rate_hz:.2f} of {rate_hz:g} measurements per second and station are delivered. "
+            f"Remedies: {'; '.join(remedies)}"
         )
-    if planned.margin_db < _ENOUGH_MARGIN_DB:
+    if planned.margin_db < _MIN_MARGIN_DB:
         found.append(
-            f"the link margin is {planned.margin_db:.0f} dB; {_ENOUGH_MARGIN_DB:.0f} are needed for fading, trees and "
-            "people in the way. A higher spreading factor gives 2.5 dB per step, better antennas give more"
+            f"the link margin is {planned.margin_db:.0f} dB; {_MIN_MARGIN_DB:.0f} are needed for fading, trees and "
+            "people in the line of sight. A higher spreading factor gives 2.5 dB per step, better antennas give more"
         )
     return found
 

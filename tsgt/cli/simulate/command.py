@@ -1,14 +1,12 @@
-"""The command ``simulate``: the whole system in virtual time."""
+"""The command ``simulate``: a mission in virtual time."""
 
 from __future__ import annotations
 
 import math
 import shlex
 import shutil
-import sys
 import tempfile
 import time
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -17,133 +15,124 @@ import numpy as np
 from click.core import ParameterSource
 
 from tsgt.analysis.formats import tum_lines
-from tsgt.cli.options import finite, json_option
-from tsgt.cli.output import CHECK_FAILED, print_json, print_table, require_new_file
+from tsgt.cli.model_options import add_options, model_option
+from tsgt.cli.options import RECORDING_SUFFIXES, OutputFile, json_option
+from tsgt.cli.output import CHECK_FAILED, numbers, print_json, print_table, require_new_file
+from tsgt.cli.progress import progress
 from tsgt.cli.simulate.figures import figures
-from tsgt.config import LARGEST_NUMBERS, ClassicMasterConfig, SuperframeMasterConfig
+from tsgt.config import (
+    MAX_STATION_NUMBERS,
+    ClassicMasterConfig,
+    PipelineConfig,
+    ScenarioConfig,
+    ScenarioRadioConfig,
+    SuperframeMasterConfig,
+)
 from tsgt.errors import OutputFileError, TsgtError
 from tsgt.geometry import quaternion_from_rotation
 from tsgt.log import configure_logging
 from tsgt.recording import write_atomically
-from tsgt.simulation.checks import Violation, violations
-from tsgt.simulation.faults import FAULT_FREE_TAIL_S, FAST_SYNC_CYCLES, FAULT_FREE_START_S, FaultKind, parse_faults
-from tsgt.simulation.options import SimulationOptions, Outage, Restart
+from tsgt.simulation.checks import Violation, check_invariants
+from tsgt.simulation.faults import (
+    FAST_SYNC_CYCLES,
+    FAULT_FREE_START_S,
+    FAULT_FREE_TAIL_S,
+    FaultKind,
+    parse_faults,
+)
+from tsgt.simulation.options import Outage, Restart, SimulationOptions
 from tsgt.simulation.runner import simulate
 from tsgt.simulation.scenario_files import MAX_STATIONS, find_scenario, with_stations
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from tsgt.config import ScenarioConfig
     from tsgt.simulation.mission import MissionResult
 
 LISTED_VIOLATIONS = 20
 
-
-@click.command("simulate")
-@click.argument("scenario_name", metavar="[SCENARIO]", default="dynamic")
-@click.option(
+protocol_option = click.option(
     "--protocol",
     type=click.Choice(["superframe", "classic"]),
     default="superframe",
     show_default=True,
-    help="What master and stations speak.",
+    help=SimulationOptions.model_fields["protocol"].description,
 )
-@click.option(
-    "--duration",
-    "duration_s",
-    type=click.FloatRange(min=0, max=86_400, min_open=True),
-    callback=finite,
-    help="How many seconds it measures.  [default: what the scenario says]",
+
+
+@click.command("simulate")
+@click.argument("scenario_name", metavar="[SCENARIO]", default="dynamic")
+@protocol_option
+@add_options(
+    model_option(
+        ScenarioConfig,
+        "duration_s",
+        "--duration",
+        default=None,
+        show_default=False,
+        help="Duration of the measurements in s.  [default: that of the scenario]",
+    ),
+    click.option(
+        "--stations",
+        type=click.IntRange(1, MAX_STATIONS),
+        help="Number of stations; additional ones track the prisms in turn.  [default: that of the scenario]",
+    ),
+    model_option(
+        ScenarioRadioConfig,
+        "loss_probability",
+        "--loss",
+        default=None,
+        show_default=False,
+        help="Probability that a packet is lost.  [default: that of the scenario]",
+    ),
+    model_option(SimulationOptions, "drift_ppm"),
+    model_option(SimulationOptions, "drift_ramp_ppm_per_min"),
+    model_option(SimulationOptions, "stamp_jitter_us"),
+    model_option(
+        ClassicMasterConfig,
+        "clock_filter",
+        default=None,
+        show_default=False,
+        help="Clock filter of the master; protocol classic only.  [default: regression]",
+    ),
+    model_option(SimulationOptions, "station_software"),
+    click.option(
+        "--unauthenticated", is_flag=True, help="Run the radios without a key; protocol superframe only."
+    ),
+    click.option(
+        "--outage",
+        "outage_texts",
+        metavar="STATIONS:START:SECONDS",
+        multiple=True,
+        help="Interrupt the radio contact of stations: all, or numbers separated by commas; may be repeated.",
+    ),
+    click.option(
+        "--restart",
+        "restart_texts",
+        metavar="STATION:AT",
+        multiple=True,
+        help="End a client, or the master, at this time and start it 2 s later; may be repeated.",
+    ),
+    model_option(SimulationOptions, "interference_rate_hz"),
+    click.option(
+        "--faults",
+        "faults_text",
+        metavar="NAMES",
+        default="none",
+        show_default=True,
+        help=f"Inject faults drawn from the seed: all, or names separated by commas: {', '.join(FaultKind)}.",
+    ),
+    model_option(
+        PipelineConfig,
+        "estimator",
+        default=None,
+        show_default=False,
+        help="Estimator of the master.  [default: that of the scenario]",
+    ),
+    model_option(SimulationOptions, "seed"),
+    click.option(
+        "--output", type=OutputFile(*RECORDING_SUFFIXES), help="Write the master's recording (.jsonl)."
+    ),
+    click.option("--truth", type=OutputFile(".tum"), help="Write the true poses (.tum)."),
 )
-@click.option(
-    "--stations",
-    type=click.IntRange(1, MAX_STATIONS),
-    help="How many; more than there are prisms track them in turn.  [default: those of the scenario]",
-)
-@click.option(
-    "--loss",
-    type=click.FloatRange(0, 1),
-    callback=finite,
-    help="Probability that a packet is not heard.  [default: what the scenario says]",
-)
-@click.option(
-    "--drift-ppm",
-    type=click.FloatRange(-1000, 1000),
-    callback=finite,
-    default=10.0,
-    show_default=True,
-    help="Drift of the stations' clocks against the master's: plus for the first, minus for the second, and so on.",
-)
-@click.option(
-    "--drift-ramp-ppm-per-min",
-    type=click.FloatRange(-50, 50),
-    callback=finite,
-    default=0.0,
-    show_default=True,
-    help="By how much that drift grows, as the computers get warm; after ten minutes it falls again.",
-)
-@click.option(
-    "--stamp-jitter-us",
-    type=click.FloatRange(0, 10_000),
-    callback=finite,
-    default=0.0,
-    show_default=True,
-    help="Scatter of each computer's stamps of its radio, one sigma.",
-)
-@click.option(
-    "--clock-filter",
-    type=click.Choice(["regression", "paper"]),
-    help="How the master follows the stations' clocks; of the protocol classic.  [default: regression]",
-)
-@click.option(
-    "--station-software",
-    type=click.Choice(["ours", "authors"]),
-    default="ours",
-    show_default=True,
-    help="What the stations run: our client, or a node as the paper's authors deployed it, which speaks classic.",
-)
-@click.option("--unauthenticated", is_flag=True, help="Radios without a key; of the protocol superframe.")
-@click.option(
-    "--outage",
-    "outage_texts",
-    metavar="STATIONS:START:SECONDS",
-    multiple=True,
-    help="The master and these stations do not hear each other for a time; all, or numbers with commas.",
-)
-@click.option(
-    "--restart",
-    "restart_texts",
-    metavar="STATION:AT",
-    multiple=True,
-    help="A client, or the master, ends at this time and is started again 2 s later.",
-)
-@click.option(
-    "--interference-rate-hz",
-    type=click.FloatRange(0, 100),
-    callback=finite,
-    default=0.0,
-    show_default=True,
-    help="Packets per second of somebody else: noise, and what it has heard, as it was, cut or changed.",
-)
-@click.option(
-    "--faults",
-    "faults_text",
-    metavar="NAMES",
-    default="none",
-    show_default=True,
-    help=f"Let things go wrong, drawn from the seed: all, or names with commas of {', '.join(FaultKind)}.",
-)
-@click.option(
-    "--estimator",
-    type=click.Choice(["linear", "continuous"]),
-    help="How the master makes its poses.  [default: what the scenario says]",
-)
-@click.option(
-    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Another seed, another run."
-)
-@click.option("--output", type=click.Path(path_type=Path), help="Keep the master's recording here.")
-@click.option("--truth", type=click.Path(path_type=Path), help="Write the true poses here, as TUM.")
 @json_option
 def simulate_command(
     *,
@@ -151,93 +140,83 @@ def simulate_command(
     protocol: str,
     duration_s: float | None,
     stations: int | None,
-    loss: float | None,
-    drift_ppm: float,
-    drift_ramp_ppm_per_min: float,
-    stamp_jitter_us: float,
-    clock_filter: Any,
-    station_software: Any,
+    loss_probability: float | None,
+    clock_filter: Literal["regression", "paper"] | None,
     unauthenticated: bool,
     outage_texts: tuple[str, ...],
     restart_texts: tuple[str, ...],
-    interference_rate_hz: float,
     faults_text: str,
-    estimator: Any,
-    seed: int,
+    estimator: str | None,
     output: Path | None,
     truth: Path | None,
     as_json: bool,
+    **given: Any,
 ) -> int:
-    """Run master and stations in virtual time, on a simulated robot, radio channel, instruments and clocks.
+    """Simulate a mission in virtual time.
 
-    SCENARIO is dynamic, static, quarry, ski-trail, snowmobile, or the path of a file. The daemons are the real
-    ones, and one seed gives one run. Everything is checked on the way; what must not happen and does is listed,
-    with exit code 3.
+    Robot, radio channel, instruments and clocks are simulated, the daemons are the real ones; the same seed gives the
+    same mission. SCENARIO is dynamic, static, quarry, ski-trail, snowmobile, or the path of a file. Invariants are
+    checked during the mission.
+
+    Exit code 3: an invariant was violated.
     """
     for path in (output, truth):
         require_new_file(path)
-    if protocol != "classic" and station_software == "authors":
-        raise click.UsageError("the authors' node speaks classic alone; say --protocol classic")
+    if protocol != "classic" and given["station_software"] == "authors":
+        raise click.UsageError("the authors' node speaks classic only; add --protocol classic")
     if protocol != "classic" and clock_filter is not None:
-        raise click.UsageError(
-            "--clock-filter is of classic, where the master follows clocks; say --protocol classic"
-        )
+        raise click.UsageError("--clock-filter is for the protocol classic; add --protocol classic")
     if protocol == "classic" and unauthenticated:
-        raise click.UsageError("--unauthenticated is of superframe; classic never has a key")
+        raise click.UsageError("--unauthenticated is for the protocol superframe; classic never has a key")
     scenario = find_scenario(scenario_name)
     if stations is not None:
         scenario = with_stations(scenario, stations)
     if estimator is not None:
         pipeline = scenario.pipeline.model_copy(update={"estimator": estimator})
         scenario = scenario.model_copy(update={"pipeline": pipeline})
-    numbers = tuple(station.station for station in scenario.stations)
-    for number in numbers:
-        if number > LARGEST_NUMBERS[protocol]:
-            raise click.UsageError(f"station {number}: {protocol} knows 1 to {LARGEST_NUMBERS[protocol]}")
-    if loss is not None:
-        radio = scenario.radio.model_copy(update={"loss_probability": loss})
+    station_numbers = tuple(station.station for station in scenario.stations)
+    for number in station_numbers:
+        if number > MAX_STATION_NUMBERS[protocol]:
+            raise click.UsageError(
+                f"station {number}: {protocol} has station numbers 1 to {MAX_STATION_NUMBERS[protocol]}"
+            )
+    if loss_probability is not None:
+        radio = scenario.radio.model_copy(update={"loss_probability": loss_probability})
         scenario = scenario.model_copy(update={"radio": radio})
     faults = parse_faults(faults_text)
     options = SimulationOptions(
         duration_s=scenario.duration_s if duration_s is None else duration_s,
-        drift_ppm=drift_ppm,
-        drift_ramp_ppm_per_min=drift_ramp_ppm_per_min,
-        stamp_jitter_us=stamp_jitter_us,
-        seed=seed,
-        station_software=station_software,
-        protocol=SuperframeMasterConfig(kind="superframe")
-        if protocol == "superframe"
-        else _classic(clock_filter, often_anew=bool(faults)),
+        protocol=_protocol(protocol, clock_filter, fast_sync=bool(faults)),
         authenticated=not unauthenticated,
-        outages=tuple(Outage.parse(text, numbers) for text in outage_texts),
-        restarts=tuple(Restart.parse(text, numbers) for text in restart_texts),
-        interference_rate_hz=interference_rate_hz,
+        outages=tuple(Outage.parse(text, station_numbers) for text in outage_texts),
+        restarts=tuple(Restart.parse(text, station_numbers) for text in restart_texts),
         faults=faults,
+        **given,
     )
     _check_times(options)
-    configure_logging("critical" if faults else "error")  # what happens on the way stands in the figures
-    again = _again(click.get_current_context())
-    began_s = time.perf_counter()
+    configure_logging("critical" if faults else "error")  # the figures say what happened
+    replay_command = _replay_command(click.get_current_context())
+    started_s = time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="tsgt-simulate-") as folder:
         run = _simulate(scenario, options, Path(folder))
-        found = violations(run)
+        found = check_invariants(run)
         result = {
             "scenario": scenario.name,
             "protocol": protocol,
-            "station_software": station_software,
+            "station_software": options.station_software,
             "clock_filter": (clock_filter or "regression") if protocol == "classic" else None,
-            "seed": seed,
-            "replay_command": again,
+            "seed": options.seed,
+            "replay_command": replay_command,
             "faults": {str(kind): count for kind, count in sorted(run.faults.items())},
             **figures(run),
             "violations": len(found),
             "violations_listed": [f"{v.check}: {v.detail}" for v in found[:LISTED_VIOLATIONS]],
         }
         if output is not None:
-            _keep_recording(run, output)
+            _write_recording(run, output)
     if truth is not None:
         _write_truth(run, truth)
-    result["wall_seconds"] = time.perf_counter() - began_s
+    result["wall_seconds"] = time.perf_counter() - started_s
     if as_json:
         print_json(result)
     else:
@@ -245,14 +224,17 @@ def simulate_command(
     return CHECK_FAILED if found else 0
 
 
-def _classic(clock_filter: Literal["regression", "paper"] | None, *, often_anew: bool) -> ClassicMasterConfig:
-    """Return the protocol's settings."""
+def _protocol(
+    name: str, clock_filter: Literal["regression", "paper"] | None, *, fast_sync: bool
+) -> ClassicMasterConfig | SuperframeMasterConfig:
+    if name == "superframe":
+        return SuperframeMasterConfig(kind="superframe")
     config = ClassicMasterConfig(kind="classic", clock_filter=clock_filter or "regression")
-    return config.model_copy(update={"initial_cycles": FAST_SYNC_CYCLES}) if often_anew else config
+    return config.model_copy(update={"initial_cycles": FAST_SYNC_CYCLES}) if fast_sync else config
 
 
-def _again(context: click.Context) -> str:
-    """Write the command that gives the same run again, without what it writes."""
+def _replay_command(context: click.Context) -> str:
+    """Return the command that gives the same mission, without its output files."""
     words = ["tsgt simulate"]
     for parameter in context.command.params:
         name, value = parameter.name or "", context.params.get(parameter.name or "")
@@ -269,25 +251,30 @@ def _again(context: click.Context) -> str:
 
 
 def _check_times(options: SimulationOptions) -> None:
-    """Refuse what would happen after the end of the run: it would look as if nothing came of it."""
+    """Reject what would happen after the end of the mission."""
     if options.faults and options.duration_s < FAULT_FREE_TAIL_S + 2 * FAULT_FREE_START_S:
         raise click.UsageError(
-            f"--faults needs a --duration of at least {FAULT_FREE_TAIL_S + 2 * FAULT_FREE_START_S:g} s: the last {FAULT_FREE_TAIL_S:g} s are without any"
+            f"--faults needs a --duration of at least {FAULT_FREE_TAIL_S + 2 * FAULT_FREE_START_S:g} s: the last {FAULT_FREE_TAIL_S:g} s are free of faults"
         )
     starts_s = [("--outage", outage.start_s) for outage in options.outages]
     starts_s += [("--restart", restart.at_s) for restart in options.restarts]
     for option, start_s in starts_s:
         if start_s >= options.duration_s:
             raise click.UsageError(
-                f"{option} at {start_s:g} s: the run ends at {options.duration_s:g} s; give an earlier one, or a longer "
+                f"{option} at {start_s:g} s: the mission ends at {options.duration_s:g} s; give an earlier time or a longer "
                 "--duration"
             )
 
 
 def _simulate(scenario: ScenarioConfig, options: SimulationOptions, folder: Path) -> MissionResult:
-    with _progress(options.duration_s) as progress:
+    with progress("simulating") as on_progress:
+
+        def report(now_s: float) -> None:
+            if on_progress is not None:
+                on_progress(now_s / options.duration_s)
+
         try:
-            return simulate(scenario, options, folder=folder, progress=progress)
+            return simulate(scenario, options, folder=folder, progress=report)
         except ExceptionGroup as group:
             known = group.subgroup(TsgtError)
             if known is None:
@@ -298,28 +285,18 @@ def _simulate(scenario: ScenarioConfig, options: SimulationOptions, folder: Path
             raise error from group
 
 
-@contextmanager
-def _progress(duration_s: float) -> Iterator[Callable[[float], None]]:
-    """Show on a terminal how many seconds have been simulated."""
-    if not sys.stderr.isatty():
-        yield lambda now_s: None  # noqa: ARG005 (nobody looks)
-        return
-    with click.progressbar(length=max(1, round(duration_s)), label="simulating", file=sys.stderr) as bar:
-        yield lambda now_s: bar.update(round(now_s) - bar.pos)
-
-
-def _keep_recording(run: MissionResult, output: Path) -> None:
+def _write_recording(run: MissionResult, output: Path) -> None:
     path = run.master_logs[-1].recording()
     if path is None:
-        raise OutputFileError("the master made no recording that could be kept", path=output)
+        raise OutputFileError("the master made no recording", path=output)
     with path.open("rb") as source, write_atomically(output) as target:
         shutil.copyfileobj(source, target)
 
 
 def _write_truth(run: MissionResult, truth: Path) -> None:
-    """Write the true poses at the epochs of the stream, from the start to the end of the run."""
+    """Write the true poses at the epochs of the stream, on the clock of the recording."""
     period_ns = run.parameters.pipeline.period_ns
-    zero_ns = run.master_logs[-1].unix_at_zero_ns  # on the clock of the recording that is kept
+    zero_ns = run.master_logs[-1].unix_at_zero_ns
     end_ns = zero_ns + run.end_ns - run.start_ns
     stamps_ns = np.arange(-(-zero_ns // period_ns) * period_ns, end_ns + 1, period_ns, dtype=np.int64)
     poses = run.world.pose_at((stamps_ns - zero_ns) / 1e9)
@@ -337,37 +314,37 @@ def _print(result: dict[str, Any], found: list[Violation]) -> None:
         [
             str(number),
             *(str(station[key]) for key in ("measured", "delivered", "duplicates")),
-            _figure(station["rate_hz"], 2),
-            *(_figure(station["age_ms"][key], 0) for key in ("p50", "p99")),
+            *numbers(station["rate_hz"]),
+            *numbers(*(station["age_ms"][key] for key in ("p50", "p99")), digits=0),
             f"{station['within_2s']:.2%}",
-            *(_figure(station["time_error_us"][key], 0) for key in ("p50", "p99", "max")),
+            *numbers(*(station["time_error_us"][key] for key in ("p50", "p99", "max")), digits=0),
             *("-" if station[key] is None else str(station[key]) for key in ("queued", "late_slots")),
         ]
         for number, station in result["stations"].items()
     ]
     header = [
-        *("station", "measured", "delivered", "twice", "rate Hz", "age ms: p50", "p99", "in 2 s"),
-        *("time error us: p50", "p99", "max", "queued", "late"),
+        *("station", "measured", "delivered", "duplicates", "rate Hz", "age ms: p50", "p99", "in 2 s"),
+        *("time error us: p50", "p99", "max", "queued", "missed slots"),
     ]
     print_table(header, rows)
     if "frame_ms" in result:
-        click.echo(f"\nframe        {_figure(result['frame_ms'], 0)} ms in the mean")
+        click.echo(f"\nframe        {_number(result['frame_ms'], 0)} ms (mean)")
     for outage in result["outages"]:
         click.echo(
             f"\noutage       of {', '.join(map(str, outage['stations']))}, {outage['seconds']:g} s from "
-            f"{outage['start_s']:g} s on: drained after {_figure(outage['drained_s'], 1)} s, meanwhile live "
-            f"measurements were {_figure(outage['live_age_ms']['p50'], 0)} ms old in the median"
+            f"{outage['start_s']:g} s: backlog drained after {_number(outage['drained_s'], 1)} s; median age of live "
+            f"measurements meanwhile {_number(outage['live_age_ms']['p50'], 0)} ms"
         )
-    click.echo("\nPoses against the truth, positions at the centroid of the prisms")
+    click.echo("\nPose errors, positions at the centroid of the prisms")
     rows = [
         [
             name,
             str(found["poses"]),
             str(found["valid_poses"]),
-            _figure(found["position_rms_mm"], 1),
-            _figure(found["orientation_rms_deg"], 2),
-            _figure(found["nees"]["mean"], 1),
-            *(_figure(found["newest_ms"][key], 0) if "newest_ms" in found else "-" for key in ("p50", "p99")),
+            *numbers(found["position_rms_mm"], digits=1),
+            *numbers(found["orientation_rms_deg"]),
+            *numbers(found["nees"]["mean"], digits=1),
+            *(_number(found["newest_ms"][key], 0) if "newest_ms" in found else "-" for key in ("p50", "p99")),
         ]
         for name, found in {
             **result["estimators"],
@@ -378,19 +355,18 @@ def _print(result: dict[str, Any], found: list[Violation]) -> None:
         ["", "poses", "valid", "rms mm", "rms deg", "NEES (6)", "newest data, age ms: p50", "p99"], rows
     )
     inter_prism_mm = next(iter(result["estimators"].values()))["inter_prism_mean_mm"]
-    click.echo(f"\ninter-prism  {_figure(inter_prism_mm, 1)} mm mean error of the distances")
+    click.echo(f"\ninter-prism  {_number(inter_prism_mm, 1)} mm mean error of the distances")
     click.echo(f"\nairtime      {result['airtime_fraction']:.1%} of the time")
     if result["faults"]:
         click.echo("faults       " + ", ".join(f"{count} {kind}" for kind, count in result["faults"].items()))
     click.echo(f"violations   {len(found)}")
     if found:
-        click.echo(f"  again with: {result['replay_command']}")
+        click.echo(f"  reproduce with: {result['replay_command']}")
     for line in result["violations_listed"]:
         click.echo(f"  {line}")
     if len(found) > LISTED_VIOLATIONS:
         click.echo(f"  ... and {len(found) - LISTED_VIOLATIONS} more")
 
 
-def _figure(value: float, digits: int) -> str:
-    """Write a figure, a dash where there was nothing to compute it from."""
+def _number(value: float, digits: int) -> str:
     return "-" if math.isnan(value) else f"{value:.{digits}f}"

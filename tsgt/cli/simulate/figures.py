@@ -1,4 +1,4 @@
-"""Figures of a simulated run: what was measured and delivered, how well it was timed, and all figures under their keys."""
+"""Figures of a simulated mission: delivery, rate, age and time errors of the measurements."""
 
 from __future__ import annotations
 
@@ -19,34 +19,33 @@ if TYPE_CHECKING:
 
 
 IN_TIME_NS = 2_000_000_000
-"""What reaches the pipeline so long after it was measured is still of use to a robot that drives."""
+"""Maximum age at which a measurement is still useful to a moving robot."""
 
 
 @dataclass(frozen=True, slots=True)
 class StationFigures:
-    """What became of one station's measurements.
+    """Delivery and timing of one station's measurements.
 
     Attributes
     ----------
     measured
-        How many the client read from its instrument before the end of the run.
+        Measurements read by the client before the end of the mission.
     delivered
-        How many different ones of them reached the pipeline, up to the end of the drain.
+        Distinct ones of them that reached the pipeline before the end of the drain.
     duplicates
-        How many the pipeline was handed again.
+        Measurements that reached the pipeline again.
     rate_hz
-        Different measurements that reached the pipeline per second, up to the end of the run: from the end of the
-        initial synchronisation of all stations, or over ``superframe`` from when the last station was first heard; NaN
-        where that never came.
+        Distinct measurements per second that reached the pipeline before the end of the mission: from the end of the
+        initial synchronisation of all stations, with ``superframe`` from the first reception of the last station; NaN
+        without.
     time_error_us
-        Percentiles 50, 99 and 100 of the absolute error of their time stamps, in us; NaN without any.
+        Percentiles 50, 99 and 100 of the absolute timestamp error in us; NaN without measurements.
     age_ms
-        Percentiles 50 and 99 of the time from a measurement to the pipeline, in ms; NaN without any.
+        Percentiles 50 and 99 of the time from measurement to pipeline in ms; NaN without measurements.
     within_2s
-        Which part of those measured reached the pipeline within :data:`IN_TIME_NS`.
+        Share of the measurements that reached the pipeline within :data:`IN_TIME_NS`.
     queued, late_slots
-        How many still waited in the station's queue at the end, and how many slots it left empty because it was late;
-        None where there is neither.
+        Measurements left in the station's send queue, and missed slots; None if the protocol has neither.
     """
 
     measured: int
@@ -62,16 +61,16 @@ class StationFigures:
 
 @dataclass(frozen=True, slots=True)
 class OutageFigures:
-    """What an outage did.
+    """Effect of an outage.
 
     Attributes
     ----------
     drained_s
-        From its end until the last measurement made before that had arrived from all of its stations; NaN: never.
+        Time from its end until all earlier measurements of its stations had arrived; NaN: never.
     live_age_ms
-        Median age of what these stations measured meanwhile, from the outage's end until it was drained.
+        Median age of the measurements made between the end of the outage and the end of the drain.
     time_error_us
-        Percentiles 50, 99 and 100 of the absolute error of the time stamps of what they measured within the outage.
+        Percentiles 50, 99 and 100 of the absolute timestamp error of the measurements made during the outage.
     """
 
     drained_s: float
@@ -81,7 +80,7 @@ class OutageFigures:
 
 @dataclass(frozen=True, slots=True)
 class _Delivery:
-    """A measurement that reached the pipeline for the first time; instants in ns from the start."""
+    """First delivery of a measurement; times in ns from the start."""
 
     measured_ns: int
     received_ns: int
@@ -91,7 +90,7 @@ class _Delivery:
 
 @dataclass(frozen=True, slots=True)
 class _Station:
-    """What was measured by one station, by true time in ns from the start, and what of it arrived."""
+    """Measurements of one station by true time in ns from the start, and their deliveries."""
 
     measured_ns: list[int]
     deliveries: dict[int, _Delivery]
@@ -99,13 +98,13 @@ class _Station:
 
 
 def station_figures(run: MissionResult) -> dict[int, StationFigures]:
-    """Count and time what came from each station."""
+    """Return delivery and timing by station."""
     stations = _stations(run)
     return {number: _station_figures(run, number, stations) for number in run.station_logs}
 
 
 def outage_figures(run: MissionResult) -> list[OutageFigures]:
-    """Tell of each outage how long it lasted on."""
+    """Return the effect of each outage."""
     stations = _stations(run)
     return [_outage_figures(outage, stations) for outage in run.outages]
 
@@ -115,7 +114,7 @@ def _stations(run: MissionResult) -> dict[int, _Station]:
 
 
 def _station(run: MissionResult, station_log: StationLog) -> _Station:
-    """Find out what of a station's measurements before the end of the run arrived, and when."""
+    """Match the deliveries of a station to its measurements before the end of the mission."""
     found = JournalIndex(station_log)
     end_ns = run.end_ns - run.start_ns
     deliveries: dict[int, _Delivery] = {}
@@ -142,7 +141,7 @@ def _station(run: MissionResult, station_log: StationLog) -> _Station:
 
 
 def _counted_from_ns(run: MissionResult, stations: dict[int, _Station]) -> int | None:
-    """Return when the last station was synchronised, or heard, for the first time; None if one never was."""
+    """Return when the last station was first synchronised, or received; None if one never was."""
     first_ns: dict[int, int] = {}
     for session in run.master_logs:
         for clock in session.clocks:
@@ -185,7 +184,7 @@ def _outage_figures(outage: Outage, stations: dict[int, _Station]) -> OutageFigu
     live_ns = [
         delivery.arrived_ns - delivery.measured_ns
         for delivery in deliveries
-        # Without a drain all that came after it: no comparison with NaN holds.
+        # Without a drain all later ones: comparisons with NaN are false.
         if end_ns <= delivery.measured_ns and not delivery.measured_ns > end_ns + drained_ns
     ]
     return OutageFigures(
@@ -214,13 +213,15 @@ def _percentiles(values_ns: Sequence[int], *percentiles: int, unit_ns: float) ->
 
 
 def frame_ms(run: MissionResult) -> float:
-    """Return the mean time from one beacon to the next, in ms; NaN without any."""
-    frames = sum(session.frames for session in run.master_logs)
-    return sum(session.frames_duration_ns for session in run.master_logs) / frames / 1e6 if frames else math.nan
+    """Return the mean interval between beacons in ms; NaN without beacons."""
+    frames = sum(session.frame_count for session in run.master_logs)
+    return (
+        sum(session.frames_duration_ns for session in run.master_logs) / frames / 1e6 if frames else math.nan
+    )
 
 
 def figures(run: MissionResult) -> dict[str, Any]:
-    """Put the figures under the keys that others rely on."""
+    """Return all figures for ``--json``."""
     return {
         "stations": {number: _station_keys(station) for number, station in station_figures(run).items()},
         "all": _all_keys(run),
@@ -229,7 +230,7 @@ def figures(run: MissionResult) -> dict[str, Any]:
             {
                 "stations": outage.stations,
                 "start_s": outage.start_s,
-                "seconds": outage.seconds,
+                "seconds": outage.duration_s,
                 "drained_s": found.drained_s,
                 "live_age_ms": {"p50": found.live_age_ms},
                 "time_error_us": dict(zip(("p50", "p99", "max"), found.time_error_us, strict=True)),
@@ -243,7 +244,7 @@ def figures(run: MissionResult) -> dict[str, Any]:
 
 
 def _all_keys(run: MissionResult) -> dict[str, Any]:
-    """Put the figures of all stations together under the keys of one."""
+    """Return the figures of all stations together."""
     stations = _stations(run).values()
     measured = sum(len(station.measured_ns) for station in stations)
     deliveries = [delivery for station in stations for delivery in station.deliveries.values()]

@@ -1,4 +1,4 @@
-"""How good the poses of a simulated run were: what each estimator makes of the run, and what was streamed live."""
+"""Pose errors of a simulated mission: of both estimators after processing, and of the live stream."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
-from tsgt.analysis.evaluation import PoseFigures, inner_part, inter_prism
+from tsgt.analysis.evaluation import PoseErrorStatistics, inter_prism, interior_mask
 from tsgt.analysis.processing import Estimator, process, with_estimator
 from tsgt.errors import RecordingError
 from tsgt.estimation import PoseBatch, build_tracks
@@ -23,28 +23,20 @@ if TYPE_CHECKING:
 
     from tsgt.model import Measurement
     from tsgt.recording import Kind
-    from tsgt.simulation.mission import Run
+    from tsgt.simulation.mission import MissionResult
 
 
 @dataclass(frozen=True, slots=True)
 class EstimatorFigures:
-    """How good poses were, against the truth.
-
-    Attributes
-    ----------
-    poses, valid_poses
-        How many there are, and how many of them are valid.
-    against_truth
-        How far valid ones are off.
-    """
+    """Numbers of poses, and the errors of the valid ones against the truth."""
 
     poses: int
     valid_poses: int
-    against_truth: PoseFigures
+    against_truth: PoseErrorStatistics
 
 
-def pose_keys(run: Run) -> dict[str, Any]:
-    """Put the figures under the keys that others rely on."""
+def pose_keys(run: MissionResult) -> dict[str, Any]:
+    """Return all figures for ``--json``."""
     inter_prism_mean_mm = _inter_prism_mean_mm(run)
     return {
         "estimators": {
@@ -58,8 +50,8 @@ def pose_keys(run: Run) -> dict[str, Any]:
     }
 
 
-def estimator_figures(run: Run) -> dict[Estimator, EstimatorFigures]:
-    """Compare what each estimator makes of all that reached the pipeline with the truth."""
+def estimator_figures(run: MissionResult) -> dict[Estimator, EstimatorFigures]:
+    """Process all delivered measurements with each estimator, and compare the poses with the truth."""
     measurements = _measurements(run)
     recording = Recording(
         header=RecordingHeader(software="", created_ns=run.start_ns, source="simulate"),
@@ -70,11 +62,11 @@ def estimator_figures(run: Run) -> dict[Estimator, EstimatorFigures]:
     return {name: _processed_figures(run, with_estimator(recording, name)) for name in get_args(Estimator)}
 
 
-def _measurements(run: Run) -> list[Measurement]:
-    """Return all measurements as if nobody had set the master's clock between two of its sessions."""
+def _measurements(run: MissionResult) -> list[Measurement]:
+    """Return all measurements on one clock, without steps of the master's clock between its sessions."""
     found: list[Measurement] = []
-    for session in run.sessions:
-        later_ns = run.start_ns - session.zero_ns
+    for session in run.master_logs:
+        later_ns = run.start_ns - session.unix_at_zero_ns
         found += [
             replace(m, stamp_ns=m.stamp_ns + later_ns, received_ns=m.received_ns + later_ns)
             if later_ns
@@ -84,11 +76,11 @@ def _measurements(run: Run) -> list[Measurement]:
     return found
 
 
-def _processed_figures(run: Run, recording: Recording) -> EstimatorFigures:
+def _processed_figures(run: MissionResult, recording: Recording) -> EstimatorFigures:
     try:
         poses = process(recording, path=Path("the run's recording"))
     except RecordingError:
-        # No valid pose came of it, as when fewer stations than prisms are simulated.
+        # No valid pose, for example with fewer stations than prisms.
         poses = PoseBatch.blank(np.empty(0, np.int64), ())
     valid = poses.valid
     return _pose_figures(
@@ -101,18 +93,18 @@ def _processed_figures(run: Run, recording: Recording) -> EstimatorFigures:
     )
 
 
-def live_figures(run: Run) -> dict[Kind, EstimatorFigures]:
-    """Compare the poses of the stream with the truth, by their kind."""
+def live_figures(run: MissionResult) -> dict[Kind, EstimatorFigures]:
+    """Compare the streamed poses with the truth, by kind."""
     counts: Counter[Kind] = Counter()
-    for session in run.sessions:
-        counts.update(session.poses)
-    streamed = [session.valid_poses() for session in run.sessions]
+    for session in run.master_logs:
+        counts.update(session.pose_counts)
+    streamed = [session.valid_poses() for session in run.master_logs]
     found = {}
     for kind, count in sorted(counts.items()):
         some = [poses.select(poses.kind == kind) for poses in streamed]
         stamp_ns = [
-            poses.stamp_ns + run.start_ns - session.zero_ns
-            for session, poses in zip(run.sessions, some, strict=True)
+            poses.stamp_ns + run.start_ns - session.unix_at_zero_ns
+            for session, poses in zip(run.master_logs, some, strict=True)
         ]
         names = ("position_m", "orientation_xyzw", "covariance")
         columns = (np.concatenate([getattr(poses, name) for poses in some]) for name in names)
@@ -120,10 +112,10 @@ def live_figures(run: Run) -> dict[Kind, EstimatorFigures]:
     return found
 
 
-def newest_ms(run: Run, kind: Kind) -> tuple[float, float]:
-    """Percentiles 50 and 99 of the age of the newest measurement at the epoch of a pose of the stream; NaN without any."""
-    streamed = [session.valid_poses() for session in run.sessions]
-    ages_s = np.concatenate([poses.newest_s[poses.kind == kind] for poses in streamed])
+def newest_ms(run: MissionResult, kind: Kind) -> tuple[float, float]:
+    """Return percentiles 50 and 99 of the age of the newest measurement at the epoch of a streamed pose; NaN without."""
+    streamed = [session.valid_poses() for session in run.master_logs]
+    ages_s = np.concatenate([poses.newest_age_s[poses.kind == kind] for poses in streamed])
     known = ages_s[np.isfinite(ages_s)]
     if not len(known):
         return math.nan, math.nan
@@ -132,18 +124,18 @@ def newest_ms(run: Run, kind: Kind) -> tuple[float, float]:
 
 
 def _pose_figures(
-    run: Run,
+    run: MissionResult,
     count: int,
     stamp_ns: NDArray[np.int64],
     position_m: NDArray[np.float64],
     orientation_xyzw: NDArray[np.float64],
     covariance: NDArray[np.float64],
 ) -> EstimatorFigures:
-    inner = inner_part(stamp_ns, run.start_ns, run.end_ns)
+    inner = interior_mask(stamp_ns, run.start_ns, run.end_ns)
     return EstimatorFigures(
         poses=count,
         valid_poses=len(stamp_ns),
-        against_truth=PoseFigures.of(
+        against_truth=PoseErrorStatistics.of(
             transform_from(rotation_from_quaternion(orientation_xyzw[inner]), position_m[inner]),
             covariance[inner],
             run.world.pose_at((stamp_ns[inner] - run.start_ns) / 1e9),
@@ -152,13 +144,13 @@ def _pose_figures(
     )
 
 
-def _inter_prism_mean_mm(run: Run) -> float:
-    """Return the mean over all pairs of how far their interpolated distances are from those of the layout."""
+def _inter_prism_mean_mm(run: MissionResult) -> float:
+    """Return the mean absolute error of the interpolated distances over all pairs."""
     tracks = build_tracks(run.parameters, _measurements(run))
     if not all(len(track) for track in tracks.values()):
         return math.nan
     pairs = inter_prism(run.parameters, tracks).dynamic
-    return float(np.mean([pair.summary().mean_abs_error for pair in pairs]))
+    return float(np.mean([pair.statistics().mean_abs_error for pair in pairs]))
 
 
 def _keys(found: EstimatorFigures) -> dict[str, Any]:

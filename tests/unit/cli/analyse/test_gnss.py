@@ -1,4 +1,4 @@
-"""The command ``analyse gnss`` on simulated receivers and prisms."""
+"""``tsgt analyse gnss`` on simulated receivers and prisms."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from harness.authors_files import write_prisms, write_tracks
 from harness.pos_files import SECOND, Variant, write_pos
-from harness.published import write_prisms, write_tracks
 
 if TYPE_CHECKING:
     from harness.cli import Tsgt
@@ -21,7 +21,7 @@ COUNT = 60
 
 @pytest.fixture
 def files(tmp_path: Path) -> list[Path]:
-    """Three receivers over 12 s, written in three ways; the last third of the second is not fixed and 1 m off."""
+    """Three receivers over 12 s in three notations; the last third of the second is not fixed and 1 m off."""
     times = [START + k * SECOND // 5 for k in range(COUNT)]
     way = np.column_stack([np.arange(COUNT) * 0.2, np.zeros(COUNT), np.zeros(COUNT)])
     off = np.column_stack([np.full(COUNT, 0.81), np.zeros(COUNT), np.where(np.arange(COUNT) < 40, 0.0, 1.0)])
@@ -39,15 +39,15 @@ def files(tmp_path: Path) -> list[Path]:
 
 @pytest.fixture
 def recording(tsgt: Tsgt, tmp_path: Path) -> Path:
-    """Ten seconds of a drive, beginning with the receivers'."""
+    """Ten seconds of a drive that starts with the receivers' data."""
     path = tmp_path / "drive.jsonl"
     tracks, prisms = write_tracks(tmp_path), write_prisms(tmp_path)
     assert tsgt("import", "rts", "--tracks", *tracks, "--prisms", prisms, "--output", path).code == 0
     return path
 
 
-def test_distances_and_their_errors(tsgt: Tsgt, files: list[Path]) -> None:
-    """With references given, in the order of the pairs."""
+def test_distance_errors_refer_to_the_given_references(tsgt: Tsgt, files: list[Path]) -> None:
+    """References are assigned in the order of the pairs."""
     given = ["--reference-mm", 812, "--reference-mm", 500, "--reference-mm", 951.9]
     found: dict[str, Any] = tsgt("analyse", "gnss", *files, *given, "--json").json()
     pair = found["inter_receiver_mm"]["front-middle"]
@@ -61,7 +61,7 @@ def test_distances_and_their_errors(tsgt: Tsgt, files: list[Path]) -> None:
 
 
 def test_receivers_are_described(tsgt: Tsgt, files: list[Path]) -> None:
-    """Time system, satellites and quality of each."""
+    """The JSON output has time system, satellites and quality of each receiver."""
     keys = tsgt("analyse", "gnss", *files, "--json").json()
     assert (keys["start_ns"], keys["end_ns"]) == (START, START + (COUNT - 1) * SECOND // 5)
     found = keys["receivers"]
@@ -70,19 +70,21 @@ def test_receivers_are_described(tsgt: Tsgt, files: list[Path]) -> None:
     assert found["middle"]["satellites"] == {"mean": 15, "std": 0, "min": 15, "max": 15}
 
 
-def test_without_references_the_median_of_fixed_ones_is_taken(tsgt: Tsgt, files: list[Path]) -> None:
-    """And it says that this hides what is always there."""
+def test_default_reference_is_the_median_of_fixed_solutions(tsgt: Tsgt, files: list[Path]) -> None:
+    """The text says that this hides a constant error."""
     outcome = tsgt("analyse", "gnss", *files)
     assert (
-        "reference the median of fixed ones (of all, where none is): an error that is always there does not show"
+        "reference: median of the fixed solutions (of all, if none is fixed), which hides a constant error"
         in outcome.out
     )
     assert re.search(r"^front-middle +60 +810\.\d ", outcome.out, flags=re.MULTILINE)
     assert re.search(r"^  single +20 ", outcome.out, flags=re.MULTILINE)
 
 
-def test_beside_a_recording(tsgt: Tsgt, files: list[Path], recording: Path, tmp_path: Path) -> None:
-    """Both over the time that they share, with a figure; the prisms' figures are those of evaluate."""
+def test_prism_distances_of_a_recording_are_added(
+    tsgt: Tsgt, files: list[Path], recording: Path, tmp_path: Path
+) -> None:
+    """Both cover the common time; the figures of the prisms equal those of evaluate."""
     figure = tmp_path / "gnss.svg"
     found = tsgt("analyse", "gnss", *files, "--recording", recording, "--figure", figure, "--json").json()
     evaluated = tsgt("evaluate", recording, "--estimator", "linear", "--json").json()
@@ -97,8 +99,8 @@ def test_beside_a_recording(tsgt: Tsgt, files: list[Path], recording: Path, tmp_
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
-        (["front.pos"], 2, "takes the files of two receivers at least"),
-        (["front.pos", "front.pos"], 2, "one of the files is given twice"),
+        (["front.pos"], 2, "give the files of at least two receivers"),
+        (["front.pos", "front.pos"], 2, "a file is given twice"),
         (
             ["front.pos", "back.pos", "--reference-mm", 1, "--reference-mm", 2],
             2,
@@ -106,14 +108,14 @@ def test_beside_a_recording(tsgt: Tsgt, files: list[Path], recording: Path, tmp_
         ),
         (["front.pos", "back.pos", "--reference-mm", "nan"], 2, "finite numbers"),
         (["front.pos", "none.pos"], 1, "none.pos: No such file or directory"),
-        (["front.pos", "later.pos"], 1, "front.pos: the receivers have no time in common"),
-        (["front.pos", "back.pos", "--figure", "x.gif"], 2, "does not end in .png, .pdf, .svg"),
+        (["front.pos", "later.pos"], 1, "front.pos: the receivers do not overlap in time"),
+        (["front.pos", "back.pos", "--figure", "x.gif"], 2, "known suffixes: .png, .pdf, .svg"),
     ],
 )
-def test_bad_input(
+def test_invalid_input_is_one_line(
     tsgt: Tsgt, files: list[Path], tmp_path: Path, arguments: list[object], code: int, message: str
 ) -> None:
-    """One line says why."""
+    """The error is one line with the reason."""
     write_pos(tmp_path / "later.pos", [START + 100 * SECOND, START + 101 * SECOND], np.zeros((2, 3)))
     assert files
     given = [tmp_path / str(a) if str(a).endswith(".pos") else a for a in arguments]
@@ -123,8 +125,8 @@ def test_bad_input(
     assert outcome.out == ""
 
 
-def test_a_recording_of_another_day_is_refused(tsgt: Tsgt, tmp_path: Path, recording: Path) -> None:
-    """It tells how far apart they are."""
+def test_recording_of_another_day_is_rejected(tsgt: Tsgt, tmp_path: Path, recording: Path) -> None:
+    """The error states the time between recording and receivers."""
     times = [START + 3600 * SECOND + k * SECOND for k in range(3)]
     files = [write_pos(tmp_path / f"{name}.pos", times, np.zeros((3, 3))) for name in "ab"]
     outcome = tsgt("analyse", "gnss", *files, "--recording", recording)
@@ -134,8 +136,8 @@ def test_a_recording_of_another_day_is_refused(tsgt: Tsgt, tmp_path: Path, recor
     )
 
 
-def test_every_key_is_on_the_page(tsgt: Tsgt, files: list[Path], recording: Path) -> None:
-    """The tables have the keys of ``--json``, and no others."""
+def test_every_json_key_is_documented(tsgt: Tsgt, files: list[Path], recording: Path) -> None:
+    """The tables of the page have exactly the keys of ``--json``."""
     found = tsgt("analyse", "gnss", *files, "--recording", recording, "--json").json()
     receiver = found["receivers"]["front"]
     pair = found["inter_receiver_mm"]["front-middle"]

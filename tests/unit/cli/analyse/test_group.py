@@ -1,4 +1,4 @@
-"""The commands that study perturbation and layout."""
+"""``tsgt analyse perturbation`` and ``layout``."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def small(tmp_path: Path) -> Path:
     return path
 
 
-def test_the_papers_study_as_json(tsgt: Tsgt) -> None:
-    """From 0 to 400 mm in steps of 4, with all figures of each; near zero they agree with the first order."""
+def test_perturbation_study_as_json(tsgt: Tsgt) -> None:
+    """Noise from 0 to 400 mm in steps of 4; small noise agrees with first-order propagation."""
     study = tsgt("analyse", "perturbation", "--json").json()
     assert list(study["at_mm"]) == [str(4 * i) for i in range(101)]
     for found in study["at_mm"].values():
@@ -49,8 +49,8 @@ def test_the_papers_study_as_json(tsgt: Tsgt) -> None:
     np.testing.assert_allclose(few["euler_std_rad"], 8 * np.array(per_mm["euler_std_rad"]), rtol=0.09)
 
 
-def test_ten_millimetres_between_prisms_beside_the_paper(tsgt: Tsgt) -> None:
-    """8 mm in position and 0.023 rad in rotation, of which each axis has 0.010 to 0.015: it says 10 mm and 0.01 rad."""
+def test_inter_prism_error_of_10_mm_against_the_paper(tsgt: Tsgt) -> None:
+    """8 mm in position and 0.023 rad in rotation, 0.010 to 0.015 rad per axis; the paper states 10 mm and 0.01 rad."""
     found = tsgt("analyse", "perturbation", "--json").json()["equivalent"]
     assert found["inter_prism_mean_mm"] == pytest.approx(10)
     assert found["noise_mm"] == pytest.approx(8.86, abs=0.05)
@@ -59,20 +59,20 @@ def test_ten_millimetres_between_prisms_beside_the_paper(tsgt: Tsgt) -> None:
     np.testing.assert_allclose(found["euler_abs_mean_rad"], [0.0150, 0.0100, 0.0097], atol=0.0002)
 
 
-def test_the_study_as_text(tsgt: Tsgt) -> None:
-    """A table, the equivalent noise, and the paper's figures to compare with."""
+def test_perturbation_study_as_text(tsgt: Tsgt) -> None:
+    """The text has a table, the equivalent noise, and the paper's figures."""
     outcome = tsgt(
         "analyse", "perturbation", "--noise-mm-max", 20, "--step-mm", 5, "--samples", 100, "--seed", 3
     )
     assert outcome.code == 0
-    assert outcome.out.startswith("5 sizes of noise, 100 poses each")
+    assert outcome.out.startswith("5 noise levels, 100 poses each")
     assert "A mean error of 10 mm between prisms is noise of 8.8" in outcome.out
     assert "The paper: 10 mm" in outcome.out
     assert "-0.0 " not in outcome.out
 
 
-def test_another_layout_and_another_point(tsgt: Tsgt, small: Path) -> None:
-    """A layout half as wide turns more; the origin, a metre below, moves with that."""
+def test_layout_and_point_change_the_result(tsgt: Tsgt, small: Path) -> None:
+    """A layout half as wide rotates more, and the origin, a metre below, moves with it."""
     arguments = ("analyse", "perturbation", "--noise-mm-max", 4, "--json")
     usual = tsgt(*arguments).json()
     found = tsgt(*arguments, "--prisms", small, "--point", 0, 0, 0).json()
@@ -96,15 +96,15 @@ def test_another_layout_and_another_point(tsgt: Tsgt, small: Path) -> None:
         ("--prisms", "/nowhere.toml"),
     ],
 )
-def test_what_makes_no_study_is_refused(tsgt: Tsgt, arguments: tuple[object, ...]) -> None:
-    """One line, exit code 2, before anything is computed."""
+def test_invalid_study_options_are_rejected(tsgt: Tsgt, arguments: tuple[object, ...]) -> None:
+    """Exit code 2 and one line before any computation."""
     outcome = tsgt("analyse", "perturbation", *arguments)
     assert outcome.code == 2
     assert "rror: " in outcome.err
 
 
-def test_prisms_in_a_line_are_refused(tsgt: Tsgt, tmp_path: Path) -> None:
-    """The message names the file and the prisms, whichever study it is."""
+def test_collinear_prisms_are_rejected(tsgt: Tsgt, tmp_path: Path) -> None:
+    """The error of both studies names file and prisms."""
     path = tmp_path / "line.toml"
     path.write_text(LINE)
     for arguments in (("perturbation", "--prisms", path), ("layout", path)):
@@ -114,7 +114,7 @@ def test_prisms_in_a_line_are_refused(tsgt: Tsgt, tmp_path: Path) -> None:
 
 
 def test_layouts_are_ranked(tsgt: Tsgt, small: Path) -> None:
-    """The wider one knows the rotation better; three times as well known as wide, by and large."""
+    """The wider layout is first; its rotation sigma is about a third."""
     study = tsgt("analyse", "layout", small, "--json").json()
     assert study["ranking"] == ["dynamic", str(small)]
     wide, narrow = (study["layouts"][name] for name in study["ranking"])
@@ -124,8 +124,8 @@ def test_layouts_are_ranked(tsgt: Tsgt, small: Path) -> None:
     assert lengths == pytest.approx(wide["position_sigma_mm"])
 
 
-def test_the_best_layout_in_an_envelope(tsgt: Tsgt) -> None:
-    """It fills the box and leaves the scenario's own layout, which lies in that box, behind."""
+def test_search_finds_a_better_layout_in_the_envelope(tsgt: Tsgt) -> None:
+    """The result fills the box and is better than the scenario's layout in it."""
     box = (-0.5, 0.5, -0.4, 0.4, 1.0, 1.5)
     study = tsgt("analyse", "layout", "--envelope", *box, "--json").json()
     assert study["ranking"] == ["best in the envelope", "dynamic"]
@@ -134,8 +134,8 @@ def test_the_best_layout_in_an_envelope(tsgt: Tsgt) -> None:
     assert prisms.max(axis=0).tolist() == [0.5, 0.4, 1.5]
 
 
-def test_poses_are_known_worse_from_afar(tsgt: Tsgt) -> None:
-    """Angles count more with the distance, wherever the stations stand."""
+def test_accuracy_decreases_with_distance(tsgt: Tsgt) -> None:
+    """Angular noise grows with the distance in either arrangement of the stations."""
     study = tsgt("analyse", "layout", "--json").json()["stations_at_m"]
     assert list(study) == ["25", "50", "100", "200", "400"]
     for arrangement in ("together", "around"):
@@ -144,7 +144,7 @@ def test_poses_are_known_worse_from_afar(tsgt: Tsgt) -> None:
 
 
 def test_layouts_as_text(tsgt: Tsgt, small: Path) -> None:
-    """Ranking, the found layout as it stands in a file, and the stations elsewhere."""
+    """The text has the ranking, the best layout in TOML, and other station positions."""
     outcome = tsgt(
         "analyse",
         "layout",
@@ -160,11 +160,11 @@ def test_layouts_as_text(tsgt: Tsgt, small: Path) -> None:
     ranked = [line.split()[0] for line in outcome.out.splitlines()[4:6]]
     assert ranked[0] == "best"
     assert "  [prisms.1]\n  position_m = [" in outcome.out
-    assert "If the stations stood elsewhere, with best in the envelope" in outcome.out
+    assert "Other station positions, with best in the envelope" in outcome.out
 
 
-def test_a_masters_stations_as_they_stand(tsgt: Tsgt) -> None:
-    """A configuration knows stations and prisms, and has to be told where the robot drives."""
+def test_configuration_needs_an_area(tsgt: Tsgt) -> None:
+    """A configuration has stations and prisms, but no area of the drive."""
     config = CONFIGS / "master.example.toml"
     study = tsgt("analyse", "layout", "--config", config, "--area", 30, 10, 0, 20, "--json").json()
     assert study["ranking"] == [str(config)]
@@ -181,24 +181,22 @@ def test_a_masters_stations_as_they_stand(tsgt: Tsgt) -> None:
         (("--scenario", "dynamic", "--config", "master.toml"), "exclude each other"),
     ],
 )
-def test_what_makes_no_layout_study_is_refused(
-    tsgt: Tsgt, arguments: tuple[object, ...], message: str
-) -> None:
-    """One line that says what to correct, exit code 2."""
+def test_invalid_layout_options_are_rejected(tsgt: Tsgt, arguments: tuple[object, ...], message: str) -> None:
+    """Exit code 2 and one line that says what to correct."""
     outcome = tsgt("analyse", "layout", *arguments)
     assert outcome.code == 2
     assert message in outcome.err
 
 
-def test_an_envelope_without_room_says_so(tsgt: Tsgt) -> None:
-    """It ran, and there is no such layout."""
+def test_envelope_without_a_valid_layout_fails(tsgt: Tsgt) -> None:
+    """Exit code 1: no layout in the box keeps the minimum separation."""
     outcome = tsgt("analyse", "layout", "--envelope", 0, 0.1, 0, 0.1, 1, 1.1)
     assert outcome.code == 1
     assert "no room for 3 prisms" in outcome.err
 
 
-def test_a_layout_without_a_tracked_prism_is_refused(tsgt: Tsgt, tmp_path: Path) -> None:
-    """Each prism that a station tracks needs its place."""
+def test_layout_without_a_tracked_prism_is_rejected(tsgt: Tsgt, tmp_path: Path) -> None:
+    """Each tracked prism needs a position."""
     path = tmp_path / "four.toml"
     path.write_text(SMALL.replace("[prisms.3]", "[prisms.4]"))
     outcome = tsgt("analyse", "layout", path)
@@ -209,17 +207,17 @@ def test_a_layout_without_a_tracked_prism_is_refused(tsgt: Tsgt, tmp_path: Path)
 @pytest.mark.parametrize("ending", FIGURES)
 @pytest.mark.parametrize("study", ["perturbation", "layout"])
 def test_figures_are_drawn(tsgt: Tsgt, tmp_path: Path, study: str, ending: str) -> None:
-    """In the format that the ending names."""
+    """The suffix selects the format."""
     path = tmp_path / f"study{ending}"
     arguments = ("analyse", study, "--figure", path, *(("--samples", 10) if study == "perturbation" else ()))
     assert tsgt(*arguments).code == 0
     assert path.read_bytes().startswith(FIGURES[ending])
 
 
-def test_figures_without_matplotlib_say_what_to_install(
+def test_figure_without_matplotlib_fails_before_the_study(
     tsgt: Tsgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The studies themselves do not need it."""
+    """The error says what to install; the studies themselves do not need matplotlib."""
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     path = tmp_path / "study.png"
     outcome = tsgt("analyse", "layout", "--figure", path)

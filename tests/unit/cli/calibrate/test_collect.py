@@ -1,4 +1,4 @@
-"""Targets collected and checked over the simulated air: both protocols, and the authors' nodes."""
+"""``tsgt calibrate collect`` and ``check`` over the simulated channel: both protocols, and the authors' nodes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from harness.radios import PAPER
 from harness.scene import FRAMES
 
 from tsgt.analysis.calibration import TargetCollection, check_station, mean_points
-from tsgt.analysis.formats import read_some_targets, read_target_file
+from tsgt.analysis.formats import read_partial_target_file, read_target_file
 from tsgt.cli.calibrate.check import measure_again, print_check
 from tsgt.cli.calibrate.collect import collect_targets
 from tsgt.cli.calibrate.session import TargetSession, target_session
@@ -24,8 +24,8 @@ from tsgt.config import JournalConfig, SuperframeConfig, SuperframeMasterConfig
 from tsgt.errors import InputFileError, RadioError, TsgtError
 from tsgt.geometry import cartesian_to_polar, invert, transform_points
 from tsgt.model import Status
-from tsgt.simulation.lora import opener
-from tsgt.station import run_client
+from tsgt.simulation.lora import radio_opener
+from tsgt.station import ClientDependencies, run_client
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from harness.cli import Tsgt
     from harness.field import Field
 
-    from tsgt.radio import OpenRadio
+    from tsgt.radio import RadioOpener
     from tsgt.station import Reading
 
 KEY = bytes(range(32))
@@ -43,7 +43,7 @@ STATIONS = (1, 2, 3)
 
 
 class AimedInstrument(SceneInstrument):
-    """One that measures the target it is aimed at, exactly.
+    """An instrument that measures the target it is aimed at without error.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class AimedInstrument(SceneInstrument):
     T = np.eye(4)
 
     async def measure(self) -> Reading:
-        """Measure the target; takes five seconds."""
+        """Measure the target in five seconds."""
         reading = await super().measure()
         await asyncio.sleep(3.0)
         h, z, d = cartesian_to_polar(transform_points(invert(self.T), TARGETS[self.target - 1]))
@@ -71,7 +71,7 @@ class AimedInstrument(SceneInstrument):
 
 
 class Script:
-    """Someone who aims where the question says and then gives the answers of a list, and Enter when it is used up."""
+    """An operator who aims as asked, gives the replies of a list, then presses Enter."""
 
     def __init__(self, instruments: dict[int, AimedInstrument], *answers: str | None) -> None:
         self.instruments = instruments
@@ -80,7 +80,7 @@ class Script:
         self.said: list[str] = []
 
     async def ask(self, question: str) -> str | None:
-        """Aim and answer."""
+        """Aim and reply."""
         self.questions.append(question)
         words = question.replace(",", " ").replace(":", " ").split()
         if words[0] == "station":
@@ -88,7 +88,7 @@ class Script:
         return self.answers.pop(0) if self.answers else ""
 
     def say(self, text: str) -> None:
-        """Remember."""
+        """Store the text."""
         self.said.append(text)
 
 
@@ -99,7 +99,7 @@ BOTH: tuple[Speaks, ...] = ("classic", "superframe")
 
 
 class SuperframeClient(Station):
-    """A station that runs the client's daemon."""
+    """A station with the client's daemon."""
 
     folder: Path
 
@@ -116,12 +116,14 @@ class SuperframeClient(Station):
         await run_client(
             config,
             PAPER,
-            instrument=self.instrument,
-            open_radio=opener(self.air, f"station-{self.number}", self.clock, rng, PAPER),
-            clock=self.clock,
-            key=KEY,
-            random_bits=lambda bits: int(rng.integers(1 << bits)),
-            boot="one",
+            ClientDependencies(
+                instrument=self.instrument,
+                open_radio=radio_opener(self.air, f"station-{self.number}", self.clock, rng, PAPER),
+                clock=self.clock,
+                key=KEY,
+                random_bits=lambda bits: int(rng.integers(1 << bits)),
+                boot="one",
+            ),
         )
 
 
@@ -148,7 +150,7 @@ async def aimed(
 
 @asynccontextmanager
 async def session(
-    field: Field, script: Script, open_radio: OpenRadio | None = None
+    field: Field, script: Script, open_radio: RadioOpener | None = None
 ) -> AsyncGenerator[TargetSession]:
     """Open the master's radio for targets."""
     config = field.config()
@@ -176,8 +178,8 @@ async def collected(
 
 
 @pytest.mark.parametrize("speaks", ["classic", "authors", "superframe"])
-async def test_all_targets_are_collected_and_the_frames_come_out(tmp_path: Path, speaks: Speaks) -> None:
-    """Station by station, target by target; the file solves to where the stations stand; all track again."""
+async def test_collected_targets_solve_the_frames(tmp_path: Path, speaks: Speaks) -> None:
+    """All stations measure all targets, the file solves to the true frames, and all stations track again."""
     path = tmp_path / "targets.csv"
     async with aimed(tmp_path, speaks) as (field, instruments):
         script = Script(instruments)
@@ -185,10 +187,10 @@ async def test_all_targets_are_collected_and_the_frames_come_out(tmp_path: Path,
         assert not [tool for tool in instruments.values() if tool.direct_mode]
     asked = [question.split(":")[0] for question in script.questions[:-1]]
     assert asked == [f"station {s}, target {t}" for s in STATIONS for t in (1, 2, 3, 4)]
-    assert script.questions[-1].startswith("nothing is left")
+    assert script.questions[-1].startswith("all targets are measured or skipped")
     file = read_target_file(path)
-    assert {s: list(seen) for s, seen in file.sights.items()} == {s: [1, 2, 3, 4] for s in STATIONS}
-    assert file.sights[2][1][0].constant_m == 0.01
+    assert {s: list(seen) for s, seen in file.measurements.items()} == {s: [1, 2, 3, 4] for s in STATIONS}
+    assert file.measurements[2][1][0].constant_m == 0.01
     # The constant is part of the file; the instruments here need none, so distances are 10 mm long.
     for station in (2, 3):
         solved = collection.residuals(station)
@@ -197,10 +199,8 @@ async def test_all_targets_are_collected_and_the_frames_come_out(tmp_path: Path,
 
 
 @pytest.mark.parametrize("speaks", BOTH)
-async def test_a_failed_measurement_is_told_in_words_and_asked_for_again(
-    tmp_path: Path, speaks: Speaks
-) -> None:
-    """The status of the instrument, and what to do about it."""
+async def test_failed_measurement_is_reported_and_requested_again(tmp_path: Path, speaks: Speaks) -> None:
+    """The report has the instrument's status and what to do about it."""
     async with aimed(tmp_path, speaks) as (field, instruments):
         instruments[1].status = Status.TILT
         script = Script(instruments, "", "q")
@@ -211,41 +211,39 @@ async def test_a_failed_measurement_is_told_in_words_and_asked_for_again(
 
 
 @pytest.mark.parametrize("speaks", BOTH)
-async def test_a_silent_station_is_named(tmp_path: Path, speaks: Speaks) -> None:
-    """The others can go on; at the end it is said that it may not be tracking."""
+async def test_station_without_response_is_named(tmp_path: Path, speaks: Speaks) -> None:
+    """The session continues; at the end the station is reported as possibly not tracking."""
     async with aimed(tmp_path, speaks) as (field, instruments):
         await field.stations[1].kill()
         script = Script(instruments, "", "q")
         await collected(field, script, tmp_path / "targets.csv")
-    assert "failed: station 1 does not answer; see that its client runs" in script.said[1]
-    assert script.said[-1].startswith("note: station 1 is not tracking again: it does not answer")
+    assert "failed: station 1 does not respond; check that its client runs" in script.said[1]
+    assert script.said[-1].startswith("note: station 1 has not returned to tracking: it does not respond")
 
 
 @pytest.mark.parametrize("speaks", BOTH)
-async def test_a_station_that_started_anew_measures_the_target_all_the_same(
-    tmp_path: Path, speaks: Speaks
-) -> None:
-    """It tracks its prism after the start; the answer must not be the prism."""
+async def test_restarted_station_measures_the_target(tmp_path: Path, speaks: Speaks) -> None:
+    """A client tracks its prism after a restart; the response must not be the prism."""
     async with aimed(tmp_path, speaks) as (field, instruments):
         script = Script(instruments)
         collection = TargetCollection(tmp_path / "targets.csv", [1], [1, 2])
         async with session(field, script) as stations:
-            first = await stations.shoot(1, constant_m=0.0)
+            first = await stations.measure(1, constant_m=0.0)
             await field.stations[1].kill()
             field.stations[1].start()
             await asyncio.sleep(2.0)
-            second = await stations.shoot(1, constant_m=0.0)
+            second = await stations.measure(1, constant_m=0.0)
     assert second.slope_distance_m == pytest.approx(first.slope_distance_m)
     assert collection.count(1, 1) == 0
 
 
-async def test_measurements_are_left_to_a_master(tmp_path: Path) -> None:
-    """Over the superframe stations send what they measure; nothing is acknowledged that nobody records."""
+async def test_measurements_are_not_acknowledged(tmp_path: Path) -> None:
+    """Superframe stations keep their measurements for a master that records them."""
     async with aimed(tmp_path, "superframe") as (field, instruments):
         script = Script(instruments)
         async with session(field, script) as stations:
             await asyncio.sleep(8.0)
-            await stations.shoot(1, constant_m=0.0)
+            await stations.measure(1, constant_m=0.0)
         reader, writer = await asyncio.open_unix_connection(tmp_path / "client2.sock")
         status = json.loads(await reader.read())
         writer.close()
@@ -254,7 +252,7 @@ async def test_measurements_are_left_to_a_master(tmp_path: Path) -> None:
 
 
 class BrokenRadio:
-    """A radio whose chip does not answer any more."""
+    """A radio whose chip does not respond any more."""
 
     async def transmit(self, payload: bytes, *, at_ns: int | None = None) -> NoReturn:
         """Fail."""
@@ -262,8 +260,8 @@ class BrokenRadio:
 
 
 @pytest.mark.parametrize("speaks", BOTH)
-async def test_a_radio_that_fails_ends_it_at_once(tmp_path: Path, speaks: Speaks) -> None:
-    """Nobody waits for answers that cannot come; it is said which stations may not be tracking."""
+async def test_radio_failure_ends_the_session_at_once(tmp_path: Path, speaks: Speaks) -> None:
+    """The stations that may not be tracking are named."""
 
     @asynccontextmanager
     async def open_radio() -> AsyncGenerator[Any]:
@@ -273,13 +271,13 @@ async def test_a_radio_that_fails_ends_it_at_once(tmp_path: Path, speaks: Speaks
         script, began_s = Script(instruments), asyncio.get_running_loop().time()
         with pytest.raises(RadioError, match="no answer"):
             async with session(field, script, open_radio) as stations:
-                await stations.shoot(1, constant_m=0.0)
+                await stations.measure(1, constant_m=0.0)
         assert asyncio.get_running_loop().time() - began_s < 1.0
-    assert script.said[-1].startswith("note: station 1 is not tracking again: the radio failed (no answer")
+    assert script.said[-1].startswith("note: station 1 has not returned to tracking: the radio failed (no answer")
 
 
-async def test_keys(tmp_path: Path) -> None:
-    """Skipped ones come again with the next run; the last one, or any, can be redone; others are refused."""
+async def test_keys_skip_repeat_and_reject(tmp_path: Path) -> None:
+    """Skipped targets are asked for by the next run, any target can be repeated, unknown keys are rejected."""
     async with aimed(tmp_path) as (field, instruments):
         script = Script(instruments, "r", "", "s", "", "r", "", "x", "r 1 1", "", "r 9", "q")
         collection = await collected(field, script, tmp_path / "targets.csv")
@@ -287,14 +285,16 @@ async def test_keys(tmp_path: Path) -> None:
     assert numbers == [f"station 1, target {t}" for t in (1, 1, 2, 3, 4, 3, 4, 4, 1, 4, 4)]
     assert [collection.count(1, t) for t in (1, 2, 3, 4)] == [1, 0, 1, 0]
     assert script.said[0] == "which one? Type r, station and target, for example r 2 5"
-    assert "'x' is none of the keys" in script.said
+    assert "unknown key 'x'" in script.said
     assert "station 1 has not measured target 9 yet" in script.said
 
 
 @pytest.mark.parametrize("speaks", BOTH)
 @pytest.mark.parametrize("stop", ["q", None, "cancel"])
-async def test_it_goes_on_where_it_stopped(tmp_path: Path, stop: str | None, speaks: Speaks) -> None:
-    """After q, the end of the input and Ctrl-C alike: what was measured is in the file, the stations track."""
+async def test_collection_continues_where_it_stopped(
+    tmp_path: Path, stop: str | None, speaks: Speaks
+) -> None:
+    """After q, the end of the input and Ctrl-C the file holds all measurements and the stations track."""
     path = tmp_path / "targets.csv"
     async with aimed(tmp_path, speaks) as (field, instruments):
         if stop == "cancel":
@@ -307,17 +307,17 @@ async def test_it_goes_on_where_it_stopped(tmp_path: Path, stop: str | None, spe
             assert task.cancelled()
         else:
             await collected(field, Script(instruments, "", "", stop), path)
-        assert list(read_some_targets(path).sights[1]) == [1, 2]
+        assert list(read_partial_target_file(path).measurements[1]) == [1, 2]
         assert not instruments[1].direct_mode
         path.write_text("# foil on the wall\n" + path.read_text())
         script = Script(instruments)
         await collected(field, script, path)
     assert script.questions[0].startswith("station 1, target 3:")
     assert path.read_text().startswith("# foil on the wall\n")
-    assert list(read_target_file(path).sights[3]) == [1, 2, 3, 4]
+    assert list(read_target_file(path).measurements[3]) == [1, 2, 3, 4]
 
 
-async def test_both_faces(tmp_path: Path) -> None:
+async def test_repeats_ask_for_each_target_again(tmp_path: Path) -> None:
     """With two repeats every target is asked for twice."""
     async with aimed(tmp_path) as (field, instruments):
         script = Script(instruments, "", "", "", "q")
@@ -325,8 +325,10 @@ async def test_both_faces(tmp_path: Path) -> None:
     assert [collection.count(1, t) for t in (1, 2)] == [2, 1]
 
 
-async def test_progress_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """What each station has, and the residuals as soon as three targets are common."""
+async def test_progress_shows_counts_and_residuals(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Residuals appear as soon as three targets are common."""
     async with aimed(tmp_path) as (field, instruments):
         await collected(
             field, Script(instruments, "", "", "", "s", "", "", "", "q"), tmp_path / "targets.csv"
@@ -342,16 +344,16 @@ async def test_progress_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture[s
 
 
 @pytest.mark.parametrize("text", ["station,target\n", "junk", ""])
-def test_a_file_of_another_kind_is_not_overwritten(tmp_path: Path, text: str) -> None:
-    """Nor one whose header this program has not written."""
+def test_other_file_is_not_overwritten(tmp_path: Path, text: str) -> None:
+    """Nor are files with a header that the program has not written."""
     path = tmp_path / "targets.csv"
     path.write_text(text)
     with pytest.raises(InputFileError, match="was not written by tsgt calibrate collect"):
         TargetCollection(path, STATIONS, [1, 2, 3]).resume()
 
 
-async def test_a_running_master_is_told_of(tmp_path: Path) -> None:
-    """It owns the radio; the message says how to stop it."""
+async def test_running_master_is_an_error(tmp_path: Path) -> None:
+    """The master owns the radio; the error says how to stop it."""
     async with aimed(tmp_path) as (field, instruments):
         server = await asyncio.start_unix_server(lambda _, w: w.close(), field.config().stream.socket)
         async with server:
@@ -361,10 +363,10 @@ async def test_a_running_master_is_told_of(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("moved_m", "code"), [(0.0, 0), (0.02, 3)])
-async def test_a_moved_tripod_is_found(
+async def test_moved_tripod_is_detected(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], moved_m: float, code: int
 ) -> None:
-    """Station 2 stands 20 mm further along; the others have not moved."""
+    """Station 2 has moved by 20 mm, the others have not."""
     path = tmp_path / "targets.csv"
     async with aimed(tmp_path) as (field, instruments):
         script = Script(instruments)
@@ -372,7 +374,7 @@ async def test_a_moved_tripod_is_found(
         T = instruments[2].T.copy()
         T[0, 3] += moved_m
         instruments[2].T = T
-        before = read_some_targets(path).sights
+        before = read_partial_target_file(path).measurements
         async with session(field, script) as stations:
             cells = [(s, t) for s in STATIONS for t in (1, 2, 3)]
             now = await measure_again(cells, before, stations, script, constant_m=0.0)
@@ -388,20 +390,20 @@ async def test_a_moved_tripod_is_found(
     assert printed["2"]["moved_mrad"] == pytest.approx(0.0, abs=0.01)
 
 
-async def test_check_can_skip_and_quit(tmp_path: Path) -> None:
-    """What was not measured is not in the result."""
+async def test_check_result_omits_skipped_targets(tmp_path: Path) -> None:
+    """Skipped and remaining targets are not in the result."""
     path = tmp_path / "targets.csv"
     async with aimed(tmp_path) as (field, instruments):
         await collected(field, Script(instruments), path)
-        before = read_some_targets(path).sights
+        before = read_partial_target_file(path).measurements
         script = Script(instruments, "s", "z", "", "q")
         async with session(field, script) as stations:
             now = await measure_again([(1, 1), (1, 2), (2, 1)], before, stations, script, constant_m=0.0)
     assert {s: list(seen) for s, seen in now.items()} == {1: [2]}
 
 
-def test_what_cannot_be_checked_is_refused(tsgt: Tsgt, tmp_path: Path) -> None:
-    """A target that was not measured before; a station that is not configured."""
+def test_check_of_unknown_target_or_station_is_rejected(tsgt: Tsgt, tmp_path: Path) -> None:
+    """The target has not been measured before, or the station is not configured."""
     config = tmp_path / "master.toml"
     config.write_text(
         'kind = "master"\n[setup]\nstation_frames = "a"\nprism_layout = "b"\n'
@@ -413,7 +415,7 @@ def test_what_cannot_be_checked_is_refused(tsgt: Tsgt, tmp_path: Path) -> None:
     targets.write_text(
         "station,target,horizontal_angle_rad,zenith_angle_rad,slope_distance_m,constant_mm\n1,1,0.1,1.5,20.0,0\n"
     )
-    common = ("calibrate", "check", "--config", config, "--targets-file", targets)
+    common = ("calibrate", "check", "--config", config, "--targets", targets)
     done = tsgt(*common, "--target", 7)
     assert (done.code, "holds no target 7" in done.err) == (1, True)
     done = tsgt(*common, "--station", 4)

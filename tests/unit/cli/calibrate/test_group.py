@@ -1,4 +1,4 @@
-"""``tsgt calibrate`` through the real command line, on the authors' field data and on the documented examples."""
+"""``tsgt calibrate targets`` and ``prisms`` on the authors' field data and on the documented examples."""
 
 from __future__ import annotations
 
@@ -77,8 +77,8 @@ def test_field_targets_give_the_published_residuals(
 
 @pytest.mark.parametrize("day", ["20220314", "20220331-1"])
 @pytest.mark.parametrize("weights", ["model", "none"])
-def test_good_field_data_is_sound(tsgt: Tsgt, field_data: Path, day: str, weights: str) -> None:
-    """No field target is rejected, no frame is weak or contradictory, and no residual exceeds 5 mm."""
+def test_field_data_is_consistent(tsgt: Tsgt, field_data: Path, day: str, weights: str) -> None:
+    """No target is rejected, no frame is weak or inconsistent, and no residual exceeds 5 mm."""
     done = tsgt(
         "calibrate", "targets", field_data / day / "GCP.txt", "--target-constant-mm", 10, "--weights", weights,
         "--json",
@@ -94,10 +94,10 @@ def test_good_field_data_is_sound(tsgt: Tsgt, field_data: Path, day: str, weight
 
 @pytest.mark.parametrize(("weights", "limit_mm"), [("none", 1.6), ("model", 1.6)])
 @pytest.mark.parametrize("station", [1, 2, 3])
-def test_a_falsified_target_is_named_and_rejected(
+def test_falsified_target_is_rejected(
     tsgt: Tsgt, markers: Path, tmp_path: Path, station: int, weights: str, limit_mm: float
 ) -> None:
-    """Each target, 50 mm too long or too short: it is rejected by every station concerned, the rest stays good."""
+    """An error of 50 mm is rejected by every station concerned, the other targets stay."""
     for target, extra_m in product(range(1, 9), (0.05, -0.05)):
         done = tsgt(
             "calibrate", "targets", falsified(markers, tmp_path, station, target, extra_m),
@@ -113,10 +113,8 @@ def test_a_falsified_target_is_named_and_rejected(
 
 
 @pytest.mark.parametrize("targets", ["1234", "1235", "1245", "1345", "2345"])
-def test_four_field_targets_nearly_in_a_line_are_weak(
-    tsgt: Tsgt, markers: Path, tmp_path: Path, targets: str
-) -> None:
-    """The direction of the line is reported, with exit code 3; the frame is still printed."""
+def test_nearly_collinear_targets_are_weak(tsgt: Tsgt, markers: Path, tmp_path: Path, targets: str) -> None:
+    """The direction of the line is reported with exit code 3; the frame is printed."""
     done = tsgt(
         "calibrate", "targets", only(markers, tmp_path, targets), "--target-constant-mm", 10, "--json"
     )
@@ -131,23 +129,23 @@ def test_four_field_targets_nearly_in_a_line_are_weak(
     assert "bearing 3" in done.err
 
 
-def test_a_line_of_targets_is_enough_for_levelled_stations(tsgt: Tsgt, markers: Path, tmp_path: Path) -> None:
-    """With --levelled the same four targets hold the frame."""
+def test_collinear_targets_suffice_for_levelled_stations(tsgt: Tsgt, markers: Path, tmp_path: Path) -> None:
+    """With --levelled the same four targets determine the frame."""
     path = only(markers, tmp_path, "1234")
     done = tsgt("calibrate", "targets", path, "--target-constant-mm", 10, "--levelled", "--json")
     assert all(station["weak"] == [] for station in done.json()["stations"].values())
 
 
-def test_the_table_shows_every_target(tsgt: Tsgt, markers: Path, tmp_path: Path) -> None:
-    """Text output has a line per station and per target, the rejected one marked as such."""
+def test_table_lists_every_target(tsgt: Tsgt, markers: Path, tmp_path: Path) -> None:
+    """A rejected target is marked."""
     done = tsgt("calibrate", "targets", falsified(markers, tmp_path, 2, 5, 0.05), "--target-constant-mm", 10)
     assert "station 2: 7 targets used, rms 1.50 mm" in done.out
     assert re.search(r"^5 +rejected +50\.\d\d$", done.out, re.MULTILINE)
     assert "station 3: 8 targets used, rms 1.09 mm" in done.out
 
 
-def test_the_set_up_file_holds_the_frames_bit_for_bit(tsgt: Tsgt, tmp_path: Path) -> None:
-    """What --output writes is read back by the configuration as exactly the printed frames, station 1 included."""
+def test_set_up_file_reproduces_the_frames_exactly(tsgt: Tsgt, tmp_path: Path) -> None:
+    """The configuration reads exactly the printed frames, station 1 included."""
     output = tmp_path / "frames.toml"
     done = tsgt("calibrate", "targets", documented(0, tmp_path), "--json", "--output", output)
     assert done.code == 0
@@ -160,8 +158,8 @@ def test_the_set_up_file_holds_the_frames_bit_for_bit(tsgt: Tsgt, tmp_path: Path
     assert written["2"].rms_mm == pytest.approx(done.json()["stations"]["2"]["rms_mm"], abs=1e-3)
 
 
-def test_a_contradiction_is_printed_but_no_file_is_written(tsgt: Tsgt, tmp_path: Path) -> None:
-    """Of four targets one is wrong: exit code 3, the residuals on stdout, the reason on stderr, nothing on disk."""
+def test_inconsistent_targets_are_not_written(tsgt: Tsgt, tmp_path: Path) -> None:
+    """One of four targets is wrong: exit code 3, residuals on stdout, reason on stderr, no file."""
     path, output = documented(0, tmp_path), tmp_path / "frames.toml"
     path.write_text(path.read_text(encoding="utf-8").replace("20.4692", "20.5192"), encoding="utf-8")
     done = tsgt("calibrate", "targets", path, "--json", "--output", output)
@@ -172,7 +170,7 @@ def test_a_contradiction_is_printed_but_no_file_is_written(tsgt: Tsgt, tmp_path:
 
 
 def test_prisms_are_solved_and_written(tsgt: Tsgt, tmp_path: Path) -> None:
-    """The documented example: positions, distances, body residuals, and a layout file with the same bits."""
+    """The documented example gives positions, distances, body residuals, and a layout file with the same bits."""
     output = tmp_path / "layout.toml"
     done = tsgt(
         "calibrate",
@@ -193,16 +191,16 @@ def test_prisms_are_solved_and_written(tsgt: Tsgt, tmp_path: Path) -> None:
     assert {str(prism): list(position) for prism, position in layout.items()} == solved["prisms"]
 
 
-def test_prisms_are_listed_for_people(tsgt: Tsgt, tmp_path: Path) -> None:
-    """Text output shows prisms, distances and body points."""
-    done = tsgt("calibrate", "prisms", documented(2, tmp_path), "--prism-constant-mm", 10)
+def test_prisms_as_text(tsgt: Tsgt, tmp_path: Path) -> None:
+    """The text has prisms, distances and body points."""
+    done = tsgt("calibrate", "prisms", documented(2, tmp_path), *CONSTANTS)
     assert done.code == 0
     assert re.search(r"^2 +0\.4838 +-0\.1757 +1\.4171", done.out, re.MULTILINE)
     assert re.search(r"^1-2 +986\.72$", done.out, re.MULTILINE)
     assert re.search(r"^mast +0\.24", done.out, re.MULTILINE)
 
 
-def test_a_bad_file_ends_with_one_line_and_writes_nothing(tsgt: Tsgt, tmp_path: Path) -> None:
+def test_invalid_file_is_one_line(tsgt: Tsgt, tmp_path: Path) -> None:
     """Exit code 1, one line on stderr, no output file."""
     path, output = tmp_path / "empty.csv", tmp_path / "frames.toml"
     path.touch()
@@ -214,8 +212,8 @@ def test_a_bad_file_ends_with_one_line_and_writes_nothing(tsgt: Tsgt, tmp_path: 
     assert not output.exists()
 
 
-def test_a_file_name_cannot_break_the_set_up_file(tsgt: Tsgt, tmp_path: Path) -> None:
-    """A line break in the measurement file's name does not get into the TOML."""
+def test_line_break_in_a_file_name_is_escaped(tsgt: Tsgt, tmp_path: Path) -> None:
+    """A line break in the input file's name does not get into the TOML."""
     path, output = tmp_path / 'a\nkind = "x"', tmp_path / "frames.toml"
     documented(0, tmp_path).rename(path)
     assert tsgt("calibrate", "targets", path, "--output", output).code == 0
@@ -229,8 +227,8 @@ def test_a_file_name_cannot_break_the_set_up_file(tsgt: Tsgt, tmp_path: Path) ->
 def test_every_json_key_is_documented(
     tsgt: Tsgt, tmp_path: Path, command: str, example: int, section: str
 ) -> None:
-    """Each key of the JSON output stands in the how-to page."""
-    printed: dict[str, Any] = tsgt("calibrate", command, documented(example, tmp_path), "--json").json()
+    """Each key of the JSON output is in the how-to page."""
+    printed: dict[str, Any] = tsgt("calibrate", command, documented(example, tmp_path), *CONSTANTS[: 2 if command == "targets" else 4], "--json").json()
     keys = (
         set(printed["stations"]["2"])
         if command == "targets"
@@ -241,8 +239,8 @@ def test_every_json_key_is_documented(
     assert [key for key in keys if f"`.{key}" not in text and f"`{key}" not in text] == []
 
 
-def test_levelled_stations_that_are_not_level_are_told(tsgt: Tsgt, markers: Path) -> None:
-    """On the field data station 2 leans by a third of a milliradian: with --levelled that is a failed check."""
+def test_levelled_detects_a_tilted_station(tsgt: Tsgt, markers: Path) -> None:
+    """Station 2 of the field data is tilted by a third of a milliradian: exit code 3."""
     done = tsgt("calibrate", "targets", markers, "--target-constant-mm", 10, "--levelled", "--json")
     assert done.code == 3
     stations = done.json()["stations"]

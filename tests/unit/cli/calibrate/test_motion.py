@@ -1,4 +1,4 @@
-"""``tsgt calibrate motion`` through the real command line: on a made-up drive and on a published one."""
+"""``tsgt calibrate motion`` on a simulated and on a published drive."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.published import write_prisms, write_targets, write_tracks
+from harness.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
 
 from tsgt.analysis.calibration import calibrate_recording
 from tsgt.config import load_station_frames, load_station_latencies
 from tsgt.geometry import exp_so3
-from tsgt.geometry.calibration import Unknowns
+from tsgt.geometry.calibration import SetupPrior
 from tsgt.recording import load_recording
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def winding(time_s: float) -> Motion:
-    """Rotation and position of a robot that winds its way over uneven ground."""
+    """Return rotation and position of a robot that winds its way over uneven ground."""
     around = 0.1 * time_s
     tilt = exp_so3(np.array([0.05 * np.sin(5 * around), 0.05 * np.cos(4 * around), 0.0]))
     place = [40 + 12 * np.sin(around), 10 + 8 * np.sin(2 * around), -1 + 0.5 * np.sin(3.1 * around)]
@@ -37,14 +37,14 @@ def recording(tsgt: Tsgt, tmp_path: Path) -> Path:
     tracks = write_tracks(tmp_path, winding, duration_s=60.0)
     done = tsgt(
         "import", "rts", "--tracks", *tracks, "--prisms", write_prisms(tmp_path),
-        "--targets", write_targets(tmp_path), "--output", path,
+        "--targets", write_targets(tmp_path), *CONSTANTS, "--output", path,
     )  # fmt: skip
     assert done.code == 0
     return path
 
 
 def test_exact_measurements_need_no_correction(tsgt: Tsgt, recording: Path, tmp_path: Path) -> None:
-    """Corrections are far below a millimetre, and the file says what the JSON says."""
+    """Corrections are far below a millimetre, and the file agrees with the JSON output."""
     output = tmp_path / "frames.toml"
     done = tsgt("calibrate", "motion", recording, "--no-held-out", "--output", output, "--json")
     assert done.code == 0
@@ -61,15 +61,15 @@ def test_exact_measurements_need_no_correction(tsgt: Tsgt, recording: Path, tmp_
     assert latencies[3] == round(1e6 * found["stations"]["3"]["latency_ms"])
 
 
-def test_what_a_layout_counts_from_does_not_matter(recording: Path) -> None:
-    """With the robot's origin some metres off the prisms the same frames and the same motion come out."""
+def test_result_is_independent_of_the_robot_origin(recording: Path) -> None:
+    """With the origin some metres off the prisms the same frames and the same motion result."""
     near = load_recording(recording)
     prisms = tuple(
         replace(each, position_m=(each.position_m[0] + 3.0, each.position_m[1] - 1.0, each.position_m[2]))
         for each in near.parameters.prisms
     )
     far = replace(near, parameters=replace(near.parameters, prisms=prisms))
-    known = Unknowns(shift_sigma_m=0.02, turn_sigma_rad=0.002, latency_sigma_s=0.1)
+    known = SetupPrior(translation_sigma_m=0.02, rotation_sigma_rad=0.002, latency_sigma_s=0.1)
     one, other = (calibrate_recording(each, known, held_out=False) for each in (near, far))
     for found, given in zip(other.parameters.prisms, prisms, strict=True):
         assert found.position_m == pytest.approx(given.position_m)
@@ -80,7 +80,7 @@ def test_what_a_layout_counts_from_does_not_matter(recording: Path) -> None:
 
 
 def test_text_names_the_stations(tsgt: Tsgt, recording: Path) -> None:
-    """Without --json a table for people comes."""
+    """Without --json the output is a table."""
     done = tsgt(
         "calibrate",
         "motion",
@@ -90,15 +90,15 @@ def test_text_names_the_stations(tsgt: Tsgt, recording: Path) -> None:
         "unknown",
         "--dof",
         "4",
-        "--prisms",
+        "--estimate-prisms",
     )
     assert done.code == 0
     assert "station 2 x" in done.out
-    assert "latency beside station 1" in done.out
+    assert "latency relative to station 1" in done.out
 
 
-def test_points_without_angles_are_refused(tsgt: Tsgt, tmp_path: Path) -> None:
-    """A recording imported without targets does not tell what stations measured."""
+def test_recording_of_points_is_rejected(tsgt: Tsgt, tmp_path: Path) -> None:
+    """A recording imported without targets has no raw measurements."""
     path = tmp_path / "points.jsonl"
     tracks = write_tracks(tmp_path, winding)
     assert (
@@ -110,19 +110,19 @@ def test_points_without_angles_are_refused(tsgt: Tsgt, tmp_path: Path) -> None:
     assert "import the recording with its targets" in done.err
 
 
-def test_the_layout_is_written_only_if_it_was_sought(tsgt: Tsgt, recording: Path, tmp_path: Path) -> None:
-    """--prism-output without --prisms is a usage error, before anything is computed."""
+def test_prism_output_needs_estimate_prisms(tsgt: Tsgt, recording: Path, tmp_path: Path) -> None:
+    """--prism-output without --estimate-prisms is a usage error before any computation."""
     assert tsgt("calibrate", "motion", recording, "--prism-output", tmp_path / "prisms.toml").code == 2
 
 
-def test_a_published_drive_is_predicted_better(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
-    """What the calibration has not seen is missed by at most 0.45 of what straight lines miss it by, at gaps 0.35."""
+def test_published_drive_has_smaller_held_out_errors(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
+    """The held-out error is at most 0.45 times that of linear interpolation, 0.35 times in gaps."""
     day = field_data / "20220314"
     path = tmp_path / "r.jsonl"
     tracks = [day / f"trimble{k}.csv" for k in (1, 2, 3)]
     done = tsgt(
         "import", "rts", "--tracks", *tracks, "--prisms", day / "sensor_positions.csv",
-        "--targets", day / "GCP.txt", "--output", path,
+        "--targets", day / "GCP.txt", *CONSTANTS, "--output", path,
     )  # fmt: skip
     assert done.code == 0
     done = tsgt("calibrate", "motion", path, "--json")

@@ -1,4 +1,4 @@
-"""The desk commands on a simulated drive, through the real command line."""
+"""The commands for recordings on a simulated drive."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from harness.published import write_prisms, write_targets, write_tracks
+from harness.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
 from harness.scene import FRAMES, LAYOUT
 
 from tsgt.analysis.formats.export import MEASUREMENT_COLUMNS, POSE_COLUMNS
@@ -23,12 +23,15 @@ DOCUMENT = Path(__file__).parents[4] / "docs" / "reference" / "evaluate.md"
 def recording(tsgt: Tsgt, tmp_path: Path) -> Path:
     """Ten seconds of a drive as raw measurements."""
     path = tmp_path / "drive.jsonl"
-    assert tsgt(*importing(tmp_path), "--targets", write_targets(tmp_path), "--output", path).code == 0
+    assert (
+        tsgt(*importing(tmp_path), "--targets", write_targets(tmp_path), *CONSTANTS, "--output", path).code
+        == 0
+    )
     return path
 
 
 def importing(folder: Path) -> list[object]:
-    """Arguments that import simulated tracks, without an output yet."""
+    """Return arguments that import simulated tracks, without an output."""
     return ["import", "rts", "--tracks", *write_tracks(folder), "--prisms", write_prisms(folder)]
 
 
@@ -37,8 +40,8 @@ def lines_of(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
 
 
-def test_import_says_what_it_wrote(tsgt: Tsgt, tmp_path: Path) -> None:
-    """The figures of --json are those of the file."""
+def test_import_summary_agrees_with_the_file(tsgt: Tsgt, tmp_path: Path) -> None:
+    """The figures of --json are those of the recording."""
     path = tmp_path / "drive.jsonl"
     result = tsgt(*importing(tmp_path), "--output", path, "--json").json()
     header, parameters, *measurements = lines_of(path)
@@ -50,8 +53,8 @@ def test_import_says_what_it_wrote(tsgt: Tsgt, tmp_path: Path) -> None:
     assert [p["position_m"] for p in parameters["prisms"]] == LAYOUT.tolist()
 
 
-def test_with_targets_the_measurements_are_raw(recording: Path) -> None:
-    """Angles and distances are recorded, with the frames and the constant that turn them into points."""
+def test_import_with_targets_gives_raw_measurements(recording: Path) -> None:
+    """Angles and distances are recorded, with frames and prism constants."""
     _, parameters, *measurements = lines_of(recording)
     assert {m["type"] for m in measurements} == {"measurement"}
     frames = [s["T_station1_station"] for s in parameters["stations"]]
@@ -59,8 +62,8 @@ def test_with_targets_the_measurements_are_raw(recording: Path) -> None:
     assert [s["prism_constant_m"] for s in parameters["stations"]] == [0.01] * 3
 
 
-def test_the_ending_tum_makes_a_trajectory(tsgt: Tsgt, recording: Path) -> None:
-    """Only valid poses are in it, and the figures count all of them."""
+def test_suffix_tum_selects_a_trajectory(tsgt: Tsgt, recording: Path) -> None:
+    """The file has the valid poses only; the summary counts all."""
     output = recording.with_suffix(".tum")
     result = tsgt("process", recording, "--estimator", "linear", "--output", output, "--json").json()
     assert np.loadtxt(output).shape == (result["valid_poses"], 8)
@@ -70,8 +73,8 @@ def test_the_ending_tum_makes_a_trajectory(tsgt: Tsgt, recording: Path) -> None:
     assert 0.0 < result["seconds"] < 10.0
 
 
-def test_any_other_ending_makes_a_recording_of_poses(tsgt: Tsgt, recording: Path) -> None:
-    """Header, the parameters in force, then all poses with their reasons."""
+def test_suffix_jsonl_selects_a_recording_of_poses(tsgt: Tsgt, recording: Path) -> None:
+    """Header and parameters in force, then all poses with their reasons."""
     output = recording.with_name("poses.jsonl")
     result = tsgt("process", recording, "--estimator", "linear", "--output", output, "--json").json()
     header, parameters, *poses = lines_of(output)
@@ -84,8 +87,8 @@ def test_any_other_ending_makes_a_recording_of_poses(tsgt: Tsgt, recording: Path
     assert "motion" not in result
 
 
-def test_what_was_found_of_the_motion_is_kept(tsgt: Tsgt, recording: Path) -> None:
-    """A smoothed trajectory stands with the parameters that it was computed with, which are printed, too."""
+def test_tuned_motion_prior_is_recorded(tsgt: Tsgt, recording: Path) -> None:
+    """The poses are recorded with the parameters that they were computed with, which are also printed."""
     output = recording.with_name("poses.jsonl")
     result = tsgt("process", recording, "--estimator", "continuous", "--output", output, "--json").json()
     _, parameters, *poses = lines_of(output)
@@ -102,8 +105,8 @@ def test_what_was_found_of_the_motion_is_kept(tsgt: Tsgt, recording: Path) -> No
     )
 
 
-def test_the_estimator_is_the_recordings_unless_told_otherwise(tsgt: Tsgt, recording: Path) -> None:
-    """What was in force in the field is what the desk goes on with."""
+def test_default_estimator_is_the_recorded_one(tsgt: Tsgt, recording: Path) -> None:
+    """The estimator in force during the drive is the default."""
     lines = recording.read_text(encoding="utf-8")
     for estimator in ("linear", "continuous"):
         parameters = lines_of(recording)[1]
@@ -125,8 +128,8 @@ def test_the_rate_sets_the_epochs(tsgt: Tsgt, recording: Path) -> None:
     assert all(every[line.split()[0]] == line for line in few)
 
 
-def test_better_set_up_files_replace_the_recorded_ones(tsgt: Tsgt, recording: Path) -> None:
-    """A layout moved by 1 m forward moves the robot by 1 m back; stations moved up by 5 m take it along."""
+def test_set_up_files_replace_the_recorded_ones(tsgt: Tsgt, recording: Path) -> None:
+    """A layout shifted by 1 m forward moves the robot back by 1 m; stations raised by 5 m raise it."""
     folder = recording.parent
     before, after = folder / "before.tum", folder / "after.tum"
     tables = [f"[prisms.{k}]\nposition_m = {row.tolist()}" for k, row in enumerate(LAYOUT + np.eye(3)[0], 1)]
@@ -144,20 +147,18 @@ def test_better_set_up_files_replace_the_recorded_ones(tsgt: Tsgt, recording: Pa
     np.testing.assert_allclose(step[:, 2], 5.0, atol=0.02)  # the robot is not quite level
 
 
-def test_frames_for_points_are_refused(tsgt: Tsgt, tmp_path: Path) -> None:
-    """Points are in frame 1 already; frames that change nothing are not taken silently."""
+def test_frames_for_points_are_rejected(tsgt: Tsgt, tmp_path: Path) -> None:
+    """Points are in the frame of station 1 already, so frames would have no effect."""
     path, frames = tmp_path / "drive.jsonl", tmp_path / "frames.toml"
     tsgt(*importing(tmp_path), "--output", path)
     outcome = tsgt("process", path, "--frames", frames, "--output", tmp_path / "poses.tum")
     assert outcome.code == 2
-    assert "--frames has nothing to change" in outcome.err
+    assert "--frames has no effect" in outcome.err
     assert not (tmp_path / "poses.tum").exists()
 
 
-def test_evaluate_is_the_same_from_points_and_from_raw_measurements(
-    tsgt: Tsgt, recording: Path, tmp_path: Path
-) -> None:
-    """The way over the stations and back changes no distance."""
+def test_evaluate_agrees_for_points_and_raw_measurements(tsgt: Tsgt, recording: Path, tmp_path: Path) -> None:
+    """The conversion to raw measurements and back changes no distance."""
     points = tmp_path / "points.jsonl"
     tsgt(*importing(tmp_path), "--output", points)
     a, b = (tsgt("evaluate", path, "--no-held-out", "--json").json() for path in (points, recording))
@@ -166,8 +167,8 @@ def test_evaluate_is_the_same_from_points_and_from_raw_measurements(
         assert a["inter_prism_mm"][pair]["mean"] == pytest.approx(b["inter_prism_mm"][pair]["mean"], abs=1e-5)
 
 
-def test_evaluate_shows_the_same_figures_to_people(tsgt: Tsgt, recording: Path) -> None:
-    """The tables have the figures of --json, to a hundredth; every figure's meaning is written down."""
+def test_evaluate_text_agrees_with_json(tsgt: Tsgt, recording: Path) -> None:
+    """The tables have the figures of --json to a hundredth, and every figure is documented."""
     reference = recording.with_name("reference.tum")
     tsgt("process", recording, "--estimator", "linear", "--output", reference)
     options = ("--estimator", "continuous", "--reference", reference)
@@ -219,8 +220,8 @@ def test_evaluate_shows_the_same_figures_to_people(tsgt: Tsgt, recording: Path) 
     assert {key for key in keys if f"`{key}`" not in documented and f".{key}`" not in documented} == set()
 
 
-def test_a_wrong_measurement_is_named(tsgt: Tsgt, recording: Path) -> None:
-    """With its station, its prism, when it was made and by how much it strays."""
+def test_outlier_is_listed(tsgt: Tsgt, recording: Path) -> None:
+    """It is listed with station, prism, time and error."""
     lines = recording.read_text(encoding="utf-8").splitlines()
     wrong = json.loads(lines[40])
     wrong["slope_distance_m"] += 1.0
@@ -236,8 +237,8 @@ def test_a_wrong_measurement_is_named(tsgt: Tsgt, recording: Path) -> None:
     assert stray["missed_mm"] == pytest.approx(1000.0, abs=10.0)
 
 
-def test_export_writes_what_was_processed(tsgt: Tsgt, recording: Path) -> None:
-    """Poses that stand in a recording are exported as they are: the same TUM file as processing gives."""
+def test_export_keeps_recorded_poses(tsgt: Tsgt, recording: Path) -> None:
+    """The TUM file equals that of processing."""
     direct, poses, exported = (recording.with_name(name) for name in ("a.tum", "poses.jsonl", "b.tum"))
     tsgt("process", recording, "--output", direct)
     tsgt("process", recording, "--output", poses)
@@ -246,8 +247,8 @@ def test_export_writes_what_was_processed(tsgt: Tsgt, recording: Path) -> None:
     assert exported.read_bytes() == direct.read_bytes()
 
 
-def test_export_picks_poses_by_their_kind(tsgt: Tsgt, recording: Path) -> None:
-    """Of a recording with predicted and smoothed poses the smoothed ones, unless told otherwise."""
+def test_export_selects_poses_by_kind(tsgt: Tsgt, recording: Path) -> None:
+    """Of predicted and smoothed poses the smoothed ones are exported by default."""
     poses, mixed = recording.with_name("poses.jsonl"), recording.with_name("mixed.jsonl")
     tsgt("process", recording, "--estimator", "continuous", "--output", poses)
     header, parameters, *lines = poses.read_text(encoding="utf-8").splitlines()
@@ -263,7 +264,7 @@ def test_export_picks_poses_by_their_kind(tsgt: Tsgt, recording: Path) -> None:
 
 
 def test_export_processes_a_recording_without_poses(tsgt: Tsgt, recording: Path) -> None:
-    """And says so, beside the data on stdout."""
+    """A note on stderr says so."""
     direct = recording.with_suffix(".tum")
     tsgt("process", recording, "--output", direct)
     outcome = tsgt("export", recording, "--format", "tum")
@@ -274,22 +275,24 @@ def test_export_processes_a_recording_without_poses(tsgt: Tsgt, recording: Path)
 @pytest.mark.parametrize(
     ("records", "columns", "count"), [("measurements", MEASUREMENT_COLUMNS, 75), ("poses", POSE_COLUMNS, 190)]
 )
-def test_export_csv(tsgt: Tsgt, recording: Path, records: str, columns: tuple[str, ...], count: int) -> None:
-    """A line of names and a line per record, each with a cell per column."""
+def test_export_csv_has_a_row_per_record(
+    tsgt: Tsgt, recording: Path, records: str, columns: tuple[str, ...], count: int
+) -> None:
+    """The header names the columns, and each row has all cells."""
     header, *rows = tsgt("export", recording, "--format", "csv", "--records", records).out.splitlines()
     assert header.split(",") == list(columns)
     assert len(rows) == pytest.approx(count, abs=8)
     assert {row.count(",") for row in rows} == {len(columns) - 1}
 
 
-def test_tum_of_measurements_is_refused(tsgt: Tsgt, recording: Path) -> None:
-    """The format has no place for them."""
+def test_tum_of_measurements_is_rejected(tsgt: Tsgt, recording: Path) -> None:
+    """The format has no measurements."""
     outcome = tsgt("export", recording, "--format", "tum", "--records", "measurements")
     assert outcome.code == 2
     assert "--format csv" in outcome.err
 
 
-def test_keep_going_skips_a_corrupt_line_and_says_so(tsgt: Tsgt, recording: Path) -> None:
+def test_keep_going_reports_and_skips_a_corrupt_line(tsgt: Tsgt, recording: Path) -> None:
     """Without the option the line is an error with its number."""
     lines = recording.read_text(encoding="utf-8").splitlines(keepends=True)
     recording.write_text("".join([*lines[:10], "garbage\n", *lines[11:]]), encoding="utf-8")
@@ -302,3 +305,26 @@ def test_keep_going_skips_a_corrupt_line_and_says_so(tsgt: Tsgt, recording: Path
     assert outcome.json()["measurements"] == 74
     assert outcome.err.startswith("warning: ")
     assert "line 11" in outcome.err
+
+
+def test_evaluate_prints_the_verdict_first(tsgt: Tsgt, recording: Path) -> None:
+    """The tables follow after an empty line."""
+    verdict, _, tables = tsgt("evaluate", recording, "--no-held-out").out.partition("\n\n")
+    levels = {line.partition(":")[0] for line in verdict.splitlines()}
+    assert levels
+    assert levels <= {"do not trust", "take care", "good"}
+    assert "Distances between prisms" in tables
+
+
+def test_csv_of_poses(tsgt: Tsgt, recording: Path) -> None:
+    """The suffix selects the format; --format overrides it."""
+    output = recording.with_suffix(".csv")
+    count = tsgt("process", recording, "--estimator", "linear", "--output", output, "--json").json()["poses"]
+    header, *rows = output.read_text(encoding="utf-8").splitlines()
+    assert header.split(",") == list(POSE_COLUMNS)
+    assert len(rows) == count
+    other = recording.with_suffix(".txt")
+    arguments = ("process", recording, "--estimator", "linear", "--output", other)
+    assert tsgt(*arguments).code == 2
+    assert tsgt(*arguments, "--format", "csv").code == 0
+    assert other.read_bytes() == output.read_bytes()

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from harness.published import write_prisms, write_tracks
+from harness.authors_files import write_prisms, write_tracks
 from harness.scene import LAYOUT
 
 if TYPE_CHECKING:
@@ -24,10 +24,10 @@ def recording(tsgt: Tsgt, tmp_path: Path) -> Path:
     return path
 
 
-def test_evo_aligns_as_we_do(
+def test_alignment_agrees_with_evo(
     tsgt: Tsgt, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """To 1e-6 m and 1e-6 degrees, as evo_ape -a: Umeyama without scale; and the unaligned figures stand beside it."""
+    """To 1e-6 m and 1e-6 degrees with evo_ape -a (Umeyama without scale); unaligned errors are printed as well."""
     monkeypatch.setenv("HOME", str(tmp_path))  # evo writes its settings there when it is first imported
     metrics = pytest.importorskip("evo.core.metrics")
     sync = pytest.importorskip("evo.core.sync")
@@ -68,12 +68,12 @@ def test_evo_aligns_as_we_do(
     text = tsgt("evaluate", recording, *arguments[:-1], "--align", "translation").out
     assert "unaligned" in text
     assert (
-        "Aligned (translation): what is left, what was removed, and how much of the error that hides" in text
+        "Aligned (translation): remaining error, alignment, and the part of the error that it hides" in text
     )
 
 
-def test_a_reference_of_another_day_is_an_error(tsgt: Tsgt, recording: Path, tmp_path: Path) -> None:
-    """One line that names both spans; nothing is printed that looks like a figure."""
+def test_reference_of_another_day_is_an_error(tsgt: Tsgt, recording: Path, tmp_path: Path) -> None:
+    """The error names both time spans; no figures are printed."""
     reference = tmp_path / "other.tum"
     reference.write_text("1600000000 0 0 0 0 0 0 1\n1600000100 0 0 0 0 0 0 1\n", encoding="utf-8")
     outcome = tsgt("evaluate", recording, "--no-held-out", "--reference", reference, "--json")
@@ -81,11 +81,11 @@ def test_a_reference_of_another_day_is_an_error(tsgt: Tsgt, recording: Path, tmp
     assert outcome.out == ""
     (line,) = outcome.err.splitlines()
     assert line.startswith(f"error: {reference}: has no pose within 0.1 s of a valid one of {recording}")
-    assert "it goes from 2020-09-13 12:26:40 to 2020-09-13 12:28:20" in line
+    assert "it covers 2020-09-13 12:26:40 to 2020-09-13 12:28:20" in line
 
 
 def test_align_needs_a_reference(tsgt: Tsgt, recording: Path) -> None:
-    """There is nothing to align with."""
+    """--align without --reference is a usage error."""
     outcome = tsgt("evaluate", recording, "--align", "rigid")
     assert outcome.code == 2
-    assert "add --reference" in outcome.err
+    assert "--align needs --reference" in outcome.err

@@ -1,3 +1,5 @@
+"""``tsgt radio airtime`` and ``ping``."""
+
 from __future__ import annotations
 
 import asyncio
@@ -11,7 +13,7 @@ import pytest
 
 from tsgt.cli.radio import ping as ping_command
 from tsgt.radio import LoRaSettings
-from tsgt.radio.ping import answer, ping
+from tsgt.radio.ping import ping, respond
 from tsgt.radio.sx127x import DRAGINO_HAT
 from tsgt.simulation.kernel import VirtualClock, VirtualTimeline, run_virtual
 from tsgt.simulation.lora import Air, LinkModel, SimulatedHal, SX1276Chip, simulated_radio
@@ -58,7 +60,7 @@ def test_airtime_of_the_paper(tsgt: Tsgt) -> None:
 
 
 def test_airtime_as_text(tsgt: Tsgt) -> None:
-    """Without --json a person can read it."""
+    """Without --json the output is text."""
     outcome = tsgt("radio", "airtime", "--sf", 12, "--bandwidth-khz", "125", "--payload", 2, "--preamble", 6)
     assert outcome.out.splitlines() == [
         "time on air  794.624 ms",
@@ -79,7 +81,7 @@ def test_airtime_as_text(tsgt: Tsgt) -> None:
         ("--payload", 256),
     ],
 )
-def test_airtime_refuses_what_the_chip_cannot_do(tsgt: Tsgt, wrong: tuple[str, object]) -> None:
+def test_airtime_rejects_invalid_settings(tsgt: Tsgt, wrong: tuple[str, object]) -> None:
     """A value out of range is a usage error that names its option."""
     outcome = tsgt("radio", "airtime", "--payload", 34, *wrong)
     assert outcome.code == 2
@@ -87,7 +89,7 @@ def test_airtime_refuses_what_the_chip_cannot_do(tsgt: Tsgt, wrong: tuple[str, o
 
 
 def test_ping_on_simulated_radios(tsgt: Tsgt) -> None:
-    """Two simulated radios answer all pings, and the summary has all its figures."""
+    """All requests are replied to, and the summary has all figures."""
     outcome = tsgt(*QUICK, "--count", 20, "--distance-m", 1000, "--json")
     assert outcome.code == 0
     summary = outcome.json()
@@ -103,7 +105,7 @@ def test_ping_on_simulated_radios(tsgt: Tsgt) -> None:
 
 
 def test_ping_out_of_range_fails(tsgt: Tsgt) -> None:
-    """Where no reply comes at all, the exit code says that the check failed."""
+    """Without any reply the exit code is 3."""
     outcome = tsgt(*QUICK, "--count", 3, "--distance-m", 1e6, "--json")
     assert outcome.code == 3
     summary = outcome.json()
@@ -111,7 +113,7 @@ def test_ping_out_of_range_fails(tsgt: Tsgt) -> None:
 
 
 def test_ping_without_reply_as_text(tsgt: Tsgt) -> None:
-    """The text says so, too."""
+    """The text says that no reply was received."""
     outcome = tsgt(*QUICK, "--count", 2, "--distance-m", 1e6)
     assert outcome.code == 3
     assert "received     0 replies, 100.0% lost" in outcome.out
@@ -126,7 +128,7 @@ def test_ping_shows_each_reply_and_a_summary(tsgt: Tsgt) -> None:
     assert "round trip   median 16." in outcome.out
 
 
-def test_simulated_pings_repeat_themselves(tsgt: Tsgt) -> None:
+def test_simulated_ping_is_deterministic(tsgt: Tsgt) -> None:
     """The same seed gives the same figures, another seed others."""
     marginal = (*QUICK, "--count", 40, "--distance-m", 28_000, "--json")
     same, again, other = (tsgt(*marginal, "--seed", seed).out for seed in (1, 1, 2))
@@ -149,7 +151,7 @@ def test_simulated_pings_repeat_themselves(tsgt: Tsgt) -> None:
         (("--simulated", "--sync-word", "lora"), "--sync-word"),
     ],
 )
-def test_wrong_usage_of_ping_is_explained(tsgt: Tsgt, arguments: tuple[str, ...], complaint: str) -> None:
+def test_ping_usage_errors_name_the_option(tsgt: Tsgt, arguments: tuple[str, ...], complaint: str) -> None:
     """A usage error names the option to change."""
     outcome = tsgt("radio", "ping", *arguments)
     assert outcome.code == 2
@@ -158,8 +160,8 @@ def test_wrong_usage_of_ping_is_explained(tsgt: Tsgt, arguments: tuple[str, ...]
 
 @pytest.mark.parametrize("backend", ["gpiod", "rpi-gpio"])
 @pytest.mark.parametrize("answer", [[], ["--answer"]])
-def test_no_radio_is_one_line(tsgt: Tsgt, backend: str, answer: list[str]) -> None:
-    """On a machine without SPI the command says what is missing and exits 1."""
+def test_missing_radio_is_one_line(tsgt: Tsgt, backend: str, answer: list[str]) -> None:
+    """On a machine without SPI the error says what is missing; exit code 1."""
     outcome = tsgt("radio", "ping", *answer, "--frequency-mhz", 905, "--backend", backend, "--spi-bus", 97)
     assert outcome.code == 1
     assert outcome.err.startswith("error: ")
@@ -167,8 +169,8 @@ def test_no_radio_is_one_line(tsgt: Tsgt, backend: str, answer: list[str]) -> No
 
 
 def test_ping_on_hardware(tsgt: Tsgt, bench: Bench) -> None:
-    """With a radio on the bus the command pings the other machine, which runs the answering side."""
-    bench.peer_does(lambda radio: _drain(answer(radio)))
+    """The command pings the other machine, which runs the answering side."""
+    bench.peer_does(lambda radio: _drain(respond(radio)))
     outcome = tsgt(
         "radio", "ping", "--frequency-mhz", 905, "--count", 5, "--nss-pin", -1, "--sync-word", "52", "--json"
     )
@@ -178,7 +180,7 @@ def test_ping_on_hardware(tsgt: Tsgt, bench: Bench) -> None:
 
 
 def test_answering_on_hardware(tsgt: Tsgt, bench: Bench) -> None:
-    """With --answer the command answers as many requests as it is told to, and sums up."""
+    """With --answer the command replies to the given number of requests and prints a summary."""
     bench.peer_does(lambda radio: _drain(_requests(radio)))
     outcome = tsgt("radio", "ping", "--answer", "--frequency-mhz", 905, "--count", 3, "--json")
     assert outcome.code == 0
@@ -196,7 +198,7 @@ def test_answering_shows_each_request_and_a_summary(tsgt: Tsgt, bench: Bench) ->
 
 
 class Bench:
-    """Our machine's radio on a simulated chip, in virtual time, and another radio that does what a test says."""
+    """Our machine's radio on a simulated chip in virtual time, and another radio controlled by the test."""
 
     def __init__(self) -> None:
         self.wiring: Wiring | None = None
@@ -207,11 +209,11 @@ class Bench:
         self._peer: Callable[[Radio], Coroutine[None, None, None]]
 
     def peer_does(self, role: Callable[[Radio], Coroutine[None, None, None]]) -> None:
-        """Say what the other radio is to do meanwhile."""
+        """Set what the other radio does meanwhile."""
         self._peer = role
 
     def open_hal(self, wiring: Wiring) -> SimulatedHal:
-        """Stand in for the hardware."""
+        """Replace the hardware."""
         self.wiring = wiring
         return SimulatedHal(SX1276Chip(self._timeline, partial(self._air.join, name="here"), self._rng))
 
@@ -237,7 +239,7 @@ class Bench:
 
 @pytest.fixture
 def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
-    """Put the command on a bench of simulated hardware."""
+    """Run the command on simulated hardware."""
     made = Bench()
     monkeypatch.setattr(ping_command, "open_hal", made.open_hal)
     monkeypatch.setattr(ping_command, "SystemClock", lambda: VirtualClock(0))
@@ -246,11 +248,11 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
 
 
 async def _requests(radio: Radio) -> AsyncIterator[Exchange]:
-    """Send something foreign, and requests without end."""
+    """Send an unknown packet, then requests without end."""
     await asyncio.sleep(1)
     await radio.transmit(b"t1")
     async with aclosing(
-        ping(radio, VirtualClock(0), run=1, count=100, payload_bytes=20, timeout_ns=500_000_000)
+        ping(radio, VirtualClock(0), session=1, count=100, payload_bytes=20, timeout_ns=500_000_000)
     ) as exchanges:
         async for exchange in exchanges:
             yield exchange
@@ -261,8 +263,8 @@ async def _drain(results: AsyncIterator[object]) -> None:
         pass
 
 
-def test_a_channel_outside_the_region_is_refused(tsgt: Tsgt) -> None:
-    """With --region the command does not transmit where that region has no band."""
+def test_channel_outside_the_region_is_rejected(tsgt: Tsgt) -> None:
+    """With --region the command does not transmit outside the region's bands."""
     done = tsgt("radio", "ping", "--simulated", "--frequency-mhz", 905, "--region", "EU868")
     assert done.code == 1
     assert "905 MHz with 250 kHz is not within a band of EU868" in done.err

@@ -1,4 +1,4 @@
-"""The command that makes a key, and how the daemons come by theirs."""
+"""``tsgt radio key``, and how the daemons read the key."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from harness.cli import Tsgt
 
 
-def test_a_key_is_made_and_what_to_do_with_it_is_said(tsgt: Tsgt, tmp_path: Path) -> None:
-    """The file is there, the text names what the configurations need, and the key itself is not printed."""
+def test_key_command_writes_a_key_and_prints_instructions(tsgt: Tsgt, tmp_path: Path) -> None:
+    """The text names the configuration keys; the key itself is not printed."""
     path = tmp_path / "mission.key"
     outcome = tsgt("radio", "key", path)
     assert outcome.code == 0
@@ -27,8 +27,8 @@ def test_a_key_is_made_and_what_to_do_with_it_is_said(tsgt: Tsgt, tmp_path: Path
     assert read_key(path).hex() not in outcome.out
 
 
-def test_an_existing_file_is_left_alone(tsgt: Tsgt, tmp_path: Path) -> None:
-    """One line says so, and the exit code is 1."""
+def test_existing_key_is_not_overwritten(tsgt: Tsgt, tmp_path: Path) -> None:
+    """Exit code 1 and one line."""
     path = tmp_path / "mission.key"
     path.write_text("precious")
     outcome = tsgt("radio", "key", path)
@@ -37,8 +37,8 @@ def test_an_existing_file_is_left_alone(tsgt: Tsgt, tmp_path: Path) -> None:
     assert path.read_text() == "precious"
 
 
-def test_a_configuration_leads_to_its_key(tsgt: Tsgt, tmp_path: Path) -> None:
-    """Both daemons get the key that their file names, and none where none is named or the protocol has none."""
+def test_daemons_read_the_configured_key(tsgt: Tsgt, tmp_path: Path) -> None:
+    """None is configured, or the protocol has none: no key."""
     path = tmp_path / "mission.key"
     tsgt("radio", "key", path)
     assert radio_key(SuperframeConfig(kind="superframe", key_file=path)) == read_key(path)
@@ -47,7 +47,7 @@ def test_a_configuration_leads_to_its_key(tsgt: Tsgt, tmp_path: Path) -> None:
     assert radio_key(ClassicConfig(kind="classic")) is None
 
 
-def test_a_key_that_is_named_must_be_there(tmp_path: Path) -> None:
-    """A daemon does not go on without the key that it was to have."""
+def test_configured_key_must_exist(tmp_path: Path) -> None:
+    """A daemon does not run without the configured key."""
     with pytest.raises(ConfigError, match="no such file"):
         radio_key(SuperframeConfig(kind="superframe", key_file=tmp_path / "mission.key"))

@@ -1,4 +1,4 @@
-"""The command that plans a channel."""
+"""``tsgt radio plan``."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ SUPERFRAME = ("radio", "plan", "--protocol", "superframe", "--stations")
 CLASSIC = ("radio", "plan", "--protocol", "classic", "--stations")
 
 
-def test_the_plan_as_json(tsgt: Tsgt) -> None:
-    """All figures have their names, for the settings asked for and for all others in the table."""
+def test_plan_as_json(tsgt: Tsgt) -> None:
+    """The output has all figures, for the given settings and for the table of others."""
     outcome = tsgt(*SUPERFRAME, 3, "--json")
     assert outcome.code == 0
     plan = outcome.json()
@@ -32,8 +32,8 @@ def test_the_plan_as_json(tsgt: Tsgt) -> None:
     assert {3, 8, 16} <= {row["stations"] for row in plan["table"]}
 
 
-def test_the_plan_as_text(tsgt: Tsgt) -> None:
-    """The same, to be read; a number of stations that is asked for has its column."""
+def test_plan_as_text(tsgt: Tsgt) -> None:
+    """The given number of stations has a column in the table."""
     outcome = tsgt(*CLASSIC, 5)
     assert outcome.code == 0
     lines = outcome.out.splitlines()
@@ -43,24 +43,24 @@ def test_the_plan_as_text(tsgt: Tsgt) -> None:
     assert sum(line.startswith("SF ") for line in lines) == 24
 
 
-def test_the_link_margin_is_power_less_loss_less_need(tsgt: Tsgt) -> None:
+def test_link_margin_is_power_minus_loss_minus_sensitivity(tsgt: Tsgt) -> None:
     """1 km of free space is 91.6 dB at 905 MHz; SF 9 at 250 kHz needs -126 dBm."""
     arguments = ("--power-dbm", 14, "--antenna-gain-db", 0, "--path-loss-exponent", 2, "--distance-m", 1000)
     plan = tsgt(*SUPERFRAME, 3, *arguments, "--json").json()
     assert plan["link_margin_db"] == pytest.approx(14 - 91.58 + 126.02, abs=0.05)
 
 
-def test_a_weak_link_is_warned_about(tsgt: Tsgt) -> None:
-    """Ten decibels are needed in the field."""
+def test_weak_link_is_a_warning(tsgt: Tsgt) -> None:
+    """The field needs ten decibels."""
     plan = tsgt(*SUPERFRAME, 3, "--distance-m", 5000, "--json").json()
     assert plan["link_margin_db"] < 10
     assert "the link margin is" in plan["warnings"][0]
 
 
-def test_measurements_that_are_lost_are_warned_about(tsgt: Tsgt) -> None:
-    """The paper's protocol does not carry what three stations measure; settings and the protocol that do are named."""
+def test_insufficient_capacity_is_a_warning(tsgt: Tsgt) -> None:
+    """Classic does not carry three stations; the warning names sufficient settings and the other protocol."""
     (warning,) = tsgt(*CLASSIC, 3, "--json").json()["warnings"]
-    assert warning.startswith("1.61 of 2.5 measurements per second and station get through")
+    assert warning.startswith("1.61 of 2.5 measurements per second and station are delivered")
     assert "--protocol superframe" in warning
 
 
@@ -68,10 +68,10 @@ def test_measurements_that_are_lost_are_warned_about(tsgt: Tsgt) -> None:
     ("region", "frequency_mhz", "exceeds"),
     [("EU868", 869.525, "10 % of any hour"), ("US915", 905.0, "47 CFR 15.249"), ("CA915", 905.0, "RSS-210")],
 )
-def test_a_region_brings_its_channel_and_its_limits(
+def test_region_selects_channel_and_limits(
     tsgt: Tsgt, region: str, frequency_mhz: float, exceeds: str
 ) -> None:
-    """Without more ado the plan is held against what is allowed there, and says what would comply."""
+    """The plan is checked against the region's limits, with settings that comply."""
     plan = tsgt(*SUPERFRAME, 3, "--region", region, "--json").json()
     assert plan["frequency_mhz"] == frequency_mhz
     (warning,) = plan["warnings"]
@@ -79,7 +79,7 @@ def test_a_region_brings_its_channel_and_its_limits(
     assert "Would comply: " in warning
 
 
-def test_what_complies_has_no_warning(tsgt: Tsgt) -> None:
+def test_compliant_settings_have_no_warning(tsgt: Tsgt) -> None:
     """500 kHz in the USA, and 7 dBm above 869.7 MHz in Europe."""
     for arguments in (
         ("--region", "US915", "--bandwidth-khz", 500),
@@ -88,8 +88,8 @@ def test_what_complies_has_no_warning(tsgt: Tsgt) -> None:
         assert tsgt(*SUPERFRAME, 3, *arguments, "--json").json()["warnings"] == []
 
 
-def test_20_dbm_is_warned_about_everywhere(tsgt: Tsgt) -> None:
-    """The chip bears it for a hundredth of the time."""
+def test_20_dbm_is_a_warning(tsgt: Tsgt) -> None:
+    """The chip supports 20 dBm at a duty cycle of 1 % only."""
     (warning,) = tsgt(*SUPERFRAME, 3, "--power-dbm", 20, "--json").json()["warnings"]
     assert "SX1276 data sheet" in warning
 
@@ -97,7 +97,7 @@ def test_20_dbm_is_warned_about_everywhere(tsgt: Tsgt) -> None:
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        ((*CLASSIC, 10), "--stations 10: classic can have 9 at most"),
+        ((*CLASSIC, 10), "--stations 10: classic supports at most 9"),
         ((*SUPERFRAME, 17), "--stations"),
         ((*SUPERFRAME, 3, "--loss", 1), "--loss"),
         ((*SUPERFRAME, 3, "--rate-hz", 0), "--rate-hz"),
@@ -108,7 +108,7 @@ def test_20_dbm_is_warned_about_everywhere(tsgt: Tsgt) -> None:
         (("radio", "plan", "--stations", 3), "--protocol"),
     ],
 )
-def test_wrong_usage_is_explained(tsgt: Tsgt, arguments: tuple[object, ...], complaint: str) -> None:
+def test_usage_errors_name_the_option(tsgt: Tsgt, arguments: tuple[object, ...], complaint: str) -> None:
     """A usage error names the option to change."""
     outcome = tsgt(*arguments)
     assert outcome.code == 2
@@ -118,8 +118,8 @@ def test_wrong_usage_is_explained(tsgt: Tsgt, arguments: tuple[object, ...], com
 @pytest.mark.parametrize(
     "arguments", [("--region", "EU868", "--frequency-mhz", 905), ("--power-dbm", 19), ("--power-dbm", 1)]
 )
-def test_what_the_radio_cannot_or_must_not_do_is_one_line(tsgt: Tsgt, arguments: tuple[object, ...]) -> None:
-    """A channel outside the region's bands or a power that the chip does not have: exit 1."""
+def test_illegal_or_unsupported_settings_are_one_line(tsgt: Tsgt, arguments: tuple[object, ...]) -> None:
+    """A channel outside the region's bands, or a power that the chip does not have: exit code 1."""
     outcome = tsgt(*SUPERFRAME, 3, *arguments)
     assert outcome.code == 1
     assert outcome.err.count("\n") == 1
@@ -158,7 +158,7 @@ def test_plan_and_simulation_agree(
     seconds: int,
     age_tolerance: float,
 ) -> None:
-    """What the planner computes is what daemons, drivers and chips make of it, their start included."""
+    """The planned rate and age agree with a mission of daemons, drivers and chips."""
     scenario = tmp_path / "prompt.toml"
     entries = [PROMPT.format(number=number, rate_hz=rate_hz) for number in range(1, stations + 1)]
     scenario.write_text('kind = "scenario"\n' + "".join(entries))

@@ -1,4 +1,4 @@
-"""The command ``simulate``: its figures, its files, its exit codes."""
+"""``tsgt simulate``: figures, files and exit codes."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ START_S = START_UNIX_NS / 1e9
 CLASSIC = ("--protocol", "classic")
 
 
-def test_the_keys_that_others_rely_on(tsgt: Tsgt) -> None:
-    """Machines find everything under the names that are promised."""
+def test_json_has_the_documented_keys(tsgt: Tsgt) -> None:
+    """Classic."""
     found = tsgt("simulate", "dynamic", *CLASSIC, "--stations", 1, "--duration", 20, "--json").json()
     station = found["stations"]["1"]
     assert station.keys() >= {"measured", "delivered", "duplicates", "rate_hz", "time_error_us"}
@@ -45,8 +45,8 @@ def test_the_keys_that_others_rely_on(tsgt: Tsgt) -> None:
     assert found["wall_seconds"] > 0
 
 
-def test_the_keys_of_the_superframe(tsgt: Tsgt) -> None:
-    """The protocol that is spoken unless told otherwise has frames, queues, late slots and outages to tell of."""
+def test_json_has_the_keys_of_the_superframe(tsgt: Tsgt) -> None:
+    """Frames, send queues, missed slots and outages."""
     found = tsgt(
         *("simulate", "--stations", 2, "--duration", 20, "--outage", "2:8:4", "--restart", "1:10"),
         *("--drift-ramp-ppm-per-min", 1, "--stamp-jitter-us", 20, "--interference-rate-hz", 0.2, "--json"),
@@ -63,16 +63,16 @@ def test_the_keys_of_the_superframe(tsgt: Tsgt) -> None:
     assert outage["live_age_ms"]["p50"] > 0
 
 
-def test_the_text(tsgt: Tsgt) -> None:
-    """People get a line for each station, and how many violations there were."""
+def test_simulate_as_text(tsgt: Tsgt) -> None:
+    """The text has a line per station and the number of violations."""
     result = tsgt("simulate", *CLASSIC, "--stations", 1, "--duration", 16)
     assert result.code == 0
     assert "dynamic, classic (ours), seed 0: 16 s simulated in" in result.out
     assert "violations   0" in result.out
 
 
-def test_recording_and_truth_are_kept(tsgt: Tsgt, tmp_path: Path) -> None:
-    """The recording can be processed, and the truth is there for each of its epochs."""
+def test_recording_and_truth_are_written(tsgt: Tsgt, tmp_path: Path) -> None:
+    """The recording can be processed, and the truth covers all its epochs."""
     recording, truth = tmp_path / "run.jsonl", tmp_path / "truth.tum"
     result = tsgt(
         *("simulate", "dynamic", *CLASSIC, "--stations", 1, "--duration", 20),
@@ -87,8 +87,8 @@ def test_recording_and_truth_are_kept(tsgt: Tsgt, tmp_path: Path) -> None:
     np.testing.assert_allclose(np.diff(rows[:, 0]), 0.05, atol=1e-6)
 
 
-def test_the_figures_follow_from_the_files(tsgt: Tsgt, tmp_path: Path) -> None:
-    """Oracle: rates, and errors of the poses, computed from nothing but recording and truth."""
+def test_figures_follow_from_the_files(tsgt: Tsgt, tmp_path: Path) -> None:
+    """Oracle: rates and pose errors computed from recording and truth only."""
     recording, truth = tmp_path / "run.jsonl", tmp_path / "truth.tum"
     arguments = (
         "simulate",
@@ -156,8 +156,8 @@ def _check_poses(
     assert figures["orientation_rms_deg"] == pytest.approx(orientation_rms_deg, rel=1e-4)
 
 
-def test_existing_files_are_not_replaced(tsgt: Tsgt, tmp_path: Path) -> None:
-    """A recording of an earlier run stays what it is."""
+def test_existing_file_is_not_replaced(tsgt: Tsgt, tmp_path: Path) -> None:
+    """Exit code 2 before the mission."""
     recording = tmp_path / "run.jsonl"
     recording.write_text("precious")
     result = tsgt("simulate", "--output", recording)
@@ -167,15 +167,15 @@ def test_existing_files_are_not_replaced(tsgt: Tsgt, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("option", ["--output", "--truth"])
-def test_a_missing_folder_is_said_before_the_run(tsgt: Tsgt, tmp_path: Path, option: str) -> None:
-    """Nobody waits for hours of simulation that cannot be kept."""
-    result = tsgt("simulate", option, tmp_path / "none" / "x")
+def test_missing_folder_is_rejected_before_the_mission(tsgt: Tsgt, tmp_path: Path, option: str) -> None:
+    """Exit code 2 before the mission."""
+    result = tsgt("simulate", option, tmp_path / "none" / {"--output": "x.jsonl", "--truth": "x.tum"}[option])
     assert result.code == 2
-    assert "there is no such folder" in result.err
+    assert "no such folder" in result.err
 
 
-def test_a_run_too_short_for_poses_has_dashes(tsgt: Tsgt) -> None:
-    """The first synchronisation takes longer."""
+def test_mission_without_poses_has_dashes(tsgt: Tsgt) -> None:
+    """The first synchronisation takes longer than the mission."""
     result = tsgt("simulate", *CLASSIC, "--duration", "3")
     assert result.code == 0
     assert "nan" not in result.out
@@ -185,34 +185,34 @@ def test_a_run_too_short_for_poses_has_dashes(tsgt: Tsgt) -> None:
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        (("--station-software", "authors"), "the authors' node speaks classic alone"),
-        ((*CLASSIC, "--stations", 10), "station 10: classic knows 1 to 9"),
+        (("--station-software", "authors"), "the authors' node speaks classic only"),
+        ((*CLASSIC, "--stations", 10), "station 10: classic has station numbers 1 to 9"),
         (("--outage", "4:10:10"), "there is no station 4"),
         (("--restart", "10"), "expected STATION:AT"),
-        (("--duration", 20, "--outage", "all:20:5"), "--outage at 20 s: the run ends at 20 s"),
-        (("--duration", 20, "--restart", "master:60"), "--restart at 60 s: the run ends at 20 s"),
-        (("--clock-filter", "paper"), "say --protocol classic"),
+        (("--duration", 20, "--outage", "all:20:5"), "--outage at 20 s: the mission ends at 20 s"),
+        (("--duration", 20, "--restart", "master:60"), "--restart at 60 s: the mission ends at 20 s"),
+        (("--clock-filter", "paper"), "add --protocol classic"),
         ((*CLASSIC, "--unauthenticated"), "classic never has a key"),
     ],
 )
-def test_what_does_not_go_together(tsgt: Tsgt, arguments: tuple[str | int, ...], reason: str) -> None:
-    """It is refused before anything runs."""
+def test_inconsistent_options_are_rejected(tsgt: Tsgt, arguments: tuple[str | int, ...], reason: str) -> None:
+    """Exit code 2 before the mission."""
     result = tsgt("simulate", *arguments)
     assert result.code == 2
     assert reason in result.err
 
 
-def test_an_unknown_scenario(tsgt: Tsgt) -> None:
-    """A name that nobody knows is a mistake of usage, answered with the names that there are."""
+def test_unknown_scenario_is_rejected(tsgt: Tsgt) -> None:
+    """Exit code 2; the error lists the scenarios."""
     result = tsgt("simulate", "quary")
     assert result.code == 2
     assert "no such scenario; there are dynamic, quarry" in result.err
 
 
-def test_violations_make_the_check_fail(tsgt: Tsgt, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What must not happen is listed, not without end, and the exit code is 3."""
+def test_violations_give_exit_code_3(tsgt: Tsgt, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Violations are listed up to a limit."""
     planted = [Violation("time", f"planted {number}") for number in range(25)]
-    monkeypatch.setattr(command, "violations", lambda _run: planted)
+    monkeypatch.setattr(command, "check_invariants", lambda _run: planted)
     result = tsgt("simulate", *CLASSIC, "--stations", 1, "--duration", 16)
     assert result.code == 3
     assert "violations   25" in result.out

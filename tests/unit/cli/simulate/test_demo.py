@@ -1,4 +1,4 @@
-"""What the demonstration keeps of the poses that it counts."""
+"""Memory of the demonstration's progress."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from harness.records import POSE
 
 from tsgt.analysis.evaluation import pose_errors
-from tsgt.cli.simulate.demo import Progress
+from tsgt.cli.simulate.demo_progress import Progress
 from tsgt.clock import SystemClock, UnixTimeline
 from tsgt.config import ScenarioConfig
 from tsgt.geometry import quaternion_from_rotation, rotation_from_quaternion, transform_from
@@ -41,15 +41,13 @@ def demo(tmp_path: Path) -> Demo:
 
 @pytest.fixture
 def timeline() -> UnixTimeline:
-    """Return this computer's."""
+    """Return the timeline of this computer."""
     return UnixTimeline.fixed_now(SystemClock())
 
 
 @pytest.mark.usefixtures("capsys")
-def test_errors_of_all_poses_are_told_and_few_bytes_of_each_are_kept(
-    demo: Demo, timeline: UnixTimeline
-) -> None:
-    """A day has 3.5 million poses, and what they are off is known to the last without keeping them."""
+def test_progress_keeps_few_bytes_per_pose(demo: Demo, timeline: UnixTimeline) -> None:
+    """A day has 3.5 million poses; the errors of all are known without storing the poses."""
     start_ns = timeline.unix_ns(demo.start_ns)
     estimated = _estimated(demo)
     progress = Progress(demo, timeline)
@@ -81,7 +79,7 @@ def test_errors_of_all_poses_are_told_and_few_bytes_of_each_are_kept(
 
 
 def _estimated(demo: Demo) -> NDArray[np.float64]:
-    """Return poses that are off by more and more."""
+    """Return poses with a growing error."""
     poses = demo.world.pose_at(np.arange(POSES) * PERIOD_NS / 1e9)
     turn = rotation_from_quaternion(np.array([0.0, 0.0, 0.01, 1.0]) / np.hypot(0.01, 1.0))
     poses[:, :3, 3] += np.arange(POSES)[:, None] * 1e-5
@@ -90,7 +88,7 @@ def _estimated(demo: Demo) -> NDArray[np.float64]:
 
 
 def _lines(poses: NDArray[np.float64], start_ns: int) -> Iterator[bytes]:
-    """Yield lines of a stream; the master says how it does once."""
+    """Yield lines of a stream with one status."""
     for index, pose in enumerate(poses):
         fields: dict[str, Any] = {
             "position_m": tuple(pose[:3, 3].tolist()),

@@ -1,4 +1,4 @@
-"""What the commands of the desk share: what is shown while a computation runs."""
+"""Progress of long computations on a terminal."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ import io
 import sys
 from typing import TYPE_CHECKING
 
-from tsgt.cli.recordings import progress
+from tsgt.cli.progress import progress
 
 if TYPE_CHECKING:
     import pytest
 
 
 class Terminal(io.StringIO):
-    """A place where somebody looks."""
+    """A stream that claims to be a terminal."""
 
     def isatty(self) -> bool:
-        """Say so."""
+        """Return True."""
         return True
 
 
-def test_what_has_no_share_yet_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A bar that stands still says what it waits for, and then what it measures."""
+def test_progress_names_the_first_phase(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before the first share is known, the label is that of the first phase."""
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     with progress("fitting", first="tuning") as on_progress:
@@ -34,7 +34,7 @@ def test_what_has_no_share_yet_is_named(monkeypatch: pytest.MonkeyPatch) -> None
     assert "50%" in terminal.getvalue()
 
 
-def test_nothing_is_shown_where_nobody_looks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_progress_without_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     """A log file gets no bar."""
     printed = io.StringIO()
     monkeypatch.setattr(sys, "stderr", printed)

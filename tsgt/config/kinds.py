@@ -1,4 +1,4 @@
-"""All kinds of files, by the name that each gives itself under its top-level key ``kind``."""
+"""All kinds of files, by the value of their top-level key ``kind``."""
 
 from __future__ import annotations
 

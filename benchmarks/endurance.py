@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from endurance_watch import (  # type: ignore[import-not-found]  # the script beside this one
+from endurance_watch import (
     Sample,
     Stream,
     beacons_ns,

@@ -92,7 +92,7 @@ def errors(case: Case, seed: int) -> list[tuple[float, float, float]]:
         if not is_distance:
             clock.add(instrument_ms, arrived_ns)
             continue
-        time = clock.stamp(instrument_ms, arrived_ns + 40_000_000)
+        time = clock.timestamp(instrument_ms, arrived_ns + 40_000_000)
         if time is not None:
             error_ms = (time.host_ns - 1e9 * (1000 + true_s)) / 1e6 - FASTEST_MS
             found.append((float(true_s), error_ms, time.bound_ns / 1e6))

@@ -30,7 +30,9 @@ def main() -> None:
     """Draw the figure."""
     recording_path, truth_path, output = map(Path, sys.argv[1:4])
     plt.rcParams.update({"font.size": 9, "font.family": "sans-serif"})
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10.0, 4.0), width_ratios=(1, 1.5), layout="constrained")
+    figure, (left, right) = plt.subplots(
+        1, 2, figsize=(10.0, 4.0), width_ratios=(1, 1.5), layout="constrained"
+    )
     truth = read_tum(truth_path)
     stations = load_recording(recording_path).parameters.stations
     left.plot(truth.position_m[:, 0], truth.position_m[:, 1], color="#444444", lw=0.8, label="robot")

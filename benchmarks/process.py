@@ -98,7 +98,7 @@ async def measured(scenario: ScenarioConfig, timeline: VirtualTimeline) -> list[
         readings = []
         while clock.monotonic_ns() < DURATION_S * 1_000_000_000:
             reading = await instrument.read()
-            readings.append(session.measured(reading, START_NS + reading.at_ns))
+            readings.append(session.measurement(reading, START_NS + reading.at_ns))
         await instrument.close()
         return readings
 

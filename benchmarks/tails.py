@@ -13,7 +13,7 @@ import sys
 from dataclasses import replace
 
 import numpy as np
-from instrument_time import Case, errors  # type: ignore[import-not-found]  # a script in this folder
+from instrument_time import Case, errors
 from measuring import normalised_squared
 from scipy.stats import chi2
 

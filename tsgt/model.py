@@ -30,17 +30,13 @@ ROBOT_FRAME = "robot"
 
 ARCSECOND_RAD = math.pi / 648_000
 
-MAX_INSTANT_NS = 2**63 - 1
-"""Times are signed 64-bit integers, which end in 2262."""
+MAX_INSTANT_NS = 2**63 - 1  # times are signed 64-bit integers, which end in 2262
 
-MAX_NUMBER = 2**31 - 1
-"""Of stations and prisms."""
+MAX_NUMBER = 2**31 - 1  # of stations and prisms
 
-MAX_COORDINATE_M = 1e8
-"""Map coordinates (UTM: 1e7) and geocentric coordinates are smaller."""
+MAX_COORDINATE_M = 1e8  # map coordinates (UTM: 1e7) and geocentric coordinates are smaller
 
-_ROTATION_TOLERANCE = 1e-3
-"""Exceeds the rounding of a matrix that is written with four digits."""
+_ROTATION_TOLERANCE = 1e-3  # exceeds the rounding of a matrix that is written with four digits
 
 
 def check_instants(*times_ns: int) -> None:

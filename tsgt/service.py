@@ -24,14 +24,11 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-SYNC_INTERVAL_S = 1.0
-"""Interval of syncs to disk: the most that a power cut can lose."""
+SYNC_INTERVAL_S = 1.0  # interval of syncs to disk: the most that a power cut can lose
 
-STATUS_INTERVAL_S = 1.0
-"""Interval of the status reports to systemd."""
+STATUS_INTERVAL_S = 1.0  # interval of the status reports to systemd
 
-MAX_SOCKET_PATH_BYTES = 107
-"""Capacity of sockaddr_un without the terminating zero: unix(7)."""
+MAX_SOCKET_PATH_BYTES = 107  # capacity of sockaddr_un without the terminating zero: unix(7)
 
 _BACKLOG = 100
 
@@ -92,14 +89,8 @@ async def sync_periodically(
 ) -> NoReturn:
     """Sync a recording to disk periodically, in a thread, because a slow SD card takes seconds.
 
-    Logs a failing disk once, and its recovery.
-
-    Parameters
-    ----------
-    sync
-        Returns when all data is on the disk; raises :class:`~tsgt.errors.TsgtError` on failure.
-    interval_s
-        From the end of one sync to the start of the next.
+    Logs a failing disk once, and its recovery. ``sync``: returns when all data is on the disk; raises
+    :class:`~tsgt.errors.TsgtError` on failure. ``interval_s``: from the end of one sync to the start of the next.
     """
     failing = False
     while True:
@@ -155,17 +146,8 @@ async def notify_systemd(status: Callable[[], str], clock: Clock) -> NoReturn:
 class UnixListener:
     """A listening UNIX socket that no other program serves.
 
-    Parameters
-    ----------
-    path
-        A stale socket is replaced; the folder is created if missing.
-    mode
-        File permissions.
-
-    Raises
-    ------
-    StreamError
-        Another program serves the socket, or it cannot be created.
+    ``path``: a stale socket is replaced; the folder is created if missing. ``mode``: file permissions. Raises
+    StreamError if another program serves the socket, or it cannot be created.
     """
 
     def __init__(self, path: Path, mode: int) -> None:

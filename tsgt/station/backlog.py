@@ -17,8 +17,7 @@ from tsgt.recording.journal import AcknowledgedRecord, JournalRecord, ReceptionR
 if TYPE_CHECKING:
     from pathlib import Path
 
-MAX_MEASUREMENTS = 10_000
-"""More than an hour; older ones stay in the journals."""
+MAX_MEASUREMENTS = 10_000  # more than an hour; older ones stay in the journals
 
 STREAM_ID_BITS = 16
 

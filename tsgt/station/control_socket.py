@@ -45,12 +45,8 @@ class AtmosphereRequest:
 class AtmosphereResponse:
     """Response to a request.
 
-    Attributes
-    ----------
-    problem
-        The reason why the setting was not applied, or not yet; empty when it was.
-    settings
-        Identity and settings of the instrument as read back; null where unknown.
+    ``problem``: the reason why the setting was not applied, or not yet; empty when it was. ``settings``: identity and
+    settings of the instrument as read back; null where unknown.
     """
 
     type: Literal["answer"] = "answer"
@@ -61,15 +57,8 @@ class AtmosphereResponse:
 class ControlSocket:
     """The open socket, a context manager that removes it on exit.
 
-    Parameters
-    ----------
-    path
-        A stale socket is replaced; the folder is created if missing.
-
-    Raises
-    ------
-    StreamError
-        Another program serves the socket, or it cannot be created.
+    ``path``: a stale socket is replaced; the folder is created if missing. Raises StreamError if another program serves
+    the socket, or it cannot be created.
     """
 
     def __init__(self, path: Path, *, mode: int = 0o660) -> None:

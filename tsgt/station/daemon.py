@@ -48,14 +48,9 @@ log = structlog.get_logger()
 async def run_client(config: ClientConfig, settings: LoRaSettings, dependencies: ClientDependencies) -> None:
     """Run a station's client until it is cancelled.
 
-    Instrument, radio and disk may fail and recover; the other parts continue meanwhile.
-
-    Raises
-    ------
-    RecordingError
-        The journal cannot be created: missing folder, no permission.
-    StreamError
-        The control socket cannot be created: another client serves it.
+    Instrument, radio and disk may fail and recover; the other parts continue meanwhile. Raises RecordingError if the
+    journal cannot be created: missing folder, no permission. Raises StreamError if the control socket cannot be
+    created: another client serves it.
     """
     clock, random_bits = dependencies.clock, dependencies.random_bits
     timeline = UnixTimeline.fixed_now(clock)

@@ -95,12 +95,8 @@ class Instrument(Protocol):
     async def track(self, prism: int, towards: Direction | None = None) -> None:
         """Track a prism and measure it continuously at the instrument's highest rate.
 
-        Returns when the instrument is set up; readings report whether it has found the prism.
-
-        Parameters
-        ----------
-        towards
-            Expected direction of the prism; None: where the telescope points, or the prism's last direction.
+        Returns when the instrument is set up; readings report whether it has found the prism. ``towards``: expected
+        direction of the prism; None: where the telescope points, or the prism's last direction.
         """
 
     async def read(self) -> Reading:

@@ -31,8 +31,7 @@ STABLE_CONNECTION_NS = 5_000_000_000
 CHECK_INTERVAL_S = 2.0
 """Interval of the checks in direct mode, where no reading would reveal that the instrument is lost."""
 
-CLOSE_TIMEOUT_S = 0.5
-"""The client must end within a second."""
+CLOSE_TIMEOUT_S = 0.5  # the client must end within a second
 
 NOT_CONNECTED = "no instrument is connected; the setting is applied after the next connection"
 
@@ -43,10 +42,7 @@ log = structlog.get_logger()
 class CommandResult:
     """The result of a command.
 
-    Attributes
-    ----------
-    reading
-        Result of a successful :class:`~tsgt.radio.commands.MeasureCommand`; None for all others.
+    ``reading``: result of a successful :class:`~tsgt.radio.commands.MeasureCommand`; None for all others.
     """
 
     command: Command
@@ -56,6 +52,8 @@ class CommandResult:
 
 class InstrumentSupervisor:
     """The only owner of an instrument.
+
+    ``description``: name and serial number of the instrument; None while disconnected.
 
     Parameters
     ----------
@@ -67,11 +65,6 @@ class InstrumentSupervisor:
         Called with identity and settings after each connection and change, before the first reading they apply to.
     on_result
         Called exactly once for each command.
-
-    Attributes
-    ----------
-    description
-        Name and serial number of the instrument; None while disconnected.
     """
 
     def __init__(
@@ -123,10 +116,7 @@ class InstrumentSupervisor:
     async def set_atmosphere(self, atmosphere: Atmosphere) -> str:
         """Set the atmospheric correction as soon as the instrument is free, and again after each connection.
 
-        Returns
-        -------
-        str
-            The reason why it is not set, or not yet; empty when it is.
+        Returns the reason why it is not set, or not yet; empty when it is.
         """
         _respond(self._atmosphere_response, "superseded by a later request")
         self._atmosphere = atmosphere

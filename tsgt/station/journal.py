@@ -17,18 +17,14 @@ WRITE_TIMEOUT_S = 0.05
 """An SD card takes a millisecond for a line, but now and then a second for housekeeping. A measurement delayed that long
 is worthless to a moving robot, and the master would detect a reset of the station's clock."""
 
-RETRY_INTERVAL_S = 1.0
-"""Interval of the attempts on a disk that refuses lines."""
+RETRY_INTERVAL_S = 1.0  # interval of the attempts on a disk that refuses lines
 
 
 class JournalQueue:
     """Writes in a thread, so that a slow disk delays neither the instrument nor the radio.
 
-    Parameters
-    ----------
-    write_timeout_s
-        How long a measurement waits for the disk before its callback is called anyway; None: until the disk has accepted
-        or refused it.
+    ``write_timeout_s``: how long a measurement waits for the disk before its callback is called anyway; None: until the
+    disk has accepted or refused it.
     """
 
     def __init__(self, recorder: Recorder, *, write_timeout_s: float | None) -> None:

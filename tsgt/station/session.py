@@ -26,17 +26,8 @@ RATE_WINDOW_NS = 10_000_000_000
 class ClientSession:
     """One run of a station's client.
 
-    Parameters
-    ----------
-    prism
-        Prism that is tracked from the start.
-    first_sequence
-        Sequence number of the first measurement.
-
-    Attributes
-    ----------
-    mode, prism
-        What the instrument is to do; changed by executed commands.
+    ``prism``: prism that is tracked from the start. ``first_sequence``: sequence number of the first measurement.
+    ``mode``, ``prism``: what the instrument is to do; changed by executed commands.
     """
 
     def __init__(self, station: int, prism: int, first_sequence: int = 0) -> None:
@@ -54,10 +45,7 @@ class ClientSession:
     def measurement(self, reading: Reading, stamp_ns: int) -> PolarMeasurement:
         """Return the journal's record of a reading of the tracked prism, and count it.
 
-        Parameters
-        ----------
-        stamp_ns
-            The reading's ``at_ns`` on the station's Unix timeline.
+        ``stamp_ns``: the reading's ``at_ns`` on the station's Unix timeline.
         """
         # The raw arrival, so that post-processing can map the instrument's time to this computer's clock again.
         received_ns = reading.at_ns if reading.received_ns is None else reading.received_ns

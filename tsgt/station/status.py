@@ -18,10 +18,8 @@ ProtocolName = Literal["classic", "superframe"]
 class LinkStatus:
     """The radio link's part of :class:`ClientStatus`.
 
-    Attributes
-    ----------
-    master_received_ns
-        RxDone of the master's last packet for this station, on the station's Unix clock; None before the first.
+    ``master_received_ns``: RxDone of the master's last packet for this station, on the station's Unix clock; None
+    before the first.
     """
 
     protocol: ProtocolName

@@ -36,22 +36,16 @@ if TYPE_CHECKING:
     from tsgt.station.bridge.process import Program, StartProgram
     from tsgt.station.instrument import Atmosphere, Reading
 
-HELLO_TIMEOUT_S = 30.0
-"""Time for a silent program to find its instrument; each usable line restarts it."""
+HELLO_TIMEOUT_S = 30.0  # time for a silent program to find its instrument; each usable line restarts it
 
-RESPONSE_TIMEOUT_S = 30.0
-"""Time for any command; a two-face measurement of a target takes 15 s."""
+RESPONSE_TIMEOUT_S = 30.0  # time for any command; a two-face measurement of a target takes 15 s
 
 
 class BridgeInstrument:
     """An :class:`~tsgt.station.instrument.Instrument`.
 
-    Parameters
-    ----------
-    clock
-        CLOCK_MONOTONIC, which the program uses for its timestamps too.
-    start
-        Starts the program; None: as a child process.
+    ``clock``: CLOCK_MONOTONIC, which the program uses for its timestamps too. ``start``: starts the program; None: as a
+    child process.
     """
 
     def __init__(

@@ -15,17 +15,13 @@ from tsgt.model import MAX_INSTANT_NS, MAX_NUMBER, Status
 from tsgt.radio import Direction  # noqa: TC001 (pydantic resolves annotations at run time)
 from tsgt.recording import Typed, decode
 
-FORMAT_VERSION = 1
-"""Changes when a client of the old version would misunderstand the new one."""
+FORMAT_VERSION = 1  # changes when a client of the old version would misunderstand the new one
 
-MAX_LINE_BYTES = 16_384
-"""Longer lines are truncated; a measurement takes 300 bytes."""
+MAX_LINE_BYTES = 16_384  # longer lines are truncated; a measurement takes 300 bytes
 
-MAX_TEXT = 200
-"""Longer texts are truncated."""
+MAX_TEXT = 200  # longer texts are truncated
 
-MAX_DISTANCE_M = 20_000.0
-"""Beyond the range of any total station: a larger number is in mm, or invalid."""
+MAX_DISTANCE_M = 20_000.0  # beyond the range of any total station: a larger number is in mm, or invalid
 
 TimestampSource = Literal["host", "instrument", "arrival"]
 
@@ -220,12 +216,8 @@ class BridgeVersionError(ValueError):
 def decode_program_line(data: bytes) -> ProgramLine | None:
     """Decode a line of a program; None for an unknown type.
 
-    Raises
-    ------
-    BridgeVersionError
-        It is the ``hello`` of another version.
-    ValueError
-        It is not JSON, or a field is missing or invalid; the message, one line, names the first.
+    Raises BridgeVersionError if it is the ``hello`` of another version. Raises ValueError if it is not JSON, or a field
+    is missing or invalid; the message, one line, names the first.
     """
     kind = decode(Typed, data).type
     if kind == "hello" and (version := decode(_Versioned, data).bridge) != FORMAT_VERSION:

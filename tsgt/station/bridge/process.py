@@ -17,17 +17,14 @@ from tsgt.station.bridge.messages import LineSplitter, printable
 if TYPE_CHECKING:
     from tsgt.clock import Clock
 
-END_TIMEOUT_S = 0.3
-"""Time from SIGTERM to SIGKILL; the client itself must end within a second."""
+END_TIMEOUT_S = 0.3  # time from SIGTERM to SIGKILL; the client itself must end within a second
 
-KILL_TIMEOUT_S = 0.1
-"""How long to wait for the end of a killed program."""
+KILL_TIMEOUT_S = 0.1  # how long to wait for the end of a killed program
 
 OUTPUT_DRAIN_S = 0.2
 """How long to wait for output printed before the program ended; its own children may keep the pipes open."""
 
-STDERR_LINES_PER_S = 20
-"""Further lines are counted, and not logged."""
+STDERR_LINES_PER_S = 20  # further lines are counted, and not logged
 
 log = structlog.get_logger()
 
@@ -62,10 +59,7 @@ StartProgram = Callable[[Sequence[str], Listener], Coroutine[Any, Any, Program]]
 async def start_process(command: Sequence[str], listener: Listener, clock: Clock) -> Program:
     """Start a program as a child process, in a session of its own so that Ctrl-C does not reach it.
 
-    Raises
-    ------
-    InstrumentError
-        It cannot be started: no such program, no permission.
+    Raises InstrumentError if it cannot be started: no such program, no permission.
     """
     environment = dict(os.environ)
     environment.pop("NOTIFY_SOCKET", None)  # it must not notify systemd on behalf of the service

@@ -38,8 +38,7 @@ if TYPE_CHECKING:
 MAX_LINES_PER_S = 1000
 """An instrument measures up to 20 times a second; a program that prints this much has a bug, and is killed."""
 
-_BYTES_PER_LINE = 1000
-"""This many bytes count as a line, so that a line without end counts too."""
+_BYTES_PER_LINE = 1000  # this many bytes count as a line, so that a line without end counts too
 
 READING_QUEUE_CAPACITY = 1000
 
@@ -108,17 +107,8 @@ class BridgeSession:
     ) -> None:
         """Wait until a condition is met.
 
-        Parameters
-        ----------
-        problem
-            What is wrong after the timeout.
-        restart_on_output
-            Whether each usable line restarts the timeout.
-
-        Raises
-        ------
-        InstrumentError
-            The timeout has expired, or the program has ended.
+        ``problem``: what is wrong after the timeout. ``restart_on_output``: whether each usable line restarts the
+        timeout. Raises InstrumentError if the timeout has expired, or the program has ended.
         """
         timeout_ns = round(timeout_s * 1e9)
         start_ns = self._clock.monotonic_ns()
@@ -241,13 +231,7 @@ class BridgeSession:
 
 
 class RejectedLines:
-    """Counts and logs rejected lines.
-
-    Attributes
-    ----------
-    last
-        What was wrong with the last one; empty since the last measurement.
-    """
+    """Counts and logs rejected lines. ``last``: what was wrong with the last one; empty since the last measurement."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock

@@ -15,8 +15,7 @@ if TYPE_CHECKING:
 MAX_AGE_NS = 10_000_000_000
 """A measurement older than this on arrival was not delayed: its time counts from another epoch."""
 
-STATUS_INTERVAL_NS = 500_000_000
-"""An unchanged status without a target is reported at this interval."""
+STATUS_INTERVAL_NS = 500_000_000  # an unchanged status without a target is reported at this interval
 
 _MS_NS = 1_000_000
 
@@ -40,10 +39,7 @@ class TimestampedLine(NamedTuple):
 class LineTimestamper:
     """Determines the time of each measurement; outlives the program, so that a restart repeats none.
 
-    Parameters
-    ----------
-    latency_ns
-        Time from a measurement to the program's timestamp; subtracted.
+    ``latency_ns``: time from a measurement to the program's timestamp; subtracted.
     """
 
     def __init__(self, latency_ns: int) -> None:
@@ -73,12 +69,8 @@ class LineTimestamper:
     ) -> list[TimestampedLine | str]:
         """Add a line; return the measurements ready now, which may include earlier ones, or why one is rejected.
 
-        Parameters
-        ----------
-        received_ns
-            Arrival of the line.
-        together
-            Whether another measurement arrived in the same piece, so that neither arrival is exact.
+        ``received_ns``: arrival of the line. ``together``: whether another measurement arrived in the same piece, so
+        that neither arrival is exact.
         """
         if not line.status.usable:
             return self._without_target(line, prism, received_ns)

@@ -20,8 +20,7 @@ from tsgt.errors import MessageError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-MAX_TRANSACTION: Final = 32_767
-"""Largest transaction number: instruments store it in a signed 16-bit integer."""
+MAX_TRANSACTION: Final = 32_767  # largest transaction number: instruments store it in a signed 16-bit integer
 
 _HEADER: Final = re.compile(
     r"%R1P,(?P<com_code>\d{1,5})(?:,(?P<transaction>-?\d{1,5}))?(?:,(?P<checksum>\d{1,5}))?:"
@@ -156,8 +155,7 @@ class Byte(int):
     __slots__ = ()
 
 
-Parameter = int | float | bool | str | Byte
-"""A value in a request or reply; a bool is sent as 0 or 1."""
+Parameter = int | float | bool | str | Byte  # a value in a request or reply; a bool is sent as 0 or 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,6 +200,9 @@ def encode_request(
 ) -> bytes:
     """Return a request line, with CR LF.
 
+    Raises MessageError if a number is not finite, a byte or the transaction is out of range, or a string is not
+    Latin-1.
+
     Parameters
     ----------
     transaction
@@ -210,11 +211,6 @@ def encode_request(
         Whether the header has a checksum, which requires a transaction.
     decimals
         Number of decimals, 0 to 15.
-
-    Raises
-    ------
-    MessageError
-        A number is not finite, a byte or the transaction is out of range, or a string is not Latin-1.
     """
     if transaction is not None and not 0 < transaction <= MAX_TRANSACTION:
         raise MessageError(f"transaction {transaction} is not between 1 and {MAX_TRANSACTION}")
@@ -230,18 +226,9 @@ def encode_request(
 def decode_reply(line: bytes, *, checksum: bool = False) -> ReplyLine:
     """Decode a reply.
 
-    Parameters
-    ----------
-    line
-        From ``%R1P``, with or without the line end.
-    checksum
-        Whether a checksum is required, unless the com code reports that the request was not delivered. A checksum that is
-        present is always verified.
-
-    Raises
-    ------
-    MessageError
-        It is not a reply, or damaged.
+    ``line``: from ``%R1P``, with or without the line end. ``checksum``: whether a checksum is required, unless the com
+    code reports that the request was not delivered. A checksum that is present is always verified. Raises MessageError
+    if it is not a reply, or damaged.
     """
     stripped = line.rstrip(b"\r\n")
     text = stripped.decode("ascii", errors="replace")

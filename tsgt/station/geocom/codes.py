@@ -228,10 +228,7 @@ _FAMILIES: Final = {
 def outcome_of(code: int, *, has_values: bool) -> Outcome:
     """Return the meaning of a return code.
 
-    Parameters
-    ----------
-    has_values
-        Whether the reply has values. A code that announces valid ones without is :attr:`Outcome.NO_VALUES`.
+    ``has_values``: whether the reply has values. A code that announces valid ones without is :attr:`Outcome.NO_VALUES`.
     """
     known = _BY_NUMBER.get(code)
     outcome = Outcome.ERROR if known is None else known.outcome

@@ -119,10 +119,7 @@ class _Pending:
 class GeoComConnection:
     """The owner of a port to a GeoCOM instrument.
 
-    Attributes
-    ----------
-    decimals
-        Number of decimals sent; must equal the instrument's setting.
+    ``decimals``: number of decimals sent; must equal the instrument's setting.
     """
 
     def __init__(self, port: Port, clock: Clock, *, checksum: bool = False) -> None:
@@ -139,15 +136,9 @@ class GeoComConnection:
     async def call(self, rpc: Rpc, *parameters: Parameter, timeout_s: float = 3.0) -> Reply:
         """Call a procedure and return its reply; may be cancelled at any time.
 
-        Repeats a request up to twice if it was not delivered, or its reply is damaged or late, unless the procedure moves
-        the telescope.
-
-        Raises
-        ------
-        InstrumentError
-            The line is lost, there was no valid reply, or the instrument does not respond any more.
-        MessageError
-            A parameter cannot be encoded.
+        Repeats a request up to twice if it was not delivered, or its reply is damaged or late, unless the procedure
+        moves the telescope. Raises InstrumentError if the line is lost, there was no valid reply, or the instrument
+        does not respond any more. Raises MessageError if a parameter cannot be encoded.
         """
         silent = False
         async with self._exclusive:
@@ -183,10 +174,7 @@ class GeoComConnection:
     async def abort(self) -> None:
         """Abort a search or another long procedure, whether its caller still waits or was cancelled, and await its reply.
 
-        Raises
-        ------
-        InstrumentError
-            The line is lost, or the instrument does not respond any more.
+        Raises InstrumentError if the line is lost, or the instrument does not respond any more.
         """
         self.port.write(_ABORT)
         async with self._exclusive:
@@ -197,15 +185,8 @@ class GeoComConnection:
     async def is_responding(self, *, abort: bool, timeout_s: float = _RESPONSE_TIMEOUT_S) -> bool:
         """Clear the line and return whether the instrument responds.
 
-        Parameters
-        ----------
-        abort
-            Whether to abort its current procedure; it does not respond during a search.
-
-        Raises
-        ------
-        InstrumentError
-            The line is lost, or the instrument does not support checksums.
+        ``abort``: whether to abort its current procedure; it does not respond during a search. Raises InstrumentError
+        if the line is lost, or the instrument does not support checksums.
         """
         self.port.drain()
         self._lines.clear()
@@ -296,17 +277,8 @@ class GeoComConnection:
 async def connect(open_port: OpenPort, baud: int, clock: Clock, *, checksum: bool) -> GeoComConnection:
     """Open a port and find the baud rate at which an instrument responds.
 
-    Parameters
-    ----------
-    baud
-        Tried first, and again between all others.
-    checksum
-        Whether every line carries a checksum.
-
-    Raises
-    ------
-    InstrumentError
-        The port cannot be opened, or no instrument responds at any baud rate; that takes ten seconds.
+    ``baud``: tried first, and again between all others. ``checksum``: whether every line carries a checksum. Raises
+    InstrumentError if the port cannot be opened, or no instrument responds at any baud rate; that takes ten seconds.
     """
     opened = ""
     for number, candidate in enumerate(_candidates(baud)):

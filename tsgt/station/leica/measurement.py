@@ -13,11 +13,9 @@ from tsgt.station.leica.identity import numeric_values
 if TYPE_CHECKING:
     from tsgt.station.geocom import Reply
 
-STATUS_INTERVAL_NS: Final = 500_000_000
-"""An unchanged status without a distance is reported at this interval."""
+STATUS_INTERVAL_NS: Final = 500_000_000  # an unchanged status without a distance is reported at this interval
 
-MAX_TIME_MS: Final = 2**32
-"""The instrument's time has 32 bits."""
+MAX_TIME_MS: Final = 2**32  # the instrument's time has 32 bits
 
 _MAX_DISTANCE_M: Final = 20_000.0
 
@@ -96,10 +94,8 @@ def decode_full_measurement(reply: Reply) -> FullMeasurement:
 class ReadingFactory:
     """Converts measurements of the tracked prism to readings.
 
-    Attributes
-    ----------
-    latency_ns
-        Time from a measurement to the fastest reply; subtracted from the arrival of replies without a distance.
+    ``latency_ns``: time from a measurement to the fastest reply; subtracted from the arrival of replies without a
+    distance.
     """
 
     def __init__(self, prism: int, latency_ns: int) -> None:

@@ -24,11 +24,9 @@ MAX_FINE_ADJUST_RAD: Final = math.radians(10.0)
 
 FULL_CIRCLE_RAD: Final = math.radians(359.0)
 
-PREDICTION_TIMEOUT_NS: Final = 10_000_000_000
-"""Instruments predict for 1 to 5 s, as set by the operator."""
+PREDICTION_TIMEOUT_NS: Final = 10_000_000_000  # instruments predict for 1 to 5 s, as set by the operator
 
-DIRECTION_MAX_AGE_NS: Final = 15_000_000_000
-"""A direction from the master's poses is used for this long."""
+DIRECTION_MAX_AGE_NS: Final = 15_000_000_000  # a direction from the master's poses is used for this long
 
 ROUND_PAUSES_NS: Final = (2_000_000_000, 5_000_000_000, 10_000_000_000, 20_000_000_000)
 """Pauses after each round of searches; the last one repeats."""
@@ -103,10 +101,7 @@ def window_at_direction(direction: Direction) -> SearchWindow:
 class ReacquisitionSequence:
     """Sequence of search windows while the instrument is not locked on.
 
-    Parameters
-    ----------
-    width_rad, height_rad
-        Full width and height of the widest window.
+    ``width_rad``, ``height_rad``: full width and height of the widest window.
     """
 
     def __init__(self, *, width_rad: float, height_rad: float) -> None:
@@ -138,13 +133,9 @@ class ReacquisitionSequence:
     def restart(self, towards: Direction | None, now_ns: int) -> bool:
         """Search at once, from the first window, at the master's direction if there is one.
 
-        A direction within the spread of the previous one only corrects that: an interrupted search counts as done, so that
-        frequent commands cannot keep the sequence from reaching its later windows.
-
-        Returns
-        -------
-        bool
-            Whether this direction only corrects the previous one.
+        A direction within the spread of the previous one only corrects that: an interrupted search counts as done, so
+        that frequent commands cannot keep the sequence from reaching its later windows. Returns whether this direction
+        only corrects the previous one.
         """
         correction = self._has_direction(now_ns) and towards is not None and self._near(towards)
         self._towards, self._towards_ns = towards, now_ns
@@ -222,10 +213,7 @@ class ReacquisitionSequence:
 class ManualPointingDetector:
     """Detects when the operator has turned the telescope to another prism: it has moved, and rests.
 
-    Parameters
-    ----------
-    initial
-        Pointing when the operator was called; None: the first pointing passed to :meth:`update`.
+    ``initial``: pointing when the operator was called; None: the first pointing passed to :meth:`update`.
     """
 
     def __init__(self, initial: Pointing | None, now_ns: int) -> None:

@@ -36,15 +36,8 @@ class RoboticLicenceMissing(Exception):  # noqa: N818 (not an error: the operato
 class TargetSearch:
     """Searches over one connection. Methods raise :class:`RoboticLicenceMissing` where the instrument lacks the licence.
 
-    Parameters
-    ----------
-    power_search
-        Whether the instrument has PowerSearch; otherwise the target recognition searches the same windows, more slowly.
-
-    Attributes
-    ----------
-    target_found
-        Whether the current search has found a target and only has to lock on.
+    ``power_search``: whether the instrument has PowerSearch; otherwise the target recognition searches the same
+    windows, more slowly. ``target_found``: whether the current search has found a target and only has to lock on.
     """
 
     def __init__(self, line: GeoComConnection, *, power_search: bool) -> None:

@@ -210,10 +210,8 @@ async def set_up(line: GeoComConnection, config: LeicaInstrumentConfig, identity
 async def set_reflector(line: GeoComConnection, prism_type: str, constant_m: float | None) -> str:
     """Set prism type and constant; return the reason why they are not known to be set, empty when they are.
 
-    Raises
-    ------
-    InstrumentError
-        The instrument does not respond, or has another constant: all distances would be off by the difference.
+    Raises InstrumentError if the instrument does not respond, or has another constant: all distances would be off by
+    the difference.
     """
     for _ in range(_TRIES):
         problem, now_m = await _set_reflector(line, prism_type, constant_m)

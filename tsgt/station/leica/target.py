@@ -36,10 +36,7 @@ _FACE_TOLERANCE_M: Final = 0.05
 async def measure_target(line: GeoComConnection, clock: Clock) -> FullMeasurement:
     """Measure the target in the line of sight once; takes some seconds.
 
-    Raises
-    ------
-    InstrumentRefusedError
-        The instrument does not start: its stored distance may be that of another target.
+    Raises InstrumentRefusedError if the instrument does not start: its stored distance may be that of another target.
     """
     await _start_program(line, _CLEAR)
     await _start_program(line, _MEASURE)
@@ -59,10 +56,7 @@ async def measure_target(line: GeoComConnection, clock: Clock) -> FullMeasuremen
 async def measure_in_two_faces(line: GeoComConnection, clock: Clock, *, at_prism: bool) -> FullMeasurement:
     """Measure in both faces and return to the first; return the mean in terms of the first face.
 
-    Raises
-    ------
-    InstrumentRefusedError
-        The instrument cannot change its face, or the faces measured different targets.
+    Raises InstrumentRefusedError if the instrument cannot change its face, or the faces measured different targets.
     """
     first = await measure_target(line, clock)
     if first.distance_m is None:
@@ -102,10 +96,7 @@ def _face_difference_rad(first: FullMeasurement, second: FullMeasurement) -> tup
 def check_same_target(first: FullMeasurement, second: FullMeasurement) -> None:
     """Check that two faces measured the same target.
 
-    Raises
-    ------
-    InstrumentRefusedError
-        They differ by more than the instrument's axis errors.
+    Raises InstrumentRefusedError if they differ by more than the instrument's axis errors.
     """
     if first.distance_m is None or second.distance_m is None:
         return

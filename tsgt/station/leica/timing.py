@@ -29,8 +29,7 @@ _SYNCHRONISATION_NS: Final = 1_000_000_000
 _SYNCHRONISED_SIGMA_NS: Final = 1_000_000
 """The first synchronisation ends when times are known to this sigma, or after this duration."""
 
-_MAX_FAILURES: Final = 3
-"""A single reply without a time is not conclusive."""
+_MAX_FAILURES: Final = 3  # a single reply without a time is not conclusive
 
 _INTERVAL_NS: Final = 500_000_000
 """Interval of exchanges for the time alone, whose replies are the fastest; twice that where they delay distances."""
@@ -46,17 +45,13 @@ _MAX_EXCHANGE_NS: Final = 200_000_000
 _RESERVE_NS: Final = 10_000_000
 """Initial estimate of an exchange's duration, its bound unless the instrument pauses, and the idle time left after it."""
 
-_REPEAT_WINDOW_MS: Final = 60_000
-"""A distance older than the last one by less than this is a repetition."""
+_REPEAT_WINDOW_MS: Final = 60_000  # a distance older than the last one by less than this is a repetition
 
 
 class DistanceTimestamper:
     """Maps the times of one instrument's distances to the host's clock.
 
-    Attributes
-    ----------
-    latency_ns
-        Time from a measurement to the fastest reply; subtracted.
+    ``latency_ns``: time from a measurement to the fastest reply; subtracted.
     """
 
     def __init__(self, latency_ns: int) -> None:

@@ -93,12 +93,8 @@ class PollScheduler:
     def next_ns(self, distance_ns: int, round_trip_ns: int) -> int:
         """Return when to poll for the distance after one; 0: at once.
 
-        Parameters
-        ----------
-        distance_ns
-            When the fastest reply with that one could have arrived.
-        round_trip_ns
-            From a request to the fastest reply.
+        ``distance_ns``: when the fastest reply with that one could have arrived. ``round_trip_ns``: from a request to
+        the fastest reply.
         """
         interval_ns = self.interval_ns
         if interval_ns is None or self._count % _PROBE_EVERY == 0:

@@ -24,13 +24,7 @@ class Link(Protocol):
         """Respond with a journalled single measurement; None: it has failed."""
 
     async def run(self, radio: Radio) -> NoReturn:
-        """Reply to the master over this radio until the radio fails.
-
-        Raises
-        ------
-        RadioError
-            The radio has failed.
-        """
+        """Reply to the master over this radio until the radio fails, which raises RadioError."""
 
     def status(self) -> LinkStatus:
         """Return the link's current status."""

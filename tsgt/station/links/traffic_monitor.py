@@ -20,10 +20,7 @@ log = structlog.get_logger()
 class UnknownTrafficMonitor:
     """Counts packets of unknown origin since the master's last one, and warns when the master stays silent.
 
-    Attributes
-    ----------
-    packets
-        Number of unknown packets since the master's last one.
+    ``packets``: number of unknown packets since the master's last one.
     """
 
     def __init__(self, clock: Clock) -> None:

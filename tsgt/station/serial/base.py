@@ -40,5 +40,4 @@ class Port(Protocol):
         """Close the port; unsent data is lost."""
 
 
-OpenPort = Callable[[int], Coroutine[Any, Any, Port]]
-"""Opens the port at a baud rate; raises InstrumentError."""
+OpenPort = Callable[[int], Coroutine[Any, Any, Port]]  # opens the port at a baud rate; raises InstrumentError

@@ -38,10 +38,7 @@ _FAILURES: Final = (OSError, ValueError, termios.error)
 async def open_serial_port(path: Path, baud: int, clock: Clock) -> Port:
     """Open a serial port exclusively, with 8 data bits, no parity and one stop bit.
 
-    Raises
-    ------
-    InstrumentError
-        The port does not exist, is in use, may not be opened, or does not support the baud rate.
+    Raises InstrumentError if the port does not exist, is in use, may not be opened, or does not support the baud rate.
     """
     try:
         device = serial.Serial(os.fspath(path), baud, timeout=0, exclusive=True)

@@ -13,8 +13,7 @@ _MAX_SYMBOL_MS = 16
 SYNC_QUARTER_SYMBOLS = 17
 """Quarter symbols after the programmed preamble: 2 symbols of sync word and 2.25 of start of frame delimiter."""
 
-HEADER_SYMBOLS = 8
-"""Symbols of the header and the start of the payload, always at rate 4/8."""
+HEADER_SYMBOLS = 8  # symbols of the header and the start of the payload, always at rate 4/8
 
 TX_DONE_NS = 67_000
 """From the end of a packet on the air to TxDone of its sender, measured by Semtech for basicmac."""
@@ -83,12 +82,8 @@ def airtime_us(
 ) -> int:
     """Return the time from the first symbol of the preamble to the end of the packet; see :func:`payload_symbols`.
 
-    Parameters
-    ----------
-    preamble_symbols
-        Value of the preamble register; 4.25 symbols more are sent.
-    low_data_rate
-        The low data rate optimisation; None follows :func:`low_data_rate_required`.
+    ``preamble_symbols``: value of the preamble register; 4.25 symbols more are sent. ``low_data_rate``: the low data
+    rate optimisation; None follows :func:`low_data_rate_required`.
     """
     if low_data_rate is None:
         low_data_rate = low_data_rate_required(spreading_factor, bandwidth_hz)

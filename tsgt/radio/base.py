@@ -13,8 +13,7 @@ from tsgt.radio.airtime import airtime_us, rx_done_ns, symbol_time_ns
 BANDWIDTHS_HZ = (7_800, 10_400, 15_600, 20_800, 31_250, 41_700, 62_500, 125_000, 250_000, 500_000)
 """Nominal bandwidths of the SX127x, in the order of their register codes."""
 
-MAX_PAYLOAD_BYTES = 255
-"""The length is one byte of the LoRa header."""
+MAX_PAYLOAD_BYTES = 255  # the length is one byte of the LoRa header
 
 _LIMITS = {
     "frequency_hz": (137_000_000, 1_020_000_000),
@@ -28,6 +27,8 @@ _LIMITS = {
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoRaSettings:
     """Settings of the modem; two radios receive each other only if all but power and coding rate agree.
+
+    Raises RadioSettingsError if a value is out of its range.
 
     Attributes
     ----------
@@ -49,11 +50,6 @@ class LoRaSettings:
         Low data rate optimisation. None: on for symbols above 16 ms, as the data sheet requires.
     power_dbm
         At the PA_BOOST pin: 2 to 17, or 20 where the driver allows it.
-
-    Raises
-    ------
-    RadioSettingsError
-        A value is out of its range.
     """
 
     frequency_hz: int
@@ -148,31 +144,16 @@ class Radio(Protocol):
     async def configure(self, settings: LoRaSettings) -> None:
         """Change the settings of a running radio.
 
-        Raises
-        ------
-        RadioError
-            The radio does not accept them; it retries in the background.
+        Raises RadioError if the radio does not accept them; it retries in the background.
         """
         ...
 
     async def transmit(self, payload: bytes, *, at_ns: int | None = None) -> Transmission:
         """Send one packet and return after its end; the radio then receives again.
 
-        Calls from several tasks are queued. Cancelling a call aborts its packet.
-
-        Parameters
-        ----------
-        payload
-            1 to 255 bytes.
-        at_ns
-            CLOCK_MONOTONIC of the start; None or a past instant: now.
-
-        Raises
-        ------
-        RadioTimeoutError
-            The end was not reported in time; the packet may have been received.
-        RadioError
-            The packet was not sent.
+        Calls from several tasks are queued. Cancelling a call aborts its packet. ``payload``: 1 to 255 bytes.
+        ``at_ns``: CLOCK_MONOTONIC of the start; None or a past instant: now. Raises RadioTimeoutError if the end was
+        not reported in time; the packet may have been received. Raises RadioError if the packet was not sent.
         """
         ...
 

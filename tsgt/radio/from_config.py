@@ -22,10 +22,7 @@ if TYPE_CHECKING:
 def lora_settings(config: ModemConfig, path: Path) -> LoRaSettings:
     """Return the modem settings of section ``[radio]`` in the file ``path``.
 
-    Raises
-    ------
-    ConfigError
-        The chip has no such bandwidth, the region has no such channel, or 20 dBm are not allowed.
+    Raises ConfigError if the chip has no such bandwidth, the region has no such channel, or 20 dBm are not allowed.
     """
     frequency_hz, bandwidth_hz = round(config.frequency_mhz * 1e6), round(config.bandwidth_khz * 1e3)
     try:

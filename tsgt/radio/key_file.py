@@ -28,17 +28,9 @@ _MAX_FILE_BYTES = 1024
 def read_key(path: Path, *, owner: int | None = None) -> bytes:
     """Read the key of a mission.
 
-    Parameters
-    ----------
-    path
-        A file made by :func:`write_key`, or a copy of it.
-    owner
-        Required user id; None: that of this process.
-
-    Raises
-    ------
-    ConfigError
-        There is no such file, another user owns it or may read, write or replace it, or its content is no key.
+    ``path``: a file made by :func:`write_key`, or a copy of it. ``owner``: required user id; None: that of this
+    process. Raises ConfigError if there is no such file, another user owns it or may read, write or replace it, or its
+    content is no key.
     """
     try:
         # Opening a pipe must not block.
@@ -72,10 +64,7 @@ def read_key(path: Path, *, owner: int | None = None) -> bytes:
 def write_key(path: Path) -> None:
     """Write a new random key into a new file that only its owner may read.
 
-    Raises
-    ------
-    OutputFileError
-        The file exists, or cannot be written.
+    Raises OutputFileError if the file exists, or cannot be written.
     """
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
@@ -100,10 +89,7 @@ def write_key(path: Path) -> None:
 def check_access(path: Path, status: os.stat_result, owner: int) -> None:
     """Check that a key file belongs to the user id ``owner`` alone.
 
-    Raises
-    ------
-    ConfigError
-        It is no regular file, belongs to another user, or another user may read or write it.
+    Raises ConfigError if it is no regular file, belongs to another user, or another user may read or write it.
     """
     if not stat.S_ISREG(status.st_mode):
         raise ConfigError(f"{path}: not a file; name one made with `tsgt radio key`", path=path)

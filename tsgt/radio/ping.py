@@ -28,8 +28,7 @@ _NO_TURNAROUND = 0xFFFFFFFF
 
 MIN_PAYLOAD_BYTES = _HEADER.size + _REPORT.size
 
-SESSION_IDS = 1 << 16
-"""Sessions are numbered from 0 to one below this."""
+SESSION_IDS = 1 << 16  # sessions are numbered from 0 to one below this
 
 
 class SignalStrength(NamedTuple):
@@ -93,12 +92,8 @@ class Exchange:
 class Response:
     """A packet at the responding side.
 
-    Attributes
-    ----------
-    number
-        Of the request; None for an unknown packet.
-    turnaround_ns
-        From its RxDone to the start of the reply; None without one: a request has one reply.
+    ``number``: of the request; None for an unknown packet. ``turnaround_ns``: from its RxDone to the start of the
+    reply; None without one: a request has one reply.
     """
 
     number: int | None
@@ -162,6 +157,8 @@ async def ping(
 ) -> AsyncGenerator[Exchange, None]:
     """Send requests one after the other and yield each exchange.
 
+    Raises RadioError if the radio failed.
+
     Parameters
     ----------
     session
@@ -172,11 +169,6 @@ async def ping(
         Of request and reply, :data:`MIN_PAYLOAD_BYTES` to 255.
     timeout_ns
         From TxDone of a request to RxDone of its reply.
-
-    Raises
-    ------
-    RadioError
-        The radio failed.
     """
     for number in range(count):
         sent = await radio.transmit(_HEADER.pack(_REQUEST, session, number).ljust(payload_bytes, b"\0"))
@@ -204,13 +196,7 @@ async def ping(
 
 
 async def respond(radio: Radio) -> AsyncGenerator[Response, None]:
-    """Reply to requests until cancelled and yield the response to each packet.
-
-    Raises
-    ------
-    RadioError
-        The radio failed.
-    """
+    """Reply to requests until cancelled and yield the response to each packet. Raises RadioError if the radio failed."""
     previous: _Header | None = None
     turnaround_us = _NO_TURNAROUND
     while True:

@@ -26,13 +26,9 @@ async def supervise_radio(
 ) -> NoReturn:
     """Open the radio and await ``use(radio)``, for ever; after an error or its return, reopen the radio.
 
-    The delay after an error grows from 0.1 s to 5 s, until the radio has worked for longer than that. Only a changed error
-    is logged, so that a missing radio does not fill the log.
-
-    Raises
-    ------
-    RadioSettingsError
-        The radio will never accept the settings.
+    The delay after an error grows from 0.1 s to 5 s, until the radio has worked for longer than that. Only a changed
+    error is logged, so that a missing radio does not fill the log. Raises RadioSettingsError if the radio will never
+    accept the settings.
     """
     delay_ns = INITIAL_RETRY_DELAY_NS
     logged = ""

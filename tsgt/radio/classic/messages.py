@@ -16,16 +16,14 @@ from tsgt.model import Status, check_finite
 Letter = Literal["t", "p", "e", "s", "c", "d", "n"]
 """t: data, p: begin synchronisation, e: ping, s: timestamp of the ping, c: end it, d: direct mode, n: track."""
 
-STATIONS = PRISMS = range(1, 10)
-"""One ASCII digit, without 0."""
+STATIONS = PRISMS = range(1, 10)  # one ASCII digit, without 0
 
 COMMAND_BYTES = 2
 PING_REPLY_BYTES = 2
 TIME_REPLY_BYTES = 9
 MEASUREMENT_BYTES = 34
 
-MAX_TIME_NS = 2**32 * 1_000_000_000 - 1
-"""In February 2106."""
+MAX_TIME_NS = 2**32 * 1_000_000_000 - 1  # in February 2106
 
 _TIME = struct.Struct("<cII")
 _MEASUREMENT = struct.Struct("<BBdddII")
@@ -58,13 +56,7 @@ _NO_SECONDS = (0, 0xFFFF_FFFF)
 
 @dataclass(frozen=True, slots=True)
 class CommandMessage:
-    """A command of the master; ``n`` may name the prism to track.
-
-    Raises
-    ------
-    ValueError
-        There is no such command.
-    """
+    """A command of the master; ``n`` may name the prism to track. Raises ValueError if there is no such command."""
 
     letter: Letter
     station: int
@@ -126,6 +118,8 @@ class Acknowledgement:
 class MeasurementMessage:
     """The reply to ``t``.
 
+    Raises ValueError if a number is out of range or not finite.
+
     Attributes
     ----------
     station
@@ -138,11 +132,6 @@ class MeasurementMessage:
         Without prism constant; 0 with status 4.
     time_ns
         On the station's Unix clock. 0: no measurement yet, or an error of an authors' node.
-
-    Raises
-    ------
-    ValueError
-        A number is out of range or not finite.
     """
 
     station: int

@@ -20,8 +20,7 @@ missing measurement it can. It may miss the first replies, but after five second
 and about six of its requests fit into these."""
 
 
-ClassicCommand = TrackCommand | DirectCommand | MeasureCommand
-"""The commands of this protocol."""
+ClassicCommand = TrackCommand | DirectCommand | MeasureCommand  # the commands of this protocol
 
 
 class ClassicStation:
@@ -47,11 +46,8 @@ class ClassicStation:
     def received(self, payload: bytes, at_ns: int) -> bytes | ClassicCommand | None:
         """Take any packet, with its RxDone on the station's Unix clock.
 
-        Returns
-        -------
-        bytes, ClassicCommand or None
-            A reply to send at once; a command to execute and report; or None: the packet is not for this station, not of
-            this protocol, or ``p`` or ``c``.
+        Returns a reply to send at once; a command to execute and report; or None: the packet is not for this station,
+        not of this protocol, or ``p`` or ``c``.
         """
         command = decode_command(payload)
         if command is None or command.station != self._station:

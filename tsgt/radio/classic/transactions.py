@@ -36,18 +36,14 @@ if TYPE_CHECKING:
 TURNAROUND_NS = 100_000_000
 """Largest turnaround of a station, from a request to its reply; the authors' nodes take 12 ms."""
 
-SINGLE_MEASUREMENT_TIMEOUT_NS = 20_000_000_000
-"""Timeout of a single measurement: instruments take 1 to 10 s."""
+SINGLE_MEASUREMENT_TIMEOUT_NS = 20_000_000_000  # timeout of a single measurement: instruments take 1 to 10 s
 
 
 @dataclass(frozen=True, slots=True)
 class LinkTiming:
     """Durations of packets and timeouts at one modem setting.
 
-    Attributes
-    ----------
-    reply_timeout_ns
-        From the end of a request to RxDone of its reply, as configured.
+    ``reply_timeout_ns``: from the end of a request to RxDone of its reply, as configured.
     """
 
     settings: LoRaSettings
@@ -110,10 +106,7 @@ class Transaction(ABC):
 class Poll(Transaction):
     """Requests a station's newest measurement, once.
 
-    Attributes
-    ----------
-    message
-        The reply; None without one. It may repeat that of an earlier poll.
+    ``message``: the reply; None without one. It may repeat that of an earlier poll.
     """
 
     def __init__(self, station: int, timing: LinkTiming) -> None:
@@ -161,12 +154,7 @@ class CommandTransaction(Transaction):
     """Sends a station the command ``d`` or ``n``, once.
 
     ``c`` precedes it: a node that was left in the middle of a synchronisation is still in that mode. ``timeout_ns`` is
-    the time for the instrument, say to turn.
-
-    Attributes
-    ----------
-    ok
-        The acknowledgement; None without one.
+    the time for the instrument, say to turn. ``ok``: the acknowledgement; None without one.
     """
 
     def __init__(self, station: int, command: CommandMessage, timeout_ns: int) -> None:
@@ -211,17 +199,11 @@ class Synchronisation(Transaction):
     - the timestamp is new in this synchronisation;
     - both instants of the master are edges.
 
-    A sample bounds the clock offset from both sides. If the bounds of two samples exclude each other, one is wrong or the
-    clock was set in between, and all samples before the second are dropped. They are also dropped when the station, having
-    replied to a ping, reports none: its program has restarted. Cycles without a sample are repeated until half of the
-    cycles have one, but at most as many again. A single sample at the end is dropped.
-
-    Parameters
-    ----------
-    cycles
-        1 or more.
-    timestamp_delay_ns
-        How late the station timestamps a reception, after its RxDone.
+    A sample bounds the clock offset from both sides. If the bounds of two samples exclude each other, one is wrong or
+    the clock was set in between, and all samples before the second are dropped. They are also dropped when the station,
+    having replied to a ping, reports none: its program has restarted. Cycles without a sample are repeated until half
+    of the cycles have one, but at most as many again. A single sample at the end is dropped. ``cycles``: 1 or more.
+    ``timestamp_delay_ns``: how late the station timestamps a reception, after its RxDone.
 
     Attributes
     ----------
@@ -238,16 +220,13 @@ class Synchronisation(Transaction):
         Whether the station's program has restarted meanwhile, by its own report; all samples are from after that.
     """
 
-    MAX_MISSED_REPLIES = 3
-    """This many requests in a row without a reply end the synchronisation."""
+    MAX_MISSED_REPLIES = 3  # this many requests in a row without a reply end the synchronisation
     LEAVE_REPEATS = 2
     """How often ``c`` is sent: it has no reply, and a node that misses it does not reply to polls."""
-    MIN_SAMPLES = 2
-    """This many samples have to agree, if that many cycles were requested."""
+    MIN_SAMPLES = 2  # this many samples have to agree, if that many cycles were requested
     TOLERANCE_NS = 5_000_000
     """Tolerance of clocks, timestamps and known delays before a reply or a sample is rejected."""
-    TOLERANCE_PPM = 500
-    """Tolerance of a station's skew between two samples."""
+    TOLERANCE_PPM = 500  # tolerance of a station's skew between two samples
 
     def __init__(self, station: int, cycles: int, timing: LinkTiming, timestamp_delay_ns: int = 0) -> None:
         super().__init__(station)

@@ -41,14 +41,11 @@ if TYPE_CHECKING:
 HOST_NS = 3_400_000
 """Mean turnaround of a computer from a packet to the next one without a scheduled start, as in the simulation."""
 
-_MIN_PROBABILITY = 1e-4
-"""Rarer events are ignored."""
+_MIN_PROBABILITY = 1e-4  # rarer events are ignored
 
-_PHASE_SETS = 16
-"""Number of sets of instrument phases to average over."""
+_PHASE_SETS = 16  # number of sets of instrument phases to average over
 
-_WAIT_SAMPLES = 100
-"""Number of samples of a wait that is uniform within a frame."""
+_WAIT_SAMPLES = 100  # number of samples of a wait that is uniform within a frame
 
 _PRIMES = (2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47, 53)
 
@@ -116,12 +113,8 @@ def classic_cycle(
 ) -> CycleEstimate:
     """Predict the paper's protocol, long after the first synchronisation.
 
-    Parameters
-    ----------
-    resync_cycles, resync_interval_ns
-        Cycles of a station's resynchronisation, and the interval between two.
-    host_ns
-        Turnaround of each computer.
+    ``resync_cycles``, ``resync_interval_ns``: cycles of a station's resynchronisation, and the interval between two.
+    ``host_ns``: turnaround of each computer.
     """
     success = load.exchange_success
     request_ns = timing.airtime_ns(COMMAND_BYTES)

@@ -18,14 +18,11 @@ if TYPE_CHECKING:
 
     from tsgt.radio.base import LoRaSettings
 
-MAX_PRESET_DBM = 17
-"""Above it the chip has its own limit of 1 % duty cycle."""
+MAX_PRESET_DBM = 17  # above it the chip has its own limit of 1 % duty cycle
 
-MIN_POWER_DBM = 2
-"""Minimum of PA_BOOST."""
+MIN_POWER_DBM = 2  # minimum of PA_BOOST
 
-WIDE_HZ = 500_000
-"""From this bandwidth on, a fixed channel is a digital modulation by 15.247(a)(2)."""
+WIDE_HZ = 500_000  # from this bandwidth on, a fixed channel is a digital modulation by 15.247(a)(2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,10 +73,7 @@ REGIONS: dict[str, tuple[Band, ...]] = {
 def preset_power_dbm(region: str, *, frequency_hz: int, bandwidth_hz: int) -> int:
     """Return the preset power at the PA_BOOST pin for a channel in a region.
 
-    Raises
-    ------
-    RadioSettingsError
-        The channel does not lie in any band of the region.
+    Raises RadioSettingsError if the channel does not lie in any band of the region.
     """
     bands = bands_of(region, frequency_hz=frequency_hz, bandwidth_hz=bandwidth_hz)
     return min(band.power_dbm if bandwidth_hz >= band.min_bandwidth_hz else MIN_POWER_DBM for band in bands)
@@ -88,10 +82,7 @@ def preset_power_dbm(region: str, *, frequency_hz: int, bandwidth_hz: int) -> in
 def bands_of(region: str, *, frequency_hz: int, bandwidth_hz: int) -> tuple[Band, ...]:
     """Return the band of a channel, or the adjoining bands.
 
-    Raises
-    ------
-    RadioSettingsError
-        The channel does not lie within the bands of the region.
+    Raises RadioSettingsError if the channel does not lie within the bands of the region.
     """
     low_hz, high_hz = frequency_hz - bandwidth_hz // 2, frequency_hz + bandwidth_hz // 2
     touched = tuple(band for band in REGIONS[region] if band.low_hz < high_hz and low_hz < band.high_hz)
@@ -109,32 +100,23 @@ def bands_of(region: str, *, frequency_hz: int, bandwidth_hz: int) -> tuple[Band
     )
 
 
-DIPOLE_DBI = 2.15
-"""Difference of e.i.r.p. and e.r.p."""
+DIPOLE_DBI = 2.15  # difference of e.i.r.p. and e.r.p.
 
-NARROW_EIRP_DBM = -1.25
-"""15.249: 50 mV/m at 3 m, for a fixed channel of any bandwidth."""
+NARROW_EIRP_DBM = -1.25  # 15.249: 50 mV/m at 3 m, for a fixed channel of any bandwidth
 
-WIDE_DBM = 30
-"""15.247(b)(3): 1 W into the antenna."""
+WIDE_DBM = 30  # 15.247(b)(3): 1 W into the antenna
 
-WIDE_GAIN_DBI = 6
-"""15.247(b)(4): gain above this reduces the allowed power."""
+WIDE_GAIN_DBI = 6  # 15.247(b)(4): gain above this reduces the allowed power
 
 CHIP_DBM = 20
-CHIP_DUTY = 0.01
-"""Duty cycle limit of the chip at +20 dBm."""
+CHIP_DUTY = 0.01  # duty cycle limit of the chip at +20 dBm
 
 
 class ChannelUse(NamedTuple):
     """The planned use of a channel.
 
-    Attributes
-    ----------
-    antenna_gain_dbi
-        Of each antenna, less the loss of its cable.
-    master_duty, station_duty
-        Duty cycle of the master, and of each station.
+    ``antenna_gain_dbi``: of each antenna, less the loss of its cable. ``master_duty``, ``station_duty``: duty cycle of
+    the master, and of each station.
     """
 
     settings: LoRaSettings
@@ -156,17 +138,8 @@ class ChannelUse(NamedTuple):
 def violations(use: ChannelUse, region: str | None, others: Sequence[ChannelUse]) -> list[str]:
     """Return a sentence for each violated limit, with what would comply.
 
-    Parameters
-    ----------
-    region
-        None: only the chip's limits apply.
-    others
-        The same use with other settings, in the order of preference.
-
-    Raises
-    ------
-    RadioSettingsError
-        The channel does not lie in any band of the region.
+    ``region``: None: only the chip's limits apply. ``others``: the same use with other settings, in the order of
+    preference. Raises RadioSettingsError if the channel does not lie in any band of the region.
     """
     violated = []
     if use.settings.power_dbm >= CHIP_DBM and use.duty > CHIP_DUTY:

@@ -47,31 +47,26 @@ MAX_GRANT_FEW_STATIONS = GRANT_BYTES.index(71)
 
 MANY_STATIONS = 8
 
-ABSENT_FRAMES = 6
-"""A station silent for this many frames gets at most :data:`DEFAULT_GRANT`."""
+ABSENT_FRAMES = 6  # a station silent for this many frames gets at most :data:`DEFAULT_GRANT`
 
-MAX_RETRY_SILENT_FRAMES = 4
-"""A station silent for longer gets no slot in a retry frame."""
+MAX_RETRY_SILENT_FRAMES = 4  # a station silent for longer gets no slot in a retry frame
 
 MAX_MEASUREMENTS = 15
 
 _NOISE = (31, -17, 54, -40, 8, -62, 25)
 """1 mm across the line of sight, in units of an angle at 75 m; twice the noise of a distance."""
 
-_GAP = 3
-"""Assumed gap of the sequence numbers after a loss."""
+_GAP = 3  # assumed gap of the sequence numbers after a loss
 
 EARLY_US = 5_000
-EARLY_SPREADS = 3
-"""How early a measurement may be: a constant, plus a multiple of the jitter of its period."""
+EARLY_SPREADS = 3  # how early a measurement may be: a constant, plus a multiple of the jitter of its period
 
 
 INITIAL_EXCHANGES = 8
 EXCHANGE_INTERVAL = 32
 """A two-way exchange measures the link delay: this many at the start, then one in this many frames."""
 
-EXCHANGE_STEP = 5
-"""Frames between the exchanges of neighbouring stations, which spreads the long replies."""
+EXCHANGE_STEP = 5  # frames between the exchanges of neighbouring stations, which spreads the long replies
 
 RETRY_INTERVAL = 32
 """Frames between requests for outstanding measurements that the station did not send though it had room."""
@@ -79,11 +74,9 @@ RETRY_INTERVAL = 32
 TYPICAL_PERIOD = Period(period_us=400_000, phase_us=0, jitter_us=50_000)
 """Of a tracking instrument, until its own is estimated."""
 
-MAX_BLOCK_BYTES = 21
-"""Upper bound of a measurement in a block of its own."""
+MAX_BLOCK_BYTES = 21  # upper bound of a measurement in a block of its own
 
-AGE_WINDOW = 32
-"""Number of replies whose newest measurement's age counts."""
+AGE_WINDOW = 32  # number of replies whose newest measurement's age counts
 
 
 @dataclass(frozen=True, slots=True)

@@ -47,8 +47,7 @@ if TYPE_CHECKING:
 
 NONCE_BITS = 48
 
-MAX_FRAMES_PER_SESSION = (1 << 24) - 1
-"""The frame counter has 24 bits; a new session starts before it wraps."""
+MAX_FRAMES_PER_SESSION = (1 << 24) - 1  # the frame counter has 24 bits; a new session starts before it wraps
 
 SESSION_INTERVAL = 32
 SESSION_INTERVAL_JOINING = 4
@@ -56,17 +55,13 @@ SESSION_STARTUP_FRAMES = 12
 """Beacons with session info, which a station needs to join: one in 32, one in 4 while a station is missing, and all of
 the first 12."""
 
-EXCHANGES_PER_FRAME = 3
-"""With more stations their initial two-way exchanges are spread over several frames."""
+EXCHANGES_PER_FRAME = 3  # with more stations their initial two-way exchanges are spread over several frames
 
-REJOIN_FRAMES = 4
-"""A station that was silent for more frames may have to join again."""
+REJOIN_FRAMES = 4  # a station that was silent for more frames may have to join again
 
-ABSENT_FRAMES = 20
-"""A station that was silent for more frames has a slot only in frames with session info."""
+ABSENT_FRAMES = 20  # a station that was silent for more frames has a slot only in frames with session info
 
-IDLE_FRAME_NS = 400_000_000
-"""Length of a frame without slots."""
+IDLE_FRAME_NS = 400_000_000  # length of a frame without slots
 
 
 @dataclass(slots=True)
@@ -88,6 +83,9 @@ class _Frame:
 class SuperframeMaster:
     """Runs the frames of a session, and a new session when the frame counter is exhausted.
 
+    ``session``, ``counter``: session nonce, and frame counter in the session; -1 before the first frame.
+    ``rejected_packets``: packets that were not a reply to the present beacon: of others, forged, late, repeated.
+
     Parameters
     ----------
     prisms
@@ -98,13 +96,6 @@ class SuperframeMaster:
         Plans the start of frames; None: as early as possible.
     records
         Measurements are recorded. Otherwise none is acknowledged, and all stations get the default grant.
-
-    Attributes
-    ----------
-    session, counter
-        Session nonce, and frame counter in the session; -1 before the first frame.
-    rejected_packets
-        Packets that were not a reply to the present beacon: of others, forged, late, repeated.
     """
 
     def __init__(

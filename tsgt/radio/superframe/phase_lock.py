@@ -35,17 +35,13 @@ MARGIN_DECREASE_NS = 30_000
 """The time that a measurement needs from its timestamp to the composed reply is learnt for each station: a measurement
 that was made in time and missed its reply increases the margin, one that just made it decreases it; one in 100 misses."""
 
-JITTER_SIGMAS = 3.0
-"""Margin for the jitter of an instrument's period."""
+JITTER_SIGMAS = 3.0  # margin for the jitter of an instrument's period
 
-PERIOD_TOLERANCE = 0.01
-"""Instruments whose periods differ by a smaller part share a phase lock."""
+PERIOD_TOLERANCE = 0.01  # instruments whose periods differ by a smaller part share a phase lock
 
-MIN_GAIN = 0.02
-"""Minimum gain of a change in mean age, as a part of the period."""
+MIN_GAIN = 0.02  # minimum gain of a change in mean age, as a part of the period
 
-GRANT_WINDOW = 4
-"""Number of frames whose median grants count."""
+GRANT_WINDOW = 4  # number of frames whose median grants count
 
 FRAME_WINDOW = 32
 """Number of frames that the usual frame length, and the usual lag behind the period, are taken from."""

@@ -30,8 +30,7 @@ MAX_BLOCK_MEASUREMENTS = 16
 MAX_BLOCKS = 15
 
 MIN_MEASUREMENT_BYTES = 6
-TYPICAL_MEASUREMENT_BYTES = 8
-"""Length of a measurement that is not the first of its block."""
+TYPICAL_MEASUREMENT_BYTES = 8  # length of a measurement that is not the first of its block
 
 _QUALITY_SPREAD = 2
 _GOOD_QUALITY = 7
@@ -39,8 +38,7 @@ _GOOD_QUALITY = 7
 that differs by more than the spread from the newest of the block gets a block of its own, which takes three times the
 room."""
 
-MAX_SHORT_QUEUE = 8
-"""A longer queue is a backlog, delivered newest first."""
+MAX_SHORT_QUEUE = 8  # a longer queue is a backlog, delivered newest first
 
 MAX_SKIPPED_REPLIES = 2
 """After this many replies without the oldest of a short queue it takes precedence for one reply."""

@@ -17,8 +17,7 @@ if TYPE_CHECKING:
 
     from tsgt.model import Status
 
-QUEUE_CAPACITY = 100_000
-"""Eleven hours of measurements, about 30 MB."""
+QUEUE_CAPACITY = 100_000  # eleven hours of measurements, about 30 MB
 
 _MAX_QUALITY = 15
 _SEQUENCE_BITS = 8

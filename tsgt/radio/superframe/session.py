@@ -27,8 +27,7 @@ if TYPE_CHECKING:
     from tsgt.radio.superframe.slots import Slot
     from tsgt.radio.superframe.wire import Beacon, Reply, SessionInfo
 
-MAX_SLOT_SIGMA_NS = 1_000_000
-"""A beacon with a less exact timestamp gives no slot."""
+MAX_SLOT_SIGMA_NS = 1_000_000  # a beacon with a less exact timestamp gives no slot
 
 _FRAME_BITS = 8
 _SENT_BITS = 16
@@ -39,11 +38,9 @@ _BEACON_RELATIVE_EXTRA_US = 2000.0
 _MAX_REACH_NS = int(4.4 * 3600e9)
 """Measurements made longer before the first beacon have no timestamp within half a second, whatever the skew bound."""
 
-_USEFUL_BEACONS_NS = 60_000_000_000
-"""Beacons later than this after an instant do not improve its timestamp."""
+_USEFUL_BEACONS_NS = 60_000_000_000  # beacons later than this after an instant do not improve its timestamp
 
-_SIGMAS = 4
-"""Sigmas in a bound."""
+_SIGMAS = 4  # sigmas in a bound
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,6 +97,9 @@ class SentReply:
 class StationSession:
     """One session of a master.
 
+    ``confirmed``: a beacon has repeated the station's nonce: the session is not a replay. ``beacon``, ``slot``: the
+    newest beacon, and the slot for the reply to it.
+
     Parameters
     ----------
     beacon, info
@@ -108,13 +108,6 @@ class StationSession:
         The station's nonce in this session, 32 bits.
     boot, clocks
         The present boot id, and the clocks of this session by boot id, from journalled receptions.
-
-    Attributes
-    ----------
-    confirmed
-        A beacon has repeated the station's nonce: the session is not a replay.
-    beacon, slot
-        The newest beacon, and the slot for the reply to it.
     """
 
     def __init__(

@@ -21,11 +21,9 @@ if TYPE_CHECKING:
     from tsgt.radio.base import LoRaSettings
     from tsgt.radio.superframe.wire import SlotOrder
 
-GUARD_UNIT_NS = 250_000
-"""Unit of guard time and turnaround in a beacon."""
+GUARD_UNIT_NS = 250_000  # unit of guard time and turnaround in a beacon
 
-COMPOSE_LEAD_NS = 6_000_000
-"""How long before its slot a station composes its reply."""
+COMPOSE_LEAD_NS = 6_000_000  # how long before its slot a station composes its reply
 
 EXACT_SIGMA_NS = 100_000
 """A timestamp with a larger sigma was made without the edge or without kernel support, and measures no delay."""
@@ -35,8 +33,7 @@ OVERLAP_SYMBOLS = 1.2
 
 MAX_FRAME_NS = 5_000_000_000
 
-_TIMESTAMP_SYMBOLS = 0.1
-"""Uncertainty of the nominal delay from the end of a packet to RxDone."""
+_TIMESTAMP_SYMBOLS = 0.1  # uncertainty of the nominal delay from the end of a packet to RxDone
 
 
 class Slot(NamedTuple):

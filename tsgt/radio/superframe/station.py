@@ -40,8 +40,7 @@ if TYPE_CHECKING:
 SESSION_TIMEOUT_NS = 3_000_000_000
 """Another session becomes a candidate only when the confirmed one has been silent for longer."""
 
-PREPARATION_NS = 1_000_000
-"""What a radio needs to start a transmission immediately."""
+PREPARATION_NS = 1_000_000  # what a radio needs to start a transmission immediately
 
 _NONCE_BITS = 32
 

@@ -23,8 +23,7 @@ if TYPE_CHECKING:
         StatusReport,
     )
 
-FULL_TIME_FRAMES = 3
-"""Beacons with the full time after a join request: the station needs two that agree."""
+FULL_TIME_FRAMES = 3  # beacons with the full time after a join request: the station needs two that agree
 
 
 class _PendingCommand(NamedTuple):

@@ -22,17 +22,14 @@ if TYPE_CHECKING:
     from tsgt.radio.superframe.wire import MeasurementBlock, Reply
     from tsgt.timesync import LinkDelayEstimator
 
-SIGMAS = 4
-"""Sigmas in the bound of a timestamp."""
+SIGMAS = 4  # sigmas in the bound of a timestamp
 
-MAX_AHEAD_US = 20_000
-"""Latest time of a measurement after the nominal, or actual, start of its reply."""
+MAX_AHEAD_US = 20_000  # latest time of a measurement after the nominal, or actual, start of its reply
 
 MAX_AMBIGUOUS_DELAY_NS = 30_000_000
 """Beacons delayed by more may agree with each other in the 16 low bits of their times."""
 
-_ROUNDING_NS = 9_000
-"""Half a time unit, plus rounding to microseconds."""
+_ROUNDING_NS = 9_000  # half a time unit, plus rounding to microseconds
 
 
 class BeaconDelayMonitor:

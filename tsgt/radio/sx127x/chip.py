@@ -27,12 +27,9 @@ if TYPE_CHECKING:
 
 log = structlog.get_logger()
 
-RESET_LOW_NS = 1_000_000
-"""Duration of the NRESET pulse; the chip needs 0.1 ms (section 7.2.2)."""
-RESET_WAIT_NS = 10_000_000
-"""Pause after the reset; the chip needs 5 ms."""
-MODE_WAIT_NS = 1_000_000
-"""Pause between a change of mode and its check; the oscillator starts in 0.25 ms."""
+RESET_LOW_NS = 1_000_000  # duration of the NRESET pulse; the chip needs 0.1 ms (section 7.2.2)
+RESET_WAIT_NS = 10_000_000  # pause after the reset; the chip needs 5 ms
+MODE_WAIT_NS = 1_000_000  # pause between a change of mode and its check; the oscillator starts in 0.25 ms
 
 # Plain integers: members of IntFlag are slow to combine.
 _RX_DONE = int(Irq.RX_DONE)
@@ -43,15 +40,7 @@ _ABSENT = 0xFF  # an open MISO line; no state of the chip has all flags set
 
 @dataclass(frozen=True, slots=True)
 class RawPacket:
-    """A packet in the chip.
-
-    Attributes
-    ----------
-    payload
-        With bit errors if ``crc_error``.
-    has_crc
-        Whether the sender added a CRC.
-    """
+    """A packet in the chip. ``payload``: with bit errors if ``crc_error``. ``has_crc``: whether the sender added a CRC."""
 
     payload: bytes
     has_crc: bool
@@ -73,12 +62,8 @@ class Chip:
     async def set_up(self) -> None:
         """Reset the chip, identify it, write and verify all settings, and enter reception.
 
-        Raises
-        ------
-        RadioNotFoundError
-            There is no chip, or it is not an SX1276/77/78/79.
-        RadioError
-            A register does not read back as written.
+        Raises RadioNotFoundError if there is no chip, or it is not an SX1276/77/78/79. Raises RadioError if a register
+        does not read back as written.
         """
         self._hal.set_reset(low=True)
         await self._pause(RESET_LOW_NS)
@@ -115,12 +100,8 @@ class Chip:
     def check_reception(self) -> None:
         """Check that the chip receives with our settings and accepts writes.
 
-        A receiver that fails with all its registers intact is indistinguishable from a quiet channel.
-
-        Raises
-        ------
-        RadioError
-            The chip was reset, hangs, or is disconnected.
+        A receiver that fails with all its registers intact is indistinguishable from a quiet channel. Raises RadioError
+        if the chip was reset, hangs, or is disconnected.
         """
         self._registers.verify(self._op_mode(Mode.RXCONTINUOUS))
         self._registers.verify(RegisterValue(Register.SYNC_WORD, self._settings.sync_word))
@@ -131,10 +112,7 @@ class Chip:
     def load(self, payload: bytes) -> None:
         """Clear all flags and load a packet for :meth:`send`, from standby.
 
-        Raises
-        ------
-        RadioError
-            The chip did not accept it.
+        Raises RadioError if the chip did not accept it.
         """
         self._tune(frf(self._settings.frequency_hz))
         self._registers.write(Register.IRQ_FLAGS, reg.ALL_IRQ_FLAGS)

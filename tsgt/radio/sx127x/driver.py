@@ -32,19 +32,15 @@ log = structlog.get_logger()
 
 PREPARATION_NS = 3_000_000
 """Time before its start at which a transmission is prepared and reception ends: the longest payload over a slow bus."""
-TX_POLL_NS = 5_000_000
-"""Interval at which TxDone is polled after the end of a packet, without an edge."""
-TX_TIMEOUT_NS = 50_000_000
-"""Timeout from the end of a packet to its TxDone."""
+TX_POLL_NS = 5_000_000  # interval at which TxDone is polled after the end of a packet, without an edge
+TX_TIMEOUT_NS = 50_000_000  # timeout from the end of a packet to its TxDone
 TX_LOST_EDGE_SIGMA_NS = 1_000_000
 """One sigma of an end of transmission that is computed from the timestamp of its start."""
-CHECK_INTERVAL_NS = 100_000_000
-"""Interval of the checks of a receiving chip."""
+CHECK_INTERVAL_NS = 100_000_000  # interval of the checks of a receiving chip
 INITIAL_RETRY_DELAY_NS = 100_000_000
 MAX_RETRY_DELAY_NS = 5_000_000_000
 """Delay between attempts to set up a chip that does not respond; it doubles after each."""
-QUEUE_CAPACITY = 64
-"""Packets queued for :meth:`SX127x.receive`; an overflow drops the oldest."""
+QUEUE_CAPACITY = 64  # packets queued for :meth:`SX127x.receive`; an overflow drops the oldest
 
 
 class State(Enum):

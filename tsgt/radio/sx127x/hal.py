@@ -20,12 +20,8 @@ from tsgt.errors import RadioError, RadioNotFoundError, RadioSettingsError
 class Edge:
     """A rising edge of DIO0.
 
-    Attributes
-    ----------
-    at_ns
-        On the driver's clock (CLOCK_MONOTONIC).
-    lost
-        Number of edges before it that the hardware detected but could not report.
+    ``at_ns``: on the driver's clock (CLOCK_MONOTONIC). ``lost``: number of edges before it that the hardware detected
+    but could not report.
     """
 
     at_ns: int
@@ -46,13 +42,7 @@ class Hal(Protocol):
         ...
 
     def transfer(self, data: bytes) -> bytes:
-        """Exchange bytes in one chip-select window; as many are received as sent.
-
-        Raises
-        ------
-        RadioError
-            The bus failed.
-        """
+        """Exchange bytes in one chip-select window; as many are received as sent. Raises RadioError if the bus failed."""
         ...
 
     def set_reset(self, *, low: bool) -> None:
@@ -111,12 +101,8 @@ DRAGINO_HAT = Wiring(reset_pin=17, dio0_pin=4, nss_pin=25)
 def open_hal(wiring: Wiring) -> Hal:
     """Open bus and pins on a Raspberry Pi.
 
-    Raises
-    ------
-    RadioNotFoundError
-        There is no such SPI bus or GPIO chip.
-    RadioError
-        A package is missing, the bus or a pin is in use, or permission is denied.
+    Raises RadioNotFoundError if there is no such SPI bus or GPIO chip. Raises RadioError if a package is missing, the
+    bus or a pin is in use, or permission is denied.
     """
     spi = _Spi(wiring)
     try:

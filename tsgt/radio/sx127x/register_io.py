@@ -172,24 +172,12 @@ class RegisterAccess:
         self._hal.transfer(bytes([reg.WRITE | address]) + data)
 
     def write_verified(self, register: RegisterValue) -> None:
-        """Write a register and read it back.
-
-        Raises
-        ------
-        RadioError
-            It reads back differently.
-        """
+        """Write a register and read it back. Raises RadioError if it reads back differently."""
         self.write(register.address, register.value)
         self.verify(register)
 
     def verify(self, register: RegisterValue) -> None:
-        """Check that a register reads back as written.
-
-        Raises
-        ------
-        RadioError
-            It reads back differently.
-        """
+        """Check that a register reads back as written. Raises RadioError if it reads back differently."""
         actual = self.read(register.address)
         if (actual ^ register.value) & register.mask:
             raise RadioError(

@@ -195,5 +195,4 @@ INVERT_IQ_2_INVERTED = 0x19
 
 RSSI_OFFSET_HF_DBM = -157
 RSSI_OFFSET_LF_DBM = -164
-MIN_HF_HZ = 525_000_000
-"""Carriers from here on use the HF port."""
+MIN_HF_HZ = 525_000_000  # carriers from here on use the HF port

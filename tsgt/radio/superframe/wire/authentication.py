@@ -15,8 +15,7 @@ CODE_BYTES = 4
 
 KEY_BYTES = 32
 
-_PERSON = b"tsgt sf1"
-"""BLAKE2 personalisation: separates these codes from other uses of the same key."""
+_PERSON = b"tsgt sf1"  # BLAKE2 personalisation: separates these codes from other uses of the same key
 
 _BEACON, _REPLY = 1, 2
 
@@ -55,13 +54,8 @@ class Authenticator:
     ) -> bytes:
         """Return the code of a reply to the beacon with ``beacon_code``.
 
-        Parameters
-        ----------
-        station_nonce
-            Nonce of the station's join request in this session, 32 bits.
-        sequence
-            Full number of the first measurement of the first block, of which the reply may carry only the low bits;
-            0 without blocks.
+        ``station_nonce``: nonce of the station's join request in this session, 32 bits. ``sequence``: full number of
+        the first measurement of the first block, of which the reply may carry only the low bits; 0 without blocks.
         """
         return self._code(content, _REPLY, session, station, station_nonce, counter, beacon_code, sequence)
 

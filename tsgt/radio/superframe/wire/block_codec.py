@@ -24,8 +24,7 @@ if TYPE_CHECKING:
 
 SEQUENCE_BITS = 8
 WIDE_SEQUENCE_BITS = 32
-VALUE_BITS = 24
-"""Of an angle and of a distance; distance 0: none."""
+VALUE_BITS = 24  # of an angle and of a distance; distance 0: none
 
 NOMINAL_STEP = 25_000
 """Predicted first time step, in units of 16 us: 0.4 s, the usual period of a tracking total station."""
@@ -33,8 +32,7 @@ NOMINAL_STEP = 25_000
 TIME_WIDTHS = (8, 12, 18, WIDE_TIME_BITS)
 HORIZONTAL_WIDTHS = (7, 13, 17, VALUE_BITS)
 ZENITH_WIDTHS = (7, 11, 14, VALUE_BITS)
-DISTANCE_WIDTHS = (8, 11, 14, VALUE_BITS)
-"""Field widths of residuals in bits, two's complement."""
+DISTANCE_WIDTHS = (8, 11, 14, VALUE_BITS)  # field widths of residuals in bits, two's complement
 
 _QUALITY_BITS = 4
 _COUNT_BITS = 4

@@ -20,29 +20,24 @@ MAX_STATIONS = 16
 GRANT_BYTES = (0, 5, 17, 21, 26, 30, 35, 39, 44, 53, 62, 71, 80, 89, 107, 125)
 """Maximum reply length by grant, authentication code included; 0: no slot. The steps follow the LoRa code blocks at SF 9."""
 
-ACK_FRAMES = 4
-"""Number of earlier frames that an acknowledgement bitmap covers."""
+ACK_FRAMES = 4  # number of earlier frames that an acknowledgement bitmap covers
 
 TIME_UNIT_US = 16
 TIME_BITS = 17
-WIDE_TIME_BITS = 36
-"""In units of 16 us, a narrow time wraps after 2.1 s and a wide time after 12.7 days."""
+WIDE_TIME_BITS = 36  # in units of 16 us, a narrow time wraps after 2.1 s and a wide time after 12.7 days
 
 MAX_NARROW_AGE_NS = 2_000_000_000
 """Older measurements need a wide block; the age is that at the start of the reply."""
 
-SESSION_TIME_BITS = 40
-"""The session time in us is transmitted modulo 2^40 us = 12.7 days."""
+SESSION_TIME_BITS = 40  # the session time in us is transmitted modulo 2^40 us = 12.7 days
 
-SINGLE_QUALITY = 3
-"""Quality of a reply of the form ``single``: bound 128 us."""
+SINGLE_QUALITY = 3  # quality of a reply of the form ``single``: bound 128 us
 
 RESTART_SKIP = 20_000
 """Sequence numbers that a restarted station skips: they may have been sent without having reached the journal.
 At 20 measurements per second they cover a quarter of an hour without a disk write."""
 
-TURNAROUND_BITS = 22
-"""Width of a turnaround in us: at most 4.2 s."""
+TURNAROUND_BITS = 22  # width of a turnaround in us: at most 4.2 s
 
 
 def quality_bound_us(quality: int) -> int:

@@ -18,22 +18,18 @@ SENDER_SIGMA_NS = 20_000
 COARSE_SENDER_SIGMA_NS = 1_000_000
 """Sigma of the master's timestamp, which no beacon states: the coarse one until enough samples show their jitter."""
 
-MAX_SKEW_PPM = 120.0
-"""Bound of the skew between two computers' clocks before it is measured."""
+MAX_SKEW_PPM = 120.0  # bound of the skew between two computers' clocks before it is measured
 
-MAX_DEVIATION_US = 200.0
-"""A sample that deviates by more than this, and by more than the gate, is rejected."""
+MAX_DEVIATION_US = 200.0  # a sample that deviates by more than this, and by more than the gate, is rejected
 
 _SKEW_SIGMA_PPM = 30.0
-_SLEWED_SIGMA_PPM = 200.0
-"""Prior of the skew of a new clock, and of one that has just been slewed."""
+_SLEWED_SIGMA_PPM = 200.0  # prior of the skew of a new clock, and of one that has just been slewed
 
 _MIN_CANDIDATE_SAMPLES = 5
 """This many consecutive samples that agree with each other start a new segment against the current one."""
 
 MAX_SAMPLES = 10_000
-_DROPPED_SAMPLES = 1_000
-"""An hour and more at the usual rate, and how many are dropped at a time."""
+_DROPPED_SAMPLES = 1_000  # an hour and more at the usual rate, and how many are dropped at a time
 
 _MAX_UNWRAP_BOUND_US = 30_000.0
 """The 16 low bits of a time are unambiguous within half of 2^16 us, less a margin for timestamps."""
@@ -122,10 +118,7 @@ class _Jitter:
 class BeaconClock:
     """Estimates the master's session time on a station's clock; one for each session of the master.
 
-    Attributes
-    ----------
-    initialised
-        Two unambiguous samples have agreed, one of them live; before that there is no time.
+    ``initialised``: two unambiguous samples have agreed, one of them live; before that there is no time.
     """
 
     def __init__(self) -> None:
@@ -167,7 +160,8 @@ class BeaconClock:
         row that agree with each other start a new segment, if one of them was live; beyond a jump of 5 ms a live one
         must be unambiguous. Before initialisation only unambiguous samples are taken, and of two that disagree the
         newer one is kept. A sample that is consistent only because of a long outage waits outside the fit, too, until
-        five agree with each other.
+        five agree with each other. Returns False if rejected: it deviates by more than 200 us, and by more than jitter
+        and wander explain: the beacon was delayed, or the clock was set.
 
         Parameters
         ----------
@@ -181,12 +175,6 @@ class BeaconClock:
             The session time is from a session part, and not from :meth:`unwrap`.
         live
             The master has received the response to this beacon, so it was not replayed.
-
-        Returns
-        -------
-        bool
-            False: rejected. It deviates by more than 200 us, and by more than jitter and wander explain: the beacon
-            was delayed, or the clock was set.
         """
         sent_ns = 1000 * sent_us
         newest_ns = self._candidate.last_ns if self._candidate else self.last_received_ns

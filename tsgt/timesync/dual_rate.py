@@ -20,13 +20,10 @@ if TYPE_CHECKING:
 _SLOW_WALK_PPM2_PER_S = 0.006
 """Skew random walk of the slow filter, 0.6 ppm in a minute: with a sample every 0.4 s it averages over 20 to 30 s."""
 
-_FAST_WALK_PPM2_PER_S = 6.0
-"""That of the fast filter, 2.5 ppm in a second: it averages over about 3 s."""
-_MAX_FAST_WALK_S = 10.0
-"""In a longer outage the fast skew walks no further: crystals do not."""
+_FAST_WALK_PPM2_PER_S = 6.0  # that of the fast filter, 2.5 ppm in a second: it averages over about 3 s
+_MAX_FAST_WALK_S = 10.0  # in a longer outage the fast skew walks no further: crystals do not
 
-SIGMAS = 5.0
-"""The truth is within this many standard errors of the fast estimate."""
+SIGMAS = 5.0  # the truth is within this many standard errors of the fast estimate
 
 _MAX_SKEW_STEP_PPM = 25.0
 _SKEW_STEP_S = 2.0
@@ -100,12 +97,8 @@ class DualEstimate(NamedTuple):
 class ClockSegment:
     """Estimates the offset of the master's clock, ``sent_ns - received_ns``, from sample to sample.
 
-    Parameters
-    ----------
-    sample
-        The first one.
-    skew_ppm, skew_sigma_ppm
-        Prior of the skew; positive: the master's clock runs faster than this one.
+    ``sample``: the first one. ``skew_ppm``, ``skew_sigma_ppm``: prior of the skew; positive: the master's clock runs
+    faster than this one.
     """
 
     def __init__(self, sample: BeaconSample, skew_ppm: float, skew_sigma_ppm: float) -> None:

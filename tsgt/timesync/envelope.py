@@ -31,13 +31,9 @@ class MinimumDelay(NamedTuple):
 def minimum_delay(share: float) -> MinimumDelay:
     """Return the height of the lowest response above the line, where times are truncated to whole units.
 
-    A response is above the line by its delay, uniform from 0 to a spread, and by the truncation, uniform from 0 to 1.
-    A height s below 1 has the probability s^2 / 2 over the spread, a larger one s - 1/2.
-
-    Parameters
-    ----------
-    share
-        The spread over the number of responses plus one, in the same units, above 0; for eight responses or more.
+    A response is above the line by its delay, uniform from 0 to a spread, and by the truncation, uniform from 0 to 1. A
+    height s below 1 has the probability s^2 / 2 over the spread, a larger one s - 1/2. ``share``: the spread over the
+    number of responses plus one, in the same units, above 0; for eight responses or more.
     """
     below_one = math.exp(-0.5 / share)
     mean = math.sqrt(math.pi * share / 2) * math.erf(math.sqrt(0.5 / share)) + share * below_one

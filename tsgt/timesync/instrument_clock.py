@@ -26,11 +26,9 @@ _BIN_NS = 2e9
 """Of each bin the lowest sample is kept. A crystal in the sun changes its rate by 1e-6 in some minutes: over a longer
 window the envelope is no line."""
 
-_MIN_KEPT_SAMPLES = 30
-"""Number of samples that are kept regardless of their age."""
+_MIN_KEPT_SAMPLES = 30  # number of samples that are kept regardless of their age
 
-_STEADY_NS = 120e9
-"""A skew from a longer span than this is kept over a power cycle."""
+_STEADY_NS = 120e9  # a skew from a longer span than this is kept over a power cycle
 
 _MAX_SKEW = 300e-6
 _UNKNOWN_SKEW_SIGMA = 60e-6
@@ -43,12 +41,10 @@ _ROUNDING_NS = 0.3e6
 """Instruments state their time in whole ms. Whether they round or truncate is unknown, and cancels: what is added to a
 stated time is missing in the height of the envelope."""
 
-_REFIT_GROWTH = 1.05
-"""Refit without other news when the number of samples has grown by this factor."""
+_REFIT_GROWTH = 1.05  # refit without other news when the number of samples has grown by this factor
 
 _MIN_DELAY_SHARE = 0.01
-_DELAY_CAP = 4.0
-"""A delay counts as at most this many mean delays: a stall says nothing about the others."""
+_DELAY_CAP = 4.0  # a delay counts as at most this many mean delays: a stall says nothing about the others
 
 _CANDIDATES = 3
 _CANDIDATE_SPREAD_NS = 100e6
@@ -83,14 +79,9 @@ class InstrumentClock:
     """Fits the lower envelope of one instrument.
 
     A sample far from the envelope is inconsistent: it is used only when others agree with it. If these are too far off
-    for any delay, the instrument was switched off and on or its count has jumped, and the fit is reset.
-
-    Attributes
-    ----------
-    resets
-        How often the instrument's count has restarted.
-    inconsistent
-        Whether the last sample, or distance, is inconsistent with the envelope.
+    for any delay, the instrument was switched off and on or its count has jumped, and the fit is reset. ``resets``: how
+    often the instrument's count has restarted. ``inconsistent``: whether the last sample, or distance, is inconsistent
+    with the envelope.
     """
 
     def __init__(self) -> None:
@@ -144,10 +135,7 @@ class InstrumentClock:
     def add(self, instrument_ms: int, arrived_ns: int) -> bool:
         """Take a sample: an instrument time, and the arrival of the first byte of its response.
 
-        Returns
-        -------
-        bool
-            False: the instrument's count has jumped, and the fit is reset.
+        Returns False if the instrument's count has jumped; the fit is reset then.
         """
         self._seen += 1
         self.inconsistent = False
@@ -180,11 +168,7 @@ class InstrumentClock:
         """Return the time of a distance, from its instrument time and the arrival of the first byte of its response.
 
         A distance is no sample unless it is inconsistent with the envelope: its delay depends on when it was requested.
-
-        Returns
-        -------
-        HostTime or None
-            None before initialisation, or for an inconsistent distance.
+        Returns None before initialisation, or for an inconsistent distance.
         """
         if self.initialised:
             x, y = self._coordinates(instrument_ms, arrived_ns)

@@ -21,19 +21,14 @@ _SIGMA_OF_MEDIAN = 1.0484
 """Sigma over the median of the absolute difference of two normally distributed values."""
 
 _PRIOR_JITTER_NS = 25_000.0
-_PRIOR_EXCHANGES = 2
-"""Prior of an exchange's jitter, and how many exchanges it counts as."""
-_MIN_EXCHANGES = 8
-"""With fewer exchanges the jitter is unknown, and no possible exchange is rejected."""
+_PRIOR_EXCHANGES = 2  # prior of an exchange's jitter, and how many exchanges it counts as
+_MIN_EXCHANGES = 8  # with fewer exchanges the jitter is unknown, and no possible exchange is rejected
 
-_ANOMALY_NS = 50_000.0
-"""Smallest deviation that is reported as an anomaly."""
+_ANOMALY_NS = 50_000.0  # smallest deviation that is reported as an anomaly
 
-_HISTORY_CAPACITY = 256
-"""Some 25 minutes with one exchange in 16 replies."""
+_HISTORY_CAPACITY = 256  # some 25 minutes with one exchange in 16 replies
 
-_ASYMMETRY_NS = 5_000
-"""Bound of the delay asymmetry between two chips."""
+_ASYMMETRY_NS = 5_000  # bound of the delay asymmetry between two chips
 
 
 class LinkDelayEstimator:
@@ -66,15 +61,8 @@ class LinkDelayEstimator:
     def add(self, round_trip_ns: int) -> bool:
         """Take an exchange.
 
-        Parameters
-        ----------
-        round_trip_ns
-            From TxDone of the beacon to RxDone of the reply, less the turnaround that the station states.
-
-        Returns
-        -------
-        bool
-            False: rejected. A packet was delayed, or a timestamp is wrong.
+        ``round_trip_ns``: from TxDone of the beacon to RxDone of the reply, less the turnaround that the station
+        states. Returns False if rejected: a packet was delayed, or a timestamp is wrong.
         """
         deviation_ns = round_trip_ns / 2 - self.nominal_ns
         if self._last_ns is not None:

@@ -23,8 +23,7 @@ if TYPE_CHECKING:
 Int64s = NDArray[np.int64]
 Floats = NDArray[np.float64]
 
-PPM = 1000.0
-"""In ns/s."""
+PPM = 1000.0  # in ns/s
 
 TIMESTAMP_FLOOR_NS = 100_000
 """Bound of a timestamp's error at best.
@@ -42,11 +41,9 @@ MAX_SKEW = 100 * PPM
 _MAX_WANDER_NS_PER_S2 = 0.01 * PPM
 _MAX_SKEW_CHANGE = 20 * PPM
 
-_USUAL_WANDER_NS_PER_S2 = 0.001 * PPM
-"""Wander in the weights of past synchronisations."""
+_USUAL_WANDER_NS_PER_S2 = 0.001 * PPM  # wander in the weights of past synchronisations
 
-_HALF_WEIGHT_EXCESS_NS = 2_000_000
-"""An exchange slower than the fastest by this has half its weight."""
+_HALF_WEIGHT_EXCESS_NS = 2_000_000  # an exchange slower than the fastest by this has half its weight
 
 _PRIOR_NOISE_NS = 10_000.0
 _PRIOR_NOISE_WEIGHT = 2
@@ -217,6 +214,8 @@ def fit_line(batches: Sequence[Batch], prior: SkewPrior, skew_error: float) -> t
 
     An offset's variance has three parts: the noise of the timestamps, from their scatter within synchronisations, less
     for fast round trips; the possible delay of a timestamp that is the only one; and its age, because skews wander.
+    Returns the line, and whether a synchronisation's mean residual exceeds what the noise explains: the skew has
+    changed, so the line should not reach back so far.
 
     Parameters
     ----------
@@ -226,12 +225,6 @@ def fit_line(batches: Sequence[Batch], prior: SkewPrior, skew_error: float) -> t
         Of the skew.
     skew_error
         See :class:`RegressionLine`.
-
-    Returns
-    -------
-    tuple[RegressionLine, bool]
-        The line, and whether a synchronisation's mean residual exceeds what the noise explains: the skew has changed,
-        so the line should not reach back so far.
     """
     origin_ns, base_ns = int(batches[-1].station_ns[-1]), int(batches[-1].offset_ns[-1])
     t = np.concatenate([(b.station_ns - origin_ns) / 1e9 for b in batches])

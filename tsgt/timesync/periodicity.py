@@ -12,16 +12,14 @@ from itertools import pairwise
 from statistics import fmean, median
 from typing import NamedTuple
 
-MAX_MEASUREMENTS = 24
-"""Measurements that are used: about ten seconds, short enough to follow any clock."""
+MAX_MEASUREMENTS = 24  # measurements that are used: about ten seconds, short enough to follow any clock
 
 MIN_MEASUREMENTS = 6
 
 MAX_GAP_US = 5_000_000
 """After a longer gap the instrument may have restarted: earlier measurements are dropped."""
 
-MAX_RELATIVE_JITTER = 0.1
-"""An instrument whose jitter exceeds this part of its period has none."""
+MAX_RELATIVE_JITTER = 0.1  # an instrument whose jitter exceeds this part of its period has none
 
 _OUTLIER_MEDIANS = 4.0
 _MIN_OUTLIER_US = 500.0

@@ -37,14 +37,12 @@ if TYPE_CHECKING:
 _KEPT_SKEW_SIGMA = 3 * PPM
 _UNKNOWN_SKEW = SkewPrior(0.0, UNKNOWN_SKEW_SIGMA)
 
-_MAX_BATCHES = 12
-"""One hour of synchronisations every 300 s. Older ones say nothing about the present skew."""
+_MAX_BATCHES = 12  # one hour of synchronisations every 300 s. Older ones say nothing about the present skew.
 
 _MAX_WAIT_NS = 150_000_000
 """How long a measurement may wait in the station from its timestamp until the radio can send it."""
 
-_FUTURE_TOLERANCE_NS = 10_000_000
-"""Rounding of a timestamp: no measurement is made in the future."""
+_FUTURE_TOLERANCE_NS = 10_000_000  # rounding of a timestamp: no measurement is made in the future
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,10 +88,7 @@ class ClockFilter(Protocol):
     def at(self, station_ns: int) -> ClockEstimate:
         """Return the offset when the station's clock shows the given time in ns.
 
-        Raises
-        ------
-        LookupError
-            There was no synchronisation since the start or the last reset.
+        Raises LookupError if there was no synchronisation since the start or the last reset.
         """
         ...
 

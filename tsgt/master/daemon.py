@@ -84,12 +84,7 @@ async def run_master(
 ) -> None:
     """Receive, compute, stream and record until cancelled; ``parameters`` are those in force.
 
-    Raises
-    ------
-    RecordingError
-        The recording cannot be opened.
-    StreamError
-        The socket cannot be opened.
+    Raises RecordingError if the recording cannot be opened. Raises StreamError if the socket cannot be opened.
     """
     clock = dependencies.clock
     timeline = UnixTimeline.fixed_now(clock)

@@ -140,8 +140,7 @@ class Geofence(Observer):
         return clearance_m - self._settings.margin_m
 
 
-COMMAND_TIMEOUT_S = 10.0
-"""After this a command is killed, with its child processes."""
+COMMAND_TIMEOUT_S = 10.0  # after this a command is killed, with its child processes
 
 KILL_TIMEOUT_S = 0.5
 """How long to wait for the end of a killed command: one that may not be killed must not block the master."""

@@ -28,11 +28,9 @@ QUARTILE = 4
 """The alarm uses the lower quartile of residual over limit. Interpolation brings the median of a good frame to 1.1 at
 1.45 Hz per station, and the lower quartile no higher than 0.7 (``benchmarks/frame_watch.py``)."""
 
-RESTORED_RATIO = 0.8
-"""Share of the limit below which the alarm ends; hysteresis."""
+RESTORED_RATIO = 0.8  # share of the limit below which the alarm ends; hysteresis
 
-MIN_WINDOW_SHARE = 1 / 3
-"""Share of the window that has to hold poses before it is evaluated."""
+MIN_WINDOW_SHARE = 1 / 3  # share of the window that has to hold poses before it is evaluated
 
 
 class LayoutMonitorSettings(Protocol):
@@ -67,13 +65,7 @@ class _Sample:
 
 
 class LayoutMonitor(Observer):
-    """Monitors the residuals of the prisms against their layout.
-
-    Parameters
-    ----------
-    period_ns
-        Interval of the poses in ns.
-    """
+    """Monitors the residuals of the prisms against their layout. ``period_ns``: interval of the poses in ns."""
 
     def __init__(self, settings: LayoutMonitorSettings, period_ns: int) -> None:
         self._settings = settings

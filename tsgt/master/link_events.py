@@ -143,5 +143,4 @@ class LinkStatus:
     """Returns the estimate of a station's clock at an instant on the master's Unix clock; None before the first one."""
 
 
-NO_LINK = LinkStatus()
-"""Status without a radio."""
+NO_LINK = LinkStatus()  # status without a radio

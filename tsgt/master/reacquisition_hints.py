@@ -30,16 +30,14 @@ if TYPE_CHECKING:
 HINT_DELAY_NS = 2_000_000_000
 """By then an instrument has found a prism that it finds by itself, by prediction or a local search."""
 
-HINT_INTERVAL_NS = 5_000_000_000
-"""A direction is valid for this long; then the next one is given."""
+HINT_INTERVAL_NS = 5_000_000_000  # a direction is valid for this long; then the next one is given
 
 MAX_FREQUENT_HINTS = 6
 SLOW_HINT_INTERVAL_NS = 30_000_000_000
 """After this many directions without success the prism is hidden, or the station's frame is wrong. The longer interval
 leaves the instrument time for a full search."""
 
-MAX_POINT_AGE_NS = 1_000_000_000
-"""An older point does not show where the robot is."""
+MAX_POINT_AGE_NS = 1_000_000_000  # an older point does not show where the robot is
 
 MIN_VELOCITY_BASELINE_NS = 200_000_000
 """Velocity is the difference of two points at least this far apart; noise would dominate over less."""
@@ -52,11 +50,9 @@ PREDICTION_S = 1.0
 """From the decision to the telescope's arrival: a frame, and turning. The direction is predicted by this, and the spread
 allows the robot to have stopped or turned, or to continue for as long again."""
 
-START_ALLOWANCE_M = 0.5
-"""A stationary robot may start: 1 m/s^2 within a second."""
+START_ALLOWANCE_M = 0.5  # a stationary robot may start: 1 m/s^2 within a second
 
-MAX_SPREAD_RAD = math.radians(45.0)
-"""A direction with a larger spread is useless: the robot is too near."""
+MAX_SPREAD_RAD = math.radians(45.0)  # a direction with a larger spread is useless: the robot is too near
 
 _LOST = (Status.NO_TARGET, Status.ANGLE_ONLY)
 

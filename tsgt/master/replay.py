@@ -45,17 +45,9 @@ def replayed(
 ) -> Iterator[tuple[int, list[bytes]]]:
     """Repeat the calls of the live master, in the same order with the same instants.
 
-    Corrupt lines are passed to ``on_problem`` and skipped if ``keep_going`` is set; else they raise.
-
-    Yields
-    ------
-    tuple[int, list[bytes]]
-        The instant of an arrival on the master's Unix clock in ns, and the stream's lines that follow from it.
-
-    Raises
-    ------
-    RecordingError
-        The recording cannot be read, or measurements precede all parameters.
+    Corrupt lines are passed to ``on_problem`` and skipped if ``keep_going`` is set; else they raise. Yields the instant
+    of an arrival on the master's Unix clock in ns, and the stream's lines that follow from it. Raises RecordingError if
+    the recording cannot be read, or measurements precede all parameters.
     """
     estimator: LiveEstimator | None = None
     missing_poses = 0

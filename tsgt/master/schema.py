@@ -76,13 +76,7 @@ def field_descriptions(cls: type) -> dict[str, str]:
 
 
 def json_schema() -> dict[str, Any]:
-    """Return the JSON Schema of one line.
-
-    Raises
-    ------
-    ValueError
-        A field has no description.
-    """
+    """Return the JSON Schema of one line. Raises ValueError if a field has no description."""
     schema = TypeAdapter(functools.reduce(operator.or_, LINE_TYPES)).json_schema(mode="serialization")
     definitions = schema["$defs"]
     for cls in (cls for classes in PAGES.values() for cls in classes):

@@ -54,10 +54,7 @@ class _Station:
 class StationEventDetector:
     """Turns changes of the stations' states into events, one per change.
 
-    Parameters
-    ----------
-    now_ns
-        The present on the master's Unix clock in ns, like all instants here.
+    ``now_ns``: the present on the master's Unix clock in ns, like all instants here.
     """
 
     def __init__(self, stations: Iterable[int], now_ns: int) -> None:
@@ -151,12 +148,8 @@ class StationEventDetector:
     def tick(self, now_ns: int, *, realtime_ns: int) -> list[EventRecord]:
         """Return the events that time alone brings.
 
-        Parameters
-        ----------
-        now_ns
-            The present on the timeline that was fixed at the start.
-        realtime_ns
-            The present on the machine's Unix clock.
+        ``now_ns``: the present on the timeline that was fixed at the start. ``realtime_ns``: the present on the
+        machine's Unix clock.
         """
         events = []
         for number, station in self._stations.items():

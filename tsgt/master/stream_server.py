@@ -30,8 +30,7 @@ QUEUE_LINES = 2000
 MAX_READERS = 64
 """Further readers are disconnected: each needs memory, and a file descriptor that the radio may need."""
 
-CLOSE_TIMEOUT_S = 0.5
-"""How long readers have at the end to take their queues."""
+CLOSE_TIMEOUT_S = 0.5  # how long readers have at the end to take their queues
 
 _SETUP_ITERATIONS = 5
 """Iterations of the event loop from accepting a connection to its protocol, with reserve."""
@@ -43,7 +42,8 @@ class StreamServer:
     """Serves lines to every reader of a UNIX socket; an async context manager.
 
     A reader gets the greeting and then what is published. What readers send is ignored. On exit, readers have
-    :data:`CLOSE_TIMEOUT_S` to take their queues.
+    :data:`CLOSE_TIMEOUT_S` to take their queues. Entering raises StreamError if another program
+    serves the socket, or it cannot be created.
 
     Parameters
     ----------
@@ -53,11 +53,6 @@ class StreamServer:
         The greeting, without line end.
     unix_now_ns
         The master's Unix clock, for the event ``lines_lost``.
-
-    Raises
-    ------
-    StreamError
-        On entering: another program serves the socket, or it cannot be created.
     """
 
     def __init__(

@@ -39,11 +39,9 @@ STALE_THRESHOLD_NS = 1_000_000_000
 """Tracking instruments measure more often than this. A new measurement that appears older may be of a clock that was
 stopped or set back while the station was not polled."""
 
-HELD_CAPACITY = 100
-"""Measurements that are held until a synchronisation; beyond that the oldest are dropped."""
+HELD_CAPACITY = 100  # measurements that are held until a synchronisation; beyond that the oldest are dropped
 
-DUPLICATE_WINDOW = 1000
-"""The last measurements among which a repeated or replayed one is recognised."""
+DUPLICATE_WINDOW = 1000  # the last measurements among which a repeated or replayed one is recognised
 
 
 class ClockState(Enum):
@@ -125,15 +123,8 @@ class _Untimed:
 class StationIngest:
     """Validates and stamps the replies of one station.
 
-    Parameters
-    ----------
-    stamp_delay_ns
-        By how much its computer's reception stamps are late on average, in ns. A single stamp may be off by as much.
-
-    Attributes
-    ----------
-    state
-        What is known of the station's clock.
+    ``stamp_delay_ns``: by how much its computer's reception stamps are late on average, in ns. A single stamp may be
+    off by as much. ``state``: what is known of the station's clock.
     """
 
     def __init__(self, station: int, prism: int, clock: ClockFilter, stamp_delay_ns: int = 0) -> None:

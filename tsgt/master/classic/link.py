@@ -24,10 +24,7 @@ if TYPE_CHECKING:
 class ClassicLink:
     """Runs transactions with the stations and reports the results.
 
-    Attributes
-    ----------
-    exchange_start_ns
-        When the present transaction began, on the master's Unix clock; None without a radio.
+    ``exchange_start_ns``: when the present transaction began, on the master's Unix clock; None without a radio.
     """
 
     def __init__(

@@ -26,8 +26,7 @@ COMMAND_TIMEOUT_NS = 1_000_000_000
 """A station that already tracks confirms at once. One that has to turn to its prism first takes longer and is asked again:
 waiting for it would delay all others as much as a lost packet."""
 
-MAX_RESPONSE_DELAY_NS = 20_000_000_000
-"""A station may respond to a command this late."""
+MAX_RESPONSE_DELAY_NS = 20_000_000_000  # a station may respond to a command this late
 
 FIRST_INTERVAL_NS = 30_000_000_000
 """From a station's first synchronisation to its second: until then the skew of its clock is poorly known."""
@@ -43,8 +42,7 @@ _RESPONDING_BACKOFF_FACTOR = 3
 """The same for a station that responds, but gives no samples or an inconclusive synchronisation: it may work with the
 next packet."""
 
-_MAX_BACKOFF_PER_SILENCE = 4
-"""The back-off of a silent station is at most its silence divided by this."""
+_MAX_BACKOFF_PER_SILENCE = 4  # the back-off of a silent station is at most its silence divided by this
 
 _RESYNC_PROBE_INTERVAL = 4
 """Every fourth transaction with a silent station is a synchronisation, except among the first."""
@@ -84,12 +82,7 @@ class SynchronisationSchedule:
 class Scheduler:
     """Chooses transactions, one at a time.
 
-    Parameters
-    ----------
-    stations
-        In the order of the round.
-    start_ns
-        The present; like all instants here on any one clock in ns.
+    ``stations``: in the order of the round. ``start_ns``: the present; like all instants here on any one clock in ns.
     """
 
     def __init__(

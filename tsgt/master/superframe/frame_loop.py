@@ -13,8 +13,7 @@ if TYPE_CHECKING:
     from tsgt.radio import Packet, Radio, Transmission
     from tsgt.radio.superframe import ReceivedReply, SuperframeMaster
 
-LEAD_NS = 6_000_000
-"""A beacon is composed this long before it is due: the radio needs 5 ms of it."""
+LEAD_NS = 6_000_000  # a beacon is composed this long before it is due: the radio needs 5 ms of it
 
 
 class FrameObserver(Protocol):

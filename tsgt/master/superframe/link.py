@@ -29,8 +29,7 @@ if TYPE_CHECKING:
 FLUSH_TIMEOUT_S = 0.015
 """How long a beacon waits for the last reply to be written. Acknowledging a frame later costs a retransmission."""
 
-TRACK_RETRY_INTERVAL_NS = 30_000_000_000
-"""Between two commands to track, while a station does not."""
+TRACK_RETRY_INTERVAL_NS = 30_000_000_000  # between two commands to track, while a station does not
 
 log = structlog.get_logger()
 
@@ -46,10 +45,7 @@ class _Unwritten(NamedTuple):
 class SuperframeLink:
     """Runs frames and reports the results.
 
-    Attributes
-    ----------
-    exchange_start_ns
-        When the present frame began, on the master's Unix clock; None without a radio.
+    ``exchange_start_ns``: when the present frame began, on the master's Unix clock; None without a radio.
     """
 
     def __init__(

@@ -20,12 +20,8 @@ if TYPE_CHECKING:
 def write_atomically(path: Path) -> Iterator[BinaryIO]:
     """Yield a file that becomes ``path`` when the block ends without an exception; an existing file is replaced.
 
-    A pipe, a terminal or ``/dev/null`` is written directly. The folder must exist.
-
-    Raises
-    ------
-    OutputFileError
-        Disk full, no such folder, no permission.
+    A pipe, a terminal or ``/dev/null`` is written directly. The folder must exist. Raises OutputFileError if the
+    disk is full, or there is no such folder or no permission.
     """
     target = path.resolve()
     part = target.with_name(f".{secrets.token_hex(8)}.part")
@@ -55,16 +51,9 @@ def write_atomically(path: Path) -> Iterator[BinaryIO]:
 def new_recording_path(directory: Path, name: str, unix_ns: int) -> Path:
     """Create an empty file with a new name in a directory, which is created if needed.
 
-    Parameters
-    ----------
-    unix_ns
-        Unix time in ns that follows ``name`` in the file name: ``name-20261121T055100Z.jsonl``. A computer without a
-        battery clock may have the same time at each start; then a number follows: ``name-20261121T055100Z-2.jsonl``.
-
-    Raises
-    ------
-    RecordingError
-        The directory or the file cannot be created.
+    ``unix_ns``: Unix time in ns that follows ``name`` in the file name: ``name-20261121T055100Z.jsonl``. A computer
+    without a battery clock may have the same time at each start; then a number follows:
+    ``name-20261121T055100Z-2.jsonl``. Raises RecordingError if the directory or the file cannot be created.
     """
     stem = f"{name}-{datetime.fromtimestamp(unix_ns // 1_000_000_000, UTC):%Y%m%dT%H%M%SZ}"
     try:

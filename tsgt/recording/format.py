@@ -20,8 +20,7 @@ FORMAT_VERSION = 1
 MAX_LINE_BYTES = 1 << 20
 """Longest line that a reader accepts; a file without line ends must not fill the memory."""
 
-HEADER_START = b'{"type":"recording",'
-"""Start of every header, by which a torn one is recognised."""
+HEADER_START = b'{"type":"recording",'  # start of every header, by which a torn one is recognised
 
 NO_HEADER = "does not begin with the header of a recording; give a file that tsgt recorded or imported"
 """Error message for a file whose first line is not a header."""
@@ -97,10 +96,7 @@ def encode_line(record: object) -> bytes:
 def decode(cls: type[T], data: bytes) -> T:
     """Build a record from one JSON object; unknown keys are ignored.
 
-    Raises
-    ------
-    ValueError
-        Not JSON, or the first field that is missing or wrong; one line.
+    Raises ValueError if it is not JSON, or names the first field that is missing or wrong, in one line.
     """
     try:
         record: T = _validator(cls).validate_json(data, strict=True)
@@ -114,10 +110,7 @@ def decode(cls: type[T], data: bytes) -> T:
 def decode_line(cls: type[T], line: Line, path: Path) -> T:
     """Build a record from a line of a recording.
 
-    Raises
-    ------
-    CorruptLineError
-        The first field that is missing or wrong, with the number of the line.
+    Raises CorruptLineError, which names the line and the first field that is missing or wrong.
     """
     try:
         return decode(cls, line.data)
@@ -130,12 +123,8 @@ def decode_line(cls: type[T], line: Line, path: Path) -> T:
 def check_header(data: bytes, path: Path, line: int) -> None:
     """Check that a line is the header of a recording in the supported format.
 
-    Raises
-    ------
-    ValueError
-        It is not a header, or a field is missing or wrong.
-    RecordingVersionError
-        It is the header of another version of the format.
+    Raises ValueError if it is not a header, or a field is missing or wrong. Raises RecordingVersionError if it is the
+    header of another version of the format.
     """
     version = decode(_Versioned, data).version
     if version != FORMAT_VERSION:

@@ -145,10 +145,7 @@ class Journal:
 def is_unfinished_journal(path: Path) -> bool:
     """Return whether the client ended before the first lines were complete: the file is empty or ends in its head.
 
-    Raises
-    ------
-    RecordingError
-        The file cannot be read.
+    Raises RecordingError if the file cannot be read.
     """
     try:
         with path.open("rb") as file:
@@ -166,6 +163,9 @@ def load_journal(
 ) -> Journal:
     """Read a journal.
 
+    Raises RecordingError if the file cannot be read, or is not a journal. Raises CorruptLineError if a line cannot have
+    been written by a client.
+
     Parameters
     ----------
     path
@@ -174,13 +174,6 @@ def load_journal(
         Skip lines that cannot be read instead of raising.
     on_problem
         Called for each skipped line: a torn last line always, others with ``keep_going``.
-
-    Raises
-    ------
-    RecordingError
-        The file cannot be read, or is not a journal.
-    CorruptLineError
-        A line cannot have been written by a client.
     """
     head: JournalRecord | None = None
     created_ns = 0

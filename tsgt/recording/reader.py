@@ -55,12 +55,8 @@ def read_lines(
 ) -> Iterator[Line]:
     """Yield the lines of a recording, headers included; each is checked to be JSON with a type.
 
-    Parameters
-    ----------
-    keep_going
-        Skip lines that cannot be read instead of raising.
-    on_problem
-        Called for each skipped line: a torn last line always, others with ``keep_going``.
+    ``keep_going``: skip lines that cannot be read instead of raising. ``on_problem``: called for each skipped line: a
+    torn last line always, others with ``keep_going``.
 
     Raises
     ------
@@ -102,15 +98,8 @@ def load_recording(
 ) -> Recording:
     """Read measurements and parameters for post-processing.
 
-    Parameters
-    ----------
-    keep_going, on_problem
-        As for :func:`read_lines`; a line with missing or wrong fields counts as one that cannot be read.
-
-    Raises
-    ------
-    RecordingError
-        As :func:`read_lines`; also without parameters in the file.
+    ``keep_going``, ``on_problem``: as for :func:`read_lines`; a line with missing or wrong fields counts as one that
+    cannot be read. Raises RecordingError as :func:`read_lines`, and without parameters in the file.
     """
     header: RecordingHeader | None = None
     parameters: Parameters | None = None

@@ -13,8 +13,7 @@ from tsgt.errors import RecordingError
 if TYPE_CHECKING:
     from tsgt.recording import RecordingWriter
 
-MAX_PENDING_LINES = 100_000
-"""About an hour of measurements and poses of three stations; 100 MB."""
+MAX_PENDING_LINES = 100_000  # about an hour of measurements and poses of three stations; 100 MB
 
 HUNG_DISK_FACTOR = 2
 """While a write hangs, lines can not be dropped from the front of the queue; this many times more may wait then."""
@@ -27,16 +26,8 @@ class Recorder:
 
     A caller that must not wait for a slow disk calls :meth:`put`, and :meth:`flush` in a thread. :meth:`close` writes
     every pending line. Lines are numbered as they are put, so that the caller can ask which were written.
-
-    Parameters
-    ----------
-    max_pending_lines
-        Queue capacity; beyond it the oldest lines are lost, and counted in the log.
-
-    Attributes
-    ----------
-    lost
-        Lines lost in all.
+    ``max_pending_lines``: queue capacity; beyond it the oldest lines are lost, and counted in the log. ``lost``: lines
+    lost in all.
     """
 
     def __init__(self, writer: RecordingWriter, *, max_pending_lines: int = MAX_PENDING_LINES) -> None:

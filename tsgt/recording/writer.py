@@ -29,27 +29,12 @@ if TYPE_CHECKING:
 class RecordingWriter:
     """Appends lines to a recording, each completely or not at all.
 
-    A line is in the kernel when :meth:`write` returns, and on the disk after the next :meth:`sync`. The file is locked: it
-    has one writer at a time. The caller writes the header and the parameters that begin every session.
-
-    Parameters
-    ----------
-    path
-        A new file, or a recording to continue.
-    write
-        Passes bytes to the kernel, default :func:`os.write`; simulations use one that fails.
-
-    Attributes
-    ----------
-    cut_bytes
-        Length of the torn line that was cut off the end of the file; 0 when it was complete.
-
-    Raises
-    ------
-    RecordingError
-        The file cannot be opened, is not a recording, or another program is writing it.
-    RecordingVersionError
-        It is a recording of another version.
+    A line is in the kernel when :meth:`write` returns, and on the disk after the next :meth:`sync`. The file is locked:
+    it has one writer at a time. The caller writes the header and the parameters that begin every session. ``path``: a
+    new file, or a recording to continue. ``write``: passes bytes to the kernel, default :func:`os.write`; simulations
+    use one that fails. ``cut_bytes``: length of the torn line that was cut off the end of the file; 0 when it was
+    complete. Raises RecordingError if the file cannot be opened, is not a recording, or another program is writing it.
+    Raises RecordingVersionError if it is a recording of another version.
     """
 
     def __init__(self, path: Path, *, write: Callable[[int, memoryview], int] | None = None) -> None:
@@ -110,10 +95,7 @@ class RecordingWriter:
     def write(self, record: object) -> None:
         """Append a record as one line.
 
-        Raises
-        ------
-        RecordingError
-            The line could not be written, and no part of it was. Later lines may succeed.
+        Raises RecordingError if the line could not be written, and no part of it was. Later lines may succeed.
         """
         self.write_line(encode_line(record))
 
@@ -152,10 +134,7 @@ class RecordingWriter:
     def sync(self) -> None:
         """Bring all lines written so far to the disk; may run in another thread.
 
-        Raises
-        ------
-        RecordingError
-            The disk failed; lines since the last successful sync may be lost.
+        Raises RecordingError if the disk failed; lines since the last successful sync may be lost.
         """
         with self._sync_lock:
             if not self._unsynced:

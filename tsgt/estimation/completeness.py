@@ -12,10 +12,7 @@ import heapq
 class CompletenessTracker:
     """Tracks the sequence numbers of one station, which rise by one. Lower numbers with later times are a restart.
 
-    Parameters
-    ----------
-    transport_limit_ns
-        A measurement that has not arrived this long after it was made is not waited for.
+    ``transport_limit_ns``: a measurement that has not arrived this long after it was made is not waited for.
     """
 
     def __init__(self, transport_limit_ns: int) -> None:

@@ -30,8 +30,7 @@ if TYPE_CHECKING:
 
 SMOOTHING_INTERVAL_NS = 500_000_000
 
-_POSE_DIM = 6
-"""Dimension of a state's error that poses need: position and rotation."""
+_POSE_DIM = 6  # dimension of a state's error that poses need: position and rotation
 
 _NONE = np.empty((0, _POSE_DIM, _POSE_DIM))
 
@@ -39,15 +38,8 @@ _NONE = np.empty((0, _POSE_DIM, _POSE_DIM))
 class ContinuousEstimator:
     """The estimator ``continuous``, with the interface of :class:`~tsgt.estimation.linear.LinearEstimator`.
 
-    Attributes
-    ----------
-    outside_lag_window
-        By station, how many measurements arrived after the poses of their time had been smoothed.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        The prisms of the layout are fewer than three, coincident or collinear.
+    ``outside_lag_window``: by station, how many measurements arrived after the poses of their time had been smoothed.
+    Raises DegenerateGeometryError if the prisms of the layout are fewer than three, coincident or collinear.
     """
 
     def __init__(self, parameters: Parameters) -> None:

@@ -47,12 +47,8 @@ _MAX_BATCH_EPOCHS = 8192
 class LinearEstimator:
     """The paper's estimator (Vaidis et al. 2021, section III-D), with reasons, covariance and velocity.
 
-    A prism that is never measured keeps every pose invalid.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        The prisms of the layout are fewer than three, coincident or collinear.
+    A prism that is never measured keeps every pose invalid. Raises DegenerateGeometryError if the prisms of the layout
+    are fewer than three, coincident or collinear.
     """
 
     def __init__(self, parameters: Parameters) -> None:

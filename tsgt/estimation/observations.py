@@ -46,14 +46,9 @@ def build_observations(
 ) -> tuple[Observations, list[Measurement]]:
     """Return the observations of all usable measurements in the order of time, and the measurement of each.
 
-    Parameters
-    ----------
-    measurements
-        In any order. Unusable and implausible ones, and those of unknown stations or prisms, are ignored. Of a
-        station's measurements with the same instant the first is used: a station without a new measurement may repeat
-        its last one.
-    origin_ns
-        Origin of the observations' times, on the master's Unix clock.
+    ``measurements``: in any order. Unusable and implausible ones, and those of unknown stations or prisms, are ignored.
+    Of a station's measurements with the same instant the first is used: a station without a new measurement may repeat
+    its last one. ``origin_ns``: origin of the observations' times, on the master's Unix clock.
     """
     stations = {station.station: row for row, station in enumerate(parameters.stations)}
     prisms = {prism.prism: row for row, prism in enumerate(parameters.prisms)}

@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from tsgt.geometry.trajectory import States
     from tsgt.model import Parameters
 
-MAX_ROTATION_SIGMA_RAD = 0.5
-"""A pose whose rotation has a larger sigma is not computed."""
+MAX_ROTATION_SIGMA_RAD = 0.5  # a pose whose rotation has a larger sigma is not computed
 
 _NEVER_NS = -(2**61)
 

@@ -81,8 +81,7 @@ class Track:
 
 _EMPTY = Track.empty()
 
-MAX_DISTANCE_M = 100_000.0
-"""Longer than the range of any total station."""
+MAX_DISTANCE_M = 100_000.0  # longer than the range of any total station
 
 MAX_FUTURE_NS = 1_000_000_000
 """A small error of the clock offset may date a measurement after its arrival by this much."""

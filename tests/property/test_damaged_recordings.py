@@ -6,12 +6,12 @@ import json
 from collections import Counter
 
 import pytest
+from harness.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
 from harness.cli import called
-from harness.damage import UNDAMAGED, Damage, Samples, damages, examples
 from harness.cli_contract import Files, check_command
+from harness.damage import UNDAMAGED, Damage, Samples, damages, examples
 from harness.merging import journals, recording
 from harness.missions import QUICK, SUPERFRAME, run_mission
-from harness.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -86,6 +86,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], str]] = {
 @examples(2)
 @given(damage=damages, keep_going=st.booleans())
 @example(damage=UNDAMAGED, keep_going=False)
+@pytest.mark.slow
 def test_commands_with_a_damaged_recording(
     recordings: Samples,
     command: str,

@@ -9,6 +9,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import hypothesis.strategies as st
+import pytest
 from harness.records import CLOCK, EVENT, HEADER, STATUS
 from harness.scene import START, driving, stationary_scene
 from hypothesis import given, settings
@@ -189,6 +190,7 @@ def test_replay_equals_the_stream(
     ),
     st.lists(st.integers(START, START + 10 * 10**9), max_size=20),
 )
+@pytest.mark.slow
 def test_replay_equals_the_stream_with_predictions(
     measurements: list[PolarMeasurement],
     others: list[tuple[int, ClockRecord | EventRecord | StatusRecord]],

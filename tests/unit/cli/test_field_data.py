@@ -125,6 +125,7 @@ HELD_OUT = {
 
 
 @pytest.mark.parametrize("segment", SEGMENTS)
+@pytest.mark.slow
 def test_held_out_errors_of_the_field_data(
     tsgt: Tsgt, field_data: Path, tmp_path: Path, segment: str
 ) -> None:

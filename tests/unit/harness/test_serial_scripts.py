@@ -24,6 +24,7 @@ def test_there_are_two_hundred_scripts() -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.slow
 def test_fault_is_survived(kind: str) -> None:
     """Every reading was offered, once, at its time; and measuring continues within the limit of the kind."""
     for script in SCRIPTS:

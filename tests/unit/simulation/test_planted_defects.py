@@ -30,6 +30,7 @@ def script() -> ModuleType:
 
 
 @pytest.mark.parametrize(("key", "check"), [("angle", "journal"), ("offset", "time"), ("order", "replay")])
+@pytest.mark.slow
 def test_planted_defect_is_detected_and_removed(script: ModuleType, key: str, check: str) -> None:
     """Eight seconds suffice for these; the program is restored afterwards."""
     defect: Any = dataclasses.replace(script.DEFECTS[key], duration_s=8.0)
@@ -41,6 +42,7 @@ def test_planted_defect_is_detected_and_removed(script: ModuleType, key: str, ch
     assert all(owner.__dict__[name] is right for owner, name, right in places)
 
 
+@pytest.mark.slow
 def test_every_defect_replaces_existing_code(script: ModuleType) -> None:
     """The replaced attributes exist and are restored; the named tests exist."""
     for defect in script.DEFECTS.values():

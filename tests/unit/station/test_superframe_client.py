@@ -97,6 +97,7 @@ async def test_every_measurement_is_delivered_with_its_time(tmp_path: Path) -> N
             assert abs(error_ns) < 100_000
 
 
+@pytest.mark.slow
 async def test_killed_client_loses_no_measurement(tmp_path: Path) -> None:
     """Restarted after any number of steps of the event loop, it delivers all readings."""
     async with superframe_day(tmp_path) as (day, air):

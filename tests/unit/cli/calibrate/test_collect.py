@@ -273,7 +273,9 @@ async def test_radio_failure_ends_the_session_at_once(tmp_path: Path, speaks: Sp
             async with session(field, script, open_radio) as stations:
                 await stations.measure(1, constant_m=0.0)
         assert asyncio.get_running_loop().time() - began_s < 1.0
-    assert script.said[-1].startswith("note: station 1 has not returned to tracking: the radio failed (no answer")
+    assert script.said[-1].startswith(
+        "note: station 1 has not returned to tracking: the radio failed (no answer"
+    )
 
 
 async def test_keys_skip_repeat_and_reject(tmp_path: Path) -> None:
@@ -423,5 +425,14 @@ def test_check_of_unknown_target_or_station_is_rejected(tsgt: Tsgt, tmp_path: Pa
     # Its radio has no air to be on.
     done = tsgt(*common)
     assert (done.code, "stop it first" in done.err) == (1, True)
-    done = tsgt("calibrate", "collect", "--config", config, "--output", tmp_path / "no" / "targets.csv")
+    done = tsgt(
+        "calibrate",
+        "collect",
+        "--config",
+        config,
+        "--target-constant-mm",
+        0,
+        "--output",
+        tmp_path / "no" / "targets.csv",
+    )
     assert (done.code, "No such" in done.err) == (1, True)

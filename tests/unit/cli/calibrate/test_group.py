@@ -19,6 +19,10 @@ if TYPE_CHECKING:
 REFERENCE = Path(__file__).parents[4] / "docs" / "reference" / "target-file.md"
 HOW_TO = Path(__file__).parents[4] / "docs" / "how-to" / "calibrate.md"
 
+PRISM_CONSTANTS = ("--target-constant-mm", 0, "--prism-constant-mm", 10)
+"""Constants of the documented examples."""
+TARGET_CONSTANT = PRISM_CONSTANTS[:2]
+
 
 @pytest.fixture
 def markers(field_data: Path) -> Path:
@@ -147,7 +151,9 @@ def test_table_lists_every_target(tsgt: Tsgt, markers: Path, tmp_path: Path) -> 
 def test_set_up_file_reproduces_the_frames_exactly(tsgt: Tsgt, tmp_path: Path) -> None:
     """The configuration reads exactly the printed frames, station 1 included."""
     output = tmp_path / "frames.toml"
-    done = tsgt("calibrate", "targets", documented(0, tmp_path), "--json", "--output", output)
+    done = tsgt(
+        "calibrate", "targets", documented(0, tmp_path), *TARGET_CONSTANT, "--json", "--output", output
+    )
     assert done.code == 0
     frames = load_station_frames(output)
     assert np.array(frames[2]).tolist() == done.json()["stations"]["2"]["T_station1_station"]
@@ -162,10 +168,10 @@ def test_inconsistent_targets_are_not_written(tsgt: Tsgt, tmp_path: Path) -> Non
     """One of four targets is wrong: exit code 3, residuals on stdout, reason on stderr, no file."""
     path, output = documented(0, tmp_path), tmp_path / "frames.toml"
     path.write_text(path.read_text(encoding="utf-8").replace("20.4692", "20.5192"), encoding="utf-8")
-    done = tsgt("calibrate", "targets", path, "--json", "--output", output)
+    done = tsgt("calibrate", "targets", path, *TARGET_CONSTANT, "--json", "--output", output)
     assert done.code == 3
     assert done.json()["stations"]["2"]["consistent"] is False
-    assert "contradict each other" in done.err
+    assert "are inconsistent" in done.err
     assert not output.exists()
 
 
@@ -176,8 +182,7 @@ def test_prisms_are_solved_and_written(tsgt: Tsgt, tmp_path: Path) -> None:
         "calibrate",
         "prisms",
         documented(2, tmp_path),
-        "--prism-constant-mm",
-        10,
+        *PRISM_CONSTANTS,
         "--json",
         "--output",
         output,
@@ -193,11 +198,28 @@ def test_prisms_are_solved_and_written(tsgt: Tsgt, tmp_path: Path) -> None:
 
 def test_prisms_as_text(tsgt: Tsgt, tmp_path: Path) -> None:
     """The text has prisms, distances and body points."""
-    done = tsgt("calibrate", "prisms", documented(2, tmp_path), *CONSTANTS)
+    done = tsgt("calibrate", "prisms", documented(2, tmp_path), *PRISM_CONSTANTS)
     assert done.code == 0
     assert re.search(r"^2 +0\.4838 +-0\.1757 +1\.4171", done.out, re.MULTILINE)
     assert re.search(r"^1-2 +986\.72$", done.out, re.MULTILINE)
     assert re.search(r"^mast +0\.24", done.out, re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    ("command", "example", "missing"),
+    [("targets", 0, "target"), ("prisms", 2, "target"), ("prisms", 2, "prism")],
+)
+def test_constants_have_no_default(
+    tsgt: Tsgt, tmp_path: Path, command: str, example: int, missing: str
+) -> None:
+    """A line without constant_mm needs the option; the usage error names the line."""
+    index = PRISM_CONSTANTS.index(f"--{missing}-constant-mm")
+    others = PRISM_CONSTANTS[:index] + PRISM_CONSTANTS[index + 2 :] if command == "prisms" else ()
+    path = documented(example, tmp_path)
+    done = tsgt("calibrate", command, path, *others)
+    assert (done.code, done.out) == (2, "")
+    assert f"{path}, line " in done.err
+    assert f"has no constant_mm; give --{missing}-constant-mm" in done.err
 
 
 def test_invalid_file_is_one_line(tsgt: Tsgt, tmp_path: Path) -> None:
@@ -216,7 +238,7 @@ def test_line_break_in_a_file_name_is_escaped(tsgt: Tsgt, tmp_path: Path) -> Non
     """A line break in the input file's name does not get into the TOML."""
     path, output = tmp_path / 'a\nkind = "x"', tmp_path / "frames.toml"
     documented(0, tmp_path).rename(path)
-    assert tsgt("calibrate", "targets", path, "--output", output).code == 0
+    assert tsgt("calibrate", "targets", path, *TARGET_CONSTANT, "--output", output).code == 0
     assert tomllib.loads(output.read_text(encoding="utf-8"))["kind"] == "station_frames"
 
 
@@ -228,7 +250,13 @@ def test_every_json_key_is_documented(
     tsgt: Tsgt, tmp_path: Path, command: str, example: int, section: str
 ) -> None:
     """Each key of the JSON output is in the how-to page."""
-    printed: dict[str, Any] = tsgt("calibrate", command, documented(example, tmp_path), *CONSTANTS[: 2 if command == "targets" else 4], "--json").json()
+    printed: dict[str, Any] = tsgt(
+        "calibrate",
+        command,
+        documented(example, tmp_path),
+        *(TARGET_CONSTANT if command == "targets" else PRISM_CONSTANTS),
+        "--json",
+    ).json()
     keys = (
         set(printed["stations"]["2"])
         if command == "targets"

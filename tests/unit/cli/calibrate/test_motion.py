@@ -115,6 +115,7 @@ def test_prism_output_needs_estimate_prisms(tsgt: Tsgt, recording: Path, tmp_pat
     assert tsgt("calibrate", "motion", recording, "--prism-output", tmp_path / "prisms.toml").code == 2
 
 
+@pytest.mark.slow
 def test_published_drive_has_smaller_held_out_errors(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
     """The held-out error is at most 0.45 times that of linear interpolation, 0.35 times in gaps."""
     day = field_data / "20220314"

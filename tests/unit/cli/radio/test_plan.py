@@ -149,6 +149,7 @@ baud = 921600
         ("superframe", 3, 2.5, 60, 0.2),
     ],
 )
+@pytest.mark.slow
 def test_plan_and_simulation_agree(
     tsgt: Tsgt,
     tmp_path: Path,

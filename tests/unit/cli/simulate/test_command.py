@@ -87,6 +87,7 @@ def test_recording_and_truth_are_written(tsgt: Tsgt, tmp_path: Path) -> None:
     np.testing.assert_allclose(np.diff(rows[:, 0]), 0.05, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_figures_follow_from_the_files(tsgt: Tsgt, tmp_path: Path) -> None:
     """Oracle: rates and pose errors computed from recording and truth only."""
     recording, truth = tmp_path / "run.jsonl", tmp_path / "truth.tum"

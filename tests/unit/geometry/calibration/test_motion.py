@@ -121,6 +121,7 @@ def test_covariance_is_consistent() -> None:
     assert 9.6 < np.mean(distances) < 19.3
 
 
+@pytest.mark.slow
 def test_wander_is_estimated_and_included() -> None:
     """Timestamps that wander by 3 ms every 40 s are found, and chi squared stays in its 99 % band."""
     distances, wander_s = [], []

@@ -79,6 +79,7 @@ def test_outlier_leaves_predicted_covariance_unchanged(observations: Observation
         )
 
 
+@pytest.mark.slow
 def test_predictions_cover_abrupt_manoeuvres() -> None:
     """Manoeuvres that begin right after the last measurements stay within the predicted covariance."""
     motion = speeding_up_and_turning_back(

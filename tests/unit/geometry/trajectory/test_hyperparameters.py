@@ -164,6 +164,7 @@ def test_tuning_recovers_the_prior(observations: Observations) -> None:
     assert found.noise_scale == pytest.approx(2.0, rel=0.15)
 
 
+@pytest.mark.slow
 def test_start_hardly_affects_the_result(observations: Observations) -> None:
     """From ten times less and ten times more process noise the result is the same."""
     calm = MotionPrior(acceleration_sigma_mps2=(0.05, 0.05, 0.02), acceleration_correlation_time_s=3.0)

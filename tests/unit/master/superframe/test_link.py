@@ -117,6 +117,7 @@ async def test_beacons_are_recorded(tmp_path: Path) -> None:
     assert mean(lengths_ms) == pytest.approx(378, abs=8)
 
 
+@pytest.mark.slow
 async def test_phase_lock_reduces_the_age(tmp_path: Path) -> None:
     """Frames of 400 ms, the instruments' period."""
     ages_ms = {}
@@ -132,6 +133,7 @@ async def test_phase_lock_reduces_the_age(tmp_path: Path) -> None:
     assert ages_ms[True] < 220 < ages_ms[False] < 310
 
 
+@pytest.mark.slow
 async def test_lossy_channel_loses_no_measurement(tmp_path: Path) -> None:
     """At 20 % packet loss everything is delivered, and the status is the newest."""
     async with (
@@ -190,6 +192,7 @@ async def test_unwritten_measurements_are_not_acknowledged(tmp_path: Path) -> No
     assert written == [encode_line(m) for m in field.of(PolarMeasurement)]
 
 
+@pytest.mark.slow
 async def test_hanging_disk_does_not_delay_frames(tmp_path: Path) -> None:
     """Beacons wait for it for some milliseconds."""
     write_line = RecordingWriter.write_line
@@ -282,6 +285,7 @@ async def test_killed_station_delivers_its_backlog(tmp_path: Path) -> None:
     assert undelivered(field, until_s=40) == NOTHING
 
 
+@pytest.mark.slow
 async def test_backlog_follows_live_data_after_an_outage(tmp_path: Path) -> None:
     """The status never shows an old measurement as the newest."""
     link = LinkModel()
@@ -376,6 +380,7 @@ async def test_lost_prism_gets_search_commands(tmp_path: Path) -> None:
     assert station_status(field, 1).rate_hz == pytest.approx(2.5, abs=0.11)
 
 
+@pytest.mark.slow
 async def test_search_commands_do_not_delay_others(tmp_path: Path) -> None:
     """Phase-locked frames keep their length, and measurements their age."""
     async with field_of(tmp_path, superframe=True) as field:

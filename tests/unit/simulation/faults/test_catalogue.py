@@ -114,6 +114,7 @@ def test_crash_window_ends_at_the_kill(tmp_path: Path) -> None:
     ],
     ids=lambda value: getattr(value, "kind", str(value)),
 )
+@pytest.mark.slow
 def test_invariants_hold_under_all_faults(tmp_path: Path, protocol: Any, estimator: str, seed: int) -> None:
     """With faults of all kinds no invariant is violated."""
     plain = ScenarioConfig()

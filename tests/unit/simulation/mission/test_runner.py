@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from tsgt.simulation.options import StationSoftware
 
 
+@pytest.mark.slow
 def test_classic_mission(tmp_path: Path) -> None:
     """Three stations deliver above 1.3 Hz each, timestamps are good to 0.3 ms, poses to centimetres."""
     run = run_mission(tmp_path, duration_s=60.0)
@@ -49,6 +50,7 @@ def with_linear_estimator(scenario: ScenarioConfig) -> ScenarioConfig:
 @pytest.mark.parametrize(
     ("station_software", "min_hz", "max_hz"), [("ours", 1.5, 1.72), ("authors", 1.3, 1.6)]
 )
+@pytest.mark.slow
 def test_rates_with_the_papers_settings(
     tmp_path: Path, station_software: StationSoftware, min_hz: float, max_hz: float
 ) -> None:
@@ -65,6 +67,7 @@ def test_rates_with_the_papers_settings(
         assert min_hz <= figure.rate_hz <= max_hz
 
 
+@pytest.mark.slow
 def test_same_seed_gives_the_same_stream(tmp_path: Path) -> None:
     """Another seed gives another stream."""
     one, same, other = (
@@ -76,6 +79,7 @@ def test_same_seed_gives_the_same_stream(tmp_path: Path) -> None:
     assert one.master_logs[0].line_hashes != other.master_logs[0].line_hashes
 
 
+@pytest.mark.slow
 def test_clock_offsets_and_drifts_are_estimated(tmp_path: Path) -> None:
     """Stations drift by plus and minus the given ppm, and are years behind."""
     run = run_mission(tmp_path, duration_s=40.0, drift_ppm=50.0)
@@ -86,6 +90,7 @@ def test_clock_offsets_and_drifts_are_estimated(tmp_path: Path) -> None:
     assert all(clock.offset_ns < -(10**15) for clock in last.values())
 
 
+@pytest.mark.slow
 def test_authors_node(tmp_path: Path) -> None:
     """Stations with the authors' software are slower, with timestamp errors of a millisecond or two.
 
@@ -105,6 +110,7 @@ def test_authors_node(tmp_path: Path) -> None:
     assert estimator_figures(run)["linear"].valid_poses > 300
 
 
+@pytest.mark.slow
 def test_packet_loss_only_costs_measurements(tmp_path: Path) -> None:
     """With a tenth of all packets lost, fewer measurements arrive, all of them correct."""
     scenario = find_scenario("dynamic")
@@ -115,6 +121,7 @@ def test_packet_loss_only_costs_measurements(tmp_path: Path) -> None:
         assert 15 < figure.delivered < 50
 
 
+@pytest.mark.slow
 def test_occluded_prisms_give_no_poses(tmp_path: Path) -> None:
     """An occlusion is delivered as a status.
 
@@ -127,6 +134,7 @@ def test_occluded_prisms_give_no_poses(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
+@pytest.mark.slow
 def test_fewer_or_more_stations_than_prisms(tmp_path: Path, count: int) -> None:
     """Two stations measure but give no pose; five share three prisms."""
     run = run_mission(tmp_path, with_stations(find_scenario("dynamic"), count), duration_s=20.0)
@@ -136,6 +144,7 @@ def test_fewer_or_more_stations_than_prisms(tmp_path: Path, count: int) -> None:
     assert (estimator_figures(run)["linear"].valid_poses > 0) == (count >= 3)
 
 
+@pytest.mark.slow
 def test_client_restart(tmp_path: Path) -> None:
     """The other stations continue; the station and the poses recover."""
 
@@ -167,6 +176,7 @@ def test_client_restart(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("down_s", [2.2, 8.0, 15.0])
 @pytest.mark.parametrize("at_s", [0.85, 2.3, 15.45])
+@pytest.mark.slow
 def test_clock_without_battery_stops_during_downtime(tmp_path: Path, at_s: float, down_s: float) -> None:
     """Timestamps stay correct, also when the downtime interrupts a synchronisation."""
 
@@ -185,6 +195,7 @@ def test_clock_without_battery_stops_during_downtime(tmp_path: Path, at_s: float
     assert len(late) > 4
 
 
+@pytest.mark.slow
 def test_master_restart(tmp_path: Path) -> None:
     """The second master has its own recording, resynchronises all clocks, and poses recover."""
 
@@ -202,6 +213,7 @@ def test_master_restart(tmp_path: Path) -> None:
     assert len(second.valid_poses().stamp_ns) > 150
 
 
+@pytest.mark.slow
 def test_outage(tmp_path: Path) -> None:
     """During the outage nothing arrives from its station, and more from the others."""
     run = run_mission(tmp_path, duration_s=40.0, outages=(Outage((2,), 15.0, 10.0),))
@@ -224,6 +236,7 @@ def test_outage(tmp_path: Path) -> None:
     assert 0 < outage.live_age_ms < 1000
 
 
+@pytest.mark.slow
 def test_outage_with_a_fractional_nanosecond_ends(tmp_path: Path) -> None:
     """Rounding of instants does not prolong it."""
     outage = Outage((2,), 2.1, 0.2)
@@ -235,6 +248,7 @@ def test_outage_with_a_fractional_nanosecond_ends(tmp_path: Path) -> None:
     assert max(received_s) > 15.0
 
 
+@pytest.mark.slow
 def test_requested_restarts(tmp_path: Path) -> None:
     """A client and the master are down for two seconds."""
     run = run_mission(tmp_path, duration_s=40.0, restarts=(Restart(1, 15.0), Restart(None, 20.0)))
@@ -247,6 +261,7 @@ def test_requested_restarts(tmp_path: Path) -> None:
     assert np.sum(made_s > 17.0) > 50
 
 
+@pytest.mark.slow
 def test_interference_over_classic(tmp_path: Path) -> None:
     """Interference costs measurements, but changes neither them nor what is measured."""
     alone, disturbed = (
@@ -259,6 +274,7 @@ def test_interference_over_classic(tmp_path: Path) -> None:
         assert 0.5 * one.delivered < other.delivered < one.delivered
 
 
+@pytest.mark.slow
 def test_timestamp_jitter_and_drift_ramp(tmp_path: Path) -> None:
     """Timestamp errors grow with the jitter and stay within the bounds.
 
@@ -270,6 +286,7 @@ def test_timestamp_jitter_and_drift_ramp(tmp_path: Path) -> None:
         assert 5 < figure.time_error_us[0] < 1500
 
 
+@pytest.mark.slow
 def test_unix_clock_step_has_no_effect_on_a_running_client(tmp_path: Path) -> None:
     """The client fixes its time at its start."""
 
@@ -282,6 +299,7 @@ def test_unix_clock_step_has_no_effect_on_a_running_client(tmp_path: Path) -> No
     assert not any(clock.restarted for clock in run.master_logs[0].clocks[3:])
 
 
+@pytest.mark.slow
 def test_paper_filter_lags(tmp_path: Path) -> None:
     """With the paper's filter and 50 ppm the timestamp errors are large, but within its bound."""
     paper = QUICK.model_copy(update={"clock_filter": "paper", "resync_interval_s": 20.0})
@@ -305,6 +323,7 @@ def _lossy(loss: float) -> ScenarioConfig:
     return scenario.model_copy(update={"radio": scenario.radio.model_copy(update={"loss_probability": loss})})
 
 
+@pytest.mark.slow
 def test_superframe_delivers_everything(tmp_path: Path) -> None:
     """Three stations deliver all measurements once and promptly, and the poses are better."""
     run = run_mission(tmp_path, duration_s=60.0, protocol=SUPERFRAME)
@@ -335,6 +354,7 @@ def test_same_seed_gives_the_same_superframe_stream(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("authenticated", [True, False])
+@pytest.mark.slow
 def test_outage_over_superframe(tmp_path: Path, *, authenticated: bool) -> None:
     """With a tenth of all packets lost, everything arrives afterwards, live measurements first."""
     run = run_mission(
@@ -354,6 +374,7 @@ def test_outage_over_superframe(tmp_path: Path, *, authenticated: bool) -> None:
     assert outage.time_error_us[2] < 200
 
 
+@pytest.mark.slow
 def test_restarts_over_superframe(tmp_path: Path) -> None:
     """No measurement is lost when clients or the master restart, and all bounds hold."""
     run = run_mission(
@@ -372,6 +393,7 @@ def test_restarts_over_superframe(tmp_path: Path) -> None:
         assert figure.delivered == figure.measured
 
 
+@pytest.mark.slow
 def test_reboot_over_superframe(tmp_path: Path) -> None:
     """The clock restarts; journalled measurements from before arrive with valid bounds."""
 
@@ -392,6 +414,7 @@ def test_reboot_over_superframe(tmp_path: Path) -> None:
     assert station.delivered == station.measured == pytest.approx(2.5 * (60 - 4), abs=2)
 
 
+@pytest.mark.slow
 def test_replay_attack_over_superframe(tmp_path: Path) -> None:
     """Noise and replayed packets cost some packets and change nothing."""
     run = run_mission(tmp_path, duration_s=60.0, protocol=SUPERFRAME, interference_rate_hz=1.0)
@@ -401,6 +424,7 @@ def test_replay_attack_over_superframe(tmp_path: Path) -> None:
         assert figure.duplicates == 0
 
 
+@pytest.mark.slow
 def test_many_stations(tmp_path: Path) -> None:
     """Twelve stations share the channel, and each delivers its measurements."""
     run = run_mission(tmp_path, with_stations(find_scenario("dynamic"), 12), duration_s=30.0, protocol=SUPERFRAME)

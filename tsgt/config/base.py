@@ -1,8 +1,4 @@
-"""Base class and value types of the models of configuration and set-up files.
-
-Keys end with the units of the field (``_mm``, ``_deg``, ``_arcsec``, ``_s``). An unknown key is an error, so that a
-misspelt key does not silently leave a default in force.
-"""
+"""Base class and value types of configuration models. Keys end with units (``_mm``, ``_deg``); unknown ones are errors."""
 
 from __future__ import annotations
 

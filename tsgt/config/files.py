@@ -28,19 +28,10 @@ _SHOWN_CHARACTERS = 60
 
 
 def load(path: Path, model: type[M]) -> M:
-    """Read a file of one kind.
+    """Read a TOML file of one kind, for example :class:`MasterConfig`.
 
-    Parameters
-    ----------
-    path
-        TOML file.
-    model
-        Expected kind, for example :class:`MasterConfig`.
-
-    Raises
-    ------
-    ConfigError
-        Missing file, invalid TOML, other kind, unknown key, missing key or invalid value; names file, key and value.
+    Raises ConfigError, with file, key and value, if it is missing or invalid TOML, of another kind, or a key or value is
+    wrong.
     """
     raw = _read(path)
     kind = _kind(path, raw)

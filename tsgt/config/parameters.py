@@ -35,13 +35,8 @@ MIN_PRISMS = 3
 def parameters(config: MasterConfig) -> Parameters:
     """Read the set-up files of a master's configuration and convert everything to SI units.
 
-    Prisms that no station tracks are omitted: every pose would wait for them.
-
-    Raises
-    ------
-    ConfigError
-        A set-up file is invalid, a station has no frame, a prism has no position, or the stations track fewer than three
-        prisms.
+    Prisms that no station tracks are omitted: every pose would wait for them. Raises ConfigError if a set-up file is
+    invalid, a station has no frame, a prism has no position, or the stations track fewer than three prisms.
     """
     frames = load_station_frames(config.setup.station_frames)
     latencies_ns = load_station_latencies(config.setup.station_frames)

@@ -1,10 +1,7 @@
-"""Permissions of the files that daemons read: not everybody on the computer may be able to change them.
+"""Permissions of the files that daemons read: whoever can change them can run programs as the daemon or move every pose.
 
-Problem: write access to the configuration of a daemon means running any program as its user, and write access to the
-station frames moves every pose. Group-writable files cannot be rejected: on Debian and Raspberry Pi OS each user has a
-group of their own, the umask is 002, and new files have mode 0664. Solution: reject what everybody can change, directly or
-through a parent folder; groups and owners are left to the administrator. A key is also protected against reading, see
-:mod:`tsgt.radio.key_file`.
+Files that everybody can change, directly or through a parent folder, are rejected; group-writable ones are not: on Debian
+each user has a group of their own and the umask is 002. Keys: see :mod:`tsgt.radio.key_file`.
 """
 
 from __future__ import annotations
@@ -26,16 +23,8 @@ _ROOT = 0
 def check_permissions(path: Path, *, user: int | None = None) -> None:
     """Reject a file that everybody can change; a missing or inaccessible file is left to its reader.
 
-    Parameters
-    ----------
-    user
-        User id of the daemon that reads the file; None: of this process.
-
-    Raises
-    ------
-    ConfigError
-        The file or a parent folder is world-writable; in a world-writable folder with the sticky bit, such as /tmp: the
-        path below it belongs to neither root nor the user.
+    ``user``: id of the daemon's user, by default of this process. Raises ConfigError if the file or a parent folder is
+    world-writable; in one with the sticky bit, such as /tmp: the path below it belongs to neither root nor the user.
     """
     owners = (_ROOT, os.geteuid() if user is None else user)
     try:

@@ -23,13 +23,7 @@ if TYPE_CHECKING:
 
 
 async def run_checks(machine: Machine, path: Path) -> AsyncGenerator[Finding]:
-    """Run all checks and yield each finding at once.
-
-    Parameters
-    ----------
-    path
-        Configuration of a client or a master; if it is invalid, only the checks that need none are run.
-    """
+    """Run all checks, yielding each finding at once; with an invalid configuration only the checks that need none."""
     finding, config = files.check_configuration(path)
     yield finding
     service = None if config is None else computer.service_of(machine, config.kind)

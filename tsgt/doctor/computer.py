@@ -17,9 +17,7 @@ if TYPE_CHECKING:
 
 Kind = Literal["client", "master"]
 
-EARLIEST = datetime(2026, 1, 1, tzinfo=UTC)
-"""A clock with an earlier time has not been set since power-on."""
-
+EARLIEST = datetime(2026, 1, 1, tzinfo=UTC)  # A clock with an earlier time has not been set since power-on
 GOOD_CLOCK_SOURCES = {"arch_sys_counter", "tsc", "timer", "kvm-clock", "stc"}
 """Clock sources of Raspberry Pis (`arch_sys_counter`; `timer` and `stc` on the oldest), PCs and virtual machines with fine resolution and fast access."""
 

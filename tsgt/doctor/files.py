@@ -38,20 +38,15 @@ Daemon = ClientConfig | MasterConfig
 BYTES_PER_HOUR = {"client": 22_000_000, "master": 145_000_000}
 """Journal at 20 Hz; recording of three stations at 2.5 Hz with 20 poses per second."""
 
-MIN_HOURS = 12
-"""A day in the field."""
-
-SLOW_FSYNC_NS = 1_000_000_000
-"""A slower disk loses more than the second that a power cut may cost."""
-
+MIN_HOURS = 12  # A day in the field
+SLOW_FSYNC_NS = 1_000_000_000  # A slower disk loses more than the second that a power cut may cost
 _FSYNC_BYTES = 65_536
 _FSYNCS = 5
 
 MAX_FRAMES_AGE_NS = 12 * 3600 * 1_000_000_000
 """Older station frames belong to another set-up, unless the tripods have stayed."""
 
-VOLATILE = {"tmpfs", "ramfs", "overlay"}
-"""File systems that lose their changes at a power cut."""
+VOLATILE = {"tmpfs", "ramfs", "overlay"}  # File systems that lose their changes at a power cut
 
 
 def check_configuration(path: Path) -> tuple[Finding, Daemon | None]:
@@ -196,14 +191,9 @@ def _age(age_ns: int) -> str:
 def check_disk(
     machine: Machine, config: Daemon, user: User, service: Mapping[str, str] | None
 ) -> list[Finding]:
-    """Check that the folder of journals or recordings is persistent, writable, large and fast enough.
+    """Check that the daemon's user can write to a persistent, large and fast folder for journals or recordings.
 
-    Parameters
-    ----------
-    user
-        User of the daemon.
-    service
-        Properties of the daemon's unit, which creates the folder.
+    ``service``: properties of the daemon's unit, which creates the folder.
     """
     folder = (config.journal if isinstance(config, ClientConfig) else config.recording).directory
     existing = _existing_parent(folder)

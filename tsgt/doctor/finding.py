@@ -10,11 +10,9 @@ class Outcome(StrEnum):
     """Outcome of a check."""
 
     OK = "ok"
-    NOTE = "note"
-    """Passed, with something that the operator should know."""
+    NOTE = "note"  # Passed, with something that the operator should know
     FAILED = "failed"
-    SKIPPED = "skipped"
-    """Not possible here and now."""
+    SKIPPED = "skipped"  # Not possible here and now
 
 
 class Finding(NamedTuple):

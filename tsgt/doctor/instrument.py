@@ -19,31 +19,20 @@ if TYPE_CHECKING:
     from tsgt.station.geocom import GeoComConnection
     from tsgt.station.leica import Identity
 
-LOW_PERCENT = 50
-"""Minimum on the evening before a day in the field."""
-
+LOW_PERCENT = 50  # Minimum on the evening before a day in the field
 EMPTY_PERCENT = 20
 
-LEVEL_RAD = math.radians(2 / 60)
-"""Half of the range of a Leica compensator."""
-
+LEVEL_RAD = math.radians(2 / 60)  # Half of the range of a Leica compensator
 _NAMES = ("instrument", "licence", "battery", "level")
 
 _STOP = "the running client has the instrument open: sudo systemctl stop tsgt-client, then tsgt doctor again"
 
-AUTOMATIC = 1
-"""TMC_INCLINE_PRG: automatic inclination mode (GeoCOM reference manual, TMC_GetAngle1)."""
+AUTOMATIC = 1  # TMC_INCLINE_PRG: automatic inclination mode (GeoCOM reference manual, TMC_GetAngle1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DaemonState:
-    """State of the daemon on this machine; a running one has instrument and radio open.
-
-    Attributes
-    ----------
-    status
-        Of a client; None for a master, and for a client that does not respond.
-    """
+    """State of the daemon on this machine, which owns instrument and radio; ``status``: of a client that responds."""
 
     running: bool
     status: ClientStatus | None = None

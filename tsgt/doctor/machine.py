@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from tsgt.station import ClientStatus
     from tsgt.station.serial import OpenPort
 
-COMMAND_TIMEOUT_S = 5.0
-"""timedatectl may have to start a service first; no command takes longer."""
+COMMAND_TIMEOUT_S = 5.0  # timedatectl may have to start a service first; no command takes longer
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,28 +52,17 @@ class Machine:
 
     Attributes
     ----------
-    user
-        User that runs the checks.
-    find_user
-        Returns a user by name, with additional groups by name; None if a name does not exist.
-    group_name
-        Returns the name of a group by number.
-    run
-        Runs a command and returns its output; None if it is missing or fails.
-    which
-        Returns the path of a program; None if it is missing.
-    free_bytes
-        Returns the free space of a folder's disk.
-    port_holder
-        Returns the process that has a device open; None if there is none or it is unknown.
-    latency_timer_ms
-        Returns the latency timer of a serial adapter in ms; None without one.
-    open_port, open_hal
-        Open a serial line; bus and pins of a radio.
-    client_status
-        Returns the status of the client behind a socket; None without one. Raises StreamError if it is stuck.
-    serves
-        Whether a process serves a socket.
+    user : User that runs the checks.
+    find_user : Returns a user by name, with additional groups by name; None if a name does not exist.
+    group_name : Returns the name of a group by number.
+    run : Runs a command and returns its output; None if it is missing or fails.
+    which : Returns the path of a program; None if it is missing.
+    free_bytes : Returns the free space of a folder's disk.
+    port_holder : Returns the process that has a device open; None if there is none or it is unknown.
+    latency_timer_ms : Returns the latency timer of a serial adapter in ms; None without one.
+    open_port, open_hal : Open a serial line; bus and pins of a radio.
+    client_status : Returns the status of the client behind a socket; None without one. Raises StreamError if it is stuck.
+    serves : Whether a process serves a socket.
     """
 
     dev: Path = Path("/dev")

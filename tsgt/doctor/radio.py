@@ -23,9 +23,7 @@ if TYPE_CHECKING:
     from tsgt.doctor.finding import Finding
     from tsgt.doctor.machine import Machine, User
 
-STATIONS = 3
-"""Assumed by a client, which does not know the number of stations."""
-
+STATIONS = 3  # Assumed by a client, which does not know the number of stations
 RATE_HZ = 2.5
 
 
@@ -61,15 +59,7 @@ def spi_device(machine: Machine, config: HardwareRadioConfig) -> Path:
 
 
 async def check_radio(machine: Machine, config: RadioConfig, path: Path, *, daemon: bool) -> Finding:
-    """Check that the radio responds and accepts its settings, without transmitting.
-
-    Parameters
-    ----------
-    path
-        File of the configuration, for messages.
-    daemon
-        Whether the daemon is running; it owns the radio then, and the check is skipped.
-    """
+    """Check that the radio responds and accepts its settings, without transmitting; skipped while the daemon owns it."""
     if not isinstance(config, HardwareRadioConfig):
         return skipped("radio", "the radio is simulated")
     if daemon:

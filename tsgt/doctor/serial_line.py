@@ -12,9 +12,7 @@ if TYPE_CHECKING:
     from tsgt.doctor.finding import Finding
     from tsgt.doctor.machine import Machine, User
 
-SLOW_TIMER_MS = 2
-"""A longer latency timer takes too much of the 50 ms of a measurement at 20 Hz."""
-
+SLOW_TIMER_MS = 2  # A longer latency timer takes too much of the 50 ms of a measurement at 20 Hz
 RULES = "udev/rules.d/60-tsgt.rules"
 INSTALL_RULES = (
     f"sudo install -m 644 configs/udev/60-tsgt.rules /etc/{RULES}, then "

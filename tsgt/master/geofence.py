@@ -72,10 +72,7 @@ class Geofence(Observer):
         self._lost = False
 
     def pose(self, record: PoseRecord, now_ns: int) -> list[EventRecord]:
-        """Take a pose that was published at ``now_ns``; return the events that follow from it.
-
-        Smoothed poses are ignored: they show where the robot was.
-        """
+        """Take a pose published at ``now_ns``; return the events that follow. Smoothed poses, of the past, are ignored."""
         events = self.tick(now_ns)
         if (
             record.kind == "smoothed"
@@ -119,11 +116,7 @@ class Geofence(Observer):
         return self._last_valid_ns + self._lost_after_ns
 
     def _clearance_m(self, point: Point, covariance: Sequence[float]) -> float:
-        """Return the distance to the boundary less margin and uncertainty; negative: beyond.
-
-        Every edge counts with the uncertainty in its own direction: where that is large, a distant edge may be the
-        critical one.
-        """
+        """Return the least distance to the edges, each less margin and its own uncertainty; negative: beyond."""
         xx, xy, _, _, _, _, _, yy, *_ = covariance
         distances = [
             (distance, self._settings.sigmas * math.sqrt(max(u * u * xx + 2 * u * v * xy + v * v * yy, 0.0)))

@@ -114,7 +114,7 @@ async def test_recent_set_up_passes(tmp_path: Path) -> None:
     assert "up to 1.4 mm rms (station 3" in findings["station_frames"].detail
     assert "2 h ago" in findings["station_frames"].detail
     assert findings["prism_layout"].outcome is Outcome.OK
-    assert "0.5 mm (one sigma)" in findings["prism_layout"].detail
+    assert "one sigma up to 0.5 mm" in findings["prism_layout"].detail
 
 
 async def test_old_frames_are_a_note(tmp_path: Path) -> None:

@@ -66,7 +66,7 @@ def test_perturbation_study_as_text(tsgt: Tsgt) -> None:
     )
     assert outcome.code == 0
     assert outcome.out.startswith("5 noise levels, 100 poses each")
-    assert "A mean error of 10 mm between prisms is noise of 8.8" in outcome.out
+    assert "A mean error of 10 mm between prisms corresponds to noise of 8.8" in outcome.out
     assert "The paper: 10 mm" in outcome.out
     assert "-0.0 " not in outcome.out
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from harness.lab import Lab
 
 HEADER = b"\xff\xff\x00\x00"
-"""What RadioHead's drivers put before each payload: to all, from nobody, number, flags."""
+"""RadioHead's header before each payload: to, from, id, flags."""
 
 MODEMS = [(7, 125_000, 5), (9, 250_000, 6), (8, 500_000, 8), (10, 500_000, 7)]
 modems = pytest.mark.parametrize(("spreading_factor", "bandwidth_hz", "coding_rate"), MODEMS)
@@ -25,10 +25,10 @@ sizes = pytest.mark.parametrize("size", SIZES)
 
 @sizes
 @modems
-async def test_adafruit_hears_us(
+async def test_adafruit_receives_our_packets(
     spreading_factor: int, bandwidth_hz: int, coding_rate: int, size: int
 ) -> None:
-    """What our driver sends arrives, and both sides agree on its strength."""
+    """Our packets arrive, and both sides agree on their RSSI."""
     async with lab(_settings(spreading_factor, bandwidth_hz, coding_rate)) as bench:
         rfm9x = await bench.program.run(lambda: _rfm9x(bench, spreading_factor, bandwidth_hz, coding_rate))
         receiving = asyncio.create_task(bench.program.run(lambda: rfm9x.receive(timeout=5)))
@@ -36,17 +36,17 @@ async def test_adafruit_hears_us(
         await bench.radio.transmit(HEADER + payload(size))
         assert bytes(await receiving) == payload(size)
         assert rfm9x.crc_error_count == 0
-        # 14 dBm less 80 dB; this driver does not stretch RSSI by 16/15, as the data sheet asks for.
+        # 14 dBm less 80 dB; this driver does not scale RSSI by 16/15 as the data sheet requires.
         assert rfm9x.last_rssi == pytest.approx(-66 - 91 / 16, abs=1)
         assert rfm9x.last_snr > 10
 
 
 @sizes
 @modems
-async def test_we_hear_adafruit(
+async def test_we_receive_adafruits_packets(
     spreading_factor: int, bandwidth_hz: int, coding_rate: int, size: int
 ) -> None:
-    """What that driver sends arrives here, with its header, at the 10 dBm that it really sets."""
+    """That driver's packets arrive with their header, at the 10 dBm that it actually sets."""
     async with lab(_settings(spreading_factor, bandwidth_hz, coding_rate)) as bench:
         rfm9x = await bench.program.run(lambda: _rfm9x(bench, spreading_factor, bandwidth_hz, coding_rate))
         assert await bench.program.run(lambda: rfm9x.send(payload(size)))
@@ -55,8 +55,8 @@ async def test_we_hear_adafruit(
         assert packet.rssi_dbm == pytest.approx(10 - 80, abs=1)
 
 
-async def test_a_conversation_with_adafruit() -> None:
-    """Twenty requests and answers in a row, each side receiving right after it has sent."""
+async def test_requests_and_responses_with_adafruit() -> None:
+    """Twenty requests and responses in a row: each side receives right after it has transmitted."""
     async with lab(_settings(7, 125_000, 5)) as bench:
 
         def converse() -> list[bytes]:
@@ -70,12 +70,12 @@ async def test_a_conversation_with_adafruit() -> None:
         conversing = asyncio.create_task(bench.program.run(converse))
         for _ in range(20):
             request = await bench.radio.receive()
-            await bench.radio.transmit(request.payload + b" heard")
-        assert await conversing == [bytes([number]) + b" heard" for number in range(20)]
+            await bench.radio.transmit(request.payload + b" ok")
+        assert await conversing == [bytes([number]) + b" ok" for number in range(20)]
 
 
-async def test_adafruit_gets_its_acknowledgement() -> None:
-    """Its reliable datagrams find an answer that our driver sends at once."""
+async def test_adafruit_receives_its_acknowledgement() -> None:
+    """Its reliable datagrams are acknowledged by our driver in time."""
     async with lab(_settings(7, 125_000, 5)) as bench:
 
         def send() -> bool:
@@ -90,8 +90,8 @@ async def test_adafruit_gets_its_acknowledgement() -> None:
         assert await sending
 
 
-async def test_another_sync_word_is_not_heard() -> None:
-    """That driver knows no sync word but 0x12; with the authors' 0x34 neither hears the other."""
+async def test_other_sync_word_is_not_received() -> None:
+    """That driver only has sync word 0x12; with the authors' 0x34 neither receives the other."""
     async with lab(
         LoRaSettings(frequency_hz=915_000_000, spreading_factor=7, bandwidth_hz=125_000, coding_rate=5)
     ) as bench:
@@ -103,8 +103,8 @@ async def test_another_sync_word_is_not_heard() -> None:
         assert bench.radio.statistics.received == 0
 
 
-async def test_no_chip_is_noticed_by_adafruit() -> None:
-    """Where nothing answers on the bus, that driver says so: the stand-ins do not hide a fault."""
+async def test_adafruit_reports_a_missing_chip() -> None:
+    """Without a chip on the bus that driver raises an error: the simulated peripherals hide no fault."""
     async with lab(_settings(7, 125_000, 5)) as bench:
         bench.chip.disconnect_bus(level=False)
         with pytest.raises(RuntimeError, match="expected version"):

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 SECOND = 1000 * MS
 START_NS = 1_790_000_000 * SECOND
 AHEAD_NS = -500_000_000 * SECOND
-"""A Pi without battery clock starts years behind."""
+"""Unix time of a Pi without battery clock: years behind."""
 spreading_factors = pytest.mark.parametrize("spreading_factor", [8, 9])
 
 
@@ -57,7 +57,7 @@ def _settings(spreading_factor: int) -> LoRaSettings:
 
 @dataclass
 class Field:
-    """A channel with a master's radio, and whatever has been put beside it."""
+    """A channel with a master's radio and the stations added to it."""
 
     radio: Radio
     clock: VirtualClock
@@ -75,7 +75,7 @@ class Field:
         await self._start(node.run())
 
     async def add_our_station(self, station: int) -> None:
-        """Start a station that answers by the core of ours."""
+        """Start a station that runs our sans-I/O core."""
         radio, clock, instrument = await self._host(station)
         await self._start(_serve(station, radio, clock, instrument))
 
@@ -91,7 +91,7 @@ class Field:
         await asyncio.sleep(1.1)  # the instrument takes a second until it tracks
 
     def our_master(self) -> Transport:
-        """Return what runs turns of ours."""
+        """Return the transport of our master."""
         return Transport(self.radio, self.clock, UnixTimeline.fixed_now(self.clock), self.timing)
 
     def their_master(self, *stations: int) -> AuthorsMaster:
@@ -100,7 +100,7 @@ class Field:
 
     @property
     def timing(self) -> LinkTiming:
-        """Of the turns."""
+        """Timing of the transactions."""
         return LinkTiming(self.settings, 250 * MS)
 
 
@@ -121,7 +121,7 @@ async def _field(spreading_factor: int = 9) -> AsyncGenerator[Field]:
 
 
 async def _serve(station: int, radio: Radio, clock: DriftingClock, instrument: ScriptedInstrument) -> None:
-    """Answer as our client does, with one task less."""
+    """Respond as our client does, with one task less."""
     timeline = UnixTimeline.fixed_now(clock)
     core = ClassicStation(station)
 
@@ -135,11 +135,11 @@ async def _serve(station: int, radio: Radio, clock: DriftingClock, instrument: S
             time_ns=timeline.unix_ns(reading.at_ns),
         )
 
-    async def carry_out(order: ClassicCommand) -> bytes:
-        if isinstance(order, MeasureCommand):
+    async def execute(command: ClassicCommand) -> bytes:
+        if isinstance(command, MeasureCommand):
             return core.single_measured(message(await instrument.measure()))
         await instrument.direct()
-        return core.executed(order, ok=True)
+        return core.executed(command, ok=True)
 
     async def read() -> None:
         while True:
@@ -151,7 +151,7 @@ async def _serve(station: int, radio: Radio, clock: DriftingClock, instrument: S
             packet = await radio.receive()
             answer = core.received(packet.payload, timeline.unix_ns(packet.received_at_ns))
             if answer is not None:
-                await radio.transmit(answer if isinstance(answer, bytes) else await carry_out(answer))
+                await radio.transmit(answer if isinstance(answer, bytes) else await execute(answer))
     finally:
         reading.cancel()
         await asyncio.wait([reading])
@@ -167,8 +167,8 @@ async def _polled(site: Field, station: int = 1) -> MeasurementMessage | None:
 
 
 @spreading_factors
-async def test_our_master_gets_their_measurement(spreading_factor: int) -> None:
-    """Polar values, raw as the instrument gave them, and the time of their arrival on the node's Unix clock."""
+async def test_our_master_receives_their_measurement(spreading_factor: int) -> None:
+    """Raw polar values, and their time of arrival on the node's Unix clock."""
     async with _field(spreading_factor) as site:
         await site.add_authors_node(1)
         site.instruments[1].give()
@@ -185,8 +185,8 @@ async def test_our_master_gets_their_measurement(spreading_factor: int) -> None:
     )
 
 
-async def test_their_node_repeats_itself() -> None:
-    """Without a new measurement the same one comes again, to the last bit, and its time tells."""
+async def test_their_node_repeats_the_last_measurement() -> None:
+    """Without a new measurement the last one is sent again bit for bit; its timestamp identifies it."""
     async with _field() as site:
         await site.add_authors_node(1)
         site.instruments[1].give()
@@ -200,7 +200,7 @@ async def test_their_node_repeats_itself() -> None:
 
 
 async def test_their_zeros_are_no_measurement() -> None:
-    """Before its first measurement their node sends zeros as a good one."""
+    """Before its first measurement their node sends zeros with a good status."""
     async with _field() as site:
         await site.add_authors_node(1)
         message = await _polled(site)
@@ -220,7 +220,7 @@ async def test_their_zeros_are_no_measurement() -> None:
 )
 @pytest.mark.parametrize("station", [1, 2, 3])
 async def test_their_errors_have_no_time(given: Status, expected: Status, station: int) -> None:
-    """What they send for a time, zeros or ones, is read as none; and none of it is usable."""
+    """Errors carry zeros or ones instead of a time: they are decoded without time and are unusable."""
     async with _field() as site:
         await site.add_authors_node(station)
         site.instruments[station].give()
@@ -232,7 +232,7 @@ async def test_their_errors_have_no_time(given: Status, expected: Status, statio
 
 
 async def test_their_measurement_without_distance_has_angles() -> None:
-    """Below a metre the angles and the time are good, and the distance is 0."""
+    """Below a metre angles and time are valid and the distance is 0."""
     async with _field() as site:
         await site.add_authors_node(1)
         site.instruments[1].give(Status.ANGLE_ONLY)
@@ -243,8 +243,8 @@ async def test_their_measurement_without_distance_has_angles() -> None:
     assert message.time_ns > 0
 
 
-async def test_their_node_without_instrument_answers_on() -> None:
-    """A plug that is pulled shows as an error and costs no time-out."""
+async def test_their_node_without_instrument_keeps_responding() -> None:
+    """An unplugged instrument gives an error status and no timeout."""
     async with _field() as site:
         await site.add_authors_node(1)
         site.instruments[1].fail()
@@ -255,7 +255,7 @@ async def test_their_node_without_instrument_answers_on() -> None:
 
 @spreading_factors
 async def test_our_master_synchronises_their_node(spreading_factor: int) -> None:
-    """Each cycle brings a sample; with the known delay of polling the mean offset is right to 0.1 ms."""
+    """Each cycle gives a clock sample; corrected for the polling delay, the mean offset is within 0.1 ms."""
     async with _field(spreading_factor) as site:
         await site.add_authors_node(1)
         turn = Synchronisation(1, 50, site.timing, timestamp_delay_ns=round(AUTHORS_TIMESTAMP_DELAY_MS * MS))
@@ -269,8 +269,8 @@ async def test_our_master_synchronises_their_node(spreading_factor: int) -> None
     assert message is not None
 
 
-async def test_a_step_of_their_clock_is_in_the_next_samples() -> None:
-    """Their stamps follow the Unix clock when it is set."""
+async def test_clock_step_of_their_node_appears_in_the_next_samples() -> None:
+    """Their timestamps follow steps of the Unix clock."""
     async with _field() as site:
         await site.add_authors_node(1)
         site.clocks[1].step(7 * SECOND)
@@ -281,8 +281,8 @@ async def test_a_step_of_their_clock_is_in_the_next_samples() -> None:
         assert offset_ns - AHEAD_NS == pytest.approx(7 * SECOND, abs=2 * MS)
 
 
-async def test_our_master_takes_their_node_to_targets_and_back() -> None:
-    """Direct mode, a single measurement with the instrument's own time in whole seconds, and back to a new prism."""
+async def test_our_master_switches_their_node_to_targets_and_back() -> None:
+    """Direct mode, a single measurement with instrument time in whole seconds, then tracking of another prism."""
     async with _field() as site:
         await site.add_authors_node(1)
         instrument, master = site.instruments[1], site.our_master()
@@ -298,11 +298,11 @@ async def test_our_master_takes_their_node_to_targets_and_back() -> None:
     assert (to_targets.ok, back.ok, again.ok) == (True, True, True)
     assert shot.message is not None
     assert (status_of(shot.message), shot.message.time_ns) == (Status.OK, 123 * SECOND)
-    assert instrument.prisms == [1, None, 4]  # while it tracks, it keeps its prism
+    assert instrument.prisms == [1, None, 4]  # the prism does not change while it tracks
 
 
-async def test_a_failed_target_of_theirs_is_an_error() -> None:
-    """A refused change of mode is a no, and a single measurement that fails has its status."""
+async def test_failed_target_of_their_node_is_an_error() -> None:
+    """A rejected change of mode is answered by No; a failed single measurement has its error status."""
     async with _field() as site:
         await site.add_authors_node(1)
         instrument, master = site.instruments[1], site.our_master()
@@ -319,23 +319,21 @@ async def test_a_failed_target_of_theirs_is_an_error() -> None:
     assert not status_of(shot.message).usable
 
 
-async def test_a_node_left_in_synchronisation_is_got_out() -> None:
-    """A master that was killed leaves a node that answers no poll; an order of the next master frees it."""
+async def test_node_left_in_synchronisation_recovers() -> None:
+    """A killed master leaves a node that responds to no poll; a command of the next master releases it."""
     async with _field() as site:
         await site.add_authors_node(1)
         await site.radio.transmit(b"p1")
         assert await _polled(site) is None
-        order = CommandTransaction(1, CommandMessage("n", 1, 1), 3 * SECOND)
-        await site.our_master().run(order)
-        assert order.ok
+        transaction = CommandTransaction(1, CommandMessage("n", 1, 1), 3 * SECOND)
+        await site.our_master().run(transaction)
+        assert transaction.ok
         assert await _polled(site) is not None
 
 
 @pytest.mark.parametrize(("spreading_factor", "rate_hz"), [(9, 1.62), (8, 2.88)])
-async def test_three_of_their_nodes_are_polled_at_the_rate_of_the_paper(
-    spreading_factor: int, rate_hz: float
-) -> None:
-    """Round after round, with the turn-round of their nodes and no pause of ours."""
+async def test_three_of_their_nodes_reach_the_papers_rate(spreading_factor: int, rate_hz: float) -> None:
+    """Continuous polling with their turnaround and no pause of ours."""
     rounds = 20
     async with _field(spreading_factor) as site:
         for station in (1, 2, 3):
@@ -351,8 +349,8 @@ async def test_three_of_their_nodes_are_polled_at_the_rate_of_the_paper(
 
 
 @spreading_factors
-async def test_their_master_gets_our_measurement(spreading_factor: int) -> None:
-    """The bytes are taken for what they are, and each request is answered, also without a new measurement."""
+async def test_their_master_receives_our_measurement(spreading_factor: int) -> None:
+    """The bytes decode correctly, and each request gets a response, also without a new measurement."""
     async with _field(spreading_factor) as site:
         await site.add_our_station(1)
         given_ns = site.clocks[1].realtime_ns()
@@ -363,8 +361,8 @@ async def test_their_master_gets_our_measurement(spreading_factor: int) -> None:
     assert answers[0] == answers[1] == (1, 0, 1.25, 2.5, 99.5, given_ns // SECOND, given_ns % SECOND)
 
 
-async def test_their_master_gets_an_error_before_our_first_measurement() -> None:
-    """Status 3 is one that it leaves out."""
+async def test_their_master_receives_an_error_before_our_first_measurement() -> None:
+    """It ignores measurements with status 3."""
     async with _field() as site:
         await site.add_our_station(1)
         answer = await site.their_master(1).poll(1)
@@ -373,7 +371,7 @@ async def test_their_master_gets_an_error_before_our_first_measurement() -> None
 
 @spreading_factors
 async def test_their_master_synchronises_our_station(spreading_factor: int) -> None:
-    """Its midpoint is right to half of what its polling takes."""
+    """Its midpoint is right within half of its polling interval."""
     async with _field(spreading_factor) as site:
         await site.add_our_station(1)
         master = site.their_master(1)
@@ -382,8 +380,8 @@ async def test_their_master_synchronises_our_station(spreading_factor: int) -> N
     assert master.offset_ns[1] == pytest.approx(AHEAD_NS, abs=0.5 * MS)
 
 
-async def test_their_master_takes_our_station_to_targets_and_back() -> None:
-    """``d`` is answered when the instrument is ready, a target when it is measured, ``n`` at once while it tracks."""
+async def test_their_master_switches_our_station_to_targets_and_back() -> None:
+    """``d`` is answered when the instrument is ready, a target when measured, ``n`` at once while tracking."""
     async with _field() as site:
         await site.add_our_station(1)
         master = site.their_master(1)
@@ -397,8 +395,8 @@ async def test_their_master_takes_our_station_to_targets_and_back() -> None:
         assert await master.poll(1) == (1, 3, 0.0, 0.0, 0.0, 0, 0)
 
 
-async def test_their_mission_runs_with_stations_of_both() -> None:
-    """Their master, one node of theirs and two stations of ours: synchronised, polled, synchronised again."""
+async def test_their_master_runs_a_mission_with_both_kinds_of_stations() -> None:
+    """Their master with one node of theirs and two stations of ours: synchronised, polled, resynchronised."""
     async with _field() as site:
         await site.add_authors_node(1)
         await site.add_our_station(2)

@@ -19,8 +19,8 @@ spreading_factors = pytest.mark.parametrize("spreading_factor", [8, 9])
 
 
 @spreading_factors
-async def test_the_node_hears_us(spreading_factor: int) -> None:
-    """A command of two bytes and a packet as long as they come arrive at the node."""
+async def test_node_receives_our_packets(spreading_factor: int) -> None:
+    """A command of two bytes and a packet of maximum length arrive at the node."""
     async with lab(_settings(spreading_factor)) as bench:
         node = await _node(bench, spreading_factor)
         await bench.program.run(node.listen)
@@ -31,8 +31,8 @@ async def test_the_node_hears_us(spreading_factor: int) -> None:
 
 
 @spreading_factors
-async def test_we_hear_the_node(spreading_factor: int) -> None:
-    """A measurement of the node arrives here, at the +20 dBm that it sends with."""
+async def test_we_receive_the_nodes_packets(spreading_factor: int) -> None:
+    """A measurement of the node arrives, transmitted at +20 dBm."""
     async with lab(_settings(spreading_factor)) as bench:
         node = await _node(bench, spreading_factor)
         assert await bench.program.run(lambda: node.send(payload(MEASUREMENT_BYTES)))
@@ -42,7 +42,7 @@ async def test_we_hear_the_node(spreading_factor: int) -> None:
 
 
 @spreading_factors
-async def test_the_node_answers_every_request(spreading_factor: int) -> None:
+async def test_node_responds_to_every_request(spreading_factor: int) -> None:
     """Thirty requests in a row are answered within the master's 250 ms."""
     async with lab(_settings(spreading_factor)) as bench:
         node = await _node(bench, spreading_factor)
@@ -64,8 +64,8 @@ async def test_the_node_answers_every_request(spreading_factor: int) -> None:
         await answering
 
 
-async def test_the_node_never_re_enters_reception() -> None:
-    """Packets that follow each other through the whole FIFO and around are all read from where they are."""
+async def test_node_reads_consecutive_packets_from_the_fifo() -> None:
+    """Consecutive packets through the whole FIFO, including the wrap, are read from their addresses."""
     async with lab(_settings(8)) as bench:
         node = await _node(bench, 8)
 
@@ -81,8 +81,8 @@ async def test_the_node_never_re_enters_reception() -> None:
         assert await receiving == [payload(size) for size in sizes]
 
 
-async def test_the_node_and_we_need_the_same_spreading_factor() -> None:
-    """A node of before 2021 does not hear a master that is set up for those of today."""
+async def test_node_needs_our_spreading_factor() -> None:
+    """A node deployed before 2021 does not receive a master configured for later nodes."""
     async with lab(_settings(8)) as bench:
         node = await _node(bench, 9)
         await bench.program.run(node.listen)

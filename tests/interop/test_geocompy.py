@@ -1,4 +1,4 @@
-"""geocompy, a client of others, operates the simulated total station through a pseudo-terminal, in real time."""
+"""geocompy, an independent client, operates the simulated total station through a pseudo-terminal in real time."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SCENARIO = ScenarioConfig(targets_m=((20.0, 5.0, 0.5),))
 
 @contextmanager
 def served(link: Path) -> Iterator[SimulatedTotalStation]:
-    """Serve an instrument from a thread of its own: geocompy blocks its caller."""
+    """Serve an instrument from its own thread: geocompy blocks its caller."""
     ready = threading.Event()
     made: list[SimulatedTotalStation] = []
     loop = asyncio.new_event_loop()
@@ -39,7 +39,7 @@ def served(link: Path) -> Iterator[SimulatedTotalStation]:
     async def serve() -> None:
         world = scenario_world(SCENARIO, 60.0, np.random.default_rng(1))
         timeline = LoopTimeline(loop)
-        # The world begins in an hour: nothing moves.
+        # The motion starts in an hour: nothing moves.
         start_ns = timeline.now_ns() + 3600 * 10**9
         made.append(
             SimulatedTotalStation(
@@ -77,8 +77,8 @@ def client(station: SimulatedTotalStation, tmp_path_factory: pytest.TempPathFact
         yield GeoCom(connection)
 
 
-def test_it_connects_and_is_told_who_it_is(client: GeoCom) -> None:
-    """Name, number and versions arrive as the instrument has them."""
+def test_identity(client: GeoCom) -> None:
+    """Name, serial number and versions are those of the instrument."""
     assert client.csv.get_instrument_name().params == "TCRP1201+"
     assert client.csv.get_serial_number().params == 230_001
     assert client.com.get_geocom_version().params == (1, 20, 0)
@@ -88,7 +88,7 @@ def test_it_connects_and_is_told_who_it_is(client: GeoCom) -> None:
 
 
 def test_angles(client: GeoCom, station: SimulatedTotalStation) -> None:
-    """Horizontal and zenith angle are those of the prism that it follows."""
+    """Horizontal and zenith angle point to the tracked prism."""
     horizontal, zenith = client.tmc.get_angle().params or (None, None)
     truth = station.telescope.direction()
     assert horizontal is not None
@@ -97,8 +97,8 @@ def test_angles(client: GeoCom, station: SimulatedTotalStation) -> None:
     assert float(zenith) == pytest.approx(truth[1], abs=1e-4)
 
 
-def test_a_full_measurement(client: GeoCom, station: SimulatedTotalStation) -> None:
-    """Angles, inclination, distance and its time come together, and the distance is the one that was offered."""
+def test_full_measurement(client: GeoCom, station: SimulatedTotalStation) -> None:
+    """Angles, inclination, distance and time come together, with the distance that the instrument reported."""
     assert client.tmc.set_edm_mode_v2(EDMModeV2.CONT_FAST)
     assert client.tmc.do_measurement(Measurement.DISTANCE)
     answer = client.tmc.get_complete_measurement(wait=2)
@@ -110,8 +110,8 @@ def test_a_full_measurement(client: GeoCom, station: SimulatedTotalStation) -> N
     assert client.tmc.do_measurement(Measurement.CLEAR)
 
 
-def test_the_lock_is_released_and_taken_again(client: GeoCom) -> None:
-    """Lock state, fine adjustment, following: as at the instrument's own keys."""
+def test_lock_is_released_and_reacquired(client: GeoCom) -> None:
+    """Lock state, fine adjustment and lock-in behave as at the instrument's keys."""
     assert client.mot.get_lockon_status().params is ATRLock.LOCK
     assert client.aus.switch_user_lock(False)
     assert client.mot.get_lockon_status().params is ATRLock.NONE
@@ -123,8 +123,8 @@ def test_the_lock_is_released_and_taken_again(client: GeoCom) -> None:
     assert client.mot.get_lockon_status().params is ATRLock.LOCK
 
 
-def test_it_turns_to_a_direction(client: GeoCom, station: SimulatedTotalStation) -> None:
-    """A positioning lets the prism go; the search window of the target recognition finds it again."""
+def test_positioning(client: GeoCom, station: SimulatedTotalStation) -> None:
+    """A positioning loses the prism; the search window of the target recognition finds it again."""
     horizontal, zenith = station.telescope.direction()
     assert client.aut.turn_to(Angle(horizontal + 0.03), Angle(zenith))
     assert client.mot.get_lockon_status().params is ATRLock.NONE
@@ -134,7 +134,7 @@ def test_it_turns_to_a_direction(client: GeoCom, station: SimulatedTotalStation)
 
 
 def test_distance_mode_prism_and_constant(client: GeoCom) -> None:
-    """What is set can be read back, and a prism type brings its constant with it."""
+    """Settings can be read back, and a prism type sets its constant."""
     assert client.tmc.set_edm_mode_v2(EDMModeV2.CONT_DYNAMIC)
     assert client.tmc.get_edm_mode_v2().params is EDMModeV2.CONT_DYNAMIC
     assert client.bap.set_prism_type(Prism.MINI360)
@@ -145,14 +145,14 @@ def test_distance_mode_prism_and_constant(client: GeoCom) -> None:
 
 
 def test_atmosphere(client: GeoCom) -> None:
-    """The correction for the air can be read; geocompy would round the wavelength to a micrometre when it writes it."""
+    """The atmospheric correction can be read; writing it with geocompy would round the wavelength to 1 µm."""
     assert client.tmc.get_atmospheric_corrections().params == (6.58e-7, 1013.25, 12.0, 8.6)
     assert client.tmc.set_atmospheric_correction_ppm(8.0)
     assert client.tmc.get_atmospheric_correction_ppm().params == 8.0
 
 
 def test_tilt(client: GeoCom, station: SimulatedTotalStation) -> None:
-    """The compensator shows how it leans, and an instrument that leans too far gives no angles."""
+    """The compensator reports the tilt, and beyond its range the instrument gives no angles."""
     answer = client.tmc.get_angle_inclination().params
     assert answer is not None
     assert [float(angle) for angle in answer[4:6]] == pytest.approx(station.tilt_rad, abs=2e-5)
@@ -162,8 +162,8 @@ def test_tilt(client: GeoCom, station: SimulatedTotalStation) -> None:
     assert client.tmc.get_compensator_status().params is True
 
 
-def test_switches_that_others_use(client: GeoCom) -> None:
-    """What the command line tool of geocompy's author sends on its rounds is answered."""
+def test_requests_of_geocompys_command_line_tool(client: GeoCom) -> None:
+    """Every request of the command line tool gets a response."""
     assert client.mot.stop_controller()
     assert client.mot.start_controller()
     assert client.sup.get_poweroff_configuration()

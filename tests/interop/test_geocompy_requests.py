@@ -1,4 +1,4 @@
-"""Our requests, byte for byte those of GeoComPy 1.0, an independent client; and where they are not, why."""
+"""Our requests equal those of GeoComPy 1.0, an independent client, byte for byte; each difference has its reason."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from tsgt.station.geocom.codec import Byte, decode_reply, encode_request
 
 
 class Wire(Connection):
-    """A line that keeps what is sent and answers everything with "done"."""
+    """A line that records requests and responds to each with success."""
 
     def __init__(self) -> None:
         self.sent: list[str] = []
 
     def is_open(self) -> bool:
-        """Say that it is."""
+        """Return True."""
         return True
 
     def send(self, message: str) -> None:
-        """Take what has no answer."""
+        """Accept a request without response."""
         self.sent.append(message)
 
     def send_binary(self, data: bytes) -> None:
@@ -45,7 +45,7 @@ class Wire(Connection):
         raise NotImplementedError
 
     def exchange(self, cmd: str) -> str:
-        """Take a request and answer it."""
+        """Accept a request and respond."""
         self.sent.append(cmd)
         transaction = cmd.partition(":")[0].split(",")[2]
         return f"%R1P,0,{transaction}:0"
@@ -63,7 +63,7 @@ class Wire(Connection):
 
 @pytest.fixture
 def wire(monkeypatch: pytest.MonkeyPatch) -> Wire:
-    """Make a line; GeoComPy's pause at the start is left out."""
+    """Make a line; GeoComPy's initial pause is skipped."""
     monkeypatch.setattr(geocompy.geo, "sleep", lambda _: None)
     return Wire()
 
@@ -231,7 +231,7 @@ OTHER: list[tuple[Request, str, str, str]] = [
 
 
 def ours(line: str, rpc: Rpc, parameters: Sequence[Parameter], *, checksum: bool = False) -> str:
-    """Encode the same with the transaction number that they have used."""
+    """Encode the same request with their transaction number."""
     transaction = int(line.partition(":")[0].split(",")[2])
     encoded = encode_request(rpc, parameters, transaction=transaction, checksum=checksum, decimals=15)
     assert encoded.endswith(b"\r\n")
@@ -239,8 +239,8 @@ def ours(line: str, rpc: Rpc, parameters: Sequence[Parameter], *, checksum: bool
 
 
 @pytest.mark.parametrize("checksum", [False, True])
-def test_our_requests_are_theirs(wire: Wire, checksum: bool) -> None:  # noqa: FBT001 (a parameter of pytest)
-    """Number, order and form of the parameters, byte for byte, with and without checksums."""
+def test_requests_are_equal(wire: Wire, checksum: bool) -> None:  # noqa: FBT001 (a parameter of pytest)
+    """Number, order and form of parameters are equal byte for byte, with and without checksums."""
     client = GeoCom(wire, checksum=checksum)
     for call, rpc, parameters in SAME:
         call(client)
@@ -248,10 +248,10 @@ def test_our_requests_are_theirs(wire: Wire, checksum: bool) -> None:  # noqa: F
 
 
 @pytest.mark.parametrize(("request_", "theirs", "own", "why"), OTHER)
-def test_where_our_requests_are_not_theirs(
+def test_known_differences_of_requests(
     wire: Wire, request_: Request, theirs: str, own: str, why: str
 ) -> None:
-    """The differences that are known, each with its reason; they are theirs."""
+    """Each known difference has its reason; the deviation is GeoComPy's."""
     call, rpc, parameters = request_
     call(GeoCom(wire))
     line = wire.sent[-1]
@@ -259,8 +259,8 @@ def test_where_our_requests_are_not_theirs(
     assert ours(line, rpc, parameters).split(":", 1)[1] == own
 
 
-def test_bytes_are_written_as_they_write_them(wire: Wire) -> None:
-    """A date is sent in bytes."""
+def test_byte_parameters_are_equal(wire: Wire) -> None:
+    """A date is sent as bytes."""
     GeoCom(wire).csv.set_datetime(datetime(2026, 11, 21, 12, 34, 56))  # noqa: DTZ001 (theirs have no zone)
     expected = encode_request(
         5007,
@@ -281,7 +281,7 @@ def test_bytes_are_written_as_they_write_them(wire: Wire) -> None:
         "%R1P,3081,4:0",
     ],
 )
-def test_replies_mean_to_us_what_they_mean_to_them(
+def test_responses_decode_equally(
     wire: Wire,
     line: str,
     checksum: bool,  # noqa: FBT001 (a parameter of pytest)
@@ -300,16 +300,16 @@ def test_replies_mean_to_us_what_they_mean_to_them(
     assert reply.values == (theirs.params or ())
 
 
-def test_our_names_of_procedures_are_theirs() -> None:
-    """Numbers that they know have the same names there, but for writing."""
+def test_rpc_names_are_equal() -> None:
+    """RPC numbers that both know have the same names, apart from spelling."""
     for rpc in Rpc:
         theirs = rpcnames.get(rpc)
         if theirs is not None:
             assert rpc.name.replace("_", "") == theirs.upper().replace("_", ""), rpc
 
 
-def test_our_names_of_codes_are_theirs() -> None:
-    """Except two that newer manuals write differently."""
+def test_return_code_names_are_equal() -> None:
+    """Return codes have the same names, except two that newer manuals spell differently."""
     theirs = {int(code): code.name for code in GeoComCode}
     different = {code.name for code in ReturnCode if theirs.get(code, code.name) != code.name}
     assert different == {"TMC_ANGLE_NOT_FULL_CORR", "TMC_ANGLE_NO_ACC_GUARANTY"}

@@ -25,8 +25,10 @@ pins = pytest.mark.parametrize("irq", [POLLING, WITH_DIO0], ids=["polling", "dio
 
 @sizes
 @modems
-async def test_lorarf_hears_us(spreading_factor: int, bandwidth_hz: int, coding_rate: int, size: int) -> None:
-    """What our driver sends arrives."""
+async def test_lorarf_receives_our_packets(
+    spreading_factor: int, bandwidth_hz: int, coding_rate: int, size: int
+) -> None:
+    """Our packets arrive."""
     async with lab(_settings(spreading_factor, bandwidth_hz, coding_rate)) as bench:
         lora = await bench.program.run(lambda: _lorarf(bench, spreading_factor, bandwidth_hz, coding_rate))
         receiving = asyncio.create_task(bench.program.run(lambda: _receive(lora)))
@@ -38,8 +40,10 @@ async def test_lorarf_hears_us(spreading_factor: int, bandwidth_hz: int, coding_
 
 @sizes
 @modems
-async def test_we_hear_lorarf(spreading_factor: int, bandwidth_hz: int, coding_rate: int, size: int) -> None:
-    """What that driver sends arrives here, at the power that it sets."""
+async def test_we_receive_lorarfs_packets(
+    spreading_factor: int, bandwidth_hz: int, coding_rate: int, size: int
+) -> None:
+    """That driver's packets arrive, at the power that it sets."""
     async with lab(_settings(spreading_factor, bandwidth_hz, coding_rate)) as bench:
         lora = await bench.program.run(lambda: _lorarf(bench, spreading_factor, bandwidth_hz, coding_rate))
         await bench.program.run(lambda: _send(lora, payload(size)))
@@ -49,8 +53,8 @@ async def test_we_hear_lorarf(spreading_factor: int, bandwidth_hz: int, coding_r
 
 
 @pins
-async def test_lorarf_sends_one_after_the_other(irq: int) -> None:
-    """Its transmit buffer starts where the last access ended, and wraps; the interrupt pin works as well."""
+async def test_lorarf_transmits_consecutive_packets(irq: int) -> None:
+    """Its transmit buffer starts where the last access ended, and wraps; polling and the interrupt pin both work."""
     async with lab(_settings(7, 125_000, 5)) as bench:
         lora = await bench.program.run(lambda: _lorarf(bench, 7, 125_000, 5, irq=irq))
         for size in (100, 120, 90):
@@ -59,8 +63,8 @@ async def test_lorarf_sends_one_after_the_other(irq: int) -> None:
 
 
 @pins
-async def test_lorarf_receives_one_after_the_other(irq: int) -> None:
-    """It receives on and on, from wherever the chip has put each packet."""
+async def test_lorarf_receives_consecutive_packets(irq: int) -> None:
+    """It receives continuously, reading each packet from its FIFO address."""
     async with lab(_settings(7, 125_000, 5)) as bench:
 
         def receive(count: int) -> list[bytes]:
@@ -82,7 +86,7 @@ async def test_lorarf_receives_one_after_the_other(irq: int) -> None:
 
 
 async def test_lorarf_times_out() -> None:
-    """Its single reception ends with RxTimeout after the time that it was given."""
+    """Its single reception ends with RxTimeout after the set time."""
     async with lab(_settings(7, 125_000, 5)) as bench:
         lora = await bench.program.run(lambda: _lorarf(bench, 7, 125_000, 5))
 
@@ -97,7 +101,7 @@ async def test_lorarf_times_out() -> None:
 
 
 async def test_packets_without_crc_are_dropped() -> None:
-    """That driver sends without CRC unless asked for one; ours takes no packet that it cannot trust."""
+    """That driver sends without CRC by default; ours drops packets without CRC."""
     async with lab(_settings(7, 125_000, 5)) as bench:
         lora = await bench.program.run(lambda: _lorarf(bench, 7, 125_000, 5))
         await bench.program.run(lambda: lora.setCrcEnable(crcType=False))
@@ -106,8 +110,8 @@ async def test_packets_without_crc_are_dropped() -> None:
         assert (bench.radio.statistics.received, bench.radio.statistics.no_crc) == (0, 1)
 
 
-async def test_inverted_chirps_meet() -> None:
-    """With inverted IQ on both sides the packets pass, with it on one side they do not."""
+async def test_inverted_iq() -> None:
+    """Packets pass with inverted IQ on both sides, not on one side only."""
     settings = _settings(7, 125_000, 5, inverted_iq=True)
     async with lab(settings) as bench:
         lora = await bench.program.run(lambda: _lorarf(bench, 7, 125_000, 5))
@@ -135,7 +139,7 @@ def _settings(
 def _lorarf(
     bench: Lab, spreading_factor: int, bandwidth_hz: int, coding_rate: int, *, irq: int = POLLING
 ) -> Any:
-    """Make and set up LoRaRF's driver on the peer's chip, a copy of its own, for it holds one radio."""
+    """Make and set up a copy of LoRaRF's module on the peer's chip; the module holds one radio."""
     pi = RaspberryPi(bench.program, bench.chip, reset_pin=RESET_PIN, dio0_pin=WITH_DIO0)
     driver: Any = import_driver("LoRaRF.SX127x", pi.modules())
     driver.time = bench.program

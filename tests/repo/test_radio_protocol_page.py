@@ -161,9 +161,9 @@ def test_every_status_of_the_superframe_stands_there() -> None:
         assert int.from_bytes(content[:2], "big") & 0b111 == int(number)
 
 
-def test_every_order_stands_there() -> None:
-    """The table of orders is that of the code, and so is how far around a direction to search."""
-    rows = _rows("order | the station")
+def test_every_command_of_the_superframe_stands_there() -> None:
+    """The table of commands is that of the code, and so is the half-width of a search window."""
+    rows = _rows("command | the station")
     direction = Direction(1.0, 1.5, math.radians(1.9))
     orders = (TrackCommand(4), SearchCommand(), DirectCommand(), MeasureCommand(), SearchCommand(direction))
     parts = [encode_command(1, 0, order, tracked=1) for order in orders]
@@ -236,7 +236,7 @@ BEACON_WITH_DIRECTION = Beacon(
     commands=(EncodedCommand(3, 6, 4, 6, EncodedDirection(19_532, 16_537)),),
 )
 SINGLE = EncodedMeasurement(1041 % 256, 10_025_000 % 2**17, Status.OK, 5_000_000, 4_233_600, 756_032)
-RUN = MeasurementBlock(
+BLOCK = MeasurementBlock(
     measurements=(
         EncodedMeasurement(1032 % 256, 57_903, Status.OK, 3_010_000, 4_200_100, 612_300),
         EncodedMeasurement(1031 % 256, 57_903 - 25_003, Status.OK, 2_994_895, 4_200_280, 608_057),
@@ -265,21 +265,21 @@ JOINING = Reply(
 )
 REPLIES = {
     "one measurement": Reply(blocks=(MeasurementBlock(measurements=(SINGLE,)),)),
-    "a run": Reply(blocks=(RUN,)),
+    "a block": Reply(blocks=(BLOCK,)),
     "a station joins": JOINING,
-    "an answer": Reply(
+    "a response": Reply(
         status_report=StatusReport(
             prism=4, direct=False, connected=True, missed_slots=0, rejected_beacons=0, rssi_dbm=-88
         ),
         turnaround_us=178_344,
         response=CommandResponse(5, ok=True),
     ),
-    "a shot": Reply(single_measurement=SingleMeasurement(6, Status.OK, 12_345_678, 4_100_000, 423_456)),
+    "a single measurement": Reply(single_measurement=SingleMeasurement(6, Status.OK, 12_345_678, 4_100_000, 423_456)),
 }
 BEACONS = {
     "a beacon": BEACON,
     "a beacon with items": BEACON_WITH_ITEMS,
-    "a beacon that says where to look": BEACON_WITH_DIRECTION,
+    "a beacon with a direction": BEACON_WITH_DIRECTION,
 }
 GIVEN = {name: _bytes(cell) for name, cell in _rows("given | value")}
 
